@@ -11,9 +11,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array, csr_array, diags_array, vstack
-from scipy.sparse.csgraph import connected_components
 
 from jaxphoto.adjustment.layout.tiling import size_class
 from jaxphoto.adjustment.model.numbers import Values, zero_increments
@@ -38,9 +37,9 @@ _ROWS = 64
 class SeenMotions:
     """d(rows / sigma) / d(motions, declared unknowns): columns of the seven motions, then one of each unknown."""
 
-    placed: csr_array
+    placed: scipy.sparse.csr_array
     """Rows that touch images or points."""
-    alone: csr_array
+    alone: scipy.sparse.csr_array
     """Rows that touch declared unknowns alone."""
 
     def null_motions(self) -> Float[np.ndarray, "defect 7"]:
@@ -50,7 +49,7 @@ class SeenMotions:
         """
         open_ones = np.setdiff1d(np.arange(7, self.alone.shape[1]), self.determined)
         kept = np.concatenate([np.arange(7), open_ones])
-        sensitivity = vstack([self.placed, self.alone]).tocsr()[:, kept].toarray()
+        sensitivity = scipy.sparse.vstack([self.placed, self.alone]).tocsr()[:, kept].toarray()
         # Those that see none of these are many.
         sensitivity = sensitivity[sensitivity.any(axis=1)]
         if not len(sensitivity):
@@ -74,7 +73,7 @@ class SeenMotions:
 
         All unknowns go along, as far as rows of their own let them.
         """
-        rows = vstack([self.placed, self.alone]).tocsr()
+        rows = scipy.sparse.vstack([self.placed, self.alone]).tocsr()
         normal = (rows.T @ rows).toarray()
         gone = self.determined
         kept = np.setdiff1d(np.arange(len(normal)), gone)
@@ -87,18 +86,18 @@ class SeenMotions:
     @classmethod
     def of_motions(cls, rows: Float[np.ndarray, "rows 7"]) -> "SeenMotions":
         """Rows that see motions alone, and no unknowns."""
-        return cls(csr_array(rows), csr_array((0, 7)))
+        return cls(scipy.sparse.csr_array(rows), scipy.sparse.csr_array((0, 7)))
 
     def with_motions(self, rows: Float[np.ndarray, "rows 7"]) -> "SeenMotions":
         """With rows more, which see motions alone."""
-        more = csr_array(np.pad(rows, [(0, 0), (0, self.placed.shape[1] - 7)]))
-        return replace(self, placed=vstack([self.placed, more]).tocsr())
+        more = scipy.sparse.csr_array(np.pad(rows, [(0, 0), (0, self.placed.shape[1] - 7)]))
+        return replace(self, placed=scipy.sparse.vstack([self.placed, more]).tocsr())
 
     @cached_property
     def determined(self) -> Int[np.ndarray, "k"]:
         """Columns of unknowns that their own rows determine, which is judged of all together that these join."""
         own = self.alone[:, 7:].tocsc()
-        count, part = connected_components(own.T @ own, directed=False)
+        count, part = scipy.sparse.csgraph.connected_components(own.T @ own, directed=False)
         found = [np.zeros(0, int)]
         for columns in (np.flatnonzero(part == k) for k in range(count)):
             rows = own[:, columns].tocsr()
@@ -108,10 +107,10 @@ class SeenMotions:
         return np.sort(np.concatenate(found))
 
 
-def _determines_all(rows: csr_array) -> bool:
+def _determines_all(rows: scipy.sparse.csr_array) -> bool:
     """Whether rows determine each of their columns; of a hundred thousand rows most are never full."""
     n = rows.shape[1]
-    rows = rows @ diags_array(1 / np.sqrt(rows.power(2).sum(axis=0)))
+    rows = rows @ scipy.sparse.diags_array(1 / np.sqrt(rows.power(2).sum(axis=0)))
     squares = np.linalg.eigvalsh((rows.T @ rows).toarray())
     if squares[0] > _PLAIN * squares[-1]:
         return True
@@ -143,7 +142,10 @@ def row_sensitivity(
     # What is not chosen, and what means no unknown, has a column behind the last.
     place = np.full(s.n_shared + 1, width)
     place[chosen] = 7 + np.arange(len(chosen))
-    found: dict[bool, list[csr_array]] = {True: [csr_array((0, width))], False: [csr_array((0, width))]}
+    found: dict[bool, list[scipy.sparse.csr_array]] = {
+        True: [scipy.sparse.csr_array((0, width))],
+        False: [scipy.sparse.csr_array((0, width))],
+    }
     for g, slope in zip(s.observed, jax.device_get(_slopes(*_in_few_sizes(values, s), motions)), strict=True):
         by_motion, by_shared = (v[..., : g.n_rows] for v in slope)
         own = np.broadcast_to(place[g.column], by_shared.shape)
@@ -151,10 +153,10 @@ def row_sensitivity(
         numbers = np.concatenate([by_motion, by_shared], axis=1)
         row = np.broadcast_to(np.arange(g.components * g.n_rows).reshape(g.components, 1, -1), numbers.shape)
         shape = g.components * g.n_rows, width + 1
-        rows = coo_array((numbers.ravel(), (row.ravel(), columns.ravel())), shape).tocsr()[:, :width]
+        rows = scipy.sparse.coo_array((numbers.ravel(), (row.ravel(), columns.ravel())), shape).tocsr()[:, :width]
         rows.eliminate_zeros()
         found[bool(len(g.image) or len(g.point))].append(rows)
-    return SeenMotions(vstack(found[True]).tocsr(), vstack(found[False]).tocsr())
+    return SeenMotions(scipy.sparse.vstack(found[True]).tocsr(), scipy.sparse.vstack(found[False]).tocsr())
 
 
 def _in_few_sizes(values: Values, s: Structure) -> tuple[Values, Structure]:

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import least_squares
+import scipy
 
 from jaxphoto.camera.distortion import AbstractDistortion, invert
 from jaxphoto.camera.equivalence import exact
@@ -159,7 +159,7 @@ def _fit(
     def jacobian(values):
         return np.asarray(call_compiled(_jacobian, whole(values), *data)).reshape(-1, len(names))[:, free]
 
-    solved = least_squares(residuals, begin[free], jacobian, method="lm", x_scale="jac", **_UNTIL)
+    solved = scipy.optimize.least_squares(residuals, begin[free], jacobian, method="lm", x_scale="jac", **_UNTIL)
     interior = _with(first, whole(solved.x))
     moved = np.asarray(call_compiled(_moved, _arrays(interior), *data[1:]))[: len(points)]
     column, row = sensor.px_from_mm(points[[np.argmax(moved)]])[0].tolist()

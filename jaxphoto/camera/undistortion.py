@@ -6,8 +6,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy.interpolate import RectBivariateSpline
 
 from jaxphoto.camera.distortion import Brown
 from jaxphoto.camera.interior import InteriorOrientation
@@ -72,7 +72,7 @@ def source_pixels(
     coarse = [np.linspace(v[0], v[-1], max(len(v) // _STEP, 4)) for v in (rows, columns)]
     found = _at(sensor, interior, new, *coarse)
     if np.isfinite(found).all():
-        column, row = (RectBivariateSpline(*coarse, found[k])(rows, columns) for k in (0, 1))
+        column, row = (scipy.interpolate.RectBivariateSpline(*coarse, found[k])(rows, columns) for k in (0, 1))
     else:
         # Where nothing is to be seen, nothing can be interpolated.
         column, row = np.nan_to_num(_at(sensor, interior, new, rows, columns), nan=_NOWHERE)

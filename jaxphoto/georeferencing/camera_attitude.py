@@ -9,8 +9,8 @@ and forward in this order, the frame being north, east, down.
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 # Columns: north, east and down in axes east, north, up; its own inverse.
 _ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -55,4 +55,4 @@ def level_from_body(roll_pitch_yaw_deg: tuple[float, float, float]) -> Float[np.
 
 
 def _turned(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Float[np.ndarray, "3 3"]:
-    return Rotation.from_euler("ZYX", [yaw_deg, pitch_deg, roll_deg], degrees=True).as_matrix()
+    return scipy.spatial.transform.Rotation.from_euler("ZYX", [yaw_deg, pitch_deg, roll_deg], degrees=True).as_matrix()

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 
 from jaxphoto.errors import InputError
 from jaxphoto.image_measurement.features import FEATURES, OF_FEW
@@ -77,5 +77,5 @@ def photograph_pairs(
 def nearest_pairs(positions_m: Float[np.ndarray, "n axes"], count: int) -> list[tuple[int, int]]:
     """The pairs (first < second) in which one is among the `count` nearest of the other."""
     n = len(positions_m)
-    _, near = cKDTree(positions_m).query(positions_m, k=range(1, min(count + 1, n) + 1))
+    _, near = scipy.spatial.cKDTree(positions_m).query(positions_m, k=range(1, min(count + 1, n) + 1))
     return sorted({(min(k, j), max(k, j)) for k in range(n) for j in near[k].tolist() if j != k})

@@ -9,8 +9,8 @@ few points far away cannot make the grid large.
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Bool, Float, Int
-from scipy.spatial import KDTree
 
 from jaxphoto.arrays import Numbers
 from jaxphoto.cloud import Cloud
@@ -276,6 +276,6 @@ def _nearest_of(grid: Grid, xy: np.ndarray, begin: np.ndarray, end: np.ndarray, 
 
 def _from_tree(grid: Grid, xy: np.ndarray, k: int):
     # Sorted as the points are, a simple tree is as good as a balanced one, and sooner made.
-    tree = KDTree(grid.xyz[: len(grid), :2], balanced_tree=False, compact_nodes=False)
+    tree = scipy.spatial.KDTree(grid.xyz[: len(grid), :2], balanced_tree=False, compact_nodes=False)
     distance, index = tree.query(xy, k=np.arange(1, k + 1))
     return distance, np.where(np.isfinite(distance), index, 0)

@@ -12,8 +12,8 @@ expression in microarray experiments.
 """
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
-from scipy.special import digamma, polygamma
 
 _ROUNDS = 50
 
@@ -23,12 +23,12 @@ def moderated_variances(variance: Float[np.ndarray, "n"], freedom: Int[np.ndarra
     if len(variance) < 2:
         return variance
     half = freedom / 2
-    log = np.log(variance) - digamma(half) + np.log(half)
-    scatter = float(np.var(log, ddof=1) - np.mean(polygamma(1, half)))
+    log = np.log(variance) - scipy.special.digamma(half) + np.log(half)
+    scatter = float(np.var(log, ddof=1) - np.mean(scipy.special.polygamma(1, half)))
     if scatter <= 0:
         return np.full(len(variance), np.exp(np.mean(log)))
     prior = _inverse_trigamma(scatter)
-    common = np.exp(np.mean(log) + digamma(prior) - np.log(prior))
+    common = np.exp(np.mean(log) + scipy.special.digamma(prior) - np.log(prior))
     return (prior * common + half * variance) / (prior + half)
 
 
@@ -36,8 +36,8 @@ def _inverse_trigamma(value: float) -> float:
     """Newton on 1 / trigamma, which is nearly a line and convex: it comes from one side."""
     x = 0.5 + 1 / value
     for _ in range(_ROUNDS):
-        slope = polygamma(1, x)
-        step = float(slope * (1 - slope / value) / polygamma(2, x))
+        slope = scipy.special.polygamma(1, x)
+        step = float(slope * (1 - slope / value) / scipy.special.polygamma(2, x))
         x += step
         if abs(step) < 1e-9 * x:
             break

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import numpy as np
+import scipy
 from jaxtyping import Array, Bool, Float
-from scipy import ndimage
 
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.collinearity import ExteriorOrientation, in_field, project
@@ -67,7 +67,7 @@ def orthophoto(
         # The centre of the first pixel is (0.5, 0.5), its index 0.
         at = px[good][:, ::-1].T - 0.5
         for band in range(bands):
-            values = ndimage.map_coordinates(photograph[band], at, float, order=1, mode="nearest")
+            values = scipy.ndimage.map_coordinates(photograph[band], at, float, order=1, mode="nearest")
             pixels[band, cells] = np.rint(values) if pixels.dtype.kind in "iu" else values
         seen[cells] = True
     return Picture(pixels.reshape(bands, rows, columns), seen.reshape(rows, columns))

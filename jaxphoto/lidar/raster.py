@@ -9,8 +9,8 @@ from typing import Literal, get_args
 
 import equinox as eqx
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy import ndimage
 
 from jaxphoto.errors import InputError
 
@@ -99,11 +99,11 @@ def filled(raster: Raster, distance_m: float) -> Raster:
     reaches the edge of the raster, which is the outside of the cloud.
     """
     empty = np.isnan(raster.heights)
-    holes, n = ndimage.label(empty)
+    holes, n = scipy.ndimage.label(empty)
     if n == 0 or empty.all():
         return raster
-    away = ndimage.distance_transform_edt(empty) * raster.cell_m
-    small = ndimage.maximum(away, holes, np.arange(n + 1)) <= distance_m * (1 + 1e-9)
+    away = scipy.ndimage.distance_transform_edt(empty) * raster.cell_m
+    small = scipy.ndimage.maximum(away, holes, np.arange(n + 1)) <= distance_m * (1 + 1e-9)
     edge = np.concatenate([holes[0], holes[-1], holes[:, 0], holes[:, -1]])
     small[edge] = False
     small[0] = False

@@ -9,10 +9,8 @@ neighbours belong to.
 
 import equinox as eqx
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, KDTree
 
 from jaxphoto.errors import InputError
 from jaxphoto.lidar.planes import Plane, fit_plane, plane_distance, point_sigma
@@ -59,14 +57,16 @@ def planar_patches(
             "window, or all classes"
         )
     sigma = point_sigma(sigma_xy_m, sigma_z_m)
-    distance, near = KDTree(xyz).query(xyz, k=_SEED)
+    distance, near = scipy.spatial.KDTree(xyz).query(xyz, k=_SEED)
     reach = _GAP * np.median(distance[:, _GRAPH - 1])
     pairs = np.argwhere(distance[:, 1:_GRAPH] <= reach)
-    graph = csr_matrix((np.ones(len(pairs)), (pairs[:, 0], near[pairs[:, 0], pairs[:, 1] + 1])), (len(xyz),) * 2)
+    graph = scipy.sparse.csr_matrix(
+        (np.ones(len(pairs)), (pairs[:, 0], near[pairs[:, 0], pairs[:, 1] + 1])), (len(xyz),) * 2
+    )
     graph = (graph + graph.T).tocsr()
     even = _unevenness(xyz[near], sigma) < _PLANAR
     # House by house: what does not hang together has no face in common.
-    _, house = connected_components(graph, directed=False)
+    _, house = scipy.sparse.csgraph.connected_components(graph, directed=False)
     by_house = np.split(np.argsort(house, kind="stable"), np.cumsum(np.bincount(house))[:-1])
     place = np.full(len(xyz), -1)
     patches: list[Patch] = []
@@ -113,7 +113,7 @@ def _plane(xyz: np.ndarray, sigma: np.ndarray) -> Plane:
 
 
 def _of_house(
-    xyz: np.ndarray, near: np.ndarray, even: np.ndarray, graph: csr_matrix, sigma: np.ndarray, least: int
+    xyz: np.ndarray, near: np.ndarray, even: np.ndarray, graph: scipy.sparse.csr_matrix, sigma: np.ndarray, least: int
 ) -> list[Patch]:
     """The patches of points that hang together; `near` are the neighbours of each, -1 where they are not among them."""
     members: list[np.ndarray] = []
@@ -157,7 +157,7 @@ def _faces(
 def _patch(members: np.ndarray, plane: Plane, xyz: np.ndarray) -> Patch:
     index = members[plane.inliers]
     plane = eqx.tree_at(lambda p: p.inliers, plane, np.ones(len(index), bool))
-    corners = xyz[index][ConvexHull(xyz[index, :2]).vertices]
+    corners = xyz[index][scipy.spatial.ConvexHull(xyz[index, :2]).vertices]
     distance, _ = plane_distance(plane, corners)
     return Patch(index, plane, corners - np.outer(distance / plane.normal[2], [0.0, 0.0, 1.0]))
 
@@ -168,7 +168,9 @@ def _unevenness(around: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     return np.linalg.eigvalsh(np.swapaxes(scaled, 1, 2) @ scaled)[:, 0] / (around.shape[1] - 3)
 
 
-def _grown(scaled: np.ndarray, seed: np.ndarray, free: np.ndarray, graph: csr_matrix) -> Int[np.ndarray, "n"]:
+def _grown(
+    scaled: np.ndarray, seed: np.ndarray, free: np.ndarray, graph: scipy.sparse.csr_matrix
+) -> Int[np.ndarray, "n"]:
     """The free points that a patch grows to from `seed`; `scaled` are all, in standard deviations of X, Y and Z."""
     patch = seed
     for _ in range(_ROUNDS):
@@ -177,7 +179,7 @@ def _grown(scaled: np.ndarray, seed: np.ndarray, free: np.ndarray, graph: csr_ma
         off = scaled - scaled[patch].mean(axis=0)
         _, axes = np.linalg.eigh(off[patch].T @ off[patch])
         near = np.flatnonzero(free & (np.abs(off @ axes[:, 0]) < _CUT))
-        _, part = connected_components(graph[near][:, near], directed=False)
+        _, part = scipy.sparse.csgraph.connected_components(graph[near][:, near], directed=False)
         largest = np.bincount(part[np.isin(near, patch)], minlength=1)
         new = near[part == np.argmax(largest)] if len(near) else near
         if np.array_equal(new, patch):
@@ -187,7 +189,7 @@ def _grown(scaled: np.ndarray, seed: np.ndarray, free: np.ndarray, graph: csr_ma
 
 
 def _shared(
-    xyz: np.ndarray, members: list[np.ndarray], planes: list[Plane], graph: csr_matrix, sigma: np.ndarray
+    xyz: np.ndarray, members: list[np.ndarray], planes: list[Plane], graph: scipy.sparse.csr_matrix, sigma: np.ndarray
 ) -> list[np.ndarray]:
     """Each point to the nearest of the planes of its neighbours and its own."""
     distance = np.abs(np.stack([_scaled_distance(xyz, plane, sigma) for plane in planes]))

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Bool, Float
-from scipy.ndimage import grey_closing, uniform_filter
 
 from jaxphoto.arrays import Numbers
 from jaxphoto.lidar.grid import Grid
@@ -51,7 +51,7 @@ def skyline(grid: Grid) -> Skyline:
     tops = np.full(len(grid.start), -np.inf)
     tops[some] = np.maximum.reduceat(z, start[some])
     inside = tops[: rows * columns].reshape(rows, columns)
-    inside[...] = grey_closing(inside, 3, mode="nearest")
+    inside[...] = scipy.ndimage.grey_closing(inside, 3, mode="nearest")
     return Skyline(tops, z.min(), z.max())
 
 
@@ -61,7 +61,7 @@ def window_reach(grid: Grid, wanted: int) -> int:
     count = np.diff(np.asarray(grid.start[: rows * columns + 1])).reshape(rows, columns)
     for reach in range(1, _FARTHEST):
         size = 2 * reach + 1
-        inside = uniform_filter(count.astype(float), size, mode="constant") * size**2
+        inside = scipy.ndimage.uniform_filter(count.astype(float), size, mode="constant") * size**2
         if np.mean(inside[count > 0] < wanted - 0.5) < 0.1:
             return reach
     return _FARTHEST

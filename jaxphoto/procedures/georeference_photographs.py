@@ -10,11 +10,10 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
 from pyproj.aoi import AreaOfInterest
 from pyproj.database import query_utm_crs_info
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from jaxphoto.block import Block, Datum, Frame
 from jaxphoto.errors import InputError
@@ -325,7 +324,7 @@ def _nearest(
     """
 
     def at(x: np.ndarray) -> Similarity:
-        turn = Rotation.from_rotvec(x[3:6]).as_matrix() @ start.turn
+        turn = scipy.spatial.transform.Rotation.from_rotvec(x[3:6]).as_matrix() @ start.turn
         return Similarity(x[:3], turn, float(np.exp(x[6])))
 
     # The shift is that of the middle, which a turn leaves where it is.
@@ -335,9 +334,12 @@ def _nearest(
         off = np.ravel((here - at(x).of(there - middle)) / sigma)
         if recorded is None:
             return off
-        apart = Rotation.from_matrix(at(x).turn @ recorded.turn.T).as_rotvec() / recorded.turn_sigma_rad
+        apart = (
+            scipy.spatial.transform.Rotation.from_matrix(at(x).turn @ recorded.turn.T).as_rotvec()
+            / recorded.turn_sigma_rad
+        )
         return np.concatenate([off, apart])
 
     begin = np.concatenate([start.of(middle[None])[0], np.zeros(3), [np.log(start.scale)]])
-    best = at(least_squares(residual, begin, x_scale="jac").x)
+    best = at(scipy.optimize.least_squares(residual, begin, x_scale="jac").x)
     return best._replace(shift=best.shift - best.scale * best.turn @ middle)

@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from jaxphoto.errors import counted, few
 from jaxphoto.georeferencing.gps import Gps
@@ -84,7 +84,7 @@ def attitude_words(recorded: RecordedTurn | str | None, used: bool, turn: Float[
         yield recorded
     if not isinstance(recorded, RecordedTurn):
         return
-    apart = np.rad2deg(np.linalg.norm(Rotation.from_matrix(turn @ recorded.turn.T).as_rotvec()))
+    apart = np.rad2deg(np.linalg.norm(scipy.spatial.transform.Rotation.from_matrix(turn @ recorded.turn.T).as_rotvec()))
     scatter, boresight = np.rad2deg([recorded.scatter_rad, recorded.turn_sigma_rad])
     words = f"{len(recorded.image)} recorded attitudes agree with one another to {scatter:.2g} degrees"
     if recorded.quarters:

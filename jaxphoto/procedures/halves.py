@@ -14,8 +14,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
-from scipy.linalg import hadamard
 
 from jaxphoto.adjustment import Adjustment, Sizes, common_sizes
 from jaxphoto.block import Block
@@ -219,7 +219,7 @@ def _balanced(units: int, rng: np.random.Generator) -> Bool[np.ndarray, "cuts un
     Source: McCarthy (1969), balanced half-samples.
     """
     order = 1 << (units - 1).bit_length()
-    rows = hadamard(order)[rng.permutation(order)]
+    rows = scipy.linalg.hadamard(order)[rng.permutation(order)]
     tried = [rows[:, rng.permutation(order)[:units]] * rng.choice([-1, 1], units) for _ in range(_TRIES)]
     return max((cuts[np.abs(cuts.sum(axis=1)) <= units / 3] for cuts in tried), key=len) > 0
 

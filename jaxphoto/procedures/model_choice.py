@@ -19,8 +19,8 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.special import fdtrc
 
 from jaxphoto.adjustment import Adjustment, Sizes
 from jaxphoto.block import Block
@@ -208,4 +208,4 @@ def _f_test(smaller: Judged, larger: Judged) -> tuple[float, float]:
     if larger.redundancy <= 0 or more <= 0:
         return _NAN, _NAN
     f = (smaller.square_sum - larger.square_sum) / more / (larger.square_sum / larger.redundancy)
-    return f, float(fdtrc(more, larger.redundancy, max(f, 0.0)))
+    return f, float(scipy.special.fdtrc(more, larger.redundancy, max(f, 0.0)))

@@ -11,8 +11,8 @@ the network in height, and a delay or a lever arm, which turn with the flight.
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
-from scipy.stats import t as student
 
 _LEVEL = 0.03
 # More are a pattern of another kind.
@@ -94,7 +94,7 @@ def _next(y: np.ndarray, model: np.ndarray, apart: np.ndarray, known: list[int],
     t = np.abs(jump) * np.sqrt(np.maximum(lever, 0.1) * free / np.maximum(squares, 1e-12))
     inside = (place >= _LEAST) & (place <= len(y) - _LEAST)
     t = np.where(inside[:, None] & (np.abs(jump) * scale * wide > least_m), t, 0.0)
-    limit = float(student.isf(_LEVEL / (2 * t.size), free))
+    limit = float(scipy.stats.t.isf(_LEVEL / (2 * t.size), free))
     return int(place[np.argmax(t.max(axis=1))]) if t.max() > limit else None
 
 

@@ -69,7 +69,7 @@ def block_in_space(source: Block | Adjustment, covariance: Covariance | None = N
     return Figure(data=traces, layout=layout, skip_invalid=False)
 
 
-def origin_of(places: BlockPlaces) -> Float[np.ndarray, "3"]:
+def origin_of(places: BlockPlaces) -> Float[np.ndarray, 3]:
     """What the drawn coordinates are less of (m): round, and zero where coordinates are small."""
     known = places.points[places.point_known] if places.point_known.any() else places.stations[places.image_known]
     known = known[np.isfinite(known).all(axis=1)]

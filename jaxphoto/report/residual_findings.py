@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import erfc
+import scipy
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
@@ -208,7 +208,7 @@ def _effect(tables: Tables, suspect: Suspect) -> tuple[str, float]:
 def _chance_of_the_worst(tables: Tables) -> float:
     """Of a normalised residual among all that there are."""
     w = max(abs(s.w) for s in tables.blunders.suspects)
-    return tables.blunders.n * float(erfc(w / np.sqrt(2)))
+    return tables.blunders.n * float(scipy.special.erfc(w / np.sqrt(2)))
 
 
 class _Pattern(NamedTuple):

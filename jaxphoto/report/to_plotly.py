@@ -305,7 +305,7 @@ def _paths(artist: Any) -> Iterator[Any]:
             yield _moved(_moved(path, turned[:2, :2], turned[:2, 2]).transformed(place), np.eye(2), moved)
 
 
-def _moved(path: Any, turn: Float[np.ndarray, "2 2"], by: Float[np.ndarray, "2"]) -> Any:
+def _moved(path: Any, turn: Float[np.ndarray, "2 2"], by: Float[np.ndarray, 2]) -> Any:
     """A path of matplotlib's, turned and shifted."""
     return type(path)(path.vertices @ turn.T + by, path.codes)
 

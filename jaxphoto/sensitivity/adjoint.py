@@ -12,8 +12,8 @@ These are a few dense products of numbers that lie still, which BLAS does best.
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
-from scipy.linalg import lapack
 
 
 class Estimates(NamedTuple):
@@ -70,11 +70,11 @@ def adjoint_vectors(h: Any, of: Estimates) -> Float[np.ndarray, "unknowns estima
 
 def _inverse(m: Float[np.ndarray, "n n"], positive: bool) -> Float[np.ndarray, "n n"]:
     """Of a matrix that may be symmetric and positive definite: half of it, then, by Cholesky."""
-    lower, failed = lapack.dpotrf(m.T, lower=True) if positive else (m, True)
+    lower, failed = scipy.linalg.lapack.dpotrf(m.T, lower=True) if positive else (m, True)
     if failed:
         return np.linalg.inv(m)
     # What lies above the diagonal is zero.
-    half = lapack.dpotri(lower, lower=True, overwrite_c=True)[0]
+    half = scipy.linalg.lapack.dpotri(lower, lower=True, overwrite_c=True)[0]
     inverse = half + half.T
     np.fill_diagonal(inverse, half.diagonal())
     return inverse

@@ -21,8 +21,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float, Int
-from scipy import sparse
 
 from jaxphoto.adjustment import Adjustment, NormalEquations, TiledBlock
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
@@ -183,12 +183,12 @@ def _observations(found: _Derivatives, tiled: TiledBlock, first: int) -> dict[st
     return {name: (b, np.broadcast_to(unknowns.astype(np.int32), b.shape)) for name, (b, unknowns) in rows.items()}
 
 
-def _sparse(rows: Sequence[Rows], unknowns: int) -> sparse.csr_array:
+def _sparse(rows: Sequence[Rows], unknowns: int) -> scipy.sparse.csr_array:
     """-B, a row each number that is observed."""
     lengths = np.repeat([b.shape[-1] for b, _ in rows], [math.prod(b.shape[:-1]) for b, _ in rows])
     data, columns = (np.concatenate([part[k].ravel() for part in rows]) for k in range(2))
     starts = np.append(0, np.cumsum(lengths)).astype(np.int32)
-    return sparse.csr_array((data, columns, starts), shape=(len(lengths), unknowns))
+    return scipy.sparse.csr_array((data, columns, starts), shape=(len(lengths), unknowns))
 
 
 class _Held(NamedTuple):

@@ -29,8 +29,8 @@ Source of the overlap of half-samples: McCarthy (1969), Review of the Internatio
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
-from scipy.special import fdtri, gammaincinv
 
 from jaxphoto.arrays import Numbers
 from jaxphoto.short_repr import shown
@@ -139,4 +139,4 @@ def square_radius(covariance: Float[np.ndarray, "cells 2 2"], rho: float = 0.0) 
     """
     trace = np.trace(covariance, axis1=1, axis2=2)
     a = trace**2 / (covariance**2).sum(axis=(1, 2))
-    return trace * (fdtri(a, a / rho, LEVEL) if rho else 2 * gammaincinv(a / 2, LEVEL) / a)
+    return trace * (scipy.special.fdtri(a, a / rho, LEVEL) if rho else 2 * scipy.special.gammaincinv(a / 2, LEVEL) / a)

@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
-from scipy.special import chdtrc, ndtr
 
 from jaxphoto.camera import (
     InteriorOrientation,
@@ -119,7 +119,7 @@ def change(
     if of_one_model(first, second):
         parameters = _parameters(first, second, q1 + q2)
         chi_square, freedom = mahalanobis(np.array([one.difference for one in parameters]), q1 + q2)
-        p_value = float(chdtrc(freedom, chi_square)) if freedom else float("nan")
+        p_value = float(scipy.special.chdtrc(freedom, chi_square)) if freedom else float("nan")
     field = Analysis(method, offsets, offset_uncertainty(offsets, *covariances))
     return Change(parameters, chi_square, freedom, p_value, field, np.sqrt(square_radius(by_point)))
 
@@ -147,7 +147,7 @@ def _parameters(
     sigma = np.sqrt(np.diagonal(covariance))
     found = []
     for name, a, b, s in zip(parameter_names(first), one, other, sigma, strict=True):
-        p_value = 2 * float(ndtr(-abs(b - a) / s)) if s > 0 else float("nan")
+        p_value = 2 * float(scipy.special.ndtr(-abs(b - a) / s)) if s > 0 else float("nan")
         numbers = float(a), float(b), float(b - a), float(s), p_value
         found.append(ParameterChange(name, *numbers, parameter_unit(first, name)))
     return tuple(found)

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.special import chdtrc
 
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names
 from jaxphoto.errors import InputError
@@ -84,7 +84,7 @@ def combine(
     for k in range(len(x)):
         others, of_others = _mean(np.delete(x, k, axis=0), np.delete(q, k, axis=0))
         square, n = mahalanobis(x[k] - others, q[k] + of_others)
-        against.append(float(chdtrc(n, square)))
+        against.append(float(scipy.special.chdtrc(n, square)))
     vector = every[0].copy()
     vector[free] = mean
     covariance = np.zeros((len(parameters), len(parameters)))
@@ -94,7 +94,7 @@ def combine(
         covariance,
         chi_square,
         freedom,
-        float(chdtrc(freedom, chi_square)),
+        float(scipy.special.chdtrc(freedom, chi_square)),
         tuple(against),
     )
 

@@ -13,8 +13,8 @@ Source: contour integration of the saddle point, Rice (1980), SIAM J. Sci. Stat.
 
 import equinox as eqx
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.optimize import brentq
 
 from jaxphoto.short_repr import shown
 
@@ -110,7 +110,7 @@ class QuadraticForm(eqx.Module):
         while off(far) > 0:
             far *= 2
         # From just beyond the mean, on the side whose tail `_log_tail` is.
-        return float(self.constant + place(brentq(off, 1e-9, far, xtol=1e-13)))
+        return float(self.constant + place(scipy.optimize.brentq(off, 1e-9, far, xtol=1e-13)))
 
     def _cumulant(self, t):
         """K(t) but for the constant, of one t or many, real or complex."""
@@ -131,7 +131,7 @@ class QuadraticForm(eqx.Module):
             place, ends = (lambda q: pole / (1 + np.exp(-q))), (-40.0, 34.0)
         else:
             place, ends = (lambda q: -pole * np.exp(-q)), (-200.0, 80.0)
-        saddle = place(brentq(lambda q: self._slope(place(q), x), *ends, xtol=1e-13))
+        saddle = place(scipy.optimize.brentq(lambda q: self._slope(place(q), x), *ends, xtol=1e-13))
         w, apart = self.weights, 1 - 2 * self.weights * saddle
         second = (4 * w * self.shifts / apart**3 + 2 * w**2 / apart**2).sum()
         third = (24 * w**2 * self.shifts / apart**4 + 8 * w**3 / apart**3).sum()

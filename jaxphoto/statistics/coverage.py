@@ -11,8 +11,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float, Int
-from scipy.spatial import cKDTree
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.camera import InteriorOrientation, Sensor
@@ -86,7 +86,7 @@ def _cells(points: np.ndarray, position: np.ndarray, around: float):
     step = float((high - low).max()) / _CELLS
     x, y = (np.arange(a + step / 2, b + step / 2, step) for a, b in zip(low, high, strict=True))
     plan = np.stack(np.meshgrid(x, y), axis=-1)
-    _, near = cKDTree(points[:, :2]).query(plan.reshape(-1, 2), k=min(_NEAR, len(points)))
+    _, near = scipy.spatial.cKDTree(points[:, :2]).query(plan.reshape(-1, 2), k=min(_NEAR, len(points)))
     z = np.median(points[near.reshape(len(near), -1), 2], axis=1)
     return x, y, np.dstack([plan, z.reshape(plan.shape[:2])]), step
 

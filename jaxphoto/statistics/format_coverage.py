@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.spatial import ConvexHull, QhullError
 
 from jaxphoto.adjustment import Adjustment
 
@@ -32,6 +32,6 @@ def format_coverage(adjusted: Adjustment, camera: str) -> FormatCoverage:
 def _hull_area(xy: Float[np.ndarray, "n 2"]) -> float:
     try:
         # In two dimensions the volume of qhull is an area.
-        return float(ConvexHull(xy).volume) if len(xy) > 2 else 0.0
-    except QhullError:
+        return float(scipy.spatial.ConvexHull(xy).volume) if len(xy) > 2 else 0.0
+    except scipy.spatial.QhullError:
         return 0.0

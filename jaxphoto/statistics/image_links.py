@@ -8,9 +8,8 @@ can be; so its weakest links are where the block would come apart first.
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Int
-from scipy.sparse import coo_array, csr_array, triu
-from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from jaxphoto.adjustment import Adjustment
 
@@ -41,7 +40,7 @@ class WeakLink(NamedTuple):
 def image_links(adjusted: Adjustment) -> ImageLinks:
     """All pairs of images with at least one point in common."""
     measured = _measured(adjusted)
-    common = triu(measured @ measured.T, k=1, format="coo")
+    common = scipy.sparse.triu(measured @ measured.T, k=1, format="coo")
     first, second = common.coords
     return ImageLinks(first.astype(int), second.astype(int), common.data.astype(int))
 
@@ -50,14 +49,14 @@ def weak_links(adjusted: Adjustment, links: ImageLinks, most: int) -> list[WeakL
     """The `most` weakest links of the tree of the strongest ones, the weakest first."""
     n, measured = len(adjusted.block.images), _measured(adjusted)
     # The strongest tree is the shortest one of what falls as links grow stronger.
-    length = coo_array((1.0 / links.common, (links.first, links.second)), shape=(n, n))
-    tree = minimum_spanning_tree(length.tocsr()).tocoo()
+    length = scipy.sparse.coo_array((1.0 / links.common, (links.first, links.second)), shape=(n, n))
+    tree = scipy.sparse.csgraph.minimum_spanning_tree(length.tocsr()).tocoo()
     found = []
     for cut in np.argsort(-tree.data, kind="stable")[:most]:
         first, second = (int(end[cut]) for end in tree.coords)
         rest = np.arange(tree.nnz) != cut
-        apart = coo_array((tree.data[rest], [end[rest] for end in tree.coords]), shape=(n, n))
-        _, part = connected_components(apart, directed=False)
+        apart = scipy.sparse.coo_array((tree.data[rest], [end[rest] for end in tree.coords]), shape=(n, n))
+        _, part = scipy.sparse.csgraph.connected_components(apart, directed=False)
         one, other = (np.flatnonzero(part == part[end]) for end in (first, second))
         seen = [np.asarray(measured[side].sum(axis=0)).ravel() > 0 for side in (one, other)]
         common = round(1 / float(tree.data[cut]))
@@ -66,11 +65,11 @@ def weak_links(adjusted: Adjustment, links: ImageLinks, most: int) -> list[WeakL
     return found
 
 
-def _measured(adjusted: Adjustment) -> csr_array:
+def _measured(adjusted: Adjustment) -> scipy.sparse.csr_array:
     """Images by points: one where an image measured a point."""
     s = adjusted.structure
     shape = len(adjusted.block.images), len(adjusted.block.points)
-    found = csr_array((np.ones(len(s.image), int), (s.image, s.point)), shape=shape)
+    found = scipy.sparse.csr_array((np.ones(len(s.image), int), (s.image, s.point)), shape=shape)
     # Measured twice in one image is measured once.
     found.data[:] = 1
     return found

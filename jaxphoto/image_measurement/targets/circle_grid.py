@@ -2,10 +2,8 @@
 
 import cv2
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from jaxphoto.image_measurement.targets.discs import Blobs, elliptic_blobs, fit_discs
 from jaxphoto.image_measurement.targets.pattern import FoundBoard, Pattern
@@ -65,14 +63,16 @@ class CircleGrid(Pattern):
         n = len(blobs.column_row)
         if n < 2:
             return blobs
-        near = cKDTree(blobs.column_row).query(blobs.column_row, k=min(n, _NEAREST))[1][:, 1:]
+        near = scipy.spatial.cKDTree(blobs.column_row).query(blobs.column_row, k=min(n, _NEAREST))[1][:, 1:]
         d = blobs.column_row[near] - blobs.column_row[:, None]
         apart = np.sqrt(2) * self._spacing_m / self.radius_m
         good = np.ones(near.shape, bool)
         for shape in (blobs.shape[:, None], blobs.shape[near]):
             good &= np.abs(np.sqrt(np.einsum("nki,nkij,nkj->nk", d, shape, d)) / apart - 1) < _OFF
         one, other = np.nonzero(good)
-        web = connected_components(coo_array((np.ones(len(one)), (one, near[one, other])), shape=(n, n)))[1]
+        web = scipy.sparse.csgraph.connected_components(
+            scipy.sparse.coo_array((np.ones(len(one)), (one, near[one, other])), shape=(n, n))
+        )[1]
         return blobs.take(web == np.bincount(web).argmax())
 
     def _placed(self, picture: np.ndarray, blobs: Blobs, centres: Float[np.ndarray, "n 2"]) -> FoundBoard | None:
@@ -81,7 +81,7 @@ class CircleGrid(Pattern):
             if self.rows % 2 == 0:
                 return None  # seen as in a mirror, which such a grid cannot be
             centres = centres.reshape(self.rows, self.columns, 2)[::-1].reshape(-1, 2)
-        which = cKDTree(blobs.column_row).query(centres)[1]
+        which = scipy.spatial.cKDTree(blobs.column_row).query(centres)[1]
         d = centres - blobs.column_row[which]
         # What OpenCV counts as a circle may be no ellipse here: cut off, or in half a shadow.
         same = np.einsum("ni,nij,nj->n", d, blobs.shape[which], d) < 1
@@ -93,7 +93,7 @@ def _drawing(places: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, float, Float
 
     OpenCV's search for spots wants them evenly lit, of some size and apart.
     """
-    distance = cKDTree(places).query(places, k=2)[0][:, 1]
+    distance = scipy.spatial.cKDTree(places).query(places, k=2)[0][:, 1]
     scale = _APART_PX / float(np.median(distance))
     scale = min(scale, _LONGEST_PX / float(np.ptp(places, axis=0).max()))
     corner = places.min(axis=0) - 2 * _APART_PX / scale

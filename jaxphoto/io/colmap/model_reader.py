@@ -7,7 +7,7 @@ Pixels are counted as ours (centre of the upper left one at (0.5, 0.5)).
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder import BlockTables
@@ -40,7 +40,11 @@ def read_colmap_model(folder: Path) -> BlockTables:
         )
     name = folder.resolve().name
     quaternions = np.array([i.quaternion for i in images]).reshape(-1, 4)
-    rotations = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix() if images else np.zeros((0, 3, 3))
+    rotations = (
+        scipy.spatial.transform.Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()
+        if images
+        else np.zeros((0, 3, 3))
+    )
     return free_network(
         TiedPhotographs(
             name,

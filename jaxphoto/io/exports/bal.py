@@ -8,7 +8,7 @@ Source: grail.cs.washington.edu/projects/bal.
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs, translations
 from jaxphoto.io.exports.same_rays import from_principal_point, radial_values
@@ -19,7 +19,13 @@ def write_bal(photographs: AdjustedPhotographs, folder: Path) -> None:
     without points that no photograph shows."""
     p = photographs
     turns = np.asarray(p.exterior.camera_from_object)
-    cameras = np.hstack([Rotation.from_matrix(turns).as_rotvec(), translations(turns, p.exterior), radial_values(p)])
+    cameras = np.hstack(
+        [
+            scipy.spatial.transform.Rotation.from_matrix(turns).as_rotvec(),
+            translations(turns, p.exterior),
+            radial_values(p),
+        ]
+    )
     points, number = np.unique(p.point, return_inverse=True)
     order = np.lexsort((p.image, number))
     rows = zip(p.image[order].tolist(), number[order].tolist(), from_principal_point(p)[order].tolist(), strict=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from jaxphoto.io.cameras.colmap import ColmapCamera, cameras_bytes, cameras_text, colmap_camera
 from jaxphoto.io.colmap.model import FILES
@@ -70,7 +70,12 @@ def _model(photographs: AdjustedPhotographs) -> _Model:
     p = photographs
     camera_ids, point_ids = numbered(tuple(p.cameras)), np.array(list(numbered(p.points).values()), int)
     rotations = downwards(p.exterior)
-    poses = np.hstack([Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]], translations(rotations, p.exterior)])
+    poses = np.hstack(
+        [
+            scipy.spatial.transform.Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]],
+            translations(rotations, p.exterior),
+        ]
+    )
     images, feature = [], p.place_in_image
     for i, rows in enumerate(p.rows_of_images):
         camera = camera_ids[p.image_camera[i]]

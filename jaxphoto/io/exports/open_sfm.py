@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from jaxphoto.camera import Equidistant, OpenCv, OpenCvFisheye, Perspective, Sensor
 from jaxphoto.io.cameras.camera_file import CameraModel
@@ -29,7 +29,10 @@ def write_open_sfm(photographs: AdjustedPhotographs, folder: Path) -> None:
     control on a map also gcp_list.txt."""
     p = photographs
     rotations = downwards(p.exterior)
-    turns, moved = Rotation.from_matrix(rotations).as_rotvec(), translations(rotations, p.exterior)
+    turns, moved = (
+        scipy.spatial.transform.Rotation.from_matrix(rotations).as_rotvec(),
+        translations(rotations, p.exterior),
+    )
     cameras = {name: _camera(camera) for name, camera in p.cameras.items()}
     shots = {
         file: {"rotation": turns[i].tolist(), "translation": moved[i].tolist(), "camera": p.image_camera[i]}

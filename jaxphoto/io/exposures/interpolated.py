@@ -1,9 +1,8 @@
 """A trajectory of positions at the times of exposures."""
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation
 
 from jaxphoto.io.exposures.records import Exposures
 
@@ -32,7 +31,7 @@ def interpolated(track: Exposures, times_s: Float[np.ndarray, "n"]) -> Exposures
         inside &= (time[after] - time[after - 1] <= gap) | np.isin(at, time)
         nearest = np.where(at - time[after - 1] < time[after] - at, after - 1, after)
         middle = np.nanmedian(track.place, axis=0)
-        place = middle + CubicSpline(time - time[0], track.place[first] - middle)(at - time[0])
+        place = middle + scipy.interpolate.CubicSpline(time - time[0], track.place[first] - middle)(at - time[0])
         sigma = np.stack([np.interp(at, time, track.sigma_m[first, k]) for k in range(3)], axis=1)
         if track.aircraft_deg is not None:
             part = ((at - time[after - 1]) / (time[after] - time[after - 1]))[:, None]
@@ -50,6 +49,8 @@ def interpolated(track: Exposures, times_s: Float[np.ndarray, "n"]) -> Exposures
 
 def _between(angles_deg: np.ndarray, after: np.ndarray, part: np.ndarray) -> np.ndarray:
     """Roll, pitch, yaw a part of the way to the record `after`, by the rotation between the two."""
-    before = Rotation.from_euler("ZYX", angles_deg[after - 1][:, ::-1], degrees=True)
-    turn = before.inv() * Rotation.from_euler("ZYX", angles_deg[after][:, ::-1], degrees=True)
-    return (before * Rotation.from_rotvec(part * turn.as_rotvec())).as_euler("ZYX", degrees=True)[:, ::-1]
+    before = scipy.spatial.transform.Rotation.from_euler("ZYX", angles_deg[after - 1][:, ::-1], degrees=True)
+    turn = before.inv() * scipy.spatial.transform.Rotation.from_euler("ZYX", angles_deg[after][:, ::-1], degrees=True)
+    return (before * scipy.spatial.transform.Rotation.from_rotvec(part * turn.as_rotvec())).as_euler(
+        "ZYX", degrees=True
+    )[:, ::-1]

@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from jaxphoto.arrays import still
 from jaxphoto.collinearity import ExteriorOrientation
@@ -255,7 +255,7 @@ def _of_bingo(path: Path, numbered: list[tuple[int, str]], system: str) -> Exter
     numbers = np.array(values).reshape(-1, 6)
     # Axes turned one after the other; Rotation goes from the camera to the object.
     read = [
-        Rotation.from_euler(axes, numbers[:, 3:] * degrees, degrees=True).inv().as_matrix()
+        scipy.spatial.transform.Rotation.from_euler(axes, numbers[:, 3:] * degrees, degrees=True).inv().as_matrix()
         for axes in ("YXZ", "XYZ")
         for degrees in (_GON_DEG, 1.0)
     ]

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.georeferencing.map_frame import Place
@@ -78,7 +78,7 @@ def read_open_sfm(source: Path) -> BlockTables:
             raise shot.error("camera", f"there is no camera {quoted(camera)} in the file; correct it")
     files, ids = list(shots), list(points)
     of_shot = lambda key: number_rows([shot.values.get(key) for shot in each], (3,), _place(path, files, key))  # noqa: E731
-    rotations = Rotation.from_rotvec(of_shot("rotation")).as_matrix().reshape(-1, 3, 3)
+    rotations = scipy.spatial.transform.Rotation.from_rotvec(of_shot("rotation")).as_matrix().reshape(-1, 3, 3)
     given = [point.get("coordinates") if isinstance(point, dict) else None for point in points.values()]
     image, point, column_row = _tracks(folder / TRACKS, files, ids, [cameras[name] for name in camera_of])
     tied = TiedPhotographs(

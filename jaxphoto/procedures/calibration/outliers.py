@@ -1,8 +1,8 @@
 """What of the residuals of a calibration is gross error, and how large the rest is beside the measurement's noise."""
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Int
-from scipy.optimize import brentq
 
 # Of the typical standard deviation: beyond, an image point is a blunder (one good point in 270,000 is).
 _LIMIT = 5.0
@@ -51,4 +51,4 @@ def added_sigma(residuals: Float[np.ndarray, "n 2"], sigma: Float[np.ndarray, "n
     largest = float(np.sqrt(np.sum(square) / max(redundancy, 1)))
     if redundancy <= 0 or largest == 0 or excess(0.0) <= 0:
         return 0.0
-    return float(brentq(excess, 0.0, largest, xtol=1e-9 * largest))
+    return float(scipy.optimize.brentq(excess, 0.0, largest, xtol=1e-9 * largest))

@@ -14,8 +14,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy.optimize import minimize
 
 from jaxphoto.camera import AbstractDistortion, Brown, InteriorOrientation, Sensor, get_parameter, set_parameter
 from jaxphoto.compiling import call_compiled
@@ -88,7 +88,7 @@ def flat_start(
         return InteriorOrientation(1.2 * max(sensor.width_mm, sensor.height_mm)), False
     # The mean of logarithms: a view of something else adds a constant and no more.
     bend = lambda k: float(np.mean(np.log(_bends(views, k, half))))  # noqa: E731
-    lens = minimize(bend, np.zeros(2), method="Nelder-Mead", options={"maxiter": 120}).x
+    lens = scipy.optimize.minimize(bend, np.zeros(2), method="Nelder-Mead", options={"maxiter": 120}).x
     bends = _bends(views, lens, half)
     straight = [view for view, error in zip(views, bends, strict=True) if error <= _MISFIT * np.median(bends)]
     homographies = [_homography(board, _straight(xy, lens, half)) for board, xy in straight]

@@ -11,8 +11,8 @@ from collections.abc import Callable, Collection
 
 import equinox as eqx
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import KDTree
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Block
@@ -139,7 +139,7 @@ def _patches(cloud: Cloud, places: Float[np.ndarray, "n 3"], settings: HeightSet
     told = cloud.classification is not None and bool(np.any(cloud.classification > 1))
     roofs = np.flatnonzero(cloud.classification == BUILDING) if told else np.arange(len(cloud))
     if len(roofs):
-        away, _ = KDTree(places[:, :2]).query(cloud.xyz[roofs, :2], distance_upper_bound=_NEAR)
+        away, _ = scipy.spatial.KDTree(places[:, :2]).query(cloud.xyz[roofs, :2], distance_upper_bound=_NEAR)
         roofs = roofs[np.isfinite(away)]
     if len(roofs) < _LEAST:
         raise BlockError(
