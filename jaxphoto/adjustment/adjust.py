@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import operator
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, Til
 from jaxphoto.adjustment.lost_digits import warn_of_lost_digits
 from jaxphoto.adjustment.model.block_values import unknowns_of, values_of, with_datum, with_start
 from jaxphoto.adjustment.model.numbers import UnknownArrays, Values, state_at, zero_increments
-from jaxphoto.adjustment.model.structure import observed_in, structure_of
+from jaxphoto.adjustment.model.structure import Structure, observed_in, structure_of
 from jaxphoto.adjustment.normal_equations import NormalEquations, optimise
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.result import Adjustment
@@ -36,7 +36,9 @@ from jaxphoto.block import Block
 from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.devices import usable
 from jaxphoto.errors import InputError
+from jaxphoto.last_used import LastUsed
 from jaxphoto.losses import AbstractLoss
+from jaxphoto.static_values import Content
 from jaxphoto.unknowns import Unknowns
 
 MAX_STEPS = 100
@@ -167,7 +169,8 @@ def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAS
     check_priors(block, priors)
     warn_of_lost_digits(block, start, priors)
     observed = observed_in(block, priors)
-    structure = structure_of(block, priors, observed)
+    key = _without_numbers(block, priors)
+    structure = _structures.get(key, lambda: structure_of(block, priors, observed))
     values = values_of(block, start, priors, structure, observed)
     constraints = close_datum(block, values, structure)
     values = with_datum(values, constraints.eop, constraints.points)
@@ -175,8 +178,27 @@ def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAS
     # Such rows may join points of two devices; of constraints, statistics have only the open motions in closed form.
     alone = alone or is_traced(values) or coupled or (constrained and not n_open_motions(values, structure))
     shards = 1 if alone else _devices_worth_using(len(structure.image))
-    tiled = pad_structure(structure, sizes, shards=shards, dense=constrained or coupled)
+    dense = constrained or coupled
+    tiled = _layouts.get(
+        (key, sizes, shards, dense), lambda: pad_structure(structure, sizes, shards=shards, dense=dense)
+    )
     return LaidOut(tiled, values, tiled.pad(values))
+
+
+# Blocks between which a study may alternate.
+_KEPT = 4
+_structures: LastUsed[Structure] = LastUsed(_KEPT)
+_layouts: LastUsed[TiledBlock] = LastUsed(_KEPT)
+
+
+def _without_numbers(*trees: Any) -> Hashable:
+    """All of `trees` but the values of their numbers: what a layout depends on."""
+    leaves, structure = jax.tree.flatten(trees)
+    return structure, *(np.shape(v) if _is_number(v) else Content(np.asarray(v)) for v in leaves)
+
+
+def _is_number(leaf: Any) -> bool:
+    return isinstance(leaf, jax.core.Tracer) or np.asarray(leaf).dtype.kind == "f"
 
 
 def _factored_like(values: TiledValues, structure: TiledStructure) -> FactoredNormal:

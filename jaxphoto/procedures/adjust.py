@@ -272,7 +272,8 @@ def _reached(block: Block) -> tuple[Block, bool]:
     """`block` with what resection and intersection find, and whether that will do."""
     reached = dataclasses.replace(block, start=completed(block))
     given = np.array(block.start.image_known)
-    given[sensor_rows(block, block.start.unknowns).image] = True
+    if not given.all():
+        given[sensor_rows(block, block.start.unknowns).image] = True
     return reached, bool(given.all() or (np.all(reached.start.image_known) and _fits(reached)))
 
 

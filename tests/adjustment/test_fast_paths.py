@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust, covariance
-from jaxphoto.adjustment.layout import tile_layout
+from jaxphoto.adjustment.layout import tile_layout, tiling
 from jaxphoto.adjustment.layout.padding import pad_structure
 from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.adjustment.solver import levenberg_marquardt
@@ -70,9 +70,10 @@ def test_a_banded_reduced_matrix_gives_what_a_dense_one_gives(corridor, monkeypa
 def test_one_small_tile_at_a_time_gives_what_many_together_give(monkeypatch):
     block, start = simulated("three_models").block, adjusted("three_models").unknowns
     together = everything(block, start)
-    monkeypatch.setattr(tile_layout, "_SLOTS", 1)
+    monkeypatch.setattr(tiling, "_SLOTS", 1)
     monkeypatch.setattr(tile_layout, "_CHUNK", 20_000)
-    monkeypatch.setattr(tile_layout, "TILE_STEP", 4)
+    for module in (tiling, tile_layout):
+        monkeypatch.setattr(module, "TILE_STEP", 4)
     padded = pad_structure(structure_of(block, block.priors)).structure
     assert padded.tiles.at_once == 1
     assert len(padded.tiles.image) > 1

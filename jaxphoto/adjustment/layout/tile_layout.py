@@ -19,6 +19,7 @@ from jaxphoto.adjustment.layout.tiling import (
     split_points,
     tile_points,
     tile_shape,
+    tiles_at_once,
 )
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup
 from jaxphoto.adjustment.model.structure import Structure
@@ -79,8 +80,6 @@ _CHUNK = 4_000_000
 _SMALL = 64
 # What a column block costs beside its operations, counted in operations (measured: about 10 microseconds).
 _OVERHEAD = 2e5
-# Slots that are computed with at a time.
-_SLOTS = 4000
 
 
 NO_SLOT = int(np.iinfo(np.int32).max)
@@ -167,7 +166,7 @@ class TileLayout(NamedTuple):
         # Of each tile there are sums for its images, and sums for what else its points meet.
         largest = max(6 * m, s.n_interior + max(met.most, wanted.met) + s.n_coupled)
         chunks = -(-per_shard * largest**2 // _CHUNK)
-        at_once = max(k for k in range(1, TILE_STEP + 1) if TILE_STEP % k == 0 and k * m * p <= max(_SLOTS, m * p))
+        at_once = tiles_at_once(m, p)
         chunk = size_class(-(-per_shard // chunks), TILE_STEP)
         # No more than it takes: a chunk may be larger than asked for.
         chunks = -(-per_shard // chunk)

@@ -44,9 +44,10 @@ def order_images(image: np.ndarray, point: np.ndarray, n_images: int, n_points: 
     return place, int(np.abs(place[one] - place[other]).max(initial=1))
 
 
-# Tiles come in multiples of this many, which a block of some 200 points fills: padding takes milliseconds, compiling
-# seconds.
-TILE_STEP = 28
+# Tiles come in multiples of this many: padding takes milliseconds, compiling seconds.
+TILE_STEP = 32
+# Slots that are computed with at a time.
+_SLOTS = 4000
 
 
 def size_class(n: int, step: int) -> int:
@@ -56,25 +57,28 @@ def size_class(n: int, step: int) -> int:
     return -(-n // step) * step
 
 
+def tiles_at_once(m: int, p: int) -> int:
+    """Return how many tiles of `m` images and `p` points are computed with at a time: a divisor of `TILE_STEP`."""
+    return max(k for k in range(1, TILE_STEP + 1) if TILE_STEP % k == 0 and k * m * p <= max(_SLOTS, m * p))
+
+
+# Points of a tile that are tried.
+_POINTS = (8, 32)
+
+
 def tile_shape(image: np.ndarray, point: np.ndarray, n_images: int, n_points: int) -> tuple[int, int]:
-    """Images and points of a tile that make the sums cheapest, found on a part of the block; see `_cost`.
+    """Return the images and points of a tile that make the sums cheapest, found on a part of the block; see `_cost`.
 
     Shapes are few, so that small blocks differ in little that they are compiled for: images are a multiple of 12, or
-    all; points 8 for fewer than 32 images where `TILE_STEP` tiles hold the block, else 32. Groups of tiles that are
-    padding take no time.
+    all.
     """
     orders, images = _orders(image, point, n_points)
     parts = [_part_of(order) for order in orders]
     most = max(1, max(map(len, images), default=1))
-    small = n_images < 32 and n_points <= 8 * TILE_STEP
-
-    def option(m: int) -> tuple[float, int, int]:
-        p = 8 if small and len(_best_cut(orders, images, m, 8)[1]) <= TILE_STEP else 32
-        return _cost(len(_best_cut(parts, images, m, p)[1]), m, p), m, p
-
     all_images = size_class(n_images, 8)
     widths = {min(size_class(int(np.ceil(k * most)), 12), all_images) for k in (1, 1.25, 1.5, 2)}
-    return min(map(option, widths))[1:]
+    options = [(m, p) for m in widths for p in _POINTS]
+    return min(options, key=lambda shape: _cost(len(_best_cut(parts, images, *shape)[1]), *shape))
 
 
 # Points of a tile, all of them fixed, and images of one that are tried.
@@ -113,8 +117,13 @@ def _part_of(order: np.ndarray) -> np.ndarray:
 
 
 def _cost(tiles: int, m: int, p: int) -> float:
-    """Microseconds that the sums take: a share by tile, by slot and by multiplication, as measured (docs/solver.md)."""
-    return tiles * (25 + 0.22 * m * p + (6 * m) ** 2 * 3 * p / 1e4)
+    """Microseconds that the sums take: a share by tile, by slot and by multiplication, as measured (docs/solver.md).
+
+    All tiles that are computed with at a time count, those among them that are padding, too.
+    """
+    at_once = tiles_at_once(m, p)
+    computed = -(-tiles // at_once) * at_once
+    return computed * (25 + 0.22 * m * p + (6 * m) ** 2 * 3 * p / 1e4)
 
 
 def tile_points(image: np.ndarray, point: np.ndarray, n_points: int, m: int, p: int) -> Tiling:
