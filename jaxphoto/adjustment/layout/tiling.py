@@ -119,11 +119,12 @@ def _part_of(order: np.ndarray) -> np.ndarray:
 def _cost(tiles: int, m: int, p: int) -> float:
     """Microseconds that the sums take: a share by tile, by slot and by multiplication, as measured (docs/solver.md).
 
-    All tiles that are computed with at a time count, those among them that are padding, too.
+    All tiles that are computed with at a time count, those among them that are padding, too; the last share is for all
+    slots that arrays have.
     """
     at_once = tiles_at_once(m, p)
-    computed = -(-tiles // at_once) * at_once
-    return computed * (25 + 0.22 * m * p + (6 * m) ** 2 * 3 * p / 1e4)
+    computed, held = -(-tiles // at_once) * at_once, size_class(tiles, TILE_STEP)
+    return computed * (25 + 0.22 * m * p + (6 * m) ** 2 * 3 * p / 1e4) + 0.05 * held * m * p
 
 
 def tile_points(image: np.ndarray, point: np.ndarray, n_points: int, m: int, p: int) -> Tiling:
