@@ -1,12 +1,15 @@
 """Size classes: padding changes nothing that is computed, and blocks of similar size share what is compiled."""
 
+import dataclasses
+
 import jax
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxphoto import adjust, covariance
+from jaxphoto import FIXED, ExteriorOrientation, adjust, covariance
 from jaxphoto.adjustment import common_sizes
+from jaxphoto.adjustment.adjust import lay_out
 from jaxphoto.adjustment.layout.padding import pad_structure
 from jaxphoto.adjustment.layout.tile_layout import sizes_of
 from jaxphoto.adjustment.layout.tiling import TILE_STEP, size_class
@@ -46,6 +49,25 @@ def test_blocks_of_similar_size_share_what_is_compiled():
         leaves, tree = jax.tree.flatten(padded)
         kinds.add((tuple(map(np.shape, leaves)), tree))
     assert len(kinds) == 1
+
+
+def test_a_layout_is_kept_for_blocks_that_differ_in_numbers_only():
+    block = simulated("cross").block
+    start = block.start.unknowns
+    first, again = (
+        lay_out(block, start, block.priors),
+        lay_out(block.shift_stations([1.0, 0.0, 0.0]), start, block.priors),
+    )
+    assert again.tiled is first.tiled
+    numbers = [jax.tree.leaves(laid.tiled_values.groups) for laid in (first, again)]
+    assert any(not np.array_equal(one, other) for one, other in zip(*numbers, strict=True))
+    # FIXED is structure, and is no number.
+    held = dataclasses.replace(block.priors, exterior=ExteriorOrientation(FIXED, FIXED))
+    other = lay_out(block, start, held)
+    assert other.tiled is not first.tiled
+    assert not other.tiled.structure.eop_free.any()
+    part = block.without_images(block.images[0])
+    assert lay_out(part, part.start.unknowns, part.priors).tiled.own.n_images == len(block.images) - 1
 
 
 def test_a_padded_structure_has_the_sizes_asked_for():
