@@ -42,7 +42,8 @@ def lines_of_readme(draws: int) -> dict[str, list[str]]:
 def measure(command: list[str], cache: str) -> str:
     """Run a command and return its wall and CPU seconds."""
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    environment = {**os.environ, "XDG_CACHE_HOME": cache, "MPLBACKEND": "agg"}
+    caches = {"XDG_CACHE_HOME": cache, "JAX_COMPILATION_CACHE_DIR": f"{cache}/jax"}
+    environment = os.environ | caches | {"MPLBACKEND": "agg"}
     out = ["--out", f"{cache}/results"] if "adjust" in command else []
     done = subprocess.run([*command, *out], cwd=_ROOT, env=environment, capture_output=True, text=True)
     wall = time.perf_counter() - start

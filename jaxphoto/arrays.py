@@ -37,6 +37,11 @@ def is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
+def is_float(value: Any) -> bool:
+    """True if `value` is a float or an array of floats; a traced one, too."""
+    return np.dtype(getattr(value, "dtype", type(value))).kind == "f"
+
+
 def namespace(*values: Any) -> Any:
     """`jax.numpy` where a transformation of JAX traces a number of `values`, else `numpy`."""
     return jnp if is_traced(values) else np

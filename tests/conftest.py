@@ -44,6 +44,7 @@ from tests.marks import QUICK  # noqa: E402
 
 check_types()
 
+from jaxphoto.adjustment.adjust import _layouts  # noqa: E402
 from jaxphoto.compiling import run, store  # noqa: E402
 
 # The suite's programs are hundreds, of 2 MB: with a user's room each would be gone before another process needs it.
@@ -107,5 +108,6 @@ def programs_let_go():
         mappings.read_bytes().count(b"\n") > _MOST_MAPPINGS or int(memory.read_text().split()[1]) * 4096 > _MOST_MEMORY
     ):
         run._programs.clear()
+        _layouts.clear()
         jax.clear_caches()
         gc.collect()

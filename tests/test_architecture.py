@@ -101,6 +101,14 @@ def test_importing_brings_neither_tables_nor_pictures():
     assert not late & set(done.stdout.split())
 
 
+def test_parts_of_scipy_are_loaded_where_they_are_used():
+    """Each takes a tenth of a second and more."""
+    program = "import sys, jaxphoto.io, jaxphoto.procedures, jaxphoto.sensitivity; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    parts = {f"scipy.{name}" for name in ("interpolate", "linalg", "ndimage", "optimize", "sparse", "spatial", "stats")}
+    assert not parts & set(done.stdout.split())
+
+
 def test_public_names_exist_and_are_documented():
     assert len(set(jaxphoto.__all__)) == len(jaxphoto.__all__)
     for name in jaxphoto.__all__:

@@ -20,7 +20,7 @@ from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, Til
 from jaxphoto.adjustment.lost_digits import warn_of_lost_digits
 from jaxphoto.adjustment.model.block_values import unknowns_of, values_of, with_datum, with_start
 from jaxphoto.adjustment.model.numbers import UnknownArrays, Values, state_at, zero_increments
-from jaxphoto.adjustment.model.structure import Structure, observed_in, structure_of
+from jaxphoto.adjustment.model.structure import ObservedRows, Structure, observed_in, structure_of
 from jaxphoto.adjustment.normal_equations import NormalEquations, optimise
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.result import Adjustment
@@ -31,12 +31,12 @@ from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.similarity import n_open_motions
 from jaxphoto.adjustment.told import tell_course
-from jaxphoto.arrays import gathered, is_traced, still
+from jaxphoto.arrays import gathered, is_float, is_traced, still
 from jaxphoto.block import Block
 from jaxphoto.compiling import prepare, run_compiled
+from jaxphoto.compiling.lru_cache import LruCache
 from jaxphoto.devices import usable
 from jaxphoto.errors import InputError
-from jaxphoto.last_used import LastUsed
 from jaxphoto.losses import AbstractLoss
 from jaxphoto.static_values import Content
 from jaxphoto.unknowns import Unknowns
@@ -169,8 +169,9 @@ def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAS
     check_priors(block, priors)
     warn_of_lost_digits(block, start, priors)
     observed = observed_in(block, priors)
-    key = _without_numbers(block, priors)
-    structure = _structures.get(key, lambda: structure_of(block, priors, observed))
+    structure, tiled_blocks = _layouts.get(
+        _layout_key(block, priors, observed), lambda: (structure_of(block, priors, observed), {})
+    )
     values = values_of(block, start, priors, structure, observed)
     constraints = close_datum(block, values, structure)
     values = with_datum(values, constraints.eop, constraints.points)
@@ -178,27 +179,24 @@ def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAS
     # Such rows may join points of two devices; of constraints, statistics have only the open motions in closed form.
     alone = alone or is_traced(values) or coupled or (constrained and not n_open_motions(values, structure))
     shards = 1 if alone else _devices_worth_using(len(structure.image))
-    dense = constrained or coupled
-    tiled = _layouts.get(
-        (key, sizes, shards, dense), lambda: pad_structure(structure, sizes, shards=shards, dense=dense)
-    )
+    key = sizes, shards, constrained or coupled
+    if key not in tiled_blocks:
+        tiled_blocks[key] = pad_structure(structure, sizes, shards=shards, dense=constrained or coupled)
+    tiled = tiled_blocks[key]
     return LaidOut(tiled, values, tiled.pad(values))
 
 
-# Blocks between which a study may alternate.
-_KEPT = 4
-_structures: LastUsed[Structure] = LastUsed(_KEPT)
-_layouts: LastUsed[TiledBlock] = LastUsed(_KEPT)
+# A study may alternate between a few blocks. The index arrays of 1,000 images and a million image points are 30 MB.
+_LAYOUTS = 4
+_layouts: LruCache[tuple[Structure, dict[Hashable, TiledBlock]]] = LruCache(_LAYOUTS)
 
 
-def _without_numbers(*trees: Any) -> Hashable:
-    """All of `trees` but the values of their numbers: what a layout depends on."""
-    leaves, structure = jax.tree.flatten(trees)
-    return structure, *(np.shape(v) if _is_number(v) else Content(np.asarray(v)) for v in leaves)
-
-
-def _is_number(leaf: Any) -> bool:
-    return isinstance(leaf, jax.core.Tracer) or np.asarray(leaf).dtype.kind == "f"
+def _layout_key(block: Block, priors: Unknowns, observed: ObservedRows) -> Hashable:
+    """Return all that a layout depends on: ids, indices, what is free, and shapes, but no value of a number."""
+    leaves, tree = jax.tree.flatten((block, priors))
+    # JAX sorts the keys of a dictionary, unknowns keep their order.
+    order = tuple(entry.label for entry in observed.entries)
+    return tree, order, *(np.shape(v) if is_float(v) else Content(np.asarray(v)) for v in leaves)
 
 
 def _factored_like(values: TiledValues, structure: TiledStructure) -> FactoredNormal:

@@ -103,7 +103,8 @@ def datum_change(code: int, longitude_deg: float, latitude_deg: float) -> DatumC
         if not grid.available
     ]
     steps = [step for step in best.description.split(" + ") if not step.startswith("axis order change")]
-    name = " + ".join(step.removeprefix("Inverse of ") for step in steps)
+    # PROJ from 9.6 on says of each step in which order pyproj has the axes.
+    name = " + ".join(step.removeprefix("Inverse of ").split(" (with axis order")[0] for step in steps)
     better_one = min(better, key=lambda b: b[1], default=None)
     return DatumChange(best, geodetic.name, name, accuracy, _meridian_deg(geodetic), better_one)
 

@@ -3,12 +3,14 @@
 Functions of one laser point; frames and signs are those of a camera's mount (docs/conventions.md).
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxphoto.parameters import AbstractParameters
 from jaxphoto.rotation import rotate, small_rotation
+from jaxphoto.static_values import ordered
 
 
 class Scanner(AbstractParameters):
@@ -23,7 +25,7 @@ class Scanner(AbstractParameters):
     names = {"boresight": tuple(f"boresight_{axis}_rad" for axis in ("right", "forward", "up"))}  # noqa: RUF012
 
     boresight: Float[Array, "3"]
-    shifts: dict[str, Float[Array, "3"]]
+    shifts: dict[str, Float[Array, "3"]] = eqx.field(converter=ordered)
 
     def labels(self, owner: str) -> tuple[str, ...]:
         """Boresight, then the shifts of the lidar strips, each by its name."""

@@ -113,7 +113,7 @@ def _plane(xyz: np.ndarray, sigma: np.ndarray) -> Plane:
 
 
 def _of_house(
-    xyz: np.ndarray, near: np.ndarray, even: np.ndarray, graph: scipy.sparse.csr_matrix, sigma: np.ndarray, least: int
+    xyz: np.ndarray, near: np.ndarray, even: np.ndarray, graph: "scipy.sparse.csr_matrix", sigma: np.ndarray, least: int
 ) -> list[Patch]:
     """The patches of points that hang together; `near` are the neighbours of each, -1 where they are not among them."""
     members: list[np.ndarray] = []
@@ -169,7 +169,7 @@ def _unevenness(around: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 
 
 def _grown(
-    scaled: np.ndarray, seed: np.ndarray, free: np.ndarray, graph: scipy.sparse.csr_matrix
+    scaled: np.ndarray, seed: np.ndarray, free: np.ndarray, graph: "scipy.sparse.csr_matrix"
 ) -> Int[np.ndarray, "n"]:
     """The free points that a patch grows to from `seed`; `scaled` are all, in standard deviations of X, Y and Z."""
     patch = seed
@@ -189,7 +189,7 @@ def _grown(
 
 
 def _shared(
-    xyz: np.ndarray, members: list[np.ndarray], planes: list[Plane], graph: scipy.sparse.csr_matrix, sigma: np.ndarray
+    xyz: np.ndarray, members: list[np.ndarray], planes: list[Plane], graph: "scipy.sparse.csr_matrix", sigma: np.ndarray
 ) -> list[np.ndarray]:
     """Each point to the nearest of the planes of its neighbours and its own."""
     distance = np.abs(np.stack([_scaled_distance(xyz, plane, sigma) for plane in planes]))

@@ -102,7 +102,7 @@ def resect_by_quaternions(
     found = refined(c, ideal, local, start.positions, start.matrices, NO_LIMIT)
     positions, matrices = _alike(c, ideal, local, found)
     found = both(found, refined(c, ideal, local, positions, matrices, NO_LIMIT))
-    best = int(np.argmin(found.costs))
+    best = found.best(len(local))
     cost, redundancy = float(found.costs[best]), 2 * len(local) - 6
     if not cost < 2 * len(local) * _HOPELESS**2:
         raise BlockError(
@@ -191,7 +191,7 @@ def _alike(c, ideal, points, found: RefinedResections):
     To both sides along the direction that is least determined, which leads over a dangerous cylinder to the orientation
     beyond it. And of a distant flat figure half a turn about its normal, and another about the sight line.
     """
-    best = int(np.argmin(found.costs))
+    best = found.best(len(points))
     position, matrix, distance = found.positions[best], found.matrices[best], found.distances[best : best + 1]
     weakest = np.linalg.eigh(found.normals[best])[1][:, 0]
     steps = np.outer(_ASIDE, weakest)

@@ -41,6 +41,11 @@ class RefinedResections(NamedTuple):
     steps: int
     """How many there were, of all starts alike."""
 
+    def best(self, n_points: int) -> int:
+        """Return the index of the least cost; of costs that differ by rounding, one where the steps ended."""
+        alike = self.costs <= (1 + _GAIN) * np.min(self.costs) + _NOTHING * n_points
+        return int(np.lexsort((self.costs, ~self.settled, ~alike))[0])
+
 
 class _ResectionState(NamedTuple):
     positions: Float[np.ndarray, "starts 3"]

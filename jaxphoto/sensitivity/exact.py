@@ -183,7 +183,7 @@ def _observations(found: _Derivatives, tiled: TiledBlock, first: int) -> dict[st
     return {name: (b, np.broadcast_to(unknowns.astype(np.int32), b.shape)) for name, (b, unknowns) in rows.items()}
 
 
-def _sparse(rows: Sequence[Rows], unknowns: int) -> scipy.sparse.csr_array:
+def _sparse(rows: Sequence[Rows], unknowns: int) -> "scipy.sparse.csr_array":
     """-B, a row each number that is observed."""
     lengths = np.repeat([b.shape[-1] for b, _ in rows], [math.prod(b.shape[:-1]) for b, _ in rows])
     data, columns = (np.concatenate([part[k].ravel() for part in rows]) for k in range(2))

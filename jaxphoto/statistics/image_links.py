@@ -65,7 +65,7 @@ def weak_links(adjusted: Adjustment, links: ImageLinks, most: int) -> list[WeakL
     return found
 
 
-def _measured(adjusted: Adjustment) -> scipy.sparse.csr_array:
+def _measured(adjusted: Adjustment) -> "scipy.sparse.csr_array":
     """Images by points: one where an image measured a point."""
     s = adjusted.structure
     shape = len(adjusted.block.images), len(adjusted.block.points)

@@ -10,6 +10,7 @@ from jaxphoto import FIXED, FREE, DatumError, InputError, RankError, Smac, Weigh
 from jaxphoto.adjustment import solve
 from jaxphoto.adjustment.arguments import check_arguments
 from jaxphoto.block import Datum, Motion
+from jaxphoto.compiling.lru_cache import LruCache
 from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.observations import Attitudes, ControlRows, StationRows
 from tests.blocks import simulated
@@ -135,6 +136,7 @@ NO_CONTROL = {"control": ControlRows.none(), "fixed": ControlRows.none()}
     ],
 )
 def test_what_cannot_be_seen_is_named_before_anything_is_compiled(make, error, words, monkeypatch):
+    monkeypatch.setattr("jaxphoto.adjustment.adjust._layouts", LruCache(1))
     monkeypatch.setattr("jaxphoto.adjustment.adjust.structure_of", None)
     monkeypatch.setattr("jaxphoto.adjustment.adjust.run_compiled", None)
     block = make()
@@ -181,6 +183,7 @@ def test_what_can_be_seen_or_is_weighted_is_let_through(make, monkeypatch):
     def stop(*_):
         raise _Passed
 
+    monkeypatch.setattr("jaxphoto.adjustment.adjust._layouts", LruCache(1))
     monkeypatch.setattr("jaxphoto.adjustment.adjust.structure_of", stop)
     block = make()
     with pytest.raises(_Passed):

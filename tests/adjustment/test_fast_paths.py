@@ -11,6 +11,7 @@ from jaxphoto.adjustment.layout import tile_layout, tiling
 from jaxphoto.adjustment.layout.padding import pad_structure
 from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.adjustment.solver import levenberg_marquardt
+from jaxphoto.compiling.lru_cache import LruCache
 from jaxphoto.statistics import redundancy_numbers
 from tests.blocks import BROWN, Scene, adjusted, all_stations, bare, free, measured, rows, simulated
 
@@ -63,7 +64,10 @@ def test_a_banded_reduced_matrix_gives_what_a_dense_one_gives(corridor, monkeypa
     assert padded.tiles.columns >= 5
     banded = everything(corridor, start)
     monkeypatch.setattr(tile_layout, "column_blocks", lambda n, bandwidth: (1, n))
-    assert_same(banded, everything(corridor, start))
+    monkeypatch.setattr("jaxphoto.adjustment.adjust._layouts", LruCache(1))
+    dense = everything(corridor, start)
+    assert dense[0].tiled.structure.tiles.columns == 1
+    assert_same(banded, dense)
 
 
 @pytest.mark.slow
@@ -74,10 +78,12 @@ def test_one_small_tile_at_a_time_gives_what_many_together_give(monkeypatch):
     monkeypatch.setattr(tile_layout, "_CHUNK", 20_000)
     for module in (tiling, tile_layout):
         monkeypatch.setattr(module, "TILE_STEP", 4)
-    padded = pad_structure(structure_of(block, block.priors)).structure
-    assert padded.tiles.at_once == 1
-    assert len(padded.tiles.image) > 1
-    assert_same(together, everything(block, start))
+    monkeypatch.setattr("jaxphoto.adjustment.adjust._layouts", LruCache(1))
+    alone = everything(block, start)
+    tiles = alone[0].tiled.structure.tiles
+    assert tiles.at_once == 1
+    assert len(tiles.image) > 1
+    assert_same(together, alone)
 
 
 @pytest.mark.slow

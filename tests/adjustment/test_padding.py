@@ -11,7 +11,7 @@ from jaxphoto import FIXED, ExteriorOrientation, adjust, covariance
 from jaxphoto.adjustment import common_sizes
 from jaxphoto.adjustment.adjust import lay_out
 from jaxphoto.adjustment.layout.padding import pad_structure
-from jaxphoto.adjustment.layout.tile_layout import sizes_of
+from jaxphoto.adjustment.layout.tile_layout import Sizes, sizes_of
 from jaxphoto.adjustment.layout.tiling import TILE_STEP, size_class
 from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.block import Block
@@ -63,11 +63,28 @@ def test_a_layout_is_kept_for_blocks_that_differ_in_numbers_only():
     assert any(not np.array_equal(one, other) for one, other in zip(*numbers, strict=True))
     # FIXED is structure, and is no number.
     held = dataclasses.replace(block.priors, exterior=ExteriorOrientation(FIXED, FIXED))
-    other = lay_out(block, start, held)
-    assert other.tiled is not first.tiled
-    assert not other.tiled.structure.eop_free.any()
-    part = block.without_images(block.images[0])
-    assert lay_out(part, part.start.unknowns, part.priors).tiled.own.n_images == len(block.images) - 1
+    assert not lay_out(block, start, held).tiled.structure.eop_free.any()
+    # The same shapes with other indices, and unknowns in another order.
+    stations = dataclasses.replace(block.stations, who=block.stations.who[::-1])
+    turned = dataclasses.replace(block, stations=stations)
+    one, other = (laid.tiled.own.observed[0] for laid in (first, lay_out(turned, start, block.priors)))
+    assert one.name == other.name == "stations"
+    np.testing.assert_array_equal(other.image, one.image[:, ::-1])
+    assert lay_out(block, start, block.priors, Sizes(images=64)).tiled.structure.n_images == 64
+
+
+def test_a_layout_follows_the_order_of_a_scanners_strips():
+    block = simulated("surfaces").block
+
+    def reordered(unknowns):
+        shifts = dict(reversed(unknowns.scanner.shifts.items()))
+        return dataclasses.replace(unknowns, scanner=dataclasses.replace(unknowns.scanner, shifts=shifts))
+
+    start, priors = reordered(block.start.unknowns), reordered(block.priors)
+    turned = dataclasses.replace(block, start=dataclasses.replace(block.start, unknowns=start), priors=priors)
+    one, other = (lay_out(b, b.start.unknowns, b.priors).tiled.own.labels for b in (block, turned))
+    assert sorted(one) == sorted(other)
+    assert one != other
 
 
 def test_a_padded_structure_has_the_sizes_asked_for():

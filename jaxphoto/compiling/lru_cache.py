@@ -1,0 +1,34 @@
+"""Least-recently-used cache, safe to share between threads."""
+
+from collections.abc import Callable, Hashable
+from threading import Lock
+from typing import Generic, TypeVar
+
+_Value = TypeVar("_Value")
+
+
+class LruCache(Generic[_Value]):
+    """Keep the `capacity` values that were used last, by key."""
+
+    def __init__(self, capacity: int):
+        self._capacity = capacity
+        self._values: dict[Hashable, _Value] = {}
+        self._lock = Lock()
+
+    def get(self, key: Hashable, make: Callable[[], _Value]) -> _Value:
+        """Return the value of `key`; `make` it where it is not kept."""
+        with self._lock:
+            if key in self._values:
+                self._values[key] = self._values.pop(key)
+                return self._values[key]
+        value = make()
+        with self._lock:
+            self._values[key] = value
+            while len(self._values) > self._capacity:
+                del self._values[next(iter(self._values))]
+        return value
+
+    def clear(self) -> None:
+        """Forget all values."""
+        with self._lock:
+            self._values.clear()
