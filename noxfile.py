@@ -68,10 +68,10 @@ def suite(session: nox.Session) -> None:
 
 @nox.session(python=FIRST)
 def slow(session: nox.Session) -> None:
-    """A twelfth of the slow tests, in turn from commit to commit: all of them take too long."""
+    """A sixteenth of the slow tests, in turn from commit to commit: all of them take too long."""
     session.install(".[dev]")
     count = subprocess.run(["git", "rev-list", "--count", "HEAD"], capture_output=True, text=True).stdout.strip()
-    session.run(*_readme_command("pytest"), "-m", "slow", "--part", f"{int(count or 0) % 12 + 1}/12")
+    session.run(*_readme_command("pytest"), "-m", "slow", "--part", f"{int(count or 0) % 16 + 1}/16")
 
 
 @nox.session(python=[version for version in PYTHONS if version != FIRST])
