@@ -1,5 +1,7 @@
 """The optimum of a block to rounding, and differences of its unknowns in standard deviations."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from jaxphoto import Adjustment, Block, Unknowns, adjust, covariance
@@ -38,12 +40,15 @@ def parameters_of(unknowns: Unknowns) -> dict[str, float]:
     return found
 
 
-def unknowns_of(adjusted: Adjustment) -> Values:
-    """Return the free shared parameters, and exterior orientations and points in the block's order."""
+def unknowns_of(adjusted: Adjustment, labels: Sequence[str] | None = None) -> Values:
+    """Return the free shared parameters in the order of `labels`, and orientations and points in the block's order.
+
+    Where `labels` is None, shared parameters are in the adjustment's own order.
+    """
     u, n = adjusted.unknowns, len(adjusted.block.images)
     shared = parameters_of(u)
     return {
-        "shared": np.array([float(shared[label]) for label in adjusted.structure.labels]),
+        "shared": np.array([float(shared[label]) for label in labels or adjusted.structure.labels]),
         "position": np.asarray(u.exterior.position),
         "rotation": np.asarray(u.exterior.camera_from_object).reshape(n, 9),
         "points": np.asarray(u.points),

@@ -102,7 +102,8 @@ def measure(block: Block, sizes: Sizes, whole: bool, mapped: bool) -> Values:
     keys = [jax.random.fold_in(jax.random.key(SEED), k) for k in range(DRAWS)]
     for k, key in enumerate(keys):
         drawn = _concrete(errors.applied(errors.drawn(key), nominal))
-        for name, value in unknowns_of(optimum(drawn, u, drawn.priors, sizes, sigmas)).items():
+        found = optimum(drawn, u, drawn.priors, sizes, sigmas)
+        for name, value in unknowns_of(found, adjusted.structure.labels).items():
             values[f"draws.{k}.{name}"] = _drawn(value)
     if mapped:
         many = monte_carlo(adjusted, errors, DRAWS, SEED, exterior=True, points=True)
