@@ -49,9 +49,9 @@ from jaxphoto.compiling import run, store  # noqa: E402
 
 # The suite's programs are hundreds, of 2 MB: with a user's room each would be gone before another process needs it.
 store.MOST = 2_000_000_000
-# Of the 65,530 mappings of memory that Linux gives a process. A large program takes some three hundred, a module of
-# tests up to ten thousand.
-_MOST_MAPPINGS = 30_000
+# Of the 65,530 mappings of memory that Linux gives a process; XLA crashes where it finds none. A large program takes
+# some three hundred, a module of tests up to 43,000 (test_declared on jax 0.12). After a module, and after a test.
+_MOST_MAPPINGS, _MOST_WITHIN = 30_000, 50_000
 # Bytes in memory, of pages of 4 kB: two processes and what they start must fit into 16 GB.
 _MOST_MEMORY = 4_000_000_000
 
@@ -99,15 +99,30 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(100_000, 10, 10)
 
 
+def _mappings() -> int:
+    maps = Path("/proc/self/maps")
+    return maps.read_bytes().count(b"\n") if maps.exists() else 0
+
+
+def _let_go() -> None:
+    run._programs.clear()
+    _layouts.clear()
+    jax.clear_caches()
+    gc.collect()
+
+
 @pytest.fixture(scope="module", autouse=True)
 def programs_let_go():
     """Let JAX's compiled programs go before a process runs out of memory or of mappings; most are on disk."""
     yield
-    mappings, memory = Path("/proc/self/maps"), Path("/proc/self/statm")
-    if mappings.exists() and (
-        mappings.read_bytes().count(b"\n") > _MOST_MAPPINGS or int(memory.read_text().split()[1]) * 4096 > _MOST_MEMORY
-    ):
-        run._programs.clear()
-        _layouts.clear()
-        jax.clear_caches()
-        gc.collect()
+    memory = Path("/proc/self/statm")
+    if _mappings() > _MOST_MAPPINGS or (memory.exists() and int(memory.read_text().split()[1]) * 4096 > _MOST_MEMORY):
+        _let_go()
+
+
+@pytest.fixture(autouse=True)
+def mappings_left():
+    """The same within a module that takes very many."""
+    yield
+    if _mappings() > _MOST_WITHIN:
+        _let_go()
