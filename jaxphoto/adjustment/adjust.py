@@ -179,9 +179,10 @@ def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAS
     # Such rows may join points of two devices; of constraints, statistics have only the open motions in closed form.
     alone = alone or is_traced(values) or coupled or (constrained and not n_open_motions(values, structure))
     shards = 1 if alone else _devices_worth_using(len(structure.image))
-    key = sizes, shards, constrained or coupled
+    dense = constrained or coupled
+    key = sizes, shards, dense
     if key not in tiled_blocks:
-        tiled_blocks[key] = pad_structure(structure, sizes, shards=shards, dense=constrained or coupled)
+        tiled_blocks[key] = pad_structure(structure, sizes, shards=shards, dense=dense)
     tiled = tiled_blocks[key]
     return LaidOut(tiled, values, tiled.pad(values))
 
