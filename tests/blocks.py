@@ -17,12 +17,12 @@ from jaxphoto import FIXED, FREE, Outcome, Unknowns, Weighted, adjust, covarianc
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import Balanced, Brown, InteriorOrientation, Sensor, Smac, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.compiling.quickly import jit_quickly
 from jaxphoto.georeferencing import Mount, Scanner, StripBias
 from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows, SurfaceRows
 from jaxphoto.rotation import small_rotation
 from jaxphoto.simulation import remeasure
 from jaxphoto.unknowns import default_priors
-from tests.derivatives import QUICKLY
 from tests.formulas import camera_from_object, collinearity
 
 SENSOR = Sensor(4500, 3000, 0.008)
@@ -169,7 +169,7 @@ def measured(simulated: Simulated, seed: int = 1) -> Simulated:
 
 def _remeasured(block: Block, truth: Unknowns, key) -> Block:
     # Compiled, because eager JAX would compile every operation.
-    once = jax.jit(lambda u, k: observed(remeasure(block, u, k)), compiler_options=QUICKLY)
+    once = jit_quickly(lambda u, k: observed(remeasure(block, u, k)))
     return eqx.tree_at(observed, block, jax.tree.map(np.asarray, once(truth, key)))
 
 

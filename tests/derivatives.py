@@ -7,12 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from jaxphoto.compiling.options import quick_to_compile
+from jaxphoto.compiling.quickly import jit_quickly
 
 # Fourth-order central differences: their error is about 30 step^4 of the fifth derivative, plus 1e-16 / step.
 _STEP = 1e-3
 _TIMES, _WEIGHTS = np.array([-2.0, -1.0, 1.0, 2.0]), np.array([1.0, -8.0, 8.0, -1.0]) / 12
-QUICKLY = quick_to_compile()
 
 
 @functools.cache
@@ -31,12 +30,12 @@ def _three_ways(fn):
         return value, forward, jax.jacrev(flat)(vector), numerical
 
     # One case after the other: to map them at once is another layer of every trace, a third of the time.
-    return jax.jit(lambda *args: jax.lax.map(of_one_case, args), compiler_options=QUICKLY)
+    return jit_quickly(lambda *args: jax.lax.map(of_one_case, args))
 
 
 def compiled(fn):
     """`fn` compiled quickly, from and to NumPy: eager JAX would compile every single operation of a test."""
-    jitted = jax.jit(fn, compiler_options=QUICKLY)
+    jitted = jit_quickly(fn)
 
     def call(*args):
         arrays = [np.asarray(a, float) if type(a) in (list, tuple, float, int) else a for a in args]

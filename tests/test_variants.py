@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from jaxphoto import FIXED, FREE, BlockError, Outcome, adjust
 from jaxphoto.block import Block, Datum, Motion
+from jaxphoto.compiling.quickly import jit_quickly
 from jaxphoto.observations import ControlRows
 from jaxphoto.simulation import remeasure
 from jaxphoto.statistics import check_discrepancies
@@ -32,7 +33,6 @@ from jaxphoto.variants import (
     without_stations,
 )
 from tests import blocks
-from tests.derivatives import QUICKLY
 
 bounded = settings(max_examples=30, deadline=None, derandomize=True, database=None)
 
@@ -259,7 +259,7 @@ def test_modes_by_name():
 def with_true_sensors(block: Block, truth) -> Block:
     """Stations and attitudes without noise, and mount and strips as they are: direct must then find the truth."""
     exact = sharp(block)
-    draw = jax.jit(lambda key: blocks.observed(remeasure(exact, truth, key)), compiler_options=QUICKLY)
+    draw = jit_quickly(lambda key: blocks.observed(remeasure(exact, truth, key)))
     sensed = jax.tree.map(np.asarray, draw(jax.random.key(0)))
     block = eqx.tree_at(lambda b: b.start.unknowns.mounts, block, truth.mounts)
     block = eqx.tree_at(lambda b: b.start.unknowns.strips, block, truth.strips)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxphoto.compiling.quickly import jit_quickly
 from jaxphoto.georeferencing.trajectory import Trajectory, covered, interpolate
 from jaxphoto.rotation import (
     matrix_from_roll_pitch_yaw,
@@ -15,12 +16,12 @@ from jaxphoto.rotation import (
     small_angles,
     small_rotation,
 )
-from tests.derivatives import QUICKLY, check_derivatives
+from tests.derivatives import check_derivatives
 
 ANY_GAP = 1e9
 # Where numbers do not matter there are as many records and times, so that what is compiled for one serves all.
 RECORDS, TIMES = 201, 400
-_at_times = jax.jit(interpolate, compiler_options=QUICKLY)
+_at_times = jit_quickly(interpolate)
 _quaternions = jax.jit(lambda a: jax.vmap(quaternion_from_matrix)(jax.vmap(matrix_from_roll_pitch_yaw)(a)))
 _matrices = jax.jit(jax.vmap(matrix_from_roll_pitch_yaw))
 _angles = jax.jit(jax.vmap(roll_pitch_yaw_from_matrix))

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from jaxphoto.block import Block
+from jaxphoto.compiling.quickly import jit_quickly
 from jaxphoto.errors import BlockError
 from jaxphoto.io import recipe_from
 from jaxphoto.simulation import Choice, Simulation, remeasure
 from jaxphoto.simulation.points import _chosen
 from jaxphoto.unknowns import FIXED, FREE
 from tests.blocks import observed
-from tests.derivatives import QUICKLY
 from tests.formulas import axis_rotation, camera_from_object, collinearity
 from tests.simulation.small import changed, made, plain
 
@@ -364,7 +364,7 @@ def test_truth_measures_the_same_flight_anew():
     }
     block, truth, _ = made(changes)
     # Compiled, because eager JAX would compile every operation.
-    once = jax.jit(lambda u, k: observed(remeasure(block, u, k)), compiler_options=QUICKLY)
+    once = jit_quickly(lambda u, k: observed(remeasure(block, u, k)))
     xy, attitudes, *values = once(truth, jax.random.key(1))
     xy_was, attitudes_were, *values_were = observed(block)
     np.testing.assert_allclose(xy, xy_was, rtol=0, atol=1e-8)
