@@ -15,7 +15,6 @@ from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals, Unk
 from jaxphoto.adjustment.solver.band import Band, dense, factor_band, invert_band, pivots, solve_band
 from jaxphoto.adjustment.solver.elimination import (
     FactoredNormal,
-    gradient,
     pull,
     pull_others,
     push,
@@ -29,7 +28,7 @@ from jaxphoto.adjustment.solver.levenberg_marquardt import Course, Task
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import iterate, typical_scale, unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.reduced import reduce_normal
-from jaxphoto.arrays import Numbers, still
+from jaxphoto.arrays import Numbers, added, still
 from jaxphoto.compiling import call_compiled
 from jaxphoto.short_repr import shown
 
@@ -128,9 +127,12 @@ class NormalEquations(eqx.Module):
         """That of the weakest."""
         return jnp.min(self.pivots())
 
-    def gradient(self, increments: Increments) -> tuple[Increments, Array, Array, Float[Array, ""]]:
-        """b = J'r at other increments, the same as `reduce` takes it down, and the square sum r'r there."""
-        return gradient(self.at._replace(increments=increments), self.factored.reduced, self.at)
+    def gradient(self, increments: Increments) -> tuple[Increments, Float[Array, ""]]:
+        """b = J'r at other increments, and the square sum r'r there."""
+        at = self.at._replace(increments=increments)
+        residuals = at.residuals()
+        b = pull(jax.tree.map(lambda v: v[None], residuals), at)
+        return jax.tree.map(lambda v: v[0], b), added(jnp.sum(v**2) for v in jax.tree.leaves(residuals))
 
     def constraints(self) -> Increments:
         """Derivatives of the constraints of the datum, along a leading axis."""

@@ -234,9 +234,7 @@ class _White(NamedTuple):
 
     def whitened(self, row: Increments) -> Float[Array, "free"]:
         """The derivative by z of what has the derivative `row` by x."""
-        return self._whitened(row, *self.equations.reduce(row))
-
-    def _whitened(self, row: Increments, right: Array, d: Array) -> Float[Array, "free"]:
+        right, d = self.equations.reduce(row)
         reduced = self.equations.factored.reduced
         if len(d):
             right = right - reduced.g @ solve(reduced.k, d)
@@ -247,8 +245,8 @@ class _White(NamedTuple):
     def slope(self, z: Float[Array, "free"]) -> tuple[Scalar, Float[Array, "free"]]:
         """Half the sum of squares and its derivative; of what the constraints hold, that of a standard normal."""
         held = self.held @ z
-        b, right, d, square = self.equations.gradient(self.increments(z))
-        return 0.5 * (square + held @ held), self._whitened(b, right, d) + self.held.T @ held
+        b, square = self.equations.gradient(self.increments(z))
+        return 0.5 * (square + held @ held), self.whitened(b) + self.held.T @ held
 
     def log_density(self, z: Float[Array, "free"]) -> Scalar:
         """Minus half the sum of squares."""

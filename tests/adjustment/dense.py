@@ -17,7 +17,7 @@ from jaxphoto.adjustment.model.block_values import values_of, with_datum
 from jaxphoto.adjustment.model.numbers import Increments, zero_increments
 from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.adjustment.solver.band import factor_band
-from jaxphoto.adjustment.solver.elimination import gradient, solve_factored
+from jaxphoto.adjustment.solver.elimination import pull, reduce_right, solve_factored
 from jaxphoto.adjustment.solver.non_image_rows import NonImageRows, non_image_rows
 from jaxphoto.adjustment.solver.optimum import typical_scale, weigh_datum
 from jaxphoto.adjustment.solver.reduced import reduce_normal, tile_numbers, tile_parts
@@ -198,7 +198,9 @@ def _dense(values, structure) -> Dense:
     # One damping after the other: half of what is compiled here is the normal equations.
     solutions, *undamped = jax.lax.map(solved, jnp.array(DAMPINGS))
     reduced, right = jax.tree.map(lambda v: v[DAMPINGS.index(0.0)], undamped)
-    b, down, d, squares = gradient(at, reduced, at)
+    own = at.residuals()
+    b = jax.tree.map(lambda v: v[0], pull(jax.tree.map(lambda v: v[None], own), at))
+    down, d = reduce_right(reduced, b, at)
     return Dense(
         jacobian=jacobian,
         residuals=residuals,
@@ -207,7 +209,7 @@ def _dense(values, structure) -> Dense:
         vector=vector,
         gradient=ravel_pytree(b)[0],
         sums=ravel_pytree(right.b)[0],
-        square_sums=jnp.stack([squares, right.square_sum]),
+        square_sums=jnp.stack([at.square_sum(), sum(jnp.sum(v**2) for v in jax.tree.leaves(own))]),
         taken_down=jnp.stack([jnp.concatenate([down, d]), jnp.concatenate([right.reduced, right.d])]),
         couples=jnp.zeros(0, bool),
         solutions=solutions,

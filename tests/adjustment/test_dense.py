@@ -14,7 +14,7 @@ from jaxphoto.adjustment.layout.tile_layout import sizes_of
 from jaxphoto.adjustment.model.numbers import state_at, zero_increments
 from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.adjustment.solver.band import factor_band
-from jaxphoto.adjustment.solver.elimination import gradient, solve_factored, solve_reduced
+from jaxphoto.adjustment.solver.elimination import solve_factored, solve_reduced
 from jaxphoto.adjustment.solver.optimum import typical_scale, unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.statistics import redundancy_numbers
@@ -102,10 +102,9 @@ def _solved(values, s, damping):
     def multiplied(x):
         return jax.tree.map(lambda nx, w, x: nx + damping * w * x, pull(push(x))[0], reduced.weight, x)
 
-    b, *down = gradient(at, reduced, at)
     by_f = solve_factored(reduced, factor, right.b, at)
-    by_rows = solve_reduced(reduced, factor, *down[:2], b.points, at)
-    return right.b, b, multiplied(by_f), multiplied(by_rows)
+    by_rows = solve_reduced(reduced, factor, right.reduced, right.d, right.b.points, at)
+    return right.b, pull(at.residuals())[0], multiplied(by_f), multiplied(by_rows)
 
 
 @pytest.mark.parametrize("name", KINDS)

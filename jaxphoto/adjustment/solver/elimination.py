@@ -1,28 +1,28 @@
 """Solution of the normal equations: right-hand sides go down to the reduced unknowns, solutions back to the points.
 
 Both ways lead through F, see `normal`. The F of a small block is kept; that of a large one takes longer to fetch from
-memory than to make anew, a few tiles at a time. That pays for many right-hand sides at once. One is taken down and up
-by two derivatives of the image rows each, in a direction and back: W z = J_e' (J_p z), W' x = J_p' (J_e x).
+memory than to make anew, a few tiles at a time. One solution, not one of many, comes back to the points by two
+derivatives of the image rows instead, in a direction and back: W' x = J_p' (J_e x).
 """
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure
-from jaxphoto.adjustment.model.image_orientations import ImageOrientations, by_image, of_images, orientations_of
+from jaxphoto.adjustment.model.image_orientations import ImageOrientations, of_images, orientations_of
 from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals, datum_residuals, state_at
 from jaxphoto.adjustment.model.observed_groups import RowsAtPoints
-from jaxphoto.adjustment.model.row_functions import group_residuals, non_image_residuals, row_jacobian, rows_at_once
+from jaxphoto.adjustment.model.row_functions import non_image_residuals, row_jacobian, rows_at_once
 from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.band import BandFactor, solve_band
 from jaxphoto.adjustment.solver.non_image_rows import non_image_rows
-from jaxphoto.adjustment.solver.normal import Linearised, Reduced, other_squares, squares
+from jaxphoto.adjustment.solver.normal import Linearised, Reduced
 from jaxphoto.adjustment.solver.reduced import tile_columns, tile_numbers, tile_parts
 from jaxphoto.adjustment.solver.tile_rows import seen_in, tile_residuals
 from jaxphoto.arrays import added
@@ -58,18 +58,15 @@ def over_tiles(function: Callable, at: Linearised, reduced: Reduced, numbers: tu
 
 def solve_factored(reduced: Reduced, factor: BandFactor, b: Increments, at: Linearised) -> Increments:
     """x of (N + damping diag(N)) x = b, one of many: down to the reduced unknowns, and back to the points."""
-    return solve_reduced(reduced, factor, *reduce_right(reduced, b, at, many=True), b.points, at, many=True)
+    return solve_reduced(reduced, factor, *reduce_right(reduced, b, at), b.points, at, many=True)
 
 
-def reduce_right(reduced: Reduced, b: Increments, at: Linearised, many: bool = False) -> tuple[Array, Array]:
-    """A right-hand side, or one of `many` under `jax.vmap`, taken down to the reduced unknowns and to mu."""
+def reduce_right(reduced: Reduced, b: Increments, at: Linearised) -> tuple[Array, Array]:
+    """A right-hand side taken down to the reduced unknowns and to mu."""
     s = at.structure
     if not s.tiles.free_points:
         return jnp.concatenate([b.eop.T.reshape(-1), b.shared]), jnp.zeros(len(reduced.k))
     z = jnp.stack(whiten(b.points, reduced.l))
-    if reduced.f is None and not many:
-        eop, shared, d = _down_by_rows(jnp.stack(unwhiten(z, reduced.l)), at)
-        return jnp.concatenate([(b.eop - eop).T.reshape(-1), b.shared - shared]), d
     image, z = s.tiles.image, s.by_tile(z)
     down = over_tiles(lambda f, _, z: f @ z.reshape(-1), at, reduced, (z,))
     of_images, border = jnp.split(down, [6 * image.shape[2]], axis=2)
@@ -104,27 +101,6 @@ def solve_reduced(
     return Increments(eop.T, shared, jnp.stack(unwhiten(z, r.l)))
 
 
-def _down_by_rows(step: Array, at: Linearised) -> tuple[Array, Array, Array]:
-    """What increments of the points add to the right-hand sides of images, shared unknowns and mu."""
-    _, scale, values, s = at
-    rest = non_image_rows(at)
-    scene, pull_scene = _scene_and_pull(at)
-
-    def tile(numbers):
-        image, point, step, xy, sigma = numbers
-        seen, place = seen_in(xy, sigma, image, s), of_images(scene, image, s)
-        moved = jax.jvp(lambda point: tile_residuals(place, point, seen, s), (point,), (step,))[1]
-        return jax.vjp(lambda scene: tile_residuals(scene, point, seen, s), place)[1](moved)[0]
-
-    numbers = (s.by_tile(at.state.points), s.by_tile(step * scale.points))
-    to_scene = s.each_tile(tile, (*numbers, values.xy, values.sigma_xy))
-    eop, shared = pull_scene(total(_by_image(to_scene, scene, s), s))
-    for g, rows in zip(s.with_shared, rest.at_points, strict=True):
-        added = jnp.einsum("clrp,ckrp,kp->lrp", rows.shared, rows.points, step)
-        shared = shared + total(jnp.zeros_like(shared).at[jnp.asarray(g.column)].add(added, mode="drop"), s)
-    return eop, shared, total(jnp.einsum("kcp,cp->k", rest.rows_p, step), s)
-
-
 def _up_by_rows(eop: Array, shared: Array, mu: Array, at: Linearised) -> Array:
     """What increments of images and shared unknowns, and mu, add to the right-hand sides of the points."""
     increments, scale, values, s = at
@@ -143,49 +119,6 @@ def _up_by_rows(eop: Array, shared: Array, mu: Array, at: Linearised) -> Array:
         moved = jnp.append(shared, 0.0)[jnp.asarray(g.column)]
         result = result + jnp.einsum("ckrp,clrp,lrp->kp", rows.points, rows.shared, moved)
     return result
-
-
-class Trial(NamedTuple):
-    """Another place for the residuals of a gradient; the derivatives stay."""
-
-    wanted: Bool[Array, ""]
-    increments: Increments
-    linear: Increments
-    """What J'r there is without curvature: to be subtracted."""
-
-
-def gradient(at: Linearised, reduced: Reduced, there: Linearised, trial: Trial | None = None):
-    """b = J'r over all rows, its part for the reduced unknowns and for mu, and the square sum of the residuals r.
-
-    What takes it down is `reduced`, linearised `there`. J is that of `at`, and so is r, unless a `trial` is wanted.
-    """
-    increments, scale, values, s = at
-    others, b_others = _others_and_gradient(at, trial)
-    scene, pull_scene = _scene_and_pull(at)
-    points = values.points + increments.points * scale.points
-    moved: tuple[Array, ...] = ()
-    if trial is not None:
-        moved_scene = _scene_at(at, trial.increments.eop, trial.increments.shared)
-        moved = (values.points + trial.increments.points * scale.points,)
-
-    def tile(numbers):
-        image, point, step, other, xy, sigma, *moved = numbers
-        seen, place = seen_in(xy, sigma, image, s), of_images(scene, image, s)
-        r, pull = jax.vjp(lambda scene, point: tile_residuals(scene, point, seen, s), place, point)
-        if trial is not None:
-            of_trial = lambda: tile_residuals(of_images(moved_scene, image, s), moved[0], seen, s)  # noqa: E731
-            r = jax.lax.cond(trial.wanted, of_trial, lambda: r)
-        to_scene, to_point = pull(r)
-        return to_scene, to_point * step + other, squares(r)
-
-    numbers = (s.by_tile(v) for v in (points, scale.points, b_others.points))
-    of_tiles = (*numbers, values.xy, values.sigma_xy, *map(s.by_tile, moved))
-    to_scene, b, square = s.each_tile(tile, of_tiles)
-    eop, shared = pull_scene(total(_by_image(to_scene, scene, s), s))
-    b = Increments(eop + b_others.eop, shared + b_others.shared, s.by_point(b))
-    if trial is not None:
-        b = jax.tree.map(lambda b, linear: b - jnp.where(trial.wanted, linear, 0.0), b, trial.linear)
-    return b, *reduce_right(reduced, b, there), total(jnp.sum(square), s) + other_squares(others, s)
 
 
 def pull(z: TiledResiduals, at: Linearised) -> Increments:
@@ -281,56 +214,6 @@ def push_others(x: Increments, at: Linearised) -> NonImageResiduals:
     return _of_many(one, x, len(x.shared), s)
 
 
-def _others_and_gradient(at: Linearised, trial: Trial | None) -> tuple[NonImageResiduals, Increments]:
-    """All but the image rows, and their part of b."""
-    increments, scale, values, s = at
-    # Each by itself: one derivative of all of them, taken once for each kind, would be twice the program.
-    parts = {at_points: _groups_and_gradient(at, trial, at_points) for at_points in (False, True)}
-    of_each = {at_points: iter(residuals) for at_points, (residuals, _) in parts.items()}
-    residuals = tuple(next(of_each[isinstance(g.rows, RowsAtPoints)]) for g in s.observed)
-    if trial is not None:
-        increments = jax.tree.map(lambda a, b: jnp.where(trial.wanted, a, b), trial.increments, increments)
-    datum = datum_residuals(increments, scale, values, s)
-    others = NonImageResiduals(residuals, datum, tuple(g.name for g in s.observed))
-    # Rows at points are dealt out with these and meet shared unknowns, which are on every device.
-    b, at_points = parts[False][1], parts[True][1]
-    if parts[True][0]:
-        b = jax.tree.map(jnp.add, b, at_points._replace(shared=total(at_points.shared, s)))
-    # The constraints of the datum go over all points.
-    eop = jnp.einsum("kci,k->ci", values.datum_eop * scale.eop, datum)
-    points = jnp.einsum("kcp,k->cp", values.datum_points * scale.points, datum)
-    return others, b._replace(eop=b.eop + eop, points=b.points + points)
-
-
-def _groups_and_gradient(at: Linearised, trial: Trial | None, at_points: bool) -> tuple[tuple[Array, ...], Increments]:
-    """Residuals of the groups that lie at points, or of all others, and their part of b on this device."""
-    increments, scale, values, s = at
-    pairs = zip(s.observed, values.groups, strict=True)
-    chosen = [(g, numbers) for g, numbers in pairs if isinstance(g.rows, RowsAtPoints) == at_points]
-    of_chosen = lambda y: tuple(group_residuals(g, numbers, y, scale, values, s) for g, numbers in chosen)  # noqa: E731
-    residuals, pull = jax.vjp(of_chosen, increments)
-    if trial is not None:
-        residuals = jax.lax.cond(trial.wanted, of_chosen, lambda _: residuals, trial.increments)
-    return residuals, pull(residuals)[0]
-
-
-def _scene_and_pull(at: Linearised):
-    """The scene, and what takes its cotangents to increments of images and shared unknowns."""
-    return jax.vjp(partial(_scene_at, at), at.increments.eop, at.increments.shared)
-
-
 def _scene_at(at: Linearised, eop: Array, shared: Array) -> ImageOrientations:
     increments, scale, values, s = at
     return orientations_of(state_at(increments._replace(eop=eop, shared=shared), scale, values, s), values, s)
-
-
-def _by_image(parts: ImageOrientations, scene: ImageOrientations, s: TiledStructure) -> ImageOrientations:
-    """Cotangents of tiles, added by image (and over all tiles, for the only camera of a group)."""
-    image, n = s.tiles.image.reshape(-1), scene.centre.shape[0]
-
-    def of_image(v):
-        return jax.ops.segment_sum(v.reshape(-1, *v.shape[3:]), image, n)
-
-    by_group = zip(s.groups, parts.cameras, strict=True)
-    cameras = tuple(jnp.sum(v, axis=(0, 1)) if not by_image(g, s) else of_image(v) for g, v in by_group)
-    return ImageOrientations(of_image(parts.centre), of_image(parts.rotation), cameras)

@@ -1,8 +1,8 @@
 """Levenberg-Marquardt for a block, as a solver of optimistix that knows the block's structure.
 
-optimistix runs the iteration. A step sums and factors the normal equations with their points eliminated (`reduced`,
-`band`), or, once steps shrink fast, keeps the factor and only takes the gradient anew: a chord step, which costs a
-third to a half and near the optimum gains nearly as much.
+optimistix runs the iteration. Each iteration evaluates the residuals of one candidate. Where it is accepted, the
+normal equations are summed there, their points eliminated (`reduced`), the rest factored (`band`), and a new step is
+proposed.
 
 Where unknowns are weakly determined the square sum is a narrow, bent valley, and a straight step leaves it: by the
 damping that it takes to stay inside, such a block creeps. So a step v that reduces the square sum by less than the
@@ -11,8 +11,7 @@ residuals along v,
 
     (N + D) v = -J'r,    (N + D) a = -J'r'',    x(t) = x + t v + t^2 a / 2
 
-and t is halved until the reduction is near what x(t) promises. The acceleration costs a gradient and one solution with
-the factor that there is, as a chord step does.
+and t is halved until the reduction is near what x(t) promises. The acceleration costs residuals and one factor more.
 """
 
 from collections.abc import Callable
@@ -27,19 +26,22 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
 from jaxphoto.adjustment.model.block_values import with_datum
 from jaxphoto.adjustment.model.numbers import Increments
+from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.band import BandFactor, factor_band
-from jaxphoto.adjustment.solver.elimination import Trial, gradient, solve_reduced
-from jaxphoto.adjustment.solver.normal import Linearised, Reduced, dot, norm2
-from jaxphoto.adjustment.solver.reduced import RightSide, reduce_normal
-from jaxphoto.adjustment.solver.similarity import after, n_open_motions, onto_datum
+from jaxphoto.adjustment.solver.elimination import solve_reduced
+from jaxphoto.adjustment.solver.normal import Linearised, Reduced, Rows
+from jaxphoto.adjustment.solver.reduced import reduce_normal
+from jaxphoto.adjustment.solver.similarity import n_open_motions, onto_datum
 from jaxphoto.arrays import Numbers
 from jaxphoto.short_repr import shown
 
+Vector = Float[Array, "unknowns"]
+"""Scaled increments one below the other: one operation, where three arrays would be three to compile."""
+
 
 class FactoredSystem(NamedTuple):
-    """Normal equations summed and factored at some increments."""
+    """Normal equations summed and factored."""
 
-    increments: Increments
     reduced: Reduced
     factor: BandFactor
 
@@ -62,7 +64,7 @@ def zero_system(y: Increments, values: TiledValues, s: TiledStructure) -> Factor
         weight=jax.tree.map(jnp.zeros_like, y),
         damping=jnp.zeros(()),
     )
-    return FactoredSystem(y, reduced, factor)
+    return FactoredSystem(reduced, factor)
 
 
 class Task(NamedTuple):
@@ -116,39 +118,56 @@ _WINDOW, _FALL, _SHRUNK = 20, 4.0, 0.5
 
 
 class Proposal(NamedTuple):
-    """A straight step from the iterate, and what came of it."""
+    """A step from the iterate, and what the linear model promises of it."""
 
-    step: Increments
-    gradient: Increments
+    step: Vector
+    gradient: Vector
     """J'r at the iterate."""
+    half: Vector
+    """Half of the acceleration; zero before it is known."""
     seen: Scalar
     """v'N v of the step v."""
     damped: Scalar
     """v'D v."""
     square_sum: Scalar
     """At the iterate."""
-    trial: Increments
-    """After the step."""
-    trial_sum: Scalar
+    straight_sum: Scalar
+    """After the whole step, without acceleration; infinite before it is known."""
 
-    def promised(self, t: Scalar | float) -> Scalar:
-        """Reduction of the square sum after the fraction t of the step, by the linear model."""
-        return 2 * t * (self.seen + self.damped) - t**2 * self.seen
+    def along(self, y: Vector, t: Scalar | float) -> Vector:
+        """After the fraction t of the step from the iterate `y`."""
+        return y + t * self.step + t**2 * self.half
+
+    @property
+    def length(self) -> Scalar:
+        """In the metric of the normal matrix."""
+        return jnp.sqrt(jnp.maximum(self.seen, 0.0))
+
+    def gain(self, t: Scalar, square_sum: Scalar) -> Scalar:
+        """The reduction of the square sum after the fraction t of the step, over that of the linear model."""
+        return (self.square_sum - square_sum) / (2 * t * (self.seen + self.damped) - t**2 * self.seen)
+
+
+# What the next candidate is: the iterate itself (first, or after a rejected step), the whole step, a place near the
+# iterate for the second derivative of the residuals, or a place along the curve.
+_HERE, _STRAIGHT, _NEAR, _CURVE = range(4)
 
 
 class SolverState(NamedTuple):
     """The solver's state between two iterations."""
 
+    stage: Int[Array, ""]
+    candidate: Vector
+    t: Scalar
+    """The fraction of the step that leads to the candidate."""
+    shortest: Scalar
+    """The smallest such fraction that is tried."""
+    proposal: Proposal
     damping: Scalar
     growth: Scalar
     """Of the damping when a step is rejected."""
     length: Scalar
-    """Of the last accepted step, in the metric of the normal matrix."""
-    chord: Bool[Array, ""]
-    """Whether the next step uses the system as it is."""
-    bend: Bool[Array, ""]
-    """Whether the next iteration bends the proposal, and takes no step of its own."""
-    proposal: Proposal
+    """Of the last accepted step."""
     system: FactoredSystem
     loose: Bool[Array, ""]
     """Whether damping takes the place of the datum's constraints."""
@@ -159,7 +178,8 @@ class SolverState(NamedTuple):
     flat: Bool[Array, ""]
     """True if there is no use in going on: the square sum does not tell where the optimum is."""
     steps: Int[Array, ""]
-    course: Course
+    course: Float[Array, "steps numbers"]
+    """The numbers of a `Course`, a step a row."""
 
 
 # Damping is what is added to the normal matrix, relative to its diagonal. It begins almost as none. A rejected step v
@@ -170,15 +190,13 @@ _FIRST_DAMPING, _GROWTH = 1e-8, 2.0
 # at most to this fraction.
 _ACCEPT, _LEAST_FACTOR = 0.001, 0.2
 # A step below this ratio is bent, and shortened until it is above the second, or below this fraction of its length.
-_STRAIGHT, _ENOUGH, _SHORTEST = 0.75, 0.25, 0.1
+_GOOD, _ENOUGH, _SHORTEST = 0.75, 0.25, 0.1
 # Bending moves by this fraction of the step at most, in the metric of diag(N): 2 |a| / |v| < 1.5 (Transtrum, Sethna).
 _BENT = 0.375
 # The fraction of a step from which its second derivative is found: the difference of residuals has digits enough.
 _DIFFERENCE = 0.01
 # Ratio of successive steps that is assumed at least when the missing part is estimated.
 _SLOWEST_SHOWN = 0.1
-# Steps that shrink like this go on with the same factor; a chord step that shrinks less than the second ends it.
-_CHORD, _CHORD_FAILS = 0.01, 0.3
 
 
 def _next_damping(
@@ -189,15 +207,18 @@ def _next_damping(
     # Nothing else keeps a loose network's matrix regular.
     less = jnp.maximum(less, jnp.where(state.loose, _FIRST_DAMPING, 0.0))
     more = jnp.maximum(state.growth * state.damping, stiffness)
-    damping, growth = jnp.where(accept, less, more), jnp.where(accept, _GROWTH, _GROWTH * state.growth)
-    # A chord that fails says nothing about the damping: the next step has a factor of its own.
-    return jnp.where(state.chord, state.damping, damping), jnp.where(state.chord, state.growth, growth)
+    return jnp.where(accept, less, more), jnp.where(accept, _GROWTH, _GROWTH * state.growth)
 
 
-class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any, SolverState]):
+def flat(x: Increments) -> Vector:
+    """The increments as a vector."""
+    return jnp.concatenate([jnp.ravel(v) for v in x])
+
+
+class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, SolverState]):
     """Levenberg-Marquardt, stopped by what is still missing to the optimum in standard deviations.
 
-    The function it minimises returns the length of the residual vector; derivatives are the solver's own business.
+    The function it minimises returns the residuals; derivatives are the solver's own business.
 
     The length of a step d in the metric of the normal matrix, sqrt(d' N d), bounds |d| / sigma of every single
     unknown. After a step of length l that follows one of length k about l (l / k) is missing; a tenth of l is assumed
@@ -220,144 +241,148 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         self.structure, self.values, self.scale = structure, values, scale
         self.tolerance, self.task = tolerance, task
 
-    def _at(self, y: Increments, loose: Bool[Array, ""]) -> Linearised:
+    def increments(self, y: Vector) -> Increments:
+        """The vector as increments."""
+        n = 6 * self.structure.n_images
+        eop, shared, points = jnp.split(y, [n, n + self.structure.n_shared])
+        return Increments(eop.reshape(6, -1), shared, points.reshape(3, -1))
+
+    def _at(self, y: Vector, loose: Bool[Array, ""]) -> Linearised:
         v = self.values
         if n_open_motions(v, self.structure):
             v = with_datum(v, jnp.where(loose, 0.0, v.datum_eop), jnp.where(loose, 0.0, v.datum_points))
-        return Linearised(y, self.scale, v, self.structure)
+        return Linearised(self.increments(y), self.scale, v, self.structure)
+
+    def _dot(self, a: Vector, b: Vector) -> Scalar:
+        s = self.structure
+        if s.shards == 1:
+            return jnp.vdot(a, b)
+        # Points are dealt out.
+        n = 6 * s.n_images + s.n_shared
+        return jnp.vdot(a[:n], b[:n]) + total(jnp.vdot(a[n:], b[n:]), s)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> SolverState:
         """Almost Gauss-Newton to begin with."""
-        damping = jnp.where(self.task.only_factor, 0.0, _FIRST_DAMPING)
-        empty = zero_system(y, self.values, self.structure)
-        no, steps = jnp.array(False), jnp.array(0)
-        course = Course(*(jnp.full(MOST_KEPT, jnp.nan) for _ in Course._fields))
-        zero, none = jax.tree.map(jnp.zeros_like, y), jnp.zeros(())
+        no, one, zero = jnp.array(False), jnp.ones(()), jnp.zeros(())
+        none = jnp.zeros_like(y)
         return SolverState(
-            damping,
-            jnp.array(_GROWTH),
-            jnp.array(jnp.inf),
-            no,
-            bend=no,
-            proposal=Proposal(zero, zero, none, none, none, y, none),
-            system=empty,
+            stage=jnp.array(_HERE),
+            candidate=y,
+            t=one,
+            shortest=one,
+            proposal=Proposal(none, none, none, zero, zero, zero, zero),
+            damping=jnp.where(self.task.only_factor, 0.0, _FIRST_DAMPING),
+            growth=jnp.array(_GROWTH),
+            length=jnp.array(jnp.inf),
+            system=zero_system(self.increments(y), self.values, self.structure),
             loose=no,
             tightened=no,
             done=no,
             flat=no,
-            steps=steps,
-            course=course,
+            steps=jnp.array(0),
+            course=jnp.full((MOST_KEPT, len(Course._fields)), jnp.nan),
         )
 
-    def _factored(self, at: Linearised, damping) -> tuple[FactoredSystem, RightSide]:
-        a, reduced, right = reduce_normal(at.for_normal_equations, damping)
-        return FactoredSystem(at.increments, reduced, factor_band(a)), self._with_cost(right, at)
-
-    def _kept(self, at: Linearised, state: SolverState) -> tuple[FactoredSystem, RightSide]:
-        """The gradient there, or J'r'' of the proposal, taken down by the system that there is."""
-        here, system, p, h = at.for_normal_equations, state.system, state.proposal, _DIFFERENCE
-        weight, damping = system.reduced.weight, system.reduced.damping
-        # r(h v) = r + h J v + h^2 r'' / 2, and (N + D) v = -J'r.
-        linear = jax.tree.map(lambda b, v, w: (1 - h) * b - h * damping * w * v, p.gradient, p.step, weight)
-        # What a similarity adds to the step (`after`) goes with the square of it.
-        near = jax.tree.map(lambda y, v, end: y + h * v + h**2 * (end - y - v), at.increments, p.step, p.trial)
-        trial = Trial(state.bend, near, linear)
-        right = RightSide(*gradient(here, system.reduced, here._replace(increments=system.increments), trial))
-        return system, self._with_cost(right, at)
-
-    def _with_cost(self, right: RightSide, at: Linearised) -> RightSide:
-        """With what is minimised for the square sum: of rows with losses, the normal equations do not tell."""
-        return right._replace(square_sum=at.square_sum()) if self.structure.has_losses else right
+    def _factored(self, at: Linearised, damping: Scalar, rows: Rows | None, less: Vector):
+        """The system there, x of (N + D) x = J'r - `less`, and that right-hand side."""
+        place = at.for_normal_equations
+        a, reduced, right = reduce_normal(place, damping, rows, self.increments(less))
+        factor = factor_band(a)
+        x = jax.lax.cond(
+            self.task.only_factor,
+            lambda: jnp.zeros_like(less),
+            lambda: flat(solve_reduced(reduced, factor, right.reduced, right.d, right.b.points, place)),
+        )
+        return FactoredSystem(reduced, factor), x, flat(right.b)
 
     def step(self, fn, y, args, options, state: SolverState, tags):
-        """Propose a step; take it if it is good, and damp more if not."""
-        at, bend = self._at(y, state.loose), state.bend
-        system, right = jax.lax.cond(
-            state.chord | bend, lambda: self._kept(at, state), lambda: self._factored(at, state.damping)
-        )
-        place = at.for_normal_equations._replace(increments=system.increments)
-        only_factor, weight = self.task.only_factor, system.reduced.weight
-        x = jax.lax.cond(
-            only_factor,
-            lambda: jax.tree.map(jnp.zeros_like, y),
-            lambda: solve_reduced(system.reduced, system.factor, right.reduced, right.d, right.b.points, place),
-        )
-        pick = lambda which, a, b: jax.tree.map(lambda a, b: jnp.where(which, a, b), a, b)  # noqa: E731
-        # (N + D) d = -b, so d'N d = -d'b - d'D d, and the linear model promises d'N d / 2 + d'D d.
-        damped = system.reduced.damping * norm2(x, weight, self.structure)
-        seen = dot(x, right.b, self.structure) - damped
-        straight = Proposal(jax.tree.map(jnp.negative, x), right.b, seen, damped, right.square_sum, y, right.square_sum)
-        p = pick(bend, state.proposal, straight)
-        half = jax.tree.map(lambda x: jnp.where(bend, -x / _DIFFERENCE**2, 0.0), x)
-        length = jnp.sqrt(jnp.maximum(p.seen, 0.0))
-        ratio = length / state.length
-        missing = length * jnp.clip(ratio, _SLOWEST_SHOWN, 1.0)
-        settled = (missing <= self.tolerance) & (p.damped <= p.seen + self.tolerance**2) & ~bend
-        new_y, square_sum, t = self._along(at, p, half, weight, fn, bend, settled | only_factor)
-        no_better = bend & ~(square_sum < p.trial_sum)
-        new_y, square_sum, t = pick(no_better, (p.trial, p.trial_sum, 1.0), (new_y, square_sum, t))
-        gain = (p.square_sum - square_sum) / p.promised(t)
-        bend_next = ~(settled | only_factor | state.chord | bend) & ~(gain >= _STRAIGHT) & jnp.isfinite(square_sum)
+        """Judge the candidate; where it is accepted, propose a step from there."""
+        s, p, h, none = self.structure, state.proposal, _DIFFERENCE, jnp.zeros_like(y)
+        straight, near, curve = (state.stage == stage for stage in (_STRAIGHT, _NEAR, _CURVE))
+        here = self._at(state.candidate, state.loose)
+        rows, _ = fn(state.candidate, here[1:])
+        square_sum = rows.square_sum(s)
+        gain = p.gain(state.t, square_sum)
         # Of a loss the linear model promises little far from the optimum, where the way is not a bent valley.
-        bend_next = bend_next & (not self.structure.has_losses)
-        accept = (settled | (gain >= _ACCEPT)) & ~bend_next
-        chord_failed = state.chord & ~(accept & (ratio < _CHORD_FAILS))
-        # One that had to be shortened is no reason for less damping.
+        bend = straight & ~(gain >= _GOOD) & jnp.isfinite(square_sum) & (not s.has_losses)
+        shorten = curve & (state.t > state.shortest) & ~(gain >= _ENOUGH)
+        judged = (straight & ~bend) | (curve & ~shorten)
+        # The curve may lead to no better place than the straight step.
+        no_better = curve & judged & ~(square_sum < p.straight_sum)
+        t = jnp.where(no_better, 1.0, state.t)
+        gain = jnp.where(no_better, p.gain(t, p.straight_sum), gain)
+        accept = judged & (gain >= _ACCEPT)
+        y = jnp.where(accept, jnp.where(no_better, y + p.step, state.candidate), y)
+        # A step that had to be shortened is no reason for less damping.
         shown = jnp.where(t < 1, jnp.minimum(gain, 0.5), gain)
-        stiffness = p.seen / norm2(p.step, weight, self.structure)
-        damping, growth = pick(bend_next, (state.damping, state.growth), _next_damping(state, accept, shown, stiffness))
-        next_y, loose, tighten = pick(accept, new_y, y), state.loose, jnp.array(False)
-        if n_open_motions(self.values, self.structure):
+        reduced = state.system.reduced
+        weight, held = flat(reduced.weight), reduced.damping
+        stiffness = p.seen / self._dot(p.step, weight * p.step)
+        damping, growth = _next_damping(state, accept, shown, stiffness)
+        damping, growth = jnp.where(judged, damping, state.damping), jnp.where(judged, growth, state.growth)
+        last = jnp.where(accept, p.length, state.length)
+        told = Course(p.square_sum, p.length, held, accept.astype(float), jnp.where(curve & ~no_better, t, 0.0))
+        # What is not judged is written over.
+        course = state.course.at[state.steps].set(jnp.stack(told), mode="drop")
+        is_flat, steps, loose = accept & Course(*course.T).is_flat(state.steps), state.steps + judged, state.loose
+        if n_open_motions(self.values, s):
             # Held about a start that is far off, the constraints bend the path: it goes on without them, and what it
             # ends at is brought to them as a whole.
-            tighten = settled & state.loose
-            next_y = jax.lax.cond(tighten, lambda y: onto_datum(self._at(y, jnp.array(False))), lambda y: y, next_y)
-            loose = (state.loose | (~accept & ~bend_next & ~state.chord & ~state.tightened)) & ~tighten
-        told = Course(
-            p.square_sum, length, system.reduced.damping, accept.astype(float), jnp.where(bend & ~no_better, t, 0.0)
+            loose = loose | (judged & ~accept & ~state.tightened)
+
+        # Near the iterate, r(h v) = r + h J v + h^2 r'' / 2, and (N + D) v = -J'r.
+        less = jnp.where(near, (1 - h) * p.gradient - h * held * weight * p.step, 0.0)
+        fresh = (state.stage == _HERE) | (accept & ~no_better)
+        system, x, b = jax.lax.cond(
+            fresh | near,
+            # Of rows with losses, the normal equations have other residuals than the cost.
+            lambda: self._factored(self._at(y, loose), damping, None if s.has_losses else rows, less),
+            lambda: (state.system, none, none),
         )
-        kept = (jnp.asarray(v).at[state.steps].set(one, mode="drop") for v, one in zip(state.course, told, strict=True))
-        course = Course(*kept)
+        weight, held = flat(system.reduced.weight), system.reduced.damping
+        # (N + D) d = -b, so d'N d = -d'b - d'D d, and the linear model promises d'N d / 2 + d'D d.
+        damped = held * self._dot(x, weight * x)
+        straight_sum = jnp.where(bend, square_sum, p.straight_sum)
+        p = Proposal(
+            step=jnp.where(fresh, -x, p.step),
+            gradient=jnp.where(fresh, b, p.gradient),
+            half=jnp.where(fresh, 0.0, jnp.where(near, -x / h**2, p.half)),
+            seen=jnp.where(fresh, self._dot(x, b) - damped, p.seen),
+            damped=jnp.where(fresh, damped, p.damped),
+            square_sum=jnp.where(fresh, square_sum, p.square_sum),
+            straight_sum=jnp.where(fresh, jnp.inf, straight_sum),
+        )
+        missing = p.length * jnp.clip(p.length / last, _SLOWEST_SHOWN, 1.0)
+        settled = fresh & (missing <= self.tolerance) & (p.damped <= p.seen + self.tolerance**2)
+        settled = settled & (steps < self.task.max_steps) & ~self.task.only_factor
+        end = jnp.stack([p.square_sum, p.length, held, jnp.ones(()), jnp.zeros(())])
+        course = course.at[jnp.where(settled, steps, MOST_KEPT)].set(end, mode="drop")
+        # The last step is short and was computed from an accepted iterate: it needs no proof.
+        y, tighten = jnp.where(settled, y + p.step, y), settled & loose
+        if n_open_motions(self.values, s):
+            y = jax.lax.cond(tighten, lambda y: flat(onto_datum(self._at(y, jnp.array(False)))), lambda y: y, y)
+        bent = jnp.sqrt(self._dot(p.half, weight * p.half) / self._dot(p.step, weight * p.step))
+        begin = jnp.minimum(_BENT / bent, 1.0)
+        stages = [tighten, fresh, bend, near, shorten]
+        t = jnp.select(stages, [0.0, 1.0, h, begin, state.t / 2], 0.0)
         progress = SolverState(
+            stage=jnp.select(stages, [_HERE, _STRAIGHT, _NEAR, _CURVE, _CURVE], _HERE),
+            candidate=p.along(y, t),
+            t=t,
+            shortest=jnp.where(near, _SHORTEST * begin, state.shortest),
+            proposal=p,
             damping=jnp.where(tighten, _FIRST_DAMPING, damping),
             growth=growth,
-            length=jnp.where(tighten, jnp.inf, pick(accept, length, state.length)),
-            chord=accept & ~chord_failed & ~tighten & (state.chord | ((ratio < _CHORD) & jnp.isfinite(state.length))),
-            bend=bend_next,
-            proposal=p._replace(trial=new_y, trial_sum=square_sum),
+            length=jnp.where(tighten, jnp.inf, last),
             system=system,
-            loose=loose,
+            loose=loose & ~tighten,
             tightened=state.tightened | tighten,
-            done=(settled & ~tighten) | only_factor,
-            flat=accept & course.is_flat(state.steps),
-            steps=state.steps + jnp.where(bend_next, 0, 1),
+            done=(settled & ~tighten) | self.task.only_factor,
+            flat=is_flat,
+            steps=steps + settled,
             course=course,
         )
-        return next_y, progress, None
-
-    def _along(self, at: Linearised, p: Proposal, half: Increments, weight: Increments, fn, bend, is_last):
-        """Where the step with half its acceleration leads, the square sum there, and the fraction of it.
-
-        A straight step (no acceleration) is tried as it is, one along a curve shorter and shorter.
-        """
-        norm = lambda v: jnp.sqrt(norm2(v, weight, self.structure))  # noqa: E731
-        farthest = _BENT * norm(p.step) / norm(half)
-        begin = jnp.where(bend & (farthest < 1), farthest, 1.0)
-        end = jnp.where(bend, _SHORTEST, 1.0) * begin
-        along = lambda t: after(at, jax.tree.map(lambda v, a: t * v + t**2 * a, p.step, half), weight)  # noqa: E731
-
-        def too_long(tried):
-            t, _, square_sum = tried
-            return (t > end) & ~(p.square_sum - square_sum >= _ENOUGH * p.promised(t))
-
-        def shorter(tried):
-            t = tried[0] / 2
-            y = along(t)
-            # The last step is short and was computed from an accepted iterate: it needs no proof.
-            return t, y, jax.lax.cond(is_last, lambda: p.square_sum, lambda: fn(y, at[1:])[0] ** 2)
-
-        t, y, square_sum = jax.lax.while_loop(too_long, shorter, (2 * begin, p.trial, jnp.array(jnp.inf)))
-        return y, square_sum, t
+        return y, progress, None
 
     def terminate(self, fn, y, args, options, state: SolverState, tags):
         """After the step that did it, the last that the task allows, or many in vain."""

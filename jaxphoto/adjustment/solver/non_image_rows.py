@@ -66,14 +66,18 @@ class NormalSums(NamedTuple):
     b_e: Float[Array, "images 6"]
 
 
-def non_image_rows(at: Linearised) -> NonImageRows:
-    """Derivatives and residuals at `at`, and their sums by point."""
+def non_image_rows(at: Linearised, residuals: NonImageResiduals | None = None) -> NonImageRows:
+    """Derivatives and residuals at `at`, or with `residuals` in their place, and their sums by point."""
     increments, scale, values, s = at
     n = increments.points.shape[1]
     jacobians = tuple(
         row_jacobian(g, numbers, increments, scale, values, s)
         for g, numbers in zip(s.observed, values.groups, strict=True)
     )
+    if residuals is None:
+        own, names = tuple(j.residual for j in jacobians), tuple(g.name for g in s.observed)
+        residuals = NonImageResiduals(own, datum_residuals(increments, scale, values, s), names)
+    jacobians = tuple(j._replace(residual=jnp.asarray(r)) for j, r in zip(jacobians, residuals.others, strict=True))
     v, b = jnp.zeros((3, 3, n)), jnp.zeros((3, n))
     at_points: list[RowsOfPoints] = []
     coupling: list[tuple[Array, Array, Array]] = []
@@ -91,11 +95,6 @@ def non_image_rows(at: Linearised) -> NonImageRows:
             coupling.append(_coupled(g, j, s, n))
             coupled.append(j.residual.reshape(-1))
     constraints = at.constraints()
-    residuals = NonImageResiduals(
-        tuple(j.residual for j in jacobians),
-        datum_residuals(increments, scale, values, s),
-        tuple(g.name for g in s.observed),
-    )
     datum = (
         constraints.eop.transpose(0, 2, 1),
         constraints.shared,

@@ -59,32 +59,45 @@ class Linearised(NamedTuple):
         none = jnp.zeros((len(values.datum_eop), s.n_shared))
         return Increments(values.datum_eop * scale.eop, none, values.datum_points * scale.points)
 
-    def residuals(self) -> TiledResiduals:
-        """All residuals over their sigmas."""
+    def rows(self) -> "Rows":
+        """All residuals over their sigmas, those of image rows tile by tile."""
         increments, scale, values, s = self
-        state, tiles = self.state, s.tiles
-        scene = orientations_of(state, values, s)
+        scene = orientations_of(self.state, values, s)
+
+        def tile(numbers):
+            image, points, xy, sigma = numbers
+            return tile_residuals(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s)
+
+        image = s.each_tile(tile, (s.by_tile(self.state.points), values.xy, values.sigma_xy))
+        return Rows(image, non_image_residuals(increments, scale, values, s))
+
+    def residuals(self) -> TiledResiduals:
+        """The same of all tiles at once, which can be differentiated backwards."""
+        increments, scale, values, s = self
+        scene = orientations_of(self.state, values, s)
 
         def tile(image, points, xy, sigma):
             return jnp.stack(tile_residuals(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s))
 
-        numbers = (tiles.image, s.by_tile(state.points), values.xy, values.sigma_xy)
-        image = jax.vmap(jax.vmap(tile))(*numbers)
+        numbers = (s.tiles.image, s.by_tile(self.state.points), values.xy, values.sigma_xy)
         others = non_image_residuals(increments, scale, values, s)
-        return TiledResiduals(others.others, others.datum, others.names, image)
+        return TiledResiduals(others.others, others.datum, others.names, jax.vmap(jax.vmap(tile))(*numbers))
 
     def square_sum(self) -> Float[Array, ""]:
-        """The sum of all squared residuals, tile by tile."""
-        increments, scale, values, s = self
-        state = self.state
-        scene = orientations_of(state, values, s)
+        """The sum of all squared residuals."""
+        return self.rows().square_sum(self.structure)
 
-        def tile(numbers):
-            image, points, xy, sigma = numbers
-            return squares(tile_residuals(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s))
 
-        image = s.each_tile(tile, (s.by_tile(state.points), values.xy, values.sigma_xy))
-        return total(jnp.sum(image), s) + other_squares(non_image_residuals(increments, scale, values, s), s)
+class Rows(NamedTuple):
+    """Residuals over their sigmas."""
+
+    image: Pair
+    """Of image rows, chunks and tiles first."""
+    others: NonImageResiduals
+
+    def square_sum(self, s: TiledStructure) -> Float[Array, ""]:
+        """The sum of all squares."""
+        return total(squares(self.image), s) + other_squares(self.others, s)
 
 
 class Reduced(NamedTuple):
@@ -104,18 +117,13 @@ class Reduced(NamedTuple):
     damping: Scalar
 
 
-def norm2(x: Increments, weight: Increments, s: TiledStructure) -> Float[Array, ""]:
-    """x' diag(weight) x over all unknowns."""
-    return dot(x, jax.tree.map(jnp.multiply, weight, x), s)
-
-
 def dot(a: Increments, b: Increments, s: TiledStructure) -> Float[Array, ""]:
     """a'b over all unknowns."""
     return jnp.vdot(a.eop, b.eop) + jnp.vdot(a.shared, b.shared) + total(jnp.vdot(a.points, b.points), s)
 
 
 def squares(r: Pair) -> Float[Array, ""]:
-    """The square sum of a tile's rows."""
+    """The square sum of image rows."""
     return added(jnp.sum(v * v) for v in r)
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
 from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.parameter_tables import ParameterTable
-from jaxphoto.adjustment.solver.levenberg_marquardt import Course, FactoredSystem, LevenbergMarquardt, Task
+from jaxphoto.adjustment.solver.levenberg_marquardt import Course, FactoredSystem, LevenbergMarquardt, Task, flat
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.camera.camera_rates import HOUR_S
@@ -52,7 +52,6 @@ def iterate(values: TiledValues, structure: TiledStructure, task: Task) -> tuple
     at_points = along_points(2)
     of_unknowns = Increments(EVERYWHERE, EVERYWHERE, at_points)
     system = FactoredSystem(
-        of_unknowns,
         Reduced(EVERYWHERE, EVERYWHERE, EVERYWHERE, TILES, at_points, of_unknowns, EVERYWHERE),
         EVERYWHERE,
     )
@@ -65,23 +64,24 @@ def _iterate(
     values: TiledValues, scale: Increments, structure: TiledStructure, task: Task
 ) -> tuple[Optimum, FactoredSystem]:
     """The iteration itself, on what one device holds; increments are scaled."""
+    solver = LevenbergMarquardt(structure, values, scale, TOLERANCE, task)
 
-    def length(y, args):
-        return jnp.sqrt(Linearised(y, *args).square_sum())
+    def residuals(y: Any, args: Any) -> Any:
+        # The solver differentiates for itself: optimistix is told that there is nothing to linearise.
+        return jax.lax.stop_gradient(Linearised(solver.increments(y), *args).rows())
 
     solution: optx.Solution = optx.least_squares(
-        # The solver differentiates for itself: optimistix is told that there is nothing to linearise.
-        lambda y, args: jax.lax.stop_gradient(length(y, args)),
-        LevenbergMarquardt(structure, values, scale, TOLERANCE, task),
-        jax.tree.map(jnp.zeros_like, scale),
+        residuals,
+        solver,
+        jnp.zeros_like(flat(scale)),
         args=(scale, values, structure),
         # The task says how many.
         max_steps=None,
         throw=False,
     )
-    converged = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(solution.value.eop))
-    state = solution.state
-    return Optimum(solution.value, state.steps, converged, state.course), state.system
+    increments, state = solver.increments(solution.value), solution.state
+    converged = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(increments.eop))
+    return Optimum(increments, state.steps, converged, Course(*state.course.T)), state.system
 
 
 def weigh_datum(values: TiledValues, structure: TiledStructure) -> TiledValues:

@@ -26,8 +26,8 @@ from jaxphoto.adjustment.solver.non_image_rows import (
     non_image_rows,
     sum_by,
 )
-from jaxphoto.adjustment.solver.normal import Linearised, Reduced, other_squares
-from jaxphoto.adjustment.solver.tile_rows import TileJacobian, seen_in, tile_jacobian
+from jaxphoto.adjustment.solver.normal import Linearised, Reduced, Rows
+from jaxphoto.adjustment.solver.tile_rows import Pair, TileJacobian, seen_in, tile_jacobian
 from jaxphoto.arrays import added
 from jaxphoto.compiling import once
 from jaxphoto.linear_algebra import solve
@@ -40,8 +40,6 @@ class RightSide(NamedTuple):
     b: Increments
     reduced: Float[Array, "reduced"]
     d: Float[Array, "constraints"]
-    square_sum: Float[Array, ""]
-    """r'r, all residuals."""
 
 
 class TileParts(NamedTuple):
@@ -58,13 +56,18 @@ class TileParts(NamedTuple):
     """Of rows at points, J_s' J_s and J_s' r of what else the tile's points meet."""
 
 
-def reduce_normal(at: Linearised, damping) -> tuple[Band, Reduced, RightSide]:
+def reduce_normal(
+    at: Linearised, damping, rows: Rows | None = None, less: Increments | None = None
+) -> tuple[Band, Reduced, RightSide]:
     """Eliminate the points of N + damping diag(N): A, what goes with it, and the right-hand side.
 
-    Unknowns held fixed (zero columns) get a unit diagonal.
+    That is J'r - `less` for the residuals r there, or for those in `rows`. Unknowns held fixed (zero columns) get a
+    unit diagonal.
     """
     s, tiles = at.structure, at.structure.tiles
-    rest = non_image_rows(at)
+    rest = non_image_rows(at, rows.others if rows else None)
+    if less is not None:
+        rest = rest._replace(b=rest.b - less.points)
     coupled = rest.coupled
     parts_of = tile_parts(at, damping, coupled)
     n, q, k, i, b = s.n_images, s.n_image_colours, len(coupled), s.n_interior, tiles.met.shape[2]
@@ -78,7 +81,8 @@ def reduce_normal(at: Linearised, damping) -> tuple[Band, Reduced, RightSide]:
         return jnp.concatenate([own, rest], axis)
 
     def tile(numbers):
-        p = parts_of(numbers)
+        *numbers, residual = numbers
+        p = parts_of(numbers, residual)
         whole = [jnp.concatenate([j.eop, j.shared, j.residual[None]]).transpose(1, 0, 2) for j in p.columns]
         j = jnp.concatenate(whole, axis=2)
         gram = p.f @ p.f.T
@@ -109,7 +113,8 @@ def reduce_normal(at: Linearised, damping) -> tuple[Band, Reduced, RightSide]:
         _Met.none(n, n_shared, i, k) if b else None,
     )
     lists = (tiles.pair_tile, tiles.pair_images, tiles.pair_block, tiles.block, tiles.met)
-    sums, (f, *of_points) = jax.lax.scan(add_chunk, zero, (lists, tiles.batches, tile_numbers(at, rest)))
+    of_tiles = (*tile_numbers(at, rest), rows.image if rows else None)
+    sums, (f, *of_points) = jax.lax.scan(add_chunk, zero, (lists, tiles.batches, of_tiles))
     (columns, last), own, border, of_met = total(sums, s)
     l, b_points, v = map(s.by_point, of_points)  # noqa: E741
     # Tiles that are padding were not computed: their points are each by itself.
@@ -153,14 +158,14 @@ def reduce_normal(at: Linearised, damping) -> tuple[Band, Reduced, RightSide]:
     a = Band(columns.reshape(inner, 12 * width, 6 * width), us[:, : 6 * of_inner], end)
 
     b_e, b_s = b_e + jnp.einsum("cna,c->na", rest.rows_e, coupled), b_s + rest.rows_s.T @ coupled
+    if less is not None:
+        b_e, b_s = b_e - less.eop.T, b_s - less.shared
     right_s = b_s.at[:i].add(-border[:i, -1])
     if of_met is not None:
         right_s = right_s - of_met.constraints[:-1, -1]
     right = jnp.concatenate([(b_e - met[:, :, -1]).reshape(-1), right_s])
     reduced = Reduced(diagonal_of(a), g, kk, f, l, weight, jnp.asarray(damping, float))
-    # Of the residuals' own square, the sums hold the image rows' part.
-    squares = jnp.sum(m_images[:, -1, -1]) + other_squares(rest.residuals, s)
-    return a, reduced, RightSide(Increments(b_e.T, b_s, b_points), right, border[i : i + k, -1], squares)
+    return a, reduced, RightSide(Increments(b_e.T, b_s, b_points), right, border[i : i + k, -1])
 
 
 class _Met(NamedTuple):
@@ -220,12 +225,14 @@ def tile_columns(at: Linearised):
 
 
 def tile_parts(at: Linearised, damping, coupled: Float[Array, "constraints"]):
-    """A function from one tile's numbers to its `TileParts`."""
+    """A function from one tile's numbers, and other residuals than its own, to its `TileParts`."""
     s, columns_of = at.structure, tile_columns(at)
 
-    def parts(numbers) -> TileParts:
+    def parts(numbers, residual: Pair | None = None) -> TileParts:
         *measured, own_v, own_b, at_points, rows_p = numbers
         j = columns_of(measured)
+        if residual is not None:
+            j = j[0]._replace(residual=residual[0]), j[1]._replace(residual=residual[1])
         image, (m, p), n_met = measured[0], j[0].residual.shape, s.tiles.met.shape[2]
         own_w, met = jnp.zeros((n_met, 3, p)), jnp.zeros((n_met, n_met + 1))
         for rows in at_points:

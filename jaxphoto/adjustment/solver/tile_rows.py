@@ -32,8 +32,9 @@ class TileMeasurements(NamedTuple):
     """By group of cameras: whether the image's camera belongs to it."""
 
 
-Pair = tuple[Float[Array, "m p"], Float[Array, "m p"]]
-"""Of a tile's rows, x and y. Joined to one array they would be computed number by number, not as vectors."""
+Pair = tuple[Float[Array, "*tiles m p"], Float[Array, "*tiles m p"]]
+"""Of the rows of a tile, or of all tiles, x and y. Joined to one array they would be computed number by number, not as
+vectors."""
 
 
 Triple = tuple[Float[Array, "m p"], Float[Array, "m p"], Float[Array, "m p"]]
