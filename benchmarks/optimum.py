@@ -47,8 +47,9 @@ def unknowns_of(adjusted: Adjustment, labels: Sequence[str] | None = None) -> Va
     """
     u, n = adjusted.unknowns, len(adjusted.block.images)
     shared = parameters_of(u)
+    labels = adjusted.structure.labels if labels is None else labels
     return {
-        "shared": np.array([float(shared[label]) for label in labels or adjusted.structure.labels]),
+        "shared": np.array([float(shared[label]) for label in labels]),
         "position": np.asarray(u.exterior.position),
         "rotation": np.asarray(u.exterior.camera_from_object).reshape(n, 9),
         "points": np.asarray(u.points),

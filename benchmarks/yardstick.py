@@ -68,7 +68,12 @@ def measure(block: Block, sizes: Sizes, whole: bool, mapped: bool) -> Values:
     adjusted = optimum(block, sizes=sizes)
     block, u, priors = adjusted.block, adjusted.unknowns, adjusted.priors
     known = covariance(adjusted, "camera", rows=True)
-    rho, first, sigmas = correlation_matrix(known), 6 * known.n_images, sigmas_of(known)
+    first, labels = 6 * known.n_images, np.array(known.labels[6 * known.n_images :], str)
+    # Cameras first and by name, whatever their order in this checkout.
+    cameras = [label.partition(".")[0] if label.startswith("interior[") else "~" for label in labels]
+    order = np.argsort(cameras, kind="stable").astype(int)
+    every = np.append(np.arange(first), first + order).astype(int)
+    rho, sigmas = correlation_matrix(known)[np.ix_(every, every)], sigmas_of(known)
     covariances = np.asarray(known.points)
     root = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0))
     scale = np.where(root > 0, root, np.inf)
@@ -82,8 +87,9 @@ def measure(block: Block, sizes: Sizes, whole: bool, mapped: bool) -> Values:
         "correlations.all": _chosen(_sums(rho).T),
         "correlations.points": _chosen(of_points[:, [0, 0, 1], [1, 2, 2]]),
     }
-    for name, value in unknowns_of(adjusted).items():
-        values[f"unknowns.{name}"], values[f"sigmas.{name}"] = _chosen(value), _chosen(sigmas[name])
+    sorted_sigmas = sigmas | {"shared": sigmas["shared"][order]}
+    for name, value in unknowns_of(adjusted, labels[order]).items():
+        values[f"unknowns.{name}"], values[f"sigmas.{name}"] = _chosen(value), _chosen(sorted_sigmas[name])
     for name, value in redundancy_numbers(adjusted, known).named.items():
         if np.size(value):
             values[f"redundancy.{name}"] = _chosen(np.asarray(value).reshape(-1, np.shape(value)[-1]).T)
@@ -93,7 +99,7 @@ def measure(block: Block, sizes: Sizes, whole: bool, mapped: bool) -> Values:
         for name, value in sensitivity(adjusted).named.items():
             flat = np.asarray(value).reshape(len(value), int(np.prod(np.shape(value)[1:])))
             images = np.linspace(0, first - 1, 6 if first else 0).astype(int)
-            rows = np.append(images, np.arange(first, len(value))[:10])
+            rows = np.append(images, every[first:][:10])
             values[f"derivatives.{name}"] = _chosen(flat[rows].T, 24)
     start = dataclasses.replace(block.start, unknowns=u, image_known=np.ones(len(block.images), bool),
                                 point_known=np.ones(len(block.points), bool))  # fmt: skip
@@ -103,12 +109,12 @@ def measure(block: Block, sizes: Sizes, whole: bool, mapped: bool) -> Values:
     for k, key in enumerate(keys):
         drawn = _concrete(errors.applied(errors.drawn(key), nominal))
         found = optimum(drawn, u, drawn.priors, sizes, sigmas)
-        for name, value in unknowns_of(found, adjusted.structure.labels).items():
+        for name, value in unknowns_of(found, labels[order]).items():
             values[f"draws.{k}.{name}"] = _drawn(value)
     if mapped:
         many = monte_carlo(adjusted, errors, DRAWS, SEED, exterior=True, points=True)
         for k in range(DRAWS):
-            values[f"monte carlo.{k}.shared"] = _drawn(many.shared[k])
+            values[f"monte carlo.{k}.shared"] = _drawn(many.shared[k][order])
             values[f"monte carlo.{k}.position"] = _drawn(many.exterior[k, :, :3])
             values[f"monte carlo.{k}.points"] = _drawn(many.points[k])
         step = errors.drawn(keys[0])

@@ -81,9 +81,7 @@ def solve(
     seconds: dict[str, float] = {}
     course: Course | None = None
     if laid.traced:
-        weighed, rows = weigh_datum(numbers, structure), rows_in_tiles(laid.tiled)
-        found: Any = find_optimum(weighed, structure, to_optimum(max_steps), rows)
-        state = state_at(found.increments, unit_scale(structure), numbers, structure)
+        found, state = _differentiable(numbers, dataclasses.replace(laid.tiled, structure=structure), max_steps)
     else:
         arguments = (numbers, structure, to_optimum(max_steps))
         # The longest first: the others are traced while it compiles.
@@ -109,6 +107,14 @@ def solve(
             return dataclasses.replace(adjusted, converged=np.array(False))
         check_rank(adjusted)
     return adjusted
+
+
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def _differentiable(values: TiledValues, tiled: TiledBlock, max_steps: int) -> Any:
+    """The optimum and the state there. Operation by operation, its derivatives would be a thousand programs."""
+    s = tiled.structure
+    found = find_optimum(weigh_datum(values, s), s, to_optimum(max_steps), rows_in_tiles(tiled))
+    return found, state_at(found.increments, unit_scale(s), values, s)
 
 
 def linearise(block: Block, unknowns: Unknowns, priors: Unknowns, sizes: Sizes = LEAST) -> Adjustment:

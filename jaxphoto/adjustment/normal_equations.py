@@ -28,7 +28,7 @@ from jaxphoto.adjustment.solver.levenberg_marquardt import Course, Task
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import iterate, typical_scale, unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.reduced import reduce_normal
-from jaxphoto.arrays import Numbers, added, still
+from jaxphoto.arrays import added, still
 from jaxphoto.compiling import call_compiled
 from jaxphoto.short_repr import shown
 
@@ -89,7 +89,7 @@ class NormalEquations(eqx.Module):
         """J x of all but image rows; of many along a leading axis."""
         return push_others(x, self.at)
 
-    def cofactors(self, of_rows: Bool[Numbers, ""]) -> tuple[Cofactors, RowCofactors]:
+    def cofactors(self, of_rows: bool) -> tuple[Cofactors, RowCofactors | None]:
         """The inverse of N for images, shared unknowns and each point, and of rows in tiles, if these are wanted."""
         return cofactors_of(self.at, self.factored, of_rows)
 

@@ -172,7 +172,7 @@ def _findings(values: TiledValues, s: TiledStructure, check: Check, rotations: R
     state, found = jax.lax.scan(solved, start, tasks)
     there, factored = with_start(values, state), jax.tree.map(lambda v: v[1], found.factored)
     equations = NormalEquations(there, s, factored)
-    cofactors, _ = equations.cofactors(np.array(False))
+    cofactors, _ = equations.cofactors(of_rows=False)
     covariance, points = in_units(cofactors, equations.scale, there.rotation, rotations)
 
     n = 6 * s.n_images

@@ -115,7 +115,7 @@ def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa", *
         points=still(points)[adjusted.tiled.places.point],
         variance_factor=adjusted.sigma0**2,
         cofactors=cofactors,
-        rows=of_rows if rows else None,
+        rows=of_rows,
         labels=(*labels, *adjusted.structure.labels),
         n_images=adjusted.structure.n_images,
         rotations=rotations,
@@ -125,7 +125,7 @@ def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa", *
 
 def prepare_covariance(equations: NormalEquations, seconds: dict[str, float]) -> None:
     """Have what `covariance` needs compiled in the background."""
-    prepare(_covariance, (equations, "omega_phi_kappa", np.array(False)), seconds)
+    prepare(_covariance, (equations, "omega_phi_kappa", True), seconds)
 
 
 def row_cofactors(adjusted: Adjustment, rotations: Rotations) -> RowCofactors:
@@ -134,15 +134,15 @@ def row_cofactors(adjusted: Adjustment, rotations: Rotations) -> RowCofactors:
 
 
 def _run(adjusted: Adjustment, rotations: Rotations, of_rows: bool):
-    given = adjusted.equations, rotations, np.array(of_rows)
+    given = adjusted.equations, rotations, of_rows
     return gathered(run_compiled(_covariance, given, adjusted.seconds, "covariance"))
 
 
 @eqx.filter_jit
 def _covariance(
-    equations: NormalEquations, rotations: Rotations, of_rows: Bool[Numbers, ""]
-) -> tuple[Cofactors, Array, Array, RowCofactors]:
-    """Cofactors; the same in units of the unknowns; and j Q j' of rows, zero where they are not wanted."""
+    equations: NormalEquations, rotations: Rotations, of_rows: bool
+) -> tuple[Cofactors, Array, Array, RowCofactors | None]:
+    """Cofactors; the same in units of the unknowns; and j Q j' of rows if these are wanted."""
     q, rows = equations.cofactors(of_rows)
     return q, *in_units(q, equations.scale, equations.values.rotation, rotations), rows
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxphoto.adjustment.layout.sharding import TILES, along_points, sharded
 from jaxphoto.adjustment.layout.tiled import TiledStructure
@@ -29,7 +29,6 @@ from jaxphoto.adjustment.solver.non_image_rows import non_image_rows
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced, dot
 from jaxphoto.adjustment.solver.reduced import tile_columns
 from jaxphoto.adjustment.solver.similarity import along_motions, n_open_motions
-from jaxphoto.arrays import Numbers
 from jaxphoto.linear_algebra import inverse as inverse_of
 from jaxphoto.linear_algebra import solve
 from jaxphoto.small_matrices import unwhiten, whiten
@@ -51,10 +50,8 @@ class RowCofactors(NamedTuple):
     """Of the groups of `AbstractStructure.with_shared`."""
 
 
-def cofactors_of(
-    at: Linearised, factored: FactoredNormal, of_rows: Bool[Numbers, ""]
-) -> tuple[Cofactors, RowCofactors]:
-    """All cofactors of one factored block, and j Q j' of its rows; see the module's head."""
+def cofactors_of(at: Linearised, factored: FactoredNormal, of_rows: bool) -> tuple[Cofactors, RowCofactors | None]:
+    """All cofactors of one factored block, and j Q j' of its rows if these are wanted; see the module's head."""
     s = at.structure
     reduced = factored.reduced
     inverse = invert_band(factored.factor)
@@ -63,15 +60,15 @@ def cofactors_of(
         kg = solve(reduced.k, reduced.g.T)
         low = inverse @ kg.T
         full = jnp.block([[inverse, low], [low.T, kg @ low - inverse_of(reduced.k)]])
-    out = (TILES, RowCofactors(TILES, (along_points(4),) * len(s.with_shared)))
+    out = (TILES, RowCofactors(TILES, (along_points(4),) * len(s.with_shared)) if of_rows else None)
     points, rows = sharded(_of_points, s, out)(full, reduced, at, of_rows)
     return _without_open_motions(Cofactors(inverse, points), at, factored), rows
 
 
 def _of_points(
-    full: Float[Array, "n n"], reduced: Reduced, at: Linearised, of_rows: Bool[Numbers, ""]
-) -> tuple[Float[Array, "points 3 3"], RowCofactors]:
-    """Cofactors of points, and j Q j' of rows."""
+    full: Float[Array, "n n"], reduced: Reduced, at: Linearised, of_rows: bool
+) -> tuple[Float[Array, "points 3 3"], RowCofactors | None]:
+    """Cofactors of points, and j Q j' of rows if these are wanted."""
     _, scale, values, s = at
     columns_of = tile_columns(at)
     at_points = non_image_rows(at).at_points if s.with_shared else ()
@@ -93,9 +90,7 @@ def _of_points(
         inner = jnp.eye(3)[:, :, None] + g
         half = jnp.stack(unwhiten(inner, l))
         points = jnp.stack(unwhiten(half.transpose(1, 0, 2), l)).transpose(2, 0, 1)
-        none = tuple(jnp.zeros((len(r), *r.shape)) for r, *_ in at_points)
-        nothing = lambda *_: (jnp.zeros((3, len(image), size)), none)  # noqa: E731
-        return points, *jax.lax.cond(of_rows, rows, nothing, (image, *measured), at_points, l, own, a, inner)
+        return (points, *rows((image, *measured), at_points, l, own, a, inner)) if of_rows else (points,)
 
     def rows(measured, at_points, l, own, a, inner):  # noqa: E741
         image, both = measured[0], columns_of(measured)
@@ -127,7 +122,8 @@ def _of_points(
     of_points = (reduced.l, at_points, values.points, scale.points)
     l, at_points, *places = jax.tree.map(s.by_tile, of_points)  # noqa: E741
     points, *found = over_tiles(tile, at, reduced, (l, at_points, met, values.xy, values.sigma_xy, *places))
-    return points.reshape(-1, 3, 3), RowCofactors(found[0], tuple(s.by_point(v) for v in found[1]))
+    rows_found = RowCofactors(found[0], tuple(s.by_point(v) for v in found[1])) if of_rows else None
+    return points.reshape(-1, 3, 3), rows_found
 
 
 def _without_open_motions(q: Cofactors, at: Linearised, factored: FactoredNormal) -> Cofactors:
