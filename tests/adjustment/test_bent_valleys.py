@@ -156,12 +156,12 @@ def test_the_right_hand_side_of_other_residuals(name):
     @jax.jit
     def both():
         there = here._replace(increments=moved)
-        *_, right = reduce_normal(here, 0.0, there.rows(), moved)
+        *_, right = reduce_normal(here, 0.0, there.residual_rows(), moved)
         residuals = lambda y: in_one_list(here._replace(increments=y).residuals())  # noqa: E731
         r = residuals(moved)
         (pulled,) = jax.vjp(residuals, zero)[1](r)
         expected = jax.tree.map(jnp.subtract, pulled, moved)
-        return ravel_pytree(right.b)[0], ravel_pytree(expected)[0], there.rows().square_sum(structure), r @ r
+        return ravel_pytree(right.b)[0], ravel_pytree(expected)[0], there.residual_rows().square_sum(structure), r @ r
 
     found, expected, square_sum, expected_sum = both()
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * float(jnp.max(jnp.abs(expected))))

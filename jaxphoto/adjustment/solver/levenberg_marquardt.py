@@ -29,7 +29,7 @@ from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.band import BandFactor, factor_band
 from jaxphoto.adjustment.solver.elimination import solve_reduced
-from jaxphoto.adjustment.solver.normal import Linearised, Reduced, Rows
+from jaxphoto.adjustment.solver.normal import Linearised, Reduced, ResidualRows
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.adjustment.solver.similarity import n_open_motions, onto_datum
 from jaxphoto.arrays import Numbers
@@ -199,15 +199,50 @@ _DIFFERENCE = 0.01
 _SLOWEST_SHOWN = 0.1
 
 
+class Judgement(NamedTuple):
+    """What becomes of a candidate."""
+
+    judged: Bool[Array, ""]
+    """Whether it decides about its proposal."""
+    accept: Bool[Array, ""]
+    bend: Bool[Array, ""]
+    """Whether the acceleration is wanted first."""
+    shorten: Bool[Array, ""]
+    """Whether a place nearer along the curve is tried first."""
+    astray: Bool[Array, ""]
+    """Whether the curve led to no lower a square sum than the straight step, which is decided about instead."""
+    t: Scalar
+    """The fraction of the step that the decision is about."""
+    gain: Scalar
+    """The reduction of the square sum over the promised one."""
+
+
+def _judged(state: SolverState, square_sum: Scalar, has_losses: bool) -> Judgement:
+    """Judge the candidate by the square sum there."""
+    p, straight, curve = state.proposal, state.stage == _STRAIGHT, state.stage == _CURVE
+    gain = p.gain(state.t, square_sum)
+    # Of a loss the linear model promises little far from the optimum, where the way is not a bent valley.
+    bend = straight & ~(gain >= _GOOD) & jnp.isfinite(square_sum) & (not has_losses)
+    shorten = curve & (state.t > state.shortest) & ~(gain >= _ENOUGH)
+    judged = (straight & ~bend) | (curve & ~shorten)
+    astray = curve & judged & ~(square_sum < p.straight_sum)
+    t = jnp.where(astray, 1.0, state.t)
+    gain = jnp.where(astray, p.gain(t, p.straight_sum), gain)
+    return Judgement(judged, judged & (gain >= _ACCEPT), bend, shorten, astray, t, gain)
+
+
 def _next_damping(
-    state: SolverState, accept: Bool[Array, ""], gain: Scalar, stiffness: Scalar
+    state: SolverState, judged: Bool[Array, ""], accept: Bool[Array, ""], t: Scalar, gain: Scalar, stiffness: Scalar
 ) -> tuple[Scalar, Scalar]:
     """Less after an accepted step, by the ratio of actual to promised reduction; more after a rejected one."""
+    # One that had to be shortened is no reason for less.
+    gain = jnp.where(t < 1, jnp.minimum(gain, 0.5), gain)
     less = state.damping * jnp.maximum(_LEAST_FACTOR, 1 - (2 * gain - 1) ** 3)
     # Nothing else keeps a loose network's matrix regular.
     less = jnp.maximum(less, jnp.where(state.loose, _FIRST_DAMPING, 0.0))
     more = jnp.maximum(state.growth * state.damping, stiffness)
-    return jnp.where(accept, less, more), jnp.where(accept, _GROWTH, _GROWTH * state.growth)
+    damping, growth = jnp.where(accept, less, more), jnp.where(accept, _GROWTH, _GROWTH * state.growth)
+    return jnp.where(judged, damping, state.damping), jnp.where(judged, growth, state.growth)
 
 
 def flat(x: Increments) -> Vector:
@@ -283,7 +318,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
             course=jnp.full((MOST_KEPT, len(Course._fields)), jnp.nan),
         )
 
-    def _factored(self, at: Linearised, damping: Scalar, rows: Rows | None, less: Vector):
+    def _factored(self, at: Linearised, damping: Scalar, rows: ResidualRows | None, less: Vector):
         """The system there, x of (N + D) x = J'r - `less`, and that right-hand side."""
         place = at.for_normal_equations
         a, reduced, right = reduce_normal(place, damping, rows, self.increments(less))
@@ -298,30 +333,17 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
     def step(self, fn, y, args, options, state: SolverState, tags):
         """Judge the candidate; where it is accepted, propose a step from there."""
         s, p, h, none = self.structure, state.proposal, _DIFFERENCE, jnp.zeros_like(y)
-        straight, near, curve = (state.stage == stage for stage in (_STRAIGHT, _NEAR, _CURVE))
+        near, curve = state.stage == _NEAR, state.stage == _CURVE
         here = self._at(state.candidate, state.loose)
         rows, _ = fn(state.candidate, here[1:])
         square_sum = rows.square_sum(s)
-        gain = p.gain(state.t, square_sum)
-        # Of a loss the linear model promises little far from the optimum, where the way is not a bent valley.
-        bend = straight & ~(gain >= _GOOD) & jnp.isfinite(square_sum) & (not s.has_losses)
-        shorten = curve & (state.t > state.shortest) & ~(gain >= _ENOUGH)
-        judged = (straight & ~bend) | (curve & ~shorten)
-        # The curve may lead to no better place than the straight step.
-        no_better = curve & judged & ~(square_sum < p.straight_sum)
-        t = jnp.where(no_better, 1.0, state.t)
-        gain = jnp.where(no_better, p.gain(t, p.straight_sum), gain)
-        accept = judged & (gain >= _ACCEPT)
-        y = jnp.where(accept, jnp.where(no_better, y + p.step, state.candidate), y)
-        # A step that had to be shortened is no reason for less damping.
-        shown = jnp.where(t < 1, jnp.minimum(gain, 0.5), gain)
+        judged, accept, bend, shorten, astray, t, gain = _judged(state, square_sum, s.has_losses)
+        y = jnp.where(accept, jnp.where(astray, y + p.step, state.candidate), y)
         reduced = state.system.reduced
         weight, held = flat(reduced.weight), reduced.damping
-        stiffness = p.seen / self._dot(p.step, weight * p.step)
-        damping, growth = _next_damping(state, accept, shown, stiffness)
-        damping, growth = jnp.where(judged, damping, state.damping), jnp.where(judged, growth, state.growth)
+        damping, growth = _next_damping(state, judged, accept, t, gain, p.seen / self._dot(p.step, weight * p.step))
         last = jnp.where(accept, p.length, state.length)
-        told = Course(p.square_sum, p.length, held, accept.astype(float), jnp.where(curve & ~no_better, t, 0.0))
+        told = Course(p.square_sum, p.length, held, accept.astype(float), jnp.where(curve & ~astray, t, 0.0))
         # What is not judged is written over.
         course = state.course.at[state.steps].set(jnp.stack(told), mode="drop")
         is_flat, steps, loose = accept & Course(*course.T).is_flat(state.steps), state.steps + judged, state.loose
@@ -332,7 +354,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
 
         # Near the iterate, r(h v) = r + h J v + h^2 r'' / 2, and (N + D) v = -J'r.
         less = jnp.where(near, (1 - h) * p.gradient - h * held * weight * p.step, 0.0)
-        fresh = (state.stage == _HERE) | (accept & ~no_better)
+        fresh = (state.stage == _HERE) | (accept & ~astray)
         system, x, b = jax.lax.cond(
             fresh | near,
             # Of rows with losses, the normal equations have other residuals than the cost.

@@ -59,7 +59,7 @@ class Linearised(NamedTuple):
         none = jnp.zeros((len(values.datum_eop), s.n_shared))
         return Increments(values.datum_eop * scale.eop, none, values.datum_points * scale.points)
 
-    def rows(self) -> "Rows":
+    def residual_rows(self) -> "ResidualRows":
         """All residuals over their sigmas, those of image rows tile by tile."""
         increments, scale, values, s = self
         scene = orientations_of(self.state, values, s)
@@ -69,7 +69,7 @@ class Linearised(NamedTuple):
             return tile_residuals(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s)
 
         image = s.each_tile(tile, (s.by_tile(self.state.points), values.xy, values.sigma_xy))
-        return Rows(image, non_image_residuals(increments, scale, values, s))
+        return ResidualRows(image, non_image_residuals(increments, scale, values, s))
 
     def residuals(self) -> TiledResiduals:
         """The same of all tiles at once, which can be differentiated backwards."""
@@ -85,10 +85,10 @@ class Linearised(NamedTuple):
 
     def square_sum(self) -> Float[Array, ""]:
         """The sum of all squared residuals."""
-        return self.rows().square_sum(self.structure)
+        return self.residual_rows().square_sum(self.structure)
 
 
-class Rows(NamedTuple):
+class ResidualRows(NamedTuple):
     """Residuals over their sigmas."""
 
     image: Pair

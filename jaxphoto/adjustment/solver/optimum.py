@@ -68,7 +68,7 @@ def _iterate(
 
     def residuals(y: Any, args: Any) -> Any:
         # The solver differentiates for itself: optimistix is told that there is nothing to linearise.
-        return jax.lax.stop_gradient(Linearised(solver.increments(y), *args).rows())
+        return jax.lax.stop_gradient(Linearised(solver.increments(y), *args).residual_rows())
 
     solution: optx.Solution = optx.least_squares(
         residuals,

@@ -26,7 +26,7 @@ from jaxphoto.adjustment.solver.non_image_rows import (
     non_image_rows,
     sum_by,
 )
-from jaxphoto.adjustment.solver.normal import Linearised, Reduced, Rows
+from jaxphoto.adjustment.solver.normal import Linearised, Reduced, ResidualRows
 from jaxphoto.adjustment.solver.tile_rows import Pair, TileJacobian, seen_in, tile_jacobian
 from jaxphoto.arrays import added
 from jaxphoto.compiling import once
@@ -57,7 +57,7 @@ class TileParts(NamedTuple):
 
 
 def reduce_normal(
-    at: Linearised, damping, rows: Rows | None = None, less: Increments | None = None
+    at: Linearised, damping, rows: ResidualRows | None = None, less: Increments | None = None
 ) -> tuple[Band, Reduced, RightSide]:
     """Eliminate the points of N + damping diag(N): A, what goes with it, and the right-hand side.
 
