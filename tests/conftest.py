@@ -38,11 +38,15 @@ os.environ.setdefault(
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 import jax  # noqa: E402
+from hypothesis import HealthCheck, settings  # noqa: E402
 
 from tests.checked_types import check_types  # noqa: E402
 from tests.marks import QUICK  # noqa: E402
 
 check_types()
+# Of a machine that does other work, too.
+settings.register_profile("patient", suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("patient")
 
 from jaxphoto.adjustment.adjust import _layouts  # noqa: E402
 from jaxphoto.compiling import run, store  # noqa: E402
