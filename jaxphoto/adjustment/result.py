@@ -156,7 +156,9 @@ class Adjustment(eqx.Module):
         Their standard deviations are larger still, so that by them any such place is as good as the optimum.
         """
         s, u = self.structure, self.unknowns
-        distance = np.linalg.norm(still(u.points)[s.point] - still(u.exterior.position)[s.image], axis=1)
+        x, y, z = (still(u.points)[s.point] - still(u.exterior.position)[s.image]).T
+        # No squares: they overflow from 1e154 m on.
+        distance = np.hypot(np.hypot(x, y), z)
         far = np.zeros(len(self.block.points), bool)
         if len(distance):
             far[s.point[~(distance < _FARTHEST * np.median(distance))]] = True

@@ -59,7 +59,7 @@ class KeptPieces:
     def write(self, name: str, **arrays: np.ndarray) -> None:
         """Keep `arrays` as the piece `name`. Raises OSError where there is no room for it."""
         packed = io.BytesIO()
-        np.savez(packed, allow_pickle=False, **arrays)
+        np.savez(packed, **arrays)  # type: ignore[arg-type]
         content = packed.getvalue()
         with whole_file(self._path(name)) as work:
             work.write_bytes(hashlib.sha256(content).digest() + content)
