@@ -10,9 +10,9 @@ import pytest
 
 from jaxphoto import adjust
 from jaxphoto.adjustment import Linearised
-from jaxphoto.adjustment.model.numbers import zero_increments
+from jaxphoto.adjustment.model.numbers import Increments, zero_increments
 from jaxphoto.adjustment.solver.optimum import unit_scale
-from jaxphoto.adjustment.solver.similarity import motions, n_open_motions, onto_datum, similarity
+from jaxphoto.adjustment.solver.similarity import after, motions, n_open_motions, onto_datum, similarity
 from jaxphoto.block import Datum
 from jaxphoto.observations import Distances, StationRows
 from jaxphoto.rotation import small_angles, small_rotation
@@ -42,6 +42,64 @@ def test_a_similarity_meets_the_constraints_and_changes_nothing_else(kind, dista
         np.testing.assert_allclose(two, one, atol=1e-6)
 
 
+def linearised(values, s, seed):
+    """Far from the start: residuals of image points there are not small."""
+    rng = np.random.default_rng(seed)
+    draw = lambda v, size: jnp.asarray(rng.normal(0, size, v.shape))  # noqa: E731
+    eop, shared, points = zero_increments(s)
+    y = eop.at[:3].set(draw(eop[:3], 80.0)).at[3:].set(draw(eop[3:], 0.2)), shared, draw(points, 40.0)
+    return Linearised(Increments(*y), unit_scale(s), values, s)
+
+
+@pytest.mark.parametrize("kind", ["turn", "scale", "all"])
+def test_a_step_along_a_motion_changes_no_image_coordinate_however_long_it_is(kind):
+    values, s, _ = prepared(simulated("cross").block)
+    at = linearised(values, s, 3)
+    state = at.state
+    centre, size = np.array([300.0, -200.0, 50.0]), 1000.0
+    rng = np.random.default_rng(5)
+    parameters = 0.7 * {"turn": np.eye(7)[3], "scale": np.eye(7)[6], "all": rng.normal(size=7)}[kind]
+
+    def moved(parameters):
+        image = lambda x, r: similarity(parameters, x, r, centre, size)  # noqa: E731
+        x, r = jax.vmap(image, (1, 2), (1, 2))(state.position, state.rotation)
+        turned = jax.vmap(lambda a, b: small_angles(a @ b.T), (2, 2), 1)(r, values.rotation)
+        points = jax.vmap(lambda x: image(x, jnp.eye(3))[0], 1, 1)(state.points)
+        return Increments(jnp.concatenate([x - values.position, turned]), at.increments.shared, points - values.points)
+
+    step = jax.jvp(moved, (jnp.zeros(7),), (jnp.asarray(parameters),))[1]
+    image = lambda y: at._replace(increments=y).residuals().image  # noqa: E731
+    here = image(at.increments)
+    largest = np.abs(here).max()
+    weight = jax.tree.map(lambda v: jnp.asarray(rng.uniform(0.2, 1.0, v.shape)), step)
+    np.testing.assert_allclose(image(after(at, step, weight)), here, atol=1e-7 * largest)
+    if kind != "scale":
+        # Added up, it bends the block.
+        assert np.abs(image(jax.tree.map(jnp.add, at.increments, step)) - here).max() > 1e-3 * largest
+
+
+def test_a_short_step_is_what_it_says():
+    """To first order, in any metric, whatever is held."""
+    values, s, _ = prepared(simulated("everything").block)
+    at = linearised(values, s, 4)
+    rng = np.random.default_rng(7)
+    draw = lambda v: jnp.asarray(rng.uniform(0.1, 2.0, v.shape))  # noqa: E731
+    free = Increments(jnp.asarray(s.eop_free), jnp.ones(s.n_shared), jnp.asarray(s.point_free))
+    step, weight = (jax.tree.map(lambda v: draw(v) * v, free) for _ in range(2))
+    found = jax.jvp(lambda t: after(at, jax.tree.map(lambda v: t * v, step), weight), (0.0,), (1.0,))[1]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), found, step)
+
+
+def test_of_a_single_image_motions_are_not_independent():
+    """Seven of them move six numbers, where all else is held."""
+    values, s, _ = prepared(simulated("cross").block)
+    eop, shared, points = unit_scale(s)
+    at = Linearised(zero_increments(s), Increments(eop.at[:, 1:].set(0.0), shared, 0 * points), values, s)
+    step = jax.tree.map(lambda scale: 1e-5 * scale, at.scale)
+    found = after(at, step, jax.tree.map(jnp.ones_like, step))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=3e-7), found, step)
+
+
 def turned(start, degrees):
     """Images and points turned as a whole about a slanted axis."""
     turn = np.asarray(small_rotation(np.radians(degrees) * np.array([0.6, -0.64, 0.48])))
@@ -66,7 +124,7 @@ def test_a_block_that_hardly_knows_how_it_lies_is_turned_as_a_whole(sigma_m, deg
     block = dataclasses.replace(block, datum=Datum("control"), stations=rows)
     near, far = adjust(block, start), adjust(block, turned(start, degrees))
     assert bool(far.converged)
-    # 28 and more than 100 steps where none is bent.
+    # 28 and more than 100 steps where increments are added up.
     assert int(far.steps) < 12
     assert float(far.square_sum) == pytest.approx(float(near.square_sum), rel=1e-9)
 

@@ -31,7 +31,7 @@ from jaxphoto.adjustment.solver.band import BandFactor, factor_band
 from jaxphoto.adjustment.solver.elimination import solve_reduced
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced, ResidualRows
 from jaxphoto.adjustment.solver.reduced import reduce_normal
-from jaxphoto.adjustment.solver.similarity import n_open_motions, onto_datum
+from jaxphoto.adjustment.solver.similarity import after, n_open_motions, onto_datum
 from jaxphoto.arrays import Numbers
 from jaxphoto.short_repr import shown
 
@@ -134,9 +134,9 @@ class Proposal(NamedTuple):
     straight_sum: Scalar
     """After the whole step, without acceleration; infinite before it is known."""
 
-    def along(self, y: Vector, t: Scalar | float) -> Vector:
-        """After the fraction t of the step from the iterate `y`."""
-        return y + t * self.step + t**2 * self.half
+    def part(self, t: Scalar, straight: Bool[Array, ""]) -> Vector:
+        """What the fraction t of the step adds up to, along its curve or `straight`."""
+        return t * self.step + jnp.where(straight, 0.0, t**2) * self.half
 
     @property
     def length(self) -> Scalar:
@@ -148,8 +148,8 @@ class Proposal(NamedTuple):
         return (self.square_sum - square_sum) / (2 * t * (self.seen + self.damped) - t**2 * self.seen)
 
 
-# What the next candidate is: the iterate itself (first, or after a rejected step), the whole step, a place near the
-# iterate for the second derivative of the residuals, or a place along the curve.
+# What the next candidate is: the next iterate (first, after a rejected step, or where a curve led astray), the whole
+# step, a place near the iterate for the second derivative of the residuals, or a place along the curve.
 _HERE, _STRAIGHT, _NEAR, _CURVE = range(4)
 
 
@@ -338,7 +338,8 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         rows, _ = fn(state.candidate, here[1:])
         square_sum = rows.square_sum(s)
         judged, accept, bend, shorten, astray, t, gain = _judged(state, square_sum, s.has_losses)
-        y = jnp.where(accept, jnp.where(astray, y + p.step, state.candidate), y)
+        fresh = (state.stage == _HERE) | (accept & ~astray)
+        y = jnp.where(fresh, state.candidate, y)
         reduced = state.system.reduced
         weight, held = flat(reduced.weight), reduced.damping
         damping, growth = _next_damping(state, judged, accept, t, gain, p.seen / self._dot(p.step, weight * p.step))
@@ -354,7 +355,6 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
 
         # Near the iterate, r(h v) = r + h J v + h^2 r'' / 2, and (N + D) v = -J'r.
         less = jnp.where(near, (1 - h) * p.gradient - h * held * weight * p.step, 0.0)
-        fresh = (state.stage == _HERE) | (accept & ~astray)
         system, x, b = jax.lax.cond(
             fresh | near,
             # Of rows with losses, the normal equations have other residuals than the cost.
@@ -386,10 +386,12 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         bent = jnp.sqrt(self._dot(p.half, weight * p.half) / self._dot(p.step, weight * p.step))
         begin = jnp.minimum(_BENT / bent, 1.0)
         stages = [tighten, fresh, bend, near, shorten]
-        t = jnp.select(stages, [0.0, 1.0, h, begin, state.t / 2], 0.0)
+        # Of a rejected step nothing is left; of a curve that led astray, the straight step.
+        t = jnp.select(stages, [0.0, 1.0, h, begin, state.t / 2], jnp.where(accept, 1.0, 0.0))
+        reached = flat(after(self._at(y, loose), self.increments(p.part(t, astray)), system.reduced.weight))
         progress = SolverState(
             stage=jnp.select(stages, [_HERE, _STRAIGHT, _NEAR, _CURVE, _CURVE], _HERE),
-            candidate=p.along(y, t),
+            candidate=jnp.where(t > 0, reached, y),
             t=t,
             shortest=jnp.where(near, _SHORTEST * begin, state.shortest),
             proposal=p,

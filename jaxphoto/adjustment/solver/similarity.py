@@ -10,13 +10,15 @@ from jaxtyping import Array, Float
 from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
 from jaxphoto.adjustment.model.numbers import AbstractValues, Increments, datum_residuals
 from jaxphoto.adjustment.model.structure import AbstractStructure, total
-from jaxphoto.adjustment.solver.normal import Linearised
+from jaxphoto.adjustment.solver.normal import Linearised, dot
 from jaxphoto.arrays import Numbers, joined
 from jaxphoto.linear_algebra import one_at_a_time, solve
 from jaxphoto.rotation import CROSS, small_angles, small_rotation
 
 # Newton's method on so few unknowns, begun so near, doubles the right digits with each of these.
 _NEWTON_STEPS = 5
+# Of the mean weight of the motions: holds what a single image, of which seven motions are not independent, leaves open.
+_RIDGE = 1e-9
 
 _svd = one_at_a_time(lambda a: tuple(jnp.linalg.svd(a)))
 
@@ -102,6 +104,29 @@ def along_motions(values: TiledValues, scale: Increments, s: TiledStructure) -> 
     k, shared = n_open_motions(values, s), scale.shared
     eop, points = motions(values.position, values.rotation, values.points, *_extent(values.points, s))
     return Increments(_scaled(eop[:k], scale.eop), jnp.zeros((k, *shared.shape)), _scaled(points[:k], scale.points))
+
+
+def after(at: Linearised, step: Increments, weight: Increments) -> Increments:
+    """The increments after `step`: what moves the whole block is taken as a similarity, the rest is added.
+
+    Added up, a turn of the whole block bends it, and where few observations see where the block lies, that is all that
+    such a step would be judged by. What is a similarity is told in the metric of `weight`. Steps of a free network are
+    added up: its constraints are straight.
+    """
+    (y, scale, values, s), state = at, at.state
+    if n_open_motions(values, s):
+        return jax.tree.map(jnp.add, y, step)
+    centre, size = _extent(state.points, s)
+    eop, points = motions(state.position, state.rotation, state.points, centre, size)
+    along = Increments(_scaled(eop, scale.eop), jnp.zeros((7, s.n_shared)), _scaled(points, scale.points))
+    weighted = jax.tree.map(jnp.multiply, along, weight)
+    product = jax.vmap(dot, in_axes=(None, 0, None))
+    normal = jax.vmap(lambda a: product(a, weighted, s))(along)
+    ridge = _RIDGE * jnp.trace(normal) + jnp.finfo(float).tiny
+    parameters = solve(normal + ridge * np.eye(7), product(step, weighted, s))
+    moved = lambda y, parameters: _moved(Linearised(y, *at[1:]), parameters, centre, size)  # noqa: E731
+    linear = jax.jvp(lambda p: moved(y, p), (jnp.zeros(7),), (parameters,))[1]
+    return moved(jax.tree.map(lambda y, x, a: y + (x - a), y, step, linear), parameters)
 
 
 def _moved(at: Linearised, parameters: Float[Array, "k"], centre, size) -> Increments:
