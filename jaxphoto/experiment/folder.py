@@ -66,10 +66,7 @@ def write_runs(runs: Mapping[Path, Run], out: Path, made: Mapping[Path, Made] = 
         pages["report.html"] = index_page({f.name: (run.experiment.title, tables[f]) for f, run in runs.items()})
     cells = [run.cells.assign(experiment=folder.name) for folder, run in runs.items()]
     with whole_folder(out) as work:
-        # As objects: pandas before 3 warns of columns that are empty in one table.
-        pd.concat([table.astype(object) for table in tables.values()], ignore_index=True).to_csv(
-            work / "tables.csv", index=False
-        )
+        pd.concat(tables.values(), ignore_index=True).to_csv(work / "tables.csv", index=False)
         pd.concat(cells, ignore_index=True).to_csv(work / "cells.csv", index=False)
         for name, page in pages.items():
             (work / name).write_text(page, encoding="utf-8")

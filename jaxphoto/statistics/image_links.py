@@ -49,7 +49,8 @@ def weak_links(adjusted: Adjustment, links: ImageLinks, most: int) -> list[WeakL
     """The `most` weakest links of the tree of the strongest ones, the weakest first."""
     n, measured = len(adjusted.block.images), _measured(adjusted)
     # The strongest tree is the shortest one of what falls as links grow stronger.
-    length = scipy.sparse.coo_array((1.0 / links.common, (links.first, links.second)), shape=(n, n))
+    ends = links.first.astype(np.int32), links.second.astype(np.int32)
+    length = scipy.sparse.coo_array((1.0 / links.common, ends), shape=(n, n))
     tree = scipy.sparse.csgraph.minimum_spanning_tree(length.tocsr()).tocoo()
     found = []
     for cut in np.argsort(-tree.data, kind="stable")[:most]:

@@ -1,5 +1,7 @@
 """`jaxphoto simulate`: the folder says what the simulation is, and an adjustment of it finds the truth."""
 
+import functools
+
 import jax
 import numpy as np
 import pandas as pd
@@ -37,7 +39,8 @@ def test_the_folder_reads_as_the_simulated_block(name, tmp_path, monkeypatch, ca
     np.testing.assert_array_equal(read_block(out).image_points.xy, want.block.image_points.xy)
     np.testing.assert_array_equal(read_block(out).stations.value, want.block.stations.value)
 
-    truth = {path.stem: pd.read_csv(path, dtype={"image": str, "point": str}) for path in (out / "truth").iterdir()}
+    read = functools.partial(pd.read_csv, dtype={"image": str, "point": str}, float_precision="round_trip")
+    truth = {path.stem: read(path) for path in (out / "truth").iterdir()}
     assert set(truth) == {"interior", "exterior", "object_points", "georeferencing"}
     np.testing.assert_array_equal(truth["exterior"][XYZ], want.truth.exterior.position)
     angles = np.rad2deg(np.asarray(want.truth.exterior.omega_phi_kappa))
