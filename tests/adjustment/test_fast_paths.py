@@ -10,7 +10,6 @@ from jaxphoto import adjust, covariance
 from jaxphoto.adjustment.layout import tile_layout, tiling
 from jaxphoto.adjustment.layout.padding import pad_structure
 from jaxphoto.adjustment.model.structure import structure_of
-from jaxphoto.adjustment.solver import levenberg_marquardt
 from jaxphoto.compiling.lru_cache import LruCache
 from jaxphoto.statistics import redundancy_numbers
 from tests.blocks import BROWN, Scene, adjusted, all_stations, bare, free, measured, rows, simulated
@@ -84,16 +83,3 @@ def test_one_small_tile_at_a_time_gives_what_many_together_give(monkeypatch):
     assert tiles.at_once == 1
     assert len(tiles.image) > 1
     assert_same(together, alone)
-
-
-@pytest.mark.slow
-def test_chords_end_where_full_steps_end(monkeypatch):
-    """Compiled apart, and kept nowhere: the constant is part of the program."""
-    block = simulated("cross").block
-    with_chords = everything(block, block.start.unknowns)
-    monkeypatch.setattr(levenberg_marquardt, "_CHORD", 0.0)
-    monkeypatch.setattr("jaxphoto.compiling.run._programs", {})
-    monkeypatch.setattr("jaxphoto.compiling.store.key_of", lambda *a: None)
-    without = everything(block, block.start.unknowns)
-    assert_same(with_chords, without)
-    assert int(with_chords[0].steps) >= int(without[0].steps)
