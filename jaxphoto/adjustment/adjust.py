@@ -81,7 +81,9 @@ def solve(
     seconds: dict[str, float] = {}
     course: Course | None = None
     if laid.traced:
-        found, state = _differentiable(numbers, dataclasses.replace(laid.tiled, structure=structure), max_steps)
+        # As it is kept with the layout, it is hashed already.
+        tiled = dataclasses.replace(laid.tiled, structure=structure) if losses else laid.tiled
+        found, state = _differentiable(numbers, tiled, max_steps)
     else:
         arguments = (numbers, structure, to_optimum(max_steps))
         # The longest first: the others are traced while it compiles.

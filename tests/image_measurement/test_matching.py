@@ -316,6 +316,5 @@ def test_a_camera_with_distortion_is_matched_by_its_ideal_coordinates(taken, tmp
     found = match_photographs(bent, camera.sensor, known, [(0, 1)])
     unknown = match_photographs(bent, camera.sensor, camera.interior, [(0, 1)])
     assert found.counts[0, 3] > 0.98 * found.counts[0, 2]
-    # Pictures interpolated twice scatter a little more; what is taken for no lens at all, far more: 4.4 times with
-    # OpenCV 4.10.
-    assert found.sigma_factor < 2 and 4 * found.sigma_factor < unknown.sigma_factor
+    # Pictures interpolated twice scatter a little more; what is taken for no lens at all, far more.
+    assert found.sigma_factor < 2 and 5 * found.sigma_factor < unknown.sigma_factor

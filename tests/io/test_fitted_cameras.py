@@ -31,10 +31,7 @@ def test_opencv_with_five_coefficients_misses_by_what_the_file_says(tmp_path):
     # Points of the whole format, not those of the fit: to rays by the one file, and back by the other, by OpenCV.
     wanted = np.stack(np.meshgrid(np.linspace(0, 1280, 80), np.linspace(0, 960, 60)), axis=-1).reshape(-1, 2)
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-12)
-    if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4
-        rays = cv2.undistortPointsIter(wanted[:, None] - 0.5, *of_opencv(full), np.eye(3), np.eye(3), until)[:, 0]
-    else:
-        rays = cv2.undistortPoints(wanted[:, None] - 0.5, *of_opencv(full), criteria=until)[:, 0]
+    rays = cv2.undistortPoints(wanted[:, None] - 0.5, *of_opencv(full), criteria=until)[:, 0]
     given = np.column_stack([rays, np.ones(len(rays))]), np.zeros(3), np.zeros(3)
     here, there = (cv2.projectPoints(*given, *of_opencv(path))[0][:, 0] + 0.5 for path in (full, five))
     np.testing.assert_allclose(here, wanted, atol=1e-6)

@@ -135,7 +135,7 @@ class Proposal(NamedTuple):
     """After the whole step, without acceleration; infinite before it is known."""
 
     def part(self, t: Scalar, straight: Bool[Array, ""]) -> Vector:
-        """What the fraction t of the step adds up to, along its curve or `straight`."""
+        """Increment after the fraction t of the step, along the curve or `straight`."""
         return t * self.step + jnp.where(straight, 0.0, t**2) * self.half
 
     @property
@@ -200,19 +200,19 @@ _SLOWEST_SHOWN = 0.1
 
 
 class Judgement(NamedTuple):
-    """What becomes of a candidate."""
+    """Decision on a candidate."""
 
     judged: Bool[Array, ""]
-    """Whether it decides about its proposal."""
+    """True if the proposal is accepted or rejected now."""
     accept: Bool[Array, ""]
     bend: Bool[Array, ""]
-    """Whether the acceleration is wanted first."""
+    """True if the acceleration is needed first."""
     shorten: Bool[Array, ""]
-    """Whether a place nearer along the curve is tried first."""
+    """True if a smaller fraction of the curve is tried first."""
     astray: Bool[Array, ""]
-    """Whether the curve led to no lower a square sum than the straight step, which is decided about instead."""
+    """True if the straight step had a smaller square sum than the curve; it is judged instead."""
     t: Scalar
-    """The fraction of the step that the decision is about."""
+    """Fraction of the step that is judged."""
     gain: Scalar
     """The reduction of the square sum over the promised one."""
 
@@ -245,7 +245,7 @@ def _next_damping(
     return jnp.where(judged, damping, state.damping), jnp.where(judged, growth, state.growth)
 
 
-def flat(x: Increments) -> Vector:
+def as_vector(x: Increments) -> Vector:
     """The increments as a vector."""
     return jnp.concatenate([jnp.ravel(v) for v in x])
 
@@ -326,9 +326,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         x = jax.lax.cond(
             self.task.only_factor,
             lambda: jnp.zeros_like(less),
-            lambda: flat(solve_reduced(reduced, factor, right.reduced, right.d, right.b.points, place)),
+            lambda: as_vector(solve_reduced(reduced, factor, right.reduced, right.d, right.b.points, place)),
         )
-        return FactoredSystem(reduced, factor), x, flat(right.b)
+        return FactoredSystem(reduced, factor), x, as_vector(right.b)
 
     def step(self, fn, y, args, options, state: SolverState, tags):
         """Judge the candidate; where it is accepted, propose a step from there."""
@@ -341,7 +341,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         fresh = (state.stage == _HERE) | (accept & ~astray)
         y = jnp.where(fresh, state.candidate, y)
         reduced = state.system.reduced
-        weight, held = flat(reduced.weight), reduced.damping
+        weight, held = as_vector(reduced.weight), reduced.damping
         damping, growth = _next_damping(state, judged, accept, t, gain, p.seen / self._dot(p.step, weight * p.step))
         last = jnp.where(accept, p.length, state.length)
         told = Course(p.square_sum, p.length, held, accept.astype(float), jnp.where(curve & ~astray, t, 0.0))
@@ -361,7 +361,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
             lambda: self._factored(self._at(y, loose), damping, None if s.has_losses else rows, less),
             lambda: (state.system, none, none),
         )
-        weight, held = flat(system.reduced.weight), system.reduced.damping
+        weight, held = as_vector(system.reduced.weight), system.reduced.damping
         # (N + D) d = -b, so d'N d = -d'b - d'D d, and the linear model promises d'N d / 2 + d'D d.
         damped = held * self._dot(x, weight * x)
         straight_sum = jnp.where(bend, square_sum, p.straight_sum)
@@ -382,13 +382,13 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         # The last step is short and was computed from an accepted iterate: it needs no proof.
         y, tighten = jnp.where(settled, y + p.step, y), settled & loose
         if n_open_motions(self.values, s):
-            y = jax.lax.cond(tighten, lambda y: flat(onto_datum(self._at(y, jnp.array(False)))), lambda y: y, y)
+            y = jax.lax.cond(tighten, lambda y: as_vector(onto_datum(self._at(y, jnp.array(False)))), lambda y: y, y)
         bent = jnp.sqrt(self._dot(p.half, weight * p.half) / self._dot(p.step, weight * p.step))
         begin = jnp.minimum(_BENT / bent, 1.0)
         stages = [tighten, fresh, bend, near, shorten]
         # Of a rejected step nothing is left; of a curve that led astray, the straight step.
         t = jnp.select(stages, [0.0, 1.0, h, begin, state.t / 2], jnp.where(accept, 1.0, 0.0))
-        reached = flat(after(self._at(y, loose), self.increments(p.part(t, astray)), system.reduced.weight))
+        reached = as_vector(after(self._at(y, loose), self.increments(p.part(t, astray)), system.reduced.weight))
         progress = SolverState(
             stage=jnp.select(stages, [_HERE, _STRAIGHT, _NEAR, _CURVE, _CURVE], _HERE),
             candidate=jnp.where(t > 0, reached, y),

@@ -16,7 +16,7 @@ from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
 from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.parameter_tables import ParameterTable
-from jaxphoto.adjustment.solver.levenberg_marquardt import Course, FactoredSystem, LevenbergMarquardt, Task, flat
+from jaxphoto.adjustment.solver.levenberg_marquardt import Course, FactoredSystem, LevenbergMarquardt, Task, as_vector
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.camera.camera_rates import HOUR_S
@@ -73,7 +73,7 @@ def _iterate(
     solution: optx.Solution = optx.least_squares(
         residuals,
         solver,
-        jnp.zeros_like(flat(scale)),
+        jnp.zeros_like(as_vector(scale)),
         args=(scale, values, structure),
         # The task says how many.
         max_steps=None,
