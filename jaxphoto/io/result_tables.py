@@ -33,6 +33,6 @@ def read_result_tables(folder: str | Path, names: Sequence[str] = ()) -> dict[st
 def read_table(path: Path) -> pd.DataFrame:
     """One of them. Raises InputError where the file is no table."""
     try:
-        return pd.read_csv(path, dtype=_TEXT, keep_default_na=False, na_values=[""], float_precision="round_trip")
+        return pd.read_csv(path, dtype=_TEXT, keep_default_na=False, na_values=[""])
     except (ValueError, UnicodeDecodeError) as error:
         raise InputError(f"{path.name} cannot be read as a table: {' '.join(str(error).split())}") from error

@@ -65,8 +65,6 @@ def _chunks(path: Path, layout: _Dialect) -> Iterator[Cloud]:
             dtype=kinds,  # type: ignore[arg-type]
             keep_default_na=False,
             na_values=[""],
-            # All digits: older pandas lose the last one by default.
-            float_precision="round_trip",
             chunksize=CHUNK,
             encoding="utf-8-sig",
         ) as tables:
