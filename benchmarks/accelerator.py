@@ -24,12 +24,12 @@ from machine import machine, markdown, sentence, write_results
 from ours import block_of
 
 import jaxphoto
-from jaxphoto.adjustment import Linearised, NormalEquations, TiledStructure, TiledValues, solve
+from jaxphoto.adjustment import Linearised, NormalEquations, PaddedStructure, PaddedValues, solve
 from jaxphoto.adjustment.layout.sharding import EVERYWHERE, along_points, sharded
 from jaxphoto.adjustment.model.numbers import Increments, zero_increments
 from jaxphoto.adjustment.solver.band import factor_band
 from jaxphoto.adjustment.solver.non_image_rows import non_image_rows
-from jaxphoto.adjustment.solver.reduced import reduce_normal, tile_numbers, tile_parts
+from jaxphoto.adjustment.solver.reduced import ray_columns, reduce_normal
 from jaxphoto.block import Block
 from jaxphoto.compiling import run_compiled
 
@@ -123,7 +123,7 @@ def _at(equations: NormalEquations) -> Linearised:
 
 
 @eqx.filter_jit
-def _step(values: TiledValues, scale: Increments, structure: TiledStructure):
+def _step(values: PaddedValues, scale: Increments, structure: PaddedStructure):
     """Sums of the reduced normal equations and their factor."""
 
     def of_device(values, scale, structure):
@@ -136,20 +136,20 @@ def _step(values: TiledValues, scale: Increments, structure: TiledStructure):
 def _work(equations: NormalEquations) -> dict[str, float]:
     """Operations of one such step, and the bytes that it has to move at least.
 
-    Operations of residuals and derivatives are those that XLA counts (`cost_analysis`) for one tile, times tiles;
-    those of the products of a tile and of the factorisation are counted by hand, as XLA counts loops once. Empty slots
+    Operations of residuals and derivatives are those that XLA counts (`cost_analysis`) for one batch of rays, times
+    batches; those of products and of the factorisation are counted by hand, as XLA counts loops once. Empty slots
     count like others. Bytes are those of what is read and written once: measurements, structure, results, and the
     reduced matrix before it is factored; what stays in caches is not counted.
     """
     at, s = _at(equations), equations.structure
-    rest = non_image_rows(at)
-    parts = tile_parts(at, 0.0, rest.coupled)
-    numbers = jax.tree.map(lambda v: v[0, 0], tile_numbers(at, rest))
-    cost = jax.jit(parts).lower(numbers).compile().cost_analysis() or {}
-    tiles = int(np.sum(s.tiles.batches)) * s.tiles.at_once
-    m, p = s.tiles.image.shape[2], s.tiles.per_tile
-    f = 6 * m + s.n_interior + len(rest.coupled) + 1
-    products = 2 * 3 * p * f**2 + 2 * 2 * p * m * (7 + s.n_image_colours) ** 2
+    rest, rays = non_image_rows(at), s.rays
+    numbers = rays.chunk_image[0], rays.ray_point[0], at.values.xy[0], at.values.sigma_xy[0]
+    cost = jax.jit(ray_columns(at)).lower(numbers).compile().cost_analysis() or {}
+    batches, pair_batches = rays.used.sum(axis=0)
+    border = s.n_interior + len(rest.coupled) + 1
+    of_ray = 2 * 2 * (7 + s.n_image_colours) ** 2 + 2 * 3 * 6 * (6 + border)
+    slots, pairs = batches * rays.ray_point[0].size, pair_batches * rays.pair[0].size // 2
+    products = slots * of_ray + pairs * 2 * 3 * 6 * 6 + 2 * 3 * s.n_points * border**2
     band = equations.factored.factor
     inner, _, width = band.columns.shape
     k, q = inner + 1, len(band.end) - width
@@ -159,8 +159,8 @@ def _work(equations: NormalEquations) -> dict[str, float]:
     into = sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(eqx.filter(at, eqx.is_array)))
     out = 3 * 8 * sum(v.size for v in band) + 8 * (9 * s.n_points)
     return {
-        "derivative_gflop": tiles * cost.get("flops", 0.0) / 1e9,
-        "product_gflop": tiles * products / 1e9,
+        "derivative_gflop": batches * cost.get("flops", 0.0) / 1e9,
+        "product_gflop": products / 1e9,
         "factor_gflop": factor / 1e9,
         "gbyte": (into + out) / 1e9,
     }

@@ -105,7 +105,7 @@ def _work(file: Path) -> dict:
     planned = solver.compiled.memory_analysis()
     program = sum(getattr(planned, f"{name}_size_in_bytes") for name in ("argument", "output", "temp"))
     # Planned is what one device needs.
-    program *= last.structure.tiles.shards
+    program *= last.structure.shards
     # By way of the host: of a block that several devices share, each would repeat what is timed here.
     reduced = reduced_matrix(last)
     reduced = jax.tree.map(lambda v: jnp.asarray(np.asarray(v)), reduced)
@@ -132,7 +132,7 @@ def _work(file: Path) -> dict:
         "steps": int(adjusted[-1].steps),
         "step_s": statistics.median(a.seconds["solve"] / int(a.steps) for a in adjusted),
         "solve_s": statistics.median(a.seconds["solve"] for a in adjusted),
-        "slots": int(np.prod(last.structure.tiles.image.shape)) * last.structure.tiles.per_tile,
+        "slots": last.structure.rays.ray_point.size,
         "program_mb": program / 1e6,
         "peak_mb": peak if fresh else None,
         "resident_mb": before,

@@ -158,9 +158,9 @@ def own_priors(prior_of) -> dict:
 def residuals_of(block: Block, unknowns: Unknowns):
     """Residuals over their standard deviations at `unknowns`, and the structure."""
     s = structure_of(block, block.priors)
-    tiled = pad_structure(s, dense=bool(s.coupled))
-    values = tiled.pad(values_of(block, unknowns, block.priors, s))
-    return tiled.crop_residuals(run_compiled(_residuals, (values, tiled.structure), {}, "residuals")), s
+    padded = pad_structure(s, dense=bool(s.coupled))
+    values = padded.pad(values_of(block, unknowns, block.priors, s))
+    return padded.crop_residuals(run_compiled(_residuals, (values, padded.structure), {}, "residuals")), s
 
 
 def changed(block: Block, change) -> Block:

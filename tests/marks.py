@@ -16,7 +16,8 @@ def slow_but(quick: Callable[[Any], bool] | Iterable, cases: Iterable) -> list:
 QUICK = {
     "adjustment": (
         "adjustment/test_bad_input.py",
-        "adjustment/test_tiling.py",
+        "adjustment/test_rays.py::test_rays_and_pairs_are_listed_once",
+        "adjustment/test_rays.py::test_rows_lie_where_they_are_computed_with",
         "adjustment/test_outcome.py::test_truth_is_recovered[cross]",
     ),
     "arrays": ("lidar/test_grid.py",),

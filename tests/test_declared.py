@@ -16,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 import jaxphoto.observations
 from jaxphoto import FIXED, FREE, AbstractObservations, JaxphotoError, Tables, Weighted, adjust, covariance, monte_carlo
 from jaxphoto.adjustment.adjust import _residuals
-from jaxphoto.adjustment.layout.tile_layout import sizes_of
+from jaxphoto.adjustment.layout.rays import sizes_of
 from jaxphoto.adjustment.model.block_values import with_start
 from jaxphoto.adjustment.model.numbers import state_at, zero_increments
 from jaxphoto.adjustment.model.structure import structure_of
@@ -100,9 +100,9 @@ def differences() -> tuple[np.ndarray, np.ndarray]:
     def at(increments) -> np.ndarray:
         """By the program of the residuals alone, which knows of no derivative."""
         there = with_start(values, state_at(back(increments), scale, values, s))
-        return in_order(a.tiled.crop_residuals(run_compiled(_residuals, (there, s), {}, "residuals")))
+        return in_order(a.padded.crop_residuals(run_compiled(_residuals, (there, s), {}, "residuals")))
 
-    unknowns = own_order(values, a.tiled)[0]
+    unknowns = own_order(values, a.padded)[0]
     rng, n = np.random.default_rng(3), np.size(ravel_pytree(zero_increments(s))[0])
     directions = np.zeros((8, n))
     directions[:, unknowns] = rng.normal(size=(8, len(unknowns)))
@@ -138,7 +138,7 @@ def test_elimination_solves_the_dense_normal_equations():
     d, equations = dense(), adjusted().equations
     j = d.jacobian[:, d.free]
     n = j.T @ j
-    unknowns = own_order(equations.values, adjusted().tiled)[0]
+    unknowns = own_order(equations.values, adjusted().padded)[0]
     flat, back = ravel_pytree(zero_increments(equations.structure))
     right = np.zeros(len(flat))
     right[unknowns] = np.sin(1.0 + np.arange(len(unknowns))) * d.free
@@ -195,7 +195,7 @@ def test_larger_sizes_change_nothing():
     a = adjusted()
     sizes = sizes_of(a.structure)
     more = tuple((name, 2 * n + 3) for name, n in sizes.rows)
-    wide = sizes._replace(images=40, tiles=20, tile_images=16, tile_points=16, rows=more)
+    wide = sizes._replace(images=40, point_groups=40, chunks=80, pair_chunks=500, rows=more)
     again = adjust(a.block, a.block.start.unknowns, sizes=wide)
     for name, v in a.residuals.named.items():
         np.testing.assert_allclose(again.residuals[name], v, atol=1e-6, err_msg=name)

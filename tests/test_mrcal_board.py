@@ -126,16 +126,13 @@ def test_cofactors_of_the_camera_are_mrcals(calibrated, reference):
     assert off(to_pixels @ own @ to_pixels.T, expected) < 2e-6
 
 
-def test_a_board_is_laid_out_as_an_arrow_of_tiles_of_few_images(calibrated):
-    tiles = calibrated.tiled.structure.tiles
+def test_a_board_is_laid_out_as_an_arrow(calibrated):
+    rays = calibrated.padded.structure.rays
     # Nothing is eliminated, no two images meet, and most slots hold a corner.
-    assert not tiles.free_points
-    assert tiles.pair_tile.size == 0
-    assert tiles.columns > 10
-    assert (
-        len(calibrated.structure.image) > 0.8 * tiles.image[:, : tiles.batches[0] * tiles.at_once].size * tiles.per_tile
-    )
-    assert jax.tree.leaves(calibrated.factored.reduced.f)[0].size == 0
+    assert not rays.free_points and not rays.used[:, 1].any()
+    assert rays.columns > 10
+    assert len(calibrated.structure.image) > 0.7 * rays.used[0, 0] * rays.ray_point[0].size
+    assert calibrated.factored.reduced.f.size == 0
 
 
 def test_the_sigma_map_is_mrcals_in_every_cell(calibrated, folder):

@@ -87,7 +87,7 @@ def test_what_is_returned_is_short_and_a_table():
     block, result = simulated("cross").block, adjusted("cross")
     tables = Tables(result)
     things = [
-        jaxphoto.compare(result, result), result.tiled, result.tiled_values, result.equations,
+        jaxphoto.compare(result, result), result.padded, result.padded_values, result.equations,
         result.structure, result.values, result.residuals, result.factored, block.start, block.datum, block.stations,
         result.verdict(), result.unknowns.exterior, tables.covariance, tables.redundancy, tables.correlations["one"],
         jaxphoto.bias(block, "station", 0.1), jaxphoto.sigma_map(result, "one"), Weighted(1.0, 0.1),

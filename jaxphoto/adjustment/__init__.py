@@ -5,10 +5,10 @@ of the last two than a result asks `NormalEquations`.
 """
 
 from jaxphoto.adjustment.adjust import MAX_STEPS, LaidOut, common_sizes, lay_out, linearise, solve
-from jaxphoto.adjustment.layout.padding import TiledBlock
-from jaxphoto.adjustment.layout.tile_layout import LEAST, Sizes
-from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues
-from jaxphoto.adjustment.normal_equations import Cofactors, Linearised, NormalEquations, RowCofactors, optimise
+from jaxphoto.adjustment.layout.padded import PaddedResiduals, PaddedStructure, PaddedValues
+from jaxphoto.adjustment.layout.padding import PaddedBlock
+from jaxphoto.adjustment.layout.rays import LEAST, Sizes
+from jaxphoto.adjustment.normal_equations import Cofactors, Linearised, Met, NormalEquations, RowCofactors, optimise
 from jaxphoto.adjustment.result import Adjustment, Outcome
 from jaxphoto.adjustment.solver.levenberg_marquardt import Task, to_factor, to_optimum
 from jaxphoto.adjustment.solver.optimum import TOLERANCE
@@ -24,15 +24,16 @@ __all__ = [
     "Cofactors",
     "LaidOut",
     "Linearised",
+    "Met",
     "NormalEquations",
     "Outcome",
+    "PaddedBlock",
+    "PaddedResiduals",
+    "PaddedStructure",
+    "PaddedValues",
     "RowCofactors",
     "Sizes",
     "Task",
-    "TiledBlock",
-    "TiledResiduals",
-    "TiledStructure",
-    "TiledValues",
     "WeakDirection",
     "WeakUnknowns",
     "common_sizes",

@@ -14,9 +14,9 @@ import numpy as np
 from jaxphoto.adjustment.arguments import check_arguments
 from jaxphoto.adjustment.datum import close_datum
 from jaxphoto.adjustment.implicit import find_optimum
-from jaxphoto.adjustment.layout.padding import TiledBlock, pad_structure
-from jaxphoto.adjustment.layout.tile_layout import LEAST, Sizes, sizes_of
-from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues
+from jaxphoto.adjustment.layout.padded import PaddedResiduals, PaddedStructure, PaddedValues
+from jaxphoto.adjustment.layout.padding import PaddedBlock, pad_structure
+from jaxphoto.adjustment.layout.rays import LEAST, Sizes, sizes_of
 from jaxphoto.adjustment.lost_digits import warn_of_lost_digits
 from jaxphoto.adjustment.model.block_values import unknowns_of, values_of, with_datum, with_start
 from jaxphoto.adjustment.model.numbers import UnknownArrays, Values, state_at, zero_increments
@@ -24,7 +24,7 @@ from jaxphoto.adjustment.model.structure import ObservedRows, Structure, observe
 from jaxphoto.adjustment.normal_equations import NormalEquations, optimise
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.result import Adjustment
-from jaxphoto.adjustment.side_by_side import rows_in_tiles
+from jaxphoto.adjustment.side_by_side import image_row_lists
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
 from jaxphoto.adjustment.solver.levenberg_marquardt import Course, to_factor, to_optimum, zero_system
 from jaxphoto.adjustment.solver.normal import Linearised
@@ -76,14 +76,14 @@ def solve(
             "a JAX transformation traces block.start, but the argument start was given and counts in its place: "
             "change start, or leave it out"
         )
-    numbers, plain = laid.tiled_values, laid.tiled.structure
+    numbers, plain = laid.padded_values, laid.padded.structure
     structure = plain.with_losses(losses)
     seconds: dict[str, float] = {}
     course: Course | None = None
     if laid.traced:
         # As it is kept with the layout, it is hashed already.
-        tiled = dataclasses.replace(laid.tiled, structure=structure) if losses else laid.tiled
-        found, state = _differentiable(numbers, tiled, max_steps)
+        padded = dataclasses.replace(laid.padded, structure=structure) if losses else laid.padded
+        found, state = _differentiable(numbers, padded, max_steps)
     else:
         arguments = (numbers, structure, to_optimum(max_steps))
         # The longest first: the others are traced while it compiles.
@@ -112,10 +112,10 @@ def solve(
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))
-def _differentiable(values: TiledValues, tiled: TiledBlock, max_steps: int) -> Any:
+def _differentiable(values: PaddedValues, padded: PaddedBlock, max_steps: int) -> Any:
     """The optimum and the state there. Operation by operation, its derivatives would be a thousand programs."""
-    s = tiled.structure
-    found = find_optimum(weigh_datum(values, s), s, to_optimum(max_steps), rows_in_tiles(tiled))
+    s = padded.structure
+    found = find_optimum(weigh_datum(values, s), s, to_optimum(max_steps), image_row_lists(padded))
     return found, state_at(found.increments, unit_scale(s), values, s)
 
 
@@ -125,29 +125,29 @@ def linearise(block: Block, unknowns: Unknowns, priors: Unknowns, sizes: Sizes =
     What an adjustment of some of the observations says of all of them. Raises what `solve` raises before it computes.
     """
     laid = lay_out(block, unknowns, priors, sizes)
-    v = laid.tiled_values
+    v = laid.padded_values
     return _at(UnknownArrays(v.position, v.rotation, v.shared, v.points), laid, block, unknowns, priors, {})
 
 
 def _at(state: UnknownArrays, laid: "LaidOut", block: Block, start: Unknowns, priors: Unknowns, seconds) -> Adjustment:
     """All that an adjustment tells with the unknowns as they are in `state`."""
-    tiled, numbers = laid.tiled, with_start(laid.tiled_values, state)
-    structure, factored = tiled.structure, None
+    padded, numbers = laid.padded, with_start(laid.padded_values, state)
+    structure, factored = padded.structure, None
     # Statistics need the factored normal matrix; a derivative of the unknowns does not, and would pay for it dearly.
     if not laid.traced:
         again = run_compiled(_optimise, (numbers, structure, to_factor()), seconds, "covariance")
         factored = gathered(again.factored)
         del again
     residuals = run_compiled(_residuals, (numbers, structure), seconds, "residuals")
-    state = tiled.crop_state(state)
+    state = padded.crop_state(state)
     return Adjustment(
         block=block,
         priors=priors,
-        unknowns=unknowns_of(state, start, tiled.own),
-        residuals=tiled.crop_residuals(residuals),
+        unknowns=unknowns_of(state, start, padded.own),
+        residuals=padded.crop_residuals(residuals),
         values=with_start(laid.values, state),
-        tiled=tiled,
-        tiled_values=numbers,
+        padded=padded,
+        padded_values=numbers,
         factored=factored,
         steps=np.array(0),
         converged=np.array(False),
@@ -156,11 +156,11 @@ def _at(state: UnknownArrays, laid: "LaidOut", block: Block, start: Unknowns, pr
 
 
 class LaidOut(NamedTuple):
-    """A block as it is computed with: index arrays and numbers, as given and in tiles."""
+    """A block as it is computed with: index arrays and numbers, as given and in padded sizes."""
 
-    tiled: TiledBlock
+    padded: PaddedBlock
     values: Values
-    tiled_values: TiledValues
+    padded_values: PaddedValues
 
     @property
     def traced(self) -> bool:
@@ -169,7 +169,7 @@ class LaidOut(NamedTuple):
 
 
 def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAST, alone: bool = False) -> LaidOut:
-    """The block with its datum closed, in tiles; for one device where it is to be `alone`.
+    """The block with its datum closed, in padded sizes; for one device where it is to be `alone`.
 
     Raises what `solve` raises before it computes.
     """
@@ -177,7 +177,7 @@ def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAS
     check_priors(block, priors)
     warn_of_lost_digits(block, start, priors)
     observed = observed_in(block, priors)
-    structure, tiled_blocks = _layouts.get(
+    structure, padded_blocks = _layouts.get(
         _layout_key(block, priors, observed), lambda: (structure_of(block, priors, observed), {})
     )
     values = values_of(block, start, priors, structure, observed)
@@ -189,15 +189,15 @@ def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAS
     shards = 1 if alone else _devices_worth_using(len(structure.image))
     dense = constrained or coupled
     key = sizes, shards, dense
-    if key not in tiled_blocks:
-        tiled_blocks[key] = pad_structure(structure, sizes, shards=shards, dense=dense)
-    tiled = tiled_blocks[key]
-    return LaidOut(tiled, values, tiled.pad(values))
+    if key not in padded_blocks:
+        padded_blocks[key] = pad_structure(structure, sizes, shards=shards, dense=dense)
+    padded = padded_blocks[key]
+    return LaidOut(padded, values, padded.pad(values))
 
 
 # A study may alternate between a few blocks. The index arrays of 1,000 images and a million image points are 30 MB.
 _LAYOUTS = 4
-_layouts: LruCache[tuple[Structure, dict[Hashable, TiledBlock]]] = LruCache(_LAYOUTS)
+_layouts: LruCache[tuple[Structure, dict[Hashable, PaddedBlock]]] = LruCache(_LAYOUTS)
 
 
 def _layout_key(block: Block, priors: Unknowns, observed: ObservedRows) -> Hashable:
@@ -208,7 +208,7 @@ def _layout_key(block: Block, priors: Unknowns, observed: ObservedRows) -> Hasha
     return tree, order, *(np.shape(v) if is_float(v) else Content(np.asarray(v)) for v in leaves)
 
 
-def _factored_like(values: TiledValues, structure: TiledStructure) -> FactoredNormal:
+def _factored_like(values: PaddedValues, structure: PaddedStructure) -> FactoredNormal:
     """Arrays of the right types that take no memory."""
     zero = zero_increments(structure)
     system = jax.eval_shape(zero_system, zero, values, structure)
@@ -235,6 +235,6 @@ _optimise = eqx.filter_jit(optimise)
 
 
 @eqx.filter_jit
-def _residuals(values: TiledValues, structure: TiledStructure) -> TiledResiduals:
+def _residuals(values: PaddedValues, structure: PaddedStructure) -> PaddedResiduals:
     s = structure.on_one_device
     return Linearised(zero_increments(s), unit_scale(s), values, s).residuals()

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Int
 
-from jaxphoto.adjustment.layout.tiling import size_class
+from jaxphoto.adjustment.layout.rays import size_class
 from jaxphoto.adjustment.model.numbers import Values, zero_increments
 from jaxphoto.adjustment.model.row_functions import row_jacobian
 from jaxphoto.adjustment.model.structure import Structure

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
+from jaxphoto.adjustment.layout.padded import PaddedStructure, PaddedValues
 from jaxphoto.adjustment.model.numbers import Increments
-from jaxphoto.adjustment.side_by_side import RowsInTiles, optimum_of
+from jaxphoto.adjustment.side_by_side import ImageRowLists, optimum_of
 from jaxphoto.adjustment.solver.band import factor_band
 from jaxphoto.adjustment.solver.elimination import solve_factored
 from jaxphoto.adjustment.solver.levenberg_marquardt import Task
@@ -25,7 +25,7 @@ from jaxphoto.adjustment.solver.optimum import Optimum, typical_scale, unit_scal
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 
 
-def find_optimum(values: TiledValues, structure: TiledStructure, task: Task, rows: RowsInTiles) -> Optimum:
+def find_optimum(values: PaddedValues, structure: PaddedStructure, task: Task, rows: ImageRowLists) -> Optimum:
     """Levenberg-Marquardt from the start in `values`; under `jax.vmap`, `side_by_side`.
 
     Differentiable in every number of `values`.
@@ -42,7 +42,7 @@ def find_optimum(values: TiledValues, structure: TiledStructure, task: Task, row
     return find(values)
 
 
-def _derivative(values: TiledValues, direction: Any, at: Increments, structure: TiledStructure) -> Optimum:
+def _derivative(values: PaddedValues, direction: Any, at: Increments, structure: PaddedStructure) -> Optimum:
     """How the optimum, which is `at` these increments, moves with the values."""
     scale = typical_scale(values, structure)
 

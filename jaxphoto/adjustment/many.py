@@ -1,7 +1,7 @@
 """The gradients of many adjustments of one block at once.
 
 Adjustments that differ in numbers only are computed side by side: arrays end in the axis of the draws, so that what
-belongs to an image row is read and written in whole stretches. Unlike in the tiles of a single adjustment
+belongs to an image row is read and written in whole stretches. Unlike in the rays of a single adjustment
 (`adjustment.layout`) there is no empty slot: image rows are listed, and gather and scatter such stretches, a chunk of
 rows at a time, whose numbers stay in the cache of a core.
 
@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
+from jaxphoto.adjustment.layout.padded import PaddedStructure, PaddedValues
 from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.image_orientations import cameras_at
 from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays, state_at
@@ -53,7 +53,7 @@ class Common(eqx.Module):
     lists: tuple[RowList, ...]
 
     @property
-    def values(self) -> TiledValues:
+    def values(self) -> PaddedValues:
         """The nominal numbers."""
         return self.at.values
 
@@ -63,7 +63,7 @@ class Common(eqx.Module):
         return self.at.scale
 
     @property
-    def structure(self) -> TiledStructure:
+    def structure(self) -> PaddedStructure:
         """That of the nominal adjustment."""
         return self.at.structure
 
@@ -72,7 +72,7 @@ class Common(eqx.Module):
         return solve_factored(self.factored.reduced, self.factored.factor, b, self.at)
 
 
-def held_in(structure: TiledStructure, parameters: int) -> dict[str, np.ndarray]:
+def held_in(structure: PaddedStructure, parameters: int) -> dict[str, np.ndarray]:
     """What is fixed, by the leaves of `Values` that unknowns start at: of these, only that tells draws apart."""
     s = structure
     return {
@@ -129,10 +129,10 @@ def _bent_cameras(shared: Float[Array, "parameters draws"], varying: Varying, co
     )(shared, varying)
 
 
-def _values_with(varying: Varying, common: Common) -> TiledValues:
+def _values_with(varying: Varying, common: Common) -> PaddedValues:
     def of_draw(path: Any, nominal: Any) -> Any:
         name = path_name(path)
-        # Those of image rows are not in tiles, and nobody looks for them there.
+        # Those of image rows are not in padded sizes, and nobody looks for them there.
         return nominal if name in ("xy", "sigma_xy") else varying.get(name, nominal)
 
     return jax.tree_util.tree_map_with_path(of_draw, common.values)
@@ -164,7 +164,7 @@ def _group_cotangent(
     state: UnknownArrays,
     bent: Array | None,
     seen: tuple[Array, Array],
-    s: TiledStructure,
+    s: PaddedStructure,
 ) -> tuple[UnknownArrays, Array]:
     """Derivatives of the sum of q over the rows of a group with respect to the state, and to `bent`, the parameters of
     the cameras by image where something bends them (those of the state are zero then)."""
@@ -201,7 +201,7 @@ def _with_chunk(
     of_points: Float[Array, "points 3 draws"],
     table: Float[Array, "owners m draws"],
     seen: tuple[Array, Array],
-    s: TiledStructure,
+    s: PaddedStructure,
 ) -> _Sums:
     """The sums with one chunk of rows added."""
     rotation_of = lambda image: image[:9].reshape(3, 3)  # noqa: E731
@@ -266,7 +266,7 @@ def _camera_cotangent(
     table: Float[Array, "owners m draws"],
     u: tuple[Array, ...],
     seen: tuple[Array, Array],
-    s: TiledStructure,
+    s: PaddedStructure,
 ) -> tuple[Array, tuple[Array, ...]]:
     """dq/d(table), summed over the rows of a group, and dq/du of each."""
     cameras, m = table.shape[:2]

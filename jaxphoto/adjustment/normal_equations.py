@@ -1,16 +1,18 @@
 """The normal equations of a block at its optimum: the one door from statistics and sensitivity to the solver.
 
-All is in scaled increments and in the order of the tiles; `Adjustment.tiled` brings it back to the order of the block.
+All is in scaled increments and in padded order; `Adjustment.padded` brings it back to the order of the block.
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues
+from jaxphoto.adjustment.layout.padded import PaddedResiduals, PaddedStructure, PaddedValues
+from jaxphoto.adjustment.layout.rays import GROUP
 from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals, UnknownArrays, state_at, zero_increments
 from jaxphoto.adjustment.solver.band import Band, dense, factor_band, invert_band, pivots, solve_band
 from jaxphoto.adjustment.solver.elimination import (
@@ -27,7 +29,13 @@ from jaxphoto.adjustment.solver.inverse import Cofactors, RowCofactors, cofactor
 from jaxphoto.adjustment.solver.levenberg_marquardt import Course, Task
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import iterate, typical_scale, unit_scale, weigh_datum
-from jaxphoto.adjustment.solver.reduced import reduce_normal
+from jaxphoto.adjustment.solver.reduced import (
+    ProductSums,
+    border_places,
+    image_places,
+    interior_in_border,
+    reduce_normal,
+)
 from jaxphoto.arrays import added, still
 from jaxphoto.compiling import call_compiled
 from jaxphoto.short_repr import shown
@@ -37,9 +45,9 @@ from jaxphoto.short_repr import shown
 class NormalEquations(eqx.Module):
     """N x = b at the optimum, undamped and factored."""
 
-    values: TiledValues
+    values: PaddedValues
     """Their start is the optimum."""
-    structure: TiledStructure
+    structure: PaddedStructure
     factored: FactoredNormal
     is_weighed: bool = eqx.field(static=True, default=False)
     """Whether the constraints of the datum are as `at` wants them: what runs many times weighs them once, before."""
@@ -73,11 +81,11 @@ class NormalEquations(eqx.Module):
         """x of N x = b; of many by `jax.vmap`."""
         return solve_factored(self.factored.reduced, self.factored.factor, b, self.at)
 
-    def pull(self, z: TiledResiduals) -> Increments:
+    def pull(self, z: PaddedResiduals) -> Increments:
         """J' z of many residuals over their sigmas, along a leading axis."""
         return pull(z, self.at)
 
-    def push(self, x: Increments) -> TiledResiduals:
+    def push(self, x: Increments) -> PaddedResiduals:
         """J x of many, along a leading axis: how what was adjusted moves, over its sigmas, with the unknowns."""
         return push(x, self.at)
 
@@ -90,7 +98,7 @@ class NormalEquations(eqx.Module):
         return push_others(x, self.at)
 
     def cofactors(self, of_rows: bool) -> tuple[Cofactors, RowCofactors | None]:
-        """The inverse of N for images, shared unknowns and each point, and of rows in tiles, if these are wanted."""
+        """The inverse of N for images, shared unknowns and each point, and of rows, if these are wanted."""
         return cofactors_of(self.at, self.factored, of_rows)
 
     def row_variances(self, q: Cofactors, of_rows: RowCofactors) -> tuple[Array, tuple[Array, ...]]:
@@ -139,12 +147,50 @@ class NormalEquations(eqx.Module):
         return self.at.constraints()
 
 
+class Met(NamedTuple):
+    """What points meet, as places among the reduced unknowns and the k constraints; beyond these where it is none."""
+
+    of_images: Int[Array, "images e"]
+    """The unknowns that an image is eliminated with: its exterior orientation, or its camera's, too."""
+    of_points: Int[Array, "points c"]
+    """Interior unknowns, constraints, a right-hand side (none), and what rows at the points of a group touch."""
+    interior: int
+    """How many of these are interior unknowns."""
+
+    @classmethod
+    def of(cls, s: PaddedStructure, k: int) -> "Met":
+        """Those of a block."""
+        n = 6 * s.n_images
+        eop = 6 * jnp.arange(s.n_images)[:, None] + jnp.arange(6)
+        of_images = jnp.concatenate([eop, n + image_places(s, k)], axis=1)
+        return cls(of_images, n + jnp.repeat(border_places(s, k), GROUP, axis=0), interior_in_border(s))
+
+    def products(
+        self, f: Float[Array, "batches m p 3 e"], border: Float[Array, "points 3 c"], s: PaddedStructure
+    ) -> Float[Array, "size size"]:
+        """F F' of rays and points, at all reduced unknowns and constraints."""
+        n, each, k = s.n_images, jnp.arange(s.n_images), self.of_points.shape[1] - s.rays.met.shape[1]
+        k = k - self.interior - 1
+        sums = ProductSums.of(border, s, k)
+        sums, _ = s.each(lambda sums, own: (sums.with_rays(*own, border, s, k), ()), sums, (f,))
+        sums = sums.with_pairs(f, s, k)
+        columns, last = sums.band
+        width, size = len(last), s.n_shared + k
+        # Of a pair of images one half is there.
+        none = jnp.zeros((0, 6 * (n - width)))
+        pairs = dense(Band(columns.reshape(-1, 12 * width, 6 * width), none, last.reshape(6 * width, -1)))
+        own = sums.own.reshape(n, -1, sums.across.shape[2])[:, :6, :6]
+        own = jnp.zeros((n, 6, n, 6)).at[each, :, each].set(own).reshape(6 * n, -1)
+        across = sums.across[:, :size, :6].transpose(1, 0, 2).reshape(-1, 6 * n)
+        return jnp.block([[own - pairs, across.T], [across, sums.border[:size, :size]]])
+
+
 # Operation by operation they would compile each of these, and the first takes half a second every time.
 _weighed = eqx.filter_jit(weigh_datum)
 _pivots = eqx.filter_jit(pivots)
 
 
-def factor_normal(values: TiledValues, structure: TiledStructure) -> FactoredNormal:
+def factor_normal(values: PaddedValues, structure: PaddedStructure) -> FactoredNormal:
     """The normal equations of values that are at their optimum."""
     values, scale = weigh_datum(values, structure), typical_scale(values, structure)
     a, reduced, _ = reduce_normal(Linearised(zero_increments(structure), scale, values, structure), 0.0)
@@ -161,7 +207,7 @@ class Optimised(eqx.Module):
     course: Course
 
 
-def optimise(values: TiledValues, structure: TiledStructure, task: Task) -> Optimised:
+def optimise(values: PaddedValues, structure: PaddedStructure, task: Task) -> Optimised:
     """The optimum; or, of values that are at theirs, the undamped normal equations, factored."""
     optimum, system, scale = iterate(weigh_datum(values, structure), structure, task)
     state = state_at(optimum.increments, unit_scale(structure), values, structure)

@@ -7,9 +7,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxphoto.adjustment.layout.padding import TiledBlock
-from jaxphoto.adjustment.layout.tile_layout import LEAST, Sizes
-from jaxphoto.adjustment.layout.tiled import TiledValues
+from jaxphoto.adjustment.layout.padded import PaddedValues
+from jaxphoto.adjustment.layout.padding import PaddedBlock
+from jaxphoto.adjustment.layout.rays import LEAST, Sizes
 from jaxphoto.adjustment.model.numbers import Residuals, Values
 from jaxphoto.adjustment.model.structure import Structure, observed_in
 from jaxphoto.adjustment.normal_equations import NormalEquations, factor_normal
@@ -53,8 +53,8 @@ class Outcome(enum.Enum):
 
 # Times the median distance of a point: float64 resolves the directions of a base no longer than a few nanoradians.
 _FARTHEST = 1e7
-# Of the image coordinates of one adjustment: chunks, tiles, x and y, images, points.
-_DIMENSIONS = 5
+# Of the image coordinates of one adjustment: batches, x and y, chunks, rays.
+_DIMENSIONS = 4
 _factored = eqx.filter_jit(factor_normal)
 
 
@@ -80,8 +80,8 @@ class Adjustment(eqx.Module):
     unknowns: Unknowns
     residuals: Residuals
     values: Values
-    tiled: TiledBlock = eqx.field(static=True)
-    tiled_values: TiledValues
+    padded: PaddedBlock = eqx.field(static=True)
+    padded_values: PaddedValues
     factored: FactoredNormal | None
     """None in an adjustment that is being differentiated or mapped over; see `equations`."""
     steps: Int[Numbers, ""]
@@ -111,7 +111,7 @@ class Adjustment(eqx.Module):
     @property
     def structure(self) -> Structure:
         """Index arrays and sizes of the block as given."""
-        return self.tiled.own
+        return self.padded.own
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -121,7 +121,7 @@ class Adjustment(eqx.Module):
     @property
     def equations(self) -> NormalEquations:
         """What statistics are computed from; inside a transformation of JAX they are factored anew each time."""
-        s, v = self.tiled.structure, self.tiled_values
+        s, v = self.padded.structure, self.padded_values
         if self.factored is not None:
             return NormalEquations(v, s, self.factored)
         if v.xy.ndim != _DIMENSIONS:

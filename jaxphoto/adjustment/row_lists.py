@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.adjustment.layout.tile_layout import Places
+from jaxphoto.adjustment.layout.rays import Places
 from jaxphoto.adjustment.model.structure import Structure
 
 # Draws that a device computes side by side. Vectors end in them: 32 are enough for that, and for what is made anew for

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment.chords import chord_steps
-from jaxphoto.adjustment.layout.padding import TiledBlock
-from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
+from jaxphoto.adjustment.layout.padded import PaddedStructure, PaddedValues
+from jaxphoto.adjustment.layout.padding import PaddedBlock
 from jaxphoto.adjustment.many import Common, Varying, held_in, path_name, states
 from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays
 from jaxphoto.adjustment.row_lists import RowList, batch_size, row_lists
@@ -32,31 +32,31 @@ _FACTORS = 3
 _STARTS, _DATUM = {"position", "rotation", "shared", "points"}, {"datum_eop", "datum_points"}
 
 
-class RowsInTiles(NamedTuple):
-    """The image rows of a block as `many` computes with them, and where they lie in the tiles."""
+class ImageRowLists(NamedTuple):
+    """The image rows of a block as `many` computes with them, and which rays they are."""
 
     lists: tuple[RowList, ...]
     slot: Int[np.ndarray, "rows"]
-    """(tile * M + image) * P + point."""
+    """Number of the ray."""
     draws: int
     """That are computed side by side."""
 
 
-def rows_in_tiles(tiled: TiledBlock) -> RowsInTiles:
+def image_row_lists(padded: PaddedBlock) -> ImageRowLists:
     """Those of a block."""
-    return RowsInTiles(row_lists(tiled.own, tiled.places), tiled.places.row, batch_size(tiled.own))
+    return ImageRowLists(row_lists(padded.own, padded.places), padded.places.row, batch_size(padded.own))
 
 
-def optimum_of(values: TiledValues, structure: TiledStructure, task: Task, rows: RowsInTiles) -> Optimum:
+def optimum_of(values: PaddedValues, structure: PaddedStructure, task: Task, rows: ImageRowLists) -> Optimum:
     """The optimum from the start in `values`, without its course; of many draws under `jax.vmap`, side by side."""
 
     @jax.custom_batching.custom_vmap
-    def one(values: TiledValues) -> Optimum:
+    def one(values: PaddedValues) -> Optimum:
         # How it went has no derivative, and nobody asks it of what is differentiated.
         return iterate(values, structure, task)[0]._replace(course=None)
 
     @one.def_vmap
-    def rule(draws: int, batched: list[Any], values: TiledValues) -> tuple[Optimum, Optimum]:
+    def rule(draws: int, batched: list[Any], values: PaddedValues) -> tuple[Optimum, Optimum]:
         found = _optima(_Draws(draws, batched[0], structure, task, rows), values)
         return found, jax.tree.map(lambda _: True, found)
 
@@ -67,11 +67,11 @@ class _Draws(NamedTuple):
     """What is known of draws before they are computed."""
 
     number: int
-    batched: TiledValues
+    batched: PaddedValues
     """Whether each leaf has an axis of draws, its first."""
-    structure: TiledStructure
+    structure: PaddedStructure
     task: Task
-    rows: RowsInTiles
+    rows: ImageRowLists
 
     @property
     def names(self) -> set[str]:
@@ -79,7 +79,7 @@ class _Draws(NamedTuple):
         leaves = jax.tree_util.tree_leaves_with_path(self.batched)
         return {path_name(path) for path, batched in leaves if batched} - _DATUM
 
-    def together(self, values: TiledValues) -> bool:
+    def together(self, values: PaddedValues) -> bool:
         """Whether draws may begin at each other's optimum."""
         if self.structure.has_losses or self.names <= {"position", "rotation", "points"}:
             # Who varies nothing but the start wants to know where each leads.
@@ -87,25 +87,25 @@ class _Draws(NamedTuple):
         # A datum about the start is another one for every start.
         return not (self.names & _STARTS and values.datum_eop.shape[-3])
 
-    def some(self, values: TiledValues, begin: Array, size: int) -> TiledValues:
+    def some(self, values: PaddedValues, begin: Array, size: int) -> PaddedValues:
         """The values of `size` draws from `begin` on."""
         cut = lambda v, batched: jax.lax.dynamic_slice_in_dim(v, begin, size) if batched else v  # noqa: E731
         return jax.tree.map(cut, values, self.batched)
 
-    def one(self, values: TiledValues, draw: Array) -> TiledValues:
+    def one(self, values: PaddedValues, draw: Array) -> PaddedValues:
         """The values of a draw."""
         return jax.tree.map(lambda v, b: v[0] if b else v, self.some(values, draw, 1), self.batched)
 
 
-def _optima(draws: _Draws, values: TiledValues) -> Optimum:
+def _optima(draws: _Draws, values: PaddedValues) -> Optimum:
     """The optimum of every draw, draws first."""
 
     @jax.custom_batching.custom_vmap
-    def many(values: TiledValues) -> Optimum:
+    def many(values: PaddedValues) -> Optimum:
         return _found(draws, values)
 
     @many.def_vmap
-    def rule(outer: int, outer_batched: list[Any], values: TiledValues) -> tuple[Optimum, Optimum]:
+    def rule(outer: int, outer_batched: list[Any], values: PaddedValues) -> tuple[Optimum, Optimum]:
         """Draws of draws are so many more draws."""
         n = draws.number
 
@@ -132,7 +132,7 @@ class _Found(NamedTuple):
     """That were tried on all draws left."""
 
 
-def _found(draws: _Draws, values: TiledValues) -> Optimum:
+def _found(draws: _Draws, values: PaddedValues) -> Optimum:
     together = draws.together(values)
 
     def adjust_next(found: _Found) -> _Found:
@@ -159,7 +159,9 @@ def _found(draws: _Draws, values: TiledValues) -> Optimum:
     return jax.lax.while_loop(lambda found: ~jnp.all(found.done), adjust_next, begin).optima
 
 
-def _common(nominal: TiledValues, optimum: Optimum, system: FactoredSystem, scale: Increments, draws: _Draws) -> Common:
+def _common(
+    nominal: PaddedValues, optimum: Optimum, system: FactoredSystem, scale: Increments, draws: _Draws
+) -> Common:
     """What draws have in common that begin at the optimum of one of them."""
     at = jax.tree.map(lambda x, k: jnp.where(k > 0, x / jnp.where(k > 0, k, 1.0), 0.0), optimum.increments, scale)
     xy, sigma = (_by_row(v[None], draws.rows.slot)[..., 0] for v in (nominal.xy, nominal.sigma_xy))
@@ -167,7 +169,7 @@ def _common(nominal: TiledValues, optimum: Optimum, system: FactoredSystem, scal
     return Common(Linearised(at, scale, nominal, draws.structure), factored, xy, sigma, draws.rows.lists)
 
 
-def _with_chords(draws: _Draws, values: TiledValues, common: Common, found: _Found) -> _Found:
+def _with_chords(draws: _Draws, values: PaddedValues, common: Common, found: _Found) -> _Found:
     """All that chord steps lead to their optimum, of the draws that are not done."""
     size = min(draws.rows.draws, draws.number)
 
@@ -199,7 +201,7 @@ def _with_chords(draws: _Draws, values: TiledValues, common: Common, found: _Fou
     return jax.lax.fori_loop(0, -(-draws.number // size), batch, found)
 
 
-def _varying(draws: _Draws, values: TiledValues, common: Common) -> Varying:
+def _varying(draws: _Draws, values: PaddedValues, common: Common) -> Varying:
     """What tells the draws apart, draws last: of what unknowns start at, that which is fixed."""
     held = held_in(draws.structure, values.shared.shape[-1])
     varying = {}
@@ -217,7 +219,7 @@ def _varying(draws: _Draws, values: TiledValues, common: Common) -> Varying:
     return varying
 
 
-def _from_start(values: TiledValues, state: UnknownArrays, draws: _Draws) -> Increments:
+def _from_start(values: PaddedValues, state: UnknownArrays, draws: _Draws) -> Increments:
     """Increments that lead from the start of each draw to a state, draws first."""
     s = draws.structure
 
@@ -233,11 +235,9 @@ def _from_start(values: TiledValues, state: UnknownArrays, draws: _Draws) -> Inc
     return Increments(eop * s.eop_free, shared, points * s.point_free)
 
 
-def _by_row(v: Float[Array, "draws chunks tiles 2 m p"], slot: Int[np.ndarray, "rows"]) -> Float[Array, "2 rows draws"]:
-    """Numbers of the slots of tiles by image row, draws last."""
-    n, chunks, tiles, k, m, p = v.shape
-    by_slot = jnp.moveaxis(v.reshape(n, chunks * tiles, k, m * p), 2, 0).reshape(k, n, -1)
-    return by_slot[:, :, slot].transpose(0, 2, 1)
+def _by_row(v: Float[Array, "draws batches 2 chunks p"], ray: Int[np.ndarray, "rows"]) -> Float[Array, "2 rows draws"]:
+    """Numbers of rays by image row, draws last."""
+    return jnp.moveaxis(v, 2, 0).reshape(2, len(v), -1)[:, :, ray].transpose(0, 2, 1)
 
 
 def _draws_first(tree: Any) -> Any:

@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment.layout.padding import TiledBlock
+from jaxphoto.adjustment.layout.padding import PaddedBlock
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.normal_equations import NormalEquations
 from jaxphoto.adjustment.result import Adjustment
@@ -130,7 +130,7 @@ def weak_directions(adjusted: Adjustment, least: float = POOR) -> list[WeakDirec
     Where the unknowns of `adjusted` are: at the optimum, or wherever the solver stopped. None where numbers are
     infinite there. The standard deviations are a priori.
     """
-    equations, tiled = _sound(adjusted), adjusted.tiled
+    equations, padded = _sound(adjusted), adjusted.padded
     yard = yardsticks(adjusted)
     scale = jax.tree.map(still, equations.scale)
     sizes = np.repeat([yard.ground, yard.angle], 3)[:, None]
@@ -161,13 +161,13 @@ def weak_directions(adjusted: Adjustment, least: float = POOR) -> list[WeakDirec
         columns = np.zeros((len(flat), len(some)))
         columns[own[some], np.arange(len(some))] = 1.0
         variance[some] = covariance_times(columns)[own[some], np.arange(len(some))]
-    found = [_direction(_tree(v[:, None], over), variance, tiled) for v in along]
+    found = [_direction(_tree(v[:, None], over), variance, padded) for v in along]
     return [d for d in found if d.sigma > least]
 
 
-def _direction(of: Increments, variance: np.ndarray, tiled: TiledBlock) -> WeakDirection:
+def _direction(of: Increments, variance: np.ndarray, padded: PaddedBlock) -> WeakDirection:
     eop, shared, points = (np.asarray(v)[0] for v in of)
-    places = tiled.places
+    places = padded.places
     share = np.clip(shared**2 / np.where(variance > 0, variance, np.inf), 0.0, 1.0)
     return WeakDirection(MovedUnknowns(eop[:, places.image].T, shared, points[:, places.point].T), share)
 

@@ -5,10 +5,21 @@ import ctypes
 import sys
 from collections.abc import Callable, Iterator
 
-# Of <malloc.h>, and what glibc begins with.
-_TRIM_THRESHOLD, _MMAP_MAX = -1, -4
-_USUAL_TRIM, _USUAL_MMAPS = 128 * 1024, 65_536
+# Of <malloc.h>.
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _MMAP_MAX = -1, -3, -4
+_USUAL_MMAPS = 65_536
 _ALL = 2**31 - 1
+# Pieces up to this size come from memory that was freed, and so much is kept: what glibc comes to by itself once it has
+# freed such a piece. Until then it may map what a program works with anew at each call: of P31, 3.3 MB and a third of
+# the time of a solution.
+_LARGEST, _KEPT = 32 * 2**20, 64 * 2**20
+
+
+def keep_freed_memory() -> None:
+    """Have glibc use what a program worked with again at its next call."""
+    if option := _of_glibc("mallopt"):
+        option(_MMAP_THRESHOLD, _LARGEST)
+        option(_TRIM_THRESHOLD, _KEPT)
 
 
 def return_freed_memory() -> None:
@@ -38,7 +49,7 @@ def freed_memory_kept() -> Iterator[None]:
         yield
     finally:
         option(_MMAP_MAX, _USUAL_MMAPS)
-        option(_TRIM_THRESHOLD, _USUAL_TRIM)
+        option(_TRIM_THRESHOLD, _KEPT)
         return_freed_memory()
 
 

@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 
 from jaxphoto.compiling import store
-from jaxphoto.compiling.freed_memory import return_freed_memory
+from jaxphoto.compiling.freed_memory import keep_freed_memory, return_freed_memory
 from jaxphoto.compiling.options import options_here
 from jaxphoto.compiling.plain_tree import Slot
 
@@ -44,6 +44,7 @@ _gone = 0
 """Programs that went since JAX forgot what it traced."""
 _prepared: dict[object, Future[_Program]] = {}
 _workers = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="jaxphoto-compile")
+keep_freed_memory()
 
 
 def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], name: str, thorough: bool = False) -> Any:

@@ -1,4 +1,4 @@
-"""Image points: the observations that an adjustment is made of, and its fast path (`adjustment.solver.tile_rows`)."""
+"""Image points: the observations that an adjustment is made of, and its fast path (`adjustment.solver.ray_rows`)."""
 
 import jax.numpy as jnp
 import numpy as np

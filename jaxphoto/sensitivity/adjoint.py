@@ -1,12 +1,12 @@
 """Adjoint vectors: H lambda = de/dx, points eliminated, for many estimates e at once.
 
-With M, C and the gain K = -V^-1 [W; Ws; D]' of `hessian`, b the derivative of an estimate by the unknowns of M and b_p
-that by the points,
+With M, C and F of `hessian`, the gain K = -V^-1 [W; Ws; D]' = -L^-T F, b the derivative of an estimate by the unknowns
+of M and b_p that by the points,
 
     lambda = M^-1 [b + K_x' b_p; C K_mu' b_p]       of images and shared unknowns, and of mu
     lambda_p = V^-1 b_p + K lambda
 
-These are a few dense products of numbers that lie still, which BLAS does best.
+These are a few products of numbers that lie still, with a matrix K that is sparse.
 """
 
 from typing import Any, NamedTuple
@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 from jaxtyping import Float, Int
+
+from jaxphoto.small_matrices import unwhiten
 
 
 class Estimates(NamedTuple):
@@ -25,7 +27,7 @@ class Estimates(NamedTuple):
     turns: Float[np.ndarray, "images 3 3"]
     """From the small rotation of an image (rad) to its angles as they are reported."""
     points: Int[np.ndarray, "asked"]
-    """Points whose coordinates are wanted, in the order of the tiles."""
+    """Points whose coordinates are wanted, in padded order."""
     point_step: Float[np.ndarray, "asked 3"]
 
 
@@ -35,14 +37,13 @@ def adjoint_vectors(h: Any, of: Estimates) -> Float[np.ndarray, "unknowns estima
     `h` is an `Eliminated` of numbers that lie still.
     """
     n, k, asked = len(of.unknowns), len(h.c), len(of.points)
-    tiles, p, _, f = h.gain.shape
+    n_points = h.l.shape[1]
     own = np.append(of.unknowns, len(h.m) - k + np.arange(k))
-    # Images that are padding meet nothing: their gain is zero.
-    place = np.zeros(len(h.m), int)
+    # What is no unknown of the block meets nothing: its F is zero.
+    place = np.zeros(int(max(h.of_rays.max(initial=0), h.of_border.max(initial=0), len(h.m))) + 1, int)
     place[own] = np.arange(n + k)
-    touched = place[h.touched]
     inverse = _inverse(h.m.take(own, axis=0).take(own, axis=1), positive=not k)
-    found = np.empty((n + k + 3 * p * tiles, n + 3 * asked))
+    found = np.empty((n + k + 3 * n_points, n + 3 * asked))
     reduced = found[: n + k]
 
     np.multiply(inverse[:, :n], of.step, out=reduced[:, :n])
@@ -52,20 +53,31 @@ def adjoint_vectors(h: Any, of: Estimates) -> Float[np.ndarray, "unknowns estima
     turned = [sum(a * turn for a, turn in zip(angles, of.turns[:, i].T, strict=True)) for i in range(3)]
     for i in range(3):
         angles[i][:] = turned[i]
-    tile, slot = np.divmod(of.points, p)
-    right = np.zeros((asked, 3, n + k))
-    met = h.gain[tile, slot] * of.point_step[:, :, None]
-    np.add.at(right, (np.arange(asked)[:, None, None], np.arange(3)[:, None], touched[tile][:, None]), met)
-    down = right.reshape(3 * asked, n + k).T
+    gain = _gain(h, place, n + k)
+    down = (
+        (gain[(3 * of.points[:, None] + np.arange(3)).ravel()].T * of.point_step.reshape(-1)).toarray()
+        if asked
+        else np.zeros((n + k, 0))
+    )
     reduced[:, n:] = inverse @ np.concatenate([down[:n], h.c @ down[n:]])
 
-    of_points = found[n + k :].reshape(tiles, 3 * p, -1)
-    for gain, unknowns, result in zip(h.gain.reshape(tiles, 3 * p, f), touched, of_points, strict=True):
-        np.matmul(gain, reduced[unknowns], out=result)
-    at_points = of_points.reshape(tiles, p, 3, -1)
-    for j, own_part in enumerate(_inverses_of(h.l[tile, :, slot]) * of.point_step[:, None]):
-        at_points[tile[j], slot[j], :, n + 3 * j : n + 3 * j + 3] += own_part
+    found[n + k :] = gain @ reduced
+    at_points = found[n + k :].reshape(n_points, 3, -1)
+    for j, own_part in enumerate(_inverses_of(h.l[:, of.points].T) * of.point_step[:, None]):
+        at_points[of.points[j], :, n + 3 * j : n + 3 * j + 3] += own_part
     return found
+
+
+def _gain(h: Any, place: Int[np.ndarray, "unknowns"], size: int) -> "scipy.sparse.csr_array":
+    """K = -L^-T F, three rows a point."""
+    rows, values, columns = [], [], []
+    for point, f, of in ((h.point, h.rays, h.of_rays), (np.arange(h.l.shape[1]), h.border, h.of_border)):
+        gain = -np.stack(unwhiten(np.moveaxis(f, 0, -1), h.l[:, point]))
+        rows.append(np.broadcast_to((3 * point + np.arange(3)[:, None])[:, None], gain.shape).ravel())
+        columns.append(np.broadcast_to(place[of].T, gain.shape).ravel())
+        values.append(gain.ravel())
+    data, at = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+    return scipy.sparse.coo_array((data, at), shape=(3 * h.l.shape[1], size)).tocsr()
 
 
 def _inverse(m: Float[np.ndarray, "n n"], positive: bool) -> Float[np.ndarray, "n n"]:

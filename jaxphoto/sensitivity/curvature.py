@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment import Linearised, TiledStructure, TiledValues
+from jaxphoto.adjustment import Linearised, PaddedStructure, PaddedValues
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
 from jaxphoto.adjustment.model.row_functions import (
@@ -36,7 +36,7 @@ class RowSecond(NamedTuple):
     """By z and by the numbers observed."""
 
 
-def mixed_second(at: Linearised, direction: TiledValues, curved: Float[Numbers, ""]) -> Increments:
+def mixed_second(at: Linearised, direction: PaddedValues, curved: Float[Numbers, ""]) -> Increments:
     """B dv over all rows, for a direction of change of the numbers; leaves that are None do not change."""
 
     def gradient(moved):
@@ -81,13 +81,13 @@ class AtPointsSecond(NamedTuple):
 
     v: Float[Array, "3 3 points"]
     w: Float[Array, "b 3 points"]
-    """By what else the tiles of the points meet, `Tiles.met`."""
+    """By what else the groups of points meet, `RayLists.met`."""
 
 
 def points_second(second: tuple[RowSecond, ...], at: Linearised) -> AtPointsSecond:
     """H of rows at points, by these, and by these and shared unknowns."""
     s, n = at.structure, at.increments.points.shape[1]
-    v, w = jnp.zeros((3, 3, n)), jnp.zeros((s.tiles.met.shape[2], n, 3))
+    v, w = jnp.zeros((3, 3, n)), jnp.zeros((s.rays.met.shape[1], n, 3))
     for g, own in zip(s.observed, second, strict=True):
         if isinstance(g.rows, RowsAtPoints):
             k = len(g.place)
@@ -133,7 +133,7 @@ def _block_diagonal(blocks: list[Array]) -> Array:
     return result
 
 
-def other_second(second: tuple[RowSecond, ...], s: TiledStructure) -> Float[Array, "n n"]:
+def other_second(second: tuple[RowSecond, ...], s: PaddedStructure) -> Float[Array, "n n"]:
     """H of all rows but image rows in the reduced unknowns, without those that couple points."""
     n = 6 * s.n_images + s.n_shared
     h = jnp.zeros((n, n))

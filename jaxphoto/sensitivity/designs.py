@@ -16,10 +16,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment import (
     NormalEquations,
+    PaddedStructure,
+    PaddedValues,
     Sizes,
     Task,
-    TiledStructure,
-    TiledValues,
     lay_out,
     optimise,
     to_factor,
@@ -53,8 +53,8 @@ class Check(NamedTuple):
 class Prepared(NamedTuple):
     """One design as it is computed with, and what is known of it beforehand."""
 
-    values: TiledValues
-    structure: TiledStructure
+    values: PaddedValues
+    structure: PaddedStructure
     check: Check
     labels: tuple[str, ...]
     """Of the shared unknowns, in their order."""
@@ -89,15 +89,15 @@ def prepare_design(block: Block, truth: Unknowns | None, sizes: Sizes, n_check: 
     `jaxphoto.adjust` raises before it computes: BlockError, DatumError, RankError.
     """
     laid = lay_out(block, approximate(block), block.priors, sizes, alone=True)
-    s, constraints = laid.tiled.own, len(laid.values.datum_eop)
+    s, constraints = laid.padded.own, len(laid.values.datum_eop)
     who = np.unique(block.check.who)
     check = Check(np.zeros(n_check, np.int32), np.zeros(n_check), np.full((n_check, 3), np.nan))
-    check.point[: len(who)], check.weight[: len(who)] = laid.tiled.places.point[who], 1.0
+    check.point[: len(who)], check.weight[: len(who)] = laid.padded.places.point[who], 1.0
     if truth is not None:
         check.truth[: len(who)] = np.asarray(truth.points)[who]
     observed = 2 * len(s.image) + sum(g.components * g.n_rows for g in s.observed) + constraints
     unknown = s.n_shared + s.eop_free.sum() + s.point_free.sum()
-    return Prepared(laid.tiled_values, laid.tiled.structure, check, s.labels, int(observed - unknown))
+    return Prepared(laid.padded_values, laid.padded.structure, check, s.labels, int(observed - unknown))
 
 
 def alike(designs: Sequence[Prepared]) -> list[list[int]]:
@@ -131,8 +131,8 @@ def find(designs: Sequence[Prepared], rotations: Rotations, max_steps: int, seco
 
 @eqx.filter_jit
 def _find(
-    values: TiledValues,
-    s: TiledStructure,
+    values: PaddedValues,
+    s: PaddedStructure,
     check: Check,
     wanted: Array,
     devices: int,
@@ -159,7 +159,7 @@ def _find(
     return run(arrays, wanted)
 
 
-def _findings(values: TiledValues, s: TiledStructure, check: Check, rotations: Rotations, max_steps: int) -> Findings:
+def _findings(values: PaddedValues, s: PaddedStructure, check: Check, rotations: Rotations, max_steps: int) -> Findings:
     """Adjustment, factor at the optimum, covariance, and what is kept of them."""
 
     def solved(start: UnknownArrays, task: Task):

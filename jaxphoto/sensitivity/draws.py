@@ -127,9 +127,9 @@ class Readjustment:
         if not bool(adjusted.converged):
             raise InputError(f"draws begin at the optimum of the block as it is, which is {adjusted.outcome.value}")
         equations = adjusted.equations.on_one_device
-        tiled = dataclasses.replace(adjusted.tiled, structure=equations.structure)
+        padded = dataclasses.replace(adjusted.padded, structure=equations.structure)
         self.adjusted = dataclasses.replace(
-            adjusted, tiled=tiled, tiled_values=equations.values, factored=equations.factored
+            adjusted, padded=padded, padded_values=equations.values, factored=equations.factored
         )
         self.change, self.exterior, self.points = change, exterior, points
         self.seconds = {"compile": 0.0}
@@ -186,7 +186,7 @@ class Readjustment:
 
     def _gathered(self, found: Found, recorded: Recorded, n: int) -> Draws:
         """Of a batch, its first `n` draws."""
-        state = self.adjusted.tiled.crop_state(UnknownArrays(*(_draws_first(v)[:n] for v in found.state)))
+        state = self.adjusted.padded.crop_state(UnknownArrays(*(_draws_first(v)[:n] for v in found.state)))
         labels, kept = self.adjusted.structure.labels, {name: np.asarray(v)[:n] for name, v in recorded.items()}
         steps, settled = np.asarray(found.steps)[:n], np.asarray(found.settled)[:n]
         return Draws(kept, *self._estimates(state), settled, steps, np.zeros(n, bool), labels)
@@ -240,7 +240,7 @@ class Readjustment:
         changed = values_of(block, block.start.unknowns, block.priors, s)
         changed = with_datum(changed, v.datum_eop, v.datum_points)
         wide, nominal = self.common.structure, self.common.values
-        padded = self.adjusted.tiled.pad(changed)
+        padded = self.adjusted.padded.pad(changed)
         numbers = {path_name(path): v for path, v in jax.tree_util.tree_leaves_with_path(padded)}
         # What is free begins at the optimum, wherever the block says that it starts.
         for name, mask in held_in(wide, len(v.shared)).items():
@@ -267,7 +267,7 @@ class Readjustment:
 def common_of(adjusted: Adjustment, at_once: int | None = None) -> Common:
     """The nominal adjustment, from whose optimum all draws begin; `at_once` image rows are computed with at a time."""
     equations, values = adjusted.equations.weighed, adjusted.values
-    lists = row_lists(adjusted.structure, adjusted.tiled.places, at_once)
+    lists = row_lists(adjusted.structure, adjusted.padded.places, at_once)
     return Common(equations.at, equations.factored, np.asarray(values.xy), np.asarray(values.sigma_xy), lists)
 
 

@@ -24,7 +24,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.adjustment import Adjustment, NormalEquations, TiledBlock
+from jaxphoto.adjustment import Adjustment, NormalEquations, PaddedBlock
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.adjustment.model.row_functions import reduced_places
 from jaxphoto.adjustment.model.structure import Structure
@@ -102,7 +102,7 @@ def sensitivity(adjusted: Adjustment, *, curvature: bool = True, points: Sequenc
     _check_points(adjusted, points)
     check_optimum(adjusted)
     equations = adjusted.equations.on_one_device
-    tiled, places, scale, s = adjusted.tiled, adjusted.tiled.places, equations.scale, equations.structure
+    padded, places, scale, s = adjusted.padded, adjusted.padded.places, equations.scale, equations.structure
     own, estimates = adjusted.structure, 6 * len(places.image) + s.n_shared + 3 * len(points)
     _check_size(own, estimates)
     given = equations, image_rows(adjusted), np.array(float(curvature))
@@ -113,7 +113,7 @@ def sensitivity(adjusted: Adjustment, *, curvature: bool = True, points: Sequenc
     of = Estimates(unknowns, step, found.turns[places.image], asked, still(scale.points).T[asked])
     adjoint = adjoint_vectors(found.h, of)
 
-    rows = _observations(found, tiled, len(unknowns) + len(found.h.c))
+    rows = _observations(found, padded, len(unknowns) + len(found.h.c))
     derivatives = _sparse(list(rows.values()), len(adjoint)) @ adjoint
     shapes = {name: b.shape[:-1] for name, (b, _) in rows.items()}
     ends = np.cumsum([math.prod(shape) for shape in shapes.values()])[:-1]
@@ -161,9 +161,9 @@ Rows = tuple[np.ndarray, np.ndarray]
 """-B of some observations, numbers last, and the unknowns that these belong to."""
 
 
-def _observations(found: _Derivatives, tiled: TiledBlock, first: int) -> dict[str, Rows]:
+def _observations(found: _Derivatives, padded: PaddedBlock, first: int) -> dict[str, Rows]:
     """-B of all observations, by the names of their groups; `first` is where the points begin."""
-    own, places = tiled.own, tiled.places
+    own, places = padded.own, padded.places
     n, q, axes = 6 * own.n_images, own.n_image_colours, np.arange(3)
     first_of = first + 3 * places.point
     of_image = np.concatenate([6 * np.arange(own.n_images)[:, None] + np.arange(6), n + own.column[:, :q]], axis=1)
@@ -175,7 +175,7 @@ def _observations(found: _Derivatives, tiled: TiledBlock, first: int) -> dict[st
     for g, b in zip(own.observed, found.others, strict=True):
         z, o = b.shape[:2]
         # (z o, rows), then rows first and z last.
-        flat = tiled.crop_rows(dataclasses.replace(g, scalar=False), np.reshape(b, (z * o, *b.shape[2:])))
+        flat = padded.crop_rows(dataclasses.replace(g, scalar=False), np.reshape(b, (z * o, *b.shape[2:])))
         flat = -np.moveaxis(flat.reshape(z, o, -1), 0, -1).swapaxes(0, 1)
         of_points = (first_of[g.point][:, None] + axes[:, None]).reshape(-1, g.n_rows)
         touched = np.concatenate([np.asarray(reduced_places(g, own.n_images)), of_points]).T
@@ -192,13 +192,11 @@ def _sparse(rows: Sequence[Rows], unknowns: int) -> "scipy.sparse.csr_array":
 
 
 class _Held(NamedTuple):
-    """What is held fixed: shared parameters by their index, then coordinates by point of the block and axis."""
+    """What is held fixed: shared parameters by their index, then coordinates by place of the point and axis."""
 
     shared: Int[np.ndarray, "n"]
     point: Int[np.ndarray, "m"]
     axis: Int[np.ndarray, "m"]
-    point_at: Int[np.ndarray, "points"]
-    """That of `Places`: a fixed point may lie at several places."""
 
 
 def _by_fixed(
@@ -207,10 +205,10 @@ def _by_fixed(
     """-lambda' B of what is held fixed, and its labels: parameter paths of what is not free, then coordinates."""
     block, fixed = adjusted.block, adjusted.block.fixed
     equations = adjusted.equations.on_one_device
-    s, places, values = equations.structure, adjusted.tiled.places, equations.values
+    s, places, values = equations.structure, adjusted.padded.places, equations.values
     every = adjusted.parameters
     shared = np.setdiff1d(np.arange(len(values.shared)), s.free)
-    held = _Held(*(np.asarray(v, np.int32) for v in (shared, fixed.who, fixed.axis, places.point_at)))
+    held = _Held(*(np.asarray(v, np.int32) for v in (shared, places.point[fixed.who], fixed.axis)))
     given = equations, np.array(float(curvature)), held
     b = still(run_compiled(_fixed_rows, given, adjusted.seconds, "sensitivity"))
     n = 6 * s.n_images + s.n_shared
@@ -237,6 +235,6 @@ def _fixed_rows(equations: NormalEquations, curved: Array, held: _Held) -> Float
         return jnp.concatenate([b.eop.T.reshape(-1), b.shared, b.points.T.reshape(-1)])
 
     by_shared = jax.lax.map(lambda k: column(shared.at[k].set(1.0), coordinates), held.shared)
-    moved = lambda axis, point: coordinates.at[axis].set(held.point_at == point)  # noqa: E731
+    moved = lambda axis, point: coordinates.at[axis, point].set(1.0)  # noqa: E731
     by_coordinate = jax.lax.map(lambda k: column(shared, moved(*k)), (held.axis, held.point))
     return jnp.concatenate([by_shared, by_coordinate])

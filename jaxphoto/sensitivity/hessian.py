@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.adjustment import Adjustment, Linearised, TiledStructure
+from jaxphoto.adjustment import Adjustment, Linearised, Met, PaddedStructure
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.arrays import Numbers
 from jaxphoto.errors import InputError
@@ -38,16 +38,22 @@ _MOST_UNKNOWNS = 6000
 
 
 class Eliminated(NamedTuple):
-    """M, and what takes vectors down to it and back to the points; tiles of all chunks are joined."""
+    """M, and what takes vectors down to it and back to the points."""
 
     m: Float[Array, "n_and_k n_and_k"]
     c: Float[Array, "k k"]
-    gain: Float[Array, "tiles p 3 f"]
-    """-V^-1 [W; Ws; D]': what points answer to unknowns of M."""
-    l: Float[Array, "tiles 6 p"]  # noqa: E741
+    l: Float[Array, "6 points"]  # noqa: E741
     """Cholesky factors of V."""
-    touched: Int[Array, "tiles f"]
-    """The unknowns of M that the columns of the gain belong to."""
+    rays: Float[Array, "rays 3 e"]
+    """F of each ray, by the unknowns of its image,"""
+    border: Float[Array, "points 3 c"]
+    """and of each point, by what else it meets."""
+    point: Int[Array, "rays"]
+    """The point of each ray."""
+    of_rays: Int[Array, "rays e"]
+    """The unknowns of M that the columns of `rays` belong to, behind the last where they are none;"""
+    of_border: Int[Array, "points c"]
+    """and those of `border`."""
     measured: Float[Array, "rows 2 touched"]
     """-B of each image row by its measured x and y (mm): of eop (6), point (3), colours."""
 
@@ -58,7 +64,7 @@ def check_optimum(adjusted: Adjustment) -> None:
         raise InputError(
             "the adjustment has not converged, and only an optimum has a sensitivity: adjust until it converges"
         )
-    s = adjusted.tiled.structure
+    s = adjusted.padded.structure
     unknowns = 6 * s.n_images + s.n_shared
     if unknowns > _MOST_UNKNOWNS:
         raise InputError(
@@ -75,45 +81,41 @@ def eliminated(at: Linearised, rows: ListedRows, curved: Float[Numbers, ""]) -> 
     k, n = len(c), 6 * s.n_images + s.n_shared
     at_points = points_second(second, at)
     h = row_products(values, scale, rows, curved, s)
-
-    def tile(numbers):
-        image, slots, own_v, own_w, d_p = numbers
-        met = h.by_point.at[:, :, slots].get(mode="promise_in_bounds")
-        v = jnp.sum(met[6:9], axis=2) + own_v
-        # Of shared unknowns that points meet besides those of cameras, which these follow.
-        of_shared = jnp.concatenate([_by_interior(met[9:], image, s), own_w])
-        added = jnp.where(jnp.einsum("iip->ip", v) == 0, 1.0, 0.0)
-        l = cholesky_3x3(v + added[:, None] * jnp.eye(3)[:, :, None])  # noqa: E741
-        by_image = met[:6].transpose(2, 0, 1, 3).reshape(-1, 3, slots.shape[1])
-        w = jnp.concatenate([by_image, of_shared, d_p])
-        f = jnp.stack(whiten(w.transpose(1, 0, 2), l), axis=1)
-        gain = -jnp.stack(unwhiten(f.transpose(1, 0, 2), l))
-        flat = f.reshape(len(f), -1)
-        return gain.transpose(2, 0, 1), l, flat @ flat.T
-
-    of_points = (s.by_tile(v) for v in (*at_points, d_p))
-    *found, gram = s.each_tile(tile, (rows.of_slot, *of_points))
-    gain, l = (v.reshape(-1, *v.shape[2:]) for v in found)  # noqa: E741
-    # Tiles that are padding were not computed: their points are each by itself.
-    l = jnp.where(l[:, :1] == 0, jnp.array([1.0, 0, 1, 0, 0, 1])[:, None], l)  # noqa: E741
-
-    image = jnp.asarray(s.tiles.image).reshape(len(l), -1)
-    met = jnp.asarray(s.tiles.met).reshape(len(l), -1)
-    # What means no unknown has no products, and its place is as good as any.
-    met = jnp.where(met < s.n_shared, 6 * s.n_images + met, 0)
-    all_meet = lambda v: jnp.broadcast_to(v, (len(l), len(v)))  # noqa: E731
-    interior = all_meet(6 * s.n_images + jnp.arange(s.n_interior))
-    border = jnp.concatenate([interior, met, all_meet(n + jnp.arange(k))], axis=1)
+    column = image_columns(s)[:, 6:][jnp.asarray(rows.image)] - 6 * s.n_images
+    places = Met.of(s, k)
+    v, interior = _by_point(h.by_point[6:], rows.point, column, places.interior, s)
+    v = v + at_points.v
+    added = jnp.where(jnp.einsum("iip->ip", v) == 0, 1.0, 0.0)
+    l = cholesky_3x3(v + added[:, None] * jnp.eye(3)[:, :, None])  # noqa: E741
+    # No right-hand side is taken down.
+    met = jnp.concatenate([interior, d_p, jnp.zeros((1, *d_p.shape[1:])), at_points.w])
+    border = jnp.stack(whiten(met.transpose(1, 0, 2), l)).transpose(2, 0, 1)
+    w, point = h.by_point[:6], jnp.asarray(rows.point)
+    if places.of_images.shape[1] > 6:
+        w = jnp.concatenate([w, h.by_point[9:]])
+    of_rows = jnp.stack(whiten(w.swapaxes(0, 1), l[:, point][:, None])).transpose(2, 0, 1)
+    f = of_rows[jnp.asarray(rows.of_slot)]
     m = jnp.zeros((n + k, n + k)).at[:n, :n].set(other_second(second, s) + _by_unknown(h, s))
-    m = m.at[n:, :n].set(d_e).at[:n, n:].set(d_e.T) - _products(gram, border, n + k, s)
+    m = m.at[n:, :n].set(d_e).at[:n, n:].set(d_e.T) - places.products(f, border, s)
     fixed = jnp.where(jnp.diagonal(m) == 0, 1.0, 0.0)
     m = m.at[n:].set(c @ m[n:]) + jnp.diag(jnp.where(jnp.arange(n + k) < n, fixed, -1.0))
-    by_eop = (6 * image[:, :, None] + jnp.arange(6)).reshape(len(l), -1)
-    touched = jnp.concatenate([by_eop, border], axis=1)
-    return Eliminated(m, c, gain, l, touched, h.measured)
+    return Eliminated(
+        m, c, l, of_rows, border, point, places.of_images[jnp.asarray(rows.image)], places.of_points, h.measured
+    )
 
 
-def _by_unknown(h: RowProducts, s: TiledStructure) -> Float[Array, "n n"]:
+def _by_point(
+    met: Float[Array, "touched 3 rows"], point: Numbers, column: Int[Array, "rows colours"], i: int, s: PaddedStructure
+) -> tuple[Float[Array, "3 3 points"], Float[Array, "interior 3 points"]]:
+    """Sums over the rows of each point, of what it meets of itself and of interior unknowns."""
+    n = s.n_points
+    v = jax.ops.segment_sum(met[:3].reshape(9, -1).T, jnp.asarray(point), n).T.reshape(3, 3, n)
+    at = jnp.asarray(point)[:, None], jnp.minimum(column, i)
+    w = jnp.zeros((n, i + 1, 3)).at[at].add(met[3:].transpose(2, 0, 1) if i else 0.0)
+    return v, w[:, :i].transpose(1, 2, 0)
+
+
+def _by_unknown(h: RowProducts, s: PaddedStructure) -> Float[Array, "n n"]:
     """Sums by image, at the unknowns of the image and of its colours."""
     n_eop, columns = 6 * s.n_images, image_columns(s)
     each, n = jnp.arange(s.n_images), n_eop + s.n_shared
@@ -126,60 +128,22 @@ def _by_unknown(h: RowProducts, s: TiledStructure) -> Float[Array, "n n"]:
     return m.at[of_shared[:, :, None], of_shared[:, None]].add(h.shared, mode="drop")
 
 
-def _products(
-    gram: Float[Array, "chunks tiles f f"], border: Int[Array, "all_tiles b"], size: int, s: TiledStructure
-) -> Float[Array, "size size"]:
-    """F F' of all tiles at their unknowns: pairs of images by the lists of `Tiles`, the border by what it means."""
-    tiles, n = s.tiles, s.n_images
-    m, width = tiles.image.shape[2], n // tiles.columns
-
-    def blocks(numbers):
-        gram, pair_tile, pair, pair_block, block = numbers
-        of_pairs = gram[:, : 6 * m, : 6 * m].reshape(-1, m, 6, m, 6)[pair_tile, pair[:, 0], :, pair[:, 1]]
-        return jax.ops.segment_sum(of_pairs, pair_block, len(block), indices_are_sorted=True)
-
-    lists = (tiles.pair_tile, tiles.pair_images, tiles.pair_block, tiles.block)
-    found = jax.lax.map(blocks, (gram, *lists)).reshape(-1, 6, 6)
-    which, row, column = jnp.asarray(tiles.block).reshape(-1, 3).T
-    row, column = which * width + row, which * width + column
-    # Blocks that are none lie behind the last column block; what is added there is dropped.
-    row, mirrored = (
-        jnp.where(which < tiles.columns, row, n),
-        jnp.where((which < tiles.columns) & (row > column), row, n),
-    )
-    eop = jnp.zeros((n, 6, n, 6)).at[row, :, column].add(found, mode="drop")
-    eop = eop.at[column, :, mirrored].add(found.transpose(0, 2, 1), mode="drop").reshape(6 * n, 6 * n)
-    image, gram = jnp.asarray(tiles.image).reshape(len(border), m), gram.reshape(len(border), *gram.shape[2:])
-    met = gram[:, : 6 * m, 6 * m :].reshape(len(border), m, 6, -1).transpose(0, 1, 3, 2)
-    across = jnp.zeros((n, 6, size)).at[image[:, :, None], :, border[:, None]].add(met).reshape(6 * n, -1)
-    result = jnp.zeros((size, size)).at[: 6 * n, : 6 * n].set(eop)
-    result = result.at[: 6 * n].add(across).at[:, : 6 * n].add(across.T)
-    return result.at[border[:, :, None], border[:, None]].add(gram[:, 6 * m :, 6 * m :])
-
-
-def image_columns(s: TiledStructure) -> Int[Array, "images e_and_colours"]:
+def image_columns(s: PaddedStructure) -> Int[Array, "images e_and_colours"]:
     """Reduced unknowns of each image: exterior orientation, then those of its camera's colours."""
     column = jnp.asarray(s.column)[:, : s.n_image_colours]
     shared = jnp.where(column < s.n_shared, 6 * s.n_images + column, NOWHERE)
     return jnp.concatenate([6 * jnp.arange(s.n_images)[:, None] + jnp.arange(6), shared], axis=1)
 
 
-def solve_eliminated(h: Eliminated, b: Increments, s: TiledStructure) -> Increments:
+def solve_eliminated(h: Eliminated, b: Increments, s: PaddedStructure) -> Increments:
     """x of H x = b."""
-    n_eop, n = 6 * s.n_images, 6 * s.n_images + s.n_shared
-    of_points = b.points.reshape(3, len(h.l), -1)
-    right = jnp.concatenate([b.eop.T.reshape(-1), b.shared, jnp.zeros(len(h.c))])
-    right = right.at[h.touched].add(jnp.einsum("tpkf,ktp->tf", h.gain, of_points))
+    n_eop, n, size = 6 * s.n_images, 6 * s.n_images + s.n_shared, len(h.m)
+    z = jnp.stack(whiten(b.points, h.l))
+    right = jnp.concatenate([b.eop.T.reshape(-1), b.shared, jnp.zeros(size - n)])
+    right = right.at[h.of_rays].add(-jnp.einsum("rae,ar->re", h.rays, z[:, h.point]), mode="drop")
+    right = right.at[h.of_border].add(-jnp.einsum("pac,ap->pc", h.border, z), mode="drop")
     x = solve(h.m, jnp.concatenate([right[:n], h.c @ right[n:]]))
-    l = h.l.transpose(1, 0, 2)  # noqa: E741
-    points = jnp.stack(unwhiten(whiten(of_points, l), l)) + jnp.einsum("tpkf,tf->ktp", h.gain, x[h.touched])
-    return Increments(x[:n_eop].reshape(-1, 6).T, x[n_eop:n], points.reshape(3, -1))
-
-
-def _by_interior(w: Float[Array, "q 3 m p"], image: Array, s: TiledStructure) -> Float[Array, "interior 3 p"]:
-    """Ws of a tile: what its colours mean, added up over its images."""
-    if not s.n_interior:
-        return jnp.zeros((0, 3, w.shape[3]))
-    column = jnp.asarray(s.column)[image, : s.n_image_colours].T
-    pick = (column == jnp.arange(s.n_interior)[:, None, None]).astype(float)
-    return jnp.einsum("iqm,qkmp->ikp", pick, w)
+    met = lambda places: x.at[places].get(mode="fill", fill_value=0.0)  # noqa: E731
+    z = z.T - jnp.einsum("pac,pc->pa", h.border, met(h.of_border))
+    z = z.at[h.point].add(-jnp.einsum("rae,re->ra", h.rays, met(h.of_rays)))
+    return Increments(x[:n_eop].reshape(-1, 6).T, x[n_eop:n], jnp.stack(unwhiten(z.T, h.l)))

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.adjustment import Adjustment, TiledStructure, TiledValues
+from jaxphoto.adjustment import Adjustment, PaddedStructure, PaddedValues
 from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.image_orientations import by_image, orientation_derivatives, orientations_of
 from jaxphoto.adjustment.model.numbers import Increments, state_at
@@ -49,8 +49,8 @@ class ListedRows(NamedTuple):
     xy: Float[Numbers, "2 rows"]
     weight: Float[Numbers, "2 rows"]
     """1 / sigma (1/mm)."""
-    of_slot: Int[np.ndarray, "chunks tiles m p"]
-    """The row in each slot of the tiles; the last one where it is empty."""
+    of_slot: Int[np.ndarray, "batches chunks p"]
+    """The row of each ray; the last one where it is none."""
 
 
 class RowProducts(NamedTuple):
@@ -68,7 +68,7 @@ class RowProducts(NamedTuple):
 
 def image_rows(adjusted: Adjustment) -> ListedRows:
     """The image rows of an adjustment."""
-    s, places, tiles = adjusted.structure, adjusted.tiled.places, adjusted.tiled.structure.tiles
+    s, places, rays = adjusted.structure, adjusted.padded.places, adjusted.padded.structure.rays
     n, size = len(s.image), _size(len(s.image) + 1)
 
     def pad(values: np.ndarray) -> np.ndarray:
@@ -77,7 +77,7 @@ def image_rows(adjusted: Adjustment) -> ListedRows:
 
     weight = pad(1 / still(adjusted.values.sigma_xy))
     weight[:, n:] = 0.0
-    of_slot = np.full((*tiles.image.shape, tiles.per_tile), size - 1, np.int32)
+    of_slot = np.full(rays.ray_point.shape, size - 1, np.int32)
     of_slot.reshape(-1)[places.row] = np.arange(n)
     image, point = places.image[s.image].astype(np.int32), places.point[s.point].astype(np.int32)
     return ListedRows(pad(image), pad(point), pad(still(adjusted.values.xy)), weight, of_slot)
@@ -90,7 +90,7 @@ def _size(rows: int) -> int:
 
 
 def row_products(
-    values: TiledValues, scale: Increments, rows: ListedRows, curved: Float[Numbers, ""], s: TiledStructure
+    values: PaddedValues, scale: Increments, rows: ListedRows, curved: Float[Numbers, ""], s: PaddedStructure
 ) -> RowProducts:
     """H and B of all rows at the values, in scaled increments; without the terms that carry r where `curved` is 0."""
     count = -(-len(rows.image) // _AT_ONCE)
@@ -115,7 +115,7 @@ def row_products(
 
 
 def _of_some(
-    values: TiledValues, scale: Increments, rows: ListedRows, curved: Float[Numbers, ""], s: TiledStructure
+    values: PaddedValues, scale: Increments, rows: ListedRows, curved: Float[Numbers, ""], s: PaddedStructure
 ) -> RowProducts:
     image, point = rows.image, rows.point
     q, zero = s.n_image_colours, jax.tree.map(jnp.zeros_like, scale)

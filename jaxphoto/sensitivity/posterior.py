@@ -166,8 +166,8 @@ def posterior(
 
 def _places(adjusted: Adjustment, parameters: Sequence[str]) -> Int[np.ndarray, " parameters"]:
     """Where `parameters` lie among all numbers of the padded state (`_numbers`)."""
-    block, s, tiled = adjusted.block, adjusted.structure, adjusted.tiled
-    n, q, image, point = tiled.structure.n_images, s.n_shared, tiled.places.image, tiled.places.point
+    block, s, padded = adjusted.block, adjusted.structure, adjusted.padded
+    n, q, image, point = padded.structure.n_images, s.n_shared, padded.places.image, padded.places.point
     names = EOP_NAMES["omega_phi_kappa"]
     exterior = {
         f"exterior[{block.images[i]}].{names[k]}": 6 * image[i] + k
@@ -175,7 +175,7 @@ def _places(adjusted: Adjustment, parameters: Sequence[str]) -> Int[np.ndarray, 
     }
     shared = {label: 6 * n + j for j, label in enumerate(s.labels)}
     points = {
-        f"points[{block.points[p]}].{AXES[k]}": 6 * n + q + k * tiled.structure.n_points + point[p]
+        f"points[{block.points[p]}].{AXES[k]}": 6 * n + q + k * padded.structure.n_points + point[p]
         for k, p in zip(*np.nonzero(s.point_free), strict=True)
     }
     places = exterior | shared | points

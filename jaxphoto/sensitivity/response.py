@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment import Adjustment, NormalEquations, TiledStructure, TiledValues
+from jaxphoto.adjustment import Adjustment, NormalEquations, PaddedStructure, PaddedValues
 from jaxphoto.adjustment.model.block_values import unknowns_of, values_of, with_datum
 from jaxphoto.adjustment.model.numbers import UnknownArrays, state_at
 from jaxphoto.arrays import still
@@ -69,12 +69,12 @@ def response(
             "response compares numbers row by row, but the block has other rows than the adjusted one: "
             "change its values, or adjust it anew"
         )
-    direction = jax.tree.map(_difference, adjusted.tiled.pad(moved), equations.values)
+    direction = jax.tree.map(_difference, adjusted.padded.pad(moved), equations.values)
     moves = _of_fixed(direction, equations.structure)
     arguments = (equations, moves, image_rows(adjusted), np.array(float(curvature)))
     state, angles = run_compiled(_response, arguments, adjusted.seconds, "sensitivity")
-    change = unknowns_of(adjusted.tiled.crop_state(state), adjusted.unknowns, s)
-    return Response(change, still(angles)[adjusted.tiled.places.image])
+    change = unknowns_of(adjusted.padded.crop_state(state), adjusted.unknowns, s)
+    return Response(change, still(angles)[adjusted.padded.places.image])
 
 
 def _difference(moved: np.ndarray, before: np.ndarray) -> np.ndarray:
@@ -83,7 +83,7 @@ def _difference(moved: np.ndarray, before: np.ndarray) -> np.ndarray:
     return np.where(both, np.where(both, moved, 0.0) - np.where(both, before, 0.0), 0.0)
 
 
-def _of_fixed(direction: TiledValues, s: TiledStructure) -> TiledValues:
+def _of_fixed(direction: PaddedValues, s: PaddedStructure) -> PaddedValues:
     """The same without what is free: where it starts does not matter."""
     shared = np.array(direction.shared)
     shared[s.free] = 0.0
@@ -101,7 +101,7 @@ def _of_fixed(direction: TiledValues, s: TiledStructure) -> TiledValues:
 
 @eqx.filter_jit
 def _response(
-    equations: NormalEquations, direction: TiledValues, rows: ListedRows, curved: jax.Array
+    equations: NormalEquations, direction: PaddedValues, rows: ListedRows, curved: jax.Array
 ) -> tuple[UnknownArrays, jax.Array]:
     at, s = equations.at, equations.structure
     h, b = eliminated(at, rows, curved), jax.tree.map(jnp.negative, mixed_second(at, direction, curved))

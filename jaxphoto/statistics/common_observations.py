@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.adjustment import Adjustment, NormalEquations, TiledResiduals
+from jaxphoto.adjustment import Adjustment, NormalEquations, PaddedResiduals
 from jaxphoto.adjustment.model.structure import observed_in
 from jaxphoto.compiling import run_compiled
 
@@ -47,7 +47,7 @@ def _weights(adjusted: Adjustment, camera: str, parameters: Sequence[str]) -> We
     which = np.array(own, np.int32)[free]
     seen = run_compiled(_influences, (adjusted.equations.on_one_device, which), adjusted.seconds, "covariance")
     found: Weights = {}
-    each = [adjusted.tiled.crop_residuals(jax.tree.map(lambda v: v[k], seen)) for k in range(len(free))]  # noqa: B023
+    each = [adjusted.padded.crop_residuals(jax.tree.map(lambda v: v[k], seen)) for k in range(len(free))]  # noqa: B023
     for group, names in called.items():
         w = np.zeros((len(parameters), len(names)))
         w[free] = [np.ravel(one[group]) for one in each]
@@ -76,7 +76,7 @@ def _called(adjusted: Adjustment) -> dict[str, list[str]]:
 
 
 @eqx.filter_jit
-def _influences(equations: NormalEquations, which: Int[Array, "parameters"]) -> TiledResiduals:
+def _influences(equations: NormalEquations, which: Int[Array, "parameters"]) -> PaddedResiduals:
     """J N^-1 e of some shared unknowns, in their own units, along a leading axis."""
     at = equations.at
     _, moved = jax.linearize(lambda y: at._replace(increments=y).residuals(), at.increments)

@@ -37,7 +37,7 @@ class Covariance(eqx.Module):
     points: Float[Numbers, "points 3 3"]
     variance_factor: Float[Numbers, ""] | float
     cofactors: Cofactors
-    """In tiles, see `Adjustment.tiled`."""
+    """In padded sizes, see `Adjustment.padded`."""
     rows: RowCofactors | None
     """j Q j' of observations, likewise, where they were asked for."""
     labels: tuple[str, ...] = eqx.field(static=True)
@@ -111,8 +111,8 @@ def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa", *
     cofactors, matrix, points, of_rows = _run(adjusted, rotations, of_rows=rows)
     labels = [f"exterior[{i}].{n}" for i in adjusted.block.images for n in EOP_NAMES[rotations]]
     return Covariance(
-        matrix=adjusted.tiled.crop_reduced(matrix),
-        points=still(points)[adjusted.tiled.places.point],
+        matrix=adjusted.padded.crop_reduced(matrix),
+        points=still(points)[adjusted.padded.places.point],
         variance_factor=adjusted.sigma0**2,
         cofactors=cofactors,
         rows=of_rows,
@@ -129,7 +129,7 @@ def prepare_covariance(equations: NormalEquations, seconds: dict[str, float]) ->
 
 
 def row_cofactors(adjusted: Adjustment, rotations: Rotations) -> RowCofactors:
-    """j Q j' of rows that are computed with their tiles, by the program that `covariance` has run with `rotations`."""
+    """j Q j' of rows that are computed with their points, by the program that `covariance` has run with `rotations`."""
     return _run(adjusted, rotations, of_rows=True)[3]
 
 

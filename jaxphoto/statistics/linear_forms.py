@@ -37,7 +37,7 @@ def linear_forms(
     points (m), of each image its position (m) and small rotations about the axes of its camera (rad), and the shared
     ones in the order of `Structure.labels`, in their own units.
     """
-    equations, places = adjusted.equations.on_one_device.weighed, adjusted.tiled.places
+    equations, places = adjusted.equations.on_one_device.weighed, adjusted.padded.places
     scale = jax.tree.map(still, equations.scale)
 
     def weights(given: Any, at: Any, of: Any) -> Any:

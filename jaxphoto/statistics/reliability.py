@@ -41,8 +41,8 @@ def prepare_statistics(equations: NormalEquations, seconds: dict[str, float]) ->
     s, v = equations.structure, equations.values
     n = 6 * s.n_images + s.n_shared
     at_points = ((g.components, g.components, *np.shape(jax.tree.leaves(g.own)[0])[-2:]) for g in s.with_shared)
-    chunks, tiles, _, *slots = v.xy.shape
-    shapes = (n, n), (s.n_points, 3, 3), (chunks, tiles, 3, *slots), *at_points
+    batches, _, *slots = v.xy.shape
+    shapes = (n, n), (s.n_points, 3, 3), (batches, 3, *slots), *at_points
     reduced, points, image, *others = (np.broadcast_to(0.0, shape) for shape in shapes)
     cofactors, rows = (reduced, points), RowCofactors(image, tuple(others))  # type: ignore[arg-type]
     prepare(_row_variances, (equations, Cofactors._make(cofactors), rows), seconds)
@@ -83,7 +83,7 @@ def redundancy_numbers(adjusted: Adjustment, covariance: Covariance) -> Redundan
     for g, v in zip(adjusted.structure.observed, others, strict=True):
         c, rows = g.components, groups[g.name]
         flat = still(v).reshape(c * c, *np.shape(v)[2:])
-        seen = adjusted.tiled.crop_rows(dataclasses.replace(g, scalar=False), flat)
+        seen = adjusted.padded.crop_rows(dataclasses.replace(g, scalar=False), flat)
         block = np.eye(c) - seen.reshape(c, c, -1).transpose(2, 0, 1)
         numbers = np.diagonal(block, axis1=1, axis2=2).T
         blocks[g.name] = block
@@ -92,7 +92,7 @@ def redundancy_numbers(adjusted: Adjustment, covariance: Covariance) -> Redundan
             numbers = np.einsum("nij,njk,nki->in", np.linalg.inv(w), block, w)
         found.append(numbers[0] if g.scalar else numbers)
     whole = dataclasses.replace(adjusted.residuals, others=tuple(found), datum=np.zeros(adjusted.n_constraints))
-    x, y, both = adjusted.tiled.crop_image(image)
+    x, y, both = adjusted.padded.crop_image(image)
     blocks = {IMAGE_POINTS: np.eye(2) - np.array([[x, both], [both, y]]).transpose(2, 0, 1), **blocks}
     return Redundancy(dataclasses.replace(whole, image=1 - np.stack([x, y])), blocks)
 

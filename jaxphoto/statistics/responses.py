@@ -54,7 +54,7 @@ class Responses(eqx.Module):
         numbers = [np.arange(e - np.size(v), e, dtype=float) for v, e in zip(leaves, ends, strict=True)]
         shaped = [n.reshape(np.shape(v)) for n, v in zip(numbers, leaves, strict=True)]
         numbered = jax.tree.unflatten(structure, shaped)
-        padded: NonImageResiduals = adjusted.tiled.pad_residuals(numbered, float(ends[-1]))
+        padded: NonImageResiduals = adjusted.padded.pad_residuals(numbered, float(ends[-1]))
         if not image_rows:
             padded = NonImageResiduals(padded.others, padded.datum, padded.names)
         laid = np.concatenate([np.ravel(v) for v in jax.tree.leaves(padded)]).astype(np.int32)

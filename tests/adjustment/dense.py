@@ -11,8 +11,8 @@ from jax.flatten_util import ravel_pytree
 
 from jaxphoto.adjustment import Linearised
 from jaxphoto.adjustment.datum import close_datum
+from jaxphoto.adjustment.layout.padded import PaddedResiduals
 from jaxphoto.adjustment.layout.padding import pad_structure
-from jaxphoto.adjustment.layout.tiled import TiledResiduals
 from jaxphoto.adjustment.model.block_values import values_of, with_datum
 from jaxphoto.adjustment.model.numbers import Increments, zero_increments
 from jaxphoto.adjustment.model.structure import structure_of
@@ -20,8 +20,8 @@ from jaxphoto.adjustment.solver.band import factor_band
 from jaxphoto.adjustment.solver.elimination import pull, reduce_right, solve_factored
 from jaxphoto.adjustment.solver.non_image_rows import NonImageRows, non_image_rows
 from jaxphoto.adjustment.solver.optimum import typical_scale, weigh_datum
-from jaxphoto.adjustment.solver.reduced import reduce_normal, tile_numbers, tile_parts
-from jaxphoto.adjustment.solver.tile_rows import TileJacobian
+from jaxphoto.adjustment.solver.ray_rows import RayJacobian
+from jaxphoto.adjustment.solver.reduced import ray_columns, reduce_normal
 from tests.blocks import adjusted
 
 
@@ -34,11 +34,11 @@ def with_constraints(block):
 
 
 def prepared(block, **layout):
-    """The same in tiles, and where everything went."""
+    """The same in padded sizes, and where everything went."""
     values, structure = with_constraints(block)
     coupled = len(values.datum_eop) > 0 or bool(structure.coupled)
-    tiled = pad_structure(structure, dense=coupled, **layout)
-    return tiled.pad(values), tiled.structure, tiled
+    padded = pad_structure(structure, dense=coupled, **layout)
+    return padded.pad(values), padded.structure, padded
 
 
 DAMPINGS = (0.0, 0.7)
@@ -52,7 +52,7 @@ class Dense(NamedTuple):
 
     jacobian: np.ndarray
     residuals: np.ndarray
-    columns: TileJacobian
+    columns: RayJacobian
     """Of image rows: eop (6, 2, rows), and so on."""
     others: NonImageRows
     vector: np.ndarray
@@ -92,15 +92,15 @@ def dense_of(a) -> Dense:
     """Of any adjustment."""
     equations = a.equations
     whole = jax.tree.map(np.asarray, _dense(equations.values, equations.structure))
-    unknowns, rows = own_order(equations.values, a.tiled)
+    unknowns, rows = own_order(equations.values, a.padded)
     image = rows[: 2 * len(a.structure.image)].reshape(2, -1)
 
     def by_row(v):
-        parts = [part.reshape(-1)[image] for part in np.moveaxis(np.asarray(v), 2, 0)]
+        parts = [part.reshape(-1)[image] for part in np.moveaxis(np.asarray(v), 1, 0)]
         return np.stack(parts) if parts else np.zeros((0, *image.shape))
 
     c = whole.columns
-    columns = TileJacobian(c.residual.reshape(-1)[image], *map(by_row, (c.eop, c.shared, c.point)))
+    columns = RayJacobian(c.residual.reshape(-1)[image], *map(by_row, (c.eop, c.shared, c.point)))
     names = ("vector", "gradient", "sums", "solutions", "scale")
     return whole._replace(
         jacobian=whole.jacobian[np.ix_(rows, unknowns)],
@@ -124,13 +124,13 @@ def in_order(residuals) -> np.ndarray:
 
 
 def in_one_list(residuals):
-    """Residuals in tiles as one list: image points, the other groups, the datum."""
+    """Residuals in padded sizes as one list: image points, the other groups, the datum."""
     return jnp.concatenate([jnp.ravel(v) for v in (residuals.image, *residuals.others, residuals.datum)])
 
 
-def own_order(values, tiled):
-    """Of the block's own unknowns and residuals, in their order: their places among those in tiles."""
-    padded, places = tiled.structure, tiled.places
+def own_order(values, block):
+    """Of the block's own unknowns and residuals, in their order: their places among the padded ones."""
+    padded, places = block.structure, block.places
     zero = zero_increments(padded)
     flat, back = ravel_pytree(zero)
     index = back(jnp.arange(len(flat), dtype=float))
@@ -140,7 +140,7 @@ def own_order(values, tiled):
     leaves = (like.image, *like.others, like.datum)
     flat, back = ravel_pytree([np.zeros(v.shape) for v in leaves])
     image, *others, datum = back(jnp.arange(len(flat), dtype=float))
-    rows = tiled.crop_residuals(TiledResiduals(tuple(others), datum, like.names, image))
+    rows = block.crop_residuals(PaddedResiduals(tuple(others), datum, like.names, image))
     return unknowns, in_order(rows).astype(int)
 
 
@@ -157,7 +157,7 @@ def rows_of(a) -> Rows:
     """Of any adjustment."""
     equations = a.equations
     jacobian, residuals, sums, scale = map(np.asarray, _rows(equations.values, equations.structure))
-    unknowns, rows = own_order(equations.values, a.tiled)
+    unknowns, rows = own_order(equations.values, a.padded)
     return Rows(jacobian[np.ix_(rows, unknowns)], residuals[rows], sums[unknowns], scale[unknowns] > 0)
 
 
@@ -170,7 +170,7 @@ def _rows(values, structure):
 
 
 def _linearised(at):
-    """The Jacobian and the residuals, in the order of the tiles."""
+    """The Jacobian and the residuals, in padded order."""
     flat, back = ravel_pytree(at.increments)
     residuals, product = jax.linearize(jax.jit(lambda y: at._replace(increments=y).residuals()), at.increments)
     by_unknown = jax.vmap(lambda seed: in_one_list(product(back(seed))), out_axes=1)(jnp.eye(len(flat)))
@@ -186,8 +186,12 @@ def _dense(values, structure) -> Dense:
     flat, back = ravel_pytree(zero)
     jacobian, residuals = _linearised(at)
     rest = non_image_rows(at)
-    both = jax.vmap(jax.vmap(lambda n: tile_parts(at, 0.0, rest.coupled)(n).columns))(tile_numbers(at, rest))
-    columns = jax.tree.map(lambda x, y: jnp.stack([x, y], axis=-3), *both)
+    numbers = structure.rays.chunk_image, structure.ray_points, values.xy, values.sigma_xy
+    columns = jax.tree.map(lambda x, y: jnp.stack([x, y], axis=-3), *jax.vmap(ray_columns(at))(numbers))
+    # Those of points in scaled increments.
+    columns = columns._replace(
+        point=columns.point * jnp.moveaxis(scale.points[:, structure.ray_points], 0, 1)[:, :, None]
+    )
     flat_scale = ravel_pytree(scale)[0]
     vector = jnp.sin(1.0 + jnp.arange(len(flat))) * (flat_scale > 0)
 
@@ -218,7 +222,7 @@ def _dense(values, structure) -> Dense:
 
 
 def assemble(dense: Dense, s) -> np.ndarray:
-    """The dense Jacobian of image rows that the tiles' columns stand for."""
+    """The dense Jacobian of image rows that the columns of rays stand for."""
     e, q, n = 6 * s.n_images, s.n_shared, len(s.image)
     result = np.zeros((2 * n, e + q + 3 * s.n_points + 1))
     each = np.arange(n)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.sharding import Mesh, PartitionSpec
 
-from jaxphoto.adjustment.layout.tile_layout import column_blocks
+from jaxphoto.adjustment.layout.rays import column_blocks
 from jaxphoto.adjustment.solver.band import (
     Band,
     BandFactor,

@@ -90,11 +90,11 @@ def test_the_optimum_is_that_of_a_search_over_the_principal_distance(seed):
     """Dense Gauss-Newton for each c, from the truth, and the c of the least square sum: no valley is followed."""
     block, truth = flat(seed).block, flat(seed).truth
     laid = lay_out(block, truth, block.priors, alone=True)
-    values, structure = laid.tiled_values, laid.tiled.structure
+    values, structure = laid.padded_values, laid.padded.structure
     scale = typical_scale(values, structure)
     flat_scale, back = ravel_pytree(scale)
     free = np.flatnonzero(flat_scale > 0)
-    (j,) = [k for k, label in enumerate(laid.tiled.own.labels) if label.endswith("c_mm")]
+    (j,) = [k for k, label in enumerate(laid.padded.own.labels) if label.endswith("c_mm")]
     c = int(np.searchsorted(free, scale.eop.size + j))
 
     def at(x):
@@ -126,8 +126,8 @@ def test_the_optimum_is_that_of_a_search_over_the_principal_distance(seed):
     deviation = np.zeros(flat_scale.shape)
     deviation[free] = np.sqrt(np.diag(covariance))
     eop, shared, points = jax.tree.map(np.multiply, back(deviation), scale)
-    theirs = laid.tiled.crop_state(state_at(at(x), scale, values, structure))
-    places, ours = laid.tiled.places, optimum(seed).unknowns
+    theirs = laid.padded.crop_state(state_at(at(x), scale, values, structure))
+    places, ours = laid.padded.places, optimum(seed).unknowns
     assert abs(float(ours.interior["kodak"].c - theirs.shared[0])) < 1e-5 * shared[j]
     off = np.asarray(ours.exterior.position) - np.asarray(theirs.position).T
     assert (np.abs(off) < 1e-5 * np.asarray(eop[:3, places.image]).T).all()
@@ -146,7 +146,7 @@ def test_the_right_hand_side_of_other_residuals(name):
     """J'r with r elsewhere, less what is subtracted: what the acceleration is solved from."""
     block = simulated(name).block
     laid = lay_out(block, block.start.unknowns, block.priors, alone=True)
-    values, structure = laid.tiled_values, laid.tiled.structure
+    values, structure = laid.padded_values, laid.padded.structure
     scale = typical_scale(values, structure)
     free, back = ravel_pytree(jax.tree.map(lambda v: v > 0, scale))
     zero = back(jnp.zeros(free.shape))

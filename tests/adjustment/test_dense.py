@@ -10,7 +10,8 @@ from jax.flatten_util import ravel_pytree
 
 from jaxphoto import adjust, covariance
 from jaxphoto.adjustment import Linearised
-from jaxphoto.adjustment.layout.tile_layout import sizes_of
+from jaxphoto.adjustment.layout import padding
+from jaxphoto.adjustment.layout.rays import sizes_of
 from jaxphoto.adjustment.model.numbers import state_at, zero_increments
 from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.adjustment.solver.band import factor_band
@@ -33,7 +34,7 @@ FREE_NETWORKS = {"inner": 6, "inner_images": 6, "inner_some": 6, "inner_scale": 
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_tiles_give_the_jacobian_of_image_rows_entry_by_entry(name):
+def test_rays_give_the_jacobian_of_image_rows_entry_by_entry(name):
     a, dense = adjusted(name), at_optimum(name)
     found = assemble(dense, a.structure)
     expected = dense.jacobian[: len(found)]
@@ -73,15 +74,14 @@ def test_elimination_solves_the_dense_normal_equations(name, damping):
 
 @pytest.mark.parametrize("damping", DAMPINGS)
 @pytest.mark.parametrize("name", slow_but(("inner",), ("everything", "surfaces", "inner", "minimal")))
-def test_many_tiles_solve_the_normal_equations(name, damping):
-    """Several groups of tiles, some of them padding: F is made anew, or the rows are gone through for one solution.
-
-    Products are those of the whole Jacobian.
-    """
+def test_many_batches_solve_the_normal_equations(name, damping, monkeypatch):
+    """Several batches of rays and pairs, some of them padding. Products are those of the whole Jacobian."""
+    for limit in ("_RAYS", "_PAIRS", "_FEWEST"):
+        monkeypatch.setattr(padding, limit, 256)
     block = simulated(name).block
-    sizes = sizes_of(structure_of(block, block.priors))._replace(tiles=50, tile_images=24, tile_points=16)
+    sizes = sizes_of(structure_of(block, block.priors))._replace(point_groups=40, chunks=140, pair_chunks=900)
     values, s, _ = prepared(block, sizes=sizes)
-    assert not s.tiles.few and s.tiles.batches.max() < s.tiles.image.shape[1] // s.tiles.at_once
+    assert 1 < s.rays.used[0, 0] < len(s.rays.chunk_image) and 1 < s.rays.used[0, 1] < len(s.rays.pair)
     # An array, so that one program serves all of them.
     b, *others = _solved(weigh_datum(values, s), s, np.asarray(damping))
     for found in others:
@@ -91,7 +91,7 @@ def test_many_tiles_solve_the_normal_equations(name, damping):
 
 @eqx.filter_jit
 def _solved(values, s, damping):
-    """J'r by sums and by a gradient, and (N + damping W) x for the x that solves it, by F and row by row."""
+    """J'r by sums and by a gradient, and (N + damping W) x for the x that solves it, taken down at once or before."""
     scale = typical_scale(values, s)
     at = Linearised(zero_increments(s), scale, values, s)
     a, reduced, right = reduce_normal(at, damping)
@@ -102,9 +102,9 @@ def _solved(values, s, damping):
     def multiplied(x):
         return jax.tree.map(lambda nx, w, x: nx + damping * w * x, pull(push(x))[0], reduced.weight, x)
 
-    by_f = solve_factored(reduced, factor, right.b, at)
-    by_rows = solve_reduced(reduced, factor, right.reduced, right.d, right.b.points, at)
-    return right.b, pull(at.residuals())[0], multiplied(by_f), multiplied(by_rows)
+    at_once = solve_factored(reduced, factor, right.b, at)
+    before = solve_reduced(reduced, factor, right.reduced, right.d, right.b.points, at)
+    return right.b, pull(at.residuals())[0], multiplied(at_once), multiplied(before)
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -196,7 +196,7 @@ def test_redundancy_numbers(name):
 @pytest.mark.parametrize("name", slow_but(("inner",), ("everything", "inner")))
 def test_scipy_finds_the_same_optimum(name):
     """scipy's dense least squares on the same residuals, from the same start."""
-    values, s, tiled = prepared(simulated(name).block)
+    values, s, padded = prepared(simulated(name).block)
     _, back = ravel_pytree(zero_increments(s))
 
     def setup(values):
@@ -227,7 +227,7 @@ def test_scipy_finds_the_same_optimum(name):
     a = adjusted(name)
     assert abs(2 * found.cost / float(a.square_sum) - 1) < 1e-9
     increments = jax.tree.map(lambda y, k: y * k, back(spread(found.x)), scale)
-    state = tiled.crop_state(jax.jit(lambda x: state_at(x, unit_scale(s), values, s))(increments))
+    state = padded.crop_state(jax.jit(lambda x: state_at(x, unit_scale(s), values, s))(increments))
     cov = covariance_of(name)
     sigma = np.sqrt(np.diag(np.asarray(cov.matrix)))
     exterior = sigma[: 6 * a.structure.n_images].reshape(-1, 6)

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust, covariance
-from jaxphoto.adjustment.layout import tile_layout, tiling
+from jaxphoto.adjustment.layout import padding, rays
 from jaxphoto.adjustment.layout.padding import pad_structure
 from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.compiling.lru_cache import LruCache
 from jaxphoto.statistics import redundancy_numbers
-from tests.blocks import BROWN, Scene, adjusted, all_stations, bare, free, measured, rows, simulated
+from tests.blocks import BROWN, Scene, adjusted, all_stations, bare, free, measured, simulated
+from tests.blocks import rows as control_rows
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +27,7 @@ def corridor():
     points = np.column_stack([rng.uniform(-300, 9100, 420), rng.uniform(-250, 250, 420), rng.uniform(0, 120, 420)])
     order = rng.permutation(n)
     block, truth = bare(Scene(positions[order], angles[order], points), {"one": BROWN}, ("one",) * n)
-    block = dataclasses.replace(block, control=rows((3, 100, 200, 300)), stations=all_stations(block))
+    block = dataclasses.replace(block, control=control_rows((3, 100, 200, 300)), stations=all_stations(block))
     return measured(type(simulated("cross"))(free(block, "one"), truth)).block
 
 
@@ -60,26 +61,22 @@ def assert_same(one, other):
 def test_a_banded_reduced_matrix_gives_what_a_dense_one_gives(corridor, monkeypatch):
     start = corridor.start.unknowns
     padded = pad_structure(structure_of(corridor, corridor.priors)).structure
-    assert padded.tiles.columns >= 5
+    assert padded.rays.columns >= 5
     banded = everything(corridor, start)
-    monkeypatch.setattr(tile_layout, "column_blocks", lambda n, bandwidth: (1, n))
+    monkeypatch.setattr(rays, "column_blocks", lambda n, bandwidth: (1, n))
     monkeypatch.setattr("jaxphoto.adjustment.adjust._layouts", LruCache(1))
     dense = everything(corridor, start)
-    assert dense[0].tiled.structure.tiles.columns == 1
+    assert dense[0].padded.structure.rays.columns == 1
     assert_same(banded, dense)
 
 
 @pytest.mark.slow
-def test_one_small_tile_at_a_time_gives_what_many_together_give(monkeypatch):
+def test_batches_one_at_a_time_give_what_one_gives(monkeypatch):
     block, start = simulated("three_models").block, adjusted("three_models").unknowns
     together = everything(block, start)
-    monkeypatch.setattr(tiling, "_SLOTS", 1)
-    monkeypatch.setattr(tile_layout, "_CHUNK", 20_000)
-    for module in (tiling, tile_layout):
-        monkeypatch.setattr(module, "TILE_STEP", 4)
+    for name in ("_RAYS", "_PAIRS", "_FEWEST"):
+        monkeypatch.setattr(padding, name, 256)
     monkeypatch.setattr("jaxphoto.adjustment.adjust._layouts", LruCache(1))
     alone = everything(block, start)
-    tiles = alone[0].tiled.structure.tiles
-    assert tiles.at_once == 1
-    assert len(tiles.image) > 1
+    assert (alone[0].padded.structure.rays.used > 1).all()
     assert_same(together, alone)

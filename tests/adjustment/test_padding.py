@@ -11,8 +11,7 @@ from jaxphoto import FIXED, ExteriorOrientation, adjust, covariance
 from jaxphoto.adjustment import common_sizes
 from jaxphoto.adjustment.adjust import lay_out
 from jaxphoto.adjustment.layout.padding import pad_structure
-from jaxphoto.adjustment.layout.tile_layout import Sizes, sizes_of
-from jaxphoto.adjustment.layout.tiling import TILE_STEP, size_class
+from jaxphoto.adjustment.layout.rays import Sizes, size_class, sizes_of
 from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.block import Block
 from jaxphoto.compiling import run
@@ -58,19 +57,19 @@ def test_a_layout_is_kept_for_blocks_that_differ_in_numbers_only():
         lay_out(block, start, block.priors),
         lay_out(block.shift_stations([1.0, 0.0, 0.0]), start, block.priors),
     )
-    assert again.tiled is first.tiled
-    numbers = [jax.tree.leaves(laid.tiled_values.groups) for laid in (first, again)]
+    assert again.padded is first.padded
+    numbers = [jax.tree.leaves(laid.padded_values.groups) for laid in (first, again)]
     assert any(not np.array_equal(one, other) for one, other in zip(*numbers, strict=True))
     # FIXED is structure, and is no number.
     held = dataclasses.replace(block.priors, exterior=ExteriorOrientation(FIXED, FIXED))
-    assert not lay_out(block, start, held).tiled.structure.eop_free.any()
+    assert not lay_out(block, start, held).padded.structure.eop_free.any()
     # The same shapes with other indices, and unknowns in another order.
     stations = dataclasses.replace(block.stations, who=block.stations.who[::-1])
     turned = dataclasses.replace(block, stations=stations)
-    one, other = (laid.tiled.own.observed[0] for laid in (first, lay_out(turned, start, block.priors)))
+    one, other = (laid.padded.own.observed[0] for laid in (first, lay_out(turned, start, block.priors)))
     assert one.name == other.name == "stations"
     np.testing.assert_array_equal(other.image, one.image[:, ::-1])
-    assert lay_out(block, start, block.priors, Sizes(images=64)).tiled.structure.n_images == 64
+    assert lay_out(block, start, block.priors, Sizes(images=64)).padded.structure.n_images == 64
 
 
 def test_a_layout_follows_the_order_of_a_scanners_strips():
@@ -82,7 +81,7 @@ def test_a_layout_follows_the_order_of_a_scanners_strips():
 
     start, priors = reordered(block.start.unknowns), reordered(block.priors)
     turned = dataclasses.replace(block, start=dataclasses.replace(block.start, unknowns=start), priors=priors)
-    one, other = (lay_out(b, b.start.unknowns, b.priors).tiled.own.labels for b in (block, turned))
+    one, other = (lay_out(b, b.start.unknowns, b.priors).padded.own.labels for b in (block, turned))
     assert sorted(one) == sorted(other)
     assert one != other
 
@@ -91,15 +90,13 @@ def test_a_padded_structure_has_the_sizes_asked_for():
     for name in VARIANTS:
         block = simulated(name).block
         structure = structure_of(block, block.priors)
-        sizes = sizes_of(structure)._replace(blocks=333, rows=(("stations", 150),))
-        tiled = pad_structure(structure, sizes)
-        s, places = tiled.structure, tiled.places
-        assert s.tiles.block.shape[1] >= 333
+        sizes = sizes_of(structure)._replace(pair_chunks=3333, rows=(("stations", 150),))
+        padded = pad_structure(structure, sizes)
+        s, places = padded.structure, padded.places
+        assert np.prod(s.rays.block.shape[:2]) >= 3333
         assert all(g.n_rows >= 150 for g in s.observed if g.name == "stations")
-        assert s.tiles.image.shape[1] % TILE_STEP == 0
         assert s.n_images > structure.n_images
         # What is padding depends on nothing and is held.
-        assert (np.diff(s.tiles.pair_block) >= 0).all()
         assert s.eop_free.sum() == structure.eop_free.sum() and s.point_free.sum() == structure.point_free.sum()
         assert s.n_images - 1 not in places.image
 
@@ -107,7 +104,7 @@ def test_a_padded_structure_has_the_sizes_asked_for():
 def test_larger_sizes_change_no_result():
     block = simulated("everything").block
     small, sizes = adjusted("everything"), sizes_of(structure_of(block, block.priors))
-    wide = sizes._replace(images=40, tiles=50, tile_images=24, tile_points=16, blocks=500, rows=(("stations", 300),))
+    wide = sizes._replace(images=40, point_groups=50, chunks=100, pair_chunks=900, rows=(("stations", 300),))
     large = adjust(block, small.unknowns, sizes=wide)
     for one, two in zip(small.residuals.named.values(), large.residuals.named.values(), strict=True):
         np.testing.assert_allclose(two, one, rtol=0, atol=1e-7)

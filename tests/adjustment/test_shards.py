@@ -85,7 +85,7 @@ def main(cases: str, folder: str) -> None:
         with mock.patch.object(adjust, "_devices_worth_using", lambda rows, n=n: usable(int(n))):
             result = jaxphoto.adjust(block, block.start.unknowns)
         assert result.outcome is jaxphoto.Outcome.CONVERGED
-        held = result.equations.structure.tiles.shards
+        held = result.equations.structure.rays.shards
         np.savez(Path(folder) / f"{name}_{n}_{process}.npz", shards=held, **numbers_of(result))
 
 

@@ -207,7 +207,7 @@ def test_first_order_matrix_is_the_dense_one() -> None:
     s, scale, values = a.equations.structure, a.equations.scale, a.equations.weighed.values
     flat, back = ravel_pytree(jax.tree.map(np.zeros_like, scale))
     at = lambda y: in_one_list(Linearised(back(y), scale, values, s).residuals())  # noqa: E731
-    unknowns, rows = own_order(values, a.tiled)
+    unknowns, rows = own_order(values, a.padded)
     j = np.asarray(jax.jit(jax.jacfwd(at))(flat))[np.ix_(rows, unknowns)]
     coupled = j[couples(a)]
     distances = coupled[: len(coupled) - len(a.residuals.datum)]

@@ -51,6 +51,6 @@ def test_gradient_of_statistics_in_jit_and_vmap() -> None:
 
 def test_statistics_of_a_batch_are_asked_for_inside() -> None:
     nominal = adjusted("cross")
-    values = jax.tree.map(lambda v: np.stack([v, v]), nominal.tiled_values)
+    values = jax.tree.map(lambda v: np.stack([v, v]), nominal.padded_values)
     with pytest.raises(ValueError, match="inside the function that jax"):
-        _ = dataclasses.replace(nominal, tiled_values=values, factored=None).equations
+        _ = dataclasses.replace(nominal, padded_values=values, factored=None).equations

@@ -36,12 +36,10 @@ def dense_products():
     Compiled once, beside them: which of the columns of shared unknowns there are.
     """
     a = corrected()
-    own, places, equations = a.structure, a.tiled.places, a.equations
+    own, places, equations = a.structure, a.padded.places, a.equations
     s, scale = equations.structure, jax.tree.map(jnp.asarray, equations.scale)
     values, zero = jax.tree.map(jnp.asarray, equations.weighed.values), jax.tree.map(jnp.zeros_like, scale)
-    tile, slot = np.divmod(places.row[ROW], s.tiles.image.shape[2] * s.tiles.per_tile)
-    chunk, tile = np.divmod(tile, s.tiles.image.shape[1])
-    m, p = np.divmod(slot, s.tiles.per_tile)
+    batch, m, p = np.unravel_index(places.row[ROW], s.rays.ray_point.shape)
     image, point = places.image[own.image[ROW]], places.point[own.point[ROW]]
     columns = np.asarray(image_columns(s))[image, 6:] - 6 * s.n_images
 
@@ -49,11 +47,11 @@ def dense_products():
         """Half the square of the row's residuals, with the second derivative J'J + curved r d2r."""
         shared = zero.shared.at[columns].add(y[9:], mode="drop")
         moved = Increments(zero.eop.at[:, image].set(y[:6]), shared, zero.points.at[:, point].set(y[6:9]))
-        v = eqx.tree_at(lambda v: v.xy, values, jnp.asarray(values.xy).at[chunk, tile, :, m, p].set(xy))
-        r = Linearised(moved, scale, v, s).residuals().image[chunk, tile, :, m, p]
+        v = eqx.tree_at(lambda v: v.xy, values, jnp.asarray(values.xy).at[batch, :, m, p].set(xy))
+        r = Linearised(moved, scale, v, s).residuals().image[batch, :, m, p]
         return jnp.sum(0.5 * r * r - (1 - curved) * jax.lax.stop_gradient(r) * r)
 
-    at = jnp.zeros(9 + len(columns)), jnp.asarray(values.xy)[chunk, tile, :, m, p]
+    at = jnp.zeros(9 + len(columns)), jnp.asarray(values.xy)[batch, :, m, p]
     return functools.partial(jax.jit(jax.hessian(half_square, (0, 1))), *at), columns < s.n_shared
 
 

@@ -99,7 +99,7 @@ def test_the_estimate_is_the_fixed_point(components):
 
 
 def test_it_is_adjusted_again_by_the_program_that_adjusted_it(monkeypatch):
-    sizes = LEAST._replace(tiles=50)
+    sizes = LEAST._replace(chunks=50)
 
     def solved(block, start, priors, max_steps, asked):
         raise InputError(f"{asked == sizes}")

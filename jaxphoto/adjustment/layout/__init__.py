@@ -1,1 +1,1 @@
-"""How a block lies in memory: points in tiles with the images that see them, padded sizes, several devices."""
+"""How a block lies in memory: rays in chunks of an image, padded sizes, several devices."""

@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from jaxphoto.adjustment.layout.tile_layout import NO_SLOT, Places
-from jaxphoto.adjustment.layout.tiled import TiledStructure
-from jaxphoto.adjustment.layout.tiling import size_class
+from jaxphoto.adjustment.layout.padded import PaddedStructure
+from jaxphoto.adjustment.layout.rays import NO_SLOT, Places, size_class
 from jaxphoto.adjustment.model.numbers import Values
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints, RowsInList
 from jaxphoto.adjustment.model.row_functions import rows_of
@@ -33,7 +32,7 @@ def pad_groups(
 ) -> tuple[ObservedGroup, ...]:
     """The groups of a structure in padded sizes: `rows` are wanted at least, `width` is images of a column block.
 
-    `slots` say of groups by point which of their tile's shared unknowns rows touch.
+    `slots` say of groups by point which of their group's shared unknowns rows touch.
     """
 
     def padded(g: ObservedGroup) -> ObservedGroup:
@@ -108,7 +107,7 @@ def _row_places(g: ObservedGroup, places: Places, n_points: int) -> Int[np.ndarr
     return result
 
 
-def pad_rows(v: Values, s: Structure, padded: TiledStructure, places: Places) -> tuple[RowsInList | RowsAtPoints, ...]:
+def pad_rows(v: Values, s: Structure, padded: PaddedStructure, places: Places) -> tuple[RowsInList | RowsAtPoints, ...]:
     """The numbers of all rows in the sizes and the order of the padded structure."""
     groups = zip(s.observed, padded.observed, v.groups, strict=True)
     return tuple(_pad_numbers(g, wide, numbers, places) for g, wide, numbers in groups)

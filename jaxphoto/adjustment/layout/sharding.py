@@ -1,6 +1,6 @@
-"""Several devices: tiles and their points are dealt out over a mesh, everything else is on every device.
+"""Several devices: rays and their points are dealt out over a mesh, everything else is on every device.
 
-Each device sums its own tiles; the sums of the reduced normal matrix are added across devices
+Each device sums its own rays; the sums of the reduced normal matrix are added across devices
 (`model.structure.total`), and each factors the result for itself. So nothing but sums the size of the reduced matrix
 ever travels.
 """
@@ -12,12 +12,12 @@ import equinox as eqx
 import jax
 from jax.sharding import PartitionSpec as P
 
-from jaxphoto.adjustment.layout.tiled import TiledStructure
+from jaxphoto.adjustment.layout.padded import PaddedStructure
 from jaxphoto.devices import AXIS, mesh_of
 
 EVERYWHERE: Any = P()
-TILES: Any = P(AXIS)
-"""Dealt out along the first axis, that of chunks of tiles."""
+BATCHES: Any = P(AXIS)
+"""Dealt out along the first axis, that of batches."""
 
 
 def along_points(ndim: int) -> Any:
@@ -25,12 +25,12 @@ def along_points(ndim: int) -> Any:
     return P(*[None] * (ndim - 1), AXIS)
 
 
-_OF_TILES = {"xy", "sigma_xy", "met", "pair_tile", "pair_images", "pair_block", "block", "batches", "f"}
+_OF_RAYS = {"xy", "sigma_xy", "met", "chunk_image", "ray_point", "pair", "block", "used", "f", "border"}
 _OF_ROWS = {"parameter", "column", "slot"}
 _OF_POINTS = {"points", "datum_points", "point_free", "l"}
 
 
-def sharded(function: Callable[..., Any], structure: TiledStructure, out: Any) -> Callable[..., Any]:
+def sharded(function: Callable[..., Any], structure: PaddedStructure, out: Any) -> Callable[..., Any]:
     """`function` on what each device holds; itself where there is one device.
 
     Its arguments are cut by the names of their fields; `out` says how its result is, as a prefix of that tree.
@@ -60,9 +60,9 @@ def _spec(path: tuple[Any, ...], array: Any) -> P:
         return along_points(array.ndim)
     if "listed" in names:
         return EVERYWHERE
-    # The images of tiles, not those of the rows of a block.
-    if name in _OF_TILES or (name == "image" and array.ndim >= 3):
-        return TILES
+    # Those of rays, not those of the rows of a group.
+    if name in _OF_RAYS and "observed" not in names:
+        return BATCHES
     # What rows by point touch, not what those in lists do.
     if name in _OF_ROWS and array.ndim == 3:
         return along_points(array.ndim)

@@ -98,7 +98,7 @@ def orientation_derivatives(
 
 
 def of_images(tree: Any, image: Array, s: AbstractStructure) -> Any:
-    """The parts of a `ImageOrientations` or of `OrientationDerivatives` that belong to a tile's images."""
+    """The parts of a `ImageOrientations` or of `OrientationDerivatives` that belong to the images of chunks."""
     take = lambda a: a.at[image].get(mode="promise_in_bounds")  # noqa: E731
     cameras = tuple(take(c) if by_image(g, s) else c for g, c in zip(s.groups, tree.cameras, strict=True))
     return type(tree)(take(tree.centre), take(tree.rotation), cameras)

@@ -2,7 +2,7 @@
 
 Increments are scaled and small: `unknown = start (+) scale * increment`, rotations by a small rotation in the
 camera frame. Arrays are batch-last (components first, rows last), which XLA vectorises best on a CPU. Image rows are
-computed in their tiles (`solver.tile_rows`), all others row by row (`row_functions`).
+computed in chunks of an image's rays (`solver.ray_rows`), all others row by row (`row_functions`).
 """
 
 from typing import NamedTuple

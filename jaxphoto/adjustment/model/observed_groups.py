@@ -4,7 +4,7 @@ What the rows of a group touch decides how they are eliminated; nobody declares 
 
     reduced     no point: rows add to the reduced normal matrix, where images and shared unknowns meet
     point       one point and no image: they add to the point's own block before it is eliminated, and meet few of
-                the shared unknowns there (`layout.tiled.Tiles.met`)
+                the shared unknowns there (`layout.padded.RayLists.met`)
     coupled     all else, such as two points, or a point and an image: few rows, that extra unknowns carry
                 (`solver.normal`)
 """
@@ -84,11 +84,11 @@ class ObservedGroup(eqx.Module):
     column: Int[np.ndarray, "l *_"]
     """The shared unknowns that they are; the number of these where a row has none."""
     slot: Int[np.ndarray, "l _ _"]
-    """Of rows by point, which of the shared unknowns of the point's tile they are, see `Tiles.met`; else empty."""
+    """Of rows by point, which of the shared unknowns of the point's group they are, see `RayLists.met`; else empty."""
     loss: AbstractLoss | LinearisedLoss | None
     """What rows cost, where it is not their square."""
     pair: Int[np.ndarray, "pairs rows 4"]
-    """Of a padded structure: where two images of a row meet in the band (see `Tiles.block`), and whether transposed."""
+    """Of a padded structure: where two images of a row meet in the band (`RayLists.block`), and whether transposed."""
 
     @property
     def own(self) -> AbstractObservations:

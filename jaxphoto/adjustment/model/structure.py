@@ -5,8 +5,8 @@
     colours     each image touches few shared unknowns; unknowns of different cameras, mounts or strips carry the
                 same colour, so one seed differentiates all of them at once
     groups      all observations but image rows, see `observed_groups`
-    tiles       points with the images that see them: a `layout.tiled.TiledStructure` is what is computed with, its
-                images and points in the order of the tiles
+    rays        image rows, each of one image and one point: a `layout.padded.PaddedStructure` is what is computed with,
+                its images and points ordered so that those which meet lie close
 
 All arrays are arguments of the compiled functions, never constants in them: a new block of the same shapes
 compiles nothing.
@@ -54,7 +54,7 @@ from jaxphoto.unknowns import FIXED, Unknowns
 
 
 class AbstractStructure(eqx.Module):
-    """Index arrays and sizes that a block has as given and in tiles."""
+    """Index arrays and sizes that a block has as given and in padded sizes."""
 
     groups: tuple[CameraGroup, ...]
     tables: tuple[ParameterTable, ...]

@@ -1,1 +1,1 @@
-"""How it is solved: sums over tiles, the reduced normal matrix and its factor, Levenberg-Marquardt, the inverse."""
+"""How it is solved: sums over rays, the reduced normal matrix and its factor, Levenberg-Marquardt, the inverse."""

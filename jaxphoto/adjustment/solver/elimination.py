@@ -1,8 +1,6 @@
 """Solution of the normal equations: right-hand sides go down to the reduced unknowns, solutions back to the points.
 
-Both ways lead through F, see `normal`. The F of a small block is kept; that of a large one takes longer to fetch from
-memory than to make anew, a few tiles at a time. One solution, not one of many, comes back to the points by two
-derivatives of the image rows instead, in a direction and back: W' x = J_p' (J_e x).
+Both ways lead through F, see `normal`.
 """
 
 from collections.abc import Callable
@@ -14,17 +12,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure
+from jaxphoto.adjustment.layout.padded import PaddedResiduals, PaddedStructure
+from jaxphoto.adjustment.layout.rays import GROUP
 from jaxphoto.adjustment.model.image_orientations import ImageOrientations, of_images, orientations_of
 from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals, datum_residuals, state_at
 from jaxphoto.adjustment.model.observed_groups import RowsAtPoints
 from jaxphoto.adjustment.model.row_functions import non_image_residuals, row_jacobian, rows_at_once
 from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.band import BandFactor, solve_band
-from jaxphoto.adjustment.solver.non_image_rows import non_image_rows
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced
-from jaxphoto.adjustment.solver.reduced import tile_columns, tile_numbers, tile_parts
-from jaxphoto.adjustment.solver.tile_rows import seen_in, tile_residuals
+from jaxphoto.adjustment.solver.ray_rows import points_at, ray_residuals, seen_in
+from jaxphoto.adjustment.solver.reduced import add_rows, border_places, image_places, ray_columns
 from jaxphoto.arrays import added
 from jaxphoto.linear_algebra import solve
 from jaxphoto.short_repr import shown
@@ -40,46 +38,32 @@ class FactoredNormal(eqx.Module):
     scale: Increments
 
 
-def over_tiles(function: Callable, at: Linearised, reduced: Reduced, numbers: tuple) -> Any:
-    """`function(F, images, *numbers)` of every tile, for the F of `reduced`, linearised `at`."""
-    if reduced.f is None:
-        rest = non_image_rows(at)
-        parts_of = tile_parts(at, reduced.damping, rest.coupled)
-        given, f_of = tile_numbers(at, rest), lambda given: parts_of(given).f
-    else:
-        given, f_of = reduced.f, lambda f: f
-
-    def tile(of_tile):
-        image, given, *own = of_tile
-        return function(f_of(given), image, *own)
-
-    return at.structure.each_tile(tile, (given, *numbers))
-
-
 def solve_factored(reduced: Reduced, factor: BandFactor, b: Increments, at: Linearised) -> Increments:
-    """x of (N + damping diag(N)) x = b, one of many: down to the reduced unknowns, and back to the points."""
-    return solve_reduced(reduced, factor, *reduce_right(reduced, b, at), b.points, at, many=True)
+    """x of (N + damping diag(N)) x = b: down to the reduced unknowns, and back to the points."""
+    return solve_reduced(reduced, factor, *reduce_right(reduced, b, at), b.points, at)
 
 
 def reduce_right(reduced: Reduced, b: Increments, at: Linearised) -> tuple[Array, Array]:
     """A right-hand side taken down to the reduced unknowns and to mu."""
-    s = at.structure
-    if not s.tiles.free_points:
-        return jnp.concatenate([b.eop.T.reshape(-1), b.shared]), jnp.zeros(len(reduced.k))
+    s, k = at.structure, len(reduced.k)
+    if not s.rays.free_points:
+        return jnp.concatenate([b.eop.T.reshape(-1), b.shared]), jnp.zeros(k)
     z = jnp.stack(whiten(b.points, reduced.l))
-    image, z = s.tiles.image, s.by_tile(z)
-    down = over_tiles(lambda f, _, z: f @ z.reshape(-1), at, reduced, (z,))
-    of_images, border = jnp.split(down, [6 * image.shape[2]], axis=2)
-    of_images = jax.ops.segment_sum(of_images.reshape(-1, 6), image.reshape(-1), s.n_images)
-    interior, met, rest = jnp.split(border, [s.n_interior, border.shape[2] - len(reduced.k) - 1], axis=2)
-    shared = s.by_unknown(met).at[: s.n_interior].add(jnp.sum(interior, (0, 1)))
-    of_images, shared, d = total((of_images, shared, jnp.sum(rest, (0, 1))[:-1]), s)
-    return jnp.concatenate([(b.eop.T - of_images).reshape(-1), b.shared - shared]), d
+    places, own, n = border_places(s, k), image_places(s, k), s.n_shared
+
+    def down(sums, numbers):
+        image, point, f = numbers
+        return sums.at[image].add(jnp.einsum("npae,anp->ne", f, points_at(z, point))), ()
+
+    of_images, _ = s.each(down, jnp.zeros((s.n_images, reduced.f.shape[-1])), (reduced.f,))
+    border = jnp.einsum("gpac,gap->gc", reduced.border.reshape(len(places), GROUP, 3, -1), s.by_group(z))
+    border = jnp.zeros(n + k + 2).at[places].add(border).at[own].add(of_images[:, 6:])
+    of_images, border = total((of_images[:, :6], border), s)
+    right = jnp.concatenate([(b.eop.T - of_images).reshape(-1), b.shared - border[:n]])
+    return right, border[n : n + k]
 
 
-def solve_reduced(
-    reduced: Reduced, factor: BandFactor, right, d, b_points, at: Linearised, many: bool = False
-) -> Increments:
+def solve_reduced(reduced: Reduced, factor: BandFactor, right, d, b_points, at: Linearised) -> Increments:
     """x of a right-hand side taken down already: `right` to the reduced unknowns, `d` to mu."""
     r, s, n = reduced, at.structure, at.structure.n_images
     if len(d):
@@ -87,61 +71,41 @@ def solve_reduced(
     x = solve_band(factor, right)
     mu = solve(r.k, r.g.T @ x + d) if len(d) else d
     eop, shared = x[: 6 * n].reshape(n, 6), x[6 * n :]
-    if not s.tiles.free_points:
+    if not s.rays.free_points:
         return Increments(eop.T, shared, jnp.zeros_like(b_points))
-    if r.f is None and not many:
-        b_points = b_points - _up_by_rows(eop.T, shared, mu, at)
-        return Increments(eop.T, shared, jnp.stack(unwhiten(whiten(b_points, r.l), r.l)))
-    interior, rest, met = shared[: s.n_interior], jnp.append(mu, 0.0), jnp.append(shared, 0.0)[s.tiles.met]
+    border = jnp.concatenate([shared, mu, jnp.zeros(2)])
+    of_images = jnp.concatenate([eop, border[image_places(s, len(d))]], axis=1)
 
-    def up(f, image, met):
-        return (jnp.concatenate([eop[image].reshape(-1), interior, met, rest]) @ f).reshape(3, -1)
+    def up(sums, numbers):
+        image, point, f = numbers
+        return sums.at[point].add(jnp.einsum("npae,ne->npa", f, of_images[image])), ()
 
-    z = jnp.stack(whiten(b_points, r.l)) - s.by_point(over_tiles(up, at, r, (met,)))
-    return Increments(eop.T, shared, jnp.stack(unwhiten(z, r.l)))
-
-
-def _up_by_rows(eop: Array, shared: Array, mu: Array, at: Linearised) -> Array:
-    """What increments of images and shared unknowns, and mu, add to the right-hand sides of the points."""
-    increments, scale, values, s = at
-    rest = non_image_rows(at)
-    scene, moved = jax.jvp(partial(_scene_at, at), (increments.eop, increments.shared), (eop, shared))
-
-    def tile(numbers):
-        image, point, xy, sigma = numbers
-        seen, place = seen_in(xy, sigma, image, s), of_images(scene, image, s)
-        moves = jax.jvp(lambda scene: tile_residuals(scene, point, seen, s), (place,), (of_images(moved, image, s),))[1]
-        return jax.vjp(lambda point: tile_residuals(place, point, seen, s), point)[1](moves)[0]
-
-    numbers = (s.by_tile(at.state.points), values.xy, values.sigma_xy)
-    result = s.by_point(s.each_tile(tile, numbers)) * scale.points + jnp.einsum("kcp,k->cp", rest.rows_p, mu)
-    for g, rows in zip(s.with_shared, rest.at_points, strict=True):
-        moved = jnp.append(shared, 0.0)[jnp.asarray(g.column)]
-        result = result + jnp.einsum("ckrp,clrp,lrp->kp", rows.points, rows.shared, moved)
-    return result
+    by_group = r.border.reshape(-1, GROUP, *r.border.shape[1:])
+    z = jnp.einsum("gpac,gc->gpa", by_group, border[border_places(s, len(d))]).reshape(-1, 3)
+    z, _ = s.each(up, z, (r.f,))
+    return Increments(eop.T, shared, jnp.stack(unwhiten(jnp.stack(whiten(b_points, r.l)) - z.T, r.l)))
 
 
-def pull(z: TiledResiduals, at: Linearised) -> Increments:
+def pull(z: PaddedResiduals, at: Linearised) -> Increments:
     """J'z of many residuals, along a leading axis, on one device; J is computed once for all of them."""
     _, scale, values, s = at
-    columns_of, image = tile_columns(at), s.tiles.image
+    columns_of, many = ray_columns(at), len(z.image)
 
-    def tile(numbers):
+    def batch(sums, numbers):
         *measured, z = numbers
-        z = jnp.moveaxis(z, 1, 0)
-        columns = columns_of(measured)
-        both = [jnp.concatenate([j.eop, j.shared]) for j in columns]
-        of_image = added(jnp.einsum("amp,kmp->mka", j, v) for j, v in zip(both, z, strict=True))
-        each = zip(columns, z, strict=True)
-        of_point = added(j.point[:, k] * v[:, None, k] for j, v in each for k in range(z.shape[2]))
-        return of_image, of_point
+        (of_images, of_points), j = sums, columns_of(measured)
+        both = list(zip((jnp.concatenate([c.eop, c.shared]) for c in j), jnp.moveaxis(z, 1, 0), strict=True))
+        of_image = added(jnp.einsum("anp,knp->nka", c, v) for c, v in both)
+        of_point = added(c.point * v[:, None] for c, v in zip(j, jnp.moveaxis(z, 1, 0), strict=True))
+        of_point = of_point.reshape(3 * many, *measured[1].shape)
+        return (of_images.at[measured[0]].add(of_image), add_rows(of_points, measured[1], of_point)), ()
 
-    given = (values.xy, values.sigma_xy, s.by_tile(at.state.points), s.by_tile(scale.points))
-    of_images, of_points = s.each_tile(tile, (*given, jnp.moveaxis(z.image, 0, 2)))
-    of_images = jax.ops.segment_sum(of_images.reshape(-1, *of_images.shape[3:]), image.reshape(-1), s.n_images)
+    none = jnp.zeros((s.n_images, many, 6 + s.n_image_colours)), jnp.zeros((s.n_points, 3 * many))
+    (of_images, of_points), _ = s.each(batch, none, (values.xy, values.sigma_xy, jnp.moveaxis(z.image, 0, 1)))
+    of_points = of_points.T.reshape(many, 3, -1) * scale.points
     column = jnp.asarray(s.column)[:, : s.n_image_colours]
     shared = jnp.zeros((s.n_shared + 1, len(z.image))).at[column].add(of_images[:, :, 6:].swapaxes(1, 2))[:-1].T
-    b = Increments(of_images[:, :, :6].transpose(1, 2, 0), shared, s.by_point(of_points))
+    b = Increments(of_images[:, :, :6].transpose(1, 2, 0), shared, of_points)
     return jax.tree.map(jnp.add, b, pull_others(z, at))
 
 
@@ -167,7 +131,7 @@ def pull_others(z: NonImageResiduals, at: Linearised) -> Increments:
     return _of_many(one, (z.others, z.datum), len(z.datum), s)
 
 
-def _of_many(function: Callable[[Any], Any], values: Any, many: int, s: TiledStructure) -> Any:
+def _of_many(function: Callable[[Any], Any], values: Any, many: int, s: PaddedStructure) -> Any:
     """`function` of many `values` along their leading axes, of as many side by side as memory allows.
 
     Of each of these, every row has numbers of what it touches.
@@ -182,26 +146,27 @@ def _of_many(function: Callable[[Any], Any], values: Any, many: int, s: TiledStr
     return jax.tree.map(lambda v: v.reshape(many, *v.shape[2:]), found)
 
 
-def push(x: Increments, at: Linearised) -> TiledResiduals:
+def push(x: Increments, at: Linearised) -> PaddedResiduals:
     """J x of many increments, along a leading axis, on one device."""
     image = jax.vmap(lambda own: _push_images(own, at))(x)
-    both = lambda own, image: TiledResiduals(own.others, own.datum, own.names, image)  # noqa: E731
+    both = lambda own, image: PaddedResiduals(own.others, own.datum, own.names, image)  # noqa: E731
     return jax.vmap(both)(push_others(x, at), image)
 
 
-def _push_images(x: Increments, at: Linearised) -> Float[Array, "chunks tiles 2 m p"]:
-    """J x of the image rows, tile by tile: what lies between stays in the processor's cache."""
+def _push_images(x: Increments, at: Linearised) -> Float[Array, "batches 2 chunks p"]:
+    """J x of the image rows, batch by batch: what lies between stays in the processor's cache."""
     _, scale, values, s = at
     scene, moved = jax.jvp(partial(_scene_at, at), at.increments[:2], x[:2])
+    points, steps = at.state.points, x.points * scale.points
 
-    def tile(numbers):
-        image, point, step, xy, sigma = numbers
+    def batch(numbers):
+        image, point, xy, sigma = numbers
         seen = seen_in(xy, sigma, image, s)
-        places, steps = (of_images(scene, image, s), point), (of_images(moved, image, s), step)
-        return jnp.stack(jax.jvp(lambda scene, point: tile_residuals(scene, point, seen, s), places, steps)[1])
+        place = of_images(scene, image, s), points_at(points, point)
+        step = of_images(moved, image, s), points_at(steps, point)
+        return jnp.stack(jax.jvp(lambda scene, points: ray_residuals(scene, points, seen, s), place, step)[1])
 
-    numbers = (s.by_tile(at.state.points), s.by_tile(x.points * scale.points), values.xy, values.sigma_xy)
-    return s.each_tile(tile, numbers)
+    return s.each_ray(batch, (values.xy, values.sigma_xy))
 
 
 def push_others(x: Increments, at: Linearised) -> NonImageResiduals:

@@ -7,9 +7,9 @@ F = [W; Ws'; D_p] L^-T what a point p meets, whitened,
     Q_pp  = L^-T (I + F' Q~ F) L^-1                 3 x 3 a point
     j Q j' = z'z + (j_r - F z)' Q~ (j_r - F z)      of an image row with columns j_r and j_p, z = L^-1 j_p'
 
-summed tile by tile, and so of other rows by point that touch shared unknowns, too. The full matrix is never inverted.
-In a free network the part along the open motions, which the constraints of the datum hold, is subtracted: what remains
-is the covariance under inner (or minimal) constraints.
+summed over rays and pairs of rays, and so of other rows by point that touch shared unknowns, too. The full matrix is
+never inverted. In a free network the part along the open motions, which the constraints of the datum hold, is
+subtracted: what remains is the covariance under inner (or minimal) constraints.
 """
 
 from typing import NamedTuple
@@ -18,16 +18,25 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.layout.sharding import TILES, along_points, sharded
-from jaxphoto.adjustment.layout.tiled import TiledStructure
+from jaxphoto.adjustment.layout.padded import PaddedStructure, each_batch
+from jaxphoto.adjustment.layout.rays import GROUP
+from jaxphoto.adjustment.layout.sharding import BATCHES, along_points, sharded
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
 from jaxphoto.adjustment.model.row_functions import RowJacobian, over_portions, reduced_places, rows_at_once
 from jaxphoto.adjustment.solver.band import invert_band
-from jaxphoto.adjustment.solver.elimination import FactoredNormal, over_tiles, solve_factored
-from jaxphoto.adjustment.solver.non_image_rows import non_image_rows
+from jaxphoto.adjustment.solver.elimination import FactoredNormal, solve_factored
+from jaxphoto.adjustment.solver.non_image_rows import RowsOfPoints, non_image_rows
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced, dot
-from jaxphoto.adjustment.solver.reduced import tile_columns
+from jaxphoto.adjustment.solver.ray_rows import points_at
+from jaxphoto.adjustment.solver.reduced import (
+    add_rows,
+    border_places,
+    image_places,
+    interior_in_border,
+    pair_images,
+    ray_columns,
+)
 from jaxphoto.adjustment.solver.similarity import along_motions, n_open_motions
 from jaxphoto.linear_algebra import inverse as inverse_of
 from jaxphoto.linear_algebra import solve
@@ -44,7 +53,7 @@ class Cofactors(NamedTuple):
 class RowCofactors(NamedTuple):
     """j Q j' of rows, in padded sizes: of the numbers of a row with one another."""
 
-    image: Float[Array, "chunks tiles 3 m p"]
+    image: Float[Array, "batches 3 m p"]
     """Of x, of y, and of both with one another."""
     at_points: tuple[Float[Array, "c c rows points"], ...]
     """Of the groups of `AbstractStructure.with_shared`."""
@@ -60,7 +69,7 @@ def cofactors_of(at: Linearised, factored: FactoredNormal, of_rows: bool) -> tup
         kg = solve(reduced.k, reduced.g.T)
         low = inverse @ kg.T
         full = jnp.block([[inverse, low], [low.T, kg @ low - inverse_of(reduced.k)]])
-    out = (TILES, RowCofactors(TILES, (along_points(4),) * len(s.with_shared)) if of_rows else None)
+    out = (BATCHES, RowCofactors(BATCHES, (along_points(4),) * len(s.with_shared)) if of_rows else None)
     points, rows = sharded(_of_points, s, out)(full, reduced, at, of_rows)
     return _without_open_motions(Cofactors(inverse, points), at, factored), rows
 
@@ -69,61 +78,147 @@ def _of_points(
     full: Float[Array, "n n"], reduced: Reduced, at: Linearised, of_rows: bool
 ) -> tuple[Float[Array, "points 3 3"], RowCofactors | None]:
     """Cofactors of points, and j Q j' of rows if these are wanted."""
-    _, scale, values, s = at
-    columns_of = tile_columns(at)
+    s = at.structure
+    seen = _seen(full, reduced, s)
+    half = jnp.stack(unwhiten(seen.inner, reduced.l))
+    points = jnp.stack(unwhiten(half.transpose(1, 0, 2), reduced.l)).transpose(2, 0, 1)
+    if not of_rows:
+        return points, None
     at_points = non_image_rows(at).at_points if s.with_shared else ()
-    n, q, k, n_met = 6 * s.n_images, s.n_image_colours, len(reduced.k), s.tiles.met.shape[2]
-    # One more than there are: zeros serve the last row of F, and what means nothing in an image or a tile.
-    interior, rest, none = n + jnp.arange(s.n_interior), n + s.n_shared + jnp.arange(k + 1), n + s.n_shared + k
-    met = jnp.asarray(s.tiles.met)
-    met = jnp.where(met < s.n_shared, n + met, none)
+    of_groups = tuple(_of_group(full, group, seen, reduced, s) for group in at_points)
+    return points, RowCofactors(_of_images(full, seen, reduced, at), of_groups)
 
-    def tile(f, image, l, at_points, met, *measured):  # noqa: E741
-        size = l.shape[1]
-        if not s.tiles.free_points:
-            f = jnp.zeros((len(f), 3 * size))
-        index = jnp.concatenate([(6 * image[:, None] + jnp.arange(6)).reshape(-1), interior, met, rest])
-        own = full.at[index[:, None], index].get(mode="fill", fill_value=0.0)
-        a = own @ f
-        # A product of matrices would want both turned round first.
-        g = jnp.sum(f.reshape(-1, 3, 1, size) * a.reshape(-1, 1, 3, size), axis=0)
-        inner = jnp.eye(3)[:, :, None] + g
-        half = jnp.stack(unwhiten(inner, l))
-        points = jnp.stack(unwhiten(half.transpose(1, 0, 2), l)).transpose(2, 0, 1)
-        return (points, *rows((image, *measured), at_points, l, own, a, inner)) if of_rows else (points,)
 
-    def rows(measured, at_points, l, own, a, inner):  # noqa: E741
-        image, both = measured[0], columns_of(measured)
-        m, size = both[0].residual.shape
-        column = jnp.asarray(s.column)[image, :q]
-        column = jnp.where(column < s.n_interior, 6 * m + column, len(own) - 1)
-        touched = jnp.concatenate([6 * jnp.arange(m)[:, None] + jnp.arange(6), column], axis=1)
-        j = jnp.stack([jnp.concatenate([c.eop, c.shared]) for c in both], axis=1).transpose(2, 0, 1, 3)
-        z = jnp.stack([jnp.stack(whiten(c.point, l)) for c in both]).transpose(0, 2, 1, 3)
-        seen = jnp.einsum("mab,mbn->man", own[touched[:, :, None], touched[:, None, :]], j.reshape(m, 6 + q, -1))
-        seen, across = seen.reshape(j.shape), jnp.einsum("mcop,mckp->omkp", j, a[touched].reshape(m, 6 + q, 3, size))
+class _Propagated(NamedTuple):
+    """Q~ F of each point, by what it meets; and I + F' Q~ F."""
+
+    rays: Float[Array, "batches m p d e"]
+    """By what its image is eliminated with."""
+    border: Float[Array, "points c 3"]
+    inner: Float[Array, "3 3 points"]
+
+
+def _places(reduced: Reduced, s: PaddedStructure) -> tuple[Array, Array]:
+    """Among the reduced unknowns: what images are eliminated with, and the border of each group of points."""
+    n, k = 6 * s.n_images, len(reduced.k)
+    eop = 6 * jnp.arange(s.n_images)[:, None] + jnp.arange(6)
+    return jnp.concatenate([eop, n + image_places(s, k)], axis=1), n + border_places(s, k)
+
+
+def _block(full: Array, row: Array, column: Array) -> Array:
+    """Q~ of rows and columns, both along their last axes; zero for what is none."""
+    return full.at[row[..., :, None], column[..., None, :]].get(mode="fill", fill_value=0.0)
+
+
+def _seen(full: Float[Array, "n n"], reduced: Reduced, s: PaddedStructure) -> _Propagated:
+    of_image, of_group = _places(reduced, s)
+    border = reduced.border.reshape(len(of_group), GROUP, *reduced.border.shape[1:])
+    n_points, d, c = reduced.border.shape
+    if not s.rays.free_points:
+        unit = jnp.broadcast_to(jnp.eye(3)[:, :, None], (3, 3, n_points))
+        return _Propagated(reduced.f, jnp.zeros((n_points, c, d)), unit)
+    take = lambda v, at: v.at[at].get(mode="clip")  # noqa: E731
+
+    def own(sums, numbers):
+        image, point, f = numbers
+        columns = of_image[image]
+        if s.rays.met.shape[1]:
+            across = _block(full, of_group[point // GROUP], columns[:, None])
+            of_border = jnp.einsum("npce,npae->npca", across, f)
+            seen = jnp.einsum("npce,npac->npae", across, take(reduced.border, point))
+        else:
+            across = _block(full, of_group[0], columns)
+            of_border = jnp.einsum("nce,npae->npca", across, f)
+            seen = jnp.einsum("nce,npac->npae", across, take(reduced.border, point))
+        seen = seen + jnp.einsum("nef,npaf->npae", _block(full, columns, columns), f)
+        rows = of_border.reshape(*point.shape, -1)
+        return add_rows(sums, point, jnp.moveaxis(rows, -1, 0)), seen
+
+    by_border = jnp.einsum("gcd,gpad->gpca", _block(full, of_group, of_group), border).reshape(n_points, -1)
+    by_border, rays = s.each(own, by_border, (reduced.f,))
+    by_border, flat, shape = by_border.reshape(n_points, c, -1), reduced.f, reduced.f.shape
+
+    def of_pairs(sums, numbers):
+        pair, block = numbers
+        one, other = (take(of_image, image) for image in pair_images(block, s))
+        met = _block(full, one, other)
+        f = flat.reshape(-1, *shape[3:])
+        seen = (
+            jnp.einsum("nef,nqaf->nqae", met, take(f, pair[:, 1])),
+            jnp.einsum("nef,nqae->nqaf", met, take(f, pair[:, 0])),
+        )
+        rows = (v.reshape(-1, shape[3] * shape[4]) for v in seen)
+        for which, v in zip((pair[:, 0], pair[:, 1]), rows, strict=True):
+            sums = sums.at[which.reshape(-1)].add(v)
+        return sums, ()
+
+    pairs, of_all = (s.pairs, s.rays.block), rays.reshape(-1, shape[3] * shape[4])
+    rays = each_batch(of_pairs, of_all, pairs, s.rays.used[0, 1])[0].reshape(shape)
+
+    def met(sums, numbers):
+        _, point, f, seen = numbers
+        rows = jnp.einsum("npae,npbe->npab", f, seen).reshape(*point.shape, -1)
+        return add_rows(sums, point, jnp.moveaxis(rows, -1, 0)), ()
+
+    inner = jnp.eye(3) + jnp.einsum("nac,ncb->nab", reduced.border, by_border)
+    inner, _ = s.each(met, inner.reshape(-1, 9), (reduced.f, rays))
+    return _Propagated(rays, by_border, inner.T.reshape(3, 3, -1))
+
+
+def _of_images(full: Array, seen: _Propagated, reduced: Reduced, at: Linearised) -> Float[Array, "batches 3 m p"]:
+    """Of image rows."""
+    _, scale, values, s = at
+    columns_of, n, q = ray_columns(at), 6 * s.n_images, s.n_image_colours
+    column = jnp.asarray(s.column)[:, :q]
+    touched = jnp.concatenate(
+        [6 * jnp.arange(s.n_images)[:, None] + jnp.arange(6), jnp.where(column < s.n_shared, n + column, len(full))], 1
+    )
+    of_points = jnp.concatenate([reduced.l, scale.points, seen.inner.reshape(9, -1)])
+
+    def batch(numbers):
+        image, point, xy, sigma, rays = numbers
+        both, own = columns_of((image, point, xy, sigma)), touched[image]
+        l, scale, inner = jnp.split(points_at(of_points, point), [6, 9])  # noqa: E741
+        inner = inner.reshape(3, 3, *point.shape)
+        if s.rays.free_points and not s.rays.by_image:
+            of_border = seen.border.at[point].get(mode="clip")
+            own_column = jnp.minimum(column[image], of_border.shape[2] - 1)[:, None, :, None]
+            of_cameras = jnp.take_along_axis(of_border, own_column, axis=2).swapaxes(2, 3)
+            rays = jnp.concatenate([rays, of_cameras], axis=3)
+        j = [jnp.concatenate([o.eop, o.shared]) for o in both]
+        z = [jnp.stack(whiten(o.point * scale, l)) for o in both]
+        met = _block(full, own, own)
+        moved = [jnp.einsum("nab,bnp->anp", met, o) for o in j]
+        across = [jnp.einsum("anp,npka->knp", o, rays) for o in j] if s.rays.free_points else [0 * z[0]] * 2
 
         def of_both(o: int, k: int) -> Float[Array, "m p"]:
-            met = jnp.sum(z[o] * across[k] + z[k] * across[o], axis=1)
-            return jnp.sum(j[:, :, o] * seen[:, :, k], axis=1) - met + jnp.einsum("mkp,klp,mlp->mp", z[o], inner, z[k])
+            met = jnp.sum(z[o] * across[k] + z[k] * across[o], axis=0)
+            return jnp.sum(j[o] * moved[k], axis=0) - met + jnp.einsum("knp,klnp,lnp->np", z[o], inner, z[k])
 
-        found = jnp.stack([of_both(0, 0), of_both(1, 1), of_both(0, 1)])
-        return found, tuple(of_group(group, 6 * m, l, own, a, inner) for group in at_points)
+        return jnp.stack([of_both(0, 0), of_both(1, 1), of_both(0, 1)])
 
-    def of_group(group, of_images, l, own, a, inner):  # noqa: E741
-        j, z = group.shared, jnp.stack(whiten(group.points.swapaxes(0, 1), l))
-        at = jnp.where(group.slot < n_met, of_images + s.n_interior + group.slot, len(own) - 1)
-        of_slot = a.reshape(len(a), 3, -1)[at, :, jnp.arange(at.shape[2])]
+    return s.each_ray(batch, (values.xy, values.sigma_xy, seen.rays))
+
+
+def _of_group(full: Array, rows: RowsOfPoints, seen: _Propagated, reduced: Reduced, s: PaddedStructure) -> Array:
+    """Of rows at points that touch shared unknowns."""
+    first = interior_in_border(s) + len(reduced.k) + 1
+
+    def one(numbers):
+        rows, border, of_group, inner, l = numbers  # noqa: E741
+        j, z = rows.shared, jnp.stack(whiten(rows.points.swapaxes(0, 1), l))
+        at = jnp.where(rows.slot < s.rays.met.shape[1], first + rows.slot, border.shape[0] - 1)
+        of_slot = border[at, :, jnp.arange(at.shape[2])]
         across = jnp.einsum("clrp,lrpk->ckrp", j, of_slot)
-        shared = jnp.einsum("clrp,lmrp,dmrp->cdrp", j, own[at[:, None], at[None]], j)
+        own = full.at[of_group[at][:, None], of_group[at][None]].get(mode="fill", fill_value=0.0)
+        shared = jnp.einsum("clrp,lmrp,dmrp->cdrp", j, own, j)
         both = jnp.einsum("kcrp,dkrp->cdrp", z, across)
         return shared - both - both.swapaxes(0, 1) + jnp.einsum("kcrp,klp,ldrp->cdrp", z, inner, z)
 
-    of_points = (reduced.l, at_points, values.points, scale.points)
-    l, at_points, *places = jax.tree.map(s.by_tile, of_points)  # noqa: E741
-    points, *found = over_tiles(tile, at, reduced, (l, at_points, met, values.xy, values.sigma_xy, *places))
-    rows_found = RowCofactors(found[0], tuple(s.by_point(v) for v in found[1])) if of_rows else None
-    return points.reshape(-1, 3, 3), rows_found
+    border = seen.border.transpose(1, 2, 0)
+    rows, border, inner, l = jax.tree.map(s.by_group, (rows, border, seen.inner, reduced.l))  # noqa: E741
+    found = jax.lax.map(one, (rows, border, _places(reduced, s)[1], inner, l), batch_size=64)
+    return jnp.moveaxis(found, 0, -2).reshape(*found.shape[1:-1], -1)
 
 
 def _without_open_motions(q: Cofactors, at: Linearised, factored: FactoredNormal) -> Cofactors:
@@ -169,7 +264,7 @@ def row_variances(
     return of_rows.image, tuple(found)
 
 
-def _of_reduced(g: ObservedGroup, j: RowJacobian, q: Array, s: TiledStructure) -> Float[Array, "c c rows"]:
+def _of_reduced(g: ObservedGroup, j: RowJacobian, q: Array, s: PaddedStructure) -> Float[Array, "c c rows"]:
     def of(touched: Array, own: Array) -> Array:
         at = touched.T
         # What means no unknown lies behind the last.

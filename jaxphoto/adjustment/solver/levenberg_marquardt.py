@@ -23,14 +23,14 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 
-from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
+from jaxphoto.adjustment.layout.padded import PaddedStructure, PaddedValues
 from jaxphoto.adjustment.model.block_values import with_datum
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.band import BandFactor, factor_band
 from jaxphoto.adjustment.solver.elimination import solve_reduced
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced, ResidualRows
-from jaxphoto.adjustment.solver.reduced import reduce_normal
+from jaxphoto.adjustment.solver.reduced import border_places, image_places, reduce_normal
 from jaxphoto.adjustment.solver.similarity import after, n_open_motions, onto_datum
 from jaxphoto.arrays import Numbers
 from jaxphoto.short_repr import shown
@@ -46,12 +46,12 @@ class FactoredSystem(NamedTuple):
     factor: BandFactor
 
 
-def zero_system(y: Increments, values: TiledValues, s: TiledStructure) -> FactoredSystem:
+def zero_system(y: Increments, values: PaddedValues, s: PaddedStructure) -> FactoredSystem:
     """A system of the right shapes, to begin with."""
     n, q, k = 6 * s.n_images, s.n_shared, s.n_coupled + len(values.datum_eop)
-    *tiles, m = s.tiles.image.shape
-    f = (*tiles, 6 * m + s.n_interior + s.tiles.met.shape[2] + k + 1, s.tiles.eliminated)
-    size, inner = n // s.tiles.columns, s.tiles.columns - 1
+    colours, three = image_places(s, k).shape[1], 3 if s.rays.free_points else 0
+    n_points, c = y.points.shape[1], border_places(s, k).shape[1]
+    size, inner = n // s.rays.columns, s.rays.columns - 1
     factor = BandFactor(
         jnp.zeros((inner, 2 * size, size)), jnp.zeros((q, inner * size)), jnp.zeros((size + q, size + q))
     )
@@ -59,8 +59,9 @@ def zero_system(y: Increments, values: TiledValues, s: TiledStructure) -> Factor
         diagonal=jnp.zeros(n + q),
         g=jnp.zeros((n + q, k)),
         k=jnp.zeros((k, k)),
-        f=jnp.zeros(f) if s.tiles.few else None,
-        l=jnp.zeros((6, y.points.shape[1])),
+        f=jnp.zeros((*s.rays.ray_point.shape, three, 6 + colours)),
+        border=jnp.zeros((n_points, three, c)),
+        l=jnp.zeros((6, n_points)),
         weight=jax.tree.map(jnp.zeros_like, y),
         damping=jnp.zeros(()),
     )
@@ -264,13 +265,15 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
     rtol: float
     atol: float
     norm: Callable[[PyTree], Scalar]
-    structure: TiledStructure
-    values: TiledValues
+    structure: PaddedStructure
+    values: PaddedValues
     scale: Increments
     tolerance: float
     task: Task
 
-    def __init__(self, structure: TiledStructure, values: TiledValues, scale: Increments, tolerance: float, task: Task):
+    def __init__(
+        self, structure: PaddedStructure, values: PaddedValues, scale: Increments, tolerance: float, task: Task
+    ):
         # optimistix' own test of convergence is not used: `step` decides.
         self.rtol, self.atol, self.norm = 0.0, 0.0, optx.max_norm
         self.structure, self.values, self.scale = structure, values, scale

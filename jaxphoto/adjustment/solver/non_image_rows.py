@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.adjustment.layout.tiled import TiledStructure
+from jaxphoto.adjustment.layout.padded import PaddedStructure
 from jaxphoto.adjustment.model.numbers import NonImageResiduals, datum_residuals
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
 from jaxphoto.adjustment.model.row_functions import RowJacobian, in_portions, row_jacobian, rows_at_once
@@ -22,10 +22,10 @@ class RowsOfPoints(NamedTuple):
     shared: Float[Array, "c l rows points"]
     points: Float[Array, "c 3 rows points"]
     slot: Int[Array, "l rows points"]
-    """Which of the unknowns of the point's tile these are."""
+    """Which of the unknowns of the point's group these are."""
 
-    def of_tile(self, size: int) -> Float[Array, "size rows points c"]:
-        """The derivatives by all `size` shared unknowns of a tile, where points are those of the tile."""
+    def of_group(self, size: int) -> Float[Array, "size rows points c"]:
+        """The derivatives by all `size` shared unknowns of a group, where points are those of the group."""
         _, rows, points = self.slot.shape
         at = self.slot, jnp.arange(rows)[:, None], jnp.arange(points)
         zero = jnp.zeros((size, rows, points, len(self.residual)))
@@ -105,7 +105,7 @@ def non_image_rows(at: Linearised, residuals: NonImageResiduals | None = None) -
     return NonImageRows(jacobians, residuals, v, b, tuple(at_points), e, of_s, p, coupled_rows)
 
 
-def _coupled(g: ObservedGroup, j: RowJacobian, s: TiledStructure, n_points: int) -> tuple[Array, Array, Array]:
+def _coupled(g: ObservedGroup, j: RowJacobian, s: PaddedStructure, n_points: int) -> tuple[Array, Array, Array]:
     """The rows of a group in full, by images, shared unknowns and points."""
     c, each = g.components, jnp.arange(g.n_rows)
     e = jnp.zeros((c, g.n_rows, s.n_images, 6))
@@ -121,7 +121,7 @@ def _coupled(g: ObservedGroup, j: RowJacobian, s: TiledStructure, n_points: int)
     return flat(e), flat(of_s)[:, :-1], flat(p)
 
 
-def add_non_image_rows(sums: NormalSums, rest: NonImageRows, s: TiledStructure) -> NormalSums:
+def add_non_image_rows(sums: NormalSums, rest: NonImageRows, s: PaddedStructure) -> NormalSums:
     """The sums with those of all rows that meet images and shared unknowns."""
     for g, j in zip(s.observed, rest.jacobians, strict=True):
         if g.elimination == "reduced":
@@ -129,7 +129,7 @@ def add_non_image_rows(sums: NormalSums, rest: NonImageRows, s: TiledStructure) 
     return sums._replace(us=sums.us[:, :, :-1], uss=sums.uss[:-1, :-1], b_s=sums.b_s[:-1])
 
 
-def _add_reduced(sums: NormalSums, g: ObservedGroup, j: RowJacobian, s: TiledStructure) -> NormalSums:
+def _add_reduced(sums: NormalSums, g: ObservedGroup, j: RowJacobian, s: PaddedStructure) -> NormalSums:
     band, u, us, uss, b_s, b_e = sums
     pair = 0
     for a, image in enumerate(g.image):
@@ -182,7 +182,7 @@ def _products(a: Float[Array, "c a rows"], b: Float[Array, "c b rows"]) -> Float
 def add_blocks(
     band: tuple[Array, Array], blocks: Float[Array, "blocks 6 6"], place: Array, distinct: bool = False
 ) -> tuple[Array, Array]:
-    """Pairs of images, added where they belong: in the inner column blocks, or in the last (see `Tiles.block`).
+    """Pairs of images, added where they belong: in the inner column blocks, or in the last (see `RayLists.block`).
 
     What lies in neither is dropped. `distinct` says that no two blocks belong in one place, which is quicker.
     """

@@ -15,23 +15,24 @@ shared unknowns:
     g   = D_r' - [Y; Ys'] Yd,   K = I + Yd' Yd        the coupling of mu
     A   = S + g K^-1 g'                               positive definite where the datum is fixed
 
-Tile by tile, `reduced.reduce_normal` makes F = [Y; Ys'; Yd'] and sums S from it; `elimination` takes vectors down to
-the reduced unknowns, and back to the points, by products with F.
+`reduced.reduce_normal` makes F = [Y; Ys'; Yd'], the rows of Y ray by ray and the others point by point, and sums S from
+it; `elimination` takes vectors down to the reduced unknowns, and back to the points, by products with F.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Scalar
 
-from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues
+from jaxphoto.adjustment.layout.padded import PaddedResiduals, PaddedStructure, PaddedValues
 from jaxphoto.adjustment.model.image_orientations import of_images, orientations_of
 from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals, UnknownArrays, state_at
 from jaxphoto.adjustment.model.observed_groups import RowsAtPoints
 from jaxphoto.adjustment.model.row_functions import non_image_residuals
 from jaxphoto.adjustment.model.structure import total
-from jaxphoto.adjustment.solver.tile_rows import Pair, seen_in, tile_residuals
+from jaxphoto.adjustment.solver.ray_rows import Pair, points_at, ray_residuals, seen_in
 from jaxphoto.arrays import added
 
 
@@ -40,8 +41,8 @@ class Linearised(NamedTuple):
 
     increments: Increments
     scale: Increments
-    values: TiledValues
-    structure: TiledStructure
+    values: PaddedValues
+    structure: PaddedStructure
 
     @property
     def state(self) -> UnknownArrays:
@@ -60,28 +61,29 @@ class Linearised(NamedTuple):
         return Increments(values.datum_eop * scale.eop, none, values.datum_points * scale.points)
 
     def residual_rows(self) -> "ResidualRows":
-        """All residuals over their sigmas, those of image rows tile by tile."""
+        """All residuals over their sigmas, those of image rows batch by batch."""
         increments, scale, values, s = self
-        scene = orientations_of(self.state, values, s)
-
-        def tile(numbers):
-            image, points, xy, sigma = numbers
-            return tile_residuals(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s)
-
-        image = s.each_tile(tile, (s.by_tile(self.state.points), values.xy, values.sigma_xy))
+        image = s.each_ray(self._of_rays(), (values.xy, values.sigma_xy))
         return ResidualRows(image, non_image_residuals(increments, scale, values, s))
 
-    def residuals(self) -> TiledResiduals:
-        """The same of all tiles at once, which can be differentiated backwards."""
+    def residuals(self) -> PaddedResiduals:
+        """The same of all batches at once, which can be differentiated backwards."""
         increments, scale, values, s = self
-        scene = orientations_of(self.state, values, s)
-
-        def tile(image, points, xy, sigma):
-            return jnp.stack(tile_residuals(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s))
-
-        numbers = (s.tiles.image, s.by_tile(self.state.points), values.xy, values.sigma_xy)
+        numbers = jnp.asarray(s.rays.chunk_image), s.ray_points, values.xy, values.sigma_xy
+        image = jnp.stack(jax.vmap(self._of_rays())(numbers), axis=1)
         others = non_image_residuals(increments, scale, values, s)
-        return TiledResiduals(others.others, others.datum, others.names, jax.vmap(jax.vmap(tile))(*numbers))
+        return PaddedResiduals(others.others, others.datum, others.names, image)
+
+    def _of_rays(self) -> Callable[[tuple[Array, ...]], Pair]:
+        state, s = self.state, self.structure
+        scene = orientations_of(state, self.values, s)
+
+        def of_batch(numbers: tuple[Array, ...]) -> Pair:
+            image, point, xy, sigma = numbers
+            seen = seen_in(xy, sigma, image, s)
+            return ray_residuals(of_images(scene, image, s), points_at(state.points, point), seen, s)
+
+        return of_batch
 
     def square_sum(self) -> Float[Array, ""]:
         """The sum of all squared residuals."""
@@ -92,10 +94,10 @@ class ResidualRows(NamedTuple):
     """Residuals over their sigmas."""
 
     image: Pair
-    """Of image rows, chunks and tiles first."""
+    """Of image rows, batches first."""
     others: NonImageResiduals
 
-    def square_sum(self, s: TiledStructure) -> Float[Array, ""]:
+    def square_sum(self, s: PaddedStructure) -> Float[Array, ""]:
         """The sum of all squares."""
         return total(squares(self.image), s) + other_squares(self.others, s)
 
@@ -107,9 +109,10 @@ class Reduced(NamedTuple):
     """Of A."""
     g: Float[Array, "reduced constraints"]
     k: Float[Array, "constraints constraints"]
-    f: Float[Array, "chunks tiles f 3p"] | None
-    """F of each tile: 6 rows an image, unknowns that points meet, constraints (coupled rows, then the datum); the
-    last row, a right-hand side of its time, serves nothing. None where tiles are many: then it is made anew."""
+    f: Float[Array, "batches chunks p d e"]
+    """F of each ray: L^-1 times what its point and its image meet, e unknowns of the image (`RayLists.by_image`)."""
+    border: Float[Array, "points d c"]
+    """F of each point: L^-1 times what it meets of the unknowns in `border_places`."""
     l: Float[Array, "6 points"]  # noqa: E741
     """Cholesky factors of V: l11, l21, l22, l31, l32, l33."""
     weight: Increments
@@ -117,7 +120,7 @@ class Reduced(NamedTuple):
     damping: Scalar
 
 
-def dot(a: Increments, b: Increments, s: TiledStructure) -> Float[Array, ""]:
+def dot(a: Increments, b: Increments, s: PaddedStructure) -> Float[Array, ""]:
     """a'b over all unknowns."""
     return jnp.vdot(a.eop, b.eop) + jnp.vdot(a.shared, b.shared) + total(jnp.vdot(a.points, b.points), s)
 
@@ -127,7 +130,7 @@ def squares(r: Pair) -> Float[Array, ""]:
     return added(jnp.sum(v * v) for v in r)
 
 
-def other_squares(others: NonImageResiduals, s: TiledStructure) -> Float[Array, ""]:
+def other_squares(others: NonImageResiduals, s: PaddedStructure) -> Float[Array, ""]:
     """The square sum of all but the image rows."""
     dealt_out, everywhere = jnp.zeros(()), jnp.sum(others.datum**2)
     for group, v in zip(s.observed, others.others, strict=True):

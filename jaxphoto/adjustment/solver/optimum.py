@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxphoto.adjustment.layout.sharding import EVERYWHERE, TILES, along_points, sharded
-from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
+from jaxphoto.adjustment.layout.padded import PaddedStructure, PaddedValues
+from jaxphoto.adjustment.layout.sharding import BATCHES, EVERYWHERE, along_points, sharded
 from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.parameter_tables import ParameterTable
@@ -40,19 +40,19 @@ class Optimum(NamedTuple):
     course: Course | None
 
 
-def unit_scale(structure: TiledStructure) -> Increments:
+def unit_scale(structure: PaddedStructure) -> Increments:
     """Increments in metres, radians and the parameters' own units; zero for what is held fixed."""
     s = structure
     return Increments(jnp.asarray(s.eop_free), jnp.ones(s.n_shared), jnp.asarray(s.point_free))
 
 
-def iterate(values: TiledValues, structure: TiledStructure, task: Task) -> tuple[Optimum, FactoredSystem, Increments]:
+def iterate(values: PaddedValues, structure: PaddedStructure, task: Task) -> tuple[Optimum, FactoredSystem, Increments]:
     """The optimum, and the last system with the scale of its unknowns; or the undamped system at the start."""
     scale = typical_scale(values, structure)
     at_points = along_points(2)
     of_unknowns = Increments(EVERYWHERE, EVERYWHERE, at_points)
     system = FactoredSystem(
-        Reduced(EVERYWHERE, EVERYWHERE, EVERYWHERE, TILES, at_points, of_unknowns, EVERYWHERE),
+        Reduced(EVERYWHERE, EVERYWHERE, EVERYWHERE, BATCHES, BATCHES, at_points, of_unknowns, EVERYWHERE),
         EVERYWHERE,
     )
     out = (Optimum(of_unknowns, EVERYWHERE, EVERYWHERE, EVERYWHERE), system)
@@ -61,7 +61,7 @@ def iterate(values: TiledValues, structure: TiledStructure, task: Task) -> tuple
 
 
 def _iterate(
-    values: TiledValues, scale: Increments, structure: TiledStructure, task: Task
+    values: PaddedValues, scale: Increments, structure: PaddedStructure, task: Task
 ) -> tuple[Optimum, FactoredSystem]:
     """The iteration itself, on what one device holds; increments are scaled."""
     solver = LevenbergMarquardt(structure, values, scale, TOLERANCE, task)
@@ -84,7 +84,7 @@ def _iterate(
     return Optimum(increments, state.steps, converged, Course(*state.course.T)), state.system
 
 
-def weigh_datum(values: TiledValues, structure: TiledStructure) -> TiledValues:
+def weigh_datum(values: PaddedValues, structure: PaddedStructure) -> PaddedValues:
     """The same constraints of the datum, each of unit length in scaled increments.
 
     Their weight does not change the optimum (no observation speaks against them); this one keeps N well-conditioned.
@@ -100,7 +100,7 @@ def weigh_datum(values: TiledValues, structure: TiledStructure) -> TiledValues:
     return eqx.tree_at(where, values, (values.datum_eop * weight, values.datum_points * weight))
 
 
-def typical_scale(values: TiledValues, structure: TiledStructure) -> Increments:
+def typical_scale(values: PaddedValues, structure: PaddedStructure) -> Increments:
     """What moves an image point by about its standard deviation; zero for what is held fixed.
 
     Scaling by these makes columns of the Jacobian alike within a factor of some tens, which is all that the
@@ -110,7 +110,7 @@ def typical_scale(values: TiledValues, structure: TiledStructure) -> Increments:
     weight = 1 / v.sigma_xy
     filled = weight > 0
     sigma = jnp.sum(filled) / jnp.sum(weight)
-    corner = jnp.max(jnp.where(filled, jnp.abs(v.xy), 0.0), axis=(0, 1, 3, 4))
+    corner = jnp.max(jnp.where(filled, jnp.abs(v.xy), 0.0), axis=(0, 2, 3))
     vector = jnp.ones(v.shared.shape)
     for group in s.groups:
         m = group.treedef.num_leaves
@@ -158,7 +158,7 @@ def _typical_of_camera(
 
 
 def _typical_of_bending(
-    s: TiledStructure, v: TiledValues, t: ParameterTable, sigma: Array, corner: Float[Array, "2"]
+    s: PaddedStructure, v: PaddedValues, t: ParameterTable, sigma: Array, corner: Float[Array, "2"]
 ) -> Float[Array, "n"]:
     """The same of what bends cameras, far from the middle of the flight and from the reference temperature."""
     farthest, of_groups = jnp.argmax(jnp.abs(v.flight_time)), []
@@ -175,12 +175,12 @@ def _typical_of_bending(
 _LASER_M, _LASER_RAD = 0.01, 1e-5
 
 
-def _typical_of_places(s: TiledStructure, v: TiledValues, filled: Array, sigma: Array) -> tuple[Array, Array, Array]:
+def _typical_of_places(s: PaddedStructure, v: PaddedValues, filled: Array, sigma: Array) -> tuple[Array, Array, Array]:
     """Typical sigma of an image point (mm), and what it is on the ground (m) and as an angle (rad)."""
     if not s.groups:
         return jnp.ones(()), jnp.array(_LASER_M), jnp.array(_LASER_RAD)
     c = v.shared[s.groups[0].offset]
-    apart = s.by_tile(v.points)[..., None, :] - jnp.moveaxis(v.position[:, s.tiles.image], 0, 2)[..., None]
-    distance = jnp.sqrt(jnp.sum(apart**2, axis=2))
-    depth = jnp.sum(distance * filled[:, :, 0]) / jnp.sum(filled[:, :, 0])
+    point, image = s.rays.ray_point, s.rays.chunk_image
+    apart = v.points[:, point] - v.position[:, image, None]
+    depth = jnp.sum(jnp.sqrt(jnp.sum(apart**2, axis=0)) * filled[:, 0]) / jnp.sum(filled[:, 0])
     return sigma, sigma * depth / c, sigma / c

@@ -1,19 +1,21 @@
-"""The sums behind the reduced normal matrix: tile by tile as products of small dense matrices, then into the band.
+"""The sums behind the reduced normal matrix: rays add to points, images and pairs of images, chunk by chunk.
 
-In a tile, all of Y and of what else meets its points (interior unknowns, constraints, the right-hand side) are the rows
-of one matrix F, three columns a point, and F F' holds every sum over the tile's points at once. See `normal` for the
-symbols.
+Each ray has three rows of F for the unknowns of its image, each point three for what else it meets (see `normal`). The
+products of F that meet in an image are those of a chunk of rays, those that meet in two images those of a chunk of
+pairs of rays. What is met besides images (`border_places`) is summed point by point.
 """
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
-from jaxphoto.adjustment.layout.tiled import TiledStructure
+from jaxphoto.adjustment.layout.padded import PaddedStructure, each_batch
+from jaxphoto.adjustment.layout.rays import GROUP
 from jaxphoto.adjustment.model.image_orientations import of_images, orientation_derivatives, orientations_of
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.structure import total
@@ -21,17 +23,23 @@ from jaxphoto.adjustment.solver.band import Band, diagonal_of
 from jaxphoto.adjustment.solver.non_image_rows import (
     NonImageRows,
     NormalSums,
+    RowsOfPoints,
     add_blocks,
     add_non_image_rows,
     non_image_rows,
     sum_by,
 )
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced, ResidualRows
-from jaxphoto.adjustment.solver.tile_rows import Pair, TileJacobian, seen_in, tile_jacobian
+from jaxphoto.adjustment.solver.ray_rows import RayJacobian, points_at, ray_jacobian, seen_in
 from jaxphoto.arrays import added
 from jaxphoto.compiling import once
 from jaxphoto.linear_algebra import solve
 from jaxphoto.small_matrices import cholesky_3x3, whiten
+
+# XLA compiles the loop over the rows of a scatter as one function where a row is short, and else calls several a row.
+_PIECE = 36
+# Groups of points whose rows are computed with at a time.
+_GROUPS = 64
 
 
 class RightSide(NamedTuple):
@@ -42,18 +50,112 @@ class RightSide(NamedTuple):
     d: Float[Array, "constraints"]
 
 
-class TileParts(NamedTuple):
-    """What a tile's sums are made of."""
+def interior_in_border(s: PaddedStructure) -> int:
+    """How many interior unknowns points meet as such, not as what their images are eliminated with."""
+    return 0 if s.rays.by_image else s.n_interior
 
-    columns: tuple[TileJacobian, TileJacobian]
-    f: Float[Array, "f 3p"]
-    """F: images, interior unknowns, what else the tile's points meet, constraints; last the right-hand side."""
-    l: Float[Array, "6 p"]  # noqa: E741
-    b: Float[Array, "3 p"]
-    diagonal: Float[Array, "3 p"]
+
+def border_places(s: PaddedStructure, k: int) -> Int[Array, "groups border"]:
+    """What the points of each group meet besides images: interior unknowns, k constraints, the right-hand side, and
+    shared unknowns of rows at points. As places among all shared unknowns, the constraints, the right-hand side, and
+    one more for none.
+    """
+    n, met = s.n_shared, jnp.asarray(s.rays.met)
+    first = jnp.concatenate([jnp.arange(interior_in_border(s)), n + jnp.arange(k + 1)])
+    met = jnp.where(met < n, met, n + k + 1)
+    return jnp.concatenate([jnp.broadcast_to(first, (len(met), len(first))), met], axis=1)
+
+
+def image_places(s: PaddedStructure, k: int) -> Int[Array, "images colours"]:
+    """The same of each image's own unknowns of its camera, where `RayLists.by_image`."""
+    colours = s.n_image_colours if s.rays.by_image else 0
+    column = jnp.asarray(s.column)[:, :colours]
+    return jnp.where(column < s.n_shared, column, s.n_shared + k + 1)
+
+
+def ray_columns(at: Linearised):
+    """A function from images, points and measurements of a batch to its residuals and Jacobian."""
+    s, points = at.structure, at.state.points
+    scene = orientations_of(at.state, at.values, s)
+    slopes = once(lambda: orientation_derivatives(at.increments, at.scale, at.values, s), s.eop_free)
+
+    def columns_of(numbers) -> tuple[RayJacobian, RayJacobian]:
+        image, point, xy, sigma = numbers
+        seen = seen_in(xy, sigma, image, s)
+        own = of_images(scene, image, s), of_images(slopes, image, s)
+        return once(partial(ray_jacobian, s=s), s.eop_free, *own, points_at(points, point), seen)
+
+    return columns_of
+
+
+class _AtPoints(NamedTuple):
+    """Sums by point, of points in metres."""
+
+    v: Float[Array, "points 9"]
+    """Of J_p' J_p (6) and J_p' r (3)."""
+    w: Float[Array, "points interior+1 3"]
+    """Of J_s' J_p; the last serves colours that mean nothing in an image."""
+
+    @classmethod
+    def none(cls, s: PaddedStructure, n: int) -> "_AtPoints":
+        """Before the first batch."""
+        return cls(jnp.zeros((n, 9)), jnp.zeros((n, interior_in_border(s) + 1, 3)))
+
+    def plus(self, j: tuple[RayJacobian, RayJacobian], image: Array, point: Array, s: PaddedStructure) -> "_AtPoints":
+        """With those of a batch."""
+        pairs = [(a, b) for a in range(3) for b in range(a + 1)]
+        own = [added(c.point[a] * c.point[b] for c in j) for a, b in pairs]
+        own += [added(c.point[a] * c.residual for c in j) for a in range(3)]
+        v, w = add_rows(self.v, point, jnp.stack(own)), self.w
+        i, q = w.shape[1] - 1, s.n_image_colours
+        if i:
+            met = added(c.shared[:, None] * c.point for c in j)
+            if i == q:
+                # One camera: its colours are its unknowns.
+                met = jnp.concatenate([met, jnp.zeros_like(met[:1])]).reshape(-1, *point.shape)
+                w = add_rows(w.reshape(len(w), -1), point, met).reshape(w.shape)
+            else:
+                column = jnp.minimum(jnp.asarray(s.column)[image, :q], i).T[:, :, None]
+                at = (point * (i + 1) + column).reshape(-1)
+                w = w.reshape(-1, 3).at[at].add(jnp.moveaxis(met, 1, -1).reshape(-1, 3)).reshape(w.shape)
+        return _AtPoints(v, w)
+
+
+def add_rows(sums: Float[Array, "n c"], which: Array, rows: Float[Array, "c m p"]) -> Float[Array, "n c"]:
+    """The sums with rows of rays, by a number."""
+    n, c = sums.shape
+    pieces = next(k for k in range(1, c + 1) if c % k == 0 and c // k <= _PIECE)
+    at = (which.reshape(-1)[:, None] * pieces + jnp.arange(pieces)).reshape(-1)
+    rows = rows.reshape(c, -1).T.reshape(-1, c // pieces)
+    return sums.reshape(-1, c // pieces).at[at].add(rows, mode="promise_in_bounds").reshape(n, c)
+
+
+class _Eliminated(NamedTuple):
+    """The points, eliminated."""
+
+    l: Float[Array, "6 points"]  # noqa: E741
+    border: Float[Array, "points d c"]
+    b: Float[Array, "3 points"]
+    diagonal: Float[Array, "3 points"]
     """That of V, without damping."""
-    met: Float[Array, "b b+1"]
-    """Of rows at points, J_s' J_s and J_s' r of what else the tile's points meet."""
+
+
+def _eliminated(sums: _AtPoints, rest: NonImageRows, met: Array, scale: Array, damping, s: PaddedStructure):
+    """L of each point, and F of what it meets besides images; `met` is W of shared unknowns that its rows touch."""
+    k, n, i = len(rest.coupled), len(sums.v), interior_in_border(s)
+    if not s.rays.free_points:
+        unit, none = jnp.array([1.0, 0, 1, 0, 0, 1])[:, None], jnp.zeros((3, n))
+        return _Eliminated(jnp.broadcast_to(unit, (6, n)), jnp.zeros((n, 0, i + k + 1 + len(met))), none, none)
+    v, b = sums.v[:, :6].T, sums.v[:, 6:].T * scale
+    v = scale[:, None] * scale * v[np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])] + rest.v
+    b = b + rest.b + jnp.einsum("kap,k->ap", rest.rows_p, rest.coupled)
+    diagonal = jnp.einsum("iip->ip", v)
+    added = damping * diagonal + jnp.where(diagonal == 0, 1.0, 0.0)
+    l = once(cholesky_3x3, s.eop_free, v + added[:, None] * jnp.eye(3)[:, :, None])  # noqa: E741
+    interior = sums.w[:, :i].transpose(1, 2, 0) * scale
+    border = jnp.concatenate([interior, rest.rows_p, b[None], met]).transpose(1, 0, 2)
+    border = once(lambda w, factors: jnp.stack(whiten(w, factors)).transpose(2, 0, 1), s.eop_free, border, l)
+    return _Eliminated(l, border, b, diagonal)
 
 
 def reduce_normal(
@@ -64,91 +166,219 @@ def reduce_normal(
     That is J'r - `less` for the residuals r there, or for those in `rows`. Unknowns held fixed (zero columns) get a
     unit diagonal.
     """
-    s, tiles = at.structure, at.structure.tiles
-    rest = non_image_rows(at, rows.others if rows else None)
+    s, rest = at.structure, non_image_rows(at, rows.others if rows else None)
     if less is not None:
         rest = rest._replace(b=rest.b - less.points)
-    coupled = rest.coupled
-    parts_of = tile_parts(at, damping, coupled)
-    n, q, k, i, b = s.n_images, s.n_image_colours, len(coupled), s.n_interior, tiles.met.shape[2]
-    c, n_shared = i + k + 1, s.n_shared
-    _, chunk, m = tiles.image.shape
-    width, inner = n // tiles.columns, tiles.columns - 1
+    columns_of, scale, k = ray_columns(at), at.scale.points, len(rest.coupled)
 
-    def in_all(v: Array, axis: int) -> Array:
-        """Of the border, what all tiles have: not what only some of them meet."""
-        own, _, rest = jnp.split(v, [i, i + b], axis)
-        return jnp.concatenate([own, rest], axis)
+    def to_points(sums, numbers):
+        *measured, residual = numbers
+        j = columns_of(measured)
+        if residual is not None:
+            j = j[0]._replace(residual=residual[0]), j[1]._replace(residual=residual[1])
+        return sums.plus(j, *measured[:2], s) if s.rays.free_points else sums, j
 
-    def tile(numbers):
-        *numbers, residual = numbers
-        p = parts_of(numbers, residual)
-        whole = [jnp.concatenate([j.eop, j.shared, j.residual[None]]).transpose(1, 0, 2) for j in p.columns]
-        j = jnp.concatenate(whole, axis=2)
-        gram = p.f @ p.f.T
-        of_images = gram[: 6 * m, : 6 * m] if tiles.free_points else gram[:0, :0]
-        across, border = gram[: 6 * m, 6 * m :].reshape(m, 6, -1), gram[6 * m :, 6 * m :]
-        square = jnp.einsum("maj,mbj->mab", j, j).reshape(m, -1)
-        own = jnp.concatenate([square, in_all(across, 2).reshape(m, -1)], axis=1)
-        f = p.f if tiles.few else None
-        met = across[:, :, i : i + b].transpose(0, 2, 1), border[i : i + b], p.met
-        return of_images, own, in_all(in_all(border, 0), 1), met, f, p.l, p.b, p.diagonal
+    numbers = at.values.xy, at.values.sigma_xy, rows.image if rows else None
+    of_points, columns = s.each(to_points, _AtPoints.none(s, scale.shape[1]), numbers)
+    own_met, of_met = _rows_with_shared(rest, s)
+    points = _eliminated(of_points, rest, own_met, scale, damping, s)
+    of_rays, m = jnp.concatenate([points.l, scale]), 7 + s.n_image_colours
 
-    def add_chunk(sums, numbers):
-        (pair_tile, pair_images, pair_block, block, which), batches, of_tiles = numbers
-        grams, own, border, met, *kept = tiles.each_of_chunk(tile, of_tiles, batches)
-        own = sum_by(own.reshape(chunk * m, -1), of_tiles[0].reshape(-1), n)
-        of_met = _add_met(sums[3], met, which, of_tiles[0], i) if b else sums[3]
-        if not tiles.free_points:
-            return (sums[0], sums[1] + own, sums[2], of_met), kept
-        grams = grams.reshape(chunk, m, 6, m, 6)[pair_tile, pair_images[:, 0], :, pair_images[:, 1]]
-        grams = jax.ops.segment_sum(grams, pair_block, len(block), indices_are_sorted=True)
-        band = add_blocks(sums[0], -grams, block, distinct=True)
-        return (band, sums[1] + own, sums[2] + border.sum(0), of_met), kept
+    def to_images(sums, numbers):
+        image, point, j = numbers
+        by_image, products = sums
+        both = [jnp.concatenate([o.eop, o.shared, o.residual[None]]).transpose(1, 0, 2) for o in j]
+        whole = jnp.concatenate(both, axis=2)
+        square = jnp.einsum("nax,nbx->nab", whole, whole).reshape(len(image), -1)
+        f = once(partial(_f_of_rays, s=s), s.eop_free, j, points_at(of_rays, point))
+        products = products.with_rays(image, point, f, points.border, s, k)
+        return (by_image + sum_by(square, image, s.n_images), products), f
 
-    zero = (
-        (jnp.zeros((inner, 2 * width, 6, width, 6)), jnp.zeros((width, 6, width, 6))),
-        jnp.zeros((n, (7 + q) ** 2 + 6 * c)),
-        jnp.zeros((c, c)),
-        _Met.none(n, n_shared, i, k) if b else None,
-    )
-    lists = (tiles.pair_tile, tiles.pair_images, tiles.pair_block, tiles.block, tiles.met)
-    of_tiles = (*tile_numbers(at, rest), rows.image if rows else None)
-    sums, (f, *of_points) = jax.lax.scan(add_chunk, zero, (lists, tiles.batches, of_tiles))
-    (columns, last), own, border, of_met = total(sums, s)
-    l, b_points, v = map(s.by_point, of_points)  # noqa: E741
-    # Tiles that are padding were not computed: their points are each by itself.
-    l = jnp.where(l[0] == 0, jnp.array([1.0, 0, 1, 0, 0, 1])[:, None], l)  # noqa: E741
+    none = jnp.zeros((s.n_images, m * m)), ProductSums.of(points.border, s, k)
+    (square, sums), f = s.each(to_images, none, (columns,))
+    square, sums, of_met = total((square, sums.with_pairs(f, s, k), of_met), s)
+    return _assembled(at, damping, less, rest, square.reshape(-1, m, m), sums, of_met, points, f)
 
-    m_images = own[:, : (7 + q) ** 2].reshape(n, 7 + q, 7 + q)
-    met = own[:, (7 + q) ** 2 :].reshape(n, 6, c)
-    us, uss, b_s = _by_unknown(m_images, s)
-    images = NormalSums((columns, last), m_images[:, :6, :6], us, uss, b_s, m_images[:, :6, -1])
+
+def _f_of_rays(j: tuple[RayJacobian, RayJacobian], of_rays: Float[Array, "9 m p"], s: PaddedStructure) -> Array:
+    """F of a batch; no rows where no point is free."""
+    eop = [jnp.concatenate([o.eop, o.shared]) if s.rays.by_image else o.eop for o in j]
+    if not s.rays.free_points:
+        return jnp.zeros((*of_rays.shape[1:], 0, len(eop[0])))
+    return whitened(eop, [o.point * of_rays[6:] for o in j], of_rays[:6])
+
+
+class ProductSums(NamedTuple):
+    """F F' of what points meet: images by themselves, with the border (`border_places`), and with one another."""
+
+    own: Float[Array, "images e_e"]
+    across: Float[Array, "images places e"]
+    border: Float[Array, "places places"]
+    band: tuple[Array, Array]
+    """Its negative, by column block, without images by themselves."""
+
+    @classmethod
+    def of(cls, border: Float[Array, "points d c"], s: PaddedStructure, k: int) -> "ProductSums":
+        """Before the first ray, with that of the border."""
+        places, n, e, size = border_places(s, k), s.n_images, 6 + image_places(s, k).shape[1], s.n_shared + k + 2
+        width, inner = n // s.rays.columns, s.rays.columns - 1
+        band = jnp.zeros((inner, 2 * width, 6, width, 6)), jnp.zeros((width, 6, width, 6))
+        return cls(jnp.zeros((n, e * e)), jnp.zeros((n, size, e)), _of_border(border, places, s, size), band)
+
+    def with_rays(self, image: Array, point: Array, f: Array, border: Array, s: PaddedStructure, k: int):
+        """With those of a batch."""
+        (chunks, _, _, e), c = f.shape, interior_in_border(s) + k + 1
+        places, flat = border_places(s, k), f.reshape(chunks, -1, e)
+        met = border.at[point].get(mode="promise_in_bounds")
+        first = met[..., :c].reshape(chunks, flat.shape[1], c)
+        across = self.across.at[image[:, None], places[0, :c]].add(jnp.einsum("nxe,nxc->nce", flat, first))
+        if met.shape[3] > c:
+            each = jnp.einsum("npxe,npxb->npbe", f, met[..., c:])
+            across = across.at[image[:, None, None], places[point // GROUP, c:]].add(each)
+        own = jnp.einsum("nxe,nxf->nef", flat, flat).reshape(chunks, -1)
+        return self._replace(own=self.own + sum_by(own, image, s.n_images), across=across)
+
+    def with_pairs(self, f: Float[Array, "batches m p d e"], s: PaddedStructure, k: int) -> "ProductSums":
+        """With those of pairs of rays, and of the unknowns of cameras."""
+        e, own = f.shape[-1], image_places(s, k)
+
+        def to_pairs(sums, numbers):
+            pair, block = numbers
+            one, other = (rows.at[pair[:, o]].get(mode="promise_in_bounds").reshape(len(pair), -1, e) for o in range(2))
+            product = jnp.einsum("nxe,nxf->nef", one, other)
+            sums = sums._replace(band=add_blocks(sums.band, -product[:, :6, :6], block))
+            return (_of_cameras(sums, product, block, own, s) if e > 6 else sums), ()
+
+        sums = self
+        if s.rays.free_points:
+            rows = f.reshape(-1, 3 * e)
+            sums, _ = each_batch(to_pairs, sums, (s.pairs, s.rays.block), s.rays.used[0, 1])
+        return _with_cameras(sums, own, s) if e > 6 else sums
+
+
+def whitened(
+    eop: Sequence[Float[Array, "e m p"]],
+    points: Sequence[Float[Array, "3 m p"]],
+    l: Float[Array, "6 m p"],  # noqa: E741
+) -> Float[Array, "m p 3 e"]:
+    """F of rays: the sum of products of derivatives by image and point, times L^-1."""
+    e, *shape = eop[0].shape
+    z = [whiten(w, l) for w in points]
+    f = [added(c * w[a] for c, w in zip(eop, z, strict=True)) for a in range(3)]
+    return jnp.concatenate(f).reshape(3 * e, -1).T.reshape(*shape, 3, e)
+
+
+def _of_border(border: Float[Array, "points d c"], places: Array, s: PaddedStructure, size: int):
+    """F F' of what points meet besides images."""
+    zero = jnp.zeros((size, size))
+    if not s.rays.met.shape[1]:
+        flat = border.reshape(-1, border.shape[2])
+        return zero.at[places[0][:, None], places[0]].add(flat.T @ flat)
+    flat = border.reshape(len(places), -1, border.shape[2])
+    return zero.at[places[:, :, None], places[:, None]].add(jnp.einsum("gxc,gxd->gcd", flat, flat))
+
+
+def _of_cameras(sums: ProductSums, product: Array, block: Array, own: Array, s: PaddedStructure) -> ProductSums:
+    """The sums with what pairs of images add for the unknowns of their cameras."""
+    one, other = pair_images(block, s)
+    columns = [jnp.asarray(own).at[image].get(mode="clip") for image in (one, other)]
+    across = sums.across.at[one[:, None], columns[1], :6].add(product[:, :6, 6:].swapaxes(1, 2), mode="drop")
+    across = across.at[other[:, None], columns[0], :6].add(product[:, 6:, :6], mode="drop")
+    inner = product[:, 6:, 6:]
+    border = sums.border.at[columns[0][:, :, None], columns[1][:, None]].add(inner)
+    border = border.at[columns[1][:, :, None], columns[0][:, None]].add(inner.swapaxes(1, 2))
+    return sums._replace(across=across, border=border)
+
+
+def pair_images(block: Array, s: PaddedStructure) -> tuple[Array, Array]:
+    """The two images of each chunk of pairs; beyond the last where there are none."""
+    width = s.n_images // s.rays.columns
+    which, row, column = jnp.asarray(block).T
+    none = which == s.rays.columns
+    return jnp.where(none, s.n_images, which * width + row), jnp.where(none, s.n_images, which * width + column)
+
+
+def _with_cameras(sums: ProductSums, own: Array, s: PaddedStructure) -> ProductSums:
+    """The sums with what each image adds for the unknowns of its camera."""
+    n, e = s.n_images, 6 + own.shape[1]
+    square, met = sums.own.reshape(n, e, e), sums.across[:, :, 6:]
+    border = sums.border.at[own].add(met.swapaxes(1, 2))
+    border = border.at[:, own].add(jnp.moveaxis(met, 0, 1))
+    border = border.at[own[:, :, None], own[:, None]].add(square[:, 6:, 6:])
+    across = sums.across.at[jnp.arange(n)[:, None], own, :6].add(square[:, 6:, :6])
+    return sums._replace(across=across, border=border)
+
+
+class _OfMet(NamedTuple):
+    """J_s' J_s and J_s' r of rows at points, by all shared unknowns."""
+
+    square: Float[Array, "shared shared"]
+    right: Float[Array, "shared"]
+
+
+def _rows_with_shared(rest: NonImageRows, s: PaddedStructure) -> tuple[Float[Array, "b 3 points"], _OfMet]:
+    """J_s' J_p of rows at points, by what their groups of points meet, and what does not meet points."""
+    size, n = s.rays.met.shape[1], s.n_shared
+    none = jnp.zeros((size, 3, rest.b.shape[1]))
+    if not rest.at_points:
+        return none, _OfMet(jnp.zeros((n, n)), jnp.zeros(n))
+
+    def of_group(groups: tuple[RowsOfPoints, ...]) -> tuple[Array, Array, Array]:
+        each = [(rows.of_group(size), rows) for rows in groups]
+        met = added(jnp.einsum("brpc,ckrp->bkp", of, rows.points) for of, rows in each)
+        square = added(jnp.einsum("arpc,brpc->ab", of, of) for of, _ in each)
+        return met, square, added(jnp.einsum("brpc,crp->b", of, rows.residual) for of, rows in each)
+
+    groups = jax.tree.map(s.by_group, rest.at_points)
+    met, square, right = jax.lax.map(of_group, groups, batch_size=_GROUPS)
+    which = jnp.asarray(s.rays.met)
+    zero = jnp.zeros((n + 1, n + 1)), jnp.zeros(n + 1)
+    square = zero[0].at[which[:, :, None], which[:, None]].add(square)[:-1, :-1]
+    return jnp.moveaxis(met, 0, -2).reshape(none.shape), _OfMet(square, zero[1].at[which].add(right)[:-1])
+
+
+def _assembled(
+    at: Linearised,
+    damping,
+    less: Increments | None,
+    rest: NonImageRows,
+    square,
+    sums: ProductSums,
+    of_met: _OfMet,
+    points,
+    f,
+) -> tuple[Band, Reduced, RightSide]:
+    """The reduced normal matrix and right-hand side from all sums."""
+    s, coupled = at.structure, rest.coupled
+    n, k, n_shared = s.n_images, len(coupled), s.n_shared
+    width, inner = n // s.rays.columns, s.rays.columns - 1
+    own = sums.own.reshape(n, sums.across.shape[2], -1)[:, :6, :6]
+    us, uss, b_s = _by_unknown(square, s)
+    images = NormalSums(sums.band, square[:, :6, :6], us, uss, b_s, square[:, :6, -1])
     (columns, last), u, us, uss, b_s, b_e = add_non_image_rows(images, rest, s)
-    weight = Increments(jnp.einsum("nii->in", u), jnp.diagonal(uss), v)
-    if of_met is not None:
-        weight, b_s = weight._replace(shared=weight.shared + of_met.rows[:-1, 0]), b_s + of_met.rows[:-1, 1]
+    uss, b_s = uss + of_met.square, b_s + of_met.right
+    weight = Increments(jnp.einsum("nii->in", u), jnp.diagonal(uss), points.diagonal)
     added = damping * weight.eop.T + jnp.where(weight.eop.T == 0, 1.0, 0.0)
-    u = u + added[:, :, None] * jnp.eye(6)
+    u = u - own + added[:, :, None] * jnp.eye(6)
     each, of_inner = jnp.arange(n), inner * width
     columns = columns.at[each[:of_inner] // width, each[:of_inner] % width, :, each[:of_inner] % width].add(
         u[:of_inner], unique_indices=True
     )
     last = last.at[each[:width], :, each[:width]].add(u[of_inner:], unique_indices=True)
 
-    us = us.at[:, :, :i].add(-met[:, :, :i])
-    uss = (uss + damping * jnp.diag(weight.shared)).at[:i, :i].add(-border[:i, :i])
-    ge = rest.rows_e.transpose(1, 2, 0) - met[:, :, i : i + k]
-    gs = rest.rows_s.T.at[:i].add(-border[:i, i : i + k])
-    if of_met is not None:
-        us = us - of_met.images[:, :, :-1]
-        # Of what is met with interior unknowns, both halves.
-        uss = (uss - of_met.shared[:-1, :-1]).at[:, :i].add(-of_met.interior[:-1])
-        uss = uss.at[:i].add(-of_met.interior[:-1].T)
-        gs = gs - of_met.constraints[:-1, :-1]
-    us = us.transpose(2, 0, 1).reshape(n_shared, 6 * n)
-    g = jnp.concatenate([ge.reshape(6 * n, k), gs])
-    kk = jnp.eye(k) + border[i : i + k, i : i + k]
+    # Of products with the border: by shared unknowns, constraints and the right-hand side.
+    e_shared, e_coupled, e_right, _ = jnp.split(
+        sums.across[..., :6], [n_shared, n_shared + k, n_shared + k + 1], axis=1
+    )
+    s_shared, s_coupled, s_right, _ = jnp.split(
+        sums.border[:n_shared], [n_shared, n_shared + k, n_shared + k + 1], axis=1
+    )
+    us = (us.transpose(2, 0, 1) - e_shared.transpose(1, 0, 2)).reshape(n_shared, 6 * n)
+    uss = uss + damping * jnp.diag(weight.shared) - s_shared
+    ge = rest.rows_e.transpose(1, 2, 0) - e_coupled.transpose(0, 2, 1)
+    g = jnp.concatenate([ge.reshape(6 * n, k), rest.rows_s.T - s_coupled])
+    of_mu = sums.border[n_shared : n_shared + k, n_shared : n_shared + k + 1]
+    kk, d = jnp.eye(k) + of_mu[:, :k], of_mu[:, k]
     # Put together by parts that are written whole: `block` would be computed number by number.
     end = jnp.zeros((6 * width + n_shared,) * 2).at[: 6 * width, : 6 * width].set(last.reshape(6 * width, -1))
     end = end.at[6 * width :, : 6 * width].set(us[:, 6 * of_inner :]).at[6 * width :, 6 * width :].set(uss)
@@ -160,137 +390,12 @@ def reduce_normal(
     b_e, b_s = b_e + jnp.einsum("cna,c->na", rest.rows_e, coupled), b_s + rest.rows_s.T @ coupled
     if less is not None:
         b_e, b_s = b_e - less.eop.T, b_s - less.shared
-    right_s = b_s.at[:i].add(-border[:i, -1])
-    if of_met is not None:
-        right_s = right_s - of_met.constraints[:-1, -1]
-    right = jnp.concatenate([(b_e - met[:, :, -1]).reshape(-1), right_s])
-    reduced = Reduced(diagonal_of(a), g, kk, f, l, weight, jnp.asarray(damping, float))
-    return a, reduced, RightSide(Increments(b_e.T, b_s, b_points), right, border[i : i + k, -1])
+    right = jnp.concatenate([(b_e - e_right[:, 0]).reshape(-1), b_s - s_right[:, 0]])
+    reduced = Reduced(diagonal_of(a), g, kk, f, points.border, points.l, weight, jnp.asarray(damping, float))
+    return a, reduced, RightSide(Increments(b_e.T, b_s, points.b), right, d)
 
 
-class _Met(NamedTuple):
-    """Sums for shared unknowns that only some points meet, in the order of all of them and one that means none."""
-
-    images: Float[Array, "images 6 shared+1"]
-    interior: Float[Array, "shared+1 interior"]
-    shared: Float[Array, "shared+1 shared+1"]
-    """F F' of two of them, less the J_s' J_s of their rows."""
-    constraints: Float[Array, "shared+1 k+1"]
-    rows: Float[Array, "shared+1 2"]
-    """The diagonal of J_s' J_s, and J_s' r."""
-
-    @classmethod
-    def none(cls, images: int, shared: int, interior: int, k: int) -> "_Met":
-        n = shared + 1
-        return cls(*map(jnp.zeros, ((images, 6, n), (n, interior), (n, n), (n, k + 1), (n, 2))))
-
-
-def _add_met(sums: _Met, of_tiles: tuple[Array, Array, Array], which: Array, image: Array, i: int) -> _Met:
-    """The sums with those of a chunk: of images, of the border and of rows, by what each tile meets (tiles, b)."""
-    images, border, rows = of_tiles
-    b = which.shape[1]
-    interior, shared, rest = jnp.split(border, [i, i + b], axis=2)
-    diagonal = jnp.diagonal(rows, axis1=1, axis2=2)
-    return _Met(
-        sums.images.at[image[:, :, None], :, which[:, None, :]].add(images),
-        sums.interior.at[which].add(interior),
-        sums.shared.at[which[:, :, None], which[:, None, :]].add(shared - rows[:, :, :b]),
-        sums.constraints.at[which].add(rest),
-        sums.rows.at[which].add(jnp.stack([diagonal, rows[:, :, b]], axis=2)),
-    )
-
-
-def tile_numbers(at: Linearised, rest: NonImageRows):
-    """What `tile_parts` wants of each tile, chunks and tiles first."""
-    increments, scale, values, s = at
-    tiles = s.tiles
-    points = values.points + increments.points * scale.points
-    of_points = (points, scale.points, rest.v, rest.b, rest.at_points, rest.rows_p)
-    return (tiles.image, values.xy, values.sigma_xy, *jax.tree.map(s.by_tile, of_points))
-
-
-def tile_columns(at: Linearised):
-    """A function from a tile's images, measurements and points to its residuals and Jacobian."""
-    s = at.structure
-    scene = orientations_of(at.state, at.values, s)
-    slopes = once(lambda: orientation_derivatives(at.increments, at.scale, at.values, s), s.eop_free)
-
-    def columns_of(numbers) -> tuple[TileJacobian, TileJacobian]:
-        image, xy, sigma, points, scale = numbers
-        seen = seen_in(xy, sigma, image, s)
-        own = of_images(scene, image, s), of_images(slopes, image, s)
-        return once(partial(tile_jacobian, s=s), s.eop_free, *own, points, scale, seen)
-
-    return columns_of
-
-
-def tile_parts(at: Linearised, damping, coupled: Float[Array, "constraints"]):
-    """A function from one tile's numbers, and other residuals than its own, to its `TileParts`."""
-    s, columns_of = at.structure, tile_columns(at)
-
-    def parts(numbers, residual: Pair | None = None) -> TileParts:
-        *measured, own_v, own_b, at_points, rows_p = numbers
-        j = columns_of(measured)
-        if residual is not None:
-            j = j[0]._replace(residual=residual[0]), j[1]._replace(residual=residual[1])
-        image, (m, p), n_met = measured[0], j[0].residual.shape, s.tiles.met.shape[2]
-        own_w, met = jnp.zeros((n_met, 3, p)), jnp.zeros((n_met, n_met + 1))
-        for rows in at_points:
-            by_met = rows.of_tile(n_met)
-            own_w = own_w + jnp.einsum("brpc,ckrp->bkp", by_met, rows.points)
-            square = jnp.einsum("arpc,brpc->ab", by_met, by_met)
-            met = met + jnp.column_stack([square, jnp.einsum("brpc,crp->b", by_met, rows.residual)])
-        if not s.tiles.free_points:
-            f = jnp.zeros((6 * m + s.n_interior + n_met + len(coupled) + 1, 0))
-            unit, nothing = jnp.array([1.0, 0, 1, 0, 0, 1])[:, None], jnp.zeros((3, p))
-            return TileParts(j, f, jnp.broadcast_to(unit, (6, p)), nothing, nothing, met)
-        v, b = _met([c.point for c in j], j), _met([c.residual[None] for c in j], j)[0]
-        ws = jnp.concatenate([_by_interior(j, image, s), own_w])
-        v, b = v + own_v, b + own_b
-        diagonal = jnp.einsum("iip->ip", v)
-        added = damping * diagonal + jnp.where(diagonal == 0, 1.0, 0.0)
-        v = v + added[:, None] * jnp.eye(3)[:, :, None]
-        b = b + jnp.einsum("ckp,c->kp", rows_p, coupled)
-        l = once(cholesky_3x3, s.eop_free, v)  # noqa: E741
-        border = jnp.concatenate([ws, rows_p, b[None]])
-        border = jnp.stack(whiten(border.transpose(1, 0, 2), l), axis=1)
-        z = once(
-            lambda factors, *points: tuple(jnp.stack(whiten(w, factors)) for w in points),
-            s.eop_free,
-            l,
-            *(c.point for c in j),
-        )
-        f = jnp.concatenate([once(_whitened_eop, s.eop_free, j, z).reshape(6 * m, 3 * p), border.reshape(-1, 3 * p)])
-        return TileParts(j, f, l, b, diagonal, met)
-
-    return parts
-
-
-def _whitened_eop(j: Iterable[TileJacobian], z: Iterable[Array]) -> Float[Array, "m 6 3 p"]:
-    """Y of a tile."""
-    both = ((c.eop.transpose(1, 0, 2), w.transpose(1, 0, 2)) for c, w in zip(j, z, strict=True))
-    return added(eop[:, :, None] * w[:, None] for eop, w in both)
-
-
-def _met(of: Iterable[Float[Array, "a m p"]], j: Iterable[TileJacobian]) -> Float[Array, "a 3 p"]:
-    """Sums over a point's rows, term by term: XLA's products of matrices this small take five times as long."""
-    each = zip(of, j, strict=True)
-    return added(a[:, None, k] * c.point[:, k] for a, c in each for k in range(a.shape[1]))
-
-
-def _by_interior(j: tuple[TileJacobian, TileJacobian], image: Array, s: TiledStructure) -> Float[Array, "interior 3 p"]:
-    """Ws of a tile."""
-    i, q = s.n_interior, s.n_image_colours
-    if i == q:
-        # One camera: its colours are its unknowns.
-        return _met([c.shared for c in j], j)
-    met = added(c.shared[:, :, None] * c.point.transpose(1, 0, 2) for c in j)
-    column = jnp.asarray(s.column)[image, :q].T.reshape(-1)
-    pick = (column == jnp.arange(i)[:, None]).astype(float)
-    return (pick @ met.reshape(q * len(image), -1)).reshape(i, 3, -1)
-
-
-def _by_unknown(m: Float[Array, "images c c"], s: TiledStructure):
+def _by_unknown(m: Float[Array, "images c c"], s: PaddedStructure):
     """Per-image sums by colour, brought to the columns of the shared unknowns; the last column is a dummy."""
     q, n = s.n_image_colours, s.n_shared
     each, column = jnp.arange(s.n_images), jnp.asarray(s.column)[:, : s.n_image_colours]

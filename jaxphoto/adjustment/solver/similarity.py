@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
+from jaxphoto.adjustment.layout.padded import PaddedStructure, PaddedValues
 from jaxphoto.adjustment.model.numbers import AbstractValues, Increments, datum_residuals
 from jaxphoto.adjustment.model.structure import AbstractStructure, total
 from jaxphoto.adjustment.solver.normal import Linearised, dot
@@ -99,7 +99,7 @@ def onto_datum(at: Linearised) -> Increments:
     return jax.tree.map(lambda new, old: jnp.where(finite, new, old), found, y)
 
 
-def along_motions(values: TiledValues, scale: Increments, s: TiledStructure) -> Increments:
+def along_motions(values: PaddedValues, scale: Increments, s: PaddedStructure) -> Increments:
     """Scaled increments along each of the `n_open_motions` (leading axis), which nothing but the datum sees."""
     k, shared = n_open_motions(values, s), scale.shared
     eop, points = motions(values.position, values.rotation, values.points, *_extent(values.points, s))
@@ -141,7 +141,7 @@ def _moved(at: Linearised, parameters: Float[Array, "k"], centre, size) -> Incre
     return Increments(eop, y.shared, _scaled(points - values.points, scale.points))
 
 
-def _extent(points: Float[Array, "3 points"], s: TiledStructure) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+def _extent(points: Float[Array, "3 points"], s: PaddedStructure) -> tuple[Float[Array, "3"], Float[Array, ""]]:
     """Centre and size (m) of the points."""
     mean = lambda v: total(jnp.sum(v, axis=-1), s) / s.n_points  # noqa: E731
     centre = mean(points)
@@ -153,7 +153,7 @@ def _scaled(v, scale):
     return jnp.where(scale > 0, v / jnp.where(scale > 0, scale, 1.0), 0.0)
 
 
-def _nearest(points, start, own, centre, size, s: TiledStructure) -> Float[Array, "7"]:
+def _nearest(points, start, own, centre, size, s: PaddedStructure) -> Float[Array, "7"]:
     """Parameters of the similarity that takes `points` nearest to `start`; only `own` points count."""
     weight = own / total(jnp.sum(own), s)
     mean, target = total((points @ weight, start @ weight), s)

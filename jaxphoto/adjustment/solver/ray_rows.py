@@ -1,9 +1,8 @@
-"""A tile: residuals of its image rows, and their derivatives, in all its slots at once.
+"""A batch of rays: residuals of its image rows, and their derivatives, in all its slots at once.
 
-A row touches one image, one point and the parameters of one camera. In a tile its image is an axis and its point
-another, so what depends on the image alone is computed once an image, and each column of the Jacobian is one forward
-derivative of `image_residual`, mapped over both axes: nothing is gathered row by row. Arrays end in (m, p): images,
-points.
+A row touches one image, one point and the parameters of one camera. Rays lie in chunks of one image, so what depends on
+the image alone is computed once a chunk, and each column of the Jacobian is one forward derivative of `image_residual`,
+mapped over chunks and rays. Arrays end in (m, p): chunks, rays of a chunk.
 """
 
 from collections.abc import Callable
@@ -14,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxphoto.adjustment.layout.tiled import TiledStructure
+from jaxphoto.adjustment.layout.padded import PaddedStructure
 from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.image_orientations import ImageOrientations, OrientationDerivatives
 from jaxphoto.arrays import added
@@ -23,8 +22,8 @@ from jaxphoto.compiling import once
 from jaxphoto.georeferencing import apparent_point
 
 
-class TileMeasurements(NamedTuple):
-    """What was measured in a tile, with weights 1 / sigma; zero in empty slots."""
+class RayMeasurements(NamedTuple):
+    """What was measured in a batch, with weights 1 / sigma; zero in empty slots."""
 
     xy: Float[Array, "2 m p"]
     weight: Float[Array, "2 m p"]
@@ -32,17 +31,17 @@ class TileMeasurements(NamedTuple):
     """By group of cameras: whether the image's camera belongs to it."""
 
 
-Pair = tuple[Float[Array, "*tiles m p"], Float[Array, "*tiles m p"]]
-"""Of the rows of a tile, or of all tiles, x and y. Joined to one array they would be computed number by number, not as
+Pair = tuple[Float[Array, "*batches m p"], Float[Array, "*batches m p"]]
+"""Of the rows of a batch, or of all, x and y. Joined to one array they would be computed number by number, not as
 vectors."""
 
 
 Triple = tuple[Float[Array, "m p"], Float[Array, "m p"], Float[Array, "m p"]]
-"""The three coordinates of a tile's points in its cameras' frames."""
+"""The three coordinates of the points in the frames of the cameras."""
 
 
-class TileJacobian(NamedTuple):
-    """Weighted residuals of a tile's rows, x or y, and their derivatives with respect to scaled increments."""
+class RayJacobian(NamedTuple):
+    """Weighted residuals of rows, x or y, and their derivatives by scaled increments; by points in metres."""
 
     residual: Float[Array, "m p"]
     eop: Float[Array, "6 m p"]
@@ -50,22 +49,27 @@ class TileJacobian(NamedTuple):
     point: Float[Array, "3 m p"]
 
 
-def seen_in(xy: Array, sigma: Array, image: Array, s: TiledStructure) -> TileMeasurements:
-    """What a tile's rows measured."""
-    return TileMeasurements(xy, 1 / sigma, tuple(jnp.asarray(g.member)[image] for g in s.groups))
+def points_at(numbers: Float[Array, "c points"], point: Array) -> Float[Array, "c m p"]:
+    """Numbers of the points of rays."""
+    return jnp.moveaxis(jnp.asarray(numbers).T.at[point].get(mode="promise_in_bounds"), -1, 0)
 
 
-def tile_residuals(
-    scene: ImageOrientations, points: Float[Array, "3 p"], seen: TileMeasurements, s: TiledStructure
+def seen_in(xy: Array, sigma: Array, image: Array, s: PaddedStructure) -> RayMeasurements:
+    """What rows measured."""
+    return RayMeasurements(xy, 1 / sigma, tuple(jnp.asarray(g.member)[image] for g in s.groups))
+
+
+def ray_residuals(
+    scene: ImageOrientations, points: Float[Array, "3 m p"], seen: RayMeasurements, s: PaddedStructure
 ) -> Pair:
-    """Weighted residuals of a tile: observed minus computed over sigma."""
+    """Weighted residuals of a batch: observed minus computed over sigma."""
     return _residuals(
         [_leaves_of(c) for c in scene.cameras], _in_cameras(scene.centre, scene.rotation, points, seen, s), seen, s
     )
 
 
-def _in_cameras(centre: Array, rotation: Array, points: Array, seen: TileMeasurements, s: TiledStructure) -> Triple:
-    """Points in the frames of a tile's cameras."""
+def _in_cameras(centre: Array, rotation: Array, points: Array, seen: RayMeasurements, s: PaddedStructure) -> Triple:
+    """Points in the frames of the cameras."""
 
     def one(centre, rotation, point, weight):
         aim = apparent_point(centre, point, s.corrections)
@@ -75,14 +79,14 @@ def _in_cameras(centre: Array, rotation: Array, points: Array, seen: TileMeasure
         return u, v, w
 
     along_points = jax.vmap(one, (None, None, -1, -1), -1)
-    return jax.vmap(along_points, (0, 0, None, 0))(centre, rotation, points, seen.weight[0])
+    return jax.vmap(along_points, (0, 0, 1, 0))(centre, rotation, points, seen.weight[0])
 
 
 def _leaves_of(camera: Array) -> list[Array]:
     return list(jnp.moveaxis(camera, -1, 0))
 
 
-def _residuals(cameras: list[list[Array]], in_camera: Triple, seen: TileMeasurements, s: TiledStructure) -> Pair:
+def _residuals(cameras: list[list[Array]], in_camera: Triple, seen: RayMeasurements, s: PaddedStructure) -> Pair:
     parts = [_residuals_of(g, c, in_camera, seen) for g, c in zip(s.groups, cameras, strict=True)]
     # Without cameras there are empty slots only.
     x, y = parts[0] if parts else (0 * in_camera[0], 0 * in_camera[0])
@@ -96,7 +100,7 @@ def _residuals(cameras: list[list[Array]], in_camera: Triple, seen: TileMeasurem
     return x, y
 
 
-def _residuals_of(g: CameraGroup, camera: list[Array], in_camera: Triple, seen: TileMeasurements) -> Pair:
+def _residuals_of(g: CameraGroup, camera: list[Array], in_camera: Triple, seen: RayMeasurements) -> Pair:
     def one(camera, in_camera, xy, weight):
         x, y = camera_residual(interior_of(g, camera), in_camera, xy)
         return x * weight[0], y * weight[1]
@@ -106,15 +110,14 @@ def _residuals_of(g: CameraGroup, camera: list[Array], in_camera: Triple, seen: 
     return jax.vmap(along_points, (whose, 0, 1, 1))(camera, in_camera, seen.xy, seen.weight)
 
 
-def tile_jacobian(
+def ray_jacobian(
     scene: ImageOrientations,
     slopes: OrientationDerivatives,
-    points: Float[Array, "3 p"],
-    scale: Float[Array, "3 p"],
-    seen: TileMeasurements,
-    s: TiledStructure,
-) -> tuple[TileJacobian, TileJacobian]:
-    """Residuals and Jacobian of a tile, x and y, by the chain rule: through the points in the cameras' frames, three
+    points: Float[Array, "3 m p"],
+    seen: RayMeasurements,
+    s: PaddedStructure,
+) -> tuple[RayJacobian, RayJacobian]:
+    """Residuals and Jacobian of a batch, x and y, by the chain rule: through the points in the cameras' frames, three
     numbers a slot.
     """
     centre, rotation, unit = scene.centre, scene.rotation, jnp.eye(3)
@@ -124,27 +127,27 @@ def tile_jacobian(
     # jit keeps the trace: every derivative below uses it again.
     place = jax.jit(partial(_in_cameras, seen=seen, s=s))
     by_eop = _slope(lambda *x: place(*x, points), centre, rotation)(*seeds)
-    by_point = _by_point(lambda x: place(centre, rotation, x), points, scale, s)
+    by_point = _by_point(lambda x: place(centre, rotation, x), points, s)
     residual, by_place, by_camera = once(
         partial(_camera_columns, s=s), s.eop_free, scene.cameras, slopes.cameras, place(centre, rotation, points), seen
     )
 
-    def of_one(k: int) -> TileJacobian:
+    def of_one(k: int) -> RayJacobian:
         eop, point = (added(b[k] * v for b, v in zip(by_place, moved, strict=True)) for moved in (by_eop, by_point))
-        return TileJacobian(residual[k], eop, by_camera[k], point)
+        return RayJacobian(residual[k], eop, by_camera[k], point)
 
     return of_one(0), of_one(1)
 
 
-def _by_point(place: Callable, points: Float[Array, "3 p"], scale: Float[Array, "3 p"], s: TiledStructure):
+def _by_point(place: Callable, points: Float[Array, "3 m p"], s: PaddedStructure):
     """Derivatives of the places in the cameras' frames by the points' coordinates; none where all are fixed."""
-    if not s.tiles.free_points:
+    if not s.rays.free_points:
         return tuple(jnp.zeros((3, *v.shape)) for v in jax.eval_shape(place, points))
-    return _slope(place, points)(jnp.eye(3)[:, :, None] * scale)
+    return _slope(place, points)(jnp.broadcast_to(jnp.eye(3)[:, :, None, None], (3, *points.shape)))
 
 
 def _camera_columns(
-    cameras: tuple[Array, ...], slopes: tuple[Array, ...], in_camera: Triple, seen: TileMeasurements, s: TiledStructure
+    cameras: tuple[Array, ...], slopes: tuple[Array, ...], in_camera: Triple, seen: RayMeasurements, s: PaddedStructure
 ):
     """Residuals, and their derivatives by the point in the camera's frame and by the cameras' unknowns."""
     leaves = [_leaves_of(c) for c in cameras]
