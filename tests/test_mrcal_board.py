@@ -3,7 +3,6 @@
 import json
 
 import equinox as eqx
-import jax
 import numpy as np
 import pandas as pd
 import pytest
