@@ -19,6 +19,7 @@ import pytest
 
 import jaxphoto
 from jaxphoto.adjustment import Adjustment, adjust
+from jaxphoto.adjustment.layout import padding
 from jaxphoto.block import Block
 from jaxphoto.devices import mesh_of, usable
 from jaxphoto.observations import Distances
@@ -82,7 +83,9 @@ def main(cases: str, folder: str) -> None:
     for name, n in (case.split(":") for case in cases.split(",")):
         block = BLOCKS[name]()
         # So small a block would be left to one device.
-        with mock.patch.object(adjust, "_devices_worth_using", lambda rows, n=n: usable(int(n))):
+        # Small batches, of which each device has several.
+        small = mock.patch.multiple(padding, _RAYS=128, _PAIRS=128, _FEWEST=128)
+        with small, mock.patch.object(adjust, "_devices_worth_using", lambda rows, n=n: usable(int(n))):
             result = jaxphoto.adjust(block, block.start.unknowns)
         assert result.outcome is jaxphoto.Outcome.CONVERGED
         held = result.equations.structure.rays.shards

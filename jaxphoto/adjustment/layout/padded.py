@@ -80,17 +80,18 @@ class PaddedStructure(AbstractStructure):
     @property
     def ray_points(self) -> Int[Array, "batches chunks p"]:
         """The point of each ray, among those that this device has."""
-        return self._here(self.rays.ray_point, self.n_points)
+        return self._here(self.rays.ray_point, self.n_points // self.shards)
 
     @property
     def pairs(self) -> Int[Array, "pair_batches pair_chunks 2 q"]:
         """Numbers of rays among those that this device has."""
+        # Where batches are dealt out, a device sees its own rays alone.
         return self._here(self.rays.pair, math.prod(self.rays.ray_point.shape))
 
-    def _here(self, index: Any, size: int) -> Array:
+    def _here(self, index: Any, of_device: int) -> Array:
         if self.shards == 1:
             return jnp.asarray(index)
-        return index - jax.lax.axis_index(AXIS) * (size // self.shards)
+        return index - jax.lax.axis_index(AXIS) * of_device
 
     def each(self, body: Callable, carry: Any, numbers: Any) -> tuple[Any, Any]:
         """`each_batch` of rays: `body` of the carry and of (images, points, *numbers)."""

@@ -196,7 +196,9 @@ class RayLayout(NamedTuple):
         groups = size_class(max(-(-s.n_points // (GROUP * shards)), wanted.point_groups), 16)
         image = place[s.image]
         point_place = np.empty(s.n_points, np.int32)
-        point_place[_order_points(image, s.point, s.n_points)] = np.arange(s.n_points)
+        # Devices have as many points each, whatever the padding.
+        of_device, number = np.divmod(np.arange(s.n_points), max(-(-s.n_points // shards), 1))
+        point_place[_order_points(image, s.point, s.n_points)] = of_device * groups * GROUP + number
         device = point_place[s.point] // (groups * GROUP)
         rows = [np.flatnonzero(device == k) for k in range(shards)]
         lists = tuple(
