@@ -31,10 +31,9 @@ from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import iterate, typical_scale, unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.reduced import (
     ProductSums,
-    border_places,
-    image_places,
     interior_in_border,
     reduce_normal,
+    reduced_columns,
 )
 from jaxphoto.arrays import added, still
 from jaxphoto.compiling import call_compiled
@@ -160,17 +159,15 @@ class Met(NamedTuple):
     @classmethod
     def of(cls, s: PaddedStructure, k: int) -> "Met":
         """Those of a block."""
-        n = 6 * s.n_images
-        eop = 6 * jnp.arange(s.n_images)[:, None] + jnp.arange(6)
-        of_images = jnp.concatenate([eop, n + image_places(s, k)], axis=1)
-        return cls(of_images, n + jnp.repeat(border_places(s, k), GROUP, axis=0), interior_in_border(s))
+        of_images, of_groups = reduced_columns(s, k)
+        return cls(of_images, jnp.repeat(of_groups, GROUP, axis=0), interior_in_border(s))
 
+    @staticmethod
     def products(
-        self, f: Float[Array, "batches m p 3 e"], border: Float[Array, "points 3 c"], s: PaddedStructure
+        f: Float[Array, "batches m p 3 e"], border: Float[Array, "points 3 c"], s: PaddedStructure, k: int
     ) -> Float[Array, "size size"]:
-        """F F' of rays and points, at all reduced unknowns and constraints."""
-        n, each, k = s.n_images, jnp.arange(s.n_images), self.of_points.shape[1] - s.rays.met.shape[1]
-        k = k - self.interior - 1
+        """F F' of rays and points, at all reduced unknowns and the k constraints."""
+        n, each = s.n_images, jnp.arange(s.n_images)
         sums = ProductSums.of(border, s, k)
         sums, _ = s.each(lambda sums, own: (sums.with_rays(*own, border, s, k), ()), sums, (f,))
         sums = sums.with_pairs(f, s, k)

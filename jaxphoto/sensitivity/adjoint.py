@@ -54,11 +54,8 @@ def adjoint_vectors(h: Any, of: Estimates) -> Float[np.ndarray, "unknowns estima
     for i in range(3):
         angles[i][:] = turned[i]
     gain = _gain(h, place, n + k)
-    down = (
-        (gain[(3 * of.points[:, None] + np.arange(3)).ravel()].T * of.point_step.reshape(-1)).toarray()
-        if asked
-        else np.zeros((n + k, 0))
-    )
+    of_asked = gain[(3 * of.points[:, None] + np.arange(3)).ravel()].toarray()
+    down = of_asked.T * of.point_step.reshape(-1)
     reduced[:, n:] = inverse @ np.concatenate([down[:n], h.c @ down[n:]])
 
     found[n + k :] = gain @ reduced

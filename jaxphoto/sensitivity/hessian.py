@@ -96,7 +96,7 @@ def eliminated(at: Linearised, rows: ListedRows, curved: Float[Numbers, ""]) -> 
     of_rows = jnp.stack(whiten(w.swapaxes(0, 1), l[:, point][:, None])).transpose(2, 0, 1)
     f = of_rows[jnp.asarray(rows.of_slot)]
     m = jnp.zeros((n + k, n + k)).at[:n, :n].set(other_second(second, s) + _by_unknown(h, s))
-    m = m.at[n:, :n].set(d_e).at[:n, n:].set(d_e.T) - places.products(f, border, s)
+    m = m.at[n:, :n].set(d_e).at[:n, n:].set(d_e.T) - Met.products(f, border, s, k)
     fixed = jnp.where(jnp.diagonal(m) == 0, 1.0, 0.0)
     m = m.at[n:].set(c @ m[n:]) + jnp.diag(jnp.where(jnp.arange(n + k) < n, fixed, -1.0))
     return Eliminated(

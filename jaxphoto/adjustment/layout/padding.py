@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxphoto.adjustment.layout.padded import PaddedResiduals, PaddedStructure, PaddedValues, RayLists
 from jaxphoto.adjustment.layout.padded_groups import crop_rows, pad_groups, pad_rows, put, scatter
-from jaxphoto.adjustment.layout.rays import CHUNK, GROUP, LEAST, PAIRS, Chunks, Places, RayLayout, Sizes, size_class
+from jaxphoto.adjustment.layout.rays import CHUNK, GROUP, LEAST, PAIRS, Places, RayLayout, Sizes, size_class
 from jaxphoto.adjustment.model.camera_groups import CameraGroup
 from jaxphoto.adjustment.model.numbers import Residuals, UnknownArrays, Values
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
@@ -134,7 +134,7 @@ def pad_structure(structure: Structure, sizes: Sizes = LEAST, *, shards: int = 1
     block = np.tile(np.array([layout.columns, 0, 0], np.int32), (shards, pair_batches * pair_chunks, 1))
     row, used = np.empty(len(s.image), np.int64), np.zeros((shards, 2), np.int32)
     for k, own in enumerate(layout.devices):
-        rays, meet = Chunks.of(own.image, CHUNK), Chunks.of(own.images, PAIRS)
+        rays, meet = own.chunks, own.pair_chunks
         slot = rays.slot + k * batches * chunks * CHUNK
         row[own.ray] = slot
         image[k, : len(rays.key)] = rays.key

@@ -152,6 +152,10 @@ class DeviceLists(NamedTuple):
     images."""
     images: Int[np.ndarray, "pairs"]
     """Both images as one number: place of the first * `n_images` + place of the second."""
+    chunks: Chunks
+    """Of rays, by image,"""
+    pair_chunks: Chunks
+    """and of pairs, by both images."""
 
     @classmethod
     def of(cls, row, image, point, own, n_images: int) -> "DeviceLists":
@@ -169,7 +173,8 @@ class DeviceLists(NamedTuple):
         pair = np.stack([np.concatenate(none + one), np.concatenate(none + other)])
         images = image[pair[0]].astype(np.int64) * n_images + image[pair[1]]
         order = np.argsort(images, kind="stable")
-        return cls(row, image, pair[:, order], images[order])
+        images = images[order]
+        return cls(row, image, pair[:, order], images, Chunks.of(image, CHUNK), Chunks.of(images, PAIRS))
 
 
 class RayLayout(NamedTuple):
@@ -210,9 +215,9 @@ class RayLayout(NamedTuple):
             bandwidth=bandwidth,
             point_groups=groups,
             # One ray at least is none: what fills up chunks of pairs is made of it.
-            chunks=max(len(Chunks.of(d.image, CHUNK).key) + 1 for d in lists),
-            pair_chunks=max(len(Chunks.of(d.images, PAIRS).key) for d in lists),
-            met=max(met.most, wanted.met),
+            chunks=max(len(d.chunks.key) + 1 for d in lists),
+            pair_chunks=max(len(d.pair_chunks.key) for d in lists),
+            met=met.most,
             rows=tuple((g.name, g.depth if g.elimination == "point" else g.n_rows) for g in s.observed),
         )
         return cls(place, point_place, columns, width, lists, met, sizes)

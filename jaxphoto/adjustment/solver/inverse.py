@@ -31,11 +31,10 @@ from jaxphoto.adjustment.solver.normal import Linearised, Reduced, dot
 from jaxphoto.adjustment.solver.ray_rows import points_at
 from jaxphoto.adjustment.solver.reduced import (
     add_rows,
-    border_places,
-    image_places,
     interior_in_border,
     pair_images,
     ray_columns,
+    reduced_columns,
 )
 from jaxphoto.adjustment.solver.similarity import along_motions, n_open_motions
 from jaxphoto.linear_algebra import inverse as inverse_of
@@ -98,20 +97,13 @@ class _Propagated(NamedTuple):
     inner: Float[Array, "3 3 points"]
 
 
-def _places(reduced: Reduced, s: PaddedStructure) -> tuple[Array, Array]:
-    """Among the reduced unknowns: what images are eliminated with, and the border of each group of points."""
-    n, k = 6 * s.n_images, len(reduced.k)
-    eop = 6 * jnp.arange(s.n_images)[:, None] + jnp.arange(6)
-    return jnp.concatenate([eop, n + image_places(s, k)], axis=1), n + border_places(s, k)
-
-
 def _block(full: Array, row: Array, column: Array) -> Array:
     """Q~ of rows and columns, both along their last axes; zero for what is none."""
     return full.at[row[..., :, None], column[..., None, :]].get(mode="fill", fill_value=0.0)
 
 
 def _seen(full: Float[Array, "n n"], reduced: Reduced, s: PaddedStructure) -> _Propagated:
-    of_image, of_group = _places(reduced, s)
+    of_image, of_group = reduced_columns(s, len(reduced.k))
     border = reduced.border.reshape(len(of_group), GROUP, *reduced.border.shape[1:])
     n_points, d, c = reduced.border.shape
     if not s.rays.free_points:
@@ -217,7 +209,7 @@ def _of_group(full: Array, rows: RowsOfPoints, seen: _Propagated, reduced: Reduc
 
     border = seen.border.transpose(1, 2, 0)
     rows, border, inner, l = jax.tree.map(s.by_group, (rows, border, seen.inner, reduced.l))  # noqa: E741
-    found = jax.lax.map(one, (rows, border, _places(reduced, s)[1], inner, l), batch_size=64)
+    found = jax.lax.map(one, (rows, border, reduced_columns(s, len(reduced.k))[1], inner, l), batch_size=64)
     return jnp.moveaxis(found, 0, -2).reshape(*found.shape[1:-1], -1)
 
 

@@ -73,6 +73,14 @@ def image_places(s: PaddedStructure, k: int) -> Int[Array, "images colours"]:
     return jnp.where(column < s.n_shared, column, s.n_shared + k + 1)
 
 
+def reduced_columns(s: PaddedStructure, k: int) -> tuple[Int[Array, "images e"], Int[Array, "groups border"]]:
+    """Places of what images are eliminated with, and of the border of each group, among the reduced unknowns and the k
+    constraints; beyond these where it is none."""
+    n = 6 * s.n_images
+    eop = 6 * jnp.arange(s.n_images)[:, None] + jnp.arange(6)
+    return jnp.concatenate([eop, n + image_places(s, k)], axis=1), n + border_places(s, k)
+
+
 def ray_columns(at: Linearised):
     """A function from images, points and measurements of a batch to its residuals and Jacobian."""
     s, points = at.structure, at.state.points
