@@ -180,7 +180,7 @@ def _rewrite_las(source: Path, path: Path, to_write: Callable[[Cloud], Float[np.
     """Write `source` with other coordinates of its own system."""
     with opened(source) as reader:
         header = without_octree(reader.header)
-        with laspy.open(path, "w", header=header) as writer:
+        with _las_writer(path, header) as writer:
             for points, part in points_and_clouds(reader, source, withheld=True):
                 xyz = to_write(part)
                 _check_room(xyz, header, source.name)
@@ -188,6 +188,17 @@ def _rewrite_las(source: Path, path: Path, to_write: Callable[[Cloud], Float[np.
                 writer.write_points(points)
             if header.evlrs:
                 writer.write_evlrs(header.evlrs)
+
+
+@contextmanager
+def _las_writer(path: Path, header: laspy.LasHeader) -> Iterator[laspy.LasWriter]:
+    """Open a file for points; it is closed on a full disk, too, where laspy leaves its own file open."""
+    compress = path.suffix.lower() == ".laz"
+    with (
+        path.open("w+b") as file,
+        laspy.open(file, "w", header=header, do_compress=compress, closefd=False) as writer,
+    ):
+        yield writer
 
 
 def _write_las(cloud: Cloud, path: Path, frame: Frame | None) -> None:
@@ -198,7 +209,7 @@ def _write_las(cloud: Cloud, path: Path, frame: Frame | None) -> None:
     header.offsets = np.floor(ends.mean(axis=0))
     if frame is not None:
         header.add_crs(CRS(f"EPSG:{frame.code}" + (f"+{frame.vertical}" if frame.vertical else "")))
-    with laspy.open(path, "w", header=header) as writer:
+    with _las_writer(path, header) as writer:
         for part, xyz in _parts(cloud, frame):
             _check_room(xyz, header, path.name)
             points = laspy.ScaleAwarePointRecord.zeros(len(part), header=header)
