@@ -15,7 +15,7 @@ from jaxphoto.adjustment.adjust import lay_out
 from jaxphoto.adjustment.model.numbers import state_at
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import typical_scale
-from jaxphoto.adjustment.solver.reduced import reduce_normal
+from jaxphoto.adjustment.solver.reduced import linearise_rows, reduce_normal
 from jaxphoto.adjustment.told import step_lines
 from jaxphoto.report.convergence import convergence_words
 from jaxphoto.report.convergence_table import convergence_table
@@ -156,7 +156,7 @@ def test_the_right_hand_side_of_other_residuals(name):
     @jax.jit
     def both():
         there = here._replace(increments=moved)
-        *_, right = reduce_normal(here, 0.0, there.residual_rows(), moved)
+        *_, right = reduce_normal(here, 0.0, linearise_rows(here, there.residual_rows()), moved)
         residuals = lambda y: in_one_list(here._replace(increments=y).residuals())  # noqa: E731
         r = residuals(moved)
         (pulled,) = jax.vjp(residuals, zero)[1](r)

@@ -47,24 +47,29 @@ class RayLists(eqx.Module):
     """Devices that the batches are dealt out to, in equal parts."""
 
 
-def each_batch(body: Callable, carry: Any, numbers: Any, used: Array) -> tuple[Any, Any]:
-    """`jax.lax.scan` over the `used` first batches; what the others give is zero. Of one batch without a loop."""
+def each_batch(body: Callable, carry: Any, numbers: Any, used: Array, into: Any = None) -> tuple[Any, Any]:
+    """`jax.lax.scan` over the `used` first batches; what the others give is zero. Of one batch without a loop.
+
+    Results are written `into` arrays that are given, and `body` gets what its own were before.
+    """
     count = len(jax.tree.leaves(numbers)[0])
     if count == 1:
-        carry, found = body(carry, jax.tree.map(lambda v: v[0], numbers))
+        carry, found = body(carry, *jax.tree.map(lambda v: v[0], (numbers,) if into is None else (numbers, into)))
         return carry, jax.tree.map(lambda v: v[None], found)
     numbers = jax.tree.map(jnp.asarray, numbers)
-    of = lambda k: jax.tree.map(lambda v: jax.lax.dynamic_index_in_dim(v, k, keepdims=False), numbers)  # noqa: E731
-    like = jax.eval_shape(lambda c: body(c, of(0))[1], carry)
+    at = lambda tree, k: jax.tree.map(lambda v: jax.lax.dynamic_index_in_dim(v, k, keepdims=False), tree)  # noqa: E731
 
     def step(k: Array, state: tuple[Any, Any]) -> tuple[Any, Any]:
         carry, found = state
-        carry, new = body(carry, of(k))
+        carry, new = body(carry, at(numbers, k), *(() if into is None else (at(found, k),)))
         put = lambda v, one: jax.lax.dynamic_update_index_in_dim(v, one, k, 0)  # noqa: E731
         return carry, jax.tree.map(put, found, new)
 
-    zero = jax.tree.map(lambda v: jnp.zeros((count, *v.shape), v.dtype), like)
-    return jax.lax.fori_loop(0, used, step, (carry, zero))
+    found = into
+    if found is None:
+        like = jax.eval_shape(lambda c: body(c, at(numbers, 0))[1], carry)
+        found = jax.tree.map(lambda v: jnp.zeros((count, *v.shape), v.dtype), like)
+    return jax.lax.fori_loop(0, used, step, (carry, found))
 
 
 class PaddedStructure(AbstractStructure):
@@ -93,9 +98,10 @@ class PaddedStructure(AbstractStructure):
             return jnp.asarray(index)
         return index - jax.lax.axis_index(AXIS) * of_device
 
-    def each(self, body: Callable, carry: Any, numbers: Any) -> tuple[Any, Any]:
+    def each(self, body: Callable, carry: Any, numbers: Any, into: Any = None) -> tuple[Any, Any]:
         """`each_batch` of rays: `body` of the carry and of (images, points, *numbers)."""
-        return each_batch(body, carry, (self.rays.chunk_image, self.ray_points, *numbers), self.rays.used[0, 0])
+        rays = self.rays
+        return each_batch(body, carry, (rays.chunk_image, self.ray_points, *numbers), rays.used[0, 0], into)
 
     def each_ray(self, function: Callable, numbers: tuple) -> Any:
         """`function` of (images, points, *numbers) of every batch of rays."""

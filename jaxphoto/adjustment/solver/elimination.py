@@ -15,14 +15,14 @@ from jaxtyping import Array, Float
 from jaxphoto.adjustment.layout.padded import PaddedResiduals, PaddedStructure
 from jaxphoto.adjustment.layout.rays import GROUP
 from jaxphoto.adjustment.model.image_orientations import ImageOrientations, of_images, orientations_of
-from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals, datum_residuals, state_at
+from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals, state_at
 from jaxphoto.adjustment.model.observed_groups import RowsAtPoints
-from jaxphoto.adjustment.model.row_functions import non_image_residuals, row_jacobian, rows_at_once
+from jaxphoto.adjustment.model.row_functions import RowJacobian, non_image_residuals, row_jacobian, rows_at_once
 from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.band import BandFactor, solve_band
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced
 from jaxphoto.adjustment.solver.ray_rows import points_at, ray_residuals, seen_in
-from jaxphoto.adjustment.solver.reduced import add_rows, border_places, image_places, ray_columns
+from jaxphoto.adjustment.solver.reduced import LinearisedRows, add_rows, border_places, image_places, ray_columns
 from jaxphoto.arrays import added
 from jaxphoto.linear_algebra import solve
 from jaxphoto.short_repr import shown
@@ -103,30 +103,52 @@ def pull(z: PaddedResiduals, at: Linearised) -> Increments:
     none = jnp.zeros((s.n_images, many, 6 + s.n_image_colours)), jnp.zeros((s.n_points, 3 * many))
     (of_images, of_points), _ = s.each(batch, none, (values.xy, values.sigma_xy, jnp.moveaxis(z.image, 0, 1)))
     of_points = of_points.T.reshape(many, 3, -1) * scale.points
+    return jax.tree.map(jnp.add, _by_unknown(of_images, of_points, s), pull_others(z, at))
+
+
+def gradient(rows: LinearisedRows, at: Linearised) -> Increments:
+    """J'r of the residuals that rows were linearised with."""
+    s = at.structure
+    of_points = rows.of_points.v[:, 6:].T * at.scale.points
+    b = _by_unknown(total(rows.by_image[:, None, :-1, -1], s), of_points[None], s)
+    others = jax.tree.map(lambda v: v[None], rows.rest.residuals)
+    b = jax.tree.map(jnp.add, b, _pull_others(others, rows.rest.jacobians, at))
+    return jax.tree.map(lambda v: v[0], b)
+
+
+def _by_unknown(of_images: Float[Array, "images k a"], points: Float[Array, "k 3 points"], s: PaddedStructure):
+    """Sums of images and points, many along the second axis and the first, as increments."""
     column = jnp.asarray(s.column)[:, : s.n_image_colours]
-    shared = jnp.zeros((s.n_shared + 1, len(z.image))).at[column].add(of_images[:, :, 6:].swapaxes(1, 2))[:-1].T
-    b = Increments(of_images[:, :, :6].transpose(1, 2, 0), shared, of_points)
-    return jax.tree.map(jnp.add, b, pull_others(z, at))
+    shared = jnp.zeros((s.n_shared + 1, len(points))).at[column].add(of_images[:, :, 6:].swapaxes(1, 2))[:-1].T
+    return Increments(of_images[:, :, :6].transpose(1, 2, 0), shared, points)
 
 
 def pull_others(z: NonImageResiduals, at: Linearised) -> Increments:
     """J'z of all but the image rows, of many along a leading axis; J is computed once for all of them."""
     increments, scale, values, s = at
-    pairs = list(zip(s.observed, values.groups, strict=True))
-    jacobians = [row_jacobian(g, numbers, increments, scale, values, s) for g, numbers in pairs]
-    _, of_datum = jax.vjp(lambda y: datum_residuals(y, scale, values, s), increments)
+    pairs = zip(s.observed, values.groups, strict=True)
+    return _pull_others(z, tuple(row_jacobian(g, own, increments, scale, values, s) for g, own in pairs), at)
+
+
+def _pull_others(z: NonImageResiduals, jacobians: tuple[RowJacobian, ...], at: Linearised) -> Increments:
+    s, constraints = at.structure, at.constraints()
 
     def one(own: tuple[tuple[Any, ...], Any]) -> Increments:
         others, datum = own
-        eop, shared, points = of_datum(datum)[0]
+        eop, everywhere, points = (jnp.einsum("k...,k->...", v, datum) for v in constraints)
+        dealt_out = jnp.zeros_like(everywhere)
         for g, j, v in zip(s.observed, jacobians, others, strict=True):
-            shared = shared.at[g.column].add(jnp.einsum("cl...,c...->l...", j.shared, v), mode="drop")
+            shared = (
+                jnp.zeros_like(everywhere).at[g.column].add(jnp.einsum("cl...,c...->l...", j.shared, v), mode="drop")
+            )
             if isinstance(g.rows, RowsAtPoints):
+                dealt_out += shared
                 points = points + jnp.einsum("cjarp,crp->ap", j.points, v)
                 continue
+            everywhere += shared
             eop = eop.at[:, g.image].add(jnp.einsum("ckar,cr->akr", j.eop, v))
             points = points.at[:, g.point].add(jnp.einsum("cjar,cr->ajr", j.points, v))
-        return Increments(eop, shared, points)
+        return Increments(eop, everywhere + total(dealt_out, s), points)
 
     return _of_many(one, (z.others, z.datum), len(z.datum), s)
 

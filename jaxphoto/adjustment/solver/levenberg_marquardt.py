@@ -2,7 +2,7 @@
 
 optimistix runs the iteration. Each iteration evaluates the residuals of one candidate. Where it is accepted, the
 normal equations are summed there, their points eliminated (`reduced`), the rest factored (`band`), and a new step is
-proposed.
+proposed. Once steps shrink to a hundredth, the factor is kept: such a chord step needs the gradient only.
 
 Where unknowns are weakly determined the square sum is a narrow, bent valley, and a straight step leaves it: by the
 damping that it takes to stay inside, such a block creeps. So a step v that reduces the square sum by less than the
@@ -28,9 +28,15 @@ from jaxphoto.adjustment.model.block_values import with_datum
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.band import BandFactor, factor_band
-from jaxphoto.adjustment.solver.elimination import solve_reduced
+from jaxphoto.adjustment.solver.elimination import gradient, reduce_right, solve_reduced
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced, ResidualRows
-from jaxphoto.adjustment.solver.reduced import border_places, image_places, reduce_normal
+from jaxphoto.adjustment.solver.reduced import (
+    RightSide,
+    border_places,
+    image_places,
+    linearise_rows,
+    reduce_normal,
+)
 from jaxphoto.adjustment.solver.similarity import after, n_open_motions, onto_datum
 from jaxphoto.arrays import Numbers
 from jaxphoto.short_repr import shown
@@ -198,6 +204,10 @@ _BENT = 0.375
 _DIFFERENCE = 0.01
 # Ratio of successive steps that is assumed at least when the missing part is estimated.
 _SLOWEST_SHOWN = 0.1
+# After a step shorter than this fraction of the one before, the next is a chord: solved for with the factor at hand. N
+# changes by about that fraction of itself, which a chord leaves of what is missing; a new factor takes several times as
+# long. At twice this, large blocks need two steps more than with new factors.
+_CHORD = 0.01
 
 
 class Judgement(NamedTuple):
@@ -321,17 +331,37 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
             course=jnp.full((MOST_KEPT, len(Course._fields)), jnp.nan),
         )
 
-    def _factored(self, at: Linearised, damping: Scalar, rows: ResidualRows | None, less: Vector):
-        """The system there, x of (N + D) x = J'r - `less`, and that right-hand side."""
+    def _solved(
+        self,
+        at: Linearised,
+        damping: Scalar,
+        rows: ResidualRows | None,
+        less: Vector,
+        chord: Bool[Array, ""],
+        old: FactoredSystem,
+    ) -> tuple[FactoredSystem, Vector, Vector]:
+        """The system there, x of (N + D) x = J'r - `less`, and J'r - `less`; for a `chord` the `old` system."""
         place = at.for_normal_equations
-        a, reduced, right = reduce_normal(place, damping, rows, self.increments(less))
-        factor = factor_band(a)
+        # New derivatives take the place of the old F; a chord keeps it.
+        linearised = linearise_rows(place, rows, old.reduced.f, chord)
+        old = old._replace(reduced=old.reduced._replace(f=linearised.w))
+
+        def by_old() -> tuple[FactoredSystem, RightSide]:
+            b = gradient(linearised, place)
+            return old, RightSide(b, *reduce_right(old.reduced, b, place))
+
+        def by_new() -> tuple[FactoredSystem, RightSide]:
+            a, reduced, right = reduce_normal(place, damping, linearised, self.increments(less))
+            return FactoredSystem(reduced, factor_band(a)), right
+
+        system, right = jax.lax.cond(chord, by_old, by_new)
+        reduced, factor = system
         x = jax.lax.cond(
             self.task.only_factor,
             lambda: jnp.zeros_like(less),
             lambda: as_vector(solve_reduced(reduced, factor, right.reduced, right.d, right.b.points, place)),
         )
-        return FactoredSystem(reduced, factor), x, as_vector(right.b)
+        return system, x, as_vector(right.b)
 
     def step(self, fn, y, args, options, state: SolverState, tags):
         """Judge the candidate; where it is accepted, propose a step from there."""
@@ -356,12 +386,18 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
             # ends at is brought to them as a whole.
             loose = loose | (judged & ~accept & ~state.tightened)
 
+        # Near the optimum N hardly changes: its factor serves on.
+        ratio = p.length / state.length
+        chord = accept & (state.stage == _STRAIGHT) & ~loose & (ratio <= _CHORD) & jnp.isfinite(state.length)
+
         # Near the iterate, r(h v) = r + h J v + h^2 r'' / 2, and (N + D) v = -J'r.
         less = jnp.where(near, (1 - h) * p.gradient - h * held * weight * p.step, 0.0)
         system, x, b = jax.lax.cond(
             fresh | near,
             # Of rows with losses, the normal equations have other residuals than the cost.
-            lambda: self._factored(self._at(y, loose), damping, None if s.has_losses else rows, less),
+            lambda: self._solved(
+                self._at(y, loose), damping, None if s.has_losses else rows, less, chord, state.system
+            ),
             lambda: (state.system, none, none),
         )
         weight, held = as_vector(system.reduced.weight), system.reduced.damping
@@ -377,7 +413,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
             square_sum=jnp.where(fresh, square_sum, p.square_sum),
             straight_sum=jnp.where(fresh, jnp.inf, straight_sum),
         )
-        missing = p.length * jnp.clip(p.length / last, _SLOWEST_SHOWN, 1.0)
+        # An old factor leaves up to twice as much as a new one.
+        left = jnp.where(chord, 2.0, 1.0) * p.length / last
+        missing = p.length * jnp.clip(left, _SLOWEST_SHOWN, 1.0)
         settled = fresh & (missing <= self.tolerance) & (p.damped <= p.seen + self.tolerance**2)
         settled = settled & (steps < self.task.max_steps) & ~self.task.only_factor
         end = jnp.stack([p.square_sum, p.length, held, jnp.ones(()), jnp.zeros(())])

@@ -107,10 +107,12 @@ def typical_scale(values: PaddedValues, structure: PaddedStructure) -> Increment
     factorisation needs: unknowns run from 1e-7 (k2) to 1e3 m.
     """
     s, v = structure, jax.tree.map(jax.lax.stop_gradient, values)
-    weight = 1 / v.sigma_xy
+    # The first ray of each chunk says enough of sigmas and distances.
+    weight = 1 / v.sigma_xy[..., 0]
     filled = weight > 0
     sigma = jnp.sum(filled) / jnp.sum(weight)
-    corner = jnp.max(jnp.where(filled, jnp.abs(v.xy), 0.0), axis=(0, 2, 3))
+    # Empty slots are zero.
+    corner = jnp.max(jnp.abs(v.xy), axis=(0, 2, 3))
     vector = jnp.ones(v.shared.shape)
     for group in s.groups:
         m = group.treedef.num_leaves
@@ -180,7 +182,7 @@ def _typical_of_places(s: PaddedStructure, v: PaddedValues, filled: Array, sigma
     if not s.groups:
         return jnp.ones(()), jnp.array(_LASER_M), jnp.array(_LASER_RAD)
     c = v.shared[s.groups[0].offset]
-    point, image = s.rays.ray_point, s.rays.chunk_image
-    apart = v.points[:, point] - v.position[:, image, None]
+    point, image = s.rays.ray_point[..., 0], s.rays.chunk_image
+    apart = v.points[:, point] - v.position[:, image]
     depth = jnp.sum(jnp.sqrt(jnp.sum(apart**2, axis=0)) * filled[:, 0]) / jnp.sum(filled[:, 0])
     return sigma, sigma * depth / c, sigma / c

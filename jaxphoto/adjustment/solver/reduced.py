@@ -5,14 +5,13 @@ products of F that meet in an image are those of a chunk of rays, those that mee
 pairs of rays. What is met besides images (`border_places`) is summed point by point.
 """
 
-from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment.layout.padded import PaddedStructure, each_batch
 from jaxphoto.adjustment.layout.rays import GROUP
@@ -166,54 +165,96 @@ def _eliminated(sums: _AtPoints, rest: NonImageRows, met: Array, scale: Array, d
     return _Eliminated(l, border, b, diagonal)
 
 
-def reduce_normal(
-    at: Linearised, damping, rows: ResidualRows | None = None, less: Increments | None = None
-) -> tuple[Band, Reduced, RightSide]:
-    """Eliminate the points of N + damping diag(N): A, what goes with it, and the right-hand side.
+class LinearisedRows(NamedTuple):
+    """Derivatives and residuals of other rows, and sums over image rows."""
 
-    That is J'r - `less` for the residuals r there, or for those in `rows`. Unknowns held fixed (zero columns) get a
-    unit diagonal.
+    rest: NonImageRows
+    by_image: Float[Array, "images c c"]
+    """Products of derivatives by the exterior orientation and the camera's unknowns, and of the residual."""
+    of_points: _AtPoints
+    w: Float[Array, "batches m p d e"]
+    """W of each ray, of points in metres: a batch's numbers lie in the order (d, e, m, p)."""
+
+
+def linearise_rows(
+    at: Linearised, rows: ResidualRows | None = None, into: Array | None = None, keep: Bool[Array, ""] | None = None
+) -> LinearisedRows:
+    """Linearise all rows with the residuals there, or with `rows`.
+
+    W is written `into` an array of its size; where it is to `keep` what it has, that is returned in place of W.
     """
-    s, rest = at.structure, non_image_rows(at, rows.others if rows else None)
-    if less is not None:
-        rest = rest._replace(b=rest.b - less.points)
-    columns_of, scale, k = ray_columns(at), at.scale.points, len(rest.coupled)
+    s, columns_of = at.structure, ray_columns(at)
 
-    def to_points(sums, numbers):
+    def to_sums(sums, numbers, before=None):
         *measured, residual = numbers
+        image, point = measured[:2]
+        of_points, by_image = sums
         j = columns_of(measured)
         if residual is not None:
             j = j[0]._replace(residual=residual[0]), j[1]._replace(residual=residual[1])
-        return sums.plus(j, *measured[:2], s) if s.rays.free_points else sums, j
-
-    numbers = at.values.xy, at.values.sigma_xy, rows.image if rows else None
-    of_points, columns = s.each(to_points, _AtPoints.none(s, scale.shape[1]), numbers)
-    own_met, of_met = _rows_with_shared(rest, s)
-    points = _eliminated(of_points, rest, own_met, scale, damping, s)
-    of_rays, m = jnp.concatenate([points.l, scale]), 7 + s.n_image_colours
-
-    def to_images(sums, numbers):
-        image, point, j = numbers
-        by_image, products = sums
         both = [jnp.concatenate([o.eop, o.shared, o.residual[None]]).transpose(1, 0, 2) for o in j]
         whole = jnp.concatenate(both, axis=2)
         square = jnp.einsum("nax,nbx->nab", whole, whole).reshape(len(image), -1)
-        f = once(partial(_f_of_rays, s=s), s.eop_free, j, points_at(of_rays, point))
-        products = products.with_rays(image, point, f, points.border, s, k)
-        return (by_image + sum_by(square, image, s.n_images), products), f
+        w = _met_of_rays(j, s)
+        w = w if keep is None else jnp.where(keep, before, w)
+        of_points = of_points.plus(j, image, point, s) if s.rays.free_points else of_points
+        return (of_points, by_image + sum_by(square, image, s.n_images)), w
 
-    none = jnp.zeros((s.n_images, m * m)), ProductSums.of(points.border, s, k)
-    (square, sums), f = s.each(to_images, none, (columns,))
-    square, sums, of_met = total((square, sums.with_pairs(f, s, k), of_met), s)
-    return _assembled(at, damping, less, rest, square.reshape(-1, m, m), sums, of_met, points, f)
+    m = 7 + s.n_image_colours
+    none = _AtPoints.none(s, at.scale.points.shape[1]), jnp.zeros((s.n_images, m * m))
+    numbers = at.values.xy, at.values.sigma_xy, rows.image if rows else None
+    (of_points, by_image), w = s.each(to_sums, none, numbers, into)
+    return LinearisedRows(non_image_rows(at, rows.others if rows else None), by_image.reshape(-1, m, m), of_points, w)
 
 
-def _f_of_rays(j: tuple[RayJacobian, RayJacobian], of_rays: Float[Array, "9 m p"], s: PaddedStructure) -> Array:
-    """F of a batch; no rows where no point is free."""
+def _met_of_rays(j: tuple[RayJacobian, RayJacobian], s: PaddedStructure) -> Float[Array, "m p d e"]:
+    """W of a batch; no rows where no point is free."""
     eop = [jnp.concatenate([o.eop, o.shared]) if s.rays.by_image else o.eop for o in j]
+    e, *shape = eop[0].shape
     if not s.rays.free_points:
-        return jnp.zeros((*of_rays.shape[1:], 0, len(eop[0])))
-    return whitened(eop, [o.point * of_rays[6:] for o in j], of_rays[:6])
+        return jnp.zeros((*shape, 0, e))
+    w = [added(c * o.point[a] for c, o in zip(eop, j, strict=True)) for a in range(3)]
+    return jnp.concatenate(w).reshape(*shape, 3, e)
+
+
+def _whitened(w: Float[Array, "m p d e"], of_rays: Float[Array, "9 m p"], s: PaddedStructure) -> Array:
+    """F of a batch from its W, with L and the scale of its points."""
+    *shape, d, e = w.shape
+    if not d:
+        return w
+
+    def by_component(w, of_rays):
+        return jnp.stack(whiten([own * scale for own, scale in zip(w, of_rays[6:], strict=True)], of_rays[:6]))
+
+    # Brought to the order of rays afterwards: what is computed on the way there is computed number by number.
+    f = once(by_component, s.eop_free, w.reshape(3, e, *shape), of_rays)
+    return f.reshape(3 * e, -1).T.reshape(*shape, 3, e)
+
+
+def reduce_normal(
+    at: Linearised, damping, rows: LinearisedRows | None = None, less: Increments | None = None
+) -> tuple[Band, Reduced, RightSide]:
+    """Eliminate the points of N + damping diag(N): A, what goes with it, and the right-hand side.
+
+    That is J'r - `less` for the residuals of `rows`. Unknowns held fixed (zero columns) get a unit diagonal.
+    """
+    s, scale = at.structure, at.scale.points
+    rest, by_image, of_points, w = rows or linearise_rows(at)
+    if less is not None:
+        rest = rest._replace(b=rest.b - less.points)
+    k = len(rest.coupled)
+    own_met, of_met = _rows_with_shared(rest, s)
+    points = _eliminated(of_points, rest, own_met, scale, damping, s)
+    of_rays = jnp.concatenate([points.l, scale])
+
+    def to_images(sums, numbers, w):
+        image, point = numbers
+        f = _whitened(w, points_at(of_rays, point), s)
+        return sums.with_rays(image, point, f, points.border, s, k), f
+
+    sums, f = s.each(to_images, ProductSums.of(points.border, s, k), (), w)
+    by_image, sums, of_met = total((by_image, sums.with_pairs(f, s, k), of_met), s)
+    return _assembled(at, damping, less, rest, by_image, sums, of_met, points, f)
 
 
 class ProductSums(NamedTuple):
@@ -262,18 +303,6 @@ class ProductSums(NamedTuple):
             rows = f.reshape(-1, 3 * e)
             sums, _ = each_batch(to_pairs, sums, (s.pairs, s.rays.block), s.rays.used[0, 1])
         return _with_cameras(sums, own, s) if e > 6 else sums
-
-
-def whitened(
-    eop: Sequence[Float[Array, "e m p"]],
-    points: Sequence[Float[Array, "3 m p"]],
-    l: Float[Array, "6 m p"],  # noqa: E741
-) -> Float[Array, "m p 3 e"]:
-    """F of rays: the sum of products of derivatives by image and point, times L^-1."""
-    e, *shape = eop[0].shape
-    z = [whiten(w, l) for w in points]
-    f = [added(c * w[a] for c, w in zip(eop, z, strict=True)) for a in range(3)]
-    return jnp.concatenate(f).reshape(3 * e, -1).T.reshape(*shape, 3, e)
 
 
 def _of_border(border: Float[Array, "points d c"], places: Array, s: PaddedStructure, size: int):
