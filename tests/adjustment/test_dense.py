@@ -15,9 +15,9 @@ from jaxphoto.adjustment.layout.rays import sizes_of
 from jaxphoto.adjustment.model.numbers import state_at, zero_increments
 from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.adjustment.solver.band import factor_band
-from jaxphoto.adjustment.solver.elimination import solve_factored, solve_reduced
+from jaxphoto.adjustment.solver.elimination import gradient, solve_factored, solve_reduced
 from jaxphoto.adjustment.solver.optimum import typical_scale, unit_scale, weigh_datum
-from jaxphoto.adjustment.solver.reduced import reduce_normal
+from jaxphoto.adjustment.solver.reduced import linearise_rows, reduce_normal
 from jaxphoto.statistics import redundancy_numbers
 from tests.adjustment.dense import DAMPINGS, assemble, at_optimum, in_one_list, prepared, split
 from tests.blocks import FIELDS, VARIANTS, adjusted, covariance_of, simulated
@@ -91,10 +91,11 @@ def test_many_batches_solve_the_normal_equations(name, damping, monkeypatch):
 
 @eqx.filter_jit
 def _solved(values, s, damping):
-    """J'r by sums and by a gradient, and (N + damping W) x for the x that solves it, taken down at once or before."""
+    """J'r by sums, a gradient and JAX, and (N + damping W) x for the x that solves it: at once, or in two steps."""
     scale = typical_scale(values, s)
     at = Linearised(zero_increments(s), scale, values, s)
-    a, reduced, right = reduce_normal(at, damping)
+    rows = linearise_rows(at)
+    a, reduced, right = reduce_normal(at, damping, rows)
     factor = factor_band(a)
     _, push = jax.linearize(lambda y: at._replace(increments=y).residuals(), at.increments)
     pull = jax.linear_transpose(push, at.increments)
@@ -104,7 +105,7 @@ def _solved(values, s, damping):
 
     at_once = solve_factored(reduced, factor, right.b, at)
     before = solve_reduced(reduced, factor, right.reduced, right.d, right.b.points, at)
-    return right.b, pull(at.residuals())[0], multiplied(at_once), multiplied(before)
+    return right.b, gradient(rows, at), pull(at.residuals())[0], multiplied(at_once), multiplied(before)
 
 
 @pytest.mark.parametrize("name", KINDS)

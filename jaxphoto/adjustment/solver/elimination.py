@@ -138,14 +138,12 @@ def _pull_others(z: NonImageResiduals, jacobians: tuple[RowJacobian, ...], at: L
         eop, everywhere, points = (jnp.einsum("k...,k->...", v, datum) for v in constraints)
         dealt_out = jnp.zeros_like(everywhere)
         for g, j, v in zip(s.observed, jacobians, others, strict=True):
-            shared = (
-                jnp.zeros_like(everywhere).at[g.column].add(jnp.einsum("cl...,c...->l...", j.shared, v), mode="drop")
-            )
+            shared = jnp.einsum("cl...,c...->l...", j.shared, v)
             if isinstance(g.rows, RowsAtPoints):
-                dealt_out += shared
+                dealt_out = dealt_out.at[g.column].add(shared, mode="drop")
                 points = points + jnp.einsum("cjarp,crp->ap", j.points, v)
                 continue
-            everywhere += shared
+            everywhere = everywhere.at[g.column].add(shared, mode="drop")
             eop = eop.at[:, g.image].add(jnp.einsum("ckar,cr->akr", j.eop, v))
             points = points.at[:, g.point].add(jnp.einsum("cjar,cr->ajr", j.points, v))
         return Increments(eop, everywhere + total(dealt_out, s), points)
