@@ -387,8 +387,8 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
             loose = loose | (judged & ~accept & ~state.tightened)
 
         # Near the optimum N hardly changes: its factor serves on.
-        ratio = p.length / state.length
-        chord = accept & (state.stage == _STRAIGHT) & ~loose & (ratio <= _CHORD) & jnp.isfinite(state.length)
+        near_optimum = (gain >= _GOOD) & (p.length <= _CHORD * state.length) & jnp.isfinite(state.length)
+        chord = accept & (state.stage == _STRAIGHT) & ~loose & near_optimum
 
         # Near the iterate, r(h v) = r + h J v + h^2 r'' / 2, and (N + D) v = -J'r.
         less = jnp.where(near, (1 - h) * p.gradient - h * held * weight * p.step, 0.0)
