@@ -55,11 +55,11 @@ def _eliminated(a: Float[Array, "n n"], b: Float[Array, "n c"]) -> Float[Array, 
 
 _lu = _solver(jnp.linalg.solve, _eliminated)
 _lu_transposed = _solver(lambda a, b: jnp.linalg.solve(a.T, b), lambda a, b: _eliminated(a.T, b))
-# LAPACK stores by columns: the transpose of what JAX stores by rows is no copy.
-_down = _solver(
-    lambda lower, b: jax.lax.linalg.triangular_solve(lower.T, b, left_side=True, lower=False, transpose_a=True)
+# LAPACK stores by columns: the transpose of what JAX stores by rows is no copy. So it solves x' L' = b' and x' L = b'.
+_down = _solver(lambda lower, b: jax.lax.linalg.triangular_solve(lower.T, b.T, left_side=False, lower=False).T)
+_up = _solver(
+    lambda lower, b: jax.lax.linalg.triangular_solve(lower.T, b.T, left_side=False, lower=False, transpose_a=True).T
 )
-_up = _solver(lambda lower, b: jax.lax.linalg.triangular_solve(lower.T, b, left_side=True, lower=False))
 _band = _solver(lambda bands, b: jax.lax.linalg.tridiagonal_solve(bands[0], bands[1], bands[2], b))
 _band_transposed = _solver(lambda bands, b: _band(_transposed_bands(bands), b))
 _eigh = one_at_a_time(lambda a: tuple(jnp.linalg.eigh(a)))

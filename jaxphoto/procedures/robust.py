@@ -110,7 +110,8 @@ def solve_placed(
     """`block` adjusted from `unknowns` without what is `left` out, and without points that the rest does not place.
 
     With it the points that it has, and what is left out with the image points of the others: blunders may leave a point
-    any place along its rays. Raises what `solve` raises, and BlockError where points do not cease to be lost.
+    any place along its rays. Raises what `solve` raises, and BlockError where points do not cease to be lost or the
+    adjustment diverges.
     """
     rows, left = block.image_points, dict(left)
     for _ in range(_ROUNDS):
@@ -122,6 +123,8 @@ def solve_placed(
             if not error.points:
                 raise
             lost = np.array(error.points)
+        if solved.outcome is Outcome.DIVERGED:
+            raise BlockError(solved.outcome.value)
         if not len(lost):
             return solved, point, left
         # From where it began: what is lost has pulled at the others.

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from jaxphoto import BlockError, adjust, robust, snoop
-from jaxphoto.adjustment import solve
+from jaxphoto.adjustment import LEAST, MAX_STEPS, solve
 from jaxphoto.losses import Huber, StudentT
+from jaxphoto.procedures.robust import solve_placed
 from tests.blocks import simulated
 
 
@@ -80,3 +81,16 @@ def test_snooping_begins_from_any_loss_and_ends_alike(block):
 def test_a_group_that_is_none_is_refused(block):
     with pytest.raises(BlockError, match="no observations gnss in this block"):
         robust(block, {"gnss": Huber()})
+
+
+def test_an_adjustment_that_diverges_ends_the_search():
+    """From a distortion whose numbers overflow: later adjustments would begin at NaN."""
+    block = simulated("cross").block
+    start = block.start.unknowns
+    (name,) = start.interior
+    camera = start.interior[name]
+    camera = dataclasses.replace(camera, distortion=dataclasses.replace(camera.distortion, k1=1e308, k2=-1e308))
+    left = {name: np.zeros(len(rows), bool) for name, rows in block.named_observations.items()}
+    unknowns = dataclasses.replace(start, interior=type(start.interior)({name: camera}))
+    with pytest.raises(BlockError, match="became infinite"):
+        solve_placed(block, left, unknowns, MAX_STEPS, LEAST)

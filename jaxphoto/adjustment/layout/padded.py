@@ -53,15 +53,16 @@ def each_batch(body: Callable, carry: Any, numbers: Any, used: Array, into: Any 
     Results are written `into` arrays that are given, and `body` gets what its own were before.
     """
     count = len(jax.tree.leaves(numbers)[0])
+    given = lambda found: (numbers,) if into is None else (numbers, found)  # noqa: E731
     if count == 1:
-        carry, found = body(carry, *jax.tree.map(lambda v: v[0], (numbers,) if into is None else (numbers, into)))
+        carry, found = body(carry, *jax.tree.map(lambda v: v[0], given(into)))
         return carry, jax.tree.map(lambda v: v[None], found)
     numbers = jax.tree.map(jnp.asarray, numbers)
     at = lambda tree, k: jax.tree.map(lambda v: jax.lax.dynamic_index_in_dim(v, k, keepdims=False), tree)  # noqa: E731
 
     def step(k: Array, state: tuple[Any, Any]) -> tuple[Any, Any]:
         carry, found = state
-        carry, new = body(carry, at(numbers, k), *(() if into is None else (at(found, k),)))
+        carry, new = body(carry, *at(given(found), k))
         put = lambda v, one: jax.lax.dynamic_update_index_in_dim(v, one, k, 0)  # noqa: E731
         return carry, jax.tree.map(put, found, new)
 
