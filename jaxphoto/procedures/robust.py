@@ -118,13 +118,14 @@ def solve_placed(
         kept, point = without_observations(block, left)
         try:
             solved = solve(kept, some_points(unknowns, point), kept.priors, max_steps, sizes, losses=losses or {})
-            lost = np.flatnonzero(solved.astray)
         except RankError as error:
             if not error.points:
                 raise
             lost = np.array(error.points)
-        if solved.outcome is Outcome.DIVERGED:
-            raise BlockError(solved.outcome.value)
+        else:
+            if solved.outcome is Outcome.DIVERGED:
+                raise BlockError(solved.outcome.value)
+            lost = np.flatnonzero(solved.astray)
         if not len(lost):
             return solved, point, left
         # From where it began: what is lost has pulled at the others.
