@@ -2,11 +2,9 @@
 
 import ast
 import inspect
-import re
 import shutil
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import jaxphoto
@@ -38,60 +36,10 @@ def test_each_floor_imports_only_floors_below():
     assert "3 kept, 0 broken" in done.stdout
 
 
-def test_the_table_of_floors_is_the_contract():
-    """CONTRIBUTING lists every floor of the contract with its rooms, highest first."""
-    contract = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]["layers"]
-    floors = [{room.strip(" ()") for room in layer.split("|")} for layer in contract]
-    rows = re.findall(r"^\| (\d+) \| (.+?) \|$", (ROOT / "CONTRIBUTING.md").read_text(), re.MULTILINE)
-    assert [int(number) for number, _ in rows] == list(range(len(floors)))[::-1]
-    assert [set(re.findall(r"`(\w+)`", rooms)) for _, rooms in rows] == floors
-    assert set().union(*floors) | {"__init__"} == {
-        p.stem for p in PACKAGE.iterdir() if p.name not in ("__pycache__", "py.typed")
-    }
-
-
-def test_a_class_name_stands_once():
-    """A name that two rooms use for two things is a riddle in every import."""
-    places: dict[str, list[str]] = {}
-    for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ClassDef):
-                places.setdefault(node.name, []).append(str(path.relative_to(PACKAGE)))
-    assert not {name: files for name, files in places.items() if len(files) > 1}
-
-
-def test_modules_can_be_read_at_one_sitting():
-    long = {p.name: n for p in PACKAGE.rglob("*.py") if (n := len(p.read_text().splitlines())) > 600}
-    assert not long
-
-
 def test_tables_pictures_and_progress_live_upstairs_only():
     for path in PACKAGE.rglob("*.py"):
         if path.relative_to(PACKAGE).parts[0] not in TABLES_AND_FILES:
             assert not imported(path) & {"pandas", "matplotlib", "plotly", "rich", "typer", "jinja2"}, path
-
-
-def test_no_import_hides_in_a_function():
-    for path in PACKAGE.rglob("*.py"):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        inner = [n for f in ast.walk(tree) if isinstance(f, ast.FunctionDef) for n in ast.walk(f)]
-        hidden = [ast.unparse(n) for n in inner if isinstance(n, ast.Import | ast.ImportFrom)]
-        # Those that are worth it: matplotlib takes a third of a second, and most uses draw nothing; scipy's graphs and
-        # matrices take a tenth, and blocks of few images, and of plain control, need none; its distributions take a
-        # fifth, and only tests compare with them; plotly takes half a second, and only reports need it; xarray takes a
-        # third, for cubes; OpenCV 150 MB, and who adjusts without photographs may do without it (docs/install.md).
-        worth_it = {
-            "from matplotlib.figure import Figure", "from matplotlib.text import Text", "from matplotlib import pyplot",
-            "from matplotlib.backends.backend_pdf import PdfPages", "from scipy.sparse import csr_matrix",
-            "from scipy import special", "from plotly.graph_objects import Figure",
-            "from plotly.offline import get_plotlyjs", "from matplotlib.collections import EllipseCollection",
-            "from matplotlib.colors import to_rgba", "import xarray as xr", "import cv2",
-            "from jaxphoto.adjustment.datum_sensitivity import SeenMotions, row_sensitivity",
-        }  # fmt: skip
-        assert set(hidden) <= worth_it | {
-            "from scipy.sparse.csgraph import reverse_cuthill_mckee",
-            "from scipy.optimize import minimize_scalar",
-        }, path
 
 
 def test_importing_brings_neither_tables_nor_pictures():
