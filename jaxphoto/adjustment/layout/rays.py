@@ -109,7 +109,7 @@ class MetUnknowns(NamedTuple):
         return size_class(int(self.slot.max(initial=-1)) + 1, 8)
 
     def listed(self, groups: int, size: int) -> Int[np.ndarray, "groups size"]:
-        """Lists of all groups, padded with the number of unknowns."""
+        """Return the lists of all groups, padded with the number of unknowns."""
         result = np.full((groups, size), self.n_shared, np.int32)
         result[self.key // (self.n_shared + 1), self.slot] = self.key % (self.n_shared + 1)
         return result
@@ -194,7 +194,7 @@ class RayLayout(NamedTuple):
 
     @classmethod
     def of(cls, s: Structure, wanted: Sizes, shards: int, dense: bool) -> "RayLayout":
-        """Arrange a block with at least the sizes `wanted`; `dense` requests a dense reduced matrix in place of a band."""
+        """Arrange a block with at least the sizes `wanted`; `dense` requests a dense reduced matrix, not a band."""
         own = np.any(s.point_free, axis=0)[s.point]
         place, bandwidth = order_images(*_meetings(s, own))
         images, bandwidth = max(s.n_images + 1, wanted.images), max(bandwidth, wanted.bandwidth)

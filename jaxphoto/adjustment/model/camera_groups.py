@@ -37,7 +37,7 @@ def interior_of(group: CameraGroup, table) -> InteriorOrientation:
 
 
 def n_parameters(cameras: tuple[CameraGroup, ...]) -> int:
-    """Number of parameters of all cameras."""
+    """Return the number of parameters of all cameras."""
     return sum(len(g.names) * g.treedef.num_leaves for g in cameras)
 
 

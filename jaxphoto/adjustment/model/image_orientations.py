@@ -67,7 +67,7 @@ def _bent(
 
 
 def by_image(g: CameraGroup, s: AbstractStructure) -> bool:
-    """True if the parameters of a camera group are stored by image."""
+    """Return True if the parameters of a camera group are stored by image."""
     return s.bends or len(g.names) > 1
 
 

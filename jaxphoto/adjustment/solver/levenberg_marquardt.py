@@ -110,7 +110,7 @@ class Course(NamedTuple):
     """Fraction of the step at the end of its curve; 0 for a straight step."""
 
     def is_flat(self, k: int | Int[Array, ""]) -> Bool[Array, ""] | np.bool_:
-        """True if the sum of squares hardly fell in the steps before step k (0, 1, ...), although these did not
+        """Return True if the sum of squares hardly fell in the steps before step k (0, 1, ...), although these did not
         shorten.
 
         In all of them it fell by less than moving one unknown by two standard deviations changes it: the observations
@@ -369,7 +369,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         return system, x, as_vector(right.b)
 
     def step(self, fn, y, args, options, state: SolverState, tags):
-        """Judge the candidate; where it is accepted, propose a step from there."""
+        """Judge the candidate; if it is accepted, propose a step from there."""
         s, p, h, none = self.structure, state.proposal, _DIFFERENCE, jnp.zeros_like(y)
         near, curve = state.stage == _NEAR, state.stage == _CURVE
         here = self._at(state.candidate, state.loose)
@@ -383,15 +383,15 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         damping, growth = _next_damping(state, judged, accept, t, gain, p.seen / self._dot(p.step, weight * p.step))
         last = jnp.where(accept, p.length, state.length)
         told = Course(p.square_sum, p.length, held, accept.astype(float), jnp.where(curve & ~astray, t, 0.0))
-        # What is not judged is written over.
+        # A candidate that is not judged is overwritten.
         course = state.course.at[state.steps].set(jnp.stack(told), mode="drop")
         is_flat, steps, loose = accept & Course(*course.T).is_flat(state.steps), state.steps + judged, state.loose
         if n_open_motions(self.values, s):
-            # Held about a start that is far off, the constraints bend the path: it goes on without them, and what it
-            # ends at is brought to them as a whole.
+            # Enforced about distant start values, the constraints bend the path: the iteration continues without them,
+            # and its end is moved onto them as a whole.
             loose = loose | (judged & ~accept & ~state.tightened)
 
-        # Near the optimum N hardly changes: its factor serves on.
+        # Near the optimum N hardly changes: keep its factor.
         near_optimum = (gain >= _GOOD) & (p.length <= _CHORD * state.length) & jnp.isfinite(state.length)
         chord = accept & (state.stage == _STRAIGHT) & ~loose & near_optimum
 
@@ -399,14 +399,14 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         less = jnp.where(near, (1 - h) * p.gradient - h * held * weight * p.step, 0.0)
         system, x, b = jax.lax.cond(
             fresh | near,
-            # Of rows with losses, the normal equations have other residuals than the cost.
+            # For rows with losses, the residuals in the normal equations differ from those of the cost.
             lambda: self._solved(
                 self._at(y, loose), damping, None if s.has_losses else rows, less, chord, state.system
             ),
             lambda: (state.system, none, none),
         )
         weight, held = as_vector(system.reduced.weight), system.reduced.damping
-        # (N + D) d = -b, so d'N d = -d'b - d'D d, and the linear model promises d'N d / 2 + d'D d.
+        # (N + D) d = -b, so d'N d = -d'b - d'D d, and the linear model predicts d'N d / 2 + d'D d.
         damped = held * self._dot(x, weight * x)
         straight_sum = jnp.where(bend, square_sum, p.straight_sum)
         p = Proposal(
@@ -418,21 +418,21 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
             square_sum=jnp.where(fresh, square_sum, p.square_sum),
             straight_sum=jnp.where(fresh, jnp.inf, straight_sum),
         )
-        # An old factor leaves up to twice as much as a new one.
+        # An old factor leaves up to twice the remainder of a new one.
         left = jnp.where(chord, 2.0, 1.0) * p.length / last
         missing = p.length * jnp.clip(left, _SLOWEST_SHOWN, 1.0)
         settled = fresh & (missing <= self.tolerance) & (p.damped <= p.seen + self.tolerance**2)
         settled = settled & (steps < self.task.max_steps) & ~self.task.only_factor
         end = jnp.stack([p.square_sum, p.length, held, jnp.ones(()), jnp.zeros(())])
         course = course.at[jnp.where(settled, steps, MOST_KEPT)].set(end, mode="drop")
-        # The last step is short and was computed from an accepted iterate: it needs no proof.
+        # The last step is short and starts from an accepted iterate: it needs no evaluation.
         y, tighten = jnp.where(settled, y + p.step, y), settled & loose
         if n_open_motions(self.values, s):
             y = jax.lax.cond(tighten, lambda y: as_vector(onto_datum(self._at(y, jnp.array(False)))), lambda y: y, y)
         bent = jnp.sqrt(self._dot(p.half, weight * p.half) / self._dot(p.step, weight * p.step))
         begin = jnp.minimum(_BENT / bent, 1.0)
         stages = [tighten, fresh, bend, near, shorten]
-        # Of a rejected step nothing is left; of a curve that led astray, the straight step.
+        # Restore the iterate after a rejected step, the straight step after a curve that diverged.
         t = jnp.select(stages, [0.0, 1.0, h, begin, state.t / 2], jnp.where(accept, 1.0, 0.0))
         reached = as_vector(after(self._at(y, loose), self.increments(p.part(t, astray)), system.reduced.weight))
         progress = SolverState(
@@ -455,11 +455,11 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         return y, progress, None
 
     def terminate(self, fn, y, args, options, state: SolverState, tags):
-        """After the step that did it, the last that the task allows, or many in vain."""
+        """Stop after the final step, at the limit of the task, or after many useless steps."""
         ended = ~state.done & ((state.steps >= self.task.max_steps) | state.flat)
         results = optx.RESULTS
         return state.done | ended, results.where(ended, results.nonlinear_max_steps_reached, results.successful)
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """Nothing is left to do."""
+        """Return the iterate unchanged."""
         return y, aux, {}

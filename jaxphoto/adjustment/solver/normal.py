@@ -55,7 +55,7 @@ class Linearised(NamedTuple):
         return self._replace(structure=self.structure.with_linearised_losses)
 
     def constraints(self) -> Increments:
-        """Derivatives of the datum constraints, along a leading axis."""
+        """Return derivatives of the datum constraints, along a leading axis."""
         _, scale, values, s = self
         none = jnp.zeros((len(values.datum_eop), s.n_shared))
         return Increments(values.datum_eop * scale.eop, none, values.datum_points * scale.points)

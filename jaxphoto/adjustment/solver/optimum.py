@@ -151,7 +151,7 @@ def _camera_of(group: CameraGroup, numbers: Array) -> InteriorOrientation:
 def _typical_of_camera(
     interior_at: Callable[[Array], InteriorOrientation], at: Float[Array, "n"], sigma: Array, corner: Float[Array, "2"]
 ) -> Float[Array, "n"]:
-    """Return the change of each number of a camera that moves the image of a point by `sigma` (mm); one if none does."""
+    """Return the change of each camera number that moves the image of a point by `sigma` (mm); one if none does."""
     # A point halfway to the corner, and one beside it: c moves the first, coefficients move the second.
     aim, centre = jnp.array([0.1, 0.1, -1.0]), ExteriorOrientation(jnp.zeros(3), jnp.eye(3))
     by_number = jax.jacfwd(lambda p: image_residual(interior_at(p), centre, aim, corner))(at)
@@ -162,7 +162,7 @@ def _typical_of_camera(
 def _typical_of_bending(
     s: PaddedStructure, v: PaddedValues, t: ParameterTable, sigma: Array, corner: Float[Array, "2"]
 ) -> Float[Array, "n"]:
-    """Return the same for what modifies cameras, far from the middle of the flight and from the reference temperature."""
+    """Return the same for what modifies cameras, far from mid-flight and from the reference temperature."""
     farthest, of_groups = jnp.argmax(jnp.abs(v.flight_time)), []
     exposure = Exposure(*(jnp.asarray(a)[..., farthest] for a in v.exposures))
     exposure = dataclasses.replace(exposure, temperature=jnp.max(jnp.abs(v.temperature)))

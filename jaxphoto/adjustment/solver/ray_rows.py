@@ -118,7 +118,7 @@ def ray_jacobian(
     seen: RayMeasurements,
     s: PaddedStructure,
 ) -> tuple[RayJacobian, RayJacobian]:
-    """Evaluate residuals and Jacobian of a batch, x and y, by the chain rule through the points in the camera frames."""
+    """Evaluate residuals and Jacobian of a batch, x and y, by the chain rule through the camera frames."""
     centre, rotation, unit = scene.centre, scene.rotation, jnp.eye(3)
     # One loop for all six: joined afterwards, they would be computed one number at a time.
     still, turns = jnp.zeros((3, *rotation.shape)), jnp.moveaxis(slopes.rotation, -1, 0)

@@ -109,7 +109,7 @@ class _AtPoints(NamedTuple):
 
     @classmethod
     def none(cls, s: PaddedStructure, n: int) -> "_AtPoints":
-        """Initial sums."""
+        """Return initial sums."""
         return cls(jnp.zeros((n, 9)), jnp.zeros((n, interior_in_border(s) + 1, 3)))
 
     def plus(self, j: tuple[RayJacobian, RayJacobian], image: Array, point: Array, s: PaddedStructure) -> "_AtPoints":
@@ -272,7 +272,7 @@ class ProductSums(NamedTuple):
 
     @classmethod
     def of(cls, border: Float[Array, "points d c"], s: PaddedStructure, k: int) -> "ProductSums":
-        """Initial sums, including those of the border."""
+        """Return initial sums, including those of the border."""
         places, n, e, size = border_places(s, k), s.n_images, 6 + image_places(s, k).shape[1], s.n_shared + k + 2
         width, inner = n // s.rays.columns, s.rays.columns - 1
         band = jnp.zeros((inner, 2 * width, 6, width, 6)), jnp.zeros((width, 6, width, 6))
