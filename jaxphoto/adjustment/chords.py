@@ -87,7 +87,7 @@ def _find(varying: Varying, common: Common, first_only: bool) -> Found:
 
 
 def chord_steps(varying: Varying, common: Common, first_only: bool = False, polished: bool = True) -> Way:
-    """Iterate chord steps of every draw from the nominal optimum; if `polished`, its gradient vanishes to the last bit."""
+    """Iterate chord steps of every draw from the nominal optimum; if `polished`, its gradient is exactly zero."""
     size = next(iter(varying.values())).shape[-1]
     y = jax.tree.map(lambda v: jnp.broadcast_to(jnp.asarray(v)[..., None], (*v.shape, size)), common.at.increments)
     of_image_rows = bool(_OF_IMAGE_ROWS & set(varying))

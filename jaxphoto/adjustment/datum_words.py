@@ -30,7 +30,7 @@ def motion_names(combinations: Float[np.ndarray, "n motions"]) -> list[str]:
 
 
 def datum_sentence(null_motions: np.ndarray, block: Block, named: list[str], sigma: float = np.inf) -> str:
-    """Return what is open, the observations present, and the cure; `sigma` if closed by noise alone (rad, or relative)."""
+    """Return what is open, the observations present, and the cure; `sigma` if closed by noise (rad, or relative)."""
     names = motion_names(null_motions)
     counts = {rows.group: int(np.size(rows.observation)) for rows in block.observations if len(rows)}
     if n := counts.pop(ControlRows.group, 0) + len(block.fixed.who):
