@@ -130,7 +130,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """The names of the package and its rooms: what tab completion offers."""
+    """Return the names of the package and its subpackages, for tab completion."""
     return sorted({*__all__, *_rooms(), "__version__"})
 
 
