@@ -1,9 +1,9 @@
-"""Attitudes of cameras as drones write them, as matrices: no angle is lost where two of them turn about one axis.
+"""Conversion of attitudes recorded by drones to matrices, valid also where two angles rotate about one axis.
 
-Two habits are in use. A gimbal counts from a camera that looks to the north, level: yaw, pitch and roll turn the axes
-forward (optical axis), right, down, and the nadir is at pitch -90 degrees, where yaw and roll are one turn. A camera in
-the belly counts from one that looks down with the top of its picture to the north. Both are turned about down, right
-and forward in this order, the frame being north, east, down.
+Two conventions are in use. A gimbal refers to a level camera facing north: yaw, pitch and roll rotate the axes forward
+(optical axis), right, down, and the nadir is at pitch -90 degrees, where yaw and roll are about one axis. A fixed
+camera refers to one facing down with the top of its image to the north. Both rotate about down, right and forward in
+this order, in a north-east-down frame.
 """
 
 from typing import NamedTuple
@@ -14,25 +14,26 @@ from jaxtyping import Float
 
 # Columns: north, east and down in axes east, north, up; its own inverse.
 _ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-# Columns: the camera's axes x (right), y (up in the picture), z (back) in forward, right, down.
+# Columns: the camera's axes x (right), y (up in the image), z (back) in forward, right, down.
 _FROM_GIMBAL = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _FROM_BELLY = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 USUAL_SIGMA_DEG = (1.0, 1.0, 5.0)
-"""Of roll, pitch and yaw where the file says none: a gimbal holds tenths of a degree to its own accelerometers, whose
-zero it knows less well, and takes yaw from a compass."""
+"""Of roll, pitch and yaw if the file has none: a gimbal is stable to tenths of a degree relative to its accelerometers,
+whose bias is larger, and takes yaw from a compass.
+"""
 
 
 class CameraAttitude(NamedTuple):
-    """How the camera was turned at the exposure."""
+    """Attitude of the camera at the exposure."""
 
     level_from_camera: Float[np.ndarray, "3 3"]
-    """From x right, y up in the picture, z back to east, true north, up at the place of the photograph."""
+    """From x right, y up in the image, z back to east, true north, up at the place of the photograph."""
     sigma_deg: tuple[float, float, float] = USUAL_SIGMA_DEG
-    """Of roll, pitch and yaw of a camera in the belly."""
+    """Of roll, pitch and yaw of a camera facing down."""
 
 
 def level_from_gimbal(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Float[np.ndarray, "3 3"]:
-    """`level_from_camera` of gimbal angles, pitch 0 to the horizon and -90 degrees to the nadir.
+    """Return `level_from_camera` of gimbal angles, pitch 0 at the horizon and -90 degrees at the nadir.
 
     R3(yaw) R2(pitch) R1(roll) of north-east-down (DJI, manuals: "NED, the rotation order is ZYX").
     """
@@ -40,16 +41,16 @@ def level_from_gimbal(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Floa
 
 
 def level_from_belly(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Float[np.ndarray, "3 3"]:
-    """`level_from_camera` of angles of a camera that looks down at pitch 0, top of the picture forward.
+    """Return `level_from_camera` of angles of a camera that faces down at pitch 0, top of the image forward.
 
-    That of the aircraft with the camera mounted so: the habit of Pix4D (support article 202558969), and of the body
-    axes right, forward, up of docs/conventions.md with `image_x = "right"`.
+    The attitude of the aircraft with the camera mounted so: the convention of Pix4D (support article 202558969), and of
+    the body axes right, forward, up of docs/conventions.md with `image_x = "right"`.
     """
     return _ENU_NED @ _turned(yaw_deg, pitch_deg, roll_deg) @ _FROM_BELLY
 
 
 def level_from_body(roll_pitch_yaw_deg: tuple[float, float, float]) -> Float[np.ndarray, "3 3"]:
-    """From the aircraft's axes right, forward, up to east, north, up."""
+    """Return the rotation from the aircraft's axes right, forward, up to east, north, up."""
     roll, pitch, yaw = roll_pitch_yaw_deg
     return level_from_belly(yaw, pitch, roll)
 

@@ -1,4 +1,4 @@
-"""Recorded heights above a geoid brought to the ellipsoid, by the grid that PROJ has of it."""
+"""Conversion of recorded heights above a geoid to ellipsoidal heights, by the geoid grids of PROJ."""
 
 from collections.abc import Mapping
 
@@ -9,15 +9,15 @@ from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.map_frame import MapFrame
 
 WGS84 = 4326
-"""Longitude and latitude as receivers have them."""
+"""Longitude and latitude of receivers."""
 
 
 def above_ellipsoid(positions: Mapping[str, Gps | None], vertical: int) -> tuple[dict[str, Gps | None], list[str]]:
-    """The positions with heights above the ellipsoid, and a sentence of what was added.
+    """Return the positions with ellipsoidal heights, and a message about the conversion.
 
-    Heights that are not above it by their files are those of the EPSG system `vertical`: h = H + N, N the height of its
-    geoid above the ellipsoid (m). Raises InputError for a code that is no system of heights, for a geoid that is not on
-    this computer, and for a place that it does not reach.
+    Heights that their files do not declare ellipsoidal belong to the EPSG system `vertical`: h = H + N, N the height of
+    its geoid above the ellipsoid (m). Raises InputError for a code that is not a vertical system, for a geoid that is
+    not installed, and outside its area.
     """
     found = dict(positions)
     names, rows = [], []
@@ -25,7 +25,7 @@ def above_ellipsoid(positions: Mapping[str, Gps | None], vertical: int) -> tuple
         if gps and gps.altitude_m is not None and gps.heights != "ellipsoid":
             names.append(name)
             rows.append((gps.longitude_deg, gps.latitude_deg, gps.altitude_m))
-    # A wrong code is wrong where no height needs it, too.
+    # A wrong code is an error even if no height needs it.
     system = MapFrame(WGS84, vertical, (0.0, 0.0, 0.0))
     if not names:
         any_height = any(gps and gps.altitude_m is not None for gps in found.values())

@@ -1,9 +1,8 @@
-"""Positions of photographs before anything is computed of them: what cannot be is named, what can be mended is.
+"""Validation of recorded positions of photographs: implausible ones are reported, correctable ones corrected.
 
-The photographs of a flight lie within kilometres. A receiver without a position writes (0, 0); latitude and longitude
-that have changed places lie elsewhere on the earth and come back where they are changed again; heights above take-off
-among heights above a datum differ from their own height above take-off by nothing where the others' differ by the
-height of the place.
+The photographs of a flight lie within kilometres. A receiver without a position writes (0, 0). Exchanged latitude and
+longitude lie elsewhere on earth and return when exchanged again. Heights above take-off mixed with heights above a
+datum are recognised by photographs that record both.
 """
 
 from collections.abc import Mapping
@@ -18,16 +17,16 @@ from jaxphoto.georeferencing.gps import HEIGHTS, Gps, Heights
 Positions = dict[str, Gps | None]
 
 _EARTH_M = 6_371_000.0
-# No flight that hangs together is larger.
+# No contiguous flight is larger.
 _FAR_M = 50_000.0
 # Some hundred metres about (0, 0), where nobody flies.
 _NOWHERE_DEG = 1e-3
-# A height that is the one above take-off; zeros of the same flight that are two; metres.
+# Tolerance of a height equal to the one above take-off; difference of two zero heights within a flight; metres.
 _SAME_M, _APART_M = 0.5, 5.0
 
 
 def plausible_positions(positions: Mapping[str, Gps | None]) -> tuple[Positions, list[str]]:
-    """The positions that can be, latitude and longitude in their places, and a sentence of each kind of mend."""
+    """Return plausible positions, with latitude and longitude in order, and one message per kind of correction."""
     found: Positions = dict(positions)
     said = []
     absent = [name for name, gps in found.items() if gps is None]
@@ -42,7 +41,7 @@ def plausible_positions(positions: Mapping[str, Gps | None]) -> tuple[Positions,
         far = [n for n, p in at.items() if np.linalg.norm(p - middle) > _FAR_M]
         back = [n for n in far if (g := _changed(known[n])) and np.linalg.norm(_on_sphere(g) - middle) <= _FAR_M]
         found |= {n: _changed(known[n]) for n in back}
-        # A majority is needed to say who is far.
+        # Outliers are relative to a majority.
         lost = [n for n in far if n not in back] if len(far) < len(known) / 2 else []
         found |= dict.fromkeys(lost, None)
         turned += back
@@ -66,11 +65,11 @@ def one_height(
     above_takeoff_m: Mapping[str, float | None],
     wanted: Heights | int | None = None,
 ) -> tuple[Positions, list[str]]:
-    """The positions with heights above one thing, and what that is in a sentence.
+    """Return the positions with heights above one reference, and a message about it.
 
-    `wanted` take-off takes the heights that drones note above it; any other says what the files do not, an EPSG code of
-    heights so that its geoid is added. Without it, heights of two kinds are brought together by those above take-off,
-    where photographs have both. Raises what `above_ellipsoid` does.
+    `wanted` "take-off" uses the heights above take-off that drones record; an EPSG code of heights adds its geoid where
+    the files do not state the reference. Without it, heights of two kinds are combined by those above take-off, if
+    photographs have both. Raises what `above_ellipsoid` does.
     """
     found: Positions = dict(positions)
     known = {n: g for n, g in found.items() if g and g.altitude_m is not None}
@@ -110,7 +109,7 @@ def one_height(
 
 
 def _joined(positions: Positions, zero: Mapping[str, float]) -> tuple[Positions, list[str]]:
-    """Heights of the rarer kind brought to those of the usual one, where their zeros tell how far they are apart."""
+    """Convert heights of the rarer kind to the usual one, if the difference of their zero heights is determined."""
     kinds: dict[Heights, list[str]] = {}
     for n, g in positions.items():
         if g and g.altitude_m is not None:
@@ -159,7 +158,7 @@ def _raised(gps: Gps, by_m: float) -> Gps:
 
 
 def _changed(gps: Gps) -> Gps | None:
-    """Latitude and longitude in each other's place; None where that cannot be."""
+    """Exchange latitude and longitude; None if the result is invalid."""
     if abs(gps.longitude_deg) > 90:
         return None
     return gps._replace(latitude_deg=gps.longitude_deg, longitude_deg=gps.latitude_deg)
