@@ -31,7 +31,7 @@ _WALKING = dynamic_fields(StripCamera)
 
 
 def drawn(recipe: Recipe, flight: Flight, clock: Float[np.ndarray, "images"], seed: int) -> Changes:
-    """Return the changes of the recipe with their truth: random deviations of each owner, and the walk between strips."""
+    """Return the changes of the recipe with their truth: deviations of each owner, and the walk between strips."""
     changes = {kind: deviated(owners, seed) for kind, owners in recipe.changes.items()}
     if recipe.walk is not None:
         strips, hours = _strip_hours(flight, clock)

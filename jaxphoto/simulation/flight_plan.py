@@ -132,7 +132,7 @@ class Swaths:
         return inside
 
     def extent(self, axes: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
-        """Minimum and maximum coordinate of all swaths, (minimum or maximum, axis) in m along the unit vectors `axes`."""
+        """Minimum and maximum coordinate of all swaths, (minimum or maximum, axis) in m along `axes`."""
         signs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
         corners = np.vstack([s.middle + signs * self.half(s) @ s.axes for s in self.strips]) @ axes.T
         return np.stack([corners.min(axis=0), corners.max(axis=0)])

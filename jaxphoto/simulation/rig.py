@@ -93,7 +93,7 @@ def runs_late(cameras: Mapping[str, SimulatedChange]) -> bool:
 
 
 def with_gnss(recipe: Recipe, flight: Flight) -> Int[np.ndarray, "n"]:
-    """The images of which stations and attitudes are observed: all, or those of the reference camera of a rig."""
+    """Return the images with observed stations and attitudes: all, or those of the reference camera of a rig."""
     return np.arange(0, len(flight.images), len(recipe.rig) + 1)
 
 

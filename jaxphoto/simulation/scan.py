@@ -93,7 +93,7 @@ def scan(
 
 
 def _pulses(plan: ScanPlan, paths: list[Path]) -> list[float]:
-    """Return the number of pulses of every path. Raises BlockError if memory cannot hold them, or a strip is not flown."""
+    """Return the number of pulses of every path. Raises BlockError for too many, and for a strip not flown."""
     pulses_of = [plan.density_per_m2 * 2 * plan.half_width * path.height_m * path.length_m for path in paths]
     if not sum(pulses_of) <= _PULSES:
         raise BlockError(

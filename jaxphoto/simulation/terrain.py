@@ -81,7 +81,7 @@ class Terrain:
         return np.maximum(self.height(xy), roof_height(self.buildings, xy))
 
     def open(self, xy: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
-        """Return True if a place (east, north) is 1 m or more away from walls and crowns, on the ground or on a roof."""
+        """Return True if a place (east, north) is at least 1 m from walls and crowns, on the ground or on a roof."""
         near_wall = np.isfinite(wall_distance(self.buildings, xy, _CLEARANCE_M))
         return ~near_wall & ~under_crown(self.trees, xy, _CLEARANCE_M)
 
