@@ -22,10 +22,10 @@ def step_lines(adjusted: Adjustment) -> Iterator[str]:
     course, redundancy = adjusted.course, max(adjusted.redundancy, 1)
     if course is None:
         return
-    for k, (square_sum, length, damping, accepted, bent) in enumerate(zip(*course, strict=True), 1):
+    for k, (before, length, damping, accepted, bent) in enumerate(zip(*course, strict=True), 1):
         along = f", {bent:.2g} of it along a curve" if bent > 0 else ""
         refused = "" if accepted > 0 else ", refused"
         moved = f"moves {length:.2g} sigmas, damping {damping:.1g}{along}{refused}"
-        yield f"step {k}: sigma naught {(square_sum / redundancy) ** 0.5:.6g}, {moved}"
+        yield f"step {k}: sigma naught {(before / redundancy) ** 0.5:.6g}, {moved}"
     if len(course.length) == int(adjusted.steps):
         yield f"end: sigma naught {(float(adjusted.square_sum) / redundancy) ** 0.5:.6g}"

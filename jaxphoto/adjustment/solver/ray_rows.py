@@ -121,8 +121,8 @@ def ray_jacobian(
     """Evaluate residuals and Jacobian of a batch, x and y, by the chain rule through the camera frames."""
     centre, rotation, unit = scene.centre, scene.rotation, jnp.eye(3)
     # One loop for all six: joined afterwards, they would be computed one number at a time.
-    still, turns = jnp.zeros((3, *rotation.shape)), jnp.moveaxis(slopes.rotation, -1, 0)
-    seeds = jnp.concatenate([unit[:, None] * slopes.centre, still[:, :, 0]]), jnp.concatenate([still, turns])
+    zero, turns = jnp.zeros((3, *rotation.shape)), jnp.moveaxis(slopes.rotation, -1, 0)
+    seeds = jnp.concatenate([unit[:, None] * slopes.centre, zero[:, :, 0]]), jnp.concatenate([zero, turns])
     # jit keeps the trace for every derivative below.
     place = jax.jit(partial(_in_cameras, seen=seen, s=s))
     by_eop = _slope(lambda *x: place(*x, points), centre, rotation)(*seeds)

@@ -161,8 +161,8 @@ def _eliminated(sums: _AtPoints, rest: NonImageRows, met: Array, scale: Array, d
     v = scale[:, None] * scale * v[np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])] + rest.v
     b = b + rest.b + jnp.einsum("kap,k->ap", rest.rows_p, rest.coupled)
     diagonal = jnp.einsum("iip->ip", v)
-    added = damping * diagonal + jnp.where(diagonal == 0, 1.0, 0.0)
-    l = once(cholesky_3x3, s.eop_free, v + added[:, None] * jnp.eye(3)[:, :, None])  # noqa: E741
+    extra = damping * diagonal + jnp.where(diagonal == 0, 1.0, 0.0)
+    l = once(cholesky_3x3, s.eop_free, v + extra[:, None] * jnp.eye(3)[:, :, None])  # noqa: E741
     interior = sums.w[:, :i].transpose(1, 2, 0) * scale
     border = jnp.concatenate([interior, rest.rows_p, b[None], met]).transpose(1, 0, 2)
     border = once(lambda w, factors: jnp.stack(whiten(w, factors)).transpose(2, 0, 1), s.eop_free, border, l)
@@ -399,8 +399,8 @@ def _assembled(
     (columns, last), u, us, uss, b_s, b_e = add_non_image_rows(images, rest, s)
     uss, b_s = uss + of_met.square, b_s + of_met.right
     weight = Increments(jnp.einsum("nii->in", u), jnp.diagonal(uss), points.diagonal)
-    added = damping * weight.eop.T + jnp.where(weight.eop.T == 0, 1.0, 0.0)
-    u = u - own + added[:, :, None] * jnp.eye(6)
+    extra = damping * weight.eop.T + jnp.where(weight.eop.T == 0, 1.0, 0.0)
+    u = u - own + extra[:, :, None] * jnp.eye(6)
     each, of_inner = jnp.arange(n), inner * width
     columns = columns.at[each[:of_inner] // width, each[:of_inner] % width, :, each[:of_inner] % width].add(
         u[:of_inner], unique_indices=True

@@ -72,9 +72,9 @@ def n_open_motions(values: AbstractValues, s: AbstractStructure) -> int:
     only control point, a shift compensated by a strip's) depend on the place, or on more than images and points.
     """
     k = len(values.datum_eop)
-    rigid = all(g.rigid for g in s.observed)
+    invariant = all(g.rigid for g in s.observed)
     lengths = any(g.rigid and g.elimination != "reduced" for g in s.observed)
-    return k if rigid and (k == 7 or (k == 6 and lengths)) else 0
+    return k if invariant and (k == 7 or (k == 6 and lengths)) else 0
 
 
 def onto_datum(at: Linearised) -> Increments:
