@@ -49,7 +49,7 @@ from jaxphoto.statistics import (
     trends,
     undetected_effects,
 )
-from jaxphoto.statistics.intersection_angles import intersection_angles
+from jaxphoto.statistics.block_geometry import intersection_angles
 from jaxphoto.statistics.sigma_map import SigmaMap, sigma_maps
 from jaxphoto.tracing import refuse_traced
 

@@ -1,29 +1,29 @@
 """What an adjustment is worth: covariance, correlation, reliability, significance, discrepancies."""
 
 from jaxphoto.statistics.blunder_test import (
-    DELTA0,
     LEAST_SIGMA0,
     LEVEL,
     BlunderTest,
-    Hidden,
     Suspect,
     blunder_test,
     critical_w,
-    detectable_errors,
-    worst_checked,
+    culprits,
 )
-from jaxphoto.statistics.camera_drift import (
-    CameraDifferences,
-    CameraDrift,
-    camera_drifts,
-    camera_wanderings,
-    strip_differences,
+from jaxphoto.statistics.correlation import (
+    Correlations,
+    GroundCorrelations,
+    LinearForms,
+    correlation_matrix,
+    correlations,
+    ground_correlations,
+    linear_forms,
 )
-from jaxphoto.statistics.common_observations import common_covariance
-from jaxphoto.statistics.correlation import Correlations, correlation_matrix, correlations
-from jaxphoto.statistics.covariance import EOP_NAMES, Covariance, Rotations, covariance
-from jaxphoto.statistics.culprits import culprits
+from jaxphoto.statistics.covariance import EOP_NAMES, Covariance, Rotations, common_covariance, covariance
 from jaxphoto.statistics.discrepancy import (
+    LEAST_CHECK_POINTS,
+    AxisErrors,
+    ComponentAccuracy,
+    PositionalAccuracy,
     Spread,
     a_priori_sigmas,
     angle_differences,
@@ -31,45 +31,58 @@ from jaxphoto.statistics.discrepancy import (
     observation_groups,
     physical_residuals,
     point_differences,
+    positional_accuracy,
     residual_spread,
     spread_of,
 )
 from jaxphoto.statistics.global_test import VarianceFactor, global_test, group_factors, stretch
-from jaxphoto.statistics.ground import GroundCorrelations, ground_correlations
-from jaxphoto.statistics.linear_forms import LinearForms, linear_forms
-from jaxphoto.statistics.partial_redundancy import PartialRedundancy, partial_redundancy
-from jaxphoto.statistics.partition import SPLITS, Partition, Parts, Selection, parts_of
-from jaxphoto.statistics.patterns import MOST_PARTS, PatternTerm, ResidualPattern
-from jaxphoto.statistics.positional_accuracy import (
-    LEAST_CHECK_POINTS,
-    AxisErrors,
-    ComponentAccuracy,
-    PositionalAccuracy,
-    positional_accuracy,
-)
+from jaxphoto.statistics.hat_matrix import prepare_responses
 from jaxphoto.statistics.quantiles import chi_square_limit
 from jaxphoto.statistics.reliability import (
+    DELTA0,
     LEAST_CHECKED,
     UNCHECKED,
+    Felt,
+    Hidden,
     Redundancy,
+    UndetectedEffects,
+    detectable_errors,
     error_precision,
+    most_felt,
     normalised_residuals,
     prepare_statistics,
     redundancy_numbers,
+    undetected_effects,
+    worst_checked,
 )
-from jaxphoto.statistics.responses import prepare_responses
 from jaxphoto.statistics.significance import (
+    POWER,
     SIGNIFICANCE_LEVEL,
+    CameraDifferences,
+    CameraDrift,
     IfZero,
     Significance,
+    ZeroTest,
+    camera_drifts,
+    camera_wanderings,
     chi_square_p,
     if_zero,
     significance,
+    strip_differences,
+    zero_test,
 )
-from jaxphoto.statistics.trends import SURE, Hint, Trend, trends
-from jaxphoto.statistics.undetected import Felt, UndetectedEffects, most_felt, undetected_effects
-from jaxphoto.statistics.variance_components import VarianceComponents, variance_components
-from jaxphoto.statistics.zero_test import POWER, ZeroTest, zero_test
+from jaxphoto.statistics.systematic_effects import MOST_PARTS, SURE, Hint, PatternTerm, ResidualPattern, Trend, trends
+from jaxphoto.statistics.variance_components import (
+    SPLITS,
+    PartialRedundancy,
+    Partition,
+    Parts,
+    Selection,
+    VarianceComponents,
+    partial_redundancy,
+    parts_of,
+    variance_components,
+)
 
 __all__ = [
     "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEAST_CHECK_POINTS", "LEAST_SIGMA0", "LEVEL", "MOST_PARTS", "POWER",

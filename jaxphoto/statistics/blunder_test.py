@@ -6,9 +6,20 @@ the tau distribution; of n of them the largest is compared with its quantile of 
 
 Sources: Baarda (1968), A testing procedure for use in geodetic networks; Pope (1976), The statistics of residuals and
 the detection of outliers, NOAA Technical Report NOS 65 NGS 1.
+
+
+Which of several suspects a test cannot do without: a blunder inflates the residuals around it.
+
+Suspects are taken out one after another, the worst first, each as an unknown error of its row. What is left to another
+suspect i beside those that are out, S, is with C = P Q_vv P of whitened observations and u = v
+
+    u_i|S = u_i - C_iS C_SS^-1 u_S,     c_i|S = C_ii - C_iS C_SS^-1 C_Si,     w_i|S = u_i|S / (s_S sqrt(c_i|S))
+
+where s_S^2 = (v'v - u_S' C_SS^-1 u_S) / (r - f_S) is the variance factor without them.
+Source: Kok (1984), On data snooping and multiple outlier testing, NOAA Technical Report NOS NGS 30.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
@@ -18,15 +29,21 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.arrays import still
 from jaxphoto.short_repr import shown
 from jaxphoto.statistics.discrepancy import observation_groups
+from jaxphoto.statistics.hat_matrix import Responses
 from jaxphoto.statistics.quantiles import student_limit
-from jaxphoto.statistics.reliability import LEAST_CHECKED, UNCHECKED, Redundancy, error_precision, normalised_residuals
+from jaxphoto.statistics.reliability import LEAST_CHECKED, Redundancy, error_precision, normalised_residuals
+from jaxphoto.statistics.systematic_effects import (
+    LEAST_SEEN,
+    PatternTerm,
+    ResidualPattern,
+    inverse_of_seen,
+    patterns_of,
+)
 
 LEVEL = 1e-3
 """Error probability of a test of the whole adjustment: of sigma naught, and of all normalised residuals together."""
 LEAST_SIGMA0 = 1e-3
 """Below this, residuals are the rounding of exact numbers, and none of them contradicts another."""
-DELTA0 = 4.13
-"""Shift of a normalised residual that a test of level 0.1 % finds with a power of 80 % (Baarda)."""
 
 
 @shown
@@ -96,41 +113,65 @@ def critical_w(n: int, redundancy: int, level: float = LEVEL) -> float:
     return t * redundancy**0.5 / (redundancy - 1 + t * t) ** 0.5
 
 
-def detectable_errors(
-    adjusted: Adjustment, redundancy: Redundancy, delta0: float = DELTA0
-) -> dict[str, Float[np.ndarray, "..."]]:
-    """By group, the least error that the test of one normalised residual finds with its power: delta0 / sqrt(P Q_vv P).
+# Of more suspects the worst: where so many contradict one another, it is for snooping to tell.
+_MOST = 24
 
-    In the unit of each observation; infinite where nothing checks it.
+
+def culprits(
+    adjusted: Adjustment, test: BlunderTest, beside: Sequence[tuple[ResidualPattern, PatternTerm]] = ()
+) -> tuple[Suspect, ...]:
+    """The suspects that are still beyond the critical value when those of them that are worse are out.
+
+    The worst first. Terms `beside` them are unknowns from the beginning: what they explain accuses nobody. Of more than
+    two dozen suspects those beyond these are taken as they are.
     """
-    found = {}
-    for name, p in error_precision(adjusted, redundancy).items():
-        checked = still(redundancy[name]) > UNCHECKED
-        found[name] = np.where(checked, delta0 / np.sqrt(np.where(checked, p, 1.0)), np.inf)
-    return found
+    some, others = test.suspects[:_MOST], test.suspects[_MOST:]
+    if len(some) + len(beside) < 2 or not some:
+        return test.suspects
+    responses = Responses.of(adjusted)
+    rows = [np.ravel(responses.places[s.group][..., s.row]) for s in some]
+    shown = [int(np.atleast_2d(responses.places[s.group])[s.number, s.row]) for s in some]
+    at, n = np.concatenate(rows), len(beside)
+    first = _columns(responses, beside)
+
+    def column(k: int) -> np.ndarray:
+        return first[k] if k < n else np.bincount(at[k - n : k - n + 1], minlength=responses.count).astype(float)
+
+    own_products = np.eye(n + len(at))
+    own_products[:n, :n], own_products[:n, n:], own_products[n:, :n] = first @ first.T, first[:, at], first[:, at].T
+    c = own_products - responses.products(column, n + len(at))[0]
+    v = responses.residuals
+    whole, places = float(v @ v), [n + np.flatnonzero(np.isin(at, own)) for own in rows]
+    u = np.concatenate([first @ v, v[at]])
+    least = min([LEAST_SEEN, *(pattern.least_seen for pattern, _ in beside)])
+    chosen: list[int] = [] if n else [0]
+    while len(chosen) < len(some):
+        out = np.concatenate([np.arange(n), *(places[i] for i in chosen)])
+        inverse, freedom = inverse_of_seen(c[np.ix_(out, out)], own_products[np.ix_(out, out)], least)
+        errors, redundancy = inverse @ u[out], adjusted.redundancy - freedom
+        left = whole - float(u[out] @ errors)
+        if redundancy < 1 or left <= LEAST_SIGMA0**2 * redundancy:
+            break
+        w = np.zeros(len(some))
+        for i in (i for i in range(len(some)) if i not in chosen):
+            own = n + int(np.flatnonzero(at == shown[i])[0])
+            square = float(c[own, own] - c[own, out] @ inverse @ c[out, own])
+            if square > LEAST_SEEN * c[own, own]:
+                w[i] = abs(u[own] - c[own, out] @ errors) / (left / redundancy * square) ** 0.5
+        if w.max() <= test.limit:
+            break
+        chosen.append(int(w.argmax()))
+    return (*(some[i] for i in chosen), *others)
 
 
-@shown
-class Hidden(NamedTuple):
-    """The observation of a group whose errors are found worst: `detectable` is infinite where none ever is."""
-
-    group: str
-    words: str
-    detectable: float
-    sigma: float
-    """A priori; both in `unit`."""
-    unit: str
-
-
-def worst_checked(adjusted: Adjustment, redundancy: Redundancy) -> list[Hidden]:
-    """Of each group of observations, that of the largest detectable error beside its standard deviation."""
-    found, block = [], adjusted.block
-    detectable = detectable_errors(adjusted, redundancy)
-    for name, rows in observation_groups(adjusted).items():
-        if rows.unit and len(rows):
-            size, sigma = np.atleast_2d(detectable[name]), np.atleast_2d(still(rows.sigmas).T)
-            k = np.unravel_index(np.argmax(size / sigma), size.shape)
-            number, row = np.reshape(k, (2, 1))
-            (words,) = rows.words_of(number, row, block.images, block.points)
-            found.append(Hidden(name, words, float(size[k]), float(sigma[k]), rows.unit))
+def _columns(
+    responses: Responses, beside: Sequence[tuple[ResidualPattern, PatternTerm]]
+) -> Float[np.ndarray, "terms count"]:
+    """Terms of patterns, of which their columns need not be known, as whitened errors of all observations."""
+    found, told = np.zeros((len(beside), responses.count)), [(p.what, p.camera) for p, _ in beside]
+    for pattern in patterns_of(responses.adjusted, responses.places) if beside else ():
+        for row, (name, (_, term)) in enumerate(zip(told, beside, strict=True)):
+            if name == (pattern.what, pattern.camera):
+                used = ((k, float(a)) for k, a in enumerate(term.coefficients) if a != 0.0)
+                found[row] = sum((a * pattern.column(k, responses.count) for k, a in used), found[row])
     return found

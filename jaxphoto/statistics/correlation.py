@@ -1,19 +1,43 @@
 """Correlations: interior with interior orientation, and each image's exterior with its camera's interior.
 
 Source: paper 000, Table 4 (mean absolute correlation over the images, per angle or coordinate and IOP).
+
+
+Covariances of linear functions of the unknowns, such as the mean height of all points.
+
+How the camera goes with the ground: its height as a whole, the height of the flight over it, its dome.
+
+Over flat ground from one height a longer c is a higher flight, and a barrel is a dome of the ground: neither leaves a
+residual. Correlations with the exterior orientation of single images do not show it, because all images and points move
+together. Each of these is a linear function f = g' x of the coordinates of points and stations, so
+
+    cov(f, u) = sigma0^2 g' N^-1 e_u,   var(f) = sigma0^2 g' N^-1 g.
+
+    height          mean Z of the points
+    flying_height   mean Z of the projection centres less that of the points
+    dome            by how much the middle of the ground rises over its edge: of Z = a + b X + c Y + d (X^2 + Y^2),
+                    fitted to the points, -d R^2 with the distance R from the middle to the farthest
+
+Source: the dome as the typical deformation of flat blocks, M. R. James and S. Robson, Mitigating systematic error in
+topographic models derived from UAV and ground-based image networks, Earth Surface Processes and Landforms 39 (2014).
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.arrays import namespace, still
+from jaxphoto.adjustment.model.numbers import Increments
+from jaxphoto.adjustment.right_hand_sides import solve_many
+from jaxphoto.arrays import Numbers, is_traced, namespace, still
 from jaxphoto.short_repr import shown
 from jaxphoto.statistics.covariance import EOP_NAMES, Covariance
+from jaxphoto.statistics.hat_matrix import products_of
 
 
 @shown
@@ -77,3 +101,124 @@ def high_pairs(names: Sequence[str], rho: Float[np.ndarray, "n n"], above: float
     lower = [(i, j) for i in range(len(names)) for j in range(i)]
     pairs = [(names[i], names[j], float(rho[i, j])) for i, j in lower if abs(rho[i, j]) > above]
     return sorted(pairs, key=lambda pair: -abs(pair[2]))
+
+
+@shown
+class LinearForms(NamedTuple):
+    """Covariances of linear functions of unknowns, with one another and with the shared unknowns."""
+
+    variance: Float[Any, "forms forms"]
+    with_shared: Float[Any, "forms shared"]
+
+
+def linear_forms(
+    adjusted: Adjustment,
+    n_forms: int,
+    *,
+    points: Float[Numbers, "forms points 3"] | None = None,
+    exterior: Float[Numbers, "forms images 6"] | None = None,
+    shared: Float[Numbers, "forms shared"] | None = None,
+) -> LinearForms:
+    """Covariances (a posteriori) of `n_forms` sums g' x of unknowns with these weights g; without weights, none of it.
+
+    With f = g' x of unknowns x with normal matrix N, cov(f, h) = sigma0^2 g' N^-1 h. Unknowns are the coordinates of
+    points (m), of each image its position (m) and small rotations about the axes of its camera (rad), and the shared
+    ones in the order of `Structure.labels`, in their own units.
+    """
+    equations, places = adjusted.equations.on_one_device.weighed, adjusted.padded.places
+    scale = jax.tree.map(still, equations.scale)
+
+    def weights(given: Any, at: Any, of: Any) -> Any:
+        if given is None:
+            return np.zeros((n_forms, *of.shape))
+        if is_traced((given, of)):
+            return jnp.zeros((n_forms, *of.shape)).at[..., at].set(given) * of
+        placed = np.zeros((n_forms, *of.shape))
+        placed[..., at] = given
+        return placed * of
+
+    b = Increments(
+        weights(None if exterior is None else exterior.swapaxes(1, 2), places.image, scale.eop),
+        weights(shared, np.arange(0 if shared is None else shared.shape[1]), scale.shared),
+        weights(None if points is None else points.swapaxes(1, 2), places.point, scale.points),
+    )
+    x, factor = solve_many(equations, b, adjusted.seconds), adjusted.sigma0**2
+    return LinearForms(factor * products_of(b, x), factor * x.shared * scale.shared)
+
+
+FORMS = ("height", "flying_height", "dome")
+# Points of two rays are as good as these meet: they would be most of the variance of a mean.
+_RAYS, _ENOUGH = 3, 10
+# Cosine of the tilt up to which photographs, on average, look down.
+_DOWN = 0.7
+# Of the yardstick: a form that is held by the datum has a variance of rounding.
+_NOTHING = 1e-9
+
+
+@shown
+class GroundCorrelations(eqx.Module):
+    """How the forms of the ground go with the interior orientation of a camera."""
+
+    camera: str = eqx.field(static=True)
+    parameters: tuple[str, ...] = eqx.field(static=True)
+    """The camera's estimated interior parameters (c_mm ...)."""
+    sigma_m: Float[np.ndarray, "forms"]
+    """Standard deviation of each of `FORMS`; zero where nothing lets it move."""
+    rho: Float[np.ndarray, "forms iop"]
+    together: Float[np.ndarray, "forms"]
+    """The multiple correlation with all parameters of the camera together."""
+
+
+def looks_down(adjusted: Adjustment) -> bool:
+    """Whether the photographs, on average, look down on what they see."""
+    up = np.asarray(adjusted.unknowns.exterior.camera_from_object)[:, 2, 2]
+    return bool(np.mean(up) > _DOWN)
+
+
+def ground_correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, GroundCorrelations]:
+    """By camera; none of a block that does not look down, or of too few points."""
+    rays = np.bincount(adjusted.structure.point, minlength=len(adjusted.block.points))
+    chosen = rays >= _RAYS if (rays >= _RAYS).sum() >= _ENOUGH else rays > 0
+    if not looks_down(adjusted) or chosen.sum() < 5:
+        return {}
+    points, positions = _weights(np.asarray(adjusted.unknowns.points), chosen, len(adjusted.block.images))
+    exterior = np.concatenate([positions, np.zeros_like(positions)], axis=2)
+    found = linear_forms(adjusted, len(FORMS), points=points, exterior=exterior)
+    variance, n = np.diagonal(found.variance), 6 * covariance.n_images
+    moves = variance > _NOTHING * np.max(np.square(covariance.point_sigma), initial=0.0)
+    sigma = np.where(moves, np.sqrt(np.maximum(variance, 0.0)), 0.0)
+    of_shared, matrix = covariance.labels[n:], np.asarray(covariance.matrix)[n:, n:] * float(covariance.variance_factor)
+    result = {}
+    for camera in adjusted.unknowns.interior:
+        prefix = f"interior[{camera}]."
+        own = [k for k, label in enumerate(of_shared) if label.startswith(prefix)]
+        if not own:
+            continue
+        both, among = found.with_shared[:, own], matrix[np.ix_(own, own)]
+        size = np.where(moves, sigma, np.inf)[:, None] * np.sqrt(np.diagonal(among))
+        rho = both / size
+        scaled = among / np.sqrt(np.outer(np.diagonal(among), np.diagonal(among)))
+        square = np.einsum("fi,fi->f", rho, np.linalg.solve(scaled, rho.T).T)
+        result[camera] = GroundCorrelations(
+            camera,
+            tuple(of_shared[k].removeprefix(prefix) for k in own),
+            sigma,
+            rho,
+            np.sqrt(np.clip(square, 0.0, 1.0)),
+        )
+    return result
+
+
+def _weights(
+    xyz: Float[np.ndarray, "points 3"], chosen: np.ndarray, n_images: int
+) -> tuple[Float[np.ndarray, "3 points 3"], Float[np.ndarray, "3 images 3"]]:
+    """Of the coordinates in each of `FORMS`."""
+    points, positions = np.zeros((3, *xyz.shape)), np.zeros((3, n_images, 3))
+    points[0, chosen, 2] = 1 / chosen.sum()
+    points[1], positions[1, :, 2] = -points[0], 1 / n_images
+    plan = xyz[chosen, :2] - xyz[chosen, :2].mean(axis=0)
+    square = (plan**2).sum(axis=1)
+    farthest = max(float(square.max()), np.finfo(float).tiny)
+    terms = np.column_stack([np.ones(len(plan)), plan / np.sqrt(farthest), square / farthest])
+    points[2, chosen, 2] = -np.linalg.pinv(terms)[3]
+    return points, positions

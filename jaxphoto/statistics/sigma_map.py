@@ -34,7 +34,7 @@ from jaxphoto.linear_algebra import solve
 from jaxphoto.rotation import small_rotation
 from jaxphoto.short_repr import shown
 from jaxphoto.stability import image_grid, parameter_vector, regular_rays, with_parameters
-from jaxphoto.statistics.linear_forms import linear_forms
+from jaxphoto.statistics.correlation import linear_forms
 
 # Cells along the longer and the shorter side of the format.
 _LONG, _SHORT = 60, 40

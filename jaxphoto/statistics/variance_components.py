@@ -1,4 +1,30 @@
-"""Variance components: how much larger or smaller the variances of parts of the observations are than was stated.
+"""Partitions of the observations: who shares a variance component with whom.
+
+A partition is declared by splits of the groups of observations, or by a selection of observations for each label:
+
+    variance_components(adjusted, ("xy-z", "camera"))
+    variance_components(adjusted, {"height": Selection("control_points", axes="Z"), "GNSS": Selection("stations")})
+
+What is known beforehand of unknowns (`Weighted`, `KnownParameters`) is no sample of anything: it keeps its weight.
+
+
+Redundancy by parts: S_kl = tr(R_k R_l), by which residuals of one part answer to the variance of another.
+
+With R = I - H, H = J Q J' of whitened observations, and R_kl the block of the rows of part k and the columns of part l,
+
+    S_kl = |R_kl|^2    (the sum of its squares),    r_k = tr R_kk = sum_l S_kl,    E[v_k' P_k v_k] = sum_l S_kl s_l
+
+where s_l is the variance factor of part l; the middle one because R is idempotent. Off the diagonal |R_kl| = |H_kl|,
+which takes products H z (`Responses`): exactly, z is each unit vector of part k in turn; or, of a large
+part, the mean of |H_l z|^2 over vectors z of random signs in part k (Hutchinson). Its standard deviation is below
+sqrt(S_kl / (2 p)) for p vectors, because no singular value of an off-diagonal block of a projector exceeds 1/2. The
+diagonal follows from the redundancy numbers, which are exact, and so does the part that no vector is spent on: the
+largest. Where that holds all image points, their rows need not be gone through for each vector: |H z|^2 = z'H z, which
+the part tells that z is in. Source: K. R. Koch, Parameter Estimation and Hypothesis Testing in Linear Models (1999),
+3.6; M. F. Hutchinson (1989), A stochastic estimator of the trace of the influence matrix.
+
+
+Variance components: how much larger or smaller the variances of parts of the observations are than was stated.
 
 REML of normal observations. With v_k' P_k v_k and S of `partial_redundancy` at the present weights, Helmert's step is
 
@@ -14,20 +40,245 @@ Kovarianzkomponenten (1979); K. R. Koch, Parameter Estimation and Hypothesis Tes
 H. D. Patterson and R. Thompson, Recovery of inter-block information when block sizes are unequal, Biometrika 58 (1971).
 """
 
-from typing import NamedTuple
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxphoto.adjustment import MAX_STEPS, Adjustment, solve
+from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError, counted
-from jaxphoto.observations import AbstractObservations
+from jaxphoto.observations import AXES, AbstractObservations, Correlated, ImageRows
 from jaxphoto.short_repr import shown
-from jaxphoto.statistics.partial_redundancy import PROBES, PartialRedundancy, partial_redundancy
-from jaxphoto.statistics.partition import Partition, Parts, parts_of
+from jaxphoto.statistics.covariance import covariance
+from jaxphoto.statistics.discrepancy import observation_groups
+from jaxphoto.statistics.hat_matrix import Responses
+from jaxphoto.statistics.reliability import redundancy_numbers
 from jaxphoto.tracing import outside_transformations
+
+
+@shown
+class Selection(NamedTuple):
+    """Observations of one group; all of them, or only those along some axes, of some cameras, images or points."""
+
+    group: str
+    axes: Collection[str] = ()
+    cameras: Collection[str] = ()
+    images: Collection[str] = ()
+    points: Collection[str] = ()
+
+
+Partition = Sequence[str] | Mapping[str, Selection | Sequence[Selection]]
+"""Splits, words of `SPLITS`, none for one part a group; or what belongs to each label."""
+
+
+@shown
+class Parts(NamedTuple):
+    """A partition of the observations of one adjustment."""
+
+    labels: tuple[str, ...]
+    of: dict[str, Int[np.ndarray, "..."]]
+    """The part of every observation by the names of their groups, shaped like the residuals; the number of parts where
+    it is in none."""
+
+    @property
+    def counts(self) -> Int[np.ndarray, "parts"]:
+        """Observations of each part."""
+        parts = np.concatenate([np.ravel(v) for v in self.of.values()])
+        return np.bincount(parts, minlength=len(self.labels) + 1)[: len(self.labels)]
+
+
+Names = Shaped[np.ndarray, "..."]
+_Split = Callable[[AbstractObservations, Block], Names | None]
+
+
+def _by_axis(rows: AbstractObservations, block: Block) -> Names | None:
+    return None if isinstance(rows, Correlated) else rows.axis_names()
+
+
+def _plan_and_height(rows: AbstractObservations, block: Block) -> Names | None:
+    axis = _by_axis(rows, block)
+    if axis is None or not set(axis.ravel()) <= set(AXES):
+        return None
+    return np.where(axis == "Z", "Z", "X-Y").astype(object)
+
+
+def _by_camera(rows: AbstractObservations, block: Block) -> Names | None:
+    return rows.names_of("image", block.image_camera) if rows.group == IMAGE_POINTS else None
+
+
+def _by_image(rows: AbstractObservations, block: Block) -> Names | None:
+    return rows.names_of("image", block.images) if rows.group == IMAGE_POINTS else None
+
+
+SPLITS: dict[str, _Split] = {"xy-z": _plan_and_height, "axis": _by_axis, "camera": _by_camera, "image": _by_image}
+"""What parts a group: X and Y from Z; each axis from the others; image points by camera; image points by image."""
+
+
+def observed_rows(adjusted: Adjustment) -> dict[str, AbstractObservations]:
+    """The rows that may have variance components, by the names of their groups: all but what is known beforehand."""
+    known = observation_groups(adjusted)
+    return {name: known[name] for name in adjusted.block.named_observations}
+
+
+def parts_of(adjusted: Adjustment, partition: Partition) -> Parts:
+    """The parts of an adjustment's observations, in the order of the partition.
+
+    Raises InputError for a split, a group or a name that there is not, for a label without observations, for
+    observations with two labels, and where rows that a covariance joins would be parted.
+    """
+    rows = observed_rows(adjusted)
+    if isinstance(partition, Mapping):
+        names, labels = _selected(adjusted, rows, partition), tuple(partition)
+    else:
+        names = _split(adjusted, rows, partition)
+        labels = tuple(dict.fromkeys(label for of in names.values() for label in of.ravel().tolist()))
+    place = {"": len(labels)} | {label: k for k, label in enumerate(labels)}
+    numbered = {name: np.vectorize(place.__getitem__, otypes=[int])(of) for name, of in names.items()}
+    given = adjusted.residuals.named
+    return Parts(labels, {name: numbered.get(name, np.full(np.shape(v), len(labels))) for name, v in given.items()})
+
+
+def _split(adjusted: Adjustment, rows: Mapping[str, AbstractObservations], words: Sequence[str]) -> dict[str, Names]:
+    words = (words,) if isinstance(words, str) else words
+    if unknown := [word for word in words if word not in SPLITS]:
+        raise InputError(f"there is no split {unknown[0]!r} of observations: there are {', '.join(SPLITS)}")
+    found = {}
+    for name, own in rows.items():
+        label = np.full(np.shape(adjusted.residuals[name]), name, object)
+        for word in words:
+            further = SPLITS[word](own, adjusted.block)
+            if further is not None and len(set(further.ravel())) > 1:
+                label = label + " " + further
+        found[name] = label
+    return found
+
+
+def _selected(
+    adjusted: Adjustment, rows: Mapping[str, AbstractObservations], partition: Mapping[str, Any]
+) -> dict[str, Names]:
+    found = {name: np.full(np.shape(adjusted.residuals[name]), "", object) for name in rows}
+    for label, chosen in partition.items():
+        for selection in [chosen] if isinstance(chosen, Selection) else chosen:
+            if selection.group not in rows:
+                raise InputError(
+                    f"{label}: the block observes no {selection.group!r} that could have a variance component; "
+                    f"there are {', '.join(rows)}"
+                )
+            mask = _mask(label, selection, rows[selection.group], adjusted.block, found[selection.group].shape)
+            if twice := set(found[selection.group][mask]) - {""}:
+                raise InputError(f"{label} and {min(twice)} share observations: leave them in one of the two")
+            found[selection.group][mask] = label
+        if not label or not any((of == label).any() for of in found.values()):
+            raise InputError(f"a part {label!r} of the partition has no name or no observations: leave it out")
+    for name, own in rows.items():
+        if isinstance(own, Correlated) and found[name].ndim > 1 and (found[name] != found[name][:1]).any():
+            raise InputError(f"{name}: rows that a covariance joins share a variance component; select whole sets")
+    return found
+
+
+def _mask(
+    label: str, selection: Selection, rows: AbstractObservations, block: Block, shape: tuple[int, ...]
+) -> np.ndarray:
+    """Which numbers of a group a selection means. Raises InputError for names that none of them has."""
+    known = {
+        "axes": rows.axis_names(),
+        "cameras": rows.names_of("image", block.image_camera),
+        "images": rows.names_of("image", block.images),
+        "points": rows.names_of("point", block.points),
+    }
+    mask = np.ones(shape, bool)
+    for what, names in known.items():
+        wanted = getattr(selection, what)
+        wanted = (wanted,) if isinstance(wanted, str) else tuple(wanted)
+        if missing := set(wanted) - set(names.ravel().tolist()):
+            raise InputError(f"{label}: no row of {selection.group} is of the {what} {', '.join(sorted(missing))}")
+        if wanted:
+            mask &= np.broadcast_to(np.isin(names, wanted), shape)
+    return mask
+
+
+PROBES = 64
+"""Random vectors a part; a part of no more observations is exact. The standard deviations of variance components,
+which alone depend on it, are off by less than a per cent where a part has a redundancy of some tens."""
+
+
+@shown
+class PartialRedundancy(eqx.Module):
+    """Of the parts of a partition and, last, of all observations that are in none."""
+
+    square_sums: Float[np.ndarray, "parts"]
+    """v_k' P_k v_k."""
+    redundancy: Float[np.ndarray, "parts"]
+    """r_k, which add up to the redundancy."""
+    matrix: Float[np.ndarray, "parts parts"]
+    """S."""
+    uncertainty: Float[np.ndarray, "parts parts"]
+    """A bound of the standard deviation of each number of `matrix`; zero where it is exact."""
+
+
+def partial_redundancy(adjusted: Adjustment, parts: Parts, probes: int = PROBES) -> PartialRedundancy:
+    """S, r and v'Pv by part, with `probes` random vectors for each part that has more observations than that."""
+    n = len(parts.labels) + 1
+    numbers = {k: np.asarray(v) for k, v in redundancy_numbers(adjusted, covariance(adjusted, rows=True)).named.items()}
+    squares = {name: np.asarray(v) ** 2 for name, v in adjusted.residuals.named.items()}
+    seen, trust = _products(adjusted, parts, probes)
+    # Of two estimates the better one; where they are alike, their mean.
+    share = np.where(trust[:, None] == trust, 0.5, trust[:, None] > trust)
+    off = share * seen + share.T * seen.T
+    np.fill_diagonal(off, 0.0)
+    redundancy = _by_part(numbers, parts, n)
+    exact = np.maximum(trust[:, None], trust) == np.inf
+    uncertainty = np.where(exact, 0.0, np.sqrt(off / (2 * probes) * np.where(trust[:, None] == trust, 0.5, 1.0)))
+    np.fill_diagonal(uncertainty, 0.0)
+    return PartialRedundancy(
+        square_sums=_by_part(squares, parts, n),
+        redundancy=redundancy,
+        matrix=off + np.diag(redundancy - off.sum(axis=1)),
+        uncertainty=uncertainty + np.diag(np.sqrt((uncertainty**2).sum(axis=1))),
+    )
+
+
+def _by_part(numbers: dict[str, np.ndarray], parts: Parts, n: int) -> Float[np.ndarray, "parts"]:
+    pairs = ((of, numbers[name]) for name, of in parts.of.items())
+    return np.sum([np.bincount(np.ravel(of), np.ravel(v), minlength=n) for of, v in pairs], axis=0)
+
+
+def _products(adjusted: Adjustment, parts: Parts, probes: int) -> tuple[np.ndarray, np.ndarray]:
+    """|H_kl|^2 off the diagonal, row by row, and how far to trust each: infinitely if exact, not if it was left out."""
+    n = len(parts.labels) + 1
+    largest = int(np.argmax(sum(np.bincount(np.ravel(of), minlength=n) for of in parts.of.values())))
+    # No vector is in the largest part. Where all image points are of it, what is left of z'Hz = |Hz|^2 is theirs.
+    without = all((of == largest).all() for name, of in parts.of.items() if name == ImageRows.group)
+    responses = Responses.of(adjusted, image_rows=not without)
+    # What the datum adds is in one part more.
+    of = np.full(responses.count, n)
+    for name, place in responses.places.items():
+        of[place] = parts.of[name]
+    at = [np.flatnonzero(of == k) for k in range(n)]
+    trust = np.array([np.inf if len(places) <= probes else 1.0 for places in at])
+    trust[largest] = 0.0
+    # Each unit vector of a part, or -1 for random signs in it.
+    units = [places if t == np.inf else np.full((t > 0) * probes, -1) for places, t in zip(at, trust, strict=True)]
+    whose, unit = np.repeat(np.arange(n), [len(u) for u in units]), np.concatenate(units)
+
+    def vector(k: int) -> Float[np.ndarray, "n"]:
+        z, own = np.zeros(responses.count), at[whose[k]] if unit[k] < 0 else unit[k : k + 1]
+        z[own] = np.random.default_rng(k).choice([-1.0, 1.0], len(own)) if unit[k] < 0 else 1.0
+        return z
+
+    seen = np.zeros((n, n))
+    for j, (_, h) in enumerate(responses.to_errors(vector, len(whose))):
+        squares = np.bincount(of, h**2, minlength=n + 1)
+        if without:
+            # Of a part that hardly meets the largest, rounding may leave less than nothing.
+            squares[largest] = max(0.0, vector(j) @ h - squares.sum() + squares[largest])
+        seen[whose[j]] += squares[:n]
+    return seen / np.where(trust == 1.0, probes, 1.0)[:, None], trust
+
 
 MAX_ROUNDS = 60
 LEAST_DEGREES = 2.0

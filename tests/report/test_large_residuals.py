@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxphoto import Tables, adjust
 from jaxphoto.report import residual_findings, verdict_of
-from jaxphoto.statistics.blunder_test import Hidden
+from jaxphoto.statistics.reliability import Hidden
 from tests.blocks import adjusted, simulated
 
 

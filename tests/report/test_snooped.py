@@ -15,7 +15,7 @@ from jaxphoto.report import Tables, verdict_of
 from jaxphoto.report.findings import Level
 from jaxphoto.report.snooped import snooped_findings
 from jaxphoto.statistics import Suspect, covariance
-from jaxphoto.statistics.trends import inverse_of_seen
+from jaxphoto.statistics.systematic_effects import inverse_of_seen
 
 
 @pytest.fixture(scope="module")

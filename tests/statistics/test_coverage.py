@@ -5,7 +5,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from jaxphoto.report.flight.coverage import draw_overlap
-from jaxphoto.statistics.coverage import Coverage, coverage
+from jaxphoto.statistics.block_geometry import Coverage, coverage
 from tests.blocks import adjusted
 
 

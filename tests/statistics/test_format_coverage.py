@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
-from jaxphoto.statistics.format_coverage import format_coverage
+from jaxphoto.statistics.block_geometry import format_coverage
 from tests.blocks import adjusted
 
 

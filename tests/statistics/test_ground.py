@@ -8,8 +8,7 @@ import pytest
 from jaxphoto import covariance, monte_carlo
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.sensitivity.perturbation import noise
-from jaxphoto.statistics.ground import FORMS, _weights, ground_correlations
-from jaxphoto.statistics.linear_forms import linear_forms
+from jaxphoto.statistics.correlation import FORMS, _weights, ground_correlations, linear_forms
 from tests.blocks import adjusted, simulated
 
 

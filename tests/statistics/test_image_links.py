@@ -5,8 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from jaxphoto.statistics.image_links import image_links, weak_links
-from jaxphoto.statistics.intersection_angles import intersection_angles
+from jaxphoto.statistics.block_geometry import image_links, intersection_angles, weak_links
 from tests.blocks import adjusted
 
 

@@ -16,7 +16,7 @@ from jaxphoto.report import verdict_of
 from jaxphoto.report.findings import Level
 from jaxphoto.simulation import remeasure
 from jaxphoto.statistics import patterns, trends
-from jaxphoto.statistics.responses import Responses
+from jaxphoto.statistics.hat_matrix import Responses
 from tests.blocks import Simulated, adjusted, free_network, observed, simulated
 
 KNOWN = ("interior[one].c_mm", "interior[one].k1")
