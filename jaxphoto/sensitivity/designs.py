@@ -32,7 +32,7 @@ from jaxphoto.block import Block
 from jaxphoto.compiling import run_compiled
 from jaxphoto.devices import AXIS, mesh_of, usable
 from jaxphoto.orientation import approximate
-from jaxphoto.statistics.covariance import Rotations, in_units
+from jaxphoto.statistics.covariance import Rotations, physical_covariance
 from jaxphoto.unknowns import Unknowns
 
 # Designs that one call of the program holds in memory, at least one a device.
@@ -173,7 +173,7 @@ def _findings(values: PaddedValues, s: PaddedStructure, check: Check, rotations:
     there, factored = with_start(values, state), jax.tree.map(lambda v: v[1], found.factored)
     equations = NormalEquations(there, s, factored)
     cofactors, _ = equations.cofactors(of_rows=False)
-    covariance, points = in_units(cofactors, equations.scale, there.rotation, rotations)
+    covariance, points = physical_covariance(cofactors, equations.scale, there.rotation, rotations)
 
     n = 6 * s.n_images
     variance = jnp.maximum(jnp.diagonal(covariance), 0.0)

@@ -38,7 +38,7 @@ from jaxphoto.sensitivity.hessian import Eliminated, check_optimum, eliminated
 from jaxphoto.sensitivity.image_rows import ListedRows, image_rows
 from jaxphoto.short_repr import shown
 from jaxphoto.statistics import EOP_NAMES
-from jaxphoto.statistics.covariance import turns_of
+from jaxphoto.statistics.covariance import rotation_jacobians
 from jaxphoto.tracing import outside_transformations
 
 # Numbers that the derivatives by image points may have: 1.6 GB.
@@ -154,7 +154,7 @@ class _Derivatives(NamedTuple):
 def _derivatives(equations: NormalEquations, rows: ListedRows, curved: Array) -> _Derivatives:
     at = equations.at
     others = tuple(second.b for second in rows_second(at, curved))
-    return _Derivatives(eliminated(at, rows, curved), turns_of(at.values.rotation, "omega_phi_kappa"), others)
+    return _Derivatives(eliminated(at, rows, curved), rotation_jacobians(at.values.rotation, "omega_phi_kappa"), others)
 
 
 Rows = tuple[np.ndarray, np.ndarray]

@@ -16,7 +16,7 @@ from jaxphoto.observations import AbstractObservations, Correlated
 from jaxphoto.sensitivity.biased_numbers import OBSERVED
 from jaxphoto.sensitivity.exact import Sensitivity
 from jaxphoto.short_repr import shown
-from jaxphoto.statistics import DELTA0, covariance, detectable_errors, observation_groups, redundancy_numbers
+from jaxphoto.statistics import DELTA0, covariance, minimal_detectable_biases, observation_groups, redundancy_numbers
 
 Per = Literal["block", "strip", "image"]
 
@@ -122,7 +122,7 @@ def external_reliability(adjusted: Adjustment, derivatives: Sensitivity, delta0:
         raise InputError(f"delta0 is the shift that a test detects, a positive number, not {delta0}")
     numbers = redundancy_numbers(adjusted, covariance(adjusted, rows=True))
     detectable, effect = {}, {}
-    for name, errors in detectable_errors(adjusted, numbers, delta0).items():
+    for name, errors in minimal_detectable_biases(adjusted, numbers, delta0).items():
         detectable[name] = _in_rows(errors)
         a = derivatives.groups[name]
         effect[name] = np.multiply(a, detectable[name], out=np.zeros_like(a), where=a != 0)

@@ -1,22 +1,19 @@
-"""Correlations: interior with interior orientation, and each image's exterior with its camera's interior.
+"""Correlations: of interior and exterior orientation, and of the camera with the ground as a whole.
 
-Source: paper 000, Table 4 (mean absolute correlation over the images, per angle or coordinate and IOP).
+Source of the image-wise correlations: paper 000, Table 4 (mean absolute correlation over the images, per angle or
+coordinate and IOP).
 
-
-Covariances of linear functions of the unknowns, such as the mean height of all points.
-
-How the camera goes with the ground: its height as a whole, the height of the flight over it, its dome.
-
-Over flat ground from one height a longer c is a higher flight, and a barrel is a dome of the ground: neither leaves a
-residual. Correlations with the exterior orientation of single images do not show it, because all images and points move
-together. Each of these is a linear function f = g' x of the coordinates of points and stations, so
+Over flat ground imaged from one height, a longer c is equivalent to a greater flying height, and radial distortion to
+a dome of the ground: neither leaves residuals. Correlations with the exterior orientation of single images do not show
+this, because all images and points move together. Each of the forms below is a linear function f = g' x of the
+coordinates of points and stations, so
 
     cov(f, u) = sigma0^2 g' N^-1 e_u,   var(f) = sigma0^2 g' N^-1 g.
 
     height          mean Z of the points
-    flying_height   mean Z of the projection centres less that of the points
-    dome            by how much the middle of the ground rises over its edge: of Z = a + b X + c Y + d (X^2 + Y^2),
-                    fitted to the points, -d R^2 with the distance R from the middle to the farthest
+    flying_height   mean Z of the projection centres minus that of the points
+    dome            height of the centre of the ground over its edge: of Z = a + b X + c Y + d (X^2 + Y^2),
+                    fitted to the points, -d R^2 with the distance R from the centre to the farthest point
 
 Source: the dome as the typical deformation of flat blocks, M. R. James and S. Robson, Mitigating systematic error in
 topographic models derived from UAV and ground-based image networks, Earth Surface Processes and Landforms 39 (2014).
@@ -37,7 +34,7 @@ from jaxphoto.adjustment.right_hand_sides import solve_many
 from jaxphoto.arrays import Numbers, is_traced, namespace, still
 from jaxphoto.short_repr import shown
 from jaxphoto.statistics.covariance import EOP_NAMES, Covariance
-from jaxphoto.statistics.hat_matrix import products_of
+from jaxphoto.statistics.hat_matrix import inner_products
 
 
 @shown
@@ -52,7 +49,7 @@ class Correlations(eqx.Module):
     interior: Float[Any, "iop iop"]
     exterior: Float[Any, "images 6 iop"]
     within_image: Float[Any, "images 6 6"]
-    """Of each image's exterior orientation with itself."""
+    """Correlations within each image's exterior orientation."""
 
     @property
     def mean_abs(self) -> Float[Any, "6 iop"]:
@@ -66,7 +63,7 @@ class Correlations(eqx.Module):
 
 
 def correlation_matrix(covariance: Covariance) -> Float[Any, "reduced reduced"]:
-    """Correlations of everything in `covariance.labels`; zero for what is fixed."""
+    """Correlation matrix of `covariance.labels`; zero for fixed unknowns."""
     matrix = still(covariance.matrix)
     xp, variance = namespace(matrix), matrix.diagonal()
     inverse = xp.where(variance > 0, 1 / xp.sqrt(xp.where(variance > 0, variance, 1.0)), 0.0)
@@ -82,8 +79,8 @@ def correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, Corr
         prefix = f"interior[{camera}]."
         columns = [k for k, label in enumerate(covariance.labels) if k >= n and label.startswith(prefix)]
         images = [i for i, c in enumerate(adjusted.block.image_camera) if c == camera]
-        own = 6 * np.array(images, int)[:, None] + np.arange(6)
-        exterior = rho[own][:, :, np.array(columns, int)]
+        rows = 6 * np.array(images, int)[:, None] + np.arange(6)
+        exterior = rho[rows][:, :, np.array(columns, int)]
         result[camera] = Correlations(
             camera,
             tuple(covariance.labels[k].removeprefix(prefix) for k in columns),
@@ -91,13 +88,13 @@ def correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, Corr
             tuple(adjusted.block.images[i] for i in images),
             rho[np.ix_(columns, columns)],
             exterior,
-            rho[own[:, :, None], own[:, None]],
+            rho[rows[:, :, None], rows[:, None]],
         )
     return result
 
 
 def high_pairs(names: Sequence[str], rho: Float[np.ndarray, "n n"], above: float) -> list[tuple[str, str, float]]:
-    """Pairs of parameters whose correlation is larger than `above`, either sign, and it; the largest first."""
+    """Pairs of parameters with |correlation| larger than `above`, and the correlation; the largest first."""
     lower = [(i, j) for i in range(len(names)) for j in range(i)]
     pairs = [(names[i], names[j], float(rho[i, j])) for i, j in lower if abs(rho[i, j]) > above]
     return sorted(pairs, key=lambda pair: -abs(pair[2]))
@@ -119,23 +116,23 @@ def linear_forms(
     exterior: Float[Numbers, "forms images 6"] | None = None,
     shared: Float[Numbers, "forms shared"] | None = None,
 ) -> LinearForms:
-    """Covariances (a posteriori) of `n_forms` sums g' x of unknowns with these weights g; without weights, none of it.
+    """A posteriori covariances of `n_forms` linear functions f = g' x of the unknowns; omitted weights g are zero.
 
-    With f = g' x of unknowns x with normal matrix N, cov(f, h) = sigma0^2 g' N^-1 h. Unknowns are the coordinates of
-    points (m), of each image its position (m) and small rotations about the axes of its camera (rad), and the shared
-    ones in the order of `Structure.labels`, in their own units.
+    cov(f, h) = sigma0^2 g' N^-1 h with the normal matrix N. Unknowns are the coordinates of points (m), of each image
+    its position (m) and small rotations about the axes of its camera (rad), and the shared unknowns in the order of
+    `Structure.labels`, in their own units.
     """
     equations, places = adjusted.equations.on_one_device.weighed, adjusted.padded.places
     scale = jax.tree.map(still, equations.scale)
 
-    def weights(given: Any, at: Any, of: Any) -> Any:
-        if given is None:
-            return np.zeros((n_forms, *of.shape))
-        if is_traced((given, of)):
-            return jnp.zeros((n_forms, *of.shape)).at[..., at].set(given) * of
-        placed = np.zeros((n_forms, *of.shape))
-        placed[..., at] = given
-        return placed * of
+    def weights(g: Any, index: Any, scale: Any) -> Any:
+        if g is None:
+            return np.zeros((n_forms, *scale.shape))
+        if is_traced((g, scale)):
+            return jnp.zeros((n_forms, *scale.shape)).at[..., index].set(g) * scale
+        padded = np.zeros((n_forms, *scale.shape))
+        padded[..., index] = g
+        return padded * scale
 
     b = Increments(
         weights(None if exterior is None else exterior.swapaxes(1, 2), places.image, scale.eop),
@@ -143,65 +140,61 @@ def linear_forms(
         weights(None if points is None else points.swapaxes(1, 2), places.point, scale.points),
     )
     x, factor = solve_many(equations, b, adjusted.seconds), adjusted.sigma0**2
-    return LinearForms(factor * products_of(b, x), factor * x.shared * scale.shared)
+    return LinearForms(factor * inner_products(b, x), factor * x.shared * scale.shared)
 
 
 FORMS = ("height", "flying_height", "dome")
-# Points of two rays are as good as these meet: they would be most of the variance of a mean.
-_RAYS, _ENOUGH = 3, 10
-# Cosine of the tilt up to which photographs, on average, look down.
-_DOWN = 0.7
-# Of the yardstick: a form that is held by the datum has a variance of rounding.
-_NOTHING = 1e-9
+# Minimum number of rays of the points used, if there are enough of these: points of two rays would dominate the
+# variance of a mean.
+_MIN_RAYS, _MIN_POINTS = 3, 10
+# Minimum mean cosine of the tilt of near-vertical photographs.
+_MIN_COSINE = 0.7
+# Fraction of the largest point variance below which the variance of a form is rounding: the datum fixes it.
+_ROUNDING = 1e-9
 
 
 @shown
 class GroundCorrelations(eqx.Module):
-    """How the forms of the ground go with the interior orientation of a camera."""
+    """Correlations of the `FORMS` of the ground with the interior orientation of a camera."""
 
     camera: str = eqx.field(static=True)
     parameters: tuple[str, ...] = eqx.field(static=True)
     """The camera's estimated interior parameters (c_mm ...)."""
     sigma_m: Float[np.ndarray, "forms"]
-    """Standard deviation of each of `FORMS`; zero where nothing lets it move."""
+    """Standard deviation of each of `FORMS`; zero where the datum fixes it."""
     rho: Float[np.ndarray, "forms iop"]
     together: Float[np.ndarray, "forms"]
-    """The multiple correlation with all parameters of the camera together."""
-
-
-def looks_down(adjusted: Adjustment) -> bool:
-    """Whether the photographs, on average, look down on what they see."""
-    up = np.asarray(adjusted.unknowns.exterior.camera_from_object)[:, 2, 2]
-    return bool(np.mean(up) > _DOWN)
+    """Multiple correlation with all interior parameters of the camera."""
 
 
 def ground_correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, GroundCorrelations]:
-    """By camera; none of a block that does not look down, or of too few points."""
+    """Correlations by camera; empty for oblique blocks and for fewer than five points."""
     rays = np.bincount(adjusted.structure.point, minlength=len(adjusted.block.points))
-    chosen = rays >= _RAYS if (rays >= _RAYS).sum() >= _ENOUGH else rays > 0
-    if not looks_down(adjusted) or chosen.sum() < 5:
+    chosen = rays >= _MIN_RAYS if (rays >= _MIN_RAYS).sum() >= _MIN_POINTS else rays > 0
+    cosine = np.mean(np.asarray(adjusted.unknowns.exterior.camera_from_object)[:, 2, 2])
+    if not cosine > _MIN_COSINE or chosen.sum() < 5:
         return {}
     points, positions = _weights(np.asarray(adjusted.unknowns.points), chosen, len(adjusted.block.images))
     exterior = np.concatenate([positions, np.zeros_like(positions)], axis=2)
-    found = linear_forms(adjusted, len(FORMS), points=points, exterior=exterior)
-    variance, n = np.diagonal(found.variance), 6 * covariance.n_images
-    moves = variance > _NOTHING * np.max(np.square(covariance.point_sigma), initial=0.0)
-    sigma = np.where(moves, np.sqrt(np.maximum(variance, 0.0)), 0.0)
-    of_shared, matrix = covariance.labels[n:], np.asarray(covariance.matrix)[n:, n:] * float(covariance.variance_factor)
+    forms = linear_forms(adjusted, len(FORMS), points=points, exterior=exterior)
+    variance, n = np.diagonal(forms.variance), 6 * covariance.n_images
+    variable = variance > _ROUNDING * np.max(np.square(covariance.point_sigma), initial=0.0)
+    sigma = np.where(variable, np.sqrt(np.maximum(variance, 0.0)), 0.0)
+    labels, matrix = covariance.labels[n:], np.asarray(covariance.matrix)[n:, n:] * float(covariance.variance_factor)
     result = {}
     for camera in adjusted.unknowns.interior:
         prefix = f"interior[{camera}]."
-        own = [k for k, label in enumerate(of_shared) if label.startswith(prefix)]
-        if not own:
+        columns = [k for k, label in enumerate(labels) if label.startswith(prefix)]
+        if not columns:
             continue
-        both, among = found.with_shared[:, own], matrix[np.ix_(own, own)]
-        size = np.where(moves, sigma, np.inf)[:, None] * np.sqrt(np.diagonal(among))
-        rho = both / size
-        scaled = among / np.sqrt(np.outer(np.diagonal(among), np.diagonal(among)))
-        square = np.einsum("fi,fi->f", rho, np.linalg.solve(scaled, rho.T).T)
+        cross, interior = forms.with_shared[:, columns], matrix[np.ix_(columns, columns)]
+        size = np.where(variable, sigma, np.inf)[:, None] * np.sqrt(np.diagonal(interior))
+        rho = cross / size
+        correlation = interior / np.sqrt(np.outer(np.diagonal(interior), np.diagonal(interior)))
+        square = np.einsum("fi,fi->f", rho, np.linalg.solve(correlation, rho.T).T)
         result[camera] = GroundCorrelations(
             camera,
-            tuple(of_shared[k].removeprefix(prefix) for k in own),
+            tuple(labels[k].removeprefix(prefix) for k in columns),
             sigma,
             rho,
             np.sqrt(np.clip(square, 0.0, 1.0)),
@@ -212,7 +205,7 @@ def ground_correlations(adjusted: Adjustment, covariance: Covariance) -> dict[st
 def _weights(
     xyz: Float[np.ndarray, "points 3"], chosen: np.ndarray, n_images: int
 ) -> tuple[Float[np.ndarray, "3 points 3"], Float[np.ndarray, "3 images 3"]]:
-    """Of the coordinates in each of `FORMS`."""
+    """Weights of the coordinates of points and of projection centres in each of `FORMS`."""
     points, positions = np.zeros((3, *xyz.shape)), np.zeros((3, n_images, 3))
     points[0, chosen, 2] = 1 / chosen.sum()
     points[1], positions[1, :, 2] = -points[0], 1 / n_images

@@ -1,7 +1,7 @@
-"""How unknowns and adjusted observations move with the observed ones, a few directions at a time.
+"""Products with the hat matrix H = J N^-1 J' and with N^-1 J', for a few directions at a time.
 
 With J the derivatives of whitened residuals (observed minus computed), an error z of the observations moves the
-unknowns by -N^-1 J' z and what was adjusted by H z = J N^-1 J' z; unknown k moves by -(J N^-1 e_k)_i with
+unknowns by -N^-1 J' z and the adjusted observations by H z = J N^-1 J' z; unknown k moves by -(J N^-1 e_k)_i with
 observation i. Products z' H z of many errors need no J x: they are those of J' z with N^-1 J' z.
 """
 
@@ -23,32 +23,29 @@ from jaxphoto.adjustment.right_hand_sides import at_once, blank, in_batches, joi
 from jaxphoto.arrays import Numbers, still
 from jaxphoto.compiling import prepare, run_compiled
 
-# Directions that are computed with side by side. Together they have no more numbers than this, as several arrays of
-# them are held.
-_AT_ONCE, _NUMBERS = 16, 20_000_000
-
-
+# Maximum number of directions per batch, and of array elements in a batch: several arrays of this size coexist.
+_MAX_BATCH, _MAX_ELEMENTS = 16, 20_000_000
 Column = Callable[[int], Float[np.ndarray, "n"]]
 
 
-class Responses(eqx.Module):
-    """What directions of errors of the observations do, computed in batches."""
+class HatMatrix(eqx.Module):
+    """Effects of errors of the observations, computed in batches."""
 
     adjusted: Adjustment
     equations: NormalEquations
-    """Of one device, weighed once for all."""
+    """On one device, with weights applied."""
     laid: Int32[np.ndarray, "places"]
-    """The number, in the block's own order, of everything in the arrays that are computed with; `count`: padding."""
+    """Observation index of every element of the padded arrays; `count` for padding."""
     count: int
     places: dict[str, Int[np.ndarray, "..."]]
-    """The number of each observation by the name of its group, shaped like the residuals."""
+    """Index of each observation by group name, shaped like the residuals."""
     image_rows: bool = eqx.field(static=True, default=True)
-    """Whether errors are in image points, too; without these, H z is not computed there (zero stands for it), which
-    takes most of the time."""
+    """False if no error is in image points: H z is then not computed for image rows, which saves most of the time;
+    they are zero."""
 
     @classmethod
-    def of(cls, adjusted: Adjustment, *, image_rows: bool = True) -> "Responses":
-        """Of an adjustment."""
+    def of(cls, adjusted: Adjustment, *, image_rows: bool = True) -> "HatMatrix":
+        """Number the observations of an adjustment and prepare its normal equations."""
         leaves, structure = jax.tree.flatten(adjusted.residuals)
         ends = np.cumsum([np.size(v) for v in leaves])
         numbers = [np.arange(e - np.size(v), e, dtype=float) for v, e in zip(leaves, ends, strict=True)]
@@ -57,101 +54,103 @@ class Responses(eqx.Module):
         padded: NonImageResiduals = adjusted.padded.pad_residuals(numbered, float(ends[-1]))
         if not image_rows:
             padded = NonImageResiduals(padded.others, padded.datum, padded.names)
-        laid = np.concatenate([np.ravel(v) for v in jax.tree.leaves(padded)]).astype(np.int32)
+        padded_index = np.concatenate([np.ravel(v) for v in jax.tree.leaves(padded)]).astype(np.int32)
         places = {name: np.asarray(v).astype(int) for name, v in numbered.named.items()}
-        return cls(adjusted, adjusted.equations.on_one_device.weighed, laid, int(ends[-1]), places, image_rows)
+        return cls(adjusted, adjusted.equations.on_one_device.weighed, padded_index, int(ends[-1]), places, image_rows)
 
     @property
     def residuals(self) -> Float[np.ndarray, "count"]:
-        """Of the adjustment, whitened, in the order of `places`; zero for what closes the datum."""
-        found = np.zeros(self.count)
+        """Whitened residuals in the order of `places`; zero for datum constraints."""
+        residuals = np.zeros(self.count)
         for name, place in self.places.items():
-            found[place] = np.asarray(self.adjusted.residuals[name])
-        return found
+            residuals[place] = np.asarray(self.adjusted.residuals[name])
+        return residuals
 
-    def to_errors(self, column: Column, many: int) -> Iterator[tuple[Float[np.ndarray, "shared"], np.ndarray]]:
-        """Of each error z = `column(k)`, whitened and in the order of `places`: the shared unknowns' motion, in their
-        own units, and H z."""
+    def apply(self, column: Column, count: int) -> Iterator[tuple[Float[np.ndarray, "shared"], np.ndarray]]:
+        """Yield the changes of the shared unknowns (own units) and H z for each error z = `column(k)`.
+
+        Errors are whitened and in the order of `places`.
+        """
         size = at_once(self.equations.scale)
-        for first in range(0, many, size):
-            x = self.solved(self._pulled(column, range(first, min(first + size, many))))
-            yield from zip(self._moved(x), self._pushed(x), strict=True)
+        for first in range(0, count, size):
+            x = self.solve(self._jt_products(column, range(first, min(first + size, count))))
+            yield from zip(self._shared_changes(x), self._j_products(x), strict=True)
 
-    def of_unknowns(self, shared: Sequence[int]) -> Iterator[Float[np.ndarray, "n"]]:
-        """By how much each of some `shared` unknowns (places in `Structure.labels`) moves, in its unit, with an error
-        of one standard deviation of each observation."""
+    def influence_on(self, shared: Sequence[int]) -> Iterator[Float[np.ndarray, "n"]]:
+        """Yield the change of each `shared` unknown (index in `Structure.labels`, own unit) per standard deviation of
+        error in each observation."""
         b = jax.tree.map(lambda v: np.zeros((len(shared), *v.shape)), self.equations.scale)
         b.shared[np.arange(len(shared)), np.array(shared, int)] = 1.0
-        for k, moved in zip(shared, self._pushed(self.solved(b)), strict=True):
-            yield -moved * self._scale[k]
+        for k, influence in zip(shared, self._j_products(self.solve(b)), strict=True):
+            yield -influence * self._scale[k]
 
-    def products(self, column: Column, many: int) -> tuple[Float[np.ndarray, "many many"], Float[np.ndarray, "m s"]]:
-        """z' H z of all errors z = `column(k)` with one another, and the shared unknowns' motions, as `to_errors`."""
-        pulled = self._pulled(column, range(many))
-        found, moved = np.zeros((many, many)), np.zeros((many, len(self._scale)))
-        # Of a large block each set of all directions takes hundreds of MB: those that are solved for are let go.
-        for first in range(0, many, size := at_once(self.equations.scale)):
-            some = slice(first, first + size)
-            x = self.solved(jax.tree.map(itemgetter(some), pulled))
-            found[:, some], moved[some] = products_of(pulled, x), self._moved(x)
-        return found, moved
+    def products(self, column: Column, count: int) -> tuple[Float[np.ndarray, "count count"], Float[np.ndarray, "m s"]]:
+        """Return z' H z of all pairs of errors z = `column(k)`, and the changes of the shared unknowns as `apply`."""
+        jt_z = self._jt_products(column, range(count))
+        products, changes = np.zeros((count, count)), np.zeros((count, len(self._scale)))
+        # In a large block one set of all directions takes hundreds of MB, so solutions are discarded batch by batch.
+        for first in range(0, count, size := at_once(self.equations.scale)):
+            batch = slice(first, first + size)
+            x = self.solve(jax.tree.map(itemgetter(batch), jt_z))
+            products[:, batch], changes[batch] = inner_products(jt_z, x), self._shared_changes(x)
+        return products, changes
 
     @property
     def _scale(self) -> Float[np.ndarray, "shared"]:
         return still(self.equations.scale.shared)
 
-    def _moved(self, x: Increments) -> Float[np.ndarray, "m shared"]:
+    def _shared_changes(self, x: Increments) -> Float[np.ndarray, "m shared"]:
         return -still(x.shared) * self._scale
 
-    def _pulled(self, column: Column, wanted: range) -> Increments:
-        """J' z of each."""
+    def _jt_products(self, column: Column, directions: range) -> Increments:
+        """J' z of each direction."""
 
         def batches() -> Iterator[Float[np.ndarray, "batch places"]]:
             batch = _batch(len(self.laid))
-            for first in wanted[::batch]:
+            for first in directions[::batch]:
                 z = np.zeros((batch, len(self.laid)))
-                for row, k in enumerate(range(first, min(first + batch, wanted.stop))):
+                for row, k in enumerate(range(first, min(first + batch, directions.stop))):
                     z[row] = np.append(column(k), 0.0)[self.laid]
                 yield z
 
-        pull = _pull if self.image_rows else _pull_others
-        parts = [jax.tree.map(still, self._run(pull, z)) for z in batches()]
-        # There may be none: blocks whose parameters are all held, or that have nothing to look for patterns in.
-        return joined(parts, self.equations.scale, len(wanted))
+        program = _pull if self.image_rows else _pull_others
+        parts = [jax.tree.map(still, self._run(program, z)) for z in batches()]
+        # There may be no direction: all parameters fixed, or no candidate effects.
+        return joined(parts, self.equations.scale, len(directions))
 
-    def solved(self, b: Increments) -> Increments:
-        """x of N x = b of right-hand sides along a leading axis, in scaled increments."""
+    def solve(self, b: Increments) -> Increments:
+        """Solve N x = b for right-hand sides along a leading axis, in scaled increments."""
         return solve_many(self.equations, b, self.adjusted.seconds)
 
-    def _pushed(self, x: Increments) -> Iterator[Float[np.ndarray, "n"]]:
-        """J x of each, in the order of `places`."""
-        kept, many, push = self.laid < self.count, len(x.shared), _push if self.image_rows else _push_others
-        for first, some in zip(range(0, many, size := _batch(len(self.laid))), in_batches(x, size), strict=True):
-            for row in still(self._run(push, some))[: many - first]:
-                own = np.zeros(self.count)
-                own[self.laid[kept]] = row[kept]
-                yield own
+    def _j_products(self, x: Increments) -> Iterator[Float[np.ndarray, "n"]]:
+        """J x of each direction, in the order of `places`."""
+        valid, count, program = self.laid < self.count, len(x.shared), _push if self.image_rows else _push_others
+        for first, batch in zip(range(0, count, size := _batch(len(self.laid))), in_batches(x, size), strict=True):
+            for row in still(self._run(program, batch))[: count - first]:
+                product = np.zeros(self.count)
+                product[self.laid[valid]] = row[valid]
+                yield product
 
-    def _run(self, program: Callable, given: Any) -> Any:
-        return run_compiled(program, (self.equations, given), self.adjusted.seconds, "covariance")
+    def _run(self, program: Callable, argument: Any) -> Any:
+        return run_compiled(program, (self.equations, argument), self.adjusted.seconds, "covariance")
 
 
-def products_of(a: Increments, b: Increments) -> Float[Numbers, "m n"]:
-    """a'b of each of `a` with each of `b`, along leading axes.
+def inner_products(a: Increments, b: Increments) -> Float[Numbers, "m n"]:
+    """a' b of each of `a` with each of `b`, along leading axes.
 
-    Kind by kind: of a large block each copy of all of them takes 100 MB.
+    Summed kind by kind: in a large block a copy of all increments takes 100 MB.
     """
-    found: Any = np.zeros((len(a.shared), len(b.shared)))
+    products: Any = np.zeros((len(a.shared), len(b.shared)))
     for pair in zip(a, b, strict=True):
-        v, w = (one.reshape(len(one), math.prod(one.shape[1:])) for one in map(still, pair))
-        found = found + v @ w.T
-    return found
+        v, w = (part.reshape(len(part), math.prod(part.shape[1:])) for part in map(still, pair))
+        products = products + v @ w.T
+    return products
 
 
-def prepare_responses(equations: NormalEquations, seconds: dict[str, float]) -> None:
-    """Have what `Responses` needs compiled in the background."""
+def prepare_hat_matrix(equations: NormalEquations, seconds: dict[str, float]) -> None:
+    """Compile the programs of `HatMatrix` in the background."""
     if jax.process_count() > 1:
-        # What comes from several processes is of types of its own.
+        # Arrays from several processes have types that cannot be predicted here.
         return
     equations = equations.on_one_device.weighed
     shapes = jax.tree.leaves(jax.eval_shape(lambda e: e.at.residuals(), equations))
@@ -161,9 +160,9 @@ def prepare_responses(equations: NormalEquations, seconds: dict[str, float]) -> 
     prepare(_push, (equations, blank(equations.scale, _batch(n))), seconds)
 
 
-def _batch(numbers: int) -> int:
-    """A power of two, which can be halved where rows have many numbers."""
-    most = int(np.clip(_NUMBERS // max(numbers, 1), 1, _AT_ONCE))
+def _batch(n_elements: int) -> int:
+    """Batch size for directions of `n_elements` each: a power of two."""
+    most = int(np.clip(_MAX_ELEMENTS // max(n_elements, 1), 1, _MAX_BATCH))
     return 1 << most.bit_length() - 1
 
 

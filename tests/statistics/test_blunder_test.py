@@ -11,11 +11,11 @@ from jaxphoto.statistics import (
     DELTA0,
     blunder_test,
     critical_w,
-    detectable_errors,
     global_test,
     group_factors,
+    largest_mdbs,
+    minimal_detectable_biases,
     redundancy_numbers,
-    worst_checked,
 )
 from tests.blocks import adjusted, covariance_of, simulated
 
@@ -63,10 +63,10 @@ def test_detectable_errors_are_those_of_the_redundancy_numbers():
     a = adjusted("cross")
     numbers = redundancy_numbers(a, covariance_of("cross"))
     r, sigma = np.asarray(numbers.image), np.asarray(a.block.image_points.sigma).T
-    np.testing.assert_allclose(detectable_errors(a, numbers)["image_points"], DELTA0 * sigma / np.sqrt(r))
-    for hidden in worst_checked(a, numbers):
-        largest = (detectable_errors(a, numbers)[hidden.group] / np.asarray(hidden.sigma)).max()
-        assert hidden.detectable / hidden.sigma == pytest.approx(largest, rel=1e-9)
+    np.testing.assert_allclose(minimal_detectable_biases(a, numbers)["image_points"], DELTA0 * sigma / np.sqrt(r))
+    for hidden in largest_mdbs(a, numbers):
+        largest = (minimal_detectable_biases(a, numbers)[hidden.group] / np.asarray(hidden.sigma)).max()
+        assert hidden.mdb / hidden.sigma == pytest.approx(largest, rel=1e-9)
 
 
 def test_a_shift_of_delta0_is_found_with_a_probability_of_80_per_cent():

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxphoto.statistics import global_test, redundancy_numbers, stretch
+from jaxphoto.statistics import expected_residual_scale, global_test, redundancy_numbers
 from tests.blocks import adjusted, covariance_of
 
 
@@ -24,8 +24,8 @@ def test_noise_is_stretched_with_the_image_as_said():
 
     shifted = np.array([corrected(xy + sigma * rng.normal(size=xy.shape)) for _ in range(400)])
     residual = (shifted - corrected(xy)) / sigma
-    assert stretch(a)["one"] == pytest.approx(np.sqrt((residual**2).mean()), abs=0.004)
-    assert stretch(a)["one"] > 1.01
+    assert expected_residual_scale(a)["one"] == pytest.approx(np.sqrt((residual**2).mean()), abs=0.004)
+    assert expected_residual_scale(a)["one"] > 1.01
 
 
 def test_it_is_counted_in_the_test_of_sigma_naught():
@@ -35,7 +35,7 @@ def test_it_is_counted_in_the_test_of_sigma_naught():
     assert counted.factor == usual.factor
     assert counted.sigma == pytest.approx(usual.sigma / counted.expected**0.5) and usual.expected == 1
     # One-sided probabilities of a square sum that is a few per cent smaller.
-    expected = 1 + float(np.sum(numbers.image)) / a.redundancy * (stretch(a)["one"] ** 2 - 1)
+    expected = 1 + float(np.sum(numbers.image)) / a.redundancy * (expected_residual_scale(a)["one"] ** 2 - 1)
     scaled = eqx.tree_at(lambda adjusted: adjusted.residuals, a, jax.tree.map(lambda v: v / expected**0.5, a.residuals))
     assert counted.p_value == pytest.approx(global_test(scaled).p_value, rel=0.02)
 
@@ -44,4 +44,4 @@ def test_residuals_of_measured_coordinates_are_not_stretched():
     a = adjusted("cross")
     interior = dataclasses.replace(a.unknowns.interior["one"], residuals="measured")
     measured = eqx.tree_at(lambda adjusted: adjusted.unknowns.interior["one"], a, interior)
-    assert stretch(measured) == {"one": 1.0}
+    assert expected_residual_scale(measured) == {"one": 1.0}

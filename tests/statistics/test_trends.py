@@ -15,8 +15,8 @@ from jaxphoto.observations.priors import KnownParameters
 from jaxphoto.report import verdict_of
 from jaxphoto.report.findings import Level
 from jaxphoto.simulation import remeasure
-from jaxphoto.statistics import patterns, trends
-from jaxphoto.statistics.hat_matrix import Responses
+from jaxphoto.statistics import systematic_effect_tests, systematic_effects
+from jaxphoto.statistics.hat_matrix import HatMatrix
 from tests.blocks import Simulated, adjusted, free_network, observed, simulated
 
 KNOWN = ("interior[one].c_mm", "interior[one].k1")
@@ -35,7 +35,7 @@ def in_strips() -> Simulated:
 
 def found_in(block) -> dict:
     a = adjust(block)
-    return {t.pattern.what: t for t in trends(a, np.asarray(covariance(a).shared_sigma))}
+    return {t.pattern.what: t for t in systematic_effect_tests(a, np.asarray(covariance(a).shared_sigma))}
 
 
 def test_where_nothing_is_missing_p_values_are_uniform():
@@ -52,7 +52,7 @@ def test_where_nothing_is_missing_p_values_are_uniform():
     p = [{what: trend.p_value for what, trend in found_in(b).items()} for b in blocks]
     assert set(p[0]) == {
         "image points of camera one over the format", "image points of camera one over time",
-        "what was known of camera one beforehand", "stations as a whole", "stations from strip to strip",
+        "prior information of camera one", "stations as a whole", "stations from strip to strip",
         "stations over time",
     }  # fmt: skip
     for what in p[0]:
@@ -69,7 +69,7 @@ def test_a_lens_term_that_is_held_is_named():
     found = tables.tested_trends[0]
     assert found.p_value < 1e-10 and found.hints[0].term.name == held and found.hints[0].share > 0.8
     said = [f.text for f in verdict_of(tables).findings if "over the format" in f.text]
-    assert len(said) == 1 and f"{held}, which is held: free it" in said[0]
+    assert len(said) == 1 and f"{held}, which is fixed: free it" in said[0]
 
 
 def test_what_stretches_the_image_may_be_a_rolling_shutter():
@@ -114,7 +114,10 @@ def test_blunders_have_no_part_in_patterns():
     a = adjust(dataclasses.replace(block, image_points=dataclasses.replace(rows, xy=xy)))
     tables = Tables(a)
     assert [s.row for s in tables.blunders.suspects][:1] == [row]
-    found = {t.pattern.what: t for t in trends(a, np.asarray(tables.covariance.shared_sigma), [("image_points", row)])}
+    found = {
+        t.pattern.what: t
+        for t in systematic_effect_tests(a, np.asarray(tables.covariance.shared_sigma), [("image_points", row)])
+    }
     # As if it had never been measured.
     without = found_in(dataclasses.replace(block, image_points=rows.take(kept)))
     for what, t in found.items():
@@ -125,6 +128,6 @@ def test_blunders_have_no_part_in_patterns():
 def test_where_there_is_nothing_to_look_for_nothing_is_found(monkeypatch):
     """More cameras than are tested one by one, and no stations; and no parameter to ask after."""
     a = adjust(free_network(), simulated("cross").truth)
-    monkeypatch.setattr(patterns, "MOST_PARTS", 0)
-    assert trends(a, np.asarray(covariance(a).shared_sigma)) == []
-    assert list(Responses.of(a).of_unknowns([])) == []
+    monkeypatch.setattr(systematic_effects, "MAX_GROUPS", 0)
+    assert systematic_effect_tests(a, np.asarray(covariance(a).shared_sigma)) == []
+    assert list(HatMatrix.of(a).influence_on([])) == []

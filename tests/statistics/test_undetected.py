@@ -7,7 +7,7 @@ import pytest
 
 from jaxphoto import adjust, correlated, covariance
 from jaxphoto.observations import Correlated, StationRows, exponential_covariance
-from jaxphoto.statistics import detectable_errors, most_felt, redundancy_numbers, undetected_effects
+from jaxphoto.statistics import largest_interior_effects, mdb_effects, minimal_detectable_biases, redundancy_numbers
 from tests.blocks import adjusted, covariance_of, simulated
 
 
@@ -16,7 +16,7 @@ def external():
     a = adjusted("cross")
     q = covariance_of("cross")
     r = redundancy_numbers(a, q)
-    return a, q, detectable_errors(a, r), undetected_effects(a, q, r)
+    return a, q, minimal_detectable_biases(a, r), mdb_effects(a, q, r)
 
 
 @pytest.mark.parametrize("group, field", [("stations", "stations"), ("control_points", "control")])
@@ -47,7 +47,7 @@ def test_nothing_moves_by_more_than_said(external):
 
 def test_the_worst_of_each_parameter_is_found(external):
     a, _, _, e = external
-    found = most_felt(a, e)
+    found = largest_interior_effects(a, e)
     assert [f.parameter for f in found] == ["c_mm", "xp_mm", "yp_mm"]
     for f in found:
         assert f.moved == max(np.nanmax(v) for v in e.interior[f.parameter].values())
@@ -56,7 +56,7 @@ def test_the_worst_of_each_parameter_is_found(external):
 def test_image_rows_are_told_of_their_own_camera():
     a = adjusted("two_cameras")
     q = covariance_of("two_cameras")
-    e = undetected_effects(a, q, redundancy_numbers(a, q))
+    e = mdb_effects(a, q, redundancy_numbers(a, q))
     assert np.isfinite(e.interior["c_mm"]["image_points"]).all()
 
 
@@ -78,7 +78,7 @@ def test_of_rows_that_a_covariance_joins_it_holds_too():
     a = adjust(joined())
     q = covariance(a)
     r = redundancy_numbers(a, q)
-    e, detectable = undetected_effects(a, q, r), detectable_errors(a, r)
+    e, detectable = mdb_effects(a, q, r), minimal_detectable_biases(a, r)
     sigma = np.sqrt(q.of_interior("one", ("c_mm",))[0, 0] / float(q.variance_factor))
     joint = [name for name, rows in a.block.named_observations.items() if isinstance(rows, Correlated)]
     for name in joint:

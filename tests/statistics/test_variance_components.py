@@ -12,7 +12,7 @@ from jaxphoto import InputError, Selection, correlated, variance_components
 from jaxphoto.adjustment import LEAST
 from jaxphoto.observations import StationRows
 from jaxphoto.report import component_findings, component_tables
-from jaxphoto.statistics import partial_redundancy, parts_of
+from jaxphoto.statistics import partial_redundancy, partition_observations
 from tests.adjustment.dense import at_optimum
 from tests.blocks import adjusted, rows
 from tests.checked_types import unchecked
@@ -27,14 +27,14 @@ def dense_traces(parts, name=BLOCK) -> np.ndarray:
     """|R_kl|^2 by a dense projector; the last part is what is known beforehand. Rows of the datum are none of it."""
     j = at_optimum(name).jacobian[:, at_optimum(name).free]
     r = np.eye(len(j)) - j @ np.linalg.solve(j.T @ j, j.T)
-    of = np.concatenate([np.ravel(v) for v in parts.of.values()])
+    of = np.concatenate([np.ravel(v) for v in parts.part_of.values()])
     own = np.eye(len(parts.labels) + 1)[of]
     return own.T @ r[: len(of), : len(of)] ** 2 @ own
 
 
 @pytest.mark.parametrize("split", SPLITS)
 def test_traces_are_those_of_dense_matrices(split):
-    parts = parts_of(adjusted(BLOCK), split)
+    parts = partition_observations(adjusted(BLOCK), split)
     assert len(parts.labels) == 7
     found, expected = partial_redundancy(adjusted(BLOCK), parts, probes=10**6), dense_traces(parts)
     np.testing.assert_allclose(found.matrix, expected, atol=1e-9)
@@ -47,7 +47,7 @@ def test_traces_are_those_of_dense_matrices(split):
 @pytest.mark.slow
 def test_constraints_of_the_datum_take_no_part_of_an_observation():
     """|H z|^2 = z'H z counts them: what the image points have of it is without."""
-    parts = parts_of(adjusted("inner"), ("xy-z",))
+    parts = partition_observations(adjusted("inner"), ("xy-z",))
     assert len(adjusted("inner").residuals.datum)
     found, expected = partial_redundancy(adjusted("inner"), parts, probes=10**6), dense_traces(parts, "inner")
     off = ~np.eye(len(expected), dtype=bool)
@@ -59,7 +59,7 @@ def test_constraints_of_the_datum_take_no_part_of_an_observation():
 def test_random_vectors_agree_with_exact_traces(split, probes):
     """Image points of three cameras have 164, 154 and 104 coordinates: two of the parts take random vectors. Where they
     are one part, they take none, and nothing is computed of them."""
-    parts = parts_of(adjusted(BLOCK), split)
+    parts = partition_observations(adjusted(BLOCK), split)
     found = partial_redundancy(adjusted(BLOCK), parts, probes=probes)
     error = found.matrix - dense_traces(parts)
     random = found.uncertainty > 0
@@ -80,7 +80,7 @@ def test_the_estimate_is_the_fixed_point(components):
     """v'Pv of every estimated part is its redundancy; all others are weighted as they were."""
     a, found = adjusted(BLOCK), components
     assert found.converged
-    parts = parts_of(found.adjusted, ("camera",))
+    parts = partition_observations(found.adjusted, ("camera",))
     now = partial_redundancy(found.adjusted, parts)
     free = found.supported
     assert 2 <= free.sum() < len(free)
@@ -91,7 +91,7 @@ def test_the_estimate_is_the_fixed_point(components):
     assert np.isnan(found.sigma[~free]).all()
     assert (found.factor[~free] == 1).all()
     before, after = a.block.image_points.sigma, found.adjusted.block.image_points.sigma
-    times = np.sqrt(found.factor)[parts.of["image_points"]].T
+    times = np.sqrt(found.factor)[parts.part_of["image_points"]].T
     np.testing.assert_allclose(after, before * times, rtol=1e-12)
     assert np.ptp(times) > 0
     # What is known beforehand has no component.
@@ -112,11 +112,11 @@ def test_it_is_adjusted_again_by_the_program_that_adjusted_it(monkeypatch):
 def test_what_cannot_support_a_component_says_so_and_stays_as_stated(components):
     weak = [label for label, good in zip(components.labels, components.supported, strict=True) if not good]
     assert "distances" in weak or "control_points" in weak
-    assert set(components.sentences) == set(weak)
-    for label, sentence in components.sentences.items():
+    assert set(components.warnings) == set(weak)
+    for label, sentence in components.warnings.items():
         assert sentence.startswith(f"{label} (")
         assert "cannot support a variance component" in sentence
-    assert [f.text for f in component_findings(components)] == list(components.sentences.values())
+    assert [f.text for f in component_findings(components)] == list(components.warnings.values())
     assert np.isnan(components.degrees[~components.supported]).all()
     assert (components.degrees[components.supported] > 2).all()
     tables = component_tables(components)
@@ -129,18 +129,18 @@ def test_what_cannot_support_a_component_says_so_and_stays_as_stated(components)
 
 def test_parts_are_what_was_selected():
     a = adjusted(BLOCK)
-    parts = parts_of(
+    parts = partition_observations(
         a,
         {
             "plan": [Selection("control_points", axes=("X", "Y")), Selection("stations", axes=("X", "Y"))],
             "one image": Selection("image_points", images="i3"),
         },
     )
-    np.testing.assert_array_equal(parts.of["control_points"] == 0, np.asarray(a.block.control.axis) < 2)
-    np.testing.assert_array_equal(parts.of["stations"] == 0, np.asarray(a.block.stations.axis) < 2)
-    np.testing.assert_array_equal(parts.of["image_points"][0] == 1, np.asarray(a.block.image_points.image) == 3)
-    assert (parts.of["attitudes"] == 2).all()
-    assert (parts.of["priors"] == 2).all()
+    np.testing.assert_array_equal(parts.part_of["control_points"] == 0, np.asarray(a.block.control.axis) < 2)
+    np.testing.assert_array_equal(parts.part_of["stations"] == 0, np.asarray(a.block.stations.axis) < 2)
+    np.testing.assert_array_equal(parts.part_of["image_points"][0] == 1, np.asarray(a.block.image_points.image) == 3)
+    assert (parts.part_of["attitudes"] == 2).all()
+    assert (parts.part_of["priors"] == 2).all()
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_parts_are_what_was_selected():
 )
 def test_a_partition_that_is_none_is_refused(partition, words):
     with unchecked(), pytest.raises(InputError, match=words):
-        parts_of(adjusted(BLOCK), partition)
+        partition_observations(adjusted(BLOCK), partition)
 
 
 def test_components_are_those_of_an_optimum():
