@@ -181,7 +181,7 @@ def test_noise_is_predicted_by_the_observations_own_sigmas(tmp_path):
     groups = {"image_points": block.image_points, "stations": block.stations, "control_points": block.control}
     variance = sum((derivatives.groups[name] ** 2) @ np.ravel(rows.sigma) ** 2 for name, rows in groups.items())
     for label in nominal.structure.labels:
-        expected = np.sqrt(variance[derivatives.of(label)])
+        expected = np.sqrt(variance[derivatives.row(label)])
         assert of[label.replace("interior[one]", "one")] == pytest.approx(expected, rel=2e-3)
 
 

@@ -13,8 +13,7 @@ from jaxphoto import FIXED, Weighted, adjust, covariance
 from jaxphoto.adjustment import Linearised
 from jaxphoto.adjustment.model.parameter_tables import shared_vector
 from jaxphoto.errors import InputError
-from jaxphoto.sensitivity.exact import sensitivity
-from jaxphoto.sensitivity.response import response
+from jaxphoto.sensitivity.exact import response, sensitivity
 from tests.adjustment.dense import couples, in_one_list, own_order
 from tests.blocks import adjusted, simulated
 
@@ -154,7 +153,7 @@ def test_derivative_by_a_fixed_lever_arm() -> None:
     a = adjust(block, truth, priors)
     found = sensitivity(a, curvature=True)
     column = found.fixed_labels.index("mounts[imu].lever_arm_forward_m")
-    row = found.of("interior[one].yp_mm")
+    row = found.row("interior[one].yp_mm")
 
     def principal_point(h: float) -> float:
         moved = a.unknowns.mounts["imu"].lever_arm + np.array([0, h, 0])

@@ -58,7 +58,7 @@ def dense_products():
 @pytest.mark.parametrize("curved", [0.0, 1.0])
 @pytest.mark.parametrize("at_once", [8192, 64])
 def test_products_of_rows_are_the_dense_ones(curved: float, at_once: int, monkeypatch) -> None:
-    monkeypatch.setattr(listed, "_AT_ONCE", at_once)
+    monkeypatch.setattr(listed, "_BATCH", at_once)
     a = corrected()
     s, scale = a.equations.structure, jax.tree.map(jnp.asarray, a.equations.scale)
     values, rows = jax.tree.map(jnp.asarray, a.equations.weighed.values), listed.image_rows(a)

@@ -52,7 +52,7 @@ def test_bias_of_a_strip_is_what_full_adjustments_show() -> None:
         return float(adjust(block, a.unknowns).unknowns.interior["one"].c)
 
     expected = (principal_distance(0.1) - principal_distance(-0.1)) / 2
-    assert found.change[derivatives("cross").of("interior[one].c_mm"), 1, 2] == pytest.approx(expected, rel=1e-3)
+    assert found.change[derivatives("cross").row("interior[one].c_mm"), 1, 2] == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("per", ["block", "image"])
@@ -64,7 +64,7 @@ def test_station_bias_by_block_and_image(per: Per) -> None:
     whole = station_bias(a, derivatives("cross"), "block", 0.1).change[:, 0]
     np.testing.assert_allclose(total, whole, rtol=1e-9, atol=1e-12)
     # Stations and control contradict each other: part of a bias in height ends in the principal distance.
-    assert abs(whole[derivatives("cross").of("interior[one].c_mm"), 2]) > 1e-5
+    assert abs(whole[derivatives("cross").row("interior[one].c_mm"), 2]) > 1e-5
 
 
 def test_variance_is_that_of_the_covariance_where_residuals_are_measurements() -> None:
@@ -97,15 +97,15 @@ def test_external_reliability_is_an_undetected_error_adjusted_in() -> None:
     found = external_reliability(a, derivatives("cross", False))
     control = 4
     r = np.asarray(redundancy_numbers(a, covariance(a))["control_points"])[control]
-    error = found.detectable["control_points"][control]
+    error = found.mdb["control_points"][control]
     assert error == pytest.approx(4.13 * 0.03 / np.sqrt(r), rel=1e-9)
     value = np.array(a.block.control.value)
     value[control] += error
     again = adjust(eqx.tree_at(lambda b: b.control.value, a.block, value), a.unknowns)
-    row = derivatives("cross").of("interior[one].c_mm")
+    row = derivatives("cross").row("interior[one].c_mm")
     moved = float(again.unknowns.interior["one"].c - a.unknowns.interior["one"].c)
     assert found.effect["control_points"][row, control] == pytest.approx(moved, rel=0.05)
-    assert all((d > 0).all() for d in found.detectable.values())
+    assert all((d > 0).all() for d in found.mdb.values())
     assert not any(np.isnan(e).any() for e in found.effect.values())
     # The test that is meant finds it: the normalised residual moves by delta0.
     change = (again.residuals["control_points"] - a.residuals["control_points"])[control] / np.sqrt(r)
@@ -118,7 +118,7 @@ def test_external_reliability_is_an_undetected_error_adjusted_in() -> None:
         (lambda a, d: station_bias(a, d, "camera"), "per block, strip, image, not per camera"),  # type: ignore[arg-type]
         (lambda a, d: station_bias(a, d, "strip"), "no image with an observed station has a strip"),
         (lambda a, d: external_reliability(a, d, 0.0), "a positive number, not 0.0"),
-        (lambda a, d: d.of("interior[one].k9"), "no estimate is called interior"),
+        (lambda a, d: d.row("interior[one].k9"), "no estimate interior"),
     ],
 )
 def test_mistakes_get_a_sentence(call, sentence: str) -> None:

@@ -242,7 +242,7 @@ def test_no_draws_are_refused(draws):
 
 
 def test_a_perturbation_that_changes_nothing_is_refused():
-    with pytest.raises(InputError, match="changes no number"):
+    with pytest.raises(InputError, match="changes no value"):
         monte_carlo(adjusted("cross"), lambda key, block: block, 3)
 
 

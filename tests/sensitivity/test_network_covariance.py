@@ -14,8 +14,8 @@ from jaxphoto import BlockError, DatumError, Equidistant, InputError
 from jaxphoto.camera import get_parameter
 from jaxphoto.compiling import call_compiled
 from jaxphoto.sensitivity.network import criteria
-from jaxphoto.sensitivity.network.block import check_layout, measured_block
 from jaxphoto.sensitivity.network.covariance import design_covariance
+from jaxphoto.sensitivity.network.layout import block_from_layout, check_layout
 from jaxphoto.sensitivity.network.search import evaluate_designs
 from jaxphoto.simulation import remeasure
 from tests.blocks import observed
@@ -33,7 +33,7 @@ def layout():
 
 @pytest.fixture(scope="module")
 def measured(layout):
-    return measured_block(layout)
+    return block_from_layout(layout)
 
 
 @pytest.fixture(scope="module")

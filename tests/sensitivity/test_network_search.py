@@ -10,15 +10,15 @@ import pytest
 
 import jaxphoto
 from jaxphoto import DatumError, InputError
-from jaxphoto.sensitivity.network.block import measured_block
-from jaxphoto.sensitivity.network.criteria import largest_correlation, sigma_of
+from jaxphoto.sensitivity.network.covariance import largest_correlation, sigma_of
+from jaxphoto.sensitivity.network.layout import block_from_layout
 from jaxphoto.sensitivity.network.search import (
+    best_designs,
     evaluate_designs,
     grid_designs,
     optimise_design,
-    promising,
     random_designs,
-    stacked,
+    stack_designs,
 )
 from jaxphoto.statistics import correlations
 from tests.sensitivity.network import PLAN, USUAL
@@ -41,7 +41,7 @@ def grid():
 
 @pytest.fixture(scope="module")
 def found(grid):
-    starts = stacked(USUAL, jax.tree.map(lambda v: v[0], promising(TILTS, PLAN, grid, 1)))
+    starts = stack_designs(USUAL, jax.tree.map(lambda v: v[0], best_designs(TILTS, PLAN, grid, 1)))
     return optimise_design(TILTS, PLAN, LOW, HIGH, starts, SMOOTH, max_steps=25)
 
 
@@ -52,11 +52,11 @@ def test_search_beats_the_grid_and_the_usual_layout(grid, found):
     assert found.value < 0.97 * np.nanmin(values)
     assert found.value < 0.8 * found.start_values[0]
     assert (found.values < found.start_values).all()
-    np.testing.assert_allclose(evaluate_designs(TILTS, PLAN, stacked(found.best)), found.value, rtol=1e-12)
+    np.testing.assert_allclose(evaluate_designs(TILTS, PLAN, stack_designs(found.best)), found.value, rtol=1e-12)
 
 
 def test_search_stays_between_its_bounds(found):
-    for low, value, high in zip(*map(jax.tree.leaves, (LOW, found.found, HIGH)), strict=True):
+    for low, value, high in zip(*map(jax.tree.leaves, (LOW, found.designs, HIGH)), strict=True):
         slack = 1e-12 * (1 + np.abs(value))
         assert ((value >= low - slack) & (value <= high + slack)).all()
     np.testing.assert_allclose(found.best.heading[0], USUAL.heading[0])
@@ -67,7 +67,7 @@ def test_the_gain_is_there_when_the_layout_is_measured(found):
     """By `jaxphoto.covariance` of a block in which a point is measured or not, nothing between."""
     measured = []
     for design in (USUAL, found.best):
-        block, truth, _ = measured_block(eqx.filter_jit(PLAN)(design))
+        block, truth, _ = block_from_layout(eqx.filter_jit(PLAN)(design))
         adjusted = jaxphoto.adjust(block, truth)
         rho = correlations(adjusted, jaxphoto.covariance(adjusted))["camera"].exterior
         measured.append(np.abs(rho[:, 3:5, 1:3]).max())
@@ -93,11 +93,11 @@ def test_a_budget_without_stations_and_control_leaves_no_datum():
 
 def test_what_cannot_be_searched_is_said_in_a_sentence():
     sigma = eqx.Partial(sigma_of, name="c_mm")
-    start = stacked(USUAL)
+    start = stack_designs(USUAL)
     with pytest.raises(InputError, match=r"the bounds of height are upside down: the low one, 1150, is above .* 850"):
         upside = dataclasses.replace(LOW, height=HIGH.height), dataclasses.replace(HIGH, height=LOW.height)
         optimise_design(sigma, PLAN, *upside, start)
-    outside = stacked(dataclasses.replace(USUAL, height=np.full(4, 1300.0)))
+    outside = stack_designs(dataclasses.replace(USUAL, height=np.full(4, 1300.0)))
     with pytest.raises(InputError, match="a start of height lies outside of its bounds"):
         optimise_design(sigma, PLAN, LOW, HIGH, outside)
     with pytest.raises(InputError, match=r"the starts of heading have the shape \(4,\), but each is one of \(4,\)"):

@@ -16,7 +16,7 @@ import jaxphoto
 from jaxphoto import FREE, DatumError, InputError, RankError
 from jaxphoto.adjustment import Sizes, common_sizes
 from jaxphoto.report.sweep import plot_sweep, sweep_figure, sweep_table
-from jaxphoto.sensitivity import designs as side_by_side
+from jaxphoto.sensitivity import sweep as side_by_side
 from jaxphoto.sensitivity.sweep import Design, Sweep, sweep
 from jaxphoto.statistics import correlations
 from tests.checked_types import unchecked
@@ -160,7 +160,7 @@ def test_what_says_nothing_is_kept_and_marked(designs, swept, sizes):
 
 
 def test_other_kinds_of_observations_are_another_program(monkeypatch):
-    """Findings come back in the order of the designs, with NaN where a design lacks an unknown."""
+    """Statistics come back in the order of the designs, with NaN where a design lacks an unknown."""
     without = {"mounts": {}, "sigmas.station_m": None}
     shifted = [{"strips": {strip: {"shift": {"sigma_m": 1.0}}}} for strip in "AB"]
     few = [design("", changes) for changes in ({}, without, DESIGNS["small"], *shifted)]
@@ -169,12 +169,12 @@ def test_other_kinds_of_observations_are_another_program(monkeypatch):
         n, q = len(prepared), len(prepared[0].labels)
         numbers = np.array([design.redundancy for design in prepared])
         ones = np.ones((n, 6, q))
-        return side_by_side.Findings(
+        return side_by_side.DesignStatistics(
             np.ones(n, bool), np.ones(n), numbers, 4.0 * numbers, np.tile(np.eye(q), (n, 1, 1)), ones[..., 0],
             ones, ones, ones[:, :3, 0], ones[:, :3, 0],
         )  # fmt: skip
 
-    monkeypatch.setattr(importlib.import_module("jaxphoto.sensitivity.sweep"), "find", found)
+    monkeypatch.setattr(importlib.import_module("jaxphoto.sensitivity.sweep"), "evaluate", found)
     swept = sweep(few)
     assert swept.programs == 3
     np.testing.assert_array_equal(swept.steps, swept.redundancy)
@@ -198,7 +198,12 @@ def test_the_study_asks_of_blocks_that_one_program_serves(monkeypatch):
         asked = study.designs()
         sizes = common_sizes(d.block for d in asked)
         assert [d.parameters["question"] for d in asked] == list(study.DRAWN)
-        assert len(side_by_side.alike([side_by_side.prepare_design(d.block, d.truth, sizes, 25) for d in asked])) == 1
+        assert (
+            len(
+                side_by_side.group_by_program([side_by_side.prepare_design(d.block, d.truth, sizes, 25) for d in asked])
+            )
+            == 1
+        )
 
 
 def test_the_table_is_tidy(swept):
