@@ -184,12 +184,12 @@ def test_equal_weights_give_the_chi_square_distribution_far_into_its_tails(freed
     form = QuadraticForm(np.ones(freedom), np.full(freedom, shift / freedom), 0.5)
     known = stats.ncx2(freedom, shift, loc=0.5) if shift else stats.chi2(freedom, loc=0.5)
     for p in (1e-4, 0.025, 0.3, 0.5, 0.7, 0.975):
-        assert form.exceeded(known.ppf(p)) == pytest.approx(1 - p, rel=1e-9)
+        assert form.tail_probability(known.ppf(p)) == pytest.approx(1 - p, rel=1e-9)
         assert form.quantile(p) == pytest.approx(known.ppf(p), rel=1e-9)
     far = known.isf(1e-12)
-    assert form.exceeded(far) == pytest.approx(known.sf(far), rel=1e-6)
+    assert form.tail_probability(far) == pytest.approx(known.sf(far), rel=1e-6)
     assert (form.mean, form.variance) == pytest.approx((known.mean(), known.var()))
-    assert form.exceeded(0.4) == 1.0
+    assert form.tail_probability(0.4) == 1.0
 
 
 def test_mean_and_spread_of_the_root_are_exact():
@@ -202,7 +202,7 @@ def test_mean_and_spread_of_the_root_are_exact():
     assert far.sigma_of_root == pytest.approx(1.0, rel=1e-9)
     nothing = QuadraticForm(np.zeros(0), np.zeros(0), 4.0)
     assert (nothing.mean_of_root, nothing.sigma_of_root, nothing.quantile(0.3)) == (2.0, 0.0, 4.0)
-    assert (nothing.exceeded(3.9), nothing.exceeded(4.1)) == (1.0, 0.0)
+    assert (nothing.tail_probability(3.9), nothing.tail_probability(4.1)) == (1.0, 0.0)
 
 
 def test_unequal_weights_are_as_sampled():
@@ -214,9 +214,9 @@ def test_unequal_weights_are_as_sampled():
         form = QuadraticForm(weights, shifts, weights.max() * rng.choice([0.0, 3.0]))
         drawn = form.constant + ((np.sqrt(shifts) + np.sqrt(weights) * rng.standard_normal((40_000, n))) ** 2).sum(1)
         for p in (0.01, 0.2, 0.5, 0.8, 0.99):
-            off = (1 - form.exceeded(float(np.quantile(drawn, p)))) - p
+            off = (1 - form.tail_probability(float(np.quantile(drawn, p)))) - p
             assert abs(off) < 4.5 * np.sqrt(p * (1 - p) / len(drawn))
-            assert form.exceeded(form.quantile(p)) == pytest.approx(1 - p, abs=1e-9)
+            assert form.tail_probability(form.quantile(p)) == pytest.approx(1 - p, abs=1e-9)
         root = np.sqrt(drawn)
         assert abs(form.mean_of_root - root.mean()) < 4.5 * root.std() / np.sqrt(len(root))
         assert form.sigma_of_root == pytest.approx(root.std(), rel=0.03)
@@ -271,14 +271,14 @@ def test_two_calibrations_of_one_camera_differ_as_predicted(repeated):
     same = bundle_offsets(ONE, ONE, GRID)
     both = block_diag(covariance(), covariance())
     form = QuadraticForm.of_normal(np.zeros(2 * len(GRID)), np.asarray(same.jacobian), both)
-    p_values = [form.exceeded(same.redundancy * r**2) for r in rmse[:400]]
+    p_values = [form.tail_probability(same.redundancy * r**2) for r in rmse[:400]]
     assert stats.kstest(p_values, "uniform").pvalue > 1e-3
     # With the derivatives at the estimates, as a user has them, it is the same p.
     drawn = np.random.default_rng(3).multivariate_normal(np.zeros(len(both)), both, method="eigh").reshape(2, -1)
     pair = [with_parameters(ONE, parameter_vector(ONE) + e) for e in drawn]
     found = bundle_offsets(*pair, GRID)
     p = offset_uncertainty(found, covariance(), covariance()).p_value
-    assert p == pytest.approx(form.exceeded(same.redundancy * float(found.rmse_mm) ** 2), abs=0.02)
+    assert p == pytest.approx(form.tail_probability(same.redundancy * float(found.rmse_mm) ** 2), abs=0.02)
 
 
 def test_a_set_without_covariance_is_taken_as_exact():
@@ -315,13 +315,16 @@ def test_a_grid_reaches_over_the_format_or_a_given_extent():
         image_grid(GOPRO, 1, 5)
     with pytest.raises(ValueError, match="is positive"):
         image_grid(GOPRO, 5, 5, (1.0, -1.0))
-    with pytest.raises(ValueError, match="leave nothing to compare"):
+    with pytest.raises(ValueError, match="too few for"):
         bundle_offsets(ONE, TWO, GRID[:3], "spr")
 
 
 def test_a_distortion_that_folds_inside_the_grid_is_named():
     check_rays(ONE, GRID, "A")
-    with pytest.raises(InputError, match=r"B: its distortion means nothing at \d+ of 165 points .* smaller extent"):
+    with pytest.raises(
+        InputError,
+        match=r"B: its distortion is not invertible.* at \d+ of 165 points .* smaller extent",
+    ):
         check_rays(smac(2.7, 0.0, 0.0, 0.2, 0.0, 0.0), GRID, "B")
     with pytest.raises(InputError, match="B: its distortion"):
         check_rays(InteriorOrientation(2.7, 0.0, 0.0, RadialPolynomial(k1=-0.2)), GRID, "B")

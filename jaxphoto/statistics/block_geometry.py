@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.compiling import call_compiled
+from jaxphoto.stability import as_arrays
 
 # Vertices per side of the polygon of the format.
 _SIDE = 8
@@ -99,8 +100,8 @@ def _format(interior: InteriorOrientation, sensor: Sensor) -> Float[np.ndarray, 
     side = np.arange(_SIDE) / _SIDE * 2 - 1
     ones = np.ones(_SIDE)
     edge = np.concatenate([np.stack(v, axis=1) for v in ((side, -ones), (ones, side), (-side, ones), (-ones, -side))])
-    arrays = jax.tree.map(lambda v: jnp.asarray(v, float), interior)
-    return np.asarray(call_compiled(_tangents, arrays, jnp.asarray(edge * [sensor.width_mm / 2, sensor.height_mm / 2])))
+    corners = jnp.asarray(edge * [sensor.width_mm / 2, sensor.height_mm / 2])
+    return np.asarray(call_compiled(_tangents, as_arrays(interior), corners))
 
 
 @eqx.filter_jit

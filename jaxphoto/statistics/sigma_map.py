@@ -33,7 +33,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.linear_algebra import solve
 from jaxphoto.rotation import small_rotation
 from jaxphoto.short_repr import shown
-from jaxphoto.stability import image_grid, parameter_vector, regular_rays, with_parameters
+from jaxphoto.stability import as_arrays, image_grid, parameter_vector, regular_rays, with_parameters
 from jaxphoto.statistics.correlation import linear_forms
 
 # Cells along the longer and the shorter side of the format.
@@ -91,9 +91,7 @@ def _sigma_map(
     interior, sensor = adjusted.unknowns.interior[name], adjusted.block.sensors[name]
     xy = _cells(sensor) if points is None else np.asarray(points, float)
     parameters, covariance = joint
-    # Values as arrays: another value must not compile another program.
-    arrays = jax.tree.map(lambda v: jnp.asarray(v, float), interior)
-    jacobian = still(call_compiled(_derivatives, arrays, jnp.asarray(xy), jnp.asarray(1 / distance_m)))
+    jacobian = still(call_compiled(_derivatives, as_arrays(interior), jnp.asarray(xy), jnp.asarray(1 / distance_m)))
     index = [
         *(parameter_names(interior).index(p) for p in parameters),
         *range(jacobian.shape[2] - 6, jacobian.shape[2]),

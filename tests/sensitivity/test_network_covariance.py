@@ -13,7 +13,7 @@ import jaxphoto
 from jaxphoto import BlockError, DatumError, Equidistant, InputError
 from jaxphoto.camera import get_parameter
 from jaxphoto.compiling import call_compiled
-from jaxphoto.sensitivity.network import criteria
+from jaxphoto.sensitivity.network import covariance as criteria
 from jaxphoto.sensitivity.network.covariance import design_covariance
 from jaxphoto.sensitivity.network.layout import block_from_layout, check_layout
 from jaxphoto.sensitivity.network.search import evaluate_designs
