@@ -131,8 +131,8 @@ def _knots(block: Block, field: str, per: str) -> Iterator[BiasedArray]:
         if weighted and np.shape(prior.value) != (3,):
             raise InputError(f"{field} of {owner}: the prior is one value for three axes, give three")
         if weighted or prior == FIXED:
-            path = ("more", kind, owner, field)
-            path = ("priors", *path, "value") if weighted else ("start", "unknowns", *path)
+            leaf = ("more", kind, owner, field)
+            path = ("priors", *leaf, "value") if weighted else ("start", "unknowns", *leaf)
             yield BiasedArray(path, [_owner(owner, per)] * 3, np.arange(3), -np.eye(3)[None])
 
 
@@ -362,8 +362,8 @@ def _parameters(block: Block, kind: str, sigma, of: Collection[str], parameter: 
     targets = []
     for name in chosen:
         if kind == "interior" and parameter not in parameter_names(table[name]):
-            names = ", ".join(parameter_names(table[name]))
-            raise InputError(f"camera {name} has no parameter {parameter!r}: choose among {names}")
+            choices = ", ".join(parameter_names(table[name]))
+            raise InputError(f"camera {name} has no parameter {parameter!r}: choose among {choices}")
         prior = _leaf(prior_table[name], field)
         if prior == FREE:
             raise InputError(f"{field} of {name} is free, so a bias of its value has no effect: fix it or weight it")

@@ -224,16 +224,18 @@ def partial_redundancy(adjusted: Adjustment, parts: Parts, probes: int = PROBES)
     estimate, weight = _products(adjusted, parts, probes)
     # The better of two estimates; the mean of equally good ones.
     share = np.where(weight[:, None] == weight, 0.5, weight[:, None] > weight)
-    off = share * estimate + share.T * estimate.T
-    np.fill_diagonal(off, 0.0)
+    off_diagonal = share * estimate + share.T * estimate.T
+    np.fill_diagonal(off_diagonal, 0.0)
     redundancy = _by_part(numbers, parts, n)
     exact = np.maximum(weight[:, None], weight) == np.inf
-    uncertainty = np.where(exact, 0.0, np.sqrt(off / (2 * probes) * np.where(weight[:, None] == weight, 0.5, 1.0)))
+    uncertainty = np.where(
+        exact, 0.0, np.sqrt(off_diagonal / (2 * probes) * np.where(weight[:, None] == weight, 0.5, 1.0))
+    )
     np.fill_diagonal(uncertainty, 0.0)
     return PartialRedundancy(
         square_sums=_by_part(squares, parts, n),
         redundancy=redundancy,
-        matrix=off + np.diag(redundancy - off.sum(axis=1)),
+        matrix=off_diagonal + np.diag(redundancy - off_diagonal.sum(axis=1)),
         uncertainty=uncertainty + np.diag(np.sqrt((uncertainty**2).sum(axis=1))),
     )
 

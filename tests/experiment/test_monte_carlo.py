@@ -256,8 +256,8 @@ def test_the_command(folder, monkeypatch, capsys, tmp_path):
     "options, words",
     [
         (("--bias", "station", "--sigma-m", "0.1", "--on", "S9", "--per", "strip"), "no strip 'S9'"),
-        (("--bias", "station", "--sigma-m", "0.1", "--draws", "0"), "1 at least, got 0"),
-        (("--bias", "station", "--sigma-m", "0.1", "--draws", "-5"), "1 at least, got -5"),
+        (("--bias", "station", "--sigma-m", "0.1", "--draws", "0"), "must be positive, got 0"),
+        (("--bias", "station", "--sigma-m", "0.1", "--draws", "-5"), "must be positive, got -5"),
         (("--bias", "station", "--sigma-deg", "0.1"), "takes --sigma-m"),
         (("--bias", "station"), "takes --sigma-m"),
         (("--bias", "station", "--sigma-m", "much"), "--sigma-m much"),
