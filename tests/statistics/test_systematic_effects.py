@@ -33,7 +33,7 @@ def in_strips() -> Simulated:
     return Simulated(block, dataclasses.replace(truth, interior={"one": as_measured(truth.interior["one"])}))
 
 
-def tests_of(block) -> dict:
+def effects_in(block) -> dict:
     a = adjust(block)
     return {t.pattern.what: t for t in systematic_effect_tests(a, np.asarray(covariance(a).shared_sigma))}
 
@@ -49,7 +49,7 @@ def test_where_nothing_is_missing_p_values_are_uniform():
         dataclasses.replace(eqx.tree_at(observed, block, draw(jax.random.key(seed))), more=(prior,))
         for seed, prior in enumerate(priors)
     )
-    p = [{what: test.p_value for what, test in tests_of(b).items()} for b in blocks]
+    p = [{what: test.p_value for what, test in effects_in(b).items()} for b in blocks]
     assert set(p[0]) == {
         "image points of camera one over the format", "image points of camera one over time",
         "prior information of camera one", "stations as a whole", "stations from strip to strip",
@@ -83,7 +83,7 @@ def test_stations_of_a_strip_that_are_off_are_named_with_their_shift():
     block, _ = in_strips()
     rows = block.stations
     error = np.where((np.asarray(rows.who) >= 5) & (rows.axis == 2), 1.5, 0.0)
-    result = tests_of(dataclasses.replace(block, stations=dataclasses.replace(rows, value=rows.value + error)))
+    result = effects_in(dataclasses.replace(block, stations=dataclasses.replace(rows, value=rows.value + error)))
     test = result["stations from strip to strip"]
     best = test.hints[0]
     assert test.p_value < 1e-4 and best.term.name in ("Z of strip b", "Z of strip a")
@@ -119,7 +119,7 @@ def test_blunders_have_no_part_in_patterns():
         for t in systematic_effect_tests(a, np.asarray(tables.covariance.shared_sigma), [("image_points", row)])
     }
     # As if it had not been measured.
-    without = tests_of(dataclasses.replace(block, image_points=rows.take(kept)))
+    without = effects_in(dataclasses.replace(block, image_points=rows.take(kept)))
     for what, t in result.items():
         assert t.freedom == without[what].freedom
         assert t.p_value == pytest.approx(without[what].p_value, rel=0.05), what
