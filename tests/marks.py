@@ -66,7 +66,7 @@ QUICK = {
     "stability": ("test_stability.py::test_equal_weights_give_the_chi_square_distribution_far_into_its_tails",),
     "statistics": (
         "statistics/test_covariance.py::test_kinds_of_rotation_are_one_covariance",
-        "statistics/test_significance.py",
+        "statistics/test_significance.py::test_chi_square",
     ),
     "tracing": ("test_transformations.py::test_what_cannot_be_traced_says_so",),
     "unknowns": ("io/test_surfaces.py",),

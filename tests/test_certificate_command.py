@@ -16,7 +16,7 @@ from jaxphoto.io.input_hashes import block_inputs, read_inputs, write_inputs
 from jaxphoto.procedures import adjust_for_tables
 from jaxphoto.report import verdict_of
 from jaxphoto.report.results import write_results
-from jaxphoto.statistics.coverage import coverage
+from jaxphoto.statistics.block_geometry import coverage
 from tests.blocks import simulated
 from tests.commands import run
 

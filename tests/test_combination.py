@@ -31,7 +31,7 @@ def drawn(rng, off=0.0):
 
 def test_one_calibration_says_nothing_twice():
     interiors, covariances = drawn(np.random.default_rng(1))
-    with pytest.raises(InputError, match="c and a are one calibration, which says nothing twice"):
+    with pytest.raises(InputError, match="c and a are the same calibration"):
         combine([*interiors[:2], interiors[0]], [*covariances[:2], covariances[0]], "abc")
 
 
@@ -93,7 +93,7 @@ def test_what_cannot_be_combined_is_said(tmp_path, monkeypatch, capsys):
         combine(interiors[:1], covariances[:1], "a")
     held = covariances[1].copy()
     held[FREE[0]] = held[:, FREE[0]] = 0.0
-    with pytest.raises(InputError, match="c_mm is held in b and estimated in a"):
+    with pytest.raises(InputError, match="c_mm is fixed in b and estimated in a"):
         combine(interiors[:2], [covariances[0], held], "ab")
     sets = [written_set(tmp_path / name, "gopro", TARGET_1) for name in ("one", "two")]
     (sets[1] / "correlation.csv").unlink()

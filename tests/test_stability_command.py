@@ -1,4 +1,4 @@
-"""`jaxphoto stability`: from files to tables, map and verdict; what is refused."""
+"""`jaxphoto stability`: tables, map and verdict from files; errors."""
 
 import json
 
@@ -20,7 +20,7 @@ SENSOR = {"width_px": 3000, "height_px": 2250, "pixel_mm": 0.00155}
 
 
 def written_set(folder, camera, values):
-    """Results with a covariance, of a camera with SMAC."""
+    """A folder of results with a covariance, of a camera with SMAC."""
     folder.mkdir()
     rows = [(camera, p, values.get(p, 0.0), SIGMAS.get(p, np.nan), True) for p in PARAMETERS]
     columns = ["camera", "parameter", "value", "sigma", "significant"]
@@ -28,14 +28,14 @@ def written_set(folder, camera, values):
     free = list(SIGMAS)
     rho = [(f"interior[{camera}].{a}", f"interior[{camera}].{b}", 0.0) for a in free for b in free if a != b]
     pd.DataFrame(rho, columns=["parameter_a", "parameter_b", "rho"]).to_csv(folder / "correlation.csv", index=False)
-    told = {"distortion": "smac", "sign": "subtract", **SENSOR}
-    (folder / "summary.json").write_text(json.dumps({"cameras": {camera: told}}))
+    summary = {"distortion": "smac", "sign": "subtract", **SENSOR}
+    (folder / "summary.json").write_text(json.dumps({"cameras": {camera: summary}}))
     return folder
 
 
 @pytest.fixture
 def sets(tmp_path):
-    """Two folders of results with covariances, and the first set as a block.toml without."""
+    """Two folders of results with covariances, and the first set as a block.toml without one."""
     for name, values in (("one", TARGET_1), ("two", TARGET_2)):
         written_set(tmp_path / name, "gopro", values)
     lines = [f"{k} = {v}" for k, v in SENSOR.items()]
@@ -75,7 +75,7 @@ def test_a_missing_covariance_is_said_and_not_invented(sets, monkeypatch, capsys
     code, text, _ = run(monkeypatch, capsys, "stability", sets / "bare.toml", sets / "bare.toml")
     assert code == 0
     assert "Neither set has a covariance: no uncertainty is given." in text
-    assert "without covariances nobody knows how sure that is" in text
+    assert "its uncertainty is unknown without covariances" in text
 
 
 @pytest.mark.parametrize(
@@ -112,22 +112,22 @@ def test_cameras_of_different_sensors_are_refused(sets, monkeypatch, capsys):
 
 @pytest.fixture(scope="module")
 def kinds(tmp_path_factory):
-    """One camera without distortion, which every model holds exactly, in every kind of file."""
+    """One camera without distortion, exact in every model, in every kind of file."""
     folder = tmp_path_factory.mktemp("kinds")
     sensor = Sensor(**SENSOR)
     interior = InteriorOrientation(2.7, -0.07, 0.08, Smac())
     files = {"opencv": "a.yml", "colmap": "cameras.txt", "agisoft": "a.xml", "smac": "a.txt", "block": "block.toml"}
-    found = {}
+    result = {}
     for kind, name in files.items():
         (folder / kind).mkdir()
-        found[kind] = folder / kind / name
-        write_camera_file(found[kind], sensor, interior, kind, name="1")
+        result[kind] = folder / kind / name
+        write_camera_file(result[kind], sensor, interior, kind, name="1")
     results = written_set(folder / "results", "1", {"c_mm": 2.7, "xp_mm": -0.07, "yp_mm": 0.08})
-    found |= {"model folder": folder / "colmap", "block folder": folder / "block"}
-    return found | {"results": results, "interior.csv": results / "interior.csv"}
+    result |= {"model folder": folder / "colmap", "block folder": folder / "block"}
+    return result | {"results": results, "interior.csv": results / "interior.csv"}
 
 
-# Every kind on one side, with as few pairs of models as that needs: each pair is compiled.
+# Every kind on one side, with few pairs of models: each pair is compiled.
 PAIRS = (
     ("results", "results"), ("results", "interior.csv"), ("block", "results"), ("results", "block folder"),
     ("opencv", "results"), ("colmap", "interior.csv"), ("model folder", "block"), ("agisoft", "results"),
@@ -144,8 +144,8 @@ def test_every_kind_of_file_is_compared(kinds, monkeypatch, capsys, first, secon
     (line,) = (line for line in text.splitlines() if line.startswith("│ RMSE_offset"))
     rmse = list(map(float, line.split("│")[2:5]))
     assert max(rmse) < 1e-8 and "…" not in text and "(um)" in text
-    known = "results" in (first, second) or "interior.csv" in (first, second)
-    assert "similar" in text and ("nothing says that it has changed" in text) == known
+    reference = "results" in (first, second) or "interior.csv" in (first, second)
+    assert "similar" in text and ("no significant change" in text) == reference
 
 
 def test_a_camera_may_have_another_name_in_b(sets, monkeypatch, capsys):

@@ -12,7 +12,7 @@ from jaxphoto.cli.two_cameras import check_one_sensor
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import read_camera_file, write_camera_file
 from jaxphoto.stability import combine
-from jaxphoto.stability.analysis import SIGNIFICANT_P
+from jaxphoto.stability.comparison import SIGNIFICANT_P
 from jaxphoto.writing import check_file
 
 

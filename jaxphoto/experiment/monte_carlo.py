@@ -27,7 +27,7 @@ from jaxphoto.report.draws import (
     summary_table,
 )
 from jaxphoto.report.made import versions
-from jaxphoto.sensitivity import Bias, Readjustment, joined_draws
+from jaxphoto.sensitivity import Bias, Readjustment, join_draws
 from jaxphoto.writing import whole_file
 
 # Draws of a part, which a run that is stopped loses at most; fewer where they are more numbers than this, or more image
@@ -105,7 +105,7 @@ class MonteCarlo:
             done += len(batch.steps)
             progress(done)
         recorded = dict(zip(self.drawn.names, errors.T, strict=True)) if self.drawn.recorded else {}
-        draws = dataclasses.replace(joined_draws(batches), recorded=recorded)
+        draws = dataclasses.replace(join_draws(batches), recorded=recorded)
         self.folder.write_part(part, draws_table(draws, self.run.adjusted, int(numbers[0])))
         self.computed += len(errors)
 

@@ -29,7 +29,7 @@ from jaxphoto.procedures.robust import (
     robust,
     solve_placed,
 )
-from jaxphoto.statistics import LEAST_CHECKED, LEVEL, covariance, trends
+from jaxphoto.statistics import LEAST_CHECKED, LEVEL, covariance, systematic_effect_tests
 from jaxphoto.unknowns import Unknowns
 from jaxphoto.variants import without_observations
 
@@ -95,9 +95,9 @@ def without_what_is_alike(
 
     Other unknowns take up most of such an error, and then sound rows contradict what looks right.
     """
-    tested = trends(found, np.asarray(covariance(found).shared_sigma))
+    tested = systematic_effect_tests(found, np.asarray(covariance(found).shared_sigma))
     for trend in tested:
-        if trend.p_value < LEVEL / len(tested) and (axes := [h.term.name for h in trend.alike]):
+        if trend.p_value < LEVEL / len(tested) and (axes := [h.term.name for h in trend.significant_terms]):
             rows = block.named_observations[trend.pattern.group]
             out = {trend.pattern.group: np.any(np.isin(rows.axis_of_numbers, axes), axis=0)}
             yield out, partial(_without, block, start, max_steps, sizes, report, out)

@@ -16,7 +16,7 @@ from jaxphoto.statistics import (
     CameraDifferences,
     CameraDrift,
     ZeroTest,
-    camera_wanderings,
+    camera_spline_differences,
     strip_differences,
 )
 
@@ -31,7 +31,7 @@ def drift_findings(tables: Tables) -> Iterator[Finding]:
     """Of cameras whose rates or splines were estimated, and of those of strips: what changed, or would have shown."""
     for drift in tables.tested_drifts:
         yield Finding(Level.INFORMATION, drift_words(drift))
-    for wandering in camera_wanderings(tables.adjusted, tables.covariance):
+    for wandering in camera_spline_differences(tables.adjusted, tables.covariance):
         yield Finding(Level.INFORMATION, differences_words(wandering))
     if (strips := strip_differences(tables.adjusted, tables.covariance)) is not None:
         yield Finding(Level.INFORMATION, differences_words(strips))

@@ -23,7 +23,7 @@ from jaxphoto.report.findings import as_sentence, symbol
 from jaxphoto.report.made import option_word
 from jaxphoto.report.rolling_shutter import readout_of
 from jaxphoto.report.source_words import assumed_pixels
-from jaxphoto.stability import LEVEL, NORMAL_95, Method, change, distortion_curve, format_sigma, image_grid
+from jaxphoto.stability import LEVEL, NORMAL_95, Method, change, distortion_curve, frame_sigma, image_grid
 from jaxphoto.statistics.correlation import high_pairs
 from jaxphoto.writing.inputs import digest_of_all
 
@@ -169,7 +169,7 @@ def _precision(given: Certified) -> Iterator[Element]:
         return
     points = image_grid(given.sensor, _COLUMNS, _ROWS)
     per_mm = given.sigma_factor / given.sensor.pixel_mm
-    found = [(words, per_mm * format_sigma(given.interior, given.covariance, points, how)) for how, words in _GIVEN_UP]
+    found = [(words, per_mm * frame_sigma(given.interior, given.covariance, points, how)) for how, words in _GIVEN_UP]
     panels = [
         DocumentPicture(
             partial(draw_map, sensor=given.sensor, cells_mm=points, values=sigma, title=f"sigma [px], {words}"),

@@ -21,7 +21,7 @@ from jaxphoto.report.results import write_summary
 from jaxphoto.report.stability import Compared, about_sets
 from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.stability import ALIGNED, LEVEL, Change
-from jaxphoto.stability.analysis import change_meaning
+from jaxphoto.stability.comparison import change_meaning
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ import pandas as pd
 
 from jaxphoto.report.findings import symbol
 from jaxphoto.statistics import Correlations, GroundCorrelations
-from jaxphoto.statistics.ground import FORMS
+from jaxphoto.statistics.correlation import FORMS
 
 
 def correlation_summary_table(correlations: Mapping[str, Correlations]) -> pd.DataFrame:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxphoto.errors import camera_words
 from jaxphoto.report.findings import Finding, Level
 from jaxphoto.report.tables import Tables
-from jaxphoto.statistics.ground import FORMS, GroundCorrelations
+from jaxphoto.statistics.correlation import FORMS, GroundCorrelations
 
 HIGH = 0.9
 _WORDS = {

@@ -47,7 +47,7 @@ from jaxphoto.report.sigma_map import sigma_map_figure, sigma_map_words
 from jaxphoto.report.source_words import assumed_pixel_words, assumed_pixels, report_title
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import LEAST_CHECKED
-from jaxphoto.statistics.format_coverage import format_coverage
+from jaxphoto.statistics.block_geometry import format_coverage
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -21,18 +21,18 @@ from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import (
     DELTA0,
     LEVEL,
-    MOST_PARTS,
-    SURE,
-    Hint,
-    PatternTerm,
-    ResidualPattern,
+    MAX_GROUPS,
+    SIGNIFICANT_RATIO,
+    EffectTerm,
     Suspect,
-    culprits,
+    SystematicEffect,
+    TermEstimate,
+    expected_residual_scale,
     global_test,
     group_factors,
-    most_felt,
-    stretch,
-    worst_checked,
+    largest_interior_effects,
+    largest_mdbs,
+    multiple_outlier_test,
 )
 from jaxphoto.unknowns import Weighted
 
@@ -73,7 +73,9 @@ def of_residuals(tables: Tables) -> Iterator[Finding]:
     worst = max((f.level for f in _blunders(tables, tables.culprits)), default=Level.INFORMATION) if first else 0
     yield from (p.finding._replace(level=Level(max(p.finding.level, worst))) for p in first)
     beside = [pair for p in first[:1] for pair in p.terms]
-    yield from _blunders(tables, culprits(tables.adjusted, tables.blunders, beside) if beside else tables.culprits)
+    yield from _blunders(
+        tables, multiple_outlier_test(tables.adjusted, tables.blunders, beside) if beside else tables.culprits
+    )
     yield from (p.finding for p in patterns if all(p is not one for one in first))
 
 
@@ -154,7 +156,7 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
 
 def of_stretched_residuals(adjusted: Adjustment) -> Iterator[Finding]:
     """Which sigma naught is expected of corrected image coordinates, where it is not 1."""
-    for camera, factor in stretch(adjusted).items() if adjusted.redundancy > 0 else ():
+    for camera, factor in expected_residual_scale(adjusted).items() if adjusted.redundancy > 0 else ():
         if abs(factor - 1) > _STRETCHED:
             yield Finding(
                 Level.INFORMATION,
@@ -218,7 +220,7 @@ class _Pattern(NamedTuple):
     """Its p-value: 1 where no usual term explains it, or it does not matter, and 0 where it explains most of what looks
     like blunders."""
     finding: Finding
-    terms: tuple[tuple[ResidualPattern, PatternTerm], ...]
+    terms: tuple[tuple[SystematicEffect, EffectTerm], ...]
     """That are most of it."""
 
 
@@ -233,8 +235,8 @@ def _trends(tables: Tables, fits: bool) -> Iterator[_Pattern]:
         said += f" ({p_words(t.p_value)})"
         if t.size > 0 and unit:
             said += f" of {factor * t.size:.2g} {unit} ({t.size / t.sigma:.2g} of their sigma)"
-        matters, spoilt, likely = t.size > _VISIBLE * t.sigma, False, list[Hint]()
-        alike = t.alike
+        matters, spoilt, likely = t.size > _VISIBLE * t.sigma, False, list[TermEstimate]()
+        alike = t.significant_terms
         # What estimated parameters nearly take up is seen so badly that its size is lost in its noise.
         matters |= any(abs(h.amount) > _VISIBLE * t.sigma for h in alike)
         if alike or (t.hints and t.hints[0].share > MOST_OF_IT):
@@ -248,11 +250,11 @@ def _trends(tables: Tables, fits: bool) -> Iterator[_Pattern]:
                 said += f"; {parameter_words(path)} would move by {moved:.1f} of its sigma"
         elif t.pattern.camera:
             said += ": no single usual term is most of it; try a distortion of more terms (docs/model_choice.md)"
-        elif several := [h for h in t.hints if abs(h.amount) > SURE * h.sigma][:_SHOWN]:
+        elif several := [h for h in t.hints if abs(h.amount) > SIGNIFICANT_RATIO * h.sigma][:_SHOWN]:
             said += f", each alone {_told(t.pattern, several)}"
         level = Level.ALARM if spoilt else Level.WARNING if matters else Level.INFORMATION
         # Blunders that the term would make are none: beside them, what is left of its rows says the same.
-        most = t.blunders_alike >= _SHOWN and t.blunders_alike > len(tables.blunders.suspects) / 2
+        most = t.matching_blunders >= _SHOWN and t.matching_blunders > len(tables.blunders.suspects) / 2
         chance = 0.0 if most else t.p_value
         terms = tuple((t.pattern, h.term) for h in likely)
         yield _Pattern(chance if matters and likely else 1.0, Finding(level, said), terms)
@@ -261,7 +263,7 @@ def _trends(tables: Tables, fits: bool) -> Iterator[_Pattern]:
 def _hidden_in_common(tables: Tables) -> Iterator[Finding]:
     """Of errors that all rows of a group have in common, how large they may be unseen, and what they then do."""
     for t in (t for t in tables.tested_trends if t.pattern.group):
-        worst: tuple[float, str, Hint] | None = None
+        worst: tuple[float, str, TermEstimate] | None = None
         for h in (h for h in t.hints if h.amount != 0.0):
             for path, moved in h.moves.items():
                 # Of an error that is found with a probability of 80 %.
@@ -279,11 +281,11 @@ def _hidden_in_common(tables: Tables) -> Iterator[Finding]:
             )
 
 
-def _told(pattern: ResidualPattern, likely: list[Hint]) -> str:
+def _told(pattern: SystematicEffect, likely: list[TermEstimate]) -> str:
     """The likeliest terms, their amounts where these are in the observations' own unit, and what cures them."""
     factor, unit = in_file_unit(pattern.unit)
     amounts = (f" {factor * h.amount:+.3g} +- {factor * h.sigma:.2g} {unit}".rstrip() for h in likely)
-    names = ", ".join(h.term.name + (a if h.term.amount_told else "") for h, a in zip(likely, amounts, strict=True))
+    names = ", ".join(h.term.name + (a if h.term.report_amount else "") for h, a in zip(likely, amounts, strict=True))
     cure = likely[0].term.cure
     return f"{names}, {cure}" if cure else names
 
@@ -291,11 +293,11 @@ def _told(pattern: ResidualPattern, likely: list[Hint]) -> str:
 def of_what_is_not_checked(tables: Tables) -> Iterator[Finding]:
     """What no test could find: points of two rays, and how large an error of each further group may stay hidden."""
     adjusted = tables.adjusted
-    if (n := len(adjusted.block.sensors)) > MOST_PARTS:
+    if (n := len(adjusted.block.sensors)) > MAX_GROUPS:
         yield Finding(
             Level.INFORMATION,
             f"of {n} cameras neither patterns over their formats nor what undetected errors do to each are looked at; "
-            f"of up to {MOST_PARTS} they are",
+            f"of up to {MAX_GROUPS} they are",
         )
     rays = np.bincount(adjusted.structure.point, minlength=len(adjusted.block.points))
     if twice := int((rays == 2).sum()):
@@ -304,17 +306,17 @@ def of_what_is_not_checked(tables: Tables) -> Iterator[Finding]:
             f"{twice} of {len(rays)} points are in two images only: an error along the plane of their rays shows "
             "nowhere",
         )
-    if felt := [f for f in most_felt(adjusted, tables.undetected) if f.moved > _MOVED]:
+    if felt := [f for f in largest_interior_effects(adjusted, tables.undetected) if f.moved > _MOVED]:
         told = ", ".join(f"{symbol(f.parameter)} by up to {f.moved:.1f} of its sigma ({f.words})" for f in felt)
         yield Finding(Level.INFORMATION, f"an error that no test finds (power 80 %) would move {told}")
     yield from _hidden_in_common(tables)
-    for hidden in worst_checked(adjusted, tables.redundancy):
-        if hidden.group != IMAGE_POINTS and hidden.detectable > _HIDDEN * hidden.sigma:
+    for hidden in largest_mdbs(adjusted, tables.redundancy):
+        if hidden.group != IMAGE_POINTS and hidden.mdb > _HIDDEN * hidden.sigma:
             factor, unit = in_file_unit(hidden.unit)
             told = (
-                f"an error of {factor * hidden.detectable:.2g} {unit} would be found with a probability of 80 % only, "
+                f"an error of {factor * hidden.mdb:.2g} {unit} would be found with a probability of 80 % only, "
                 "a smaller one less often"
-                if np.isfinite(hidden.detectable)
+                if np.isfinite(hidden.mdb)
                 else "nothing checks it, and no error of it would be found, however large"
             )
             text = f"{hidden.words}: {told} (its sigma is {factor * hidden.sigma:.2g} {unit})"

@@ -11,10 +11,10 @@ from jaxphoto.adjustment.model.numbers import Residuals
 from jaxphoto.arrays import Numbers
 from jaxphoto.observations import AbstractObservations
 from jaxphoto.statistics import (
+    MdbEffects,
     Redundancy,
-    UndetectedEffects,
     a_priori_sigmas,
-    detectable_errors,
+    minimal_detectable_biases,
     observation_groups,
     physical_residuals,
 )
@@ -27,16 +27,14 @@ def in_file_unit(unit: str) -> tuple[float, str]:
     return (180 / np.pi, "deg") if unit == "rad" else (1.0, unit)
 
 
-def residual_table(
-    adjusted: Adjustment, redundancy: Redundancy, w: Residuals, undetected: UndetectedEffects
-) -> pd.DataFrame:
+def residual_table(adjusted: Adjustment, redundancy: Redundancy, w: Residuals, undetected: MdbEffects) -> pd.DataFrame:
     """group, image, point, axis, residual, sigma, unit, redundancy_number, w, detectable and what that moves.
 
     Names are categories: millions of observations have few of them, and texts would take ten times the memory. Each
     column is made by itself, as all of them side by side would be copied twice.
     """
     residual, sigma = physical_residuals(adjusted), a_priori_sigmas(adjusted)
-    detectable = detectable_errors(adjusted, redundancy)
+    detectable = minimal_detectable_biases(adjusted, redundancy)
     block, s = adjusted.block, adjusted.structure
     labels = np.full(len(adjusted.values.shared), "", object)
     labels[s.free] = s.labels

@@ -124,7 +124,7 @@ class SensitivityTables:
         sigma = np.sqrt(variance_shares(self.adjusted, self.exact).variance)[self._rows]
         tables = []
         for group, effect in found.effect.items():
-            detectable = found.detectable[group]
+            detectable = found.mdb[group]
             checked = np.isfinite(detectable)
             if not checked.any():
                 continue
@@ -261,7 +261,7 @@ def _page(tables: SensitivityTables, picture: WholePicture, made: Made) -> tuple
 def _summary(tables: SensitivityTables, seconds: dict[str, float]) -> dict:
     adjusted, largest = tables.adjusted, tables.largest.set_index("estimate")
     shares = tables.variance_shares
-    detectable = external_reliability(adjusted, tables.exact, tables.delta0).detectable
+    detectable = external_reliability(adjusted, tables.exact, tables.delta0).mdb
     interior = {}
     for name in (label for label in tables.exact.labels if label.startswith("interior")):
         worst = largest.loc[name]

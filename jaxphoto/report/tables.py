@@ -25,31 +25,31 @@ from jaxphoto.statistics import (
     CameraDrift,
     Correlations,
     Covariance,
+    EffectTest,
     GroundCorrelations,
+    MdbEffects,
     PositionalAccuracy,
     Redundancy,
     Rotations,
     Significance,
     Suspect,
-    Trend,
-    UndetectedEffects,
     blunder_test,
     camera_drifts,
     check_discrepancies,
     correlations,
     covariance,
-    culprits,
     ground_correlations,
+    mdb_effects,
+    multiple_outlier_test,
     normalised_residuals,
     positional_accuracy,
     prepare_statistics,
     redundancy_numbers,
     residual_spread,
     significance,
-    trends,
-    undetected_effects,
+    systematic_effect_tests,
 )
-from jaxphoto.statistics.intersection_angles import intersection_angles
+from jaxphoto.statistics.block_geometry import intersection_angles
 from jaxphoto.statistics.sigma_map import SigmaMap, sigma_maps
 from jaxphoto.tracing import refuse_traced
 
@@ -118,13 +118,13 @@ class Tables:
     @cached_property
     def culprits(self) -> tuple[Suspect, ...]:
         """The suspects among them that the worse ones do not explain."""
-        return culprits(self.adjusted, self.blunders)
+        return multiple_outlier_test(self.adjusted, self.blunders)
 
     @cached_property
-    def tested_trends(self) -> list[Trend]:
+    def tested_trends(self) -> list[EffectTest]:
         """Patterns that the residuals may follow, tested; what contradicts the others has no part in them."""
         suspects = [(s.group, s.row) for s in self.blunders.suspects]
-        return trends(self.adjusted, np.asarray(self.covariance.shared_sigma), suspects)
+        return systematic_effect_tests(self.adjusted, np.asarray(self.covariance.shared_sigma), suspects)
 
     @cached_property
     def trends(self) -> pd.DataFrame:
@@ -144,9 +144,9 @@ class Tables:
         return pd.DataFrame(rows, columns=columns)
 
     @cached_property
-    def undetected(self) -> UndetectedEffects:
+    def undetected(self) -> MdbEffects:
         """What an error that no test finds does to the result."""
-        return undetected_effects(self.adjusted, self.covariance, self.redundancy)
+        return mdb_effects(self.adjusted, self.covariance, self.redundancy)
 
     @cached_property
     def correlations(self) -> dict[str, Correlations]:

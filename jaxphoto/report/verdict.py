@@ -30,7 +30,7 @@ from jaxphoto.report.residual_findings import (
 from jaxphoto.report.rolling_shutter import shutter_findings
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.weakness import FELT, at_corner, weaknesses
-from jaxphoto.statistics import Correlations, Significance, if_zero, prepare_responses
+from jaxphoto.statistics import Correlations, Significance, fix_at_zero, prepare_hat_matrix
 from jaxphoto.statistics.correlation import high_pairs
 
 HIGH_CORRELATION = 0.9
@@ -69,7 +69,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
             )
         # Nothing that is said of an optimum holds elsewhere.
         return
-    prepare_responses(adjusted.equations, adjusted.seconds)
+    prepare_hat_matrix(adjusted.equations, adjusted.seconds)
     yield from (Finding(Level.WARNING, doubt) for doubt in adjusted.block.doubts)
     if adjusted.left_out:
         yield Finding(Level.WARNING, left_out_words(adjusted))
@@ -117,7 +117,7 @@ def _weak(tables: Tables, told: frozenset[str]) -> Iterator[Finding]:
 def _not_significant(tables: Tables, s: Significance) -> Finding:
     """What holding a parameter at zero would change, for whoever wants fewer of them."""
     adjusted = tables.adjusted
-    change = if_zero(adjusted, tables.covariance, s)
+    change = fix_at_zero(adjusted, tables.covariance, s)
     sensor = adjusted.block.sensors[s.camera]
     others = {name: abs(v) for name, v in change.in_sigmas.items() if name != s.parameter}
     most = max(others, key=lambda name: others[name], default="")

@@ -45,8 +45,8 @@ def component_findings(found: VarianceComponents, blunders: Sequence[MadeByBlund
         "with --snoop as well"
         for made in blunders
     ]
-    lost = f"the variance components have not settled after {found.rounds} rounds: estimate them for fewer groups"
-    sentences = [*([] if found.converged else [lost]), *found.sentences.values()]
+    lost = f"variance components not converged after {found.iterations} iterations: estimate them for fewer groups"
+    sentences = [*([] if found.converged else [lost]), *found.warnings.values()]
     return [
         *(Finding(Level.ALARM, text) for text in alarms),
         *(Finding(Level.WARNING, text) for text in sentences),
@@ -55,7 +55,7 @@ def component_findings(found: VarianceComponents, blunders: Sequence[MadeByBlund
 
 def print_components(found: VarianceComponents, console: Console) -> None:
     """A line for each group: by what its standard deviations were multiplied, and the variance factor."""
-    console.print(f"variance components, adjusted with them ({counted(found.rounds, 'round')}):")
+    console.print(f"variance components, adjusted with them ({counted(found.iterations, 'iteration')}):")
     for k, label in enumerate(found.labels):
         factor, sigma = found.factor[k], found.sigma[k]
         said = f"standard deviations x {factor**0.5:.3g}, variances x {factor:.3g} +- {sigma:.2g}"

@@ -12,7 +12,7 @@ from jaxphoto.camera import CameraSpline
 from jaxphoto.georeferencing import StripSpline
 from jaxphoto.io import read_block, write_block
 from jaxphoto.report.camera_drift import differences_words
-from jaxphoto.statistics import camera_wanderings
+from jaxphoto.statistics import camera_spline_differences
 from tests.camera.test_camera_rates import TRUE, at, changing_block
 
 STRAIGHT = dataclasses.replace(TRUE, k1_rate=0.0)
@@ -80,7 +80,7 @@ def test_the_interior_orientation_is_bent_by_the_spline():
 def test_it_is_tested_without_what_was_known():
     """Of the changes as the photographs alone have them; what all knots have in common is the camera's own."""
     adjusted, cov = found()
-    (wander,) = camera_wanderings(adjusted, cov)
+    (wander,) = camera_spline_differences(adjusted, cov)
     at_ = [k for k, label in enumerate(cov.labels) if label.startswith("camera_splines[")]
     value = np.concatenate(
         [np.asarray(v) for v in adjusted.unknowns.more["camera_splines"]["one"].__dict__.values()][:3]
@@ -98,7 +98,7 @@ def test_it_is_tested_without_what_was_known():
 
 
 def test_words():
-    (wander,) = camera_wanderings(*found())
+    (wander,) = camera_spline_differences(*found())
     assert differences_words(wander).startswith("camera one wandered during its flight (p ")
     assert " mm at -50 min to " in differences_words(wander)
     still = wander._replace(more=wander.more._replace(p_value=0.4))

@@ -181,7 +181,7 @@ def test_noise_is_predicted_by_the_observations_own_sigmas(tmp_path):
     groups = {"image_points": block.image_points, "stations": block.stations, "control_points": block.control}
     variance = sum((derivatives.groups[name] ** 2) @ np.ravel(rows.sigma) ** 2 for name, rows in groups.items())
     for label in nominal.structure.labels:
-        expected = np.sqrt(variance[derivatives.of(label)])
+        expected = np.sqrt(variance[derivatives.row(label)])
         assert of[label.replace("interior[one]", "one")] == pytest.approx(expected, rel=2e-3)
 
 
@@ -256,8 +256,8 @@ def test_the_command(folder, monkeypatch, capsys, tmp_path):
     "options, words",
     [
         (("--bias", "station", "--sigma-m", "0.1", "--on", "S9", "--per", "strip"), "no strip 'S9'"),
-        (("--bias", "station", "--sigma-m", "0.1", "--draws", "0"), "1 at least, got 0"),
-        (("--bias", "station", "--sigma-m", "0.1", "--draws", "-5"), "1 at least, got -5"),
+        (("--bias", "station", "--sigma-m", "0.1", "--draws", "0"), "must be positive, got 0"),
+        (("--bias", "station", "--sigma-m", "0.1", "--draws", "-5"), "must be positive, got -5"),
         (("--bias", "station", "--sigma-deg", "0.1"), "takes --sigma-m"),
         (("--bias", "station"), "takes --sigma-m"),
         (("--bias", "station", "--sigma-m", "much"), "--sigma-m much"),

@@ -15,7 +15,7 @@ from jaxphoto.procedures.orientation import Oriented
 from jaxphoto.procedures.orientation.orient_photographs import GrossErrors, OrientationReport
 from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.flight import FlightSource, PartReport
-from jaxphoto.statistics.coverage import coverage
+from jaxphoto.statistics.block_geometry import coverage
 from jaxphoto.writing.inputs import InputFile
 from tests.blocks import BROWN, adjusted
 

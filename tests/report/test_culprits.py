@@ -29,7 +29,7 @@ def without_k2():
 
 def test_a_term_that_is_held_is_told_before_the_observations_that_it_accuses(without_k2):
     assert without_k2.colour == "red"
-    first = next(k for k, text in enumerate(without_k2.texts) if "k2, which is held: free it" in text)
+    first = next(k for k, text in enumerate(without_k2.texts) if "k2, which is fixed: free it" in text)
     accused = [k for k, text in enumerate(without_k2.texts) if "contradicts the other observations" in text]
     assert accused and first < min(accused)
 
@@ -128,7 +128,7 @@ def test_a_camera_that_has_changed_since_its_calibration_is_told_first():
     tables = Tables(adjust(dataclasses.replace(larger, more=(known,))))
     verdict = verdict_of(tables)
     assert verdict.colour == "red"
-    assert "contradicts what was known of camera kodak beforehand" in verdict.texts[0]
+    assert "contradicts the prior information of camera kodak" in verdict.texts[0]
     assert "c_mm -0.06" in verdict.texts[0]
     # As surprising as the difference from the calibration by this block alone, by the covariances of both.
     (found,) = [t for t in tables.tested_trends if t.pattern.begins]

@@ -25,7 +25,7 @@ from jaxphoto.report.flight.provenance import provenance_section
 from jaxphoto.report.flight.surveyed import axis_cell
 from jaxphoto.report.flight.time_line import time_line, time_section
 from jaxphoto.report.plots import draw_density
-from jaxphoto.statistics.image_links import ImageLinks
+from jaxphoto.statistics.block_geometry import ImageLinks
 from tests.blocks import BROWN
 from tests.report.flights import OFFSETS_M, VERDICT, part_report, source
 

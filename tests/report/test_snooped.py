@@ -15,7 +15,7 @@ from jaxphoto.report import Tables, verdict_of
 from jaxphoto.report.findings import Level
 from jaxphoto.report.snooped import snooped_findings
 from jaxphoto.statistics import Suspect, covariance
-from jaxphoto.statistics.trends import inverse_of_seen
+from jaxphoto.statistics.systematic_effects import truncated_inverse
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_an_image_that_is_mirrored_is_an_alarm(block):
 
 def test_numbers_that_overflow_are_no_pattern():
     """As where every image is mirrored and nothing fits: no direction shows, and no traceback."""
-    inverse, freedom = inverse_of_seen(np.full((3, 3), np.nan), np.eye(3), 1e-3)
+    inverse, freedom = truncated_inverse(np.full((3, 3), np.nan), np.eye(3), 1e-3)
     assert freedom == 0 and not inverse.any()
 
 

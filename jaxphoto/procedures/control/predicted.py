@@ -23,7 +23,7 @@ from jaxphoto.georeferencing import apparent_point
 from jaxphoto.georeferencing.ground import moved_exterior, moved_interior
 from jaxphoto.orientation.rays import padded_length
 from jaxphoto.statistics import covariance
-from jaxphoto.statistics.covariance import turns_of
+from jaxphoto.statistics.covariance import rotation_jacobians
 
 
 class Predicted(NamedTuple):
@@ -51,7 +51,7 @@ def predicted(
     n, factor = len(block.images), float(joint.variance_factor)
     matrix, labels = np.asarray(joint.matrix) * factor, list(joint.labels)
     position, turn = still(unknowns.exterior.position), still(unknowns.exterior.camera_from_object)
-    to_angles = np.asarray(turns_of(jnp.asarray(np.moveaxis(turn, 0, -1)), joint.rotations))
+    to_angles = np.asarray(rotation_jacobians(jnp.asarray(np.moveaxis(turn, 0, -1)), joint.rotations))
     found: list[Predicted] = []
     image = np.arange(n).repeat(len(xyz))
     point = np.tile(np.arange(len(xyz)), n)

@@ -12,7 +12,7 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Block
 from jaxphoto.report.document import DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
 from jaxphoto.report.flight.part import PartReport
-from jaxphoto.statistics.coverage import Coverage
+from jaxphoto.statistics.block_geometry import Coverage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

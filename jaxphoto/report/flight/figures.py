@@ -20,8 +20,7 @@ from jaxphoto.report.flight.residuals import draw_by_photograph
 from jaxphoto.report.flight.time_line import draw_in_time, shown_in_time, time_line
 from jaxphoto.report.plots import axes_or_new
 from jaxphoto.report.tables import Tables
-from jaxphoto.statistics.coverage import coverage
-from jaxphoto.statistics.image_links import image_links
+from jaxphoto.statistics.block_geometry import coverage, image_links
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,7 +13,7 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.errors import few
 from jaxphoto.report.document import DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
 from jaxphoto.report.flight.part import PartReport
-from jaxphoto.statistics.image_links import ImageLinks, WeakLink, image_links, weak_links
+from jaxphoto.statistics.block_geometry import ImageLinks, WeakLink, image_links, weak_links
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

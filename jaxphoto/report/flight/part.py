@@ -14,7 +14,7 @@ from jaxphoto.report.orientation import ALIKE
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.report.weights import component_findings
-from jaxphoto.statistics.coverage import Coverage, coverage
+from jaxphoto.statistics.block_geometry import Coverage, coverage
 
 
 class PartReport(NamedTuple):

@@ -1,4 +1,4 @@
-"""Patterns in residuals: as rare by chance as said, and named where something is missing."""
+"""Systematic effects in residuals: uniform p-values for complete models, and names of missing terms."""
 
 import dataclasses
 from pathlib import Path
@@ -15,15 +15,15 @@ from jaxphoto.observations.priors import KnownParameters
 from jaxphoto.report import verdict_of
 from jaxphoto.report.findings import Level
 from jaxphoto.simulation import remeasure
-from jaxphoto.statistics import patterns, trends
-from jaxphoto.statistics.responses import Responses
+from jaxphoto.statistics import systematic_effect_tests, systematic_effects
+from jaxphoto.statistics.hat_matrix import HatMatrix
 from tests.blocks import Simulated, adjusted, free_network, observed, simulated
 
 KNOWN = ("interior[one].c_mm", "interior[one].k1")
 
 
 def in_strips() -> Simulated:
-    """The crossing strips with names and times; residuals in the image that has the noise."""
+    """The crossing strips with names and times; residuals of measured coordinates."""
     block, truth = simulated("cross")
     time = np.concatenate([np.linspace(-6, 6, 5), np.linspace(20, 34, 5)])
     block = dataclasses.replace(block, image_strip=("a",) * 5 + ("b",) * 5, image_time=time)
@@ -33,9 +33,9 @@ def in_strips() -> Simulated:
     return Simulated(block, dataclasses.replace(truth, interior={"one": as_measured(truth.interior["one"])}))
 
 
-def found_in(block) -> dict:
+def effects_in(block) -> dict:
     a = adjust(block)
-    return {t.pattern.what: t for t in trends(a, np.asarray(covariance(a).shared_sigma))}
+    return {t.pattern.what: t for t in systematic_effect_tests(a, np.asarray(covariance(a).shared_sigma))}
 
 
 def test_where_nothing_is_missing_p_values_are_uniform():
@@ -43,16 +43,16 @@ def test_where_nothing_is_missing_p_values_are_uniform():
     rng, true = np.random.default_rng(1), truth.interior["one"]
     q = np.array([[4e-4, -3e-8], [-3e-8, 9e-12]])
     value = np.array([float(true.c), float(get_parameter(true, "k1"))])
-    known = (KnownParameters(KNOWN, value + np.linalg.cholesky(q) @ rng.normal(size=2), q) for _ in range(40))
+    priors = (KnownParameters(KNOWN, value + np.linalg.cholesky(q) @ rng.normal(size=2), q) for _ in range(40))
     draw = jax.jit(lambda key: observed(remeasure(block, truth, key)))
     blocks = (
-        dataclasses.replace(eqx.tree_at(observed, block, draw(jax.random.key(seed))), more=(one,))
-        for seed, one in enumerate(known)
+        dataclasses.replace(eqx.tree_at(observed, block, draw(jax.random.key(seed))), more=(prior,))
+        for seed, prior in enumerate(priors)
     )
-    p = [{what: trend.p_value for what, trend in found_in(b).items()} for b in blocks]
+    p = [{what: test.p_value for what, test in effects_in(b).items()} for b in blocks]
     assert set(p[0]) == {
         "image points of camera one over the format", "image points of camera one over time",
-        "what was known of camera one beforehand", "stations as a whole", "stations from strip to strip",
+        "prior information of camera one", "stations as a whole", "stations from strip to strip",
         "stations over time",
     }  # fmt: skip
     for what in p[0]:
@@ -60,39 +60,39 @@ def test_where_nothing_is_missing_p_values_are_uniform():
 
 
 def test_a_lens_term_that_is_held_is_named():
-    held = "k2"
+    term = "k2"
     block, _ = in_strips()
     path = lambda b: (b.start.unknowns.interior["one"], b.priors.interior["one"])  # noqa: E731
-    zero, fixed = (set_parameter(tree, held, value) for tree, value in zip(path(block), (0.0, FIXED), strict=True))
+    zero, fixed = (set_parameter(tree, term, value) for tree, value in zip(path(block), (0.0, FIXED), strict=True))
     a = adjust(eqx.tree_at(path, block, (zero, fixed)))
     tables = Tables(a)
-    found = tables.tested_trends[0]
-    assert found.p_value < 1e-10 and found.hints[0].term.name == held and found.hints[0].share > 0.8
-    said = [f.text for f in verdict_of(tables).findings if "over the format" in f.text]
-    assert len(said) == 1 and f"{held}, which is held: free it" in said[0]
+    result = tables.tested_trends[0]
+    assert result.p_value < 1e-10 and result.hints[0].term.name == term and result.hints[0].share > 0.8
+    messages = [f.text for f in verdict_of(tables).findings if "over the format" in f.text]
+    assert len(messages) == 1 and f"{term}, which is fixed: free it" in messages[0]
 
 
 def test_what_stretches_the_image_may_be_a_rolling_shutter():
     (tested,) = (t for t in Tables(adjusted("cross")).tested_trends if "over the format" in t.pattern.what)
-    of = {term.name.split()[0]: term.cure for term in tested.pattern.terms}
-    shutter = {name for name, cure in of.items() if "rolling shutter" in cure}
-    assert shutter == {"b1", "b2"} and of["p1"] and not of["c_mm"]
+    cures = {term.name.split()[0]: term.cure for term in tested.pattern.terms}
+    shutter = {name for name, cure in cures.items() if "rolling shutter" in cure}
+    assert shutter == {"b1", "b2"} and cures["p1"] and not cures["c_mm"]
 
 
 def test_stations_of_a_strip_that_are_off_are_named_with_their_shift():
     block, _ = in_strips()
     rows = block.stations
-    off = np.where((np.asarray(rows.who) >= 5) & (rows.axis == 2), 1.5, 0.0)
-    found = found_in(dataclasses.replace(block, stations=dataclasses.replace(rows, value=rows.value + off)))
-    trend = found["stations from strip to strip"]
-    best = trend.hints[0]
-    assert trend.p_value < 1e-4 and best.term.name in ("Z of strip b", "Z of strip a")
+    error = np.where((np.asarray(rows.who) >= 5) & (rows.axis == 2), 1.5, 0.0)
+    result = effects_in(dataclasses.replace(block, stations=dataclasses.replace(rows, value=rows.value + error)))
+    test = result["stations from strip to strip"]
+    best = test.hints[0]
+    assert test.p_value < 1e-4 and best.term.name in ("Z of strip b", "Z of strip a")
     sign = 1 if best.term.name.endswith("b") else -1
     assert abs(best.amount - sign * 1.5) < 4 * best.sigma
 
 
 def test_stations_that_are_all_off_alike_are_named_before_any_single_one():
-    """By another kind of height, say. c and the ground take up nearly all of it, single stations seem wrong."""
+    """As with another kind of height: c and the ground absorb nearly all of it, and single stations seem wrong."""
     block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
     rows = block.stations
     value = np.asarray(rows.value) + np.where(rows.axis == 2, 48.0, 0.0)
@@ -114,17 +114,20 @@ def test_blunders_have_no_part_in_patterns():
     a = adjust(dataclasses.replace(block, image_points=dataclasses.replace(rows, xy=xy)))
     tables = Tables(a)
     assert [s.row for s in tables.blunders.suspects][:1] == [row]
-    found = {t.pattern.what: t for t in trends(a, np.asarray(tables.covariance.shared_sigma), [("image_points", row)])}
-    # As if it had never been measured.
-    without = found_in(dataclasses.replace(block, image_points=rows.take(kept)))
-    for what, t in found.items():
+    result = {
+        t.pattern.what: t
+        for t in systematic_effect_tests(a, np.asarray(tables.covariance.shared_sigma), [("image_points", row)])
+    }
+    # As if it had not been measured.
+    without = effects_in(dataclasses.replace(block, image_points=rows.take(kept)))
+    for what, t in result.items():
         assert t.freedom == without[what].freedom
         assert t.p_value == pytest.approx(without[what].p_value, rel=0.05), what
 
 
 def test_where_there_is_nothing_to_look_for_nothing_is_found(monkeypatch):
-    """More cameras than are tested one by one, and no stations; and no parameter to ask after."""
+    """More cameras than are tested one by one, and no stations; and no direction to solve for."""
     a = adjust(free_network(), simulated("cross").truth)
-    monkeypatch.setattr(patterns, "MOST_PARTS", 0)
-    assert trends(a, np.asarray(covariance(a).shared_sigma)) == []
-    assert list(Responses.of(a).of_unknowns([])) == []
+    monkeypatch.setattr(systematic_effects, "MAX_GROUPS", 0)
+    assert systematic_effect_tests(a, np.asarray(covariance(a).shared_sigma)) == []
+    assert list(HatMatrix.of(a).influence_on([])) == []

@@ -1,4 +1,4 @@
-"""Residuals by group and axis, check points that take no part, differences of two adjustments, normalised residuals."""
+"""External reliability by adjusting with errors; residuals, check points, differences, normalised residuals."""
 
 import dataclasses
 
@@ -6,18 +6,105 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from jaxphoto import adjust, angle_differences, point_differences
+from jaxphoto import adjust, angle_differences, correlated, covariance, point_differences
 from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.observations import Correlated, StationRows, exponential_covariance
 from jaxphoto.simulation import image_coordinates
 from jaxphoto.statistics import (
     a_priori_sigmas,
     check_discrepancies,
+    largest_interior_effects,
+    mdb_effects,
+    minimal_detectable_biases,
     normalised_residuals,
     physical_residuals,
     redundancy_numbers,
     residual_spread,
 )
 from tests.blocks import adjusted, covariance_of, simulated
+
+
+@pytest.fixture(scope="module")
+def external():
+    a = adjusted("cross")
+    q = covariance_of("cross")
+    r = redundancy_numbers(a, q)
+    return a, q, minimal_detectable_biases(a, r), mdb_effects(a, q, r)
+
+
+@pytest.mark.parametrize("group, field", [("stations", "stations"), ("control_points", "control")])
+def test_the_interior_orientation_moves_as_said_with_an_error_that_no_test_finds(external, group, field):
+    a, q, mdbs, e = external
+    row = int(np.argmax(e.interior["c_mm"][group]))
+    rows = getattr(a.block, field)
+    moved = []
+    for sign in (1, -1):
+        value = np.array(rows.value)
+        value[row] += sign * 0.1 * mdbs[group][row]
+        with_error = adjust(dataclasses.replace(a.block, **{field: dataclasses.replace(rows, value=value)}))
+        camera = with_error.unknowns.interior["one"]
+        moved.append([float(camera.c), float(camera.x_p), float(camera.y_p)])
+    change = np.abs(np.subtract(*moved)) / 0.2
+    sigmas = np.sqrt(np.diagonal(q.of_interior("one", ("c_mm", "xp_mm", "yp_mm"))) / float(q.variance_factor))
+    predicted = [e.interior[name][group][row] for name in ("c_mm", "xp_mm", "yp_mm")]
+    np.testing.assert_allclose(change / sigmas, predicted, rtol=0.02, atol=2e-3)
+
+
+def test_nothing_moves_by_more_than_said(external):
+    _, _, _, e = external
+    for moved in e.interior.values():
+        for group, most in e.most.items():
+            finite = np.isfinite(most)
+            assert (moved[group][finite] <= most[finite] * (1 + 1e-6)).all()
+
+
+def test_the_worst_of_each_parameter_is_found(external):
+    a, _, _, e = external
+    result = largest_interior_effects(a, e)
+    assert [f.parameter for f in result] == ["c_mm", "xp_mm", "yp_mm"]
+    for f in result:
+        assert f.moved == max(np.nanmax(v) for v in e.interior[f.parameter].values())
+
+
+def test_image_rows_are_told_of_their_own_camera():
+    a = adjusted("two_cameras")
+    q = covariance_of("two_cameras")
+    e = mdb_effects(a, q, redundancy_numbers(a, q))
+    assert np.isfinite(e.interior["c_mm"]["image_points"]).all()
+
+
+def joined():
+    """The block with its stations in two correlated groups: within each image, and heights along strips."""
+    block = simulated("cross").block
+    gnss, n, rng = block.stations, len(block.images), np.random.default_rng(4)
+    factor = rng.normal(0, 0.02, (n, 3, 3)) + 0.1 * np.eye(3)
+    times = np.array([np.linspace(-6, 6, n // 2), np.linspace(-7, 7, n // 2)])
+    along = np.stack([exponential_covariance(t, 0.08, 5.0) for t in times])
+    more = (
+        correlated(gnss, np.arange(3 * n).reshape(n, 3), factor @ factor.transpose(0, 2, 1)),
+        correlated(gnss.take(gnss.axis == 2), np.arange(n).reshape(2, -1), along),
+    )
+    return dataclasses.replace(block, stations=StationRows.none(), more=more)
+
+
+def test_of_rows_that_a_covariance_joins_it_holds_too():
+    a = adjust(joined())
+    q = covariance(a)
+    r = redundancy_numbers(a, q)
+    e, mdbs = mdb_effects(a, q, r), minimal_detectable_biases(a, r)
+    sigma = np.sqrt(q.of_interior("one", ("c_mm",))[0, 0] / float(q.variance_factor))
+    joint = [name for name, rows in a.block.named_observations.items() if isinstance(rows, Correlated)]
+    for name in joint:
+        assert (e.interior["c_mm"][name] <= e.most[name] * (1 + 1e-6)).all()
+        number = np.unravel_index(np.argmax(e.interior["c_mm"][name]), e.most[name].shape)
+        rows, result = a.block.named_observations[name], []
+        for sign in (1, -1):
+            value = np.array(rows.observation).reshape(len(rows), -1)
+            value[number[1], number[0]] += sign * 0.1 * mdbs[name][number]
+            changed = rows.with_observation(value.reshape(np.shape(rows.observation)))
+            result.append(float(adjust(a.block.with_observations({name: changed})).unknowns.interior["one"].c))
+        assert abs(np.subtract(*result)) / 0.2 / sigma == pytest.approx(e.interior["c_mm"][name][number], rel=0.02)
+    assert len(joint) == 2
 
 
 def test_physical_residuals_are_observed_minus_computed():
@@ -30,7 +117,7 @@ def test_physical_residuals_are_observed_minus_computed():
     ends = points[block.distances.points]
     length = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
     np.testing.assert_allclose(v["distances"], block.distances.value - length, atol=1e-9)
-    # Image residuals in the ideal domain; to first order those of the measured coordinate, scaled by the distortion.
+    # Image residuals are of ideal coordinates; to first order those of the measured ones, scaled by the distortion.
     measured = (np.asarray(block.image_points.xy) - np.asarray(image_coordinates(block, u))).T
     np.testing.assert_allclose(v["image_points"], measured, atol=0.2 * np.abs(measured).max())
     assert np.corrcoef(np.ravel(v["image_points"]), np.ravel(measured))[0, 1] > 0.999
@@ -73,7 +160,7 @@ def test_check_points_are_surveyed_minus_computed():
 
 
 def test_check_points_do_not_take_part():
-    """A check point in error by a metre changes its own discrepancy by a metre and nothing else."""
+    """An error of 1 m of a check point changes its discrepancy by 1 m and nothing else."""
     block = simulated("cross").block
     wrong = eqx.tree_at(lambda b: b.check.value, block, np.asarray(block.check.value) + 1.0)
     a = adjust(wrong, wrong.start.unknowns)
@@ -112,10 +199,10 @@ def test_normalised_residuals():
     a = adjusted("everything")
     numbers = redundancy_numbers(a, covariance_of("everything"))
     w = normalised_residuals(a, numbers)
-    for v, r, found in zip(*(of.named.values() for of in (a.residuals, numbers, w)), strict=True):
-        np.testing.assert_allclose(found, np.asarray(v) / (float(a.sigma0) * np.sqrt(np.asarray(r))), rtol=1e-9)
+    for v, r, w_group in zip(*(of.named.values() for of in (a.residuals, numbers, w)), strict=True):
+        np.testing.assert_allclose(w_group, np.asarray(v) / (float(a.sigma0) * np.sqrt(np.asarray(r))), rtol=1e-9)
     everything = np.concatenate([np.ravel(x) for x in w.named.values()])
-    # Standard normal but for their correlation.
+    # Standard normal, apart from correlations.
     assert 0.9 < np.std(everything) < 1.1
     assert np.abs(everything).max() < 4.5
 
