@@ -9,7 +9,7 @@ import pytest
 
 from jaxphoto.io import FORMATS, control_files
 from jaxphoto.io.cameras import CAMERA_FORMATS, camera_reader
-from jaxphoto.io.clouds import cloud_reader, copc
+from jaxphoto.io.clouds import cloud_reader
 from jaxphoto.io.exports import EXPORTS
 from jaxphoto.io.trajectory import is_sbet
 
@@ -42,7 +42,7 @@ def control_forms():
 
 EXPOSURES = importlib.import_module("jaxphoto.io.exposures.located")
 SBET = [("trajectory", end) for end in (".sbet", ".out") if is_sbet(Path(f"a{end}"))]
-CLOUDS = [("cloud", end) for end in (*cloud_reader._OPENERS, copc._ENDING)]
+CLOUDS = [("cloud", suffix) for suffix in cloud_reader.SUFFIXES]
 DECLARED = {
     "read": [
         *(("convert", name) for name in FORMATS),
@@ -52,6 +52,7 @@ DECLARED = {
         *SBET,
         ("trajectory", ".csv"),
         *CLOUDS,
+        ("cloud", ".copc.laz"),
         ("raster", "dsm"),
     ],
     "written": [
