@@ -7,6 +7,7 @@ intervals a shift by one fits nearly as well: then the positions that the photog
 they have none nothing does.
 """
 
+from datetime import datetime
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,11 @@ _ZONE_S = 900.0
 _MOST_PAIRS = 2_000_000
 WORSE = 1.5
 """Exposures whose positions miss by this many times the best's are no candidates."""
+
+
+def gps_seconds(at: datetime) -> float:
+    """Seconds since 1980-01-06, in the time zone of `at`, without leap seconds."""
+    return (at - datetime(1980, 1, 6)).total_seconds()
 
 
 class Taken(NamedTuple):

@@ -12,7 +12,7 @@ from PIL import Image
 
 from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS
 from jaxphoto.io.exposures import located
-from jaxphoto.io.sound_photographs import sound_photographs
+from jaxphoto.io.photographs import valid_photographs
 from tests.io.test_exposures import ALL, FLIGHT
 
 GPS, ZONE_S = 0x8825, 7200
@@ -55,7 +55,7 @@ def clean(tmp_path_factory):
 
 def said_of(folder):
     """All sentences, each without its folder, and the photographs that are left with their positions."""
-    kept, left = sound_photographs([folder])
+    kept, left = valid_photographs([folder])
     taken, sentences = located(kept, [folder])
     said = [s.replace(f"{folder}/", "") for s in (*left.values(), *sentences)]
     return said, {p.name: p.gps for p in taken}
@@ -64,7 +64,7 @@ def said_of(folder):
 FAR = (56.7, 13.2)
 SPOILT = {
     "truncated": (cut, "cut.jpg: the picture is cut off or damaged", ()),
-    "no picture": (lambda f: (f / "x.jpg").write_text("none"), "x.jpg: this is no picture", ()),
+    "no picture": (lambda f: (f / "x.jpg").write_text("none"), "x.jpg: this is not a picture", ()),
     "doubled": (lambda f: shutil.copy(f / "DJI_0002.jpg", f / "DJI_0002 (1).jpg"), "it is a copy of DJI_0002", ()),
     "screenshot": (lambda f: Image.new("RGB", (640, 480)).save(f / "s.png"), "s.png: its size is 640 x 480 px", ()),
     "other camera": (lambda f: picture(f, 4, model="Other"), "its camera is Maker Other", ("DJI_0005",)),

@@ -175,7 +175,7 @@ class _Vertices(NamedTuple):
     """Vertices of a PLY file from byte `begin`, after `lines` lines of header."""
 
     order: str
-    count: int
+    n: int
     fields: list[tuple[str, str]]
     begin: int
     lines: int
@@ -187,12 +187,12 @@ def open_ply(path: Path, system: CoordinateSystem | None) -> CloudSource:
     Raises InputError for an invalid header, invalid numbers and a file that is cut off.
     """
     vertices = _ply_header(path)
-    if vertices.count == 0:
+    if vertices.n == 0:
         raise no_points(path.name)
-    if path.stat().st_size - vertices.begin < vertices.count:
-        raise InputError(f"{path.name} is cut off: its header promises {vertices.count} points; copy it again")
+    if path.stat().st_size - vertices.begin < vertices.n:
+        raise InputError(f"{path.name} is cut off: its header promises {vertices.n} points; copy it again")
     chunks = partial(_ply_chunks, path, vertices)
-    return CloudSource(path.name, system or CoordinateSystem(), vertices.count, None, chunks)
+    return CloudSource(path.name, system or CoordinateSystem(), vertices.n, None, chunks)
 
 
 def _ply_header(path: Path) -> _Vertices:
@@ -255,11 +255,11 @@ def _ply_chunks(path: Path, vertices: _Vertices) -> Iterator[Cloud]:
         except ValueError:
             file.seek(vertices.begin)
             lines = (line.decode("ascii", "replace").split()[: len(keys)] for line in file)
-            rows = itertools.islice(enumerate(lines, vertices.lines + 1), vertices.count)
+            rows = itertools.islice(enumerate(lines, vertices.lines + 1), vertices.n)
             raise _first_error(path.name, rows, keys, set(keys)) from None
-    if read < vertices.count:
+    if read < vertices.n:
         raise InputError(
-            f"{path.name} is cut off: its header promises {vertices.count} points, but there are {read}; copy it again "
+            f"{path.name} is cut off: its header promises {vertices.n} points, but there are {read}; copy it again "
             "from its source"
         )
 
@@ -268,7 +268,7 @@ def _ply_tables(file: IO[bytes], vertices: _Vertices, keys: list[str]) -> Iterat
     """The vertices, at most `CHUNK` together."""
     if vertices.order:
         record = np.dtype([(key, vertices.order + kind) for key, (_, kind) in zip(keys, vertices.fields, strict=True)])
-        left = vertices.count
+        left = vertices.n
         while left and len(records := np.fromfile(file, record, min(CHUNK, left))):
             left -= len(records)
             yield records
@@ -280,7 +280,7 @@ def _ply_tables(file: IO[bytes], vertices: _Vertices, keys: list[str]) -> Iterat
         header=None,
         names=keys,
         usecols=range(len(keys)),
-        nrows=vertices.count,
+        nrows=vertices.n,
         dtype=float,
         quoting=csv.QUOTE_NONE,
         skip_blank_lines=False,

@@ -17,7 +17,6 @@ from jaxphoto.errors import InputError, RowError, quoted
 from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS, WEEK_S
 from jaxphoto.georeferencing.gps import Fix, Heights
 from jaxphoto.io.exposures.records import Exposures, check_places
-from jaxphoto.io.photograph_times import seconds
 from jaxphoto.io.text_tables import each_row, finite
 from jaxphoto.io.whole_text import LARGE, read_text
 
