@@ -102,7 +102,7 @@ def test_a_wrong_time_zone_of_marks_is_one_sentence(clean, tmp_path, zone_s, wor
     marks(right)
     marks(wrong, zone_s)
     (before, sound), (said, found) = said_of(right), said_of(wrong)
-    assert [words in s and s.endswith("which is taken off") for s in said if s not in before] == [True], said
+    assert [words in s and s.endswith("which is corrected") for s in said if s not in before] == [True], said
     assert found == sound and all(g.heights == "ellipsoid" for g in found.values())
 
 

@@ -43,7 +43,7 @@ def test_what_packets_tell_is_said(folder):
     picture.save(folder / "3.jpg", exif=picture.getexif(), xmp=packet.encode())
     kept, _ = valid_photographs([folder])
     assert located(kept).sentences[0] == (
-        "the photographs' own files tell heights above take-off (1 of 4), standard deviations of positions (3 of 4), "
+        "the photographs' own files have heights above take-off (1 of 4), standard deviations of positions (3 of 4), "
         "solutions: 3 fixed"
     )
 
@@ -128,9 +128,7 @@ def test_links_and_hidden_files(folder):
     (folder / "._1.jpg").write_bytes(b"macOS")
     kept, left = valid_photographs([folder])
     assert [p.name for p in kept] == ["0", "1", "2", "3"]
-    assert list(left.values()) == [
-        f"{folder / 'lost.JPG'}: the target of this link is missing; correct the name"
-    ]
+    assert list(left.values()) == [f"{folder / 'lost.JPG'}: the target of this link is missing; correct the name"]
     # Copies of one name in two folders are told by these.
     _, left = valid_photographs([folder, away])
     assert f"{away / '0.jpg'}: it is a copy of {folder / '0.jpg'}" in left.values()
