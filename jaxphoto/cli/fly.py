@@ -16,8 +16,8 @@ from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
 from jaxphoto.cli.provenance import Provenance
 from jaxphoto.errors import InputError, counted
-from jaxphoto.georeferencing.geoid_heights import WGS84
 from jaxphoto.georeferencing.map_frame import check_heights
+from jaxphoto.georeferencing.recorded_positions import WGS84
 from jaxphoto.image_measurement.control_targets import target_looker
 from jaxphoto.image_measurement.features import LONGEST_PX
 from jaxphoto.image_measurement.matching import match_photographs

@@ -94,7 +94,7 @@ def read_conditions(path: Path) -> list[Conditions]:
         numbers = {name: pd.to_numeric(table[name]) for name in NUMBERS if name in table}
         valid = table["sha256"].str.fullmatch("[0-9a-f]{64}") & table["used"].isin(["True", "False"])
         table = table.assign(used=table["used"] == "True")[
-            ["image", "file", "sha256", "used", *table.columns.intersection(TEXTS)]
+            ["image", "file", "sha256", "used", *table.columns.intersection(list(TEXTS))]
         ]
     except OSError:
         raise

@@ -106,7 +106,7 @@ def read_photograph(path: Path) -> Photograph:
             return _photograph(path, *picture.size, read_exif(picture))
     # Pillow raises many errors for damaged bytes.
     except Exception as error:
-        raise InputError(f"{path}: this is not a picture that can be read; give a TIFF, PNG or JPEG") from error
+        raise InputError(f"{path}: this is no picture that can be read; give a TIFF, PNG or JPEG") from error
 
 
 def _photograph(path: Path, width_px: int, height_px: int, exif: Exif) -> Photograph:

@@ -133,10 +133,10 @@ def test_files_that_are_no_photographs(tmp_path):
     with pytest.raises(InputError, match=r"none.jpg: there is no such photograph"):
         photographs([good, tmp_path / "none.jpg"])
     (tmp_path / "text.jpg").write_text("no picture")
-    with pytest.raises(InputError, match=r"text.jpg: this is not a picture that can be read"):
+    with pytest.raises(InputError, match=r"text.jpg: this is no picture that can be read"):
         photographs([tmp_path / "text.jpg"])
     (tmp_path / "empty.jpg").write_bytes(b"")
-    with pytest.raises(InputError, match=r"empty.jpg: this is not a picture that can be read"):
+    with pytest.raises(InputError, match=r"empty.jpg: this is no picture that can be read"):
         photographs([tmp_path / "empty.jpg"])
     with pytest.raises(InputError, match=r"is a folder; name its photographs"):
         photographs([tmp_path])

@@ -64,7 +64,7 @@ def said_of(folder):
 FAR = (56.7, 13.2)
 SPOILT = {
     "truncated": (cut, "cut.jpg: the picture is cut off or damaged", ()),
-    "no picture": (lambda f: (f / "x.jpg").write_text("none"), "x.jpg: this is not a picture", ()),
+    "no picture": (lambda f: (f / "x.jpg").write_text("none"), "x.jpg: this is no picture", ()),
     "doubled": (lambda f: shutil.copy(f / "DJI_0002.jpg", f / "DJI_0002 (1).jpg"), "it is a copy of DJI_0002", ()),
     "screenshot": (lambda f: Image.new("RGB", (640, 480)).save(f / "s.png"), "s.png: its size is 640 x 480 px", ()),
     "other camera": (lambda f: picture(f, 4, model="Other"), "its camera is Maker Other", ("DJI_0005",)),

@@ -130,7 +130,7 @@ def read_table(file: str, lines: Lines, errors: dict[int, str], code: int | None
         unknown,
         place,
         np.stack([numbers.get(name, unknown) for name in _SIGMA], axis=1),
-        tuple(fix or "unknown" for fix in fixes),
+        tuple(fixes.replace("", "unknown")),  # type: ignore[arg-type]
         heights,
         names=tuple(ids),
     )
@@ -163,7 +163,8 @@ def _table(file: str, lines: Lines, errors: dict[int, str]) -> _Table:
         except csv.Error:
             errors[row] = "the quotation marks do not pair; close or remove them"
     first = records.get(content[0][0], [])
-    for header in (first, *(_split(line.lstrip("# "), separator, strict=False) for line in comments)):
+    comment_cells = [line.lstrip("# ").split(None if separator == " " else separator) for line in comments]
+    for header in (first, *comment_cells):
         columns = columns_of(header, _WORDS)
         if {"image", "x", "y"} <= set(columns) and len(header) <= len(first):
             break
@@ -192,10 +193,10 @@ def _table(file: str, lines: Lines, errors: dict[int, str]) -> _Table:
     )
 
 
-def _split(line: str, separator: str, strict: bool = True) -> list[str]:
+def _split(line: str, separator: str) -> list[str]:
     if separator == " ":
         return line.split()
-    (cells,) = csv.reader([line], delimiter=separator, skipinitialspace=True, strict=strict)
+    (cells,) = csv.reader([line], delimiter=separator, skipinitialspace=True, strict=True)
     return [cell.strip() for cell in cells]
 
 
