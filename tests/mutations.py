@@ -41,7 +41,6 @@ from jaxphoto.io.kept_pieces import KeptPieces
 from jaxphoto.io.photograph_metadata import drone_record, xmp_fields
 from jaxphoto.io.photographs import photographs
 from jaxphoto.io.photomodeler import read_photomodeler
-from jaxphoto.io.raster import read_dsm
 from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, write_sbet
 from jaxphoto.procedures.control.system import places, system_of
 from jaxphoto.unknowns import FIXED, FREE, Weighted
@@ -438,13 +437,8 @@ READERS: dict[str, Reader] = {
     "exposures-reference": Reader(text(a__csv=sound_files.REFERENCE), lambda folder: read_exposures(folder / "a.csv")),
     "exposures-pospac": Reader(text(eo__txt=sound_files.POSPAC), lambda folder: read_exposures(folder / "eo.txt")),
     "photograph-xmp": Reader(text(a__xmp=sound_files.XMP), lambda folder: _drone_record(folder / "a.xmp")),
-    "dsm": Reader(sound_files.surface, lambda folder: read_dsm(folder / "a.tif")),
     "cloud-ply-text": Reader(sound_files.ply_text, lambda folder: clouds.read_cloud(folder / "a.ply")),
-    **{f"cloud-{kind}": Reader(partial(sound_files.cloud, kind), _cloud(kind)) for kind in ("csv", "ply", "copc.laz")},
-    **{
-        f"cloud-{kind}-{of}": Reader(partial(sound_files.cloud, kind, of), _cloud(kind))
-        for kind, of in (("las", 3), ("las", 6), ("laz", 1), ("laz", 3), ("laz", 6), ("laz", 8), ("laz", 10))
-    },
+    **{f"cloud-{kind}": Reader(partial(sound_files.cloud, kind), _cloud(kind)) for kind in ("csv", "ply", "las")},
     **{f"picture-{kind}": Reader(partial(sound_files.picture, kind), _picture(kind)) for kind in ("jpg", "png", "tif")},
 }
 """The readers by name."""

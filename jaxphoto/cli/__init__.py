@@ -10,20 +10,11 @@ import typer
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import show_warning
 from jaxphoto.errors import JaxphotoError, printable
+from jaxphoto.optional import EXTRAS, MissingExtra
 from jaxphoto.writing import discard_all
 from jaxphoto_command import tidy_up, wait_if_ending
 
 __all__ = ["app", "main"]
-
-# What a lean installation leaves out (docs/install.md): how it is imported, and installed.
-_LEFT_OUT = {
-    "cv2": "opencv-python-headless",
-    "faiss": "faiss-cpu",
-    "laspy": "laspy[lazrs]",
-    "pyarrow": "pyarrow",
-    "rasterio": "rasterio",
-    "xarray": "xarray",
-}
 
 
 def main() -> None:
@@ -38,11 +29,11 @@ def main() -> None:
         typer.echo(f"jaxphoto: {said}", err=True)
         sys.exit(2)
     except ModuleNotFoundError as error:
-        package = _LEFT_OUT.get((error.name or "").partition(".")[0])
-        if package is None:
+        module = (error.name or "").partition(".")[0]
+        if module not in EXTRAS:
             raise
         wait_if_ending()
-        typer.echo(f"jaxphoto: {package} is needed for this and not there: pip install '{package}'", err=True)
+        typer.echo(f"jaxphoto: {MissingExtra(module)}", err=True)
         sys.exit(2)
     except OSError as error:
         wait_if_ending()

@@ -16,8 +16,8 @@ from jaxphoto.io.cameras.own_cameras import results_in
 from jaxphoto.io.conditions import CONDITIONS, conditions_of, read_conditions
 from jaxphoto.io.input_hashes import INPUTS, read_inputs
 from jaxphoto.io.json_file import read_json
+from jaxphoto.io.photographs import picture_files
 from jaxphoto.io.results_judged import read_summary, reservation
-from jaxphoto.io.sound_photographs import pictures_in
 from jaxphoto.io.text_tables import read_csv
 from jaxphoto.report.certificate import certificate_of
 from jaxphoto.report.certified import Certified, ExteriorCorrelation, FormatBand, LastCalibration
@@ -85,8 +85,8 @@ def certificate_document(
     conditions: list[Conditions] = []
     inputs: list[InputFile] = []
     if photographs:
-        conditions = [conditions_of(path) for path in pictures_in(photographs)]
-        inputs = [input_file(path) for path in pictures_in(photographs)]
+        conditions = [conditions_of(path) for path in picture_files(photographs)]
+        inputs = [input_file(path) for path in picture_files(photographs)]
     elif (folder / CONDITIONS).is_file():
         conditions = read_conditions(folder / CONDITIONS)
     if (folder / INPUTS).is_file():

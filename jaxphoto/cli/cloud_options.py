@@ -27,5 +27,7 @@ def class_numbers(text: str | None) -> list[int] | None:
 
 
 def corrected_name(cloud: Path) -> str:
-    """What a corrected cloud is called: LAS and LAZ, which keep all else, by their own name."""
+    """File name of a corrected cloud: that of LAS and LAZ, which keep all other dimensions; COPC becomes LAZ."""
+    if cloud.name.lower().endswith(".copc.laz"):
+        return f"{cloud.name[: -len('.copc.laz')]}.laz"
     return cloud.name if cloud.suffix.lower() in (".las", ".laz") else f"corrected_{cloud.name}"

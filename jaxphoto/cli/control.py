@@ -15,7 +15,7 @@ from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
 from jaxphoto.io import read_block
 from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.control_files import FORMS, read_control
-from jaxphoto.io.sound_photographs import in_short, sound_photographs
+from jaxphoto.io.photographs import skipped_messages, valid_photographs
 from jaxphoto.procedures import adjust
 from jaxphoto.procedures.control import at_optimum, control_block, control_block_with_targets
 from jaxphoto.report import Level, Tables, verdict_of
@@ -65,7 +65,7 @@ def control_command(
         control, given = read_control(file, marks), read_block(block)
         status.update("adjusting the block as it is")
         oriented = at_optimum(adjust(given))
-        sound, spoilt = sound_photographs(photographs) if photographs else ([], {})
+        sound, spoilt = valid_photographs(photographs) if photographs else ([], {})
         paths = {p.name: p.path for p in sound}
         options = {"control_epsg": control_epsg, "targets": targets, "epsg": epsg}
         files = [file, *([marks] if marks else ())]
@@ -90,7 +90,7 @@ def control_command(
             write_summary({**verdict.summary, **control_summary(found), "versions": versions()}, work)
             with whole_block(found.adjusted.block, work / "block") as folder:
                 signed.write(images, folder)
-    for sentence in in_short(spoilt):
+    for sentence in skipped_messages(spoilt):
         output.warn(f"no target is looked for in what is left out: {sentence}")
     for sentence in found.sentences:
         output.say(sentence)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxphoto.errors import InputError
-from jaxphoto.io.clouds.placement import Placement
+from jaxphoto.io.clouds.coordinate_system import Placement
 from jaxphoto.io.control_files import read_control
 from jaxphoto.procedures.control import SurveyedPoints
 from jaxphoto.procedures.control.system import system_of

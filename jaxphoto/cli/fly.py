@@ -16,8 +16,8 @@ from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
 from jaxphoto.cli.provenance import Provenance
 from jaxphoto.errors import InputError, counted
-from jaxphoto.georeferencing.geoid_heights import WGS84
 from jaxphoto.georeferencing.map_frame import check_heights
+from jaxphoto.georeferencing.recorded_positions import WGS84
 from jaxphoto.image_measurement.control_targets import target_looker
 from jaxphoto.image_measurement.features import LONGEST_PX
 from jaxphoto.image_measurement.matching import match_photographs
@@ -29,8 +29,13 @@ from jaxphoto.io.exports import write_photograph_files
 from jaxphoto.io.exposures import exposure_files, located
 from jaxphoto.io.kept_orientation import kept_orient
 from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
-from jaxphoto.io.photographs import known_lens, sensor_and_interior
-from jaxphoto.io.sound_photographs import folders_not_looked_into, in_short, sound_photographs
+from jaxphoto.io.photographs import (
+    known_lens,
+    sensor_and_interior,
+    skipped_messages,
+    skipped_subfolders,
+    valid_photographs,
+)
 from jaxphoto.procedures.calibration import distortion_model
 from jaxphoto.procedures.control.of_flight import flight_control
 from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
@@ -124,8 +129,8 @@ def fly_command(
         check_heights(WGS84, above)
     Thread(target=prepare_pictures, daemon=True).start()
     with output.progress.status("reading the photographs") as status, ExitStack() as opened:
-        read, spoilt = sound_photographs(photographs)
-        for sentence in (*in_short(spoilt), *folders_not_looked_into(photographs).values()):
+        read, spoilt = valid_photographs(photographs)
+        for sentence in (*skipped_messages(spoilt), *skipped_subfolders(photographs).values()):
             output.progress.print(f"left out: {plain(sentence)}", soft_wrap=True)
         told = located(read, photographs, exposures or (), code=code, arm=arm, heights=above)
         read = told.photographs

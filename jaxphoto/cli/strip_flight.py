@@ -25,8 +25,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import PATTERN_OF, ScannerCalibration
 from jaxphoto.io import clouds, read_block, write_block
 from jaxphoto.io.block_folder import exposure_times
-from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
-from jaxphoto.io.clouds.placement import Placement
+from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, Placement
 from jaxphoto.io.names import points_called
 from jaxphoto.io.raster import write_dsm
 from jaxphoto.io.trajectory import Records, read_records, write_moved
@@ -164,7 +163,7 @@ def adjust_flight(output: Output, context: typer.Context, flight: StripFiles, ch
         # Of a file that is filtered nobody knows how much will come.
         every = flight.classes is None and flight.returns == "all"
         progress = CloudProgress(
-            StepsLeft(output.progress, status), status, clouds.most_points(cloud) if every else None
+            StepsLeft(output.progress, status), status, clouds.point_count(cloud) if every else None
         )
         coverage = None if path is None else CoveredTimes(path)
         looked_at = kept_returns(
@@ -201,7 +200,7 @@ def adjust_flight(output: Output, context: typer.Context, flight: StripFiles, ch
             progress("writing the corrected cloud", part)
             _check_known(part, result)
             corrected = correct_strips(part, result.errors, track).xyz
-            seen = clouds.chosen_of(part, flight.classes, flight.returns, cloud.name)  # type: ignore[arg-type]
+            seen = clouds.selection(part, flight.classes, flight.returns, cloud.name)  # type: ignore[arg-type]
             gaps.add(part.take(seen), corrected[seen])
             return corrected
 

@@ -50,7 +50,7 @@ def dsm_command(
         ends += np.array([[-cell_m], [cell_m]])
         parts = partial(clouds.cloud_chunks, cloud, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
         # Of a file that is filtered nobody knows how much will come.
-        most = clouds.most_points(cloud) if chosen is None and returns == "all" else None
+        most = clouds.point_count(cloud) if chosen is None and returns == "all" else None
         seen = CloudProgress(StepsLeft(output.progress, status), status, most).passes(parts)
         surface = surface_model((part.xyz for part in seen()), ends, cell_m, statistic)  # type: ignore[arg-type]
         status.update(f"writing {out}")

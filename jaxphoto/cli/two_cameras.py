@@ -10,7 +10,7 @@ from jaxphoto.io.cameras import CameraFile, read_camera_file
 from jaxphoto.io.cameras.own_cameras import results_in
 from jaxphoto.io.conditions import CONDITIONS, read_conditions
 from jaxphoto.io.input_hashes import INPUTS, read_inputs
-from jaxphoto.io.sound_photographs import SUFFIXES
+from jaxphoto.io.photographs import SUFFIXES
 from jaxphoto.report.stability import Compared
 
 _MEASURED = ("image_points.csv", *SUFFIXES)

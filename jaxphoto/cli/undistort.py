@@ -11,7 +11,7 @@ from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.progress import StepsLeft
 from jaxphoto.io.cameras import read_camera_file
-from jaxphoto.io.sound_photographs import folders_not_looked_into, in_short, sound_photographs
+from jaxphoto.io.photographs import skipped_messages, skipped_subfolders, valid_photographs
 from jaxphoto.io.undistorted import write_undistorted
 from jaxphoto.writing import check_folder
 
@@ -31,7 +31,7 @@ def undistort_command(
     check_folder(out, camera, *photographs)
     with output.progress.status("reading the photographs") as status:
         given = read_camera_file(camera, camera=which)
-        read, spoilt = sound_photographs(photographs)
+        read, spoilt = valid_photographs(photographs)
         done = write_undistorted(
             read,
             given,
@@ -40,7 +40,7 @@ def undistort_command(
             progress=partial(StepsLeft(output.progress, status), "undistorting"),
         )
     left = spoilt | done.left_out
-    for sentence in (*in_short(left), *folders_not_looked_into(photographs).values()):
+    for sentence in (*skipped_messages(left), *skipped_subfolders(photographs).values()):
         output.warn(f"left out: {sentence}")
     sensor, interior = done.camera
     size = f"{sensor.width_px} x {sensor.height_px} pixels"

@@ -1,56 +1,61 @@
-"""Matching of photographs and recorded exposures by the times of two clocks that differ by a constant.
+"""Match photographs with exposures of a receiver by the times of two clocks that differ by a constant.
 
-The clock of a camera is set to some time zone, with or without leap seconds, and is off by seconds; a receiver uses GPS
-time. The clock difference is the difference between times of photographs and exposures that most photographs share: a
-gap, a missing or an additional exposure shifts no other. If exposures follow at equal intervals, a shift by one fits
-nearly as well: then the positions recorded by the photographs decide; without these the result is ambiguous.
+The clock of a camera is in some time zone and seconds off; a receiver counts GPS time. The difference of the clocks is
+the one that most photographs share: a gap, a missing or a surplus exposure does not change it. At equal intervals a
+shift by one exposure fits nearly as well: then the photographs' own positions decide.
 """
 
+from datetime import datetime
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 GPS_EPOCH_UNIX_S = 315_964_800.0
-"""Midnight of 6 January 1980 UTC, the origin of GPS weeks."""
+"""6 January 1980 UTC, the begin of GPS weeks."""
 LEAP_SECONDS = 18.0
 """GPS time minus UTC since 2017."""
 WEEK_S = 604_800.0
 _HOUR_S, DAY_S = 3600.0, 86_400.0
 ZONES_S = 15 * _HOUR_S
-"""Largest difference of a clock from UTC or GPS time: the farthest time zone is 14 hours ahead."""
-# A camera's clock is set by hand, or by the receiver: remaining error besides time zone and leap seconds.
+"""Largest difference of a clock to UTC: the farthest zone is 14 hours ahead."""
+# Error of a camera's clock besides zone and leap seconds.
 _NEAR_ZONE_S = 300.0
-# Time zones are multiples of a quarter of an hour.
+# Zones are quarters of an hour.
 _ZONE_S = 900.0
-# Maximum number of differences; of more photographs every second one suffices.
+# Largest number of differences; of more photographs every n-th is used.
 _MOST_PAIRS = 2_000_000
 WORSE = 1.5
-"""Ratio of position misfits above which an assignment is rejected."""
+"""Offsets whose positions differ by this multiple of the best offset's are rejected."""
+
+
+def gps_seconds(at: datetime) -> float:
+    """Seconds since 1980-01-06, in the time zone of `at`, without leap seconds."""
+    return (at - datetime(1980, 1, 6)).total_seconds()
 
 
 class Taken(NamedTuple):
-    """Exposure time of a photograph, from its file."""
+    """Time of exposure in the file of a photograph."""
 
     clock_s: float
-    """Seconds since 1980-01-06 of the camera's own clock, in its time zone."""
+    """Seconds since 1980-01-06 of the camera's clock, in its time zone."""
     resolution_s: float
-    """1 if the file has whole seconds."""
+    """1 for whole seconds."""
     ahead_of_utc_s: float | None = None
-    """Offset of that clock from UTC, if the file has it."""
+    """Offset of the clock to UTC; None if unknown."""
 
 
 class Matched(NamedTuple):
-    """Exposure of every photograph, and the clock difference."""
+    """The exposure of every photograph, and the difference of the clocks."""
 
     exposure: Int[np.ndarray, "photographs"]
-    """Index of the exposure; -1 if there is none."""
+    """Index of the exposure; -1 for none."""
     offset_s: float
     """Clock of the photographs minus that of the exposures; NaN if matched without times."""
 
 
 class Ambiguous(NamedTuple):
-    """Two clock differences that fit equally many photographs."""
+    """Two differences of the clocks that fit equally many photographs."""
 
     offsets_s: tuple[float, float]
     fitted: int
@@ -63,9 +68,9 @@ def match_times(
     photographs_at: Float[np.ndarray, "photographs 3"] | None = None,
     exposures_at: Float[np.ndarray, "exposures 3"] | None = None,
 ) -> Matched | Ambiguous | None:
-    """Match photographs and exposures by times that differ by a constant; NaN for a photograph without time.
+    """Match photographs and exposures whose times (NaN: unknown) differ by a constant.
 
-    `tolerance_s` applies to a single difference. `photographs_at` and `exposures_at` (m, NaN if unknown) decide between
+    `tolerance_s` is that of a single difference. `photographs_at` and `exposures_at` (m, NaN: unknown) decide between
     constants that fit equally many. None if no two photographs share a constant.
     """
     known = np.flatnonzero(np.isfinite(photographs_s))
@@ -78,12 +83,11 @@ def match_times(
     most = max(int((found >= 0).sum()) for found, _ in tried)
     if most < 2:
         return None
-    # One photograph fewer may be the end of a shifted row.
     near = [(found, offset) for found, offset in tried if (found >= 0).sum() >= most]
     if photographs_at is not None and exposures_at is not None:
         off = [_apart(photographs_at[order], exposures_at[rank], found) for found, _ in tried]
         if np.isfinite(off).any():
-            # Positions reveal a shifted row, even one that fits more times.
+            # Positions decide against a shift, even if it fits more times.
             enough = [k for k, (found, _) in enumerate(tried) if (found >= 0).sum() >= 0.8 * most]
             best = min(enough, key=lambda k: off[k])
             near = [tried[k] for k in enough if off[k] <= WORSE * off[best]]
@@ -99,9 +103,7 @@ def match_times(
 
 
 def _offsets(times: np.ndarray, events: np.ndarray, tolerance_s: float, most: int = 12) -> list[float]:
-    """Return constants shared by many pairs, the most frequent first: centres of windows, as seconds are truncated
-    evenly.
-    """
+    """Constants by the number of pairs within the tolerance, the largest first: middles of windows."""
     times = times[:: 1 + len(times) * len(events) // _MOST_PAIRS]
     every = np.sort((times[:, None] - events[None, :]).ravel())
     count = np.searchsorted(every, every + 2 * tolerance_s, side="right") - np.arange(len(every))
@@ -116,9 +118,9 @@ def _offsets(times: np.ndarray, events: np.ndarray, tolerance_s: float, most: in
 
 
 def _joined(times: np.ndarray, events: np.ndarray, offset: float, tolerance_s: float) -> tuple[np.ndarray, float]:
-    """Match each time to an exposure, each once and in order, and return the constant of those matched."""
+    """The exposure of each time, each used once and in order, and the refined constant."""
     best, left = _in_order(times, events, offset, tolerance_s)
-    # The window may be off centre: the mean of fine times, and the mid-range of truncated seconds, are better.
+    # Refine the window: its middle is the mean of fine times, and the midrange of truncated seconds.
     for _ in range(2):
         for middle in (np.mean, lambda v: (np.min(v) + np.max(v)) / 2):
             if not len(left):
@@ -133,7 +135,7 @@ def _joined(times: np.ndarray, events: np.ndarray, offset: float, tolerance_s: f
 def _in_order(
     times: np.ndarray, events: np.ndarray, offset: float, tolerance_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """For windows of equal width, the first free exposure gives the most pairs."""
+    """Pair each time with the first unused exposure in its window; return pairs and their residuals."""
     found, k = np.full(len(times), -1), 0
     for i, time in enumerate(times):
         while k < len(events) and time - events[k] - offset > tolerance_s:
@@ -145,10 +147,7 @@ def _in_order(
 
 
 def _apart(at: np.ndarray, there: np.ndarray, found: np.ndarray) -> float:
-    """Return the median distance of the positions of matched pairs; infinite if none is known.
-
-    A common shift is included: for a single strip it is all that a shift by one exposure changes.
-    """
+    """Median distance of matched positions, including a common shift; infinite if unknown."""
     d = (at - there[found])[found >= 0]
     d = d[np.isfinite(d).all(axis=1)]
     return float(np.median(np.linalg.norm(d, axis=1))) if len(d) >= 3 else np.inf

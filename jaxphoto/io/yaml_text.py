@@ -2,7 +2,7 @@
 
 from typing import Any
 
-import yaml
+from jaxphoto.optional import extra
 
 # A camera has some 500 characters; the parser takes seconds for a million.
 _LONGEST = 100_000
@@ -12,6 +12,8 @@ def yaml_values(text: str) -> dict[str, Any]:
     """The names that are text, and their values. Raises ValueError, saying why, for what cannot be read."""
     if len(text) > _LONGEST:
         raise ValueError(f"{len(text)} characters are no file of cameras; give the one that the program wrote")
+    with extra():
+        import yaml
     try:
         content = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError, ValueError, TypeError, AttributeError, KeyError):

@@ -9,8 +9,9 @@ import pytest
 
 from jaxphoto.io import FORMATS, control_files
 from jaxphoto.io.cameras import CAMERA_FORMATS, camera_reader
-from jaxphoto.io.clouds import cloud_reader, copc
+from jaxphoto.io.clouds import cloud_reader
 from jaxphoto.io.exports import EXPORTS
+from jaxphoto.io.exposures import files
 from jaxphoto.io.trajectory import is_sbet
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/formats.md"
@@ -40,18 +41,18 @@ def control_forms():
     return [*told, "tables"]
 
 
-EXPOSURES = importlib.import_module("jaxphoto.io.exposures.located")
 SBET = [("trajectory", end) for end in (".sbet", ".out") if is_sbet(Path(f"a{end}"))]
-CLOUDS = [("cloud", end) for end in (*cloud_reader._OPENERS, copc._ENDING)]
+CLOUDS = [("cloud", suffix) for suffix in cloud_reader.SUFFIXES]
 DECLARED = {
     "read": [
         *(("convert", name) for name in FORMATS),
         *(("camera", name) for name in camera_reader._FORMATS),
         *(("control", name) for name in control_forms()),
-        *(("exposures", name) for name in (*EXPOSURES._SUFFIXES, *EXPOSURES._TABLES)),
+        *(("exposures", name) for name in (*files.SUFFIXES, *files.NAMES)),
         *SBET,
         ("trajectory", ".csv"),
         *CLOUDS,
+        ("cloud", ".copc.laz"),
         ("raster", "dsm"),
     ],
     "written": [

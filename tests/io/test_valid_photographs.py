@@ -9,8 +9,7 @@ from PIL import Image
 from jaxphoto.errors import InputError
 from jaxphoto.io.exposures import located
 from jaxphoto.io.photograph_metadata import drone_record, xmp_fields
-from jaxphoto.io.photographs import photographs
-from jaxphoto.io.sound_photographs import folders_not_looked_into, in_short, sound_photographs
+from jaxphoto.io.photographs import photographs, skipped_messages, skipped_subfolders, valid_photographs
 
 PACKET = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF>
 <rdf:Description xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" drone-dji:AbsoluteAltitude="+129.52"
@@ -32,7 +31,7 @@ def folder(tmp_path):
 
 
 def test_sound_ones_are_kept_with_what_their_files_say(folder):
-    kept, left = sound_photographs([folder])
+    kept, left = valid_photographs([folder])
     assert [p.name for p in kept] == ["0", "1", "2", "3"] and not left
     assert kept[0].gps is not None and kept[0].gps.sigma_m == (0.01174, 0.01262, 0.02684)
 
@@ -42,9 +41,9 @@ def test_what_packets_tell_is_said(folder):
     picture = Image.open(folder / "3.jpg")
     packet = PACKET.replace('RtkFlag="50"', 'RelativeAltitude="+80.1" drone-dji:RtkFlag="0"')
     picture.save(folder / "3.jpg", exif=picture.getexif(), xmp=packet.encode())
-    kept, _ = sound_photographs([folder])
+    kept, _ = valid_photographs([folder])
     assert located(kept).sentences[0] == (
-        "the photographs' own files tell heights above take-off (1 of 4), standard deviations of positions (3 of 4), "
+        "the photographs' own files have heights above take-off (1 of 4), standard deviations of positions (3 of 4), "
         "solutions: 3 fixed"
     )
 
@@ -52,7 +51,7 @@ def test_what_packets_tell_is_said(folder):
 def test_of_several_copies_each_names_the_one_that_is_kept(folder):
     for n in (1, 2):
         shutil.copy(folder / "2.jpg", folder / f"0 copy {n} of 2.jpg")
-    kept, left = sound_photographs([folder])
+    kept, left = valid_photographs([folder])
     assert [p.name for p in kept] == ["0", "1", "2", "3"]
     assert len(left) == 2 and all(why.endswith(": it is a copy of 2.jpg") for why in left.values())
 
@@ -62,16 +61,16 @@ def test_a_copy_that_was_changed_is_left_out(folder):
     for quality, (name, of) in enumerate((("2-edited", 2), ("21", 2), ("1-b", 3)), 50):
         picture = Image.open(folder / f"{of}.jpg")
         picture.save(folder / f"{name}.jpg", exif=picture.getexif(), xmp=picture.info["xmp"], quality=quality)
-    kept, left = sound_photographs([folder])
+    kept, left = valid_photographs([folder])
     assert [p.name for p in kept] == ["0", "1-b", "1", "2", "21", "3"]
-    assert list(left.values()) == [f"{folder / '2-edited.jpg'}: it is 2.jpg again, changed: of the same time and place"]
+    assert list(left.values()) == [f"{folder / '2-edited.jpg'}: it is an edited copy of 2.jpg (same time and position)"]
 
 
 def test_of_copies_that_is_kept_whose_name_is_as_those_of_the_others(tmp_path, folder):
     for k in range(4):
         (folder / f"{k}.jpg").rename(folder / f"DJI_000{k}.jpg")
     shutil.copy(folder / "DJI_0003.jpg", folder / "3d.jpg")
-    kept, left = sound_photographs([folder])
+    kept, left = valid_photographs([folder])
     assert [p.name for p in kept] == [f"DJI_000{k}" for k in range(4)]
     assert "3d.jpg: it is a copy of DJI_0003.jpg" in left[str(folder / "3d.jpg")]
 
@@ -80,17 +79,17 @@ def test_folders_in_a_folder_and_raw_files_are_told(folder, tmp_path):
     card = tmp_path / "DCIM"
     (card / "100MEDIA").mkdir(parents=True)
     with pytest.raises(InputError, match=r"no photograph that can be read$"):
-        sound_photographs([card])
+        valid_photographs([card])
     (folder / "0.jpg").rename(card / "100MEDIA" / "0.jpg")
     (card / "a.DNG").write_text("raw")
     with pytest.raises(InputError, match=r"pictures in .*100MEDIA: name these folders; raw files such as a\.DNG"):
-        sound_photographs([card])
+        valid_photographs([card])
     inner = card / "100MEDIA"
     said = {str(inner): f"{inner}: 1 picture in a folder that is not named; name it, too"}
-    assert folders_not_looked_into([card]) == said
-    assert not folders_not_looked_into([card, inner])
+    assert skipped_subfolders([card]) == said
+    assert not skipped_subfolders([card, inner])
     (inner / ".jaxphoto.json").write_text("{}")
-    assert not folders_not_looked_into([card])
+    assert not skipped_subfolders([card])
 
 
 def test_spoilt_ones_are_left_out_each_with_a_sentence(folder):
@@ -105,7 +104,7 @@ def test_spoilt_ones_are_left_out_each_with_a_sentence(folder):
     exif[272] = "Another"
     other.save(folder / "other.jpg", exif=exif)
     (folder / "notes.txt").write_text("not looked at")
-    kept, left = sound_photographs([folder])
+    kept, left = valid_photographs([folder])
     assert [p.name for p in kept] == ["0", "1", "2", "3"]
     for name, why in {
         "cut.jpg": "cut off or damaged",
@@ -127,23 +126,21 @@ def test_links_and_hidden_files(folder):
     (folder / "0.jpg").symlink_to(away / "0.jpg")
     (folder / "lost.JPG").symlink_to(away / "absent.jpg")
     (folder / "._1.jpg").write_bytes(b"macOS")
-    kept, left = sound_photographs([folder])
+    kept, left = valid_photographs([folder])
     assert [p.name for p in kept] == ["0", "1", "2", "3"]
-    assert list(left.values()) == [
-        f"{folder / 'lost.JPG'}: what this links to is not there; bring that file here, or remove the link"
-    ]
+    assert list(left.values()) == [f"{folder / 'lost.JPG'}: the target of this link is missing; correct the name"]
     # Copies of one name in two folders are told by these.
-    _, left = sound_photographs([folder, away])
+    _, left = valid_photographs([folder, away])
     assert f"{away / '0.jpg'}: it is a copy of {folder / '0.jpg'}" in left.values()
 
 
 def test_files_left_out_for_one_reason_have_one_sentence(folder):
     for k in range(3):
         Image.new("RGB", (64, 48 + 8 * (k // 2)), (k, 0, 0)).save(folder / f"T{k}.png")
-    assert len(in_short(sound_photographs([folder])[1])) == 3
+    assert len(skipped_messages(valid_photographs([folder])[1])) == 3
     for k in range(3, 5):
         Image.new("RGB", (64, 48), (k, 0, 0)).save(folder / f"T{k}.png")
-    one, other = in_short(sound_photographs([folder])[1])
+    one, other = skipped_messages(valid_photographs([folder])[1])
     assert one.startswith("4 files (T0.png, T1.png, T3.png and 1 more), each: its size is 64 x 48 px, that of most")
     assert other.startswith(f"{folder / 'T2.png'}: its size is 64 x 56 px")
 
@@ -155,22 +152,22 @@ def test_a_second_body_of_the_same_model_and_a_digital_zoom_are_left_out(folder)
         exif = picture.getexif()
         exif.get_ifd(0x8769).update({0xA431: serial, 0xA404: zoom})
         picture.save(folder / f"{k}.jpg", exif=exif)
-    kept, left = sound_photographs([folder])
+    kept, left = valid_photographs([folder])
     assert [p.name for p in kept] == ["0", "1"]
     assert "its digital zoom is 2, that of most is 1" in left[str(folder / "2.jpg")]
     assert "its serial number is B7, that of most is A1" in left[str(folder / "3.jpg")]
     packet = PACKET.replace('RtkFlag="50"', 'CameraSerialNumber="C9"')
     picture.save(folder / "4.jpg", exif=Image.Exif(), xmp=packet.encode())
-    assert "its serial number is C9" in sound_photographs([folder])[1][str(folder / "4.jpg")]
+    assert "its serial number is C9" in valid_photographs([folder])[1][str(folder / "4.jpg")]
 
 
 def test_what_is_not_there_and_what_leaves_nothing_is_refused(folder, tmp_path):
     with pytest.raises(InputError, match="there is no such photograph or folder"):
-        sound_photographs([folder / "absent"])
+        valid_photographs([folder / "absent"])
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(InputError, match="there is no photograph that can be read"):
-        sound_photographs([empty])
+        valid_photographs([empty])
 
 
 def test_packets_of_others_and_damaged_ones_say_nothing(folder):
