@@ -118,7 +118,7 @@ def read_conditions(path: Path) -> list[Conditions]:
     """The rows of a conditions.csv. Raises InputError for what is none."""
     words = ("image", "file", "sha256", "used", *TEXTS)
     table = read_csv(path, ("image", "file", "sha256", "used"), (*TEXTS, *NUMBERS), text=words)
-    columns = {name: table.names(name).tolist() for name in words}
+    columns = {name: table.text(name).tolist() for name in words}
     columns |= {
         name: [None if math.isnan(v) else v for v in table.numbers(name, empty=True).tolist()] for name in NUMBERS
     }

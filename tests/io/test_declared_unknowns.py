@@ -15,7 +15,7 @@ from jaxphoto.block import Block, Motion, Temperatures
 from jaxphoto.camera import ImageMotion, RollingShutter
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import read_block, write_block
-from jaxphoto.io.block_folder.declared_unknowns import keys_of, known_unknowns, static_fields
+from jaxphoto.io.block_folder.parameters import keys_of, known_unknowns, static_fields
 from jaxphoto.parameters import AbstractParameters, leaves_in_order
 from jaxphoto.unknowns import FIXED, FREE, UNKNOWNS, Weighted, is_prior
 
