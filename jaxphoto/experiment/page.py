@@ -1,23 +1,32 @@
-"""The page of an experiment: what agrees, then each table as printed, ours in the same cells."""
+"""The page of an experiment: agreement, then each table as printed, ours in the same cells; its figures and files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from decimal import Decimal
 from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 from jinja2 import Environment
 from markupsafe import Markup
 
-from jaxphoto.experiment.comparison import MEAN_DIFFERENCE
-from jaxphoto.experiment.plots import draw_agreement
-from jaxphoto.experiment.runner import Run
-from jaxphoto.experiment.wording import heading, own_decimals, power_of, printed_decimals, table_title
-from jaxphoto.report import check_points_figure, page_head
+from jaxphoto.experiment.experiment import MEAN_DIFFERENCE, Run, compare
+from jaxphoto.report import check_points_figure, new_figure, page_head
 from jaxphoto.report.document import BlockInSpace, DocumentPicture, Heading, Paragraph, Pictures, Rows
 from jaxphoto.report.made import Made, made_section
+from jaxphoto.report.plots import axes_or_new
 from jaxphoto.report.study_page import StudyPart, WholePicture, study_page
+from jaxphoto.writing import whole_folder
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _AGREEMENT = (
     "Ours minus printed over the tolerance promised, by table: within it between the lines at -1 and 1, crosses beyond"
@@ -168,3 +177,201 @@ def _column(of: pd.DataFrame, power: int, marks: dict[str, int]) -> list[tuple[p
 def _difference(cell: pd.Series) -> dict[str, str]:
     promised = f" (at most {cell['tolerance']:g} promised)" if pd.notna(cell["tolerance"]) else ""
     return {"words": f"{cell['ours']:.3g}{promised}", "within": cell["within"]}
+
+
+def write_runs(runs: Mapping[Path, Run], out: Path, made: Mapping[Path, Made] = MappingProxyType({})) -> None:
+    """tables.csv, cells.csv (every layout) and report.html of the `runs` of some experiment folders, in `out`.
+
+    Several experiments have a page each, to which report.html leads; a page says how its runs were `made`. Raises what
+    `whole_folder` raises.
+    """
+    tables = {folder: compare(run, folder) for folder, run in runs.items()}
+    only = len(runs) == 1
+    pages = {
+        "report.html" if only else f"{folder.name}.html": experiment_page(run, tables[folder], made.get(folder))
+        for folder, run in runs.items()
+    }
+    if not only:
+        pages["report.html"] = index_page({f.name: (run.experiment.title, tables[f]) for f, run in runs.items()})
+    cells = [run.cells.assign(experiment=folder.name) for folder, run in runs.items()]
+    with whole_folder(out) as work:
+        pd.concat(tables.values(), ignore_index=True).to_csv(work / "tables.csv", index=False)
+        pd.concat(cells, ignore_index=True).to_csv(work / "cells.csv", index=False)
+        for name, page in pages.items():
+            (work / name).write_text(page, encoding="utf-8")
+
+
+# Labels ----------------------------------------------------------------------------------------------------
+
+_WORDS = {
+    "iops": "IOPs", "gcp": "GCP", "abs": "absolute", "rmse": "RMSE", "n": "number of", "sigma": "σ",
+    "omega": "ω", "phi": "φ", "kappa": "κ", "domega": "dω", "dphi": "dφ", "dkappa": "dκ",
+}  # fmt: skip
+_UNITS = {"mm", "m", "px", "um", "deg", "arcsec", "mm-1", "mm-2", "mm-4", "mm-6"}
+_SMALL = 1e-3
+"""Columns below it throughout are given in a power of ten."""
+
+
+def table_title(name: str) -> str:
+    """`table2_iops` -> `Table 2: IOPs`; `agreement` -> `Agreement`."""
+    numbered = re.fullmatch(r"table(\d+)_(.+)", name)
+    if numbered:
+        return f"Table {numbered[1]}: {_words(numbered[2])}"
+    return _words(name)[:1].upper() + _words(name)[1:]
+
+
+def heading(column: str, unit: str, power: int) -> str:
+    """The column in words, with its unit: that of its name, else `unit`; the numbers below are times 10**`power`."""
+    stem, _, last = column.rpartition("_")
+    named = last in _UNITS and bool(stem)
+    of = (last if named else unit).replace("um", "µm")
+    of = re.sub(r"\^?-(\d)", lambda m: _raised(-int(m[1])), of)
+    scale = f"10{_raised(power)}" if power else ""
+    inside = " ".join(word for word in (scale, of) if word)
+    return _words(stem if named else column) + (f" [{inside}]" if inside else "")
+
+
+def power_of(values: Iterable[float]) -> int:
+    """The power of ten in which a column of small numbers is given, 0 for others."""
+    largest = max((abs(v) for v in values), default=0.0)
+    return math.floor(math.log10(largest)) if 0 < largest < _SMALL else 0
+
+
+def printed_decimals(values: Iterable[float], power: int) -> int | None:
+    """Decimals that hold every one of `values` (in 10**`power`) whole; None where there is none but zero."""
+    places = [-int(Decimal(repr(float(v))).normalize().as_tuple().exponent) + power for v in values if v]
+    return max([0, *places]) if places else None
+
+
+def own_decimals(value: float, spread: float, printed: int | None, size: float) -> int:
+    """Decimals of a value of ours: two digits of its spread, but as many as `printed` and at most one more.
+
+    Where nothing is printed and the spread is not known, three digits of `size`. Whole numbers, which are counted,
+    have none.
+    """
+    if value == round(value) and not spread > 0:
+        return 0
+    of_spread = 1 - math.floor(math.log10(spread)) if spread > 0 else None
+    if printed is not None:
+        return min(max(printed, of_spread if of_spread is not None else printed + 1), printed + 1)
+    of_size = 2 - math.floor(math.log10(abs(size))) if size else 0
+    return max(0, of_spread if of_spread is not None else of_size)
+
+
+def _words(name: str) -> str:
+    return " ".join(_WORDS.get(word, word) for word in name.split("_"))
+
+
+def _raised(power: int) -> str:
+    return str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+
+
+# Figures ---------------------------------------------------------------------------------------------------
+
+_ACROSS = 5
+
+
+def plot_comparison(comparison: pd.DataFrame, table: str, column: str, ax: Axes | None = None) -> Axes:
+    """One printed column of `table`, a line for each row: what is printed and ours.
+
+    `comparison` is that of `compare`. Bars are the tolerance of the printed value and the standard deviation of ours
+    from layout to layout. Raises ValueError where nothing of the column is both printed and ours.
+    """
+    cells = _both(comparison, table)
+    of = cells[cells["column"] == column]
+    if of.empty:
+        known = ", ".join(dict.fromkeys(cells["column"]))
+        raise ValueError(f"no column {column!r} of {table!r} is both printed and ours; those that are: {known}")
+    ax = axes_or_new(ax)
+    rows = list(dict.fromkeys(of["row"]))
+    _draw_column(ax, of, rows)
+    _name_rows(ax, rows)
+    ax.legend(fontsize=8)
+    return ax
+
+
+def comparison_figure(comparison: pd.DataFrame, table: str) -> Figure:
+    """One panel for each printed column of `table`, as `plot_comparison` has it.
+
+    Raises ValueError where nothing of the table is both printed and ours.
+    """
+    cells = _both(comparison, table)
+    rows = list(dict.fromkeys(cells["row"]))
+    groups = list(cells.groupby("column", sort=False))
+    down = -(-len(groups) // _ACROSS)
+    figure = new_figure(1.6 + 1.8 * min(len(groups), _ACROSS), down * (1.2 + 0.24 * len(rows)))
+    panels = figure.subplots(down, min(len(groups), _ACROSS), squeeze=False, sharey=True).ravel()
+    for axes, (_, of) in zip(panels, groups, strict=False):
+        _draw_column(axes, of, rows)
+    for axes in panels[len(groups) :]:
+        axes.set_axis_off()
+    _name_rows(panels[0], rows)
+    figure.suptitle(table_title(table), fontsize=11)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
+    return figure
+
+
+def _both(comparison: pd.DataFrame, table: str) -> pd.DataFrame:
+    """The cells of a table that are both printed and ours."""
+    cells = comparison[(comparison["table"] == table) & (comparison["column"] != MEAN_DIFFERENCE)]
+    cells = cells[cells["published"].notna() & cells["ours"].notna()]
+    if cells.empty:
+        raise ValueError(f"nothing of {table!r} is both printed and ours")
+    return cells
+
+
+def _draw_column(axes: Axes, of: pd.DataFrame, rows: list[str]) -> None:
+    power = power_of(np.concatenate([of["published"], of["ours"]]))
+    values = of[["published", "tolerance", "ours", "spread"]].astype(float) * 10.0**-power
+    at = np.array([rows.index(row) for row in of["row"]])
+    bars: dict[str, Any] = {"capsize": 2, "lw": 1, "ls": "none"}
+    axes.errorbar(
+        values["published"], at - 0.15, xerr=values["tolerance"], marker="s", ms=5, mfc="none",
+        color="0.45", label="printed ± tolerance", **bars,
+    )  # fmt: skip
+    axes.errorbar(
+        values["ours"], at + 0.15, xerr=values["spread"], marker="o", ms=4, color="tab:blue",
+        label="ours ± spread", **bars,
+    )  # fmt: skip
+    unit = next((u for u in of["unit"] if isinstance(u, str)), "")
+    axes.set_title(heading(str(of["column"].iloc[0]), unit, power), fontsize=9)
+    axes.tick_params(labelsize=7)
+    axes.grid(axis="y", lw=0.3)
+    axes.locator_params(axis="x", nbins=4)
+
+
+def _name_rows(axes: Axes, rows: list[str]) -> None:
+    axes.set_yticks(range(len(rows)), rows, fontsize=8)
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+
+
+def plot_agreement(comparison: pd.DataFrame, ax: Axes | None = None) -> Axes:
+    """Of every value with a tolerance ours minus printed over it, by table; `comparison` is that of `compare`.
+
+    Raises ValueError where no value that is ours has one.
+    """
+    if not comparison["within"].ne("").any():
+        raise ValueError("no value that is printed and ours has a tolerance")
+    ax = axes_or_new(ax)
+    draw_agreement(ax, comparison)
+    return ax
+
+
+def draw_agreement(axes: Axes, comparison: pd.DataFrame) -> None:
+    """The same in a panel."""
+    cells = comparison[comparison["within"] != ""]
+    off = ((cells["ours"] - cells["published"]) / cells["tolerance"]).to_numpy(float)
+    tables = list(dict.fromkeys(cells["table"]))
+    place, number = pd.factorize(cells["table"])[0], cells.groupby("table").cumcount().to_numpy()
+    # Values of a table one below the other, in the order of the print.
+    at = place + 0.7 * (number / np.maximum(cells.groupby("table")["table"].transform("size") - 1, 1) - 0.5)
+    within = (cells["within"] == "yes").to_numpy()
+    axes.axvspan(-1, 1, color="0.93", lw=0)
+    for rows, marker, colour, label in ((within, "o", "tab:blue", "within"), (~within, "x", "tab:red", "not within")):
+        if rows.any():
+            axes.plot(off[rows], at[rows], marker, ms=5, mew=1.5, color=colour, label=label, ls="none")
+    axes.set_yticks(range(len(tables)), list(map(table_title, tables)), fontsize=8)
+    axes.set_ylim(len(tables) - 0.5, -0.5)
+    axes.set_xlabel("(ours - printed) / tolerance")
+    axes.set_title("all values with a tolerance", loc="left", fontsize=9)
+    axes.legend(fontsize=7)

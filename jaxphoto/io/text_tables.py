@@ -89,6 +89,14 @@ class Table:
         self.check(values == "", lambda line: f"the {column} is empty; give its id or delete the row")
         return values
 
+    def find(self, column: str, known: Sequence[str], message: Callable[[str], str]) -> np.ndarray:
+        """The index in `known` of the id in each line. Raises BlockError with the `message` about an unknown id."""
+        named = self.ids(column)
+        index = pd.Index(known, dtype=object).get_indexer(pd.Index(named, dtype=object))
+        for line in np.flatnonzero(index < 0)[:1]:
+            raise self.misfit(line, message(named[line]))
+        return index
+
     def numbers(self, column: str, *, empty: bool = False) -> np.ndarray:
         """A column of finite numbers; NaN stands for an empty cell or a missing column where `empty` allows it."""
         cells = self.columns.get(column)

@@ -1,6 +1,6 @@
-"""Tables of TOML and JSON files: read, checked key by key or by a pydantic model, and written.
+"""Tables of TOML and JSON files: read, validated by key or by a pydantic model, and written.
 
-An error is one sentence: file, [table] key, what is wrong, cure.
+A validation error is one sentence: file, [table] key, what is wrong, cure.
 """
 
 import functools
@@ -181,10 +181,15 @@ class Section:
         for part in place[:-1]:
             path += f", number {part + 1}" if isinstance(part, int) else f".{part}" if path else part
         name = place[-1] if place else ""
-        told = {"input": quoted(error["input"]), "table": f"{path}.{name}" if path else name, **error.get("ctx", {})}
+        told = {
+            "input": quoted(error["input"]),
+            "msg": error["msg"],
+            "table": f"{path}.{name}" if path else name,
+            **error.get("ctx", {}),
+        }
         if "expected" in told:
             told["expected"] = told["expected"].replace("'", '"')
-        sentence = str(mistake) if mistake else _SENTENCES.get(error["type"], "{input} is not valid: " + error["msg"])
+        sentence = str(mistake) if mistake else _SENTENCES.get(error["type"], "{input} is not valid: {msg}")
         return Section(self.file, path, {}).error(name, sentence if mistake else sentence.format(**told))
 
 
@@ -221,9 +226,10 @@ def _vector(size: int) -> TypeAdapter:
 
 def read_toml(path: Path) -> dict[str, Any]:
     """The content of a TOML file. Raises InputError with the line of a syntax error."""
+    text = read_text(path, SMALL)
     try:
-        return tomllib.loads(read_text(path, SMALL))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path.name}: {error}; correct the TOML there") from None
 
 

@@ -55,14 +55,11 @@ class Ids(NamedTuple):
         """The index of the `kind` of thing in each line. Raises BlockError for one that does not exist."""
         if kind == "image":
             return self.images.find(table, column)
-        named, known = table.ids(column), self.points.ids if kind == "point" else tuple(self.owners.get(kind, ()))
-        index = pd.Index(known, dtype=object).get_indexer(pd.Index(named))
-        cure = f"is none of the {kind} of this block ({few(known) or 'it has none'}); correct it"
-        if kind == "point":
-            cure = "is measured in no image; measure it or delete the row"
-        for line in np.flatnonzero(index < 0)[:1]:
-            raise table.misfit(line, f"{kind} {named[line]} {cure}")
-        return index
+        known, cure = self.points.ids, "is measured in no image; measure it or delete the row"
+        if kind != "point":
+            known = tuple(self.owners.get(kind, ()))
+            cure = f"is none of the {kind} of this block ({few(known) or 'it has none'}); correct it"
+        return table.find(column, known, lambda name: f"{kind} {name} {cure}")
 
 
 def known_kinds(more: Iterable[Kind]) -> tuple[Kind, ...]:
@@ -184,8 +181,9 @@ def _square(kind: Kind) -> tuple[str, float]:
 def _sets(table: Table, matrices: Table, unit: str, scale: float, k: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """The lines of each set, and its covariance matrix over `k` numbers of each line."""
     named, owner = table.text("set"), matrices.text("set")
-    for line in np.flatnonzero(~np.isin(owner.astype(str), named.astype(str)))[:1]:
-        raise matrices.misfit(line, f"set {owner[line]} is not in {table.file}; add it there or delete the row")
+    matrices.find(
+        "set", list(dict.fromkeys(named)), lambda name: f"set {name} is not in {table.file}; add or delete it"
+    )
     places, value = matrices.matrix("ab"), matrices.numbers(f"covariance{unit}") * scale
     lines_of, entries_of = (pd.Series(names).groupby(names, sort=False).indices for names in (named, owner))
     for name in dict.fromkeys(named):

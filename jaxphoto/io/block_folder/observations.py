@@ -66,13 +66,8 @@ class Images(NamedTuple):
 
     def find(self, table: Table, column: str = "image") -> np.ndarray:
         """The index of the image in each line of `table`. Raises BlockError for one that is not listed."""
-        named = table.ids(column)
-        index = pd.Index(self.ids).get_indexer(pd.Index(named))
-        for line in np.flatnonzero(index < 0)[:1]:
-            raise table.misfit(
-                line, f"image {named[line]} is not in {self.table.file}; add it there or delete this row"
-            )
-        return index
+        listed = self.table.file
+        return table.find(column, self.ids, lambda name: f"image {name} is not in {listed}; add it or delete this row")
 
     @property
     def strips_are_the_flight(self) -> bool:
@@ -85,11 +80,14 @@ def read_images(table: Table, settings: Settings) -> Images:
     if not len(table):
         raise BlockError(f"{table.file}: there are no images; list at least two")
     cameras, strips, times = table.text("camera"), table.text("strip"), table.numbers("time_s", empty=True)
-    for line in np.flatnonzero(~np.isin(cameras.astype(str), list(settings.cameras)))[:1]:
-        named, known = f"[cameras.{cameras[line]}]", ", ".join(settings.cameras)
-        raise table.misfit(
-            line, f"camera {cameras[line]} has no table {named} in {settings.file}; add it or use one of {known}"
-        )
+    table.find(
+        "camera",
+        tuple(settings.cameras),
+        lambda name: (
+            f"camera {name} has no table [cameras.{name}] in {settings.file}; add it or use one of "
+            + ", ".join(settings.cameras)
+        ),
+    )
     table.check(
         strips == "default",
         lambda _: f"the strip name default means every strip in {settings.file}; give it another name",
@@ -396,17 +394,15 @@ def read_surfaces(table: Table, strips: tuple[str, ...], points: ObservedPoints,
 
     `strips` are those with a table of [scanner.shifts].
     """
-    named = table.text("point")
-    point = points.find(named)
-    for line in np.flatnonzero(point < 0)[:1]:
-        raise table.misfit(line, f"point {named[line]} is measured in no image; measure it or delete the row")
+    message = "is measured in no image; measure it or delete the row"
+    point = table.find("point", points.ids, lambda name: f"point {name} {message}")
     foot, normal, turn = (table.matrix(names) for names in (FOOT, NORMAL, TURN))
     sigma, length = table.numbers("sigma_m"), np.linalg.norm(normal, axis=1)
     table.check(np.abs(length - 1) > _UNIT, lambda k: f"the normal has the length {length[k]:.4f}; give a unit vector")
-    strip = table.text("strip")
-    for line in np.flatnonzero([bool(strips) and name not in strips for name in strip])[:1]:
-        raise table.misfit(
-            line, f"strip {quoted(strip[line])} has no table; add [scanner.shifts.{strip[line]}] to {settings.file}"
+    number = np.zeros(len(table), int)
+    if strips:
+        cure = f"to {settings.file}"
+        number = table.find(
+            "strip", strips, lambda name: f"strip {quoted(name)} has no table; add [scanner.shifts.{name}] {cure}"
         )
-    number = np.array([strips.index(name) if strips else 0 for name in strip], int)
     return SurfaceRows(point, number, *map(on_device, (foot, normal, turn, sigma)))
