@@ -71,7 +71,7 @@ _INDEX = """{{ head("Experiments") }}<body>
 
 
 def index_page(experiments: Mapping[str, tuple[str, pd.DataFrame]]) -> str:
-    """A page that leads to those of several experiments: name -> title and comparison."""
+    """The index of several experiments: name -> title and comparison."""
     rows = [
         {
             "name": name,
@@ -85,16 +85,16 @@ def index_page(experiments: Mapping[str, tuple[str, pd.DataFrame]]) -> str:
 
 
 def experiment_page(run: Run, comparison: pd.DataFrame, made: Made | None = None) -> str:
-    """The whole page as HTML: what agrees, the block of the first layout, each table as printed, check points."""
+    """The page as HTML: agreement, the block of the first layout, each table as printed, check points."""
     tables = [table_texts(str(name), cells) for name, cells in comparison.groupby("table", sort=False)]
     judged, good = (sum(table[name] for table in tables) for name in ("judged", "good"))
     if judged:
-        said = f"{good} of {judged} printed values for which a tolerance is promised are within it"
+        verdict = f"{good} of {judged} printed values for which a tolerance is promised are within it"
     else:
-        said = "nothing is promised here: no printed value has a tolerance"
+        verdict = "nothing is promised here: no printed value has a tolerance"
     colour = "" if not judged else "green" if good == judged else "amber"
     parts = list(_parts(run, comparison, tables))
-    return study_page(run.experiment.title, [said], [*parts, *(made_section(made) if made else ())], colour, _STYLE)
+    return study_page(run.experiment.title, [verdict], [*parts, *(made_section(made) if made else ())], colour, _STYLE)
 
 
 def _parts(run: Run, comparison: pd.DataFrame, tables: list[dict]) -> Iterator[StudyPart]:
@@ -119,10 +119,10 @@ def _parts(run: Run, comparison: pd.DataFrame, tables: list[dict]) -> Iterator[S
 
 
 def table_texts(name: str, cells: pd.DataFrame) -> dict:
-    """What a printed table says, each cell as text: title, columns, rows, notes, and how many cells are within."""
+    """The texts of a printed table: title, columns, rows, notes, and the number of cells within their tolerance."""
     overall = cells["column"] == MEAN_DIFFERENCE
     shown = cells[~overall]
-    # A note of a whole column stands at its heading, others at their cells; they are numbered as they come.
+    # A note of a whole column is put at its heading, others at their cells; they are numbered in order.
     numbers: dict[str, int] = {}
     columns: list[dict] = []
     texts: dict[tuple, dict] = {}
@@ -153,11 +153,11 @@ def table_texts(name: str, cells: pd.DataFrame) -> dict:
 
 
 def _column(of: pd.DataFrame, power: int, marks: dict[str, int]) -> list[tuple[pd.Series, dict]]:
-    """Every cell of one column with its texts; the digits are those of the column."""
+    """Every cell of one column with its texts, in the digits of the column."""
     scale = 10.0**-power
     printed = printed_decimals(of["published"].dropna(), power)
     size = scale * float(of["ours"].abs().max())
-    found = []
+    column = []
     for _, cell in of.iterrows():
         spread = scale * float(cell["spread"]) if pd.notna(cell["spread"]) else 0.0
         ours, paper = scale * float(cell["ours"]), scale * float(cell["published"])
@@ -170,8 +170,8 @@ def _column(of: pd.DataFrame, power: int, marks: dict[str, int]) -> list[tuple[p
             "within": cell["within"],
             "note": marks.get(cell["note"], ""),
         }
-        found.append((cell, text))
-    return found
+        column.append((cell, text))
+    return column
 
 
 def _difference(cell: pd.Series) -> dict[str, str]:
@@ -180,9 +180,9 @@ def _difference(cell: pd.Series) -> dict[str, str]:
 
 
 def write_runs(runs: Mapping[Path, Run], out: Path, made: Mapping[Path, Made] = MappingProxyType({})) -> None:
-    """tables.csv, cells.csv (every layout) and report.html of the `runs` of some experiment folders, in `out`.
+    """Write tables.csv, cells.csv (every layout) and report.html of the `runs` of experiment folders into `out`.
 
-    Several experiments have a page each, to which report.html leads; a page says how its runs were `made`. Raises what
+    Several experiments have a page each and report.html as index; `made` is the provenance of each run. Raises what
     `whole_folder` raises.
     """
     tables = {folder: compare(run, folder) for folder, run in runs.items()}
@@ -209,7 +209,7 @@ _WORDS = {
 }  # fmt: skip
 _UNITS = {"mm", "m", "px", "um", "deg", "arcsec", "mm-1", "mm-2", "mm-4", "mm-6"}
 _SMALL = 1e-3
-"""Columns below it throughout are given in a power of ten."""
+"""Columns of smaller numbers are given in a power of ten."""
 
 
 def table_title(name: str) -> str:
@@ -221,7 +221,7 @@ def table_title(name: str) -> str:
 
 
 def heading(column: str, unit: str, power: int) -> str:
-    """The column in words, with its unit: that of its name, else `unit`; the numbers below are times 10**`power`."""
+    """The label of a column, with the unit of its name, else `unit`; its numbers are times 10**`power`."""
     stem, _, last = column.rpartition("_")
     named = last in _UNITS and bool(stem)
     of = (last if named else unit).replace("um", "µm")
@@ -232,22 +232,21 @@ def heading(column: str, unit: str, power: int) -> str:
 
 
 def power_of(values: Iterable[float]) -> int:
-    """The power of ten in which a column of small numbers is given, 0 for others."""
+    """The power of ten of a column of small numbers, 0 for others."""
     largest = max((abs(v) for v in values), default=0.0)
     return math.floor(math.log10(largest)) if 0 < largest < _SMALL else 0
 
 
 def printed_decimals(values: Iterable[float], power: int) -> int | None:
-    """Decimals that hold every one of `values` (in 10**`power`) whole; None where there is none but zero."""
+    """Decimals that give all `values` (in 10**`power`) exactly; None if all are zero."""
     places = [-int(Decimal(repr(float(v))).normalize().as_tuple().exponent) + power for v in values if v]
     return max([0, *places]) if places else None
 
 
 def own_decimals(value: float, spread: float, printed: int | None, size: float) -> int:
-    """Decimals of a value of ours: two digits of its spread, but as many as `printed` and at most one more.
+    """Decimals of a value of ours: two digits of its spread, but at least `printed` and at most one more.
 
-    Where nothing is printed and the spread is not known, three digits of `size`. Whole numbers, which are counted,
-    have none.
+    Without printed value and spread: three digits of `size`. Counts have none.
     """
     if value == round(value) and not spread > 0:
         return 0
@@ -272,10 +271,10 @@ _ACROSS = 5
 
 
 def plot_comparison(comparison: pd.DataFrame, table: str, column: str, ax: Axes | None = None) -> Axes:
-    """One printed column of `table`, a line for each row: what is printed and ours.
+    """Plot one printed column of `table`, a line for each row: printed and ours.
 
-    `comparison` is that of `compare`. Bars are the tolerance of the printed value and the standard deviation of ours
-    from layout to layout. Raises ValueError where nothing of the column is both printed and ours.
+    `comparison` is from `compare`. Bars are the tolerance of the printed value and the standard deviation of ours
+    from layout to layout. Raises ValueError if no cell of the column is both printed and ours.
     """
     cells = _both(comparison, table)
     of = cells[cells["column"] == column]
@@ -291,9 +290,9 @@ def plot_comparison(comparison: pd.DataFrame, table: str, column: str, ax: Axes 
 
 
 def comparison_figure(comparison: pd.DataFrame, table: str) -> Figure:
-    """One panel for each printed column of `table`, as `plot_comparison` has it.
+    """One panel for each printed column of `table`, as in `plot_comparison`.
 
-    Raises ValueError where nothing of the table is both printed and ours.
+    Raises ValueError if no cell of the table is both printed and ours.
     """
     cells = _both(comparison, table)
     rows = list(dict.fromkeys(cells["row"]))
@@ -346,9 +345,9 @@ def _name_rows(axes: Axes, rows: list[str]) -> None:
 
 
 def plot_agreement(comparison: pd.DataFrame, ax: Axes | None = None) -> Axes:
-    """Of every value with a tolerance ours minus printed over it, by table; `comparison` is that of `compare`.
+    """Plot ours minus printed over the tolerance, by table; `comparison` is from `compare`.
 
-    Raises ValueError where no value that is ours has one.
+    Raises ValueError if no value of ours has a tolerance.
     """
     if not comparison["within"].ne("").any():
         raise ValueError("no value that is printed and ours has a tolerance")
@@ -358,7 +357,7 @@ def plot_agreement(comparison: pd.DataFrame, ax: Axes | None = None) -> Axes:
 
 
 def draw_agreement(axes: Axes, comparison: pd.DataFrame) -> None:
-    """The same in a panel."""
+    """`plot_agreement` in a panel."""
     cells = comparison[comparison["within"] != ""]
     off = ((cells["ours"] - cells["published"]) / cells["tolerance"]).to_numpy(float)
     tables = list(dict.fromkeys(cells["table"]))

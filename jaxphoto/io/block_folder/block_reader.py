@@ -134,7 +134,7 @@ def assemble(source: BlockTables) -> Block:
     for name, layout in known.items():
         layout = layout_in(frame, layout)
         empty = Table.of(f"{name}.csv", {column: np.zeros(0, object) for column in layout.names(required=True)})
-        tables[name] = checked(name, source.tables.get(name, empty), layout)
+        tables[name] = checked(source.tables.get(name, empty), layout)
     if frame.kind == "epsg":
         frame = with_origin(frame, tables, source.trajectory, source.file)
         tables = tables_to_local(tables, frame)

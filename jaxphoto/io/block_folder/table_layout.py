@@ -25,12 +25,12 @@ TURN = ("turn_right_m", "turn_forward_m", "turn_up_m")
 
 
 class Column(NamedTuple):
-    """A column: `text`, or numbers, of which a `sigma` is positive, an `angle` at most 360 degrees, a `whole` whole."""
+    """A column of `text` or numbers: a `sigma` is positive, an `angle` at most 360 degrees, a `whole` number whole."""
 
     name: str
-    kind: Literal["text", "number", "sigma", "angle", "whole"] = "number"
+    kind: Literal["text", "number", "coordinate", "sigma", "angle", "whole"] = "number"
     required: bool = False
-    """The file must have it, with no empty cell (but for sigmas, which [sigmas] may complete)."""
+    """The file must have it, without empty cells (but for coordinates, and sigmas, which [sigmas] may complete)."""
 
 
 class TableLayout(NamedTuple):
@@ -79,7 +79,7 @@ LAYOUTS = {
     ),
     "control_points": TableLayout((*text("point"), *numbers(*XYZ, *SIGMA_XYZ), *text("role", required=False))),
     "stations": TableLayout(
-        (*text("image"), *(c._replace(required=True) for c in numbers(*XYZ)), *numbers(*SIGMA_XYZ, *VELOCITY)),
+        (*text("image"), *(Column(name, "coordinate", True) for name in XYZ), *numbers(*SIGMA_XYZ, *VELOCITY)),
         unique=("image",),
     ),
     "attitudes": TableLayout(
@@ -91,8 +91,6 @@ LAYOUTS = {
     ),
 }  # fmt: skip
 """The tables of the block itself; those of other observations follow from their classes (`declared_tables`)."""
-# Columns that the file must have, with cells that may be empty.
-_MAY_BE_EMPTY = {"stations": XYZ}
 
 
 def coordinate_names(frame: Frame) -> tuple[str, ...]:
@@ -107,7 +105,7 @@ def layout_in(frame: Frame, layout: TableLayout) -> TableLayout:
     return layout._replace(columns=tuple(c._replace(name=names.get(c.name, c.name)) for c in layout.columns))
 
 
-def checked(name: str, table: Table, layout: TableLayout) -> Table:
+def checked(table: Table, layout: TableLayout) -> Table:
     """The table with all columns of its layout: ids as text and numbers as floats, NaN and "" where they are empty.
 
     Raises RowError for the first cell that its column does not allow, and for rows that are given twice.
@@ -119,8 +117,7 @@ def checked(name: str, table: Table, layout: TableLayout) -> Table:
         elif kind == "sigma":
             columns[column] = table.sigmas(column)
         elif column in table or required:
-            may_be_empty = not required or column in _MAY_BE_EMPTY.get(name, ())
-            columns[column] = table.numbers(column, empty=may_be_empty)
+            columns[column] = table.numbers(column, empty=not required or kind == "coordinate")
         if kind == "angle" and column in columns:
             check_angles(table, columns[column][:, None], (column,))
         if kind == "whole":

@@ -166,7 +166,7 @@ class _BuildingKeys(PlanKeys):
 
 JitterKeys = plan_keys(Jitter, angle_deg=NotNegative, crab_deg=NotNegative, rate_deg_per_s=NotNegative)
 StartKeys = plan_keys(Approximation, position_m=NotNegative, angle_deg=NotNegative, points_m=NotNegative)
-CoolingKeys = plan_keys(Cooling, time_constant_s=Positive, reference_c=None)
+CoolingKeys = plan_keys(Cooling, time_constant_s=Positive, reference_c=Number | None)
 ChoiceKeys = plan_keys(Choice)
 PointKeys = plan_keys(
     PointPlan, _PointKeys, ties=Points | None, min_images=Annotated[Count, Field(ge=2)], mean_rays=Positive,

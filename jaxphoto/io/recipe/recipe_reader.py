@@ -37,6 +37,7 @@ from jaxphoto.simulation import (
     Assumed,
     CameraWalk,
     ConvergentPlan,
+    Cooling,
     Field,
     FlightPlan,
     Footprint,
@@ -134,8 +135,7 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
         biases=_biases(settings.top.section("strips"), top.section("strips"), strips),
         shutters={n: _shutter(table) for n, table in by_owner(top.section("shutters"), cameras).items()},
         changes=_changes(top, keys, list(cameras), strips),
-        temperature=keys.temperature
-        and keys.temperature.plan(reference_c=top.section("temperature").number("reference_c", keys.temperature.air_c)),
+        temperature=_temperature(keys.temperature),
         walk=_walk(top, keys.camera_walk),
         rig=_change(RigCamera, rig, cameras),
         datum_offset_m=tuple(keys.truth.datum_offset_m),
@@ -240,6 +240,11 @@ def _changes(top: Section, keys: Any, cameras: list[str], strips: list[str]) -> 
     if ThermalRates.kind in changes and keys.temperature is None:
         raise top.error(ThermalRates.kind, "the recipe has no temperature; add a table [temperature]")
     return changes
+
+
+def _temperature(keys: Any) -> Cooling | None:
+    """The temperature of the cameras; its reference is the air unless it is given."""
+    return keys and keys.plan(reference_c=keys.air_c if keys.reference_c is None else keys.reference_c)
 
 
 def _walk(top: Section, keys: Any) -> CameraWalk | None:
