@@ -92,7 +92,7 @@ class Table:
     def find(self, column: str, known: Sequence[str], message: Callable[[str], str]) -> np.ndarray:
         """The index in `known` of the id in each line. Raises BlockError with the `message` about an unknown id."""
         named = self.ids(column)
-        index = pd.Index(known, dtype=object).get_indexer(pd.Index(named, dtype=object))
+        index = pd.Index(np.array(known, object)).get_indexer(pd.Index(named))
         for line in np.flatnonzero(index < 0)[:1]:
             raise self.misfit(line, message(named[line]))
         return index

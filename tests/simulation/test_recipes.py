@@ -151,7 +151,7 @@ STRIP = {"name": "A", "heading_deg": 0.0, "images": 3}
         ({"cameras.kodak.start": {}}, "start: no such key is known"),
         ({"mounts.leica": {}}, r"\[mounts\] leica: no such key"),
         ({"mounts.default.truth.arm": 1}, r"\[mounts.default.truth\] arm: no such key"),
-        ({"mounts.default.image_x": "up"}, r"\[mounts.default\]: image_x is one of .*'up'"),
+        ({"mounts.default.image_x": "up"}, "image_x: 'up' is unknown; write forward"),
         ({"strips.Z.truth.shift_m": [0, 0, 0]}, r"\[strips\] Z: no such key is known; use default, A, B, C"),
         ({"strips.A.truth.shift": [0, 0, 0]}, r"\[strips.A.truth\] shift: no such key"),
         ({"truth.offset": [0, 0, 0]}, r"\[truth\] offset: no such key is known; use datum_offset_m"),

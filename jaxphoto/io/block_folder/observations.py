@@ -241,7 +241,7 @@ def _image_sigmas(table: Table, pixel: np.ndarray, settings: Settings) -> np.nda
     in_mm = np.stack([table.sigmas("sigma_x_mm"), table.sigmas("sigma_y_mm")], axis=1)
     in_px = table.sigmas("sigma_px")[:, None] * pixel * np.ones(2)
     table.check(
-        np.isfinite(in_mm + in_px).any(axis=1),
+        np.asarray(np.isfinite(in_mm + in_px).any(axis=1)),
         lambda _: "both sigma_px and sigma_x_mm or sigma_y_mm are given; keep one of them",
     )
     default = np.full_like(in_mm, default_sigma(settings, "image_mm"))

@@ -15,8 +15,8 @@ import numpy as np
 from jaxphoto.arrays import annotated, on_device
 from jaxphoto.block import Block
 from jaxphoto.camera import ImageMotion, RollingShutter
-from jaxphoto.errors import BlockError, counted, few
-from jaxphoto.georeferencing import Mount, Scanner, StripBias
+from jaxphoto.errors import BlockError, counted, few, quoted
+from jaxphoto.georeferencing import IMAGE_X, Mount, Scanner, StripBias
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.toml import Section, status
 from jaxphoto.observations.columns import FILE_UNITS
@@ -140,6 +140,9 @@ def by_owner(section: Section, owners: Iterable[str]) -> dict[str, Section]:
 def read_mounts(section: Section, cameras: Iterable[str]) -> Pairs:
     """Mounts and their priors by name: "default" or the id of a camera."""
     section.known("default", *cameras)
+    for table in map(section.section, section):
+        if table.values.get("image_x", "forward") not in IMAGE_X:
+            raise table.error("image_x", f"{quoted(table.values['image_x'])} is unknown; write {', '.join(IMAGE_X)}")
     mounts, priors = _read_each(Mount, {name: section.section(name) for name in section})
     for name, mount in mounts.items():
         if np.any(np.abs(mount.lever_arm) > 100):

@@ -163,13 +163,15 @@ def _camera(stated: Section, section: Section, camera: Camera) -> Assumed[Interi
     return Assumed(true.interior, camera.interior, camera.priors)
 
 
-def _truth(kind: type[AbstractParameters], section: Section, *others: str) -> tuple[Any, Any]:
-    """The true parameters of a table and their priors, by which they are drawn; `others` are no parameters.
+def _truth(kind: type[AbstractParameters], section: Section, *others: str, drawn: bool = False) -> tuple[Any, Any]:
+    """The true parameters of a table, and the priors by which they may be `drawn`; `others` are no parameters.
 
     Parameters that its table `truth` does not give are those of the block.
     """
     starts = {key.start for key in keys_of(kind)} | set(static_fields(kind))
     truth = section.section("truth")
+    if not drawn:
+        truth.known(*sorted(starts), *others)
     values = {key: value for key, value in section.values.items() if key in starts}
     values |= {key: value for key, value in truth.values.items() if key not in others}
     return read_parameters(kind, Section(truth.file, truth.path, values))
@@ -220,7 +222,7 @@ def _change(kind: type[AbstractParameters], section: Section, owners: Iterable[s
     """Changes by owner; the block's model does not know of one whose table has nothing but a `truth`."""
     changes = {}
     for name, table in by_owner(section, owners).items():
-        true, spread = _truth(kind, table)
+        true, spread = _truth(kind, table, drawn=True)
         for field in dynamic_fields(kind):
             if getattr(spread, field) == FREE:
                 raise table.section("truth").error(field, "a truth is not free; give its value or a sigma")
