@@ -241,7 +241,7 @@ def _image_sigmas(table: Table, pixel: np.ndarray, settings: Settings) -> np.nda
     in_mm = np.stack([table.sigmas("sigma_x_mm"), table.sigmas("sigma_y_mm")], axis=1)
     in_px = table.sigmas("sigma_px")[:, None] * pixel * np.ones(2)
     table.check(
-        np.asarray(np.isfinite(in_mm + in_px).any(axis=1)),
+        np.isfinite(in_mm + in_px).any(axis=1),
         lambda _: "both sigma_px and sigma_x_mm or sigma_y_mm are given; keep one of them",
     )
     default = np.full_like(in_mm, default_sigma(settings, "image_mm"))
@@ -249,7 +249,7 @@ def _image_sigmas(table: Table, pixel: np.ndarray, settings: Settings) -> np.nda
         default[:] = default_sigma(settings, "image_px") * pixel
     sigma = np.where(np.isnan(in_mm), np.where(np.isnan(in_px), default, in_px), in_mm)
     table.check(
-        np.isnan(sigma).any(axis=1),
+        np.asarray(np.isnan(sigma).any(axis=1)),
         lambda _: (
             "there is no standard deviation; add the column sigma_px, the columns sigma_x_mm and sigma_y_mm, or "
             f"image_mm (or image_px) under [sigmas] in {settings.file}"
