@@ -83,7 +83,7 @@ def single_image_cameras() -> Blocks:
 def _experiment(name: str, *variants: str) -> Blocks:
     """The first layout of an experiment, in the variants named or all."""
     from jaxphoto.experiment import simulated
-    from jaxphoto.experiment.folder import load_experiment
+    from jaxphoto.experiment.experiment import load_experiment
 
     folder = ROOT / "experiments" / name
     experiment = load_experiment(folder)

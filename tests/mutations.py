@@ -28,7 +28,6 @@ from jaxphoto.camera import ImageMotion, InteriorOrientation, OpenCv, RollingShu
 from jaxphoto.errors import JaxphotoError
 from jaxphoto.image_measurement import read_grey
 from jaxphoto.io import clouds, export, read_block, read_recipe, read_source, write_block
-from jaxphoto.io.block_folder.settings import toml_text
 from jaxphoto.io.cameras import read_camera_file, write_camera_file
 from jaxphoto.io.conditions import read_conditions
 from jaxphoto.io.control_files import read_control
@@ -41,6 +40,7 @@ from jaxphoto.io.kept_pieces import KeptPieces
 from jaxphoto.io.photograph_metadata import drone_record, xmp_fields
 from jaxphoto.io.photographs import photographs
 from jaxphoto.io.photomodeler import read_photomodeler
+from jaxphoto.io.toml import toml_text
 from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, write_sbet
 from jaxphoto.procedures.control.system import places, system_of
 from jaxphoto.unknowns import FIXED, FREE, Weighted

@@ -8,7 +8,7 @@ import typer
 from jaxphoto.cli.output import Output, command
 from jaxphoto.io import read_recipe, write_simulation
 from jaxphoto.io.block_folder import check_block_target
-from jaxphoto.io.recipe.scan_files import CLOUD, TRAJECTORY
+from jaxphoto.io.recipe.truth import CLOUD, TRAJECTORY
 from jaxphoto.simulation import simulate
 
 

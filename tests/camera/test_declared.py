@@ -28,7 +28,8 @@ from jaxphoto.camera import (
 from jaxphoto.camera.conversion import converted
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
-from jaxphoto.io.block_folder.settings import read_settings, toml_text
+from jaxphoto.io.block_folder.settings import read_settings
+from jaxphoto.io.toml import toml_text
 from jaxphoto.procedures.calibration import distortion_model
 from jaxphoto.procedures.camera_candidates import candidate_of
 from jaxphoto.unknowns import FIXED, FREE

@@ -14,7 +14,7 @@ import pytest
 
 from jaxphoto import InputError, bias
 from jaxphoto.experiment import MonteCarlo
-from jaxphoto.experiment.monte_carlo import _told
+from jaxphoto.experiment.monte_carlo import _errors_line
 from jaxphoto.io import write_block
 from jaxphoto.sensitivity import Readjustment, noise
 from jaxphoto.sensitivity.exact import sensitivity
@@ -212,13 +212,13 @@ def test_a_block_that_estimates_a_scanner(tmp_path):
         assert [of[f"scanner.{strip}.shift_{axis}_m"] for axis in "XYZ"] == pytest.approx(np.asarray(shift), rel=1e-9)
 
 
-def test_noise_of_observations_of_further_kinds_is_told(tmp_path):
+def test_errors_of_further_kinds_of_observations_are_listed(tmp_path):
     """They are found by their number in `Block.more`."""
     nominal = adjusted("cross")
     levelled = HeightDifferences(np.array([0]), np.array([1]), np.zeros(1), np.array([0.01]))
     drawn = noise(dataclasses.replace(nominal.block, more=(levelled,)))
     assert ("more", 0, "value") in drawn.targets
-    assert _told(drawn).startswith(f"{len(drawn.names)} of control, image_points, more, stations, ")
+    assert _errors_line(drawn).startswith(f"{len(drawn.names)} of control, image_points, more, stations, ")
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,16 @@ from matplotlib.figure import Figure
 
 from jaxphoto import Tables
 from jaxphoto.experiment import Experiment, Run, comparison_figure, plot_agreement, plot_comparison, side_by_side
-from jaxphoto.experiment.page import _STYLE, experiment_page, table_texts
-from jaxphoto.experiment.wording import heading, own_decimals, power_of, printed_decimals, table_title
+from jaxphoto.experiment.page import (
+    _STYLE,
+    experiment_page,
+    heading,
+    own_decimals,
+    power_of,
+    printed_decimals,
+    table_texts,
+    table_title,
+)
 from jaxphoto.report import to_plotly
 from tests.blocks import adjusted
 

@@ -5,8 +5,8 @@ import pytest
 
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder.camera_section import read_camera
-from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.dbat import read_dbat
+from jaxphoto.io.toml import Section
 from tests.sound_files import DBAT
 
 PIXEL, C = 5.4 / 1704, 7.457

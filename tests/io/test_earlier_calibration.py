@@ -102,7 +102,7 @@ def test_a_camera_file_keeps_the_covariance(years, results, monkeypatch, capsys)
         ('calibration = "../nothing"', "there is no file"),
         (
             'calibration = "../results"\nwidth_px = 3',
-            "width_px: the calibration says it; only residuals, unknowns",
+            "width_px: the calibration gives it; only residuals, unknowns",
         ),
         ('calibration = "../results"\n[cameras.one.unknowns]\nc_mm = "fixed"', "it is known beforehand by"),
     ],

@@ -10,7 +10,7 @@ import pytest
 import jaxphoto
 from jaxphoto.block import Block
 from jaxphoto.io import read_block, recipe_from, write_simulation
-from jaxphoto.io.block_folder.settings import toml_text
+from jaxphoto.io.toml import toml_text
 from jaxphoto.simulation import simulate
 from tests.commands import run
 from tests.simulation.small import RECIPES, changed, made

@@ -9,14 +9,13 @@ import pandas as pd
 from jaxphoto.arrays import on_device
 from jaxphoto.camera import InteriorOrientation, Sensor, constant_names, empty_camera, parameter_names, set_parameter
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section, known_together, read_sensor
-from jaxphoto.io.block_folder.section import Section
-from jaxphoto.io.block_folder.settings import read_settings, toml_text
+from jaxphoto.io.block_folder.settings import read_settings
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.cameras.camera_file import CameraFile, CameraSource
 from jaxphoto.io.json_file import read_json
 from jaxphoto.io.results_judged import SUMMARY, read_summary, reservation
 from jaxphoto.io.text_tables import read_csv
-from jaxphoto.io.toml import read_toml
+from jaxphoto.io.toml import Section, read_toml, toml_text
 from jaxphoto.unknowns import FIXED
 
 INTERIOR = "interior.csv"

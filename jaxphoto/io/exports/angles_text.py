@@ -15,11 +15,11 @@ import pandas as pd
 from jaxphoto.arrays import still
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
-from jaxphoto.io.block_folder.settings import toml_text
 from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs
 from jaxphoto.io.exports.image_points import write_image_points
 from jaxphoto.io.exports.map_photographs import in_map
 from jaxphoto.io.reconstructions.text_project import IMAGES
+from jaxphoto.io.toml import toml_text
 from jaxphoto.unknowns import FIXED
 
 FILE, CAMERAS = "exterior.txt", "camera.toml"

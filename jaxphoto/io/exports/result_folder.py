@@ -22,8 +22,7 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError, few
 from jaxphoto.io.block_folder import read_block
-from jaxphoto.io.block_folder.images import check_angles
-from jaxphoto.io.block_folder.table_layout import ANGLES, TOML, XYZ
+from jaxphoto.io.block_folder.table_layout import ANGLES, TOML, XYZ, check_angles
 from jaxphoto.io.cameras import read_camera_file
 from jaxphoto.io.cameras.own_cameras import INTERIOR
 from jaxphoto.io.json_file import read_json

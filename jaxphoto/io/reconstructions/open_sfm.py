@@ -22,13 +22,13 @@ from jaxtyping import Float, Int
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.georeferencing.map_frame import Place
 from jaxphoto.io.block_folder import BlockTables
-from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.cameras.camera_file import CameraSource, in_pixels
 from jaxphoto.io.cameras.open_cv import FISHEYE, PLANE
 from jaxphoto.io.json_file import read_any_json
 from jaxphoto.io.reconstructions.numbers import number_rows
 from jaxphoto.io.reconstructions.on_map import about_place
 from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotographs, free_network
+from jaxphoto.io.toml import Section
 from jaxphoto.io.whole_text import LARGE, has_words, read_text
 
 RECONSTRUCTION, TRACKS, REFERENCE = "reconstruction.json", "tracks.csv", "reference_lla.json"

@@ -20,7 +20,6 @@ from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError, few, quoted
 from jaxphoto.io.block_folder import BlockTables
-from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.cameras.camera_file import CameraSource, in_pixels
 from jaxphoto.io.cameras.open_cv import FISHEYE, PLANE
 from jaxphoto.io.json_file import read_any_json
@@ -28,6 +27,7 @@ from jaxphoto.io.reconstructions.numbers import number_rows
 from jaxphoto.io.reconstructions.points_beside import PhotographCamera, network_beside, points_beside
 from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, estimated
 from jaxphoto.io.text_tables import read_csv
+from jaxphoto.io.toml import Section
 from jaxphoto.io.whole_text import LARGE, SMALL, read_text
 from jaxphoto.io.yaml_text import yaml_values
 

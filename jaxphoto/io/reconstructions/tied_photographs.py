@@ -20,7 +20,7 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError, few, quoted
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
-from jaxphoto.io.block_folder.frame_sections import frame_section
+from jaxphoto.io.block_folder.settings import frame_section
 from jaxphoto.io.block_folder.table_layout import ANGLES, SIGMA_XYZ, coordinate_names
 from jaxphoto.io.text_tables import Table
 from jaxphoto.procedures.control.surveyed import SIGMA_M, SurveyedPoints
