@@ -278,7 +278,7 @@ def test_a_mistake_is_one_sentence_and_nothing_written(folder, monkeypatch, caps
 
 @pytest.mark.slow
 def test_killed_in_the_middle_it_goes_on_to_the_same_file(folder, tmp_path):
-    program = [sys.executable, "-c", "from jaxphoto.cli import main; main()", "monte-carlo", str(folder)]
+    program = [sys.executable, "-c", "from jaxphoto_command import main; main()", "monte-carlo", str(folder)]
     program += ["--bias", "station", "--per", "image", "--sigma-m", "0.1", "--draws", "10000"]
     subprocess.run([*program, "--out", str(tmp_path / "whole")], check=True, capture_output=True)
     killed = subprocess.Popen(
