@@ -45,7 +45,7 @@ def grid_points(sensor: Any, grid: str, extent: str | None) -> Any:
     minimum = max(UNKNOWNS.values()) // 2 + 1
     if columns != int(columns) or rows != int(rows) or min(columns, rows) < 2 or columns * rows < minimum:
         raise typer.BadParameter(f"--grid {grid}: give whole numbers of 2 or more, like 15x11.")
-    return image_grid(sensor, int(columns), int(rows), extent and pair("--extent", extent, "4.0x3.0"))
+    return image_grid(sensor, int(columns), int(rows), pair("--extent", extent, "4.0x3.0") if extent else None)
 
 
 Block = Annotated[Path, typer.Argument(help="Block folder (docs/block_folder.md).")]

@@ -71,7 +71,6 @@ class Output:
         plain = {"markup": False, "highlight": False, "emoji": False}
         self.screen = Console(quiet=quiet or as_json, **plain)  # type: ignore[arg-type]
         """Console of the results."""
-        self._bars = Console(stderr=True, quiet=quiet or verbose, **plain)  # type: ignore[arg-type]
         self._start, self._warnings, self._files = time.perf_counter(), list[str](), list[str]()
         self._summary, self._compile_s = dict[str, Any](), defaultdict[str, float](float)
         self._log = logging.StreamHandler() if verbose else None
@@ -92,6 +91,9 @@ class Output:
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, traceback: object) -> None:
+        import jax.monitoring
+
+        jax.monitoring.unregister_event_duration_listener(self._compiled)
         warnings.showwarning = self._showwarning
         if self._log:
             _LOG.removeHandler(self._log)
@@ -111,7 +113,9 @@ class Output:
             progress.TimeElapsedColumn(),
             progress.TimeRemainingColumn(),
         )
-        with progress.Progress(*columns, console=self._bars, transient=True, redirect_stdout=False) as bar:
+        console = Console(stderr=True)
+        hidden = self._quiet or self._log is not None or not console.is_terminal
+        with progress.Progress(*columns, console=console, transient=True, redirect_stdout=False, disable=hidden) as bar:
             yield Progress(bar, description)
 
     def warn(self, text: str) -> None:
@@ -174,12 +178,12 @@ class Output:
         options = {name: value for name, value in params.items() if name not in paths} | values
         return {"method": {"command": self.context.info_name, **options}}
 
-    def _compiled(self, event: str, duration_s: float, **tags: Any) -> None:
+    def _compiled(self, event: str, duration_secs: float, **tags: Any) -> None:
         if event == _COMPILED:
             name = str(tags.get("fun_name", "")).removeprefix("jit(").removesuffix(")").strip("_") or "a program"
-            self._compile_s[name] += duration_s
-            if duration_s >= _COMPILE_LISTED_S:
-                _LOG.info("compiled %s in %.1f s", name, duration_s)
+            self._compile_s[name] += duration_secs
+            if duration_secs >= _COMPILE_LISTED_S:
+                _LOG.info("compiled %s in %.1f s", name, duration_secs)
 
     def _end(self, exit_code: int) -> None:
         seconds = sum(self._compile_s.values())

@@ -124,14 +124,8 @@ def adjust_flight(output: Output, flight: StripFiles, choices: StripChoices, out
         placement = Placement(cloud.name, system, map_frame)
         control = None if flight.control is None else control_in_frame(flight.control, placement)
         track = None if path is None else scanner_path(path)
-        parts = partial(
-            clouds.cloud_chunks,
-            cloud,
-            map_frame,
-            classes=flight.classes,
-            returns=flight.returns,
-            **options,  # type: ignore[arg-type]
-        )
+        selection: dict[str, Any] = {"classes": flight.classes, "returns": flight.returns}
+        parts = partial(clouds.cloud_chunks, cloud, map_frame, **selection, **options)
         # The number of points that a filter leaves is unknown.
         total = clouds.most_points(cloud) if flight.classes is None and flight.returns == "all" else None
         coverage = None if path is None else CoveredTimes(path)

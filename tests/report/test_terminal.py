@@ -8,7 +8,6 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxphoto import Tables
-from jaxphoto.cli.console import plain_console
 from jaxphoto.report import Finding, Level, Verdict, print_adjustment, residuals_figure
 from jaxphoto.report.plots import drawn, new_figure
 from tests.blocks import adjusted
