@@ -9,5 +9,5 @@ from jaxphoto_command import blocks, photographs, cameras, lidar, files, example
 from jaxphoto_command.app import app, command, main, share_one_pool
 
 __all__ = [
-    "app", "blocks", "cameras", "command", "examples", "files", "lidar", "main", "photographs", "share_one_pool",
+    "app", "blocks", "cameras", "command", "examples", "files", "lidar", "main", "photographs", "share_one_pool"
 ]  # fmt: skip

@@ -9,6 +9,7 @@ from importlib.metadata import version
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 
 from jaxphoto_command.output import Output
 
@@ -25,15 +26,10 @@ OPTIONAL_PACKAGES = {
 _Function = Callable[..., None]
 _PANEL = "Output"
 _COMMON = {
-    "json": Annotated[
-        bool, typer.Option("--json", help="Print one JSON object, for programs.", rich_help_panel=_PANEL)
-    ],
-    "quiet": Annotated[
-        bool, typer.Option("--quiet", "-q", help="Print only warnings and errors.", rich_help_panel=_PANEL)
-    ],
+    "json": Annotated[bool, Option("--json", help="Print one JSON object, for programs.", rich_help_panel=_PANEL)],
+    "quiet": Annotated[bool, Option("--quiet", "-q", help="Print only warnings and errors.", rich_help_panel=_PANEL)],
     "verbose": Annotated[
-        bool,
-        typer.Option("--verbose", "-v", help="Log each step, iteration and compilation.", rich_help_panel=_PANEL),
+        bool, Option("--verbose", "-v", help="Log each step, iteration and compilation.", rich_help_panel=_PANEL)
     ],
 }
 # M_ARENA_MAX of <malloc.h>.
@@ -49,7 +45,7 @@ app = typer.Typer(
 
 
 @app.callback(invoke_without_command=True)
-def root(show_version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
+def root(show_version: Annotated[bool, Option("--version", help="Print the version and exit.")] = False) -> None:
     """Print the version."""
     if show_version:
         typer.echo(f"jaxphoto {version('jaxphoto')}")

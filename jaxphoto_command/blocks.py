@@ -8,20 +8,10 @@ from threading import Thread
 from typing import Annotated, Any, Literal
 
 import typer
+from typer import Argument, Option
 
+from jaxphoto_command import options as opt
 from jaxphoto_command.app import command
-from jaxphoto_command.options import (
-    Alignment,
-    Block,
-    Camera,
-    Extent,
-    Grid,
-    MaxSteps,
-    Out,
-    Seed,
-    grid_points,
-    names,
-)
 from jaxphoto_command.output import Output
 
 PANEL = "Adjustment and assessment"
@@ -29,7 +19,7 @@ _EXAMPLE = "jaxphoto example cross_block && "
 _ADJUSTED = f"{_EXAMPLE}jaxphoto adjust cross_block --out results && "
 _BIASES = Literal[
     "station", "attitude", "trajectory", "trajectory-attitude", "control", "image-points", "lever-arm", "boresight",
-    "interior", "noise",
+    "interior", "noise"
 ]  # fmt: skip
 # Unit and option of the standard deviation of each bias; metres otherwise.
 _DEGREES = ("attitude", "trajectory-attitude", "boresight")
@@ -46,22 +36,22 @@ _SHOWN = 12
 )
 def adjust(
     output: Output,
-    block: Block,
-    out: Out,
+    block: opt.Block,
+    out: opt.Out,
     rotations: Annotated[
-        Literal["omega_phi_kappa", "object", "camera"], typer.Option(help="Rotation parameters of the correlations.")
+        Literal["omega_phi_kappa", "object", "camera"], Option(help="Rotation parameters of the correlations.")
     ] = "omega_phi_kappa",
     snoop: Annotated[
-        bool, typer.Option("--snoop", help="Reject outliers by data snooping; write them and the remaining block.")
+        bool, Option("--snoop", help="Reject outliers by data snooping; write them and the remaining block.")
     ] = False,
     robust: Annotated[
         Literal["huber", "tukey", "geman_mcclure", "student_t"] | None,
-        typer.Option(help="Reject outliers, starting from a robust adjustment with this loss."),
+        Option(help="Reject outliers, starting from a robust adjustment with this loss."),
     ] = None,
-    max_steps: MaxSteps = 100,
+    max_steps: opt.MaxSteps = 100,
     weights: Annotated[
         str | None,
-        typer.Option(help="Estimate variance components by group, or comma-separated by xy-z, axis, camera, image."),
+        Option(help="Estimate variance components by group, or comma-separated by xy-z, axis, camera, image."),
     ] = None,
 ) -> None:
     """Adjust a block and write tables, statistics and a report. Exit code 1: written, but the verdict is red."""
@@ -75,7 +65,7 @@ def adjust(
     from jaxphoto.writing import check_folder, whole_folder
     from jaxphoto_command.provenance import Provenance, made_by
 
-    splits = tuple(dict.fromkeys(names(weights)))
+    splits = tuple(dict.fromkeys(opt.names(weights)))
     if unknown := [name for name in splits if name not in (*SPLITS, "group")]:
         raise typer.BadParameter(f"--weights {unknown[0]}: choose from group, {', '.join(SPLITS)}.")
     splits = tuple(name for name in splits if name != "group")
@@ -132,10 +122,10 @@ def adjust(
 )
 def boresight(
     output: Output,
-    block: Block,
-    out: Out,
-    go_on: Annotated[bool, typer.Option("--go-on", help="Continue after a step that fails its test.")] = False,
-    max_steps: MaxSteps = 100,
+    block: opt.Block,
+    out: opt.Out,
+    go_on: Annotated[bool, Option("--go-on", help="Continue after a step that fails its test.")] = False,
+    max_steps: opt.MaxSteps = 100,
 ) -> None:
     """Estimate the boresight misalignment in four steps. Exit code 1: written, but a step failed."""
     from jaxphoto.io import read_block
@@ -161,14 +151,14 @@ def boresight(
 @command("certificate", PANEL, f"{_ADJUSTED}jaxphoto certificate results --out camera.pdf")
 def certificate(
     output: Output,
-    results: Annotated[Path, typer.Argument(help="Results of adjust or fly.")],
-    out: Annotated[Path, typer.Option(help="Certificate to write (.html or .pdf).")],
-    last: Annotated[Path | None, typer.Option(help="Last calibration (results or camera file), to compare.")] = None,
-    halves: Annotated[Path | None, typer.Option(help="Results of jaxphoto halves on the block.")] = None,
+    results: Annotated[Path, Argument(help="Results of adjust or fly.")],
+    out: Annotated[Path, Option(help="Certificate to write (.html or .pdf).")],
+    last: Annotated[Path | None, Option(help="Last calibration (results or camera file), to compare.")] = None,
+    halves: Annotated[Path | None, Option(help="Results of jaxphoto halves on the block.")] = None,
     photographs: Annotated[
-        list[Path] | None, typer.Option(help="Photographs or folders of them, if the results name none.")
+        list[Path] | None, Option(help="Photographs or folders of them, if the results name none.")
     ] = None,
-    camera: Camera = None,
+    camera: opt.Camera = None,
 ) -> None:
     """Write the certificate of a calibration: parameters, precision, stability, inputs."""
     from jaxphoto.io.results_judged import read_summary, reservation
@@ -188,10 +178,10 @@ def certificate(
 @command("tables", PANEL, f"{_ADJUSTED}jaxphoto tables results --to latex --only interior --out tables")
 def tables(
     output: Output,
-    results: Annotated[Path, typer.Argument(help="Folder of results, as of adjust.")],
-    to: Annotated[Literal["csv", "parquet", "markdown", "latex"], typer.Option(help="Format.")],
-    out: Annotated[Path, typer.Option(help="Output folder; earlier tables in it are replaced.")],
-    only: Annotated[str, typer.Option(help="Tables, comma-separated, like interior,exterior (default: all).")] = "",
+    results: Annotated[Path, Argument(help="Folder of results, as of adjust.")],
+    to: Annotated[Literal["csv", "parquet", "markdown", "latex"], Option(help="Format.")],
+    out: Annotated[Path, Option(help="Output folder; earlier tables in it are replaced.")],
+    only: Annotated[str, Option(help="Tables, comma-separated, like interior,exterior (default: all).")] = "",
 ) -> None:
     """Write tables of results as CSV, Parquet, Markdown or LaTeX, rounded to their standard deviations."""
     from jaxphoto.io import read_result_tables
@@ -200,7 +190,7 @@ def tables(
     from jaxphoto.writing import check_folder, whole_folder
 
     check_folder(out, results)
-    read = read_result_tables(results, names(only))
+    read = read_result_tables(results, opt.names(only))
     with output.progress("writing") as progress, whole_folder(out) as work:
         for number, (name, table) in enumerate(read.items()):
             progress.steps("writing tables", number, len(read))
@@ -218,23 +208,22 @@ def tables(
 )
 def monte_carlo(
     output: Output,
-    block: Block,
-    out: Annotated[Path, typer.Option(help="Output folder; an interrupted run in it is resumed.")],
-    kind: Annotated[_BIASES, typer.Option("--bias", help="Observations or parameters in error.")],
-    per: Annotated[str | None, typer.Option(help="Draw one error per block, strip, image, point ...")] = None,
+    block: opt.Block,
+    out: Annotated[Path, Option(help="Output folder; an interrupted run in it is resumed.")],
+    kind: Annotated[_BIASES, Option("--bias", help="Observations or parameters in error.")],
+    per: Annotated[str | None, Option(help="Draw one error per block, strip, image, point ...")] = None,
     sigma_m: Annotated[
-        str | None, typer.Option(help="Standard deviation (m): one number, or three, comma-separated.")
+        str | None, Option(help="Standard deviation (m): one number, or three, comma-separated.")
     ] = None,
-    sigma_deg: Annotated[str | None, typer.Option(help="Standard deviation (degrees) of attitude, boresight.")] = None,
-    sigma_mm: Annotated[str | None, typer.Option(help="Standard deviation (mm) of image points.")] = None,
-    sigma: Annotated[str | None, typer.Option(help="Standard deviation of the interior parameter.")] = None,
-    parameter: Annotated[str, typer.Option(help="Interior parameter (c_mm, k1 ...) of --bias interior.")] = "",
-    on: Annotated[list[str] | None, typer.Option(help="Only this strip, image, point ... (repeatable).")] = None,
-    draws: Annotated[int, typer.Option(help="Number of draws.")] = 1000,
-    seed: Seed = 0,
+    sigma_deg: Annotated[str | None, Option(help="Standard deviation (degrees) of attitude, boresight.")] = None,
+    sigma_mm: Annotated[str | None, Option(help="Standard deviation (mm) of image points.")] = None,
+    sigma: Annotated[str | None, Option(help="Standard deviation of the interior parameter.")] = None,
+    parameter: Annotated[str, Option(help="Interior parameter (c_mm, k1 ...) of --bias interior.")] = "",
+    on: Annotated[list[str] | None, Option(help="Only this strip, image, point ... (repeatable).")] = None,
+    draws: Annotated[int, Option(help="Number of draws.")] = 1000,
+    seed: opt.Seed = 0,
     keep: Annotated[
-        list[str] | None,
-        typer.Option("--with", help="Also keep exterior, or points with check points (repeatable)."),
+        list[str] | None, Option("--with", help="Also keep exterior, or points with check points (repeatable).")
     ] = None,
 ) -> None:
     """Re-adjust a block with drawn errors; write draws, their statistics and a report."""
@@ -305,12 +294,12 @@ def _sigmas(kind: str, values: dict[str, str | None]) -> list[float]:
 @command("sensitivity", PANEL, f"{_EXAMPLE}jaxphoto sensitivity cross_block --out sensitivity")
 def sensitivity(
     output: Output,
-    block: Block,
-    out: Out,
-    per: Annotated[Literal["block", "strip", "image"], typer.Option(help="Bias the stations of each.")] = "strip",
-    bias_m: Annotated[float, typer.Option(help="Station bias.")] = 0.10,
-    delta0: Annotated[float, typer.Option(help="Non-centrality parameter of the test of normalised residuals.")] = 4.13,
-    max_steps: MaxSteps = 100,
+    block: opt.Block,
+    out: opt.Out,
+    per: Annotated[Literal["block", "strip", "image"], Option(help="Bias the stations of each.")] = "strip",
+    bias_m: Annotated[float, Option(help="Station bias.")] = 0.10,
+    delta0: Annotated[float, Option(help="Non-centrality parameter of the test of normalised residuals.")] = 4.13,
+    max_steps: opt.MaxSteps = 100,
 ) -> None:
     """Compute the exact sensitivity of interior orientation and check points to stations, and external reliability."""
     from jaxphoto.io import read_block
@@ -355,17 +344,17 @@ def sensitivity(
 @command("halves", PANEL, f"{_EXAMPLE}jaxphoto halves cross_block --by image --cuts 64 --out halves")
 def halves(
     output: Output,
-    block: Block,
-    out: Out,
+    block: opt.Block,
+    out: opt.Out,
     by: Annotated[
-        str, typer.Option(help="Unit of the split: image, strip, or a partition of block.toml like day.")
+        str, Option(help="Unit of the split: image, strip, or a partition of block.toml like day.")
     ] = "image",
-    cuts: Annotated[int, typer.Option(min=1, help="Number of random splits.")] = 64,
-    seed: Seed = 0,
-    method: Alignment = "rot",
-    grid: Grid = "15x11",
-    extent: Extent = None,
-    camera: Camera = None,
+    cuts: Annotated[int, Option(min=1, help="Number of random splits.")] = 64,
+    seed: opt.Seed = 0,
+    method: opt.Alignment = "rot",
+    grid: opt.Grid = "15x11",
+    extent: opt.Extent = None,
+    camera: opt.Camera = None,
 ) -> None:
     """Assess the standard deviations of a calibration by random halves of its block.
 
@@ -382,7 +371,7 @@ def halves(
     check_folder(out, block)
     with output.progress("reading the block") as progress:
         read, made = read_block(block), made_by(output, block)
-        cells = grid_points(read.sensors[camera_of(read, camera)], grid, extent)
+        cells = opt.grid_points(read.sensors[camera_of(read, camera)], grid, extent)
         result = compare_halves(
             read, cells, by=by, camera=camera, n_cuts=cuts, seed=seed, method=method, report=progress.update
         )

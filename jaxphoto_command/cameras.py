@@ -5,29 +5,16 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
+from jaxphoto_command import options as opt
 from jaxphoto_command.app import command
-from jaxphoto_command.options import (
-    Alignment,
-    Block,
-    Camera,
-    CameraB,
-    Extent,
-    Grid,
-    Out,
-    PixelSize,
-    ResultBlock,
-    Seed,
-    grid_points,
-    names,
-    positive,
-)
 from jaxphoto_command.output import Output
 
 PANEL = "Camera comparison"
-CameraA = Annotated[Path, typer.Argument(metavar="A", help="Results or camera file of one calibration.")]
-CameraFileB = Annotated[Path, typer.Argument(metavar="B", help="Results or camera file of the other calibration.")]
-OptionalOut = Annotated[Path | None, typer.Option(help="Output folder for tables, figures and report.")]
+CameraA = Annotated[Path, Argument(metavar="A", help="Results or camera file of one calibration.")]
+CameraFileB = Annotated[Path, Argument(metavar="B", help="Results or camera file of the other calibration.")]
+OptionalOut = Annotated[Path | None, Option(help="Output folder for tables, figures and report.")]
 
 
 @command("stability", PANEL, "jaxphoto stability camera_2025 camera_2026 --out stability")
@@ -35,15 +22,15 @@ def stability(
     output: Output,
     first: CameraA,
     second: CameraFileB,
-    method: Alignment = "rot",
-    grid: Grid = "15x11",
-    extent: Extent = None,
-    noise_px: Annotated[float, typer.Option(callback=positive, help="Noise of image coordinates.")] = 1.0,
-    relief: Annotated[float, typer.Option(help="Relief of the object points of spr, as a fraction of distance.")] = 0.0,
-    camera: Camera = None,
-    camera_b: CameraB = None,
-    pixel_mm: PixelSize = None,
-    block: ResultBlock = None,
+    method: opt.Alignment = "rot",
+    grid: opt.Grid = "15x11",
+    extent: opt.Extent = None,
+    noise_px: Annotated[float, Option(callback=opt.positive, help="Noise of image coordinates.")] = 1.0,
+    relief: Annotated[float, Option(help="Relief of the object points of spr, as a fraction of distance.")] = 0.0,
+    camera: opt.Camera = None,
+    camera_b: opt.CameraB = None,
+    pixel_mm: opt.PixelSize = None,
+    block: opt.ResultBlock = None,
     out: OptionalOut = None,
 ) -> None:
     """Compare the bundles of rays of two interior orientations (Habib et al. 2006), with uncertainty."""
@@ -59,7 +46,7 @@ def stability(
         check_folder(out, first, second)
     a, b = read_two((first, second), (camera, camera_b), pixel_mm, block)
     with output.progress("comparing"):
-        points = grid_points(a.sensor, grid, extent)
+        points = opt.grid_points(a.sensor, grid, extent)
         analysis = analyse(a.interior, b.interior, points, (a.covariance, b.covariance), relief)
     noise_mm = noise_px * a.sensor.pixel_mm
     sets = compared("A", first, a), compared("B", second, b)
@@ -78,13 +65,13 @@ def compare(
     output: Output,
     first: CameraA,
     second: CameraFileB,
-    method: Alignment = "rot",
-    grid: Grid = "15x11",
-    extent: Extent = None,
-    camera: Camera = None,
-    camera_b: CameraB = None,
-    pixel_mm: PixelSize = None,
-    block: ResultBlock = None,
+    method: opt.Alignment = "rot",
+    grid: opt.Grid = "15x11",
+    extent: opt.Extent = None,
+    camera: opt.Camera = None,
+    camera_b: opt.CameraB = None,
+    pixel_mm: opt.PixelSize = None,
+    block: opt.ResultBlock = None,
     out: OptionalOut = None,
 ) -> None:
     """Test whether a camera has changed between two calibrations, by its parameters and by its bundle of rays."""
@@ -101,7 +88,7 @@ def compare(
     if share_measurements(first, second):
         output.warn("A and B share photographs or image points; the test assumes independent ones")
     with output.progress("comparing"):
-        points = grid_points(a.sensor, grid, extent)
+        points = opt.grid_points(a.sensor, grid, extent)
         result = change(a.interior, b.interior, points, (a.covariance, b.covariance), method)
     sets = compared("A", first, a), compared("B", second, b)
     for letter, file in (("A", a), ("B", b)):
@@ -117,9 +104,9 @@ def compare(
 @command("combine", PANEL, "jaxphoto combine 2023 2024 2025 --out camera.toml")
 def combine(
     output: Output,
-    calibrations: Annotated[list[Path], typer.Argument(help="Results or camera files with a covariance.")],
-    out: Annotated[Path, typer.Option(help="Camera file (.toml) to write, prior information for blocks.")],
-    camera: Camera = None,
+    calibrations: Annotated[list[Path], Argument(help="Results or camera files with a covariance.")],
+    out: Annotated[Path, Option(help="Camera file (.toml) to write, prior information for blocks.")],
+    camera: opt.Camera = None,
 ) -> None:
     """Combine calibrations of one camera by their full covariances. Exit code 1: written, but they disagree."""
     import numpy as np
@@ -148,13 +135,7 @@ def combine(
     result = combine([file.interior for file in files.values()], covariances, list(files))
     notes = "; ".join(f"{name}: {file.note}" for name, file in files.items() if file.note)
     write_camera_file(
-        out,
-        first.sensor,
-        result.interior,
-        "block",
-        name=first.name,
-        covariance=result.covariance,
-        reservation=notes,
+        out, first.sensor, result.interior, "block", name=first.name, covariance=result.covariance, reservation=notes
     )
     for parameter, variance in zip(parameter_names(result.interior), np.diagonal(result.covariance), strict=True):
         if variance > 0:
@@ -189,14 +170,13 @@ def combine(
 )
 def models(
     output: Output,
-    block: Block,
-    out: Out,
+    block: opt.Block,
+    out: opt.Out,
     models: Annotated[
-        str,
-        typer.Option(help="Comma-separated: brown (usual parameters), brown:all, brown:none, brown:k1+k2, smac."),
+        str, Option(help="Comma-separated: brown (usual parameters), brown:all, brown:none, brown:k1+k2, smac.")
     ] = "brown:none,brown:k1,brown:k1+k2,brown:k1+k2+k3,brown,brown:all",
-    folds: Annotated[int, typer.Option(min=0, help="Folds of the cross-validation; 0 for none.")] = 5,
-    seed: Seed = 0,
+    folds: Annotated[int, Option(min=0, help="Folds of the cross-validation; 0 for none.")] = 5,
+    seed: opt.Seed = 0,
 ) -> None:
     """Compare distortion models by cross-validation, information criteria and significance."""
     from jaxphoto.io import read_block
@@ -210,7 +190,7 @@ def models(
     with output.progress("reading the block") as progress:
         read, made = read_block(block), made_by(output, block)
         seconds = {"read": time.perf_counter() - start}
-        choice = model_choice(read, names(models), k=folds, seed=seed, report=progress.update)
+        choice = model_choice(read, opt.names(models), k=folds, seed=seed, report=progress.update)
         seconds["adjust"] = time.perf_counter() - start - seconds["read"]
         progress.update(f"writing {out}")
         write_model_choice(choice, read, out, seconds, made)

@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
+from jaxphoto_command import options as opt
 from jaxphoto_command.app import command
-from jaxphoto_command.options import BlockOut, Seed
 from jaxphoto_command.output import Output
 
 PANEL = "Examples and simulation"
@@ -27,9 +27,9 @@ NEXT = {
 def example(
     output: Output,
     name: Annotated[
-        str | None, typer.Argument(metavar="NAME", help=f"Example: {', '.join(NEXT)} (default: list them).")
+        str | None, Argument(metavar="NAME", help=f"Example: {', '.join(NEXT)} (default: list them).")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Path to write (default: NAME or NAME.toml).")] = None,
+    out: Annotated[Path | None, Option(help="Path to write (default: NAME or NAME.toml).")] = None,
 ) -> None:
     """Write an example block, recipe or experiment that comes with jaxphoto."""
     import shutil
@@ -66,9 +66,9 @@ def example(
 @command("simulate", PANEL, "jaxphoto example recipe && jaxphoto simulate recipe.toml --out block --seed 1")
 def simulate(
     output: Output,
-    recipe: Annotated[Path, typer.Argument(help="Recipe in TOML (docs/simulation.md).")],
-    out: BlockOut,
-    seed: Seed = 0,
+    recipe: Annotated[Path, Argument(help="Recipe in TOML (docs/simulation.md).")],
+    out: opt.BlockOut,
+    seed: opt.Seed = 0,
 ) -> None:
     """Simulate a block with known truth."""
     from jaxphoto.io import read_recipe, write_simulation
@@ -97,17 +97,13 @@ def simulate(
     output.add(**counts, seed=seed)
 
 
-@command(
-    "experiment",
-    PANEL,
-    "jaxphoto example experiments && jaxphoto experiment 000 --layouts 4 --out runs",
-)
+@command("experiment", PANEL, "jaxphoto example experiments && jaxphoto experiment 000 --layouts 4 --out runs")
 def experiment(
     output: Output,
-    name: Annotated[str, typer.Argument(help="Folder of the experiment, like 000, or all.")],
-    out: Annotated[Path, typer.Option(help="Output folder; an earlier run in it is replaced.")] = Path("results"),
-    experiments: Annotated[Path, typer.Option(help="Folder of the experiments.")] = Path("experiments"),
-    layouts: Annotated[int | None, typer.Option(min=1, help="Simulated layouts (default: of the experiment).")] = None,
+    name: Annotated[str, Argument(help="Folder of the experiment, like 000, or all.")],
+    out: Annotated[Path, Option(help="Output folder; an earlier run in it is replaced.")] = Path("results"),
+    experiments: Annotated[Path, Option(help="Folder of the experiments.")] = Path("experiments"),
+    layouts: Annotated[int | None, Option(min=1, help="Simulated layouts (default: of the experiment).")] = None,
 ) -> None:
     """Run experiments; write tables.csv and report.html with the published values."""
     from jaxphoto.experiment import compare, find_experiments, load_experiment, run_experiment, write_runs

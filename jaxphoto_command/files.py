@@ -4,15 +4,24 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
+from typer import Argument, Option
 
+from jaxphoto_command import options as opt
 from jaxphoto_command.app import command
-from jaxphoto_command.options import Camera, PixelSize
 from jaxphoto_command.output import Output
 
 PANEL = "Files and formats"
 _ADJUSTED = "jaxphoto example cross_block && jaxphoto adjust cross_block --out results && "
-Source = Annotated[Path, typer.Argument(help="Results, block folder, or file or folder of another program.")]
-Second = Annotated[Path | None, typer.Argument(hidden=True, metavar="OUT")]
+_Source = Literal[
+    "block", "dbat", "photomodeler", "aicon", "bal", "colmap", "opensfm", "openmvg", "blocksexchange", "metashape",
+    "pix4d", "nerfstudio", "orthority", "texts", "bundler"
+]  # fmt: skip
+_Target = Literal[
+    "block", "colmap", "colmap-binary", "metashape", "opensfm", "openmvg", "blocksexchange", "nerfstudio", "bundler",
+    "bal", "opk", "orthority", "geojson", "geopackage"
+]  # fmt: skip
+Source = Annotated[Path, Argument(help="Results, block folder, or file or folder of another program.")]
+Second = Annotated[Path | None, Argument(hidden=True, metavar="OUT")]
 
 
 def _target(out: Path | None, second: Path | None) -> Path:
@@ -27,29 +36,16 @@ def convert(
     output: Output,
     source: Source,
     second: Second = None,
-    out: Annotated[Path | None, typer.Option(help="Folder to write (required).")] = None,
+    out: Annotated[Path | None, Option(help="Folder to write (required).")] = None,
     source_format: Annotated[
-        Literal[
-            "block", "dbat", "photomodeler", "aicon", "bal", "colmap", "opensfm", "openmvg", "blocksexchange",
-            "metashape", "pix4d", "nerfstudio", "orthority", "texts", "bundler",
-        ]
-        | None,
-        typer.Option("--format", help="Format of SOURCE (docs/command_line.md; default: recognised by content)."),
+        _Source | None, Option("--format", help="Format of SOURCE (docs/command_line.md; default: by its content).")
     ] = None,
-    to: Annotated[
-        Literal[
-            "block", "colmap", "colmap-binary", "metashape", "opensfm", "openmvg", "blocksexchange", "nerfstudio",
-            "bundler", "bal", "opk", "orthority", "geojson", "geopackage",
-        ],
-        typer.Option(help="Format of --out (docs/exports.md)."),
-    ] = "block",
-    block: Annotated[Path | None, typer.Option(help="Block of the results in SOURCE, if it was moved.")] = None,
-    part: Annotated[int, typer.Option(min=1, help="Part of a flight; the largest is 1.")] = 1,
-    photographs: Annotated[
-        list[Path] | None, typer.Option(help="Folder of the photographs, for their file names.")
-    ] = None,
-    adjust: Annotated[bool, typer.Option("--adjust", help="Adjust the block in SOURCE first.")] = False,
-) -> None:  # fmt: skip
+    to: Annotated[_Target, Option(help="Format of --out (docs/exports.md).")] = "block",
+    block: Annotated[Path | None, Option(help="Block of the results in SOURCE, if it was moved.")] = None,
+    part: Annotated[int, Option(min=1, help="Part of a flight; the largest is 1.")] = 1,
+    photographs: Annotated[list[Path] | None, Option(help="Folder of the photographs, for their file names.")] = None,
+    adjust: Annotated[bool, Option("--adjust", help="Adjust the block in SOURCE first.")] = False,
+) -> None:
     """Convert another program's files to a block folder, or a block or results to files of other programs."""
     from jaxphoto.io import exports, read_source, write_block
     from jaxphoto.io.block_folder import check_block_target
@@ -129,27 +125,27 @@ def camera(
     output: Output,
     source: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             help="Results, block folder or COLMAP model; or a file: OpenCV's and ROS' YAML, COLMAP's cameras.txt, "
             "Agisoft's XML, mrcal's .cameramodel, Kalibr's camera chain, a SMAC report, interior.csv, block.toml."
         ),
     ],
     second: Second = None,
-    out: Annotated[Path | None, typer.Option(help="Camera file to write (required).")] = None,
+    out: Annotated[Path | None, Option(help="Camera file to write (required).")] = None,
     out_format: Annotated[
         Literal["opencv", "colmap", "agisoft", "mrcal", "ros", "smac", "block"] | None,
-        typer.Option("--format", help="Format of --out (default: by its name)."),
+        Option("--format", help="Format of --out (default: by its name)."),
     ] = None,
-    camera: Camera = None,
-    pixel_mm: PixelSize = None,
-    width_px: Annotated[int | None, typer.Option(min=1, help="Image width, if SOURCE lacks it.")] = None,
-    height_px: Annotated[int | None, typer.Option(min=1, help="Image height, if SOURCE lacks it.")] = None,
-    block: Annotated[Path | None, typer.Option(help="Block of the results in SOURCE.")] = None,
-    distortion: Annotated[str | None, typer.Option(help="Distortion model of a .toml (default: of SOURCE).")] = None,
+    camera: opt.Camera = None,
+    pixel_mm: opt.PixelSize = None,
+    width_px: Annotated[int | None, Option(min=1, help="Image width, if SOURCE lacks it.")] = None,
+    height_px: Annotated[int | None, Option(min=1, help="Image height, if SOURCE lacks it.")] = None,
+    block: Annotated[Path | None, Option(help="Block of the results in SOURCE.")] = None,
+    distortion: Annotated[str | None, Option(help="Distortion model of a .toml (default: of SOURCE).")] = None,
     model: Annotated[
-        str | None, typer.Option(help="Largest model of the format to use, like OPENCV (default: as required).")
+        str | None, Option(help="Largest model of the format to use, like OPENCV (default: as required).")
     ] = None,
-    loss_px: Annotated[float, typer.Option(min=0, help="Maximum misfit of a fitted model.")] = 1.0,
+    loss_px: Annotated[float, Option(min=0, help="Maximum misfit of a fitted model.")] = 1.0,
 ) -> None:
     """Convert a camera file: exactly where the models allow it, otherwise fitted, with the misfit in pixels."""
     from jaxphoto.camera import AbstractDistortion, get_parameter, parameter_names

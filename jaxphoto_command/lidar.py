@@ -6,23 +6,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
+from typer import Argument, Option
 
+from jaxphoto_command import options as opt
 from jaxphoto_command.app import command
-from jaxphoto_command.options import (
-    Block,
-    BlockOut,
-    Classes,
-    Cloud,
-    CloudEpsg,
-    CloudUnit,
-    MaxSteps,
-    Out,
-    Returns,
-    class_numbers,
-    finite,
-    names,
-    positive,
-)
 from jaxphoto_command.output import Output, Progress
 
 PANEL = "Lidar"
@@ -30,27 +17,26 @@ _EXAMPLE = "jaxphoto example lidar && "
 SCANNER = ("boresight", "lever-arm", "range-offset", "range-scale", "angle-scale", "eccentricity", "time-offset")
 """Scanner parameters that may be estimated."""
 
-SigmaZ = Annotated[float, typer.Option(callback=positive, help="Standard deviation of a laser point in Z.")]
-SigmaXY = Annotated[float, typer.Option(callback=positive, help="Standard deviation of a laser point in each of X, Y.")]
-Systematic = Annotated[float, typer.Option(help="Standard deviation of a common error of all heights.")]
-MaxRounds = Annotated[int, typer.Option(min=1, help="Maximum number of outer iterations (surface lookup, adjustment).")]
+SigmaZ = Annotated[float, Option(callback=opt.positive, help="Standard deviation of a laser point in Z.")]
+SigmaXY = Annotated[float, Option(callback=opt.positive, help="Standard deviation of a laser point in each of X, Y.")]
+Systematic = Annotated[float, Option(help="Standard deviation of a common error of all heights.")]
+MaxRounds = Annotated[int, Option(min=1, help="Maximum number of outer iterations (surface lookup, adjustment).")]
 Trajectory = Annotated[
-    Path | None, typer.Option(help="Trajectory of the scanner (docs/trajectory.md), on the clock of the cloud.")
+    Path | None, Option(help="Trajectory of the scanner (docs/trajectory.md), on the clock of the cloud.")
 ]
-TrajectoryShift = Annotated[float, typer.Option(callback=finite, help="Trajectory time minus point cloud time.")]
-ExposureShift = Annotated[float, typer.Option(callback=finite, help="Point cloud time minus time_s of images.csv.")]
-Control = Annotated[Path | None, typer.Option(help="Surveyed points on smooth surfaces (docs/control.md).")]
+TrajectoryShift = Annotated[float, Option(callback=opt.finite, help="Trajectory time minus point cloud time.")]
+ExposureShift = Annotated[float, Option(callback=opt.finite, help="Point cloud time minus time_s of images.csv.")]
+Control = Annotated[Path | None, Option(help="Surveyed points on smooth surfaces (docs/control.md).")]
 Breaklines = Annotated[
-    str | None,
-    typer.Option(help="Tie points on breaklines, comma-separated, * as wildcard (default: those of block.toml)."),
+    str | None, Option(help="Tie points on breaklines, comma-separated, * as wildcard (default: those of block.toml).")
 ]
 Pattern = Annotated[
     Literal["line", "circle", "oscillating", "rotating", "risley", "nutating"] | None,
-    typer.Option(help="Scan pattern (default: line)."),
+    Option(help="Scan pattern (default: line)."),
 ]
-CellSize = Annotated[float, typer.Option(callback=positive, help="Cell size of the plane search.")]
-Roughness = Annotated[float, typer.Option(callback=positive, help="Maximum scatter of the returns of a plane.")]
-KnotSpacing = Annotated[float, typer.Option(callback=positive, help="Knot spacing of the trajectory errors.")]
+CellSize = Annotated[float, Option(callback=opt.positive, help="Cell size of the plane search.")]
+Roughness = Annotated[float, Option(callback=opt.positive, help="Maximum scatter of the returns of a plane.")]
+KnotSpacing = Annotated[float, Option(callback=opt.positive, help="Knot spacing of the trajectory errors.")]
 # Options of `simultaneous` without and with --adjust.
 _SURFACE_OPTIONS = ("boresight", "shift", "method", "sigma_z_m", "sigma_xy_m", "sigma_systematic_m")
 _PLANE_OPTIONS = ("exposure_shift_s", "control", "breaklines", "pattern", "cell_m", "roughness_m", "knots_s")
@@ -59,19 +45,19 @@ _PLANE_OPTIONS = ("exposure_shift_s", "control", "breaklines", "pattern", "cell_
 @command("lidar-control", PANEL, f"{_EXAMPLE}jaxphoto lidar-control lidar lidar/cloud.laz --out with_heights")
 def lidar_control(
     output: Output,
-    block: Block,
-    cloud: Cloud,
-    out: BlockOut,
+    block: opt.Block,
+    cloud: opt.Cloud,
+    out: opt.BlockOut,
     method: Annotated[
-        Literal["plane", "local", "tin", "idw", "image"], typer.Option(help="Height from laser points.")
+        Literal["plane", "local", "tin", "idw", "image"], Option(help="Height from laser points.")
     ] = "plane",
     sigma_z_m: SigmaZ = 0.15,
     sigma_xy_m: SigmaXY = 0.5,
     sigma_systematic_m: Systematic = 0.0,
-    classes: Classes = None,
-    returns: Returns = "all",
-    cloud_epsg: CloudEpsg = None,
-    cloud_unit: CloudUnit = None,
+    classes: opt.Classes = None,
+    returns: opt.Returns = "all",
+    cloud_epsg: opt.CloudEpsg = None,
+    cloud_unit: opt.CloudUnit = None,
     max_rounds: MaxRounds = 20,
 ) -> None:
     """Add the heights of laser points at tie points as control, and write the block."""
@@ -86,7 +72,7 @@ def lidar_control(
     from jaxphoto_command.provenance import made_by
 
     settings = HeightSettings(sigma_z_m=sigma_z_m, sigma_xy_m=sigma_xy_m, sigma_systematic_m=sigma_systematic_m)
-    selection = {"classes": class_numbers(classes), "returns": returns, "epsg": cloud_epsg, "unit": cloud_unit}
+    selection = {"classes": opt.class_numbers(classes), "returns": returns, "epsg": cloud_epsg, "unit": cloud_unit}
     check_block_target(out, block, cloud)
     with output.progress("reading the block") as progress:
         read, points = _block_and_cloud(block, cloud, selection, progress)
@@ -113,16 +99,16 @@ def lidar_control(
 @command("roof-control", PANEL, f"{_EXAMPLE}jaxphoto roof-control lidar lidar/cloud.laz --out with_roofs")
 def roof_control(
     output: Output,
-    block: Block,
-    cloud: Cloud,
-    out: BlockOut,
-    centroids: Annotated[str | None, typer.Option(help="Points at centroids of roof faces, comma-separated.")] = None,
+    block: opt.Block,
+    cloud: opt.Cloud,
+    out: opt.BlockOut,
+    centroids: Annotated[str | None, Option(help="Points at centroids of roof faces, comma-separated.")] = None,
     sigma_z_m: SigmaZ = 0.15,
     sigma_xy_m: SigmaXY = 0.5,
-    classes: Classes = None,
-    returns: Returns = "all",
-    cloud_epsg: CloudEpsg = None,
-    cloud_unit: CloudUnit = None,
+    classes: opt.Classes = None,
+    returns: opt.Returns = "all",
+    cloud_epsg: opt.CloudEpsg = None,
+    cloud_unit: opt.CloudUnit = None,
     max_rounds: MaxRounds = 20,
 ) -> None:
     """Constrain tie points to planes of roof faces, and centroids of roofs in X, Y and Z; write the block."""
@@ -133,12 +119,12 @@ def roof_control(
     from jaxphoto.report.lidar import print_rounds
 
     settings = HeightSettings(sigma_z_m=sigma_z_m, sigma_xy_m=sigma_xy_m, sigma_systematic_m=0.0)
-    selection = {"classes": class_numbers(classes), "returns": returns, "epsg": cloud_epsg, "unit": cloud_unit}
+    selection = {"classes": opt.class_numbers(classes), "returns": returns, "epsg": cloud_epsg, "unit": cloud_unit}
     check_block_target(out, block, cloud)
     with output.progress("reading the block") as progress:
         read, points = _block_and_cloud(block, cloud, selection, progress)
         options: dict[str, Any] = {"max_rounds": max_rounds, "report": _report_rounds(progress)}
-        result = roof_control(read, points, settings, centroids=names(centroids), **options)
+        result = roof_control(read, points, settings, centroids=opt.names(centroids), **options)
         progress.update(f"writing {out}")
         write_block(result.block, out)
     print_rounds(result.rounds, result.still, output.screen)
@@ -154,30 +140,28 @@ def roof_control(
 )
 def simultaneous(
     output: Output,
-    block: Block,
-    cloud: Cloud,
-    out: Out,
+    block: opt.Block,
+    cloud: opt.Cloud,
+    out: opt.Out,
     trajectory: Trajectory = None,
     trajectory_shift_s: TrajectoryShift = 0.0,
     boresight: Annotated[
         str | None,
-        typer.Option(
-            help="Boresight of the scanner: free (default with a trajectory), fixed, or its sigma in degrees."
-        ),
+        Option(help="Boresight of the scanner: free (default with a trajectory), fixed, or its sigma in degrees."),
     ] = None,
-    shift: Annotated[str, typer.Option(help="Shift of each lidar strip: free, fixed, or its sigma in m.")] = "0.3",
-    method: Annotated[Literal["local", "plane", "tin", "idw"], typer.Option(help="Surface model.")] = "local",
+    shift: Annotated[str, Option(help="Shift of each lidar strip: free, fixed, or its sigma in m.")] = "0.3",
+    method: Annotated[Literal["local", "plane", "tin", "idw"], Option(help="Surface model.")] = "local",
     sigma_z_m: SigmaZ = 0.15,
     sigma_xy_m: SigmaXY = 0.5,
     sigma_systematic_m: Systematic = 0.0,
-    classes: Classes = None,
-    returns: Returns = "all",
-    cloud_epsg: CloudEpsg = None,
-    cloud_unit: CloudUnit = None,
+    classes: opt.Classes = None,
+    returns: opt.Returns = "all",
+    cloud_epsg: opt.CloudEpsg = None,
+    cloud_unit: opt.CloudUnit = None,
     max_rounds: MaxRounds = 20,
     adjust: Annotated[
         str | None,
-        typer.Option(help="Estimate of the whole system, comma-separated: scanner,trajectory,camera (docs/joint.md)."),
+        Option(help="Estimate of the whole system, comma-separated: scanner,trajectory,camera (docs/joint.md)."),
     ] = None,
     exposure_shift_s: ExposureShift = 0.0,
     control: Control = None,
@@ -219,7 +203,7 @@ def simultaneous(
     )
 
     _check_options(output, _PLANE_OPTIONS if adjust is None else _SURFACE_OPTIONS)
-    selected = class_numbers(classes)
+    selected = opt.class_numbers(classes)
     if adjust is not None:
         free = _scanner_parameters(adjust, ("scanner", "trajectory", "camera"))
         times = (trajectory_shift_s, block, exposure_shift_s)
@@ -282,55 +266,53 @@ def simultaneous(
 )
 def strips(
     output: Output,
-    cloud: Cloud,
-    out: Out,
+    cloud: opt.Cloud,
+    out: opt.Out,
     trajectory: Trajectory = None,
     trajectory_shift_s: TrajectoryShift = 0.0,
     adjust: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help=f"Scanner parameters to estimate, comma-separated: {', '.join(SCANNER)}; or none (default: boresight)."
         ),
     ] = None,
     pattern: Pattern = None,
     block: Annotated[
-        Path | None, typer.Option(help="Block folder of photographs on this trajectory, to adjust with the strips.")
+        Path | None, Option(help="Block folder of photographs on this trajectory, to adjust with the strips.")
     ] = None,
     exposure_shift_s: ExposureShift = 0.0,
     control: Control = None,
     breaklines: Breaklines = None,
-    hold: Annotated[str, typer.Option(help="Strips with a fixed trajectory, comma-separated.")] = "",
+    hold: Annotated[str, Option(help="Strips with a fixed trajectory, comma-separated.")] = "",
     cell_m: CellSize = 3.0,
     roughness_m: Roughness = 0.06,
-    most_planes: Annotated[int, typer.Option(min=1, help="Maximum number of observed planes.")] = 4000,
+    most_planes: Annotated[int, Option(min=1, help="Maximum number of observed planes.")] = 4000,
     knots_s: KnotSpacing = 10.0,
     correlation_s: Annotated[
-        float, typer.Option(callback=positive, help="Correlation time of the trajectory errors.")
+        float, Option(callback=opt.positive, help="Correlation time of the trajectory errors.")
     ] = 100.0,
     sigma_position_m: Annotated[
         float | None,
-        typer.Option(callback=positive, help="Standard deviation of positions (default: of the trajectory, or 0.08)."),
+        Option(callback=opt.positive, help="Standard deviation of positions (default: of the trajectory, or 0.08)."),
     ] = None,
     sigma_attitude_deg: Annotated[
         float | None,
-        typer.Option(
-            callback=positive, help="Standard deviation of roll, pitch (default: of the trajectory, or 0.005)."
-        ),
+        Option(callback=opt.positive, help="Standard deviation of roll, pitch (default: of the trajectory, or 0.005)."),
     ] = None,
     sigma_heading_deg: Annotated[
         float | None,
-        typer.Option(callback=positive, help="Standard deviation of heading (default: of the trajectory, or 0.01)."),
+        Option(callback=opt.positive, help="Standard deviation of heading (default: of the trajectory, or 0.01)."),
     ] = None,
     sigma_exposure_m: Annotated[
-        float, typer.Option(callback=positive, help="Additional standard deviation of exposure positions.")
+        float, Option(callback=opt.positive, help="Additional standard deviation of exposure positions.")
     ] = 0.01,
     sigma_exposure_deg: Annotated[
-        float, typer.Option(callback=positive, help="Additional standard deviation of exposure attitudes.")
+        float, Option(callback=opt.positive, help="Additional standard deviation of exposure attitudes.")
     ] = 0.002,
-    classes: Classes = None,
-    returns: Returns = "all",
-    cloud_epsg: CloudEpsg = None,
-    cloud_unit: CloudUnit = None,
+    classes: opt.Classes = None,
+    returns: opt.Returns = "all",
+    cloud_epsg: opt.CloudEpsg = None,
+    cloud_unit: opt.CloudUnit = None,
     max_rounds: MaxRounds = 10,
 ) -> None:
     """Fit the strips of a point cloud to each other; write errors, corrected cloud and corrected trajectory.
@@ -366,7 +348,7 @@ def strips(
         trajectory_shift_s,
         block,
         exposure_shift_s,
-        class_numbers(classes),
+        opt.class_numbers(classes),
         returns,
         cloud_epsg,
         cloud_unit,
@@ -377,22 +359,22 @@ def strips(
     if adjust is not None or pattern is not None:
         free = set() if adjust == "none" else _scanner_parameters(adjust or "boresight")
         priors = scanner_priors(free, pattern)
-    adjust_flight(output, files, StripChoices(settings, set(stated), priors, names(hold), False, max_rounds), out)
+    adjust_flight(output, files, StripChoices(settings, set(stated), priors, opt.names(hold), False, max_rounds), out)
 
 
 @command("dsm", PANEL, f"{_EXAMPLE}jaxphoto dsm lidar/cloud.laz --out dsm.tif --cell-m 4 --hillshade hill.png")
 def dsm(
     output: Output,
-    cloud: Cloud,
-    out: Annotated[Path, typer.Option(help="GeoTIFF to write.")],
-    cell_m: Annotated[float, typer.Option(callback=positive, help="Cell size.")] = 1.0,
-    classes: Classes = None,
-    returns: Returns = "all",
-    statistic: Annotated[Literal["highest", "mean", "lowest"], typer.Option(help="Height of a cell.")] = "highest",
-    fill_m: Annotated[float, typer.Option(min=0.0, help="Fill gaps within this distance of heights.")] = 0.0,
-    cloud_epsg: CloudEpsg = None,
-    cloud_unit: CloudUnit = None,
-    shading: Annotated[Path | None, typer.Option("--hillshade", help="PNG of the shaded surface to write.")] = None,
+    cloud: opt.Cloud,
+    out: Annotated[Path, Option(help="GeoTIFF to write.")],
+    cell_m: Annotated[float, Option(callback=opt.positive, help="Cell size.")] = 1.0,
+    classes: opt.Classes = None,
+    returns: opt.Returns = "all",
+    statistic: Annotated[Literal["highest", "mean", "lowest"], Option(help="Height of a cell.")] = "highest",
+    fill_m: Annotated[float, Option(min=0.0, help="Fill gaps within this distance of heights.")] = 0.0,
+    cloud_epsg: opt.CloudEpsg = None,
+    cloud_unit: opt.CloudUnit = None,
+    shading: Annotated[Path | None, Option("--hillshade", help="PNG of the shaded surface to write.")] = None,
 ) -> None:
     """Compute a surface model from a point cloud."""
     import numpy as np
@@ -404,7 +386,7 @@ def dsm(
     check_file(out, cloud)
     if shading is not None:
         check_file(shading, cloud, out)
-    selected, options = class_numbers(classes), {"epsg": cloud_epsg, "unit": cloud_unit}
+    selected, options = opt.class_numbers(classes), {"epsg": cloud_epsg, "unit": cloud_unit}
     with output.progress("reading the cloud") as progress:
         system = clouds.cloud_system(cloud, **options)  # type: ignore[arg-type]
         # Headers are rounded: one more cell on each side, removed if empty.
@@ -434,13 +416,13 @@ def dsm(
 @command("orthophoto", PANEL, "jaxphoto orthophoto BLOCK photo.jpg dsm.tif --image A1 --out ortho.tif")
 def orthophoto(
     output: Output,
-    block: Block,
-    photo: Annotated[Path, typer.Argument(help="Photograph of the image.")],
-    dsm: Annotated[Path, typer.Argument(help="Surface model.")],
-    image: Annotated[str, typer.Option(help="Id of the image in the block.")],
-    out: Annotated[Path, typer.Option(help="GeoTIFF to write.")],
-    dsm_epsg: Annotated[int | None, typer.Option(help="EPSG code of the surface model, if not in the file.")] = None,
-    max_steps: MaxSteps = 100,
+    block: opt.Block,
+    photo: Annotated[Path, Argument(help="Photograph of the image.")],
+    dsm: Annotated[Path, Argument(help="Surface model.")],
+    image: Annotated[str, Option(help="Id of the image in the block.")],
+    out: Annotated[Path, Option(help="GeoTIFF to write.")],
+    dsm_epsg: Annotated[int | None, Option(help="EPSG code of the surface model, if not in the file.")] = None,
+    max_steps: opt.MaxSteps = 100,
 ) -> None:
     """Adjust a block and project the photograph of one of its images onto a surface model."""
     import jax
@@ -504,10 +486,10 @@ def _check_options(output: Output, options: tuple[str, ...]) -> None:
 
 def _scanner_parameters(text: str, others: tuple[str, ...] = ()) -> set[str]:
     """Return the comma-separated scanner parameters, or names of `others`."""
-    for name in names(text) or [""]:
+    for name in opt.names(text) or [""]:
         if name not in (*others, *SCANNER):
             raise typer.BadParameter(f"--adjust {name or repr(text)}: choose from {', '.join((*others, *SCANNER))}.")
-    return set(names(text))
+    return set(opt.names(text))
 
 
 def _prior(option: str, text: str, unit: float) -> Any:

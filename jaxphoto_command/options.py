@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
+from typer import Argument, Option
 
 
 def positive(context: typer.Context, value: float | None) -> float | None:
@@ -48,64 +49,60 @@ def grid_points(sensor: Any, grid: str, extent: str | None) -> Any:
     return image_grid(sensor, int(columns), int(rows), pair("--extent", extent, "4.0x3.0") if extent else None)
 
 
-Block = Annotated[Path, typer.Argument(help="Block folder (docs/block_folder.md).")]
-Out = Annotated[Path, typer.Option(help="Output folder; earlier results in it are replaced.")]
-BlockOut = Annotated[Path, typer.Option(help="Block folder to write; a block in it is replaced.")]
-MaxSteps = Annotated[int, typer.Option(min=1, help="Maximum number of iterations.")]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")]
+Block = Annotated[Path, Argument(help="Block folder (docs/block_folder.md).")]
+Out = Annotated[Path, Option(help="Output folder; earlier results in it are replaced.")]
+BlockOut = Annotated[Path, Option(help="Block folder to write; a block in it is replaced.")]
+MaxSteps = Annotated[int, Option(min=1, help="Maximum number of iterations.")]
+Seed = Annotated[int, Option(min=0, help="Seed of the random numbers.")]
 
 Alignment = Annotated[
-    Literal["zrot", "rot", "spr"], typer.Option("--method", help="What the exterior orientation may compensate.")
+    Literal["zrot", "rot", "spr"], Option("--method", help="What the exterior orientation may compensate.")
 ]
-Grid = Annotated[str, typer.Option(help="Columns and rows of the grid.")]
+Grid = Annotated[str, Option(help="Columns and rows of the grid.")]
 Extent = Annotated[
-    str | None, typer.Option(help="Width and height of the grid in mm, like 4.0x3.0 (default: the image format).")
+    str | None, Option(help="Width and height of the grid in mm, like 4.0x3.0 (default: the image format).")
 ]
-Camera = Annotated[str | None, typer.Option(help="Camera, where there are several.")]
-CameraB = Annotated[str | None, typer.Option(help="Camera of B, if its name differs.")]
-ResultBlock = Annotated[Path | None, typer.Option(help="Block of the results, where they lack the camera model.")]
+Camera = Annotated[str | None, Option(help="Camera, where there are several.")]
+CameraB = Annotated[str | None, Option(help="Camera of B, if its name differs.")]
+ResultBlock = Annotated[Path | None, Option(help="Block of the results, where they lack the camera model.")]
 
-Photographs = Annotated[list[Path], typer.Argument(help="Photographs of one camera, or folders of them.")]
-Distortion = Annotated[str, typer.Option(help="Distortion model, like brown, smac or opencv (docs/models.md).")]
+Photographs = Annotated[list[Path], Argument(help="Photographs of one camera, or folders of them.")]
+Distortion = Annotated[str, Option(help="Distortion model, like brown, smac or opencv (docs/models.md).")]
 FreeParameters = Annotated[
-    str | None, typer.Option(help="Parameters to estimate, comma-separated: c,xp,yp,k1 (default: usual ones).")
+    str | None, Option(help="Parameters to estimate, comma-separated: c,xp,yp,k1 (default: usual ones).")
 ]
-R0 = Annotated[float | None, typer.Option(help="Balance radius R0 of SMAC (default: 0).")]
-PixelSize = Annotated[float | None, typer.Option(help="Pixel size (default: from the file).")]
-PrincipalDistance = Annotated[float | None, typer.Option(help="Initial principal distance (default: from EXIF).")]
+R0 = Annotated[float | None, Option(help="Balance radius R0 of SMAC (default: 0).")]
+PixelSize = Annotated[float | None, Option(help="Pixel size (default: from the file).")]
+PrincipalDistance = Annotated[float | None, Option(help="Initial principal distance (default: from EXIF).")]
 Pairs = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="Photographs to match: exhaustive, sequence:K, position:K, similar:K (default: exhaustive up to 40, else "
         "position:20, or similar:20 without positions). Fewer pairs take less time."
     ),
 ]
 Features = Annotated[
-    int | None, typer.Option(min=100, help="Maximum number of features (default: 10000, above 40 photographs 5000).")
+    int | None, Option(min=100, help="Maximum number of features (default: 10000, above 40 photographs 5000).")
 ]
-LongestSide = Annotated[
-    int | None, typer.Option(min=200, help="Longer side of the photograph for features (default: 2400).")
-]
-ControlMarks = Annotated[Path | None, typer.Option(help="Image measurements of the points, if in another file.")]
+LongestSide = Annotated[int | None, Option(min=200, help="Longer side of the photograph for features (default: 2400).")]
+ControlMarks = Annotated[Path | None, Option(help="Image measurements of the points, if in another file.")]
 ControlSystem = Annotated[
-    str | None, typer.Option(help="Coordinate system of the points, if not in the file: 25832, 25832+7837, local.")
+    str | None, Option(help="Coordinate system of the points, if not in the file: 25832, 25832+7837, local.")
 ]
 MapSystem = Annotated[
-    str | None, typer.Option(help="Map system of the block, like 25832 or with heights 25832+7837 (default: UTM zone).")
+    str | None, Option(help="Map system of the block, like 25832 or with heights 25832+7837 (default: UTM zone).")
 ]
 Targets = Annotated[
     str | None,
-    typer.Option(
-        help="Targets to find at the points: circle:diameter_mm=300, aruco:dictionary=4X4_50, cross:side_mm=600."
-    ),
+    Option(help="Targets to find at the points: circle:diameter_mm=300, aruco:dictionary=4X4_50, cross:side_mm=600."),
 ]
 
-Cloud = Annotated[Path, typer.Argument(help="Point cloud: .las, .laz, .csv or .ply (docs/clouds.md).")]
-Classes = Annotated[str | None, typer.Option("--class", help="Classes to use, comma-separated: 2,6.")]
-Returns = Annotated[Literal["all", "first", "last", "only"], typer.Option(help="Returns to use.")]
-CloudEpsg = Annotated[int | None, typer.Option(help="EPSG code of the point cloud; overrides the file.")]
+Cloud = Annotated[Path, Argument(help="Point cloud: .las, .laz, .csv or .ply (docs/clouds.md).")]
+Classes = Annotated[str | None, Option("--class", help="Classes to use, comma-separated: 2,6.")]
+Returns = Annotated[Literal["all", "first", "last", "only"], Option(help="Returns to use.")]
+CloudEpsg = Annotated[int | None, Option(help="EPSG code of the point cloud; overrides the file.")]
 CloudUnit = Annotated[
-    Literal["m", "ft", "us_ft"] | None, typer.Option(help="Linear unit of the point cloud; overrides the file.")
+    Literal["m", "ft", "us_ft"] | None, Option(help="Linear unit of the point cloud; overrides the file.")
 ]
 
 

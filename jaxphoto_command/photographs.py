@@ -9,29 +9,10 @@ from threading import Thread
 from typing import Annotated, Any, Literal, get_args
 
 import typer
+from typer import Argument, Option
 
+from jaxphoto_command import options as opt
 from jaxphoto_command.app import command
-from jaxphoto_command.options import (
-    R0,
-    BlockOut,
-    Camera,
-    ControlMarks,
-    ControlSystem,
-    Distortion,
-    Features,
-    FreeParameters,
-    LongestSide,
-    MapSystem,
-    MaxSteps,
-    Out,
-    Pairs,
-    Photographs,
-    PixelSize,
-    PrincipalDistance,
-    Targets,
-    names,
-    positive,
-)
 from jaxphoto_command.output import Output
 
 PANEL = "Photographs"
@@ -41,37 +22,35 @@ _CONTROL = "gcp_list.txt, markers of Metashape, GeoJSON, GeoPackage, geoin.dat o
 @command("fly", PANEL, "jaxphoto fly photographs --out flight")
 def fly(
     output: Output,
-    photographs: Photographs,
-    out: Out,
-    pairs: Pairs = None,
-    epsg: MapSystem = None,
-    features: Features = None,
-    longest_px: LongestSide = None,
-    c_mm: PrincipalDistance = None,
-    pixel_mm: PixelSize = None,
-    model: Distortion = "brown",
+    photographs: opt.Photographs,
+    out: opt.Out,
+    pairs: opt.Pairs = None,
+    epsg: opt.MapSystem = None,
+    features: opt.Features = None,
+    longest_px: opt.LongestSide = None,
+    c_mm: opt.PrincipalDistance = None,
+    pixel_mm: opt.PixelSize = None,
+    model: opt.Distortion = "brown",
     no_lens_prior: Annotated[
-        bool, typer.Option("--no-lens-prior", help="Omit the prior information of such lenses (docs/lens_priors.md).")
+        bool, Option("--no-lens-prior", help="Omit the prior information of such lenses (docs/lens_priors.md).")
     ] = False,
     rolling_shutter: Annotated[
-        bool, typer.Option("--rolling-shutter", help="Estimate the readout time of the rows from positions and times.")
+        bool, Option("--rolling-shutter", help="Estimate the readout time of the rows from positions and times.")
     ] = False,
     exposures: Annotated[
-        list[Path] | None, typer.Option(help="Exposure files outside the folders: .MRK, .pos, SBET, a table.")
+        list[Path] | None, Option(help="Exposure files outside the folders: .MRK, .pos, SBET, a table.")
     ] = None,
     lever_arm: Annotated[
-        str | None, typer.Option(help="From camera to antenna in m: right,forward,up of the aircraft.")
+        str | None, Option(help="From camera to antenna in m: right,forward,up of the aircraft.")
     ] = None,
     heights: Annotated[
         str | None,
-        typer.Option(
-            help="Height reference, if not in the files: ellipsoid, geoid, take-off, or EPSG code (EGM96: 5773)."
-        ),
+        Option(help="Height reference, if not in the files: ellipsoid, geoid, take-off, or EPSG code (EGM96: 5773)."),
     ] = None,
-    control: Annotated[Path | None, typer.Option(help=f"Surveyed points: {_CONTROL}.")] = None,
-    marks: ControlMarks = None,
-    control_epsg: ControlSystem = None,
-    targets: Targets = None,
+    control: Annotated[Path | None, Option(help=f"Surveyed points: {_CONTROL}.")] = None,
+    marks: opt.ControlMarks = None,
+    control_epsg: opt.ControlSystem = None,
+    targets: opt.Targets = None,
 ) -> None:
     """Calibrate the camera of a flight from its photographs and their positions: orient, georeference, adjust, assess.
 
@@ -220,16 +199,16 @@ def fly(
 @command("control", PANEL, "jaxphoto control flight/block gcp_list.txt --out controlled")
 def control(
     output: Output,
-    block: Annotated[Path, typer.Argument(help="Block folder with oriented images.")],
-    file: Annotated[Path, typer.Argument(help=f"Surveyed points: {_CONTROL}.")],
-    out: Out,
-    marks: ControlMarks = None,
-    control_epsg: ControlSystem = None,
-    targets: Targets = None,
+    block: Annotated[Path, Argument(help="Block folder with oriented images.")],
+    file: Annotated[Path, Argument(help=f"Surveyed points: {_CONTROL}.")],
+    out: opt.Out,
+    marks: opt.ControlMarks = None,
+    control_epsg: opt.ControlSystem = None,
+    targets: opt.Targets = None,
     photographs: Annotated[
-        list[Path] | None, typer.Option(help="Folder of the photographs of the block, to find targets.")
+        list[Path] | None, Option(help="Folder of the photographs of the block, to find targets.")
     ] = None,
-    epsg: MapSystem = None,
+    epsg: opt.MapSystem = None,
 ) -> None:
     """Adjust an oriented block with surveyed points and their image measurements.
 
@@ -311,19 +290,19 @@ def control(
 )
 def calibrate(
     output: Output,
-    images: Annotated[list[Path], typer.Argument(help="Photographs of the board by one camera at one focus.")],
-    board: Annotated[str, typer.Option(help="Board, as below.")],
-    out: Out,
-    model: Distortion = "smac",
-    r0_mm: R0 = None,
-    free: FreeParameters = None,
-    pixel_mm: PixelSize = None,
-    c_mm: PrincipalDistance = None,
+    images: Annotated[list[Path], Argument(help="Photographs of the board by one camera at one focus.")],
+    board: Annotated[str, Option(help="Board, as below.")],
+    out: opt.Out,
+    model: opt.Distortion = "smac",
+    r0_mm: opt.R0 = None,
+    free: opt.FreeParameters = None,
+    pixel_mm: opt.PixelSize = None,
+    c_mm: opt.PrincipalDistance = None,
     board_sigma_mm: Annotated[
         float | None,
-        typer.Option(callback=positive, help="Standard deviation of the board's coordinates (default: fixed)."),
+        Option(callback=opt.positive, help="Standard deviation of the board's coordinates (default: fixed)."),
     ] = None,
-    max_steps: MaxSteps = 100,
+    max_steps: opt.MaxSteps = 100,
 ) -> None:
     """Calibrate a camera with photographs of a board. Exit code 1: written, but not converged."""
     from jaxphoto.image_measurement.grey_values import read_grey
@@ -339,7 +318,7 @@ def calibrate(
     check_folder(out, *images)
     pattern, taken = read_board(board), photographs(images)
     camera = sensor_and_interior(taken, pixel_mm, c_mm)
-    wanted = None if free is None else names(free)
+    wanted = None if free is None else opt.names(free)
     free_parameters(model, distortion_model(model, camera.sensor, r0_mm or 0.0), wanted)
     Thread(target=prepare_pictures, daemon=True).start()
     start, number = time.perf_counter(), count(1)
@@ -385,15 +364,15 @@ def calibrate(
 @command("orient", PANEL, "jaxphoto orient photographs/*.jpg --out BLOCK")
 def orient(
     output: Output,
-    images: Annotated[list[Path], typer.Argument(help="Photographs of one camera, or one block folder.")],
-    out: BlockOut,
-    pairs: Pairs = None,
-    features: Features = None,
-    longest_px: LongestSide = None,
-    c_mm: PrincipalDistance = None,
-    pixel_mm: PixelSize = None,
-    model: Annotated[str | None, typer.Option(help="Distortion model, like brown or smac (default: brown).")] = None,
-    r0_mm: R0 = None,
+    images: Annotated[list[Path], Argument(help="Photographs of one camera, or one block folder.")],
+    out: opt.BlockOut,
+    pairs: opt.Pairs = None,
+    features: opt.Features = None,
+    longest_px: opt.LongestSide = None,
+    c_mm: opt.PrincipalDistance = None,
+    pixel_mm: opt.PixelSize = None,
+    model: Annotated[str | None, Option(help="Distortion model, like brown or smac (default: brown).")] = None,
+    r0_mm: opt.R0 = None,
 ) -> None:
     """Orient photographs by their features, as initial values for `jaxphoto adjust`.
 
@@ -499,12 +478,12 @@ def _orient_block(output: Output, folder: Path, out: Path) -> None:
 @command("undistort", PANEL, "jaxphoto undistort photographs --camera results --out straight")
 def undistort(
     output: Output,
-    photographs: Photographs,
-    camera: Annotated[Path, typer.Option(help="Results, block, COLMAP model or camera file.")],
-    out: Annotated[Path, typer.Option(help="Output folder for the photographs and their camera.toml.")],
-    which: Camera = None,
+    photographs: opt.Photographs,
+    camera: Annotated[Path, Option(help="Results, block, COLMAP model or camera file.")],
+    out: Annotated[Path, Option(help="Output folder for the photographs and their camera.toml.")],
+    which: opt.Camera = None,
     keep: Annotated[
-        Literal["crop", "all"], typer.Option(help="crop: no black borders; all: the whole image with black borders.")
+        Literal["crop", "all"], Option(help="crop: no black borders; all: the whole image with black borders.")
     ] = "crop",
 ) -> None:
     """Resample photographs to a camera without distortion. Exit code 1: written, but some were skipped."""
