@@ -9,12 +9,12 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
-from rich import progress
-from rich.console import Console
-from rich.table import Table
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bar
 
 COMPILE_NOTE_S = 2.0
 """Compile time (s) from which a note is printed at the end."""
@@ -28,7 +28,7 @@ _LOG = logging.getLogger("jaxphoto")
 class Progress:
     """Progress of long work: a line on a terminal, or log records with --verbose."""
 
-    def __init__(self, bar: progress.Progress, description: str) -> None:
+    def __init__(self, bar: "Bar", description: str) -> None:
         self._bar, self._task, self._description = bar, bar.add_task("", total=None), ""
         self.update(description)
 
@@ -67,6 +67,8 @@ class Output:
     def __init__(self, context: typer.Context, as_json: bool, quiet: bool, verbose: bool) -> None:
         if quiet and verbose:
             raise typer.BadParameter("--quiet and --verbose contradict each other. Omit one of them.")
+        from rich.console import Console
+
         self.context, self._json, self._quiet = context, as_json, quiet
         plain = {"markup": False, "highlight": False, "emoji": False}
         self.screen = Console(quiet=quiet or as_json, **plain)  # type: ignore[arg-type]
@@ -106,6 +108,9 @@ class Output:
     @contextmanager
     def progress(self, description: str) -> Iterator[Progress]:
         """Show progress of long work on standard error."""
+        from rich import progress
+        from rich.console import Console
+
         columns = (
             progress.SpinnerColumn(),
             progress.TextColumn("{task.description}", markup=False),
@@ -130,6 +135,8 @@ class Output:
 
     def table(self, title: str, headings: tuple[str, ...], rows: Iterator[tuple[str, ...]]) -> None:
         """Print a table of the results."""
+        from rich.table import Table
+
         table = Table(title=title)
         for heading in headings:
             # A long number is folded, not cut.
