@@ -54,7 +54,10 @@ def adjust(
         Option(help="Estimate variance components by group, or comma-separated by xy-z, axis, camera, image."),
     ] = None,
 ) -> None:
-    """Adjust a block and write tables, statistics and a report. Exit code 1: written, but the verdict is red."""
+    """Adjust a block and write tables, statistics and a report.
+
+    Exit code 1: written, but the verdict is red.
+    """
     import jaxphoto
     from jaxphoto import report
     from jaxphoto.io import read_block, read_truth, write_block
@@ -63,7 +66,7 @@ def adjust(
     from jaxphoto.procedures.weights import made_by_blunders
     from jaxphoto.statistics import SPLITS
     from jaxphoto.writing import check_folder, whole_folder
-    from jaxphoto_command.provenance import Provenance, made_by
+    from jaxphoto_command.provenance import Provenance
 
     splits = tuple(dict.fromkeys(opt.names(weights)))
     if unknown := [name for name in splits if name not in (*SPLITS, "group")]:
@@ -75,7 +78,7 @@ def adjust(
     with output.progress("reading the block") as progress:
         read = read_block(block)
         provenance = Provenance.of_block(block)
-        made = made_by(output, block)
+        made = output.made_by(block)
         seconds = {"read": time.perf_counter() - start}
         progress.update("computing initial values")
         snooped = components = None
@@ -127,17 +130,19 @@ def boresight(
     go_on: Annotated[bool, Option("--go-on", help="Continue after a step that fails its test.")] = False,
     max_steps: opt.MaxSteps = 100,
 ) -> None:
-    """Estimate the boresight misalignment in four steps. Exit code 1: written, but a step failed."""
+    """Estimate the boresight misalignment in four steps.
+
+    Exit code 1: written, but a step failed.
+    """
     from jaxphoto.io import read_block
     from jaxphoto.procedures import boresight as estimate
     from jaxphoto.report import print_boresight, write_boresight
     from jaxphoto.writing import check_folder
-    from jaxphoto_command.provenance import made_by
 
     check_folder(out, block)
     start = time.perf_counter()
     with output.progress("reading the block") as progress:
-        read, made = read_block(block), made_by(output, block)
+        read, made = read_block(block), output.made_by(block)
         seconds = {"read": time.perf_counter() - start}
         steps = estimate(read, go_on=go_on, max_steps=max_steps, report=progress.update)
         progress.update(f"writing {out}")
@@ -236,7 +241,6 @@ def monte_carlo(
     from jaxphoto.report.draws import LONG, write_draws_page
     from jaxphoto.report.table_files import readable
     from jaxphoto.sensitivity import Readjustment, bias, check_draws, noise
-    from jaxphoto_command.provenance import made_by
 
     check_draws(draws)
     if invalid := set(keep or ()) - {"exterior", "points"}:
@@ -248,7 +252,7 @@ def monte_carlo(
     check_place(out)
     sigmas = _sigmas(kind, {"m": sigma_m, "deg": sigma_deg, "mm": sigma_mm, "own": sigma})
     with output.progress("reading the block") as progress:
-        read, made = read_block(block), made_by(output, block)
+        read, made = read_block(block), output.made_by(block)
         drawn = noise(read) if kind == "noise" else bias(read, kind, sigmas, per, of=on or [], parameter=parameter)
         progress.update("adjusting the nominal block")
         adjusted = adjust(read)
@@ -307,14 +311,13 @@ def sensitivity(
     from jaxphoto.report.digits import in_figures
     from jaxphoto.report.sensitivity import SensitivityTables, write_sensitivity
     from jaxphoto.writing import check_folder
-    from jaxphoto_command.provenance import made_by
 
     if bias_m == 0 or not math.isfinite(bias_m):
         raise typer.BadParameter(f"--bias-m {bias_m:g} is no bias: give its size in metres.")
     check_folder(out, block)
     start = time.perf_counter()
     with output.progress("reading the block") as progress:
-        read, made = read_block(block), made_by(output, block)
+        read, made = read_block(block), output.made_by(block)
         seconds = {"read": time.perf_counter() - start}
         progress.update("computing initial values")
         adjusted = adjust_for_tables(read, max_steps, progress.update)
@@ -366,11 +369,10 @@ def halves(
     from jaxphoto.procedures.halves import halves as compare_halves
     from jaxphoto.report.halves import print_halves, write_halves
     from jaxphoto.writing import check_folder
-    from jaxphoto_command.provenance import made_by
 
     check_folder(out, block)
     with output.progress("reading the block") as progress:
-        read, made = read_block(block), made_by(output, block)
+        read, made = read_block(block), output.made_by(block)
         cells = opt.grid_points(read.sensors[camera_of(read, camera)], grid, extent)
         result = compare_halves(
             read, cells, by=by, camera=camera, n_cuts=cuts, seed=seed, method=method, report=progress.update

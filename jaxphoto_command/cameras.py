@@ -38,7 +38,6 @@ def stability(
     from jaxphoto.stability import analyse
     from jaxphoto.writing import check_folder
     from jaxphoto_command.certificate import compared, read_two
-    from jaxphoto_command.provenance import made_by
 
     if not 0 <= relief < 1:
         raise typer.BadParameter(f"--relief {relief:g}: give a fraction of the object distance, 0 <= relief < 1.")
@@ -56,7 +55,7 @@ def stability(
     print_stability(analysis, sets, a.sensor.pixel_mm, noise_mm, method, output.screen)
     output.add(**stability_summary(analysis, sets, noise_mm, method))
     if out is not None:
-        write_stability(analysis, sets, a.sensor, noise_mm, method, out, made_by(output, first, second))
+        write_stability(analysis, sets, a.sensor, noise_mm, method, out, output.made_by(first, second))
         output.wrote(out, f"results in {out} (open report.html)")
 
 
@@ -79,7 +78,6 @@ def compare(
     from jaxphoto.stability import change
     from jaxphoto.writing import check_folder
     from jaxphoto_command.certificate import check_two_calibrations, compared, read_two, share_measurements
-    from jaxphoto_command.provenance import made_by
 
     if out is not None:
         check_folder(out, first, second)
@@ -97,7 +95,7 @@ def compare(
     print_change(result, sets, a.sensor, output.screen)
     output.add(**change_summary(result, a.sensor))
     if out is not None:
-        write_change(result, sets, a.sensor, out, made_by(output, first, second))
+        write_change(result, sets, a.sensor, out, output.made_by(first, second))
         output.wrote(out, f"results in {out} (open report.html)")
 
 
@@ -108,7 +106,10 @@ def combine(
     out: Annotated[Path, Option(help="Camera file (.toml) to write, prior information for blocks.")],
     camera: opt.Camera = None,
 ) -> None:
-    """Combine calibrations of one camera by their full covariances. Exit code 1: written, but they disagree."""
+    """Combine calibrations of one camera by their full covariances.
+
+    Exit code 1: written, but they disagree.
+    """
     import numpy as np
 
     from jaxphoto.camera import get_parameter, parameter_names
@@ -183,12 +184,11 @@ def models(
     from jaxphoto.procedures.model_choice import model_choice
     from jaxphoto.report.model_choice import print_model_choice, write_model_choice
     from jaxphoto.writing import check_folder
-    from jaxphoto_command.provenance import made_by
 
     check_folder(out, block)
     start = time.perf_counter()
     with output.progress("reading the block") as progress:
-        read, made = read_block(block), made_by(output, block)
+        read, made = read_block(block), output.made_by(block)
         seconds = {"read": time.perf_counter() - start}
         choice = model_choice(read, opt.names(models), k=folds, seed=seed, report=progress.update)
         seconds["adjust"] = time.perf_counter() - start - seconds["read"]

@@ -108,12 +108,11 @@ def experiment(
     """Run experiments; write tables.csv and report.html with the published values."""
     from jaxphoto.experiment import compare, find_experiments, load_experiment, run_experiment, write_runs
     from jaxphoto.writing import check_folder
-    from jaxphoto_command.provenance import made_by
 
     folders = find_experiments(experiments, name)
     check_folder(out, *folders)
     declared = {folder: load_experiment(folder) for folder in folders}
-    runs, made = {}, {folder: made_by(output, folder) for folder in folders}
+    runs, made = {}, {folder: output.made_by(folder) for folder in folders}
     for folder, declaration in declared.items():
         with output.progress(folder.name) as progress:
             runs[folder] = run_experiment(declaration, folder, layouts, progress.update)

@@ -69,7 +69,6 @@ def lidar_control(
     from jaxphoto.procedures.lidar.vertical_control import flag_counts
     from jaxphoto.report.lidar import heights_figure, heights_page, heights_table, print_rounds, rounds_table
     from jaxphoto.report.study_page import WholePicture
-    from jaxphoto_command.provenance import made_by
 
     settings = HeightSettings(sigma_z_m=sigma_z_m, sigma_xy_m=sigma_xy_m, sigma_systematic_m=sigma_systematic_m)
     selection = {"classes": opt.class_numbers(classes), "returns": returns, "epsg": cloud_epsg, "unit": cloud_unit}
@@ -81,7 +80,7 @@ def lidar_control(
         progress.update(f"writing {out}")
         heights, rounds = heights_table(result), rounds_table(result.rounds)
         picture = WholePicture.of(heights_figure(result), "control heights and their residuals")
-        page = heights_page(result, picture, made_by(output, block, cloud))
+        page = heights_page(result, picture, output.made_by(block, cloud))
         with whole_block(result.block, out) as folder:
             heights.to_csv(folder / "lidar_heights.csv", index=False)
             rounds.to_csv(folder / "lidar_rounds.csv", index=False)
@@ -192,7 +191,6 @@ def simultaneous(
     from jaxphoto.procedures.lidar import simultaneous
     from jaxphoto.report.lidar import print_moved, print_rounds, write_simultaneous
     from jaxphoto.writing import check_folder
-    from jaxphoto_command.provenance import made_by
     from jaxphoto_command.strip_flight import (
         StripChoices,
         StripFiles,
@@ -244,7 +242,7 @@ def simultaneous(
         result = simultaneous(read, surface, path, priors, **options)
         progress.update(f"writing {out}")
         track = None if path is None else scanner_path(path)
-        with write_simultaneous(result, out, seconds, made_by(output, block, cloud, trajectory)) as folder:
+        with write_simultaneous(result, out, seconds, output.made_by(block, cloud, trajectory)) as folder:
             strips = tuple(result.scanner.shifts)
             corrected = lambda part: correct_cloud(part, result.scanner, track).xyz  # noqa: E731
             write_corrected(cloud, folder, corrected, strips, path, read.frame, system)

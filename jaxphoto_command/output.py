@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 COMPILE_NOTE_S = 2.0
 """Compile time (s) from which a note is printed at the end."""
-# Programs that compile faster than this (s) are not listed.
-_COMPILE_LISTED_S = 0.1
+# Programs that compile faster than this (s) are not logged.
+_COMPILE_LOG_S = 0.1
 _COMPILED = "/jax/core/compile/backend_compile_duration"
 _FLAGS = ("json", "quiet", "verbose")
 _LOG = logging.getLogger("jaxphoto")
@@ -78,18 +78,18 @@ class Output:
         self._log = logging.StreamHandler() if verbose else None
 
     def __enter__(self) -> "Output":
-        # Before JAX: it sets the environment that JAX reads.
-        import jax.monitoring
-
+        # Before JAX, which reads the environment that jaxphoto sets.
         import jaxphoto  # noqa: F401
 
-        jax.monitoring.register_event_duration_secs_listener(self._compiled)
         self._showwarning = warnings.showwarning
         warnings.showwarning = lambda message, *_, **__: self.warn(str(message))
         if self._log:
             self._log.setFormatter(logging.Formatter("{relativeCreated:9.0f} ms  {message}", style="{"))
             _LOG.addHandler(self._log)
             _LOG.setLevel(logging.INFO)
+        import jax.monitoring
+
+        jax.monitoring.register_event_duration_secs_listener(self._compiled)
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, traceback: object) -> None:
@@ -176,20 +176,28 @@ class Output:
                 words += (word for v in values for word in (parameter.opts[0], v))
         return shlex.join(words)
 
+    def made_by(self, *inputs: Path | None) -> Any:
+        """Return the command line and the hashes of its input files and folders."""
+        from jaxphoto.report.made import Made
+        from jaxphoto_command.provenance import hashes
+
+        return Made(self.command_line(), [file for path in inputs if path is not None for file in hashes(path)])
+
     def options(self, **values: Any) -> dict[str, Any]:
         """Return the options that are not paths, with those of `values` replaced, as the method of a result."""
-        params = {name: value for name, value in self.context.params.items() if name not in _FLAGS}
-        paths = [
-            n for n, v in params.items() if isinstance(v, Path) or (isinstance(v, list) and isinstance(v[0], Path))
-        ]
-        options = {name: value for name, value in params.items() if name not in paths} | values
-        return {"method": {"command": self.context.info_name, **options}}
+        params = {name: v for name, v in (self.context.params | values).items() if name not in _FLAGS}
+        return {
+            "method": {
+                "command": self.context.info_name,
+                **{name: v for name, v in params.items() if v is None or isinstance(v, str | int | float)},
+            }
+        }
 
     def _compiled(self, event: str, duration_secs: float, **tags: Any) -> None:
         if event == _COMPILED:
             name = str(tags.get("fun_name", "")).removeprefix("jit(").removesuffix(")").strip("_") or "a program"
             self._compile_s[name] += duration_secs
-            if duration_secs >= _COMPILE_LISTED_S:
+            if duration_secs >= _COMPILE_LOG_S:
                 _LOG.info("compiled %s in %.1f s", name, duration_secs)
 
     def _end(self, exit_code: int) -> None:
@@ -201,9 +209,6 @@ class Output:
         import jaxphoto
 
         summary, judged = dict(self._summary), self._summary.get("verdict") in ("green", "amber", "red")
-        programs = {
-            n: s for n, s in sorted(self._compile_s.items(), key=lambda item: -item[1]) if s >= _COMPILE_LISTED_S
-        }
         values = {
             "command": self.context.info_name,
             "version": jaxphoto.__version__,
@@ -214,7 +219,7 @@ class Output:
             "written": self._files,
             "summary": summary,
             "seconds": time.perf_counter() - self._start,
-            "compiling": {"seconds": seconds, "programs": programs},
+            "compiling": {"seconds": seconds, "programs": self._compile_s},
         }
         # Arrays as lists, paths as text; NaN and infinity, which JSON lacks, as null.
         text = json.dumps(values, default=lambda v: v.tolist() if hasattr(v, "tolist") else str(v))

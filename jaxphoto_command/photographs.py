@@ -229,7 +229,7 @@ def control(
     from jaxphoto.report.made import versions
     from jaxphoto.report.results import write_results, write_summary
     from jaxphoto.writing import check_folder, whole_folder
-    from jaxphoto_command.provenance import Provenance, made_by
+    from jaxphoto_command.provenance import Provenance
 
     files = [path for path in (file, marks) if path]
     check_folder(out, block, *files)
@@ -263,7 +263,7 @@ def control(
         with whole_folder(out) as work:
             with whole_folder(work / "result") as folder:
                 method = {"block": "../block", **output.options()}
-                write_results(tables, verdict, folder, times, method, made_by(output, block, file, marks))
+                write_results(tables, verdict, folder, times, method, output.made_by(block, file, marks))
                 provenance.write(images, folder)
             write_control(result, work)
             write_summary({**verdict.summary, **control_summary(result), "versions": versions()}, work)
@@ -304,7 +304,10 @@ def calibrate(
     ] = None,
     max_steps: opt.MaxSteps = 100,
 ) -> None:
-    """Calibrate a camera with photographs of a board. Exit code 1: written, but not converged."""
+    """Calibrate a camera with photographs of a board.
+
+    Exit code 1: written, but not converged.
+    """
     from jaxphoto.image_measurement.grey_values import read_grey
     from jaxphoto.image_measurement.targets import find_targets, read_board
     from jaxphoto.io import write_block
@@ -313,7 +316,6 @@ def calibrate(
     from jaxphoto.report import prepare_pictures, print_adjustment, verdict_of
     from jaxphoto.report.calibration import print_calibration, write_calibration
     from jaxphoto.writing import check_folder
-    from jaxphoto_command.provenance import made_by
 
     check_folder(out, *images)
     pattern, taken = read_board(board), photographs(images)
@@ -349,7 +351,7 @@ def calibrate(
             lambda folder: write_block(result.adjusted.block, folder / "block"),
             detections=targets.detections,
             start=camera.origin,
-            made=made_by(output, *images),
+            made=output.made_by(*images),
             # An assumed pixel size is the unit of every length in the report.
             notes=() if pixel_mm is not None else (camera.origin,),
         )
@@ -486,7 +488,10 @@ def undistort(
         Literal["crop", "all"], Option(help="crop: no black borders; all: the whole image with black borders.")
     ] = "crop",
 ) -> None:
-    """Resample photographs to a camera without distortion. Exit code 1: written, but some were skipped."""
+    """Resample photographs to a camera without distortion.
+
+    Exit code 1: written, but some were skipped.
+    """
     from jaxphoto.io.cameras import read_camera_file
     from jaxphoto.io.sound_photographs import folders_not_looked_into, in_short, sound_photographs
     from jaxphoto.io.undistorted import write_undistorted

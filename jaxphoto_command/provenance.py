@@ -9,21 +9,15 @@ from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.conditions import CONDITIONS, conditions_of, marked, read_conditions, write_conditions
 from jaxphoto.io.input_hashes import block_inputs, write_inputs
-from jaxphoto.report.made import Made
 from jaxphoto.writing.inputs import InputFile, input_file
 from jaxphoto_command.certificate import certificate_document, write_certificate
-from jaxphoto_command.output import Output
 
 # Files read of a folder of results or of an experiment.
 _READ = (".csv", ".json", ".toml", ".py")
 
 
-def made_by(output: Output, *inputs: Path | None) -> Made:
-    """Return the command line and the hashes of its input files and folders."""
-    return Made(output.command_line(), [file for path in inputs if path is not None for file in _files(path)])
-
-
-def _files(path: Path) -> Iterator[InputFile]:
+def hashes(path: Path) -> Iterator[InputFile]:
+    """Yield the hashes of a file, or of the input files of a folder."""
     if path.is_file():
         yield input_file(path)
     elif (path / TOML).is_file():
@@ -43,14 +37,16 @@ class Provenance(NamedTuple):
     def of(cls, photographs: Sequence[Path], others: Sequence[Path]) -> "Provenance":
         """Return the provenance of a flight; `others` are files of control and exposures."""
         conditions = [conditions_of(path) for path in photographs]
-        return cls(conditions, [*_hashes(conditions, photographs), *map(input_file, others)])
+        return cls(conditions, [*_photograph_hashes(conditions, photographs), *map(input_file, others)])
 
     @classmethod
     def of_block(cls, block: Path, others: Sequence[Path] = (), photographs: Sequence[Path] = ()) -> "Provenance":
         """Return the provenance of a block folder, other files and photographs; it prefers the block's conditions."""
         inspected = [conditions_of(path) for path in photographs]
         conditions = read_conditions(block / CONDITIONS) if (block / CONDITIONS).is_file() else inspected
-        return cls(conditions, [*block_inputs(block), *map(input_file, others), *_hashes(inspected, photographs)])
+        return cls(
+            conditions, [*block_inputs(block), *map(input_file, others), *_photograph_hashes(inspected, photographs)]
+        )
 
     def conditions_for(self, images: Sequence[str]) -> list[Conditions]:
         """Return the conditions of all photographs, with `images` marked as used."""
@@ -74,5 +70,5 @@ def certify(flight: Path) -> str:
     return ""
 
 
-def _hashes(conditions: Sequence[Conditions], photographs: Sequence[Path]) -> list[InputFile]:
+def _photograph_hashes(conditions: Sequence[Conditions], photographs: Sequence[Path]) -> list[InputFile]:
     return [InputFile(c.file, path.stat().st_size, c.sha256) for c, path in zip(conditions, photographs, strict=True)]

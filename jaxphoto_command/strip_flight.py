@@ -55,7 +55,6 @@ from jaxphoto.writing import check_folder
 from jaxphoto_command.lidar import SCANNER
 from jaxphoto_command.options import names
 from jaxphoto_command.output import Output
-from jaxphoto_command.provenance import made_by
 
 
 class StripFiles(NamedTuple):
@@ -181,7 +180,7 @@ def adjust_flight(output: Output, flight: StripFiles, choices: StripChoices, out
                 write_dsm(folder / f"differences_{name}.tif", raster, differences.system)
             return maps
 
-        made = made_by(output, cloud, trajectory, block, flight.control)
+        made = output.made_by(cloud, trajectory, block, flight.control)
         write_strips(result, tables, verdict, out, write_files, made)
     print_verdict(verdict, output.screen)
     print_strips(result, output.screen)
