@@ -262,10 +262,10 @@ def test_the_command(folder, monkeypatch, capsys, tmp_path):
         (("--bias", "station"), "takes --sigma-m"),
         (("--bias", "station", "--sigma-m", "much"), "--sigma-m much"),
         (("--bias", "station", "--sigma-m", "-1"), "above zero"),
-        (("--bias", "wind", "--sigma-m", "1"), "--bias wind: there are station"),
-        (("--bias", "noise", "--sigma-m", "1"), "takes no --sigma-m"),
-        (("--bias", "noise", "--per", "strip"), "takes no --per"),
-        (("--bias", "station", "--sigma-m", "1", "--with", "all"), "--with all: there are exterior, points"),
+        (("--bias", "wind", "--sigma-m", "1"), "'wind' is not one of 'station'"),
+        (("--bias", "noise", "--sigma-m", "1"), "omit --sigma-m"),
+        (("--bias", "noise", "--per", "strip"), "omit --per"),
+        (("--bias", "station", "--sigma-m", "1", "--with", "all"), "--with all: choose from exterior, points"),
     ],
 )
 def test_a_mistake_is_one_sentence_and_nothing_written(folder, monkeypatch, capsys, tmp_path, options, words):
