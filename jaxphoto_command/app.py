@@ -83,6 +83,12 @@ def main() -> None:
     share_one_pool()
     try:
         app()
+    except (KeyboardInterrupt, SystemExit) as stop:
+        # typer exits with 130 after an interruption.
+        if isinstance(stop, SystemExit) and stop.code != 130:
+            raise
+        typer.echo("jaxphoto: interrupted", err=True)
+        sys.exit(130)
     except Exception as error:
         text = message(error)
         if text is None:

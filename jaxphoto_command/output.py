@@ -100,9 +100,7 @@ class Output:
         if self._log:
             _LOG.removeHandler(self._log)
             _LOG.setLevel(logging.NOTSET)
-        if isinstance(error, KeyboardInterrupt):
-            typer.echo("jaxphoto: interrupted", err=True)
-        elif error is None or isinstance(error, typer.Exit):
+        if error is None or isinstance(error, typer.Exit):
             self._end(0 if error is None else error.exit_code)
 
     @contextmanager
