@@ -40,11 +40,10 @@ def pair(option: str, text: str, example: str) -> tuple[float, float]:
 
 def grid_points(sensor: Any, grid: str, extent: str | None) -> Any:
     """Return the image points (mm) of --grid and --extent."""
-    from jaxphoto.stability import UNKNOWNS, image_grid
+    from jaxphoto.stability import image_grid
 
     columns, rows = pair("--grid", grid, "15x11")
-    minimum = max(UNKNOWNS.values()) // 2 + 1
-    if columns != int(columns) or rows != int(rows) or min(columns, rows) < 2 or columns * rows < minimum:
+    if columns != int(columns) or rows != int(rows) or min(columns, rows) < 2:
         raise typer.BadParameter(f"--grid {grid}: give whole numbers of 2 or more, like 15x11.")
     return image_grid(sensor, int(columns), int(rows), pair("--extent", extent, "4.0x3.0") if extent else None)
 

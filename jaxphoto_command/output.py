@@ -29,7 +29,7 @@ class Progress:
     """Progress of long work: a line on a terminal, or log records with --verbose."""
 
     def __init__(self, bar: "Bar", description: str) -> None:
-        self._bar, self._task, self._description = bar, bar.add_task("", total=None), ""
+        self._bar, self._task, self._description = bar, bar.add_task(""), ""
         self.update(description)
 
     def update(self, description: str) -> None:
@@ -56,8 +56,8 @@ class Progress:
         return counted
 
     def _start(self, description: str, total: int | None) -> None:
-        self._description = description
-        self._bar.reset(self._task, total=total, description=description)
+        self._bar.remove_task(self._task)
+        self._task, self._description = self._bar.add_task(description, total=total), description
         _LOG.info(description)
 
 
