@@ -18,7 +18,7 @@ SCANNER = ("boresight", "lever-arm", "range-offset", "range-scale", "angle-scale
 """Scanner parameters that may be estimated."""
 
 SigmaZ = Annotated[float, Option(callback=opt.positive, help="Standard deviation of a laser point in Z.")]
-SigmaXY = Annotated[float, Option(callback=opt.positive, help="Standard deviation of a laser point in each of X, Y.")]
+SigmaXY = Annotated[float, Option(help="Standard deviation of a laser point in each of X, Y.")]
 Systematic = Annotated[float, Option(help="Standard deviation of a common error of all heights.")]
 MaxRounds = Annotated[int, Option(min=1, help="Maximum number of outer iterations (surface lookup, adjustment).")]
 Trajectory = Annotated[
