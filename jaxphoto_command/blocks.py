@@ -11,7 +11,7 @@ import typer
 from typer import Argument, Option
 
 from jaxphoto_command import options as opt
-from jaxphoto_command.app import command
+from jaxphoto_command.application import command
 from jaxphoto_command.output import Output
 
 PANEL = "Adjustment and assessment"

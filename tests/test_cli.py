@@ -327,17 +327,17 @@ def test_results_never_take_the_place_of_what_they_are_made_of(tmp_path):
 
 @pytest.mark.parametrize("make", [np.zeros, jax.numpy.zeros])
 def test_too_little_memory_is_one_sentence(make, monkeypatch, capsys):
-    monkeypatch.setattr("jaxphoto_command.app.app", lambda: make((10**7, 10**8)).sum())
+    monkeypatch.setattr("jaxphoto_command.application.app", lambda **_: make((10**7, 10**8)).sum())
     code, out, err = run(monkeypatch, capsys, "adjust")
     assert (code, out) == (2, "") and err.count("\n") == 1
     assert err.startswith("jaxphoto: not enough memory. Close other programs")
 
 
 def test_other_errors_of_xla_are_not_taken_for_it(monkeypatch, capsys):
-    def broken():
+    def broken(**_):
         raise jax.errors.JaxRuntimeError("INTERNAL: no such thing")
 
-    monkeypatch.setattr("jaxphoto_command.app.app", broken)
+    monkeypatch.setattr("jaxphoto_command.application.app", broken)
     monkeypatch.setattr(sys, "argv", ["jaxphoto"])
     with pytest.raises(jax.errors.JaxRuntimeError):
         jaxphoto_command.main()

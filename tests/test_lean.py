@@ -13,7 +13,7 @@ from pathlib import Path
 from typer.main import get_command
 
 from jaxphoto_command import app
-from jaxphoto_command.app import OPTIONAL_PACKAGES
+from jaxphoto_command.application import OPTIONAL_PACKAGES
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")

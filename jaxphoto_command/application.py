@@ -82,7 +82,7 @@ def main() -> None:
     """Run the command line; a user's mistake is one sentence and exit code 2."""
     share_one_pool()
     try:
-        app()
+        app(prog_name="jaxphoto")
     except (KeyboardInterrupt, SystemExit) as stop:
         # typer exits with 130 after an interruption.
         if isinstance(stop, SystemExit) and stop.code != 130:
