@@ -9,6 +9,7 @@ import jaxphoto
 from jaxphoto.errors import InputError
 from jaxphoto.experiment import compare, find_experiments, load_experiment, run_experiment, simulated, write_runs
 from jaxphoto.variants import vertical_control
+from jaxphoto_command import app
 
 RECIPE = """
 title = "small"
@@ -43,7 +44,6 @@ station_m = 0.10
 DECLARED = """
 from jaxphoto.experiment import Experiment, Variant, check_points, iops, tie_point_differences
 from jaxphoto.variants import vertical_control
-from jaxphoto_command import app
 
 EXPERIMENT = Experiment(
     title="small",
