@@ -193,7 +193,7 @@ class Output:
 
     def _compiled(self, event: str, duration_secs: float, **tags: Any) -> None:
         if event == _COMPILED:
-            name = str(tags.get("fun_name", "")).removeprefix("jit(").removesuffix(")").strip("_") or "a program"
+            name = str(tags.get("fun_name", "")).removeprefix("jit(").removesuffix(")").removesuffix("_of_arrays")
             self._compile_s[name] += duration_secs
             if duration_secs >= _COMPILE_LOG_S:
                 _LOG.info("compiled %s in %.1f s", name, duration_secs)
