@@ -27,7 +27,10 @@ QUICK = {
     "block_parts": ("io/test_bad_blocks.py",),
     "losses": ("test_losses.py",),
     "camera": ("camera/test_additional_parameters.py", "camera/test_balance.py", "camera/test_principal_points.py"),
-    "cli": ("test_cli.py::test_version_and_help", "test_cli.py::test_bad_input_is_one_sentence_and_nothing_written"),
+    "jaxphoto_command": (
+        "test_cli.py::test_version_and_help",
+        "test_cli.py::test_bad_input_is_one_sentence_and_nothing_written",
+    ),
     "cloud": ("lidar/test_roofs.py",),
     "columns": ("test_block_from_arrays.py",),
     "collinearity": ("georeferencing/test_direct.py",),

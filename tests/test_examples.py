@@ -12,10 +12,10 @@ import pytest
 
 import jaxphoto
 from jaxphoto.camera.distortion import DISTORTIONS
-from jaxphoto.cli import app
 from jaxphoto.io.block_folder.settings import read_settings
 from jaxphoto.io.block_folder.table_layout import LAYOUTS
 from jaxphoto.report.results import _TABLES
+from jaxphoto_command import app
 from tests.marks import slow_but
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -1,16 +1,20 @@
 """Without the extras: what starts, and the line that a missing extra names."""
 
+import ast
+import inspect
 import os
 import re
 import subprocess
 import sys
+import textwrap
 import tomllib
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
-from jaxphoto.cli.app import COMMANDS
 from jaxphoto.optional import EXTRAS
+from jaxphoto_command import app
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
@@ -24,6 +28,12 @@ def without_extras(program):
     )
 
 
+def imports(function):
+    """Return the imports inside a function, as lines."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    return [ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+
+
 def test_every_extra_is_declared_and_documented():
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert set(EXTRAS.values()) <= set(declared)
@@ -32,17 +42,22 @@ def test_every_extra_is_declared_and_documented():
 
 def test_commands_without_an_extra_start():
     (rows,) = re.findall(r"^\| extra \|.*\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
-    named = {name for name in re.findall(r"`([a-z-]+)`", rows) if name in COMMANDS}
+    commands = get_command(app).commands
+    named = {name for name in re.findall(r"`([a-z-]+)`", rows) if name in commands}
     assert {"fly", "dsm", "monte-carlo"} <= named
-    modules = {f"jaxphoto.cli.{command.module}" for name, command in COMMANDS.items() if name not in named}
-    done = without_extras(f"import importlib\nfor module in {sorted(modules)}: importlib.import_module(module)")
+    functions = [inspect.unwrap(command.callback) for name, command in commands.items() if name not in named]
+    done = without_extras("\n".join(line for function in functions for line in imports(function)))
     assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(
     ("program", "module", "extra"),
     [
-        ("sys.argv = ['jaxphoto', 'orient', '--help']\nfrom jaxphoto.cli import main\nmain()", "cv2", "photos"),
+        (
+            "sys.argv = ['jaxphoto', 'orient', 'a.jpg', '--out', 'out']\nfrom jaxphoto_command import main\nmain()",
+            "cv2",
+            "photos",
+        ),
         ("import jaxphoto.io.raster", "rasterio", "lidar"),
         ("import jaxphoto.io.clouds.las", "laspy", "lidar"),
     ],

@@ -262,10 +262,10 @@ def test_the_command(folder, monkeypatch, capsys, tmp_path):
         (("--bias", "station"), "takes --sigma-m"),
         (("--bias", "station", "--sigma-m", "much"), "--sigma-m much"),
         (("--bias", "station", "--sigma-m", "-1"), "above zero"),
-        (("--bias", "wind", "--sigma-m", "1"), "--bias wind: there are station"),
-        (("--bias", "noise", "--sigma-m", "1"), "takes no --sigma-m"),
-        (("--bias", "noise", "--per", "strip"), "takes no --per"),
-        (("--bias", "station", "--sigma-m", "1", "--with", "all"), "--with all: there are exterior, points"),
+        (("--bias", "wind", "--sigma-m", "1"), "'wind' is not one of 'station'"),
+        (("--bias", "noise", "--sigma-m", "1"), "omit --sigma-m"),
+        (("--bias", "noise", "--per", "strip"), "omit --per"),
+        (("--bias", "station", "--sigma-m", "1", "--with", "all"), "--with all: choose from exterior, points"),
     ],
 )
 def test_a_mistake_is_one_sentence_and_nothing_written(folder, monkeypatch, capsys, tmp_path, options, words):
@@ -278,7 +278,7 @@ def test_a_mistake_is_one_sentence_and_nothing_written(folder, monkeypatch, caps
 
 @pytest.mark.slow
 def test_killed_in_the_middle_it_goes_on_to_the_same_file(folder, tmp_path):
-    program = [sys.executable, "-c", "from jaxphoto.cli import main; main()", "monte-carlo", str(folder)]
+    program = [sys.executable, "-c", "from jaxphoto_command import main; main()", "monte-carlo", str(folder)]
     program += ["--bias", "station", "--per", "image", "--sigma-m", "0.1", "--draws", "10000"]
     subprocess.run([*program, "--out", str(tmp_path / "whole")], check=True, capture_output=True)
     killed = subprocess.Popen(

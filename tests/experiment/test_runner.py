@@ -6,10 +6,10 @@ import pytest
 from typer.testing import CliRunner
 
 import jaxphoto
-from jaxphoto.cli import app
 from jaxphoto.errors import InputError
 from jaxphoto.experiment import compare, find_experiments, load_experiment, run_experiment, simulated, write_runs
 from jaxphoto.variants import vertical_control
+from jaxphoto_command import app
 
 RECIPE = """
 title = "small"

@@ -18,9 +18,9 @@ from jaxphoto.camera import (
     parameter_names,
     rebalance,
 )
-from jaxphoto.cli import main
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import ASSUMED_PIXEL_MM, read_camera_file, write_camera_file
+from jaxphoto_command import main
 from tests.derivatives import compiled
 
 # Points before a camera that looks along +z with y down, as computer vision has it, to the corners of its format.
@@ -514,9 +514,9 @@ def test_command_converts_and_says_how_well(tmp_path, monkeypatch, capsys):
     np.testing.assert_allclose(*map(columns_rows, both), rtol=0, atol=1e-9)
     for out, more, message in (
         ("lens.xml", [], "exists already"),
-        ("new.xml", ["--width-px", "100"], "--width-px and --height-px belong together"),
-        ("new.xml", ["--distortion", "none"], "--distortion none: there are brown"),
-        ("new.xml", ["--format", "none"], "there are opencv"),
+        ("new.xml", ["--width-px", "100"], "both --width-px and --height-px"),
+        ("new.xml", ["--distortion", "none"], "brown"),
+        ("new.xml", ["--format", "none"], "not one of 'opencv'"),
         ("new.xml", ["--distortion", "brown"], "the format agisoft has the distortion Agisoft, not Brown; leave"),
     ):
         monkeypatch.setattr("sys.argv", ["jaxphoto", *arguments[:2], str(tmp_path / out), *arguments[3:], *more])

@@ -40,10 +40,10 @@ def results(years):
     patch = pytest.MonkeyPatch()
     with patch.context() as m:
         m.setattr("sys.argv", ["jaxphoto", "adjust", str(years / "last"), "--out", str(years / "results")])
-        from jaxphoto import cli
+        import jaxphoto_command
 
         with pytest.raises(SystemExit) as stop:
-            cli.main()
+            jaxphoto_command.main()
     assert not stop.value.code
     return years / "results"
 

@@ -39,7 +39,6 @@ from jaxphoto.io import EXPORTS, AdjustedPhotographs, export
 from jaxphoto.io.cameras import read_camera_file
 from jaxphoto.io.exports import ExportCamera
 from jaxphoto.writing import MARKER
-from tests.commands import run
 from tests.formulas import camera_from_object
 
 EPSG = 32633
@@ -560,10 +559,6 @@ def test_features_lie_where_the_map_says(tmp_path):
         export(photographs("opencv", "local"), tmp_path / "local", "geojson")
 
 
-def test_the_page_and_the_help_name_every_format(monkeypatch, capsys):
+def test_the_page_names_every_format():
     page = (Path(__file__).parents[2] / "docs" / "exports.md").read_text()
     assert re.findall(r"^\| `([\w-]+)` \|", page.split("## Signs")[0], re.MULTILINE) == list(EXPORTS)
-    monkeypatch.setenv("COLUMNS", "250")
-    _, said, _ = run(monkeypatch, capsys, "convert", "--help")
-    words = re.sub(r"[\s│]+", " ", said)
-    assert all(f"{name}: {known.about}" in words for name, known in EXPORTS.items())

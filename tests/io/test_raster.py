@@ -273,7 +273,7 @@ def test_the_command_lays_a_photograph_over_the_ground(tmp_path, monkeypatch, ca
     ("changes", "says"),
     [
         ({"--image": "nobody"}, "no such image; it has"),
-        ({"dsm": "away"}, r"sees nothing of dsm\.tif"),
+        ({"dsm": "away"}, r"does not see dsm\.tif"),
         ({"dsm": "utm"}, "frame is local"),
         ({"photo": "dsm"}, "its camera 450 x 300"),
         ({"photo": "none"}, "no file"),
@@ -298,12 +298,12 @@ def test_what_the_command_cannot_do(tmp_path, monkeypatch, capsys, changes, says
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("--class", "two"), "give numbers of classes by commas"),
+        (("--class", "two"), "give class numbers"),
         (("--class", "9"), "no points of class 9"),
-        (("--returns", "none"), "--returns none: there are all"),
-        (("--statistic", "median"), "--statistic median: there are highest"),
-        (("--cell-m", "0"), "positive size"),
-        (("--cloud-unit", "yd"), "--cloud-unit yd: there are m"),
+        (("--returns", "none"), "'none' is not one of 'all'"),
+        (("--statistic", "median"), "'median' is not one of 'highest'"),
+        (("--cell-m", "0"), "0 is not a positive number"),
+        (("--cloud-unit", "yd"), "'yd' is not one of 'm'"),
         (("--cloud-epsg", "1"), "EPSG code 1 is unknown"),
     ],
 )
@@ -311,5 +311,5 @@ def test_what_dsm_cannot_do(tmp_path, monkeypatch, capsys, arguments, says):
     clouds.write_cloud(Cloud(np.arange(30.0).reshape(10, 3), np.ones(10, np.uint8)), tmp_path / "c.las")
     with unchecked():
         code, _, errors = run(monkeypatch, capsys, "dsm", tmp_path / "c.las", "--out", tmp_path / "d.tif", *arguments)
-    assert code == 2 and says in errors and errors.count("\n") == 1
+    assert code == 2 and says in errors and "Traceback" not in errors
     assert not (tmp_path / "d.tif").exists()

@@ -153,12 +153,12 @@ def test_the_command_writes_what_was_adjusted(own, tmp_path, monkeypatch, capsys
     np.testing.assert_allclose(start.exterior.position, position, rtol=0, atol=1e-9)
     assert start.interior["one"].c == adjusted("cross").unknowns.interior["one"].c
     code, said, _ = run(monkeypatch, capsys, "convert", own / "block", tmp_path / "start", "--to", "opk")
-    assert code == 0 and "start values of the block: --adjust adjusts it first" in said
+    assert code == 0 and "initial values of the block" in said
     for arguments, message in (
-        ((own / "result", tmp_path / "no", "--to", "opk", "--adjust"), "--adjust: SOURCE is a result already"),
-        ((own / "block", tmp_path / "no", "--adjust"), "--adjust: a block folder has start values"),
-        ((own / "block", tmp_path / "no", "--to", "opk", "--part", 2), "--block and --part are of results"),
-        ((own / "result", tmp_path / "no.xml", "--to", "metashape"), "is the name of a file; leave .xml out"),
+        ((own / "result", tmp_path / "no", "--to", "opk", "--adjust"), "--adjust applies to a block that is exported"),
+        ((own / "block", tmp_path / "no", "--adjust"), "--adjust applies to a block that is exported"),
+        ((own / "block", tmp_path / "no", "--to", "opk", "--part", 2), "--block and --part apply to results"),
+        ((own / "result", tmp_path / "no.xml", "--to", "metashape"), "omit .xml"),
     ):
         code, _, wrong = run(monkeypatch, capsys, "convert", *arguments)
         assert code == 2 and message in wrong and not list(tmp_path.glob("no*"))

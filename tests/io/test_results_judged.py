@@ -47,10 +47,10 @@ def results(tmp_path_factory):
     patch = pytest.MonkeyPatch()
     with patch.context() as m:
         m.setattr("sys.argv", ["jaxphoto", "adjust", str(folder / "block"), "--out", str(folder / "results"), "-q"])
-        from jaxphoto import cli
+        import jaxphoto_command
 
         with pytest.raises(SystemExit) as stop:
-            cli.main()
+            jaxphoto_command.main()
     assert not stop.value.code
     return folder
 

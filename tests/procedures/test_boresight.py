@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from jaxphoto import FIXED, FREE, BlockError, boresight, cli
+import jaxphoto_command
+from jaxphoto import FIXED, FREE, BlockError, boresight
 from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.io import write_block
 from jaxphoto.observations import Attitudes, ControlRows, StationRows
@@ -243,7 +244,7 @@ def test_what_a_step_lacks_is_said_before_the_first(spoil, words, monkeypatch):
 def run(monkeypatch, capsys, *arguments):
     monkeypatch.setattr(sys, "argv", ["jaxphoto", "boresight", *map(str, arguments)])
     with pytest.raises(SystemExit) as stop:
-        cli.main()
+        jaxphoto_command.main()
     captured = capsys.readouterr()
     return stop.value.code or 0, captured.out, captured.err
 

@@ -77,31 +77,31 @@ def test_simultaneous(folder, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--method", "magic"), "--method magic: there are idw, plane, tin, local, image"),
-        (("--sigma-z-m", "-1"), "--sigma-z-m -1: give a positive number"),
-        (("--class", "ground"), "--class ground: give numbers of classes"),
+        (("--method", "magic"), "'magic' is not one of 'plane'"),
+        (("--sigma-z-m", "-1"), "'--sigma-z-m': -1 is not a positive number"),
+        (("--class", "ground"), "--class ground: give class numbers"),
         (("--class", "9"), "9"),
     ],
 )
 def test_bad_options_of_lidar_control(folder, tmp_path, monkeypatch, capsys, arguments, said):
     given = ("lidar-control", folder, folder / "cloud.laz", "--out", tmp_path / "out", *arguments)
     code, _, error = run(monkeypatch, capsys, *given)
-    assert code == 2 and said in error and error.count("\n") == 1
+    assert code == 2 and said in error and "Traceback" not in error
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--shift", "much"), "--shift much: write free, fixed, or a standard deviation"),
-        (("--method", "image"), "there are idw, plane, tin, local"),
+        (("--shift", "much"), "--shift much: give free, fixed, or a standard deviation"),
+        (("--method", "image"), "'image' is not one of"),
         (("--trajectory", "nowhere.csv"), "nowhere.csv"),
     ],
 )
 def test_bad_options_of_simultaneous(folder, tmp_path, monkeypatch, capsys, arguments, said):
     given = ("simultaneous", folder, folder / "cloud.laz", "--out", tmp_path / "out", *arguments)
     code, _, error = run(monkeypatch, capsys, *given)
-    assert code == 2 and said in error and error.count("\n") == 1
+    assert code == 2 and said in error and "Traceback" not in error
 
 
 def test_a_trajectory_of_another_day(folder, tmp_path, monkeypatch, capsys):

@@ -5,35 +5,13 @@ import io
 
 import pytest
 from rich.console import Console
-from rich.table import Table
 
 from jaxphoto import Tables
-from jaxphoto.cli.console import plain_console
 from jaxphoto.report import Finding, Level, Verdict, print_adjustment, residuals_figure
 from jaxphoto.report.plots import drawn, new_figure
 from tests.blocks import adjusted
 
 NAMES = ("[/red]", "[bold]x", ":smile:", "$\\frac{1$", "a$b$c", "\\$", "\x1b[31mred", "x_$^{")
-
-
-def printed(console: Console, *things) -> str:
-    console.file = io.StringIO()
-    for thing in things:
-        console.print(thing)
-    return console.file.getvalue()
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_the_console_of_commands_prints_names_as_they_are(name):
-    table = Table(name, title=name)
-    table.add_row(name)
-    said = printed(plain_console(), f"wrote {name}", table)
-    plain = name.replace("\x1b", "\\x1b")
-    assert said.count(plain) == 4 and "\x1b" not in said
-    status = plain_console(stderr=True).status(f"reading {name}")
-    assert status.renderable.text.__rich__().plain == f"reading {plain}"
-    status.update(f"writing {name}")
-    assert status.renderable.text.__rich__().plain == f"writing {plain}"
 
 
 def _camera(found):

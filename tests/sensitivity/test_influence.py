@@ -13,7 +13,6 @@ import pytest
 from typer.testing import CliRunner
 
 from jaxphoto import adjust, covariance, read_block
-from jaxphoto.cli import app
 from jaxphoto.errors import InputError
 from jaxphoto.observations import StationRows
 from jaxphoto.report.sensitivity import SensitivityTables
@@ -21,6 +20,7 @@ from jaxphoto.sensitivity.exact import sensitivity
 from jaxphoto.sensitivity.influence import Per, external_reliability, station_bias, variance_shares
 from jaxphoto.statistics import redundancy_numbers
 from jaxphoto.writing import MARKER
+from jaxphoto_command import app
 from tests.blocks import adjusted, simulated
 from tests.checked_types import unchecked
 from tests.test_examples import EXAMPLES
