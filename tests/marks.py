@@ -45,9 +45,9 @@ QUICK = {
     "observations": ("adjustment/test_structure.py",),
     "parameters": ("adjustment/test_structure.py",),
     "orientation": (
-        "orientation/test_averaging.py",
-        "orientation/test_intersection.py",
-        "orientation/test_resection.py",
+        "initial/test_averaging.py",
+        "initial/test_intersection.py",
+        "initial/test_resection.py",
     ),
     "procedures": ("procedures/test_orient_parts.py",),
     "report": ("report/test_large_residuals.py", "report/test_plots.py"),

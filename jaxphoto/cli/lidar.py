@@ -44,7 +44,7 @@ from jaxphoto.lidar import HeightSettings
 from jaxphoto.lidar.correction import correct_cloud, scanner_path
 from jaxphoto.lidar.coverage import check_covered
 from jaxphoto.lidar.strip_settings import StripSettings
-from jaxphoto.orientation import approximate
+from jaxphoto.initial import approximate
 from jaxphoto.procedures.lidar import Round, lidar_control, roof_control, simultaneous
 from jaxphoto.procedures.lidar.images_and_cloud import SHIFT_SIGMA, SURFACES
 from jaxphoto.procedures.lidar.roof_control import RoofControl

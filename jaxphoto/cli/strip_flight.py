@@ -38,7 +38,7 @@ from jaxphoto.lidar.raster import Raster
 from jaxphoto.lidar.strip_correction import correct_strips
 from jaxphoto.lidar.strip_differences import strip_differences
 from jaxphoto.lidar.strip_settings import StripSettings
-from jaxphoto.orientation import approximate
+from jaxphoto.initial import approximate
 from jaxphoto.parameters import dynamic_fields
 from jaxphoto.procedures.lidar import (
     Photographs,

@@ -17,7 +17,7 @@ from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, paramete
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.io.kept_pieces import KeptPieces, name_of
 from jaxphoto.observations import ImageRows
-from jaxphoto.orientation.matches import PairMatches
+from jaxphoto.initial.matches import PairMatches
 from jaxphoto.procedures.orientation import GrossErrors, OrientationReport, Oriented, orient
 from jaxphoto.procedures.orientation.orient_photographs import CAMERA, METHOD, photographs_block
 from jaxphoto.procedures.orientation.related_pairs import Report

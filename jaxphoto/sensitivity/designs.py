@@ -31,7 +31,7 @@ from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block
 from jaxphoto.compiling import run_compiled
 from jaxphoto.devices import AXIS, mesh_of, usable
-from jaxphoto.orientation import approximate
+from jaxphoto.initial import approximate
 from jaxphoto.statistics.covariance import Rotations, in_units
 from jaxphoto.unknowns import Unknowns
 

@@ -10,7 +10,7 @@ from jaxphoto.image_measurement.matching import match_photographs
 from jaxphoto.image_measurement.photograph_pairs import MostAlike, photograph_pairs, usual_choice, usual_count
 from jaxphoto.io.kept_pieces import KeptPieces
 from jaxphoto.io.photographs import photographs, sensor_and_interior
-from jaxphoto.orientation.matches import connected_images
+from jaxphoto.initial.matches import connected_images
 from tests.image_measurement.ground import C_MM, SENSOR, photograph, texture
 
 COUNT = 400

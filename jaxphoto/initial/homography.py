@@ -15,8 +15,8 @@ Sources: Hartley and Zisserman (2004), "Multiple View Geometry", algorithm 4.1; 
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.orientation.coplanarity import RayPairs
-from jaxphoto.orientation.quaternions import cross_matrices
+from jaxphoto.initial.coplanarity import RayPairs
+from jaxphoto.initial.quaternions import cross_matrices
 
 _TURNED = 1e-3  # a difference of squared singular values below which the homography is a rotation
 _SAME = 1e-12

@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.orientation.quaternions import best_rotations
+from jaxphoto.initial.quaternions import best_rotations
 
 _PARALLEL = np.deg2rad(3.0)  # lines at less than this do not meet in a point
 _CLOSED = np.deg2rad(2.0)  # of a triplet: by more its rotations are not those of three images

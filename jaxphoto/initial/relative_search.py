@@ -9,11 +9,9 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.errors import BlockError
-from jaxphoto.orientation.coplanarity import RayPairs, behind, essential, misclosures
-from jaxphoto.orientation.essential_matrix import linear_essential, orientations
-from jaxphoto.orientation.five_point import five_point_essentials
-from jaxphoto.orientation.homography import homographies, homography_orientations, transfer_errors
+from jaxphoto.initial.coplanarity import RayPairs, behind, essential, misclosures
+from jaxphoto.initial.five_point import five_point_essentials, orientations
+from jaxphoto.initial.homography import homographies, homography_orientations, transfer_errors
 
 _FIVES = 60  # at a time
 _BATCHES = 40  # at most: three in four false matches still leave two fives of true ones
@@ -52,7 +50,6 @@ def candidates(pairs: RayPairs) -> tuple[Float[np.ndarray, "starts 3 3"], Float[
                 break
     if not len(costs):
         return best, np.zeros((0, 3))
-    best = np.concatenate([best, _linear(best[:1], pairs)])
     rotations, bases = (part.reshape(-1, *part.shape[2:]) for part in orientations(best))
     both = _of_plane(plane, pairs)
     if both:
@@ -88,15 +85,6 @@ def _fives(rng: np.random.Generator, n: int):
 
 def _costs(essentials, judges: RayPairs):
     return np.minimum(misclosures(essentials, judges) ** 2, _LIMIT**2).sum(axis=1)
-
-
-def _linear(best, pairs: RayPairs):
-    """The linear solution of all points that agree with the best five, which has less noise; none of a flat scene."""
-    agrees = np.abs(misclosures(best, pairs)[0]) < _LIMIT
-    try:
-        return linear_essential(pairs.rays_1[agrees], pairs.rays_2[agrees])[None]
-    except BlockError:
-        return np.zeros((0, 3, 3))
 
 
 def _distinct(rotations, bases, order, most: int):
