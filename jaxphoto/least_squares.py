@@ -42,10 +42,10 @@ class _State(NamedTuple):
 
 
 class _LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
-    damping: float
     rtol: float
     atol: float
-    norm: Callable = optx.two_norm
+    norm: Callable
+    damping: float
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         u = len(y)
@@ -102,7 +102,7 @@ def least_squares(
     `damping` is the first lambda. The iteration ends with a step that changes the residuals by less than `rtol` of
     their norm or by `atol`, and after `max_steps`, not converged.
     """
-    solver: Any = _LevenbergMarquardt(damping, rtol, atol)
-    solution = optx.least_squares(residuals, solver, start, data, max_steps=max_steps, throw=False)
+    solver: Any = _LevenbergMarquardt(rtol, atol, optx.two_norm, damping)
+    solution: Any = optx.least_squares(residuals, solver, start, data, max_steps=max_steps, throw=False)
     state = solution.state
     return Fit(solution.value, state.normal, state.cost, state.converged, solution.stats["num_steps"])

@@ -35,6 +35,7 @@ from jaxphoto.cli.strip_flight import (
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Scanner
+from jaxphoto.initial import approximate
 from jaxphoto.io import clouds, read_block, write_block
 from jaxphoto.io.block_folder import check_block_target, whole_block
 from jaxphoto.io.text_tables import is_number
@@ -44,7 +45,6 @@ from jaxphoto.lidar import HeightSettings
 from jaxphoto.lidar.correction import correct_cloud, scanner_path
 from jaxphoto.lidar.coverage import check_covered
 from jaxphoto.lidar.strip_settings import StripSettings
-from jaxphoto.initial import approximate
 from jaxphoto.procedures.lidar import Round, lidar_control, roof_control, simultaneous
 from jaxphoto.procedures.lidar.images_and_cloud import SHIFT_SIGMA, SURFACES
 from jaxphoto.procedures.lidar.roof_control import RoofControl

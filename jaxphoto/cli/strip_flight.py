@@ -23,6 +23,7 @@ from jaxphoto.cli.progress import StepsLeft
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import PATTERN_OF, ScannerCalibration
+from jaxphoto.initial import approximate
 from jaxphoto.io import clouds, read_block, write_block
 from jaxphoto.io.block_folder import exposure_times
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
@@ -38,7 +39,6 @@ from jaxphoto.lidar.raster import Raster
 from jaxphoto.lidar.strip_correction import correct_strips
 from jaxphoto.lidar.strip_differences import strip_differences
 from jaxphoto.lidar.strip_settings import StripSettings
-from jaxphoto.initial import approximate
 from jaxphoto.parameters import dynamic_fields
 from jaxphoto.procedures.lidar import (
     Photographs,

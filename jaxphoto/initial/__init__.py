@@ -2,7 +2,7 @@
 
 from jaxphoto.initial.approximate import approximate
 from jaxphoto.initial.averaging import average_rotation, best_triplet, intersect_directions
-from jaxphoto.initial.block_intersection import intersect_points, intersect_with_covariance
+from jaxphoto.initial.intersection import intersect_points, intersect_with_covariance
 from jaxphoto.initial.quaternion_resection import Resection, resect_by_quaternions
 from jaxphoto.initial.relative import RelativeOrientation, relative_orientation, relative_orientations
 from jaxphoto.initial.resection import resect

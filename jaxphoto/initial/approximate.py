@@ -21,10 +21,10 @@ from jaxphoto.arrays import still
 from jaxphoto.block import Block, Start, direct_exterior, sensor_rows
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.errors import BlockError, InputError
-from jaxphoto.observations import ControlRows
-from jaxphoto.initial.block_intersection import intersect_points
+from jaxphoto.initial.intersection import intersect_points
 from jaxphoto.initial.rays import camera_rays, directions_of, ideal_coordinates, turn_to_object
 from jaxphoto.initial.resection import resect_ideal
+from jaxphoto.observations import ControlRows
 from jaxphoto.small_matrices import cholesky_3x3, unwhiten, whiten
 from jaxphoto.unknowns import Unknowns
 

@@ -160,8 +160,8 @@ def _steps(rotations, bases, tangents, pairs, used, tolerance):
 
 @eqx.filter_jit
 def _linearised(rotations, bases, tangents, pairs):
-    def one(*place):
-        misclosures = lambda step: _misclosures(step, *place, pairs)  # noqa: E731
+    def one(rotation, base, tangent):
+        misclosures = lambda step: _misclosures(step, rotation, base, tangent, pairs)  # noqa: E731
         return misclosures(jnp.zeros(5)), jax.jacfwd(misclosures)(jnp.zeros(5))
 
     return jax.vmap(one)(rotations, bases, tangents)

@@ -94,10 +94,7 @@ def resect_by_quaternions(
     positions, matrices, iterations, converged = _starts(c, ideal, local)
     refined = refine(c, ideal, local, positions, matrices)
     others = refine(c, ideal, local, *_alternatives(c, ideal, local, refined))
-    refined = RefinedResections(
-        *(np.concatenate(both) for both in zip(refined[:-1], others[:-1], strict=True)),
-        max(refined.steps, others.steps),
-    )
+    refined = RefinedResections(*(np.concatenate(both) for both in zip(refined, others, strict=True)))
     best = refined.best(len(local))
     cost, redundancy = float(refined.costs[best]), 2 * len(local) - 6
     if not cost < 2 * len(local) * _HOPELESS**2:
@@ -123,7 +120,7 @@ def resect_by_quaternions(
         ideal + c * in_camera[:, :2] / in_camera[:, 2:],
         iterations,
         converged,
-        refined.steps,
+        int(refined.steps.max()),
     )
 
 
@@ -143,7 +140,7 @@ def _check_unique(refined: RefinedResections, best: int, sigma: float, image: st
 
 
 def _starts(c, ideal, points):
-    """Up to `STARTS` positions and matrices of the quaternion solution, best first; iterations, and True if converged."""
+    """Up to `STARTS` positions and matrices, best first, with the iterations, and True if converged."""
     matrices = _from_plane(ideal, points)
     product = _condition(unit_rays(c, ideal), points)
     iterations, change = 0, np.inf

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation
@@ -49,7 +49,7 @@ class RefinedResections(NamedTuple):
     distances: Float[np.ndarray, " starts"]
     """In m, of each start from the origin."""
     converged: Bool[np.ndarray, " starts"]
-    steps: int
+    steps: Int[np.ndarray, " starts"]
 
     def best(self, n_points: int) -> int:
         """Return the index of the least cost; of costs equal but for rounding, that of a converged one."""
@@ -118,8 +118,7 @@ def refine(
         np.arange(n) < len(points),
         np.asarray(limit, float),
     )
-    *parts, steps = (np.asarray(v)[: len(positions)] for v in call_compiled(_refined, *arguments))
-    return RefinedResections(*parts, int(steps.max()))
+    return RefinedResections(*(np.asarray(v)[: len(positions)] for v in call_compiled(_refined, *arguments)))
 
 
 @eqx.filter_jit
@@ -184,7 +183,8 @@ def checked_points(
     cure = "or give its approximate X_m, Y_m, Z_m, omega_deg, phi_deg, kappa_deg in images.csv"
     if distinct < 4:
         raise BlockError(
-            f"image {image} sees {distinct} known points, and a resection needs 4: measure more known points in it {cure}"
+            f"image {image} sees {distinct} known points, and a resection needs 4: measure more known points in it "
+            + cure
         )
     origin = points.mean(axis=0)
     for centred, where in (

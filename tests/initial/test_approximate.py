@@ -8,9 +8,9 @@ from jaxphoto.block import Motion
 from jaxphoto.camera import Brown, InteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Exposure, Mount, StripBias, recorded_attitude, sensor_position
-from jaxphoto.observations import Attitudes, ImageRows
 from jaxphoto.initial import approximate
 from jaxphoto.initial.resection import resect_ideal
+from jaxphoto.observations import Attitudes, ImageRows
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 from tests.derivatives import compiled
 from tests.initial.scene import Truth, block_of, coordinate_rows, strip, with_known

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust, read_block, snoop
-from jaxphoto.observations import Distances
 from jaxphoto.initial.approximate import in_front, looking_away
+from jaxphoto.observations import Distances
 from jaxphoto.procedures import Snooped
 from jaxphoto.procedures.mistakes import coordinate_mistakes
 from jaxphoto.report import Tables, verdict_of

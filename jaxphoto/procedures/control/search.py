@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.errors import counted
-from jaxphoto.initial.block_intersection import intersect_points
+from jaxphoto.initial.intersection import intersect_points
 from jaxphoto.initial.rays import turn_to_object
 from jaxphoto.procedures.control.intersected import misses, rays_of
 from jaxphoto.procedures.control.marked import Marked

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation
-from jaxphoto.initial.block_intersection import intersect_points
+from jaxphoto.initial.intersection import intersect_points
 from jaxphoto.initial.rays import ideal_coordinates, turn_to_object, unit_rays
 
 # Rays left out of one point at most, one in each round: longer false tracks are hopeless.
