@@ -15,8 +15,9 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-# Relative change of r'r that is rounding.
-_ROUNDING = 1e-15
+# Relative change of r'r that is rounding, and the least lambda: with less, the rounding errors of a step in a direction
+# that the residuals hardly see would be large.
+_ROUNDING, _LEAST_DAMPING = 1e-13, 1e-12
 
 
 class Fit(NamedTuple):
@@ -38,6 +39,8 @@ class _State(NamedTuple):
     gradient: Float[Array, "u"]
     cost: Float[Array, ""]
     damping: Float[Array, ""]
+    is_small: Bool[Array, ""]
+    """True if the step to `trial` is small enough to be the last."""
     converged: Bool[Array, ""]
 
 
@@ -49,8 +52,8 @@ class _LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         u = len(y)
-        first = jnp.asarray(10 * self.damping)
-        return _State(y, jnp.zeros((u, u)), jnp.zeros(u), jnp.asarray(jnp.inf), first, jnp.asarray(False))
+        first, no = jnp.asarray(10 * self.damping), jnp.asarray(False)
+        return _State(y, jnp.zeros((u, u)), jnp.zeros(u), jnp.asarray(jnp.inf), first, no, no)
 
     def step(self, fn, y, args, options, state, tags):
         def residuals(y):
@@ -62,18 +65,18 @@ class _LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         better = (cost <= (1 + _ROUNDING) * state.cost) | (state.cost == jnp.inf)
         candidate = (state.trial, jacobian.T @ jacobian, jacobian.T @ r, cost)
         y, normal, gradient, cost = (jnp.where(better, a, b) for a, b in zip(candidate, (y, *state[1:4]), strict=True))
-        damping = state.damping * jnp.where(better, 0.1, 10.0)
+        damping = jnp.maximum(state.damping * jnp.where(better, 0.1, 10.0), _LEAST_DAMPING)
         diagonal = jnp.diagonal(normal)
         step = -_solve(normal + jnp.diag(damping * jnp.where(diagonal > 0, diagonal, 1.0)), gradient)
         limit = self.atol + self.rtol * jnp.sqrt(cost)
-        return y, _State(y + step, normal, gradient, cost, damping, step @ normal @ step <= limit**2), None
+        is_small = jnp.abs(step @ normal @ step) <= limit**2
+        return y, _State(y + step, normal, gradient, cost, damping, is_small, state.is_small), None
 
     def terminate(self, fn, y, args, options, state, tags):
         return state.converged, optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        # The last step is too small to be judged by the residuals.
-        return jnp.where(state.converged, state.trial, y), aux, {}
+        return y, aux, {}
 
 
 def _solve(a: Float[Array, "n n"], b: Float[Array, "n"]) -> Float[Array, "n"]:
