@@ -17,18 +17,18 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxphoto.compiling import call_compiled
-from jaxphoto.initial.quaternions import cross_matrices, rotated
+from jaxphoto.initial.quaternions import cayley, cross_matrices, rotated
 from jaxphoto.initial.rays import padded, padded_length, ray_noise
 from jaxphoto.least_squares import least_squares
-from jaxphoto.rotation import CROSS, small_rotation
+from jaxphoto.rotation import CROSS
 
 # First lambda: with less, few points of a flat scene leap over the nearest orientation.
 _DAMPING = 1e-2
 # Within a few sigmas of the epipole the condition is all noise, and the first order says nothing of that: there the
 # epipole would be drawn to the point. The variance of second order counts with this factor.
 _EPIPOLE = 50.0
-# Numbers of orientations and of points that programs are compiled for.
-_STARTS = 2, 8, 40
+# Numbers of orientations that programs are compiled for; the first only where there are many points.
+_STARTS, _MANY_POINTS = (2, 8, 40), 512
 
 
 class RayPairs(NamedTuple):
@@ -125,24 +125,29 @@ def fit(
     The iteration ends with a step of less than `tolerance` standard deviations.
     """
     m, n = len(rotations), len(pairs.rays_1)
-    starts, rows = next(k for k in (*_STARTS, m) if k >= m), padded_length(n)
+    rows = padded_length(n)
+    starts = next(k for k in (*_STARTS[rows <= _MANY_POINTS :], m) if k >= m)
     rays = RayPairs(*(padded(part, rows) for part in pairs))
     used_rows = np.zeros((starts, rows), bool)
     used_rows[:m, :n] = used
-    places = [padded(part, starts) for part in (rotations, bases)]
-    steps = call_compiled(_steps, *places, tangent_plane(places[1]), rays, used_rows, np.asarray(tolerance, float))
-    places = list(moved(*places, np.asarray(steps)))
-    values, slopes = (
-        np.asarray(v)[:m, :n] for v in call_compiled(_linearised, *places, tangent_plane(places[1]), rays)
-    )
-    across = np.swapaxes(slopes * used[..., None], 1, 2)
-    return RelativeFits(places[0][:m], places[1][:m], values, slopes, across @ slopes)
+    rotations, bases = padded(rotations, starts), padded(bases, starts)
+    place = rotations, bases, tangent_plane(bases), rays
+    rotations, bases = map(np.asarray, call_compiled(_fitted, *place, used_rows, np.asarray(tolerance, float)))
+    linearised = call_compiled(_linearised, rotations, bases, tangent_plane(bases), rays)
+    values, slopes = (np.asarray(v)[:m, :n] for v in linearised)
+    normals = np.swapaxes(slopes * used[..., None], 1, 2) @ slopes
+    return RelativeFits(rotations[:m], bases[:m], values, slopes, normals)
+
+
+def _moved(step, rotation, base, tangent):
+    base = base + tangent @ step[3:]
+    return cayley(step[:3]) @ rotation, base / jnp.linalg.norm(base)
 
 
 def _misclosures(step, rotation, base, tangent, pairs: RayPairs):
     """Misclosures over their standard deviations after a step of the five unknowns, of one orientation."""
-    base = base + tangent @ step[3:]
-    matrix = small_rotation(step[:3]) @ rotation @ (CROSS @ (base / jnp.linalg.norm(base)))
+    rotation, base = _moved(step, rotation, base, tangent)
+    matrix = rotation @ (CROSS @ base)
     by_1, by_2 = pairs.rays_2 @ matrix, pairs.rays_1 @ matrix.T
     along = [jnp.einsum("ni,nij->nj", by, noise) for by, noise in ((by_1, pairs.noise_1), (by_2, pairs.noise_2))]
     variance = jnp.sum(along[0] ** 2 + along[1] ** 2, axis=1) + pairs.floor
@@ -150,12 +155,13 @@ def _misclosures(step, rotation, base, tangent, pairs: RayPairs):
 
 
 @eqx.filter_jit
-def _steps(rotations, bases, tangents, pairs, used, tolerance):
-    def step(rotation, base, tangent, used):
+def _fitted(rotations, bases, tangents, pairs, used, tolerance):
+    def fitted(rotation, base, tangent, used):
         residuals = lambda x, _: used * _misclosures(x, rotation, base, tangent, pairs)  # noqa: E731
-        return least_squares(residuals, jnp.zeros(5), damping=_DAMPING, atol=tolerance).unknowns
+        step = least_squares(residuals, jnp.zeros(5), damping=_DAMPING, atol=tolerance).unknowns
+        return _moved(step, rotation, base, tangent)
 
-    return jax.vmap(step)(rotations, bases, tangents, used)
+    return jax.vmap(fitted)(rotations, bases, tangents, used)
 
 
 @eqx.filter_jit

@@ -19,13 +19,14 @@ from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError
+from jaxphoto.initial.quaternions import cayley
 from jaxphoto.initial.rays import ideal_coordinates, padded, padded_length, unit_rays
 from jaxphoto.initial.three_points import three_point_resections
 from jaxphoto.least_squares import least_squares
-from jaxphoto.rotation import small_rotation
 
 STARTS = 4
 """Orientations to refine, at most."""
+_STARTS = 8  # that a program refines side by side
 _TRIANGLES = 16  # largest, and as many at random
 _JUDGES = 60  # points at most that choose among the solutions
 # Ideal image errors, as fractions of c: those that count as small when solutions are compared, and the typical one
@@ -111,36 +112,38 @@ def refine(
 
     `points` (m) are about the origin.
     """
-    n, starts = padded_length(len(points)), STARTS * -(-len(positions) // STARTS)
-    arguments = (
-        *(padded(v, starts) for v in (positions, matrices)),
-        *(padded(v, n) for v in (ideal / c_mm, points)),
-        np.arange(n) < len(points),
-        np.asarray(limit, float),
-    )
-    return RefinedResections(*(np.asarray(v)[: len(positions)] for v in call_compiled(_refined, *arguments)))
+    n, starts = padded_length(len(points)), _STARTS * -(-len(positions) // _STARTS)
+    place = tuple(padded(v, starts) for v in (positions, matrices))
+    rows = *(padded(v, n) for v in (ideal / c_mm, points)), np.arange(n) < len(points)
+    # From the solution once more: normal matrices are of small rotations from there.
+    for _ in range(2):
+        results = [np.asarray(v) for v in call_compiled(_refined, *place, *rows, np.asarray(limit, float))]
+        place = results[0], results[1]
+    return RefinedResections(*(v[: len(positions)] for v in results))
 
 
 @eqx.filter_jit
 def _refined(positions, matrices, observed, points, used, limit):
-    def residuals(step, position, matrix, distance):
-        """Robust residuals over c after a shift over `distance` and a small rotation in the camera frame."""
-        in_camera = (points - position - distance * step[:3]) @ (small_rotation(step[3:]) @ matrix).T
-        depth = -in_camera[:, 2:]
-        residual = observed - in_camera[:, :2] / jnp.where(depth == 0, 1e-100, depth)
-        # The squares of r sqrt(log(1 + q) / q) are Cauchy's loss.
-        q = jnp.sum(residual**2, axis=1) / limit**2 + 1e-30
-        # A blunder may lie behind the best candidate, but no step may take more points there.
-        behind = jnp.sqrt(jnp.sum(used) * jnp.sum(used * (depth[:, 0] <= 0)))
-        return jnp.append((residual * (used * jnp.sqrt(jnp.log1p(q) / q))[:, None]).ravel(), behind)
-
     def refined(position, matrix):
         distance = jnp.linalg.norm(position)
-        start = jnp.zeros(6)
-        fit = least_squares(lambda x, _: residuals(x, position, matrix, distance), start, damping=1e-6)
-        position, matrix = position + distance * fit.unknowns[:3], small_rotation(fit.unknowns[3:]) @ matrix
-        jacobian = jax.jacfwd(residuals)(start, position, matrix, distance)
-        return position, matrix, fit.cost, jacobian.T @ jacobian, distance, fit.converged, fit.steps
+
+        def moved(step):
+            return position + distance * step[:3], cayley(step[3:]) @ matrix
+
+        def residuals(step, _):
+            """Robust residuals over c after a shift over `distance` and a small rotation in the camera frame."""
+            position, matrix = moved(step)
+            in_camera = (points - position) @ matrix.T
+            depth = -in_camera[:, 2:]
+            residual = observed - in_camera[:, :2] / jnp.where(depth == 0, 1e-100, depth)
+            # The squares of r sqrt(log(1 + q) / q) are Cauchy's loss.
+            q = jnp.sum(residual**2, axis=1, keepdims=True) / limit**2 + 1e-30
+            # A blunder may lie behind the best candidate, but no step may take more points there.
+            behind = jnp.sqrt(jnp.sum(used) * jnp.sum(used * (depth[:, 0] <= 0)))
+            return jnp.append(residual * used[:, None] * jnp.sqrt(jnp.log1p(q) / q), behind)
+
+        fit = least_squares(residuals, jnp.zeros(6), damping=1e-6)
+        return *moved(fit.unknowns), fit.cost, fit.normal, distance, fit.converged, fit.steps
 
     return jax.vmap(refined)(positions, matrices)
 
