@@ -90,9 +90,9 @@ def intersected(block: Block) -> Unknowns:
     across = jnp.eye(3) - along[:, :, None] * along[:, None] / jnp.sum(along**2, axis=1)[:, None, None]
     normal = jnp.zeros((len(block.points), 3, 3)).at[point].add(across)
     right = jnp.zeros((len(block.points), 3)).at[point].add(jnp.einsum("nij,nj->ni", across, exterior.position[image]))
-    for rows in (block.control, block.fixed):
-        normal = normal.at[rows.who, rows.axis, rows.axis].add(_SURVEYED)
-        right = right.at[rows.who, rows.axis].add(_SURVEYED * rows.value)
+    for table in (block.control, block.fixed):
+        normal = normal.at[table.who, table.axis, table.axis].add(_SURVEYED)
+        right = right.at[table.who, table.axis].add(_SURVEYED * table.value)
     factor = cholesky_3x3(jnp.moveaxis(normal, 0, -1))
     points = jnp.stack(unwhiten(whiten(right.T, factor), factor), axis=1)
     return dataclasses.replace(start, exterior=exterior, points=points)

@@ -102,11 +102,11 @@ def intersect_with_covariance(
         some = np.flatnonzero(determined & (sizes == size))
         used = np.arange(size) < count[some, None]
         ray = rows[begin[some, None] + np.where(used, np.arange(size), 0)]
-        arguments = points[some, None] - positions[image[ray]], camera_from_object[image[ray]], rays[ray], used
-        arguments = tuple(padded(v, padded_length(len(some))) for v in arguments)
+        offsets, matrices = points[some, None] - positions[image[ray]], camera_from_object[image[ray]]
+        arguments = (padded(v, padded_length(len(some))) for v in (offsets, matrices, rays[ray], used))
         shift, normal, good = (np.asarray(v)[: len(some)] for v in call_compiled(_adjusted, *arguments))
-        offsets = arguments[0][: len(some)] + shift[:, None]
-        depth = np.einsum("pri,pri->pr", camera_from_object[image[ray]][:, :, 2], offsets)
+        offsets = offsets + shift[:, None]
+        depth = np.einsum("pri,pri->pr", matrices[:, :, 2], offsets)
         distance = np.linalg.norm(offsets, axis=2).min(axis=1)
         points[some] += shift
         covariance[some] = sigma_rad**2 * _inverses(normal)

@@ -333,20 +333,20 @@ def _nearest(
     n = padded_length(len(here))
     weight = padded(1 / sigma, n) * (np.arange(n) < len(here))[:, None]
     turn, turn_weight = (start.turn, 0.0) if recorded is None else (recorded.turn, 1 / recorded.turn_sigma_rad)
-    begin = Similarity(start.of(middle[None])[0], start.turn, np.asarray(start.scale))  # type: ignore[arg-type]
+    begin = start.of(middle[None])[0], start.turn, np.asarray(start.scale)
     rows = padded(there - middle, n), padded(here, n), weight
     shift, matrix, scale = map(
-        np.asarray, call_compiled(_fitted_similarity, begin, *rows, turn, np.asarray(turn_weight))
+        np.asarray, call_compiled(_fitted_similarity, *begin, *rows, turn, np.asarray(turn_weight))
     )
     return Similarity(shift - scale * matrix @ middle, matrix, float(scale))
 
 
 @eqx.filter_jit
-def _fitted_similarity(start: Similarity, there, here, weight, turn, turn_weight) -> Similarity:
-    """Least squares of the offsets, and of the angles to the rotation `turn`."""
+def _fitted_similarity(shift, matrix, scale, there, here, weight, turn, turn_weight):
+    """Shift, rotation and scale of least squares of the offsets, and of the angles to the rotation `turn`."""
 
     def at(x):
-        return Similarity(start.shift + x[:3], small_rotation(x[3:6]) @ start.turn, start.scale * jnp.exp(x[6]))
+        return shift + x[:3], small_rotation(x[3:6]) @ matrix, scale * jnp.exp(x[6])
 
     def residuals(x, _):
         shift, matrix, scale = at(x)
