@@ -25,6 +25,7 @@ QUICK = {
     "block_edits": ("test_block_edits.py::test_what_a_block_does_not_have_is_named",),
     "block_from_arrays": ("test_block_from_arrays.py",),
     "block_parts": ("io/test_bad_blocks.py",),
+    "least_squares": ("test_least_squares.py",),
     "losses": ("test_losses.py",),
     "camera": ("camera/test_additional_parameters.py", "camera/test_balance.py", "camera/test_principal_points.py"),
     "cli": ("test_cli.py::test_version_and_help", "test_cli.py::test_bad_input_is_one_sentence_and_nothing_written"),
@@ -44,7 +45,7 @@ QUICK = {
     "lidar": ("lidar/test_planes.py",),
     "observations": ("adjustment/test_structure.py",),
     "parameters": ("adjustment/test_structure.py",),
-    "orientation": (
+    "initial": (
         "initial/test_averaging.py",
         "initial/test_intersection.py",
         "initial/test_resection.py",
