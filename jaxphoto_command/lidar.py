@@ -512,7 +512,7 @@ def _block_and_cloud(block: Path, cloud: Path, selection: dict[str, Any], progre
     import numpy as np
 
     from jaxphoto.io import clouds, read_block
-    from jaxphoto.orientation import approximate
+    from jaxphoto.initial import approximate
 
     read = read_block(block)
     progress.update("reading the cloud")

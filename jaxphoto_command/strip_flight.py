@@ -30,7 +30,7 @@ from jaxphoto.lidar.raster import Raster
 from jaxphoto.lidar.strip_correction import correct_strips
 from jaxphoto.lidar.strip_differences import strip_differences
 from jaxphoto.lidar.strip_settings import StripSettings
-from jaxphoto.orientation import approximate
+from jaxphoto.initial import approximate
 from jaxphoto.procedures.control import SurveyedPoints
 from jaxphoto.procedures.control.system import system_of
 from jaxphoto.procedures.lidar import (

@@ -25,6 +25,7 @@ QUICK = {
     "block_edits": ("test_block_edits.py::test_what_a_block_does_not_have_is_named",),
     "block_from_arrays": ("test_block_from_arrays.py",),
     "block_parts": ("io/test_bad_blocks.py",),
+    "least_squares": ("test_least_squares.py",),
     "losses": ("test_losses.py",),
     "camera": ("camera/test_additional_parameters.py", "camera/test_balance.py", "camera/test_principal_points.py"),
     "jaxphoto_command": (
@@ -47,10 +48,10 @@ QUICK = {
     "lidar": ("lidar/test_planes.py",),
     "observations": ("adjustment/test_structure.py",),
     "parameters": ("adjustment/test_structure.py",),
-    "orientation": (
-        "orientation/test_averaging.py",
-        "orientation/test_intersection.py",
-        "orientation/test_resection.py",
+    "initial": (
+        "initial/test_averaging.py",
+        "initial/test_intersection.py",
+        "initial/test_resection.py",
     ),
     "procedures": ("procedures/test_orient_parts.py",),
     "report": ("report/test_large_residuals.py", "report/test_plots.py"),

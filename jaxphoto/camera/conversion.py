@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
 
 from jaxphoto.camera.distortion import AbstractDistortion, invert
 from jaxphoto.camera.equivalence import exact
@@ -14,14 +13,15 @@ from jaxphoto.camera.interior import InteriorOrientation, get_parameter, paramet
 from jaxphoto.camera.projection import AbstractProjection
 from jaxphoto.camera.sensor import Sensor
 from jaxphoto.compiling import call_compiled
+from jaxphoto.least_squares import least_squares
 from jaxphoto.linear_algebra import solve
 
 # Image points along each side of the format, corners included, at which cameras are compared.
 _SIDE = 25
 # A fit without rarely needed terms is accepted if its error does not exceed this.
 _GOOD_PX = 0.01
-# Convergence limit of a fit: rational models lie in a flat valley, in which only the coefficients still change.
-_UNTIL = {"ftol": 1e-10, "xtol": 1e-13, "gtol": 1e-13, "max_nfev": 300}
+# Rational models lie in a flat valley and take many.
+_MAX_STEPS = 300
 
 
 class Conversion(NamedTuple):
@@ -146,21 +146,8 @@ def _fit(
     free = np.array([name not in held for name in names])
     begin = np.array([float(get_parameter(first, name)) for name in names])
     data = (_arrays(first), np.array(sensor.pixel_mm), _padded(points), _padded(rays))
-
     # All parameters are arguments, fixed ones too: one program serves a model.
-    def whole(values):
-        full = begin.copy()
-        full[free] = values
-        return full
-
-    def residuals(values):
-        return np.asarray(call_compiled(_displacements, whole(values), *data)).ravel()
-
-    def jacobian(values):
-        return np.asarray(call_compiled(_jacobian, whole(values), *data)).reshape(-1, len(names))[:, free]
-
-    solved = scipy.optimize.least_squares(residuals, begin[free], jacobian, method="lm", x_scale="jac", **_UNTIL)
-    interior = _with(first, whole(solved.x))
+    interior = _with(first, np.asarray(call_compiled(_fitted_values, begin, free, *data)))
     moved = np.asarray(call_compiled(_moved, _arrays(interior), *data[1:]))[: len(points)]
     column, row = sensor.px_from_mm(points[[np.argmax(moved)]])[0].tolist()
     return Conversion(interior, float(np.sqrt(np.mean(moved**2))), float(np.max(moved)), 1.0, (column, row))
@@ -172,6 +159,12 @@ def _padded(values: np.ndarray) -> np.ndarray:
 
 
 @eqx.filter_jit
+def _fitted_values(start, free, first: InteriorOrientation, pixel_mm, points, rays):
+    """Parameters of least squares of the displacements, from `start`; only those that are `free` change."""
+    displacements = lambda v, _: _displacements(jnp.where(free, v, start), first, pixel_mm, points, rays)  # noqa: E731
+    return least_squares(displacements, start, atol=1e-9, max_steps=_MAX_STEPS).unknowns
+
+
 def _displacements(values, first: InteriorOrientation, pixel_mm, points, rays):
     """Return the displacements (px) of image points of the given rays, to first order for measured-domain models."""
     interior = _with(first, values)
@@ -189,12 +182,7 @@ def _displacements(values, first: InteriorOrientation, pixel_mm, points, rays):
             apart = solve(j, aimed / interior.c - ideal(xy))
         return jnp.where(here, apart / pixel_mm, 0.0)
 
-    return jax.vmap(of_one)(points, rays)
-
-
-@eqx.filter_jit
-def _jacobian(values, *rest):
-    return jax.jacfwd(lambda v: _displacements(v, *rest))(values)
+    return jax.vmap(of_one)(points, rays).ravel()
 
 
 @eqx.filter_jit

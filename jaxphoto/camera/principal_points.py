@@ -22,15 +22,12 @@ from jaxtyping import Array, Float
 from jaxphoto.camera.distortion import Brown, PpsRadial
 from jaxphoto.camera.interior import InteriorOrientation, get_parameter, parameter_names, set_parameter
 from jaxphoto.camera.sensor import Sensor
+from jaxphoto.least_squares import least_squares
 from jaxphoto.rotation import small_rotation
 from jaxphoto.short_repr import shown
 
 # Image points along each side of the format, corners included, at which two cameras are compared.
 _SIDE = 25
-# Gauss-Newton iterations of a re-fit: it is nearly linear, and tests show no improvement after these.
-_STEPS = 6
-# Columns of a re-fit closer to linear dependence than this are undetermined: take the shortest solution.
-_DEPENDENT = 1e-10
 
 
 @shown
@@ -117,15 +114,9 @@ def conversion_error(
         turned = rays @ small_rotation(theta).T
         return (jax.vmap(before.ideal_from_direction)(*turned.T) - wanted).ravel()
 
-    def improved(_, unknowns):
-        jacobian = jax.jacfwd(displacement)(unknowns)
-        length = jnp.linalg.norm(jacobian, axis=0)
-        length = jnp.where(length > 0, length, 1.0)
-        return unknowns - jnp.linalg.lstsq(jacobian / length, displacement(unknowns), rcond=_DEPENDENT)[0] / length
-
     unknowns = jnp.stack([*jnp.zeros(3), *(jnp.asarray(get_parameter(after, name), float) for name in names)])
     if refit:
-        unknowns = jax.lax.fori_loop(0, _STEPS, improved, unknowns)
+        unknowns = least_squares(lambda u, _: displacement(u), unknowns, damping=1e-6).unknowns
     moved = jnp.linalg.norm(displacement(unknowns).reshape(-1, 2), axis=1)
     return ConversionError(jnp.max(moved), jnp.sqrt(jnp.mean(moved**2)), camera(unknowns[3:]))
 

@@ -28,10 +28,10 @@ from jaxphoto.image_measurement.epipolar import LEAST_MATCHES, epipolar_lines, o
 from jaxphoto.image_measurement.features import LONGEST_PX, METHOD, SiftFeatures, sift_features
 from jaxphoto.image_measurement.likely_pairs import largest_of, most_alike
 from jaxphoto.image_measurement.photograph_pairs import MostAlike, usual_count
+from jaxphoto.initial.matches import PairMatches, connected_images, tracks
+from jaxphoto.initial.rays import ideal_coordinates
 from jaxphoto.io.kept_pieces import KeptPieces, name_of
 from jaxphoto.io.photographs import Photograph
-from jaxphoto.orientation.matches import PairMatches, connected_images, tracks
-from jaxphoto.orientation.rays import ideal_coordinates
 from jaxphoto.procedures.matched_part import MatchedPart
 
 # Off the epipolar line at most, of the diagonal: 4 pixels of 1,300. A distortion not known yet grows with the format.

@@ -15,9 +15,9 @@ from jaxphoto.adjustment import Sizes
 from jaxphoto.arrays import on_device
 from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.initial.matches import PairMatches
 from jaxphoto.io.kept_pieces import KeptPieces, name_of
 from jaxphoto.observations import ImageRows
-from jaxphoto.orientation.matches import PairMatches
 from jaxphoto.procedures.orientation import GrossErrors, OrientationReport, Oriented, orient
 from jaxphoto.procedures.orientation.orient_photographs import CAMERA, METHOD, photographs_block
 from jaxphoto.procedures.orientation.related_pairs import Report

@@ -15,9 +15,9 @@ from jaxphoto.arrays import is_traced
 from jaxphoto.block import Block, sensor_rows
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError, DatumError, RankError, few
+from jaxphoto.initial import approximate
+from jaxphoto.initial.approximate import PointsBehind, completed, intersected
 from jaxphoto.observations import AbstractObservations, KnownParameters
-from jaxphoto.orientation import approximate
-from jaxphoto.orientation.approximate import PointsBehind, completed, intersected
 from jaxphoto.procedures.orientation import orient_block
 from jaxphoto.procedures.orientation.network import empty_network, misfits, sight_of
 from jaxphoto.statistics import prepare_statistics

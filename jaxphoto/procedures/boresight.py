@@ -19,7 +19,7 @@ from jaxphoto.adjustment import MAX_STEPS
 from jaxphoto.block import Block, Start
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Mount, StripBias
-from jaxphoto.orientation import approximate
+from jaxphoto.initial import approximate
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.boresight_judgement import Biases, Step, judge
 from jaxphoto.tracing import outside_transformations

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
-from jaxphoto.orientation.rays import camera_rays, turn_to_object
+from jaxphoto.initial.rays import camera_rays, turn_to_object
 from jaxphoto.procedures.robust import Masks
 from jaxphoto.short_repr import shown
 

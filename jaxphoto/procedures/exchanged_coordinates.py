@@ -17,9 +17,9 @@ from jaxphoto.arrays import still
 from jaxphoto.block import Block
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError, few
+from jaxphoto.initial import resect
+from jaxphoto.initial.intersection import intersect_points
 from jaxphoto.observations import AbstractCoordinates
-from jaxphoto.orientation import resect
-from jaxphoto.orientation.block_intersection import intersect_points
 from jaxphoto.procedures.exchange import Exchange, rays_of, with_places
 from jaxphoto.procedures.exchanged_names import points_that_meet
 from jaxphoto.procedures.robust import Masks

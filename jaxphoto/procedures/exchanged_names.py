@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
-from jaxphoto.orientation.block_intersection import intersect_points
+from jaxphoto.initial.intersection import intersect_points
 from jaxphoto.procedures.cross_validation import measured_discrepancies
 from jaxphoto.procedures.exchange import Exchange, exchanged, rays_of, with_places
 from jaxphoto.procedures.robust import Blocks, Masks

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.errors import counted, few
-from jaxphoto.orientation.approximate import in_front, looking_away
+from jaxphoto.initial.approximate import in_front, looking_away
 from jaxphoto.report.findings import Finding, Level
 
 

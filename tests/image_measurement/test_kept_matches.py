@@ -8,9 +8,9 @@ from jaxphoto.image_measurement.features import sift_features
 from jaxphoto.image_measurement.likely_pairs import largest_of, most_alike
 from jaxphoto.image_measurement.matching import match_photographs
 from jaxphoto.image_measurement.photograph_pairs import MostAlike, photograph_pairs, usual_choice, usual_count
+from jaxphoto.initial.matches import connected_images
 from jaxphoto.io.kept_pieces import KeptPieces
 from jaxphoto.io.photographs import photographs, sensor_and_interior
-from jaxphoto.orientation.matches import connected_images
 from tests.image_measurement.ground import C_MM, SENSOR, photograph, texture
 
 COUNT = 400

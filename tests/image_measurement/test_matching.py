@@ -14,8 +14,8 @@ from jaxphoto.image_measurement.epipolar import epipolar_lines
 from jaxphoto.image_measurement.features import FEATURES, OF_FEW, SiftFeatures, sift_features
 from jaxphoto.image_measurement.matching import match_photographs, tie_features
 from jaxphoto.image_measurement.photograph_pairs import nearest_pairs, photograph_pairs
+from jaxphoto.initial.matches import PairMatches, connected_images, tracks
 from jaxphoto.io.photographs import photographs, sensor_and_interior
-from jaxphoto.orientation.matches import PairMatches, connected_images, tracks
 from tests.image_measurement.ground import C_MM, SENSOR, mapped, photograph, texture
 
 STATIONS = [

@@ -7,8 +7,8 @@ import pytest
 from jaxphoto import ExteriorOrientation, InputError, InteriorOrientation, Sensor, Smac
 from jaxphoto.image_measurement.targets import find_targets, read_board, rendered
 from jaxphoto.image_measurement.targets.discs import elliptic_blobs, fit_discs
+from jaxphoto.initial.rays import ideal_coordinates
 from jaxphoto.io.photographs import photographs
-from jaxphoto.orientation.rays import ideal_coordinates
 from jaxphoto.procedures.calibration.eccentricity import eccentricities
 from jaxphoto.procedures.calibration.reprojection import projections
 

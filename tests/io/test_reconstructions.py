@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.collinearity import project
 from jaxphoto.errors import InputError
+from jaxphoto.initial.approximate import approximate
 from jaxphoto.io import convert, read_block, read_source, write_block
 from jaxphoto.io.exports import AdjustedPhotographs, ExportCamera, export
-from jaxphoto.orientation.approximate import approximate
 from jaxphoto.report.source_words import assumed_pixel_words, report_title
 from jaxphoto.unknowns import FREE
 from tests.io.test_exports import CAMERAS, SENSOR, fisheye, photographs, plane

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxphoto.camera import Sensor
-from jaxphoto.orientation.matches import PairMatches
+from jaxphoto.initial.matches import PairMatches
 from jaxphoto.procedures.orientation.onto_known import similarity_between
 from jaxphoto.statistics import covariance
 from tests.formulas import camera_from_object

@@ -9,9 +9,9 @@ from jaxphoto.block import Start
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
+from jaxphoto.initial.approximate import completed
+from jaxphoto.initial.matches import tracks
 from jaxphoto.observations import ControlRows, ImageRows, StationRows
-from jaxphoto.orientation.approximate import completed
-from jaxphoto.orientation.matches import tracks
 from jaxphoto.procedures.adjust import adjust, needs_orientation, start_of
 from jaxphoto.procedures.orientation import orient_block
 from jaxphoto.procedures.orientation.orient_photographs import _block_of

@@ -9,8 +9,8 @@ from jaxphoto.block import Start
 from jaxphoto.camera import InteriorOrientation, Smac
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
+from jaxphoto.initial.matches import tracks
 from jaxphoto.observations import Distances, StationRows
-from jaxphoto.orientation.matches import tracks
 from jaxphoto.procedures.orientation.depths import supported
 from jaxphoto.procedures.orientation.finish import _open
 from jaxphoto.procedures.orientation.growing import _starts, _worth

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust, read_block, snoop
+from jaxphoto.initial.approximate import in_front, looking_away
 from jaxphoto.observations import Distances
-from jaxphoto.orientation.approximate import in_front, looking_away
 from jaxphoto.procedures import Snooped
 from jaxphoto.procedures.mistakes import coordinate_mistakes
 from jaxphoto.report import Tables, verdict_of

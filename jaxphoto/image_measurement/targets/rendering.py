@@ -9,7 +9,7 @@ import numpy as np
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.image_measurement.targets.pattern import Pattern
-from jaxphoto.orientation.rays import camera_rays
+from jaxphoto.initial.rays import camera_rays
 
 _BACKGROUND = 0.55
 _GOLDEN = (5**0.5 - 1) / 2

@@ -25,8 +25,8 @@ from jaxtyping import Array, Float
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.compiling import call_compiled
+from jaxphoto.initial.rays import padded_length
 from jaxphoto.linear_algebra import cholesky, inverse, solve
-from jaxphoto.orientation.rays import padded_length
 
 _POINTS = 32
 # From the ellipse of the moments, which is the nearest but for the lens.

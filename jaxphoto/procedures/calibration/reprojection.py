@@ -9,7 +9,7 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.compiling import call_compiled
-from jaxphoto.orientation.rays import padded_length
+from jaxphoto.initial.rays import padded_length
 from jaxphoto.procedures.calibration.calibration_block import CAMERA
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
-from jaxphoto.orientation import resect, resect_by_quaternions
+from jaxphoto.initial import resect, resect_by_quaternions
 from jaxphoto.procedures.calibration.board import Board
 from jaxphoto.procedures.calibration.calibration_block import TargetRows
 

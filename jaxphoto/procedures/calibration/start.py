@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxphoto.camera import AbstractDistortion, Brown, InteriorOrientation, Sensor, get_parameter, set_parameter
 from jaxphoto.compiling import call_compiled
-from jaxphoto.orientation.rays import ideal_coordinates
+from jaxphoto.initial.rays import ideal_coordinates
 from jaxphoto.procedures.calibration.board import Board
 from jaxphoto.procedures.calibration.calibration_block import TargetRows
 from jaxphoto.procedures.calibration.reprojection import projections

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 
 from jaxphoto.block import Block
 from jaxphoto.errors import few
-from jaxphoto.orientation.block_intersection import intersect_points, intersect_with_covariance
-from jaxphoto.orientation.rays import camera_rays, turn_to_object
+from jaxphoto.initial.intersection import intersect_points, intersect_with_covariance
+from jaxphoto.initial.rays import camera_rays, turn_to_object
 from jaxphoto.procedures.control.marked import Marked
 from jaxphoto.unknowns import Unknowns
 

@@ -21,7 +21,7 @@ from jaxphoto.collinearity import ExteriorOrientation, in_field, project
 from jaxphoto.compiling import jit_quickly
 from jaxphoto.georeferencing import apparent_point
 from jaxphoto.georeferencing.ground import moved_exterior, moved_interior
-from jaxphoto.orientation.rays import padded_length
+from jaxphoto.initial.rays import padded_length
 from jaxphoto.statistics import covariance
 from jaxphoto.statistics.covariance import rotation_jacobians
 

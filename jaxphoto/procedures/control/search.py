@@ -14,8 +14,8 @@ from jaxtyping import Float, Int
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.errors import counted
-from jaxphoto.orientation.block_intersection import intersect_points
-from jaxphoto.orientation.rays import turn_to_object
+from jaxphoto.initial.intersection import intersect_points
+from jaxphoto.initial.rays import turn_to_object
 from jaxphoto.procedures.control.intersected import misses, rays_of
 from jaxphoto.procedures.control.marked import Marked
 from jaxphoto.procedures.control.predicted import Predicted, predicted

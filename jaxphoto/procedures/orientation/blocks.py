@@ -13,8 +13,8 @@ import numpy as np
 from jaxphoto.block import Block, Start
 from jaxphoto.camera import Perspective
 from jaxphoto.errors import BlockError
-from jaxphoto.orientation.approximate import completed
-from jaxphoto.orientation.matches import PairMatches
+from jaxphoto.initial.approximate import completed
+from jaxphoto.initial.matches import PairMatches
 from jaxphoto.procedures.orientation.growing import grown
 from jaxphoto.procedures.orientation.network import Sight, sight_of
 from jaxphoto.procedures.orientation.onto_known import onto_known

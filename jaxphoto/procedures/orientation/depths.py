@@ -10,7 +10,7 @@ stand before one another, neighbours spread as widely as the scene is deep, and 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxphoto.orientation.rays import turn_to_object
+from jaxphoto.initial.rays import turn_to_object
 from jaxphoto.procedures.orientation.network import Fate, Network, Sight
 
 # Nearest points in the image, and by how many of their spreads a point may differ from their median.

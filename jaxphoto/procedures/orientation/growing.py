@@ -14,9 +14,8 @@ from jaxtyping import Float, Int
 
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError, counted
-from jaxphoto.orientation.averaging import best_triplet
-from jaxphoto.orientation.resection import resect_ideal
-from jaxphoto.orientation.resection_steps import refined as refined_by_points
+from jaxphoto.initial.averaging import best_triplet
+from jaxphoto.initial.resection import refine, resect_ideal
 from jaxphoto.procedures.orientation.network import (
     Network,
     empty_network,
@@ -263,8 +262,8 @@ def _by_points(
         start = (placed.position - origin)[None], placed.camera_from_object[None]
         # Rays off by more count less and less.
         limit = _DOUBTFUL * growth.most * float(np.median(sight.sigma[rows]))
-        settled = refined_by_points(c, ideal, points - origin, *start, limit)
-        yield settled.positions[0] + origin, settled.matrices[0]
+        refined_image = refine(c, ideal, points - origin, *start, limit)
+        yield refined_image.positions[0] + origin, refined_image.matrices[0]
     try:
         found = resect_ideal(c, ideal, points, growth.block.images[image])
     except BlockError:

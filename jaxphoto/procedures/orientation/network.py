@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Int
 
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation
-from jaxphoto.orientation.block_intersection import intersect_points
-from jaxphoto.orientation.rays import ideal_coordinates, turn_to_object, unit_rays
+from jaxphoto.initial.intersection import intersect_points
+from jaxphoto.initial.rays import ideal_coordinates, turn_to_object, unit_rays
 
 # Rays left out of one point at most, one in each round: longer false tracks are hopeless.
 _ROUNDS = 12

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from jaxphoto.block import Block, Start
 from jaxphoto.errors import BlockError
-from jaxphoto.orientation.averaging import average_rotation
+from jaxphoto.initial.averaging import average_rotation
 from jaxphoto.procedures.orientation.network import Network
 
 # Known places whose spread across their line is less than this part of that along it leave a turn about it open.

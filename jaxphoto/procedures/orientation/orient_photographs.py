@@ -18,9 +18,9 @@ from jaxphoto.adjustment import Sizes
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.initial.matches import PairMatches, Tracks, tracks
+from jaxphoto.initial.rays import ideal_coordinates, unit_rays
 from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
-from jaxphoto.orientation.matches import PairMatches, Tracks, tracks
-from jaxphoto.orientation.rays import ideal_coordinates, unit_rays
 from jaxphoto.procedures.orientation.finish import FIRST_ROUNDS, LAST_ROUNDS, finished, told
 from jaxphoto.procedures.orientation.growing import grown
 from jaxphoto.procedures.orientation.network import Fate, Network, empty_network, meet, sight_of

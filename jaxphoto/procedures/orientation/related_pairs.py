@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.errors import BlockError, GroupsError
-from jaxphoto.orientation.matches import PairMatches, connected_images
-from jaxphoto.orientation.relative import RelativeOrientation, relative_orientations
+from jaxphoto.initial.matches import PairMatches, connected_images
+from jaxphoto.initial.relative import RelativeOrientation, relative_orientations
 
 LENS_PX = 1.2
 """What an unknown lens does to a match, in pixels, while relative orientations are found."""

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.camera import InteriorOrientation
-from jaxphoto.orientation.coplanarity import RayPairs, behind, essential, misclosures
-from jaxphoto.orientation.matches import PairMatches
-from jaxphoto.orientation.rays import ideal_coordinates, unit_rays
+from jaxphoto.initial.coplanarity import RayPairs, behind, essential, misclosures
+from jaxphoto.initial.matches import PairMatches
+from jaxphoto.initial.rays import ideal_coordinates, unit_rays
 from jaxphoto.procedures.orientation.network import Network
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.orientation.averaging import average_rotation, intersect_directions
+from jaxphoto.initial.averaging import average_rotation, intersect_directions
 from jaxphoto.procedures.orientation.network import Network, Sight
 from jaxphoto.procedures.orientation.related_pairs import Pair
 

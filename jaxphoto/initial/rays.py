@@ -42,11 +42,11 @@ def camera_rays(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"
 
 def _of_rows(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"]) -> Float[np.ndarray, "rows 3"]:
     n = len(xy_mm)
-    padded = np.zeros((padded_length(n), 2))
-    padded[:n] = xy_mm
+    xy = np.zeros((padded_length(n), 2))
+    xy[:n] = xy_mm
     # Numbers as arrays: a float in the tree would be compiled in, and every camera compiled anew.
     numbers = jax.tree.map(partial(np.asarray, dtype=float), interior)
-    return np.asarray(directions_of(numbers, padded))[:n]
+    return np.asarray(directions_of(numbers, xy))[:n]
 
 
 def padded_length(n: int) -> int:
@@ -55,6 +55,11 @@ def padded_length(n: int) -> int:
     while length < n:
         length *= 4 if length < 2048 else 2
     return length
+
+
+def padded(values: np.ndarray, length: int) -> np.ndarray:
+    """`values` with the last row repeated to `length` rows."""
+    return values[np.minimum(np.arange(length), len(values) - 1)]
 
 
 def unit_rays(

@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
-from jaxphoto.orientation import average_rotation, best_triplet, intersect_directions, intersect_with_covariance
-from jaxphoto.orientation.quaternions import turned
+from jaxphoto.initial import average_rotation, best_triplet, intersect_directions, intersect_with_covariance
+from jaxphoto.initial.quaternions import rotated
 from jaxphoto.rotation import small_rotation
 from tests.formulas import random_rotations, turns
-from tests.orientation.image_pairs import normalised, rays_of
+from tests.initial.image_pairs import normalised, rays_of
 
 
 class Pair(NamedTuple):
@@ -37,7 +37,7 @@ def test_average_of_rotations():
 
 def test_small_turns_are_those_of_the_adjustment():
     for theta in ([0.0, 0, 0], [1e-9, 0, 2e-9], [0.3, -0.2, 0.9]):
-        np.testing.assert_allclose(turned(np.eye(3), np.array(theta)), small_rotation(np.array(theta)), atol=1e-14)
+        np.testing.assert_allclose(rotated(np.eye(3), np.array(theta)), small_rotation(np.array(theta)), atol=1e-14)
 
 
 POSITIONS = np.array([[0.0, 0, 0], [4, 1, 0], [1, 5, 1], [-2, 2, 3]])

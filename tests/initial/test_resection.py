@@ -3,10 +3,10 @@ import pytest
 
 from jaxphoto.camera import Brown, InteriorOrientation
 from jaxphoto.errors import BlockError
-from jaxphoto.orientation import resect
-from jaxphoto.orientation.three_points import three_point_resections
+from jaxphoto.initial import resect
+from jaxphoto.initial.three_points import three_point_resections
 from tests.formulas import camera_from_object, random_rotations
-from tests.orientation.scene import K1, C, ideal_images, measured
+from tests.initial.scene import K1, C, ideal_images, measured
 
 IDEAL = InteriorOrientation(C)
 POSITION = np.array([6.5e5, 7.2e6, 900.0])

@@ -1,14 +1,19 @@
-"""Forward intersection of all points of a block at once: 3 x 3 normal equations summed over rows, in NumPy."""
+"""Forward intersection of all points of a block at once."""
 
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-_STEPS = 5
-_OPEN = (
-    0.2  # a standard deviation, of the distance, beyond which errors along the rays are on one side more than the other
-)
+from jaxphoto.compiling import call_compiled
+from jaxphoto.initial.rays import padded, padded_length
+from jaxphoto.least_squares import least_squares
+
+# Standard deviation, over the distance, beyond which errors along the rays are no longer symmetrical.
+_OPEN = 0.2
 
 
 class IntersectedPoints(NamedTuple):
@@ -19,7 +24,7 @@ class IntersectedPoints(NamedTuple):
     covariance: Float[np.ndarray, "points 3 3"]
     """A priori, m^2."""
     determined: Bool[np.ndarray, " points"]
-    """Whether rays meet at an angle that their errors leave certain, in front of the cameras."""
+    """True if rays meet at an angle that their errors leave certain, in front of the cameras."""
 
 
 def intersect_points(
@@ -30,14 +35,14 @@ def intersect_points(
     coordinates: tuple[Int[np.ndarray, " known"], Int[np.ndarray, " known"], Float[np.ndarray, " known"]] | None = None,
     min_angle: float = np.deg2rad(0.02),
 ) -> tuple[Float[np.ndarray, "points 3"], Bool[np.ndarray, " points"]]:
-    """The point (m) nearest to its rays, for every point, and whether its rays determine it.
+    """The point (m) nearest to its rays, for every point, and True if its rays determine it.
 
         sum over rays (I - d d') (X - origin) = 0
 
     `origins` (m) and unit `directions` are of the ray of each row, `point` is the point it belongs to. `coordinates`
     (point, axis, value in m) are single known coordinates, such as a height: each is one more plane of the weight of
     a ray. Where all rays of a point are within `min_angle` (rad) of each other, or there is only one, the point is not
-    determined and its coordinates are NaN. `jaxphoto.collinearity.intersect` is the same of one point, for derivatives.
+    determined and its coordinates are NaN. `jaxphoto.collinearity.intersect` is for one point, differentiable.
     """
     # About the centre of the cameras, so that map coordinates lose no digits.
     centre = origins.mean(axis=0) if len(origins) else np.zeros(3)
@@ -87,36 +92,45 @@ def intersect_with_covariance(
     if not sigma_rad > 0:
         raise ValueError(f"the standard deviation of image coordinates is positive, but sigma_rad is {sigma_rad}")
     directions = np.einsum("nij,ni->nj", camera_from_object[image], rays)
-    found, determined = intersect_points(positions[image], directions, point, n_points, min_angle=min_angle)
+    points, determined = intersect_points(positions[image], directions, point, n_points, min_angle=min_angle)
     covariance = np.full((n_points, 3, 3), np.nan)
-    use = determined[point]
-    image, point, turn = image[use], point[use], camera_from_object[image[use]]
-    measured = rays[use, :2] / -rays[use, 2:]
-    some = np.flatnonzero(determined)
-    with np.errstate(all="ignore"):  # rays that only just meet may send a point to infinity, and it is then behind
-        for _ in range(_STEPS):
-            x, y, z = np.einsum("nij,nj->in", turn, found[point] - positions[image])
-            slope = (turn[:, :2] + np.stack([x, y], axis=1)[:, :, None] / -z[:, None, None] * turn[:, 2:]) / -z[
-                :, None, None
-            ]
-            residual = measured - np.stack([x, y], axis=1) / -z[:, None]
-            normal, right = np.zeros((n_points, 3, 3)), np.zeros((n_points, 3))
-            np.add.at(normal, point, np.swapaxes(slope, 1, 2) @ slope)
-            np.add.at(right, point, np.einsum("nki,nk->ni", slope, residual))
-            covariance[some] = sigma_rad**2 * _inverses(normal[some])
-            step = (covariance[some] @ right[some][..., None])[..., 0] / sigma_rad**2
-            found[some] += step
-        offsets = found[point] - positions[image]
-        depth = np.einsum("ni,ni->n", turn[:, 2], offsets)
-        distance = np.full(n_points, np.inf)
-        np.minimum.at(distance, point, np.linalg.norm(offsets, axis=1))
-        spread = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
-        # What the last step still moved by more than it may be wrong by has not arrived.
-        good = spread < _OPEN * distance
-        good[some] &= np.linalg.norm(step, axis=1) < spread[some]
-    good &= np.bincount(point[~(depth < 0)], minlength=n_points) == 0
-    found[~good], covariance[~good] = np.nan, np.nan
-    return IntersectedPoints(found, covariance, determined & good)
+    rows, count = np.argsort(point, kind="stable"), np.bincount(point, minlength=n_points)
+    begin = np.cumsum(count) - count
+    # A program takes as many rays of each point: points with about as many are adjusted together.
+    sizes = 4 ** np.ceil(np.log(np.maximum(count, 2)) / np.log(4)).astype(int)
+    for size in np.unique(sizes[determined]):
+        some = np.flatnonzero(determined & (sizes == size))
+        used = np.arange(size) < count[some, None]
+        ray = rows[begin[some, None] + np.where(used, np.arange(size), 0)]
+        offsets, matrices = points[some, None] - positions[image[ray]], camera_from_object[image[ray]]
+        arguments = (padded(v, padded_length(len(some))) for v in (offsets, matrices, rays[ray], used))
+        shift, normal, good = (np.asarray(v)[: len(some)] for v in call_compiled(_adjusted, *arguments))
+        offsets = offsets + shift[:, None]
+        depth = np.einsum("pri,pri->pr", matrices[:, :, 2], offsets)
+        distance = np.linalg.norm(offsets, axis=2).min(axis=1)
+        points[some] += shift
+        covariance[some] = sigma_rad**2 * _inverses(normal)
+        spread = np.sqrt(np.trace(covariance[some], axis1=1, axis2=2))
+        determined[some] = good & (spread < _OPEN * distance) & (depth < 0).all(axis=1)
+    points[~determined], covariance[~determined] = np.nan, np.nan
+    return IntersectedPoints(points, covariance, determined)
+
+
+@eqx.filter_jit
+def _adjusted(offsets, camera_from_object, rays, used):
+    """Shifts (m) of points, normal matrices, and True if converged; `offsets` are from the images to the points."""
+
+    def adjusted(offsets, camera_from_object, rays, used):
+        def residuals(shift, _):
+            x, y, z = jnp.einsum("rij,rj->ir", camera_from_object, offsets + shift)
+            return jnp.concatenate(
+                [used * (rays[:, 0] / -rays[:, 2] + x / z), used * (rays[:, 1] / -rays[:, 2] + y / z)]
+            )
+
+        fit = least_squares(residuals, jnp.zeros(3), damping=1e-6, atol=1e-14)
+        return fit.unknowns, fit.normal, fit.converged
+
+    return jax.vmap(adjusted)(offsets, camera_from_object, rays, used)
 
 
 def _inverses(normal: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:

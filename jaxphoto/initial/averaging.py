@@ -1,55 +1,26 @@
-"""The two steps of one more image, and the three images to begin with, from relative orientations of pairs.
+"""Orientation of one more image, and the first three images, from relative orientations of pairs.
 
-Step one: each oriented image i that makes a pair with the new image k says `R_ik M_i` of k's rotation; the quaternions
-are averaged. Step two: each says on which line through its centre the new one lies; the lines are intersected.
+Step one: each oriented image i that forms a pair with the new image k gives `R_ik M_i` for k's rotation; the
+quaternions are averaged. Step two: each gives a line through its centre to the new one; the lines are intersected.
 
 Source: He and Habib (2014), "Linear approach for initial recovery of the exterior orientation parameters of randomly
-captured images by low-cost mobile mapping systems", ISPRS Archives XL-1. What makes a triplet the best is ours.
+captured images by low-cost mobile mapping systems", ISPRS Archives XL-1. The criteria of the best triplet are ours.
 """
 
 from collections import defaultdict
 from collections.abc import Sequence
 from itertools import product
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.orientation.quaternions import best_rotations
+from jaxphoto.initial.quaternions import best_rotations
 
 _PARALLEL = np.deg2rad(3.0)  # lines at less than this do not meet in a point
 _CLOSED = np.deg2rad(2.0)  # of a triplet: by more its rotations are not those of three images
 _SPREAD = np.deg2rad(10.0)  # bases at more than this span a triangle
 _WIDE = np.deg2rad(5.0)  # rays at less than this count in proportion
-
-
-@runtime_checkable
-class OrientedPair(Protocol):
-    """What the choice of a triplet asks of a pair."""
-
-    @property
-    def first(self) -> int:
-        """Index of the first image."""
-
-    @property
-    def second(self) -> int:
-        """Index of the second image."""
-
-    @property
-    def second_from_first(self) -> Float[np.ndarray, "3 3"]:
-        """Rotation between the camera frames."""
-
-    @property
-    def base(self) -> Float[np.ndarray, "3"]:
-        """Unit vector from the first projection centre to the second, in the first camera's frame."""
-
-    @property
-    def n(self) -> int:
-        """Points that agree."""
-
-    @property
-    def angle(self) -> float:
-        """Median angle (rad) between their rays."""
 
 
 class DirectedPoint(NamedTuple):
@@ -107,15 +78,17 @@ def intersect_directions(
     return DirectedPoint(origin + found, np.linalg.inv(np.einsum("n,nij->ij", w * scale, across)))
 
 
-def best_triplet(pairs: Sequence[OrientedPair]) -> tuple[int, int, int] | None:
-    """The three images to begin with; None where no three make three pairs that close.
+def best_triplet(pairs: Sequence[Any]) -> tuple[int, int, int] | None:
+    """The three images to begin with; None where no three form three pairs that close.
 
-    Three images close where |R_ki R_jk R_ij - I| is small; their bases should not be parallel. Of those that do, the
-    one whose weakest pair has the most points, those of rays at a narrow angle counted in proportion, is the best.
-    Triplets with parallel bases only serve where there is no other. A pair may be given several times, with
-    orientations that fit equally well.
+    A pair has the indices `first` and `second` of its images, the rotation `second_from_first` between the camera
+    frames, the `base` (unit vector to the second centre in the first camera's frame), the number `n` of points that
+    agree and the median `angle` (rad) between their rays. Three images close where |R_ki R_jk R_ij - I| is small; their
+    bases should not be parallel. Of those that do, the one whose weakest pair has the most points, those of rays at a
+    narrow angle counted in proportion, is the best. Triplets with parallel bases only serve where there is no other. A
+    pair may be given several times, with orientations that fit equally well.
     """
-    by_ends: dict[tuple[int, int], list[OrientedPair]] = defaultdict(list)
+    by_ends: dict[tuple[int, int], list[Any]] = defaultdict(list)
     for pair in pairs:
         by_ends[min(pair.first, pair.second), max(pair.first, pair.second)].append(pair)
     worth = {ends: max(p.n * min(1.0, p.angle / _WIDE) for p in same) for ends, same in by_ends.items()}
@@ -134,21 +107,21 @@ def best_triplet(pairs: Sequence[OrientedPair]) -> tuple[int, int, int] | None:
     return flat
 
 
-def _of(pair: OrientedPair):
+def _of(pair):
     """Rotation and base of a pair from the lower index to the higher."""
     if pair.first < pair.second:
         return pair.second_from_first, pair.base
     return pair.second_from_first.T, -pair.second_from_first @ pair.base
 
 
-def _closes(ij: OrientedPair, jk: OrientedPair, ik: OrientedPair) -> bool:
-    """Whether the three rotations are those of three images."""
+def _closes(ij, jk, ik) -> bool:
+    """True if the three rotations are those of three images."""
     chord = np.linalg.norm(_of(jk)[0] @ _of(ij)[0] - _of(ik)[0])
     return bool(2 * np.arcsin(min(chord / np.sqrt(8), 1.0)) < _CLOSED)
 
 
-def _spans(ij: OrientedPair, jk: OrientedPair, ik: OrientedPair) -> bool:
-    """Whether the three bases, in the frame of image i, lie in a plane and span it."""
+def _spans(ij, jk, ik) -> bool:
+    """True if the three bases, in the frame of image i, lie in a plane and span it."""
     turn, first = _of(ij)
     second, third = turn.T @ _of(jk)[1], _of(ik)[1]
     products = [np.cross(first, second), np.cross(second, third), np.cross(first, third)]

@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from scipy.stats import kstest
 
 from jaxphoto.errors import BlockError
-from jaxphoto.orientation import relative_orientation, relative_orientations
-from jaxphoto.orientation.coplanarity import tangent_plane
-from jaxphoto.orientation.relative_tests import check_described
+from jaxphoto.initial import relative_orientation, relative_orientations
+from jaxphoto.initial.coplanarity import tangent_plane
+from jaxphoto.initial.relative import check_described
 from tests.formulas import turns
-from tests.orientation.image_pairs import normalised, rotation_error
-from tests.orientation.random_scenes import SIGMA_RAD, random_pair
+from tests.initial.image_pairs import normalised, rotation_error
+from tests.initial.random_scenes import SIGMA_RAD, random_pair
 
 # A study of a thousand cases: minutes.
 pytestmark = pytest.mark.slow

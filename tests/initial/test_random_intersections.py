@@ -3,9 +3,9 @@
 import numpy as np
 from scipy.stats import kstest
 
-from jaxphoto.orientation import intersect_with_covariance
-from tests.orientation.image_pairs import normalised, rays_of
-from tests.orientation.random_scenes import intersections
+from jaxphoto.initial import intersect_with_covariance
+from tests.initial.image_pairs import normalised, rays_of
+from tests.initial.random_scenes import intersections
 
 SIGMA_RAD = 1e-4
 

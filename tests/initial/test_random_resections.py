@@ -2,19 +2,16 @@
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 import pytest
 from scipy.stats import kstest
 
 from jaxphoto.camera import InteriorOrientation
-from jaxphoto.collinearity import ExteriorOrientation, project_ideal
 from jaxphoto.errors import BlockError
-from jaxphoto.orientation import resect, resect_by_quaternions
-from jaxphoto.orientation.resection_steps import linearised, moved
-from tests.formulas import camera_from_object, collinearity, random_rotations
-from tests.orientation.image_pairs import normalised, rotation_error
-from tests.orientation.random_scenes import SIGMA_MM, image_scene
+from jaxphoto.initial import resect, resect_by_quaternions
+from tests.formulas import camera_from_object
+from tests.initial.image_pairs import normalised, rotation_error
+from tests.initial.random_scenes import SIGMA_MM, image_scene
 
 # A study of a thousand cases: minutes.
 pytestmark = pytest.mark.slow
@@ -103,25 +100,3 @@ def test_exact_images_give_the_exact_orientation():
             moved_by = np.linalg.norm(np.asarray(found.position) - scene.position) / 1000
             worst = max(worst, moved_by, np.max(np.abs(np.asarray(found.camera_from_object) - matrix)))
     assert worst < 1e-9
-
-
-def test_derivatives_equal_differences_and_those_of_the_collinearity_equations():
-    rng = np.random.default_rng(0)
-    positions, matrices = rng.normal(size=(3, 3)), random_rotations(rng, 3)
-    distances = np.array([2.0, 3, 5])
-    points = np.concatenate([rng.normal(size=(7, 3)) - 8 * m[2] + p for p, m in zip(positions, matrices, strict=True)])
-    u, slope, in_front = linearised(points, positions, matrices, distances)
-    for k in range(6):
-        step = np.zeros((3, 6))
-        step[:, k] = 1e-6
-        there, back = (
-            linearised(points, *moved(positions, matrices, distances, s), distances)[0] for s in (step, -step)
-        )
-        np.testing.assert_allclose(slope[..., k], (there - back) / 2e-6, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
-    one = ExteriorOrientation(positions[0], matrices[0])
-    by_jax = jax.jacobian(
-        lambda position: project_ideal(InteriorOrientation(1.0), ExteriorOrientation(position, matrices[0]), points[0])
-    )
-    np.testing.assert_allclose(slope[0, 0, :, :3], distances[0] * by_jax(positions[0]), rtol=1e-12)
-    np.testing.assert_allclose(u[0, 0], collinearity(1.0, one.omega_phi_kappa, positions[0], points[0]), rtol=1e-12)
-    assert in_front[0, :7].all()

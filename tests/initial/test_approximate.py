@@ -8,12 +8,12 @@ from jaxphoto.block import Motion
 from jaxphoto.camera import Brown, InteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Exposure, Mount, StripBias, recorded_attitude, sensor_position
+from jaxphoto.initial import approximate
+from jaxphoto.initial.resection import resect_ideal
 from jaxphoto.observations import Attitudes, ImageRows
-from jaxphoto.orientation import approximate
-from jaxphoto.orientation.resection import resect_ideal
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 from tests.derivatives import compiled
-from tests.orientation.scene import Truth, block_of, coordinate_rows, strip, with_known
+from tests.initial.scene import Truth, block_of, coordinate_rows, strip, with_known
 
 
 def all_of(names):
@@ -74,7 +74,7 @@ def test_images_wait_until_they_see_many_known_points(monkeypatch):
         used.append((image, len(points)))
         return resect_ideal(c_mm, ideal, points, image)
 
-    monkeypatch.setattr(sys.modules["jaxphoto.orientation.approximate"], "resect_ideal", recorded)
+    monkeypatch.setattr(sys.modules["jaxphoto.initial.approximate"], "resect_ideal", recorded)
     both = np.intersect1d(points_of_image(block, 0), points_of_image(block, 2))
     known = np.setdiff1d(points_of_image(block, 0), both[np.arange(len(both)) % 3 > 0])
     at_first = np.isin(points_of_image(block, 2), known).sum()

@@ -5,14 +5,13 @@ import pytest
 from scipy.stats import kstest
 
 from jaxphoto.errors import BlockError
-from jaxphoto.orientation import relative_orientation, relative_orientations
-from jaxphoto.orientation.coplanarity import RayPairs, essential, fitted, linearised, misclosures, moved, tangent_plane
-from jaxphoto.orientation.essential_matrix import linear_essential, orientations
-from jaxphoto.orientation.five_point import five_point_essentials
-from jaxphoto.orientation.homography import homographies, homography_orientations, transfer_errors
+from jaxphoto.initial import relative_orientation, relative_orientations
+from jaxphoto.initial.coplanarity import RayPairs, essential, fit, misclosures, moved, tangent_plane
+from jaxphoto.initial.five_point import five_point_essentials, orientations
+from jaxphoto.initial.homography import homographies, homography_orientations, transfer_errors
 from tests.checked_types import unchecked
 from tests.formulas import turns
-from tests.orientation.image_pairs import normalised, pair_scene, rays_of, rotation_error
+from tests.initial.image_pairs import normalised, pair_scene, rays_of, rotation_error
 
 SIGMA = 5e-4
 
@@ -44,9 +43,9 @@ def test_one_of_the_five_point_solutions_is_the_truth():
         np.testing.assert_allclose(np.einsum("ni,sij,nj->sn", scene.rays_2, found, scene.rays_1), 0, atol=1e-9)
 
 
-def test_linear_solution_and_its_four_orientations():
+def test_four_orientations_of_an_essential_matrix():
     scene = pair_scene(20, 3)
-    matrix = linear_essential(scene.rays_1, scene.rays_2)
+    matrix = essential(scene.rotation, scene.base)
     rotations, bases = orientations(matrix[None])
     np.testing.assert_allclose(np.linalg.det(rotations[0]), 1)
     for rotation, base in zip(rotations[0], bases[0], strict=True):
@@ -59,37 +58,22 @@ def test_linear_solution_and_its_four_orientations():
     assert np.sort(apart)[0] < 1e-9 < 0.1 < np.sort(apart)[1]
 
 
-def test_linear_solution_says_where_it_is_open():
-    flat, few = pair_scene(30, 1, sigma=1e-4, flat=True), pair_scene(7, 1)
-    with pytest.raises(BlockError, match="flat scene"):
-        linear_essential(flat.rays_1, flat.rays_2)
-    with pytest.raises(BlockError, match=r"7 points in common .* needs 8"):
-        linear_essential(few.rays_1, few.rays_2)
-
-
-def test_derivatives_equal_differences():
-    scene = pair_scene(30, 2, sigma=SIGMA)
-    pairs = RayPairs.of(scene.rays_1, scene.rays_2, SIGMA)
-    (value,), (slope,) = linearised(scene.rotation[None], scene.base[None], pairs)
-    np.testing.assert_allclose(value, misclosures(essential(scene.rotation, scene.base)[None], pairs)[0], atol=1e-9)
-
-    def there(k, h):
-        step = np.zeros((1, 5))
-        step[0, k] = h
-        return linearised(*moved(scene.rotation[None], scene.base[None], step), pairs)[0][0]
-
-    for k in range(5):
-        np.testing.assert_allclose(slope[:, k], (there(k, 1e-6) - there(k, -1e-6)) / 2e-6, rtol=1e-6, atol=1e-4)
-
-
 def test_least_squares_is_the_least():
     scene = pair_scene(30, 4, sigma=SIGMA)
     pairs = RayPairs.of(scene.rays_1, scene.rays_2, SIGMA)
-    found = fitted(scene.rotation[None], scene.base[None], pairs, np.ones((1, 30), bool))
-    (value,), (slope,) = linearised(found.rotations, found.bases, pairs)
-    gradient = slope.T @ value / np.sqrt(np.diagonal(found.normals[0]))
-    np.testing.assert_allclose(gradient, 0, atol=1e-5)
-    assert value @ value < np.sum(linearised(scene.rotation[None], scene.base[None], pairs)[0] ** 2)
+    found = fit(scene.rotation[None], scene.base[None], pairs, np.ones((1, 30), bool))
+    (value,), (slope,), (normal,) = found.values, found.slopes, found.normals
+    np.testing.assert_allclose(slope.T @ value / np.sqrt(np.diagonal(normal)), 0, atol=1e-5)
+
+    def misclosures_at(*step):
+        return misclosures(essential(*moved(found.rotations, found.bases, np.array([step]))), pairs)[0]
+
+    np.testing.assert_allclose(value, misclosures_at(0, 0, 0, 0, 0), atol=1e-9)
+    assert value @ value < np.sum(misclosures(essential(scene.rotation, scene.base)[None], pairs) ** 2)
+    np.testing.assert_allclose(normal, slope.T @ slope, rtol=1e-12)
+    for k, step in enumerate(1e-6 * np.eye(5)):
+        difference = (misclosures_at(*step) - misclosures_at(*-step)) / 2e-6
+        np.testing.assert_allclose(slope[:, k], difference, rtol=1e-6, atol=1e-4)
 
 
 @pytest.mark.parametrize(("false", "flat", "n", "count"), [(0.3, False, 60, 120), (0.3, True, 60, 60)])

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tests.formulas import random_rotations, turns
-from tests.orientation.image_pairs import PairScene, rays_of
+from tests.initial.image_pairs import PairScene, rays_of
 
 SIGMA_MM, SIGMA_RAD = 0.005, 5e-4
 

@@ -1,6 +1,6 @@
-"""Starts of a relative orientation: what random fives of points say that most other points agree with.
+"""Starts of a relative orientation from random fives of points, judged by most other points.
 
-The fives are always the same ones for as many points, so a result can be had again. A few hundred points judge; an
+The fives depend on the number of points alone, so results are reproducible. A few hundred points are judges; an
 orientation costs each judge its squared misclosure, a gross error no more than the limit.
 """
 
@@ -9,11 +9,9 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.errors import BlockError
-from jaxphoto.orientation.coplanarity import RayPairs, behind, essential, misclosures
-from jaxphoto.orientation.essential_matrix import linear_essential, orientations
-from jaxphoto.orientation.five_point import five_point_essentials
-from jaxphoto.orientation.homography import homographies, homography_orientations, transfer_errors
+from jaxphoto.initial.coplanarity import RayPairs, behind, essential, misclosures
+from jaxphoto.initial.five_point import five_point_essentials, orientations
+from jaxphoto.initial.homography import homographies, homography_orientations, transfer_errors
 
 _FIVES = 60  # at a time
 _BATCHES = 40  # at most: three in four false matches still leave two fives of true ones
@@ -22,15 +20,15 @@ _JUDGES = 300
 _LIMIT = 6.0  # standard deviations; wider than a blunder, because five points leave errors of their own
 _FEW, _NEARLY = 8, 0.1  # of so few points, essential matrices with imaginary parts are starts, too
 _FOURS = 20  # of the fives, of which four points make a homography
-_OFF_PLANE = 8.0  # the same of points and a homography, which four have more errors of
-_PLANE, _LEAST_PLANE = 0.2, 6  # part and number of the points that make a plane at least
-_BEST = 16  # essential matrices that are looked at for the points in front
+_OFF_PLANE = 8.0  # `_LIMIT` of points and a homography, which four have more errors of
+_PLANE, _LEAST_PLANE = 0.2, 6  # least fraction and number of the points that make a plane
+_BEST = 16  # essential matrices whose orientations are tested for the points in front
 _STARTS, _STARTS_OF_FEW = 8, 40
 _APART = np.deg2rad(3.0)  # starts closer to one another than this in rotation and base lead to the same result
 
 
 def candidates(pairs: RayPairs) -> tuple[Float[np.ndarray, "starts 3 3"], Float[np.ndarray, "starts 3"]]:
-    """Rotations `camera_2_from_camera_1` and bases (unit vectors) worth adjusting; none may be found."""
+    """Rotations `camera_2_from_camera_1` and bases (unit vectors) worth adjusting; possibly none."""
     n = len(pairs.rays_1)
     rng = np.random.default_rng(0)
     judges = pairs if n <= _JUDGES else pairs.take(np.sort(rng.choice(n, _JUDGES, replace=False)))
@@ -38,8 +36,9 @@ def candidates(pairs: RayPairs) -> tuple[Float[np.ndarray, "starts 3 3"], Float[
     plane, least = np.zeros((0, 3, 3)), np.inf
     for batch in range(1, _BATCHES + 1):
         fives = _fives(rng, n)
-        found = five_point_essentials(pairs.rays_1[fives], pairs.rays_2[fives], 1e-9 if n > _FEW else _NEARLY)
-        best, costs = np.concatenate([best, found]), np.concatenate([costs, _costs(found, judges)])
+        new = five_point_essentials(pairs.rays_1[fives], pairs.rays_2[fives], 1e-9 if n > _FEW else _NEARLY)
+        new_costs = np.minimum(misclosures(new, judges) ** 2, _LIMIT**2).sum(axis=1)
+        best, costs = np.concatenate([best, new]), np.concatenate([costs, new_costs])
         order = np.argsort(costs, kind="stable")[: _BEST if n > _FEW else None]
         best, costs = best[order], costs[order]
         flat = homographies(pairs.rays_1[fives[:_FOURS, :4]], pairs.rays_2[fives[:_FOURS, :4]])
@@ -47,23 +46,28 @@ def candidates(pairs: RayPairs) -> tuple[Float[np.ndarray, "starts 3 3"], Float[
         if np.min(misfits) < least:
             plane, least = flat[np.argmin(misfits)][None], float(np.min(misfits))
         if len(costs):
-            share = np.mean(np.abs(misclosures(best[:1], judges)) < _LIMIT)
-            if n <= _FEW or batch * _FIVES * share**5 > _GOOD_FIVES:
+            fraction = np.mean(np.abs(misclosures(best[:1], judges)) < _LIMIT)
+            if n <= _FEW or batch * _FIVES * fraction**5 > _GOOD_FIVES:
                 break
     if not len(costs):
         return best, np.zeros((0, 3))
-    best = np.concatenate([best, _linear(best[:1], pairs)])
     rotations, bases = (part.reshape(-1, *part.shape[2:]) for part in orientations(best))
-    both = _of_plane(plane, pairs)
-    if both:
-        rotations = np.concatenate([[rotation for rotation, _ in both], rotations])
-        bases = np.concatenate([[base for _, base in both], bases])
+    of_plane = _of_plane(plane, pairs)
+    if of_plane:
+        rotations = np.concatenate([[rotation for rotation, _ in of_plane], rotations])
+        bases = np.concatenate([[base for _, base in of_plane], bases])
     # A point behind a camera costs as much as a gross error.
     squares = np.minimum(misclosures(essential(rotations, bases), judges) ** 2, _LIMIT**2)
     costs = np.where(behind(rotations, bases, judges, _LIMIT), _LIMIT**2, squares).sum(axis=1)
-    # Both orientations of a plane are worth a look, whatever they cost before they are adjusted.
-    order = np.concatenate([np.arange(len(both)), len(both) + np.argsort(costs[len(both) :], kind="stable")])
-    return _distinct(rotations, bases, order, _STARTS if n > _FEW else _STARTS_OF_FEW)
+    # Both orientations of a plane are adjusted, whatever they cost before.
+    costs[: len(of_plane)] = -1
+    chosen: list[int] = []
+    angles = 0.5 * (rotations.reshape(-1, 9) @ rotations.reshape(-1, 9).T - 1)
+    far = np.minimum(angles, bases @ bases.T) < np.cos(_APART)
+    for k in np.argsort(costs, kind="stable"):
+        if far[k, chosen].all() and len(chosen) < (_STARTS if n > _FEW else _STARTS_OF_FEW):
+            chosen.append(int(k))
+    return rotations[chosen], bases[chosen]
 
 
 def _of_plane(plane, pairs: RayPairs):
@@ -84,29 +88,3 @@ def _fives(rng: np.random.Generator, n: int):
         return np.argsort(rng.random((_FIVES, n)), axis=1)[:, :5]
     drawn = np.sort(rng.integers(n, size=(2 * _FIVES, 5)), axis=1)
     return drawn[np.all(np.diff(drawn, axis=1) > 0, axis=1)][:_FIVES]
-
-
-def _costs(essentials, judges: RayPairs):
-    return np.minimum(misclosures(essentials, judges) ** 2, _LIMIT**2).sum(axis=1)
-
-
-def _linear(best, pairs: RayPairs):
-    """The linear solution of all points that agree with the best five, which has less noise; none of a flat scene."""
-    agrees = np.abs(misclosures(best, pairs)[0]) < _LIMIT
-    try:
-        return linear_essential(pairs.rays_1[agrees], pairs.rays_2[agrees])[None]
-    except BlockError:
-        return np.zeros((0, 3, 3))
-
-
-def _distinct(rotations, bases, order, most: int):
-    """The first of every group of like orientations, so many at most."""
-    turned = 0.5 * (rotations.reshape(-1, 9) @ rotations.reshape(-1, 9).T - 1)
-    far = np.minimum(turned, bases @ bases.T) < np.cos(_APART)
-    chosen: list[int] = []
-    for k in order:
-        if far[k, chosen].all():
-            chosen.append(k)
-        if len(chosen) == most:
-            break
-    return rotations[chosen], bases[chosen]

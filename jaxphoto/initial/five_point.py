@@ -2,8 +2,8 @@
 
 The four right singular vectors of the five coplanarity conditions span the essential matrices
 `E = x E_1 + y E_2 + z E_3 + E_4`. `det E = 0` and `2 E E' E - tr(E E') E = 0` are ten cubic equations in x, y, z.
-Solved for the ten monomials of third degree, they tell what x times each of the other ten is: a 10 x 10 matrix whose
-real eigenvalues are x, and whose eigenvectors hold y and z. Unlike the linear solution of eight points this also serves
+Solved for the ten monomials of third degree, they give x times each of the other ten: a 10 x 10 matrix whose real
+eigenvalues are x, and whose eigenvectors hold y and z. Unlike the linear solution of eight points this also serves
 where the scene is flat.
 
 Sources: Nister (2004), "An efficient solution to the five-point relative pose problem", IEEE PAMI 26(6); Stewenius,
@@ -24,7 +24,7 @@ _LEFT = _MONOMIALS[10:]
 
 
 def _collected() -> Float[np.ndarray, "64 20"]:
-    """Which monomial each product of three of (x, y, z, 1) is."""
+    """Monomials (columns) of the products of three of (x, y, z, 1)."""
     factors = ((1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0))
     table = np.zeros((64, 20))
     for row, three in enumerate(product(factors, repeat=3)):
@@ -42,9 +42,9 @@ def five_point_essentials(
 ) -> Float[np.ndarray, "solutions 3 3"]:
     """Every real essential matrix E, `x_2' E x_1 = 0`, of every five pairs of rays; of norm sqrt 2.
 
-    Fives whose conditions depend on one another, such as points on a line, are left out. With measuring errors a pair
-    of real solutions may turn complex: no five is sure to have one. For where there is no other five, an `imaginary`
-    part of so much of the size is passed over, and the matrix is only nearly an essential one.
+    Fives whose conditions depend on one another, such as points on a line, are skipped. With measuring errors a pair of
+    real solutions may turn complex, so a five may have none. `imaginary` is the imaginary part, relative to the size,
+    that is ignored; the matrix is then only nearly an essential one.
     """
     conditions = np.einsum("fni,fnj->fnij", rays_2, rays_1).reshape(-1, 5, 9)
     _, size, vectors = np.linalg.svd(conditions)
@@ -79,3 +79,20 @@ def _cubics(basis: Float[np.ndarray, "fives 4 3 3"]) -> Float[np.ndarray, "fives
     determinant = np.einsum("fia,fibd->fabd", e[:, 0], rest)
     rows = np.concatenate([cubic.reshape(-1, 9, 64), determinant.reshape(-1, 1, 64)], axis=1)
     return rows @ _COLLECTED
+
+
+def orientations(
+    essentials: Float[np.ndarray, "m 3 3"],
+) -> tuple[Float[np.ndarray, "m 4 3 3"], Float[np.ndarray, "m 4 3"]]:
+    """The four orientations of each essential matrix: `camera_2_from_camera_1` and the base in camera 1's frame.
+
+    Both rotations U W V', U W' V' with both directions of the base, the vector that E maps to zero. Points lie in
+    front of both cameras in one of the four only.
+    """
+    u, _, vt = np.linalg.svd(essentials)
+    u = u * np.linalg.det(u)[:, None, None]
+    vt = vt * np.linalg.det(vt)[:, None, None]
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    first, second = u @ quarter @ vt, u @ quarter.T @ vt
+    base = vt[:, 2]
+    return np.stack([first, first, second, second], axis=1), np.stack([base, -base, base, -base], axis=1)

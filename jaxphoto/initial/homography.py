@@ -1,12 +1,11 @@
-"""Homographies: what the points of a plane are in a second image, and the orientations that a homography means.
+"""Homographies of the points of a plane in two images, and the orientations of a homography.
 
 Of points X in the plane m' X = 1, in the frame of camera 1, the rays are
 
     x_2 ~ H x_1,   H = R (I - b m'),   R = camera_2_from_camera_1,   b the base (m)
 
-which four points determine, and which two orientations have in common, as a rule both with all points in front. A
-flat scene has both, and its noise decides which of them fits better; five points of it may give the one and not
-the other.
+which four points determine, and which two orientations share, usually both with all points in front. Of a flat scene,
+noise decides which of them fits better; five points of it may give the one and not the other.
 
 Sources: Hartley and Zisserman (2004), "Multiple View Geometry", algorithm 4.1; Ma, Soatto, Kosecka and Sastry (2004),
 "An Invitation to 3-D Vision", section 5.3.3.
@@ -15,10 +14,10 @@ Sources: Hartley and Zisserman (2004), "Multiple View Geometry", algorithm 4.1; 
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.orientation.coplanarity import RayPairs
-from jaxphoto.orientation.quaternions import cross_matrices
+from jaxphoto.initial.coplanarity import RayPairs
+from jaxphoto.initial.quaternions import cross_matrices
 
-_TURNED = 1e-3  # a difference of squared singular values below which the homography is a rotation
+_ROTATION = 1e-3  # a difference of squared singular values below which the homography is a rotation
 _SAME = 1e-12
 
 
@@ -28,15 +27,15 @@ def homographies(rays_1: Float[np.ndarray, "sets n 3"], rays_2: Float[np.ndarray
     Of three points on a line, or of fewer than four different ones, it is one of many.
     """
     rows = (cross_matrices(rays_2)[..., :, None] * rays_1[..., None, None, :]).reshape(len(rays_1), -1, 9)
-    found = np.linalg.eigh(np.swapaxes(rows, 1, 2) @ rows)[1][:, :, 0].reshape(-1, 3, 3)
-    middle = np.linalg.svd(found, compute_uv=False)[:, 1]
-    sign = np.sign(np.einsum("sni,sij,snj->s", rays_2, found, rays_1))
-    return found * (sign / np.maximum(middle, 1e-300))[:, None, None]
+    matrices = np.linalg.eigh(np.swapaxes(rows, 1, 2) @ rows)[1][:, :, 0].reshape(-1, 3, 3)
+    middle = np.linalg.svd(matrices, compute_uv=False)[:, 1]
+    sign = np.sign(np.einsum("sni,sij,snj->s", rays_2, matrices, rays_1))
+    return matrices * (sign / np.maximum(middle, 1e-300))[:, None, None]
 
 
-def transfer_errors(found: Float[np.ndarray, "m 3 3"], pairs: RayPairs) -> Float[np.ndarray, "m n"]:
-    """How far H x_1 is from x_2 in each image, in standard deviations of both, of many homographies."""
-    moved = found @ pairs.rays_1.T  # (m, 3, n)
+def transfer_errors(matrices: Float[np.ndarray, "m 3 3"], pairs: RayPairs) -> Float[np.ndarray, "m n"]:
+    """Distances of H x_1 from x_2, in standard deviations of both, of many homographies."""
+    moved = matrices @ pairs.rays_1.T  # (m, 3, n)
     length = np.linalg.norm(moved, axis=1)
     apart = np.linalg.norm(moved / np.maximum(length, 1e-300)[:, None] - pairs.rays_2.T, axis=1)
     # Errors of ray 1 grow with the scale, of which the homography has three; the mean of them all is enough here.
@@ -47,17 +46,17 @@ def transfer_errors(found: Float[np.ndarray, "m 3 3"], pairs: RayPairs) -> Float
 def homography_orientations(
     homography: Float[np.ndarray, "3 3"], rays_1: Float[np.ndarray, "n 3"]
 ) -> list[tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]:
-    """Rotations `camera_2_from_camera_1` and bases (unit vectors) that a homography of middle singular value 1 means.
+    """Rotations `camera_2_from_camera_1` and bases (unit vectors) of a homography of middle singular value 1.
 
-    Two, with most of the points seen from the side that they have in front; none of a rotation.
+    Two, with most of the points in front; none of a rotation.
     """
     squares, vectors = np.linalg.eigh(homography.T @ homography)
-    if squares[2] - squares[0] < _TURNED:
+    if squares[2] - squares[0] < _ROTATION:
         return []
     small, large = max(1 - squares[0], 0.0), max(squares[2] - 1, 0.0)
-    found = []
+    result = []
     for sign in (1.0, -1.0):
-        # Lengths along this vector and the middle one stay what they are: they lie across the base of the change.
+        # Lengths along this vector and the middle one do not change.
         kept = np.sqrt(small) * vectors[:, 2] + sign * np.sqrt(large) * vectors[:, 0]
         kept /= np.sqrt(squares[2] - squares[0])
         axes = np.stack([vectors[:, 1], kept, np.cross(vectors[:, 1], kept)], axis=1)
@@ -68,5 +67,5 @@ def homography_orientations(
         base = (np.eye(3) - rotation.T @ homography) @ axes[:, 2]
         base *= np.sign(np.sum(rays_1 @ axes[:, 2]))
         if np.linalg.norm(base) > _SAME:
-            found.append((rotation, base / np.linalg.norm(base)))
-    return found
+            result.append((rotation, base / np.linalg.norm(base)))
+    return result
