@@ -77,7 +77,8 @@ from jaxphoto.statistics import (
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted, default_priors
 
 if TYPE_CHECKING:
-    from jaxphoto.io import convert, read_block, read_recipe, read_source, write_block, write_simulation
+    from jaxphoto.extras.formats import convert, read_source
+    from jaxphoto.io import read_block, read_recipe, write_block, write_simulation
     from jaxphoto.procedures.calibration import calibrate
     from jaxphoto.procedures.compare import compare
     from jaxphoto.procedures.halves import halves

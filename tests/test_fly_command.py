@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 from PIL import Image
 
+from jaxphoto.extras.formats import FORMS
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.io import read_block
-from jaxphoto.io.control_files import FORMS
 from jaxphoto.procedures.georeference_photographs import utm_of
 from tests.commands import run
 from tests.image_measurement.ground import SENSOR, photograph, texture

@@ -15,7 +15,7 @@ from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.provenance import Provenance
 from jaxphoto.errors import JaxphotoError
 from jaxphoto.io import read_block, read_truth, write_block
-from jaxphoto.io.cameras import CAMERAS_READ
+from jaxphoto.io.camera_files import CAMERAS_READ
 from jaxphoto.losses import LOSSES
 from jaxphoto.procedures import adjust_for_tables
 from jaxphoto.procedures.weights import MadeByBlunders, made_by_blunders

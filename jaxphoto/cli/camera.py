@@ -9,14 +9,8 @@ from jaxphoto.camera import AbstractDistortion, get_parameter, parameter_names
 from jaxphoto.cli.choices import Second, one_of, place
 from jaxphoto.cli.output import Output, command
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import (
-    CAMERA_FORMATS,
-    CAMERA_MODELS,
-    CAMERAS_READ,
-    LOSS_PX,
-    read_camera_file,
-    write_camera_file,
-)
+from jaxphoto.extras.formats import CAMERA_MODELS, CAMERAS_WRITTEN, LOSS_PX, write_camera_file
+from jaxphoto.io.camera_files import CAMERAS_READ, read_camera_file
 from jaxphoto.writing import check_file
 
 
@@ -30,7 +24,7 @@ def camera_command(
     out: Annotated[Path | None, typer.Option(help="Camera file to write (needed).")] = None,
     out_format: Annotated[
         str | None,
-        one_of(CAMERA_FORMATS, "--format", help="Of --out; told by its name when not given."),
+        one_of(CAMERAS_WRITTEN, "--format", help="Of --out; told by its name when not given."),
     ] = None,
     camera: Annotated[str | None, typer.Option(help="Which camera, where SOURCE holds several.")] = None,
     pixel_mm: Annotated[float | None, typer.Option(help="Size of a pixel, where SOURCE does not give it.")] = None,

@@ -10,7 +10,8 @@ from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.two_cameras import check_one_sensor
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import read_camera_file, write_camera_file
+from jaxphoto.extras.formats import write_camera_file
+from jaxphoto.io.camera_files import read_camera_file
 from jaxphoto.stability import combine
 from jaxphoto.stability.analysis import SIGNIFICANT_P
 from jaxphoto.writing import check_file

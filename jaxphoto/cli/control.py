@@ -10,11 +10,11 @@ from jaxphoto.cli.made import made_by
 from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.provenance import Provenance
 from jaxphoto.errors import InputError
+from jaxphoto.extras.formats import FORMS, read_control
 from jaxphoto.image_measurement.control_targets import target_looker
 from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
 from jaxphoto.io import read_block
 from jaxphoto.io.block_folder import whole_block
-from jaxphoto.io.control_files import FORMS, read_control
 from jaxphoto.io.sound_photographs import in_short, sound_photographs
 from jaxphoto.procedures import adjust
 from jaxphoto.procedures.control import at_optimum, control_block, control_block_with_targets

@@ -10,19 +10,11 @@ from jaxphoto.block import Block
 from jaxphoto.cli.choices import Second, one_of, place
 from jaxphoto.cli.output import Output, command
 from jaxphoto.errors import InputError
-from jaxphoto.io import FORMATS, read_source, write_block
+from jaxphoto.extras.formats import EXPORTS, FORMATS, Exported, Project, check_export_target, export, read_source
+from jaxphoto.io import write_block
 from jaxphoto.io.block_folder import check_block_target
-from jaxphoto.io.cameras import ASSUMED_PIXEL_MM
-from jaxphoto.io.exports import (
-    EXPORTS,
-    AdjustedPhotographs,
-    Exported,
-    adjusted_block,
-    check_export_target,
-    export,
-    is_result,
-    photograph_files,
-)
+from jaxphoto.io.camera_files import ASSUMED_PIXEL_MM
+from jaxphoto.io.result_folder import adjusted_block, is_result, photograph_files
 from jaxphoto.procedures.adjust import start_of
 from jaxphoto.unknowns import Unknowns
 
@@ -89,7 +81,7 @@ def convert_command(
             values, said = (given.start.unknowns, "adjusted values") if result else _values(given, adjust)
             files = photograph_files(given.images, photographs or (), source if result else None)
             status.update(f"writing {out}")
-            done = export(AdjustedPhotographs.of_block(given, values, files), out, to)
+            done = export(Project.of_block(given, values, files), out, to)
             _say(output, done, said, "cameras" not in EXPORTS[to].lacks)
     assumed = [name for name, sensor in given.sensors.items() if sensor.pixel_assumed]
     if to == "block" and not result and assumed:

@@ -16,6 +16,7 @@ from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
 from jaxphoto.cli.provenance import Provenance
 from jaxphoto.errors import InputError, counted
+from jaxphoto.extras.formats import FORMS, read_control
 from jaxphoto.georeferencing.geoid_heights import WGS84
 from jaxphoto.georeferencing.map_frame import check_heights
 from jaxphoto.image_measurement.control_targets import target_looker
@@ -24,12 +25,11 @@ from jaxphoto.image_measurement.matching import match_photographs
 from jaxphoto.image_measurement.photograph_pairs import MostAlike, photograph_pairs, usual_choice, usual_count
 from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
 from jaxphoto.io.block_folder import whole_block
-from jaxphoto.io.control_files import FORMS, read_control
-from jaxphoto.io.exports import write_photograph_files
 from jaxphoto.io.exposures import exposure_files, located
 from jaxphoto.io.kept_orientation import kept_orient
 from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
 from jaxphoto.io.photographs import known_lens, sensor_and_interior
+from jaxphoto.io.result_folder import write_photograph_files
 from jaxphoto.io.sound_photographs import folders_not_looked_into, in_short, sound_photographs
 from jaxphoto.procedures.calibration import distortion_model
 from jaxphoto.procedures.control.of_flight import flight_control

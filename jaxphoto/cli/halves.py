@@ -10,8 +10,8 @@ from jaxphoto.cli.grid_options import check_grid, points_of
 from jaxphoto.cli.judged_block import print_judgement
 from jaxphoto.cli.made import made_by
 from jaxphoto.cli.output import Output, command
+from jaxphoto.extras.formats import write_camera_file
 from jaxphoto.io import read_block
-from jaxphoto.io.cameras import write_camera_file
 from jaxphoto.procedures.halves import CUTS, camera_of, halves
 from jaxphoto.report.halves import print_halves, write_halves
 from jaxphoto.stability import METHODS, Method

@@ -6,8 +6,7 @@ from pathlib import Path
 import equinox as eqx
 
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import CameraFile, read_camera_file
-from jaxphoto.io.cameras.own_cameras import results_in
+from jaxphoto.io.camera_files import CameraFile, read_camera_file, results_in
 from jaxphoto.io.conditions import CONDITIONS, read_conditions
 from jaxphoto.io.input_hashes import INPUTS, read_inputs
 from jaxphoto.io.sound_photographs import SUFFIXES

@@ -10,7 +10,7 @@ from jaxphoto.camera.undistortion import Keep
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.progress import StepsLeft
-from jaxphoto.io.cameras import read_camera_file
+from jaxphoto.io.camera_files import read_camera_file
 from jaxphoto.io.sound_photographs import folders_not_looked_into, in_short, sound_photographs
 from jaxphoto.io.undistorted import write_undistorted
 from jaxphoto.writing import check_folder

@@ -6,11 +6,11 @@ import re
 from pathlib import Path
 
 import pytest
+from jaxphoto.io.cameras import camera_reader
 
-from jaxphoto.io import FORMATS, control_files
-from jaxphoto.io.cameras import CAMERA_FORMATS, camera_reader
+from jaxphoto.extras.formats import CAMERA_FORMATS, EXPORTS, FORMATS
+from jaxphoto.io import control_files
 from jaxphoto.io.clouds import cloud_reader, copc
-from jaxphoto.io.exports import EXPORTS
 from jaxphoto.io.trajectory import is_sbet
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/formats.md"

@@ -11,9 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxphoto.errors import InputError
-from jaxphoto.io import export
-from jaxphoto.io.control_files import read_control
-from jaxphoto.io.exports.map_photographs import in_map
+from jaxphoto.extras.formats import export, read_control
 from jaxphoto.procedures.control.system import places, system_of
 from tests.io import control_files as files
 from tests.io.test_exports import photographs
@@ -200,7 +198,7 @@ def test_points_of_a_geo_package_come_back(tmp_path_factory, xyz, kind):
         export(p, folder, "geopackage")
     points = read_control(folder / "photographs.gpkg").points
     assert points.ids == p.points and points.system == ("EPSG:32633" if kind == "epsg" else "local")
-    np.testing.assert_allclose(points.coordinates, in_map(p).xyz, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(points.coordinates, p.in_map().xyz, rtol=0, atol=1e-9)
 
 
 def _geo(old, new):

@@ -6,7 +6,8 @@ import pytest
 
 from jaxphoto.camera import Equidistant, InteriorOrientation, OpenCv, OpenCvFisheye
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import read_camera_file, write_camera_file
+from jaxphoto.extras.formats import write_camera_file
+from jaxphoto.io.camera_files import read_camera_file
 from tests.io.test_cameras import POINTS, SENSOR, columns_rows, same_numbers, written
 
 RATIONAL = [-0.21, 0.11, 1.1e-3, -2.3e-3, 0.02, 0.03, -0.01, 0.004]

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from jaxphoto.errors import InputError, JaxphotoError
-from jaxphoto.io import read_source
-from jaxphoto.io.cameras import read_camera_file
+from jaxphoto.extras.formats import read_source
+from jaxphoto.io.camera_files import read_camera_file
 from tests.io import test_cameras as good
 from tests.io.test_colmap import write_binary, write_text
 

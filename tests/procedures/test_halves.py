@@ -15,7 +15,7 @@ from jaxphoto.adjustment import common_sizes
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import InputError
 from jaxphoto.io import write_block
-from jaxphoto.io.cameras import read_camera_file
+from jaxphoto.io.camera_files import read_camera_file
 from jaxphoto.procedures.halves import halved, halves
 from jaxphoto.simulation import image_coordinates, remeasure
 from jaxphoto.stability import Differences, band_of, bundle_offsets, concentration, image_grid, leading_unit, overlap

@@ -12,11 +12,11 @@ import jax
 import numpy as np
 
 from jaxphoto.camera import get_parameter
-from jaxphoto.io.block_folder.camera_section import Camera, camera_section, known_together
-from jaxphoto.io.block_folder.section import Section
 
 # The module, not its function: a camera file may be a block.toml, which it reads by modules of this package.
-from jaxphoto.io.cameras import camera_reader
+from jaxphoto.io import camera_files
+from jaxphoto.io.block_folder.camera_section import Camera, camera_section, known_together
+from jaxphoto.io.block_folder.section import Section
 from jaxphoto.observations import KnownParameters
 from jaxphoto.unknowns import FIXED
 
@@ -47,7 +47,7 @@ def with_earlier_calibrations(settings: dict[str, Any], file: str, folder: Path)
         named = Section(file, f"cameras.{name}.{_KEY}", given)
         named.known("file", "camera")
         camera = named.text("camera") if "camera" in named else None
-        read = camera_reader.read_camera_file(folder / named.text("file"), camera=camera)
+        read = camera_files.read_camera_file(folder / named.text("file"), camera=camera)
         if read.covariance is None:
             raise section.error(
                 _KEY, f"{named.text('file')} has no covariance; name results of jaxphoto adjust, or a camera file of it"

@@ -23,10 +23,17 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxphoto.errors import InputError
-from jaxphoto.io.control_files.gcp_list import SYSTEM
-from jaxphoto.io.control_files.rows import Cells
-from jaxphoto.io.control_files.table_header import PLACE, Columns, columns_of, in_degrees
-from jaxphoto.io.control_files.tables import separator_of, split_row, with_points
+from jaxphoto.io.control_table import (
+    PLACE,
+    SYSTEM,
+    Cells,
+    Columns,
+    columns_of,
+    in_degrees,
+    separator_of,
+    split_row,
+    with_points,
+)
 from jaxphoto.io.exposures.pospac import read_pospac
 from jaxphoto.io.text_tables import Table, each_row, is_number
 from jaxphoto.io.whole_text import LARGE, read_text

@@ -19,7 +19,7 @@ import re
 import numpy as np
 from pyproj import Transformer
 
-from jaxphoto.io.control_files.rows import Cells
+from jaxphoto.io.control_table import Cells
 from jaxphoto.io.text_tables import finite
 from jaxphoto.procedures.control.system import ControlSystem, system_of
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from jaxphoto.errors import InputError, RowError, few
-from jaxphoto.io.control_files.tables import separator_of
+from jaxphoto.io.control_table import separator_of
 from jaxphoto.io.exposures.records import Exposures
 from jaxphoto.io.whole_text import LARGE, read_text
 
