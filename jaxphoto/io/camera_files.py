@@ -5,7 +5,8 @@
 
 import importlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +24,7 @@ from jaxphoto.camera import (
     parameter_names,
     set_parameter,
 )
-from jaxphoto.errors import InputError, quoted
+from jaxphoto.errors import InputError, JaxphotoError, quoted
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section, known_together, read_sensor
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.block_folder.settings import read_settings, toml_text
@@ -131,6 +132,19 @@ class CameraSource(NamedTuple):
         return Sensor(int(width), int(height), float(pixel)), ""
 
 
+@contextmanager
+def reading(path: Path, what: str) -> Iterator[None]:
+    """Turn any error of damaged content into one InputError about the file."""
+    try:
+        yield
+    except JaxphotoError:
+        raise
+    except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RecursionError, SyntaxError) as error:
+        raise InputError(
+            f"{path.name}: damaged or no {what} ({type(error).__name__}: {error}). Export it again"
+        ) from error
+
+
 def joined_notes(*notes: str) -> str:
     """Join notes into one."""
     return "; ".join(note for note in notes if note)
@@ -187,7 +201,8 @@ def read_camera_file(
     text = "" if path.name == "cameras.bin" else source.text()
     for reader in camera_readers().values():
         if reader.recognise(path, text):
-            found = reader.read(source)
+            with reading(path, "camera file"):
+                found = reader.read(source)
             if pixel_mm is not None and not math.isclose(found.sensor.pixel_mm, pixel_mm, rel_tol=1e-6):
                 raise source.error(
                     f"it says itself that a pixel is {found.sensor.pixel_mm:g} mm, not {pixel_mm:g}: leave --pixel-mm "

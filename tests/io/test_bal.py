@@ -186,5 +186,5 @@ def test_an_image_of_two_points_is_skipped(write):
 def test_a_folder_of_two_problems_is_refused(write):
     path = write()
     (path.parent / "other.txt").write_text(path.read_text())
-    with pytest.raises(InputError, match="holds 2 files of bal .*; name one"):
+    with pytest.raises(InputError, match=r"holds 2 files of bal .*; name one"):
         read_source(path.parent, "bal")

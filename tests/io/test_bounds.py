@@ -143,10 +143,6 @@ def test_tables_are_bounded(tmp_path, text, words):
     refused(lambda: read_csv(tmp_path / "a.csv", ("a",), ("b",)), "a.csv", words)
 
 
-def test_tables_without_a_header_are_bounded(tmp_path):
-    (tmp_path / "a.txt").write_text("1,2\n3," + "9" * 1000 + "\n")
-
-
 @pytest.mark.parametrize(
     ("name", "words"),
     [

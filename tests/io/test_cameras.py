@@ -413,7 +413,7 @@ def test_a_block_may_get_another_model(tmp_path):
         (OPENCV.replace("912.25", ".Nan"), "a.yml", "no matrix of finite numbers"),
         (OPENCV.replace("912.25", "-912.25"), "a.yml", "-912.25 and 910.75 pixels cannot be"),
         (OPENCV + "fisheye_model: 1\n", "a.yml", "8 distortion_coefficients; OpenCV's fisheye model has 4"),
-        (AGISOFT[:400], "a.xml", "the XML is broken"),
+        (AGISOFT[:400], "a.xml", "damaged or no camera file"),
         (AGISOFT.replace("frame", "spherical"), "a.xml", "projection 'spherical' is not known here; known are frame"),
         (AGISOFT.replace("<f>3268.30117351641</f>", ""), "a.xml", "<f> is missing"),
         (AGISOFT.replace("<width>4032</width>", ""), "a.xml", "<width> or <height> is missing"),

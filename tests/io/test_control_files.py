@@ -128,7 +128,7 @@ def test_our_own_tables(tmp_path):
             "row 3: the point 'G1' stands in a, row 2, too",
         ),
         (files.GCP_LIST.replace("DJI_0003.JPG", "=DJI()"), None, "begins like a formula"),
-        (files.MARKERS[:900], None, "the XML is broken"),
+        (files.MARKERS[:900], None, "a: damaged"),
         (files.MARKERS.replace('camera_id="0"', 'camera_id="5"'), None, "the file has no such camera"),
         (files.MARKERS.replace('x="100.25"', 'x="nan"'), None, "x is 'nan', not a number"),
     ],
@@ -212,7 +212,7 @@ GEO_REFUSED = {
     "role": (_geo('"check"', '"both"'), "a, feature 2: the role 'both' is unknown"),
     "twice": (_geo('"G2"', '"G1"'), "a, feature 2: the point 'G1' stands in a, feature 1, too"),
     "system": (_geo("EPSG::32633", "ESRI::102100"), "the system 'urn:ogc:def:crs:ESRI::102100' is no EPSG code"),
-    "cut": (files.GEO_JSON[:-20], "no JSON that can be read"),
+    "cut": (files.GEO_JSON[:-20], "JSON"),
     "no feature": ('{"type": "FeatureCollection", "features": []}', "there are no features"),
 }  # fmt: skip
 

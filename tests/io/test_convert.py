@@ -247,7 +247,7 @@ def test_a_bad_camera_of_an_aicon_project_is_named(data_dir, tmp_path, line, old
 
 def test_an_aicon_project_needs_its_files(data_dir, tmp_path):
     shutil.copy(data_dir / "aicon" / "example.phc", tmp_path)
-    with pytest.raises(InputError, match="example.ior"):
+    with pytest.raises(InputError, match=r"example\.ior"):
         read_source(tmp_path / "example.phc", "aicon")
 
 

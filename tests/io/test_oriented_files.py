@@ -289,7 +289,7 @@ REFUSED = {
         lambda f: _with_markers(_metashape(_without("<transform>-?[0-9].*?</transform>"))(f)), "cameras.xml: no camera",
     ),
     "no size": (_nerf(lambda t: {k: v for k, v in t.items() if k not in "wh"}), "does not say how large its"),
-    "cut": (_metashape(lambda text: text[:-30]), "cameras.xml: the XML is broken"),
+    "cut": (_metashape(lambda text: text[:-30]), "cameras.xml: damaged"),
     "no sensor": (_metashape(_without("<calibration.*</calibration>")), "'a b': its sensor is not calibrated"),
     "matrix": (_metashape(lambda text: text.replace(" 1.0</tr", " x</tr")), "'a b', transform: .* 16 fi"),
     "scale": (_metashape(lambda text: text.replace(">1.0</scale>", ">-1</scale>")), "a scale of -1 cannot be"),
@@ -301,7 +301,7 @@ REFUSED = {
     "angle": (_angles(lambda text: text + "x.jpg 1 2 3 4 5 1e99\n" * 2), "row 8: '1 2 3 4 5 1e99' is not 6 numbers"),
     "system": (_angles(lambda text: text.replace("EPSG:32633", "EPSG:99999")), "EPSG code 99999 is unknown"),
     "no camera": (lambda folder: without(write_angles(folder), "camera.toml"), "0 camera files and needs one"),
-    "no points": (lambda folder: without(write_angles(folder), "ties.dat") / "exterior.txt", "has no image points for"),
+    "no points": (lambda folder: without(write_angles(folder), "ties.dat") / "exterior.txt", "has no image points"),
     "point": (lambda folder: appended(write_angles(folder), "a b c\n7 1\n"), "row [0-9]+: '7 1' is not point"),
     "xy": (lambda folder: appended(write_angles(folder), "a b c\n7 1 x\n"), "'1 x' is not 2 numbers"),
     "matrix end": (_patb(lambda text: text.rsplit("\n", 2)[0]), "patb.ori, row 10: .* first of three rows"),
@@ -310,7 +310,7 @@ REFUSED = {
         r"itera.dat, row \d+: .* is not ORIA, name, X, Y, Z, phi, omega, kappa",
     ),
     "matrix row": (_patb(lambda text: text.rstrip() + "x\n"), "patb.ori, row 12: .* is not 4 numbers"),
-    "frames": (_nerf(lambda t: {**t, "frames": 5}), "has no list of frames; give transforms.json"),
+    "frames": (_nerf(lambda t: {**t, "frames": 5}), "transforms.json: damaged"),
     "model": (_nerf(lambda t: {**t, "camera_model": "EQUIRECTANGULAR"}), "'EQUIRECTANGULAR' is not known here"),
     "focal": (_nerf(lambda t: {**t, "fl_x": 0}), "fl_x: 0 is not positive"),
     "pose": (_nerf(lambda t: {**t, "frames": [{**f, "transform_matrix": [1]} for f in t["frames"]]}), "is not 4 x"),
@@ -324,7 +324,7 @@ REFUSED = {
     "interior": (
         lambda f: changed(write_orthority(f), "int_param.yaml", ": brown", ": other"), r"\[one\] type: 'other' is",
     ),
-    "yaml": (lambda f: changed(write_orthority(f), "int_param.yaml", "type: ", "type: {"), "no YAML that can be read"),
+    "yaml": (lambda f: changed(write_orthority(f), "int_param.yaml", "type: ", "type: {"), "damaged YAML"),
     "spherical": (_metashape(lambda text: text.replace('"frame"', '"spherical"')), "'spherical' is not known here"),
 }  # fmt: skip
 

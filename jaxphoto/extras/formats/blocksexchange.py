@@ -26,8 +26,7 @@ from pyproj.exceptions import CRSError
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.extras.formats.camera_models import AGISOFT, BROWN_TERMS, ProjectCamera, in_pixels, pixels_of
 from jaxphoto.extras.formats.files import Format, add, by_content, number_rows, warn, xml_text
-from jaxphoto.extras.formats.frames import about_place, in_system
-from jaxphoto.extras.formats.project import Project, pose
+from jaxphoto.extras.formats.project import Project, about_place, in_system, pose
 from jaxphoto.io.camera_files import CameraSource
 from jaxphoto.io.whole_text import LARGE, has_words, read_whole
 
@@ -82,19 +81,13 @@ def read(path: Path) -> Project:
     kept = [k for k, number in enumerate(ties.photo) if number in index]
     of_tie = lambda k: f"{path.name}, tie point {ties.point[kept[k]] + 1}"  # noqa: E731
     project = Project(
-        (block.findtext("Name") or path.stem).strip(),
-        cameras,
-        (),
-        [photo.file for photo in photos],
-        [photo.camera for photo in photos],
-        pose(rotations, number_rows(centres, (3,), here("Center"))),
+        (block.findtext("Name") or path.stem).strip(), cameras, (), [photo.file for photo in photos],
+        [photo.camera for photo in photos], pose(rotations, number_rows(centres, (3,), here("Center"))),
         [f"t{k + 1}" for k in range(len(ties.xyz))],
         number_rows(ties.xyz, (3,), lambda k: f"{path.name}, tie point {k + 1}"),
-        np.array([index[ties.photo[k]] for k in kept], int),
-        np.array([ties.point[k] for k in kept], int),
-        number_rows([ties.xy[k] for k in kept], (2,), of_tie) + _FIRST_PX,
-        file=path.name,
-    )
+        np.array([index[ties.photo[k]] for k in kept], int), np.array([ties.point[k] for k in kept], int),
+        number_rows([ties.xy[k] for k in kept], (2,), of_tie) + _FIRST_PX, file=path.name,
+    )  # fmt: skip
     if origin := _ENU.fullmatch(system):
         latitude, longitude, height = (float(number or 0) for number in origin.groups())
         return about_place(project, (longitude, latitude, height))
@@ -105,24 +98,18 @@ def _parsed(path: Path) -> tuple[ElementTree.Element, _Ties, int]:
     """The tree without tie points (gigabytes in it), the tie points, and the number of control points."""
     ties, n_control = _Ties([], [], [], []), 0
     events = ElementTree.iterparse(io.BytesIO(read_whole(path, LARGE)), ("start", "end"))
-    root = None
-    try:
-        for event, element in events:
-            root = element if root is None else root
-            if event == "end" and element.tag == "TiePoint":
-                ties.xyz.append([element.findtext(f"Position/{axis}") for axis in "xyz"])
-                for measurement in element.iterfind("Measurement"):
-                    ties.photo.append((measurement.findtext("PhotoId") or "").strip())
-                    ties.point.append(len(ties.xyz) - 1)
-                    ties.xy.append([measurement.findtext(axis) for axis in "xy"])
-                element.clear()
-            elif event == "end" and element.tag == "ControlPoint":
-                n_control += 1
-                element.clear()
-    except (ElementTree.ParseError, LookupError, ValueError) as error:
-        raise InputError(f"{path.name}: the XML is broken ({error}). Export it again") from None
-    if root is None or root.tag != "BlocksExchange":
-        raise InputError(f"{path.name} is no BlocksExchange XML; export the block as such")
+    _, root = next(events)
+    for event, element in events:
+        if event == "end" and element.tag == "TiePoint":
+            ties.xyz.append([element.findtext(f"Position/{axis}") for axis in "xyz"])
+            for measurement in element.iterfind("Measurement"):
+                ties.photo.append((measurement.findtext("PhotoId") or "").strip())
+                ties.point.append(len(ties.xyz) - 1)
+                ties.xy.append([measurement.findtext(axis) for axis in "xy"])
+            element.clear()
+        elif event == "end" and element.tag == "ControlPoint":
+            n_control += 1
+            element.clear()
     return root, ties, n_control
 
 

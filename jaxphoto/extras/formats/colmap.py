@@ -19,7 +19,7 @@ import scipy
 from jaxphoto.camera import InteriorOrientation, OpenCvFisheye, Sensor
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.extras.formats.camera_models import OPENCV, OPENCV_FISHEYE, ProjectCamera, in_pixels, pixels_of
-from jaxphoto.extras.formats.files import CameraFormat, Format, content_rows, read_text
+from jaxphoto.extras.formats.files import CameraFormat, Format, content_rows, read_text, row_numbers
 from jaxphoto.extras.formats.project import Project, numbered, pose, translations
 from jaxphoto.io.camera_files import CameraFile, CameraReader, CameraSource
 from jaxphoto.io.text_tables import is_number, natural
@@ -151,19 +151,11 @@ def read(path: Path) -> Project:
     moved = np.array([i.translation for i in images]).reshape(-1, 3)
     folder = path.resolve().parent.name
     return Project(
-        folder,
-        cameras,
-        (),
-        [i.name for i in images],
-        [str(i.camera) for i in images],
-        pose(rotations, translations(np.swapaxes(rotations, 1, 2), moved)),
-        ids.astype(str).tolist(),
-        model.xyz[np.argsort(model.point_ids)],
-        np.repeat(np.arange(len(images)), [len(i.point) for i in images]),
-        np.searchsorted(ids, point),
-        np.concatenate([np.zeros((0, 2)), *(i.xy_px for i in images)]),
-        file=folder,
-    )
+        folder, cameras, (), [i.name for i in images], [str(i.camera) for i in images],
+        pose(rotations, translations(np.swapaxes(rotations, 1, 2), moved)), ids.astype(str).tolist(),
+        model.xyz[np.argsort(model.point_ids)], np.repeat(np.arange(len(images)), [len(i.point) for i in images]),
+        np.searchsorted(ids, point), np.concatenate([np.zeros((0, 2)), *(i.xy_px for i in images)]), file=folder,
+    )  # fmt: skip
 
 
 def read_model(path: Path) -> ColmapModel:
@@ -192,25 +184,10 @@ def read_model(path: Path) -> ColmapModel:
     return ColmapModel(cameras, images, ids, xyz)
 
 
-def _row_error(path: Path, row: int, message: str) -> InputError:
-    return InputError(f"{path}, row {row}: {message}. Correct it or let COLMAP write it again")
-
-
-def _numbers(path: Path, row: int, cells: list[str]) -> np.ndarray:
-    try:
-        values = np.array(cells, float)
-    except ValueError:
-        values = np.array([np.nan])
-    if not np.isfinite(values).all():
-        raise _row_error(path, row, "a cell is no finite number")
-    return values
-
-
-def _ids(path: Path, row: int, cells: list[str]) -> np.ndarray:
-    try:
-        return np.array(cells, object).astype(np.int64)
-    except (ValueError, OverflowError):
-        raise _row_error(path, row, "an id is a whole number") from None
+def _cells_error(path: Path, row: int, count: int, expected: str) -> InputError:
+    return InputError(
+        f"{path}, row {row}: {count} cells instead of {expected}. Correct it or let COLMAP write it again"
+    )
 
 
 def _text_images(path: Path) -> Iterator[ColmapImage]:
@@ -221,26 +198,29 @@ def _text_images(path: Path) -> Iterator[ColmapImage]:
             continue
         cells = line.split(maxsplit=9)
         if len(cells) < 10:
-            raise _row_error(path, row, f"{len(cells)} cells instead of IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
-        numbers = tuple(_numbers(path, row, cells[1:8]).tolist())
-        camera = int(_ids(path, row, cells[8:9])[0])
+            raise _cells_error(path, row, len(cells), "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
+        *numbers, camera = row_numbers(path, row, cells[1:9], 8)
         row, line = next(lines, (row + 1, ""))
         features = line.split()
         if len(features) % 3:
-            raise _row_error(path, row, f"{len(features)} cells are not X Y POINT3D_ID of some features")
-        xy, ids = _numbers(path, row, features).reshape(-1, 3)[:, :2], _ids(path, row, features[2::3])
-        yield ColmapImage(cells[9].strip(), camera, numbers[:4], numbers[4:], xy[ids >= 0], ids[ids >= 0])
+            raise _cells_error(path, row, len(features), "X Y POINT3D_ID of some features")
+        measured = np.array(row_numbers(path, row, features, len(features))).reshape(-1, 3)
+        measured = measured[measured[:, 2] >= 0]
+        ids = measured[:, 2].astype(np.int64)
+        yield ColmapImage(cells[9].strip(), int(camera), tuple(numbers[:4]), tuple(numbers[4:]), measured[:, :2], ids)
 
 
 def _text_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    ids, xyz = [], []
+    points = []
     for row, line in content_rows(path):
-        cells = line.split(maxsplit=4)
+        cells = line.split(maxsplit=4)[:4]
         if len(cells) < 4:
-            raise _row_error(path, row, f"{len(cells)} cells instead of POINT3D_ID X Y Z and more")
-        ids.append(_ids(path, row, cells[:1])[0])
-        xyz.append(_numbers(path, row, cells[1:4]))
-    return np.array(ids, np.int64), np.array(xyz, float).reshape(-1, 3)
+            raise _cells_error(path, row, len(cells), "POINT3D_ID X Y Z and more")
+        points.append(row_numbers(path, row, cells, 4))
+        if points[-1][0] % 1 or abs(points[-1][0]) >= 2**53:
+            raise InputError(f"{path}, row {row}: {cells[0]} is no id. Write a whole number")
+    values = np.array(points).reshape(-1, 4)
+    return values[:, 0].astype(np.int64), values[:, 1:]
 
 
 def _binary_images(path: Path) -> Iterator[ColmapImage]:

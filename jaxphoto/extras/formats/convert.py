@@ -33,12 +33,12 @@ from jaxphoto.extras.formats import (
     texts,
 )
 from jaxphoto.extras.formats.camera_models import CameraModel
-from jaxphoto.extras.formats.files import CameraFormat, Format, by_content, read_text, reading
+from jaxphoto.extras.formats.files import CameraFormat, Format, by_content, read_text
 from jaxphoto.extras.formats.project import Project
 from jaxphoto.io.block_folder import BlockTables, assemble, write_block
 from jaxphoto.io.block_folder.block_reader import read_folder
 from jaxphoto.io.block_folder.table_layout import TOML
-from jaxphoto.io.camera_files import CAMERA_READERS, is_camera_file, joined_notes, write_block_camera
+from jaxphoto.io.camera_files import CAMERA_READERS, is_camera_file, joined_notes, reading, write_block_camera
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 from jaxphoto.writing import check_folder, whole_file, whole_folder
 

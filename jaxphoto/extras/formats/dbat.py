@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.extras.formats.files import Format, by_content, parse_xml, read_columns
+from jaxphoto.extras.formats.files import Format, by_content, read_columns
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.table_layout import SIGMA_XYZ, XYZ
 from jaxphoto.io.text_tables import Table, concatenate, finite
@@ -104,7 +104,7 @@ def _names_itself(path: Path) -> bool:
 
 
 def _open(path: Path) -> _Script:
-    return _Script(path, parse_xml(path, read_whole(path, SMALL)))
+    return _Script(path, ElementTree.fromstring(read_whole(path, SMALL)))
 
 
 def read(path: Path) -> BlockTables:

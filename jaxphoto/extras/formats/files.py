@@ -1,11 +1,9 @@
 """Declarations of formats, and reading of their files: text, trees and numbers with the place of an error."""
 
 import json
-import struct
 import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.camera import InteriorOrientation, Perspective, Sensor
-from jaxphoto.errors import InputError, JaxphotoError, quoted
+from jaxphoto.errors import InputError, quoted
 from jaxphoto.extras.formats.camera_models import CameraModel
 from jaxphoto.extras.formats.project import Project
 from jaxphoto.io.block_folder import BlockTables
@@ -23,10 +21,6 @@ from jaxphoto.io.whole_text import LARGE, read_whole
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 
 Find = Callable[[Path], list[Path]]
-_DAMAGED = (
-    ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RecursionError, struct.error,
-    ElementTree.ParseError,
-)  # fmt: skip
 
 
 class Format(NamedTuple):
@@ -92,19 +86,6 @@ def by_content(pattern: str, is_file: Callable[[Path], bool]) -> Find:
     return find
 
 
-@contextmanager
-def reading(path: Path, what: str) -> Iterator[None]:
-    """Turn any error of damaged content into one InputError about the file."""
-    try:
-        yield
-    except JaxphotoError:
-        raise
-    except _DAMAGED as error:
-        raise InputError(
-            f"{path.name}: damaged or no {what} ({type(error).__name__}: {error}). Export it again"
-        ) from error
-
-
 def warn(message: str) -> None:
     """Warn the user."""
     warnings.warn(message, UserWarning, stacklevel=3)
@@ -144,8 +125,8 @@ def read_columns(path: Path, columns: Sequence[str], separator: str | None = ","
     for row, cells in rows:
         if len(cells) != len(columns):
             raise InputError(
-                f"{path.name}, row {row}: {len(cells)} cells instead of {len(columns)} ({', '.join(columns)}). Complete "
-                "the row or correct the format"
+                f"{path.name}, row {row}: {len(cells)} cells instead of {len(columns)} ({', '.join(columns)}). "
+                "Complete the row or correct the format"
             )
     values = {name: np.array([cells[j] for _, cells in rows], object) for j, name in enumerate(columns)}
     return Table.of(path.name, values, np.array([row for row, _ in rows], int))
@@ -153,20 +134,7 @@ def read_columns(path: Path, columns: Sequence[str], separator: str | None = ","
 
 def read_json(path: Path) -> Any:
     """Return the content of a JSON file."""
-    try:
-        return json.loads(read_text(path))
-    except (RecursionError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path.name} is no JSON that can be read ({error}). Export it again") from None
-
-
-def parse_xml(path: Path, text: str | bytes) -> ElementTree.Element:
-    """Return the root of an XML file."""
-    try:
-        return ElementTree.fromstring(text)
-    except (ElementTree.ParseError, LookupError, ValueError) as error:
-        raise InputError(f"{path.name}: the XML is broken ({error}). Export it again") from None
+    return json.loads(read_text(path))
 
 
 def add(parent: ElementTree.Element, tag: str, content: Any = None, **attributes: str) -> ElementTree.Element:

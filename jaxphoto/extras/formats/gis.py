@@ -243,16 +243,14 @@ def read_geojson(path: Path, text: str) -> SurveyedPoints:
 def _point_feature(path: Path, k: int, feature: Any) -> tuple[list[float], dict[str, Any]]:
     geometry = feature.get("geometry") if isinstance(feature, dict) else None
     place = geometry.get("coordinates") if isinstance(geometry, dict) and geometry.get("type") == "Point" else None
-    try:
-        coordinates = [float(v) for v in place or () if not isinstance(v, str)]
-    except (TypeError, ValueError, OverflowError):
-        coordinates = []
-    if not 2 <= len(coordinates) <= 4 or not all(abs(v) <= LARGEST for v in coordinates):
+    coordinates = place if isinstance(place, list) else []
+    numbers = all(isinstance(v, int | float) and abs(v) <= LARGEST for v in coordinates)
+    if not numbers or not 2 <= len(coordinates) <= 4:
         raise InputError(
             f"{path.name}, feature {k}: the geometry is no point of finite coordinates; export a layer of points"
         )
     attributes = feature.get("properties") or {}
-    return coordinates[:3], ({"id": feature["id"]} if "id" in feature else {}) | attributes
+    return [float(v) for v in coordinates[:3]], ({"id": feature["id"]} if "id" in feature else {}) | attributes
 
 
 def _geojson_system(path: Path, content: dict[str, Any]) -> str:

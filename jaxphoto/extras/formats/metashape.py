@@ -35,21 +35,19 @@ from jaxphoto.block import Frame
 from jaxphoto.camera import Agisoft, InteriorOrientation, Sensor
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.extras.formats.camera_models import AGISOFT, AGISOFT_FISHEYE, ProjectCamera
-from jaxphoto.extras.formats.control_rows import Mark, SurveyRows, read_marks
+from jaxphoto.extras.formats.control import Mark, SurveyRows, read_marks
 from jaxphoto.extras.formats.files import (
     CameraFormat,
     ControlFormat,
     Format,
     add,
     number_rows,
-    parse_xml,
     read_text,
     warn,
     xml_text,
 )
-from jaxphoto.extras.formats.frames import WGS84, geocentric, is_geocentric
 from jaxphoto.extras.formats.points_beside import joined, marks_shown, points_beside, write_image_points
-from jaxphoto.extras.formats.project import ControlPoints, Project, pose
+from jaxphoto.extras.formats.project import WGS84, ControlPoints, Project, geocentric, is_geocentric, pose
 from jaxphoto.georeferencing.map_frame import map_system
 from jaxphoto.io.camera_files import CameraFile, CameraReader, CameraSource, joined_notes
 from jaxphoto.io.text_tables import finite
@@ -72,7 +70,7 @@ _LOCAL = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["me
 
 def read_calibration(source: CameraSource) -> CameraFile:
     """Read the camera of a calibration file, or one sensor of exported cameras."""
-    root = parse_xml(source.path, source.text())
+    root = ElementTree.fromstring(source.text())
     sensors = {source.path.stem: (root, None)} if root.tag == "calibration" else _sensors(root)
     name = source.chosen(list(sensors))
     return _camera(source, name, *sensors[name])
@@ -212,20 +210,10 @@ def read(path: Path) -> Project:
             "tie points as BINGO or PATB into the folder of this file, or the project as BlocksExchange"
         )
     project = Project(
-        chunk.get("label") or path.stem,
-        {names[key]: camera for key, camera in sensors.items()},
-        (),
-        labels,
-        [names[photo.sensor] for photo in photos],
-        pose(rotations, centres),
-        shown.points,
-        None,
-        shown.image,
-        shown.point,
-        shown.column_row,
-        sigma_px=shown.sigma_px,
-        file=path.name,
-    )
+        chunk.get("label") or path.stem, {names[key]: camera for key, camera in sensors.items()}, (), labels,
+        [names[photo.sensor] for photo in photos], pose(rotations, centres), shown.points, None, shown.image,
+        shown.point, shown.column_row, sigma_px=shown.sigma_px, file=path.name,
+    )  # fmt: skip
     if system.crs is not None:
         project = geocentric(project, _datum_code(path, system), system.vertical).in_map()
     if not len(rows):
@@ -342,7 +330,7 @@ def read_markers(path: Path, text: str) -> GivenControl:
 
 
 def _chunk(path: Path, text: str) -> ElementTree.Element:
-    root = parse_xml(path, text)
+    root = ElementTree.fromstring(text)
     chunk = root if root.tag == "chunk" else root.find("chunk")
     if chunk is None:
         raise InputError(

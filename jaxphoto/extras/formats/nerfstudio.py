@@ -53,9 +53,7 @@ def _is_transforms(path: Path) -> bool:
 def read(path: Path) -> Project:
     """Read frames; those of the same values have one camera, free in c, xp, yp and coefficients that are not zero."""
     content = read_json(path)
-    frames = content.get("frames") if isinstance(content, dict) else None
-    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-        raise InputError(f"{path} has no list of frames; give transforms.json of nerfstudio in full")
+    frames = content["frames"]
     files = [Section(path.name, f"frames.{k}", frame).text("file_path") for k, frame in enumerate(frames)]
     shared = {key: content[key] for key in _OF_CAMERA if key in content}
     values = [shared | {key: frame[key] for key in _OF_CAMERA if key in frame} for frame in frames]

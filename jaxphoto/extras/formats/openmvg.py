@@ -55,8 +55,6 @@ def _is_scene(path: Path) -> bool:
 def read(path: Path) -> Project:
     """Read a scene; cameras are free in c, xp, yp and the coefficients of their kind."""
     content = read_json(path)
-    if not isinstance(content, dict) or not all(isinstance(content.get(key), list) for key in _LISTS):
-        raise InputError(f"{path} has not the lists {', '.join(_LISTS)}; give sfm_data.json of OpenMVG in full")
     views, intrinsics, poses, points = (_by_key(path, content, name) for name in _LISTS)
     kinds = {_kind_number(v): v["polymorphic_name"] for v in intrinsics.values() if "polymorphic_name" in v}
     cameras = {key: _camera(path, key, value, kinds) for key, value in intrinsics.items()}

@@ -30,8 +30,7 @@ from jaxphoto.extras.formats.camera_models import (
 )
 from jaxphoto.extras.formats.control import write_gcp_list
 from jaxphoto.extras.formats.files import Format, by_content, number_rows, read_json, read_text, warn
-from jaxphoto.extras.formats.frames import about_place
-from jaxphoto.extras.formats.project import Project, pose, translations
+from jaxphoto.extras.formats.project import Project, about_place, pose, translations
 from jaxphoto.georeferencing.map_frame import Place
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.camera_files import CameraSource
@@ -80,19 +79,11 @@ def read(path: Path) -> Project:
     xyz = [point.get("coordinates") for point in points.values()]
     image, point, column_row = _tracks(folder / TRACKS, files, ids, [cameras[name] for name in camera_of])
     project = Project(
-        folder.resolve().name,
-        cameras,
-        (),
-        files,
-        camera_of,
-        pose(rotations, translations(np.swapaxes(rotations, 1, 2), vectors("translation"))),
-        ids,
-        number_rows(xyz, (3,), lambda k: f"{path.name}, {quoted(ids[k])}, coordinates"),
-        image,
-        point,
-        column_row,
+        folder.resolve().name, cameras, (), files, camera_of,
+        pose(rotations, translations(np.swapaxes(rotations, 1, 2), vectors("translation"))), ids,
+        number_rows(xyz, (3,), lambda k: f"{path.name}, {quoted(ids[k])}, coordinates"), image, point, column_row,
         file=path.name,
-    )
+    )  # fmt: skip
     reference = _reference(folder, content)
     return about_place(project, reference) if reference else project
 

@@ -45,19 +45,10 @@ def read(path: Path) -> Project:
     offset_path = path.with_name(name + OFFSET_FILE)
     offset = row_numbers(offset_path, 1, read_text(offset_path).split(), 3) if offset_path.is_file() else np.zeros(3)
     return Project(
-        name.strip("_"),
-        {str(k): _camera(path, values.tolist()) for k, values in enumerate(kinds)},
-        (),
-        files,
-        [str(k) for k in number.tolist()],
-        pose(numbers[:, 17:].reshape(-1, 3, 3), numbers[:, 14:17] + offset),
-        shown.points,
-        None,
-        shown.image,
-        shown.point,
-        shown.column_row,
-        file=path.name,
-    )
+        name.strip("_"), {str(k): _camera(path, values.tolist()) for k, values in enumerate(kinds)}, (), files,
+        [str(k) for k in number.tolist()], pose(numbers[:, 17:].reshape(-1, 3, 3), numbers[:, 14:17] + offset),
+        shown.points, None, shown.image, shown.point, shown.column_row, file=path.name,
+    )  # fmt: skip
 
 
 def _read_cameras(path: Path) -> tuple[list[str], list[tuple[int, int]], np.ndarray]:

@@ -22,8 +22,7 @@ from jaxtyping import Float, Int
 
 from jaxphoto.errors import InputError, few, quoted
 from jaxphoto.extras.formats.camera_models import ProjectCamera
-from jaxphoto.extras.formats.control import is_geoin
-from jaxphoto.extras.formats.control_rows import Mark
+from jaxphoto.extras.formats.control import Mark, is_geoin
 from jaxphoto.extras.formats.files import beginning, read_text, row_numbers, warn
 from jaxphoto.extras.formats.project import Project
 from jaxphoto.io.text_tables import is_number, read_csv

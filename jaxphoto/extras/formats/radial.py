@@ -88,10 +88,7 @@ def _project(path: Path, title: str, s: _Scene) -> Project:
 def read_bundler(path: Path) -> Project:
     """Read a bundle file; images that are not oriented are skipped."""
     lines = read_text(path).split("\n")
-    try:
-        numbers = np.array(" ".join(line for line in lines if not line.startswith("#")).split(), float)
-    except ValueError as error:
-        raise InputError(f"{path.name}: {error}. Export it again") from None
+    numbers = np.array(" ".join(line for line in lines if not line.startswith("#")).split(), float)
     if not (np.abs(numbers) <= LARGEST).all():
         raise InputError(f"{path.name}: a number is not finite or too large. Export it again")
     n_cameras, n_points = (_count(path, numbers, k, what) for k, what in enumerate(("cameras", "points")))

@@ -35,7 +35,6 @@ from jaxphoto.errors import InputError, few, quoted
 from jaxphoto.extras.formats.camera_models import ProjectCamera
 from jaxphoto.extras.formats.control import is_geoin
 from jaxphoto.extras.formats.files import Format, beginning, read_text, row_numbers
-from jaxphoto.extras.formats.frames import with_system
 from jaxphoto.extras.formats.points_beside import (
     Shown,
     measured_texts,
@@ -43,7 +42,7 @@ from jaxphoto.extras.formats.points_beside import (
     points_beside,
     write_image_points,
 )
-from jaxphoto.extras.formats.project import Project
+from jaxphoto.extras.formats.project import Project, with_system
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
 from jaxphoto.io.block_folder.settings import toml_text
 from jaxphoto.io.camera_files import CAMERA, SeveralCamerasError, read_camera_file
