@@ -233,7 +233,7 @@ def test_markers_in_another_system_are_refused_and_what_markers_cannot_be_is_tol
     assert len(read_source(tmp_path / "out").control.who) == 9
     path = tmp_path / "out" / "markers.xml"
     path.write_text(path.read_text().replace("LOCAL_CS[", "GEOGCS["))
-    with pytest.raises(InputError, match=r"markers.xml is in another coordinate system than cameras.xml; export both"):
+    with pytest.raises(InputError, match=r"markers.xml is in another coordinate system than cameras.xml"):
         read_source(tmp_path / "out")
 
 

@@ -486,7 +486,7 @@ REFUSED = {
     "cut": (_blocks(lambda text: text[:-30]), "block.xml: damaged"),
     "unknown encoding": (_blocks(_replaced("utf-8", "utf-0")), "block.xml: damaged .*unknown encoding: utf-0"),
     "wide encoding": (_blocks(_replaced("utf-8", "shift_jis")), "block.xml: damaged .*multi-byte encodings are not"),
-    "angles": (_blocks(_geographic), "longitude and latitude; export it in a map system"),
+    "angles": (_blocks(_geographic), "is longitude and latitude"),
     "axes": (_blocks(_replaced("XRightYUp", "XUpYLeft"), upwards=True), "one: CameraOrientation 'XUpYLeft'"),
     "fisheye": (_blocks(_replaced(">Perspective<", ">Fisheye<")), "is a 'Fisheye'"),
     "centre": (_blocks(_replaced("<x>0.5</x>", "<x>a</x>")), "photo 5, Center: .* is not 3 finite numbers"),

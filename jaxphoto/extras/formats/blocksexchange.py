@@ -125,9 +125,7 @@ def _system(path: Path, root: ElementTree.Element, block: ElementTree.Element) -
         except (CRSError, UnicodeError, ValueError):
             geographic = False
         if geographic:
-            raise InputError(
-                f"{path.name}: the block is in {quoted(words)}, longitude and latitude; export it in a map system"
-            )
+            raise InputError(f"{path.name}: {quoted(words)} is longitude and latitude. Export it in a map system")
         return words
     return ""
 

@@ -103,9 +103,7 @@ class SurveyRows:
         same = np.array_equal(np.array(first[0]), np.array(xyz), equal_nan=True)
         if first is not row and (once or not same):
             other = "" if same else " with other coordinates"
-            raise InputError(
-                f"{place}: the point {quoted(name)} stands in {first[3]}, too{other}; give each point once"
-            )
+            raise InputError(f"{place}: the point {quoted(name)} stands in {first[3]}, too{other}")
 
     def surveyed(self, system: str = "") -> SurveyedPoints:
         """Return all points. Raise InputError if there is none."""
@@ -287,9 +285,7 @@ def read_gcp_list(path: Path, text: str) -> GivenControl:
     for k, row in enumerate(cells.records):
         unmarked = None if marked else _unmarked(row)
         if unmarked is None and len(row) < 6:
-            raise cells.bad(
-                k, f"{len(row)} cells; a row has geo_x, geo_y, geo_z, im_x, im_y and image_name, so complete it"
-            )
+            raise cells.bad(k, f"{len(row)} cells; write geo_x, geo_y, geo_z, im_x, im_y, image_name")
         name, first = unmarked or (row[6] if len(row) > 6 else "", 0)
         xyz = [cells.number(k, first, "geo_x"), cells.number(k, first + 1, "geo_y"), cells.height(k, first + 2)]
         name = name or points.named_by(xyz)

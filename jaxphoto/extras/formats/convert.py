@@ -305,9 +305,7 @@ def _target(
     """The model in which a camera is written."""
     if format.plane is not None and format.fisheye is None and type(interior.projection) is not Perspective:
         others = ", ".join(n for n in CAMERAS_WRITTEN if CAMERA_FORMATS[n].fisheye or not CAMERA_FORMATS[n].plane)
-        raise InputError(
-            f"{path}: cameras of {format.name} are perspective, and this one is a fisheye; write one of {others}"
-        )
+        raise InputError(f"{path}: cameras of {format.name} are perspective, this is a fisheye; write one of {others}")
     if model is not None and model not in format.models:
         there = f"it has {', '.join(format.models)}" if format.models else "leave the model out"
         raise InputError(f"{path}: {model} is no model of the format {format.name}; {there}")
@@ -338,9 +336,7 @@ def read_control(control: str | Path, marks: str | Path | None = None) -> GivenC
     """
     own = _read_control(Path(control))
     if isinstance(own, Marks):
-        raise InputError(
-            f"{Path(control).name} has marks but no coordinates; give it as the marks, and the points as well"
-        )
+        raise InputError(f"{Path(control).name} has marks but no coordinates; give it as the marks")
     points, seen = (own.points, own.marks) if isinstance(own, GivenControl) else (own, Marks.none())
     if marks is not None:
         other = _read_control(Path(marks))

@@ -220,8 +220,8 @@ def _image_sigma(script: _Script, element: ElementTree.Element, table: Table, ax
             if value is None:
                 raise script.error(f"{name} = {quoted(element.attrib[name])} is not a number; give it in pixels")
             return np.full(len(table), value)
-    if name := _first(table, "sxy", f"s{axis}"):
-        return table.sigmas(name)
+    if column := _first(table, "sxy", f"s{axis}"):
+        return table.sigmas(column)
     raise script.error(f"the points of {table.file} have no standard deviation; add sxy='...' (pixels) to their <file>")
 
 

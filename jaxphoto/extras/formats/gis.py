@@ -246,9 +246,7 @@ def _point_feature(path: Path, k: int, feature: Any) -> tuple[list[float], dict[
     coordinates = place if isinstance(place, list) else []
     numbers = all(isinstance(v, int | float) and abs(v) <= LARGEST for v in coordinates)
     if not numbers or not 2 <= len(coordinates) <= 4:
-        raise InputError(
-            f"{path.name}, feature {k}: the geometry is no point of finite coordinates; export a layer of points"
-        )
+        raise InputError(f"{path.name}, feature {k}: the geometry is no point. Export a layer of points")
     attributes = feature.get("properties") or {}
     return [float(v) for v in coordinates[:3]], ({"id": feature["id"]} if "id" in feature else {}) | attributes
 
@@ -259,10 +257,7 @@ def _geojson_system(path: Path, content: dict[str, Any]) -> str:
     name = str(content["crs"]["properties"]["name"])
     code = _EPSG.search(name)
     if code is None and not _CRS84.search(name):
-        raise InputError(
-            f"{path.name}: the system {quoted(name)} is no EPSG code; export the layer in longitude and latitude or "
-            "in an EPSG system"
-        )
+        raise InputError(f"{path.name}: the system {quoted(name)} is no EPSG code")
     return f"EPSG:{code[1] if code else _WGS84}"
 
 
@@ -297,10 +292,7 @@ def _read_layer(path: Path, file: sqlite3.Connection) -> SurveyedPoints:
         if point_attributes(["x", "y", *(c for c in columns if c != geometry)]) is not None:
             layers.append((name, geometry, srs, columns))
     if len(layers) != 1:
-        raise InputError(
-            f"{path.name} has {len(layers)} layers of points with an attribute point, name, label or id; export the "
-            "control points alone"
-        )
+        raise InputError(f"{path.name} has {len(layers)} layers of points with an attribute point, name, label or id")
     ((name, geometry, srs, columns),) = layers
     if geometry not in columns:
         raise InputError(f"{path.name}: layer {quoted(name)} has no column {quoted(geometry)}; export it again")

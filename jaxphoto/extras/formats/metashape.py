@@ -191,9 +191,7 @@ def read(path: Path) -> Project:
     sensors, names = _project_cameras(path, chunk), _sensor_names(chunk)
     for photo in photos:
         if photo.sensor not in sensors:
-            raise InputError(
-                f"{path.name}, camera {quoted(photo.label)}: its sensor is not calibrated. Export it again"
-            )
+            raise InputError(f"{path.name}, camera {quoted(photo.label)}: its sensor is not calibrated.")
     labels = [photo.label for photo in photos]
     place = lambda k: f"{path.name}, camera {quoted(labels[k])}, transform"  # noqa: E731
     poses = number_rows([photo.transform.split() for photo in photos], (16,), place).reshape(-1, 4, 4)
@@ -205,10 +203,7 @@ def read(path: Path) -> Project:
     cameras = [sensors[photo.sensor] for photo in photos]
     shown = joined(points_beside(path, labels, cameras), marks_shown(marks, labels), path.name)
     if not len(shown.image):
-        raise InputError(
-            f"{path.name} has no tie points and no marks, which cameras of Metashape never bring with them. Export the "
-            "tie points as BINGO or PATB into the folder of this file, or the project as BlocksExchange"
-        )
+        raise InputError(f"{path.name} has no tie points and no marks; export tie points as BINGO or PATB beside it")
     project = Project(
         chunk.get("label") or path.stem, {names[key]: camera for key, camera in sensors.items()}, (), labels,
         [names[photo.sensor] for photo in photos], pose(rotations, centres), shown.points, None, shown.image,
@@ -245,10 +240,7 @@ def _photos(path: Path, chunk: ElementTree.Element) -> tuple[list[_Aligned], str
         else:
             photos.append(_Aligned(label, camera.get("sensor_id", ""), camera.get("component_id", ""), transform))
     if not photos:
-        raise InputError(
-            f"{path.name}: no camera is aligned; align the photographs and export the cameras again (markers alone are "
-            "for jaxphoto control)"
-        )
+        raise InputError(f"{path.name}: no camera is aligned; align them (markers alone are for jaxphoto control)")
     ((component, count),) = Counter(photo.component for photo in photos).most_common(1)
     if unaligned or count < len(photos):
         warn(
@@ -311,10 +303,7 @@ def _datum_code(path: Path, system: ControlSystem) -> int:
     geodetic = None if system.crs is None else system.crs.geodetic_crs
     code = None if geodetic is None else geodetic.to_epsg()
     if code is None:
-        raise InputError(
-            f"{path.name}: neither its system ({system.name}) nor the datum of that has an EPSG code; export it in a "
-            "system that has one"
-        )
+        raise InputError(f"{path.name}: neither {system.name} nor its datum has an EPSG code")
     warn(f"{path.name}: its system has no EPSG code; the block is in EPSG:{code}")
     return code
 
@@ -333,10 +322,7 @@ def _chunk(path: Path, text: str) -> ElementTree.Element:
     root = ElementTree.fromstring(text)
     chunk = root if root.tag == "chunk" else root.find("chunk")
     if chunk is None:
-        raise InputError(
-            f"{path.name}: there is no <chunk>; export the markers or cameras of a chunk (File, Export, Export "
-            "Markers, Export Cameras)"
-        )
+        raise InputError(f"{path.name}: there is no <chunk>. Export markers or cameras of a chunk")
     return chunk
 
 
@@ -352,10 +338,7 @@ def _markers(path: Path, chunk: ElementTree.Element) -> tuple[SurveyRows, list[M
         return _markers_of(path.name, chunk)
     other = _chunk(beside, read_text(beside))
     if _system_words(other) != _system_words(chunk):
-        raise InputError(
-            f"{MARKERS_FILE} is in another coordinate system than {path.name}; export both in one, or give "
-            f"{MARKERS_FILE} to jaxphoto control"
-        )
+        raise InputError(f"{MARKERS_FILE} is in another coordinate system than {path.name}")
     return _markers_of(MARKERS_FILE, other)
 
 

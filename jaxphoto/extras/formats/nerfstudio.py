@@ -79,10 +79,7 @@ def _camera(path: Path, place: str, values: dict[str, Any]) -> ProjectCamera:
         if name not in coefficients and section.number(name, 0.0) != 0:
             raise section.error(name, f"cameras of kind {kind} have no such term here; calibrate without it")
     if not ("w" in section and "h" in section):
-        raise InputError(
-            f"{path.name} does not say how large its photographs are; add w and h (pixels) to it, and write "
-            "image_points.csv into its folder, or convert the COLMAP model that it was made of"
-        )
+        raise InputError(f"{path.name} does not say how large its photographs are. Add w and h (pixels)")
     width, height = section.number("w"), section.number("h")
     sensor, _ = source.sensor(width, height)
     if "fl_x" not in section and "camera_angle_x" in section:

@@ -128,9 +128,7 @@ def _matrix(source: CameraSource, storage: Any, key: str) -> np.ndarray:
         # A list of one dimension, as OpenCV 5 writes it.
         rows, columns = 1.0, sizes[0]
     if not rows or not columns or rows % 1 or columns % 1 or None in values or not rows * columns == len(values) > 0:
-        raise source.error(
-            f"{key} is no matrix with rows, cols and as many numbers in data; write it again with OpenCV"
-        )
+        raise source.error(f"{key} is no matrix with rows, cols and as many numbers in data")
     matrix = np.array(values, float).reshape(-1, max(int(columns), 1))
     if not np.isfinite(matrix).all():
         raise source.error(f"{key} is no matrix of finite numbers; calibrate again")
@@ -232,10 +230,7 @@ def read_mrcal(source: CameraSource) -> CameraFile:
     values = ast.literal_eval(source.text())
     model = values.get("lensmodel", values.get("lens_model"))
     if not isinstance(model, str) or model not in _MRCAL:
-        raise source.error(
-            f"the lens model {quoted(model)} is not known here; known are {', '.join(_MRCAL)}: "
-            "mrcal-convert-lensmodel LENSMODEL_OPENCV8 FILE fits one"
-        )
+        raise source.error(f"the lens model {quoted(model)} is not known here; known are {', '.join(_MRCAL)}")
     fx, fy, cx, cy, *coefficients = _list(source, values, "intrinsics", 4 + _MRCAL[model], model)
     _check_plane(source, np.array(coefficients))
     sensor, assumed = source.sensor(*_list(source, values, "imagersize", 2, model))

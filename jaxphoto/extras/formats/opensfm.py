@@ -57,10 +57,7 @@ def read(path: Path) -> Project:
     """Read a reconstruction; cameras are free in c, the coefficients of their kind and, where given, xp, yp and b1."""
     folder = path.parent
     if not (folder / TRACKS).is_file():
-        raise InputError(
-            f"{path} has no {TRACKS} beside it, which says where its photographs show points; copy it there from the "
-            "folder of the project (its folder opensfm, of OpenDroneMap), or run opensfm create_tracks again"
-        )
+        raise InputError(f"{path} has no {TRACKS} beside it. Copy it from the project's folder (opensfm)")
     content = _largest(path, read_json(path))
     shots, points = content.section("shots").values, content.section("points").values
     cameras = {name: _camera(path, content.section("cameras").section(name)) for name in content.section("cameras")}
@@ -140,10 +137,7 @@ def _tracks(
     for row, line in enumerate(lines[begin:], begin + 1):
         cells = line.split("\t")
         if len(cells) < 5 and line.strip():
-            raise InputError(
-                f"{path.name}, row {row}: {len(cells)} cells, where photograph, track, feature, x and y are five at "
-                "least, between tabs. Write the file again"
-            )
+            raise InputError(f"{path.name}, row {row}: {len(cells)} cells, not photograph, track, feature, x, y ...")
         if len(cells) >= 5 and cells[0] in shot_of and cells[1] in point_of:
             index.append((shot_of[cells[0]], point_of[cells[1]]))
             xy.append(cells[3:5])

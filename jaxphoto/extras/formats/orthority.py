@@ -147,9 +147,7 @@ def write(p: Project, folder: Path) -> None:
     """Write the three files, the .prj only for a map system, and image_points.csv."""
     m = p.in_map()
     if m.geographic:
-        raise InputError(
-            f"orthority counts metres, and the block is in {m.system}, in degrees; adjust it in a map system"
-        )
+        raise InputError(f"orthority counts metres, and the block is in {m.system}, in degrees")
     cameras = "".join(_written(name, camera) for name, camera in p.cameras.items())
     (folder / "int_param.yaml").write_text(cameras, encoding="utf-8")
     values = np.hstack([np.asarray(m.exterior.position), angles_deg(m.exterior)])

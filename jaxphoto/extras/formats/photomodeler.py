@@ -102,9 +102,7 @@ def read(path: Path) -> BlockTables:
 def _camera(path: Path, lines: list[str]) -> dict[str, Any]:
     """The [cameras.X] table."""
     if len(lines[1].split()) == 2:
-        raise InputError(
-            f"{path.name}, row 2: it has no size of the photographs; write width and height in pixels at its end"
-        )
+        raise InputError(f"{path.name}, row 2: it has no size of the photographs; write width, height at its end")
     _, _, width, height = row_numbers(path, 2, lines[1].split(), 4)
     c, px, py, width_mm, height_mm, *coefficients = row_numbers(path, 4, lines[3].split(), 10)
     if min(width, height, width_mm, height_mm) <= 0:

@@ -59,10 +59,7 @@ def _read_cameras(path: Path) -> tuple[list[str], list[tuple[int, int]], np.ndar
     rows = [(k + 1, line) for k, line in enumerate(lines) if k >= begin and line.strip()]
     each = len(_ROWS) + 1
     if not rows or len(rows) % each:
-        raise InputError(
-            f"{path.name} has {len(rows)} rows of photographs, which are not {each} each: it ends early, or its "
-            "cameras are fisheyes, which are not read"
-        )
+        raise InputError(f"{path.name} has {len(rows)} rows, not {each} a photograph: it ends early, or has fisheyes")
     names, sizes, numbers = [], [], []
     for first in range(0, len(rows), each):
         row, line = rows[first]

@@ -233,9 +233,7 @@ class Project(NamedTuple):
         image, point, column_row, sigma = p._measurements(np.argsort(order)[p.image], control)
         kept = np.flatnonzero(np.bincount(image, minlength=len(names)))
         if not len(kept):
-            raise InputError(
-                f"{p.file}: no image shows {_LEAST} points that others show, too; export the tie points of the project"
-            )
+            raise InputError(f"{p.file}: no image shows {_LEAST} points that others show, too")
         if skipped := [quoted(name) for name in np.delete(names, kept).tolist()]:
             _warn(f"{p.file}: {len(skipped)} image(s) with fewer than {_LEAST} points are left out: {few(skipped)}")
         order, names, image = order[kept], names[kept], np.searchsorted(kept, image)
@@ -367,10 +365,7 @@ def _check_rotations(p: Project) -> None:
         off = np.abs(np.einsum("nij,nkj->nik", r, r) - np.eye(3)).max(axis=(1, 2))
         bad = ~(off < _ROTATION_TOLERANCE) | ~(np.linalg.det(np.where(off[:, None, None] < 1, r, 0.0)) > 0)
     for k in np.flatnonzero(bad).tolist():
-        raise InputError(
-            f"{p.file}: the matrix of image {p.files[k]} is no rotation (rows not orthonormal or left-handed). Export "
-            "it again"
-        )
+        raise InputError(f"{p.file}: the matrix of image {p.files[k]} is no rotation.")
 
 
 def _image_names(files: list[str]) -> list[str]:
@@ -396,10 +391,7 @@ def geocentric(p: Project, code: int, vertical: int | None) -> Project:
     """Return a project in geocentric axes of the datum of the EPSG system `code` in a frame of that system."""
     centres = np.asarray(p.exterior.position)
     if not is_geocentric(centres):
-        raise InputError(
-            f"{p.file}: photographs are not on the earth where its transform puts them; export it with its transform, "
-            "or in local coordinates"
-        )
+        raise InputError(f"{p.file}: its transform puts photographs not on the earth")
     frame = _frame_amid(code, vertical, place_from_geocentric(code, centres))
     rotation, translation = frame.map.geocentric_from_local()
     exterior = ExteriorOrientation((centres - translation) @ rotation, p.exterior.camera_from_object @ rotation)  # type: ignore[arg-type]

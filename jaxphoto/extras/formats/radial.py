@@ -129,10 +129,7 @@ def _listed_names(path: Path, number: int) -> list[str]:
         if file != path and file.is_file():
             names = [line.split()[0] for line in read_text(file).split("\n") if line.strip()]
             if len(names) != number:
-                raise InputError(
-                    f"{file.name} names {len(names)} photographs and {path.name} has {number} cameras; give the list "
-                    "of this file, or none"
-                )
+                raise InputError(f"{file.name} names {len(names)} photographs and {path.name} has {number} cameras")
             return names
     warn(f"{path.name}: photographs have numbers, as no list.txt names them")
     return [str(k) for k in range(number)]
@@ -199,9 +196,7 @@ def read_bal(path: Path) -> Project:
     pairs, times = np.unique(observed[:, :2], axis=0, return_counts=True)
     for camera, point in pairs[times > 1].astype(int).tolist():
         last = np.flatnonzero((observed[:, :2] == (camera, point)).all(axis=1))[-1]
-        raise InputError(
-            f"{path.name}, row {rows[last + 1][0]}: point {point} is measured twice in image {camera}. Delete one"
-        )
+        raise InputError(f"{path.name}, row {rows[last + 1][0]}: point {point} is measured twice in image {camera}.")
     words = [(row, word) for row, line in rows[n + 1 :] for word in line.split()]
     needed = 9 * n_cameras + 3 * n_points
     if len(words) != needed:

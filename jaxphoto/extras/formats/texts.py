@@ -124,10 +124,7 @@ def oriented_project(
 ) -> Project:
     """Return the project of orientations in the system named by words, and of the image points beside them."""
     if not len(shown.image):
-        raise InputError(
-            f"{path.name} has no image points, and none are beside it; export the tie points as BINGO or PATB into its "
-            "folder, or write image_points.csv"
-        )
+        raise InputError(f"{path.name} has no image points; write BINGO, PATB or image_points.csv beside it")
     project = Project(
         path.resolve().parent.name, cameras, (), files, image_camera, exterior, shown.points, None, shown.image,
         shown.point, shown.column_row, sigma_px=shown.sigma_px, file=path.name,
@@ -140,19 +137,13 @@ def _cameras(path: Path, names: list[str]) -> tuple[dict[str, ProjectCamera], li
     near = (p for p in sorted(path.parent.iterdir()) if p.is_file() and not p.name.startswith("."))
     files = [p for p in near if p.suffix.lower() in _CAMERAS]
     if len(files) != 1:
-        raise InputError(
-            f"{path.parent} holds {len(files)} camera files and needs one: camera.toml with [cameras.NAME], or that "
-            "of another program (docs/camera_files.md)"
-        )
+        raise InputError(f"{path.parent} holds {len(files)} camera files and needs one (docs/camera_files.md)")
     file, beside = files[0], path.with_name(IMAGES)
     if not beside.is_file():
         try:
             camera = read_camera_file(file)
         except SeveralCamerasError:
-            raise InputError(
-                f"{file.name} holds several cameras, and nothing says which photograph has which; write {IMAGES} "
-                "beside it (image, camera), or keep one camera in the file"
-            ) from None
+            raise InputError(f"{file.name} holds several cameras; write {IMAGES} beside it") from None
         return {camera.name: ProjectCamera.estimated(camera.sensor, camera.interior)}, [camera.name] * len(names)
     table, places, camera_of = read_csv(beside, ("image", "camera")), places_by_name(names), dict[int, str]()
     for row, (image, name) in enumerate(zip(table.ids("image"), table.ids("camera"), strict=True)):
@@ -237,9 +228,7 @@ def read_exterior(path: Path) -> ExteriorText:
     if matrices:
         return _of_matrices(path, rows)._replace(system=_system(path, head))
     if _GRAD.search(head) and not _GON.search(head):
-        raise InputError(
-            f"{path.name} has angles in grad, which are degrees to some and gon to others; write degrees or gon"
-        )
+        raise InputError(f"{path.name} has angles in grad, degrees to some and gon to others; write one")
     row, above = numbered[first - 1] if first else (0, "")
     places = _places(above)
     if places is None and set(_COLUMNS[3:]) & set(_meanings(above)):
@@ -318,9 +307,7 @@ def _of_angles(path: Path, rows: list[_Row], places: dict[str, int], degrees: fl
     names, values, most = [], [], -min(places.values())
     for k, cells, line in rows:
         if len(cells) <= most:
-            raise InputError(
-                f"{path.name}, row {k}: {quoted(line)} is not name, X, Y, Z, omega, phi, kappa. Complete the row"
-            )
+            raise InputError(f"{path.name}, row {k}: {quoted(line)} is not name, X, Y, Z, omega, phi, kappa")
         values.append(row_numbers(path, k, [cells[places[name]] for name in _COLUMNS], len(_COLUMNS)))
         names.append(" ".join(cells[:-most]))
     numbers = np.array(values).reshape(-1, len(_COLUMNS))
@@ -334,9 +321,7 @@ def _of_matrices(path: Path, rows: list[_Row]) -> ExteriorText:
     for at in range(0, len(rows), 3):
         (k, cells, line), below = rows[at], rows[at + 1 : at + 3]
         if len(cells) <= 3 or len(below) < 2:
-            raise InputError(
-                f"{path.name}, row {k}: {quoted(line)} is not the first of three rows of a photograph. Export it again"
-            )
+            raise InputError(f"{path.name}, row {k}: {quoted(line)} is not the first of three rows of a photograph.")
         matrix = [
             x for (n, words, _), many in zip(below, _MATRIX, strict=True) for x in row_numbers(path, n, words, many)
         ]
@@ -362,9 +347,7 @@ def _of_bingo(path: Path, numbered: list[tuple[int, str]]) -> ExteriorText:
         words = line.split()
         begin = _oria(words)
         if words[0] == _ORIA and begin is None:
-            raise InputError(
-                f"{path.name}, row {k}: {quoted(line)} is not ORIA, name, X, Y, Z, phi, omega, kappa. Complete the row"
-            )
+            raise InputError(f"{path.name}, row {k}: {quoted(line)} is not ORIA, name, X, Y, Z, phi, omega, kappa")
         if begin is not None:
             names.append(" ".join(words[1:begin]))
             values.append(row_numbers(path, k, words[begin : begin + 6], 6))
