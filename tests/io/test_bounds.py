@@ -212,23 +212,6 @@ def test_a_report_of_many_digits_is_read_in_time(tmp_path):
         refused(lambda text=text: read_camera_file(cameras.written(tmp_path, text, "a.txt")), "a.txt")
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "%YAML:1.0\n---\ncamera_matrix: " + "[" * 60_000,
-        "%YAML:1.0\n---\ncamera_matrix: " + "{a: " * 60_000,
-        "%YAML:1.0\n---\ncamera_matrix: " + "- " * 60_000,
-        "%YAML:1.0\n---\ncamera_matrix: " + "a: " * 60_000,
-        "%YAML:1.0\n---\ncamera_matrix:\n" + "".join(" " * k + "a:\n" for k in range(3_000)),
-        '<?xml version="1.0"?>\n<opencv_storage>' + "<a>" * 60_000,
-        '{"camera_matrix": ' + "[" * 60_000,
-    ],
-    ids=["list", "map", "dashes", "keys", "indented", "xml", "json"],
-)
-def test_opencv_s_parser_is_kept_from_the_end_of_the_stack(tmp_path, text):
-    refused(lambda: read_camera_file(cameras.written(tmp_path, text, "a.yml")), "a.yml", "deeply")
-
-
 def test_cameras_of_impossible_sizes_and_ids(tmp_path):
     big = cameras.OPENCV.replace("1280", "9" * 30)
     refused(lambda: read_camera_file(cameras.written(tmp_path, big, "a.yml")), "a.yml")

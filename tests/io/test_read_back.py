@@ -83,7 +83,7 @@ def test_several_cameras_come_back_with_their_photographs_from_opk(tmp_path):
     assert dict(zip(block.images, block.image_camera, strict=True)) == dict(
         zip(p.images, two.image_camera, strict=True)
     )
-    for name, (sensor, interior) in two.cameras.items():
+    for name, (sensor, interior, _) in two.cameras.items():
         assert block.sensors[name] == sensor
         again = block.start.unknowns.interior[name]
         assert [float(get_parameter(again, n)) for n in parameter_names(interior)] == pytest.approx(
