@@ -363,8 +363,8 @@ def halves(
 
     Both halves of each split are adjusted; their differences are compared with their covariances.
     """
+    from jaxphoto.extras.formats import write_camera_file
     from jaxphoto.io import read_block
-    from jaxphoto.io.cameras import write_camera_file
     from jaxphoto.procedures.halves import camera_of
     from jaxphoto.procedures.halves import halves as compare_halves
     from jaxphoto.report.halves import print_halves, write_halves

@@ -114,7 +114,8 @@ def combine(
 
     from jaxphoto.camera import get_parameter, parameter_names
     from jaxphoto.errors import InputError
-    from jaxphoto.io.cameras import read_camera_file, write_camera_file
+    from jaxphoto.extras.formats import write_camera_file
+    from jaxphoto.io.camera_files import read_camera_file
     from jaxphoto.stability import combine
     from jaxphoto.stability.comparison import SIGNIFICANT_P
     from jaxphoto.writing import check_file

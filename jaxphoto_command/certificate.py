@@ -8,8 +8,7 @@ import numpy as np
 
 from jaxphoto.camera.conditions import Conditions
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import CameraFile, read_camera_file
-from jaxphoto.io.cameras.own_cameras import results_in
+from jaxphoto.io.camera_files import CameraFile, read_camera_file, results_in
 from jaxphoto.io.conditions import CONDITIONS, conditions_of, read_conditions
 from jaxphoto.io.input_hashes import INPUTS, read_inputs
 from jaxphoto.io.json_file import read_json

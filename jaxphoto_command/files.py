@@ -47,22 +47,24 @@ def convert(
     adjust: Annotated[bool, Option("--adjust", help="Adjust the block in SOURCE first.")] = False,
 ) -> None:
     """Convert another program's files to a block folder, or a block or results to files of other programs."""
-    from jaxphoto.io import exports, read_source, write_block
+    from jaxphoto.extras.formats import EXPORTS, Project, check_export_target, export, read_source
+    from jaxphoto.io import write_block
     from jaxphoto.io.block_folder import check_block_target
-    from jaxphoto.io.cameras import ASSUMED_PIXEL_MM
+    from jaxphoto.io.camera_files import ASSUMED_PIXEL_MM
+    from jaxphoto.io.result_folder import adjusted_block, is_result, photograph_files
 
     out = _target(out, second)
-    result = source_format is None and exports.is_result(source)
+    result = source_format is None and is_result(source)
     if adjust and (result or to == "block"):
         raise typer.BadParameter("--adjust applies to a block that is exported, not to results or --to block.")
     if not result and (block is not None or part != 1):
         raise typer.BadParameter(f"--block and --part apply to results, which {source} is not.")
-    if out.suffix.lower() in {suffix for known in exports.EXPORTS.values() for suffix in known.endings}:
+    if out.suffix.lower() in {suffix for known in EXPORTS.values() for suffix in known.endings}:
         raise typer.BadParameter(f"--out {out}: {to} is a folder of files; omit {out.suffix}.")
-    (check_block_target if to == "block" else exports.check_export_target)(out, source)
-    lacks: Any = exports.EXPORTS[to].lacks if to in exports.EXPORTS else ()
+    (check_block_target if to == "block" else check_export_target)(out, source)
+    lacks: Any = EXPORTS[to].lacks if to in EXPORTS else ()
     with output.progress(f"reading {source}") as progress:
-        read = exports.adjusted_block(source, block, part) if result else read_source(source, source_format)
+        read = adjusted_block(source, block, part) if result else read_source(source, source_format)
         size = {
             "n_images": len(read.images),
             "n_points": len(read.points),
@@ -74,8 +76,8 @@ def convert(
         else:
             progress.update("adjusting" if adjust else f"writing {out}")
             values, text = (read.start.unknowns, "adjusted values") if result else _values(read, adjust)
-            files = exports.photograph_files(read.images, photographs or (), source if result else None)
-            written = exports.export(exports.AdjustedPhotographs.of_block(read, values, files), out, to)
+            files = photograph_files(read.images, photographs or (), source if result else None)
+            written = export(Project.of_block(read, values, files), out, to)
             _report_export(output, written, text, "cameras" not in lacks)
     assumed = [name for name, sensor in read.sensors.items() if sensor.pixel_assumed]
     if to == "block" and not result and assumed:
@@ -149,7 +151,8 @@ def camera(
 ) -> None:
     """Convert a camera file: exactly where the models allow it, otherwise fitted, with the misfit in pixels."""
     from jaxphoto.camera import AbstractDistortion, get_parameter, parameter_names
-    from jaxphoto.io.cameras import read_camera_file, write_camera_file
+    from jaxphoto.extras.formats import write_camera_file
+    from jaxphoto.io.camera_files import read_camera_file
     from jaxphoto.writing import check_file
 
     out = _target(out, second)

@@ -511,8 +511,8 @@ def _block_and_cloud(block: Path, cloud: Path, selection: dict[str, Any], progre
     """Read a block, and the cloud in the area of its points."""
     import numpy as np
 
-    from jaxphoto.io import clouds, read_block
     from jaxphoto.initial import approximate
+    from jaxphoto.io import clouds, read_block
 
     read = read_block(block)
     progress.update("reading the cloud")

@@ -60,21 +60,26 @@ def fly(
 
     from jaxphoto.camera import InteriorOrientation
     from jaxphoto.errors import counted
-    from jaxphoto.georeferencing.recorded_positions import WGS84
+    from jaxphoto.extras.formats import read_control
     from jaxphoto.georeferencing.map_frame import check_heights
+    from jaxphoto.georeferencing.recorded_positions import WGS84
     from jaxphoto.image_measurement.control_targets import target_looker
     from jaxphoto.image_measurement.features import LONGEST_PX
     from jaxphoto.image_measurement.matching import match_photographs
     from jaxphoto.image_measurement.photograph_pairs import MostAlike, photograph_pairs, usual_choice, usual_count
     from jaxphoto.image_measurement.targets.on_ground import read_target
     from jaxphoto.io.block_folder import whole_block
-    from jaxphoto.io.control_files import read_control
-    from jaxphoto.io.exports import write_photograph_files
     from jaxphoto.io.exposures import exposure_files, located
     from jaxphoto.io.kept_orientation import kept_orient
     from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
-    from jaxphoto.io.photographs import known_lens, sensor_and_interior
-    from jaxphoto.io.photographs import skipped_subfolders, skipped_messages, valid_photographs
+    from jaxphoto.io.photographs import (
+        known_lens,
+        sensor_and_interior,
+        skipped_messages,
+        skipped_subfolders,
+        valid_photographs,
+    )
+    from jaxphoto.io.result_folder import write_photograph_files
     from jaxphoto.procedures.calibration import distortion_model
     from jaxphoto.procedures.control.of_flight import flight_control
     from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
@@ -215,11 +220,11 @@ def control(
     A block without a datum is transformed to the control. Contradicting observations are rejected and named. Exit code
     1: written, but the verdict is red.
     """
+    from jaxphoto.extras.formats import read_control
     from jaxphoto.image_measurement.control_targets import target_looker
     from jaxphoto.image_measurement.targets.on_ground import read_target
     from jaxphoto.io import read_block
     from jaxphoto.io.block_folder import whole_block
-    from jaxphoto.io.control_files import read_control
     from jaxphoto.io.photographs import skipped_messages, valid_photographs
     from jaxphoto.procedures import adjust
     from jaxphoto.procedures.control import at_optimum, control_block, control_block_with_targets
@@ -492,8 +497,8 @@ def undistort(
 
     Exit code 1: written, but some were skipped.
     """
-    from jaxphoto.io.cameras import read_camera_file
-    from jaxphoto.io.photographs import skipped_subfolders, skipped_messages, valid_photographs
+    from jaxphoto.io.camera_files import read_camera_file
+    from jaxphoto.io.photographs import skipped_messages, skipped_subfolders, valid_photographs
     from jaxphoto.io.undistorted import write_undistorted
     from jaxphoto.writing import check_folder
 

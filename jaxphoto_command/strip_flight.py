@@ -13,12 +13,12 @@ from jaxtyping import Float
 from jaxphoto.block import Block, Frame
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError, counted
+from jaxphoto.extras.formats import read_control
 from jaxphoto.georeferencing import PATTERN_OF, ScannerCalibration, Trajectory
+from jaxphoto.initial import approximate
 from jaxphoto.io import clouds, read_block, write_block
 from jaxphoto.io.block_folder import exposure_times
-from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
-from jaxphoto.io.clouds.coordinate_system import Placement
-from jaxphoto.io.control_files import read_control
+from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, Placement
 from jaxphoto.io.names import points_called
 from jaxphoto.io.raster import write_dsm
 from jaxphoto.io.trajectory import Records, read_records, write_moved
@@ -30,7 +30,6 @@ from jaxphoto.lidar.raster import Raster
 from jaxphoto.lidar.strip_correction import correct_strips
 from jaxphoto.lidar.strip_differences import strip_differences
 from jaxphoto.lidar.strip_settings import StripSettings
-from jaxphoto.initial import approximate
 from jaxphoto.procedures.control import SurveyedPoints
 from jaxphoto.procedures.control.system import system_of
 from jaxphoto.procedures.lidar import (

@@ -26,20 +26,18 @@ from PIL import Image
 
 from jaxphoto.camera import ImageMotion, InteriorOrientation, OpenCv, RollingShutter
 from jaxphoto.errors import JaxphotoError
+from jaxphoto.extras.formats import export, read_control, read_source, write_camera_file
 from jaxphoto.image_measurement import read_grey
-from jaxphoto.io import clouds, export, read_block, read_recipe, read_source, write_block
-from jaxphoto.io.cameras import read_camera_file, write_camera_file
+from jaxphoto.io import clouds, read_block, read_recipe, write_block
+from jaxphoto.io.camera_files import read_camera_file
 from jaxphoto.io.conditions import read_conditions
-from jaxphoto.io.control_files import read_control
-from jaxphoto.io.dbat import read_dbat
 from jaxphoto.io.draws_folder import DrawsFolder
-from jaxphoto.io.exports import adjusted_block, photograph_files
 from jaxphoto.io.exposures import read_exposures
 from jaxphoto.io.input_hashes import read_inputs
 from jaxphoto.io.kept_pieces import KeptPieces
 from jaxphoto.io.photograph_metadata import drone_record, xmp_fields
 from jaxphoto.io.photographs import photographs
-from jaxphoto.io.photomodeler import read_photomodeler
+from jaxphoto.io.result_folder import adjusted_block, photograph_files
 from jaxphoto.io.toml import toml_text
 from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, write_sbet
 from jaxphoto.procedures.control.system import places, system_of
@@ -408,8 +406,8 @@ READERS: dict[str, Reader] = {
     ),
     "texts-bingo": Reader(written_by(oriented_files.write_bingo), lambda folder: read_source(folder, "texts")),
     "texts-patb": Reader(written_by(oriented_files.write_patb), lambda folder: read_source(folder, "texts")),
-    "dbat": Reader(text(**sound_files.DBAT), read_dbat),
-    "photomodeler": Reader(text(**sound_files.PHOTOMODELER), read_photomodeler),
+    "dbat": Reader(text(**sound_files.DBAT), lambda folder: read_source(folder, "dbat")),
+    "photomodeler": Reader(text(**sound_files.PHOTOMODELER), lambda folder: read_source(folder, "photomodeler")),
     "control-gcp-list": Reader(text(a=control_files.GCP_LIST), _control),
     "control-metashape": Reader(text(a=control_files.MARKERS), _control),
     "control-geojson": Reader(text(a=control_files.GEO_JSON), _control),

@@ -5,7 +5,7 @@ import pytest
 
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import read_camera_file
+from jaxphoto.io.camera_files import read_camera_file
 from jaxphoto.stability import combine, parameter_vector
 from tests.commands import run
 from tests.test_stability import ONE, SIGMAS, covariance, smac

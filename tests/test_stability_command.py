@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from jaxphoto.camera import InteriorOrientation, Sensor, Smac
-from jaxphoto.io.cameras import write_camera_file
+from jaxphoto.extras.formats import write_camera_file
 from tests.commands import run
 
 TARGET_1 = {"c_mm": 2.6989, "xp_mm": -7.3634e-02, "yp_mm": 8.7821e-02, "k1": -3.9445e-02, "k2": -1.1881e-03}

@@ -9,16 +9,16 @@ import sys
 from typing import get_args
 
 import pytest
+from jaxphoto.io.cameras import CAMERA_FORMATS, LOSS_PX
+from jaxphoto.io.exports import EXPORTS
 from typer.main import get_command
 
 from jaxphoto.camera.undistortion import Keep
 from jaxphoto.georeferencing import PATTERN_OF, ScannerCalibration
 from jaxphoto.image_measurement.features import LONGEST_PX
 from jaxphoto.io import FORMATS
-from jaxphoto.io.cameras import CAMERA_FORMATS, LOSS_PX
 from jaxphoto.io.clouds.cloud_reader import Returns
 from jaxphoto.io.clouds.coordinate_system import UNITS
-from jaxphoto.io.exports import EXPORTS
 from jaxphoto.io.shipped import EXAMPLES
 from jaxphoto.lidar.raster import Statistic
 from jaxphoto.lidar.strip_settings import StripSettings

@@ -14,7 +14,7 @@ import pytest
 from jaxphoto.camera import Brown, InteriorOrientation, Sensor
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
-from jaxphoto.io import write_camera_file
+from jaxphoto.extras.formats import write_camera_file
 from jaxphoto.io.clouds import write_cloud
 from jaxphoto.io.raster import write_dsm, write_hillshade
 from jaxphoto.lidar.raster import Raster

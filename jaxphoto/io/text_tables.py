@@ -214,22 +214,6 @@ def _cells(path: Path, lines: list[str], rows: list[int], separator: str) -> pd.
     raise RowError(f"{path.name}, row {row}: {message}", [row])
 
 
-def read_columns(path: Path, columns: Sequence[str], separator: str | None = ",") -> Table:
-    """A file without a header whose columns are named by the caller; `separator` None means blanks."""
-    lines, rows = content_lines(path)
-    records = []
-    for line, row in zip(lines, rows, strict=True):
-        record = [cell.strip() for cell in line.split(separator)]
-        if len(record) != len(columns):
-            raise InputError(
-                f"{path.name}, row {row}: {len(record)} cells instead of {len(columns)} ({', '.join(columns)}); "
-                "complete the row or correct the format"
-            )
-        records.append(record)
-    cells = {name: _objects([record[j] for record in records]) for j, name in enumerate(columns)}
-    return Table.of(path.name, cells, np.array(rows, int))
-
-
 def content_lines(path: Path, without: Container[int] = ()) -> tuple[list[str], list[int]]:
     """The lines of a text file that are neither empty nor comments nor `without`, and their row numbers."""
     # Not splitlines(): that also ends lines at form feeds and other characters an editor does not count.

@@ -10,7 +10,7 @@ import pytest
 
 from jaxphoto.errors import InputError, JaxphotoError, quoted, shown
 from jaxphoto.io import read_block, recipe_from
-from jaxphoto.io.cameras import read_camera_file
+from jaxphoto.io.camera_files import read_camera_file
 from jaxphoto.io.draws_folder import DrawsFolder
 from jaxphoto.io.json_file import read_json
 from jaxphoto.io.names import harm_in
@@ -130,23 +130,6 @@ def test_a_report_of_many_digits_is_read_in_time(tmp_path):
         "calibrated focal length" + " K1 = = " * 5_000 + "1.5 " * 5_000,
     ):
         refused(lambda text=text: read_camera_file(cameras.written(tmp_path, text, "a.txt")), "a.txt")
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "%YAML:1.0\n---\ncamera_matrix: " + "[" * 60_000,
-        "%YAML:1.0\n---\ncamera_matrix: " + "{a: " * 60_000,
-        "%YAML:1.0\n---\ncamera_matrix: " + "- " * 60_000,
-        "%YAML:1.0\n---\ncamera_matrix: " + "a: " * 60_000,
-        "%YAML:1.0\n---\ncamera_matrix:\n" + "".join(" " * k + "a:\n" for k in range(3_000)),
-        '<?xml version="1.0"?>\n<opencv_storage>' + "<a>" * 60_000,
-        '{"camera_matrix": ' + "[" * 60_000,
-    ],
-    ids=["list", "map", "dashes", "keys", "indented", "xml", "json"],
-)
-def test_opencv_s_parser_is_kept_from_the_end_of_the_stack(tmp_path, text):
-    refused(lambda: read_camera_file(cameras.written(tmp_path, text, "a.yml")), "a.yml", "deeply")
 
 
 def test_cameras_of_impossible_sizes_and_ids(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from jaxphoto import adjust, covariance, read_block, write_block
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import read_camera_file
+from jaxphoto.io.camera_files import read_camera_file
 from jaxphoto.io.toml import read_toml
 from jaxphoto.simulation import remeasure
 from tests.blocks import FIVE, measured, simulated

@@ -10,8 +10,9 @@ import pytest
 
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import InputError
-from jaxphoto.io import AdjustedPhotographs, adjusted_block, read_block, read_source, write_block
-from jaxphoto.io.exports import photograph_files
+from jaxphoto.extras.formats import Project, read_source
+from jaxphoto.io import adjusted_block, read_block, write_block
+from jaxphoto.io.result_folder import photograph_files
 from jaxphoto.report import Tables, Verdict, write_results
 from tests.blocks import adjusted
 from tests.commands import run
@@ -45,8 +46,8 @@ def test_a_result_is_read_with_the_values_that_were_adjusted(folders):
     block, truth = adjusted_block(folders / "result"), adjusted("cross")
     same_unknowns(block.start.unknowns, truth.unknowns)
     assert block.start.image_known.all() and block.start.point_known.all()
-    p = AdjustedPhotographs.of(truth)
-    again = AdjustedPhotographs.of_block(block, block.start.unknowns)
+    p = Project.of(truth)
+    again = Project.of_block(block, block.start.unknowns)
     assert (again.files, again.image_camera) == (p.files, p.image_camera)
     np.testing.assert_allclose(again.column_row, p.column_row, rtol=0, atol=1e-9)
     for of, rows in (("image", p.rows_of_images), ("point", p.rows_of_points)):
@@ -130,7 +131,7 @@ def test_photographs_are_called_by_their_files(tmp_path):
     assert photograph_files(images, [tmp_path / "right"], tmp_path) == {"a": "a.png", "b": "b.jpg", "c": "c.png"}
     with pytest.raises(InputError, match="two images are of the photograph a"):
         block = read_source(write_text(tmp_path / "model"))
-        AdjustedPhotographs.of_block(block, block.start.unknowns, {"b": "a"})
+        Project.of_block(block, block.start.unknowns, {"b": "a"})
 
 
 def test_the_command_writes_what_was_adjusted(own, tmp_path, monkeypatch, capsys):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import InputError, adjust, compare, read_block, write_block
-from jaxphoto.io.cameras import read_camera_file
+from jaxphoto.io.camera_files import read_camera_file
 from jaxphoto.io.results_judged import read_summary, reservation
 from jaxphoto.report import Tables
 from tests.blocks import adjusted, simulated

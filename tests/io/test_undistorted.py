@@ -8,8 +8,8 @@ from PIL import ExifTags, Image
 from jaxphoto.camera import Brown, Equidistant, InteriorOrientation, OpenCv, OpenCvFisheye, Sensor
 from jaxphoto.camera.undistortion import pinhole, source_pixels
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import read_camera_file, write_camera_file
-from jaxphoto.io.cameras.camera_file import CameraFile
+from jaxphoto.extras.formats import write_camera_file
+from jaxphoto.io.camera_files import CameraFile, read_camera_file
 from jaxphoto.io.photographs import photographs
 from jaxphoto.io.undistorted import write_undistorted
 from tests.commands import run

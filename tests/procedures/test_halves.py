@@ -15,7 +15,7 @@ from jaxphoto.adjustment import common_sizes
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import InputError
 from jaxphoto.io import write_block
-from jaxphoto.io.cameras import read_camera_file
+from jaxphoto.io.camera_files import read_camera_file
 from jaxphoto.procedures.halves import halved, halves
 from jaxphoto.simulation import image_coordinates, remeasure
 from jaxphoto.stability import Differences, bundle_offsets, concentration, error_band, image_grid, leading_unit, overlap

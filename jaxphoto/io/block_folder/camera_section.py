@@ -211,7 +211,7 @@ def with_earlier_calibrations(settings: dict[str, Any], file: str, folder: Path)
     if not isinstance(cameras, dict) or not any(isinstance(t, dict) and _CALIBRATION in t for t in cameras.values()):
         return settings
     # A camera file may be a block.toml, which it reads by modules of this package.
-    from jaxphoto.io.cameras import camera_reader
+    from jaxphoto.io.camera_files import read_camera_file
 
     completed: dict[str, Any] = {}
     for name, table in cameras.items():
@@ -227,7 +227,7 @@ def with_earlier_calibrations(settings: dict[str, Any], file: str, folder: Path)
         named = Section(file, f"cameras.{name}.{_CALIBRATION}", given)
         named.known("file", "camera")
         camera = named.text("camera") if "camera" in named else None
-        read = camera_reader.read_camera_file(folder / named.text("file"), camera=camera)
+        read = read_camera_file(folder / named.text("file"), camera=camera)
         if read.covariance is None:
             raise section.error(
                 _CALIBRATION,

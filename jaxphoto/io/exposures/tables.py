@@ -36,8 +36,7 @@ from jaxphoto.georeferencing.camera_attitude import USUAL_SIGMA_DEG, CameraAttit
 from jaxphoto.georeferencing.datum_change import wgs84_places
 from jaxphoto.georeferencing.gps import Fix, Heights
 from jaxphoto.georeferencing.map_frame import MapFrame
-from jaxphoto.io.control_files.gcp_list import SYSTEM
-from jaxphoto.io.control_files.table_header import PLACE, columns_of, in_degrees
+from jaxphoto.io.control_table import PLACE, SYSTEM, columns_of, in_degrees
 from jaxphoto.io.exposures.records import Exposures, Lines
 from jaxphoto.procedures.control.system import ControlSystem, system_of
 from jaxphoto.rotation import matrix_from_omega_phi_kappa

@@ -1,0 +1,1 @@
+"""Rooms that the core does not need: other programs' formats."""
