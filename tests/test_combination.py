@@ -89,7 +89,7 @@ def test_the_command_writes_a_prior(tmp_path, monkeypatch, capsys):
 
 def test_what_cannot_be_combined_is_said(tmp_path, monkeypatch, capsys):
     interiors, covariances = drawn(np.random.default_rng(1))
-    with pytest.raises(InputError, match="two calibrations at least"):
+    with pytest.raises(InputError, match="at least two calibrations"):
         combine(interiors[:1], covariances[:1], "a")
     held = covariances[1].copy()
     held[FREE[0]] = held[:, FREE[0]] = 0.0

@@ -51,7 +51,7 @@ def intersect_directions(
     directions: Float[np.ndarray, "n 3"],
     weights: Float[np.ndarray, " n"] | None = None,
 ) -> DirectedPoint | None:
-    """Where the lines from known `positions` along unit `directions` meet; None where they are nearly parallel.
+    """Intersect the lines from known `positions` along unit `directions`; None if they are nearly parallel.
 
         sum w / D^2 (I - d d') (X - position) = 0,   D = |X - position|
 
@@ -68,14 +68,14 @@ def intersect_directions(
     local = positions - origin
     for _ in range(5):
         normal = np.einsum("n,nij->ij", w * scale, across)
-        found = np.linalg.solve(normal, np.einsum("n,nij,nj->i", w * scale, across, local))
-        distance = np.linalg.norm(found - local, axis=1)
+        point = np.linalg.solve(normal, np.einsum("n,nij,nj->i", w * scale, across, local))
+        distance = np.linalg.norm(point - local, axis=1)
         # The noise of directions is a distance across the line in proportion to the distance along it.
         scale = 1 / np.maximum(distance, 1e-3 * distance.max()) ** 2
-    ahead = np.sum(directions * (found - local), axis=1) > 0
+    ahead = np.sum(directions * (point - local), axis=1) > 0
     if w[ahead].sum() < 0.5 * w.sum():
         return None
-    return DirectedPoint(origin + found, np.linalg.inv(np.einsum("n,nij->ij", w * scale, across)))
+    return DirectedPoint(origin + point, np.linalg.inv(np.einsum("n,nij->ij", w * scale, across)))
 
 
 def best_triplet(pairs: Sequence[Any]) -> tuple[int, int, int] | None:

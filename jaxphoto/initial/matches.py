@@ -1,9 +1,9 @@
-"""Matches of features between photographs, and the points they hang together to.
+"""Tracks: object points from feature matches between photographs.
 
-A point is a connected component of the graph whose nodes are the features and whose edges are the matches. A single
-false match joins two points into one that shows twice in some photographs. Dropping all of such a component would lose
-the long tracks first, which have most matches and are worth most; `tracks` grows the components match by match
-instead, those first that other matches confirm, and leaves out a match that would show a photograph twice.
+A track is a connected component of the graph of features (nodes) and matches (edges). A single false match joins two
+tracks into one that appears twice in some photographs. Dropping such a component would lose the long tracks first,
+which are worth most. `tracks` therefore grows components match by match, in order of confirmation by other matches, and
+rejects a match that would add a photograph twice.
 """
 
 import itertools
@@ -13,40 +13,39 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-# Matches that are looked at together.
+# Matches processed together.
 _AT_ONCE = 200_000
 
 
 class PairMatches(NamedTuple):
-    """Features that two photographs have in common."""
+    """Matches of features of two photographs."""
 
     first: int
     """Index of a photograph."""
     second: int
-    """Index of another one, greater than `first`."""
+    """Index of another photograph, greater than `first`."""
     features: Int[np.ndarray, "n 2"]
-    """Index of the feature in the first and in the second photograph; each occurs once at most in its column."""
+    """Index of the feature in the first and in the second photograph; each at most once in its column."""
 
 
 class Tracks(NamedTuple):
-    """Points that photographs show in common: one row a measurement, sorted by point, then by photograph."""
+    """Image measurements of tracks, sorted by point, then by photograph."""
 
     image: Int[np.ndarray, "rows"]
     feature: Int[np.ndarray, "rows"]
     point: Int[np.ndarray, "rows"]
     n_conflicting: int
-    """Matches left out because with them a point would have shown twice in a photograph."""
+    """Matches rejected because a point would appear twice in a photograph."""
 
 
 def tracks(n_features: list[int], pairs: list[PairMatches]) -> Tracks:
-    """The points that `pairs` make of features, each point once at most in a photograph.
+    """Build tracks from matches; each point appears at most once in a photograph.
 
-    `n_features` says how many features every photograph has. The matches join features in the order of their support:
-    the number of third features that both of the two are matched to. Ties keep the order given. A match whose
-    two components hold one photograph in common, in two features, is left out and counted. Points are numbered in the
-    order of their first feature.
+    `n_features` is the number of features of every photograph. Matches are added in the order of their support, the
+    number of third features matched to both of the two; ties keep their order. A match whose two components share a
+    photograph is rejected and counted. Points are numbered in the order of their first feature.
 
-    Raises ValueError for a match of a photograph or feature that is not there.
+    Raises ValueError for an index of a photograph or feature out of range.
     """
     number = np.asarray(n_features, int)
     first = np.concatenate([[0], np.cumsum(number)])
@@ -74,7 +73,7 @@ def tracks(n_features: list[int], pairs: list[PairMatches]) -> Tracks:
     rows = np.unique(edges)
     roots = np.fromiter((_root(parent, k) for k in rows.tolist()), int, len(rows))
     _, begins, point, times = np.unique(roots, return_index=True, return_inverse=True, return_counts=True)
-    # A feature whose every match was left out makes no point.
+    # A feature without accepted matches is no point.
     kept = times[point] >= 2
     rows, point = rows[kept], begins[point][kept]
     image = np.searchsorted(first, rows, side="right") - 1
@@ -85,7 +84,7 @@ def tracks(n_features: list[int], pairs: list[PairMatches]) -> Tracks:
 
 
 def connected_images(n_images: int, pairs: list[PairMatches]) -> list[Int[np.ndarray, "images"]]:
-    """The groups of images that matches join, the largest first; an image that matches no other one is a group."""
+    """Groups of images connected by matches, the largest first; an image without matches is a group."""
     parent = list(range(n_images))
     for pair in pairs:
         if len(pair.features):
@@ -95,7 +94,7 @@ def connected_images(n_images: int, pairs: list[PairMatches]) -> list[Int[np.nda
 
 
 def _edges(first: np.ndarray, pairs: list[PairMatches]) -> Int[np.ndarray, "edges 2"]:
-    """The matches of all pairs as features counted through all photographs."""
+    """Matches of all pairs, with features numbered across photographs."""
     edges = [np.zeros((0, 2), int)]
     for one, other, features in pairs:
         if not 0 <= one < other < len(first) - 1:
@@ -108,29 +107,29 @@ def _edges(first: np.ndarray, pairs: list[PairMatches]) -> Int[np.ndarray, "edge
 
 
 def _support(edges: np.ndarray, n: int) -> Int[np.ndarray, "edges"]:
-    """How many third features both ends of each match are matched to: the triangles of the graph over it."""
+    """Number of third features matched to both ends of each match: the triangles of the graph over it."""
     # SciPy takes a quarter of a second to import, and few orient photographs.
     from scipy.sparse import csr_matrix
 
     both = np.concatenate([edges, edges[:, ::-1]])
     matched = csr_matrix((np.ones(len(both), np.int32), (both[:, 0], both[:, 1])), (n, n))
-    # Of a match that is there twice.
+    # A match may occur twice.
     matched.data[:] = 1
-    found = [np.zeros(0, int)]
+    support = [np.zeros(0, int)]
     for some in _portions(edges):
         one, other = (matched[some[:, side]] for side in (0, 1))
-        found.append(np.asarray(one.multiply(other).sum(axis=1), int).ravel())
-    return np.concatenate(found)
+        support.append(np.asarray(one.multiply(other).sum(axis=1), int).ravel())
+    return np.concatenate(support)
 
 
 def _portions(edges: np.ndarray) -> Iterator[np.ndarray]:
-    """Some at a time: all as Python's numbers, or with all their partners, would be gigabytes."""
+    """Some at a time, to limit memory."""
     for begin in range(0, len(edges), _AT_ONCE):
         yield edges[begin : begin + _AT_ONCE]
 
 
 def _root(parent: list[int], k: int) -> int:
-    """The representative of the component of `k`; the way to it is halved."""
+    """Representative of the component of `k`, with path halving."""
     while parent[k] != k:
         parent[k] = parent[parent[k]]
         k = parent[k]

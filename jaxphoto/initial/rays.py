@@ -1,4 +1,4 @@
-"""Rays of many image coordinates at once, and where they meet the perspective plane."""
+"""Rays and ideal coordinates of many image coordinates at once."""
 
 from functools import partial
 
@@ -10,8 +10,8 @@ from jaxtyping import Array, Float, Int
 from jaxphoto.camera import InteriorOrientation, Perspective
 from jaxphoto.compiling import jit_quickly
 
-# Cosine of the angle from the axis beyond which a ray of a fisheye is not taken to the perspective plane: 80 degrees,
-# where a pixel there is 30 times as large as in the middle.
+# Cosine of the largest angle from the axis at which a fisheye ray is projected to the perspective plane: 80 degrees,
+# where a pixel is 30 times as large as in the centre.
 _FLATTEST = 0.17
 
 
@@ -27,7 +27,7 @@ def ideal_coordinates(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "r
     NaN for a ray of another projection that is farther than 80 degrees from the axis.
     """
     directions = _of_rows(interior, xy_mm)
-    # In this order the ideal coordinates of a perspective camera stay what they are.
+    # In this order the ideal coordinates of a perspective camera are unchanged.
     ideal = directions[:, :2] * (-float(interior.c) / directions[:, 2:])
     if type(interior.projection) is not Perspective:
         ideal[~(-directions[:, 2] > _FLATTEST * np.linalg.norm(directions, axis=1))] = np.nan
@@ -35,7 +35,7 @@ def ideal_coordinates(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "r
 
 
 def camera_rays(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"]) -> Float[np.ndarray, "rows 3"]:
-    """Unit directions in the camera frame of the measured rows of one camera, of whatever projection."""
+    """Unit directions in the camera frame of the measured rows of one camera of any projection."""
     directions = _of_rows(interior, xy_mm)
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
@@ -44,7 +44,7 @@ def _of_rows(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"]) 
     n = len(xy_mm)
     xy = np.zeros((padded_length(n), 2))
     xy[:n] = xy_mm
-    # Numbers as arrays: a float in the tree would be compiled in, and every camera compiled anew.
+    # Numbers as arrays: a float in the tree would be a constant of the program, one for every camera.
     numbers = jax.tree.map(partial(np.asarray, dtype=float), interior)
     return np.asarray(directions_of(numbers, xy))[:n]
 
@@ -71,13 +71,13 @@ def unit_rays(
 
 
 def ray_noise(rays: Float[np.ndarray, "rows 3"], sigma_rad: float) -> Float[np.ndarray, "rows 3 2"]:
-    """What errors of one sigma in the two ideal image coordinates do to unit rays in the camera frame.
+    """Errors of unit rays in the camera frame by one sigma in each of the two ideal image coordinates.
 
         d ray = (I - ray ray') (e_x, e_y) |z| sigma_rad
 
     `sigma_rad` is the standard deviation of an image coordinate as a fraction of c: the angle at the principal point.
-    Away from it the same error in the image is a smaller angle. Raises ValueError where a ray does not point to the
-    front of the camera (z < 0).
+    Away from it the same error in the image is a smaller angle. Raises ValueError for a ray that does not point to
+    the front of the camera (z < 0).
     """
     if not np.all(rays[:, 2] < 0):
         raise ValueError("rays in the camera frame point to the front of the camera, so their z is negative")

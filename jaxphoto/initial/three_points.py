@@ -4,15 +4,15 @@ Grunert's (1841) solution as written by Haralick, Lee, Ottenberg and Noelle (199
 of the three point perspective pose estimation problem", equations (2)-(9). With the sides a, b, c of the object
 triangle opposite points 1, 2, 3 and the cosines of the angles between the rays, the distances are s1, u s1, v s1, and
 v is a root of a quartic. The printed formula for u divides by zero for symmetric figures, such as a vertical
-photograph of a square; u is taken here from the quadratic of side c instead, whose false root the caller's reprojection
-error sorts out.
+photograph of a square. Here u is a root of the quadratic of side c; the caller rejects its false root by the
+reprojection error.
 """
 
 import numpy as np
 from jaxtyping import Float
 
-# The sides of the triangle found may differ from the given ones by this fraction: false roots are far off, but true
-# double roots are only found to the square root of the rounding error and of the image errors.
+# Relative difference of the sides of a solution: false roots are far off, but true double roots are only as good as the
+# square root of the rounding error and of the image errors.
 _MISFIT = 0.3
 
 
