@@ -133,7 +133,7 @@ def test_the_command_writes_and_reads_again(tmp_path, monkeypatch, capsys, forma
     assert code == 0 and f"wrote {tmp_path / 'out'}" in said
     assert ("image points are relative to the principal point\n" in said) == (format in OF)
     code, said, _ = run(monkeypatch, capsys, "convert", tmp_path / "out", tmp_path / "block")
-    assert code == 0 and ("assumed pixel size 0.001 mm" in said) == (format in OF)
+    assert code == 0 and ("pixel size 0.001 mm assumed" in said) == (format in OF)
     given, again = read_block("examples/cross_block"), read_block(tmp_path / "block")
     assert len(again.image_points.image) == len(given.image_points.image)
     if format == "metashape":
