@@ -437,7 +437,7 @@ def test_a_mirror_that_oscillates_looks_to_and_fro_and_longer_at_the_edges():
         ({"lidar.truth.boresight": [0, 0, 0]}, r"\[lidar.truth\] boresight: no such key"),
         ({"lidar.strips": [{"name": "default", "length_m": 5.0}]}, "a strip cannot be called 'default'"),
         ({"lidar.same_trajectory": 1}, r"\[lidar\] same_trajectory: 1 is neither true nor false"),
-        ({"lidar.same_trajectory": True, "lidar.strips": [OWN]}, r"same_trajectory: \[\[lidar\.strips\]\] are another flight"),
+        ({"lidar.same_trajectory": True, "lidar.strips": [OWN]}, "are another flight"),
         ({"terrain.roughness_m": 2.0}, r"\[terrain\] roughness_m: points 2 m above or below the ground lie on no surf"),
         ({"terrain": {"kind": "rolling"}}, r"roughness_m: points 6 m .* in place of .rolling. give its waves"),
     ],
