@@ -109,7 +109,7 @@ class PlanKeys(Keys):
 _TYPES: dict[Any, Any] = {
     float: Number, int: Whole, bool: StrictBool, str: StrictStr,
     scan_plan.Triple: Triple, settlement.Range: PositiveRange,
-    tuple[tuple[float, float], ...]: list[Pair], tuple[tuple[float, ...], ...]: list[Place], tuple[float, float]: Pair,
+    tuple[tuple[float, float], ...]: list[Pair], tuple[tuple[float, ...], ...]: list[Place],
     dict[str, scan_plan.Triple]: dict[str, Vector],
 }  # fmt: skip
 
@@ -184,7 +184,7 @@ RandomKeys = plan_keys(RandomWaves, count=Annotated[Count, Field(le=1_000)], rms
 BuildingKeys = plan_keys(Buildings, _BuildingKeys, count=Annotated[Whole, Field(le=10_000)], heading_deg=Range)
 TreeKeys = plan_keys(Trees, count=Annotated[Whole, Field(le=1_000_000)])
 LidarTruthKeys = plan_keys(
-    ScanPlan, correlation_s=Positive, knots_s=Positive,
+    ScanPlan, correlation_s=Positive, knots_s=Positive, eccentricity_deg=Pair,
     **dict.fromkeys(("density_per_m2", "scan_angle_deg", "pattern", "strips", "same_trajectory")),
     **dict.fromkeys(("boresight_deg", "lever_arm_m"), Vector),
 )  # fmt: skip

@@ -307,14 +307,14 @@ def _plan(top: Section, keys: Any, cameras: Flown) -> FlightPlan | ConvergentPla
     if ("flight" in top) == ("convergent" in top):
         raise top.error("", "a recipe has a table [flight] or a table [convergent]; give one of the two")
     plan = _flight(top, keys.flight, cameras) if keys.flight else _convergent(top, keys.convergent, list(cameras))
-    for name in cameras:
-        if name not in plan.cameras:
-            raise top.section("cameras").error(name, "no image is taken with this camera; use it or remove it")
     if not 2 <= plan.n_images <= IMAGES:
         table, key = ("flight", "strips") if keys.flight else ("convergent", "stations")
         raise top.section(table).error(
             key, f"there are {plan.n_images} images in all; give from 2, which see a point twice, to {IMAGES}"
         )
+    for name in cameras:
+        if name not in plan.cameras:
+            raise top.section("cameras").error(name, "no image is taken with this camera; use it or remove it")
     return plan
 
 
