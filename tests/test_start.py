@@ -9,14 +9,12 @@ import sys
 from typing import get_args
 
 import pytest
-from jaxphoto.io.cameras import CAMERA_FORMATS, LOSS_PX
-from jaxphoto.io.exports import EXPORTS
 from typer.main import get_command
 
 from jaxphoto.camera.undistortion import Keep
+from jaxphoto.extras.formats import CAMERAS_WRITTEN, EXPORTS, FORMATS, LOSS_PX
 from jaxphoto.georeferencing import PATTERN_OF, ScannerCalibration
 from jaxphoto.image_measurement.features import LONGEST_PX
-from jaxphoto.io import FORMATS
 from jaxphoto.io.clouds.cloud_reader import Returns
 from jaxphoto.io.clouds.coordinate_system import UNITS
 from jaxphoto.io.shipped import EXAMPLES
@@ -50,7 +48,7 @@ CHOICES = [
     (blocks.halves, "method", ALIGNMENTS),
     (files.convert, "source_format", FORMATS),
     (files.convert, "to", ["block", *EXPORTS]),
-    (files.camera, "out_format", CAMERA_FORMATS),
+    (files.camera, "out_format", CAMERAS_WRITTEN),
     (photographs.undistort, "keep", get_args(Keep)),
     (lidar.lidar_control, "method", METHODS),
     (lidar.lidar_control, "returns", get_args(Returns)),
