@@ -482,7 +482,7 @@ REFUSED = {
     ),
     "mirror": (_mvg(_TURN, np.diag([1.0, 1, -1]).tolist()), "image a.jpg is no rotation"),
     "model": (_mvg(_KIND, "spherical"), "'spherical' is not known here"),
-    "terms": (_mvg((*_DATA, "disto_k3"), [1.0]), "intrinsics 3. disto_k3: .*not a list of three"),
+    "terms": (_mvg((*_DATA, "disto_k3"), [1.0]), "intrinsics 3. disto_k3: .*has 1 entries; give 3"),
     "cut": (_blocks(lambda text: text[:-30]), "the XML is broken"),
     "unknown encoding": (_blocks(_replaced("utf-8", "utf-0")), "the XML is broken .unknown encoding: utf-0"),
     "wide encoding": (_blocks(_replaced("utf-8", "shift_jis")), "the XML is broken .multi-byte encodings are not"),
