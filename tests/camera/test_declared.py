@@ -104,7 +104,7 @@ def test_block_toml_holds_it_and_gives_it_back():
     ("wrong", "message"),
     [
         ({"way": "up"}, '\'up\' is neither "out" nor "in"; choose one of them'),
-        ({"sign": "add"}, "no such key is known; use width_px, .*, way, interior, unknowns"),
+        ({"sign": "add"}, "no such key is known; use width_px, .*, interior, unknowns, .*, way"),
         ({"projection": "fish"}, "no projection model is called 'fish'; choose one of perspective, equidistant"),
         ({"distortion": "tangend"}, "no distortion model is called 'tangend'; choose one of brown, affine_brown"),
         ({"interior": {"c_mm": 35.0, "a": 0.1}}, "s_mm: the key is missing"),
