@@ -482,21 +482,12 @@ REFUSED = {
     ),
     "mirror": (_mvg(_TURN, np.diag([1.0, 1, -1]).tolist()), "image a.jpg is no rotation"),
     "model": (_mvg(_KIND, "spherical"), "'spherical' is not known here"),
-<<<<<<< HEAD
-    "terms": (_mvg((*_DATA, "disto_k3"), [1.0]), "intrinsics 3. disto_k3: .*not a list of three"),
+    "terms": (_mvg((*_DATA, "disto_k3"), [1.0]), "intrinsics 3. disto_k3: .*has 1 entries; give 3"),
     "cut": (_blocks(lambda text: text[:-30]), "block.xml: damaged"),
     "unknown encoding": (_blocks(_replaced("utf-8", "utf-0")), "block.xml: damaged .*unknown encoding: utf-0"),
     "wide encoding": (_blocks(_replaced("utf-8", "shift_jis")), "block.xml: damaged .*multi-byte encodings are not"),
     "angles": (_blocks(_geographic), "is longitude and latitude"),
     "axes": (_blocks(_replaced("XRightYUp", "XUpYLeft"), upwards=True), "one: CameraOrientation 'XUpYLeft'"),
-=======
-    "terms": (_mvg((*_DATA, "disto_k3"), [1.0]), "intrinsics 3. disto_k3: .*has 1 entries; give 3"),
-    "cut": (_blocks(lambda text: text[:-30]), "the XML is broken"),
-    "unknown encoding": (_blocks(_replaced("utf-8", "utf-0")), "the XML is broken .unknown encoding: utf-0"),
-    "wide encoding": (_blocks(_replaced("utf-8", "shift_jis")), "the XML is broken .multi-byte encodings are not"),
-    "angles": (_blocks(_geographic), "longitude and latitude; export it in a map system"),
-    "axes": (_blocks(_replaced("XRightYUp", "XUpYLeft"), upwards=True), "'XUpYLeft' is not read"),
->>>>>>> half-blockfolder
     "fisheye": (_blocks(_replaced(">Perspective<", ">Fisheye<")), "is a 'Fisheye'"),
     "centre": (_blocks(_replaced("<x>0.5</x>", "<x>a</x>")), "photo 5, Center: .* is not 3 finite numbers"),
     "end": (_bundle(lambda lines: lines[:-1]), "number of measurements of point 6"),
