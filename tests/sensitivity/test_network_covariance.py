@@ -134,7 +134,7 @@ def test_largest_is_the_limit_of_its_norm():
 
 
 def test_what_a_layout_cannot_be_is_said_in_a_sentence(layout):
-    with pytest.raises(InputError, match=r"k2, which is fixed .* \(c_mm, xp_mm, yp_mm, k1\)"):
+    with pytest.raises(InputError, match=r"k2, which is fixed: .* \(c_mm, xp_mm, yp_mm, k1\)"):
         criteria.sigma_of(design_covariance(layout), "k2")
     with pytest.raises(InputError, match=r"unknown exterior parameter roll .* X, Y"):
         criteria.mean_correlation(design_covariance(layout), ("roll",), ("k1",))
