@@ -20,7 +20,6 @@ from jaxphoto.losses import LOSSES
 from jaxphoto.procedures import adjust_for_tables
 from jaxphoto.procedures.weights import MadeByBlunders, made_by_blunders
 from jaxphoto.report import (
-    Level,
     Tables,
     Verdict,
     component_findings,
@@ -103,7 +102,7 @@ def adjust_command(
     if components:
         print_components(components, output.screen)
     output.wrote(out, f"results in {out} (open report.html)")
-    if verdict.level == Level.ALARM:
+    if verdict.severity == "error":
         raise typer.Exit(1)
 
 

@@ -19,11 +19,14 @@ from jaxphoto.io.json_file import read_json
 from jaxphoto.io.results_judged import read_summary, reservation
 from jaxphoto.io.sound_photographs import pictures_in
 from jaxphoto.io.text_tables import read_csv
-from jaxphoto.report.certificate import certificate_of
-from jaxphoto.report.certified import Certified, ExteriorCorrelation, FormatBand, LastCalibration
-from jaxphoto.report.document import Document
-from jaxphoto.report.document_html import html_page
-from jaxphoto.report.document_pdf import pdf_of
+from jaxphoto.report.certificate import (
+    Certified,
+    ExteriorCorrelation,
+    FormatBand,
+    LastCalibration,
+    certificate_page,
+)
+from jaxphoto.report.page import write_pdf
 from jaxphoto.writing import check_room, whole_file
 from jaxphoto.writing.inputs import InputFile, input_file
 
@@ -60,11 +63,13 @@ def certificate_command(
     output.wrote(out, f"certificate in {out}")
 
 
-def write_certificate(document: Document, path: Path) -> None:
-    """As HTML or PDF, by the ending of the name."""
-    content = pdf_of(document) if path.suffix.lower() == ".pdf" else html_page(document).encode()
+def write_certificate(document: str, path: Path) -> None:
+    """Write it as HTML or, printed by a browser, as PDF."""
     with whole_file(path) as work:
-        work.write_bytes(content)
+        if path.suffix.lower() == ".pdf":
+            write_pdf(document, work)
+        else:
+            work.write_text(document, encoding="utf-8")
 
 
 def certificate_document(
@@ -73,7 +78,7 @@ def certificate_document(
     last: Path | None = None,
     halves: Path | None = None,
     photographs: list[Path] | None = None,
-) -> Document:
+) -> str:
     """The certificate of a folder of results; of a flight, that of its largest part.
 
     Raises InputError for a folder that holds none, and for an adjustment that did not converge.
@@ -91,7 +96,7 @@ def certificate_document(
         conditions = read_conditions(folder / CONDITIONS)
     if (folder / INPUTS).is_file():
         inputs += read_inputs(folder / INPUTS)
-    return certificate_of(
+    return certificate_page(
         Certified(
             camera=file.name,
             sensor=file.sensor,

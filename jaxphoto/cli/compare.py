@@ -10,7 +10,7 @@ from jaxphoto.cli.grid_options import check_grid, points_of
 from jaxphoto.cli.made import made_by
 from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.two_cameras import check_two_calibrations, compared, read_two, share_measurements
-from jaxphoto.report.change import change_summary, print_change, write_change
+from jaxphoto.report.stability import change_summary, print_change, write_change
 from jaxphoto.stability import METHODS, Method, change
 from jaxphoto.writing import check_folder
 

@@ -18,10 +18,10 @@ from jaxphoto.io.control_files import FORMS, read_control
 from jaxphoto.io.sound_photographs import in_short, sound_photographs
 from jaxphoto.procedures import adjust
 from jaxphoto.procedures.control import at_optimum, control_block, control_block_with_targets
-from jaxphoto.report import Level, Tables, verdict_of
+from jaxphoto.report import Tables, verdict_of
 from jaxphoto.report.control import control_findings, control_summary, write_control
 from jaxphoto.report.findings import Verdict
-from jaxphoto.report.made import versions
+from jaxphoto.report.page import versions
 from jaxphoto.report.results import write_results, write_summary
 from jaxphoto.writing import check_folder, whole_folder
 
@@ -96,8 +96,8 @@ def control_command(
         output.say(sentence)
     output.say(verdict.headline)
     for finding in verdict.findings:
-        if finding.level > Level.INFORMATION or "check point" in finding.text:
+        if finding.severity != "note" or finding.code == "check_points":
             output.say(f"  {finding.text}")
     output.wrote(out, f"results in {out} (open result/report.html)")
-    if verdict.level == Level.ALARM:
+    if verdict.severity == "error":
         raise typer.Exit(1)

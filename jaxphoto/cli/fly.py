@@ -34,7 +34,7 @@ from jaxphoto.io.sound_photographs import folders_not_looked_into, in_short, sou
 from jaxphoto.procedures.calibration import distortion_model
 from jaxphoto.procedures.control.of_flight import flight_control
 from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
-from jaxphoto.report import Level, prepare_pictures
+from jaxphoto.report import prepare_pictures
 from jaxphoto.report.flight import (
     FlightSource,
     block_folder,
@@ -229,12 +229,12 @@ def fly_command(
         output.say(f"{name} is not used: {why}")
     output.say(verdict.headline)
     for finding in verdict.findings:
-        if finding.level > Level.INFORMATION:
+        if finding.severity != "note":
             output.say(f"  {finding.text}")
     if why_not:
         output.say(f"no certificate: {why_not}")
     output.wrote(out, f"results in {out} (open report.html)")
-    if verdict.level == Level.ALARM:
+    if verdict.severity == "error":
         raise typer.Exit(1)
 
 

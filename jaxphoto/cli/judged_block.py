@@ -2,7 +2,7 @@
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.cli.output import Output
-from jaxphoto.report import Level, Tables, Verdict
+from jaxphoto.report import Tables, Verdict
 from jaxphoto.report.residual_findings import contradictions
 
 
@@ -12,6 +12,6 @@ def print_judgement(adjusted: Adjustment, output: Output) -> None:
         against = [adjusted.outcome.value]
     else:
         verdict = Verdict.of(contradictions(Tables(adjusted)))
-        against = [f.text for f in verdict.findings if f.level > Level.INFORMATION]
+        against = [f.text for f in verdict.findings if f.severity != "note"]
     if against:
         output.warn(f"the block itself: {against[0]} (jaxphoto adjust says more)")

@@ -59,7 +59,6 @@ from jaxphoto.report.lidar import (
     rounds_table,
     write_simultaneous,
 )
-from jaxphoto.report.study_page import WholePicture
 from jaxphoto.unknowns import FIXED, FREE, Weighted
 from jaxphoto.writing import check_folder
 
@@ -108,12 +107,12 @@ def lidar_control_command(
         found = lidar_control(read, points, method, settings, max_rounds=max_rounds, report=report)  # type: ignore[arg-type]
         status.update(f"writing {out}")
         heights, rounds = heights_table(found), rounds_table(found.rounds)
-        picture = WholePicture.of(heights_figure(found), "where heights are control, and what they leave")
+        picture = heights_figure(found)
         page = heights_page(found, picture, made_by(context, block, cloud))
         with whole_block(found.block, out) as folder:
             heights.to_csv(folder / "lidar_heights.csv", index=False)
             rounds.to_csv(folder / "lidar_rounds.csv", index=False)
-            (folder / "lidar_heights.png").write_bytes(picture.png)
+            picture.savefig(folder / "lidar_heights.png")
             (folder / "report.html").write_text(page, encoding="utf-8")
     print_rounds(found.rounds, found.still, output.screen)
     refused = ", ".join(

@@ -9,7 +9,7 @@ import typer
 from jaxphoto.cli.output import OF_OUTPUT
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.input_hashes import block_inputs
-from jaxphoto.report.made import Made
+from jaxphoto.report.page import Made
 from jaxphoto.writing.inputs import InputFile, input_file
 
 # Of a folder of results or of an experiment, what is read.

@@ -19,7 +19,7 @@ from jaxphoto.io import read_block
 from jaxphoto.io.draws_folder import check_place
 from jaxphoto.procedures import adjust
 from jaxphoto.report.draws import LONG, write_draws_page
-from jaxphoto.report.table_files import readable
+from jaxphoto.report.formatting import readable
 from jaxphoto.sensitivity import PER, Bias, Readjustment, bias, check_draws, noise
 
 _KINDS = (*PER, "noise")

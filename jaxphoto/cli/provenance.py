@@ -59,13 +59,12 @@ class Provenance(NamedTuple):
         write_inputs(self.inputs, folder)
 
     def certify(self, flight: Path) -> str:
-        """certificate.html and certificate.pdf of the largest part, or why there is none."""
+        """Write certificate.html of the largest part, or return why there is none."""
         try:
             document = certificate_document(flight)
         except InputError as error:
             return str(error)
-        for suffix in (".html", ".pdf"):
-            write_certificate(document, (flight / CERTIFICATE).with_suffix(suffix))
+        write_certificate(document, (flight / CERTIFICATE).with_suffix(".html"))
         return ""
 
 

@@ -16,7 +16,7 @@ from jaxphoto.cli.output import Output, command
 from jaxphoto.errors import InputError
 from jaxphoto.io import read_block
 from jaxphoto.procedures import adjust_for_tables
-from jaxphoto.report.digits import in_figures
+from jaxphoto.report.formatting import in_figures
 from jaxphoto.report.sensitivity import SensitivityTables, write_sensitivity
 from jaxphoto.report.terminal import plain
 from jaxphoto.sensitivity.influence import DELTA0, Per

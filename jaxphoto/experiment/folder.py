@@ -12,7 +12,7 @@ from jaxphoto.experiment.comparison import compare
 from jaxphoto.experiment.declaration import Experiment
 from jaxphoto.experiment.page import experiment_page, index_page
 from jaxphoto.experiment.runner import Run
-from jaxphoto.report.made import Made
+from jaxphoto.report.page import Made
 from jaxphoto.writing import whole_folder
 
 FILE = "experiment.py"

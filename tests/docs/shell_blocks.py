@@ -113,7 +113,7 @@ NOT_RUN = {
     "docs/install.md": {
         "pip install jaxphoto\n": _INSTALLS,
         "pip install --no-deps jaxphoto\npip install jax optimistix equinox lineax jaxtyping numpy pandas typer rich "
-        "matplotlib plotly jinja2 pyproj scipy pillow pyyaml\n": "benchmarks/install.py --lean does so",
+        "matplotlib jinja2 pyproj scipy pillow pyyaml\n": "benchmarks/install.py --lean does so",
     },
     "docs/scaling.md": {
         "srun --cpus-per-task=32 --cpu-bind=cores python adjust_block.py\n": "wants a cluster with Slurm"

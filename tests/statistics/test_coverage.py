@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from jaxphoto.report.flight.coverage import draw_overlap
+from jaxphoto.report.plots import draw_overlap
 from jaxphoto.statistics.coverage import Coverage, coverage
 from tests.blocks import adjusted
 
