@@ -96,7 +96,7 @@ def by_method(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_mm: fl
         else {}
     )
     rows = {f"{name} [um]": (1e3 * table[column]).map("{:.4g}".format) for name, column in um.items()}
-    rows["RMSE_offset [px]"] = table["rmse_offset_px"].map("{:.4g}".format)
+    rows["in pixels"] = table["rmse_offset_px"].map("{:.4g}".format)
     rows |= {"p": table["p_value"].map("{:.2g}".format)} if known else {}
     return pd.DataFrame(rows).T.reset_index(names="quantity")
 

@@ -110,7 +110,7 @@ def test_a_report_opens_with_verdict_and_summary_and_is_self_contained(tables, r
     assert f"{len(tables.adjusted.block.images)} camera stations" in report
     assert all(f">{name}</td>" in report for name in tables.adjusted.block.images)
     labels = re.findall(r'<figure role="img" aria-label="([^"]{10,})"><svg', report)
-    assert len(labels) > 10 and len(labels) == report.count("<svg")
+    assert len(labels) > 10 and len(labels) == report.count('<figure role="img"')
 
 
 def test_without_plotly_a_report_has_the_plan_alone(tables, monkeypatch):
