@@ -198,9 +198,8 @@ def write_pdf(text: str, path: Path) -> None:
     """Print a page to PDF by a Chromium-based browser. Raises InputError if none is installed."""
     browser = next(filter(None, map(shutil.which, _BROWSERS)), None)
     if browser is None:
-        html_file = path.with_suffix(".html").name
-        raise InputError(f"{path}: no Chromium, Chrome or Edge found to print a PDF; write {html_file} and print that")
-    with tempfile.TemporaryDirectory() as folder:
+        raise InputError("no Chromium, Chrome or Edge found to print a PDF: write HTML and print it in a browser")
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         source = Path(folder, "page.html")
         source.write_text(text, encoding="utf-8")
         options = ("--headless", "--no-sandbox", "--disable-gpu", "--no-pdf-header-footer", f"--user-data-dir={folder}")

@@ -21,7 +21,15 @@ from jaxphoto.observations import AXES
 from jaxphoto.report import plots
 from jaxphoto.report.block_plot import block_view, block_words, plot_block
 from jaxphoto.report.findings import Verdict, as_sentence, p_words
-from jaxphoto.report.formatting import check_table_format, of_sigma, plus_minus, readable, with_sigma, write_table
+from jaxphoto.report.formatting import (
+    check_table_format,
+    of_sigma,
+    plus_minus,
+    readable,
+    with_sigma,
+    without_empty,
+    write_table,
+)
 from jaxphoto.report.page import Heading, Made, Paragraph, Part, Plot, page, provenance, verdict_parts, versions
 from jaxphoto.report.tables import Tables, check_spread, recovery_spread, side_by_side, with_correlated_sigma
 from jaxphoto.statistics import (
@@ -44,7 +52,7 @@ _MAP_TABLES = ("exterior_map", "object_points_map")
 # Cameras that are plotted, rows of the largest residuals and of the iteration history, findings at the top.
 _PLOTTED, _LARGEST, _STEPS, _TOP = 6, 20, 40, 3
 _RELIABILITY = {
-    "c_moves": "c moves [sigma]", "xp_moves": "x_p moves [sigma]", "yp_moves": "y_p moves [sigma]",
+    "c_moves": "c moves [sigma]", "xp_moves": "xp moves [sigma]", "yp_moves": "yp moves [sigma]",
     "most_moves": "any moves [sigma]", "redundancy_number": "r", "detectable": "MDB",
 }  # fmt: skip
 _EFFECTS = {"pattern": "systematic effect", "freedom": "degrees of freedom", "share": "fraction", "amount": "estimate"}
@@ -395,7 +403,7 @@ def _residuals(tables: Tables, cameras: Sequence[str]) -> Iterator[Part]:
         yield [Plot(partial(plots.plot_station_residuals, tables), "residuals of stations in order of time")]
     if len(tables.trends):
         yield Paragraph("Systematic residuals, by image format, time and strip:")
-        yield readable(tables.trends).rename(columns=_EFFECTS)
+        yield without_empty(readable(tables.trends)).rename(columns=_EFFECTS)
     checked = tables.residuals["redundancy_number"] > LEAST_CHECKED
     largest = tables.residuals.loc[tables.residuals["w"].abs()[checked].nlargest(_LARGEST).index]
     yield Paragraph(
@@ -418,9 +426,9 @@ def points_section(tables: Tables, unit: str = "m") -> Iterator[Part]:
         of = table[(table["n_images"] >= low) & (table["n_images"] < high)]
         name = str(low) if high == low + 1 else f"{low} to {high - 1}" if high < math.inf else f"{low} or more"
         sigmas = {f"median sigma {axis} [{unit}]": of_sigma(of[f"sigma_{axis}_m"].median()) for axis in AXES}
-        angle = f"{of['angle_deg'].median():.1f}"
-        share = f"{100 * len(of) / len(table):.1f} %"
-        row = {"rays": name if low else "all", "points": len(of), "share": share, "median angle [deg]": angle, **sigmas}
+        counts = {"points": len(of), "fraction": f"{100 * len(of) / len(table):.1f} %"}
+        angle = {"median angle [deg]": f"{of['angle_deg'].median():.1f}"}
+        row = {"rays": name if low else "all", **counts, **angle, **sigmas}
         rows += [row] if len(of) else []
     yield pd.DataFrame(rows)
     small = int((table["angle_deg"] < _SMALL_DEG).sum())
