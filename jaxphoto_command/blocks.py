@@ -113,7 +113,7 @@ def adjust(
     if components:
         report.print_components(components, output.screen)
     output.wrote(out, f"results in {out} (open report.html)")
-    if verdict.level == report.Level.ALARM:
+    if verdict.severity == "error":
         raise typer.Exit(1)
 
 
@@ -239,7 +239,7 @@ def monte_carlo(
     from jaxphoto.io.draws_folder import check_place
     from jaxphoto.procedures import adjust
     from jaxphoto.report.draws import LONG, write_draws_page
-    from jaxphoto.report.table_files import readable
+    from jaxphoto.report.formatting import readable
     from jaxphoto.sensitivity import Readjustment, bias, check_draws, noise
 
     check_draws(draws)
@@ -308,7 +308,7 @@ def sensitivity(
     """Compute the exact sensitivity of interior orientation and check points to stations, and external reliability."""
     from jaxphoto.io import read_block
     from jaxphoto.procedures import adjust_for_tables
-    from jaxphoto.report.digits import in_figures
+    from jaxphoto.report.formatting import in_figures
     from jaxphoto.report.sensitivity import SensitivityTables, write_sensitivity
     from jaxphoto.writing import check_folder
 
@@ -393,12 +393,12 @@ def halves(
 
 def warn_of_contradictions(adjusted: Any, output: Output) -> None:
     """Warn of the worst contradiction among the observations of a block that is the input of a further computation."""
-    from jaxphoto.report import Level, Tables, Verdict
+    from jaxphoto.report import Tables, Verdict
     from jaxphoto.report.residual_findings import contradictions
 
     if bool(adjusted.converged):
         verdict = Verdict.of(contradictions(Tables(adjusted)))
-        texts = [finding.text for finding in verdict.findings if finding.level > Level.INFORMATION]
+        texts = [finding.text for finding in verdict.findings if finding.severity != "note"]
     else:
         texts = [adjusted.outcome.value]
     if texts:

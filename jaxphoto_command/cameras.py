@@ -74,7 +74,7 @@ def compare(
     out: OptionalOut = None,
 ) -> None:
     """Test whether a camera has changed between two calibrations, by its parameters and by its bundle of rays."""
-    from jaxphoto.report.change import change_summary, print_change, write_change
+    from jaxphoto.report.stability import change_summary, print_change, write_change
     from jaxphoto.stability import change
     from jaxphoto.writing import check_folder
     from jaxphoto_command.certificate import check_two_calibrations, compared, read_two, share_measurements

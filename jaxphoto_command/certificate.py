@@ -14,11 +14,14 @@ from jaxphoto.io.input_hashes import INPUTS, read_inputs
 from jaxphoto.io.json_file import read_json
 from jaxphoto.io.photographs import SUFFIXES, picture_files
 from jaxphoto.io.text_tables import read_csv
-from jaxphoto.report.certificate import certificate_of
-from jaxphoto.report.certified import Certified, ExteriorCorrelation, FormatBand, LastCalibration
-from jaxphoto.report.document import Document
-from jaxphoto.report.document_html import html_page
-from jaxphoto.report.document_pdf import pdf_of
+from jaxphoto.report.certificate import (
+    Certified,
+    ExteriorCorrelation,
+    FormatBand,
+    LastCalibration,
+    certificate_page,
+)
+from jaxphoto.report.page import write_pdf
 from jaxphoto.report.stability import Compared
 from jaxphoto.writing import whole_file
 from jaxphoto.writing.inputs import InputFile, input_file
@@ -29,11 +32,13 @@ _CAMERA_FILES = ("interior.csv", "correlation.csv", "camera.toml", "block.toml")
 _MEASUREMENTS = ("image_points.csv", *SUFFIXES)
 
 
-def write_certificate(document: Document, path: Path) -> None:
-    """Write HTML or PDF, by the suffix."""
-    content = pdf_of(document) if path.suffix.lower() == ".pdf" else html_page(document).encode()
+def write_certificate(page: str, path: Path) -> None:
+    """Write HTML or, printed by a browser, PDF."""
     with whole_file(path) as work:
-        work.write_bytes(content)
+        if path.suffix.lower() == ".pdf":
+            write_pdf(page, work)
+        else:
+            work.write_text(page, encoding="utf-8")
 
 
 def certificate_document(
@@ -42,7 +47,7 @@ def certificate_document(
     last: Path | None = None,
     halves: Path | None = None,
     photographs: list[Path] | None = None,
-) -> Document:
+) -> str:
     """Return the certificate of a folder of results; for a flight, of its largest part.
 
     Raises InputError if there are no results or the adjustment did not converge.
@@ -60,7 +65,7 @@ def certificate_document(
         conditions = read_conditions(folder / CONDITIONS)
     if (folder / INPUTS).is_file():
         inputs += read_inputs(folder / INPUTS)
-    return certificate_of(
+    return certificate_page(
         Certified(
             camera=file.name,
             sensor=file.sensor,

@@ -83,7 +83,7 @@ def fly(
     from jaxphoto.procedures.calibration import distortion_model
     from jaxphoto.procedures.control.of_flight import flight_control
     from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
-    from jaxphoto.report import Level, prepare_pictures
+    from jaxphoto.report import prepare_pictures
     from jaxphoto.report.flight import (
         FlightSource,
         block_folder,
@@ -193,11 +193,11 @@ def fly(
         controlled = part.controlled.sentences if part.controlled else ()
         output.say(f"part {k}: {size}", *(f"  {text}" for text in (*camera_sentences(page), *placed, *controlled)))
     output.say(*(f"{name} is not used: {reason}" for name, reason in flight.left_out.items()), verdict.headline)
-    output.say(*(f"  {finding.text}" for finding in verdict.findings if finding.level > Level.INFORMATION))
+    output.say(*(f"  {finding.text}" for finding in verdict.findings if finding.severity != "note"))
     if no_certificate:
         output.say(f"no certificate: {no_certificate}")
     output.wrote(out, f"results in {out} (open report.html)")
-    if verdict.level == Level.ALARM:
+    if verdict.severity == "error":
         raise typer.Exit(1)
 
 
@@ -228,10 +228,10 @@ def control(
     from jaxphoto.io.photographs import skipped_messages, valid_photographs
     from jaxphoto.procedures import adjust
     from jaxphoto.procedures.control import at_optimum, control_block, control_block_with_targets
-    from jaxphoto.report import Level, Tables, verdict_of
+    from jaxphoto.report import Tables, verdict_of
     from jaxphoto.report.control import control_findings, control_summary, write_control
     from jaxphoto.report.findings import Verdict
-    from jaxphoto.report.made import versions
+    from jaxphoto.report.page import versions
     from jaxphoto.report.results import write_results, write_summary
     from jaxphoto.writing import check_folder, whole_folder
     from jaxphoto_command.provenance import Provenance
@@ -278,10 +278,10 @@ def control(
         output.warn(f"skipped in the search for targets: {text}")
     output.say(*result.sentences, verdict.headline)
     for finding in verdict.findings:
-        if finding.level > Level.INFORMATION or "check point" in finding.text:
+        if finding.severity != "note" or finding.code == "check_points":
             output.say(f"  {finding.text}")
     output.wrote(out, f"results in {out} (open result/report.html)")
-    if verdict.level == Level.ALARM:
+    if verdict.severity == "error":
         raise typer.Exit(1)
 
 

@@ -60,13 +60,12 @@ class Provenance(NamedTuple):
 
 
 def certify(flight: Path) -> str:
-    """Write certificate.html and certificate.pdf of the largest part of a flight, or return why not."""
+    """Write certificate.html of the largest part of a flight, or return why not."""
     try:
-        document = certificate_document(flight)
+        page = certificate_document(flight)
     except InputError as error:
         return str(error)
-    for name in ("certificate.html", "certificate.pdf"):
-        write_certificate(document, flight / name)
+    write_certificate(page, flight / "certificate.html")
     return ""
 
 

@@ -44,9 +44,7 @@ from jaxphoto.procedures.lidar.looks import looks_of
 from jaxphoto.procedures.lidar.strip_control import check_complete
 from jaxphoto.procedures.lidar.until_still import at_result, interior_held
 from jaxphoto.procedures.lidar.vertical_control import tie_points
-from jaxphoto.report.findings import Level
-from jaxphoto.report.strips import print_strips, strips_verdict
-from jaxphoto.report.strips_folder import write_strips
+from jaxphoto.report.strips import print_strips, strips_verdict, write_strips
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.terminal import print_verdict
 from jaxphoto.unknowns import FIXED, FREE
@@ -184,7 +182,7 @@ def adjust_flight(output: Output, flight: StripFiles, choices: StripChoices, out
     print_verdict(verdict, output.screen)
     print_strips(result, output.screen)
     output.wrote(out, f"results in {out} (open report.html)")
-    if verdict.level == Level.ALARM:
+    if verdict.severity == "error":
         raise typer.Exit(1)
 
 

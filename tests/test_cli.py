@@ -131,20 +131,18 @@ def test_files_say_what_the_adjustment_says(results, folder):
         off = tables.check_points[f"d{axis}_m"].dropna()
         if len(off):
             assert summary["check_points"][axis]["rmse_m"] == pytest.approx((off**2).mean() ** 0.5)
-            row = re.search(rf"│ {axis} +│ {len(off)} +│ \S+ +│ (\S+) +│ (\S+) +│ (\S+)", screen)
+            row = re.search(rf"│ {axis} +│ *{len(off)} *│ *\S+ *│ *(\S+) *│ *(\S+) *│ *(\S+)", screen)
             assert float(row[1]) == pytest.approx((off**2).mean() ** 0.5, rel=6e-3)
             assert float(row[2]) == pytest.approx(off.abs().max(), rel=6e-3)
             assert row[3] == tables.check_points["point"][off.abs().idxmax()]
-    assert "c_mm" in screen
+    assert re.search(r"│ c +│ +3", screen)
 
 
 def test_report_opens_without_a_network(results):
     page = (results[0] / "report.html").read_text()
     assert page.startswith("<!DOCTYPE html>")
-    # A picture's own letters may spell anything.
-    text, pictures = re.subn(r'"data:image/png;base64,[^"]*"', '""', page)
-    assert "http" not in text
-    assert pictures >= 3
+    assert not re.search(r'<(img|script|link)[^>]*(src|href)="(?!data:)', page)
+    assert page.count('<figure role="img"') >= 3
 
 
 def test_the_command_of_a_report_is_typed_again(results, folder, monkeypatch, capsys, tmp_path):
@@ -205,7 +203,7 @@ def test_blunders_are_left_out_and_written(folder, monkeypatch, capsys, tmp_path
     assert named in screen
     code, screen, _ = run(monkeypatch, capsys, "adjust", spoilt, "--out", out, "--snoop")
     assert code == 0
-    assert f"left out: {named}" in " ".join(screen.split())
+    assert f"rejected: {named}" in " ".join(screen.split())
     left = pd.read_csv(out / "left_out.csv")
     assert left["observation"].tolist() == [named]
     assert abs(left["error"][0] - 7.0) < 5 * left["sigma"][0]

@@ -78,7 +78,7 @@ def test_a_folder_becomes_blocks_results_and_a_page(flown, tmp_path, monkeypatch
     interior = pd.read_csv(out / "result" / "interior.csv").set_index("parameter")
     assert abs(interior.loc["c_mm", "value"] - C_MM) < 4 * interior.loc["c_mm", "sigma"] + 0.01
     page = (out / "report.html").read_text()
-    for part in ("a05", "blank", "cut.jpg", "result/report.html", "result_2/report.html", "2 parts of 12, 3"):
+    for part in ("a05", "blank", "cut.jpg", "result/report.html", "result_2/report.html", "2 blocks of 12, 3"):
         assert part in page
     assert (out / "result_2" / "report.html").is_file() and (out / "block_2" / "block.toml").is_file()
 

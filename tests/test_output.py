@@ -32,7 +32,10 @@ def json_values(screen):
     for name, value in values.items():
         assert isinstance(value, TYPES[name]), name
     assert values["verdict"] in (None, "green", "amber", "red")
-    assert all(set(finding) == {"level", "text"} for finding in values["findings"])
+    assert all(
+        set(finding) == {"code", "severity", "subject", "value", "limit", "hint", "text"}
+        for finding in values["findings"]
+    )
     assert all(Path(file).is_file() for file in values["written"])
     return values
 

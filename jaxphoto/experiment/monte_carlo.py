@@ -26,7 +26,7 @@ from jaxphoto.report.draws import (
     moments,
     summary_table,
 )
-from jaxphoto.report.made import versions
+from jaxphoto.report.page import versions
 from jaxphoto.sensitivity import Bias, Readjustment, join_draws
 from jaxphoto.writing import whole_file
 

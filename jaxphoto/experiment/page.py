@@ -13,15 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from jinja2 import Environment
+from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
 
 from jaxphoto.experiment.experiment import MEAN_DIFFERENCE, Run, compare
-from jaxphoto.report import check_points_figure, new_figure, page_head
-from jaxphoto.report.document import BlockInSpace, DocumentPicture, Heading, Paragraph, Pictures, Rows
-from jaxphoto.report.made import Made, made_section
+from jaxphoto.report import check_points_figure, new_figure, plot_block
+from jaxphoto.report.block_plot import block_words
+from jaxphoto.report.page import Heading, Link, Made, Paragraph, Part, Plot, page, provenance
 from jaxphoto.report.plots import axes_or_new
-from jaxphoto.report.study_page import StudyPart, WholePicture, study_page
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
@@ -48,64 +47,42 @@ _LEGEND = Markup(
     "to the notes below the table. Tables sort by what is ours.</p>"
 )
 _SPREAD = Markup(', <span class="spread">± the standard deviation from layout to layout</span>')
-_TABLE = Environment(autoescape=True).from_string("""\
-{% if columns %}<div class="wide"><table class="as-printed">
-<thead><tr><th></th>{% for c in columns %}<th>{{ c.heading }}{% for n in c.notes %}<sup>{{ n }}</sup>{% endfor %}</th>{% endfor %}</tr></thead>
-<tbody>{% for row in rows %}<tr><td>{{ row.name }}</td>{% for cell in row.cells %}<td class="{{ cell.within }}" data-value="{{ cell.ours or cell.published.split()[0] }}">
-{%- if cell.ours %}<span class="ours">{{ cell.ours }}</span><span class="spread">{{ cell.spread }}</span>{% endif %}
-{%- if cell.published or printed %}<br><span class="paper">{{ cell.published|replace("± ", "±\u00a0") or "&nbsp;"|safe }}</span>{% endif %}
-{%- if cell.note %}<sup>{{ cell.note }}</sup>{% endif %}</td>{% endfor %}</tr>
-{% endfor %}</tbody></table></div>{% endif %}
-{% if notes %}<ol class="notes">{% for note in notes %}<li>{{ note }}</li>{% endfor %}</ol>{% endif %}
-{% if difference %}<p>Mean of |ours - printed| over the table:
-<span class="chip {{ difference.within }}">{{ difference.words }}</span></p>{% endif %}
-""")
-
-
-_INDEX = """{{ head("Experiments") }}<body>
-<h1>Experiments</h1>
-<div class="wide"><table><thead><tr><th>experiment</th><th>within</th><th>of the values promised</th></tr></thead>
-<tbody>{% for row in rows %}<tr><td><a href="{{ row.name }}.html">{{ row.title }}</a></td><td>{{ row.good }}</td><td>{{ row.judged }}</td></tr>
-{% endfor %}</tbody></table></div></body></html>
-"""
+_TABLE = Environment(loader=PackageLoader("jaxphoto.experiment"), autoescape=True).get_template("printed_table.html")
 
 
 def index_page(experiments: Mapping[str, tuple[str, pd.DataFrame]]) -> str:
-    """The index of several experiments: name -> title and comparison."""
-    rows = [
-        {
-            "name": name,
-            "title": title,
-            "good": int((t["within"] == "yes").sum()),
-            "judged": int((t["within"] != "").sum()),
-        }
-        for name, (title, t) in experiments.items()
-    ]
-    return Environment(autoescape=True).from_string(_INDEX).render(head=page_head, rows=rows)
+    """A page with links to those of several experiments: name -> title and comparison."""
+    parts: list[Part] = []
+    for name, (title, t) in experiments.items():
+        good, judged = int((t["within"] == "yes").sum()), int((t["within"] != "").sum())
+        parts.append(Link(f"{title}: {good} of {judged} printed values with a tolerance are within it", f"{name}.html"))
+    return page("Experiments", parts)
 
 
 def experiment_page(run: Run, comparison: pd.DataFrame, made: Made | None = None) -> str:
     """The page as HTML: agreement, the block of the first layout, each table as printed, check points."""
     tables = [table_texts(str(name), cells) for name, cells in comparison.groupby("table", sort=False)]
     judged, good = (sum(table[name] for table in tables) for name in ("judged", "good"))
-    if judged:
-        verdict = f"{good} of {judged} printed values for which a tolerance is promised are within it"
-    else:
-        verdict = "nothing is promised here: no printed value has a tolerance"
+    verdict = f"{good} of {judged} printed values with a tolerance are within it"
+    n = int(comparison["published"].notna().sum())
+    verdict += f"; {n - judged} of {n} printed values have no tolerance" if n > judged else ""
+    if not judged:
+        verdict = "no printed value has a tolerance"
     colour = "" if not judged else "green" if good == judged else "amber"
-    parts = list(_parts(run, comparison, tables))
-    return study_page(run.experiment.title, [verdict], [*parts, *(made_section(made) if made else ())], colour, _STYLE)
+    parts = [*_parts(run, comparison, tables), *(provenance(made) if made else ())]
+    return page(run.experiment.title, parts, (verdict, colour), _STYLE)
 
 
-def _parts(run: Run, comparison: pd.DataFrame, tables: list[dict]) -> Iterator[StudyPart]:
-    yield from (Paragraph(f"left out: {failure}", "warning") for failure in run.failures)
+def _parts(run: Run, comparison: pd.DataFrame, tables: list[dict]) -> Iterator[Part]:
+    yield from (Paragraph(f"skipped: {failure}", "warning") for failure in run.failures)
     yield Heading("Within the tolerances")
-    counts = ((t["title"], *((str(t["good"]), str(t["judged"])) if t["judged"] else ("", "none"))) for t in tables)
-    yield Rows(("table", "within", "of the values promised"), tuple(counts))
+    counts = [(t["title"], t["good"], t["judged"]) for t in tables]
+    yield pd.DataFrame(counts, columns=["table", "within", "values with a tolerance"])
     if any(table["judged"] for table in tables):
-        yield Pictures((DocumentPicture(partial(draw_agreement, comparison=comparison), _AGREEMENT, 3.6),))
+        yield [Plot(partial(draw_agreement, comparison=comparison), _AGREEMENT, 3.6)]
+    first = next(iter(run.first.values()))
     yield Heading("Block of the first layout")
-    yield BlockInSpace(next(iter(run.first.values())))
+    yield [Plot(lambda ax: plot_block(first.adjusted, ax), block_words(first.adjusted.block), 4.2)]
     layouts = run.cells["layout"].nunique()
     many = layouts > 1
     yield Heading("Tables")
@@ -115,7 +92,7 @@ def _parts(run: Run, comparison: pd.DataFrame, tables: list[dict]) -> Iterator[S
         yield Markup(_TABLE.render(table))
     if check := {name: of for name, of in run.first.items() if len(of.check_points)}:
         yield Heading("Check points of the first layout")
-        yield WholePicture.of(check_points_figure(check), "discrepancies at check points, in plan and in height")
+        yield Plot(check_points_figure(check), "discrepancies at check points, in plan and in height")
 
 
 def table_texts(name: str, cells: pd.DataFrame) -> dict:
@@ -197,8 +174,8 @@ def write_runs(runs: Mapping[Path, Run], out: Path, made: Mapping[Path, Made] = 
     with whole_folder(out) as work:
         pd.concat(tables.values(), ignore_index=True).to_csv(work / "tables.csv", index=False)
         pd.concat(cells, ignore_index=True).to_csv(work / "cells.csv", index=False)
-        for name, page in pages.items():
-            (work / name).write_text(page, encoding="utf-8")
+        for name, content in pages.items():
+            (work / name).write_text(content, encoding="utf-8")
 
 
 # Labels ----------------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ def compare(
 
     `camera` and `camera_b` name it in either where a block has several. `points` (mm from the centre) are those of the
     format at which rays are compared, 15 x 11 from edge to edge where they are not given; `method` is what the
-    orientation of images may take up (docs/stability.md). `jaxphoto.report.change` has tables and words of the result.
+    orientation of images may take up (docs/stability.md). `jaxphoto.report.stability` has tables and sentences.
     Raises InputError for adjustments that did not converge, formats that differ, and bundles that cannot be compared.
     """
     for adjusted in (first, second):

@@ -11,7 +11,7 @@ from jaxphoto import InputError, Outcome, RankError, Weighted, adjust, covarianc
 from jaxphoto.camera import CameraSpline
 from jaxphoto.georeferencing import StripSpline
 from jaxphoto.io import read_block, write_block
-from jaxphoto.report.camera_drift import differences_words
+from jaxphoto.report.verdict import differences_finding
 from jaxphoto.statistics import camera_spline_differences
 from tests.camera.test_camera_rates import TRUE, at, changing_block
 
@@ -99,10 +99,10 @@ def test_it_is_tested_without_what_was_known():
 
 def test_words():
     (wander,) = camera_spline_differences(*found())
-    assert differences_words(wander).startswith("camera one wandered during its flight (p ")
-    assert " mm at -50 min to " in differences_words(wander)
+    finding = differences_finding(wander)
+    assert (finding.code, finding.subject) == ("drift", "camera one") and " mm at -50 min to " in finding.text
     still = wander._replace(more=wander.more._replace(p_value=0.4))
-    assert differences_words(still).startswith("no wandering of camera one is seen (p = 0.4); any one knot alone would")
+    assert differences_finding(still).code == "no_drift"
 
 
 def test_it_comes_back_from_a_block_folder(tmp_path):

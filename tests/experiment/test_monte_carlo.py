@@ -237,9 +237,9 @@ def test_the_command(folder, monkeypatch, capsys, tmp_path):
     assert code == 0
     assert "20 draws, 20 converged" in printed
     page = (out / "report.html").read_text(encoding="utf-8")
-    assert "20 draws, of which 20 converged." in page and "--sigma-m 0.05,0.05,0.1" in page
+    assert "20 draws, 20 converged." in page and "--sigma-m 0.05,0.05,0.1" in page
     assert (
-        "Images, points and knots of trajectories stand in summary.csv." in page
+        "Images, points and trajectory knots are in summary.csv." in page
         and f"exterior.{simulated(NOMINAL).block.images[0]}" not in page
     )
     draws = pd.read_parquet(out / "draws.parquet")

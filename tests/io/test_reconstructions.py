@@ -16,7 +16,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.extras.formats import Project, ProjectCamera, convert, export, read_source
 from jaxphoto.initial.approximate import approximate
 from jaxphoto.io import read_block, write_block
-from jaxphoto.report.source_words import assumed_pixel_words, report_title
+from jaxphoto.report.results import assumed_pixel_words, report_title
 from jaxphoto.unknowns import FREE
 from tests.io.test_exports import CAMERAS, SENSOR, fisheye, photographs, plane
 
@@ -392,7 +392,7 @@ def test_a_block_keeps_where_it_is_from_and_that_its_pixel_is_assumed(tmp_path):
     block = read_source(tmp_path / "again")
     assert block.converted_from == f"opensfm: {tmp_path.name}/opensfm" and block.sensors["v2 one"].pixel_assumed
     assert report_title(block) == f"opensfm, converted from opensfm: {tmp_path.name}/opensfm"
-    assert "pixel of every camera is not known: 0.001 mm is assumed. c," in assumed_pixel_words(block.sensors)
+    assert "of every camera is unknown: 0.001 mm is assumed." in assumed_pixel_words(block.sensors)
     # A pixel that is known to be of that size is not assumed.
     known = dataclasses.replace(block.sensors["v2 one"], pixel_assumed=False)
     write_block(dataclasses.replace(block, sensors={"v2 one": known}), tmp_path / "known")

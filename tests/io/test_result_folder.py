@@ -111,7 +111,7 @@ def test_what_is_no_result_of_its_block_is_told_in_a_sentence(own, spoil, messag
 
 def test_a_red_verdict_is_said(own):
     path = own / "result" / "summary.json"
-    alarm = {"verdict": "red", "findings": [{"level": "alarm", "text": "the test of sigma naught fails"}]}
+    alarm = {"verdict": "red", "findings": [{"severity": "error", "text": "the test of sigma naught fails"}]}
     path.write_text(json.dumps(json.loads(path.read_text()) | alarm))
     with pytest.warns(UserWarning, match="the verdict on this adjustment is red: the test of sigma naught fails"):
         adjusted_block(own / "result")

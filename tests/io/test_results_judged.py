@@ -16,7 +16,7 @@ from tests.commands import run
 
 FAILED = {"passed": False, "expected_sigma0": 1.0}
 AMBER = {"converged": True, "verdict": "amber", "sigma0": 0.53, "global_test": FAILED}
-RED = {"verdict": "red", "findings": [{"level": "alarm", "text": "T1 is off"}]}
+RED = {"verdict": "red", "findings": [{"severity": "error", "text": "T1 is off"}]}
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,7 @@ RED = {"verdict": "red", "findings": [{"level": "alarm", "text": "T1 is off"}]}
         ({"converged": False, "outcome": "too few steps"}, "no results: too few steps"),
         (RED, "the verdict on .* is red: T1 is off"),
         ({"verdict": "red", "findings": "none"}, "is red: see its report"),
-        ({"verdict": "red", "findings": [{"level": "alarm", "text": "\x1b[2J"}]}, "is red: see its report"),
+        ({"verdict": "red", "findings": [{"severity": "error", "text": "\x1b[2J"}]}, "is red: see its report"),
         (AMBER, r"sigma naught of this adjustment is 0\.53, expected 1, which is no chance"),
         (AMBER | {"sigma0": "half"}, "is nan, expected 1"),
     ],
@@ -86,7 +86,7 @@ def test_sigma_naught_that_fails_its_test_is_said_and_travels_with_the_camera(re
             code, _, error = run(monkeypatch, capsys, "adjust", tmp_path / f"copy_of_{named.name}", "--out", rests)
         assert code == 0 and said in " ".join(error.split())
         findings = read_summary(rests)["findings"]
-        assert any(f["level"] == "warning" and f["text"].endswith(read.doubts[0]) for f in findings), findings
+        assert any(f["severity"] == "warning" and f["text"].endswith(read.doubts[0]) for f in findings), findings
         assert "this adjustment rests on an earlier one" in read_camera_file(rests).note
         assert said in read_camera_file(rests).note
 

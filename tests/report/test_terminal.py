@@ -7,8 +7,8 @@ import pytest
 from rich.console import Console
 
 from jaxphoto import Tables
-from jaxphoto.report import Finding, Level, Verdict, print_adjustment, residuals_figure
-from jaxphoto.report.plots import drawn, new_figure
+from jaxphoto.report import Finding, Verdict, plot_residuals, print_adjustment
+from jaxphoto.report.plots import label, new_figure
 from tests.blocks import adjusted
 
 NAMES = ("[/red]", "[bold]x", ":smile:", "$\\frac{1$", "a$b$c", "\\$", "\x1b[31mred", "x_$^{")
@@ -27,7 +27,7 @@ def test_a_report_on_any_console_has_the_names(name):
     unknowns = dataclasses.replace(tables.adjusted.unknowns, interior={name: _camera(tables.adjusted)})
     tables.adjusted = dataclasses.replace(tables.adjusted, block=block, unknowns=unknowns)
     console = Console(width=200, file=io.StringIO())
-    print_adjustment(tables, Verdict((Finding(Level.WARNING, f"image {name} is far off"),)), console)
+    print_adjustment(tables, Verdict((Finding("message", "warning", f"image {name} is far off"),)), console)
     said = console.file.getvalue()
     plain = name.replace("\x1b", "\\x1b")
     assert said.count(plain) == 2 + len(tables.significance)
@@ -37,9 +37,9 @@ def test_a_report_on_any_console_has_the_names(name):
 def test_names_in_pictures_are_no_formulas(name):
     figure = new_figure(2.0, 2.0)
     axes = figure.subplots()
-    axes.plot([0, 1], [0, 1], label=drawn(name) or "none")
-    axes.set_title(drawn(name))
-    axes.set_xticks([0.5], [drawn(name)])
+    axes.plot([0, 1], [0, 1], label=label(name) or "none")
+    axes.set_title(label(name))
+    axes.set_xticks([0.5], [label(name)])
     axes.legend()
     figure.savefig(io.BytesIO(), format="png")
     shown, formula = axes.title._preprocess_math(axes.title.get_text())
@@ -53,4 +53,4 @@ def test_the_camera_of_residuals_is_no_formula():
         block, sensors={name: next(iter(block.sensors.values()))}, image_camera=(name,) * len(block.images)
     )
     tables.adjusted = dataclasses.replace(tables.adjusted, block=block)
-    residuals_figure(tables, name).savefig(io.BytesIO(), format="png")
+    plot_residuals(tables, name, new_figure(4, 3).subplots()).figure.savefig(io.BytesIO(), format="svg")

@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.spatial import Delaunay
 
-from jaxphoto.report.flight.coverage import draw_overlap
+from jaxphoto.report.plots import draw_overlap
 from jaxphoto.statistics.block_geometry import (
     Coverage,
     coverage,

@@ -9,7 +9,8 @@ import pytest
 
 from jaxphoto import Tables, angle_differences, covariance, point_differences
 from jaxphoto.observations import ControlRows
-from jaxphoto.report.positional_accuracy import accuracy_sentences, accuracy_table
+from jaxphoto.report.results import accuracy_sentences
+from jaxphoto.report.tables import accuracy_table
 from jaxphoto.statistics import (
     ComponentAccuracy,
     check_discrepancies,
@@ -144,7 +145,7 @@ def test_a_survey_whose_errors_nobody_told_claims_nothing():
     assert plan.claimed and not height.claimed and not space.claimed
     assert height.rmse_m == pytest.approx(0.03)
     messages = " ".join(accuracy_sentences(positional_accuracy(check_rows(thirty(), sigma))))
-    assert "survey not known" in messages and "vertical, three-dimensional" in messages
+    assert "survey unknown" in messages and "vertical, three-dimensional" in messages
 
 
 def test_a_shift_and_a_poor_survey_are_named():
@@ -156,7 +157,7 @@ def test_a_shift_and_a_poor_survey_are_named():
     assert [axis.biased for axis in few.axes] == [False, True, False]
     assert not any(axis.biased for axis in positional_accuracy(check_rows(np.full((1, 3), 0.05), 0.01)).axes)
     poor = accuracy_sentences(positional_accuracy(check_rows(thirty(), [0.1, 0.1, 0.001])))
-    assert "not twice as accurate as what it tests (horizontal)" in poor[-1]
+    assert "not twice as accurate as the tested product (horizontal)" in poor[-1]
 
 
 def test_no_check_points_say_nothing():

@@ -8,8 +8,8 @@ from scipy import stats
 
 from jaxphoto import FIXED, FREE, Tables, Weighted, adjust, covariance
 from jaxphoto.camera import CameraRates
-from jaxphoto.report.camera_drift import drift_words
 from jaxphoto.report.results import table_names
+from jaxphoto.report.verdict import drift_finding
 from jaxphoto.statistics import CameraDrift, ZeroTest, camera_drifts, chi_square_p
 from tests.camera.test_camera_rates import TRUE, changing_block, with_rates
 
@@ -76,25 +76,22 @@ def test_the_table_has_a_row_a_rate_where_cameras_change():
 
 def words(parameters, change, sigma, p_values, detectable, p_value, hours=1.0):
     test = ZeroTest(*map(np.array, (change, sigma, p_values, detectable)), p_value)
-    return drift_words(CameraDrift("kodak", CameraRates, hours, parameters, test))
+    return drift_finding(CameraDrift("kodak", CameraRates, hours, parameters, test)).text
 
 
 def test_what_changed_is_said_with_its_standard_deviation():
     moved = words(("c", "xp", "k1"), [4.8e-3, -3.1e-3, 2e-9], [1.9e-3, 1e-3, 3e-9], [0.011, 0.002, 0.5],
                   [5e-3, 3e-3, 9e-9], 0.003)  # fmt: skip
-    assert moved == (
-        "camera kodak changed over the 60 min of its flight (p = 0.003): c grew by 4.8 +- 1.9 um, "
-        "x_p changed by -3.1 +- 1.0 um"
-    )
-    assert "c shrank by 4.8 +- 1.9 um" in words(("c",), [-4.8e-3], [1.9e-3], [0.01], [5e-3], 0.01)
+    assert moved == "camera kodak changed over 60 min (p = 0.003): c by 4.8 +- 1.9 um, x_p by -3.1 +- 1.0 um"
+    assert "c by -4.8 +- 1.9 um" in words(("c",), [-4.8e-3], [1.9e-3], [0.01], [5e-3], 0.01)
 
 
 def test_what_would_have_been_seen_is_said_where_nothing_is():
     still = words(("c", "xp", "yp"), [1e-3] * 3, [1.9e-3] * 3, [0.6] * 3, [5.3e-3, 2.1e-3, np.inf], 0.62, 2.0)
     assert still == (
-        "no drift of camera kodak is seen (p = 0.6); over its 2 h this flight would have shown, with a probability of "
-        "80%, 5.3 um of c, 2.1 um of x_p, no change of y_p at all"
+        "camera kodak: no significant change over 2 h (p = 0.6); MDB of a change (power 80 %): c 5.3 um, x_p 2.1 um, "
+        "y_p none"
     )
     hardly = words(("c", "xp"), [0.1] * 2, [0.4] * 2, [0.6] * 2, [8.2, 0.0994], 0.62, 2.0)
-    assert hardly.endswith("of 80%, 8.2 mm of c, 99 um of x_p")
-    assert "c grew by 1.20 +- 0.38 mm" in words(("c",), [1.2], [0.38], [0.01], [1.1], 0.01)
+    assert hardly.endswith(": c 8.2 mm, x_p 99 um")
+    assert "c by 1.20 +- 0.38 mm" in words(("c",), [1.2], [0.38], [0.01], [1.1], 0.01)

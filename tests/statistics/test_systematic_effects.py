@@ -13,7 +13,6 @@ from jaxphoto import FIXED, Tables, adjust, covariance, read_block
 from jaxphoto.camera import get_parameter, set_parameter
 from jaxphoto.observations.priors import KnownParameters
 from jaxphoto.report import verdict_of
-from jaxphoto.report.findings import Level
 from jaxphoto.simulation import remeasure
 from jaxphoto.statistics import systematic_effect_tests, systematic_effects
 from jaxphoto.statistics.hat_matrix import HatMatrix
@@ -68,7 +67,8 @@ def test_a_lens_term_that_is_held_is_named():
     tables = Tables(a)
     result = tables.tested_trends[0]
     assert result.p_value < 1e-10 and result.hints[0].term.name == term and result.hints[0].share > 0.8
-    messages = [f.text for f in verdict_of(tables).findings if "over the format" in f.text]
+    findings = verdict_of(tables).findings
+    messages = [f.text for f in findings if f.code == "systematic" and "over the format" in f.subject]
     assert len(messages) == 1 and f"{term}, which is fixed: free it" in messages[0]
 
 
@@ -99,7 +99,7 @@ def test_stations_that_are_all_off_alike_are_named_before_any_single_one():
     tables = Tables(adjust(block.with_observations({"stations": dataclasses.replace(rows, value=value)})))
     assert tables.blunders.suspects
     alarm = verdict_of(tables).findings[0]
-    assert alarm.level == Level.ALARM
+    assert alarm.severity == "error"
     assert "stations as a whole" in alarm.text and ", Z +51" in alarm.text and "flight_bias" in alarm.text
     (hint,) = [t.hints[0] for t in tables.tested_trends if t.pattern.what == "stations as a whole"]
     assert abs(hint.amount - 48.0) < 3 * hint.sigma
