@@ -125,7 +125,7 @@ def test_a_camera_that_has_changed_since_its_calibration_is_told_first():
     tables = Tables(adjust(dataclasses.replace(larger, more=(known,))))
     verdict = verdict_of(tables)
     assert verdict.colour == "red"
-    assert "contradicts what was known of camera kodak beforehand" in verdict.texts[0]
+    assert "contradicts the prior information of camera kodak" in verdict.texts[0]
     assert "c_mm -0.06" in verdict.texts[0]
     # As surprising as the difference from the calibration by this block alone, by the covariances of both.
     (found,) = [t for t in tables.tested_trends if t.pattern.begins]
