@@ -7,7 +7,7 @@ EXTRAS = {
     "laspy": "lidar", "lazrs": "lidar", "rasterio": "lidar",
     "cv2": "photos", "faiss": "photos", "yaml": "photos",
     "pyarrow": "parquet",
-    "plotly": "report", "xarray": "report",
+    "xarray": "report",
     "blackjax": "posterior",
 }  # fmt: skip
 """The extra that installs each optional module."""
