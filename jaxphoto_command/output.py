@@ -202,7 +202,7 @@ class Output:
         seconds = sum(self._compile_s.values())
         if not self._json:
             if seconds >= COMPILE_NOTE_S and not self._quiet:
-                typer.echo(f"compiled in {seconds:.1f} s (cached for similar blocks)", err=True)
+                typer.echo(f"compilation: {seconds:.1f} s, summed over cores (cached for similar blocks)", err=True)
             return
         import jaxphoto
 
