@@ -27,6 +27,7 @@ QUICK = {
     "block_parts": ("io/test_bad_blocks.py",),
     "least_squares": ("test_least_squares.py",),
     "losses": ("test_losses.py",),
+    "optional": ("test_lean.py::test_every_extra_is_declared_and_documented",),
     "camera": ("camera/test_additional_parameters.py", "camera/test_balance.py", "camera/test_principal_points.py"),
     "jaxphoto_command": (
         "test_cli.py::test_version_and_help",
