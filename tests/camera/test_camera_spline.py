@@ -121,7 +121,7 @@ def test_it_comes_back_from_a_block_folder(tmp_path):
         ("interval_s = -1.0", r"interval_s = -1\.0 is no positive number"),
         ("interval_s = 1e308", r"interval_s = 1e\+308 is no positive number of seconds up to 1e\+09"),
         ("yp_spline = { walk_mm = 1, sigma = 2 }", r"yp_spline\] sigma: no such key is known; use walk_mm"),
-        ("c_spline_mm = [1.0]", r"c_spline_mm: \[1\.0\] is not a list of 6 numbers"),
+        ("c_spline_mm = [1.0]", r"c_spline_mm: \[1\.0\] has 1 entries; give 6"),
     ):
         key = wrong.split(" = ")[0]
         toml.write_text(

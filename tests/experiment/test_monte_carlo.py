@@ -255,7 +255,7 @@ def test_the_command(folder, monkeypatch, capsys, tmp_path):
 @pytest.mark.parametrize(
     "options, words",
     [
-        (("--bias", "station", "--sigma-m", "0.1", "--on", "S9", "--per", "strip"), "no strip 'S9'"),
+        (("--bias", "station", "--sigma-m", "0.1", "--on", "S9", "--per", "strip"), "unknown strip 'S9'"),
         (("--bias", "station", "--sigma-m", "0.1", "--draws", "0"), "must be positive, got 0"),
         (("--bias", "station", "--sigma-m", "0.1", "--draws", "-5"), "must be positive, got -5"),
         (("--bias", "station", "--sigma-deg", "0.1"), "takes --sigma-m"),
