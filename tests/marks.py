@@ -27,7 +27,6 @@ QUICK = {
     "block_parts": ("io/test_bad_blocks.py",),
     "least_squares": ("test_least_squares.py",),
     "losses": ("test_losses.py",),
-    "optional": ("test_lean.py::test_every_extra_is_declared_and_documented",),
     "camera": ("camera/test_additional_parameters.py", "camera/test_balance.py", "camera/test_principal_points.py"),
     "jaxphoto_command": (
         "test_cli.py::test_version_and_help",
@@ -63,6 +62,7 @@ QUICK = {
         "sensitivity/test_network_search.py::test_what_cannot_be_searched_is_said_in_a_sentence",
         "sensitivity/test_network_search.py::test_grid_and_random_designs_fill_the_region",
     ),
+    "optional": ("test_lean.py::test_every_extra_is_declared_and_documented",),
     "short_repr": ("test_front_door.py",),
     "single": ("test_front_door.py",),
     "simulation": ("simulation/test_flight_plan.py", "simulation/test_recipes.py", "simulation/test_terrain.py"),

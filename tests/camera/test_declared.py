@@ -103,7 +103,7 @@ def test_block_toml_holds_it_and_gives_it_back():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"way": "up"}, '\'up\' is neither "out" nor "in"; choose one of them'),
+        ({"way": "up"}, 'way: \'up\' is unknown; write "out" or "in"'),
         ({"sign": "add"}, "no such key is known; use width_px, .*, interior, unknowns, .*, way"),
         ({"projection": "fish"}, "no projection model is called 'fish'; choose one of perspective, equidistant"),
         ({"distortion": "tangend"}, "no distortion model is called 'tangend'; choose one of brown, affine_brown"),

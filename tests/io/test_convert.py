@@ -229,7 +229,7 @@ def test_a_bad_row_of_an_aicon_file_is_named(data_dir, tmp_path):
         (0, "-28.78507", "c", r"example\.ior, row 1: a cell is not a finite number; correct it"),
         (4, "35.96800", "9" * 400, r"example\.ior, row 5: a cell is not a finite number; correct it"),
         (4, "35.96800", "0", r"example\.ior, row 5: the format in mm and pixels is positive; correct it"),
-        (4, "35.96800", "0.035968", r"pixel_mm: a pixel of .* cannot be"),
+        (4, "35.96800", "0.035968", r"pixel_mm: .* is no size of a pixel"),
     ],
 )
 def test_a_bad_camera_of_an_aicon_project_is_named(data_dir, tmp_path, line, old, new, message):

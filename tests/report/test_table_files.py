@@ -153,7 +153,7 @@ def test_the_command_writes_those_that_are_asked_for(tmp_path, monkeypatch, caps
     assert code == 0 and "2 tables" in screen
     assert {p.name for p in out.glob("*.tex")} == {"interior.tex", "exterior.tex"}
     for words, message in (
-        (("--to", "excel"), "--to excel: there are csv, parquet, markdown, latex"),
+        (("--to", "excel"), "'excel' is not one of"),
         (("--to", "latex", "--only", "inner"), "has no table inner; it has check_points, exterior, interior"),
     ):
         code, _, error = run(monkeypatch, capsys, "tables", tmp_path / "results", *words, "--out", tmp_path / "no")

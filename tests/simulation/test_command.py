@@ -83,7 +83,7 @@ def test_mistakes_end_with_one_sentence_and_nothing_written(tmp_path, monkeypatc
     recipe.write_text((RECIPES / "000.toml").read_text().replace("= 60.0\nside", "= 160.0\nside"))
     code, said, errors = run(monkeypatch, capsys, "simulate", recipe, "--out", tmp_path / "block")
     assert (code, said) == (2, "")
-    assert errors.startswith("jaxphoto: bad.toml, [flight] forward_overlap_percent: an overlap of 160 %")
+    assert errors.startswith("jaxphoto: bad.toml, [flight] forward_overlap_percent: 160")
     assert [p.name for p in tmp_path.iterdir()] == ["bad.toml"]
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("mine")

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from jaxphoto.camera import InteriorOrientation, OpenCvFisheye, Sensor
 from jaxphoto.errors import quoted
@@ -186,6 +185,8 @@ def _recognise_kalibr(path: Path, text: str) -> bool:
 
 def yaml_cameras(source: CameraSource) -> dict[str, dict[str, Any]]:
     """Return the tables of a YAML file by name."""
+    import yaml
+
     try:
         content = yaml.safe_load(source.text())
     except yaml.YAMLError as error:
