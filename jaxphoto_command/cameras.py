@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
@@ -37,7 +37,7 @@ def stability(
     from jaxphoto.report.stability import print_stability, stability_summary, write_stability
     from jaxphoto.stability import analyse
     from jaxphoto.writing import check_folder
-    from jaxphoto_command.certificate import compared, read_two
+    from jaxphoto_command.certificate import read_two
 
     if not 0 <= relief < 1:
         raise typer.BadParameter(f"--relief {relief:g}: give a fraction of the object distance, 0 <= relief < 1.")
@@ -48,10 +48,7 @@ def stability(
         points = opt.grid_points(a.sensor, grid, extent)
         analysis = analyse(a.interior, b.interior, points, (a.covariance, b.covariance), relief)
     noise_mm = noise_px * a.sensor.pixel_mm
-    sets = compared("A", first, a), compared("B", second, b)
-    for letter, file in (("A", a), ("B", b)):
-        if file.note:
-            output.warn(f"{letter}: {file.note}")
+    sets = _compared(output, (first, second), (a, b))
     print_stability(analysis, sets, a.sensor.pixel_mm, noise_mm, method, output.screen)
     output.add(**stability_summary(analysis, sets, noise_mm, method))
     if out is not None:
@@ -77,7 +74,7 @@ def compare(
     from jaxphoto.report.stability import change_summary, print_change, write_change
     from jaxphoto.stability import change
     from jaxphoto.writing import check_folder
-    from jaxphoto_command.certificate import check_two_calibrations, compared, read_two, share_measurements
+    from jaxphoto_command.certificate import check_two_calibrations, read_two, share_measurements
 
     if out is not None:
         check_folder(out, first, second)
@@ -88,10 +85,7 @@ def compare(
     with output.progress("comparing"):
         points = opt.grid_points(a.sensor, grid, extent)
         result = change(a.interior, b.interior, points, (a.covariance, b.covariance), method)
-    sets = compared("A", first, a), compared("B", second, b)
-    for letter, file in (("A", a), ("B", b)):
-        if file.note:
-            output.warn(f"{letter}: {file.note}")
+    sets = _compared(output, (first, second), (a, b))
     print_change(result, sets, a.sensor, output.screen)
     output.add(**change_summary(result, a.sensor))
     if out is not None:
@@ -199,3 +193,14 @@ def models(
     output.wrote(out, f"results in {out} (open report.html)")
     if not choice.by_bic:
         raise typer.Exit(1)
+
+
+def _compared(output: Output, paths: tuple[Path, Path], files: tuple[Any, Any]) -> tuple[Any, Any]:
+    """Return both calibrations for a comparison, A and B, and print the notes of their files."""
+    from jaxphoto_command.certificate import compared
+
+    for letter, file in zip("AB", files, strict=True):
+        if file.note:
+            output.warn(f"{letter}: {file.note}")
+    a, b = (compared(letter, *pair) for letter, pair in zip("AB", zip(paths, files, strict=True), strict=True))
+    return a, b

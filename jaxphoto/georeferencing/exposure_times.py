@@ -11,8 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-GPS_EPOCH_UNIX_S = 315_964_800.0
-"""6 January 1980 UTC, the begin of GPS weeks."""
 LEAP_SECONDS = 18.0
 """GPS time minus UTC since 2017."""
 WEEK_S = 604_800.0

@@ -238,12 +238,6 @@ def each_row(read: Callable[[int, str], T], numbered: Iterable[tuple[int, str]])
     return values
 
 
-def _objects(cells: list[str]) -> np.ndarray:
-    values = np.empty(len(cells), object)
-    values[:] = cells
-    return values
-
-
 def natural(cell: str) -> int | None:
     """The whole number, zero or more, that a cell is; None where it is none, or has more digits than any count."""
     return int(cell) if cell.isascii() and cell.isdigit() and len(cell) <= _DIGITS else None

@@ -147,7 +147,9 @@ def read(path: Path) -> Project:
         )
     cameras = {str(k): _project_camera(path, model.cameras[k]) for k in sorted({i.camera for i in images})}
     quaternions = np.array([i.quaternion for i in images]).reshape(-1, 4)[:, [1, 2, 3, 0]]
-    rotations = scipy.spatial.transform.Rotation.from_quat(quaternions).as_matrix().reshape(-1, 3, 3)
+    # SciPy before 1.17 takes no empty array.
+    of = scipy.spatial.transform.Rotation.from_quat
+    rotations = of(quaternions).as_matrix() if len(quaternions) else np.zeros((0, 3, 3))
     moved = np.array([i.translation for i in images]).reshape(-1, 3)
     folder = path.resolve().parent.name
     return Project(

@@ -49,8 +49,6 @@ LEAST_MATCHES = 15
 """Of a pair of photographs: fewer false ones agree with some orientation by chance."""
 LEAST_POINTS = 10
 """That an oriented photograph sees."""
-# Matches off the epipolar line are beyond so many a priori standard deviations once the camera is known.
-_EPIPOLAR = 4.0
 
 
 class GrossErrors(NamedTuple):
