@@ -11,13 +11,13 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment import Sizes
-from jaxphoto.arrays import on_device
+from jaxphoto.adjustment import PaddedSizes
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.initial.matches import PairMatches
 from jaxphoto.io.kept_pieces import KeptPieces, name_of
-from jaxphoto.observations import ImageRows
+from jaxphoto.observations import ImagePoints
 from jaxphoto.procedures.orientation import GrossErrors, OrientationReport, Oriented, orient
 from jaxphoto.procedures.orientation.orient_photographs import CAMERA, METHOD, photographs_block
 from jaxphoto.procedures.orientation.related_pairs import Report
@@ -97,13 +97,13 @@ def unpacked(arrays: dict[str, np.ndarray], sensor: Sensor, interior: InteriorOr
         arrays["images"].tolist(),
         arrays["points"].tolist(),
         sensor,
-        (jax.tree.map(on_device, interior), priors),
+        (jax.tree.map(as_jax_array, interior), priors),
         (exterior, arrays["xyz"]),
-        ImageRows(arrays["image"], arrays["point"], arrays["xy"], arrays["sigma"]),
+        ImagePoints(arrays["image"], arrays["point"], arrays["xy"], arrays["sigma"]),
     )
     report = json.loads(str(arrays["report"]))
     report = {key: tuple(value) if isinstance(value, list) else value for key, value in report.items()}
     gross = GrossErrors(**report.pop("gross_errors"))
     *most, rows = json.loads(str(arrays["sizes"]))
-    sizes = Sizes._make([*most, tuple((group, number) for group, number in rows)])
+    sizes = PaddedSizes._make([*most, tuple((group, number) for group, number in rows)])
     return Oriented(block, arrays["residuals_mm"], OrientationReport(**report, gross_errors=gross), sizes)

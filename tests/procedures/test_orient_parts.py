@@ -10,7 +10,7 @@ from jaxphoto.camera import InteriorOrientation, Smac
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.initial.matches import tracks
-from jaxphoto.observations import Distances, StationRows
+from jaxphoto.observations import CameraPositions, Distances
 from jaxphoto.procedures.orientation.depths import supported
 from jaxphoto.procedures.orientation.finish import _open
 from jaxphoto.procedures.orientation.growing import _starts, _worth
@@ -244,7 +244,7 @@ def elsewhere():
 def stations_of(there, images):
     """Stations of `images` as rows of a block."""
     n = len(images)
-    return StationRows(
+    return CameraPositions(
         np.repeat(images, 3), np.tile(np.arange(3), n), there.positions[images].ravel(), np.full(3 * n, 0.1)
     )
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import InteriorOrientation, Sensor, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
+from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
 from jaxphoto.procedures.calibration.board import Board, Detection
 from jaxphoto.unknowns import FREE, Unknowns, default_priors
 
@@ -62,7 +62,7 @@ def calibration_block(
     seen, point = np.unique(rows.point, return_inverse=True)
     xyz = board.xyz_m[seen]
     who, axis = np.repeat(np.arange(len(seen)), 3), np.tile(np.arange(3), len(seen))
-    known = ControlRows(who, axis, xyz.ravel(), np.full(len(who), board_sigma_m or 0.0))
+    known = ControlCoordinates(who, axis, xyz.ravel(), np.full(len(who), board_sigma_m or 0.0))
     interior = jax.tree.map(lambda v: np.asarray(v, float), interior)
     unknowns = Unknowns({CAMERA: interior}, exterior, xyz, {}, {})
     priors = default_priors(unknowns)
@@ -78,11 +78,11 @@ def calibration_block(
         image_mount=none,
         image_strip=none,
         image_time=np.zeros(n),
-        image_points=ImageRows(rows.image, point, rows.xy_mm, rows.sigma_mm),
-        control=ControlRows.none() if board_sigma_m is None else known,
-        fixed=known if board_sigma_m is None else ControlRows.none(),
-        check=ControlRows.none(),
-        stations=StationRows.none(),
+        image_points=ImagePoints(rows.image, point, rows.xy_mm, rows.sigma_mm),
+        control=ControlCoordinates.none() if board_sigma_m is None else known,
+        fixed=known if board_sigma_m is None else ControlCoordinates.none(),
+        check=ControlCoordinates.none(),
+        stations=CameraPositions.none(),
         attitudes=Attitudes.none(),
         distances=Distances.none(),
         datum=Datum(),

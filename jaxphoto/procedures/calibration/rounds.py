@@ -32,7 +32,7 @@ from jaxphoto.procedures.calibration.parameters import distortion_model, free_pa
 from jaxphoto.procedures.calibration.reprojection import reprojection_residuals, rms_px
 from jaxphoto.procedures.calibration.resections import resected
 from jaxphoto.procedures.calibration.start import nearest_distortion, rough_interior
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.unknowns import FIXED
 
 LEAST_IMAGES = 3
@@ -46,7 +46,7 @@ _FIRST_SIGMA_PX = 1.0
 _FIRST = ("c_mm", "k1", "k2", "a1", "a2", "a14")
 
 
-@shown
+@pretty_repr
 class Calibration(NamedTuple):
     """A calibrated camera, and what became of the photographs."""
 

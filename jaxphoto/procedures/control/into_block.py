@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxphoto.arrays import on_device
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.block import Block
 from jaxphoto.block_parts import Datum, Start
 from jaxphoto.georeferencing import FlightBias
-from jaxphoto.observations import ControlRows, ImageRows
+from jaxphoto.observations import ControlCoordinates, ImagePoints
 from jaxphoto.parameters import AbstractParameters
 from jaxphoto.procedures.control.marked import Marked
 from jaxphoto.unknowns import FIXED, FREE
@@ -32,8 +32,8 @@ def into_block(
     begin, in the frame of the block.
     """
     n = len(block.points)
-    new = ImageRows(
-        rows.image, rows.point + n, on_device(rows.xy_mm), on_device(np.repeat(rows.sigma_mm[:, None], 2, 1))
+    new = ImagePoints(
+        rows.image, rows.point + n, as_jax_array(rows.xy_mm), as_jax_array(np.repeat(rows.sigma_mm[:, None], 2, 1))
     )
     unknowns = block.start.unknowns
     unknowns = dataclasses.replace(unknowns, points=np.concatenate([np.asarray(unknowns.points, float), start]))
@@ -41,17 +41,17 @@ def into_block(
     return dataclasses.replace(
         block,
         points=(*block.points, *ids),
-        image_points=ImageRows.joined(block.image_points, new),
-        control=ControlRows.joined(block.control, _coordinates(xyz, sigma, control, n)),
-        check=ControlRows.joined(block.check, _coordinates(xyz, sigma, check, n)),
+        image_points=ImagePoints.joined(block.image_points, new),
+        control=ControlCoordinates.joined(block.control, _coordinates(xyz, sigma, control, n)),
+        check=ControlCoordinates.joined(block.check, _coordinates(xyz, sigma, check, n)),
         datum=Datum(),
         start=Start(unknowns, block.start.image_known, known),
     )
 
 
-def _coordinates(xyz, sigma, chosen, first: int) -> ControlRows:
+def _coordinates(xyz, sigma, chosen, first: int) -> ControlCoordinates:
     point, axis = np.nonzero(np.isfinite(xyz) & chosen[:, None])
-    return ControlRows(first + point, axis, on_device(xyz[point, axis]), on_device(sigma[point, axis]))
+    return ControlCoordinates(first + point, axis, as_jax_array(xyz[point, axis]), as_jax_array(sigma[point, axis]))
 
 
 def without_names(block: Block, ids: tuple[str, ...]) -> Block:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.camera import parameter_names
 from jaxphoto.collinearity import ExteriorOrientation, in_field, project
 from jaxphoto.compiling import jit_quickly
@@ -50,7 +50,7 @@ def predicted(
     joint = covariance(adjusted)
     n, factor = len(block.images), float(joint.variance_factor)
     matrix, labels = np.asarray(joint.matrix) * factor, list(joint.labels)
-    position, turn = still(unknowns.exterior.position), still(unknowns.exterior.camera_from_object)
+    position, turn = to_numpy(unknowns.exterior.position), to_numpy(unknowns.exterior.camera_from_object)
     to_angles = np.asarray(rotation_jacobians(jnp.asarray(np.moveaxis(turn, 0, -1)), joint.rotations))
     found: list[Predicted] = []
     image = np.arange(n).repeat(len(xyz))

@@ -17,7 +17,7 @@ from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.control.control_block import ControlledBlock, control_block
 from jaxphoto.procedures.control.judged import CRITICAL
 from jaxphoto.procedures.control.marked import Marked, marked
-from jaxphoto.procedures.control.onto_control import LEAST
+from jaxphoto.procedures.control.onto_control import MINIMAL_SIZES
 from jaxphoto.procedures.control.placed import in_frame
 from jaxphoto.procedures.control.search import Looker, found_marks
 from jaxphoto.procedures.control.surveyed import SIGMA_M, GivenControl, Marks
@@ -114,7 +114,7 @@ def _far(now: ControlledBlock, by_hand: Marked) -> dict[int, float]:
     They stay unless another target is found: a block may be bent there, which check points are to tell.
     """
     state, off = np.array(now.state, object), np.linalg.norm(np.nan_to_num(now.off_m), axis=1)
-    if (state == "control").sum() < LEAST:
+    if (state == "control").sum() < MINIMAL_SIZES:
         return {}
     usual = np.median(off[np.isin(state, ["control", "check"])])
     far = np.isin(state, ["check", "left out"]) & (np.nan_to_num(now.w).max(axis=1) > CRITICAL) & (off > _FAR * usual)

@@ -14,13 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment import Sizes
+from jaxphoto.adjustment import PaddedSizes
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.initial.matches import PairMatches, Tracks, tracks
 from jaxphoto.initial.rays import ideal_coordinates, unit_rays
-from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
+from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
 from jaxphoto.procedures.orientation.finish import FIRST_ROUNDS, LAST_ROUNDS, finished, told
 from jaxphoto.procedures.orientation.growing import grown
 from jaxphoto.procedures.orientation.network import Fate, Network, empty_network, meet, sight_of
@@ -36,7 +36,7 @@ from jaxphoto.procedures.orientation.refine import (
 )
 from jaxphoto.procedures.orientation.related_pairs import LENS_PX, MOST, Report, check_connected, relate
 from jaxphoto.procedures.orientation.second_look import second_look
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.unknowns import Unknowns, default_priors
 
 CAMERA = "camera"
@@ -102,7 +102,7 @@ class OrientationReport(NamedTuple):
     """By what the standard deviations of the camera are larger than if neighbouring rays erred independently."""
 
 
-@shown
+@pretty_repr
 class Oriented(NamedTuple):
     """A block of photographs, oriented as a free network of arbitrary scale, and how it was made."""
 
@@ -111,7 +111,7 @@ class Oriented(NamedTuple):
     residuals_mm: Float[np.ndarray, "rows 2"]
     """Of its image points, observed minus computed."""
     report: OrientationReport
-    sizes: Sizes
+    sizes: PaddedSizes
     """That its adjustments were compiled for; with them that of `block` runs the same program."""
 
 
@@ -221,7 +221,7 @@ def _block_of(title, names, sensor, interior, features, sigmas_mm, found: Tracks
         sensor,
         (interior, freed(interior, _candidates(interior))),
         (exterior, np.zeros((n_points, 3))),
-        ImageRows(found.image, found.point, xy, np.stack([sigma, sigma], axis=1)),
+        ImagePoints(found.image, found.point, xy, np.stack([sigma, sigma], axis=1)),
     )
     nothing = dataclasses.replace(block.start, image_known=np.zeros(n, bool), point_known=np.zeros(n_points, bool))
     return dataclasses.replace(block, start=nothing)
@@ -234,7 +234,7 @@ def photographs_block(
     sensor: Sensor,
     camera: tuple[InteriorOrientation, InteriorOrientation],
     start: tuple[ExteriorOrientation, Float[np.ndarray, "points 3"]],
-    rows: ImageRows,
+    rows: ImagePoints,
 ) -> Block:
     """Photographs of one `camera`, its interior orientation and the priors of that, as a free network from `start`."""
     interior, priors = (dataclasses.replace(part, residuals="measured") for part in camera)
@@ -250,10 +250,10 @@ def photographs_block(
         image_strip=("",) * n,
         image_time=np.zeros(n),
         image_points=rows,
-        control=ControlRows.none(),
-        fixed=ControlRows.none(),
-        check=ControlRows.none(),
-        stations=StationRows.none(),
+        control=ControlCoordinates.none(),
+        fixed=ControlCoordinates.none(),
+        check=ControlCoordinates.none(),
+        stations=CameraPositions.none(),
         attitudes=Attitudes.none(),
         distances=Distances.none(),
         datum=Datum("inner", "points"),

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
-from jaxphoto.adjustment import Adjustment, Sizes, common_sizes, solve
+from jaxphoto.adjustment import Adjustment, PaddedSizes, common_sizes, solve
 from jaxphoto.block import Block, Datum, Frame, Start
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.georeferencing import Corrections
-from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows, SurfaceRows
+from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints, SurfaceRows
 from jaxphoto.procedures.orientation.network import Network
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted, default_priors
 
@@ -52,7 +52,7 @@ class SelfCalibration(NamedTuple):
     """By camera and parameter: the change that moves the corner of the format by its whole radius."""
     start: dict[str, dict[str, float]]
     """By camera and parameter."""
-    sizes: Sizes
+    sizes: PaddedSizes
     """Of the whole block, which all its parts are padded to."""
 
 
@@ -65,7 +65,7 @@ def calibration_of(block: Block) -> SelfCalibration:
         corner = np.array([sensor.width_mm, sensor.height_mm]) / 2
         unit[camera] = {n: float(np.linalg.norm(corner)) / _at_corner(interior, n, corner) for n in names[camera]}
         begin[camera] = {n: float(np.asarray(get_parameter(interior, n))) for n in names[camera]}
-    calibration = SelfCalibration(names, unit, begin, Sizes())
+    calibration = SelfCalibration(names, unit, begin, PaddedSizes())
     return calibration._replace(sizes=common_sizes([_with_priors(bare(block), calibration, Asked(names, {}))]))
 
 
@@ -119,7 +119,7 @@ def refined(
     part = part_of(block, network, images, points, network.used)
     part = _with_priors(part, calibration, estimated, growing)
     adjusted = solve(part, part.start.unknowns, part.priors, _STEPS, calibration.sizes)
-    if not bool(adjusted.converged) and not np.isfinite(float(adjusted.square_sum)):
+    if not bool(adjusted.converged) and not np.isfinite(float(adjusted.sum_of_squares)):
         return network, adjusted
     exterior = adjusted.unknowns.exterior
     positions, matrices, at = network.positions.copy(), network.camera_from_object.copy(), network.points.copy()
@@ -170,7 +170,7 @@ def part_of(
         image_mount=("",) * len(images),
         image_strip=("",) * len(images),
         image_time=np.zeros(len(images)),
-        image_points=ImageRows(
+        image_points=ImagePoints(
             image[np.asarray(measured.image)[rows]],
             point[np.asarray(measured.point)[rows]],
             np.asarray(measured.xy)[rows],
@@ -199,10 +199,10 @@ def bare(block: Block) -> Block:
         flight_time=None,
         temperatures=None,
         partitions={},
-        control=ControlRows.none(),
-        fixed=ControlRows.none(),
-        check=ControlRows.none(),
-        stations=StationRows.none(),
+        control=ControlCoordinates.none(),
+        fixed=ControlCoordinates.none(),
+        check=ControlCoordinates.none(),
+        stations=CameraPositions.none(),
         attitudes=Attitudes.none(),
         distances=Distances.none(),
         datum=Datum("inner", "points"),
