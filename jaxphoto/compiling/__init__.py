@@ -2,6 +2,6 @@
 
 from jaxphoto.compiling.quickly import jit_quickly
 from jaxphoto.compiling.run import call_compiled, prepare, run_compiled
-from jaxphoto.compiling.unique import once
+from jaxphoto.compiling.once import once
 
 __all__ = ["call_compiled", "jit_quickly", "once", "prepare", "run_compiled"]
