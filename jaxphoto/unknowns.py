@@ -189,7 +189,7 @@ def late_cameras(start: Unknowns, priors: Unknowns) -> list[str]:
 
 
 def uniform_priors(unknowns: Unknowns, prior: Prior) -> Unknowns:
-    """A tree of priors shaped like `unknowns`, `prior` everywhere."""
+    """Return a tree of priors shaped like `unknowns`, `prior` everywhere."""
     return jax.tree.map(lambda _: prior, unknowns)
 
 
@@ -201,7 +201,7 @@ def default_priors(unknowns: Unknowns) -> Unknowns:
 
 
 def weighted(name: str, start: Any, value: Any, sigma: Any) -> Weighted:
-    """The prior of a parameter that was observed as `value` with `sigma`; arrays have the shape of its `start`.
+    """Return the prior of a parameter that was observed as `value` with `sigma`; arrays have the shape of its `start`.
 
     Raises InputError, which names the parameter, for what no observation can be.
     """

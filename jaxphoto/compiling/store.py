@@ -8,6 +8,7 @@ the program, in a folder that only takes what this user wrote (`private_folder`)
 import contextlib
 import functools
 import hashlib
+import importlib.metadata
 import json
 import os
 import platform
@@ -15,12 +16,8 @@ import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
-import jaxlib
-import lineax as lx
 import numpy as np
-import optimistix as optx
 
 from jaxphoto.compiling import private_folder
 from jaxphoto.compiling.description import Indescribable, describe
@@ -32,7 +29,7 @@ with contextlib.suppress(ImportError):  # Another jaxlib: `load` finds nothing.
 
 # What the folder may hold (bytes): beyond, what was not used for longest goes.
 MOST = 1_000_000_000
-_PACKAGES = (jax, jaxlib, eqx, optx, lx, np)
+_PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy")
 # Of the number of bytes of the text, which comes first.
 _LENGTH = 8
 
@@ -120,7 +117,7 @@ def _settings() -> list[str]:
 @functools.cache
 def _surroundings() -> tuple[str, ...]:
     """Sources, versions, Python, the processor and the devices: they stay as they are while a process runs."""
-    versions = [f"{package.__name__} {package.__version__}" for package in _PACKAGES]
+    versions = [f"{name} {importlib.metadata.version(name)}" for name in _PACKAGES]
     devices = [f"{device.id} {device.platform} {device.device_kind}" for device in jax.devices()]
     return (_SOURCES, sys.version, *versions, platform.platform(), _processor(), *devices)
 

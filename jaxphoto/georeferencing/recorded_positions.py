@@ -25,7 +25,7 @@ _SAME_M, _APART_M = 0.5, 5.0
 
 
 def plausible_positions(positions: Mapping[str, Gps | None]) -> tuple[Positions, list[str]]:
-    """The plausible positions, exchanged latitudes and longitudes corrected, and a message for each kind of change."""
+    """Return plausible positions (exchanged latitudes and longitudes corrected) and a message per kind of change."""
     result: Positions = dict(positions)
     absent = [name for name, gps in result.items() if gps is None]
     nowhere = [n for n, g in result.items() if g and max(abs(g.latitude_deg), abs(g.longitude_deg)) < _NOWHERE_DEG]
@@ -63,7 +63,7 @@ def one_height(
     above_takeoff_m: Mapping[str, float | None],
     wanted: Heights | int | None = None,
 ) -> tuple[Positions, list[str]]:
-    """The positions with heights of one reference, and messages about it.
+    """Return the positions with heights of one reference, and messages about it.
 
     `wanted` "take-off" selects the heights above take-off; others are the reference of heights without one, an EPSG
     code that of a geoid, which is added. If None, heights of two references are joined by those above take-off.
