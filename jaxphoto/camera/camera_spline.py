@@ -1,4 +1,4 @@
-"""A camera that wanders during a flight: principal distance and principal point as cubic B-splines of time.
+"""Camera that drifts during a flight: principal distance and principal point as cubic B-splines of time.
 
 With n knots h apart, the middle of them in the middle of the flight, an exposure at time t from there sees through
 

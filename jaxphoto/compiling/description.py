@@ -65,7 +65,7 @@ def _content(value: Any) -> list:
         return [part for item in value.items() for part in item]
     if dataclasses.is_dataclass(value):
         return [getattr(value, field.name) for field in dataclasses.fields(value)]
-    raise Indescribable(f"{type(value)} is not known to be told by its parts")
+    raise Indescribable(f"{type(value)} is not known to be identified by its parts")
 
 
 def _array(value: Any) -> str:
