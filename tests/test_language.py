@@ -1,4 +1,4 @@
-"""Words of the dialect that the first versions were written in do not come back (docs, docstrings, comments, messages)."""
+"""The dialect of the first versions stays out of docs, docstrings, comments and messages."""
 
 import ast
 import io
