@@ -169,7 +169,7 @@ def check_prior(label: str, prior: Any) -> None:
     if not is_prior(prior):
         given = " ".join(repr(prior).split())
         raise InputError(
-            f"{label}: {given:.80} is no prior; use FREE, FIXED (at the start value) or Weighted(value, sigma)"
+            f"{label}: {given:.80} is not a prior; use FREE, FIXED (at the start value) or Weighted(value, sigma)"
         )
 
 
@@ -214,7 +214,7 @@ def weighted(name: str, start: Any, value: Any, sigma: Any) -> Weighted:
             raise InputError(f"{name}: its {what} is {' '.join(str(given).split()):.60}: give a finite number")
         if what == "sigma" and (bad := known[known <= 0]).size:
             raise InputError(
-                f"{name}: its sigma is {bad[0]:g}: give one above zero, or hold the parameter with fix({name!r})"
+                f"{name}: its sigma is {bad[0]:g}: give a positive one, or fix the parameter with fix({name!r})"
             )
         if known.shape != whole[len(whole) - known.ndim :]:
             more = f", or an array of the shape {whole}" if whole else ""

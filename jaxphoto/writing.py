@@ -110,7 +110,7 @@ def check_folder(directory: Path, *inputs: Path, clashes: Clashes = lambda name:
             raise InputError(f"{directory} is or holds the input {given}, which would be lost: name another folder")
     _check_parents(target, "name a folder")
     if os.path.ismount(target):
-        raise InputError(f"{directory} is a disk of its own, which cannot be replaced: name a folder in it")
+        raise InputError(f"{directory} is a mount point, which cannot be replaced: name a folder in it")
     if os.path.lexists(target) and not target.is_dir():
         raise InputError(f"{target} is a file: name a folder")
     check_room(target)

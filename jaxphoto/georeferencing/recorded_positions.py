@@ -151,8 +151,8 @@ def _above_ellipsoid(positions: Positions, vertical: int) -> tuple[Positions, li
     for name, place, height in zip(places, given, heights, strict=True):
         if not np.isfinite(height):
             raise InputError(
-                f"the geoid of the heights EPSG:{vertical} does not reach the photograph {quoted(name)} at "
-                f"{place[0]:.4f}, {place[1]:.4f} degrees; give the system of heights of that place"
+                f"the geoid of the heights EPSG:{vertical} does not cover the photograph {quoted(name)} at "
+                f"{place[0]:.4f}, {place[1]:.4f} degrees; give the vertical CRS of that place"
             )
     result = dict(positions)
     for name, height in zip(places, heights.tolist(), strict=True):

@@ -197,8 +197,8 @@ def checked_points(
         across = np.linalg.svd(centred, compute_uv=False)
         if across[1] < 1e-4 * across[0]:
             raise BlockError(
-                f"the known points of image {image} lie {where}, which leaves its orientation open: measure a known "
-                f"point off that line {cure}"
+                f"the known points of image {image} lie {where}, which leaves its orientation undetermined: measure "
+                f"a known point off that line {cure}"
             )
     return points - origin, origin
 
@@ -224,7 +224,7 @@ def check_determined(normal: Float[np.ndarray, "6 6"], sigma: float, image: str,
 def open_orientation(image: str) -> BlockError:
     """Error for points that do not determine the orientation."""
     return BlockError(
-        f"the known points of image {image} leave its orientation open, as points close to a line do, few points "
+        f"the known points of image {image} leave its orientation undetermined, as points close to a line do, few points "
         "in a small part of the image, or points on a dangerous cylinder or curve through the projection centre: "
         "measure known points elsewhere in it"
     )
