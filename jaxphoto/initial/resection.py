@@ -225,8 +225,8 @@ def open_orientation(image: str) -> BlockError:
     """Error for points that do not determine the orientation."""
     return BlockError(
         f"the known points of image {image} leave its orientation undetermined, as points close to a line do, few "
-        "points in a small part of the image, or points on a dangerous cylinder or curve through the projection centre: "
-        "measure known points elsewhere in it"
+        "points in a small part of the image, or points on a dangerous cylinder or curve through the projection "
+        "centre: measure known points elsewhere in it"
     )
 
 
