@@ -44,7 +44,8 @@ def tables(cells: pd.DataFrame, paper: str) -> str:
         f"\nOf {len(cells)} printed values with a [tolerance](../experiments/{paper}/published.csv) "
         f"{(cells['within'] == 'yes').sum()} are within it (layouts: {layouts}).\n"
     ]
-    return "\n".join([*parts, *(_table(str(name), of) for name, of in cells.groupby("table", sort=False))])
+    parts += [_table(str(name), of) for name, of in cells.groupby("table", sort=False)]
+    return "\n".join([*parts, ""])
 
 
 def _table(name: str, cells: pd.DataFrame) -> str:
