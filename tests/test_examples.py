@@ -25,11 +25,10 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *EXAMPLES.gl
 LONG = (
     "boresight",
     "control",
-    "correlation_studies",
-    "experiments",
     "extending",
     "monte_carlo",
     "network_design",
+    "papers",
     "sensitivity",
     "weights",
 )
