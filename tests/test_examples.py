@@ -32,7 +32,8 @@ LONG = (
     "monte_carlo",
     "network_design",
     "sensitivity",
-    "weights",
+    "statistics",
+    "trust",
 )
 
 

@@ -75,6 +75,7 @@ GIVEN = {
     ),
     "docs/scaling.md": Given(_BLOCK.replace("BLOCK", "block") + "echo 'import jaxphoto' > my_script.py\n"),
     "docs/simultaneous.md": Given(_LIDAR, {" --centroids R1,R2": ""}),
+    "docs/statistics.md": Given(_BLOCK),
     "docs/stability.md": Given(_RESULTS + "cp -r RESULTS RESULTS_A\ncp -r RESULTS RESULTS_B\n"),
     "docs/strip_adjustment.md": Given(
         _STRIPS + "echo point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m > surveyed.csv\n"
@@ -87,7 +88,7 @@ GIVEN = {
     "docs/target_calibration.md": Given(
         "made_photographs board photographs\nmade_photographs board odd\nmade_photographs board even\n"
     ),
-    "docs/weights.md": Given(_BLOCK),
+    "docs/trust.md": Given(_BLOCK),
     "README.md": Given("", {".venv/bin/": ""}),
 }
 
