@@ -178,7 +178,7 @@ def _notebook_title(path: Path) -> str:
 
 
 def _public() -> dict[str, list[str]]:
-    """The names of `import jaxphoto`, all pictures, and what papers.md names, by room."""
+    """List the public names, the plots, and the names on papers.md, by package."""
     found: dict[str, set[str]] = {}
     for identifier in _identifiers().values():
         found.setdefault(identifier.split(".")[1], set()).add(identifier)

@@ -71,8 +71,9 @@ GIVEN = {
     "docs/reconstructions.md": Given(
         "jaxphoto example cross_block\njaxphoto convert cross_block FILE_OR_FOLDER --to openmvg --adjust\n"
     ),
-    "docs/scaling.md": Given(_BLOCK.replace("BLOCK", "block") + "echo 'import jaxphoto' > my_script.py\n"),
+    "docs/solver.md": Given(_BLOCK + "cp -r BLOCK block\necho 'import jaxphoto' > my_script.py\n"),
     "docs/simultaneous.md": Given(_LIDAR, {" --centroids R1,R2": ""}),
+    "docs/statistics.md": Given(_BLOCK),
     "docs/stability.md": Given(
         _BLOCK + _RESULTS + _YEARS + "cp -r RESULTS RESULTS_A\ncp -r RESULTS RESULTS_B\n", {"--cuts 64": "--cuts 8"}
     ),
@@ -87,7 +88,7 @@ GIVEN = {
     "docs/target_calibration.md": Given(
         "made_photographs board photographs\nmade_photographs board odd\nmade_photographs board even\n"
     ),
-    "docs/weights.md": Given(_BLOCK),
+    "docs/trust.md": Given(_BLOCK),
     "README.md": Given("", {".venv/bin/": ""}),
 }
 
@@ -109,14 +110,14 @@ NOT_RUN = {
     "docs/install.md": {
         "pip install 'jaxphoto'\n": _INSTALLS,
     },
-    "docs/scaling.md": {
+    "docs/solver.md": {
         "srun --cpus-per-task=32 --cpu-bind=cores python adjust_block.py\n": "wants a cluster with Slurm"
     },
 }
 
 
 # Whose blocks are of `py`, which does not run: they want several processes, as tests/adjustment/test_shards.py has.
-PYTHON_NOT_RUN = ("docs/scaling.md",)
+PYTHON_NOT_RUN = ("docs/solver.md",)
 # Pages whose blocks run in a test of their own, which looks at what comes out.
 ELSEWHERE = {
     "docs/from_other_programs.md": "test_from_other_programs.py",
