@@ -42,9 +42,7 @@ GIVEN = {
     ),
     "docs/certificate.md": Given(_RESULTS),
     "docs/command_line.md": Given(_BLOCK),
-    "docs/control.md": Given(
-        _FLIGHT + "jaxphoto orient PHOTOGRAPHS/*.jpg --out BLOCK\n", {"--out DIR --control": "--out FLOWN --control"}
-    ),
+    "docs/control.md": Given(_FLIGHT + "jaxphoto orient PHOTOGRAPHS/*.jpg --out BLOCK\n"),
     "docs/exports.md": Given(
         _BLOCK + _RESULTS + _FLIGHT,
         {
