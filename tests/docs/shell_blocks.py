@@ -41,6 +41,7 @@ GIVEN = {
         "jaxphoto camera block/block.toml --distortion smac --out report.txt\n"
     ),
     "docs/certificate.md": Given(_RESULTS),
+    "docs/clouds.md": Given("made_photographs blank PHOTO\n"),
     "docs/command_line.md": Given(_BLOCK),
     "docs/control.md": Given(_FLIGHT + "jaxphoto orient PHOTOGRAPHS/*.jpg --out BLOCK\n"),
     "docs/exports.md": Given(
@@ -78,9 +79,6 @@ GIVEN = {
         _STRIPS + "echo point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m > surveyed.csv\n"
         "sed '1d; s/$/,0.02,0.02,0.02/' BLOCK/truth/object_points.csv >> surveyed.csv\n",
         {"CLOUD.laz --": "CLOUD.laz --cell-m 8 --"},
-    ),
-    "docs/surface_model.md": Given(
-        _LIDAR + "made_photographs blank PHOTO\n", {"--cell-m 1.0": "--cell-m 5.0", "8936": "E1_03"}
     ),
     "docs/target_calibration.md": Given(
         "made_photographs board photographs\nmade_photographs board odd\nmade_photographs board even\n"
