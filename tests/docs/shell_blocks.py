@@ -53,7 +53,6 @@ GIVEN = {
         },
     ),
     "docs/experiments.md": Given("jaxphoto example experiments\n", {"000": "000 --layouts 1"}),
-    "docs/fly.md": Given(_FLIGHT),
     "docs/halves.md": Given(_BLOCK + _YEARS, {"--cuts 64": "--cuts 8"}),
     "docs/joint.md": Given(
         _STRIPS,
@@ -65,10 +64,10 @@ GIVEN = {
             "--out DRAWS": "--draws 20 --out DRAWS",
         },
     ),
-    "docs/orient.md": Given(_FLIGHT, {"IMAGES...": "PHOTOGRAPHS/*.jpg"}),
     "docs/orientations.md": Given(
         "jaxphoto example cross_block\njaxphoto convert cross_block FOLDER --to metashape --adjust\n"
     ),
+    "docs/photographs.md": Given(_FLIGHT),
     "docs/reconstructions.md": Given(
         "jaxphoto example cross_block\njaxphoto convert cross_block FILE_OR_FOLDER --to openmvg --adjust\n"
     ),
