@@ -75,9 +75,9 @@ GIVEN = {
     "docs/simultaneous.md": Given(_LIDAR, {" --centroids R1,R2": ""}),
     "docs/stability.md": Given(_RESULTS + "cp -r RESULTS RESULTS_A\ncp -r RESULTS RESULTS_B\n"),
     "docs/strip_adjustment.md": Given(
-        _STRIPS + "echo point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m > surveyed.csv\n"
-        "sed '1d; s/$/,0.02,0.02,0.02/' BLOCK/truth/object_points.csv >> surveyed.csv\n",
-        {"CLOUD.laz --": "CLOUD.laz --cell-m 8 --"},
+        "jaxphoto example strips --out SURVEYED\n"
+        "echo point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m > surveyed.csv\n"
+        "sed '1d; s/$/,0.02,0.02,0.02/' SURVEYED/truth/object_points.csv >> surveyed.csv\n"
     ),
     "docs/target_calibration.md": Given(
         "made_photographs board photographs\nmade_photographs board odd\nmade_photographs board even\n"
