@@ -159,7 +159,7 @@ def simultaneous(
     max_rounds: MaxRounds = 20,
     adjust: Annotated[
         str | None,
-        Option(help="Estimate of the whole system, comma-separated: scanner,trajectory,camera (docs/joint.md)."),
+        Option(help="Estimate of the whole system, comma-separated: scanner,trajectory,camera (docs/boresight.md)."),
     ] = None,
     exposure_shift_s: ExposureShift = 0.0,
     control: Control = None,
