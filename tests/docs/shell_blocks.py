@@ -40,7 +40,6 @@ GIVEN = {
         "jaxphoto camera block/block.toml --out calib.yml\n"
         "jaxphoto camera block/block.toml --distortion smac --out report.txt\n"
     ),
-    "docs/certificate.md": Given(_RESULTS),
     "docs/command_line.md": Given(_BLOCK),
     "docs/control.md": Given(
         _FLIGHT + "jaxphoto orient PHOTOGRAPHS/*.jpg --out BLOCK\n", {"--out DIR --control": "--out FLOWN --control"}
