@@ -38,9 +38,9 @@ def convert(
     second: Second = None,
     out: Annotated[Path | None, Option(help="Folder to write (required).")] = None,
     source_format: Annotated[
-        _Source | None, Option("--format", help="Format of SOURCE (docs/command_line.md; default: by its content).")
+        _Source | None, Option("--format", help="Format of SOURCE (docs/formats.md; default: by its content).")
     ] = None,
-    to: Annotated[_Target, Option(help="Format of --out (docs/exports.md).")] = "block",
+    to: Annotated[_Target, Option(help="Format of --out (docs/formats.md).")] = "block",
     block: Annotated[Path | None, Option(help="Block of the results in SOURCE, if it was moved.")] = None,
     part: Annotated[int, Option(min=1, help="Part of a flight; the largest is 1.")] = 1,
     photographs: Annotated[list[Path] | None, Option(help="Folder of the photographs, for their file names.")] = None,

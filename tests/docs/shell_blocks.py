@@ -35,25 +35,13 @@ done
 
 GIVEN = {
     "docs/boresight.md": Given("jaxphoto simulate examples/boresight.toml --out BLOCK\n"),
-    "docs/camera_files.md": Given(
-        "jaxphoto example cross_block --out block\njaxphoto adjust block --out results\n"
-        "jaxphoto camera block/block.toml --out calib.yml\n"
-        "jaxphoto camera block/block.toml --distortion smac --out report.txt\n"
-    ),
     "docs/command_line.md": Given(_BLOCK),
     "docs/control.md": Given(
         _FLIGHT + "jaxphoto orient PHOTOGRAPHS/*.jpg --out BLOCK\n", {"--out DIR --control": "--out FLOWN --control"}
     ),
-    "docs/exports.md": Given(
-        _BLOCK + _RESULTS + _FLIGHT,
-        {
-            "CAMERA_OR_RESULTS": "PHOTOGRAPHS.toml",
-            "RESULTS OUT --to FORMAT": "RESULTS A --to colmap",
-            "FORMAT": "opensfm",
-        },
-    ),
     "docs/experiments.md": Given("jaxphoto example experiments\n", {"000": "000 --layouts 1"}),
     "docs/fly.md": Given(_FLIGHT),
+    "docs/formats.md": Given(_FLIGHT, {"CAMERA_OR_RESULTS": "PHOTOGRAPHS.toml"}),
     "docs/halves.md": Given(_BLOCK + _YEARS, {"--cuts 64": "--cuts 8"}),
     "docs/joint.md": Given(
         _STRIPS,
@@ -66,12 +54,6 @@ GIVEN = {
         },
     ),
     "docs/orient.md": Given(_FLIGHT, {"IMAGES...": "PHOTOGRAPHS/*.jpg"}),
-    "docs/orientations.md": Given(
-        "jaxphoto example cross_block\njaxphoto convert cross_block FOLDER --to metashape --adjust\n"
-    ),
-    "docs/reconstructions.md": Given(
-        "jaxphoto example cross_block\njaxphoto convert cross_block FILE_OR_FOLDER --to openmvg --adjust\n"
-    ),
     "docs/scaling.md": Given(_BLOCK.replace("BLOCK", "block") + "echo 'import jaxphoto' > my_script.py\n"),
     "docs/simultaneous.md": Given(_LIDAR, {" --centroids R1,R2": ""}),
     "docs/stability.md": Given(_RESULTS + "cp -r RESULTS RESULTS_A\ncp -r RESULTS RESULTS_B\n"),
@@ -105,6 +87,15 @@ NOT_RUN = {
         ".venv/bin/pytest -m quick\n.venv/bin/pytest -n 2 tests/camera\n": "runs these tests",
     },
     "docs/experiments.md": {"jaxphoto experiment all --layouts 4\n": "hours; the pages of docs/papers run each alone"},
+    "docs/formats.md": {
+        **{
+            f"jaxphoto convert cross_block {name} --to {format} --adjust\n\njaxphoto convert {name} from_{name}\n"
+            f"jaxphoto adjust from_{name} --out results_{name}\n": "runs in test_other_programs.py"
+            for name, format in (("metashape", "metashape"), ("colmap", "colmap"), ("pix4d", "opk"))
+        },
+        'jaxphoto convert "$JAXPHOTO_DATA/sxb" strasbourg\njaxphoto adjust strasbourg --out results_dbat\n': "runs in "
+        "test_other_programs.py",
+    },
     "docs/half_an_hour.md": {"python3 -m venv venv && . venv/bin/activate && pip install jaxphoto": _INSTALLS},
     "docs/install.md": {
         "pip install 'jaxphoto'\n": _INSTALLS,
@@ -119,7 +110,6 @@ NOT_RUN = {
 PYTHON_NOT_RUN = ("docs/scaling.md",)
 # Pages whose blocks run in a test of their own, which looks at what comes out.
 ELSEWHERE = {
-    "docs/from_other_programs.md": "test_from_other_programs.py",
     "docs/half_an_hour.md": "test_half_an_hour.py",
     **{f"docs/papers/{paper}.md": "test_commands_on_pages.py" for paper in ("000", "001", "003", "004")},
 }
