@@ -14,13 +14,7 @@ from jaxphoto.io.input_hashes import INPUTS, read_inputs
 from jaxphoto.io.json_file import read_json
 from jaxphoto.io.photographs import SUFFIXES, picture_files
 from jaxphoto.io.text_tables import read_csv
-from jaxphoto.report.certificate import (
-    Certified,
-    ExteriorCorrelation,
-    FormatBand,
-    LastCalibration,
-    certificate_page,
-)
+from jaxphoto.report.certificate import Certified, ExteriorCorrelation, FormatBand, LastCalibration, certificate_page
 from jaxphoto.report.page import write_pdf
 from jaxphoto.report.stability import Compared
 from jaxphoto.writing import whole_file

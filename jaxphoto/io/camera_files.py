@@ -16,14 +16,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from jaxphoto.arrays import as_jax_array
-from jaxphoto.camera import (
-    InteriorOrientation,
-    Sensor,
-    constant_names,
-    empty_camera,
-    parameter_names,
-    set_parameter,
-)
+from jaxphoto.camera import InteriorOrientation, Sensor, constant_names, empty_camera, parameter_names, set_parameter
 from jaxphoto.errors import InputError, JaxphotoError, quoted
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section, known_together, read_sensor
 from jaxphoto.io.block_folder.settings import read_settings

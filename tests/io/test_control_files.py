@@ -122,11 +122,7 @@ def test_our_own_tables(tmp_path):
         (files.OWN, files.OWN_MARKS.replace("G1", "H1"), "no mark is of a point that a has (H1; there are G1, G2)"),
         (files.OWN, files.OWN_MARKS.replace("DJI_0002", "DJI_0001"), "'G1' is marked in 'DJI_0001' in b, row 2, too"),
         (files.GCP_LIST + "1 2 3 4 5\n", None, "row 7: 5 cells"),
-        (
-            files.GCP_LIST.replace("30.5 512.5", "31.5 512.5"),
-            None,
-            "row 3: the point 'G1' stands in a, row 2, too",
-        ),
+        (files.GCP_LIST.replace("30.5 512.5", "31.5 512.5"), None, "row 3: the point 'G1' stands in a, row 2, too"),
         (files.GCP_LIST.replace("DJI_0003.JPG", "=DJI()"), None, "begins like a formula"),
         (files.MARKERS[:900], None, "a: damaged"),
         (files.MARKERS.replace('camera_id="0"', 'camera_id="5"'), None, "the file has no such camera"),
@@ -297,8 +293,7 @@ def test_tables_with_words_of_bingo_in_them_are_tables(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["# points in E N of name 25832\nA 1.5 2.5 3.5\n", "# measured by E N name\npoint x y z\nA 1.5 2.5 3.5\n"],
+    "text", ["# points in E N of name 25832\nA 1.5 2.5 3.5\n", "# measured by E N name\npoint x y z\nA 1.5 2.5 3.5\n"]
 )
 def test_a_comment_that_is_a_sentence_is_no_header(tmp_path, text):
     path = tmp_path / "points.txt"

@@ -8,14 +8,7 @@ from hypothesis import strategies as st
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from jaxphoto.camera import (
-    DISTORTIONS,
-    PROJECTIONS,
-    InteriorOrientation,
-    Sensor,
-    get_parameter,
-    parameter_names,
-)
+from jaxphoto.camera import DISTORTIONS, PROJECTIONS, InteriorOrientation, Sensor, get_parameter, parameter_names
 from jaxphoto.cloud import Cloud
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.extras.formats import CAMERA_FORMATS, export, write_camera_file

@@ -19,13 +19,7 @@ import numpy as np
 
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError, few, quoted
-from jaxphoto.extras.formats.camera_models import (
-    FISHEYE_TERMS,
-    OPENCV,
-    OPENCV_FISHEYE,
-    ProjectCamera,
-    in_pixels,
-)
+from jaxphoto.extras.formats.camera_models import FISHEYE_TERMS, OPENCV, OPENCV_FISHEYE, ProjectCamera, in_pixels
 from jaxphoto.extras.formats.files import Format, beginning, number_rows, read_json, read_text
 from jaxphoto.extras.formats.opencv import yaml_cameras
 from jaxphoto.extras.formats.points_beside import points_beside, write_image_points

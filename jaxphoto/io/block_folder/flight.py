@@ -265,13 +265,7 @@ def _check_inside(times: np.ndarray, image: np.ndarray, records: Records, images
 
 
 def _check_leap_seconds(
-    poses: Poses,
-    times: np.ndarray,
-    image: np.ndarray,
-    records: Records,
-    images: Images,
-    frame: Frame,
-    shift: float,
+    poses: Poses, times: np.ndarray, image: np.ndarray, records: Records, images: Images, frame: Frame, shift: float
 ) -> None:
     """Raise BlockError where approximate positions fit a clock that is off by leap seconds, and not this one."""
     known = images.known[image]

@@ -37,10 +37,7 @@ def positions_in(records: Records, frame: Frame) -> Float[np.ndarray, "records 3
 
 
 def trajectory_in(
-    records: Records,
-    frame: Frame,
-    sigma_m: Float[np.ndarray, "records 3"],
-    sigma_rad: Float[np.ndarray, "records 3"],
+    records: Records, frame: Frame, sigma_m: Float[np.ndarray, "records 3"], sigma_rad: Float[np.ndarray, "records 3"]
 ) -> Trajectory:
     """The trajectory in the frame of the block, with the standard deviations given. Raises as `positions_in`."""
     position = positions_in(records, frame)
