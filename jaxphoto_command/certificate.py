@@ -10,9 +10,9 @@ from jaxphoto.camera.conditions import Conditions
 from jaxphoto.errors import InputError
 from jaxphoto.io.camera_files import CameraFile, read_camera_file, results_in
 from jaxphoto.io.conditions import CONDITIONS, conditions_of, read_conditions
-from jaxphoto.io.input_hashes import INPUTS, read_inputs
-from jaxphoto.io.json_file import read_json
 from jaxphoto.io.photographs import SUFFIXES, picture_files
+from jaxphoto.io.result_tables import INPUTS, read_inputs
+from jaxphoto.io.text_files import read_json
 from jaxphoto.io.text_tables import read_csv
 from jaxphoto.report.certificate import Certified, ExteriorCorrelation, FormatBand, LastCalibration, certificate_page
 from jaxphoto.report.page import write_pdf

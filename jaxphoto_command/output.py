@@ -145,7 +145,7 @@ class Output:
 
     def wrote(self, path: Path, text: str) -> None:
         """Print that a file or folder was written; its summary.json goes into the JSON object."""
-        from jaxphoto.io.json_file import read_json
+        from jaxphoto.io.text_files import read_json
         from jaxphoto.writing import files_in
 
         inside = files_in(path) if path.is_dir() else []

@@ -392,10 +392,10 @@ def orient(
     from jaxphoto.image_measurement.photograph_pairs import photograph_pairs, usual_choice
     from jaxphoto.io.block_folder import check_block_target, whole_block
     from jaxphoto.io.block_folder.table_layout import TOML
-    from jaxphoto.io.json_file import read_json
     from jaxphoto.io.kept_orientation import kept_orient
     from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
     from jaxphoto.io.photographs import photographs, sensor_and_interior
+    from jaxphoto.io.text_files import read_json
     from jaxphoto.procedures.calibration import distortion_model
     from jaxphoto.report.orientation import print_orientation, write_orientation
 

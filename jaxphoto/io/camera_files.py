@@ -21,12 +21,10 @@ from jaxphoto.errors import InputError, JaxphotoError, quoted
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section, known_together, read_sensor
 from jaxphoto.io.block_folder.settings import read_settings
 from jaxphoto.io.block_folder.table_layout import TOML
-from jaxphoto.io.json_file import read_json
-from jaxphoto.io.names import harm_in
-from jaxphoto.io.results_judged import SUMMARY, read_summary, reservation
+from jaxphoto.io.result_tables import SUMMARY, read_summary, reservation
+from jaxphoto.io.text_files import read_bytes, read_json
 from jaxphoto.io.text_tables import LARGEST, read_csv
 from jaxphoto.io.toml import Section, read_toml, toml_text
-from jaxphoto.io.whole_text import SMALL, read_whole
 from jaxphoto.unknowns import FIXED
 
 ASSUMED_PIXEL_MM = 0.001
@@ -75,7 +73,7 @@ class CameraSource(NamedTuple):
 
     def text(self) -> str:
         """Return the whole text, UTF-8 or else Windows-1252. Raise InputError for a binary file."""
-        content = read_whole(self.path, SMALL)
+        content = read_bytes(self.path)
         if b"\0" in content:
             raise self.error("the file is no text; give a camera file")
         try:
@@ -99,9 +97,6 @@ class CameraSource(NamedTuple):
         listed = ", ".join(names)
         if not names:
             raise self.error("there is no camera in it; give a file with one")
-        for name in names:
-            if harm := harm_in(name):
-                raise self.error(f"the camera {quoted(name)} {harm}")
         if self.camera is None and len(names) > 1:
             raise SeveralCamerasError(f"{self.path}: it holds {len(names)} cameras; name one of {listed}")
         if self.camera not in (None, *names):

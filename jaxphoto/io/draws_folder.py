@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError
-from jaxphoto.io.json_file import read_json
+from jaxphoto.io.text_files import read_json
 from jaxphoto.writing import check_room, clear_leftovers, is_place, locked, whole_file
 
 _RUN, _PARTS, DRAWS = "run.json", "parts", "draws.parquet"

@@ -25,8 +25,8 @@ from pydantic import (
 
 from jaxphoto.arrays import as_jax_array
 from jaxphoto.errors import BlockError, InputError, quoted
+from jaxphoto.io.text_files import read_text
 from jaxphoto.io.text_tables import LARGEST
-from jaxphoto.io.whole_text import SMALL, read_text
 from jaxphoto.observations import is_covariance
 from jaxphoto.unknowns import FIXED, FREE, Prior, Weighted
 
@@ -226,7 +226,7 @@ def _vector(size: int) -> TypeAdapter:
 
 def read_toml(path: Path) -> dict[str, Any]:
     """The content of a TOML file. Raises InputError with the line of a syntax error."""
-    text = read_text(path, SMALL)
+    text = read_text(path)
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:

@@ -690,4 +690,3 @@ def test_copc_is_read_and_rewritten_as_laz(tmp_path):
 def test_a_time_that_is_none(tmp_path, kind):
     time = np.where(np.arange(1000) == 700, np.nan, 5.0)
     assert "no finite time" in complaint(write_las(tmp_path / f"c.{kind}", sample().xyz, gps_time=time))
-

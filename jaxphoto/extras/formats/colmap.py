@@ -22,8 +22,8 @@ from jaxphoto.extras.formats.camera_models import OPENCV, OPENCV_FISHEYE, Projec
 from jaxphoto.extras.formats.files import CameraFormat, Format, content_rows, read_text, row_numbers
 from jaxphoto.extras.formats.project import Project, numbered, pose, translations
 from jaxphoto.io.camera_files import CameraFile, CameraReader, CameraSource
-from jaxphoto.io.text_tables import is_number, natural
-from jaxphoto.io.whole_text import LARGE, read_whole
+from jaxphoto.io.text_files import read_bytes
+from jaxphoto.io.text_tables import is_number
 
 FILES = ("cameras", "images", "points3D")
 _PLANES = {
@@ -96,7 +96,7 @@ class _Binary:
     """Little-endian records."""
 
     def __init__(self, path: Path):
-        self.path, self.data, self.at = path, read_whole(path, 8 * LARGE), 0
+        self.path, self.data, self.at = path, read_bytes(path), 0
 
     def take(self, layout: str) -> tuple:
         try:
@@ -290,7 +290,7 @@ def _lines_by_id(source: CameraSource) -> dict[int, list[str]]:
     lines: dict[int, list[str]] = {}
     for row, line in content_rows(source.path):
         cells = line.split()
-        identifier = natural(cells[0])
+        identifier = int(cells[0]) if cells[0].isdecimal() else None
         if identifier is None:
             raise source.error(f"row {row} begins with {quoted(cells[0])}, which is no id")
         if identifier in lines:

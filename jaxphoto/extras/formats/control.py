@@ -37,8 +37,7 @@ from jaxphoto.io.control_table import (
     split_row,
     with_points,
 )
-from jaxphoto.io.names import LONGEST, harm_in
-from jaxphoto.io.text_tables import MOST_COLUMNS, is_number
+from jaxphoto.io.text_tables import is_number
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 
 GCP_LIST = "gcp_list.txt"
@@ -128,11 +127,9 @@ def read_marks(rows: Sequence[Mark]) -> Marks:
 
 
 def check_name(name: str, what: str, place: str) -> None:
-    """Raise InputError for a name that is empty, too long or harmful in results."""
+    """Raise InputError for an empty name."""
     if not name:
         raise InputError(f"{place}: the {what} is empty; give its name or delete the row")
-    if len(name) > LONGEST or harm_in(name):
-        raise InputError(f"{place}: the {what} {quoted(name)} {harm_in(name)}")
 
 
 def numbered_lines(text: str) -> list[tuple[int, str]]:
@@ -158,13 +155,13 @@ def read_table(path: Path, text: str) -> SurveyedPoints | Marks:
         raise cells.none("the file is empty; give it points or marks")
     width = len(cells.records[0])
     in_comments = [line.lstrip("#").strip().split(None if separator == " " else separator) for line in comments]
-    for k, header in enumerate([cells.records[0], *(words for words in in_comments if len(words) <= MOST_COLUMNS)]):
+    for k, header in enumerate([cells.records[0], *in_comments]):
         below = cells._replace(records=cells.records[k == 0 :], rows=cells.rows[k == 0 :])
         marks, points = columns_of(header, _MARK), columns_of(header, _POINT)
         # A comment whose columns the rows do not have is a sentence.
-        if _has(marks, ("image", "point", "x", "y"), width if k else MOST_COLUMNS):
+        if _has(marks, ("image", "point", "x", "y"), width if k else len(header)):
             return _marks(below, marks, separator)
-        if "image" not in marks and _has(points, ("point", "x", "y"), width if k else MOST_COLUMNS):
+        if "image" not in marks and _has(points, ("point", "x", "y"), width if k else len(header)):
             return read_points(below, points, separator, system, in_degrees(header, points))
     records = with_points(cells, separator).records
     kind, columns = _without_header(records)

@@ -16,8 +16,8 @@ from jaxphoto.extras.formats.camera_models import CameraModel
 from jaxphoto.extras.formats.project import Project
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.camera_files import CameraReader
+from jaxphoto.io.text_files import read_bytes
 from jaxphoto.io.text_tables import LARGEST, Table
-from jaxphoto.io.whole_text import LARGE, read_whole
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 
 Find = Callable[[Path], list[Path]]
@@ -99,7 +99,7 @@ def begins_with(path: Path, words: str) -> bool:
 
 def read_text(path: Path) -> str:
     """Return the text of a file, UTF-8 or else Windows-1252, with any line ends."""
-    content = read_whole(path, LARGE)
+    content = read_bytes(path)
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:

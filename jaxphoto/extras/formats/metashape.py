@@ -50,8 +50,8 @@ from jaxphoto.extras.formats.points_beside import joined, marks_shown, points_be
 from jaxphoto.extras.formats.project import WGS84, ControlPoints, Project, geocentric, is_geocentric, pose
 from jaxphoto.georeferencing.map_frame import map_system
 from jaxphoto.io.camera_files import CameraFile, CameraReader, CameraSource, joined_notes
+from jaxphoto.io.text_files import has_words
 from jaxphoto.io.text_tables import finite
-from jaxphoto.io.whole_text import has_words
 from jaxphoto.procedures.control.surveyed import GivenControl
 from jaxphoto.procedures.control.system import ControlSystem, system_of
 

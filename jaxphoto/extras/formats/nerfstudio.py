@@ -32,8 +32,8 @@ from jaxphoto.extras.formats.points_beside import points_beside, write_image_poi
 from jaxphoto.extras.formats.project import Project
 from jaxphoto.extras.formats.texts import oriented_project
 from jaxphoto.io.camera_files import CameraSource
+from jaxphoto.io.text_files import has_words
 from jaxphoto.io.toml import Section
-from jaxphoto.io.whole_text import has_words
 
 FILE = "transforms.json"
 _KINDS: dict[str, tuple[CameraModel, tuple[str, ...]]] = {

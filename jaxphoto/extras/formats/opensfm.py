@@ -33,8 +33,8 @@ from jaxphoto.extras.formats.files import Format, by_content, number_rows, read_
 from jaxphoto.extras.formats.project import Project, about_place, pose, translations
 from jaxphoto.georeferencing.map_frame import Place
 from jaxphoto.io.camera_files import CameraSource
+from jaxphoto.io.text_files import has_words
 from jaxphoto.io.toml import Section
-from jaxphoto.io.whole_text import has_words
 
 RECONSTRUCTION, TRACKS, REFERENCE = "reconstruction.json", "tracks.csv", "reference_lla.json"
 _KINDS = {

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.errors import InputError
+from jaxphoto.io.text_files import read_bytes
 from jaxphoto.io.text_tables import LARGEST
 from jaxphoto.io.trajectory.records import Records, check_records
-from jaxphoto.io.whole_text import read_whole
 
 FIELDS = (
     "time", "latitude", "longitude", "altitude", "x_velocity", "y_velocity", "z_velocity", "roll", "pitch",
@@ -23,13 +23,11 @@ FIELDS = (
 """The numbers of a record in their order: s, rad, m, m/s, m/s^2, rad/s."""
 _TYPE = np.dtype("<f8")
 _RECORD = len(FIELDS) * _TYPE.itemsize
-# Forty hours at 200 Hz.
-_MOST = 4_000_000_000
 
 
 def read_sbet(path: Path) -> Float[np.ndarray, "records 17"]:
     """The records as they stand, columns `FIELDS`. Raises InputError for a file that cannot be an SBET."""
-    data = read_whole(path, _MOST)
+    data = read_bytes(path)
     if len(data) % _RECORD:
         raise InputError(
             f"{path.name}: {len(data)} bytes are no whole number of SBET records of {_RECORD} bytes; the file is cut "
