@@ -6,7 +6,6 @@ from datetime import datetime, timedelta
 import numpy as np
 import pyproj
 import pytest
-from PIL import Image
 from pyproj import CRS
 
 from jaxphoto.errors import InputError
@@ -15,7 +14,7 @@ from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS, WEEK_S, Taken
 from jaxphoto.georeferencing.gps import FIX_SIGMA_M, Gps, moved
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.io.exposures import located, read_exposures, with_exposures
-from jaxphoto.io.photographs import Photograph, photographs
+from jaxphoto.io.photographs import Photograph
 from jaxphoto.io.trajectory import write_sbet
 from tests import sound_files
 
@@ -88,7 +87,7 @@ def test_marks_are_read(tmp_path):
     nothing = read_exposures(written(tmp_path / "a.MRK", FLIGHT.mark(3, flag=0)))
     assert nothing.gps(0) is None
     with pytest.raises(InputError, match=r"row 2: '2.* is not a time mark"):
-        read_exposures(written(tmp_path / "b.MRK", FLIGHT.mark(0) + FLIGHT.mark(1)[:60]))
+        located([FLIGHT.photograph(3)], [], [written(tmp_path / "b.MRK", FLIGHT.mark(0) + FLIGHT.mark(1)[:60])])
 
 
 def test_marks_by_number_with_fewer_and_more_lines_than_photographs(tmp_path):
@@ -443,47 +442,6 @@ def test_a_table_on_a_national_datum_is_brought_to_that_of_receivers(tmp_path):
         (found.place[0] - space.transform(527000.25, 352000.75, 400.5)) * [1e5, 1e5, 1], 0, atol=1e-4
     )
     assert read_exposures(file, 31287).place[0, 2] == 400.5
-
-
-def test_a_folder_of_pictures_and_all_that_lies_in_it(tmp_path):
-    """Small JPEGs with EXIF and XMP: marks, spoilt files, and photographs without positions are each one sentence."""
-    rng = np.random.default_rng(0)
-    for k in ALL:
-        gps = FLIGHT.camera[k]
-        exif = Image.Exif()
-        at = datetime(1980, 1, 6) + timedelta(seconds=int(FLIGHT.time[k] - 18 + 7200))
-        exif.get_ifd(0x8769).update({0x9003: f"{at:%Y:%m:%d %H:%M:%S}", 0x9011: "+02:00"})
-        parts = [(v, 0, 0) for v in (gps.latitude_deg, gps.longitude_deg)]
-        if k == 3:
-            parts = parts[::-1]
-        if k == 4:
-            parts = [(0, 0, 0), (0, 0, 0)]
-        if k != 5:
-            exif.get_ifd(0x8825).update({1: "N", 2: parts[0], 3: "E", 4: parts[1], 5: b"\0", 6: 57.0})
-        heights = {"Absolute": 40 * (k != 6) + 17 + k, "Relative": 17 + k}
-        xmp = "<rdf:Description " + " ".join(f'drone-dji:{n}Altitude="+{h}"' for n, h in heights.items()) + "/>"
-        picture = Image.fromarray(rng.integers(0, 255, (30, 40), dtype=np.uint8))
-        picture.save(tmp_path / f"DJI_{k + 1:04}.jpg", exif=exif, xmp=xmp.encode())
-    read = photographs(sorted(tmp_path.glob("*.jpg")))
-    taken, said = located(read, [tmp_path])
-    assert [p.name for p in taken if p.gps is None] == ["DJI_0005", "DJI_0006"]
-    assert same(taken[3].gps._replace(altitude_m=0.0), FLIGHT.camera[3]._replace(altitude_m=0.0), 0.5)
-    assert [p.gps.altitude_m for p in taken if p.gps] == [57 + k for k in ALL if k not in (4, 5)]
-    for words in (
-        "DJI_0004 have changed places",
-        "DJI_0005 are (0, 0)",
-        "1 of 10 photographs has no position (DJI_0006)",
-        "DJI_0007 are above take-off",
-    ):
-        assert sum(words in s for s in said) == 1, said
-    (tmp_path / "bad.MRK").write_text("no marks\n")
-    (tmp_path / "DJI_Timestamp.MRK").write_text("".join(FLIGHT.mark(k) for k in ALL))
-    taken, said = located(read, [tmp_path])
-    assert all(same(p.gps, c) for p, c in zip(taken, FLIGHT.camera, strict=True))
-    assert {p.gps.heights for p in taken} == {"ellipsoid"} and "heights are above the ellipsoid" in said
-    assert any("bad.MRK, row 1" in s and s.endswith("the file is not used") for s in said)
-    with pytest.raises(InputError, match=r"bad.MRK, row 1"):
-        located(read, [], [tmp_path / "bad.MRK"])
 
 
 TABLE_ROWS = "image,longitude_deg,latitude_deg,height_m,sigma_X_m,sigma_Y_m,sigma_Z_m\n" + "".join(

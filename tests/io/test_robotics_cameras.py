@@ -113,12 +113,9 @@ SPLINED = "SPLINED_STEREOGRAPHIC_order=3_Nx=30_Ny=20_fov_x_deg=170"
 REFUSED = {
     "splined": ("a.cameramodel", mrcal(SPLINED, []), f"'LENSMODEL_{SPLINED}' is not known here"),
     "prism": ("a.cameramodel", mrcal("OPENCV12", [*RATIONAL, 0.1, 0.0, 0.0, 0.0]), "terms of a thin prism"),
-    "few": ("a.cameramodel", mrcal("OPENCV8", RATIONAL[:7]), "12 numbers are needed"),
-    "cut": ("a.cameramodel", mrcal("OPENCV4", RATIONAL[:4])[:-40], "damaged or no camera file"),
     "a word": ("a.cameramodel", mrcal("OPENCV4", RATIONAL[:4]).replace("655.5", "'x'"), "intrinsics .*'x'"),
     "omni": ("a.yaml", KALIBR.replace("camera_model: pinhole", "camera_model: omni"), "cam0 is a 'omni'"),
     "fov": ("a.yaml", KALIBR.replace("radtan", "fov"), "the distortion 'fov' of cam0"),
-    "short": ("a.yaml", KALIBR.replace("912.25, ", ""), "intrinsics of cam0 .*4 numbers"),
 }  # fmt: skip
 
 
