@@ -66,7 +66,7 @@ def adjust(
     from jaxphoto.procedures.weights import made_by_blunders
     from jaxphoto.statistics import SPLITS
     from jaxphoto.writing import check_folder, whole_folder
-    from jaxphoto_command.provenance import Provenance
+    from jaxphoto_command.certificate import Provenance
 
     splits = tuple(dict.fromkeys(opt.names(weights)))
     if unknown := [name for name in splits if name not in (*SPLITS, "group")]:

@@ -177,7 +177,7 @@ class Output:
     def made_by(self, *inputs: Path | None) -> Any:
         """Return the command line and the hashes of its input files and folders."""
         from jaxphoto.report.page import Made
-        from jaxphoto_command.provenance import hashes
+        from jaxphoto_command.certificate import hashes
 
         return Made(self.command_line(), [file for path in inputs if path is not None for file in hashes(path)])
 

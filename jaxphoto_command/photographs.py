@@ -93,7 +93,7 @@ def fly(
         write_part_orientation,
     )
     from jaxphoto.writing import check_folder, whole_folder
-    from jaxphoto_command.provenance import Provenance, certify
+    from jaxphoto_command.certificate import Provenance, certify
 
     if control is None and (marks or control_epsg or targets):
         raise typer.BadParameter("--marks, --control-epsg and --targets need --control FILE.")
@@ -234,7 +234,7 @@ def control(
     from jaxphoto.report.page import versions
     from jaxphoto.report.results import write_results, write_summary
     from jaxphoto.writing import check_folder, whole_folder
-    from jaxphoto_command.provenance import Provenance
+    from jaxphoto_command.certificate import Provenance
 
     files = [path for path in (file, marks) if path]
     check_folder(out, block, *files)

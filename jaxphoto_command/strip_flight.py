@@ -21,8 +21,7 @@ from jaxphoto.io.block_folder import exposure_times
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, Placement
 from jaxphoto.io.raster import write_dsm
 from jaxphoto.io.text_tables import points_matching
-from jaxphoto.io.trajectory import Records, read_records, write_moved
-from jaxphoto.io.trajectory.in_frame import trajectory_in, with_poses
+from jaxphoto.io.trajectory import Records, read_records, trajectory_in, with_poses, write_moved
 from jaxphoto.lidar.cell_returns import CellTally
 from jaxphoto.lidar.correction import scanner_path
 from jaxphoto.lidar.coverage import CoveredTimes

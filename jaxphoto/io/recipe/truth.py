@@ -13,8 +13,7 @@ from jaxphoto.io import clouds
 from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
 from jaxphoto.io.result_tables import read_table
-from jaxphoto.io.trajectory import write_flight_csv
-from jaxphoto.io.trajectory.in_frame import records_of
+from jaxphoto.io.trajectory import records_of, write_flight_csv
 from jaxphoto.observations import AXES
 from jaxphoto.parameters import AbstractParameters, numbers_of
 from jaxphoto.simulation import Simulation
