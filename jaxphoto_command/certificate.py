@@ -155,7 +155,7 @@ def check_two_calibrations(a: CameraFile, b: CameraFile, first: Path, second: Pa
 
 
 def share_measurements(first: Path, second: Path) -> bool:
-    """True if two folders of results are based on the same photograph or file of image points."""
+    """Return True if two folders of results are based on the same photograph or file of image points."""
     return not _measurements(first).isdisjoint(_measurements(second))
 
 

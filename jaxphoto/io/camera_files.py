@@ -151,7 +151,7 @@ def camera_readers() -> dict[str, CameraReader]:
 
 
 def is_camera_file(path: Path) -> bool:
-    """True if the content of a file is that of a camera file other than block.toml."""
+    """Return True if the content of a file is that of a camera file other than block.toml."""
     try:
         text = CameraSource(path).text()
     except InputError:

@@ -100,7 +100,7 @@ def columns_of(header: Sequence[str], words: Mapping[str, tuple[str, ...]]) -> C
 
 
 def in_degrees(header: Sequence[str], columns: Columns) -> bool:
-    """True if the header calls the first two coordinates longitude and latitude."""
+    """Return True if the header calls the first two coordinates longitude and latitude."""
     return not {"longitude", "lon", "long", "latitude", "lat"}.isdisjoint(header_words(header[columns["x"]]))
 
 

@@ -37,7 +37,7 @@ _PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".dng", ".bmp", ".webp", 
 
 
 def is_result(folder: Path) -> bool:
-    """True for a folder of results of `adjust` or of `fly`."""
+    """Return True for a folder of results of `adjust` or of `fly`."""
     return (folder / INTERIOR).is_file() or _parts(folder) is not None
 
 

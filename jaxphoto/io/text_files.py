@@ -52,7 +52,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def has_words(path: Path, *words: str) -> bool:
-    """True if the file exists and its first two megabytes contain all `words`."""
+    """Return True if the file exists and its first two megabytes contain all `words`."""
     if not path.is_file():
         return False
     with path.open("rb") as file:

@@ -225,7 +225,7 @@ def finite(cell: str) -> float | None:
 
 
 def is_number(cell: str) -> bool:
-    """True if a cell is a number."""
+    """Return True if a cell is a number."""
     try:
         float(cell)
     except ValueError:

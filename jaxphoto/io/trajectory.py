@@ -60,7 +60,7 @@ class Records(NamedTuple):
 
 
 def is_sbet(path: Path) -> bool:
-    """True for the suffixes of SBET: .sbet and .out (POSPac)."""
+    """Return True for the suffixes of SBET: .sbet and .out (POSPac)."""
     return path.suffix.lower() in (".sbet", ".out")
 
 

@@ -253,7 +253,7 @@ def _binary_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def recognise_cameras(path: Path, text: str) -> bool:
-    """True for the file names of COLMAP, or if the first line is an id, a model and numbers."""
+    """Return True for the file names of COLMAP, or if the first line is an id, a model and numbers."""
     lines = (line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#"))
     first = next(lines, [])
     named = path.name in ("cameras.txt", "cameras.bin")

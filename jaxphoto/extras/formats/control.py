@@ -325,7 +325,7 @@ def write_gcp_list(p: Project, folder: Path) -> None:
 
 
 def is_geoin(lines: list[str]) -> bool:
-    """True if all lines are records of BINGO, points among them."""
+    """Return True if all lines are records of BINGO, points among them."""
     rows = [row for line in lines if (row := line.split(maxsplit=5)) and row[0][0] not in "*#"]
     records = all(re.fullmatch("[A-Z]{4}|C", row[0]) for row in rows)
     points = (row for row in rows if row[0] in _BINGO_CHECK and len(row) >= 5)

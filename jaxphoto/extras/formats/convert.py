@@ -324,7 +324,7 @@ def _target(
 
 
 def is_control_file(path: Path) -> bool:
-    """True if the content of a file is that of a control file other than a plain table."""
+    """Return True if the content of a file is that of a control file other than a plain table."""
     text = "" if gis.is_geopackage(path) else read_text(path)
     return any(format.recognise(path, text) for format in CONTROL_FORMATS.values())
 

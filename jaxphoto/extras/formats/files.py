@@ -92,7 +92,7 @@ def warn(message: str) -> None:
 
 
 def begins_with(path: Path, words: str) -> bool:
-    """True if a file begins with `words`."""
+    """Return True if a file begins with `words`."""
     with path.open("rb") as file:
         return file.read(len(words)) == words.encode()
 

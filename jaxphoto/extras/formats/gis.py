@@ -261,7 +261,7 @@ def _geojson_system(path: Path, content: dict[str, Any]) -> str:
 
 
 def is_geopackage(path: Path) -> bool:
-    """True if a file is a database of SQLite."""
+    """Return True if a file is a database of SQLite."""
     if not path.is_file():
         return False
     with path.open("rb") as file:

@@ -174,7 +174,7 @@ def write_image_points(p: Project, folder: Path, names: Sequence[str] | None = N
 
 
 def _is_measured(path: Path) -> bool:
-    """True if a file begins with a head and a row of point, x, y, and has an end somewhere."""
+    """Return True if a file begins with a head and a row of point, x, y, and has an end somewhere."""
     begin = beginning(path, _HEAD)
     lines = [line.split() for line in begin]
     if len(lines) < 3 or is_geoin(begin) or not _is_row(lines[1]) or _is_head(lines[1]):
@@ -187,7 +187,7 @@ def _is_row(words: list[str]) -> bool:
 
 
 def _is_head(words: list[str]) -> bool:
-    """True for a head without an end before it: an image and what cannot be a coordinate."""
+    """Return True for a head without an end before it: an image and what cannot be a coordinate."""
     return len(words) == 2 and not is_number(words[1])
 
 

@@ -167,7 +167,7 @@ def write_bundler(p: Project, folder: Path) -> None:
 
 
 def _is_bal(path: Path) -> bool:
-    """True for three counts, then two indices and two numbers."""
+    """Return True for three counts, then two indices and two numbers."""
     with path.open("rb") as file:
         first, second = (file.readline(200).split() for _ in range(2))
     indices = [cell.isdigit() for cell in (*first, *second[:2])]

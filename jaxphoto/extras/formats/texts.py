@@ -204,7 +204,7 @@ def ray_misfit(
 
 
 def is_exterior(path: Path) -> bool:
-    """True if a file begins as a text of orientations, or has a row of BINGO's."""
+    """Return True if a file begins as a text of orientations, or has a row of BINGO's."""
     if _ORIA_ROW.search(path.read_bytes()):
         return True
     lines = beginning(path, _HEAD)
@@ -259,7 +259,7 @@ def _cells(line: str) -> list[str]:
 
 
 def _is_angles(row: list[str]) -> bool:
-    """True for a name and six numbers; a name of several words has no three numbers in it."""
+    """Return True for a name and six numbers; a name of several words has no three numbers in it."""
     surplus = len(row) - len(_COLUMNS)
     if surplus < 1 or not all(map(is_number, row[surplus:])):
         return False
