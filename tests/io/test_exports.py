@@ -16,8 +16,6 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from pyproj import CRS, Proj, Transformer
 from scipy.spatial.transform import Rotation
 
@@ -414,25 +412,6 @@ def test_angles_on_the_map_are_against_the_lines_of_its_grid(tmp_path):
         np.testing.assert_allclose(camera_from_object(*np.radians(values[3:])), axes, rtol=0, atol=2e-7)
         # The convergence is there: against the local frame kappa differs by it.
         assert abs(factors.meridian_convergence) > 1
-
-
-angle = st.floats(-3.1, 3.1)
-
-
-@settings(max_examples=12, deadline=None)
-@given(angle, st.floats(-1.57, 1.57), angle)
-def test_any_angles_come_back(tmp_path_factory, omega, phi, kappa):
-    p = photographs("opencv", "local")
-    matrix = camera_from_object(omega, phi, kappa)
-    turned = p._replace(exterior=ExteriorOrientation(p.exterior.position, np.repeat(matrix[None], 4, axis=0)))
-    folder = tmp_path_factory.mktemp("angles")
-    export(turned, folder / "opk", "opk")
-    cells = (folder / "opk" / "exterior.txt").read_text().splitlines()[3].split("\t")
-    np.testing.assert_allclose(camera_from_object(*np.radians(np.array(cells[4:], float))), matrix, rtol=0, atol=1e-12)
-    export(turned, folder / "sfm", "opensfm")
-    shot = json.loads((folder / "sfm" / "reconstruction.json").read_text())[0]["shots"][p.files[0]]
-    expected = np.diag([1, -1, -1]) @ matrix
-    np.testing.assert_allclose(Rotation.from_rotvec(shot["rotation"]).as_matrix(), expected, rtol=0, atol=1e-12)
 
 
 def test_the_table_of_angles_has_the_camera_as_it_was_adjusted(tmp_path):

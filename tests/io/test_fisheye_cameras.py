@@ -16,8 +16,6 @@ from jaxphoto.camera import (
     OpenCvFisheye,
     Perspective,
     Sensor,
-    get_parameter,
-    parameter_names,
 )
 from jaxphoto.errors import InputError
 from jaxphoto.extras.formats import write_camera_file
@@ -33,27 +31,11 @@ def fisheye(**more):
 
 
 CAMERAS = {
-    "opencv": fisheye(b1=0.002),
     "SIMPLE_RADIAL_FISHEYE": fisheye(k2=0.0, k3=0.0, k4=0.0),
     "RADIAL_FISHEYE": fisheye(k3=0.0, k4=0.0),
     "OPENCV_FISHEYE": fisheye(b1=0.002),
     "THIN_PRISM_FISHEYE": fisheye(b1=0.002, p1=0.001, p2=-0.002, s1=0.003, s2=-0.004),
-    "toml": fisheye(b1=0.002, b2=0.001, p1=0.001, p2=-0.002, s1=0.003, s2=-0.004),
 }
-
-
-@pytest.mark.parametrize("kind", CAMERAS)
-def test_what_is_written_reads_back_as_the_same_camera(tmp_path, kind):
-    camera = CAMERAS[kind]
-    path = tmp_path / {"opencv": "a.yml", "toml": "a.toml"}.get(kind, "cameras.txt")
-    assert write_camera_file(path, SENSOR, camera).max_px == 0
-    if path.name == "cameras.txt":
-        assert f"1 {kind} 1280 960 " in path.read_text()
-    read = read_camera_file(path, pixel_mm=0.003)
-    assert isinstance(read.interior.projection, Equidistant) and isinstance(read.interior.distortion, OpenCvFisheye)
-    for name in parameter_names(camera):
-        found, wanted = (float(get_parameter(c, name)) for c in (read.interior, camera))
-        assert found == pytest.approx(wanted, rel=1e-13, abs=1e-15), name
 
 
 def test_a_file_of_colmap_projects_as_opencv(tmp_path):

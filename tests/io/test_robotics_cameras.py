@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxphoto.camera import Equidistant, InteriorOrientation, OpenCv, OpenCvFisheye
+from jaxphoto.camera import InteriorOrientation, OpenCv
 from jaxphoto.errors import InputError
 from jaxphoto.extras.formats import write_camera_file
 from jaxphoto.io.camera_files import read_camera_file
-from tests.io.test_cameras import POINTS, SENSOR, columns_rows, same_numbers, written
+from tests.io.test_cameras import POINTS, SENSOR, columns_rows, written
 
 RATIONAL = [-0.21, 0.11, 1.1e-3, -2.3e-3, 0.02, 0.03, -0.01, 0.004]
 MRCAL = """# generated on a board
@@ -78,26 +78,6 @@ def test_cameras_of_a_chain_of_kalibr_project_as_opencv(tmp_path):
     np.testing.assert_allclose(found, fisheye([-0.02, 0.01, -0.003, 0.001]), rtol=0, atol=1e-9)
     with pytest.raises(InputError, match="name one of cam0, cam1"):
         read_camera_file(path)
-
-
-@pytest.mark.parametrize(
-    ("format", "distortion", "projection"),
-    [
-        ("mrcal", OpenCv(k1=-0.2, k2=0.1, p1=1e-3, p2=-2e-3, b1=1e-3), None),
-        ("mrcal", OpenCv(k1=-0.2, k2=0.1, k3=0.01, k4=0.02, k5=-0.03, k6=0.04), None),
-        ("ros", OpenCv(k1=-0.2, k2=0.1, k3=0.01, p1=1e-3, p2=-2e-3, b1=1e-3), None),
-        ("ros", OpenCv(k1=-0.2, k4=0.02, k6=0.04), None),
-        ("ros", OpenCvFisheye(-0.02, 0.01, -0.003, 0.001), Equidistant()),
-    ],
-)  # fmt: skip
-def test_what_is_written_is_the_same_camera(tmp_path, format, distortion, projection):
-    more = {} if projection is None else {"projection": projection}
-    interior = InteriorOrientation(35.0, 0.065, 0.274, distortion, **more)
-    conversion = write_camera_file(tmp_path / "a.yaml", SENSOR, interior, format, name="front: left")
-    assert conversion.max_px == 0.0
-    back = read_camera_file(tmp_path / "a.yaml", pixel_mm=SENSOR.pixel_mm)
-    same_numbers(back.interior, interior)
-    assert back.sensor == SENSOR and type(back.interior.projection) is type(interior.projection)
 
 
 def test_a_file_of_ros_says_what_opencv_reads(tmp_path):

@@ -39,17 +39,6 @@ def lines(n: int = 10, **changes) -> str:
     return HEADER + "".join(changes.get(f"row{k}", f"{k},{2 * k},0,100,0,0,90\n") for k in range(n))
 
 
-@pytest.mark.parametrize("geographic", [False, True])
-@pytest.mark.parametrize("sigmas", [False, True])
-def test_csv_comes_back_exactly(tmp_path, geographic, sigmas):
-    records = flight(geographic, sigmas)
-    write_flight_csv(records, tmp_path / "flight.csv")
-    got = read_records(tmp_path / "flight.csv")
-    assert (got.file, got.geographic) == ("flight.csv", geographic)
-    for a, b in zip(got[1:], records[1:], strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 def test_sbet_comes_back_exactly(tmp_path):
     values = random_sbet()
     write_sbet(values, tmp_path / "flight.sbet")

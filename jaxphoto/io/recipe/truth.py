@@ -1,4 +1,4 @@
-"""Write a simulation as a block folder with point cloud and trajectory, and its truth as tables like those of results."""
+"""Write a simulation as a block folder with point cloud and trajectory; the truth has the columns of result tables."""
 
 from collections.abc import Sequence
 from pathlib import Path
