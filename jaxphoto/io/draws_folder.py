@@ -36,18 +36,16 @@ class DrawsFolder:
         settings = settings | {"draws": draws, "per_part": per_part}
         run = directory / _RUN
         if run.is_file():
-            self._check(_settings_in(run), settings)
+            self._check(run, settings)
         else:
             with whole_file(run) as work:
                 work.write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
         if not self.done:
             (directory / _PARTS).mkdir(exist_ok=True)
 
-    def _check(self, held: dict, settings: dict) -> None:
-        wanted = json.loads(json.dumps(settings))
-        different = [name for name in {**held, **wanted} if held.get(name) != wanted.get(name)]
-        if different:
-            name = different[0]
+    def _check(self, run: Path, settings: dict) -> None:
+        held, wanted = read_json(run), json.loads(json.dumps(settings))
+        for name in [name for name in {**held, **wanted} if held.get(name) != wanted.get(name)][:1]:
             raise InputError(
                 f"{self.directory} holds a run with other settings ({name} {held.get(name)}, now {wanted.get(name)}): "
                 "name a new folder, or give the settings of that run to go on with it"
@@ -84,7 +82,9 @@ class DrawsFolder:
     def write_part(self, k: int, table: pd.DataFrame) -> None:
         """Write the draws of part `k`."""
         with whole_file(self._part(k)) as work:
-            pq.write_table(_arrow(table), work, write_page_checksum=True)
+            # Without pandas' metadata, which contains versions.
+            arrow = pa.Table.from_pandas(table, preserve_index=False).replace_schema_metadata(None)
+            pq.write_table(arrow, work, write_page_checksum=True)
 
     def join(self) -> None:
         """Join all parts into one file."""
@@ -151,13 +151,6 @@ def check_place(directory: Path) -> None:
     check_room(directory / _RUN)
 
 
-def _settings_in(run: Path) -> dict:
-    try:
-        return read_json(run)
-    except InputError:
-        raise InputError(f"{run} holds no settings of a Monte Carlo run: name a new folder") from None
-
-
 @contextmanager
 def _reading(file: Path) -> Iterator[None]:
     """Raise InputError if a file of draws is damaged."""
@@ -166,8 +159,3 @@ def _reading(file: Path) -> Iterator[None]:
     # pyarrow raises KeyError or UnicodeDecodeError for damaged column names.
     except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError):
         raise InputError(f"{file} is damaged: delete it, and its draws are made anew") from None
-
-
-def _arrow(table: pd.DataFrame) -> pa.Table:
-    # Without pandas' metadata, which contains versions.
-    return pa.Table.from_pandas(table, preserve_index=False).replace_schema_metadata(None)

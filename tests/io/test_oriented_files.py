@@ -21,6 +21,8 @@ from tests.formulas import camera_from_object
 from tests.io.oriented_files import (
     inside,
     markers,
+    misfits_px,
+    poses,
     write_angles,
     write_bingo,
     write_metashape,

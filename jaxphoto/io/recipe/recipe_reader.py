@@ -24,6 +24,7 @@ from jaxphoto.io.block_folder.camera_section import Camera, read_camera
 from jaxphoto.io.block_folder.parameters import (
     by_owner,
     keys_of,
+    mounts_of,
     read_mounts,
     read_parameters,
     read_strips,
@@ -37,7 +38,6 @@ from jaxphoto.simulation import (
     Assumed,
     CameraWalk,
     ConvergentPlan,
-    Cooling,
     Field,
     FlightPlan,
     Footprint,
@@ -99,10 +99,15 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
         for name, camera in settings.cameras.items()
     }
     sensors = {name: camera.sensor for name, camera in settings.cameras.items()}
-    mounts = _mounts(settings.top.section("mounts"), top.section("mounts"), cameras)
+    mount_starts, mount_priors = read_mounts(settings.top.section("mounts"), cameras)
+    mounts = {
+        name: Assumed(_truth(Mount, top.section("mounts").section(name))[0], start, mount_priors[name])
+        for name, start in mount_starts.items()
+    }
     rig = top.section(RigCamera.kind)
     flown = _flown_cameras(top, rig, list(cameras))
-    image_x = {n: (mounts[m].truth.image_x if (m := _mount_of(n, mounts)) else "forward") for n in flown}
+    mount_of = mounts_of(flown, mounts)
+    image_x = {name: mounts[mount].truth.image_x if mount else "forward" for name, mount in mount_of.items()}
     plan = _plan(top, keys, {name: (sensors[name], cameras[name].truth, image_x[name]) for name in flown})
     strips = [strip.name for strip in plan.strips] if isinstance(plan, FlightPlan) else []
     targets = plain(keys.targets)
@@ -118,7 +123,7 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
     stated_sigmas, noise = _sigmas(top, keys, targets)
     if rig.values and (stated_sigmas.rig_place_m is None or stated_sigmas.rig_turn_deg is None):
         raise top.section("sigmas").error("", "the rigidity of the rig is missing; add rig_place_m and rig_turn_deg")
-    terrain = keys.terrain.terrain(top.section("terrain"))
+    terrain, air = keys.terrain.terrain(top.section("terrain")), keys.temperature
     near = {}
     if isinstance(plan, ConvergentPlan) and "position_m" not in keys.start.model_fields_set:
         near["position_m"] = _NEAR * min(station.distance_m for station in plan.stations)
@@ -135,7 +140,7 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
         biases=_biases(settings.top.section("strips"), top.section("strips"), strips),
         shutters={n: _shutter(table) for n, table in by_owner(top.section("shutters"), cameras).items()},
         changes=_changes(top, keys, list(cameras), strips),
-        temperature=_temperature(keys.temperature),
+        temperature=air and air.plan(reference_c=air.air_c if air.reference_c is None else air.reference_c),
         walk=_walk(top, keys.camera_walk),
         rig=_change(RigCamera, rig, cameras),
         datum_offset_m=tuple(keys.truth.datum_offset_m),
@@ -175,17 +180,6 @@ def _truth(kind: type[AbstractParameters], section: Section, *others: str, drawn
     values = {key: value for key, value in section.values.items() if key in starts}
     values |= {key: value for key, value in truth.values.items() if key not in others}
     return read_parameters(kind, Section(truth.file, truth.path, values))
-
-
-def _mount_of(camera: str, mounts: Mapping[str, Any]) -> str:
-    return camera if camera in mounts else "default" if "default" in mounts else ""
-
-
-def _mounts(stated: Section, section: Section, cameras: Iterable[str]) -> dict[str, Assumed[Mount]]:
-    starts, priors = read_mounts(stated, cameras)
-    return {
-        name: Assumed(_truth(Mount, section.section(name))[0], start, priors[name]) for name, start in starts.items()
-    }
 
 
 def _biases(stated: Section, section: Section, strips: list[str]) -> dict[str, SimulatedBias]:
@@ -242,11 +236,6 @@ def _changes(top: Section, keys: Any, cameras: list[str], strips: list[str]) -> 
     if ThermalRates.kind in changes and keys.temperature is None:
         raise top.error(ThermalRates.kind, "the recipe has no temperature; add a table [temperature]")
     return changes
-
-
-def _temperature(keys: Any) -> Cooling | None:
-    """Read the temperature of the cameras; the default reference is that of the air."""
-    return keys and keys.plan(reference_c=keys.air_c if keys.reference_c is None else keys.reference_c)
 
 
 def _walk(top: Section, keys: Any) -> CameraWalk | None:

@@ -7,8 +7,7 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.camera import constant_names, get_parameter, parameter_names
-from jaxphoto.cloud import Cloud
-from jaxphoto.georeferencing import Scanner, StripErrors, Trajectory
+from jaxphoto.georeferencing import Scanner, StripErrors
 from jaxphoto.io import clouds
 from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
@@ -38,7 +37,8 @@ def write_simulation(simulation: Simulation, folder: str | Path) -> None:
         for name, table in truth_tables(simulation).items():
             table.to_csv(work / FOLDER / f"{name}.csv", index=False)
         if simulation.cloud is not None and simulation.trajectory is not None:
-            _write_scan(simulation.cloud, simulation.trajectory, work)
+            clouds.write_cloud(simulation.cloud, work / CLOUD)
+            write_flight_csv(records_of(simulation.trajectory, TRAJECTORY), work / TRAJECTORY)
 
 
 def truth_tables(simulation: Simulation) -> dict[str, pd.DataFrame]:
@@ -94,12 +94,6 @@ def _georeferencing(simulation: Simulation) -> list[tuple[str, float]]:
         for name, own in owners.items():
             rows += _in_degrees(own, name)
     return rows + [(f"datum_offset_{a}_m", v) for a, v in zip(AXES, simulation.datum_offset_m, strict=True)]
-
-
-def _write_scan(cloud: Cloud, trajectory: Trajectory, folder: Path) -> None:
-    """Write the point cloud and the trajectory in the frame of the block."""
-    clouds.write_cloud(cloud, folder / CLOUD)
-    write_flight_csv(records_of(trajectory, TRAJECTORY), folder / TRAJECTORY)
 
 
 def _scanner_rows(scanner: Scanner, errors: StripErrors) -> list[tuple[str, float]]:
