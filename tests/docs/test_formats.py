@@ -18,7 +18,7 @@ from tests.io import (
     test_cameras,
     test_colmap,
     test_reconstructions,
-    test_robotics_cameras,
+    test_camera_formats,
 )
 from tests.io.conftest import FILES
 
@@ -124,8 +124,8 @@ CAMERAS = {
     "interior": ("interior.csv", test_cameras.INTERIOR), "block": ("a.toml", test_cameras.TOML),
     "agisoft": ("a.xml", test_cameras.AGISOFT), "smac": ("a.txt", test_cameras.SMAC),
     "colmap": ("cameras.txt", test_cameras.COLMAP), "opencv": ("a.yml", test_cameras.OPENCV),
-    "mrcal": ("a", test_robotics_cameras.mrcal("OPENCV8", test_robotics_cameras.RATIONAL)),
-    "kalibr": ("a.yaml", test_robotics_cameras.KALIBR),
+    "mrcal": ("a", test_camera_formats.mrcal("OPENCV8", test_camera_formats.RATIONAL)),
+    "kalibr": ("a.yaml", test_camera_formats.KALIBR),
 }  # fmt: skip
 CONTROL = {
     "gcp_list": control_files.GCP_LIST, "metashape": control_files.MARKERS, "geo_json": control_files.GEO_JSON,

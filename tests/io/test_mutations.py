@@ -16,7 +16,7 @@ from jaxphoto.io.exposures import read_exposures
 from tests import sound_files
 from tests.io import control_files, oriented_files, test_bal, test_cameras, test_colmap, test_reconstructions
 from tests.io.conftest import FILES
-from tests.io.test_robotics_cameras import KALIBR
+from tests.io.test_camera_formats import KALIBR
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 

@@ -14,7 +14,7 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
 from jaxphoto.extras.formats import ProjectCamera, export, read_source, read_tables
 from jaxphoto.extras.formats.points_beside import joined, named, points_of
-from jaxphoto.extras.formats.texts import is_exterior, read_exterior
+from jaxphoto.extras.formats.texts import is_exterior, ray_misfit, read_exterior
 from jaxphoto.io.block_folder.table_layout import XYZ
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
 from tests.formulas import camera_from_object
@@ -369,3 +369,10 @@ def test_a_fisheye_of_instant_ngp_is_one_and_a_term_that_is_not_read_is_refused(
     path.write_text(json.dumps(content | {"k4": 0.1}))
     with pytest.raises(InputError, match="k4: cameras of kind OPENCV have no such term here"):
         read_source(tmp_path, "nerfstudio")
+
+
+def test_parallel_rays_of_a_row_that_is_repeated_have_a_misfit():
+    # Found among spoilt files: the sum of so many of these rays is singular to the last digit.
+    number = 594
+    rays, first = np.tile([-0.9, 0.5, 1.5], (number, 1)), np.zeros(number, int)
+    assert np.isfinite(ray_misfit(np.zeros((1, 3)), np.eye(3)[None], rays, first, first))
