@@ -15,10 +15,10 @@ from tests.io import (
     control_files,
     oriented_files,
     test_bal,
+    test_camera_formats,
     test_cameras,
     test_colmap,
     test_reconstructions,
-    test_camera_formats,
 )
 from tests.io.conftest import FILES
 

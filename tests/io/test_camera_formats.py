@@ -1,21 +1,30 @@
 """Cameras of mrcal, ROS, Kalibr and COLMAP, of fisheyes, and in models of fewer terms: projection, conversion, loss."""
 
+import struct
+
 import cv2
+import equinox as eqx
 import numpy as np
 import pytest
-from jaxphoto.camera import InteriorOrientation, OpenCv
-from jaxphoto.errors import InputError
-from jaxphoto.extras.formats import write_camera_file
-from jaxphoto.io.camera_files import read_camera_file
-from tests.io.test_cameras import POINTS, SENSOR, columns_rows, written
-import struct
-import equinox as eqx
+
 import jaxphoto
-from jaxphoto.camera import Equidistant, Equisolid, InteriorOrientation, OpenCv, OpenCvFisheye, Perspective, Sensor
-from jaxphoto.extras.formats.colmap import MODELS
-from jaxphoto.camera import Brown, InteriorOrientation, OpenCv, Sensor, get_parameter
+from jaxphoto.camera import (
+    Brown,
+    Equidistant,
+    Equisolid,
+    InteriorOrientation,
+    OpenCv,
+    OpenCvFisheye,
+    Perspective,
+    Sensor,
+    get_parameter,
+)
+from jaxphoto.errors import InputError
 from jaxphoto.extras.formats import CAMERA_FORMATS, CAMERA_MODELS, write_camera_file
+from jaxphoto.extras.formats.colmap import MODELS
+from jaxphoto.io.camera_files import read_camera_file
 from tests.commands import run
+from tests.io.test_cameras import POINTS, SENSOR, columns_rows, written
 
 RATIONAL = [-0.21, 0.11, 1.1e-3, -2.3e-3, 0.02, 0.03, -0.01, 0.004]
 MRCAL = """# generated on a board
@@ -260,7 +269,10 @@ def test_a_loss_that_nobody_wants_is_refused_until_it_is_allowed(tmp_path):
         write_camera_file(path, FITTED_SENSOR, RATIONAL_CAMERA, model="SIMPLE_PINHOLE")
     assert not path.exists()
     allowed = float(str(e.value).rsplit(maxsplit=1)[-1].rstrip(")"))
-    assert allowed - 1 <= write_camera_file(path, FITTED_SENSOR, RATIONAL_CAMERA, model="SIMPLE_PINHOLE", loss_px=allowed).max_px
+    assert (
+        allowed - 1
+        <= write_camera_file(path, FITTED_SENSOR, RATIONAL_CAMERA, model="SIMPLE_PINHOLE", loss_px=allowed).max_px
+    )
 
 
 def test_a_model_of_another_format_is_refused(tmp_path):

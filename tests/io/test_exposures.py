@@ -1,25 +1,24 @@
 """Files of exposures: read, matched to photographs, reduced to the camera; each invalid input costs one message."""
 
 import re
+import shutil
 from datetime import datetime, timedelta
+
 import numpy as np
 import pyproj
 import pytest
+from PIL import Image
 from pyproj import CRS
+
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude, level_from_belly
 from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS, WEEK_S, Taken
 from jaxphoto.georeferencing.gps import FIX_SIGMA_M, Gps, moved
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.io.exposures import located, read_exposures, with_exposures
-from jaxphoto.io.photographs import Photograph
+from jaxphoto.io.photographs import Photograph, valid_photographs
 from jaxphoto.io.trajectory import write_sbet
 from tests import sound_files
-import shutil
-from PIL import Image
-from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS
-from jaxphoto.io.exposures import located
-from jaxphoto.io.photographs import valid_photographs
 
 ORIGIN = Gps(55.7, 13.2, 100.0)
 BEGIN_S = 2200 * WEEK_S + 200_000.0

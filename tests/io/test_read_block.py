@@ -1,19 +1,20 @@
 """Read good block folders in every permitted spelling, and the modes of georeferencing."""
 
 import warnings
+
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
+
 from jaxphoto.block import Datum
 from jaxphoto.camera import Brown14, Ebner, Gruen, Smac
-from jaxphoto.io import read_block
-from jaxphoto.unknowns import FIXED, FREE, Weighted
-import equinox as eqx
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import read_block, write_block
-from jaxphoto.unknowns import FIXED, FREE
+from jaxphoto.unknowns import FIXED, FREE, Weighted
 from jaxphoto.variants import direct, indirect, integrated
 from tests.io.test_write_block import assert_same
+
 
 def test_observations(write_folder):
     block = read_block(write_folder())
