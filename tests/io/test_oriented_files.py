@@ -138,7 +138,7 @@ def test_parameters_and_image_points_are_a_block(tmp_path, name):
     )
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     case=st.sampled_from(
         [("metashape", "agisoft", "local"), ("metashape", "agisoft", "epsg"), ("opk", "opencv", "local"),

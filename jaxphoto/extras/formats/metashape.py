@@ -1,8 +1,9 @@
 """Agisoft Metashape and PhotoScan: calibrations, exported cameras and markers as XML.
 
     calibration                              f, cx, cy, b1, b2 in pixels, k1-k4, p1-p4; cx, cy from the image centre, y
-    down document/chunk/sensors/sensor            id, label, calibration .../components/component/transform
-    rotation, translation, scale: from the chunk to geocentric axes of the
+                                             down
+    document/chunk/sensors/sensor            id, label, calibration
+    .../components/component/transform       rotation, translation, scale: from the chunk to geocentric axes of the
                                              datum, or to the local system; chunk/transform in older files
     .../cameras//camera                      id, sensor_id, component_id, label; transform: 4 x 4, from the axes of the
                                              camera, x right, y down, z ahead, to the chunk
