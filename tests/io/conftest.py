@@ -1,4 +1,4 @@
-"""A small block folder that has every file, for tests to read and to spoil."""
+"""A small block folder with every file, to read and to modify."""
 
 from collections.abc import Callable
 from pathlib import Path

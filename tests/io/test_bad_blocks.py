@@ -1,4 +1,4 @@
-"""Every kind of bad input: one sentence that names the file, the row or key, and the mend."""
+"""Every kind of invalid block: one message with file, row or key, and cure."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Problems of "Bundle Adjustment in the Large": the block of a small one, its cost, and what is refused."""
+"""Problems of "Bundle Adjustment in the Large": block, cost and refusals."""
 
 import jax
 import jax.numpy as jnp
@@ -80,7 +80,7 @@ def test_half_the_weighted_square_sum_is_the_cost_of_the_problem(write):
     np.testing.assert_allclose(0.5 * np.sum(v**2), 0.5 * np.sum(NOISE**2), rtol=1e-11)
 
 
-def test_what_a_problem_becomes(write):
+def test_a_problem_is_read_as_a_block(write):
     path = write()
     block = read_source(path)
     assert block.title == "problem-3-5-pre"

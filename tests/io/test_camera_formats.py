@@ -96,7 +96,7 @@ def test_cameras_of_a_chain_of_kalibr_project_as_opencv(tmp_path):
         read_camera_file(path)
 
 
-def test_a_file_of_ros_says_what_opencv_reads(tmp_path):
+def test_ros_file_has_the_keys_of_opencv(tmp_path):
     interior = InteriorOrientation(35.0, 0.065, 0.274, OpenCv(k1=-0.2, k2=0.1, p1=1e-3, p2=-2e-3))
     write_camera_file(tmp_path / "a.yaml", SENSOR, interior, "ros", name="nadir")
     text = (tmp_path / "a.yaml").read_text()
@@ -116,7 +116,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_read_is_told_in_a_sentence(tmp_path, name):
+def test_invalid_camera_files_are_refused(tmp_path, name):
     file, text, message = REFUSED[name]
     with pytest.raises(InputError, match=message):
         read_camera_file(written(tmp_path, text, file), camera="cam0" if file.endswith("yaml") else None)
@@ -222,7 +222,7 @@ def of_opencv(path):
     return [storage.getNode(k).mat() for k in ("camera_matrix", "distortion_coefficients")]
 
 
-def test_opencv_with_five_coefficients_misses_by_what_the_file_says(tmp_path):
+def test_opencv_with_five_coefficients_has_the_reported_misfit(tmp_path):
     full, five = tmp_path / "full.yml", tmp_path / "five.yml"
     assert write_camera_file(full, FITTED_SENSOR, RATIONAL_CAMERA).max_px == 0
     done = write_camera_file(five, FITTED_SENSOR, RATIONAL_CAMERA, model="OPENCV5")
@@ -263,7 +263,7 @@ def test_more_terms_lose_less(tmp_path):
     assert lost == sorted(lost, reverse=True) and lost[0] > 10 and lost[-1] == 0
 
 
-def test_a_loss_that_nobody_wants_is_refused_until_it_is_allowed(tmp_path):
+def test_losses_beyond_the_limit_are_refused(tmp_path):
     path = tmp_path / "cameras.txt"
     with pytest.raises(InputError, match=r"not be this camera any more \(fitted .*at column .*--loss-px \d+\)") as e:
         write_camera_file(path, FITTED_SENSOR, RATIONAL_CAMERA, model="SIMPLE_PINHOLE")
@@ -283,7 +283,7 @@ def test_a_model_of_another_format_is_refused(tmp_path):
     assert {name for _, name in EVERY} == set(CAMERA_MODELS)
 
 
-def test_the_command_says_what_is_lost_and_where(tmp_path, monkeypatch, capsys):
+def test_the_command_reports_loss_and_worst_point(tmp_path, monkeypatch, capsys):
     brown = InteriorOrientation(9.0, 0.02, -0.03, Brown(k1=-9e-4, k2=1e-6))
     write_camera_file(tmp_path / "block.toml", FITTED_SENSOR, brown)
     files = tmp_path / "block.toml", tmp_path / "a.yaml"

@@ -1,3 +1,5 @@
+"""Camera files of OpenCV, Agisoft, COLMAP, SMAC reports, results and blocks: projection, round trips, refusals."""
+
 import json
 
 import cv2
@@ -147,7 +149,7 @@ def test_opencv_file_projects_as_opencv(tmp_path):
     assert "assumed" not in sized.note
 
 
-def test_agisoft_file_projects_as_its_manual_says(tmp_path):
+def test_agisoft_file_projects_by_the_equations_of_its_manual(tmp_path):
     camera = read_camera_file(written(tmp_path, AGISOFT, "lens.xml"))
     x, y = POINTS[:, 0] / POINTS[:, 2], POINTS[:, 1] / POINTS[:, 2]
     k = (-0.118322055927498, 0.093632083518507, -0.0123, 0.0021)
@@ -160,7 +162,7 @@ def test_agisoft_file_projects_as_its_manual_says(tmp_path):
 
 
 @pytest.mark.parametrize("p", [(0.0, 0.0), (0.0011, -0.0007)])
-def test_an_older_agisoft_file_projects_as_the_manual_of_lens_says(tmp_path, p):
+def test_older_agisoft_file_projects_by_the_equations_of_lens(tmp_path, p):
     """fx, fy and skew, the principal point from the upper left corner, p1 and p2 as OpenCV has them."""
     numbers = {"fx": 3270.5, "fy": 3268.3, "cx": 1971.4, "cy": 1529.5, "skew": -4.25, "k1": -0.118, "k2": 0.0936}
     numbers |= {"width": 4032, "height": 3024, "p1": p[0], "p2": p[1]}
@@ -245,7 +247,7 @@ SENSOR = Sensor(4500, 3000, 0.008)
         ("ros", "a.yaml"),
     ],
 )
-def test_what_speaks_against_a_camera_stands_in_its_file_and_does_no_harm(tmp_path, kind, file):
+def test_reservations_are_comments_of_camera_files(tmp_path, kind, file):
     interior = InteriorOrientation(35.0, 0.065, 0.274, OpenCv(k1=-0.2, k2=0.1, p1=1e-3, p2=-2e-3))
     said = "the verdict is red: T1 -- and 3 <others> are off"
     for name, against in (("plain", ""), ("marked", said)):
@@ -266,7 +268,7 @@ def test_json_and_reports_have_no_comment(tmp_path):
         same_numbers(read_camera_file(tmp_path / file, pixel_mm=SENSOR.pixel_mm).interior, interior)
 
 
-def test_colmap_camera_is_the_simplest_model_that_holds_it(tmp_path):
+def test_colmap_camera_is_the_simplest_sufficient_model(tmp_path):
     models = []
     for distortion in (OpenCv(), OpenCv(b1=1e-3), OpenCv(k1=0.1), OpenCv(k2=0.1), OpenCv(p2=0.1), OpenCv(k3=0.1)):
         write_camera_file(tmp_path / "cameras.txt", SENSOR, InteriorOrientation(35.0, 0.1, 0.2, distortion))
@@ -507,7 +509,7 @@ def test_results_that_are_incomplete_are_refused(tmp_path):
 # The command ------------------------------------------------------------------------------------------------
 
 
-def test_command_converts_and_says_how_well(tmp_path, monkeypatch, capsys):
+def test_command_converts_and_reports_the_misfit(tmp_path, monkeypatch, capsys):
     written(tmp_path, OPENCV.replace("0.03, -0.01, 0.004", "0., 0., 0."), "calib.yml")
     arguments = ["camera", str(tmp_path / "calib.yml"), str(tmp_path / "lens.xml"), "--pixel-mm", "0.0048"]
     monkeypatch.setattr("sys.argv", ["jaxphoto", *arguments])

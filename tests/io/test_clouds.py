@@ -1,4 +1,4 @@
-"""Clouds: LAS, LAZ, CSV and PLY, their systems and units, filters, and what is said of those that cannot be used."""
+"""Point clouds in LAS, LAZ, CSV and PLY: systems, units, filters, and refusals."""
 
 import dataclasses
 import warnings
@@ -69,7 +69,7 @@ def small_chunks(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["c.las", "c.laz", "c.csv", "c.ply"])
-def test_what_is_written_is_read(tmp_path, name):
+def test_clouds_round_trip(tmp_path, name):
     cloud = sample()
     clouds.write_cloud(cloud, tmp_path / name)
     read = clouds.read_cloud(tmp_path / name, LOCAL)
@@ -80,7 +80,7 @@ def test_what_is_written_is_read(tmp_path, name):
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
-def test_what_a_file_does_not_tell_is_none(tmp_path):
+def test_missing_columns_are_none(tmp_path):
     bare = Cloud(sample(50).xyz)
     for name in ("c.csv", "c.ply"):
         clouds.write_cloud(bare, tmp_path / name)
@@ -119,7 +119,7 @@ def test_strips_without_points_are_left_out(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["las", "laz"])
-def test_withheld_points_are_not_read_but_stay_in_what_is_written(tmp_path, kind):
+def test_withheld_points_are_kept_in_written_files(tmp_path, kind):
     cloud = sample(500)
     withheld = np.arange(500) % 3 == 0
     kinds = np.where(np.arange(500) % 5 == 0, 7, 2)
@@ -141,7 +141,7 @@ def test_withheld_points_are_not_read_but_stay_in_what_is_written(tmp_path, kind
             np.testing.assert_array_equal(written[name], values)
 
 
-def test_withheld_points_that_cannot_be_moved_stay(tmp_path):
+def test_withheld_points_outside_the_system_stay(tmp_path):
     """Far from any map, without a time or of a strip that nobody knows: that is why a file withholds them."""
     xyz = sample(500).xyz
     xyz[3] = [9e8, 0.0, 0.0]
@@ -444,7 +444,7 @@ def test_points_outside_the_header_show_damage(tmp_path):
     assert "outside the extent" in complaint(path)
 
 
-def test_files_that_are_none(tmp_path):
+def test_invalid_files_are_refused(tmp_path):
     assert "no file" in complaint(tmp_path / "none.las")
     assert "folder" in complaint(tmp_path)
     (tmp_path / "c.xyz").write_text("1 2 3\n")
@@ -516,7 +516,7 @@ def test_coordinates_that_a_scale_cannot_count(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["c.las", "c.csv", "c.ply"])
-def test_beside_the_block(tmp_path, name):
+def test_clouds_off_the_block_are_refused(tmp_path, name):
     cloud = sample(middle=(600_000.0, 800_000.0, 0.0))
     clouds.write_cloud(Cloud(cloud.xyz), tmp_path / name)
     away = np.array([[0.0, 0.0], [1000.0, 2000.0]])
@@ -532,7 +532,7 @@ def test_beside_the_block(tmp_path, name):
     assert "--cloud-unit m)" in message or "--cloud-unit m " in message
 
 
-def test_filters_that_leave_nothing_say_what_there_is(tmp_path):
+def test_empty_selections_list_classes_and_returns(tmp_path):
     cloud = sample()
     clouds.write_cloud(cloud, tmp_path / "c.laz")
     message = complaint(tmp_path / "c.laz", classes=[3, 9])
@@ -586,7 +586,7 @@ def test_faulty_rows_are_named(tmp_path, row, says):
         assert f"c.ply, row {404 - 3 + len(header) + 1}: {where}" in complaint(tmp_path / "c.ply")
 
 
-def test_tables_that_are_none(tmp_path):
+def test_invalid_tables_are_refused(tmp_path):
     path = tmp_path / "c.csv"
     for text, says in (("", "is empty"), ("X_m,Y_m\n1,2\n", "Z_m is missing"), ("x y z\n1 2 3\n", "X_m is missing")):
         path.write_text(text)
@@ -687,6 +687,6 @@ def test_copc_is_read_and_rewritten_as_laz(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["las", "laz"])
-def test_a_time_that_is_none(tmp_path, kind):
+def test_nonfinite_times_are_refused(tmp_path, kind):
     time = np.where(np.arange(1000) == 700, np.nan, 5.0)
     assert "no finite time" in complaint(write_las(tmp_path / f"c.{kind}", sample().xyz, gps_time=time))

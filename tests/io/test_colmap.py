@@ -1,4 +1,4 @@
-"""COLMAP models: the same block from text and binary, by COLMAP's own equations, and back; what is refused."""
+"""COLMAP models in text and binary by COLMAP's equations, their round trip, and refusals."""
 
 import dataclasses
 import operator
@@ -94,7 +94,7 @@ def write_binary(folder):
 
 
 @pytest.mark.parametrize("write", [write_text, write_binary])
-def test_a_model_is_read_as_colmap_means_it(tmp_path, write):
+def test_a_model_projects_by_the_equations_of_colmap(tmp_path, write):
     block = read_source(write(tmp_path / "model"))
     assert block.images == ("a", "b", "c")
     assert set(block.points) == {str(i) for i in IDS}
@@ -128,7 +128,7 @@ def test_it_becomes_a_block_folder(tmp_path):
         ("FULL_OPENCV", "800 801 320 240 .1 .01 .001 .002 .3 .4 .5 .6", {*RATIONAL, "p1", "p2", "b1"}),
     ],
 )  # fmt: skip
-def test_cameras_are_free_in_what_their_model_has(tmp_path, model, params, free):
+def test_parameters_of_the_model_are_free(tmp_path, model, params, free):
     def change(name, lines):
         return [f"5 {model} 640 480 {params}"] if name == "cameras" else lines
 
@@ -143,7 +143,7 @@ def test_cameras_are_free_in_what_their_model_has(tmp_path, model, params, free)
         assert float(interior.distortion.b1) == pytest.approx(800 / 801 - 1)
 
 
-def test_what_a_model_has_twice_is_used_once(tmp_path):
+def test_duplicates_in_a_model_are_used_once(tmp_path):
     """Point 41 is point 40 again by the same features; image c shows point 3 in two features; point 50 is seen once."""
 
     def change(name, lines):
@@ -192,7 +192,7 @@ def spoil(file, row, text):
         (lambda name, lines: lines[:2] if name == "images" else lines, "no image is oriented"),
     ],
 )  # fmt: skip
-def test_what_is_no_model_is_told_in_a_sentence(tmp_path, change, message):
+def test_invalid_models_are_refused(tmp_path, change, message):
     with pytest.raises(InputError, match=message):
         read_source(write_text(tmp_path / "model", change), "colmap")
 
@@ -298,7 +298,7 @@ def test_pycolmap_reads_what_is_written(tmp_path, format):
         np.testing.assert_allclose(*pose, atol=1e-12)
 
 
-def test_where_no_model_can_be_written(tmp_path):
+def test_models_that_cannot_be_written(tmp_path):
     block = read_source(write_text(tmp_path / "model"))
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.txt").write_text("years of work")

@@ -1,4 +1,4 @@
-"""Other programs' projects -> blocks, on real data: counts as published, and published orientations reproject."""
+"""Projects of other programs as blocks, with real data: published counts and orientations."""
 
 import re
 import shutil

@@ -1,4 +1,4 @@
-"""Last year's calibration as a prior: read as a user names it, and worth what its covariance says."""
+"""An earlier calibration as prior information with its covariance."""
 
 import shutil
 
@@ -98,7 +98,7 @@ def test_a_camera_file_keeps_the_covariance(years, results, monkeypatch, capsys)
         ('calibration = "../results"\n[cameras.one.unknowns]\nc_mm = "fixed"', "it is known beforehand by"),
     ],
 )
-def test_what_is_no_prior_is_refused(years, results, table, sentence):
+def test_invalid_calibrations_are_refused(years, results, table, sentence):
     name = f"bad{abs(hash(table))}"
     folder = with_camera(years, name, f"[cameras.one]\n{table}")
     with pytest.raises(InputError, match=sentence.replace("(", r"\(")):

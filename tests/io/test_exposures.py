@@ -105,7 +105,7 @@ def test_marks_by_number_with_fewer_and_more_lines_than_photographs(tmp_path):
 
 
 @pytest.mark.parametrize(("shift_s", "words"), [(-8 * 3600.0, "+8 h (time zone)"), (-18.0, "+18 s (leap seconds")])
-def test_marks_in_a_wrong_time_zone_or_in_utc_are_found_and_said(tmp_path, shift_s, words):
+def test_marks_in_a_wrong_time_zone_or_in_utc_are_corrected_and_reported(tmp_path, shift_s, words):
     file = read_exposures(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k, k + 31, shift_s) for k in ALL)))
     taken, said = with_exposures([FLIGHT.photograph(k, told=True, name=f"IMG{k}") for k in ALL], [file])
     assert all(same(p.gps, c) for p, c in zip(taken, FLIGHT.camera, strict=True))
@@ -113,7 +113,7 @@ def test_marks_in_a_wrong_time_zone_or_in_utc_are_found_and_said(tmp_path, shift
 
 
 @pytest.mark.parametrize("lost", [0, 2])
-def test_marks_numbered_anew_after_a_loss_are_joined_by_the_positions(tmp_path, lost):
+def test_renumbered_marks_are_matched_by_positions(tmp_path, lost):
     """Exposures at equal intervals: the numbers fit the times as well, shifted by one."""
     steady = Flight()
     steady.time = BEGIN_S + 3.0 * np.arange(10)
@@ -261,7 +261,7 @@ def test_an_sbet_gives_positions_and_attitudes(tmp_path):
     assert all(same(p.gps, c, 0.1) for p, c in zip(taken, FLIGHT.camera, strict=True) if p.gps.fix == "integrated")
 
 
-def test_a_lever_arm_that_turns_nothing_is_said(tmp_path):
+def test_unused_lever_arm_is_reported(tmp_path):
     file = read_exposures(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k) for k in ALL)))
     photographs = [FLIGHT.photograph(k) for k in ALL]
     arm = (0.0, 0.1, 0.2)
@@ -403,7 +403,7 @@ def test_tables_of_other_programs(tmp_path, form):
         ("EASTING, NORTHING", "E, N", "its head names no columns"),
     ],
 )
-def test_a_text_of_pospac_that_is_not_what_it_says_is_refused(tmp_path, old, new, words):
+def test_inconsistent_pospac_texts_are_refused(tmp_path, old, new, words):
     text = OTHERS["pospac"][0]
     assert old in text
     with pytest.raises(InputError, match=words):
@@ -415,7 +415,7 @@ def test_a_row_of_pospac_that_is_too_short_is_left_out(tmp_path):
     assert "row 18: 10 cells, and the header has 11" in read_exposures(written(tmp_path / "eo.txt", text)).why
 
 
-def test_tables_that_nobody_can_know_are_refused(tmp_path):
+def test_ambiguous_tables_are_refused(tmp_path):
     for text, words in (
         (table_of("imageName,X,Y,Z", "{0},{4},{5},{3}"), "are map coordinates; give the EPSG code"),
         (table_of("#imagename,coordinate1,coordinate2,z", "{0},{1},{2},{3}"), "add a header"),
@@ -468,7 +468,7 @@ def at_row(text, row, change):
 
 
 @pytest.mark.parametrize("name", FORMS)
-def test_rows_that_are_wrong_are_left_out_and_named(tmp_path, name):
+def test_invalid_rows_are_skipped_and_named(tmp_path, name):
     text, first = FORMS[name]
     path = tmp_path / name
     whole = read_exposures(written(path, text))
@@ -497,7 +497,7 @@ def test_rows_that_are_wrong_are_left_out_and_named(tmp_path, name):
         read_exposures(written(path, worse))
 
 
-def test_what_is_wrong_with_a_whole_table_is_not_said_of_a_row(tmp_path):
+def test_errors_of_a_whole_table_name_no_row(tmp_path):
     text = table_of("imageName,X,Y,Z", "{0},{4},{5},{3}")
     with pytest.raises(InputError, match="are map coordinates; give the EPSG code"):
         read_exposures(written(tmp_path / "a.csv", at_row(text, 3, lambda line: line + '"')))
@@ -508,7 +508,7 @@ def test_what_is_wrong_with_a_whole_table_is_not_said_of_a_row(tmp_path):
     assert found.without == (2, 5) and "it is there twice" in found.why and len(found.rows) == 8
 
 
-def test_numbers_are_not_trusted_where_a_row_that_was_lost_may_have_hidden_that_they_began_anew(tmp_path):
+def test_numbers_are_not_used_if_an_invalid_row_may_hide_a_renumbering(tmp_path):
     """The first exposure is not in the file, which counts from 1, and a row in its middle is spoilt."""
     steady = Flight()
     steady.time = BEGIN_S + 3.0 * np.arange(10)
@@ -586,7 +586,7 @@ SPOILT = {
 
 
 @pytest.mark.parametrize("kind", SPOILT)
-def test_each_spoilt_input_costs_one_sentence_and_the_rest_goes_on(clean, tmp_path, kind):
+def test_each_invalid_input_costs_one_message(clean, tmp_path, kind):
     spoil, words, lost = SPOILT[kind]
     before, sound = said_of(clean)
     folder = shutil.copytree(clean, tmp_path / "flight")

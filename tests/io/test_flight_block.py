@@ -1,4 +1,4 @@
-"""Blocks whose stations, attitudes and motion come from a trajectory, or whose motion stands in the tables."""
+"""Blocks with stations, attitudes and motion from a trajectory or from tables."""
 
 import dataclasses
 
@@ -86,7 +86,7 @@ def test_coarse_records_cost_accuracy(fly):
     assert (np.abs(block.stations.value - position) < 3 * np.asarray(block.stations.sigma)).all()
 
 
-def test_sigmas_are_those_of_block_toml_where_the_file_has_none(fly, write_folder):
+def test_default_sigmas_are_those_of_block_toml(fly, write_folder):
     records = flight()._replace(sigma_m=np.full((len(flight().time), 3), np.nan))
     np.testing.assert_allclose(read_block(fly(records)).stations.sigma, 0.10, rtol=1e-3)
 
@@ -286,7 +286,7 @@ def with_motion(folder, velocity=True, rate=True):
     return folder
 
 
-def test_motion_from_tables_comes_back(write_folder, tmp_path):
+def test_motion_from_tables_round_trip(write_folder, tmp_path):
     block = read_block(with_motion(write_folder(FIX_OFFSET)))
     np.testing.assert_array_equal(block.motion.velocity, [[60, 0.5, -0.1], [61, 0.25, 0.3], [0, 0, 0]])
     np.testing.assert_allclose(np.rad2deg(block.motion.rate), [[0.5, 1.5, 2.5], [0, -1, -2], [0, 0, 0]])

@@ -1,4 +1,4 @@
-"""Files with random mistakes of a user's editor: read as they stand, or refused by an error, never by a traceback."""
+"""Files with random mistakes: read, or refused by an error without traceback."""
 
 import re
 import warnings

@@ -1,4 +1,4 @@
-"""Orientations with image points beside them: read as they were written, in map systems too; refused in a sentence."""
+"""Orientations with separate image points, in local and map systems, and refusals."""
 
 import dataclasses
 import json
@@ -64,7 +64,7 @@ REAL = """<document version="2.0.0"><chunk label="Chunk 1"><sensors><sensor id="
 -0.01288400 0.02326485 -0.99964631 0.43561421 0 0 0 1</transform></camera></group></cameras></chunk></document>"""
 
 
-def test_a_camera_of_metashape_itself_is_where_its_receiver_was_and_looks_down(tmp_path):
+def test_a_camera_exported_by_metashape_agrees_with_gnss_and_looks_down(tmp_path):
     """One photograph of a flight that is public: its GNSS says -120.417985477, 39.41191747, 2420.109."""
     # Two of it, because points of one photograph tie nothing.
     twice = re.sub(r"(<camera .*?</camera>)", lambda m: m[1] + m[1].replace("one.JPG", "two.JPG"), REAL, flags=re.S)
@@ -147,7 +147,7 @@ def test_parameters_and_image_points_are_a_block(tmp_path, name):
     values=poses,
 )  # fmt: skip
 @pytest.mark.filterwarnings("ignore:.*fewer than", "ignore:.*not read")
-def test_poses_come_back(tmp_path_factory, case, values):
+def test_poses_round_trip(tmp_path_factory, case, values):
     (format, camera, kind), folder, values = case, tmp_path_factory.mktemp("poses"), np.array(values)
     turn = np.stack([camera_from_object(*angles) for angles in values[:, 3:]])
     p = photographs(camera, kind)._replace(exterior=ExteriorOrientation(values[:, :3], turn))
@@ -273,13 +273,13 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_is_told_in_a_sentence(tmp_path, name):
+def test_invalid_files_are_refused(tmp_path, name):
     write, message = REFUSED[name]
     with pytest.raises(InputError, match=message):
         read_source(write(tmp_path / "in"))
 
 
-def test_photographs_that_nothing_ties_are_told(tmp_path):
+def test_untied_photographs_are_reported(tmp_path):
     write_metashape(tmp_path / "in", ties=False)
     (tmp_path / "in" / "ties.txt").write_text("a b camera\n1 0.5 0.5\n2 0.5 0.6\n3 0.5 0.7\n-99\nlost camera\n")
     with (
@@ -347,7 +347,7 @@ def test_a_tie_point_of_a_markers_name_is_another_point_unless_it_lies_there():
     }  # fmt: skip
 
 
-def test_an_empty_line_ends_a_photograph_and_millimetres_are_told_by_their_signs(tmp_path):
+def test_empty_lines_end_photographs_and_signs_identify_millimetres(tmp_path):
     text = tmp_path / "ties.txt"
     text.write_text("a.jpg\n1 -1.0 2.0\n2 3.0 1.0\n\nb.jpg\n1 4.0 2.0\n2 1.0 0.5\n\n")
     sensor = Sensor(1000, 800, 0.01)
@@ -359,7 +359,7 @@ def test_an_empty_line_ends_a_photograph_and_millimetres_are_told_by_their_signs
     np.testing.assert_allclose(pixels, [[1.0, 2.0], [3.0, 1.0], [4.0, 2.0], [1.0, 0.5]])
 
 
-def test_a_fisheye_of_instant_ngp_is_one_and_a_term_that_is_not_read_is_refused(tmp_path):
+def test_instant_ngp_fisheye_and_unknown_terms(tmp_path):
     path = write_nerfstudio(tmp_path, "fisheye") / "transforms.json"
     content = json.loads(path.read_text())
     del content["camera_model"]

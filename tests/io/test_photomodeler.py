@@ -1,4 +1,4 @@
-"""PhotoModeler's text export: by its own equations, written down independently; alone and with control; refused."""
+"""PhotoModeler's text export by its equations, alone and with control, and refusals."""
 
 import numpy as np
 import pytest
@@ -95,7 +95,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_a_bad_export_is_told_in_a_sentence(tmp_path, name):
+def test_invalid_exports_are_refused(tmp_path, name):
     text, message = REFUSED[name]
     (tmp_path / "a.txt").write_text(text)
     with pytest.raises(InputError, match=message):

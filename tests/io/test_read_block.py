@@ -228,7 +228,7 @@ interior.c_mm = 5.0
         ),
     ],
 )  # fmt: skip
-def test_what_is_not_used_is_said(write_folder, change, words):
+def test_unused_content_is_reported(write_folder, change, words):
     with pytest.warns(UserWarning, match="not.* used") as caught:
         block = read_block(write_folder(change))
     assert len(caught) == 1
@@ -238,7 +238,7 @@ def test_what_is_not_used_is_said(write_folder, change, words):
     assert len(block.points) == 4
 
 
-def test_nothing_is_said_of_a_good_folder(write_folder):
+def test_valid_folder_gives_no_warning(write_folder):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         read_block(write_folder())
@@ -261,7 +261,7 @@ def read_quietly(folder, name):
 
 
 @pytest.mark.parametrize("name", MODES)
-def test_the_mode_is_the_variant_and_comes_back(write_folder, tmp_path, name):
+def test_the_mode_selects_the_variant_and_round_trips(write_folder, tmp_path, name):
     block = read_quietly(write_folder(PLACED, mode(name)), name)
     (tmp_path / "block").rename(tmp_path / "first")
     assert_same(block, MODES[name](read_block(write_folder(PLACED))))
@@ -276,7 +276,7 @@ def test_integrated_is_the_default(write_folder):
     assert len(read_block(write_folder()).stations.who) == 6
 
 
-def test_what_a_mode_cannot_be(write_folder):
+def test_unknown_modes_are_refused(write_folder):
     with pytest.raises(InputError, match=r"\[georeferencing\] mode: 'pure' is unknown; write .direct., .integrated."):
         read_block(write_folder(mode("pure")))
 
@@ -286,7 +286,7 @@ def test_direct_needs_an_orientation_of_every_image(write_folder):
         read_block(write_folder(mode("direct")))
 
 
-def test_held_images_beside_their_sensors_cannot_be_written(write_folder, tmp_path):
+def test_fixed_images_with_sensors_cannot_be_written(write_folder, tmp_path):
     block = read_block(write_folder(PLACED))
     both = lambda b: (b.priors.exterior.position, b.priors.exterior.camera_from_object)  # noqa: E731
     for held in ((FIXED, FIXED), (FIXED, FREE)):

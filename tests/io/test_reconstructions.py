@@ -1,4 +1,4 @@
-"""What other programs oriented: read as each means it, by its own equations; written and read again; refused."""
+"""Reconstructions of other programs by their equations, round trips, and refusals."""
 
 import dataclasses
 import json
@@ -255,7 +255,7 @@ WRITERS = {
 
 @pytest.mark.filterwarnings("ignore:.*are not read", "ignore:.*are left out")
 @pytest.mark.parametrize("name", WRITERS)
-def test_it_is_read_as_the_program_means_it(tmp_path, name):
+def test_reprojection_errors_vanish_by_the_equations_of_the_program(tmp_path, name):
     block = read_source(WRITERS[name](tmp_path / "in"))
     assert block.images == ("a", "b", "c")
     assert len(block.points) == 7 and len(block.image_points.image) == 21
@@ -286,7 +286,7 @@ PLACED = [("opensfm", "opencv", "epsg"), ("blocksexchange", "brown", "epsg")]
 
 @pytest.mark.filterwarnings("ignore:.*fewer than two images")
 @pytest.mark.parametrize(("format", "camera", "frame"), [(*each, "local") for each in ROUND_TRIPS] + PLACED)
-def test_what_was_exported_is_read_again(tmp_path, format, camera, frame):
+def test_exports_round_trip(tmp_path, format, camera, frame):
     p = inside(camera, frame)
     # Pixels have no size there.
     held = dataclasses.replace(SENSOR, pixel_mm=0.001, pixel_assumed=True)
@@ -310,7 +310,7 @@ def test_what_was_exported_is_read_again(tmp_path, format, camera, frame):
     assert float(block.start.unknowns.interior["one"].c) == pytest.approx(float(CAMERAS[camera].c) / 2.4, abs=1e-12)
 
 
-def test_of_several_reconstructions_the_largest_is_read_and_told(tmp_path):
+def test_the_largest_of_several_reconstructions_is_read_with_a_warning(tmp_path):
     small = lambda content: [{**content[0], "shots": dict(list(content[0]["shots"].items())[:1])}, *content]  # noqa: E731
     with pytest.warns(UserWarning, match="of 2 reconstructions the one of 3 shots is read, 4 are in all"):
         assert len(read_source(write_open_sfm(tmp_path / "in", change=small)).images) == 3
@@ -343,7 +343,7 @@ def test_a_reconstruction_far_from_its_reference_or_without_one_stays_local(tmp_
         read_source(folder)
 
 
-def test_what_a_block_of_blocks_exchange_loses_is_told(tmp_path):
+def test_skipped_content_of_blocks_exchange_is_reported(tmp_path):
     with pytest.warns(UserWarning, match="1 photographs without pose and 1 control points are not read"):
         read_source(write_blocks_exchange(tmp_path / "in"))
 
@@ -353,7 +353,7 @@ def test_without_a_list_photographs_of_bundler_have_numbers(tmp_path):
         assert read_source(write_bundler(tmp_path / "in", names=False)).images == ("0", "1", "2")
 
 
-def test_a_file_of_another_name_is_told_by_its_content_and_a_list_by_that_of_its_bundle(tmp_path):
+def test_files_are_recognised_by_content_and_lists_by_the_name_of_the_bundle(tmp_path):
     for folder, name, other in (
         (write_open_sfm(tmp_path / "sfm"), "reconstruction.json", "aligned.json"),
         (write_bundler(tmp_path / "bundle"), "bundle.out", "bundle_r000.out"),
@@ -368,13 +368,13 @@ def test_a_file_of_another_name_is_told_by_its_content_and_a_list_by_that_of_its
     ("text", "said"),
     [("'lensmodel': 'LENSMODEL_X'", "jaxphoto camera converts"), ("EPSG:32633\n1 2 3 4 5 a.jpg g", "jaxphoto control")],
 )
-def test_a_file_for_another_command_is_told_which(tmp_path, text, said):
+def test_files_for_other_commands_name_the_command(tmp_path, text, said):
     (tmp_path / "given.txt").write_text(text)
     with pytest.raises(InputError, match=said):
         read_source(tmp_path / "given.txt")
 
 
-def test_a_block_keeps_where_it_is_from_and_that_its_pixel_is_assumed(tmp_path):
+def test_a_block_keeps_its_source_and_assumed_pixel_size(tmp_path):
     convert(write_open_sfm(tmp_path / "opensfm"), tmp_path / "block")
     write_block(read_source(tmp_path / "block"), tmp_path / "again")
     block = read_source(tmp_path / "again")
@@ -387,7 +387,7 @@ def test_a_block_keeps_where_it_is_from_and_that_its_pixel_is_assumed(tmp_path):
     assert assumed_pixel_words(read_block(tmp_path / "known").sensors) == ""
 
 
-def test_photographs_of_pix4d_without_a_camera_are_told_and_its_points_are_found_by_their_rays(tmp_path):
+def test_pix4d_photographs_without_camera_are_reported_and_points_intersected(tmp_path):
     with pytest.warns(UserWarning, match="1 photographs are not in flight_calibrated.*: 'lost'"):
         block = read_source(write_pix4d(tmp_path / "in", offset=(0.25, -1.0, 3.0)))
     assert free_of(block, "0") == {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2"}
@@ -485,7 +485,7 @@ REFUSED = {
 
 @pytest.mark.filterwarnings("ignore:.*are not read", "ignore:.*are left out")
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_is_told_in_a_sentence(tmp_path, name):
+def test_invalid_files_are_refused(tmp_path, name):
     write, message = REFUSED[name]
     with pytest.raises(InputError, match=message):
         read_source(write(tmp_path / "in"))

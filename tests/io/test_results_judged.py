@@ -1,4 +1,4 @@
-"""What speaks against results is said by all that read them, and travels with a camera file."""
+"""Warnings about results, by all their readers and in camera files."""
 
 import json
 import re
@@ -47,7 +47,7 @@ def results(tmp_path_factory):
     return folder
 
 
-def test_sigma_naught_that_fails_its_test_is_said_and_travels_with_the_camera(results, monkeypatch, capsys, tmp_path):
+def test_a_failed_global_test_is_reported_and_kept_with_the_camera(results, monkeypatch, capsys, tmp_path):
     summary = read_summary(results / "results")
     test = summary["global_test"]
     assert summary["verdict"] == "amber" and not test["passed"] and test["p_value"] < 1e-3
@@ -89,7 +89,7 @@ def test_a_block_that_contradicts_itself_is_reported_before_simulation(results, 
     assert code == 0 and "the block itself: sigma naught" in " ".join(error.split())
 
 
-def test_what_did_not_converge_is_not_compared_and_nothing_of_it_is_significant():
+def test_a_diverged_adjustment_has_no_sigmas_and_is_not_compared():
     block = simulated("cross").block
     short = adjust(block, max_steps=1)
     assert not bool(short.converged)

@@ -1,4 +1,4 @@
-"""Trajectories written and read again, and what is refused."""
+"""Trajectory files: round trips and refusals."""
 
 import struct
 
@@ -39,7 +39,7 @@ def lines(n: int = 10, **changes) -> str:
     return HEADER + "".join(changes.get(f"row{k}", f"{k},{2 * k},0,100,0,0,90\n") for k in range(n))
 
 
-def test_sbet_comes_back_exactly(tmp_path):
+def test_sbet_round_trip_exactly(tmp_path):
     values = random_sbet()
     write_sbet(values, tmp_path / "flight.sbet")
     assert (tmp_path / "flight.sbet").stat().st_size == 12 * 136

@@ -1,4 +1,4 @@
-"""`write_block` and back: the same block, or nothing at all."""
+"""Round trips of `write_block`; failed writes leave nothing."""
 
 import dataclasses
 
@@ -92,7 +92,7 @@ def test_round_trip_of_smac_keeps_what_is_static(write_folder, tmp_path):
     ),
 )
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_numbers_and_ids_come_back_exactly(write_folder, tmp_path_factory, values, sigma, name):
+def test_numbers_and_ids_round_trip_exactly(write_folder, tmp_path_factory, values, sigma, name):
     folder = tmp_path_factory.mktemp("any")
     source = folder.parent / "source"
     if not source.exists():
@@ -125,7 +125,7 @@ def test_an_existing_block_is_replaced_whole(write_folder, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["block", "copy"]
 
 
-def test_what_is_not_jaxphotos_is_never_replaced(write_folder, tmp_path):
+def test_foreign_files_are_never_replaced(write_folder, tmp_path):
     """A block of the user's own, a table that was changed by hand, one that would be read with another block."""
     own = write_folder()
     block, before = read_block(own), {path: path.read_bytes() for path in own.iterdir()}
@@ -171,7 +171,7 @@ def test_priors_that_cannot_be_written_are_refused(write_folder, tmp_path, prior
     assert [path.name for path in tmp_path.iterdir()] == ["block"]
 
 
-def test_a_mount_that_is_no_cameras_cannot_be_written(write_folder, tmp_path):
+def test_mounts_without_a_camera_cannot_be_written(write_folder, tmp_path):
     block = read_block(write_folder())
     (mount,) = block.start.unknowns.mounts.values()
     start = dataclasses.replace(block.start.unknowns, mounts={"imu": mount})
