@@ -189,14 +189,14 @@ def read_camera_file(
     for reader in camera_readers().values():
         if reader.recognise(path, text):
             with reading(path, "camera file"):
-                found = reader.read(source)
-            if pixel_mm is not None and not math.isclose(found.sensor.pixel_mm, pixel_mm, rel_tol=1e-6):
+                result = reader.read(source)
+            if pixel_mm is not None and not math.isclose(result.sensor.pixel_mm, pixel_mm, rel_tol=1e-6):
                 raise source.error(
-                    f"it says itself that a pixel is {found.sensor.pixel_mm:g} mm, not {pixel_mm:g}: leave --pixel-mm "
+                    f"it says itself that a pixel is {result.sensor.pixel_mm:g} mm, not {pixel_mm:g}: leave --pixel-mm "
                     "out, or, if that was assumed, write it in pixels first: jaxphoto camera "
                     f"{quoted(str(path))} --out pixels.yml"
                 )
-            return found
+            return result
     if not text.strip():
         raise source.error("the file is empty; write it again")
     raise source.error(f"this is no camera file that is known; {CAMERAS_READ} are")

@@ -182,16 +182,16 @@ class Section:
         for part in place[:-1]:
             path += f", number {part + 1}" if isinstance(part, int) else f".{part}" if path else part
         name = place[-1] if place else ""
-        told = {
+        context = {
             "input": quoted(error["input"]),
             "msg": error["msg"],
             "table": f"{path}.{name}" if path else name,
             **error.get("ctx", {}),
         }
-        if "expected" in told:
-            told["expected"] = told["expected"].replace("'", '"')
+        if "expected" in context:
+            context["expected"] = context["expected"].replace("'", '"')
         sentence = str(mistake) if mistake else _SENTENCES.get(error["type"], "{input} is not valid: {msg}")
-        return Section(self.file, path, {}).error(name, sentence if mistake else sentence.format(**told))
+        return Section(self.file, path, {}).error(name, sentence if mistake else sentence.format(**context))
 
 
 _NUMBER, _POSITIVE, _COUNT = TypeAdapter(Number), TypeAdapter(Positive), TypeAdapter(Count)

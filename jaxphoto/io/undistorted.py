@@ -96,9 +96,9 @@ def _write(pixels: np.ndarray, exif: Image.Exif, kept: dict[str, Any], path: Pat
     for tag, side in ((_TAG.ExifImageWidth, pixels.shape[1]), (_TAG.ExifImageHeight, pixels.shape[0])):
         if tag in taken:
             taken[tag] = side
-    # Tags of the layout of a TIFF; the new file has its own.
-    for own in [tag for tag in exif if tag in _LAYOUT]:
-        del exif[own]
+    # Tags of the layout of a TIFF; the new file has others.
+    for layout in [tag for tag in exif if tag in _LAYOUT]:
+        del exif[layout]
     suffix = path.suffix.lower()
     name = path.name if suffix in (*_JPEG, *_TIFF, ".png") else f"{path.stem}.png"
     options: dict[str, Any] = {"quality": _QUALITY, "subsampling": 0} if suffix in _JPEG else {}

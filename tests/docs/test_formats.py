@@ -115,7 +115,7 @@ PROJECTS = {
     "blocksexchange": [test_reconstructions.write_blocks_exchange, _exported("blocksexchange")],
     "bundler": [test_reconstructions.write_bundler, _exported("bundler")],
     "pix4d": [test_reconstructions.write_pix4d],
-    "metashape": [oriented_files.write_metashape, oriented_files.write_metashape_beside],
+    "metashape": [oriented_files.write_metashape, _exported("metashape")],
     "texts": [oriented_files.write_angles, oriented_files.write_patb, oriented_files.write_bingo, _exported("opk")],
     "nerfstudio": [oriented_files.write_nerfstudio],
     "orthority": [oriented_files.write_orthority, _exported("orthority")],

@@ -6,8 +6,8 @@
                   coordinates in the order of the system's axes, z [, horizontal and vertical accuracy], or image,
                   label, x, y [, accuracy]. Pixels are ours.
     gcp_list.txt  a line that names the system, then geo_x geo_y geo_z im_x im_y image_name [gcp_name] [extras]; geo_x
-                  is the easting or longitude; pixels count from the centre of the upper left one. A list without marks has
-                  rows of gcp_name geo_x geo_y geo_z, or of geo_x geo_y geo_z [gcp_name].
+                  is the easting or longitude; pixels count from the centre of the upper left one. A list without marks
+                  has rows of gcp_name geo_x geo_y geo_z, or of geo_x geo_y geo_z [gcp_name].
     geoin.dat     rows that begin with CONT are control, with CHCK check points: CONT point X Y Z ...
 
 Sources: OpenDroneMap and OpenSfM documentation, "Ground Control Points"; for BINGO, whose manual is not public, S.

@@ -334,10 +334,10 @@ def read_control(control: str | Path, marks: str | Path | None = None) -> GivenC
 
     The content tells the format of `FORMS`. Raises InputError if either is none.
     """
-    own = _read_control(Path(control))
-    if isinstance(own, Marks):
+    content = _read_control(Path(control))
+    if isinstance(content, Marks):
         raise InputError(f"{Path(control).name} has marks but no coordinates; give it as the marks")
-    points, seen = (own.points, own.marks) if isinstance(own, GivenControl) else (own, Marks.none())
+    points, seen = content if isinstance(content, GivenControl) else (content, Marks.none())
     if marks is not None:
         other = _read_control(Path(marks))
         if isinstance(other, SurveyedPoints):

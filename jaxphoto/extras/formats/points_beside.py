@@ -77,11 +77,11 @@ def points_of(text: Path, files: Sequence[str], of: str, cameras: Sequence[Proje
     """Read a text of image points; in pixels without `cameras`. `of` names the file that lists `files`."""
     heads, photograph, points, xy = _read_measured(text)
     places = places_by_name(files)
-    found = [_photograph(head, places) for head in heads]
-    _warn_unknown([head for head, (k, _) in zip(heads, found, strict=True) if k < 0], text, of)
-    image = np.array([k for k, _ in found], int)[photograph]
+    photographs = [_photograph(head, places) for head in heads]
+    _warn_unknown([head for head, (k, _) in zip(heads, photographs, strict=True) if k < 0], text, of)
+    image = np.array([k for k, _ in photographs], int)[photograph]
     centred = bool((xy < 0).any())
-    scales = [_scale(None if cameras is None or k < 0 else cameras[k], rest, centred) for k, rest in found]
+    scales = [_scale(None if cameras is None or k < 0 else cameras[k], rest, centred) for k, rest in photographs]
     scale, offset = np.array(scales).reshape(-1, 2, 2)[photograph].transpose(1, 0, 2)
     kept = image >= 0
     return named(image[kept], [points[k] for k in np.flatnonzero(kept).tolist()], (xy * scale + offset)[kept])

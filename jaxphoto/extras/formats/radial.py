@@ -152,14 +152,14 @@ def write_bundler(p: Project, folder: Path) -> None:
     moved = translations(rotations, p.exterior.position).tolist()
     shown = [rows for rows in p.rows_of_points if len(rows)]
     lines = [_HEAD, f"{len(p.files)} {len(shown)}"]
-    for own, rotation, translation in zip(values, rotations.tolist(), moved, strict=True):
-        lines += [words(own), *map(words, rotation), words(translation)]
+    for camera, rotation, translation in zip(values, rotations.tolist(), moved, strict=True):
+        lines += [words(camera), *map(words, rotation), words(translation)]
     xy, image, key, xyz = (a.tolist() for a in (_from_middle(p), p.image, p.number_in_image, np.asarray(p.xyz)))
     for rows in shown:
         seen = " ".join(f"{image[k]} {key[k]} {words(xy[k])}" for k in rows.tolist())
         lines += [words(xyz[p.point[rows[0]]]), "0 0 0", f"{len(rows)} {seen}"]
     (folder / BUNDLE).write_text("\n".join(lines) + "\n", encoding="utf-8")
-    listed = "".join(f"{file} 0 {own[0]!r}\n" for file, own in zip(p.files, values, strict=True))
+    listed = "".join(f"{file} 0 {camera[0]!r}\n" for file, camera in zip(p.files, values, strict=True))
     (folder / LIST).write_text(listed, encoding="utf-8")
 
 

@@ -78,8 +78,8 @@ def by_name(photographs: Sequence[Photograph], file: Exposures) -> Int[np.ndarra
 
 def by_time(photographs: Sequence[Photograph], file: Exposures, clock: Clock) -> Matched | Ambiguous | None:
     """Matches of times that differ by a constant; the photographs' own positions decide between constants."""
-    own, listed = _plane(photographs, file.place)
-    return match_times(clock.time_s, file.time_s, clock.tolerance_s, own, listed)
+    positions, listed = _plane(photographs, file.place)
+    return match_times(clock.time_s, file.time_s, clock.tolerance_s, positions, listed)
 
 
 def by_number_or_time(
@@ -134,8 +134,8 @@ def _by_number(photographs: Sequence[Photograph], file: Exposures, clock: Clock)
 
 def distance(photographs: Sequence[Photograph], file: Exposures, exposure: Int[np.ndarray, "n"]) -> float | None:
     """Median horizontal distance (m) of exposures to the photographs' own positions; None if none are known."""
-    own, listed = _plane(photographs, file.place)
-    d = np.linalg.norm(own - listed[exposure], axis=1)[exposure >= 0]
+    positions, listed = _plane(photographs, file.place)
+    d = np.linalg.norm(positions - listed[exposure], axis=1)[exposure >= 0]
     return float(np.median(d[np.isfinite(d)])) if np.isfinite(d).any() else None
 
 
@@ -143,15 +143,15 @@ def _plane(photographs: Sequence[Photograph], place: np.ndarray) -> tuple[np.nda
     """East and north (m), and 0 for the height, of photographs and of `place`: files have different height systems."""
     # (0, 0) is no position.
     known = [p.gps is not None and (p.gps.longitude_deg, p.gps.latitude_deg) != (0, 0) for p in photographs]
-    own = np.array(
+    positions = np.array(
         [(p.gps.longitude_deg, p.gps.latitude_deg) if p.gps and k else (np.nan,) * 2
          for p, k in zip(photographs, known, strict=True)]
     ).reshape(-1, 2)  # fmt: skip
     finite = place[np.isfinite(place[:, :2]).all(axis=1), :2]
     middle = np.median(finite, axis=0) if len(finite) else np.zeros(2)
     scale = _DEGREE_M * np.array([np.cos(np.deg2rad(middle[1])), 1.0])
-    own, listed = (np.pad((v - middle) * scale, ((0, 0), (0, 1))) for v in (own, place[:, :2]))
-    return own, listed
+    positions, listed = (np.pad((v - middle) * scale, ((0, 0), (0, 1))) for v in (positions, place[:, :2]))
+    return positions, listed
 
 
 def interpolated(track: Exposures, times_s: Float[np.ndarray, "n"]) -> Exposures:
