@@ -22,7 +22,11 @@ CHOSEN = {"colmap": "5", "kalibr": "cam1"}
 
 
 def project(format, write):
-    return write, lambda folder: read_source(folder, format)
+    return write, lambda folder: read_source(folder / "out" if (folder / "out").is_dir() else folder, format)
+
+
+def camera(kind, name, content):
+    return text(name, content, lambda path: read_camera_file(path, camera=CHOSEN.get(kind)))
 
 
 def text(name, content, read):
@@ -32,10 +36,7 @@ def text(name, content, read):
 READERS = {
     "recipe": text("a.toml", RECIPE.read_text(), read_recipe),
     **{f"{format} {k}": project(format, w) for format, writers in PROJECTS.items() for k, w in enumerate(writers)},
-    **{
-        f"camera {kind}": text(name, content, lambda path, of=CHOSEN.get(kind): read_camera_file(path, camera=of))
-        for kind, (name, content) in CAMERAS.items()
-    },
+    **{f"camera {kind}": camera(kind, name, content) for kind, (name, content) in CAMERAS.items()},
     **{f"control {kind}": text("a", content, read_control) for kind, content in CONTROL.items()},
     **{f"table {k}": text("a", content, read_control) for k, content in enumerate(TABLES)},
     **{name: text(name, content, lambda path: read_exposures(path, 32633)) for name, content in EXPOSURES.items()},
