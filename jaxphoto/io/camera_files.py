@@ -22,7 +22,7 @@ from jaxphoto.io.block_folder.camera_section import Camera, camera_section, know
 from jaxphoto.io.block_folder.settings import read_settings
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.result_tables import SUMMARY, read_summary, reservation
-from jaxphoto.io.text_files import read_bytes, read_json
+from jaxphoto.io.text_files import read_json, read_legacy_text
 from jaxphoto.io.text_tables import LARGEST, read_csv
 from jaxphoto.io.toml import Section, read_toml, toml_text
 from jaxphoto.unknowns import FIXED
@@ -73,14 +73,10 @@ class CameraSource(NamedTuple):
 
     def text(self) -> str:
         """Return the whole text, UTF-8 or else Windows-1252. Raise InputError for a binary file."""
-        content = read_bytes(self.path)
-        if b"\0" in content:
+        text = read_legacy_text(self.path)
+        if "\0" in text:
             raise self.error("the file is no text; give a camera file")
-        try:
-            text = content.decode("utf-8-sig")
-        except UnicodeDecodeError:
-            text = content.decode("cp1252", "replace")
-        return text.replace("\r\n", "\n").replace("\r", "\n")
+        return text
 
     def number(self, name: str, text: Any) -> float:
         """Return a finite number of the file."""

@@ -38,6 +38,16 @@ def read_text(path: Path) -> str:
         ) from None
 
 
+def read_legacy_text(path: Path) -> str:
+    """Read a text file of another program, UTF-8 or else Windows-1252, with line ends of any system."""
+    content = read_bytes(path)
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = content.decode("cp1252", "replace")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
 def read_json(path: Path) -> dict[str, Any]:
     """Read the object in a JSON file. Raises InputError if there is none."""
     try:

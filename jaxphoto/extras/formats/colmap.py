@@ -19,10 +19,10 @@ import scipy
 from jaxphoto.camera import InteriorOrientation, OpenCvFisheye, Sensor
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.extras.formats.camera_models import OPENCV, OPENCV_FISHEYE, ProjectCamera, in_pixels, pixels_of
-from jaxphoto.extras.formats.files import CameraFormat, Format, content_rows, read_text, row_numbers
+from jaxphoto.extras.formats.files import CameraFormat, Format, content_rows, row_numbers
 from jaxphoto.extras.formats.project import Project, numbered, pose, translations
 from jaxphoto.io.camera_files import CameraFile, CameraReader, CameraSource
-from jaxphoto.io.text_files import read_bytes
+from jaxphoto.io.text_files import read_bytes, read_legacy_text
 from jaxphoto.io.text_tables import is_number
 
 FILES = ("cameras", "images", "points3D")
@@ -193,7 +193,7 @@ def _cells_error(path: Path, row: int, count: int, expected: str) -> InputError:
 
 
 def _text_images(path: Path) -> Iterator[ColmapImage]:
-    numbered_lines = enumerate(read_text(path).split("\n"), 1)
+    numbered_lines = enumerate(read_legacy_text(path).split("\n"), 1)
     lines = iter([(row, line) for row, line in numbered_lines if not line.lstrip().startswith("#")])
     for row, line in lines:
         if not line.strip():

@@ -33,12 +33,13 @@ from jaxphoto.extras.formats import (
     texts,
 )
 from jaxphoto.extras.formats.camera_models import CameraModel
-from jaxphoto.extras.formats.files import CameraFormat, Format, by_content, read_text
+from jaxphoto.extras.formats.files import CameraFormat, Format, by_content
 from jaxphoto.extras.formats.project import Project
 from jaxphoto.io.block_folder import BlockTables, assemble, write_block
 from jaxphoto.io.block_folder.block_reader import read_folder
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.camera_files import CAMERA_READERS, is_camera_file, joined_notes, reading, write_block_camera
+from jaxphoto.io.text_files import read_legacy_text
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 from jaxphoto.writing import check_folder, whole_file, whole_folder
 
@@ -325,7 +326,7 @@ def _target(
 
 def is_control_file(path: Path) -> bool:
     """Return True if the content of a file is that of a control file other than a plain table."""
-    text = "" if gis.is_geopackage(path) else read_text(path)
+    text = "" if gis.is_geopackage(path) else read_legacy_text(path)
     return any(format.recognise(path, text) for format in CONTROL_FORMATS.values())
 
 
@@ -356,7 +357,7 @@ def read_control(control: str | Path, marks: str | Path | None = None) -> GivenC
 
 
 def _read_control(path: Path) -> GivenControl | SurveyedPoints | Marks:
-    text = "" if gis.is_geopackage(path) else read_text(path)
+    text = "" if gis.is_geopackage(path) else read_legacy_text(path)
     chosen = next((f for f in CONTROL_FORMATS.values() if f.recognise(path, text)), control.TABLES)
     with reading(path, chosen.about):
         return chosen.read(path, text)

@@ -23,8 +23,9 @@ from jaxtyping import Float, Int
 from jaxphoto.errors import InputError, few, quoted
 from jaxphoto.extras.formats.camera_models import ProjectCamera
 from jaxphoto.extras.formats.control import Mark, is_geoin
-from jaxphoto.extras.formats.files import beginning, read_text, row_numbers, warn
+from jaxphoto.extras.formats.files import beginning, row_numbers, warn
 from jaxphoto.extras.formats.project import Project
+from jaxphoto.io.text_files import read_legacy_text
 from jaxphoto.io.text_tables import is_number, read_csv
 
 TABLE = "image_points.csv"
@@ -194,7 +195,7 @@ def _is_head(words: list[str]) -> bool:
 def _read_measured(path: Path) -> tuple[list[str], np.ndarray, list[str], np.ndarray]:
     """Heads, and of every point the number of its head, its name and coordinates."""
     heads, photograph, points, rows, within = [], [], [], [], False
-    for k, line in enumerate(read_text(path).split("\n"), 1):
+    for k, line in enumerate(read_legacy_text(path).split("\n"), 1):
         words = line.split()
         if not words or words == [_END]:
             within = False

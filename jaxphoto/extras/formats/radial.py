@@ -33,9 +33,10 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.extras.formats.camera_models import CameraModel, ProjectCamera
-from jaxphoto.extras.formats.files import Format, begins_with, by_content, content_rows, read_text, row_numbers, warn
+from jaxphoto.extras.formats.files import Format, begins_with, by_content, content_rows, row_numbers, warn
 from jaxphoto.extras.formats.project import Project, translations
 from jaxphoto.io.camera_files import ASSUMED_PIXEL_MM
+from jaxphoto.io.text_files import read_legacy_text
 from jaxphoto.io.text_tables import LARGEST
 
 BUNDLE, LIST = "bundle.out", "list.txt"
@@ -87,7 +88,7 @@ def _project(path: Path, title: str, s: _Scene) -> Project:
 
 def read_bundler(path: Path) -> Project:
     """Read a bundle file; images that are not oriented are skipped."""
-    lines = read_text(path).split("\n")
+    lines = read_legacy_text(path).split("\n")
     numbers = np.array(" ".join(line for line in lines if not line.startswith("#")).split(), float)
     if not (np.abs(numbers) <= LARGEST).all():
         raise InputError(f"{path.name}: a number is not finite or too large. Export it again")
@@ -127,7 +128,7 @@ def _listed_names(path: Path, number: int) -> list[str]:
     for name in (f"{path.stem}.txt", f"{stem}.txt", f"{stem}.out", LIST, "bundle.out.list.txt"):
         file = path.with_name(name)
         if file != path and file.is_file():
-            names = [line.split()[0] for line in read_text(file).split("\n") if line.strip()]
+            names = [line.split()[0] for line in read_legacy_text(file).split("\n") if line.strip()]
             if len(names) != number:
                 raise InputError(f"{file.name} names {len(names)} photographs and {path.name} has {number} cameras")
             return names

@@ -24,8 +24,9 @@ import numpy as np
 from jaxphoto.errors import InputError, few, quoted
 from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS, WEEK_S, gps_seconds
 from jaxphoto.georeferencing.gps import Fix, Heights
+from jaxphoto.io.control_table import separator_of
 from jaxphoto.io.exposures.records import Exposures, Lines
-from jaxphoto.io.exposures.tables import read_table, separator_of
+from jaxphoto.io.exposures.tables import read_table
 from jaxphoto.io.photograph_metadata import fix_of
 from jaxphoto.io.text_files import read_text
 from jaxphoto.io.text_tables import finite
