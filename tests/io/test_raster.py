@@ -80,21 +80,8 @@ def test_real_strip_to_a_surface_model(data_dir, tmp_path, monkeypatch, capsys):
     """The command against every cell by NumPy; and the PNG is the shading of that."""
     cloud, out = data_dir / "lidar" / "autzen_trim.laz", tmp_path / "dsm.tif"
     hill = tmp_path / "hill.png"
-    arguments = (
-        "dsm",
-        cloud,
-        "--out",
-        out,
-        "--cell-m",
-        1.5,
-        "--returns",
-        "first",
-        "--fill-m",
-        1.5,
-        "--hillshade",
-        hill,
-    )
-    code, said, errors = run(monkeypatch, capsys, *arguments)
+    arguments = ("--cell-m", 1.5, "--returns", "first", "--fill-m", 1.5, "--hillshade", hill)
+    code, said, errors = run(monkeypatch, capsys, "dsm", cloud, "--out", out, *arguments)
     assert (code, errors) == (0, "") and "NAD_1983_HARN" in said
     xyz = clouds.read_cloud(cloud, returns="first").xyz
     column, row = (np.floor(xyz[:, :2] / 1.5).astype(int) * [1, -1]).T

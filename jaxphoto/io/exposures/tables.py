@@ -284,13 +284,15 @@ def _from_map(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Longitude, latitude, height of WGS 84, and the rotations from the axes of the grid to those of true north."""
     place = MapFrame(code, vertical, (0.0, 0.0, 0.0)).place(coordinates)
-    if not np.isfinite(place).any():
-        return np.full_like(place, np.nan), np.broadcast_to(np.eye(3), (len(place), 3, 3))
-    place = np.where(np.isfinite(place), place, np.nan)
-    frame = MapFrame(code, None, (*np.nanmedian(place[:, :2], axis=0).tolist(), 0.0))
-    local = frame.local_from_place(place)
-    rotation = np.swapaxes(frame.local_from_level(local), 1, 2) @ frame.local_from_grid(local)
-    return wgs84_places(code, place, heights == "ellipsoid"), rotation
+    inside = np.isfinite(place).all(axis=1)
+    on_wgs84, rotation = np.full_like(place, np.nan), np.tile(np.eye(3), (len(place), 1, 1))
+    if inside.any():
+        place = place[inside]
+        frame = MapFrame(code, None, (*np.median(place[:, :2], axis=0).tolist(), 0.0))
+        local = frame.local_from_place(place)
+        rotation[inside] = np.swapaxes(frame.local_from_level(local), 1, 2) @ frame.local_from_grid(local)
+        on_wgs84[inside] = wgs84_places(code, place, heights == "ellipsoid")
+    return on_wgs84, rotation
 
 
 def _attitudes(
