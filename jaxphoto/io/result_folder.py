@@ -142,8 +142,8 @@ def _block_of(folder: Path) -> Path:
 
 
 def _below(folder: Path, name: Any) -> Path | None:
-    """A folder in `folder`; None if the summary names none."""
-    return folder / name if isinstance(name, str) and name else None
+    """A folder in `folder`; None for any other name."""
+    return folder / name if isinstance(name, str) and name != ".." and Path(name).name == name != "" else None
 
 
 def _camera(result: Path, name: str, block: Block, source: Path) -> InteriorOrientation:
