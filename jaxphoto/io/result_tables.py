@@ -12,7 +12,7 @@ from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.text_files import read_json
 from jaxphoto.io.text_tables import read_csv
 from jaxphoto.io.toml import read_toml
-from jaxphoto.writing.inputs import InputFile, input_file
+from jaxphoto.writing import InputFile, input_file
 
 SUMMARY, INPUTS = "summary.json", "inputs.csv"
 # Ids that may look like numbers: image 0012 is not image 12.

@@ -1,4 +1,4 @@
-"""GNSS/IMU trajectories from CSV and Applanix SBET, in the frame of a block, and back (docs/trajectory.md).
+"""GNSS/IMU trajectories from CSV and Applanix SBET, in the frame of a block, and back (docs/georeferencing.md).
 
 SBET (smoothed best estimate of trajectory) has 17 little-endian doubles per record and no header. Angles are radians,
 the altitude is ellipsoidal. Platform heading and horizontal velocities refer to axes rotated by the wander angle: true
