@@ -1,7 +1,6 @@
-"""Files spoilt at random, seeded, for the readers: each is read as it stands or refused in one sentence.
+"""Randomly corrupted files, seeded: a reader reads each as it stands or refuses it in one sentence.
 
-`READERS` lists what is read. A new reader is one entry there; `tests/io/test_mutations.py` then spoils its files a few
-hundred times, and `benchmarks/mutations.py` as often as it is asked to, each reader in a process of its own.
+`READERS` lists the readers. `tests/io/test_mutations.py` corrupts the files of each some hundred times.
 """
 
 import dataclasses
@@ -11,7 +10,6 @@ import re
 import shutil
 import struct
 import tempfile
-import time
 import traceback
 import warnings
 import zlib
@@ -53,13 +51,9 @@ from tests.simulation import test_relative_poses, test_rig
 from tests.simulation.small import RECIPES, changed
 
 Files = dict[str, bytes]
-SLOWEST_S = 10.0
-"""Of the processor: a file of any content is read or refused in it, with a shape that is compiled for anew."""
-MOST_MB = 1000.0
-"""And with so much memory beyond what was used before."""
-# A sentence about one place; what it quotes is cut.
+# Characters of a message.
 _LONGEST = 1500
-# Bytes of a spoilt file: what takes long in it takes long by its form, not by its size.
+# Bytes of a corrupt file.
 _LARGEST = 3_000_000
 # No control characters: they would be commands to a terminal.
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
@@ -70,36 +64,27 @@ NUMBERS = (
     "9" * 5000, "0." + "3" * 400, "1_000", "1,5", "0x1F", "1e", "--1", "\u0661\u0662", "1e5000000", "2147483648",
     "18446744073709551616", "true", "\u22121.5", "1.2.3", "",
 )  # fmt: skip
-"""What stands in place of a number."""
+"""Replacements of numbers."""
 TEXTS = (
     "", " ", "#", "\0", "\x1b[31m", "\x1b]0;title\x07", "\u202e", "\ufeff", "\ud7ff", "[/red]", "[bold]", "$\\frac{1$",
     "=cmd|' /C calc'!A0", "../../etc/passwd", "/dev/zero", "/dev/null", "<script>", "&amp;", '"', "'", '""', "\\", "{",
     "}", "[", "]", "%s", "{0}", "default", "x" * 200_000, '"' + "y" * 200_000 + '"', "[" * 3000, "{a=" * 3000,
     "a." * 3000, "," * 20_000, ";" * 20_000, " " * 200_000, "\t", "\r", "\n", "<a>" * 3000, "(" * 3000, "-" * 3000,
 )  # fmt: skip
-"""What stands in place of a word, or between two."""
+"""Replacements of words, and insertions."""
 _NUMBER = re.compile(rb"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
 _WORD = re.compile(rb"[^\s,;=\[\]{}<>\"']+")
 
 
 class Reader(NamedTuple):
-    """A reader and sound files for it."""
+    """A reader and valid files for it."""
 
     files: Callable[[], Files]
-    """The sound files by their names, below one folder."""
+    """Valid files by name, below one folder."""
     read: Callable[[Path], object]
     """Reads from that folder."""
-    spoilt: tuple[str, ...] = ()
-    """The files that are spoilt; all where none are named."""
-
-
-class Finding(NamedTuple):
-    """What a reader did that it must not do."""
-
-    reader: str
-    seed: int
-    what: str
-    detail: str
+    corrupt: tuple[str, ...] = ()
+    """Files to corrupt; all by default."""
 
 
 def text(**files: str) -> Callable[[], Files]:
@@ -108,7 +93,7 @@ def text(**files: str) -> Callable[[], Files]:
 
 
 def written_by(write: Callable[[Path], object]) -> Callable[[], Files]:
-    """The files that `write` leaves in the folder that it is given."""
+    """Files that `write` writes into a folder."""
 
     def files() -> Files:
         with tempfile.TemporaryDirectory() as folder:
@@ -443,70 +428,49 @@ READERS: dict[str, Reader] = {
 
 
 @functools.cache
-def sound(reader: str) -> Files:
-    """The sound files of a reader."""
+def valid_files(reader: str) -> Files:
+    """Valid files of a reader."""
     return READERS[reader].files()
 
 
-def spoilt(reader: str, seed: int) -> Files:
-    """The files of a reader, one of them spoilt."""
+def corrupted(reader: str, seed: int) -> Files:
+    """Files of a reader, one of them corrupt."""
     rng = np.random.default_rng((zlib.crc32(reader.encode()), seed))
-    files = dict(sound(reader))
-    name = str(rng.choice(sorted(READERS[reader].spoilt or files)))
+    files = dict(valid_files(reader))
+    name = str(rng.choice(sorted(READERS[reader].corrupt or files)))
     content = files[name]
     for _ in range(1 + rng.integers(3)):
         content = _WAYS[rng.integers(len(_WAYS))](content, rng)[:_LARGEST]
     return files | {name: content}
 
 
-def tried(reader: str, seed: int, folder: Path) -> list[Finding]:
-    """Spoil the files of a reader, read them, and say what it did that it must not do."""
+def tried(reader: str, seed: int, folder: Path) -> list[str]:
+    """Corrupt the files of a reader, read them, and list tracebacks, warnings and unreadable messages."""
     shutil.rmtree(folder, ignore_errors=True)
-    for name, content in spoilt(reader, seed).items():
+    for name, content in corrupted(reader, seed).items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
-    found: list[tuple[str, str]] = []
-    said: list[str] = []
-    # Of the processor: others may keep it busy, and a reader that only waits is seen by the script.
-    began, before = time.process_time(), peak_mb(anew=True)
+    errors: list[str] = []
+    messages: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
             READERS[reader].read(folder)
         except JaxphotoError as error:
-            said.append(str(error))
+            messages.append(str(error))
         except Exception:
-            found.append(("traceback", traceback.format_exc(limit=-4)))
-    seconds, more = time.process_time() - began, peak_mb() - before
-    said += [str(w.message) for w in caught if issubclass(w.category, UserWarning)]
-    found += [
-        ("warning", f"{w.filename}:{w.lineno}: {w.message}") for w in caught if issubclass(w.category, RuntimeWarning)
-    ]
-    found += [("message", message[:300]) for message in said if len(message) > _LONGEST or _CONTROL.search(message)]
-    if seconds > SLOWEST_S:
-        found.append(("slow", f"{seconds:.1f} s"))
-    if more > MOST_MB:
-        found.append(("memory", f"{more:.0f} MB"))
-    return [Finding(reader, seed, *what) for what in found]
+            errors.append(traceback.format_exc(limit=-4))
+    messages += [str(w.message) for w in caught if issubclass(w.category, UserWarning)]
+    errors += [f"{w.filename}:{w.lineno}: {w.message}" for w in caught if issubclass(w.category, RuntimeWarning)]
+    return errors + [message[:300] for message in messages if len(message) > _LONGEST or _CONTROL.search(message)]
 
 
-def peak_mb(*, anew: bool = False) -> float:
-    """The most memory (MB) that this process has had resident, `anew` from now on; 0 where that is not told."""
-    try:
-        if anew:
-            Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-        return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
-    except OSError:
-        return 0.0
-
-
-# Ways to spoil -----------------------------------------------------------------------------------------------
+# Mutations ---------------------------------------------------------------------------------------------------
 
 
 def _span(content: bytes, rng: np.random.Generator, longest: int = 200) -> tuple[int, int]:
-    """Begin and end of a piece."""
+    """Begin and end of a random piece."""
     begin = int(rng.integers(len(content) + 1))
     return begin, min(len(content), begin + int(rng.integers(1, longest)))
 
@@ -545,7 +509,7 @@ def _moved(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _lines(content: bytes, rng: np.random.Generator) -> bytes:
-    """Two lines change places, or one stands there more often, or not at all."""
+    """Swap two lines, repeat one, or delete it."""
     lines = content.split(b"\n")
     i, j = rng.integers(len(lines), size=2)
     kind = rng.integers(4)
@@ -582,7 +546,7 @@ def _inserted(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _exchanged(content: bytes, rng: np.random.Generator) -> bytes:
-    """A word in place of another of the same file."""
+    """Replace a word by another of the file."""
     words = sorted(set(_WORD.findall(content[:100_000])))
     return (
         _replaced(content, rng, _WORD, (words[rng.integers(len(words))].decode("utf-8", "replace"),))
@@ -592,7 +556,7 @@ def _exchanged(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _binary_number(content: bytes, rng: np.random.Generator) -> bytes:
-    """Eight bytes, or four, that are an extreme number."""
+    """Overwrite four or eight bytes by an extreme number."""
     kind, values = [
         ("<f8", [np.nan, np.inf, -np.inf, 1e308, -1e300, 5e-324, 0.0, -1.0]),
         ("<i8", [-1, 0, 2**63 - 1, -(2**63), 2**32, 10**9]),

@@ -28,8 +28,12 @@ LONG = (
     "correlation_studies",
     "experiments",
     "extending",
+    "georeferencing",
+    "live_cameras",
     "monte_carlo",
     "network_design",
+    "notebook",
+    "relative_control",
     "sensitivity",
     "weights",
 )

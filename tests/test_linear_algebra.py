@@ -16,9 +16,8 @@ from jaxphoto.linear_algebra import (
     solve_lower_transposed,
     solve_tridiagonal,
 )
+from tests.marks import slow_but
 from tests.programs import batched_lapack_calls
-
-N = (3, 7, 9)
 
 
 def _general(n, seed=0):
@@ -63,7 +62,7 @@ PAIRS = {
 }
 
 
-@pytest.mark.parametrize("n", N)
+@pytest.mark.parametrize("n", slow_but((3, 9), (3, 7, 9)))
 @pytest.mark.parametrize("name", PAIRS)
 def test_equals_numpy_one_at_a_time_and_many(name, n):
     ours, theirs = PAIRS[name]
