@@ -136,16 +136,16 @@ PAIRS = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(("first", "second"), slow_but(lambda p: not {*p} & {"opencv", "colmap", "agisoft"}, PAIRS))
-def test_every_kind_of_file_is_compared(kinds, monkeypatch, capsys, first, second):
+@pytest.mark.parametrize("names", slow_but(lambda p: not {*p} & {"opencv", "colmap", "agisoft"}, PAIRS))
+def test_every_kind_of_file_is_compared(kinds, monkeypatch, capsys, names):
     monkeypatch.setenv("COLUMNS", "80")
-    pair = kinds[first], kinds[second]
+    pair = [kinds[name] for name in names]
     code, text, error = run(monkeypatch, capsys, "stability", *pair, "--pixel-mm", SENSOR["pixel_mm"])
     assert code == 0, error
     (line,) = (line for line in text.splitlines() if line.startswith("│ RMSE_offset"))
     rmse = list(map(float, line.split("│")[2:5]))
     assert max(rmse) < 1e-8 and "…" not in text and "[um]" in text
-    reference = "results" in (first, second) or "interior.csv" in (first, second)
+    reference = "results" in names or "interior.csv" in names
     assert "similar" in text and ("no significant change" in text) == reference
 
 

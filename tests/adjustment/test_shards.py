@@ -132,8 +132,9 @@ def assert_same(found: dict[str, np.ndarray], name: str) -> None:
 CASES = [("two_cameras", 3), ("surfaces", 2), ("afar", 3), ("declared", 2)]
 
 
-@pytest.mark.parametrize(("name", "shards"), slow_but([("surfaces", 2)], CASES))
-def test_several_devices_find_the_same(tmp_path: Path, name: str, shards: int) -> None:
+@pytest.mark.parametrize("case", slow_but([("surfaces", 2)], CASES))
+def test_several_devices_find_the_same(tmp_path: Path, case: tuple[str, int]) -> None:
+    name, shards = case
     run_all(f"{name}:{shards}", tmp_path, 3, [{}])
     found = dict(np.load(tmp_path / f"{name}_{shards}_0.npz"))
     assert found["shards"] == shards
