@@ -37,7 +37,6 @@ def of_cross() -> Posterior:
     return posterior(adjusted("cross"), OF_CROSS, draws=250, warmup=150, seed=3)
 
 
-@pytest.mark.slow
 def test_strong_block_has_the_posterior_that_least_squares_reports(of_cross):
     assert of_cross.samples.shape == (2, 250, len(OF_CROSS))
     assert (of_cross.ess > 200).all()
@@ -46,7 +45,6 @@ def test_strong_block_has_the_posterior_that_least_squares_reports(of_cross):
     assert (np.abs(pairs - 0.05) < 0.05).all()
 
 
-@pytest.mark.slow
 def test_laplace_is_the_a_priori_covariance(of_cross):
     whole = covariance(adjusted("cross"))
     index = [whole.labels.index(name) for name in OF_CROSS[:-1]]
@@ -117,6 +115,7 @@ def integrated(case: TwoHeights) -> tuple[np.ndarray, ...]:
     return tuple(np.array(moments).T)
 
 
+@pytest.mark.slow
 def test_curved_posterior_is_the_density_summed_over_a_grid():
     case = two_heights()
     p, again = (posterior(case.adjusted, PARAMETERS, draws=400, warmup=150, seed=1) for _ in range(2))
@@ -166,7 +165,6 @@ def test_fixed_coordinates_and_images_have_no_posterior():
             posterior(a, [name])
 
 
-@pytest.mark.slow
 def test_table_and_figure_show_both(of_cross):
     table = posterior_table(of_cross)
     assert list(table["parameter"]) == [
