@@ -399,8 +399,8 @@ def dense_sigmas() -> dict[str, float]:
     scale, j = scale[own_order(a.equations.values, a.padded)[0]], d.jacobian[:, d.free]
     sigma = np.zeros(len(scale))
     sigma[d.free] = scale[d.free] * np.sqrt(np.diagonal(np.linalg.inv(j.T @ j)))
-    shared = sigma[6 * len(a.block.images) :][a.structure.free]
-    return dict(zip(a.structure.labels, shared, strict=True))
+    labels, first = a.structure.labels, 6 * len(a.block.images)
+    return dict(zip(labels, sigma[first : first + len(labels)], strict=True))
 
 
 @pytest.mark.parametrize("label", TRUE)
