@@ -61,6 +61,7 @@ def mistaken(text, rng):
     return text[:at]
 
 
+@pytest.mark.parametrize("count", [8, pytest.param(200, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("reader", READERS)
 def test_mistakes_are_read_or_refused(tmp_path, reader):
     write, read = READERS[reader]
