@@ -28,13 +28,13 @@ LONG = (
     "control",
     "extending",
     "georeferencing",
-    "live_cameras",
     "monte_carlo",
     "network_design",
-    "papers",
     "notebook",
+    "papers",
     "sensitivity",
     "statistics",
+    "time_dependent_cameras",
     "trust",
 )
 
