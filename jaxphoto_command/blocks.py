@@ -63,7 +63,7 @@ def adjust(
     from jaxphoto.io import read_block, read_truth, write_block
     from jaxphoto.losses import LOSSES
     from jaxphoto.procedures import adjust_for_tables
-    from jaxphoto.procedures.weights import made_by_blunders
+    from jaxphoto.procedures.blunder_causes import inflated_components
     from jaxphoto.statistics import SPLITS
     from jaxphoto.writing import check_folder, whole_folder
     from jaxphoto_command.provenance import Provenance
@@ -90,7 +90,7 @@ def adjust(
         if weights is not None and bool(adjusted.converged):
             progress.update("estimating variance components")
             components = jaxphoto.variance_components(adjusted, splits, max_steps=max_steps)
-            masked += made_by_blunders(adjusted, components, splits, max_steps=max_steps, report=progress.update)
+            masked += inflated_components(adjusted, components, splits, max_steps=max_steps, report=progress.update)
             adjusted = components.adjusted
         progress.update("computing statistics")
         tables = jaxphoto.Tables(adjusted, rotations, read_truth(block))  # type: ignore[arg-type]
@@ -365,8 +365,8 @@ def halves(
     """
     from jaxphoto.extras.formats import write_camera_file
     from jaxphoto.io import read_block
-    from jaxphoto.procedures.halves import camera_of
-    from jaxphoto.procedures.halves import halves as compare_halves
+    from jaxphoto.procedures.compare import camera_of
+    from jaxphoto.procedures.compare import halves as compare_halves
     from jaxphoto.report.halves import print_halves, write_halves
     from jaxphoto.writing import check_folder
 

@@ -11,7 +11,7 @@ import pandas as pd
 from rich.console import Console
 
 from jaxphoto.errors import camera_words
-from jaxphoto.procedures.halves import Halves
+from jaxphoto.procedures.compare import Halves
 from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.formatting import without_empty
 from jaxphoto.report.page import Heading, Made, Paragraph, Part, Plot

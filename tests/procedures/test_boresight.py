@@ -137,7 +137,7 @@ def test_a_blunder_stops_at_the_first_step():
     assert [s.number for s in found] == [1]
     assert not found[0].go_on
     assert f"blunders, the largest first: {name}" in said(found[0])
-    assert "makes no sense to continue" in said(found[0])
+    assert "continuing is pointless" in said(found[0])
     assert len(boresight(made, go_on=True)) == 4
 
 

@@ -143,5 +143,5 @@ def test_refraction_and_curvature_of_the_block_are_applied():
 
 
 def test_no_sensors():
-    with pytest.raises(BlockError, match="no image has both a whole station and an attitude"):
+    with pytest.raises(BlockError, match="no image has both a complete station and an attitude"):
         georeference(without_attitudes(uncertain()[0]))

@@ -16,7 +16,7 @@ from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import InputError
 from jaxphoto.io import write_block
 from jaxphoto.io.camera_files import read_camera_file
-from jaxphoto.procedures.halves import halved, halves
+from jaxphoto.procedures.compare import halved, halves
 from jaxphoto.simulation import image_coordinates, remeasure
 from jaxphoto.stability import Differences, bundle_offsets, concentration, error_band, image_grid, leading_unit, overlap
 from jaxphoto.stability.band import square_radius
@@ -213,5 +213,5 @@ def test_an_image_that_a_cut_leaves_without_points_does_not_spoil_it():
 def test_too_few_images_to_cut_are_refused():
     block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
     block = some_images(block, np.isin(block.images, ["A3", "A4"]))
-    with pytest.raises(InputError, match="no two halves of this block can be compared: the images of a half have no"):
+    with pytest.raises(InputError, match="no two halves of this block can be compared: the images of a half have too few"):
         halves(block, image_grid(block.sensors["kodak"], 7, 5), n_cuts=1)

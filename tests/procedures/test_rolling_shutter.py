@@ -115,4 +115,4 @@ def test_a_flight_tells_the_readout_by_its_times():
     table = Tables(found).georeferencing.set_index("parameter").loc["shutters[kodak].readout_ms"]
     assert abs(table["value"] - 30.0) < 3 * table["sigma"] < 6.0
     still, why = _rolling(found, taken, False)
-    assert still is found and "without positions" in why
+    assert still is found and "need positions" in why

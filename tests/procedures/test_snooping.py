@@ -190,7 +190,7 @@ def test_rows_in_another_order_are_put_right(group, names, gone):
         value[here] = np.asarray(rows.value)[there]
     found = snoop(block.with_observations({group: dataclasses.replace(rows, value=value)}))
     (exchange,) = found.exchanged
-    assert (exchange.group == group and f"'s stood at {names[-2]}" in exchange.words) or len(names) > 4
+    assert (exchange.group == group and f"'s at {names[-2]}" in exchange.words) or len(names) > 4
     assert ("the rows are off by one" in exchange.words) == (group == "stations")
     assert {(s.group, s.row) for s in found.left_out} == {
         (group, int(row)) for name in gone for row in own[names.index(name)]

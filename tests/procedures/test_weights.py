@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust, read_block, variance_components
-from jaxphoto.procedures.weights import made_by_blunders
+from jaxphoto.procedures.blunder_causes import inflated_components
 from jaxphoto.report import component_findings
 
 
@@ -19,7 +19,7 @@ def block():
 def found_in(block):
     adjusted = adjust(block)
     components = variance_components(adjusted, ("xy-z",))
-    return components, made_by_blunders(adjusted, components, ("xy-z",))
+    return components, inflated_components(adjusted, components, ("xy-z",))
 
 
 def test_the_component_that_one_wrong_height_makes_is_an_alarm(block):

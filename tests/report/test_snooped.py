@@ -10,7 +10,7 @@ from jaxphoto import adjust, read_block, snoop
 from jaxphoto.initial.approximate import in_front, looking_away
 from jaxphoto.observations import Distances
 from jaxphoto.procedures import Snooped
-from jaxphoto.procedures.mistakes import coordinate_mistakes
+from jaxphoto.procedures.blunder_causes import coordinate_mistakes
 from jaxphoto.report import Tables, verdict_of
 from jaxphoto.report.residual_findings import snooped_findings
 from jaxphoto.statistics import Suspect, covariance

@@ -137,7 +137,7 @@ def test_a_rig_is_made_of_photographs_of_one_event():
     with pytest.raises(InputError, match="no image of another camera is in an event of camera kodak"):
         with_rig(apart, "kodak", 0.001, 1e-5)
     unknown = dataclasses.replace(bare.start, image_known=np.zeros(28, bool))
-    with pytest.raises(InputError, match="nothing says where oblique is in the rig; orient the block first"):
+    with pytest.raises(InputError, match="which locate oblique in the rig; orient the block first"):
         with_rig(dataclasses.replace(bare, start=unknown), "kodak", 0.001, 1e-5)
     fewer = tuple(f"{name} alone" if k == 1 else name for k, name in enumerate(events))
     with pytest.warns(UserWarning, match="1 photographs are in no event of the rig"):
