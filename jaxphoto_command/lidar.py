@@ -186,7 +186,7 @@ def simultaneous(
     from jaxphoto.lidar import HeightSettings
     from jaxphoto.lidar.correction import correct_cloud, scanner_path
     from jaxphoto.lidar.coverage import check_covered
-    from jaxphoto.lidar.strip_settings import StripSettings
+    from jaxphoto.lidar.strip_planes import StripSettings
     from jaxphoto.procedures.lidar import simultaneous
     from jaxphoto.report.lidar import print_moved, print_rounds, write_simultaneous
     from jaxphoto.writing import check_folder
@@ -320,7 +320,7 @@ def strips(
     --class and --returns select the points of the planes; the whole cloud is corrected. Exit code 1: written, but the
     verdict is red, or not converged.
     """
-    from jaxphoto.lidar.strip_settings import StripSettings
+    from jaxphoto.lidar.strip_planes import StripSettings
     from jaxphoto_command.strip_flight import StripChoices, StripFiles, adjust_flight, scanner_priors
 
     sigmas = {
@@ -427,7 +427,7 @@ def orthophoto(
 
     from jaxphoto.errors import BlockError, InputError
     from jaxphoto.io import clouds, raster, read_block
-    from jaxphoto.lidar.orthophoto import orthophoto
+    from jaxphoto.lidar.raster import orthophoto
     from jaxphoto.procedures import adjust
     from jaxphoto.writing import check_file
 

@@ -23,13 +23,10 @@ from jaxphoto.io.names import points_called
 from jaxphoto.io.raster import write_dsm
 from jaxphoto.io.trajectory import Records, read_records, write_moved
 from jaxphoto.io.trajectory.in_frame import trajectory_in, with_poses
-from jaxphoto.lidar.cell_returns import CellTally
-from jaxphoto.lidar.correction import scanner_path
+from jaxphoto.lidar.correction import correct_strips, scanner_path
 from jaxphoto.lidar.coverage import CoveredTimes
-from jaxphoto.lidar.raster import Raster
-from jaxphoto.lidar.strip_correction import correct_strips
-from jaxphoto.lidar.strip_differences import strip_differences
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.raster import Raster, strip_differences
+from jaxphoto.lidar.strip_planes import CellTally, StripSettings
 from jaxphoto.procedures.control import SurveyedPoints
 from jaxphoto.procedures.control.system import system_of
 from jaxphoto.procedures.lidar import (
@@ -41,8 +38,8 @@ from jaxphoto.procedures.lidar import (
     kept_returns,
 )
 from jaxphoto.procedures.lidar.iterate_to_convergence import at_result, interior_held
-from jaxphoto.procedures.lidar.looks import looks_of
 from jaxphoto.procedures.lidar.strip_control import check_complete
+from jaxphoto.procedures.lidar.strip_model import looks_of
 from jaxphoto.procedures.lidar.vertical_control import tie_points
 from jaxphoto.report.strips import print_strips, strips_verdict, write_strips
 from jaxphoto.report.tables import Tables

@@ -19,7 +19,7 @@ from jaxphoto.io.clouds.cloud_reader import Returns
 from jaxphoto.io.clouds.coordinate_system import UNITS
 from jaxphoto.io.shipped import EXAMPLES
 from jaxphoto.lidar.raster import Statistic
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.losses import LOSSES
 from jaxphoto.parameters import dynamic_fields
 from jaxphoto.procedures.compare import CUTS

@@ -17,7 +17,7 @@ import pandas as pd
 
 from jaxphoto.georeferencing import ScannerCalibration
 from jaxphoto.io import read_recipe
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.procedures.lidar import Photographs, ScannerPriors, StripAdjustment, adjust_strips
 from jaxphoto.report.strips import all_correlations, calibration_table
 from jaxphoto.simulation import Recipe, Simulation, simulate

@@ -20,12 +20,20 @@ from jaxphoto.arrays import ArrayLike
 from jaxphoto.cloud import Cloud
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
-from jaxphoto.lidar.breaklines import lie_on_two_planes
 from jaxphoto.lidar.grid import Grid, index_cloud, nearest
-from jaxphoto.lidar.height_error import LidarNoise
-from jaxphoto.lidar.height_estimate import APART, TIMES, WIDE, HeightEstimate, HeightNumbers, estimate_heights
-from jaxphoto.lidar.height_settings import HeightFlag, HeightSettings
-from jaxphoto.lidar.local_surface import Neighbours
+from jaxphoto.lidar.height_estimate import (
+    APART,
+    TIMES,
+    WIDE,
+    HeightEstimate,
+    HeightFlag,
+    HeightNumbers,
+    HeightSettings,
+    LidarNoise,
+    Neighbours,
+    estimate_heights,
+    lie_on_two_planes,
+)
 
 Method = Literal["idw", "plane", "tin", "local"]
 # Places of a call are padded to one of these: few programs.
@@ -186,3 +194,40 @@ def _broken(grid: Grid, xy: np.ndarray, found: HeightEstimate, k: int) -> np.nda
         near = near._replace(xy=np.where(there[..., None], near.xy, 0.0), there=there)
         broken[some] = np.asarray(call_compiled(lie_on_two_planes, near, found.one_surface[padded]))[: len(some)]
     return broken
+
+
+class TangentPlanes(eqx.Module):
+    """Planes at places; NaN where the cloud does not determine the surface (see `heights_at`)."""
+
+    foot: Float[np.ndarray, "places 3"]
+    """Point on the surface above or below the place (m)."""
+    normal: Float[np.ndarray, "places 3"]
+    """Unit vectors, upwards."""
+    sigma: Float[np.ndarray, "places"]
+    """Standard deviation of the surface along the normal (m)."""
+    flag: Integer[np.ndarray, "places"]
+    """Sums of `HeightFlag`."""
+    nearest: Int[np.ndarray, "places"]
+    """Laser point nearest to the place, in the order of the cloud."""
+
+
+def tangent_planes(
+    grid: Grid, xy: Float[np.ndarray, "places 2"], method: Method, settings: HeightSettings
+) -> TangentPlanes:
+    """Return the tangent planes of the surface at places X, Y (m).
+
+    With the gradient g of the surface, the normal is (-g, 1) / sqrt(1 + g.g), and its height error is projected
+    accordingly. Raises what `heights_at` raises.
+    """
+    heights = heights_at(grid, xy, method, settings)
+    normal = np.column_stack([-heights.gradient, np.ones(len(xy))])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal[np.isnan(heights.z)] = np.nan
+    found = nearest(grid, xy, 1).index[:, 0]
+    return TangentPlanes(
+        np.column_stack([xy, heights.z]),
+        normal,
+        np.asarray(heights.sigma) * normal[:, 2],
+        np.asarray(heights.flag),
+        np.asarray(grid.order)[found],
+    )

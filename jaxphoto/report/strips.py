@@ -18,8 +18,7 @@ from jaxphoto.lidar.raster import Raster
 from jaxphoto.observations import AttitudeSteps, PositionSteps
 from jaxphoto.procedures.lidar import StripAdjustment, StripDifference, StripRound
 from jaxphoto.procedures.lidar.strip_adjustment import PHOTOGRAPHS
-from jaxphoto.procedures.lidar.strip_control import CHECK, CONTROL
-from jaxphoto.procedures.lidar.surveyed_gaps import SurveyedGap
+from jaxphoto.procedures.lidar.strip_control import CHECK, CONTROL, SurveyedGap
 from jaxphoto.report.draws import in_degrees
 from jaxphoto.report.findings import Finding, Severity, Verdict, p_words
 from jaxphoto.report.formatting import label_unit, of_sigma, with_sigma

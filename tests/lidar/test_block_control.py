@@ -9,8 +9,8 @@ import pytest
 from jaxphoto import adjust, covariance, simulate
 from jaxphoto.errors import BlockError
 from jaxphoto.io import recipe_from
-from jaxphoto.lidar.block_control import pseudo_control_of_block
 from jaxphoto.lidar.grid import index_cloud
+from jaxphoto.lidar.pseudo_control import pseudo_control_of_block
 from jaxphoto.simulation.terrain import ROLLING
 from tests.simulation.small import changed
 

@@ -4,9 +4,16 @@ import hypothesis.strategies as st
 import numpy as np
 from hypothesis import given, settings
 
-from jaxphoto.lidar.cell_returns import CellTally, cells_of, columns_and_rows, gathered, joined
-from jaxphoto.lidar.corresponding_planes import planes_from, planes_of
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import (
+    CellTally,
+    StripSettings,
+    cells_of,
+    columns_and_rows,
+    gathered,
+    joined,
+    planes_from,
+    planes_of,
+)
 
 SETTINGS = StripSettings(cell_m=3.0)
 

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import InputError
-from jaxphoto.lidar.cell_returns import cells_of
-from jaxphoto.lidar.corresponding_planes import corresponding, fitting, planes_of
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import StripSettings, cells_of, corresponding, fitting, planes_of
 from tests.lidar.clouds import SURFACES, ground
 
 SETTINGS = StripSettings(cell_m=4.0, roughness_m=0.05)

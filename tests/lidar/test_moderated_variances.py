@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxphoto.lidar.moderated_variances import moderated_variances
+from jaxphoto.lidar.strip_planes import moderated_variances
 
 
 @pytest.mark.parametrize(("prior", "off"), [(1e9, 0.01), (30.0, 0.05), (8.0, 0.1)])

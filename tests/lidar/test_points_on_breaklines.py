@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxphoto.lidar.corresponding_planes import planes_of
-from jaxphoto.lidar.points_on_breaklines import faces_about
-from jaxphoto.lidar.points_on_planes import PointsOnPlanes, on_planes
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import PointsOnPlanes, StripSettings, faces_about, on_planes, planes_of
 from tests.lidar.clouds import gable, ground
 
 SETTINGS = StripSettings(cell_m=3.0, returns=10)

@@ -2,9 +2,7 @@
 
 import numpy as np
 
-from jaxphoto.lidar.corresponding_planes import planes_of
-from jaxphoto.lidar.points_on_planes import on_planes, returns_about
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import StripSettings, on_planes, planes_of, returns_about
 
 SETTINGS = StripSettings(cell_m=4.0, returns=8)
 

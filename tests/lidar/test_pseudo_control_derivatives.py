@@ -6,7 +6,7 @@ import pytest
 
 from jaxphoto import ExteriorOrientation, InteriorOrientation
 from jaxphoto.camera import Brown
-from jaxphoto.lidar.height_settings import HeightFlag, HeightSettings
+from jaxphoto.lidar.height_estimate import HeightFlag, HeightSettings
 from jaxphoto.lidar.pseudo_control import pseudo_control_points
 from tests.lidar.test_pseudo_control import anywhere, image, indexed, measured, scanned, slope
 from tests.marks import slow_but

@@ -8,8 +8,7 @@ from scipy.stats import binned_statistic_2d
 from jaxphoto import Brown, ExteriorOrientation, InputError, InteriorOrientation, Sensor
 from jaxphoto.camera import BundlerRadial
 from jaxphoto.georeferencing import Corrections
-from jaxphoto.lidar.orthophoto import hidden, orthophoto
-from jaxphoto.lidar.raster import Raster, filled, hillshade, surface_model
+from jaxphoto.lidar.raster import Raster, filled, hidden, hillshade, orthophoto, surface_model
 from tests.checked_types import unchecked
 from tests.formulas import camera_from_object
 from tests.lidar.photographs import rendered

@@ -3,9 +3,8 @@
 import numpy as np
 
 from jaxphoto.cloud import Cloud
-from jaxphoto.lidar.cell_returns import CellTally
-from jaxphoto.lidar.strip_differences import strip_differences
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.raster import strip_differences
+from jaxphoto.lidar.strip_planes import CellTally, StripSettings
 
 RNG = np.random.default_rng(4)
 SETTINGS = StripSettings(cell_m=2.0, roughness_m=0.05)

@@ -5,7 +5,7 @@ import dataclasses
 import functools
 
 from jaxphoto.georeferencing import ScannerCalibration
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.procedures.lidar import ScannerPriors, StripAdjustment, adjust_strips
 from jaxphoto.simulation import Simulation
 from jaxphoto.unknowns import FIXED, FREE, Weighted

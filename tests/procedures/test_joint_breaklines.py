@@ -8,12 +8,11 @@ import pytest
 from jaxphoto import BlockError, InputError, read_block, write_block
 from jaxphoto.georeferencing import StripSpline
 from jaxphoto.io.names import points_called
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.observations import StripPlanes
 from jaxphoto.procedures.lidar import Photographs, adjust_strips
 from jaxphoto.procedures.lidar.photographs import check_photographs, on_trajectory
-from jaxphoto.procedures.lidar.strip_search import StripSearch
-from jaxphoto.procedures.lidar.tie_point_search import PointSearch
+from jaxphoto.procedures.lidar.plane_search import PointSearch, StripSearch
 from tests.lidar.clouds import gable
 from tests.procedures.joint import JOINT, flown, photographs
 from tests.procedures.strips import PRIORS, SETTINGS

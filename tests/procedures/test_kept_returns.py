@@ -7,8 +7,8 @@ import pytest
 
 from jaxphoto import InputError
 from jaxphoto.cloud import Cloud
-from jaxphoto.lidar.cell_returns import cells_of
 from jaxphoto.lidar.correction import scanner_path
+from jaxphoto.lidar.strip_planes import cells_of
 from jaxphoto.procedures.lidar import adjust_strips, kept_returns
 from tests.procedures.strips import PRIORS, SETTINGS, fitted, flown
 

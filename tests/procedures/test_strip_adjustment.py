@@ -12,13 +12,18 @@ from jaxphoto.adjustment import Outcome
 from jaxphoto.cloud import Cloud
 from jaxphoto.georeferencing import StripSpline, TrajectoryKnot
 from jaxphoto.io.recipe.truth import truth_tables
-from jaxphoto.lidar.correction import in_portions, scanner_path, scanner_poses
-from jaxphoto.lidar.strip_correction import correct_flight, correct_strips, corrected_strip
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.correction import (
+    correct_flight,
+    correct_strips,
+    corrected_strip,
+    in_portions,
+    scanner_path,
+    scanner_poses,
+)
+from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.procedures.lidar import ScannerPriors, adjust_strips
 from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
-from jaxphoto.procedures.lidar.strip_rows import _angles, step_rows
-from jaxphoto.procedures.lidar.strip_unknowns import knot_sigmas
+from jaxphoto.procedures.lidar.strip_model import _angles, knot_sigmas, step_rows
 from jaxphoto.report.strips import calibration_table, trajectory_errors_table
 from jaxphoto.rotation import (
     matrix_from_quaternion,

@@ -12,7 +12,7 @@ from jaxphoto import BlockError, InputError
 from jaxphoto.block import Frame
 from jaxphoto.cloud import Cloud
 from jaxphoto.io import clouds
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.procedures.control import SurveyedPoints
 from jaxphoto.procedures.lidar import StripAdjustment, adjust_strips
 from jaxphoto.procedures.lidar.strip_control import with_control

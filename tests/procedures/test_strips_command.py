@@ -20,7 +20,7 @@ from jaxphoto.io.raster import read_dsm
 from jaxphoto.io.recipe.truth import write_simulation
 from jaxphoto.io.trajectory import FIELDS, read_sbet, sbet_records, with_records, write_sbet
 from jaxphoto.io.trajectory.in_frame import positions_in, records_of, with_poses
-from jaxphoto.lidar.strip_correction import correct_flight
+from jaxphoto.lidar.correction import correct_flight
 from jaxphoto.procedures.lidar import kept_returns
 from jaxphoto_command.strip_flight import write_corrected
 from tests.commands import run

@@ -17,8 +17,7 @@ from jaxphoto.io import read_block, recipe_from, write_simulation
 from jaxphoto.io.clouds import read_cloud
 from jaxphoto.io.recipe.truth import truth_tables
 from jaxphoto.io.trajectory import read_flight_csv
-from jaxphoto.lidar.correction import scanner_path
-from jaxphoto.lidar.strip_correction import correct_strips
+from jaxphoto.lidar.correction import correct_strips, scanner_path
 from jaxphoto.rotation import matrix_from_quaternion
 from jaxphoto.simulation import Simulation
 from jaxphoto.simulation.buildings import roof_height

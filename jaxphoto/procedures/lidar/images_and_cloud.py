@@ -36,8 +36,7 @@ from jaxphoto.lidar.correction import (
     scanner_poses,
 )
 from jaxphoto.lidar.coverage import check_covered
-from jaxphoto.lidar.heights import Method
-from jaxphoto.lidar.tangent_planes import TangentPlanes, tangent_planes
+from jaxphoto.lidar.heights import Method, TangentPlanes, tangent_planes
 from jaxphoto.observations import SurfaceRows
 from jaxphoto.procedures.lidar.iterate_to_convergence import (
     MAX_ROUNDS,

@@ -13,12 +13,9 @@ from jaxtyping import Bool, Float, Int
 
 from jaxphoto.cloud import Cloud
 from jaxphoto.georeferencing import Pattern
-from jaxphoto.lidar.cell_returns import CellReturns, CellTally, cells_of
 from jaxphoto.lidar.correction import ScannerPath
-from jaxphoto.lidar.corresponding_planes import corresponding, planes_from
-from jaxphoto.lidar.strip_settings import StripSettings
-from jaxphoto.procedures.lidar.looks import Look, looks_of
-from jaxphoto.procedures.lidar.strip_rows import thinned
+from jaxphoto.lidar.strip_planes import CellReturns, CellTally, StripSettings, cells_of, corresponding, planes_from
+from jaxphoto.procedures.lidar.strip_model import Look, looks_of, thinned
 
 KEPT = 10_000_000
 """Returns in memory: about a gigabyte with the search, and far more than 4,000 planes need."""

@@ -13,7 +13,7 @@ from jaxphoto.georeferencing import StripSpline, Trajectory
 from jaxphoto.georeferencing.time_scales import looks_like, shift_that_fits
 from jaxphoto.lidar.correction import scanner_path, scanner_poses
 from jaxphoto.lidar.coverage import CoveredTimes
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.observations import Attitudes, CameraPositions, StripPlanes, TrajectoryAttitudes, TrajectoryStations
 from jaxphoto.procedures.lidar.iterate_to_convergence import check_without_surfaces
 

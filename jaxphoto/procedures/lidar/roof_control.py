@@ -19,8 +19,7 @@ from jaxphoto.block import Block
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.lidar import HeightSettings
-from jaxphoto.lidar.planes import plane_feet
-from jaxphoto.lidar.roofs import Patch, planar_patches, roof_centroid
+from jaxphoto.lidar.planes import Patch, planar_patches, plane_feet, roof_centroid
 from jaxphoto.observations import ControlCoordinates, SurfaceRows
 from jaxphoto.procedures.lidar.iterate_to_convergence import (
     MAX_ROUNDS,

@@ -17,7 +17,7 @@ from jaxphoto.georeferencing.time_scales import LEAP_SECONDS
 from jaxphoto.georeferencing.yaw_units import counts_in_radians
 from jaxphoto.lidar.correction import ScannerPath, scanner_poses
 from jaxphoto.lidar.coverage import CoveredTimes, longest_interval
-from jaxphoto.procedures.lidar.looks import aside
+from jaxphoto.procedures.lidar.strip_model import aside
 
 # Maximum range of an airborne laser scanner (m).
 _FARTHEST_M = 10_000.0

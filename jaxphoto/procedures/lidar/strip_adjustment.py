@@ -18,30 +18,28 @@ from jaxphoto.block import empty_block
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import StripErrors, StripSpline, Trajectory
-from jaxphoto.lidar.correction import scanner_path
+from jaxphoto.lidar.correction import correct_flight, scanner_path, times_of
 from jaxphoto.lidar.coverage import check_covered
-from jaxphoto.lidar.strip_correction import correct_flight, times_of
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.observations import StripPoints
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
 from jaxphoto.procedures.lidar.iterate_to_convergence import STILL, at_result, with_interior_held
 from jaxphoto.procedures.lidar.photographs import Photographs, check_photographs, on_trajectory, spans_with
+from jaxphoto.procedures.lidar.plane_search import CommonPlanes, PointPlanes, PointSearch, StripSearch, check_joined
 from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
 from jaxphoto.procedures.lidar.strip_control import (
     CHECK,
     CONTROL,
     ControlSearch,
     OnStrips,
+    SurveyedGap,
     check_seen,
+    surveyed_gaps,
     with_control,
     with_datum,
 )
-from jaxphoto.procedures.lidar.strip_rows import step_rows
-from jaxphoto.procedures.lidar.strip_search import CommonPlanes, StripSearch, check_joined
-from jaxphoto.procedures.lidar.strip_unknowns import ScannerPriors, errors_of, knot_sigmas, strip_block
-from jaxphoto.procedures.lidar.surveyed_gaps import SurveyedGap, surveyed_gaps
-from jaxphoto.procedures.lidar.tie_point_search import PointPlanes, PointSearch
+from jaxphoto.procedures.lidar.strip_model import ScannerPriors, errors_of, knot_sigmas, step_rows, strip_block
 from jaxphoto.procedures.lidar.vertical_control import tie_points
 from jaxphoto.statistics import Covariance, covariance
 from jaxphoto.unknowns import FIXED

@@ -19,7 +19,7 @@ from jaxphoto.block import Block
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.lidar import Grid, HeightFlag, HeightSettings, heights_at, index_cloud
-from jaxphoto.lidar.block_control import pseudo_control_of_block
+from jaxphoto.lidar.pseudo_control import pseudo_control_of_block
 from jaxphoto.observations import ControlCoordinates
 from jaxphoto.procedures.lidar.iterate_to_convergence import (
     MAX_ROUNDS,
