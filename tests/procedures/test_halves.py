@@ -213,5 +213,5 @@ def test_an_image_that_a_cut_leaves_without_points_does_not_spoil_it():
 def test_too_few_images_to_cut_are_refused():
     block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
     block = some_images(block, np.isin(block.images, ["A3", "A4"]))
-    with pytest.raises(InputError, match="no two halves .* compared: the images of a half have too few"):
+    with pytest.raises(InputError, match=r"no two halves .* compared: the images of a half have too few"):
         halves(block, image_grid(block.sensors["kodak"], 7, 5), n_cuts=1)
