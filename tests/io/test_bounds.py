@@ -17,7 +17,7 @@ from jaxphoto.io.names import harm_in
 from jaxphoto.io.trajectory import read_records
 from jaxphoto.io.whole_text import read_text, read_whole
 from jaxphoto.simulation import visibility
-from jaxphoto.simulation.flight_plan import Footprint, Strip, Swaths
+from jaxphoto.simulation.plans import Footprint, Strip, Swaths
 from tests.io import test_cameras as cameras
 from tests.io.test_map_block import to_utm
 from tests.mutations import SUMMARY

@@ -11,7 +11,7 @@ from jaxphoto.errors import BlockError
 from jaxphoto.io import recipe_from
 from jaxphoto.lidar.grid import index_cloud
 from jaxphoto.lidar.pseudo_control import pseudo_control_of_block
-from jaxphoto.simulation.terrain import ROLLING
+from jaxphoto.simulation.scene import ROLLING
 from tests.simulation.small import changed
 
 

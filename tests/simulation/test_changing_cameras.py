@@ -9,7 +9,7 @@ from jaxphoto import FREE, BlockError, InputError
 from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.io import read_block, read_truth, recipe_from, write_simulation
 from jaxphoto.simulation import image_coordinates
-from jaxphoto.simulation.changing_cameras import drawn
+from jaxphoto.simulation.camera_changes import draw_changes
 from jaxphoto.simulation.flight import fly
 from tests.derivatives import compiled
 from tests.simulation.small import changed, made, plain
@@ -88,7 +88,7 @@ def test_cameras_of_strips_walk():
     hours = np.diff([block.flight_time[np.array(block.image_strip) == name].mean() / 3600 for name in "ABC"])
     np.testing.assert_allclose(steps.sigma, np.sqrt(hours[1:]) * [[0.1, 0.05, 0.05]])
     for seed in range(60):
-        own = drawn(recipe_from(changed(STRIPS)), flown(), block.flight_time, seed)["strip_cameras"]
+        own = draw_changes(recipe_from(changed(STRIPS)), flown(), block.flight_time, seed)["strip_cameras"]
         walks.append(np.diff([float(own[name].truth.xp_more) for name in "ABC"]) / np.sqrt(hours) / 0.2)
     assert abs(np.std(walks) - 1) < 4 / np.sqrt(2 * np.size(walks))
 
@@ -99,7 +99,7 @@ def flown():
 
 
 def test_a_camera_wanders_along_its_spline():
-    walks = [drawn(recipe_from(changed(SPLINE)), flown(), np.zeros(14), seed) for seed in range(60)]
+    walks = [draw_changes(recipe_from(changed(SPLINE)), flown(), np.zeros(14), seed) for seed in range(60)]
     ends = np.array([np.asarray(walk["camera_splines"]["kodak"].truth.c_spline)[[0, -1]] for walk in walks])
     assert abs(np.std(ends) / (0.3 * np.sqrt(250 / 3600)) - 1) < 4 / np.sqrt(2 * ends.size)
     assert not np.asarray(walks[0]["camera_splines"]["kodak"].truth.xp_spline).any()

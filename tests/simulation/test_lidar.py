@@ -20,7 +20,7 @@ from jaxphoto.io.trajectory import read_flight_csv
 from jaxphoto.lidar.correction import correct_strips, scanner_path
 from jaxphoto.rotation import matrix_from_quaternion
 from jaxphoto.simulation import Simulation
-from jaxphoto.simulation.buildings import roof_height
+from jaxphoto.simulation.scene import roof_height
 from tests.commands import run
 from tests.simulation.small import RECIPES, changed, made
 

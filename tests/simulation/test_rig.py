@@ -16,7 +16,7 @@ from jaxphoto.io import read_block, read_truth, recipe_from, write_block, write_
 from jaxphoto.parameters import numbers_of
 from jaxphoto.procedures.rig import with_rig
 from jaxphoto.simulation import remeasure, simulate
-from jaxphoto.simulation.further_rows import observed_anew
+from jaxphoto.simulation.remeasure import remeasure_rows
 from jaxphoto.variants import indirect, some_images
 from tests.derivatives import compiled
 from tests.simulation.small import SMALL, changed
@@ -110,7 +110,7 @@ def test_it_goes_through_files(tmp_path):
 def test_measured_once_more_the_rig_bends_anew():
     block, truth, _ = flown()
     place, _ = poses(flown())
-    off = np.array([observed_anew(block.more[0], block, truth, jax.random.key(k)).off for k in range(40)])
+    off = np.array([remeasure_rows(block.more[0], block, truth, jax.random.key(k)).off for k in range(40)])
     np.testing.assert_allclose(off.mean(0), place - TRUE_PLACE, atol=4 * 0.001 / np.sqrt(40))
     assert abs(off.std(0).mean() / 0.001 - 1) < 0.1
     assert not np.array_equal(remeasure(block, truth, jax.random.key(1)).more[1].off, block.more[1].off)

@@ -11,8 +11,7 @@ from scipy.stats import poisson
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import recipe_from
 from jaxphoto.simulation import Building, Terrain, Tree
-from jaxphoto.simulation.buildings import entered, roof_height, solids
-from jaxphoto.simulation.trees import met_leaves
+from jaxphoto.simulation.scene import entry_distances, intersect_crowns, roof_height, solids
 from tests.simulation.small import changed, made
 
 bounded = settings(max_examples=40, deadline=None, derandomize=True, database=None)
@@ -66,7 +65,7 @@ def test_rays_enter_where_they_first_fall_below_the_surface(roof, heading, lengt
     origin = np.column_stack([rng.uniform(-30, 30, (n, 2)), rng.uniform(35, 40, n)])
     aim = np.column_stack([rng.uniform(-20, 20, (n, 2)) + building.centre_m, np.zeros(n)])
     direction = (aim - origin) / np.linalg.norm(aim - origin, axis=1, keepdims=True)
-    by_roof, by_wall = entered(solids((building,)), np.zeros(n, int), origin, direction)
+    by_roof, by_wall = entry_distances(solids((building,)), np.zeros(n, int), origin, direction)
     assert not (np.isfinite(by_roof) & np.isfinite(by_wall)).any()
     way = np.arange(0, 90, step)
     for k in range(n):
@@ -170,7 +169,7 @@ def test_pulses_pass_a_crown_as_poisson_says():
     """Straight down through the middle of a crown 14 m deep: returns within it, and what reaches the ground."""
     tree, n = Tree((0.0, 0.0), 0.0, 20.0, 4.0), 40_000
     origin, down = np.tile([0.0, 0.0, 500.0], (n, 1)), np.tile([0.0, 0.0, -1.0], (n, 1))
-    leaves = met_leaves((tree,), origin, down, np.full(n, 500.0), np.random.default_rng(4))
+    leaves = intersect_crowns((tree,), origin, down, np.full(n, 500.0), np.random.default_rng(4))
     z = 500 - leaves.at
     assert z.min() >= 6 - 1e-9 and z.max() <= 20
     # Of k meetings (at most 3 count) a pulse survives all with 2^-k.
@@ -185,7 +184,9 @@ def test_pulses_pass_a_crown_as_poisson_says():
     depth = leaves.at[first] - 480
     expected = 1 - np.exp(-2.5 / 2.5)
     assert abs((depth < 2.5).sum() / n - expected) < 4 * np.sqrt(expected * (1 - expected) / n)
-    beside = met_leaves((tree,), origin + np.array([4.01, 0, 0]), down, np.full(n, 500.0), np.random.default_rng(4))
+    beside = intersect_crowns(
+        (tree,), origin + np.array([4.01, 0, 0]), down, np.full(n, 500.0), np.random.default_rng(4)
+    )
     assert not len(beside.pulse) and not beside.stopped.any()
 
 

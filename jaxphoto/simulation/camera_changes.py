@@ -12,27 +12,26 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.camera import RowMotion, StripCamera
+from jaxphoto.camera import ImageMotion, RollingShutter, RowMotion, StripCamera
 from jaxphoto.camera.camera_rates import HOUR_S
 from jaxphoto.collinearity import ExteriorOrientation, project
-from jaxphoto.georeferencing import Exposure
+from jaxphoto.georeferencing import Exposure, Mount, body_from_camera
 from jaxphoto.observations import StripCameraSteps
 from jaxphoto.parameters import AbstractParameters, dynamic_fields
-from jaxphoto.simulation.chunks import in_chunks
 from jaxphoto.simulation.flight import Flight
+from jaxphoto.simulation.points import Rays
 from jaxphoto.simulation.recipe import Recipe, SimulatedChange, triple
-from jaxphoto.simulation.streams import stream
-from jaxphoto.simulation.visibility import Rays
-from jaxphoto.unknowns import Unknowns, Weighted
+from jaxphoto.simulation.sampling import in_chunks, stream
+from jaxphoto.unknowns import FIXED, Unknowns, Weighted
 
 Changes = Mapping[str, Mapping[str, SimulatedChange]]
 _CHUNK = 1024
 _WALKING = dynamic_fields(StripCamera)
 
 
-def drawn(recipe: Recipe, flight: Flight, clock: Float[np.ndarray, "images"], seed: int) -> Changes:
+def draw_changes(recipe: Recipe, flight: Flight, clock: Float[np.ndarray, "images"], seed: int) -> Changes:
     """Return the changes of the recipe with their truth: deviations of each owner, and the walk between strips."""
-    changes = {kind: deviated(owners, seed) for kind, owners in recipe.changes.items()}
+    changes = {kind: draw_deviations(owners, seed) for kind, owners in recipe.changes.items()}
     if recipe.walk is not None:
         strips, hours = _strip_hours(flight, clock)
         steps = np.sqrt(np.diff(hours, prepend=hours[:1]))[:, None] * triple(recipe.walk.truth)
@@ -46,7 +45,7 @@ def drawn(recipe: Recipe, flight: Flight, clock: Float[np.ndarray, "images"], se
     return changes
 
 
-def deviated(owners: Mapping[str, SimulatedChange], seed: int) -> dict[str, SimulatedChange]:
+def draw_deviations(owners: Mapping[str, SimulatedChange], seed: int) -> dict[str, SimulatedChange]:
     """Return the changes with the deviations of each owner in their truth."""
     found = {}
     for name, own in owners.items():
@@ -89,7 +88,7 @@ class Circumstances(eqx.Module):
     above: Float[np.ndarray, "images"]
 
 
-def seen_by_changing(
+def reproject_changing(
     recipe: Recipe,
     flight: Flight,
     rays: Rays,
@@ -166,3 +165,53 @@ def with_changes(
         more(priors, {kind: {n: model[1] for n, model in owners.items()} for kind, owners in known.items()}),
         more(truth, {kind: {n: own.truth for n, own in owners.items()} for kind, owners in changes.items()}),
     )
+
+
+def camera_motions(exterior: ExteriorOrientation, velocity, rate, mounts: list[Mount]) -> Float[np.ndarray, "images 6"]:
+    """Return velocity (m/s) and rotation rate (rad/s) in the axes of the camera.
+
+    From a velocity in the object frame and a rate about the body's right, forward and up axes.
+    """
+    turned = np.einsum("nij,nj->ni", np.asarray(exterior.camera_from_object), velocity)
+    camera = np.stack([np.asarray(body_from_camera(m.boresight, m.nominal)).T for m in mounts])
+    return np.hstack([turned, np.einsum("nij,nj->ni", camera, rate)])
+
+
+def with_shutters(
+    recipe: Recipe, flight: Flight, motions: np.ndarray, seed: int, start: Unknowns, priors: Unknowns, truth: Unknowns
+) -> tuple[Unknowns, Unknowns, Unknowns]:
+    """Return start, priors and truth with the shutters and the motions of images whose camera the block models with
+    one.
+
+    The block receives each motion with the error that it states, or exactly if it is fixed.
+    """
+    if not recipe.shutters:
+        return start, priors, truth
+    of = [recipe.shutters.get(camera) for camera in flight.cameras]
+    true = {name: _motion(m) for name, m, own in zip(flight.images, motions, of, strict=True) if own}
+    error = stream(seed, "noise of motions").standard_normal(motions.shape)
+    told, known = {}, {}
+    for name, m, e, own in zip(flight.images, motions, error, of, strict=True):
+        if own is None or own.model is None:
+            continue
+        sigma = np.repeat([own.velocity_m_per_s, np.deg2rad(own.rate_deg_per_s)], 3)
+        told[name] = _motion(m + sigma * e)
+        known[name] = ImageMotion(
+            Weighted(told[name].velocity, sigma[:3]) if own.velocity_m_per_s else FIXED,  # type: ignore[arg-type]
+            Weighted(told[name].rate, sigma[3:]) if own.rate_deg_per_s else FIXED,  # type: ignore[arg-type]
+        )
+    models = {name: own.model for name, own in recipe.shutters.items() if own.model}
+    kinds = RollingShutter.kind, ImageMotion.kind
+
+    def more(shutters: dict, images: dict) -> dict:
+        return dict(zip(kinds, (shutters, images), strict=True)) if shutters else {}
+
+    return (
+        dataclasses.replace(start, more=more({name: model[0] for name, model in models.items()}, told)),
+        dataclasses.replace(priors, more=more({name: model[1] for name, model in models.items()}, known)),
+        dataclasses.replace(truth, more=more({name: own.truth for name, own in recipe.shutters.items()}, true)),
+    )
+
+
+def _motion(numbers: np.ndarray) -> ImageMotion:
+    return ImageMotion(numbers[:3], numbers[3:])  # type: ignore[arg-type]

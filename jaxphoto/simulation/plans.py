@@ -1,6 +1,8 @@
-"""Flight plan: straight strips over level ground, their exposures, and the ground they cover.
+"""Plans of flights, convergent images and laser scans.
 
-Headings are in degrees clockwise from north, lengths in metres, object frame east-north-up (docs/conventions.md).
+Headings are in degrees clockwise from north, lengths in metres, object frame east-north-up (docs/conventions.md). The
+object frame of convergent images is that of a level field at close range: X and Y along its sides, Z towards the
+cameras.
 """
 
 import dataclasses
@@ -158,3 +160,130 @@ def footprint(sensor: Sensor, c_mm: float, height_m: float, image_x: ImageX) -> 
     """Return the coverage of a vertical image from `height_m`: format times height over principal distance."""
     sides = np.array([sensor.width_mm, sensor.height_mm]) * height_m / c_mm
     return Footprint(*map(float, sides if image_x in ("forward", "back") else sides[::-1]))
+
+
+@dataclasses.dataclass(frozen=True)
+class Station:
+    """Image taken `distance_m` from the centre of the field, aimed at it.
+
+    `azimuth_deg` is the viewing direction clockwise from Y, `tilt_deg` the angle from the nadir, `roll_deg` the
+    rotation about the camera axis, counter-clockwise from behind. Without roll the x axis is level; if all are zero, x
+    is X and y is Y.
+    """
+
+    name: str
+    camera: str
+    distance_m: float
+    azimuth_deg: float = 0.0
+    tilt_deg: float = 0.0
+    roll_deg: float = 0.0
+
+    @property
+    def camera_from_object(self) -> Float[np.ndarray, "3 3"]:
+        """Rows: the camera's axes; `R3(roll) R1(tilt) R3(-azimuth)`."""
+        angles = np.deg2rad([self.azimuth_deg, self.tilt_deg, self.roll_deg])
+        (sa, st, sr), (ca, ct, cr) = np.sin(angles), np.cos(angles)
+        level = np.array([[ca, -sa, 0.0], [ct * sa, ct * ca, st], [-st * sa, -st * ca, ct]])
+        return np.array([[cr, sr, 0.0], [-sr, cr, 0.0], [0.0, 0.0, 1.0]]) @ level
+
+    @property
+    def position(self) -> Float[np.ndarray, "3"]:
+        """Position relative to the centre of the field (m)."""
+        return self.distance_m * self.camera_from_object[2]
+
+
+@dataclasses.dataclass(frozen=True)
+class Field:
+    """Ground of a convergent set: a rectangle about the origin, in metres along X and Y."""
+
+    size_m: tuple[float, float]
+
+    @property
+    def axes(self) -> Float[np.ndarray, "2 2"]:
+        """Unit vectors (X, Y) along the sides."""
+        return np.eye(2)
+
+    @property
+    def directions(self) -> Float[np.ndarray, "2 2"]:
+        """Unit vectors along the sides."""
+        return self.axes
+
+    def extent(self, axes: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
+        """Minimum and maximum coordinate, (minimum or maximum, axis) in m along `axes`."""
+        reach = np.abs(axes) @ np.array(self.size_m) / 2
+        return np.stack([-reach, reach])
+
+    def draw(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n 2"]:
+        """Draw places (X, Y) of uniform density."""
+        return rng.uniform(-0.5, 0.5, (n, 2)) * np.array(self.size_m)
+
+
+@dataclasses.dataclass(frozen=True)
+class ConvergentPlan:
+    """Stations in order of exposure, and the field they aim at."""
+
+    stations: tuple[Station, ...]
+    field: Field
+
+    @property
+    def cameras(self) -> set[str]:
+        """Cameras used."""
+        return {station.camera for station in self.stations}
+
+    @property
+    def n_images(self) -> int:
+        """Number of images, one per station."""
+        return len(self.stations)
+
+
+Triple = tuple[float, float, float]
+_ZERO = (0.0, 0.0, 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class ScanPlan:
+    """Scanner with lines across the track, up to `scan_angle_deg` on either side of the body's nadir.
+
+    `pattern` is one of `georeferencing.PATTERN_OF`: "oscillating" scans back and forth; "circle" or "risley" has two
+    counter-rotating prisms, "nutating" a constant nadir angle. `density_per_m2` is the pulse density of one strip on
+    level ground at the mean height of the terrain. It scans the strips of the flight, or `strips` of its own flight.
+    `boresight_deg` (about the body's right, forward and up axes) is the true misalignment. The true trajectory error of
+    a strip is its `shift_m` (by name or "default") plus a normal one of `shift_sigma_m`; that of its attitude is
+    `attitude_deg` (about right, forward, up). Both drift linearly from the centre of the strip by `drift_m_per_s` and
+    `attitude_drift_deg_per_s`, and randomly with `drift_sigma_m`, `drift_sigma_deg` and `correlation_s`, at knots
+    `knots_s` apart. `lever_arm_m`, `range_offset_m`, the scales, `eccentricity_deg` (of cos and sin) and
+    `time_offset_s` are those of `georeferencing.ScannerCalibration`. With `same_trajectory` stations and attitudes of
+    the exposures have the errors of this trajectory, in addition to their noise.
+    """
+
+    density_per_m2: float
+    scan_angle_deg: float = 20.0
+    pattern: str = "line"
+    strips: tuple[Strip, ...] = ()
+    boresight_deg: Triple = _ZERO
+    shift_m: dict[str, Triple] = dataclasses.field(default_factory=dict)
+    drift_m_per_s: dict[str, Triple] = dataclasses.field(default_factory=dict)
+    attitude_deg: dict[str, Triple] = dataclasses.field(default_factory=dict)
+    attitude_drift_deg_per_s: dict[str, Triple] = dataclasses.field(default_factory=dict)
+    shift_sigma_m: Triple = _ZERO
+    drift_sigma_m: Triple = _ZERO
+    drift_sigma_deg: Triple = _ZERO
+    correlation_s: float = 100.0
+    knots_s: float = 5.0
+    lever_arm_m: Triple = _ZERO
+    range_offset_m: float = 0.0
+    range_scale_ppm: float = 0.0
+    angle_scale_ppm: float = 0.0
+    eccentricity_deg: tuple[float, float] = (0.0, 0.0)
+    time_offset_s: float = 0.0
+    same_trajectory: bool = False
+
+    @property
+    def half_width(self) -> float:
+        """Half width of the swath relative to the height above ground: tangent of the scan angle."""
+        return float(np.tan(np.deg2rad(self.scan_angle_deg)))
+
+
+def strip_value(values: dict[str, Triple], strip: str) -> Float[np.ndarray, "3"]:
+    """Return the planned value of a strip, by its name or "default", without random parts."""
+    return np.array(values.get(strip, values.get("default", _ZERO)))
