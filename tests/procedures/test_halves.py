@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -22,7 +21,7 @@ from jaxphoto.stability import Differences, bundle_offsets, concentration, error
 from jaxphoto.stability.band import square_radius
 from jaxphoto.statistics import common_covariance
 from jaxphoto.variants import some_images
-from tests.blocks import FIELDS, FIVE, SENSOR, simulated
+from tests.blocks import FIELDS, FIVE, SENSOR, adjusted_example, example, simulated
 from tests.commands import run
 
 CELLS = image_grid(SENSOR, 7, 5)
@@ -196,8 +195,8 @@ def test_a_unit_that_all_differences_follow_is_found():
 
 def test_an_image_that_a_cut_leaves_without_points_does_not_spoil_it():
     """It says nothing of the camera: the half goes without it."""
-    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
-    adjusted, rng = adjust(block), np.random.default_rng(0)
+    block = example()
+    adjusted, rng = adjusted_example(), np.random.default_rng(0)
     masks = (rng.permutation(len(block.images)) < len(block.images) // 2 for _ in range(1000))
 
     def few(mask):
@@ -211,7 +210,7 @@ def test_an_image_that_a_cut_leaves_without_points_does_not_spoil_it():
 
 
 def test_too_few_images_to_cut_are_refused():
-    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    block = example()
     block = some_images(block, np.isin(block.images, ["A3", "A4"]))
     with pytest.raises(InputError, match=r"no two halves .* compared: the images of a half have too few"):
         halves(block, image_grid(block.sensors["kodak"], 7, 5), n_cuts=1)

@@ -1,17 +1,17 @@
 """What a whole group of observations gets wrong: its standard deviations, and an error that all have in common."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from jaxphoto import adjust, covariance, read_block, significance
+from jaxphoto import adjust, covariance, significance
+from tests.blocks import adjusted_example, example
 
 
 @pytest.fixture(scope="module")
 def block():
-    return read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    return example()
 
 
 def test_standard_deviations_of_few_are_judged_although_all_together_fit(block):
@@ -21,12 +21,12 @@ def test_standard_deviations_of_few_are_judged_although_all_together_fit(block):
     verdict = adjust(block.with_observations({"control_points": vague})).verdict()
     assert verdict.colour == "amber"
     assert any(f.code == "group_sigma" and f.subject == "control points" for f in verdict.findings)
-    assert adjust(block).verdict().colour == "green"
+    assert adjusted_example().verdict().colour == "green"
 
 
 def test_how_large_an_error_in_common_may_be_unseen_is_what_it_does(block):
     """1.5 m in the heights of all stations shows nowhere, and moves c by what the sentence says."""
-    sound = adjust(block)
+    sound = adjusted_example()
     (finding,) = [f for f in sound.verdict().findings if f.code == "common_bias"]
     assert finding.subject == "stations as a whole" and finding.numbers["term"] == "Z"
     seen, moved = finding.value, finding.numbers["moved"]

@@ -1,18 +1,17 @@
 """The likeliest culprit stands first: what the model lacks accuses sound observations."""
 
 import dataclasses
-from pathlib import Path
 
 import equinox as eqx
 import numpy as np
 import pytest
 
-from jaxphoto import adjust, covariance, read_block
+from jaxphoto import adjust, covariance
 from jaxphoto.camera import get_parameter, set_parameter
 from jaxphoto.observations.priors import KnownParameters
 from jaxphoto.report import Tables, verdict_of
 from jaxphoto.statistics.quantiles import beta_tail
-from tests.blocks import simulated
+from tests.blocks import adjusted_example, example, simulated
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +40,7 @@ def test_parameters_are_called_as_people_call_them(without_k2):
 
 def test_a_strip_that_is_off_is_told_before_its_stations():
     """By 3 m along X; most of its stations are suspects, each alone."""
-    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    block = example()
     rows = block.stations
     off = np.array([block.image_strip[k] == "A" for k in rows.who]) & (rows.axis == 0)
     spoilt = dataclasses.replace(rows, value=np.asarray(rows.value) + 3.0 * off)
@@ -55,7 +54,7 @@ def test_a_strip_that_is_off_is_told_before_its_stations():
 
 
 def test_stations_that_are_off_each_by_itself_are_no_strip():
-    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    block = example()
     rows = block.stations
     value = np.array(rows.value)
     for name, error in (("A2", 4.0), ("A3", -5.0), ("A5", 3.0), ("A6", -4.0)):
@@ -67,7 +66,7 @@ def test_stations_that_are_off_each_by_itself_are_no_strip():
 
 def test_of_a_drift_the_strips_that_show_it_are_told():
     """3 m along Y from the first image to the last: no strip is most of it."""
-    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    block = example()
     rows, time = block.stations, np.asarray(block.flight_time)
     drift = 3.0 * (time - time.min()) / np.ptp(time)
     value = np.asarray(rows.value) + np.where(rows.axis == 1, drift[rows.who], 0.0)
@@ -86,7 +85,7 @@ def spoilt_control(block, axis, **errors):
 
 def test_what_a_blunder_does_to_its_neighbours_is_no_alarm_of_theirs():
     """Of suspects those count that are still beyond the critical value when the worse ones are no more observed."""
-    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    block = example()
     spoilt = spoilt_control(block, 2, T11=2.0)
     tables = Tables(adjust(spoilt))
     assert [s.words for s in tables.culprits] == ["control point T11 in Z"]
@@ -101,7 +100,7 @@ def test_what_a_blunder_does_to_its_neighbours_is_no_alarm_of_theirs():
 
 
 def test_two_blunders_are_both_culprits():
-    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    block = example()
     tables = Tables(adjust(spoilt_control(block, 0, T11=1.5, T21=-2.0)))
     assert {s.words for s in tables.culprits} == {f"control point {name} in X" for name in ("T11", "T21")}
     assert len(tables.blunders.suspects) > 2
@@ -119,8 +118,8 @@ def calibration_by(adjusted):
 
 def test_a_camera_that_has_changed_since_its_calibration_is_told_first():
     """Stations that are all off in height would explain it about as well, and lead to the old c."""
-    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
-    known = calibration_by(adjust(block))
+    block = example()
+    known = calibration_by(adjusted_example())
     larger = eqx.tree_at(lambda b: b.image_points.xy, block, np.asarray(block.image_points.xy) * 1.002)
     tables = Tables(adjust(dataclasses.replace(larger, more=(known,))))
     verdict = verdict_of(tables)
@@ -138,15 +137,15 @@ def test_a_camera_that_has_changed_since_its_calibration_is_told_first():
 
 
 def test_the_same_photographs_counted_twice_are_told():
-    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
-    known = calibration_by(adjust(block))
+    block = example()
+    known = calibration_by(adjusted_example())
     verdict = verdict_of(Tables(adjust(dataclasses.replace(block, more=(known,)))))
     assert verdict.colour == "amber" and verdict.findings[0].code == "prior_counted_twice"
 
 
 def test_standard_deviations_in_another_unit_are_an_alarm():
     """Micrometres for millimetres: sigma naught is a thousandth, and stations tell nothing any more."""
-    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    block = example()
     p = block.image_points
     vague = dataclasses.replace(p, sigma=1000 * np.asarray(p.sigma))
     verdict = verdict_of(Tables(adjust(block.with_observations({"image_points": vague}))))

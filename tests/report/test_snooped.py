@@ -1,12 +1,11 @@
 """What was left out is told as what it is: single errors, or one that many rows have in common."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from jaxphoto import adjust, read_block, snoop
+from jaxphoto import snoop
 from jaxphoto.initial.approximate import in_front, looking_away
 from jaxphoto.observations import Distances
 from jaxphoto.procedures import Snooped
@@ -15,11 +14,12 @@ from jaxphoto.report import Tables, verdict_of
 from jaxphoto.report.residual_findings import snooped_findings
 from jaxphoto.statistics import Suspect, covariance
 from jaxphoto.statistics.systematic_effects import truncated_inverse
+from tests.blocks import adjusted_example, example
 
 
 @pytest.fixture(scope="module")
 def block():
-    return read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    return example()
 
 
 def test_the_shift_of_a_strip_is_told_as_one(block):
@@ -77,7 +77,7 @@ def test_an_image_that_is_mirrored_is_an_alarm(block):
     verdict = verdict_of(Tables(found.adjusted))
     assert any("image D4" in text for text in (*alarms, *(verdict.texts if verdict.colour == "red" else ())))
     # Of the block as it is, no point is behind its image.
-    sound = adjust(block)
+    sound = adjusted_example()
     seen = in_front(block, sound.unknowns)
     assert seen.all() and not len(looking_away(block, seen))
 
