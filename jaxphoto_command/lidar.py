@@ -85,7 +85,7 @@ def lidar_control(
             rounds.to_csv(folder / "lidar_rounds.csv", index=False)
             picture.savefig(folder / "lidar_heights.png")
             (folder / "report.html").write_text(page, encoding="utf-8")
-    print_rounds(result.rounds, result.still, output.screen)
+    print_rounds(result.rounds, result.converged, output.screen)
     rejected = flag_counts(result.flag[~np.isfinite(result.height)]).items()
     note = f" (rejected: {', '.join(f'{name.lower()} {n}' for name, n in rejected)})" if rejected else ""
     used = int(result.used.sum())
@@ -125,7 +125,7 @@ def roof_control(
         result = roof_control(read, points, settings, centroids=opt.names(centroids), **options)
         progress.update(f"writing {out}")
         write_block(result.block, out)
-    print_rounds(result.rounds, result.still, output.screen)
+    print_rounds(result.rounds, result.converged, output.screen)
     output.wrote(out, f"wrote {out}: {len(result.points)} tie points lie on {result.faces} roof faces")
     output.add(n_tie_points=len(result.points), n_roof_faces=result.faces)
     _end_of_rounds(output, result)
@@ -248,10 +248,10 @@ def simultaneous(
             if trajectory is not None and records is not None and result.trajectory is not None:
                 moved = with_positions(records, np.asarray(result.trajectory.position), read.frame)
                 write_moved(moved._replace(time=moved.time + trajectory_shift_s), trajectory, folder)
-    print_rounds(result.rounds, result.still, output.screen)
+    print_rounds(result.rounds, result.converged, output.screen)
     print_moved(result, output.screen)
     output.wrote(out, f"results in {out}")
-    if not result.still:
+    if not result.converged:
         raise typer.Exit(1)
 
 
@@ -535,6 +535,6 @@ def _report_rounds(progress: Progress) -> Any:
 
 def _end_of_rounds(output: Output, result: Any) -> None:
     """Report the outer iterations; exit code 1 if they did not converge."""
-    output.add(rounds=len(result.rounds), came_to_rest=result.still, rmse_m=result.rounds[-1].rmse_m)
-    if not result.still:
+    output.add(rounds=len(result.rounds), iteration_converged=result.converged, rmse_m=result.rounds[-1].rmse_m)
+    if not result.converged:
         raise typer.Exit(1)

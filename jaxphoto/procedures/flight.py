@@ -68,7 +68,7 @@ class FlightPart(NamedTuple):
     """Reason for unused control."""
     lens: tuple[str, ...] = ()
     """Messages about the prior information about the lens, if used."""
-    why_still: str = ""
+    why_no_shutter: str = ""
     """Reason why a requested rolling shutter was not estimated."""
 
 
@@ -152,7 +152,7 @@ def _calibrated(
             raise
         placed, why_not, adjusted = _placed_otherwise(placed, prior.positions, oriented.block, error)
     metric = bool(controlled or (placed and not why_not))
-    adjusted, why_still = _rolling(adjusted, prior.taken, metric)
+    adjusted, why_no_shutter = _rolling(adjusted, prior.taken, metric)
     components = None
     # Prior information about the lens needs the relative weight of image points, with or without stations.
     if (placed or controlled or lens) and bool(adjusted.converged):
@@ -171,7 +171,7 @@ def _calibrated(
         rejudged(controlled, adjusted) if controlled else None,
         no_control,
         lens.sentences(oriented.block, CAMERA) if lens else (),
-        why_still,
+        why_no_shutter,
     )
 
 

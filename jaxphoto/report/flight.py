@@ -30,7 +30,7 @@ from jaxphoto.report.flight_plots import (
     time_line,
 )
 from jaxphoto.report.formatting import plus_minus, without_empty
-from jaxphoto.report.orientation import ALIKE, orientation_sentences, write_orientation
+from jaxphoto.report.orientation import CORRELATED, orientation_sentences, write_orientation
 from jaxphoto.report.page import (
     Heading,
     Link,
@@ -105,8 +105,8 @@ def _findings(part: FlightPart) -> Iterator[Finding]:
     report = part.oriented.report
     if not report.converged:
         yield Finding("orientation_not_converged", "error", hint="See the section on the orientation")
-    if part.why_still:
-        yield Finding("message", "warning", part.why_still)
+    if part.why_no_shutter:
+        yield Finding("message", "warning", part.why_no_shutter)
     if part.no_control:
         yield Finding("control_unused", "error", part.no_control)
     if part.controlled:
@@ -118,9 +118,9 @@ def _findings(part: FlightPart) -> Iterator[Finding]:
     if part.placed and not part.placed.used.all():
         used = part.placed.used
         yield Finding("positions_rejected", "warning", value=int((~used).sum()), numbers={"n": len(used)})
-    if report.alike > ALIKE:
+    if report.alike > CORRELATED:
         hint = "jaxphoto halves on the block determines the factor better"
-        yield Finding("correlated_residuals", "warning", value=report.alike, limit=ALIKE, hint=hint)
+        yield Finding("correlated_residuals", "warning", value=report.alike, limit=CORRELATED, hint=hint)
 
 
 def _images(part: FlightPart) -> pd.DataFrame:
@@ -529,7 +529,7 @@ def write_flight(
             own = {"sigma_factor": r.sigma_factor, "flight": flight_words(r.coverage, r.part.adjusted.block)}
             write_results(r.tables, r.verdict, folder, times, {**source.told, **own})
             alike = with_correlated_sigma(r.tables.interior, r.part.adjusted, r.part.oriented.report.alike)
-            alike.to_csv(folder / "interior_alike.csv", index=False)
+            alike.to_csv(folder / "interior_correlated.csv", index=False)
             if r.part.controlled:
                 write_control(r.part.controlled, folder)
             beside(r.part, folder)

@@ -15,7 +15,7 @@ from jaxphoto.observations import AXES
 from jaxphoto.procedures.flight import FlightPart
 from jaxphoto.procedures.rolling_shutter import GAP, NEIGHBOUR_M, Moment, usual_interval, velocities
 from jaxphoto.report.findings import Verdict
-from jaxphoto.report.orientation import ALIKE
+from jaxphoto.report.orientation import CORRELATED
 from jaxphoto.report.plots import axes_or_new, label, title
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics.block_geometry import Coverage
@@ -50,7 +50,7 @@ class PartReport(NamedTuple):
     def sigma_factor(self) -> float:
         """Factor of camera sigmas for spatially correlated residuals; 1 if not significant."""
         alike = self.part.oriented.report.alike
-        return alike if alike > ALIKE else 1.0
+        return alike if alike > CORRELATED else 1.0
 
 
 def offsets_less_mean(report: PartReport) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

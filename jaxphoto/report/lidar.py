@@ -196,7 +196,7 @@ def write_simultaneous(result: Simultaneous, directory: Path, seconds: dict[str,
         figure, free = above_figure(result), moved["sigma"].notna()
         parts: list[Part] = [
             *verdict_parts(verdict),
-            *(Paragraph(as_sentence(sentence)) for sentence in rounds_words(result.rounds, result.still)),
+            *(Paragraph(as_sentence(sentence)) for sentence in rounds_words(result.rounds, result.converged)),
             Link("all results of the images", "adjustment/report.html"),
             Heading("Changes"),
             moved[free],
@@ -219,7 +219,8 @@ def write_simultaneous(result: Simultaneous, directory: Path, seconds: dict[str,
         write_study(
             work, f"{tables.adjusted.block.title or 'Block'} and cloud, adjusted together",
             (verdict.headline, verdict.colour), parts,
-            summary | {"rounds": len(result.rounds), "came_to_rest": result.still}, made, files, {"above": figure},
+            summary | {"rounds": len(result.rounds), "iteration_converged": result.converged}, made, files,
+            {"above": figure},
         )  # fmt: skip
         yield work
 
@@ -255,7 +256,7 @@ def heights_page(control: LidarControl, figure: Figure, made: Made) -> str:
     largest = heights.sort_values("difference_m", key=np.abs, ascending=False, kind="stable")[:_ROWS]
     metres = largest.select_dtypes(float)
     written = {str(name): metres[name].map("{:z.3f}".format).where(metres[name].notna(), "") for name in metres}
-    words = [*rounds_words(control.rounds, control.still)]
+    words = [*rounds_words(control.rounds, control.converged)]
     words.append(f"{int(control.used.sum())} of {len(control.points)} tie points have a control height")
     parts: list[Part] = [
         *(Paragraph(as_sentence(sentence)) for sentence in words[1:]),

@@ -332,12 +332,14 @@ def interior_table(tables: Tables, start: InteriorOrientation | None = None, fac
     rows = []
     for p in table[table["sigma"].notna() | (table["value"] != 0)].to_dict("records"):
         name, pixel, estimated = p["parameter"], tables.adjusted.block.sensors[p["camera"]].pixel_mm, p["sigma"] > 0
-        in_px = plus_minus(p["value"] / pixel, p["sigma_alike"] / pixel) if estimated and name.endswith("_mm") else ""
+        in_px = (
+            plus_minus(p["value"] / pixel, p["sigma_correlated"] / pixel) if estimated and name.endswith("_mm") else ""
+        )
         rows.append({
             "camera": p["camera"], "parameter": name,
             "initial": f"{float(get_parameter(start, name)):.6g}" if start and name in parameter_names(start) else "",
             "value": with_sigma(p["value"], p["sigma"]), "sigma": of_sigma(p["sigma"]) if estimated else "fixed",
-            "sigma (correlated residuals)": of_sigma(p["sigma_alike"]) if estimated and factor > 1 else "",
+            "sigma (correlated residuals)": of_sigma(p["sigma_correlated"]) if estimated and factor > 1 else "",
             "unit": p["unit"], "in pixels": in_px, "significant": {True: "yes", False: "no"}.get(p["significant"], ""),
         })  # fmt: skip
     shown = pd.DataFrame(rows)

@@ -137,12 +137,12 @@ def _knot_labels(result: StripAdjustment) -> list[list[str]]:
 def strips_verdict(result: StripAdjustment, tables: Tables | None) -> Verdict:
     """Judge a strip adjustment; `tables` are those of the adjustment if it has images."""
     found = _sigma_naught(result) if tables is None else verdict_of(tables).findings
-    odd = (Finding("message", "warning", sentence) for sentence in result.odd)
+    odd = (Finding("message", "warning", sentence) for sentence in result.warnings)
     return Verdict.of((*_lookups(result), *_steps(result), *odd, *_surveyed(result), *found))
 
 
 def _lookups(result: StripAdjustment) -> Iterator[Finding]:
-    if not result.still:
+    if not result.converged:
         n, change = len(result.rounds), result.rounds[-1].largest_change
         hint = "Ask for more iterations"
         yield Finding("lookups_not_converged", "error", value=change, hint=hint, numbers={"n": n})
@@ -382,7 +382,8 @@ def write_strips(
         n = len(result.cloud.strips)
         name = f"{n} strip{'s' * (n > 1)}{' and photographs' if result.before else ''}: strip adjustment"
         summary = verdict.summary | {
-            "rounds": len(result.rounds), "came_to_rest": result.still, "sigma0": float(result.adjusted.sigma0),
+            "rounds": len(result.rounds), "iteration_converged": result.converged,
+            "sigma0": float(result.adjusted.sigma0),
             "pattern": result.errors.calibration.pattern, **surveyed_summary(result),
             "seconds": seconds | {"write": time.perf_counter() - began},
         }  # fmt: skip
@@ -436,7 +437,7 @@ def _in_tenths_of_mm(table: pd.DataFrame) -> pd.DataFrame:
 def print_strips(result: StripAdjustment, console: Console) -> None:
     """Print iterations, gaps of strips, and the scanner."""
     last = result.rounds[-1]
-    end = f"{'' if result.still else 'not '}converged after {last.number} iterations"
+    end = f"{'' if result.converged else 'not '}converged after {last.number} iterations"
     ties = f" and {last.points} tie points on them" if last.points else ""
     ties += f" and {last.control} of control" if last.control else ""
     lines = [f"{end}; {last.planes} planes{ties}, {last.left_out} rejected"]

@@ -480,10 +480,10 @@ def side_by_side(table: pd.DataFrame, rows: list[str], column: str, value: str) 
 
 
 def with_correlated_sigma(interior: pd.DataFrame, adjusted: Adjustment, factor: float) -> pd.DataFrame:
-    """The interior orientations with the column `sigma_alike`: `sigma` for spatially correlated residuals.
+    """The interior orientations with the column `sigma_correlated`: `sigma` for spatially correlated residuals.
 
     The information of the rays is divided by `factor`^2, that of priors is not: with sigma s and prior p, the rays
-    alone give 1 / d^2 = 1 / s^2 - 1 / p^2, and `sigma_alike` combines p and `factor` d, parameter by parameter.
+    alone give 1 / d^2 = 1 / s^2 - 1 / p^2, and `sigma_correlated` combines p and `factor` d, parameter by parameter.
     """
     weights = []
     for camera, parameter in interior[["camera", "parameter"]].itertuples(index=False):
@@ -492,7 +492,7 @@ def with_correlated_sigma(interior: pd.DataFrame, adjusted: Adjustment, factor: 
     before, sigma = np.array(weights), interior["sigma"].to_numpy(float)
     total = before + np.maximum(1 / sigma**2 - before, 0.0) / max(factor, 1.0) ** 2
     scaled = np.where(total > 0, 1 / np.sqrt(np.where(total > 0, total, 1.0)), sigma)
-    return interior.assign(sigma_alike=np.where(np.isfinite(sigma), np.maximum(scaled, sigma), np.nan))
+    return interior.assign(sigma_correlated=np.where(np.isfinite(sigma), np.maximum(scaled, sigma), np.nan))
 
 
 # Recovery of a simulation: (estimate - truth) / sigma is standard normal if the model is right, except for the datum.

@@ -38,7 +38,7 @@ def test_boresight_and_shifts_of_the_scanner_are_recovered():
     sigma = np.array([s for label, s in zip(labels, known.shared_sigma, strict=True) if label.startswith("scanner")])
     free, truth = np.r_[:3, 6:12], scanner_vector(flight.truth.scanner)
     off = (scanner_vector(found.scanner) - truth)[free]
-    assert found.still
+    assert found.converged
     assert (np.abs(off) < 3 * sigma).all()
     # The simulated ones are many sigma: not to find them would show.
     assert (np.abs(truth[free]) > 3 * sigma).sum() > 5

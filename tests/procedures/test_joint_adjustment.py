@@ -50,7 +50,7 @@ def test_camera_and_scanner_are_found():
 
 def test_nothing_changes_any_more_and_weights_are_right():
     found = fitted()
-    assert found.still and found.adjusted.outcome is Outcome.CONVERGED
+    assert found.converged and found.adjusted.outcome is Outcome.CONVERGED
     assert float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
     over = [d for d in found.differences if d.one == "photographs"]
     assert [d.other for d in over] == ["1", "2", "3"]

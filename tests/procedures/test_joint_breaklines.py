@@ -93,7 +93,7 @@ def test_breaklines_tell_where_ridges_are():
         covariance = np.asarray(found.covariance.points)[number]
         off = np.asarray(found.adjusted.unknowns.points)[number] - truth
         spread[bool(names)] = np.sqrt(np.trace(covariance[:, :2, :2], axis1=1, axis2=2)).mean()
-        assert float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1) and not found.odd
+        assert float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1) and not found.warnings
         chi = np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off)
         assert chi.mean() < 8
     assert spread[True] < 0.95 * spread[False]

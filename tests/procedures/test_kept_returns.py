@@ -53,7 +53,7 @@ def test_whole_cells_are_kept_as_many_as_there_is_room_for(kept):
 def test_what_is_found_is_what_all_returns_say(kept):
     flight = flown()
     found, asked = adjust_strips(kept, flight.trajectory, SETTINGS, PRIORS), fitted()
-    assert found.still and float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
+    assert found.converged and float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
     labels = found.adjusted.structure.labels
     assert labels == asked.adjusted.structure.labels
     own = np.array([label.startswith("scanner") for label in labels])

@@ -66,7 +66,7 @@ def test_simultaneous(folder, tmp_path, monkeypatch, capsys):
     surfaces = pd.read_csv(out / "surfaces.csv")
     assert np.sqrt((surfaces["above_m"] ** 2).mean()) == pytest.approx(after)
     assert after < before
-    assert json.loads((out / "summary.json").read_text())["came_to_rest"] is True
+    assert json.loads((out / "summary.json").read_text())["iteration_converged"] is True
     # The corrected cloud: the same points, moved.
     raw, mended = read_cloud(cloud), read_cloud(out / "cloud.laz")
     np.testing.assert_array_equal(mended.classification, raw.classification)

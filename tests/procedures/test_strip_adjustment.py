@@ -55,7 +55,7 @@ def test_the_truth_mends_the_cloud():
 
 def test_strips_fit_to_the_noise_of_their_planes():
     found = fitted()
-    assert found.still and found.adjusted.outcome is Outcome.CONVERGED
+    assert found.converged and found.adjusted.outcome is Outcome.CONVERGED
     assert len(found.differences) == 3
     for d in found.differences:
         assert d.rms_before_m > 0.06
@@ -111,7 +111,7 @@ def test_the_scanner_is_found():
 def test_a_scanner_of_prisms_is_found_by_what_it_sees_ahead_and_behind():
     flight = flown_around()
     found = adjust_strips(flight.cloud, flight.trajectory, SETTINGS, PRIORS_AROUND)
-    assert found.still and float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
+    assert found.converged and float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
     assert chi_squared_of_the_scanner(flight, found) < 20.5  # 99.9 %
     within = [d for d in found.differences if (d.one, d.other) == ("1 ahead", "1 behind")]
     assert len(within) == 1 and within[0].rms_before_m > 0.03
@@ -132,7 +132,7 @@ def test_angles_and_clock_of_a_scanner_are_found(kind):
     flight, priors = made(STRIPS | {"lidar": lidar}, 5), scanner_priors(["eccentricity", "time-offset"], kind)
     found = adjust_strips(flight.cloud, flight.trajectory, SETTINGS, priors)
     table, told = calibration_table(found), truth_tables(flight)["scanner"].set_index("parameter").value
-    assert len(table) == 3 and found.still
+    assert len(table) == 3 and found.converged
     assert (np.abs(table.value - told[table.parameter].to_numpy()) < 3 * table.sigma).all()
     assert (table.value.abs() > 4 * table.sigma).all()
 
@@ -192,7 +192,7 @@ def test_without_a_trajectory_shifts_are_found():
     shift = np.array([0.15, -0.2, 0.1])
     found = adjust_strips(two_strips(shift), settings=COARSE)
     sigma = np.asarray(found.covariance.shared_sigma)
-    assert found.still
+    assert found.converged
     assert (np.abs(found.errors.position[1] - shift) < 3.5 * sigma).all() and (sigma < 0.01).all()
     assert not found.errors.position[0].any()
     other = adjust_strips(two_strips(shift), settings=COARSE, held=("2",))

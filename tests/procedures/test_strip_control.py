@@ -66,7 +66,7 @@ def on_roofs(n: int, seed: int) -> np.ndarray:
 def pulls(seed: int) -> np.ndarray:
     """Errors of the six shifts over their standard deviations, found by control on roofs."""
     found = adjust_strips(two_strips(seed), settings=COARSE, control=surveyed(on_roofs(12, seed), seed))
-    assert found.still
+    assert found.converged
     return (found.errors.position - [COMMON, COMMON + SHIFT]).ravel() / np.asarray(found.covariance.shared_sigma)
 
 
@@ -78,7 +78,7 @@ def test_control_finds_what_strips_have_in_common_without_a_trajectory():
     found = adjust_strips(two_strips(3), settings=COARSE, control=control)
     sigma = np.asarray(found.covariance.shared_sigma)
     off = found.errors.position - [COMMON, COMMON + SHIFT]
-    assert found.still and (np.abs(off.ravel()) < 3.5 * sigma).all() and (sigma < 0.025).all()
+    assert found.converged and (np.abs(off.ravel()) < 3.5 * sigma).all() and (sigma < 0.025).all()
     # Both strips stand on the same survey of 18 points, which does not get better by that.
     assert (sigma[2::3] > SIGMA_M / np.sqrt(18)).all()
     told = {(d.one, d.other): d for d in found.differences}
@@ -100,7 +100,7 @@ def test_one_strip_goes_through_control():
     one = dataclasses.replace(both, xyz=both.xyz[both.strip == 0], strip=both.strip[both.strip == 0], strips=("1",))
     found = adjust_strips(one, settings=COARSE, control=surveyed(on_roofs(24, 3), 3))
     sigma = np.asarray(found.covariance.shared_sigma)
-    assert found.still and found.rounds[-1].planes == 0 and np.isnan(found.rounds[-1].rms_m)
+    assert found.converged and found.rounds[-1].planes == 0 and np.isnan(found.rounds[-1].rms_m)
     assert (np.abs(found.errors.position[0] - COMMON) < 3.5 * sigma).all() and (sigma < 0.025).all()
     assert [(d.one, d.other) for d in found.differences] == [("control", "1")]
     assert strips_verdict(found, None).findings[0].severity == "note"
@@ -118,7 +118,7 @@ def test_on_level_ground_control_tells_heights_and_the_first_strip_the_rest():
     control = surveyed(np.column_stack([xy, level(*xy.T)]))
     found = adjust_strips(two_strips(1, level), settings=COARSE, control=control)
     sigma = np.asarray(found.covariance.shared_sigma).reshape(2, 3)
-    assert found.still
+    assert found.converged
     np.testing.assert_allclose(found.errors.position[0, :2], 0.0, atol=2e-3)
     off = found.errors.position[:, 2] - [COMMON[2], COMMON[2] + SHIFT[2]]
     assert (np.abs(off) < 3.5 * sigma[:, 2]).all() and (sigma[:, 2] < 0.02).all()
@@ -159,7 +159,7 @@ def raised(rise: float = 0.25) -> tuple[Simulation, StripAdjustment, StripAdjust
 @pytest.mark.slow
 def test_with_a_trajectory_control_finds_the_height_of_a_flight():
     flight, alone, found = raised()
-    assert found.still and found.rounds[-1].control > 40
+    assert found.converged and found.rounds[-1].control > 40
 
     def off(result: StripAdjustment) -> float:
         ground = np.flatnonzero(result.cloud.classification == 2)[::20]

@@ -47,7 +47,11 @@ def test_rays_that_err_alike_widen_what_they_say_and_not_what_was_known():
     block = dataclasses.replace(found.block, priors=dataclasses.replace(found.block.priors, interior={"one": priors}))
     rows = [("one", "c_mm", 35.0, 0.012), ("one", "k1", 1e-5, 1e-6), ("one", "p1", 0.0, np.nan)]
     table = pd.DataFrame(rows, columns=["camera", "parameter", "value", "sigma"])
-    wide = with_correlated_sigma(table, dataclasses.replace(found, block=block), 2.0).set_index("parameter").sigma_alike
+    wide = (
+        with_correlated_sigma(table, dataclasses.replace(found, block=block), 2.0)
+        .set_index("parameter")
+        .sigma_correlated
+    )
     # 1 / 0.012^2 = 1 / 0.02^2 + 1 / 0.015^2; the rays' 0.015 become 0.030.
     assert wide["c_mm"] == pytest.approx(1 / np.sqrt(1 / 0.02**2 + 1 / 0.03**2))
     assert wide["k1"] == pytest.approx(2e-6) and np.isnan(wide["p1"])

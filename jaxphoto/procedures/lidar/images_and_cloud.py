@@ -85,7 +85,7 @@ class Simultaneous(eqx.Module):
     moved_cloud: Float[np.ndarray, "3"]
     """Root mean square motion (m) of the laser points along X, Y and Z."""
     rounds: tuple[Round, ...]
-    still: bool
+    converged: bool
     """True if the iteration converged."""
 
 
@@ -203,7 +203,7 @@ def simultaneous(
         after.apart(found.adjusted)[used],
         np.sqrt(((corrected.xyz - cloud.xyz) ** 2).mean(axis=0)),
         found.rounds,
-        found.still,
+        found.converged,
     )
 
 

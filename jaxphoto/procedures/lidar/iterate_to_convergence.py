@@ -18,7 +18,7 @@ from jaxphoto.statistics import LEAST_CHECKED, Covariance, angle_differences, co
 from jaxphoto.unknowns import FIXED, Unknowns
 
 MAX_ROUNDS = 20
-STILL = 0.1
+CHANGE_LIMIT = 0.1
 """Converged if no unknown moves by more than this fraction of its standard deviation.
 
 Smaller limits may never be reached: with each motion some laser point becomes a neighbour, and another ceases to be.
@@ -81,7 +81,7 @@ class Observed(NamedTuple):
     seen: SeenByCloud
     used: Bool[np.ndarray, "rows"]
     rounds: tuple[Round, ...]
-    still: bool
+    converged: bool
     """True if converged."""
 
 
@@ -179,11 +179,11 @@ def iterate_to_convergence(
         )
         report(rounds[-1])
         before, adjusted, known = adjusted, new, now
-        still = len(rounds) > _JUDGED and change < STILL and bool(new.converged)
-        if still or len(rounds) >= max_rounds:
+        converged = len(rounds) > _JUDGED and change < CHANGE_LIMIT and bool(new.converged)
+        if converged or len(rounds) >= max_rounds:
             _check_used(seen, used)
             _warn_of_scale(first, new)
-            return Observed(at_first, adjusted, known, seen, used, tuple(rounds), still)
+            return Observed(at_first, adjusted, known, seen, used, tuple(rounds), converged)
         if len(rounds) >= _JUDGED:
             # In later iterations rejected observations stay rejected, to avoid alternation.
             fits = _fit(seen, adjusted, known, used, group) & (fits if len(rounds) >= _SETTLED else True)

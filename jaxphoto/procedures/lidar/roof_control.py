@@ -55,7 +55,7 @@ class RoofControl(eqx.Module):
     faces: int
     """Number of roof faces with a tie point."""
     rounds: tuple[Round, ...]
-    still: bool
+    converged: bool
     """True if the iteration converged."""
 
 
@@ -129,7 +129,7 @@ def roof_control(
         found.seen.apart(found.adjusted)[found.used],
         len(np.unique(chosen[found.used])),
         found.rounds,
-        found.still,
+        found.converged,
     )
 
 

@@ -24,7 +24,7 @@ from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.observations import StripPoints
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
-from jaxphoto.procedures.lidar.iterate_to_convergence import STILL, at_result, with_interior_held
+from jaxphoto.procedures.lidar.iterate_to_convergence import CHANGE_LIMIT, at_result, with_interior_held
 from jaxphoto.procedures.lidar.photographs import Photographs, check_photographs, on_trajectory, spans_with
 from jaxphoto.procedures.lidar.plane_search import CommonPlanes, PointPlanes, PointSearch, StripSearch, check_joined
 from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
@@ -105,9 +105,9 @@ class StripAdjustment(eqx.Module):
     """Errors that were removed."""
     differences: tuple[StripDifference, ...]
     rounds: tuple[StripRound, ...]
-    still: bool
+    converged: bool
     """True if the iteration converged."""
-    odd: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     """Messages about inconsistencies of cloud and trajectory."""
     surveyed: tuple[SurveyedGap, ...] = ()
     """Control and check points, each above the plane of each strip that has one."""
@@ -209,13 +209,13 @@ def adjust_strips(
         counted = len(planes), sum(map(len, points)), sum(map(len, given))
         rounds.append(_round(len(rounds) + 1, counted, seen, [*on, *met.control], _change(now - before, known)))
         report(rounds[-1])
-        still = rounds[-1].largest_change < STILL and bool(adjusted.converged)
+        converged = rounds[-1].largest_change < CHANGE_LIMIT and bool(adjusted.converged)
         block, before, errors = at_result(block, adjusted.unknowns), now, errors_of(adjusted.unknowns, splines)
         settled = len(rounds) >= _SETTLED
         seen = search.look(errors, settled)
         on = [] if ties is None else ties.look(*_of(ties, adjusted, known), settled)
         met = OnStrips([], []) if surveyed is None else surveyed.look(settled)
-        if still or len(rounds) >= max_rounds:
+        if converged or len(rounds) >= max_rounds:
             return StripAdjustment(
                 alone,
                 adjusted,
@@ -228,7 +228,7 @@ def adjust_strips(
                 + _point_differences(CONTROL, first_met.control, met.control)
                 + _point_differences(CHECK, first_met.check, met.check),
                 tuple(rounds),
-                still,
+                converged,
                 (*odd, *(() if ties is None else ties.unseen(on, adjusted.block.points))),
                 () if control is None else surveyed_gaps(control, met, errors, path, adjusted, known),
             )

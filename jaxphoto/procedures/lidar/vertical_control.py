@@ -54,7 +54,7 @@ class LidarControl(eqx.Module):
     used: Bool[np.ndarray, "points"]
     """True if the height is control: neither refused nor an outlier."""
     rounds: tuple[Round, ...]
-    still: bool
+    converged: bool
     """True if the iteration converged."""
 
 
@@ -110,7 +110,7 @@ def lidar_control(
         heights["flag"],
         found.used,
         found.rounds,
-        found.still,
+        found.converged,
     )
 
 
