@@ -37,7 +37,7 @@ from jaxphoto.procedures.lidar import (
     adjust_strips,
     kept_returns,
 )
-from jaxphoto.procedures.lidar.iterate_to_convergence import at_result, interior_held
+from jaxphoto.procedures.lidar.iterate_to_convergence import at_result, fix_interior
 from jaxphoto.procedures.lidar.strip_control import check_complete
 from jaxphoto.procedures.lidar.strip_model import looks_of
 from jaxphoto.procedures.lidar.vertical_control import tie_points
@@ -146,7 +146,7 @@ def adjust_flight(output: Output, flight: StripFiles, choices: StripChoices, out
             priors,
             photographs=photographs,
             control=control,
-            held=choices.fixed_strips,
+            fixed=choices.fixed_strips,
             max_rounds=choices.max_rounds,
             report=report,
         )
@@ -192,7 +192,7 @@ def cloud_records(trajectory: Path, shift_s: float) -> Records:
 def _photographs(block: Path, flight: StripFiles, fixed_camera: bool) -> Photographs:
     read, times = read_block(block), exposure_times(block) + flight.exposure_shift_s
     breaklines = points_called(read.points, names(flight.breaklines), "--breaklines")
-    return Photographs(interior_held(read) if fixed_camera else read, times, breaklines)
+    return Photographs(fix_interior(read) if fixed_camera else read, times, breaklines)
 
 
 def _stated_sigmas(records: Records, stated: set[str]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:

@@ -195,7 +195,7 @@ def test_without_a_trajectory_shifts_are_found():
     assert found.converged
     assert (np.abs(found.errors.position[1] - shift) < 3.5 * sigma).all() and (sigma < 0.01).all()
     assert not found.errors.position[0].any()
-    other = adjust_strips(two_strips(shift), settings=COARSE, held=("2",))
+    other = adjust_strips(two_strips(shift), settings=COARSE, fixed=("2",))
     np.testing.assert_allclose(other.errors.position[0], -found.errors.position[1], atol=2 * sigma.max())
 
 
@@ -223,11 +223,11 @@ def test_what_cannot_be_adjusted():
     with pytest.raises(InputError, match="the cloud has one strip"):
         adjust_strips(dataclasses.replace(cloud, strip=None, strips=()))
     with pytest.raises(InputError, match="north is no strip of the cloud, which has 1, 2"):
-        adjust_strips(cloud, held=("north",))
-    with pytest.raises(InputError, match="all strips are held"):
-        adjust_strips(cloud, held=("1", "2"))
-    with pytest.raises(InputError, match="all strips are held"):
-        adjust_strips(flight.cloud, flight.trajectory, priors=ScannerPriors(FIXED), held="all")
+        adjust_strips(cloud, fixed=("north",))
+    with pytest.raises(InputError, match="all strips are fixed"):
+        adjust_strips(cloud, fixed=("1", "2"))
+    with pytest.raises(InputError, match="all strips are fixed"):
+        adjust_strips(flight.cloud, flight.trajectory, priors=ScannerPriors(FIXED), fixed="all")
     with pytest.raises(InputError, match=r"with knots 1e-05 s apart .* take them farther apart \(--knots-s\)"):
         adjust_strips(flight.cloud, flight.trajectory, StripSettings(knots_s=1e-5))
     with pytest.raises(InputError, match="the cloud has no times"):

@@ -103,22 +103,22 @@ class StripSearch:
         return StripPlanes.joined(*parts) if parts else StripPlanes.none()
 
 
-def check_joined(names: Sequence[str], seen: Sequence[CommonPlanes]) -> None:
+def check_joined(names: Sequence[str], planes: Sequence[CommonPlanes]) -> None:
     """Raise BlockError for a strip without a common plane, or in another coordinate system."""
-    apart = [found for found in seen if found.one.strip != found.other.strip]
-    joined = {look.strip for found in apart for look in (found.one, found.other)}
+    apart = [common for common in planes if common.one.strip != common.other.strip]
+    joined = {look.strip for common in apart for look in (common.one, common.other)}
     alone = [name for k, name in enumerate(names) if k not in joined]
     if alone and len(names) > 1:
         raise BlockError(
             f"strip {alone[0]} has fewer than {_FEWEST} planes in common with any other: leave it out, take larger "
             "cells (--cell-m) or rougher planes (--roughness-m), or check that all strips overlap and are in one system"
         )
-    for found in apart:
-        up = float(np.median(found.pairs.gap / found.pairs.normal[:, 2]))
+    for common in apart:
+        up = float(np.median(common.pairs.gap / common.pairs.normal[:, 2]))
         if abs(up) > _APART_M:
             raise BlockError(
-                f"strip {found.one.name} lies {abs(up):.1f} m {'above' if up > 0 else 'below'} strip "
-                f"{found.other.name}: heights of one may count in feet or belong to another vertical system, as those "
+                f"strip {common.one.name} lies {abs(up):.1f} m {'above' if up > 0 else 'below'} strip "
+                f"{common.other.name}: heights of one may count in feet or belong to another vertical system, as those "
                 "above an ellipsoid and a geoid; bring all strips and their trajectory into one"
             )
 

@@ -64,14 +64,14 @@ def check_measured_from(cloud: Cloud, path: ScannerPath, pattern: Pattern | None
         )
     _check_leap_seconds(cloud, path)
     odd = [*_odd_yaw(path.trajectory), *_jumps(path.trajectory)]
-    seen = _seen(cloud, path)
-    if seen is None:
+    positions = _positions_in_body(cloud, path)
+    if positions is None:
         return odd
-    moves = np.subtract(*np.quantile(seen.middle, (0.9, 0.1), axis=0)) / 2
-    looks = np.median(seen.middle, axis=0)
-    if max(moves) > _WANDERS * max(seen.half_width) or max(np.abs(looks)) > _ASIDE:
-        furthest = np.abs(seen.middle).max()
-        if elsewhere := _elsewhere(cloud, path, _WANDERS * max(seen.half_width)):
+    moves = np.subtract(*np.quantile(positions.middle, (0.9, 0.1), axis=0)) / 2
+    looks = np.median(positions.middle, axis=0)
+    if max(moves) > _WANDERS * max(positions.half_width) or max(np.abs(looks)) > _ASIDE:
+        furthest = np.abs(positions.middle).max()
+        if elsewhere := _distant_strips(cloud, path, _WANDERS * max(positions.half_width)):
             raise BlockError(
                 f"the laser points of strip {few(elsewhere)} lie up to {furthest:.1f} of the scanner's height to one "
                 "side, and those of the other strips do not: bring all strips and their trajectory into one coordinate "
@@ -79,15 +79,15 @@ def check_measured_from(cloud: Cloud, path: ScannerPath, pattern: Pattern | None
             )
         raise BlockError(
             f"the laser points of a second lie now here, now there about the scanner, up to {furthest:.1f} of its "
-            f"height to one side, while the swath is {2 * max(seen.half_width):.2f} of it wide: bring cloud and "
+            f"height to one side, while the swath is {2 * max(positions.half_width):.2f} of it wide: bring cloud and "
             "trajectory into one coordinate system, both in metres, and onto one clock, with angles in degrees"
         )
     if pattern is not None:
-        _check_pattern(seen, pattern)
+        _check_pattern(positions, pattern)
     return odd
 
 
-def _elsewhere(cloud: Cloud, path: ScannerPath, most: float) -> list[str]:
+def _distant_strips(cloud: Cloud, path: ScannerPath, most: float) -> list[str]:
     """Return strips whose mean lies farther across than `most` (a tangent); none if all do."""
     some = _probed(cloud)
     if cloud.strip is None:
@@ -98,9 +98,9 @@ def _elsewhere(cloud: Cloud, path: ScannerPath, most: float) -> list[str]:
     return [] if len(far) == len(numbers) else [cloud.strips[k] for k in far]
 
 
-def _check_pattern(seen: _FromBody, pattern: Pattern) -> None:
+def _check_pattern(positions: _FromBody, pattern: Pattern) -> None:
     """Raise BlockError if the points correspond to another pattern."""
-    right, ahead = seen.half_width
+    right, ahead = positions.half_width
     spread = f"to the side by {right:.2f} of the height and ahead by {ahead:.2f}"
     if right < _ALIKE * ahead:
         raise BlockError(
@@ -125,12 +125,12 @@ def _check_leap_seconds(cloud: Cloud, path: ScannerPath) -> None:
     times.
     """
     some = cloud.take(np.linspace(0, len(cloud) - 1, _SOME).astype(int))
-    own = np.asarray(some.time)
+    times = np.asarray(some.time)
     covered = CoveredTimes(path.trajectory)
 
     def ahead(shift: float) -> float:
         """Return the median tangent of the angle ahead; infinite if the trajectory covers few of the shifted times."""
-        time = own + shift
+        time = times + shift
         known = np.flatnonzero(covered.covers(time))
         if len(known) < _SOME / 2:
             return np.inf
@@ -200,7 +200,7 @@ def _probed(cloud: Cloud) -> Int[np.ndarray, "n"]:
     return np.linspace(0, len(cloud) - 1, min(_PROBED, len(cloud))).astype(int)
 
 
-def _seen(cloud: Cloud, path: ScannerPath) -> _FromBody | None:
+def _positions_in_body(cloud: Cloud, path: ScannerPath) -> _FromBody | None:
     """Return the positions; None for a narrow swath, or for few points."""
     some = _probed(cloud)
     time = cloud.time[some]  # type: ignore[index]

@@ -68,13 +68,13 @@ class ControlSearch:
     def look(self, settled: bool) -> OnStrips:
         """Return the planes about the points, in the strips as last corrected by the other search."""
         seen = self._points.look(self.control.coordinates, self._spread, settled)
-        control = [_of(f, ~self.control.check[f.found.point]) for f in seen]
+        control = [_select_planes(f, ~self.control.check[f.found.point]) for f in seen]
         # All strips together: a few points of one strip do not show which of them is a blunder.
         found = [(f.patches.normal[f.found.patch], f.found.gap, f.sigma) for f in control]
         normal, gap, sigma = (np.concatenate(v) for v in zip(*found, strict=True))
-        fit = fitting(_without_shift(normal, gap, sigma), sigma, self.search.settings.outlier)
+        fit = fitting(_remove_common_shift(normal, gap, sigma), sigma, self.search.settings.outlier)
         fits = np.split(fit, np.cumsum([len(f.fits) for f in control]))
-        check = [_of(f, self.control.check[f.found.point]) for f in seen]
+        check = [_select_planes(f, self.control.check[f.found.point]) for f in seen]
         return OnStrips(
             [f._replace(fits=own) for f, own in zip(control, fits, strict=False)],
             [f._replace(fits=np.ones(len(f.fits), bool)) for f in check],
@@ -92,10 +92,10 @@ def with_control(block: Block, control: SurveyedPoints) -> tuple[Block, Int[np.n
     height or a standard deviation, and for other points of the block with the same name.
     """
     check_complete(control)
-    again = _again(block, control)
-    own = np.flatnonzero(~control.check & ~again)
-    ids, xyz, sigma = tuple(control.ids[k] for k in own), control.coordinates[own], control.sigma_m[own]
-    every = np.ones(len(own), bool)
+    again = _also_in_block(block, control)
+    new = np.flatnonzero(~control.check & ~again)
+    ids, xyz, sigma = tuple(control.ids[k] for k in new), control.coordinates[new], control.sigma_m[new]
+    every = np.ones(len(new), bool)
     whole = into_block(block, ids, xyz, sigma, xyz, _NO_MARKS, every, ~every)
     place = {name: k for k, name in enumerate(whole.points)}
     number = [-1 if out else place[name] for name, out in zip(control.ids, control.check, strict=True)]
@@ -115,9 +115,9 @@ def check_complete(control: SurveyedPoints) -> None:
             )
 
 
-def check_seen(control: SurveyedPoints, seen: OnStrips, search: StripSearch) -> None:
+def check_seen(control: SurveyedPoints, surveyed: OnStrips, search: StripSearch) -> None:
     """Raise BlockError for surveyed points away from the strips, in plan or in height."""
-    gap = np.concatenate([f.found.gap for f in (*seen.control, *seen.check)])
+    gap = np.concatenate([f.found.gap for f in (*surveyed.control, *surveyed.check)])
     settings = search.settings
     if not len(gap):
         low, high = search.cloud.extent
@@ -142,21 +142,21 @@ def check_seen(control: SurveyedPoints, seen: OnStrips, search: StripSearch) -> 
         )
 
 
-def with_datum(block: Block, strip: str, seen: OnStrips, settings: StripSettings) -> Block:
+def with_datum(block: Block, strip: str, surveyed: OnStrips, settings: StripSettings) -> Block:
     """Return `block` of shifts alone, with `strip` fixed in the directions that control does not determine.
 
     These are determined worse than by a trajectory: control on level ground says nothing about X and Y.
     """
-    found = [(f.patches.normal[f.found.patch[f.fits]], f.sigma[f.fits]) for f in seen.control]
-    normal, sigma = (np.concatenate(v) for v in zip(*found, strict=True))
+    planes = [(f.patches.normal[f.found.patch[f.fits]], f.sigma[f.fits]) for f in surveyed.control]
+    normal, sigma = (np.concatenate(v) for v in zip(*planes, strict=True))
     weighed = normal / sigma[:, None]
-    known, axes = np.linalg.eigh(weighed.T @ weighed)
-    told = known > settings.sigma_position_m**-2
+    eigenvalues, axes = np.linalg.eigh(weighed.T @ weighed)
+    determined = eigenvalues > settings.sigma_position_m**-2
     # At least the direction that control determines best, if there is any.
-    told[-1] = len(sigma) > 0
-    if told.all():
+    determined[-1] = len(sigma) > 0
+    if determined.all():
         return block
-    covariance = (axes * np.where(told, _FREE_M, _RIGHT_M) ** 2) @ axes.T
+    covariance = (axes * np.where(determined, _FREE_M, _RIGHT_M) ** 2) @ axes.T
     first = TrajectoryKnot(Weighted(np.zeros(3), covariance=covariance), FIXED)  # type: ignore[arg-type]
     more = block.priors.more
     knots = {**more[TrajectoryKnot.kind], strip: first}
@@ -169,7 +169,7 @@ def _far(metres: float) -> str:
     return f"{metres:.0f} m" if metres < _KILOMETRES else f"{metres / 1000:.0f} km"
 
 
-def _without_shift(
+def _remove_common_shift(
     normal: Float[np.ndarray, "n 3"], gap: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n"]:
     """Return gaps without their most common shift (of least absolute deviations).
@@ -185,12 +185,12 @@ def _without_shift(
     return off
 
 
-def _of(seen: PointPlanes, chosen: Bool[np.ndarray, "n"]) -> PointPlanes:
-    found = type(seen.found)(*(v[chosen] for v in seen.found))
-    return seen._replace(found=found, sigma=seen.sigma[chosen], fits=seen.fits[chosen])
+def _select_planes(planes: PointPlanes, chosen: Bool[np.ndarray, "n"]) -> PointPlanes:
+    selected = type(planes.found)(*(v[chosen] for v in planes.found))
+    return planes._replace(found=selected, sigma=planes.sigma[chosen], fits=planes.fits[chosen])
 
 
-def _again(block: Block, control: SurveyedPoints) -> Bool[np.ndarray, "points"]:
+def _also_in_block(block: Block, control: SurveyedPoints) -> Bool[np.ndarray, "points"]:
     """Return which control also belongs to the block. Raises InputError for names of other points there."""
     place, again = {name: k for k, name in enumerate(block.points)}, np.zeros(len(control.ids), bool)
     surveyed = [(rows.who, rows.axis, np.asarray(rows.value)) for rows in (block.control, block.fixed)]
@@ -198,10 +198,10 @@ def _again(block: Block, control: SurveyedPoints) -> Bool[np.ndarray, "points"]:
     for k, name in enumerate(control.ids):
         if control.check[k] or name not in place:
             continue
-        own = who == place[name]
-        off = np.abs(value[own] - control.coordinates[k, axis[own]])
-        if not own.any() or (off > _SAME * control.sigma_m[k, axis[own]]).any():
-            how = f"{off.max():.3f} m away" if own.any() else "without being control there"
+        of_point = who == place[name]
+        off = np.abs(value[of_point] - control.coordinates[k, axis[of_point]])
+        if not of_point.any() or (off > _SAME * control.sigma_m[k, axis[of_point]]).any():
+            how = f"{off.max():.3f} m away" if of_point.any() else "without being control there"
             raise InputError(
                 f"{control.places[k]}: {name} is a point of the block, too, {how}: give it the same coordinates in "
                 "the control of both, or another name"
@@ -248,33 +248,33 @@ class SurveyedGap(NamedTuple):
 
 def surveyed_gaps(
     control: SurveyedPoints,
-    met: OnStrips,
+    surveyed: OnStrips,
     errors: StripErrors,
     path: ScannerPath | None,
     adjusted: Adjustment,
-    known: Covariance,
+    cov: Covariance,
 ) -> tuple[SurveyedGap, ...]:
     """Return the gaps of surveyed points for each strip with a plane about them; `errors` are the adjusted ones."""
-    found: list[SurveyedGap] = []
+    gaps: list[SurveyedGap] = []
     roles: tuple[tuple[Literal["control", "check"], list[PointPlanes]], ...]
-    roles = (("control", met.control), ("check", met.check))
+    roles = (("control", surveyed.control), ("check", surveyed.check))
     for role, looks in roles:
         for f in (f for f in looks if len(f.fits)):
-            moves, used = _moves(f, errors, path, adjusted, known), f.fits & (role == "control")
+            moves, used = _variance_of_foot(f, errors, path, adjusted, cov), f.fits & (role == "control")
             variance = f.sigma**2 + np.where(used, -moves, moves)
             sigma = np.sqrt(np.maximum(variance, 0.0))
             w = np.where(sigma > _UNTESTED * f.sigma, f.found.gap / np.maximum(sigma, np.finfo(float).tiny), np.nan)
             off = f.found.gap[:, None] * f.patches.normal[f.found.patch]
             rows = zip(f.found.point, off.tolist(), f.found.gap, f.sigma, sigma, w, used, strict=True)
             for p, (dx, dy, dz), *numbers, within in rows:
-                gap, noise, own, test = map(float, numbers)
+                gap, noise, sigma_of_gap, test = map(float, numbers)
                 name, strip = control.ids[p], f.look.name
-                found.append(SurveyedGap(name, role, strip, dx, dy, dz, gap, noise, own, test, bool(within)))
-    return tuple(found)
+                gaps.append(SurveyedGap(name, role, strip, dx, dy, dz, gap, noise, sigma_of_gap, test, bool(within)))
+    return tuple(gaps)
 
 
-def _moves(
-    f: PointPlanes, errors: StripErrors, path: ScannerPath | None, adjusted: Adjustment, known: Covariance
+def _variance_of_foot(
+    f: PointPlanes, errors: StripErrors, path: ScannerPath | None, adjusted: Adjustment, cov: Covariance
 ) -> Float[np.ndarray, "n"]:
     """Return a C a', a priori."""
     side = side_of(f.patches, f.found.patch, f.found.foot, f.look.strip, errors, path)
@@ -294,7 +294,7 @@ def _moves(
     for label, slopes in zip(labels, np.concatenate(by_scanner, axis=1).T, strict=True):
         a[:, place.get(label, -1)] = slopes
     a = a[:, :-1]
-    return np.einsum("ni,ij,nj->n", a, np.asarray(known.matrix)[-a.shape[1] :, -a.shape[1] :], a)
+    return np.einsum("ni,ij,nj->n", a, np.asarray(cov.matrix)[-a.shape[1] :, -a.shape[1] :], a)
 
 
 @eqx.filter_jit

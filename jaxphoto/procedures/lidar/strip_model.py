@@ -47,12 +47,12 @@ def looks_of(cloud: Cloud, path: ScannerPath | None, pattern: Pattern) -> list[L
     """Return one look per strip; for a circular scanner two, "1 ahead" and "1 behind" of strip 1."""
     looks = []
     for k, name in enumerate(cloud.strips):
-        own = np.flatnonzero(cloud.strip == k)
+        returns_of_strip = np.flatnonzero(cloud.strip == k)
         if pattern == "line" or path is None:
-            looks.append(Look(k, name, own))
+            looks.append(Look(k, name, returns_of_strip))
             continue
-        ahead = aside(cloud, own, path)[:, 1] > 0
-        sides = (f"{name} ahead", own[ahead]), (f"{name} behind", own[~ahead])
+        ahead = aside(cloud, returns_of_strip, path)[:, 1] > 0
+        sides = (f"{name} ahead", returns_of_strip[ahead]), (f"{name} behind", returns_of_strip[~ahead])
         looks += [Look(k, side, returns) for side, returns in sides if len(returns)]
     return looks
 
@@ -61,9 +61,9 @@ def aside(cloud: Cloud, which: Int[np.ndarray, "n"], path: ScannerPath) -> Float
     """Return tangents of the angles of returns to the right and ahead, from the body's nadir."""
     parts = [np.zeros((0, 2))]
     for first in range(0, len(which), PORTION):
-        own = which[first : first + PORTION]
-        poses = scanner_poses(path, cloud.time[own])  # type: ignore[index]
-        shot = np.einsum("nji,nj->ni", poses.object_from_body, cloud.xyz[own] - poses.position)
+        portion = which[first : first + PORTION]
+        poses = scanner_poses(path, cloud.time[portion])  # type: ignore[index]
+        shot = np.einsum("nji,nj->ni", poses.object_from_body, cloud.xyz[portion] - poses.position)
         parts.append(shot[:, :2] / np.maximum(-shot[:, 2:], 1e-9))
     return np.concatenate(parts)
 
@@ -91,10 +91,10 @@ def knot_sigmas(splines: Sequence[StripSpline], trajectory: Trajectory | None, s
         return KnotSigmas(position, attitude)
     # Of roll, pitch and yaw, which are rotations about forward, right and up.
     stated = np.asarray(trajectory.sigma_position), np.asarray(trajectory.sigma_attitude)[:, [1, 0, 2]]
-    for own, sigmas in zip((position, attitude), stated, strict=True):
+    for sigma_of_knots, sigmas in zip((position, attitude), stated, strict=True):
         for axis, column in enumerate(sigmas.T):
             if (column > 0).all():
-                own[:, axis] = np.interp(times, np.asarray(trajectory.time), column)
+                sigma_of_knots[:, axis] = np.interp(times, np.asarray(trajectory.time), column)
     return KnotSigmas(position, attitude)
 
 
@@ -126,7 +126,7 @@ def strip_block(
     Without `priors` strips have only a shift, which is free. The trajectory of strips in `held` is fixed.
     """
     knots: dict[str, AbstractParameters] = {}
-    known: dict[str, AbstractParameters] = {}
+    knot_priors: dict[str, AbstractParameters] = {}
     later = TrajectoryKnot(FREE, FREE)  # type: ignore[arg-type]
     shift, right = TrajectoryKnot(FREE, FIXED), TrajectoryKnot(FIXED, FIXED)  # type: ignore[arg-type]
     for name, spline in zip(names, splines, strict=True):
@@ -134,11 +134,11 @@ def strip_block(
         for k, time in enumerate(spline.times):
             owner = name if priors is None else knot_name(name, time)
             knots[owner] = TrajectoryKnot(_ZERO, _ZERO)  # type: ignore[arg-type]
-            known[owner] = right if name in held else shift if priors is None else later if k else first
+            knot_priors[owner] = right if name in held else shift if priors is None else later if k else first
     block = empty_block("strips of a laser scanner") if photographs is None else photographs
     start, prior = block.start.unknowns, block.priors
     start = dataclasses.replace(start, more=start.more | {TrajectoryKnot.kind: knots})
-    prior = dataclasses.replace(prior, more=prior.more | {TrajectoryKnot.kind: known})
+    prior = dataclasses.replace(prior, more=prior.more | {TrajectoryKnot.kind: knot_priors})
     if priors is not None:
         of_scanner, own = ScannerCalibration.kind, priors.calibration
         right_scanner = Scanner(_ZERO, {})  # type: ignore[arg-type]
@@ -224,9 +224,9 @@ def step_rows(
 ) -> tuple[PositionSteps, AttitudeSteps]:
     """Return steps from knot to knot of every strip, so that every knot has its a priori standard deviation."""
     start = np.concatenate([s.first + np.arange(s.size - 1) for s in splines])
-    apart = np.concatenate([np.full(s.size - 1, s.interval) for s in splines])
-    kept = np.exp(-apart / settings.correlation_s)
-    part, none = kept[:, None] ** 2, np.zeros((len(start), 3))
+    interval = np.concatenate([np.full(s.size - 1, s.interval) for s in splines])
+    decay = np.exp(-interval / settings.correlation_s)
+    part, none = decay[:, None] ** 2, np.zeros((len(start), 3))
 
     def new(sigma: Float[np.ndarray, "knots 3"]) -> Float[np.ndarray, "steps 3"]:
         # If errors decrease faster than their correlation decays, new variance still enters.
@@ -234,8 +234,8 @@ def step_rows(
         return np.sqrt(np.maximum(after - part * before, (1 - part) * np.minimum(before, after)))
 
     return (
-        PositionSteps(start, start + 1, kept, new(sigmas.position), none),
-        AttitudeSteps(start, start + 1, kept, new(sigmas.attitude), none),
+        PositionSteps(start, start + 1, decay, new(sigmas.position), none),
+        AttitudeSteps(start, start + 1, decay, new(sigmas.attitude), none),
     )
 
 
