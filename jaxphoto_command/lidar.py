@@ -79,7 +79,7 @@ def lidar_control(
         progress.update(f"writing {out}")
         heights, rounds = heights_table(result), rounds_table(result.rounds)
         picture = heights_figure(result)
-        page = heights_page(result, picture, output.made_by(block, cloud))
+        page = heights_page(result, picture, output.command_record(block, cloud))
         with whole_block(result.block, out) as folder:
             heights.to_csv(folder / "lidar_heights.csv", index=False)
             rounds.to_csv(folder / "lidar_rounds.csv", index=False)
@@ -241,7 +241,7 @@ def simultaneous(
         result = simultaneous(read, surface, path, priors, **options)
         progress.update(f"writing {out}")
         track = None if path is None else scanner_path(path)
-        with write_simultaneous(result, out, seconds, output.made_by(block, cloud, trajectory)) as folder:
+        with write_simultaneous(result, out, seconds, output.command_record(block, cloud, trajectory)) as folder:
             strips = tuple(result.scanner.shifts)
             corrected = lambda part: correct_cloud(part, result.scanner, track).xyz  # noqa: E731
             write_corrected(cloud, folder, corrected, strips, path, read.frame, system)

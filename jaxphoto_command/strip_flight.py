@@ -174,8 +174,8 @@ def adjust_flight(output: Output, flight: StripFiles, choices: StripChoices, out
                 write_dsm(folder / f"differences_{name}.tif", raster, differences.system)
             return maps
 
-        made = output.made_by(cloud, trajectory, block, flight.control)
-        write_strips(result, tables, verdict, out, write_files, made)
+        record = output.command_record(cloud, trajectory, block, flight.control)
+        write_strips(result, tables, verdict, out, write_files, record)
     print_verdict(verdict, output.screen)
     print_strips(result, output.screen)
     output.wrote(out, f"results in {out} (open report.html)")

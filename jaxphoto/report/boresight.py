@@ -16,7 +16,7 @@ from rich.text import Text
 from jaxphoto.errors import InputError
 from jaxphoto.procedures import Step
 from jaxphoto.report.findings import as_sentence
-from jaxphoto.report.page import Heading, Link, Made, Paragraph, Part, Plot
+from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, Plot
 from jaxphoto.report.plots import axes_or_new, label, new_figure
 from jaxphoto.report.results import rounded, write_results, write_study
 from jaxphoto.report.tables import Tables
@@ -125,7 +125,7 @@ def boresight_parts(steps: Sequence[Step]) -> list[Part]:
     return parts
 
 
-def write_boresight(steps: Sequence[Step], directory: Path, seconds: dict[str, float], made: Made) -> None:
+def write_boresight(steps: Sequence[Step], directory: Path, seconds: dict[str, float], record: CommandRecord) -> None:
     """steps.csv, summary.json, report.html and step_1 ... step_4.
 
     Raises InputError if `directory` holds something else than an earlier result.
@@ -136,7 +136,7 @@ def write_boresight(steps: Sequence[Step], directory: Path, seconds: dict[str, f
         for step in steps:
             tables, times = Tables(step.adjusted), step.adjusted.seconds
             spent = {name: times[name] for name in ("compile", "solve", "covariance")}
-            write_results(tables, verdict_of(tables), work / f"step_{step.number}", spent, made=made)
+            write_results(tables, verdict_of(tables), work / f"step_{step.number}", spent, record=record)
         summary = {
             "title": block.title,
             "verdict": verdict,
@@ -158,7 +158,7 @@ def write_boresight(steps: Sequence[Step], directory: Path, seconds: dict[str, f
         }
         write_study(
             work, f"{block.title or 'block'}: boresight", (verdict, "green" if passed else "red"),
-            boresight_parts(steps), summary, made, {"steps": steps_table(steps)},
+            boresight_parts(steps), summary, record, {"steps": steps_table(steps)},
         )  # fmt: skip
 
 

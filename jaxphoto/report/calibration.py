@@ -15,7 +15,7 @@ from jaxphoto.camera import Sensor
 from jaxphoto.errors import counted
 from jaxphoto.procedures.calibration import Calibration, Detection, rms_px
 from jaxphoto.report.findings import Finding, Verdict
-from jaxphoto.report.page import Heading, Link, Made, Part, PictureFile, page
+from jaxphoto.report.page import CommandRecord, Heading, Link, Part, PictureFile, page
 from jaxphoto.report.plots import label, new_figure
 from jaxphoto.report.results import write_results, write_summary
 from jaxphoto.report.tables import Tables
@@ -114,7 +114,7 @@ def write_calibration(
     beside: Callable[[Path], None] = lambda folder: None,
     *,
     detections: Sequence[Detection] = (),
-    made: Made,
+    record: CommandRecord,
     start: str = "",
     notes: Sequence[str] = (),
 ) -> Tables:
@@ -132,7 +132,7 @@ def write_calibration(
     times = calibration.adjusted.seconds
     with whole_folder(directory) as work:
         spent = seconds | {k: times[k] for k in ("compile", "solve", "covariance")}
-        write_results(tables, verdict, work, spent, made=made)
+        write_results(tables, verdict, work, spent, record=record)
         photographs = photographs_table(calibration)
         photographs.to_csv(work / "photographs.csv", index=False)
         (work / PICTURES).mkdir()

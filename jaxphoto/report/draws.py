@@ -15,7 +15,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.observations import AXES
 from jaxphoto.report.formatting import column_unit
-from jaxphoto.report.page import Heading, Made, Paragraph, Part, Plot, page, provenance
+from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot, page, provenance
 from jaxphoto.report.plots import axes_or_new, label, new_figure
 from jaxphoto.report.results import assumed_pixels
 from jaxphoto.sensitivity import Draws
@@ -195,7 +195,11 @@ def effects_figure(effects: pd.DataFrame, summary: pd.DataFrame, quantities: lis
 
 
 def write_draws_page(
-    summary: Mapping[str, Any], table: pd.DataFrame, sensors: Mapping[str, Sensor], directory: Path, made: Made
+    summary: Mapping[str, Any],
+    table: pd.DataFrame,
+    sensors: Mapping[str, Sensor],
+    directory: Path,
+    record: CommandRecord,
 ) -> None:
     """report.html of the draws in `directory`, from the summary, its table and the plots in the folder."""
     few = ~table["quantity"].str.startswith(LONG)
@@ -213,6 +217,6 @@ def write_draws_page(
     parts += [Heading("Means and standard deviations"), ordered]
     if not few.all():
         parts.append(Paragraph("Images, points and trajectory knots are in summary.csv."))
-    text = page(f"Monte Carlo: {summary.get('title') or 'block'}", [*parts, *provenance(made)], (verdict, ""))
+    text = page(f"Monte Carlo: {summary.get('title') or 'block'}", [*parts, *provenance(record)], (verdict, ""))
     with whole_file(directory / "report.html") as work:
         work.write_text(text, encoding="utf-8")

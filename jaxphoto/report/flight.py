@@ -81,8 +81,8 @@ class FlightSource(NamedTuple):
     """Exposure times by image."""
     conditions: Sequence[Conditions] = ()
     inputs: Sequence[InputFile] = ()
-    told: Mapping[str, Any] = MappingProxyType({})
-    """How the results came about: goes into the summaries."""
+    entries: Mapping[str, Any] = MappingProxyType({})
+    """Further entries of the summaries: options and inputs."""
     written: str = ""
     """Date of the results."""
     command: str = ""
@@ -480,7 +480,7 @@ def provenance_section(source: FlightSource) -> Iterator[Part]:
         rows[name] = ", ".join(dict.fromkeys(v for c in conditions if (v := getattr(c, field))))
     rows |= dict(known_conditions(conditions))
     rows["command"] = source.command
-    method = {k: v for k, v in dict(source.told.get("method", {})).items() if k != "command" and v is not None}
+    method = {k: v for k, v in dict(source.entries.get("method", {})).items() if k != "command" and v is not None}
     rows["options as used"] = ", ".join(f"{k} {option_word(v)}" for k, v in method.items())
     rows["versions"] = ", ".join(f"{name} {number}" for name, number in versions().items())
     if source.inputs:
@@ -527,7 +527,7 @@ def write_flight(
         times = {name: r.part.adjusted.seconds[name] for name in ("compile", "solve", "covariance")}
         with whole_folder(work / folder_name) as folder:
             own = {"sigma_factor": r.sigma_factor, "flight": flight_words(r.coverage, r.part.adjusted.block)}
-            write_results(r.tables, r.verdict, folder, times, {**source.told, **own})
+            write_results(r.tables, r.verdict, folder, times, {**source.entries, **own})
             alike = with_correlated_sigma(r.tables.interior, r.part.adjusted, r.part.oriented.report.alike)
             alike.to_csv(folder / "interior_correlated.csv", index=False)
             if r.part.controlled:
@@ -546,7 +546,7 @@ def write_flight(
         "not_used": {**spoilt, **flight.left_out},
         "versions": versions(),
     }
-    write_summary(summary | dict(source.told), work)
+    write_summary(summary | dict(source.entries), work)
     return verdict
 
 

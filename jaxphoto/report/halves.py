@@ -14,7 +14,7 @@ from jaxphoto.errors import camera_words
 from jaxphoto.procedures.compare import Halves
 from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.formatting import without_empty
-from jaxphoto.report.page import Heading, Made, Paragraph, Part, Plot
+from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot
 from jaxphoto.report.plots import axes_or_new, draw_format_map, new_figure
 from jaxphoto.report.results import assumed_pixels, write_study
 from jaxphoto.report.terminal import print_lines
@@ -122,7 +122,9 @@ def print_halves(halves: Halves, console: Console) -> None:
     print_lines(halves_verdict(halves), console)
 
 
-def write_halves(halves: Halves, directory: Path, write_camera: Callable[[Path], object], made: Made) -> None:
+def write_halves(
+    halves: Halves, directory: Path, write_camera: Callable[[Path], object], record: CommandRecord
+) -> None:
     """cells.csv, cuts.csv, halves.png, report.html and summary.json; `write_camera` writes the camera as well.
 
     Raises InputError if `directory` holds something else than an earlier result.
@@ -154,6 +156,6 @@ def write_halves(halves: Halves, directory: Path, write_camera: Callable[[Path],
     with whole_folder(directory) as work:
         write_camera(work)
         write_study(
-            work, f"{halves.adjusted.block.title or 'block'}: halves", (verdict[0], colour), parts, summary, made,
+            work, f"{halves.adjusted.block.title or 'block'}: halves", (verdict[0], colour), parts, summary, record,
             {"cells": cells, "cuts": cuts}, {"halves": figure},
         )  # fmt: skip

@@ -20,7 +20,7 @@ from jaxphoto.procedures.lidar import LidarControl, Round, Simultaneous
 from jaxphoto.procedures.lidar.vertical_control import flag_counts
 from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.formatting import without_empty, without_unit
-from jaxphoto.report.page import Heading, Link, Made, Paragraph, Part, Plot, page, provenance, verdict_parts
+from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, Plot, page, provenance, verdict_parts
 from jaxphoto.report.plots import axes_or_new, new_figure, title
 from jaxphoto.report.results import summary_of, write_results, write_study
 from jaxphoto.report.tables import Tables
@@ -176,7 +176,9 @@ def heights_figure(control: LidarControl) -> Figure:
 
 
 @contextmanager
-def write_simultaneous(result: Simultaneous, directory: Path, seconds: dict[str, float], made: Made) -> Iterator[Path]:
+def write_simultaneous(
+    result: Simultaneous, directory: Path, seconds: dict[str, float], record: CommandRecord
+) -> Iterator[Path]:
     """Tables of iterations, moves, surfaces and correlations, plot, report, summary.json, and the folder `adjustment`.
 
     Yields the folder before it is in place, for further files. Raises InputError if `directory` holds something else
@@ -187,7 +189,7 @@ def write_simultaneous(result: Simultaneous, directory: Path, seconds: dict[str,
         tables = Tables(result.adjusted)
         verdict, times = verdict_of(tables), result.adjusted.seconds
         spent = {name: times[name] for name in ("compile", "solve", "covariance")}
-        write_results(tables, verdict, work / "adjustment", spent, made=made)
+        write_results(tables, verdict, work / "adjustment", spent, record=record)
         rounds, moved, correlations = (
             rounds_table(result.rounds),
             moved_table(result),
@@ -219,7 +221,7 @@ def write_simultaneous(result: Simultaneous, directory: Path, seconds: dict[str,
         write_study(
             work, f"{tables.adjusted.block.title or 'Block'} and cloud, adjusted together",
             (verdict.headline, verdict.colour), parts,
-            summary | {"rounds": len(result.rounds), "iteration_converged": result.converged}, made, files,
+            summary | {"rounds": len(result.rounds), "iteration_converged": result.converged}, record, files,
             {"above": figure},
         )  # fmt: skip
         yield work
@@ -249,7 +251,7 @@ def print_rounds(rounds: Sequence[Round], converged: bool, console: Console) -> 
     print_lines(rounds_words(rounds, converged), console)
 
 
-def heights_page(control: LidarControl, figure: Figure, made: Made) -> str:
+def heights_page(control: LidarControl, figure: Figure, record: CommandRecord) -> str:
     """The page of heights of a cloud as control: iterations, flags, plot, and the largest differences."""
     heights = heights_table(control)
     heights.insert(5, "difference_m", heights["height_m"] - heights["Z_m"])
@@ -268,7 +270,7 @@ def heights_page(control: LidarControl, figure: Figure, made: Made) -> str:
     if flags := flag_counts(control.flag):
         parts.append(pd.DataFrame({"flag": [name.lower() for name in flags], "heights": list(flags.values())}))
     parts += [Heading("Largest differences"), without_empty(largest.assign(**written))]
-    parts += [Paragraph("All heights are in lidar_heights.csv."), *provenance(made)]
+    parts += [Paragraph("All heights are in lidar_heights.csv."), *provenance(record)]
     return page(f"{control.block.title or 'Block'}: heights of a cloud as control", parts, (words[0], ""))
 
 

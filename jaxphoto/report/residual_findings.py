@@ -401,10 +401,12 @@ def component_tables(components: VarianceComponents) -> dict[str, pd.DataFrame]:
 def component_findings(components: VarianceComponents, blunders: Sequence[InflatedComponent] = ()) -> list[Finding]:
     """Components caused by blunders, missing convergence, and groups that support no component."""
     found = []
-    for made in blunders:
+    for component in blunders:
         hint = "Blunders are no measure of precision: adjust with --snoop as well"
-        numbers = {"words": few(list(made.words))}
-        found.append(Finding("component_blunder", "error", made.label, made.factor, made.without, hint, numbers))
+        numbers = {"words": few(list(component.words))}
+        found.append(
+            Finding("component_blunder", "error", component.label, component.factor, component.without, hint, numbers)
+        )
     if not components.converged:
         hint = "Estimate them for fewer groups"
         found.append(Finding("components_not_converged", "warning", value=components.iterations, hint=hint))

@@ -13,7 +13,7 @@ from rich.console import Console
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.report.findings import as_sentence, p_words
 from jaxphoto.report.formatting import to_rich
-from jaxphoto.report.page import Heading, Made, Paragraph, Part, Plot
+from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot
 from jaxphoto.report.plots import axes_or_new, draw_format, draw_format_map, new_figure, title
 from jaxphoto.report.results import assumed_pixel_words, write_study
 from jaxphoto.report.terminal import print_lines
@@ -140,7 +140,7 @@ def print_stability(
 
 def write_stability(
     analyses: Mapping[Method, Analysis], sets: tuple[Compared, Compared], sensor: Sensor, noise_mm: float,
-    method: Method, directory: Path, made: Made,
+    method: Method, directory: Path, record: CommandRecord,
 ) -> None:  # fmt: skip
     """stability.csv, and of `method` offsets.csv and offsets.png; report.html and summary.json.
 
@@ -163,7 +163,7 @@ def write_stability(
     with whole_folder(directory) as work:
         write_study(
             work, "Stability of interior orientation", (verdict, colour), parts,
-            stability_summary(analyses, sets, noise_mm, method), made, tables, {"offsets": figure},
+            stability_summary(analyses, sets, noise_mm, method), record, tables, {"offsets": figure},
         )  # fmt: skip
 
 
@@ -275,7 +275,9 @@ def print_change(change: Change, sets: tuple[Compared, Compared], sensor: Sensor
     print_lines(change_verdict(change, sensor), console)
 
 
-def write_change(change: Change, sets: tuple[Compared, Compared], sensor: Sensor, directory: Path, made: Made) -> None:
+def write_change(
+    change: Change, sets: tuple[Compared, Compared], sensor: Sensor, directory: Path, record: CommandRecord
+) -> None:
     """parameters.csv, cells.csv, change.png, report.html and summary.json.
 
     Raises InputError if `directory` holds something else than an earlier result.
@@ -293,7 +295,14 @@ def write_change(change: Change, sets: tuple[Compared, Compared], sensor: Sensor
     verdict = change_headline(change), "amber" if change.changed else "green"
     with whole_folder(directory) as work:
         write_study(
-            work, "Change of a camera", verdict, parts, change_summary(change, sensor), made, tables, {"change": figure}
+            work,
+            "Change of a camera",
+            verdict,
+            parts,
+            change_summary(change, sensor),
+            record,
+            tables,
+            {"change": figure},
         )
 
 

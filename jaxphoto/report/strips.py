@@ -22,7 +22,7 @@ from jaxphoto.procedures.lidar.strip_control import CHECK, CONTROL, SurveyedGap
 from jaxphoto.report.draws import in_degrees
 from jaxphoto.report.findings import Finding, Severity, Verdict, p_words
 from jaxphoto.report.formatting import label_unit, of_sigma, with_sigma
-from jaxphoto.report.page import Heading, Made, Paragraph, Part, Plot, verdict_parts
+from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot, verdict_parts
 from jaxphoto.report.plots import axes_or_new, draw_matrix, label, new_figure
 from jaxphoto.report.results import write_results, write_study
 from jaxphoto.report.tables import Tables
@@ -359,7 +359,7 @@ def write_strips(
     verdict: Verdict,
     directory: Path,
     write_corrected: Callable[[Path], tuple[Raster, Raster] | None],
-    made: Made,
+    record: CommandRecord,
 ) -> None:
     """Tables, differences.png, report.html, summary.json; with images the folder `adjustment`.
 
@@ -375,7 +375,7 @@ def write_strips(
     files |= {"surveyed_points": surveyed_table(result)} if result.surveyed else {}
     with whole_folder(directory) as work:
         if tables is not None:
-            write_results(tables, verdict, work / "adjustment", seconds, made=made)
+            write_results(tables, verdict, work / "adjustment", seconds, record=record)
         all_correlations(result).round(_DIGITS).to_csv(work / "correlation.csv")
         gaps = write_corrected(work)
         figures = {} if gaps is None else {"differences": differences_figure(*gaps)}
@@ -388,7 +388,7 @@ def write_strips(
             "seconds": seconds | {"write": time.perf_counter() - began},
         }  # fmt: skip
         parts = [*verdict_parts(verdict), *_sections(result, files, figures.get("differences"))]
-        write_study(work, name, (verdict.headline, verdict.colour), parts, summary, made, files, figures)
+        write_study(work, name, (verdict.headline, verdict.colour), parts, summary, record, files, figures)
 
 
 def _sections(result: StripAdjustment, files: dict[str, pd.DataFrame], gaps: Figure | None) -> Iterator[Part]:
