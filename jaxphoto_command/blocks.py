@@ -367,7 +367,7 @@ def halves(
     from jaxphoto.io import read_block
     from jaxphoto.procedures.compare import camera_of
     from jaxphoto.procedures.compare import halves as compare_halves
-    from jaxphoto.report.halves import print_halves, write_halves
+    from jaxphoto.report.stability import print_halves, write_halves
     from jaxphoto.writing import check_folder
 
     check_folder(out, block)
