@@ -16,7 +16,7 @@ from jaxphoto.io.json_file import read_json
 from jaxphoto.io.names import harm_in
 from jaxphoto.io.trajectory import read_records
 from jaxphoto.io.whole_text import read_text, read_whole
-from jaxphoto.simulation import visibility
+from jaxphoto.simulation import points
 from jaxphoto.simulation.plans import Footprint, Strip, Swaths
 from tests.io import test_cameras as cameras
 from tests.io.test_map_block import to_utm
@@ -185,7 +185,7 @@ def test_places_in_strips_that_are_far_apart_end():
 
 def test_points_looked_at_in_parts_are_the_same(monkeypatch):
     whole = made().block.image_points
-    monkeypatch.setattr(visibility, "_PAIRS", 100)
+    monkeypatch.setattr(points, "_PAIRS", 100)
     parts = made().block.image_points
     np.testing.assert_array_equal(whole.image, parts.image)
     np.testing.assert_array_equal(whole.point, parts.point)
