@@ -135,13 +135,7 @@ def fit_surface(near: Neighbours, weight: Float[ArrayLike, "points"], quadratic:
     residual = z - basis @ (rows @ z)
     rows = _seen_from_place(-middle / unit, unit)[:, :n] @ rows
     freedom = n_used - n
-    return LocalFit(
-        rows @ z,
-        rows,
-        jnp.sum(residual**2) / jnp.maximum(freedom, 1),
-        freedom.astype(float),
-        determined,
-    )
+    return LocalFit(rows @ z, rows, jnp.sum(residual**2) / jnp.maximum(freedom, 1), freedom.astype(float), determined)
 
 
 def _seen_from_place(at: Float[Array, "2"], unit: Float[Array, ""]) -> Float[Array, "6 6"]:

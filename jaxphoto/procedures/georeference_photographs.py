@@ -370,9 +370,7 @@ def is_line(centres: Float[np.ndarray, "n 3"]) -> bool:
 
 
 def level_rotation(
-    centres: Float[np.ndarray, "n 3"],
-    positions: Float[np.ndarray, "n 3"],
-    backwards: Float[np.ndarray, "m 3"],
+    centres: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"], backwards: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, "3 3"]:
     """Rotation of a network to a level frame: its line to that of the `positions`, as upright as possible on average.
 

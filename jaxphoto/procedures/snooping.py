@@ -55,15 +55,7 @@ from jaxphoto.procedures.robust import (
     without_common_errors,
 )
 from jaxphoto.short_repr import pretty_repr
-from jaxphoto.statistics import (
-    LEAST_CHECKED,
-    LEAST_SIGMA0,
-    LEVEL,
-    UNCHECKED,
-    Suspect,
-    chi_square_limit,
-    global_test,
-)
+from jaxphoto.statistics import LEAST_CHECKED, LEAST_SIGMA0, LEVEL, UNCHECKED, Suspect, chi_square_limit, global_test
 from jaxphoto.tracing import outside_transformations
 from jaxphoto.unknowns import Unknowns
 

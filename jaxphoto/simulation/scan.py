@@ -263,13 +263,7 @@ class _Returns(NamedTuple):
     by: UInt8[np.ndarray, "returns"]
 
 
-def scan(
-    plan: ScanPlan,
-    paths: list[Path],
-    terrain: Terrain,
-    noise_m: Float[np.ndarray, "3"],
-    seed: int,
-) -> Scan:
+def scan(plan: ScanPlan, paths: list[Path], terrain: Terrain, noise_m: Float[np.ndarray, "3"], seed: int) -> Scan:
     """Scan `terrain`, which is drawn and settled, from the path of every strip; strips are called 1, 2 ... in turn.
 
     The trajectory has shift and drift errors by strip, the shots those of boresight and calibration: with these,

@@ -41,11 +41,7 @@ def test_a_cloud_has_the_gaps_of_its_cells():
 
 
 def test_of_three_strips_the_largest_gap_counts_and_rough_ground_has_none():
-    parts = (
-        strip(0.0, 30.0, 0.0),
-        strip(0.0, 30.0, -0.2),
-        strip(0.0, 30.0, 0.05),
-    )
+    parts = (strip(0.0, 30.0, 0.0), strip(0.0, 30.0, -0.2), strip(0.0, 30.0, 0.05))
     found = strip_differences(cells_of_strips(*parts), SETTINGS)
     gap = found.heights[np.isfinite(found.heights)]
     np.testing.assert_allclose(gap, 0.25, atol=0.03)

@@ -13,15 +13,7 @@ from jaxphoto.procedures.orientation import orient
 from jaxphoto.procedures.orientation.finish import erring_alike
 from tests.blocks import example
 from tests.marks import slow_but
-from tests.procedures.orientable import (
-    PIXEL,
-    SENSOR,
-    Camera,
-    aerial,
-    errors_with_covariance,
-    photographed,
-    projected,
-)
+from tests.procedures.orientable import PIXEL, SENSOR, Camera, aerial, errors_with_covariance, photographed, projected
 
 N_IMAGES, PER_IMAGE = 9, 800
 

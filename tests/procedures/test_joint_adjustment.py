@@ -15,12 +15,7 @@ from jaxphoto.observations import Attitudes, CameraPositions
 from jaxphoto.procedures.lidar import adjust_strips
 from jaxphoto.procedures.lidar.photographs import check_photographs
 from jaxphoto.report import plot_scanner_correlation, plot_trajectory_errors
-from jaxphoto.report.strips import (
-    all_correlations,
-    errors_along,
-    scanner_correlation_figure,
-    trajectory_errors_figure,
-)
+from jaxphoto.report.strips import all_correlations, errors_along, scanner_correlation_figure, trajectory_errors_figure
 from jaxphoto.statistics import correlation_matrix
 from tests.procedures.joint import CAMERA, fitted, flown, photographs, truth
 from tests.procedures.strips import SETTINGS

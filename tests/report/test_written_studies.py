@@ -14,14 +14,7 @@ from jaxphoto.report.sensitivity import SensitivityTables, write_sensitivity
 from jaxphoto.report.stability import Compared, write_change, write_halves, write_stability
 from jaxphoto.stability import change, image_grid
 from tests.blocks import adjusted
-from tests.report.studies import (
-    GOPRO,
-    boresight_steps,
-    halves_found,
-    lidar_control_of,
-    model_choice_of,
-    ray_offsets,
-)
+from tests.report.studies import GOPRO, boresight_steps, halves_found, lidar_control_of, model_choice_of, ray_offsets
 
 MADE = CommandRecord("jaxphoto study")
 ONE, TWO = (InteriorOrientation(c, 0.0, 0.0, Brown()) for c in (2.69, 2.70))

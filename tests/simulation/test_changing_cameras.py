@@ -142,20 +142,11 @@ def test_a_photograph_without_a_time_is_named(tmp_path):
         ({"camera_rates.kodak.truth.c_rate": 1.0}, r"\[camera_rates.kodak.truth\] c_rate: 1.0 is no status"),
         ({"camera_rates.leica": {}}, r"\[camera_rates\] leica: no such key is known"),
         ({"flight.turn_s": -1.0}, r"\[flight\] turn_s"),
-        (
-            {"thermal_rates": THERMAL["thermal_rates"]},
-            "thermal_rates: the recipe has no temperature",
-        ),
+        ({"thermal_rates": THERMAL["thermal_rates"]}, "thermal_rates: the recipe has no temperature"),
         ({"camera_walk": {"c_mm": 0.1}}, r"camera_walk: there are no cameras of strips"),
         (STRIPS | {"camera_walk.c_mm": 0.0}, r"\[camera_walk\]: c, x_p and y_p all walk"),
-        (
-            STRIPS | {"strip_cameras.A.truth": {"c_more": "free"}},
-            r"A\.truth\] c_more: a truth is not free",
-        ),
-        (
-            SPLINE | {"camera_splines.kodak.knots": 7},
-            r"kodak\.truth\]: knots = 7 is not an even number",
-        ),
+        (STRIPS | {"strip_cameras.A.truth": {"c_more": "free"}}, r"A\.truth\] c_more: a truth is not free"),
+        (SPLINE | {"camera_splines.kodak.knots": 7}, r"kodak\.truth\]: knots = 7 is not an even number"),
         (THERMAL | {"temperature.time_constant_s": 0.0}, r"\[temperature\] time_constant_s: 0.0 is not positive"),
     ],
 )

@@ -122,11 +122,7 @@ def on_trajectory(
     attitude = TrajectoryAttitudes(a.image, knots[a.image], weights[a.image], angles, np.full(angles.shape, turn))
     more = (*block.more, position, *([attitude] if len(attitude) else []))
     return dataclasses.replace(
-        block,
-        stations=CameraPositions.none(),
-        attitudes=Attitudes.none(),
-        breaklines=photographs.breaklines,
-        more=more,
+        block, stations=CameraPositions.none(), attitudes=Attitudes.none(), breaklines=photographs.breaklines, more=more
     )
 
 
