@@ -8,18 +8,6 @@ from jaxphoto.procedures.robust import Robust, robust
 from jaxphoto.procedures.snooping import Snooped, snoop
 
 __all__ = [
-    "BoresightEstimate",
-    "Exchange",
-    "Georeferenced",
-    "Robust",
-    "Snooped",
-    "Step",
-    "adjust",
-    "adjust_for_tables",
-    "boresight",
-    "georeference",
-    "judge",
-    "robust",
-    "snoop",
-    "step_block",
-]
+    "BoresightEstimate", "Exchange", "Georeferenced", "Robust", "Snooped", "Step", "adjust", "adjust_for_tables",
+    "boresight", "georeference", "judge", "robust", "snoop", "step_block",
+]  # fmt: skip

@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import jaxphoto_command
 from jaxphoto import FIXED, FREE, BlockError, boresight
 from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.io import write_block
@@ -19,6 +18,7 @@ from jaxphoto.procedures import step_block
 from jaxphoto.writing import MARKER
 from tests.blocks import BORESIGHT, BROWN, CONTROL, Simulated, aerial, all_attitudes, all_stations, bare, measured, rows
 from tests.blocks import free as free_interior
+from tests.commands import run
 
 STATION = 0.05
 ZERO = np.zeros(3)
@@ -241,18 +241,10 @@ def test_what_a_step_lacks_is_said_before_the_first(spoil, words, monkeypatch):
     assert all(word in str(caught.value) for word in words), str(caught.value)
 
 
-def run(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr(sys, "argv", ["jaxphoto", "boresight", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        jaxphoto_command.main()
-    captured = capsys.readouterr()
-    return stop.value.code or 0, captured.out, captured.err
-
-
 def test_the_command_writes_all_four_steps(monkeypatch, capsys, tmp_path):
     folder, out = tmp_path / "block", tmp_path / "out"
     write_block(block(), folder)
-    code, screen, _ = run(monkeypatch, capsys, folder, "--out", out)
+    code, screen, _ = run(monkeypatch, capsys, "boresight", folder, "--out", out)
     assert code == 0
     names = {MARKER, "steps.csv", "summary.json", "report.html", "step_1", "step_2", "step_3", "step_4"}
     assert {p.name for p in out.iterdir()} == names
@@ -280,7 +272,7 @@ def test_the_command_writes_all_four_steps(monkeypatch, capsys, tmp_path):
     assert "misalignment of mount one" in screen
     # Earlier results are replaced whole, and exit code 1 says that a step is not passed.
     write_block(block(2.0), folder)
-    code, screen, _ = run(monkeypatch, capsys, folder, "--out", out)
+    code, screen, _ = run(monkeypatch, capsys, "boresight", folder, "--out", out)
     assert code == 1
     assert "stopped at step 2" in screen
     assert {p.name for p in out.iterdir()} == names - {"step_3", "step_4"}
@@ -290,7 +282,7 @@ def test_the_command_writes_all_four_steps(monkeypatch, capsys, tmp_path):
 def test_a_block_without_attitudes_is_one_sentence(monkeypatch, capsys, tmp_path):
     folder = tmp_path / "block"
     write_block(dataclasses.replace(block(), attitudes=Attitudes.none()), folder)
-    code, screen, error = run(monkeypatch, capsys, folder, "--out", tmp_path / "out")
+    code, screen, error = run(monkeypatch, capsys, "boresight", folder, "--out", tmp_path / "out")
     assert (code, screen) == (2, "")
     assert "attitudes.csv" in error
     assert not (tmp_path / "out").exists()

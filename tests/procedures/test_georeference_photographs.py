@@ -35,21 +35,16 @@ def network():
     unknowns = adjust(block, truth).unknowns
     away = lambda x: 0.01 * (np.asarray(x) - 300.0) @ TURN.T + 5.0  # noqa: E731
     matrices = np.asarray(unknowns.exterior.camera_from_object) @ TURN.T
-    exterior = dataclasses.replace(
-        unknowns.exterior, position=away(unknowns.exterior.position), camera_from_object=matrices
-    )
+    position = away(unknowns.exterior.position)
+    exterior = dataclasses.replace(unknowns.exterior, position=position, camera_from_object=matrices)
     moved = dataclasses.replace(unknowns, exterior=exterior, points=away(unknowns.points))
     return eqx.tree_at(lambda b: b.start.unknowns, block, moved), truth
 
 
 def recorded(positions, names, sigma=None):
     frame = MapFrame(utm_of(*ORIGIN[:2]), None, ORIGIN)
-    utm = frame.map(np.asarray(positions, float))
-    places = frame.place(utm)
-    return {
-        name: Gps(latitude, longitude, height, sigma)
-        for name, (longitude, latitude, height) in zip(names, places, strict=True)
-    }
+    places = frame.place(frame.map(np.asarray(positions, float)))
+    return {name: Gps(lat, lon, height, sigma) for name, (lon, lat, height) in zip(names, places, strict=True)}
 
 
 def test_the_block_is_where_its_photographs_were_taken():
@@ -108,9 +103,8 @@ def test_positions_within_their_own_standard_deviations_contradict_nothing(state
     position[[1, 3, 6]] += [[1.6, -1.1, 2.0], [-0.9, 1.4, -3.0], [60.0, 0.0, 0.0]]
     known = recorded(position, block.images, (0.02, 0.02, 0.04))
     rest = {block.images[k] for k in (1, 3, 6)}
-    found = georeference_photographs(
-        block, {n: g._replace(sigma_m=stated) if n in rest else g for n, g in known.items()}
-    )
+    known |= {n: known[n]._replace(sigma_m=stated) for n in rest}
+    found = georeference_photographs(block, known)
     assert np.flatnonzero(~found.used).tolist() == [6]
     assert np.median(np.abs(found.offsets_m)) < 0.3
 
@@ -127,10 +121,8 @@ def test_positions_that_do_not_tell_the_turn_well_bring_the_block_to_its_place_a
     own = held.block.frame.map
     back = MapFrame(own.code, None, ORIGIN).local(own.map(np.asarray(a.unknowns.exterior.position)))
     assert np.abs(back - position).max() < 2.0
-    assert (
-        with_fixed_datum(georeference_photographs(block, recorded(position, block.images, (500.0,) * 3)), block.datum)
-        is None
-    )
+    worse = georeference_photographs(block, recorded(position, block.images, (500.0,) * 3))
+    assert with_fixed_datum(worse, block.datum) is None
 
 
 def test_positions_that_scatter_less_than_is_taken_for_granted_hold_a_small_block():
@@ -239,10 +231,8 @@ def test_attitudes_of_pictures_that_a_program_turned_are_turned_likewise(degrees
     block, truth = network()
     rng = np.random.default_rng(5)
     turned = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
-    attitudes = {
-        n: a._replace(level_from_camera=a.level_from_camera @ turned)
-        for n, a in strip_attitudes(block, truth, rng, common_deg=1.0).items()
-    }
+    own = strip_attitudes(block, truth, rng, common_deg=1.0)
+    attitudes = {n: a._replace(level_from_camera=a.level_from_camera @ turned) for n, a in own.items()}
     found = georeference_photographs(block, of_one_strip(block, truth, rng), attitudes=attitudes)
     assert any(words in s for s in found.sentences)
     if degrees == 120:

@@ -148,9 +148,8 @@ def raised(rise: float = 0.25) -> tuple[Simulation, StripAdjustment, StripAdjust
     xy = some[np.random.default_rng(2).choice(len(some), 60, replace=False), :2]
     control = surveyed(np.column_stack([xy, flight.terrain.height(xy)]), 7)
     cloud = dataclasses.replace(flight.cloud, xyz=flight.cloud.xyz + np.array([0.0, 0.0, rise]))
-    path = dataclasses.replace(
-        flight.trajectory, position=np.asarray(flight.trajectory.position) + np.array([0.0, 0.0, rise])
-    )
+    position = np.asarray(flight.trajectory.position) + np.array([0.0, 0.0, rise])
+    path = dataclasses.replace(flight.trajectory, position=position)
     settings = dataclasses.replace(SETTINGS, sigma_position_m=0.2, correlation_s=200.0)
     both = [adjust_strips(cloud, path, settings, PRIORS, control=given) for given in (None, control)]
     return flight, both[0], both[1]
@@ -193,10 +192,7 @@ def test_control_of_a_block_is_the_same_point_and_counts_once():
         (lambda c: c._replace(coordinates=c.coordinates + np.array([5000.0, 0, 0])), r"lie 49\d\d m from the strips"),
         (lambda c: c._replace(coordinates=c.coordinates + np.array([0, 0, 47.0])), r"lie 4\d\.\d m above the strips"),
         (lambda c: c._replace(coordinates=c.coordinates * np.array([1, 1, np.nan])), "point K0 has no height"),
-        (
-            lambda c: c._replace(coordinates=c.coordinates * 0 + np.array([8.0, 20.0, 4.6])),
-            "lies on a plane of a strip",
-        ),
+        (lambda c: c._replace(coordinates=0 * c.coordinates + [8.0, 20.0, 4.6]), "lies on a plane of a strip"),
     ],
 )
 def test_control_that_cannot_be(change, sentence):
