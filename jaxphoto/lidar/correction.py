@@ -93,9 +93,9 @@ def correct_cloud(cloud: Cloud, scanner: Scanner, path: ScannerPath | None) -> C
     turned = path is not None and bool(np.any(np.asarray(scanner.boresight)))
     for strip, shift in _strips(cloud, scanner):
         for first in range(0, len(strip), PORTION):
-            own = strip[first : first + PORTION]
-            poses = scanner_poses(path, cloud.time[own]) if turned and cloud.time is not None else None  # type: ignore[arg-type]
-            xyz[own] = corrected_xyz(cloud.xyz[own], poses, scanner.boresight, shift)
+            portion = strip[first : first + PORTION]
+            poses = scanner_poses(path, cloud.time[portion]) if turned and cloud.time is not None else None  # type: ignore[arg-type]
+            xyz[portion] = corrected_xyz(cloud.xyz[portion], poses, scanner.boresight, shift)
     return dataclasses.replace(cloud, xyz=xyz)
 
 
@@ -105,10 +105,10 @@ def correct_trajectory(trajectory: Trajectory, cloud: Cloud, scanner: Scanner) -
         return trajectory
     time = np.asarray(trajectory.time)
     away, shifts = [], []
-    for own, shift in _strips(cloud, scanner):
-        flown = cloud.time[own]
-        if len(flown):
-            away.append(np.maximum(flown.min() - time, time - flown.max()))
+    for of_strip, shift in _strips(cloud, scanner):
+        times = cloud.time[of_strip]
+        if len(times):
+            away.append(np.maximum(times.min() - time, time - times.max()))
             shifts.append(np.asarray(shift))
     nearest = np.argmin(np.maximum(np.stack(away), 0.0), axis=0)
     return dataclasses.replace(
@@ -131,12 +131,12 @@ def in_portions(
     """Apply `function`, made by `eqx.filter_jit`, to the rows of `points` in portions, and to `common` data."""
     result = np.empty((len(points[0]), 3))
     for first in range(0, len(result), PORTION):
-        own = slice(first, first + PORTION)
-        some = [v[own] for v in points]
+        portion = slice(first, first + PORTION)
+        some = [v[portion] for v in points]
         n = len(some[0])
         padded = (np.concatenate([v, np.broadcast_to(v[:1], (padded_size(n) - n, *v.shape[1:]))]) for v in some)
         # Slicing a JAX array would compile a program for each length.
-        result[own] = np.asarray(call_compiled(function, *padded, *common))[:n]
+        result[portion] = np.asarray(call_compiled(function, *padded, *common))[:n]
     return result
 
 
@@ -201,9 +201,9 @@ def correct_strips(cloud: Cloud, errors: StripErrors, path: ScannerPath | None) 
     """Correct a cloud for these errors; all its other fields are kept."""
     xyz = np.array(cloud.xyz)
     for k in range(len(errors.splines)):
-        own = np.flatnonzero(cloud.strip == k) if cloud.strip is not None else np.arange(len(cloud))
-        if len(own):
-            xyz[own] = corrected_strip(cloud.xyz[own], times_of(cloud)[own], k, errors, path)
+        of_strip = np.flatnonzero(cloud.strip == k) if cloud.strip is not None else np.arange(len(cloud))
+        if len(of_strip):
+            xyz[of_strip] = corrected_strip(cloud.xyz[of_strip], times_of(cloud)[of_strip], k, errors, path)
     return dataclasses.replace(cloud, xyz=xyz)
 
 
@@ -213,13 +213,13 @@ def correct_flight(trajectory: Trajectory, errors: StripErrors) -> Trajectory:
     ends = np.array([(s.start, s.start + s.interval * max(s.size - 3, 0)) for s in errors.splines])
     away = np.maximum(ends[:, :1] - time, time - ends[:, 1:])
     nearest = np.argmin(np.maximum(away, 0.0), axis=0)
-    off, turn = np.zeros((len(time), 3)), np.zeros((len(time), 3))
+    offset, turn = np.zeros((len(time), 3)), np.zeros((len(time), 3))
     for k in range(len(ends)):
-        own = nearest == k
-        off[own], turn[own] = errors.at(k, time[own])
+        closest = nearest == k
+        offset[closest], turn[closest] = errors.at(k, time[closest])
     quaternion = call_compiled(_turned, np.asarray(trajectory.quaternion), turn)
     return dataclasses.replace(
-        trajectory, position=jnp.asarray(np.asarray(trajectory.position) - off), quaternion=quaternion
+        trajectory, position=jnp.asarray(np.asarray(trajectory.position) - offset), quaternion=quaternion
     )
 
 

@@ -121,14 +121,14 @@ class CoveredTimes:
                 f"{self._measured(outside)}: the cloud's clock shows {looks_like(cloud, _START)}, the trajectory's "
                 f"{looks_like(trajectory, _START)}; {mend}"
             )
-        off = [f"begins {start - first:.3f} s later"] if first < start else []
-        off += [f"ends {last - end:.3f} s earlier"] if last > end else []
+        gaps = [f"begins {start - first:.3f} s later"] if first < start else []
+        gaps += [f"ends {last - end:.3f} s earlier"] if last > end else []
         mend = "give the trajectory of the whole flight, or the cloud without these points"
         if shift is not None:
             mend += f", or, if one clock is UTC and the other GPS time, {option}"
         return BlockError(
             f"{self._measured(outside)}: the cloud goes from {first:.3f} to {last:.3f} s, and the trajectory, from "
-            f"{start:.3f} to {end:.3f} s, {' and '.join(off)}; {mend}"
+            f"{start:.3f} to {end:.3f} s, {' and '.join(gaps)}; {mend}"
         )
 
     def _in_a_gap(self) -> BlockError | None:
@@ -171,9 +171,9 @@ class CoveredTimes:
         if not usual.any():
             return None
         speed = float(np.median(moves[usual] / lasts[usual]))
-        own = record - near.start
-        needed = moves[own] / speed if speed > _FLYING else np.inf
-        return lasts[own] - needed if needed < longest_interval(self._trajectory) else None
+        index = record - near.start
+        needed = moves[index] / speed if speed > _FLYING else np.inf
+        return lasts[index] - needed if needed < longest_interval(self._trajectory) else None
 
     def _of_two_lines(self) -> BlockError | None:
         for strip, first in self._first.items():

@@ -97,9 +97,9 @@ def plane_distance(
     plane: Plane, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Return the distance (m) of `points` (m) above the plane, along its normal, and its sigma (m) due to the plane."""
-    off = points - plane.centroid
-    by = np.column_stack([off, -np.ones(len(off))])
-    return off @ plane.normal, np.sqrt(np.einsum("ni,ij,nj->n", by, plane.covariance, by))
+    offset = points - plane.centroid
+    by = np.column_stack([offset, -np.ones(len(offset))])
+    return offset @ plane.normal, np.sqrt(np.einsum("ni,ij,nj->n", by, plane.covariance, by))
 
 
 def plane_feet(
@@ -254,19 +254,19 @@ def _of_house(
     free, scaled = np.ones(len(xyz), bool), xyz / sigma
     seeds = np.random.default_rng(0).permutation(np.flatnonzero(even))
     while len(seeds):
-        starts = [found[(found >= 0) & free[found]] for found in near[seeds[:_TRIED]]]
+        starts = [n[(n >= 0) & free[n]] for n in near[seeds[:_TRIED]]]
         grown, _ = _faces(xyz, [_grown(scaled, start, free, graph) for start in starts], least, sigma)
         if grown:
-            found = max(grown, key=len)
-            members.append(found)
-            free[found] = False
+            largest = max(grown, key=len)
+            members.append(largest)
+            free[largest] = False
         else:
             seeds = seeds[_TRIED:]
         seeds = seeds[free[seeds]]
     members, planes = _faces(xyz, members, least, sigma)
     for _ in range(_SHARED if len(planes) > 1 else 0):
         members, planes = _faces(xyz, _shared(xyz, members, planes, graph, sigma), least, sigma)
-    return [_patch(found, plane, xyz) for found, plane in zip(members, planes, strict=True)]
+    return [_patch(member, plane, xyz) for member, plane in zip(members, planes, strict=True)]
 
 
 def _faces(
@@ -278,12 +278,12 @@ def _faces(
     about its plane as the lidar's noise does, without filling the band from which they were taken.
     """
     faces, planes = [], []
-    for found in members:
-        points = xyz[found]
-        if len(found) >= max(least, 4) and np.linalg.eigvalsh(np.cov(points[:, :2].T))[0] > (_WIDTH * sigma[0]) ** 2:
+    for member in members:
+        points = xyz[member]
+        if len(member) >= max(least, 4) and np.linalg.eigvalsh(np.cov(points[:, :2].T))[0] > (_WIDTH * sigma[0]) ** 2:
             plane = _plane(points, sigma)
             if plane.sigma0 < _SPREAD:
-                faces.append(found)
+                faces.append(member)
                 planes.append(plane)
     return faces, planes
 
@@ -310,9 +310,9 @@ def _grown(
     for _ in range(_RIDGE_ROUNDS):
         if len(patch) < 4:
             break
-        off = scaled - scaled[patch].mean(axis=0)
-        _, axes = np.linalg.eigh(off[patch].T @ off[patch])
-        near = np.flatnonzero(free & (np.abs(off @ axes[:, 0]) < _CUT))
+        offset = scaled - scaled[patch].mean(axis=0)
+        _, axes = np.linalg.eigh(offset[patch].T @ offset[patch])
+        near = np.flatnonzero(free & (np.abs(offset @ axes[:, 0]) < _CUT))
         _, part = scipy.sparse.csgraph.connected_components(graph[near][:, near], directed=False)
         largest = np.bincount(part[np.isin(near, patch)], minlength=1)
         new = near[part == np.argmax(largest)] if len(near) else near
@@ -327,10 +327,10 @@ def _shared(
 ) -> list[np.ndarray]:
     """Assign each point to the nearest of the planes of its neighbours and its own."""
     distance = np.abs(np.stack([_scaled_distance(xyz, plane, sigma) for plane in planes]))
-    for k, found in enumerate(members):
-        member = np.zeros(len(xyz))
-        member[found] = 1
-        beside = graph @ member + member > 0
+    for k, member in enumerate(members):
+        mask = np.zeros(len(xyz))
+        mask[member] = 1
+        beside = graph @ mask + mask > 0
         distance[k, ~beside | (distance[k] > _CUT)] = np.inf
     best = np.where(np.isfinite(distance.min(axis=0)), np.argmin(distance, axis=0), -1)
     return [np.flatnonzero(best == k) for k in range(len(planes))]

@@ -190,16 +190,18 @@ def _pseudo_control(
 ) -> PseudoControl:
     one = exterior.position.ndim == 1
 
-    def of_feature(given):
-        image, at = (exterior, given) if one else given
+    def of_feature(data):
+        image, at = (exterior, data) if one else data
         held = jax.lax.stop_gradient((interior, image, at))
-        chosen, met = _choose(*held, grid, sky, numbers, points, reach, corrections)
-        return _interpolated(interior, image, at, grid, chosen, met, numbers, points, interpolation, corrections)
+        chosen, intersected = _choose(*held, grid, sky, numbers, points, reach, corrections)
+        return _interpolated(
+            interior, image, at, grid, chosen, intersected, numbers, points, interpolation, corrections
+        )
 
-    given = xy if one else (exterior, xy)
-    portions = jax.tree.map(lambda v: v.reshape(-1, min(_AT_ONCE, len(v)), *v.shape[1:]), given)
-    found = jax.lax.map(jax.vmap(of_feature), portions)
-    return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), found)
+    data = xy if one else (exterior, xy)
+    portions = jax.tree.map(lambda v: v.reshape(-1, min(_AT_ONCE, len(v)), *v.shape[1:]), data)
+    results = jax.lax.map(jax.vmap(of_feature), portions)
+    return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), results)
 
 
 def _choose(
@@ -216,12 +218,12 @@ def _choose(
     """Return the candidates of a feature, and True if its ray meets the cloud."""
     ideal = interior.ideal_from_measured(xy)
     ray = _Ray(*image_ray(interior, exterior, xy))
-    place, met = first_met(ray.origin, ray.direction, sky, grid)
+    place, intersected = first_met(ray.origin, ray.direction, sky, grid)
 
     def squared_distance(point):
         aim = apparent_point(exterior.position, point, corrections)
-        off = project_ideal(interior, exterior, aim) - ideal
-        return jnp.where(interior.projection.sees(*camera_coordinates(exterior, aim)), off @ off, jnp.inf)
+        offset = project_ideal(interior, exterior, aim) - ideal
+        return jnp.where(interior.projection.sees(*camera_coordinates(exterior, aim)), offset @ offset, jnp.inf)
 
     def candidates(place):
         index, there = around(grid, place, reach)
@@ -234,17 +236,17 @@ def _choose(
         return _Candidates(index, level.seen, level.broken), z
 
     def again(_, state):
-        place, found = state
+        place, previous = state
         new, z = candidates(place)
         near = new.seen & (jnp.cumsum(new.seen) <= points)
         mean = jnp.sum(jnp.where(near, z, 0)) / jnp.maximum(near.sum(), 1)
         # The image may show a step that the ray passes on its way.
-        new = _Candidates(new.index, new.seen, new.broken | found.broken)
+        new = _Candidates(new.index, new.seen, new.broken | previous.broken)
         return jnp.where(near.any(), ray.at(mean), place), new
 
     some = around(grid, place, reach)[0][: _CANDIDATES * points]
     none = _Candidates(some, jnp.zeros(len(some), bool), jnp.array(False))
-    return jax.lax.fori_loop(0, _ROUNDS, again, (place, none))[1], met
+    return jax.lax.fori_loop(0, _ROUNDS, again, (place, none))[1], intersected
 
 
 def _interpolated(
@@ -253,7 +255,7 @@ def _interpolated(
     xy: Float[Array, "2"],
     grid: Grid,
     chosen: _Candidates,
-    met: Bool[Array, ""],
+    intersected: Bool[Array, ""],
     numbers: _Numbers,
     points: int,
     interpolation: Interpolation,
@@ -272,20 +274,20 @@ def _interpolated(
     else:
         shown = jax.vmap(lambda p: project(interior, exterior, apparent_point(exterior.position, p, corrections)))(xyz)
         squared = jnp.sum((shown - xy) ** 2, axis=1)
-        known = jax.lax.stop_gradient(jnp.where(chosen.seen, squared, jnp.inf))
-        nearest = chosen.seen & (jnp.sum(known < known[:, None], axis=1) < points)
+        distances = jax.lax.stop_gradient(jnp.where(chosen.seen, squared, jnp.inf))
+        nearest = chosen.seen & (jnp.sum(distances < distances[:, None], axis=1) < points)
         weight = inverse_distance_weights(squared, nearest, numbers.power)
     z = base + weight @ around_ray.z
     point, ahead = ground_point(interior, exterior, xy, z, corrections)
 
-    lost = ~(met & ahead & chosen.seen.any())
+    lost = ~(intersected & ahead & chosen.seen.any())
     described = _described(around_ray, weight, fit, ray, chosen.broken, numbers, points)
     sigma, flag, gradient, roughness = jax.lax.stop_gradient(described)
     leafy = jnp.sum(jnp.where(weight != 0, jnp.asarray(grid.leafy)[chosen.index], False)) / jnp.sum(weight != 0)
     flag |= ((leafy > 0) & (leafy >= numbers.leafy)) * int(HeightFlag.VEGETATION)
     flag = jnp.where(lost, int(HeightFlag.HOLE), flag)
-    told = lambda value: jnp.where(lost | (flag & numbers.refuse.astype(int) != 0), jnp.nan, value)  # noqa: E731
-    return PseudoControl(told(point), told(sigma), flag, gradient, roughness)
+    unless_refused = lambda value: jnp.where(lost | (flag & numbers.refuse.astype(int) != 0), jnp.nan, value)  # noqa: E731
+    return PseudoControl(unless_refused(point), unless_refused(sigma), flag, gradient, roughness)
 
 
 def _described(

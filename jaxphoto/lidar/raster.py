@@ -230,15 +230,15 @@ def hidden(raster: Raster, points: Float[np.ndarray, "n 3"], camera: Float[np.nd
     row = (raster.north - points[:, 1]) / raster.cell_m - 0.5
     column = (points[:, 0] - raster.west) / raster.cell_m - 0.5
     down, across = (points[:, 1] - camera[1]) / raster.cell_m, (camera[0] - points[:, 0]) / raster.cell_m
-    up, found = camera[2] - points[:, 2], np.zeros(len(points), bool)
+    up, result = camera[2] - points[:, 2], np.zeros(len(points), bool)
     # Steps go from line to line of the axis along which the distance is larger.
     by_row = np.abs(down) >= np.abs(across)
     for chosen, heights, way in (
         (by_row, raster.heights, (row, down, column, across)),
         (~by_row, raster.heights.T, (column, across, row, down)),
     ):
-        found[chosen] = _blocked(heights, *(v[chosen] for v in (*way, points[:, 2], up)))
-    return found
+        result[chosen] = _blocked(heights, *(v[chosen] for v in (*way, points[:, 2], up)))
+    return result
 
 
 def _blocked(
@@ -264,7 +264,7 @@ def _blocked(
         ]
     last = np.floor(np.min(limits, axis=0))
     line = np.rint(line).astype(int)
-    found = np.zeros(len(line), bool)
+    result = np.zeros(len(line), bool)
     left = np.flatnonzero(last >= 1)
     k = 0
     while len(left):
@@ -275,9 +275,9 @@ def _blocked(
         # Next to a cell without height only the other one counts.
         a, b = np.where(np.isnan(a), b, a), np.where(np.isnan(b), a, b)
         blocked = a + (here - low) * (b - a) > z[left] + k * rise[left] + _GRAZING_M
-        found[left[blocked]] = True
+        result[left[blocked]] = True
         left = left[~blocked & (last[left] > k)]
-    return found
+    return result
 
 
 def _imaged(
@@ -289,8 +289,8 @@ def _imaged(
     for begin in range(0, len(points), _CHUNK):
         part = points[begin : begin + _CHUNK]
         padded = np.concatenate([part, np.repeat(part[-1:], _CHUNK - len(part), axis=0)])
-        found = call_compiled(_each_imaged, arrays, exterior, padded, corrections)
-        xy[begin : begin + _CHUNK], good[begin : begin + _CHUNK] = (np.asarray(v)[: len(part)] for v in found)
+        images = call_compiled(_each_imaged, arrays, exterior, padded, corrections)
+        xy[begin : begin + _CHUNK], good[begin : begin + _CHUNK] = (np.asarray(v)[: len(part)] for v in images)
     return xy, good
 
 
@@ -316,7 +316,7 @@ def strip_differences(strips: Cloud | Iterable[CellReturns], settings: StripSett
     For a cloud larger than memory its accumulated cells suffice.
     """
     cells = _cells(strips, settings) if isinstance(strips, Cloud) else strips
-    patches = [planes_from(own, settings) for own in cells]
+    patches = [planes_from(returns, settings) for returns in cells]
     columns, ups = columns_and_rows(np.concatenate([p.cell for p in patches]))
     if not len(columns):
         return None

@@ -139,13 +139,13 @@ def _together(
 
     middle = np.column_stack([average(v) for v in mean.T])
     before = middle if measured is mean else np.column_stack([average(v) for v in measured.T])
-    off = mean - middle[of]
+    offset = mean - middle[of]
     result = np.empty((len(cells), 3, 3))
     for i in range(3):
         for j in range(i + 1):
-            own = count * (off[:, i] * off[:, j])
-            own = own if scatter is None else own + scatter[:, i, j]
-            result[:, i, j] = result[:, j, i] = np.bincount(of, own, len(cells))
+            product = count * (offset[:, i] * offset[:, j])
+            product = product if scatter is None else product + scatter[:, i, j]
+            result[:, i, j] = result[:, j, i] = np.bincount(of, product, len(cells))
     return CellReturns(cells, total.astype(int), middle, before, average(time), result)
 
 
@@ -272,24 +272,24 @@ def planes_from(cells: CellReturns, settings: StripSettings) -> StripPatches:
     count = cells.returns
     value, axes = np.linalg.eigh(cells.scatter)
     roughness = np.sqrt(np.maximum(value[:, 0], 0.0) / np.maximum(count - 3, 1))
-    kept = (
+    usable = (
         (count >= settings.returns)
         & (roughness <= settings.roughness_m)
         & (np.sqrt(np.maximum(value[:, 1], 0.0) / count) > _SPREAD * settings.cell_m)
     )
     normal = axes[:, :, 0] * np.where(axes[:, 2, 0] < 0, -1.0, 1.0)[:, None]
-    along = axes[kept][:, :, 1:]
+    along = axes[usable][:, :, 1:]
     # A patch smoother than any scanner is so by chance.
-    variance = np.maximum(roughness[kept], settings.least_roughness_m) ** 2
+    variance = np.maximum(roughness[usable], settings.least_roughness_m) ** 2
     return StripPatches(
-        cells.cell[kept],
-        count[kept],
-        cells.mean[kept],
-        cells.measured[kept],
-        cells.time[kept],
-        normal[kept],
-        np.sqrt(_moderated(variance, count[kept] - 3, normal[kept])),
-        np.einsum("nik,nk,njk->nij", along, 1 / value[kept][:, 1:], along),
+        cells.cell[usable],
+        count[usable],
+        cells.mean[usable],
+        cells.measured[usable],
+        cells.time[usable],
+        normal[usable],
+        np.sqrt(_moderated(variance, count[usable] - 3, normal[usable])),
+        np.einsum("nik,nk,njk->nij", along, 1 / value[usable][:, 1:], along),
     )
 
 
@@ -303,8 +303,8 @@ def _moderated(
 ) -> Float[np.ndarray, "n"]:
     """Moderate variances by planes of similar slope: errors in X and Y make steep ones rougher than flat ones."""
     result, above = variance.copy(), steep(normal)
-    for own in (above, ~above):
-        result[own] = moderated_variances(variance[own], freedom[own])
+    for part in (above, ~above):
+        result[part] = moderated_variances(variance[part], freedom[part])
     return result
 
 
@@ -313,8 +313,8 @@ def corresponding(one: StripPatches, other: StripPatches, settings: StripSetting
     cell, a, b = np.intersect1d(one.cell, other.cell, assume_unique=True, return_indices=True)
     cosine = np.einsum("ni,ni->n", one.normal[a], other.normal[b])
     apart = np.linalg.norm((one.mean[a] - other.mean[b])[:, :2], axis=1)
-    alike = (cosine > np.cos(np.deg2rad(settings.normals_deg))) & (apart < _CLOSE * settings.cell_m)
-    a, b = a[alike], b[alike]
+    similar = (cosine > np.cos(np.deg2rad(settings.normals_deg))) & (apart < _CLOSE * settings.cell_m)
+    a, b = a[similar], b[similar]
     weight = (one.returns[a] / (one.returns[a] + other.returns[b]))[:, None]
     place = weight * one.mean[a] + (1 - weight) * other.mean[b]
     normal = weight * one.normal[a] + (1 - weight) * other.normal[b]
@@ -324,7 +324,7 @@ def corresponding(one: StripPatches, other: StripPatches, settings: StripSetting
     return PlanePairs(
         a,
         b,
-        cell[alike],
+        cell[similar],
         place + up_a[:, None] * normal,
         place + up_b[:, None] * normal,
         normal,
@@ -344,14 +344,14 @@ def fitting(gap: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"], limit: f
 
 def up_to_plane(patches: StripPatches, which: np.ndarray, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Return the distance of the planes from places along the normal."""
-    own = patches.normal[which]
-    return np.einsum("ni,ni->n", own, patches.mean[which] - place) / np.einsum("ni,ni->n", own, normal)
+    normals = patches.normal[which]
+    return np.einsum("ni,ni->n", normals, patches.mean[which] - place) / np.einsum("ni,ni->n", normals, normal)
 
 
 def variance_of_plane(patches: StripPatches, which: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Return the variance of the heights of the planes at places (m^2)."""
-    off = place - patches.mean[which]
-    tilt = np.einsum("ni,nij,nj->n", off, patches.cofactor[which], off)
+    offset = place - patches.mean[which]
+    tilt = np.einsum("ni,nij,nj->n", offset, patches.cofactor[which], offset)
     return patches.roughness[which] ** 2 * (1 / patches.returns[which] + tilt)
 
 
@@ -443,30 +443,30 @@ def faces_about(
     A point without two such faces has none.
     """
     index, point = returns_about(xyz, points, dataclasses.replace(settings, cell_m=2 * settings.cell_m))
-    found = [np.zeros((2, 0), int)]
+    parts = [np.zeros((2, 0), int)]
     for k in np.flatnonzero(np.bincount(point, minlength=len(points)) >= 2 * settings.returns):
-        own = index[point == k]
-        side = _sides(xyz[own] - points[k], settings)
-        found.append(np.stack([own, 2 * k + side])[:, side >= 0])
-    index, face = np.concatenate(found, axis=1)
+        candidates = index[point == k]
+        side = _sides(xyz[candidates] - points[k], settings)
+        parts.append(np.stack([candidates, 2 * k + side])[:, side >= 0])
+    index, face = np.concatenate(parts, axis=1)
     return index, face
 
 
-def _sides(off: Float[np.ndarray, "n 3"], settings: StripSettings) -> Int[np.ndarray, "n"]:
+def _sides(offset: Float[np.ndarray, "n 3"], settings: StripSettings) -> Int[np.ndarray, "n"]:
     """Return 0 and 1 for the returns of either face about the origin; -1 for neither."""
-    none = np.full(len(off), -1)
-    tried = [off[:, :2] @ np.array([np.cos(a), np.sin(a)]) > 0 for a in _DIRECTIONS]
+    none = np.full(len(offset), -1)
+    tried = [offset[:, :2] @ np.array([np.cos(a), np.sin(a)]) > 0 for a in _DIRECTIONS]
     tried = [first for first in tried if _enough(first, settings)]
     if not tried:
         return none
-    first = min(tried, key=lambda one: float(np.sum(np.square(_fitted(off, one)[1]))))
+    first = min(tried, key=lambda one: float(np.sum(np.square(_fitted(offset, one)[1]))))
     for _ in range(_TURNS):
-        planes, residual = _fitted(off, first)
+        planes, residual = _fitted(offset, first)
         constant, slope = planes[0, 0] - planes[1, 0], planes[0, 1:] - planes[1, 1:]
         size = float(np.linalg.norm(slope))
         if size < _BREAK or abs(constant) / size > _FAR * settings.cell_m:
             return none
-        beyond = (constant + off[:, :2] @ slope) / size
+        beyond = (constant + offset[:, :2] @ slope) / size
         parted = beyond > 0
         # A ridge is the lower of its planes on either side, a valley the higher.
         parted = parted if np.mean(parted == first) > 0.5 else ~parted
@@ -476,18 +476,18 @@ def _sides(off: Float[np.ndarray, "n 3"], settings: StripSettings) -> Int[np.nda
             break
         first = parted
     spread = 1.4826 * float(np.median(np.abs(residual)))
-    own = (np.abs(beyond) > _NEAR * settings.cell_m) & (np.abs(residual) <= _OTHER * spread)
-    return np.where(own, np.where(first, 0, 1), -1)
+    clear = (np.abs(beyond) > _NEAR * settings.cell_m) & (np.abs(residual) <= _OTHER * spread)
+    return np.where(clear, np.where(first, 0, 1), -1)
 
 
 def _enough(first: np.ndarray, settings: StripSettings) -> bool:
     return settings.returns <= int(first.sum()) <= len(first) - settings.returns
 
 
-def _fitted(off: Float[np.ndarray, "n 3"], first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _fitted(offset: Float[np.ndarray, "n 3"], first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return height at the origin and slopes of the planes of both sides, and the residual of each return."""
-    rows, residual, planes = np.column_stack([np.ones(len(off)), off[:, :2]]), np.empty(len(off)), []
+    rows, residual, planes = np.column_stack([np.ones(len(offset)), offset[:, :2]]), np.empty(len(offset)), []
     for side in (first, ~first):
-        planes.append(np.linalg.lstsq(rows[side], off[side, 2])[0])
-        residual[side] = off[side, 2] - rows[side] @ planes[-1]
+        planes.append(np.linalg.lstsq(rows[side], offset[side, 2])[0])
+        residual[side] = offset[side, 2] - rows[side] @ planes[-1]
     return np.stack(planes), residual

@@ -285,5 +285,5 @@ def _rays_fit(block: Block) -> bool:
         points=np.asarray(start.points),
     )
     rows = np.flatnonzero(np.asarray(block.start.point_known)[sight.point])
-    off = misfits(sight, network, rows) * sight.sigma[rows]
-    return bool(np.isfinite(off).all() and np.quantile(off, 0.9) < _MAX_MISCLOSURE_RAD)
+    misfit = misfits(sight, network, rows) * sight.sigma[rows]
+    return bool(np.isfinite(misfit).all() and np.quantile(misfit, 0.9) < _MAX_MISCLOSURE_RAD)

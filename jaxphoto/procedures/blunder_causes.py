@@ -75,7 +75,7 @@ def is_mirrored(snooped: Snooped, block: Block, image: int) -> bool:
         pose = resect(interior, mirrored, points, block.images[image])
     except BlockError:
         return False
-    off = reprojection_errors(
+    errors = reprojection_errors(
         float(interior.c),
         ideal_coordinates(interior, mirrored),
         points,
@@ -86,7 +86,7 @@ def is_mirrored(snooped: Snooped, block: Block, image: int) -> bool:
     # Mirrored flat ground also fits from below.
     if (others - points.mean(axis=0)) @ (to_numpy(pose.position) - points.mean(axis=0)) <= 0:
         return False
-    return bool(np.median(off) < _FIT * np.median(to_numpy(p.sigma)[rows]))
+    return bool(np.median(errors) < _FIT * np.median(to_numpy(p.sigma)[rows]))
 
 
 def _stated_and_predicted(
@@ -105,10 +105,10 @@ def _stated_and_predicted(
 
 def _explains(stated: np.ndarray, instead: np.ndarray, predicted: np.ndarray) -> bool:
     """Return True if `instead` removes nearly all errors of `given`."""
-    off = np.abs(stated - predicted)
-    wrong = off > 0
+    deviation = np.abs(stated - predicted)
+    wrong = deviation > 0
     left = np.abs(instead - predicted)[wrong]
-    return bool(np.isfinite(left).any() and np.nanmedian(left) < _LEFT * np.nanmedian(off[wrong]))
+    return bool(np.isfinite(left).any() and np.nanmedian(left) < _LEFT * np.nanmedian(deviation[wrong]))
 
 
 def _exchanged_axes(stated: Float[np.ndarray, "who 3"], predicted: Float[np.ndarray, "who 3"]) -> str:

@@ -243,8 +243,8 @@ def _epipolar_distance(rays: _Rays, one: int, other: int) -> float:
         return np.inf
     # Angle between a ray and the plane of the base and the other one, both rays of equal uncertainty.
     plane = np.cross(base, rays.directions[one])
-    off = abs(float(rays.directions[other] @ plane)) / max(float(np.linalg.norm(plane)), 1e-300)
-    return off / float(np.hypot(rays.sigma[one], rays.sigma[other]))
+    distance = abs(float(rays.directions[other] @ plane)) / max(float(np.linalg.norm(plane)), 1e-300)
+    return distance / float(np.hypot(rays.sigma[one], rays.sigma[other]))
 
 
 def _intersect_with(rays: _Rays, row: int, other: int) -> tuple[int, Float[np.ndarray, "3"], list[int]] | None:
@@ -267,9 +267,9 @@ def _intersection(data: _Rays, rays: Int[np.ndarray, "rays"]) -> Float[np.ndarra
     nearest, farthest = data.depths[data.block.image_points.image[rays]].T
     if not np.all((far > nearest) & (far < farthest)):
         return None
-    off = np.linalg.norm(towards - far[:, None] * directions, axis=1) / far / data.sigma[rays]
+    error = np.linalg.norm(towards - far[:, None] * directions, axis=1) / far / data.sigma[rays]
     freedom = 2 * len(rays) - 3
-    return places[0] if float(np.sum(off**2)) <= data.limit * freedom else None
+    return places[0] if float(np.sum(error**2)) <= data.limit * freedom else None
 
 
 def _agrees_with_prediction(
@@ -282,10 +282,10 @@ def _agrees_with_prediction(
         return True
     # Far from the prediction a difference is not a measure: repeat with exchanged names.
     block, _ = exchanged(at.block, {}, Exchange(p.group, (pair,), "", {}))
-    off = (measured_discrepancies(block, at.unknowns) / to_numpy(p.sigma))[staying]
+    discrepancy = (measured_discrepancies(block, at.unknowns) / to_numpy(p.sigma))[staying]
     # Both coordinates of a point are tested; like all others, against all others.
     limit = sigma0**2 * float(chi_square_limit(np.array(2), LEVEL / len(p)))
-    return bool(np.all(np.einsum("ni,nij,nj->n", off, r[p.group][staying], off) < limit))
+    return bool(np.all(np.einsum("ni,nij,nj->n", discrepancy, r[p.group][staying], discrepancy) < limit))
 
 
 # Maximum ratio of the distance from another's coordinates to that from the next nearest.
@@ -320,9 +320,11 @@ def coordinate_exchanges(
         else:
             by_images, placed = _placed_images(at, suspects, gone)
         there = linearise(at.block, by_images.unknowns, at.block.priors, sizes)
-        off = np.where(np.isin(who, placed), rows.physical(to_numpy(there.residuals[group])), np.nan)
+        discrepancy = np.where(np.isin(who, placed), rows.physical(to_numpy(there.residuals[group])), np.nan)
         near = _NEARER if left[group].all() else _NEAR
-        if new := [_exchange(at.block, rows, what, *own) for own in _cycles(rows, who, suspects, off, near)]:
+        if new := [
+            _exchange(at.block, rows, what, *cycle) for cycle in _cycles(rows, who, suspects, discrepancy, near)
+        ]:
             exchanges, at = exchanges + new, by_images
     return exchanges, at
 
@@ -389,10 +391,10 @@ def _exchange(
         stood = [f"{a}'s at {b}" for a, b in zip(names, names[1:] + names[:1], strict=True)]
         stood = stood[: -1 if lacks else None]
         # In the order of the block, except for the closing link.
-        off = int((np.abs(np.diff([*ids, ids[0]])) == 1).sum()) >= len(ids) - 1
+        shifted_by_one = int((np.abs(np.diff([*ids, ids[0]])) == 1).sum()) >= len(ids) - 1
         words = (
             f"{len(ids)} {many} had one another's {has}, {few(stood)}"
-            f"{': the rows are off by one' if off else ''}; or {otherwise}"
+            f"{': the rows are off by one' if shifted_by_one else ''}; or {otherwise}"
         )
     return Exchange(rows.group, cycles, words, back, lacks)
 
@@ -450,7 +452,9 @@ def _intersect_rows(
     return intersect_points(origins[rows], directions[rows], which, len(points))
 
 
-def _cycles(rows: AbstractCoordinates, who, suspects, off: Float[np.ndarray, "rows"], near: float) -> Iterator[tuple]:
+def _cycles(
+    rows: AbstractCoordinates, who, suspects, discrepancy: Float[np.ndarray, "rows"], near: float
+) -> Iterator[tuple]:
     """Return cycles in which each lies where the next is said to be, and their rows, axis by axis.
 
     `off` is observed minus determined (m), NaN if undetermined by the images. The last lies where the first is said to
@@ -459,28 +463,31 @@ def _cycles(rows: AbstractCoordinates, who, suspects, off: Float[np.ndarray, "ro
     """
     rows_of = {int(k): np.flatnonzero(who == k) for k in suspects}
     rows_of = {k: own_rows[np.argsort(rows.axis[own_rows])] for k, own_rows in rows_of.items()}
-    after = _coincidences(rows, rows_of, off, near)
+    after = _coincidences(rows, rows_of, discrepancy, near)
     while after:
         first = next((k for k in after if k not in after.values()), next(iter(after)))
         ids = [first]
         while (following := after.pop(ids[-1], None)) not in (None, first):
             ids.append(following)
         last = rows_of[ids[-1]]
-        closed, unseen = following == first, not np.isfinite(off[last]).all()
+        closed, unseen = following == first, not np.isfinite(discrepancy[last]).all()
         if closed or len(ids) > 2 or len(last) > 1:
             lacks = () if closed or unseen else tuple(last.tolist())
             yield tuple(ids), tuple(zip(*(rows_of[k].tolist() for k in ids), strict=True)), lacks
 
 
 def _coincidences(
-    rows: AbstractCoordinates, rows_of: dict[int, Int[np.ndarray, "axes"]], off: Float[np.ndarray, "rows"], near: float
+    rows: AbstractCoordinates,
+    rows_of: dict[int, Int[np.ndarray, "axes"]],
+    discrepancy: Float[np.ndarray, "rows"],
+    near: float,
 ) -> dict[int, int]:
     """Return the pairs of positions and stated coordinates that coincide."""
     pairs: list[tuple[float, int, int]] = []
     for axes in {tuple(rows.axis[own_rows].tolist()) for own_rows in rows_of.values()}:
         ids = [k for k, own_rows in rows_of.items() if tuple(rows.axis[own_rows].tolist()) == axes]
         stated = np.array([np.asarray(rows.value)[rows_of[k]] for k in ids])
-        determined = stated - np.array([off[rows_of[k]] for k in ids])
+        determined = stated - np.array([discrepancy[rows_of[k]] for k in ids])
         usable = np.flatnonzero(np.isfinite(determined).all(axis=1))
         for k in usable.tolist() if len(ids) > 1 else ():
             miss = np.abs(stated - determined[k]).max(axis=1)

@@ -156,11 +156,11 @@ def with_observed_scatter(
     positions are too few, or their scatter is not smaller.
     """
     names = [name for name, used in zip(placed.images, placed.used, strict=True) if used]
-    off, n = placed.offsets_m[placed.used], len(names)
+    offset, n = placed.offsets_m[placed.used], len(names)
     if n < _SCATTER or any((gps := positions[name]) and gps.stated_sigma_m for name in names):
         return None
-    plan = max(float(np.sqrt(np.sum(off[:, :2] ** 2) / (2 * n - 4))), _FINEST_M)
-    height = max(float(np.sqrt(np.sum(off[:, 2] ** 2) / (n - 3))), _FINEST_M)
+    plan = max(float(np.sqrt(np.sum(offset[:, :2] ** 2) / (2 * n - 4))), _FINEST_M)
+    height = max(float(np.sqrt(np.sum(offset[:, 2] ** 2) / (n - 3))), _FINEST_M)
     if plan >= SIGMA_M[0] or height >= SIGMA_M[2]:
         return None
     stations = placed.block.stations
@@ -279,9 +279,9 @@ def utm_of(longitude_deg: float, latitude_deg: float) -> int:
 
 def _inliers(offsets: Float[np.ndarray, "n 3"], sigmas: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
     """Mark offsets no larger than most, or within their own standard deviations (zero: unknown)."""
-    off = np.linalg.norm(offsets, axis=1)
+    distance = np.linalg.norm(offsets, axis=1)
     allowed = np.linalg.norm(offsets / np.maximum(sigmas, 1e-9), axis=1) <= _BEYOND_OWN
-    return (off <= max(_BEYOND * float(np.median(off)), 1e-9)) | allowed
+    return (distance <= max(_BEYOND * float(np.median(distance)), 1e-9)) | allowed
 
 
 def _fit_by_positions(
@@ -439,8 +439,8 @@ def position_messages(
             f"the heights of {high.sum()} photographs ({few(names[high].tolist())}) all differ by "
             f"{np.median(offsets[high, 2]):+.0f} m from the others: another height datum, such as take-off; rejected"
         )
-    for name, off in zip(names[~used & ~high], offsets[~used & ~high], strict=True):
-        components = ", ".join(f"{v:z.1f}" for v in off)
+    for name, offset in zip(names[~used & ~high], offsets[~used & ~high], strict=True):
+        components = ", ".join(f"{v:z.1f}" for v in offset)
         yield f"the position of {name} differs by {components} m (east, north, up) from the others: rejected"
 
 

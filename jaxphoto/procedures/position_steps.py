@@ -135,9 +135,9 @@ def _isolated(offsets: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
     """Mark offsets far from the median of their neighbours."""
     n = len(offsets)
     about = np.stack([np.clip(np.arange(n) + k, 0, n - 1) for k in range(-_LEAST, _LEAST + 1)])
-    off = offsets - np.median(offsets[about], axis=0)
-    scale = np.maximum(_MAD * np.median(np.abs(off), axis=0), 1e-9)
-    return (np.abs(off) > _ISOLATED * scale).any(axis=1)
+    deviation = offsets - np.median(offsets[about], axis=0)
+    scale = np.maximum(_MAD * np.median(np.abs(deviation), axis=0), 1e-9)
+    return (np.abs(deviation) > _ISOLATED * scale).any(axis=1)
 
 
 class PositionParts(NamedTuple):

@@ -105,16 +105,16 @@ def _rotation_of(
     image = np.array([k for k, _, _ in usable])
     rotations = attitude @ np.asarray(block.start.unknowns.exterior.camera_from_object, float)[image]
     sigma = np.deg2rad([a.sigma_deg for _, _, a in usable])
-    inlier, off = np.ones(len(rotations), bool), np.zeros(len(rotations))
+    inlier, deviation = np.ones(len(rotations), bool), np.zeros(len(rotations))
     # The attitude nearest to most, then the average of those near it.
     some = rotations[_subset(len(rotations))]
     apart = _angles(np.einsum("nji,mjk->nmik", some, some))
     turn = some[np.argmin(np.median(apart, axis=1))]
     for _ in range(5):
-        off = _angles(rotations @ turn.T)
-        inlier = off <= max(_BEYOND * float(np.median(off)), np.deg2rad(_LEAST_DEG))
+        deviation = _angles(rotations @ turn.T)
+        inlier = deviation <= max(_BEYOND * float(np.median(deviation)), np.deg2rad(_LEAST_DEG))
         turn, _ = average_rotation(rotations[inlier])
-    apart_deg = np.rad2deg(np.median(off))
+    apart_deg = np.rad2deg(np.median(deviation))
     if apart_deg > _CONTRADICT_DEG:
         return f"the attitudes of the files contradict the photographs by {apart_deg:.0f} degrees: not used"
     scatter = float(np.sqrt(np.mean(_angles(rotations[inlier] @ turn.T) ** 2)))

@@ -89,8 +89,8 @@ def robust(
     if unknown := [name for name in losses if name not in rows]:
         raise BlockError(f"the block has no observations {unknown[0]}, only {', '.join(rows)}")
     unknowns = start_of(block, report) if start is None else start
-    left = {name: np.zeros(len(own), bool) for name, own in rows.items()}
-    estimated: dict[str, AbstractLoss] = {name: dataclasses.replace(own, scale=_WIDE) for name, own in losses.items()}
+    left = {name: np.zeros(len(group), bool) for name, group in rows.items()}
+    estimated: dict[str, AbstractLoss] = {name: dataclasses.replace(loss, scale=_WIDE) for name, loss in losses.items()}
     r: RedundancyBlocks = {}
     at: Adjustment | None = None
     converged = False
@@ -106,10 +106,10 @@ def robust(
             break
         estimated = new
     assert at is not None
-    weights = {name: np.ones(len(own)) for name, own in rows.items()}
-    for name, own in estimated.items():
+    weights = {name: np.ones(len(group)) for name, group in rows.items()}
+    for name, each in estimated.items():
         v = np.atleast_2d(at.residuals[name])
-        weights[name] = own.weights(np.sum(v**2, axis=0), len(v))
+        weights[name] = each.weights(np.sum(v**2, axis=0), len(v))
     return Robust(unknowns, converged, estimated, weights, at, left)
 
 
@@ -238,7 +238,7 @@ def initial_solutions(
         yield lambda: robustly(loss)
         return
     rows = block.named_observations
-    coordinates = [name for name, own in rows.items() if isinstance(own, AbstractCoordinates)]
+    coordinates = [name for name, group in rows.items() if isinstance(group, AbstractCoordinates)]
     yield lambda: _huber_solution(block, from_all(), max_steps, sizes, report, {})
     yield lambda: robustly(Tukey())
     yield lambda: _huber_solution(block, from_all(), max_steps, sizes, report, dict.fromkeys(coordinates, _LOOSE))
@@ -277,9 +277,9 @@ def _without(
     """Adjust the block without some rows."""
     none = {name: out.get(name, np.zeros(len(rows), bool)) for name, rows in block.named_observations.items()}
     start = start_of(without_observations(block, none)[0], report) if start is None else start
-    least = {name: np.where(own, _NOTHING, 1.0) for name, own in out.items()}
+    least = {name: np.where(rejected, _NOTHING, 1.0) for name, rejected in out.items()}
     begun = _huber_solution(block, start, max_steps, sizes, report, least)
-    return begun._replace(left=begun.left | {name: begun.left[name] | own for name, own in out.items()})
+    return begun._replace(left=begun.left | {name: begun.left[name] | rejected for name, rejected in out.items()})
 
 
 def _huber_solution(
@@ -292,14 +292,14 @@ def _huber_solution(
 ) -> InitialSolution:
     """Adjust with weights that decrease with the residual, from `least` on by group, or from 1."""
     rows, unknowns = block.named_observations, start
-    weight = {name: np.broadcast_to(least.get(name, 1.0), len(own)) for name, own in rows.items()}
+    weight = {name: np.broadcast_to(least.get(name, 1.0), len(group)) for name, group in rows.items()}
     least = weight
-    left = {name: np.zeros(len(own), bool) for name, own in rows.items()}
+    left = {name: np.zeros(len(group), bool) for name, group in rows.items()}
     at: Adjustment | None = None
     r: RedundancyBlocks = {}
     for step in range(_ROBUST_STEPS + 1):
         report(f"robust step {step}" if step else "adjusting all observations")
-        lighter = block.with_observations({name: scale_weights(own, weight[name]) for name, own in rows.items()})
+        lighter = block.with_observations({name: scale_weights(group, weight[name]) for name, group in rows.items()})
         adjusted, point, left = solve_without_diverged(lighter, left, unknowns, max_steps, sizes)
         unknowns = restore_points(adjusted.unknowns, unknowns, point)
         at = linearise(block, unknowns, block.priors, sizes)

@@ -336,8 +336,8 @@ def _suspects(
         words = rows.words_of(worst, out, block.images, block.points)
         for row, k, word in zip(out.tolist(), worst.tolist(), words, strict=True):
             sigma_error = sigma0 * float(sigma[k, row] / root[k, row])
-            off = float(error[k, row])
-            suspects.append(Suspect(name, row, k, word, off / sigma_error, off, sigma_error, rows.unit))
+            discrepancy = float(error[k, row])
+            suspects.append(Suspect(name, row, k, word, discrepancy / sigma_error, discrepancy, sigma_error, rows.unit))
     return tuple(sorted(suspects, key=lambda out: -abs(out.w)))
 
 
@@ -354,10 +354,10 @@ def blunder_statistics(
     of two rays is checked across their epipolar plane, not along it. A prediction hardly checks what is hardly
     determined, but rounding does not enter.
     """
-    axes = {name: np.linalg.eigh(own) for name, own in r.items()}
+    axes = {name: np.linalg.eigh(matrix) for name, matrix in r.items()}
     least = UNCHECKED if predicted else LEAST_CHECKED
     checked = {name: values > least for name, (values, _) in axes.items()}
-    n = sum(int(own.any(axis=1).sum()) for own in checked.values())
+    n = sum(int(matrix.any(axis=1).sum()) for matrix in checked.values())
     statistics = {}
     for name, (values, vectors) in axes.items():
         along = np.einsum("nij,in->nj", vectors, np.atleast_2d(at.residuals[name])) ** 2
@@ -371,7 +371,7 @@ def blunder_statistics(
 def predicted_redundancy(at: Adjustment, left: RowMasks, sizes: PaddedSizes) -> RedundancyBlocks:
     """Return `redundancy_blocks`, of rejected rows as if each was added to the others, which then predict it."""
     rows = at.block.named_observations
-    weak = {name: scale_weights(own, np.where(left[name], _WEAK**-2, 1.0)) for name, own in rows.items()}
+    weak = {name: scale_weights(group, np.where(left[name], _WEAK**-2, 1.0)) for name, group in rows.items()}
     r = redundancy_blocks(linearise(at.block.with_observations(weak), at.unknowns, at.block.priors, sizes))
     for name, out in left.items():
         if out.any():

@@ -39,27 +39,27 @@ def draw_changes(recipe: Recipe, flight: Flight, clock: Float[np.ndarray, "image
         cameras = changes[StripCamera.kind]
         for name, more in zip(strips, walked, strict=True):
             if name in cameras:
-                own = cameras[name]
-                moved = {f: np.asarray(getattr(own.truth, f)) + v for f, v in zip(_WALKING, more, strict=True)}
-                cameras[name] = dataclasses.replace(own, truth=dataclasses.replace(own.truth, **moved))
+                change = cameras[name]
+                moved = {f: np.asarray(getattr(change.truth, f)) + v for f, v in zip(_WALKING, more, strict=True)}
+                cameras[name] = dataclasses.replace(change, truth=dataclasses.replace(change.truth, **moved))
     return changes
 
 
 def draw_deviations(owners: Mapping[str, SimulatedChange], seed: int) -> dict[str, SimulatedChange]:
     """Return the changes with the deviations of each owner in their truth."""
-    found = {}
-    for name, own in owners.items():
-        rng, moved = stream(seed, f"{type(own.truth).kind} of {name}"), {}
-        for field in dynamic_fields(type(own.truth)):
-            value, prior = np.asarray(getattr(own.truth, field)), getattr(own.spread, field)
+    result = {}
+    for name, change in owners.items():
+        rng, moved = stream(seed, f"{type(change.truth).kind} of {name}"), {}
+        for field in dynamic_fields(type(change.truth)):
+            value, prior = np.asarray(getattr(change.truth, field)), getattr(change.spread, field)
             # Every field draws, so that no other's deviation depends on it.
             z = rng.standard_normal(value.shape)
             if isinstance(prior, Weighted):
                 joint = prior.covariance
-                off = prior.sigma * z if joint is None else np.linalg.cholesky(np.asarray(joint)) @ z
-                moved[field] = value + off
-        found[name] = dataclasses.replace(own, truth=dataclasses.replace(own.truth, **moved))
-    return found
+                deviation = prior.sigma * z if joint is None else np.linalg.cholesky(np.asarray(joint)) @ z
+                moved[field] = value + deviation
+        result[name] = dataclasses.replace(change, truth=dataclasses.replace(change.truth, **moved))
+    return result
 
 
 def camera_steps(
@@ -68,9 +68,9 @@ def camera_steps(
     """Return the block's random walk constraints between successive strips whose camera it models."""
     if recipe.walk is None or recipe.walk.stated is None:
         return ()
-    known = list(start.more.get(StripCamera.kind, {}))
-    hours = [hour for strip, hour in zip(*_strip_hours(flight, clock), strict=True) if strip in known]
-    n = len(known) - 1
+    modelled = list(start.more.get(StripCamera.kind, {}))
+    hours = [hour for strip, hour in zip(*_strip_hours(flight, clock), strict=True) if strip in modelled]
+    n = len(modelled) - 1
     sigma = np.sqrt(np.diff(hours))[:, None] * triple(recipe.walk.stated)
     return (StripCameraSteps(np.arange(n), np.arange(n) + 1, np.zeros((n, 3)), sigma),) if n > 0 else ()
 
@@ -103,28 +103,28 @@ def reproject_changing(
     it.
     """
     xy, own_of = rays.xy.copy(), [_of_images(owners, flight) for owners in changes.values()]
-    changing = np.any([found for found, _ in own_of], axis=0) if own_of else np.zeros(len(flight.images), bool)
+    changing = np.any([mask for mask, _ in own_of], axis=0) if own_of else np.zeros(len(flight.images), bool)
     cameras = np.array(flight.cameras)
     for name, camera in recipe.cameras.items():
         shutter = recipe.shutters.get(name)
-        own = np.flatnonzero(((cameras == name) & (changing | (shutter is not None)))[rays.image])
-        if not len(own):
+        rows_of = np.flatnonzero(((cameras == name) & (changing | (shutter is not None)))[rays.image])
+        if not len(rows_of):
             continue
-        image = rays.image[own]
+        image = rays.image[rows_of]
         readout_s = 1e-3 * float(shutter.truth.readout) if shutter else 0.0
         place = (flight.exterior.position, flight.exterior.camera_from_object)
         truth = jax.tree.map(np.float64, camera.truth)
         bending = [jax.tree.map(lambda v: v[image], stacked) for _, stacked in own_of]  # noqa: B023
-        xy[own] = in_chunks(
+        xy[rows_of] = in_chunks(
             lambda *rows: _seen(truth, *rows),  # noqa: B023
             _CHUNK,
             bending,
-            np.full(len(own), readout_s / recipe.sensors[name].height_mm),
+            np.full(len(rows_of), readout_s / recipe.sensors[name].height_mm),
             motions[image],
             when.time[image],
             when.above[image],
             *(np.asarray(v)[image] for v in place),
-            points[rays.point[own]],
+            points[rays.point[rows_of]],
         )
     return rays._replace(xy=xy)
 
@@ -143,8 +143,8 @@ def _seen(interior, bending, time_per_mm, motion, in_flight, above, position, ca
     def one(bending, time_per_mm, motion, in_flight, above, position, camera_from_object, point):
         # Changes of a camera depend on nothing else of an exposure.
         exposure, changed = Exposure(in_flight, motion[:3], motion[3:], temperature=above), interior
-        for own in bending:
-            changed = own.interior(changed, exposure)
+        for change in bending:
+            changed = change.interior(changed, exposure)
         moving = dataclasses.replace(changed, rows=RowMotion(time_per_mm, *motion))
         return project(moving, ExteriorOrientation(position, camera_from_object), point)
 
@@ -157,13 +157,15 @@ def with_changes(
     """Return start, priors and truth with the changes; the truth includes those that the block does not model."""
 
     def more(unknowns: Unknowns, own_of: Mapping[str, dict[str, AbstractParameters]]) -> Unknowns:
-        return dataclasses.replace(unknowns, more=unknowns.more | {kind: own for kind, own in own_of.items() if own})
+        return dataclasses.replace(unknowns, more=unknowns.more | {kind: of for kind, of in own_of.items() if of})
 
-    known = {kind: {n: own.model for n, own in owners.items() if own.model} for kind, owners in changes.items()}
+    modelled = {
+        kind: {n: change.model for n, change in owners.items() if change.model} for kind, owners in changes.items()
+    }
     return (
-        more(start, {kind: {n: model[0] for n, model in owners.items()} for kind, owners in known.items()}),
-        more(priors, {kind: {n: model[1] for n, model in owners.items()} for kind, owners in known.items()}),
-        more(truth, {kind: {n: own.truth for n, own in owners.items()} for kind, owners in changes.items()}),
+        more(start, {kind: {n: model[0] for n, model in owners.items()} for kind, owners in modelled.items()}),
+        more(priors, {kind: {n: model[1] for n, model in owners.items()} for kind, owners in modelled.items()}),
+        more(truth, {kind: {n: change.truth for n, change in owners.items()} for kind, owners in changes.items()}),
     )
 
 
@@ -188,28 +190,28 @@ def with_shutters(
     if not recipe.shutters:
         return start, priors, truth
     of = [recipe.shutters.get(camera) for camera in flight.cameras]
-    true = {name: _motion(m) for name, m, own in zip(flight.images, motions, of, strict=True) if own}
+    true = {name: _motion(m) for name, m, shutter in zip(flight.images, motions, of, strict=True) if shutter}
     error = stream(seed, "noise of motions").standard_normal(motions.shape)
-    told, known = {}, {}
-    for name, m, e, own in zip(flight.images, motions, error, of, strict=True):
-        if own is None or own.model is None:
+    stated, prior = {}, {}
+    for name, m, e, shutter in zip(flight.images, motions, error, of, strict=True):
+        if shutter is None or shutter.model is None:
             continue
-        sigma = np.repeat([own.velocity_m_per_s, np.deg2rad(own.rate_deg_per_s)], 3)
-        told[name] = _motion(m + sigma * e)
-        known[name] = ImageMotion(
-            Weighted(told[name].velocity, sigma[:3]) if own.velocity_m_per_s else FIXED,  # type: ignore[arg-type]
-            Weighted(told[name].rate, sigma[3:]) if own.rate_deg_per_s else FIXED,  # type: ignore[arg-type]
+        sigma = np.repeat([shutter.velocity_m_per_s, np.deg2rad(shutter.rate_deg_per_s)], 3)
+        stated[name] = _motion(m + sigma * e)
+        prior[name] = ImageMotion(
+            Weighted(stated[name].velocity, sigma[:3]) if shutter.velocity_m_per_s else FIXED,  # type: ignore[arg-type]
+            Weighted(stated[name].rate, sigma[3:]) if shutter.rate_deg_per_s else FIXED,  # type: ignore[arg-type]
         )
-    models = {name: own.model for name, own in recipe.shutters.items() if own.model}
+    models = {name: shutter.model for name, shutter in recipe.shutters.items() if shutter.model}
     kinds = RollingShutter.kind, ImageMotion.kind
 
     def more(shutters: dict, images: dict) -> dict:
         return dict(zip(kinds, (shutters, images), strict=True)) if shutters else {}
 
     return (
-        dataclasses.replace(start, more=more({name: model[0] for name, model in models.items()}, told)),
-        dataclasses.replace(priors, more=more({name: model[1] for name, model in models.items()}, known)),
-        dataclasses.replace(truth, more=more({name: own.truth for name, own in recipe.shutters.items()}, true)),
+        dataclasses.replace(start, more=more({name: model[0] for name, model in models.items()}, stated)),
+        dataclasses.replace(priors, more=more({name: model[1] for name, model in models.items()}, prior)),
+        dataclasses.replace(truth, more=more({name: shutter.truth for name, shutter in recipe.shutters.items()}, true)),
     )
 
 

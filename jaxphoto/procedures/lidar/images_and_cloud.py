@@ -174,10 +174,10 @@ def simultaneous(
             raise no_surface_error(np.asarray(adjusted.unknowns.points)[which], cloud.xyz, flag)
         return SurfaceAtPoints(np.tile(which, len(names)), foot, normal, sigma, usable)
 
-    def build(adjusted: Adjustment, cov: Covariance, seen: SurfaceAtPoints, used: np.ndarray) -> Block:
+    def build(adjusted: Adjustment, cov: Covariance, surface: SurfaceAtPoints, used: np.ndarray) -> Block:
         scanner = adjusted.unknowns.scanner or none
-        last["turn"] = _turns(seen, strip, [poses for _, poses in last["planes"]])
-        rows = _surface_rows(seen, used, strip, last["turn"], scanner)
+        last["turn"] = _turns(surface, strip, [poses for _, poses in last["planes"]])
+        rows = _surface_rows(surface, used, strip, last["turn"], scanner)
         unknowns = dataclasses.replace(adjusted.unknowns, scanner=scanner)
         posed = dataclasses.replace(block, surfaces=rows, priors=dataclasses.replace(block.priors, scanner=priors))
         return at_result(posed, unknowns)
@@ -238,9 +238,9 @@ def _near(
     order = np.asarray(strip.grid.order)
     # Places in the measured cloud: displaced like the laser points there.
     one = order[nearest(strip.grid, xy, 1).index[:, 0]]
-    off = strip.cloud.xyz[one, :2] - corrected(one)[0].xyz[:, :2]
+    offset = strip.cloud.xyz[one, :2] - corrected(one)[0].xyz[:, :2]
     enough = min(max(_NEAR, _TIMES * settings.points), len(strip.cloud))
-    return corrected(np.unique(order[nearest(strip.grid, xy + off, enough).index]))
+    return corrected(np.unique(order[nearest(strip.grid, xy + offset, enough).index]))
 
 
 def _turns(

@@ -205,12 +205,12 @@ def _check_heights(first: Adjustment, surface: SurfaceAtPoints) -> None:
     """Raise BlockError if the distance of the cloud from the points exceeds any error of the principal distance."""
     apart = surface.apart(first)[surface.usable]
     camera = float(np.mean(np.asarray(first.unknowns.exterior.position)[:, 2]))
-    off, height = (float(np.median(v)) for v in (apart, camera - surface.foot[surface.usable, 2]))
-    if abs(off) > _FAR * abs(height):
+    offset, height = (float(np.median(v)) for v in (apart, camera - surface.foot[surface.usable, 2]))
+    if abs(offset) > _FAR * abs(height):
         raise BlockError(
-            f"the cloud lies {abs(off):.0f} m {'below' if off > 0 else 'above'} where the block puts its points, with "
-            f"the cameras {height:.0f} m over the cloud: its heights may count in feet or belong to another vertical "
-            "system, or the principal distance that the block begins with is wrong"
+            f"the cloud lies {abs(offset):.0f} m {'below' if offset > 0 else 'above'} where the block puts its points, "
+            f"with the cameras {height:.0f} m over the cloud: its heights may count in feet or belong to another "
+            "vertical system, or the principal distance that the block begins with is wrong"
         )
 
 

@@ -82,8 +82,8 @@ def check_photographs(photographs: Photographs, trajectory: Trajectory | None) -
         )
     rows = block.stations
     at = scanner_poses(scanner_path(trajectory), time[rows.who]).position
-    off = np.asarray(rows.value) - at[np.arange(len(rows)), rows.axis]
-    apart = float(np.median(np.sqrt(np.bincount(rows.who, off**2)[np.unique(rows.who)])))
+    offset = np.asarray(rows.value) - at[np.arange(len(rows)), rows.axis]
+    apart = float(np.median(np.sqrt(np.bincount(rows.who, offset**2)[np.unique(rows.who)])))
     if apart > _FAR_M:
         raise BlockError(
             f"the stations of the block lie {apart:.0f} m from where the trajectory is at their times: bring "

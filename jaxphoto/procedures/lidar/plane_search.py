@@ -64,9 +64,9 @@ class StripSearch:
     def look(self, errors: StripErrors, settled: bool) -> list[CommonPlanes]:
         """Return the planes of every pair of strips; for a strip with two looks, those of both."""
         patches, cells, corrected = [], [], []
-        for k, own in enumerate(self.looks):
-            measured, time = self.cloud.xyz[own.returns], times_of(self.cloud)[own.returns]
-            xyz = corrected_strip(measured, time, own.strip, errors, self.path)
+        for k, strip_look in enumerate(self.looks):
+            measured, time = self.cloud.xyz[strip_look.returns], times_of(self.cloud)[strip_look.returns]
+            xyz = corrected_strip(measured, time, strip_look.strip, errors, self.path)
             corrected.append(xyz)
             cells.append(self.cells[k] if settled else cells_of(xyz, self.settings))
             patches.append(planes_of(xyz, measured, time, cells[-1], self.settings))
@@ -78,8 +78,8 @@ class StripSearch:
     def corrected_cloud(self) -> Cloud:
         """Return the cloud as corrected in the last search; all its other fields are kept."""
         xyz = np.empty_like(self.cloud.xyz)
-        for own, corrected in zip(self.looks, self.corrected, strict=True):
-            xyz[own.returns] = corrected
+        for look, corrected in zip(self.looks, self.corrected, strict=True):
+            xyz[look.returns] = corrected
         return dataclasses.replace(self.cloud, xyz=xyz)
 
     def _common(self, one: int, other: int, patches: list[StripPatches]) -> CommonPlanes | None:
@@ -89,14 +89,14 @@ class StripSearch:
         fits = fitting(pairs.gap, pairs.sigma, self.settings.outlier)
         return CommonPlanes(self.looks[one], self.looks[other], (patches[one], patches[other]), pairs, fits)
 
-    def rows(self, seen: Sequence[CommonPlanes], errors: StripErrors) -> StripPlanes:
+    def rows(self, planes: Sequence[CommonPlanes], errors: StripErrors) -> StripPlanes:
         """Return the fitting planes as observations, at most `most`, distributed over the pairs of strips."""
-        total, parts = sum(int(f.fits.sum()) for f in seen), []
-        for f in seen:
-            own = np.flatnonzero(f.fits)
-            share = max(_FEWEST, self.settings.most * len(own) // total)
-            own = own[thinned(f.pairs.normal[own], f.pairs.cell[own], share)]
-            pairs = PlanePairs(*(v[own] for v in f.pairs))
+        total, parts = sum(int(f.fits.sum()) for f in planes), []
+        for f in planes:
+            chosen = np.flatnonzero(f.fits)
+            share = max(_FEWEST, self.settings.most * len(chosen) // total)
+            chosen = chosen[thinned(f.pairs.normal[chosen], f.pairs.cell[chosen], share)]
+            pairs = PlanePairs(*(v[chosen] for v in f.pairs))
             a = side_of(f.patches[0], pairs.a, pairs.foot_a, f.one.strip, errors, self.path)
             b = side_of(f.patches[1], pairs.b, pairs.foot_b, f.other.strip, errors, self.path)
             parts.append(plane_rows(pairs, a, b))
@@ -159,16 +159,18 @@ class PointSearch:
         search.
         """
         search, about, seen = self.search, [], []
-        for k, (own, xyz) in enumerate(zip(search.looks, search.corrected, strict=True)):
+        for k, (strip_look, xyz) in enumerate(zip(search.looks, search.corrected, strict=True)):
             about.append(self.about[k] if settled else self._about(xyz, place))
             index, point = about[-1]
-            measured, time = search.cloud.xyz[own.returns], times_of(search.cloud)[own.returns]
+            measured, time = search.cloud.xyz[strip_look.returns], times_of(search.cloud)[strip_look.returns]
             patches = planes_of(xyz[index], measured[index], time[index], point, search.settings)
             found = on_planes(patches, place)
             found = found._replace(sigma=found.sigma * np.sqrt(windows_of_returns(index, point)[found.point]))
             of_points = np.einsum("ni,nij,nj->n", patches.normal, spread[found.point], patches.normal)
             sigma = np.sqrt(found.sigma**2 + of_points)
-            seen.append(PointPlanes(own, patches, found, sigma, fitting(found.gap, sigma, search.settings.outlier)))
+            seen.append(
+                PointPlanes(strip_look, patches, found, sigma, fitting(found.gap, sigma, search.settings.outlier))
+            )
         self.about = about
         return seen
 
@@ -178,10 +180,10 @@ class PointSearch:
         of_faces, face = faces_about(xyz, place[self._plain :: 2], self.search.settings)
         return np.concatenate([index, of_faces]), np.concatenate([point, self._plain + face])
 
-    def unseen(self, seen: Sequence[PointPlanes], names: Sequence[str]) -> list[str]:
+    def unseen(self, planes: Sequence[PointPlanes], names: Sequence[str]) -> list[str]:
         """Return a message if points on breaklines have no faces in any strip; `names` are those of the block."""
         lines = self.points[self._plain :: 2]
-        number = np.concatenate([f.found.point[f.found.point >= self._plain] for f in seen])
+        number = np.concatenate([f.found.point[f.found.point >= self._plain] for f in planes])
         out = np.setdiff1d(np.arange(len(lines)), (number - self._plain) // 2)
         if not len(out):
             return []
@@ -191,10 +193,10 @@ class PointSearch:
             "the roofs, or leave these points out"
         ]
 
-    def rows(self, seen: Sequence[PointPlanes], errors: StripErrors) -> tuple[StripPoints, ...]:
+    def rows(self, planes: Sequence[PointPlanes], errors: StripErrors) -> tuple[StripPoints, ...]:
         """Return the fitting points as observations: one group, if there are any."""
         of_strips = []
-        for f in (f for f in seen if f.fits.any()):
+        for f in (f for f in planes if f.fits.any()):
             found = PointsOnPlanes(*(v[f.fits] for v in f.found))
             side = side_of(f.patches, found.patch, found.foot, f.look.strip, errors, self.search.path)
             normal = f.patches.normal[found.patch]

@@ -103,21 +103,26 @@ def roof_control(
             )
         foot, normal, sigma = np.full((len(which), 3), np.nan), np.full((len(which), 3), np.nan), np.ones(len(which))
         for k in np.unique(chosen[chosen >= 0]):
-            own = chosen == k
-            foot[own], normal[own], of_plane = plane_feet(patches[k].plane, xyz[own])
+            members = chosen == k
+            foot[members], normal[members], of_plane = plane_feet(patches[k].plane, xyz[members])
             # The error of a plane is common to its points.
-            sigma[own] = of_plane * np.sqrt(own.sum())
+            sigma[members] = of_plane * np.sqrt(members.sum())
         # A yard between wings of a house lies within the outline of its roof, too.
-        off = np.einsum("nk,nk->n", normal, xyz - foot)
-        chosen[~(np.abs(off) < _STOREY)] = -1
+        distance = np.einsum("nk,nk->n", normal, xyz - foot)
+        chosen[~(np.abs(distance) < _STOREY)] = -1
         return SurfaceAtPoints(which, foot, normal, sigma, chosen >= 0)
 
-    def build(adjusted: Adjustment, known: Covariance, seen: SurfaceAtPoints, used: Bool[np.ndarray, "rows"]) -> Block:
-        n, own = int(used.sum()), np.concatenate([which[used], middles])
-        others = of_heights.take(~np.isin(of_heights.who, own))
+    def build(adjusted: Adjustment, cov: Covariance, surface: SurfaceAtPoints, used: Bool[np.ndarray, "rows"]) -> Block:
+        n, observed = int(used.sum()), np.concatenate([which[used], middles])
+        others = of_heights.take(~np.isin(of_heights.who, observed))
         held = dataclasses.replace(block, control=ControlCoordinates.joined(block.control, centres, others))
         rows = SurfaceRows(
-            which[used], np.zeros(n, int), seen.foot[used], seen.normal[used], np.zeros((n, 3)), seen.sigma[used]
+            which[used],
+            np.zeros(n, int),
+            surface.foot[used],
+            surface.normal[used],
+            np.zeros((n, 3)),
+            surface.sigma[used],
         )
         return at_result(dataclasses.replace(held, surfaces=rows), adjusted.unknowns)
 

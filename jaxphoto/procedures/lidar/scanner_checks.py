@@ -63,10 +63,10 @@ def check_measured_from(cloud: Cloud, path: ScannerPath, pattern: Pattern | None
             "was: bring cloud and trajectory into one coordinate system, in metres, and onto one clock"
         )
     _check_leap_seconds(cloud, path)
-    odd = [*_odd_yaw(path.trajectory), *_jumps(path.trajectory)]
+    messages = [*_odd_yaw(path.trajectory), *_jumps(path.trajectory)]
     positions = _positions_in_body(cloud, path)
     if positions is None:
-        return odd
+        return messages
     moves = np.subtract(*np.quantile(positions.middle, (0.9, 0.1), axis=0)) / 2
     looks = np.median(positions.middle, axis=0)
     if max(moves) > _WANDERS * max(positions.half_width) or max(np.abs(looks)) > _ASIDE:
@@ -84,7 +84,7 @@ def check_measured_from(cloud: Cloud, path: ScannerPath, pattern: Pattern | None
         )
     if pattern is not None:
         _check_pattern(positions, pattern)
-    return odd
+    return messages
 
 
 def _distant_strips(cloud: Cloud, path: ScannerPath, most: float) -> list[str]:
@@ -92,9 +92,9 @@ def _distant_strips(cloud: Cloud, path: ScannerPath, most: float) -> list[str]:
     some = _probed(cloud)
     if cloud.strip is None:
         return []
-    off, strip = aside(cloud, some, path), cloud.strip[some]
+    distance, strip = aside(cloud, some, path), cloud.strip[some]
     numbers = np.flatnonzero(np.bincount(strip))
-    far = [k for k in numbers if np.abs(np.median(off[strip == k], axis=0)).max() > most]
+    far = [k for k in numbers if np.abs(np.median(distance[strip == k], axis=0)).max() > most]
     return [] if len(far) == len(numbers) else [cloud.strips[k] for k in far]
 
 
@@ -131,10 +131,10 @@ def _check_leap_seconds(cloud: Cloud, path: ScannerPath) -> None:
     def ahead(shift: float) -> float:
         """Return the median tangent of the angle ahead; infinite if the trajectory covers few of the shifted times."""
         time = times + shift
-        known = np.flatnonzero(covered.covers(time))
-        if len(known) < _SOME / 2:
+        covered_points = np.flatnonzero(covered.covers(time))
+        if len(covered_points) < _SOME / 2:
             return np.inf
-        return float(np.median(np.abs(aside(dataclasses.replace(some, time=time), known, path)[:, 1])))
+        return float(np.median(np.abs(aside(dataclasses.replace(some, time=time), covered_points, path)[:, 1])))
 
     now = ahead(0.0)
     if now < _OBLIQUE:
@@ -164,10 +164,10 @@ def _odd_yaw(trajectory: Trajectory) -> list[str]:
             "the yaw of the trajectory follows its course as radians, not as degrees: convert roll, pitch and yaw to "
             "degrees"
         )
-    off = np.rad2deg(np.median(np.abs(np.arctan2(np.sin(yaw - course), np.cos(yaw - course)))))
+    deviation = np.rad2deg(np.median(np.abs(np.arctan2(np.sin(yaw - course), np.cos(yaw - course)))))
     return [
-        f"the yaw of the trajectory is {off:.0f} degrees off its course in the median, as of an aircraft that flies "
-        "sideways or backwards: boresight and lever arm refer to these axes; correct yaw if it does not"
+        f"the yaw of the trajectory is {deviation:.0f} degrees off its course in the median, as of an aircraft that "
+        "flies sideways or backwards: boresight and lever arm refer to these axes; correct yaw if it does not"
     ]
 
 
@@ -177,16 +177,16 @@ def _jumps(trajectory: Trajectory) -> list[str]:
     between = np.diff(time)[:, None]
     speed = np.diff(position, axis=0) / between
     # Relative to extrapolation from the steps before and after.
-    off = np.linalg.norm((speed[1:-1] - (speed[:-2] + speed[2:]) / 2) * between[1:-1], axis=1)
+    jump = np.linalg.norm((speed[1:-1] - (speed[:-2] + speed[2:]) / 2) * between[1:-1], axis=1)
     # Nothing is expected across a gap, as in the turn between strips.
     gap = between[:, 0] > longest_interval(trajectory)
-    off[gap[1:-1] | gap[:-2] | gap[2:]] = 0.0
-    k = int(np.argmax(off))
-    if off[k] < max(_JUMP_M, _TIMES * float(np.median(off))):
+    jump[gap[1:-1] | gap[:-2] | gap[2:]] = 0.0
+    k = int(np.argmax(jump))
+    if jump[k] < max(_JUMP_M, _TIMES * float(np.median(jump))):
         return []
     return [
-        f"the trajectory jumps by {off[k]:.2g} m at {time[k + 2]:.3f} s from one record to the next, which no aircraft "
-        "does: splines go over it; process the trajectory anew, or leave out the strip that was flown then"
+        f"the trajectory jumps by {jump[k]:.2g} m at {time[k + 2]:.3f} s from one record to the next, which no "
+        "aircraft does: splines go over it; process the trajectory anew, or leave out the strip that was flown then"
     ]
 
 

@@ -162,7 +162,7 @@ def adjust_strips(
     names = _check(cloud, trajectory, fixed, photographs is None and priors.right, control is not None)
     path = None if trajectory is None else scanner_path(trajectory)
     pattern = priors.calibration.pattern
-    odd = [] if path is None else check_measured_from(cloud, path, None if priors.right else pattern)
+    messages = [] if path is None else check_measured_from(cloud, path, None if priors.right else pattern)
     spans, images = _spans(cloud), None
     if photographs is not None:
         check_photographs(photographs, trajectory)
@@ -237,7 +237,7 @@ def adjust_strips(
                 + _point_differences(CHECK, first_on_surveyed.check, on_surveyed.check),
                 tuple(rounds),
                 converged,
-                (*odd, *(() if ties is None else ties.unseen(on_ties, adjusted.block.points))),
+                (*messages, *(() if ties is None else ties.unseen(on_ties, adjusted.block.points))),
                 () if control is None else surveyed_gaps(control, on_surveyed, errors, path, adjusted, cov),
             )
         # For a large flight gigabytes, which the next iteration needs.

@@ -121,8 +121,8 @@ def check_seen(control: SurveyedPoints, surveyed: OnStrips, search: StripSearch)
     settings = search.settings
     if not len(gap):
         low, high = search.cloud.extent
-        off = np.maximum(np.maximum(low - control.coordinates, control.coordinates - high), 0.0)[:, :2]
-        away = float(np.median(np.linalg.norm(off, axis=1)))
+        offset = np.maximum(np.maximum(low - control.coordinates, control.coordinates - high), 0.0)[:, :2]
+        away = float(np.median(np.linalg.norm(offset, axis=1)))
         if away > 0:
             raise BlockError(
                 f"the points of {control.file} lie {_far(away)} from the strips: give them in the cloud's coordinate "
@@ -133,11 +133,11 @@ def check_seen(control: SurveyedPoints, surveyed: OnStrips, search: StripSearch)
             f"{settings.cell_m:g} m, that scatter by {settings.roughness_m:g} m at most: give points on smooth, open "
             "surfaces, or take larger cells (--cell-m) or rougher planes (--roughness-m)"
         )
-    off = float(np.median(gap))
-    if abs(off) > _FAR_M:
+    offset = float(np.median(gap))
+    if abs(offset) > _FAR_M:
         raise BlockError(
-            f"the points of {control.file} lie {abs(off):.1f} m {'above' if off > 0 else 'below'} the strips: its "
-            "heights may count in feet or belong to another vertical system than those of the cloud; bring both into "
+            f"the points of {control.file} lie {abs(offset):.1f} m {'above' if offset > 0 else 'below'} the strips: "
+            "its heights may count in feet or belong to another vertical system than those of the cloud; bring both into "
             "one"
         )
 
@@ -176,13 +176,13 @@ def _remove_common_shift(
 
     It includes the effect of a blunder among few points on the strips.
     """
-    off = gap
+    remaining = gap
     for k in range(_TURNS):
-        weight = 1 / np.sqrt(sigma * (np.maximum(np.abs(off), _SMALL * sigma) if k else sigma))
+        weight = 1 / np.sqrt(sigma * (np.maximum(np.abs(remaining), _SMALL * sigma) if k else sigma))
         # Directions that are hardly determined stay unchanged.
         shift = np.linalg.lstsq(normal * weight[:, None], gap * weight, rcond=_UNTOLD)[0]
-        off = gap - normal @ shift
-    return off
+        remaining = gap - normal @ shift
+    return remaining
 
 
 def _select_planes(planes: PointPlanes, chosen: Bool[np.ndarray, "n"]) -> PointPlanes:
@@ -199,9 +199,9 @@ def _also_in_block(block: Block, control: SurveyedPoints) -> Bool[np.ndarray, "p
         if control.check[k] or name not in place:
             continue
         of_point = who == place[name]
-        off = np.abs(value[of_point] - control.coordinates[k, axis[of_point]])
-        if not of_point.any() or (off > _SAME * control.sigma_m[k, axis[of_point]]).any():
-            how = f"{off.max():.3f} m away" if of_point.any() else "without being control there"
+        difference = np.abs(value[of_point] - control.coordinates[k, axis[of_point]])
+        if not of_point.any() or (difference > _SAME * control.sigma_m[k, axis[of_point]]).any():
+            how = f"{difference.max():.3f} m away" if of_point.any() else "without being control there"
             raise InputError(
                 f"{control.places[k]}: {name} is a point of the block, too, {how}: give it the same coordinates in "
                 "the control of both, or another name"
@@ -264,8 +264,8 @@ def surveyed_gaps(
             variance = f.sigma**2 + np.where(used, -moves, moves)
             sigma = np.sqrt(np.maximum(variance, 0.0))
             w = np.where(sigma > _UNTESTED * f.sigma, f.found.gap / np.maximum(sigma, np.finfo(float).tiny), np.nan)
-            off = f.found.gap[:, None] * f.patches.normal[f.found.patch]
-            rows = zip(f.found.point, off.tolist(), f.found.gap, f.sigma, sigma, w, used, strict=True)
+            offset = f.found.gap[:, None] * f.patches.normal[f.found.patch]
+            rows = zip(f.found.point, offset.tolist(), f.found.gap, f.sigma, sigma, w, used, strict=True)
             for p, (dx, dy, dz), *numbers, within in rows:
                 gap, noise, sigma_of_gap, test = map(float, numbers)
                 name, strip = control.ids[p], f.look.name
@@ -278,10 +278,10 @@ def _variance_of_foot(
 ) -> Float[np.ndarray, "n"]:
     """Return a C a', a priori."""
     side = side_of(f.patches, f.found.patch, f.found.foot, f.look.strip, errors, path)
-    off = np.concatenate([errors.position, errors.attitude], axis=1)[side.knots]
-    off = np.einsum("nk,nkc->nc", side.weights, off)
+    errors_at = np.concatenate([errors.position, errors.attitude], axis=1)[side.knots]
+    errors_at = np.einsum("nk,nkc->nc", side.weights, errors_at)
     normal = f.patches.normal[f.found.patch]
-    by_knots, *by_scanner = call_compiled(_slopes, side, normal, off, errors.boresight, errors.calibration)
+    by_knots, *by_scanner = call_compiled(_slopes, side, normal, errors_at, errors.boresight, errors.calibration)
     place = {label: k for k, label in enumerate(adjusted.structure.labels)}
     # Fixed unknowns have no place, and contribute nothing.
     a = np.zeros((len(normal), len(place) + 1))
@@ -301,17 +301,17 @@ def _variance_of_foot(
 def _slopes(
     side: Side,
     normal: Float[Array, "n 3"],
-    off: Float[Array, "n 6"],
+    offset: Float[Array, "n 6"],
     boresight: Float[Array, "3"],
     calibration: ScannerCalibration,
 ) -> tuple[Float[Array, "n 6"], Float[Array, "n 3"], Float[Array, "n calibrated"]]:
     """Differentiate the height of the foot along the normal by the trajectory's error, the boresight and the rest."""
     numbers, back = ravel_pytree(calibration)
 
-    def height(off, boresight, numbers, normal, point, position, angles, velocity, rate):
-        errors = TrajectoryKnot(off[:3], off[3:]), Scanner(boresight, {}), back(numbers)
+    def height(offset, boresight, numbers, normal, point, position, angles, velocity, rate):
+        errors = TrajectoryKnot(offset[:3], offset[3:]), Scanner(boresight, {}), back(numbers)
         return jnp.sum(normal * return_at(point, position, angles, velocity, rate, *errors))
 
     pose = side.point, side.scanner, side.roll_pitch_yaw, side.velocity, side.rate
     slopes = jax.vmap(jax.grad(height, argnums=(0, 1, 2)), (0, None, None, *[0] * 6))
-    return slopes(off, boresight, numbers, normal, *pose)
+    return slopes(offset, boresight, numbers, normal, *pose)

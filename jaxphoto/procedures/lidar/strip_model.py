@@ -140,12 +140,12 @@ def strip_block(
     start = dataclasses.replace(start, more=start.more | {TrajectoryKnot.kind: knots})
     prior = dataclasses.replace(prior, more=prior.more | {TrajectoryKnot.kind: knot_priors})
     if priors is not None:
-        of_scanner, own = ScannerCalibration.kind, priors.calibration
+        of_scanner, calibration = ScannerCalibration.kind, priors.calibration
         right_scanner = Scanner(_ZERO, {})  # type: ignore[arg-type]
-        none = dataclasses.replace(NO_CALIBRATION, pattern=own.pattern)
+        none = dataclasses.replace(NO_CALIBRATION, pattern=calibration.pattern)
         start = dataclasses.replace(start, scanner=right_scanner, more=start.more | {of_scanner: {"": none}})
         prior = dataclasses.replace(
-            prior, scanner=Scanner(priors.boresight, {}), more=prior.more | {of_scanner: {"": own}}
+            prior, scanner=Scanner(priors.boresight, {}), more=prior.more | {of_scanner: {"": calibration}}
         )
     return dataclasses.replace(at_result(block, start), priors=prior)
 
