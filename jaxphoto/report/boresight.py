@@ -81,11 +81,11 @@ def plot_boresight(steps: Sequence[Step], ax: Axes | None = None, *, shifts: boo
     names = [_short(str(parameter)) for parameter in rows["parameter"]]
     places = {name: k for k, name in enumerate(dict.fromkeys(names))}
     several = len(set(rows["step"])) > 1
-    for k, (step, own) in enumerate(rows.assign(at=[places[name] for name in names]).groupby("step")):
-        at = own["at"] + (0.3 * (k - 0.5) if several else 0.0)
+    for k, (step, of_step) in enumerate(rows.assign(at=[places[name] for name in names]).groupby("step")):
+        at = of_step["at"] + (0.3 * (k - 0.5) if several else 0.0)
         marker, colour = ("s", "0.5") if several and k == 0 else ("o", "tab:blue")
-        bars: dict[str, Any] = {"xerr": _BARS * own["sigma"], "fmt": marker, "ms": 4, "capsize": 3}
-        ax.errorbar(own["value"], at, color=colour, label=f"step {step}", **bars)
+        bars: dict[str, Any] = {"xerr": _BARS * of_step["sigma"], "fmt": marker, "ms": 4, "capsize": 3}
+        ax.errorbar(of_step["value"], at, color=colour, label=f"step {step}", **bars)
     ax.set_yticks(list(places.values()), [label(name) for name in places], fontsize=8)
     ax.set_ylim(len(places) - 0.5, -0.5)
     ax.axvline(0, color="0.4", lw=0.6)

@@ -46,8 +46,8 @@ def photographs_table(calibration: Calibration) -> pd.DataFrame:
 def targets_figure(calibration: Calibration, image: str, picture: np.ndarray | None = None) -> Figure:
     """The targets of one image, over its grey values if given, with enlarged residual vectors."""
     rows, sensor = calibration.measured, calibration.sensor
-    own = rows.image == rows.images.index(image)
-    place, v = sensor.px_from_mm(rows.xy_mm[own]), calibration.residuals_px[own]
+    of_image = rows.image == rows.images.index(image)
+    place, v = sensor.px_from_mm(rows.xy_mm[of_image]), calibration.residuals_px[of_image]
     scale = _ARROW * sensor.width_px / max(rms_px(calibration.residuals_px), 1e-12)
     figure = _image_figure(sensor, picture, f"{image}: RMS {rms_px(v):.3f} px, residuals {scale:.0f} times enlarged")
     (axes,) = figure.axes

@@ -112,17 +112,17 @@ def moments(values: np.ndarray) -> Moments:
 
 
 def summary_table(
-    found: Mapping[str, Moments],
+    moments_of: Mapping[str, Moments],
     nominal: Mapping[str, float],
     predicted: Mapping[str, float],
     cameras: Mapping[str, InteriorOrientation],
 ) -> pd.DataFrame:
     """quantity, nominal, mean, sd, quantiles, predicted_sigma, ratio (sd over predicted), unit."""
-    rows = [(name, nominal.get(name, np.nan), m.mean, m.sd, *m.quantiles) for name, m in found.items()]
+    rows = [(name, nominal.get(name, np.nan), m.mean, m.sd, *m.quantiles) for name, m in moments_of.items()]
     table = pd.DataFrame(rows, columns=["quantity", "nominal", "mean", "sd", *_QUANTILES])
-    table["predicted_sigma"] = [predicted.get(name, np.nan) for name in found]
+    table["predicted_sigma"] = [predicted.get(name, np.nan) for name in moments_of]
     table["ratio"] = table["sd"] / table["predicted_sigma"]
-    return table.assign(unit=[column_unit(name, cameras) for name in found])
+    return table.assign(unit=[column_unit(name, cameras) for name in moments_of])
 
 
 def draws_figure(columns: Mapping[str, np.ndarray], summary: pd.DataFrame) -> Figure:
@@ -147,8 +147,8 @@ def plot_draws(draws: pd.DataFrame, summary: pd.DataFrame, quantity: str, ax: Ax
     """
     quantities = summary["quantity"].tolist()
     if quantity not in quantities or quantity not in draws:
-        known = ", ".join(name for name in quantities if name in draws and not name.startswith(LONG))
-        raise InputError(f"the draws have no {quantity!r}; they have {known}, and those of images and points")
+        names = ", ".join(name for name in quantities if name in draws and not name.startswith(LONG))
+        raise InputError(f"the draws have no {quantity!r}; they have {names}, and those of images and points")
     ax = axes_or_new(ax)
     _draw_histogram(ax, quantity, draws[quantity].to_numpy(float), summary)
     return ax
@@ -179,9 +179,9 @@ def plot_effects(
     `effects` is effects.csv and `summary` summary.csv of a Monte Carlo. Raises InputError for unknown quantities.
     """
     names = list(quantities)
-    known = [name for name in summary["quantity"] if name in effects]
-    if missing := [name for name in names if name not in known]:
-        raise InputError(f"the effects have no {missing[0]!r}; they have {', '.join(known)}")
+    available = [name for name in summary["quantity"] if name in effects]
+    if missing := [name for name in names if name not in available]:
+        raise InputError(f"the effects have no {missing[0]!r}; they have {', '.join(available)}")
     ax, predicted = axes_or_new(ax), summary.set_index("quantity")["predicted_sigma"][names].to_numpy()
     fractions = effects[names].to_numpy() / np.where(predicted > 0, predicted, np.nan)
     image = ax.imshow(fractions, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")

@@ -98,9 +98,9 @@ def _rms(values: np.ndarray) -> float:
 
 def scanner_correlations(adjusted: Adjustment) -> pd.DataFrame:
     """parameter_a, parameter_b, rho: boresight and shifts of the scanner with each other and with the cameras."""
-    known = Tables(adjusted).covariance
-    first = 6 * known.n_images
-    rho, paths = correlation_matrix(known)[first:, first:], known.labels[first:]
+    covariance = Tables(adjusted).covariance
+    first = 6 * covariance.n_images
+    rho, paths = correlation_matrix(covariance)[first:, first:], covariance.labels[first:]
     scanner = [k for k, path in enumerate(paths) if path.startswith("scanner")]
     rows = [(paths[a], paths[b], rho[a, b]) for a in scanner for b in range(len(paths)) if a != b]
     return pd.DataFrame(rows, columns=["parameter_a", "parameter_b", "rho"])
@@ -128,9 +128,9 @@ def plot_lidar_heights(control: LidarControl, ax: Axes | None = None, *, residua
         raise InputError("no height of the cloud is control: there are no residuals to be drawn")
     ax = axes_or_new(ax)
     if residuals:
-        off = (control.height - points[:, 2])[used]
-        name = f"cloud minus adjusted: RMSE {_rms(off):.3f} m"
-        _draw_heights(ax, points[used], off, off, "cloud minus adjusted height [m]", name)
+        difference = (control.height - points[:, 2])[used]
+        name = f"cloud minus adjusted: RMSE {_rms(difference):.3f} m"
+        _draw_heights(ax, points[used], difference, difference, "cloud minus adjusted height [m]", name)
         return ax
     missing = ~np.isfinite(control.height)
     sets = ((missing, "refused", "0.6", "+"), (used, "control", "tab:blue", "o"))
@@ -278,7 +278,7 @@ def print_moved(result: Simultaneous, console: Console) -> None:
     """Print every change, one per line."""
     lines = []
     for what, before, after, moved, sigma, unit in moved_table(result).itertuples(index=False):
-        known = f" from {before:.6g} to {after:.6g}" if np.isfinite(before) else ""
+        range_words = f" from {before:.6g} to {after:.6g}" if np.isfinite(before) else ""
         spread = f" (sigma {sigma:.2g})" if np.isfinite(sigma) else ""
-        lines.append(f"  {what}:{known} by {moved:.4g} {unit}{spread}".rstrip())
+        lines.append(f"  {what}:{range_words} by {moved:.4g} {unit}{spread}".rstrip())
     print_lines(lines, console)

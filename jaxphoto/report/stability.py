@@ -91,15 +91,15 @@ def by_method(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_mm: fl
     """The same for reading, in micrometres, with a column per method."""
     table = stability_table(analyses, pixel_mm, noise_mm).set_index("method")
     um = {"RMSE_offset": "rmse_offset_mm", "as measured": "rmse_measured_mm", "largest": "largest_mm"}
-    known = "sigma_mm" in table
+    with_sigma = "sigma_mm" in table
     um |= (
         {"sigma": "sigma_mm", "95 % from": "low_mm", "95 % to": "high_mm", "one camera": "expected_of_one_mm"}
-        if known
+        if with_sigma
         else {}
     )
     rows = {f"{name} [um]": (1e3 * table[column]).map("{:.4g}".format) for name, column in um.items()}
     rows["in pixels"] = table["rmse_offset_px"].map("{:.4g}".format)
-    rows |= {"p": table["p_value"].map("{:.2g}".format)} if known else {}
+    rows |= {"p": table["p_value"].map("{:.2g}".format)} if with_sigma else {}
     return pd.DataFrame(rows).T.reset_index(names="quantity")
 
 
@@ -193,8 +193,8 @@ def parameter_changes(change: Change) -> pd.DataFrame:
     different models."""
     columns = ["parameter", "first", "second", "difference", "sigma", "p_value", "unit"]
     table = pd.DataFrame(change.parameters, columns=columns)
-    known = table["sigma"] > 0
-    table.insert(5, "ratio", table["difference"].where(known) / table["sigma"].where(known))
+    estimated = table["sigma"] > 0
+    table.insert(5, "ratio", table["difference"].where(estimated) / table["sigma"].where(estimated))
     return table
 
 
@@ -369,8 +369,8 @@ def cut_table(halves: Halves) -> pd.DataFrame:
 def halves_verdict(halves: Halves) -> list[str]:
     """The result in sentences."""
     band, n, camera = halves.band, len(halves.cuts), camera_words(halves.camera)
-    off, factor = (band.factor - 1) / band.sigma_factor, f"{band.factor:.2f} +- {band.sigma_factor:.2f}"
-    size = "too small" if off > _SURE else "too large" if off < -_SURE else "consistent with the halves"
+    deviation, factor = (band.factor - 1) / band.sigma_factor, f"{band.factor:.2f} +- {band.sigma_factor:.2f}"
+    size = "too small" if deviation > _SURE else "too large" if deviation < -_SURE else "consistent with the halves"
     cell, wide = band.cell_factor, band.calibration
     sentences = [
         f"standard deviations of {camera} are {size}: factor {factor} ({n} splits by {halves.by}; bundles of rays "

@@ -78,8 +78,8 @@ def calibration_table(result: StripAdjustment) -> pd.DataFrame:
 
     Angles in degrees.
     """
-    known, s = result.covariance, result.adjusted.structure
-    rho, sigma = correlation_matrix(known), np.asarray(known.shared_sigma)
+    covariance, s = result.covariance, result.adjusted.structure
+    rho, sigma = correlation_matrix(covariance), np.asarray(covariance.shared_sigma)
     value = np.asarray(result.adjusted.values.shared)[s.free]
     first, rows = len(rho) - len(s.free), []
     for k, path in enumerate(s.labels):
@@ -118,9 +118,9 @@ def errors_along(
     covariances, variance = np.asarray(result.covariance.matrix)[-len(place) :, -len(place) :], np.zeros_like(value)
     for c in range(value.shape[1]):
         # Fixed knots are not among the estimated ones.
-        own = np.array([place.get(labels[k][c], -1) for k in range(spline.first, spline.first + spline.size)])
-        known, by = own[own >= 0], weights[:, own >= 0]
-        variance[:, c] = np.einsum("ni,ij,nj->n", by, covariances[np.ix_(known, known)], by)
+        columns = np.array([place.get(labels[k][c], -1) for k in range(spline.first, spline.first + spline.size)])
+        estimated, by = columns[columns >= 0], weights[:, columns >= 0]
+        variance[:, c] = np.einsum("ni,ij,nj->n", by, covariances[np.ix_(estimated, estimated)], by)
     return value * _IN_FILES, np.sqrt(np.maximum(variance, 0.0)) * _IN_FILES
 
 
@@ -137,8 +137,8 @@ def _knot_labels(result: StripAdjustment) -> list[list[str]]:
 def strips_verdict(result: StripAdjustment, tables: Tables | None) -> Verdict:
     """Judge a strip adjustment; `tables` are those of the adjustment if it has images."""
     found = _sigma_naught(result) if tables is None else verdict_of(tables).findings
-    odd = (Finding("message", "warning", sentence) for sentence in result.warnings)
-    return Verdict.of((*_lookups(result), *_steps(result), *odd, *_surveyed(result), *found))
+    warnings = (Finding("message", "warning", sentence) for sentence in result.warnings)
+    return Verdict.of((*_lookups(result), *_steps(result), *warnings, *_surveyed(result), *found))
 
 
 def _lookups(result: StripAdjustment) -> Iterator[Finding]:
@@ -184,11 +184,11 @@ def surveyed_summary(result: StripAdjustment) -> dict[str, dict[str, float]]:
     """Control and check points over all strips: planes, RMS of their gaps (m) before and after, and noise."""
     summary: dict[str, dict[str, float]] = {}
     for what in (CONTROL, CHECK):
-        own = [d for d in result.differences if d.one == what]
-        if own:
-            now, then = ([getattr(d, name) for d in own] for name in ("planes", "planes_before"))
+        rows = [d for d in result.differences if d.one == what]
+        if rows:
+            now, then = ([getattr(d, name) for d in rows] for name in ("planes", "planes_before"))
             counts = {"rms_before_m": then, "rms_m": now, "noise_m": now}
-            pooled = {name: _pooled([getattr(d, name) for d in own], n) for name, n in counts.items()}
+            pooled = {name: _pooled([getattr(d, name) for d in rows], n) for name, n in counts.items()}
             summary[what.replace(" ", "_")] = {"planes": sum(now), **pooled}
     return summary
 
@@ -449,8 +449,8 @@ def print_strips(result: StripAdjustment, console: Console) -> None:
         )
     if result.trajectory is None:
         for one in trajectory_errors_table(result).to_dict("records"):
-            known = [(a, one[f"{a}_m"], one[f"sigma_{a}_m"]) for a in "XYZ" if one[f"sigma_{a}_m"] > 0]
-            shift = ", ".join(f"{a} {with_sigma(v, s)} m (sigma {of_sigma(s)})" for a, v, s in known)
+            estimated = [(a, one[f"{a}_m"], one[f"sigma_{a}_m"]) for a in "XYZ" if one[f"sigma_{a}_m"] > 0]
+            shift = ", ".join(f"{a} {with_sigma(v, s)} m (sigma {of_sigma(s)})" for a, v, s in estimated)
             lines.append(f"  strip {one['strip']}: {'shift ' + shift if shift else 'fixed'}")
     for parameter, value, sigma in calibration_table(result)[["parameter", "value", "sigma"]].itertuples(index=False):
         lines.append(f"  {parameter}: {with_sigma(value, sigma)} (sigma {of_sigma(sigma)})")

@@ -342,11 +342,11 @@ class Tables:
         points = list(dict.fromkeys(rows.who.tolist()))
         place = {p: k for k, p in enumerate(points)}
         at = [place[p] for p in rows.who.tolist()], rows.axis
-        off, sigma = np.full((len(points), 3), np.nan), np.full((len(points), 3), np.nan)
-        off[at] = rows.value
+        difference, sigma = np.full((len(points), 3), np.nan), np.full((len(points), 3), np.nan)
+        difference[at] = rows.value
         sigma[at] = np.hypot(np.asarray(rows.sigma), np.asarray(self.covariance.point_sigma)[rows.who, rows.axis])
         columns: dict[str, Any] = {"point": [self.adjusted.block.points[p] for p in points]}
-        columns |= {f"d{axis}_m": off[:, k] for k, axis in enumerate(AXES)}
+        columns |= {f"d{axis}_m": difference[:, k] for k, axis in enumerate(AXES)}
         return pd.DataFrame(columns | {f"sigma_d{axis}_m": sigma[:, k] for k, axis in enumerate(AXES)})
 
     @cached_property

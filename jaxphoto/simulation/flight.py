@@ -170,7 +170,7 @@ def add_rig_images(
     truths: list[Any] = [own.truth for own in cameras.values()]
     place = np.array([own.place for own in truths]) + noise[0] * bent[:, :, 0]
     # Rotated from its place in the rig.
-    turn, off = np.broadcast_to([own.turn for own in truths], place.shape), noise[1] * bent[:, :, 1]
+    turn, flexure = np.broadcast_to([own.turn for own in truths], place.shape), noise[1] * bent[:, :, 1]
     at = np.repeat(np.arange(n), m - 1)
     reference = np.asarray(exterior.position)[at], np.asarray(exterior.camera_from_object)[at]
     mounts = [recipe.mounts[name].truth if (name := recipe.mount_of(c)) else NO_MOUNT for c in flight.cameras]
@@ -179,7 +179,7 @@ def add_rig_images(
     )
     motion = flight.motion.velocity[at], flight.motion.rate[at]
     delay = np.tile([float(own.delay) for own in truths], n)
-    rigid = (v.reshape(-1, 3) for v in (place, turn, off))
+    rigid = (v.reshape(-1, 3) for v in (place, turn, flexure))
     there = in_chunks(_rig_exterior, _CHUNK, *reference, *motion, arm, boresight, nominal, delay, *rigid)
     position, rotation = (
         _after_each(np.asarray(own), new)
@@ -199,16 +199,16 @@ def add_rig_images(
     )
 
 
-def _after_each(own: np.ndarray, new: np.ndarray) -> np.ndarray:
+def _after_each(reference: np.ndarray, new: np.ndarray) -> np.ndarray:
     """Interleave the values of each exposure and those of the other cameras in it."""
-    n, shape = len(own), own.shape[1:]
-    return np.concatenate([own[:, None], new.reshape(n, -1, *shape)], axis=1).reshape(-1, *shape)
+    n, shape = len(reference), reference.shape[1:]
+    return np.concatenate([reference[:, None], new.reshape(n, -1, *shape)], axis=1).reshape(-1, *shape)
 
 
 def rig_rows(recipe: Recipe, flight: Flight) -> tuple[RigPlaces | RigTurns, ...]:
     """Return the block's rig observations of photographs whose cameras it models in the rig."""
-    known = [name for name, own in recipe.rig.items() if own.model]
-    m, image = len(recipe.rig) + 1, np.flatnonzero(np.isin(flight.cameras, known))
+    modelled = [name for name, own in recipe.rig.items() if own.model]
+    m, image = len(recipe.rig) + 1, np.flatnonzero(np.isin(flight.cameras, modelled))
     if not len(image):
         return ()
     reference, none = image // m * m, np.zeros((len(image), 3))
@@ -221,9 +221,9 @@ def rig_rows(recipe: Recipe, flight: Flight) -> tuple[RigPlaces | RigTurns, ...]
 
 def has_delay(cameras: Mapping[str, SimulatedChange]) -> bool:
     """Return True if a camera of the rig may expose late: the block then needs its motion."""
-    known: list[Any] = [own.model for own in cameras.values() if own.model]
-    delays = [own.truth.delay for own in cameras.values()] + [start.delay for start, _ in known]  # type: ignore[attr-defined]
-    return any(float(delay) != 0 for delay in delays) or any(prior.delay != FIXED for _, prior in known)
+    modelled: list[Any] = [own.model for own in cameras.values() if own.model]
+    delays = [own.truth.delay for own in cameras.values()] + [start.delay for start, _ in modelled]  # type: ignore[attr-defined]
+    return any(float(delay) != 0 for delay in delays) or any(prior.delay != FIXED for _, prior in modelled)
 
 
 def gnss_images(recipe: Recipe, flight: Flight) -> Int[np.ndarray, "n"]:
@@ -233,11 +233,11 @@ def gnss_images(recipe: Recipe, flight: Flight) -> Int[np.ndarray, "n"]:
 
 @jax.jit
 @jax.vmap
-def _rig_exterior(position, camera_from_object, velocity, rate, arm, boresight, nominal, delay, place, turn, off):
+def _rig_exterior(position, camera_from_object, velocity, rate, arm, boresight, nominal, delay, place, turn, flexure):
     mount, exposure = Mount(arm, boresight), Exposure(0.0, velocity, rate, nominal)
     then = reference_later(delay, position, camera_from_object, mount, exposure)
     there, rotation = in_rig(*then, RigCamera(place, turn))
-    return there, small_rotation(off) @ rotation
+    return there, small_rotation(flexure) @ rotation
 
 
 def relative_rows(
@@ -258,14 +258,16 @@ def relative_rows(
         return ()
     rows: list[Any] = []
     if stated.relative_position_m is not None:
-        off = triple(noise.relative_position_m) * stream(seed, "noise of relative positions").standard_normal((n, 3))  # type: ignore[arg-type]
+        error = stream(seed, "noise of relative positions").standard_normal((n, 3))
+        error *= triple(noise.relative_position_m)  # type: ignore[arg-type]
         sigma = np.tile(triple(stated.relative_position_m), (n, 1))
-        rows.append(RelativePositions(*pair, position[pair[1]] - position[pair[0]] + off, sigma))
+        rows.append(RelativePositions(*pair, position[pair[1]] - position[pair[0]] + error, sigma))
     if stated.relative_attitude_deg is not None:
         turn = in_chunks(_relative_angles, _CHUNK, angles[pair[0]], angles[pair[1]])
-        off = triple(noise.relative_attitude_deg) * stream(seed, "noise of relative attitudes").standard_normal((n, 3))  # type: ignore[arg-type]
+        error = stream(seed, "noise of relative attitudes").standard_normal((n, 3))
+        error *= triple(noise.relative_attitude_deg)  # type: ignore[arg-type]
         sigma = np.tile(np.deg2rad(triple(stated.relative_attitude_deg)), (n, 1))
-        rows.append(RelativeAttitudes(*pair, turn + np.deg2rad(off), sigma))
+        rows.append(RelativeAttitudes(*pair, turn + np.deg2rad(error), sigma))
     return tuple(rows)
 
 

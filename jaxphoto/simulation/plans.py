@@ -82,8 +82,8 @@ class FlightPlan:
         """Return the time of every exposure from the mean of all (s)."""
         times, begin = [], 0.0
         for strip in self.strips:
-            own = strip.along / self.speed_m_per_s
-            times.append(own - own[0] + begin)
+            at = strip.along / self.speed_m_per_s
+            times.append(at - at[0] + begin)
             begin = times[-1][-1] + self.turn_s
         every = np.concatenate(times)
         return every - every.mean()
@@ -147,12 +147,12 @@ class Swaths:
                 "let the points lie beyond the ends too, or add images"
             )
         low, high = self.extent(np.eye(2))
-        found = np.zeros((0, 2))
+        result = np.zeros((0, 2))
         for _ in range(_TRIES):
-            if len(found) >= n:
-                return found[:n]
+            if len(result) >= n:
+                return result[:n]
             xy = rng.uniform(low, high, (4 * n, 2))
-            found = np.vstack([found, xy[self.contain(xy)]])
+            result = np.vstack([result, xy[self.contain(xy)]])
         raise BlockError("the strips lie so far apart that places are hardly ever in one; bring them together")
 
 

@@ -79,25 +79,25 @@ def _photograph(
     """Apply `photograph` to all points at once."""
     position, matrix = np.asarray(exterior.position), np.asarray(exterior.camera_from_object)
     # (images, points, 3), in the camera frame
-    seen = np.einsum("kij,knj->kni", matrix, points[None] - position[:, None])
-    found = []
+    in_camera = np.einsum("kij,knj->kni", matrix, points[None] - position[:, None])
+    parts = []
     for name, interior in cameras.items():
         sensor = sensors[name]
         interior = jax.tree.map(np.float64, interior)
         half = np.array([sensor.width_mm, sensor.height_mm]) / 2
-        own = np.flatnonzero([camera == name for camera in image_camera])
-        direction = np.moveaxis(seen[own], -1, 0)
+        images = np.flatnonzero([camera == name for camera in image_camera])
+        direction = np.moveaxis(in_camera[images], -1, 0)
         with np.errstate(divide="ignore", invalid="ignore"):
             ideal = np.stack(interior.projection.ideal_from_direction(float(interior.c), *direction), axis=-1)
-        mine = np.asarray(interior.projection.sees(*direction))
-        image, point = np.nonzero(mine & (np.abs(ideal) <= _reach(interior, half)).all(axis=2))
+        visible = np.asarray(interior.projection.sees(*direction))
+        image, point = np.nonzero(visible & (np.abs(ideal) <= _reach(interior, half)).all(axis=2))
         if not len(image):
             continue
         xy, valid = in_chunks(functools.partial(_measured, interior), _CHUNK, ideal[image, point])
-        found.append(Rays(own[image], point, xy).take(valid & (np.abs(xy) < half - margin_mm).all(axis=1)))
-    if not found:
+        parts.append(Rays(images[image], point, xy).take(valid & (np.abs(xy) < half - margin_mm).all(axis=1)))
+    if not parts:
         return Rays(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
-    rays = Rays(*(np.concatenate(part) for part in zip(*found, strict=True)))
+    rays = Rays(*(np.concatenate(part) for part in zip(*parts, strict=True)))
     return rays.take(np.lexsort((rays.image, rays.point)))
 
 
@@ -177,9 +177,9 @@ def scatter(recipe: Recipe, flight: Flight, terrain: Terrain, seed: int) -> True
     counts: dict[str, int] = {}
     for number, group in enumerate(recipe.targets):
         rng = stream(seed, f"targets {number}")
-        given = _given(group, terrain, recipe.ground, rng)
-        _check_seen(recipe, flight, terrain, given)
-        places = np.vstack([given, _uniform(recipe, flight, terrain, group.count, rng)])
+        stated = _given(group, terrain, recipe.ground, rng)
+        _check_seen(recipe, flight, terrain, stated)
+        places = np.vstack([stated, _uniform(recipe, flight, terrain, group.count, rng)])
         begin = counts.get(group.prefix, 0)
         counts[group.prefix] = begin + len(places)
         ids += [f"{group.prefix}{begin + k + 1}" for k in range(len(places))]
@@ -209,19 +209,19 @@ def _seen_often(
     draw: Callable[[int], np.ndarray],
 ) -> np.ndarray:
     """Return the first `n` open places from `draw`, on ground or roofs, that enough images see."""
-    found = np.zeros((0, 3))
+    result = np.zeros((0, 3))
     for _ in range(_TRIES):
-        if len(found) >= n:
+        if len(result) >= n:
             break
         places = terrain.place(draw(n), rng)
         often = _rays(recipe, flight, terrain, places).per_point(n) >= recipe.points.min_images
-        found = np.vstack([found, places[often & terrain.open(places[:, :2])]])
-    if len(found) < n:
+        result = np.vstack([result, places[often & terrain.open(places[:, :2])]])
+    if len(result) < n:
         raise BlockError(
-            f"only {len(found)} of {n} points are seen in {recipe.points.min_images} images, of {_TRIES * n} tried; "
+            f"only {len(result)} of {n} points are seen in {recipe.points.min_images} images, of {_TRIES * n} tried; "
             "raise the overlaps or the number of images, or ask less of the points"
         )
-    return found[:n]
+    return result[:n]
 
 
 def _given(group: TargetPlan, terrain: Terrain, ground: Swaths | Field, rng: np.random.Generator) -> np.ndarray:
@@ -230,19 +230,19 @@ def _given(group: TargetPlan, terrain: Terrain, ground: Swaths | Field, rng: np.
     parts = np.array(group.at, float).reshape(-1, 2)
     relative = ((low + high) / 2 + parts * (high - low) / 2) @ axes
     flat = np.array([place[:2] for place in group.at_m], float).reshape(-1, 2)
-    given = terrain.place(np.vstack([relative, flat]), rng)
+    places = terrain.place(np.vstack([relative, flat]), rng)
     for k, place in enumerate(group.at_m, start=len(relative)):
-        given[k, 2:] = place[2:] or given[k, 2:]
-    return given
+        places[k, 2:] = place[2:] or places[k, 2:]
+    return places
 
 
 def _check_seen(recipe: Recipe, flight: Flight, terrain: Terrain, xyz: np.ndarray) -> None:
-    seen = _rays(recipe, flight, terrain, xyz).per_point(len(xyz))
-    for k in np.flatnonzero(seen < recipe.points.min_images):
+    counts = _rays(recipe, flight, terrain, xyz).per_point(len(xyz))
+    for k in np.flatnonzero(counts < recipe.points.min_images):
         x, y, _ = xyz[k]
         raise BlockError(
-            f"the target at X {x:.1f} m, Y {y:.1f} m is seen in {seen[k]} image(s), not in {recipe.points.min_images}; "
-            "move it inside the block"
+            f"the target at X {x:.1f} m, Y {y:.1f} m is seen in {counts[k]} image(s), not in "
+            f"{recipe.points.min_images}; move it inside the block"
         )
 
 

@@ -41,7 +41,7 @@ def _touched(what: str, index: np.ndarray, block: Block, truth: Unknowns) -> Any
         return jnp.asarray(truth.points)[index]
     if what != "image":
         return jax.tree.map(lambda *v: jnp.stack(v)[index], *map(_numbers, truth.tables[what].values()))
-    exterior, taken, own = truth.exterior, jax.tree.map(lambda v: jnp.asarray(v)[index], exposures(block)), {}
+    exterior, taken, parameters = truth.exterior, jax.tree.map(lambda v: jnp.asarray(v)[index], exposures(block)), {}
     for kind, owners in truth.tables.items():
         if not owners:
             continue
@@ -49,13 +49,13 @@ def _touched(what: str, index: np.ndarray, block: Block, truth: Unknowns) -> Any
         place = {name: k for k, name in enumerate(owners)}
         names = block.owners(type(next(iter(owners.values()))).owner)
         at = np.array([place.get(name, len(place)) for name in names])[index]
-        own[kind] = jax.tree.map(lambda v: v[at], table)  # noqa: B023
+        parameters[kind] = jax.tree.map(lambda v: v[at], table)  # noqa: B023
     position, rotation = (jnp.asarray(v)[index] for v in (exterior.position, exterior.camera_from_object))
     states = ImageState
     # One image each: a state is declared as that of one.
     for _ in range(index.ndim):
         states = jax.vmap(states)
-    return states(position, rotation, taken, own)
+    return states(position, rotation, taken, parameters)
 
 
 def _numbers(parameters: Any) -> Any:
@@ -112,12 +112,12 @@ def image_coordinates(block: Block, truth: Unknowns) -> Float[Array, "rows 2"]:
     exterior, points = jax.tree.map(jnp.asarray, (truth.exterior, truth.points))
     xy, bent = jnp.zeros((len(image), 2)), bent_cameras(block, truth)
     for name, interior in truth.interior.items():
-        mine = np.flatnonzero(camera == name)
-        eo = ExteriorOrientation(exterior.position[image[mine]], exterior.camera_from_object[image[mine]])
-        aim = jax.vmap(apparent_point, in_axes=(0, 0, None))(eo.position, points[point[mine]], block.corrections)
+        of_camera = np.flatnonzero(camera == name)
+        eo = ExteriorOrientation(exterior.position[image[of_camera]], exterior.camera_from_object[image[of_camera]])
+        aim = jax.vmap(apparent_point, in_axes=(0, 0, None))(eo.position, points[point[of_camera]], block.corrections)
         camera_of_row = None if bent is None else 0
-        own = interior if bent is None else jax.tree.map(lambda v: v[image[mine]], bent[name])  # noqa: B023
-        xy = xy.at[mine].set(jax.vmap(project, in_axes=(camera_of_row, 0, 0))(own, eo, aim))
+        cameras = interior if bent is None else jax.tree.map(lambda v: v[image[of_camera]], bent[name])  # noqa: B023
+        xy = xy.at[of_camera].set(jax.vmap(project, in_axes=(camera_of_row, 0, 0))(cameras, eo, aim))
     return xy
 
 

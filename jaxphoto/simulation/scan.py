@@ -91,17 +91,17 @@ def paths(recipe: Recipe, plan: ScanPlan, flight: Flight, mean_height: float, se
     quaternion = in_chunks(_quaternions_from_angles, _CHUNK_EXPOSURES, attitude)
     turn = _turn(quaternion, np.asarray(flight.motion.rate))
     motion = (flight.time, position, np.asarray(flight.motion.velocity), quaternion, turn)
-    found, begin, of = [], 0.0, np.array(flight.strips)
+    result, begin, of = [], 0.0, np.array(flight.strips)
     for strip in flown.strips:
         lead = strip.footprint.along / 2 / flown.speed_m_per_s
         time, *nodes = _led(lead, *(a[of == strip.name] for a in motion))
         length = (time[-1] - time[0]) * flown.speed_m_per_s
-        found.append(Path(strip.name, strip.height_m, length, time - time[0] + begin, *nodes))
-        begin = found[-1].node[-1] + _GAP_S
+        result.append(Path(strip.name, strip.height_m, length, time - time[0] + begin, *nodes))
+        begin = result[-1].node[-1] + _GAP_S
     if plan.same_trajectory:
-        middle = np.mean(np.concatenate([path.node[1:-1] for path in found]))
-        found = [path._replace(node=path.node - middle) for path in found]
-    return found
+        middle = np.mean(np.concatenate([path.node[1:-1] for path in result]))
+        result = [path._replace(node=path.node - middle) for path in result]
+    return result
 
 
 def _led(lead: float, time, position, velocity, quaternion, turn) -> tuple[np.ndarray, ...]:
@@ -215,9 +215,9 @@ def rotate_body(
 def _drift(spline: StripSpline, correlation_s: float, rng: np.random.Generator) -> Float[np.ndarray, "knots 6"]:
     """Draw six processes of standard deviation 1."""
     noise = rng.standard_normal((spline.size, 6))
-    kept = np.exp(-spline.interval / correlation_s)
+    memory = np.exp(-spline.interval / correlation_s)
     for k in range(1, spline.size):
-        noise[k] = kept * noise[k - 1] + np.sqrt(1 - kept**2) * noise[k]
+        noise[k] = memory * noise[k - 1] + np.sqrt(1 - memory**2) * noise[k]
     return noise
 
 
@@ -392,12 +392,12 @@ def _returned(
     if terrain.buildings:
         roof, wall = _built(origin, ray, ground, terrain)
     end = np.minimum(np.minimum(ground, roof), wall)
-    seen = np.isfinite(ground)
-    met = intersect_crowns(terrain.trees, origin, ray, np.where(seen, end, 0.0), rng)
-    last = np.flatnonzero(seen & (wall > end) & ~met.stopped)
+    hits = np.isfinite(ground)
+    leaves = intersect_crowns(terrain.trees, origin, ray, np.where(hits, end, 0.0), rng)
+    last = np.flatnonzero(hits & (wall > end) & ~leaves.stopped)
     by_last = np.where(roof[last] <= ground[last], ROOF, GROUND)
-    by = np.concatenate([np.full(len(met.pulse), VEGETATION), by_last]).astype(np.uint8)
-    return _Returns(np.concatenate([met.pulse, last]), np.concatenate([met.at, end[last]]), by)
+    by = np.concatenate([np.full(len(leaves.pulse), VEGETATION), by_last]).astype(np.uint8)
+    return _Returns(np.concatenate([leaves.pulse, last]), np.concatenate([leaves.at, end[last]]), by)
 
 
 def _ground(origin: np.ndarray, ray: np.ndarray, terrain: Terrain) -> Float[np.ndarray, "n"]:
@@ -421,10 +421,10 @@ def _built(
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Return the distance at which each ray first enters a building by its roof, and by a wall."""
     planes = solids(terrain.buildings)
-    seen = np.flatnonzero(np.isfinite(ground))
-    hit = origin[seen] + ground[seen, None] * ray[seen]
-    which, place = pairs_along(hit, ray[seen], planes.centre, planes.radius, planes.top)
-    pulse = seen[place]
+    hits = np.flatnonzero(np.isfinite(ground))
+    hit = origin[hits] + ground[hits, None] * ray[hits]
+    which, place = pairs_along(hit, ray[hits], planes.centre, planes.radius, planes.top)
+    pulse = hits[place]
     by_roof, by_wall = entry_distances(planes, which, origin[pulse], ray[pulse])
     roof, wall = (np.full(len(ray), np.inf) for _ in range(2))
     np.minimum.at(roof, pulse, by_roof)
@@ -437,10 +437,10 @@ def _trajectory(paths: list[Path], errors: StripErrors) -> Trajectory:
     ends = [(path.node[0], path.node[-1]) for path in paths]
     times = [np.linspace(begin, end, int(np.ceil((end - begin) * _RATE_HZ)) + 1) for begin, end in ends]
     poses = [path.pose(time) for path, time in zip(paths, times, strict=True)]
-    off = [errors.at(k, time) for k, time in enumerate(times)]
-    position = np.vstack([x + shift for (shift, _), (x, _) in zip(off, poses, strict=True)])
+    errors_at = [errors.at(k, time) for k, time in enumerate(times)]
+    position = np.vstack([x + shift for (shift, _), (x, _) in zip(errors_at, poses, strict=True)])
     exact = np.zeros((len(position), 3))
-    quaternion, turn = np.vstack([q for _, q in poses]), np.vstack([turn for _, turn in off])
+    quaternion, turn = np.vstack([q for _, q in poses]), np.vstack([turn for _, turn in errors_at])
     if np.any(turn):
         quaternion = in_chunks(_quaternions, _CHUNK_POINTS, rotate_body(matrices(quaternion), turn))
     return Trajectory(np.concatenate(times), position, quaternion, exact, exact)  # type: ignore[arg-type]
@@ -472,12 +472,12 @@ def recorded_on_path(
     errors: StripErrors,
 ) -> tuple[Float[np.ndarray, "images 3"], Float[np.ndarray, "images 3"]]:
     """Return positions (m) and angles (rad) of the exposures with the trajectory errors at their times."""
-    off, turn, of = np.zeros_like(position), np.zeros_like(position), np.array(flight.strips)
+    offset, turn, of = np.zeros_like(position), np.zeros_like(position), np.array(flight.strips)
     for k, path in enumerate(paths):
-        own = of == path.strip
-        off[own], turn[own] = errors.at(k, time[own])
+        on_path = of == path.strip
+        offset[on_path], turn[on_path] = errors.at(k, time[on_path])
     turned = rotate_body(in_chunks(_matrices_from_angles, _CHUNK_EXPOSURES, roll_pitch_yaw), turn)
-    return position + off, in_chunks(_angles, _CHUNK_EXPOSURES, turned)
+    return position + offset, in_chunks(_angles, _CHUNK_EXPOSURES, turned)
 
 
 _matrices_from_angles = jax.jit(jax.vmap(matrix_from_roll_pitch_yaw))

@@ -178,9 +178,9 @@ def entry_distances(
     beside = np.any((towards == 0) & (left < 0), axis=1)
     face = into.argmax(axis=1)
     begin = np.take_along_axis(into, face[:, None], axis=1)[:, 0]
-    met = (begin <= out_of) & (begin >= 0) & ~beside
+    hits = (begin <= out_of) & (begin >= 0) & ~beside
     roof = face >= _WALLS
-    return np.where(met & roof, begin, np.inf), np.where(met & ~roof, begin, np.inf)
+    return np.where(hits & roof, begin, np.inf), np.where(hits & ~roof, begin, np.inf)
 
 
 def _planes(b: Building) -> tuple[np.ndarray, np.ndarray]:
@@ -271,19 +271,19 @@ def intersect_crowns(
     which, first, count = np.unique(pulse, return_index=True, return_counts=True)
     begin, length = line[first], line[first + count] - line[first]
     gone, on = np.zeros(len(which)), np.ones(len(which), bool)
-    found = []
+    returns = []
     for _ in range(_RETURNS):
         gone = gone + rng.exponential(_WAY_M, len(which))
         stays = rng.random(len(which)) < 0.5
         meets = on & (gone < length)
         place = begin[meets] + gone[meets]
         chord = np.clip(np.searchsorted(line, place, side="right") - 1, 0, len(way) - 1)
-        found.append((which[meets], into[chord] + place - line[chord]))
+        returns.append((which[meets], into[chord] + place - line[chord]))
         on &= ~(meets & stays)
     stopped = np.zeros(len(origin), bool)
     stopped[which[~on]] = True
-    met, at = (np.concatenate(part) for part in zip(*found, strict=True))
-    return Leaves(met, at, stopped)
+    pulses, at = (np.concatenate(part) for part in zip(*returns, strict=True))
+    return Leaves(pulses, at, stopped)
 
 
 def _chords(
@@ -505,10 +505,10 @@ def _places(
     free: Callable[[np.ndarray], np.ndarray], ground: Swaths | Field, rng: np.random.Generator, n: int, what: str
 ) -> Float[np.ndarray, "n 2"]:
     """Return the first `n` free places."""
-    found = np.zeros((0, 2))
+    result = np.zeros((0, 2))
     for _ in range(_TRIES):
-        if len(found) >= n:
-            return found[:n]
+        if len(result) >= n:
+            return result[:n]
         xy = ground.draw(rng, max(_PLACES, 2 * n))
-        found = np.vstack([found, xy[free(xy)]])
+        result = np.vstack([result, xy[free(xy)]])
     raise BlockError(f"there is no room for {what} beside the other buildings; ask for fewer or smaller ones")

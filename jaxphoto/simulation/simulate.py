@@ -251,9 +251,9 @@ def _start(
 ) -> tuple[Start, Unknowns]:
     """Start values and priors; control replaces approximate coordinates."""
     n, near = len(flight.images), recipe.start
-    off = _draw(seed, "approximate orientation", (2, n, 3))
-    position = np.asarray(flight.exterior.position) + near.position_m * off[0]
-    turn = np.deg2rad(near.angle_deg) * off[1]
+    deviation = _draw(seed, "approximate orientation", (2, n, 3))
+    position = np.asarray(flight.exterior.position) + near.position_m * deviation[0]
+    turn = np.deg2rad(near.angle_deg) * deviation[1]
     exterior = ExteriorOrientation(position, rotate_cameras(flight.exterior, turn))  # type: ignore[arg-type]
     points = np.full(scene.xyz.shape, np.nan)
     if near.points_m is not None:

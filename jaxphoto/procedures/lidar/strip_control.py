@@ -137,8 +137,8 @@ def check_seen(control: SurveyedPoints, surveyed: OnStrips, search: StripSearch)
     if abs(offset) > _FAR_M:
         raise BlockError(
             f"the points of {control.file} lie {abs(offset):.1f} m {'above' if offset > 0 else 'below'} the strips: "
-            "its heights may count in feet or belong to another vertical system than those of the cloud; bring both into "
-            "one"
+            "its heights may count in feet or belong to another vertical system than those of the cloud; bring both "
+            "into one"
         )
 
 
