@@ -48,7 +48,7 @@ from tests.io import test_cameras as cameras
 from tests.io import test_robotics_cameras as robotics
 from tests.io import test_surfaces as surfaces
 from tests.io.conftest import FILES
-from tests.simulation import test_changing_cameras as changing_cameras
+from tests.simulation import test_camera_changes as changing_cameras
 from tests.simulation import test_relative_poses, test_rig
 from tests.simulation.small import RECIPES, changed
 

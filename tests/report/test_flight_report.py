@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
 from jaxphoto.camera.conditions import Conditions
-from jaxphoto.errors import camera_words
 from jaxphoto.procedures.control import ControlledBlock
 from jaxphoto.procedures.control.marked import Marked
 from jaxphoto.report.findings import as_sentence, p_words
@@ -253,10 +252,6 @@ def test_provenance_is_silent_of_what_photographs_do_not_say():
 )
 def test_a_maker_that_is_in_the_name_of_the_model_is_told_once(make, model, camera):
     assert Conditions("i", "i.jpg", "0" * 64, make=make, model=model).camera == camera
-
-
-def test_a_camera_without_a_name_of_its_own_is_called_so_once():
-    assert camera_words("camera") == "the camera" and camera_words("one") == "camera one"
 
 
 def test_p_values_are_never_zero():
