@@ -117,16 +117,11 @@ def table_texts(name: str, cells: pd.DataFrame) -> dict:
     names = list(dict.fromkeys(shown["column"]))
     rows = [{"name": r, "cells": [texts.get((r, c), empty) for c in names]} for r in dict.fromkeys(shown["row"])]
     return {
-        "name": name,
-        "title": table_title(name),
-        "judged": int((cells["within"] != "").sum()),
-        "good": int((cells["within"] == "yes").sum()),
-        "columns": columns,
-        "rows": rows,
-        "printed": bool(shown["published"].notna().any()),
-        "notes": list(numbers),
+        "name": name, "title": table_title(name), "judged": int((cells["within"] != "").sum()),
+        "good": int((cells["within"] == "yes").sum()), "columns": columns, "rows": rows,
+        "printed": bool(shown["published"].notna().any()), "notes": list(numbers),
         "difference": _difference(cells[overall].iloc[0]) if overall.any() else None,
-    }
+    }  # fmt: skip
 
 
 def _column(of: pd.DataFrame, power: int, marks: dict[str, int]) -> list[tuple[pd.Series, dict]]:

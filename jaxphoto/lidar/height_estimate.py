@@ -512,18 +512,10 @@ def _estimate(near: Neighbours, leafy: Bool[Array, "points"], numbers: HeightNum
     expected = noise_variance(fit, numbers.noise)
     return HeightEstimate(
         height=jnp.sum(weight * jnp.where(near.there, near.z, 0.0)),
-        sigma=height_sigma(near, weight, fit, numbers.noise),
-        used=jnp.sum(used),
-        density=(n_there - 1) / (jnp.pi * reach**2),
-        roughness=jnp.sqrt(fit.variance),
-        gradient=fit.coefficients[1:3],
-        leafy=jnp.sum(leafy & used) / jnp.maximum(jnp.sum(used), 1),
-        hole=empty_about(near.distance, around),
-        surrounded=surrounded(near.xy, around) & fit.interpolates & interpolates,
-        plane=take_flat & (method == "local"),
-        misfit=misfit(fit, _HARDLY),
-        rough=fit.variance > _ROUGH**2 * expected,
-        wide=jnp.sum(wide),
-        one_surface=curved.variance,
-        final=final,
-    )
+        sigma=height_sigma(near, weight, fit, numbers.noise), used=jnp.sum(used),
+        density=(n_there - 1) / (jnp.pi * reach**2), roughness=jnp.sqrt(fit.variance), gradient=fit.coefficients[1:3],
+        leafy=jnp.sum(leafy & used) / jnp.maximum(jnp.sum(used), 1), hole=empty_about(near.distance, around),
+        surrounded=surrounded(near.xy, around) & fit.interpolates & interpolates, plane=take_flat & (method == "local"),
+        misfit=misfit(fit, _HARDLY), rough=fit.variance > _ROUGH**2 * expected, wide=jnp.sum(wide),
+        one_surface=curved.variance, final=final,
+    )  # fmt: skip

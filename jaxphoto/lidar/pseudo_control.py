@@ -160,18 +160,11 @@ def pseudo_control_points(
     rows = np.arange(_room(n)) % n
     one = exterior.position.ndim == 1
     found = call_compiled(
-        _pseudo_control,
-        jax.tree.map(to_numpy, interior),
-        jax.tree.map(lambda v: to_numpy(v) if one else to_numpy(v)[rows], exterior),
-        to_numpy(xy)[rows],
-        grid,
-        skyline(grid),
-        _Numbers(*map(as_jax_array, numbers)),
-        settings.points,
-        window_reach(grid, _CANDIDATES * settings.points),
-        interpolation,
-        corrections,
-    )
+        _pseudo_control, jax.tree.map(to_numpy, interior),
+        jax.tree.map(lambda v: to_numpy(v) if one else to_numpy(v)[rows], exterior), to_numpy(xy)[rows], grid,
+        skyline(grid), _Numbers(*map(as_jax_array, numbers)), settings.points,
+        window_reach(grid, _CANDIDATES * settings.points), interpolation, corrections,
+    )  # fmt: skip
     return jax.tree.map(lambda v: to_numpy(v)[:n], found)
 
 

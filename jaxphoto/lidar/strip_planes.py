@@ -282,15 +282,10 @@ def planes_from(cells: CellReturns, settings: StripSettings) -> StripPatches:
     # A patch smoother than any scanner is so by chance.
     variance = np.maximum(roughness[usable], settings.least_roughness_m) ** 2
     return StripPatches(
-        cells.cell[usable],
-        count[usable],
-        cells.mean[usable],
-        cells.measured[usable],
-        cells.time[usable],
-        normal[usable],
-        np.sqrt(_moderated(variance, count[usable] - 3, normal[usable])),
+        cells.cell[usable], count[usable], cells.mean[usable], cells.measured[usable], cells.time[usable],
+        normal[usable], np.sqrt(_moderated(variance, count[usable] - 3, normal[usable])),
         np.einsum("nik,nk,njk->nij", along, 1 / value[usable][:, 1:], along),
-    )
+    )  # fmt: skip
 
 
 def steep(normal: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
@@ -322,15 +317,9 @@ def corresponding(one: StripPatches, other: StripPatches, settings: StripSetting
     up_a, up_b = (up_to_plane(p, k, place, normal) for p, k in ((one, a), (other, b)))
     variance = variance_of_plane(one, a, place) + variance_of_plane(other, b, place)
     return PlanePairs(
-        a,
-        b,
-        cell[similar],
-        place + up_a[:, None] * normal,
-        place + up_b[:, None] * normal,
-        normal,
-        up_a - up_b,
+        a, b, cell[similar], place + up_a[:, None] * normal, place + up_b[:, None] * normal, normal, up_a - up_b,
         np.sqrt(variance),
-    )
+    )  # fmt: skip
 
 
 def fitting(gap: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"], limit: float) -> np.ndarray:

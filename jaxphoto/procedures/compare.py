@@ -194,17 +194,10 @@ def halves(
         overlap=overlap(first[good], size),
     )
     return Halves(
-        adjusted=adjusted,
-        camera=name,
-        by=by,
-        method=method,
-        cells_mm=cells_mm,
-        covariance=camera_covariance,
-        promised_px=np.sqrt(np.trace(whole, axis1=1, axis2=2)),
-        cuts=cuts,
-        failed=tuple(cut for cut in done if cut.problem),
-        band=error_band(differences, whole),
-    )
+        adjusted=adjusted, camera=name, by=by, method=method, cells_mm=cells_mm, covariance=camera_covariance,
+        promised_px=np.sqrt(np.trace(whole, axis1=1, axis2=2)), cuts=cuts,
+        failed=tuple(cut for cut in done if cut.problem), band=error_band(differences, whole),
+    )  # fmt: skip
 
 
 def camera_of(block: Block, camera: str | None) -> str:

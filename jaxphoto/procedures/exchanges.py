@@ -193,17 +193,10 @@ def _ray_data(at: Adjustment, left: RowMasks, gone: Int[np.ndarray, "points"], s
     np.minimum.at(depths[:, 0], p.image[valid], far[valid])
     np.maximum.at(depths[:, 1], p.image[valid], far[valid])
     return _Rays(
-        block,
-        measured,
-        measured - measured_discrepancies(block, unknowns),
-        is_gone,
-        left[p.group],
-        origins,
-        directions,
-        to_numpy(p.sigma).mean(axis=1) / c,
-        depths * [1 / _DEPTH, _DEPTH],
+        block, measured, measured - measured_discrepancies(block, unknowns), is_gone, left[p.group], origins,
+        directions, to_numpy(p.sigma).mean(axis=1) / c, depths * [1 / _DEPTH, _DEPTH],
         sigma0**2 * float(chi_square_limit(np.array(1), LEVEL / len(p))),
-    )
+    )  # fmt: skip
 
 
 def _candidates(rays: _Rays) -> Int[np.ndarray, "pairs 2"]:

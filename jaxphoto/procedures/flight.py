@@ -162,17 +162,10 @@ def _calibrated(
         # Without convergence they are no weights; the report says so.
         adjusted = components.adjusted if bool(components.adjusted.converged) else adjusted
     return FlightPart(
-        oriented,
-        matched,
-        placed,
-        why_not,
-        components,
-        adjusted,
-        rejudged(controlled, adjusted) if controlled else None,
-        no_control,
-        lens.sentences(oriented.block, CAMERA) if lens else (),
-        why_no_shutter,
-    )
+        oriented, matched, placed, why_not, components, adjusted,
+        rejudged(controlled, adjusted) if controlled else None, no_control,
+        lens.sentences(oriented.block, CAMERA) if lens else (), why_no_shutter,
+    )  # fmt: skip
 
 
 def _placed_otherwise(

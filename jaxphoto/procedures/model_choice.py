@@ -309,17 +309,11 @@ def _judge(candidate: Candidate, adjusted: Adjustment) -> Judged:
     fit = n * np.log(s / n) if r > 0 else _NAN
     aic = fit + 2 * (p + 1)
     return Judged(
-        candidate=candidate,
-        n_parameters=p,
-        n_effective=n,
-        redundancy=r,
-        sum_of_squares=s,
-        rms_px=float(np.sqrt(np.mean(_squares_px(block, apart)))),
-        aic=aic,
-        aicc=aic + 2 * (p + 1) * (p + 2) / (n - p - 2) if n > p + 2 else _NAN,
-        bic=fit + (p + 1) * np.log(n),
+        candidate=candidate, n_parameters=p, n_effective=n, redundancy=r, sum_of_squares=s,
+        rms_px=float(np.sqrt(np.mean(_squares_px(block, apart)))), aic=aic,
+        aicc=aic + 2 * (p + 1) * (p + 2) / (n - p - 2) if n > p + 2 else _NAN, bic=fit + (p + 1) * np.log(n),
         parameters=tuple(significance(adjusted, covariance(adjusted))),
-    )
+    )  # fmt: skip
 
 
 def _squares_px(block: Block, apart_mm: Float[np.ndarray, "rows 2"]) -> Float[np.ndarray, "rows"]:

@@ -143,19 +143,15 @@ def write_boresight(steps: Sequence[Step], directory: Path, seconds: dict[str, f
             "passed": passed,
             "steps": [
                 {
-                    "step": step.number,
-                    "title": step.title,
-                    "go_on": step.go_on,
-                    "converged": bool(step.adjusted.converged),
-                    "sigma0": float(step.adjusted.sigma0),
-                    "redundancy": step.adjusted.redundancy,
-                    "findings": list(step.findings),
+                    "step": step.number, "title": step.title, "go_on": step.go_on,
+                    "converged": bool(step.adjusted.converged), "sigma0": float(step.adjusted.sigma0),
+                    "redundancy": step.adjusted.redundancy, "findings": list(step.findings),
                     "estimates": [estimate._asdict() for estimate in step.estimates],
                 }
                 for step in steps
             ],
             "seconds": rounded(seconds | {"write": time.perf_counter() - began}),
-        }
+        }  # fmt: skip
         write_study(
             work, f"{block.title or 'block'}: boresight", (verdict, "green" if passed else "red"),
             boresight_parts(steps), summary, record, {"steps": steps_table(steps)},

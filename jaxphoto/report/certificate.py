@@ -39,15 +39,11 @@ _ALIGNMENTS: tuple[tuple[Method, str], ...] = (
 )
 _UNKNOWN = "not in the image files"
 _QUANTITIES = (
-    ("exposure", "exposure_s", "s"),
-    ("f-number", "f_number", ""),
-    ("sensitivity", "iso", "ISO"),
-    ("focal length", "focal_length_mm", "mm (as stated by the lens)"),
-    ("focus distance", "subject_distance_m", "m"),
-    ("temperature", "temperature_c", "degrees Celsius"),
-    ("relative humidity", "humidity_percent", "%"),
+    ("exposure", "exposure_s", "s"), ("f-number", "f_number", ""), ("sensitivity", "iso", "ISO"),
+    ("focal length", "focal_length_mm", "mm (as stated by the lens)"), ("focus distance", "subject_distance_m", "m"),
+    ("temperature", "temperature_c", "degrees Celsius"), ("relative humidity", "humidity_percent", "%"),
     ("air pressure", "pressure_hpa", "hPa"),
-)
+)  # fmt: skip
 
 
 class LastCalibration(NamedTuple):

@@ -310,20 +310,14 @@ def posterior_table(posterior: Posterior) -> pd.DataFrame:
     low, high = np.quantile(posterior.draws, [0.025, 0.975], axis=0) * factor
     return pd.DataFrame(
         {
-            "parameter": names,
-            "optimum": optimum,
-            "laplace_sigma": sigma,
+            "parameter": names, "optimum": optimum, "laplace_sigma": sigma,
             "laplace_2.5_percent": optimum - _NORMAL_97_5 * sigma,
-            "laplace_97.5_percent": optimum + _NORMAL_97_5 * sigma,
-            "posterior_mean": posterior.mean * factor,
-            "posterior_sigma": np.sqrt(np.diagonal(posterior.covariance)) * factor,
-            "posterior_2.5_percent": low,
-            "posterior_97.5_percent": high,
-            "skewness": posterior.skewness,
-            "rhat": posterior.rhat,
+            "laplace_97.5_percent": optimum + _NORMAL_97_5 * sigma, "posterior_mean": posterior.mean * factor,
+            "posterior_sigma": np.sqrt(np.diagonal(posterior.covariance)) * factor, "posterior_2.5_percent": low,
+            "posterior_97.5_percent": high, "skewness": posterior.skewness, "rhat": posterior.rhat,
             "ess": posterior.ess,
         }
-    )
+    )  # fmt: skip
 
 
 def posterior_figure(posterior: Posterior) -> Figure:

@@ -560,17 +560,11 @@ def write_part_orientation(part: FlightPart, folder: Path) -> None:
 def _summary(r: PartReport, number: int) -> dict:
     report, placed = r.part.oriented.report, r.part.placed
     return {
-        "verdict": r.verdict.colour,
-        "block": block_folder(number),
-        "result": part_folder(number),
-        "n_images": len(r.part.adjusted.block.images),
-        "n_image_points": report.n_image_points,
-        "n_points": report.n_points,
-        "mean_px": report.mean_px,
-        "alike": report.alike,
-        "epsg": r.part.adjusted.block.frame.code,
-        "positions_used": int(placed.used.sum()) if placed else 0,
+        "verdict": r.verdict.colour, "block": block_folder(number), "result": part_folder(number),
+        "n_images": len(r.part.adjusted.block.images), "n_image_points": report.n_image_points,
+        "n_points": report.n_points, "mean_px": report.mean_px, "alike": report.alike,
+        "epsg": r.part.adjusted.block.frame.code, "positions_used": int(placed.used.sum()) if placed else 0,
         "positions_left_out": [n for n, u in zip(placed.images, placed.used, strict=True) if not u] if placed else [],
         "sigma0": float(r.part.adjusted.sigma0),
         "control": control_summary(r.part.controlled) if r.part.controlled else None,
-    }
+    }  # fmt: skip

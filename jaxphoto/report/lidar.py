@@ -199,18 +199,12 @@ def write_simultaneous(
         parts: list[Part] = [
             *verdict_parts(verdict),
             *(Paragraph(as_sentence(sentence)) for sentence in rounds_words(result.rounds, result.converged)),
-            Link("all results of the images", "adjustment/report.html"),
-            Heading("Changes"),
-            moved[free],
-            Paragraph("Root mean square changes:"),
-            without_empty(moved[~free]),
-            Plot(figure, "points above the surface of the cloud, before and after"),
-            Heading("Iterations"),
-            rounds.replace(np.inf, np.nan),
-            Heading("Correlations of the scanner"),
-            Paragraph("The strongest; all are in scanner_correlation.csv."),
-            _strongest(correlations),
-        ]
+            Link("all results of the images", "adjustment/report.html"), Heading("Changes"), moved[free],
+            Paragraph("Root mean square changes:"), without_empty(moved[~free]),
+            Plot(figure, "points above the surface of the cloud, before and after"), Heading("Iterations"),
+            rounds.replace(np.inf, np.nan), Heading("Correlations of the scanner"),
+            Paragraph("The strongest; all are in scanner_correlation.csv."), _strongest(correlations),
+        ]  # fmt: skip
         files = {
             "rounds": rounds,
             "moved": moved,

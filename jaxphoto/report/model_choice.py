@@ -158,14 +158,10 @@ def write_model_choice(
         parameters,
     ]
     summary = {
-        "title": block.title,
-        "verdict": verdict,
-        "by_bic": choice.by_bic,
-        "by_prediction": choice.by_prediction,
-        "n_left_out": choice.n_left_out,
-        "models": table["model"].tolist(),
+        "title": block.title, "verdict": verdict, "by_bic": choice.by_bic, "by_prediction": choice.by_prediction,
+        "n_left_out": choice.n_left_out, "models": table["model"].tolist(),
         "seconds": rounded(seconds | {"write": time.perf_counter() - began}),
-    }
+    }  # fmt: skip
     with whole_folder(directory) as work:
         write_study(
             work, f"{block.title or 'block'}: models", (". ".join(verdict), ""), parts, summary, record,

@@ -252,14 +252,8 @@ def _summary(tables: SensitivityTables, seconds: dict[str, float]) -> dict:
             "variance_shares": {str(group): float(share) for group, share in groups.items()},
         }
     return {
-        "title": adjusted.block.title,
-        "bias_m": tables.bias_m,
-        "per": tables.per,
-        "delta0": tables.delta0,
-        "sigma0": float(adjusted.sigma0),
-        "redundancy": adjusted.redundancy,
-        "check_points": len(tables.check),
-        "unchecked_observations": {name: int((~np.isfinite(v)).sum()) for name, v in mdb.items()},
-        "interior": interior,
+        "title": adjusted.block.title, "bias_m": tables.bias_m, "per": tables.per, "delta0": tables.delta0,
+        "sigma0": float(adjusted.sigma0), "redundancy": adjusted.redundancy, "check_points": len(tables.check),
+        "unchecked_observations": {name: int((~np.isfinite(v)).sum()) for name, v in mdb.items()}, "interior": interior,
         "seconds": rounded(seconds),
-    }
+    }  # fmt: skip

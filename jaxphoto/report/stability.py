@@ -72,14 +72,10 @@ def stability_table(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_
         alignment = np.full(6, np.nan)
         alignment[: len(v.alignment)] = v.alignment
         row = {
-            "method": method,
-            "unknowns": len(v.alignment),
-            "rmse_offset_mm": float(v.rmse_mm),
-            "rmse_offset_px": float(v.rmse_mm) / pixel_mm,
-            "rmse_measured_mm": float(v.rmse_measured_mm),
-            "largest_mm": float(np.linalg.norm(v.offsets, axis=1).max()),
-            "similar": one.similar(noise_mm),
-        }
+            "method": method, "unknowns": len(v.alignment), "rmse_offset_mm": float(v.rmse_mm),
+            "rmse_offset_px": float(v.rmse_mm) / pixel_mm, "rmse_measured_mm": float(v.rmse_measured_mm),
+            "largest_mm": float(np.linalg.norm(v.offsets, axis=1).max()), "similar": one.similar(noise_mm),
+        }  # fmt: skip
         row |= one.uncertainty._asdict() if one.uncertainty is not None else {}
         row |= dict(zip(("rx_deg", "ry_deg", "rz_deg"), np.rad2deg(alignment[:3]), strict=True))
         row |= dict(zip(("X_of_distance", "Y_of_distance", "Z_of_distance"), alignment[3:], strict=True))
@@ -175,14 +171,10 @@ def stability_summary(
     """The comparison in summary.json."""
     chosen = analyses[method]
     return {
-        "verdict": f"{method}: {chosen.verdict(noise_mm)}",
-        "method": method,
-        "similar": chosen.similar(noise_mm),
-        "noise_mm": noise_mm,
-        "rmse_offset_mm": {name: float(one.offsets.rmse_mm) for name, one in analyses.items()},
-        "n_points": len(chosen.offsets.points),
-        "covariance": {"A": sets[0].known, "B": sets[1].known},
-    }
+        "verdict": f"{method}: {chosen.verdict(noise_mm)}", "method": method, "similar": chosen.similar(noise_mm),
+        "noise_mm": noise_mm, "rmse_offset_mm": {name: float(one.offsets.rmse_mm) for name, one in analyses.items()},
+        "n_points": len(chosen.offsets.points), "covariance": {"A": sets[0].known, "B": sets[1].known},
+    }  # fmt: skip
 
 
 # Change ----------------------------------------------------------------------------------------------------------
@@ -297,15 +289,9 @@ def write_change(
     verdict = change_headline(change), "amber" if change.changed else "green"
     with whole_folder(directory) as work:
         write_study(
-            work,
-            "Change of a camera",
-            verdict,
-            parts,
-            change_summary(change, sensor),
-            record,
-            tables,
+            work, "Change of a camera", verdict, parts, change_summary(change, sensor), record, tables,
             {"change": figure},
-        )
+        )  # fmt: skip
 
 
 def change_summary(change: Change, sensor: Sensor) -> dict[str, Any]:
@@ -337,14 +323,10 @@ def cell_table(halves: Halves) -> pd.DataFrame:
     """
     offsets = np.stack([cut.offsets_px for cut in halves.cuts])
     columns = {
-        "x_mm": halves.cells_mm[:, 0],
-        "y_mm": halves.cells_mm[:, 1],
-        "promised_px": halves.promised_px,
-        "factor": halves.band.cell_factor,
-        "halves_px": np.sqrt((offsets**2).sum(axis=2).mean(axis=0)),
-        "halves_band_px": halves.band.halves,
-        "band_px": halves.band.calibration,
-    }
+        "x_mm": halves.cells_mm[:, 0], "y_mm": halves.cells_mm[:, 1], "promised_px": halves.promised_px,
+        "factor": halves.band.cell_factor, "halves_px": np.sqrt((offsets**2).sum(axis=2).mean(axis=0)),
+        "halves_band_px": halves.band.halves, "band_px": halves.band.calibration,
+    }  # fmt: skip
     return pd.DataFrame(columns)
 
 
@@ -439,18 +421,11 @@ def write_halves(
     ]
     inside, sigma = halves.inside
     summary = {
-        "title": halves.adjusted.block.title,
-        "verdict": verdict,
-        "camera": halves.camera,
-        "by": halves.by,
-        "method": halves.method,
-        "factor": halves.band.factor,
-        "sigma_factor": halves.band.sigma_factor,
-        "inside": inside if np.isfinite(inside) else None,
-        "sigma_inside": sigma if np.isfinite(sigma) else None,
-        "n_cuts": len(halves.cuts),
-        "n_failed": len(halves.failed),
-    }
+        "title": halves.adjusted.block.title, "verdict": verdict, "camera": halves.camera, "by": halves.by,
+        "method": halves.method, "factor": halves.band.factor, "sigma_factor": halves.band.sigma_factor,
+        "inside": inside if np.isfinite(inside) else None, "sigma_inside": sigma if np.isfinite(sigma) else None,
+        "n_cuts": len(halves.cuts), "n_failed": len(halves.failed),
+    }  # fmt: skip
     with whole_folder(directory) as work:
         write_camera(work)
         write_study(

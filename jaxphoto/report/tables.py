@@ -295,19 +295,15 @@ class Tables:
             return np.where(axes == "", rows.names_of("parameter", labels), axes)
 
         columns = {
-            "group": names(lambda g, rows: g),
-            "image": names(lambda g, rows: rows.names_of("image", block.images)),
-            "point": names(lambda g, rows: rows.names_of("point", block.points)),
-            "axis": names(axis),
-            "residual": in_units(residual),
-            "sigma": in_units(sigma),
+            "group": names(lambda g, rows: g), "image": names(lambda g, rows: rows.names_of("image", block.images)),
+            "point": names(lambda g, rows: rows.names_of("point", block.points)), "axis": names(axis),
+            "residual": in_units(residual), "sigma": in_units(sigma),
             "unit": names(lambda g, rows: in_file_unit(rows.unit)[1]),
-            "redundancy_number": numbers(self.redundancy.named),
-            "w": numbers(self.w.named),
+            "redundancy_number": numbers(self.redundancy.named), "w": numbers(self.w.named),
             "detectable": in_units(detectable),
             **{f"{p.removesuffix('_mm')}_moves": numbers(v) for p, v in self.undetected.interior.items()},
             "most_moves": numbers(self.undetected.most),
-        }
+        }  # fmt: skip
         return pd.DataFrame(columns, copy=False)
 
     @cached_property

@@ -130,29 +130,15 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     unknowns, priors, truth = with_changes({**changes, RigCamera.kind: rig}, *known)
     start = dataclasses.replace(start, unknowns=unknowns)
     block = Block(
-        title=recipe.title,
-        images=flight.images,
-        points=scene.ids,
-        sensors=recipe.sensors,
-        image_camera=flight.cameras,
-        image_mount=tuple(recipe.mount_of(camera) for camera in flight.cameras),
-        image_strip=flight.strips,
-        image_time=flight.time,
-        image_points=_image_points(recipe, scene, seed),
-        control=control,
-        fixed=ControlCoordinates.none(),
-        check=check,
-        stations=stations,
-        attitudes=attitudes,
-        distances=Distances.none(),
-        datum=recipe.datum,
-        start=start,
-        priors=priors,
+        title=recipe.title, images=flight.images, points=scene.ids, sensors=recipe.sensors, image_camera=flight.cameras,
+        image_mount=tuple(recipe.mount_of(camera) for camera in flight.cameras), image_strip=flight.strips,
+        image_time=flight.time, image_points=_image_points(recipe, scene, seed), control=control,
+        fixed=ControlCoordinates.none(), check=check, stations=stations, attitudes=attitudes,
+        distances=Distances.none(), datum=recipe.datum, start=start, priors=priors,
         motion=flight.motion if has_delay(rig) or any(map(_has_time_offset, recipe.mounts.values())) else None,
-        flight_time=clock,
-        temperatures=temperatures,
+        flight_time=clock, temperatures=temperatures,
         more=(*camera_steps(recipe, flight, times, start.unknowns), *rig_rows(recipe, flight), *relative),
-    )
+    )  # fmt: skip
     return Simulation(block, truth, triple(recipe.datum_offset_m), terrain, cloud, trajectory, errors)
 
 

@@ -220,15 +220,8 @@ def test_published_tables_that_cannot_be_are_refused(text, message, run, tmp_pat
 
 def test_the_command_runs_a_users_own_experiments(folder, tmp_path):
     arguments = [
-        "experiment",
-        "all",
-        "--experiments",
-        str(folder.parent),
-        "--layouts",
-        "1",
-        "--out",
-        str(tmp_path / "out"),
-    ]
+        "experiment", "all", "--experiments", str(folder.parent), "--layouts", "1", "--out", str(tmp_path / "out"),
+    ]  # fmt: skip
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
     table = pd.read_csv(tmp_path / "out" / "tables.csv")

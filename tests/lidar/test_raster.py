@@ -150,14 +150,9 @@ def test_orthophoto_of_whole_numbers_in_another_frame():
     moved = Raster(raster.heights + shift[2], raster.west + shift[0], raster.north + shift[1], raster.cell_m)
     here = orthophoto(raster, photograph, SENSOR, INTERIOR, EXTERIOR)
     there = orthophoto(
-        moved,
-        photograph,
-        SENSOR,
-        INTERIOR,
-        EXTERIOR,
-        object_from_map=lambda xyz: xyz - shift,
+        moved, photograph, SENSOR, INTERIOR, EXTERIOR, object_from_map=lambda xyz: xyz - shift,
         map_from_object=lambda xyz: xyz + shift,
-    )
+    )  # fmt: skip
     assert here.pixels.dtype == np.uint8
     np.testing.assert_array_equal(here.seen, there.seen)
     assert np.abs(here.pixels.astype(int) - there.pixels).max() <= 1

@@ -194,19 +194,11 @@ def simultaneous(
     corrected, used = correct_cloud(cloud, scanner, path), result.used
     after = look(result.adjusted)
     return Simultaneous(
-        first,
-        result.adjusted,
-        corrected,
-        correct_trajectory(trajectory, cloud, scanner) if trajectory is not None else None,
-        scanner,
-        result.seen.point[used],
-        strip[used],
-        result.before.apart(first)[used],
-        after.apart(result.adjusted)[used],
-        np.sqrt(((corrected.xyz - cloud.xyz) ** 2).mean(axis=0)),
-        result.rounds,
-        result.converged,
-    )
+        first, result.adjusted, corrected,
+        correct_trajectory(trajectory, cloud, scanner) if trajectory is not None else None, scanner,
+        result.seen.point[used], strip[used], result.before.apart(first)[used], after.apart(result.adjusted)[used],
+        np.sqrt(((corrected.xyz - cloud.xyz) ** 2).mean(axis=0)), result.rounds, result.converged,
+    )  # fmt: skip
 
 
 def _strips(cloud: Cloud, names: tuple[str, ...], path: ScannerPath | None) -> list[_Strip]:

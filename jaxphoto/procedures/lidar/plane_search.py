@@ -202,17 +202,8 @@ class PointSearch:
             normal = f.patches.normal[found.patch]
             of_strips.append(
                 StripPoints(
-                    self.points[found.point],
-                    side.knots,
-                    side.weights,
-                    side.point,
-                    side.scanner,
-                    side.roll_pitch_yaw,
-                    side.velocity,
-                    side.rate,
-                    normal,
-                    found.sigma,
-                    np.zeros(len(normal)),
+                    self.points[found.point], side.knots, side.weights, side.point, side.scanner, side.roll_pitch_yaw,
+                    side.velocity, side.rate, normal, found.sigma, np.zeros(len(normal)),
                 )
-            )
+            )  # fmt: skip
         return (StripPoints.joined(*of_strips),) if of_strips else ()

@@ -128,14 +128,10 @@ def roof_control(
 
     result = iterate_to_convergence(first, look, build, max_rounds, report, "surfaces")
     return RoofControl(
-        at_result(result.adjusted.block, result.adjusted.unknowns),
-        result.adjusted,
-        which[result.used],
-        result.seen.apart(result.adjusted)[result.used],
-        len(np.unique(chosen[result.used])),
-        result.rounds,
+        at_result(result.adjusted.block, result.adjusted.unknowns), result.adjusted, which[result.used],
+        result.seen.apart(result.adjusted)[result.used], len(np.unique(chosen[result.used])), result.rounds,
         result.converged,
-    )
+    )  # fmt: skip
 
 
 def _patches(cloud: Cloud, places: Float[np.ndarray, "n 3"], settings: HeightSettings) -> list[Patch]:

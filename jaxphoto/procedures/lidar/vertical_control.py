@@ -104,16 +104,9 @@ def lidar_control(
         adjust_with_fixed_interior(block), look, build, max_rounds, report, "control_points"
     )
     return LidarControl(
-        at_result(result.adjusted.block, result.adjusted.unknowns),
-        result.adjusted,
-        which,
-        result.seen.foot[:, 2],
-        heights["sigma"],
-        heights["flag"],
-        result.used,
-        result.rounds,
-        result.converged,
-    )
+        at_result(result.adjusted.block, result.adjusted.unknowns), result.adjusted, which, result.seen.foot[:, 2],
+        heights["sigma"], heights["flag"], result.used, result.rounds, result.converged,
+    )  # fmt: skip
 
 
 def tie_points(block: Block, names: Collection[str] | None = None) -> Int[np.ndarray, "points"]:
