@@ -227,11 +227,11 @@ def _inseparable(cov: Covariance) -> list[str]:
     plan = "a shift of every strip along its heading is equivalent; relief helps, or a fixed principal point"
     height = "fix c, or fly at two heights"
     messages = []
-    for axes, ends, mend in (("XY", ("].xp_mm", "].yp_mm"), plan), ("Z", ("].c_mm",), height)):
+    for axes, ends, advice in (("XY", ("].xp_mm", "].yp_mm"), plan), ("Z", ("].c_mm",), height)):
         shifts = tuple(f".shift_{axis}_m" for axis in axes)
         rho, a, b = _strongest(cov, lambda x, s=shifts: x.endswith(s), lambda x, e=ends: x.endswith(e))
         if abs(rho) > HIGH:
-            messages.append(f"{a} and {b} are hardly separable (rho = {rho:+.3f}): {mend}")
+            messages.append(f"{a} and {b} are hardly separable (rho = {rho:+.3f}): {advice}")
     return messages
 
 

@@ -188,8 +188,8 @@ class PointSearch:
         if not len(out):
             return []
         return [
-            f"{len(out)} of {len(lines)} points on breaklines have no two smooth faces about them in any strip, and "
-            f"nothing is said of them: {few([names[p] for p in lines[out]])}; take cells (--cell-m) half as wide as "
+            f"{len(out)} of {len(lines)} points on breaklines have no two smooth faces about them in any strip, hence "
+            f"no observations: {few([names[p] for p in lines[out]])}; take cells (--cell-m) half as wide as "
             "the roofs, or leave these points out"
         ]
 

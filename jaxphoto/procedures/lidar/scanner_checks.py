@@ -186,7 +186,7 @@ def _jumps(trajectory: Trajectory) -> list[str]:
         return []
     return [
         f"the trajectory jumps by {jump[k]:.2g} m at {time[k + 2]:.3f} s from one record to the next, which no "
-        "aircraft does: splines go over it; process the trajectory anew, or leave out the strip that was flown then"
+        "aircraft does: splines go over it; process the trajectory again, or leave out the strip that was flown then"
     ]
 
 
