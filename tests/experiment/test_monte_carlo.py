@@ -231,25 +231,20 @@ def folder(tmp_path_factory):
 def test_the_command(folder, monkeypatch, capsys, tmp_path):
     out = tmp_path / "run"
     options = ("--bias", "station", "--per", "strip", "--sigma-m", "0.05,0.05,0.1", "--draws", 20, "--seed", 3)
-    code, printed, _ = run(
-        monkeypatch, capsys, "monte-carlo", folder, *options, "--with", "exterior", "--with", "points", "--out", out
-    )
-    assert code == 0
-    assert "20 draws, 20 converged" in printed
+    command = ("monte-carlo", folder, *options, "--with", "exterior", "--with", "points", "--out", out)
+    code, printed, _ = run(monkeypatch, capsys, *command)
+    assert code == 0 and "20 draws, 20 converged" in printed
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "20 draws, 20 converged." in page and "--sigma-m 0.05,0.05,0.1" in page
-    assert (
-        "Images, points and trajectory knots are in summary.csv." in page
-        and f"exterior.{simulated(NOMINAL).block.images[0]}" not in page
-    )
+    assert "Images, points and trajectory knots are in summary.csv." in page
+    assert f"exterior.{simulated(NOMINAL).block.images[0]}" not in page
     draws = pd.read_parquet(out / "draws.parquet")
     block = simulated(NOMINAL).block
     strips = set(block.image_strip)
     assert {f"bias.{strip}.{axis}_m" for strip in strips for axis in "XYZ"} <= set(draws.columns)
     assert f"exterior.{block.images[0]}.kappa_deg" in draws.columns
     assert f"point.{block.points[0]}.Z_m" in draws.columns
-    shifts = [c for c in draws.columns if c.startswith("strips.")]
-    assert shifts
+    assert any(c.startswith("strips.") for c in draws.columns)
 
 
 @pytest.mark.parametrize(
@@ -257,9 +252,7 @@ def test_the_command(folder, monkeypatch, capsys, tmp_path):
     [
         (("--bias", "station", "--sigma-m", "0.1", "--on", "S9", "--per", "strip"), "unknown strip 'S9'"),
         (("--bias", "station", "--sigma-m", "0.1", "--draws", "0"), "must be positive, got 0"),
-        (("--bias", "station", "--sigma-m", "0.1", "--draws", "-5"), "must be positive, got -5"),
         (("--bias", "station", "--sigma-deg", "0.1"), "takes --sigma-m"),
-        (("--bias", "station"), "takes --sigma-m"),
         (("--bias", "station", "--sigma-m", "much"), "--sigma-m much"),
         (("--bias", "station", "--sigma-m", "-1"), "above zero"),
         (("--bias", "wind", "--sigma-m", "1"), "'wind' is not one of 'station'"),
@@ -270,10 +263,7 @@ def test_the_command(folder, monkeypatch, capsys, tmp_path):
 )
 def test_a_mistake_is_one_sentence_and_nothing_written(folder, monkeypatch, capsys, tmp_path, options, words):
     code, _, error = run(monkeypatch, capsys, "monte-carlo", folder, "--out", tmp_path / "run", *options)
-    assert code == 2
-    assert words in error
-    assert "Traceback" not in error
-    assert not (tmp_path / "run").exists()
+    assert code == 2 and words in error and "Traceback" not in error and not (tmp_path / "run").exists()
 
 
 @pytest.mark.slow
@@ -281,9 +271,8 @@ def test_killed_in_the_middle_it_goes_on_to_the_same_file(folder, tmp_path):
     program = [sys.executable, "-c", "from jaxphoto_command import main; main()", "monte-carlo", str(folder)]
     program += ["--bias", "station", "--per", "image", "--sigma-m", "0.1", "--draws", "10000"]
     subprocess.run([*program, "--out", str(tmp_path / "whole")], check=True, capture_output=True)
-    killed = subprocess.Popen(
-        [*program, "--out", str(tmp_path / "killed")], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    killed = subprocess.Popen([*program, "--out", str(tmp_path / "killed")], **silent)
     parts = tmp_path / "killed" / "parts"
     while not list(parts.glob("part-*.parquet")):
         assert killed.poll() is None

@@ -130,12 +130,9 @@ def test_comparison_holds_every_printed_and_every_own_cell_with_its_judgement(fo
 def test_a_run_is_written_whole_and_read_back(folder, run, tmp_path):
     out = tmp_path / "out"
     write_runs({folder: run}, out)
-    pd.testing.assert_frame_equal(
-        pd.read_csv(out / "tables.csv", dtype={"row": str}, keep_default_na=False, na_values=[""])[
-            ["ours", "published"]
-        ],
-        compare(run, folder)[["ours", "published"]],
-    )
+    columns = ["ours", "published"]
+    table = pd.read_csv(out / "tables.csv", dtype={"row": str}, keep_default_na=False, na_values=[""])
+    pd.testing.assert_frame_equal(table[columns], compare(run, folder)[columns])
     assert len(pd.read_csv(out / "cells.csv")) == len(run.cells)
     page = (out / "report.html").read_text()
     assert "far off" in page and "34.25" in page and "<svg" in page
