@@ -72,7 +72,7 @@ class Stop(Exception):
 
 
 @pytest.mark.parametrize("at", slow_but((1030,), (1, 1030, 1100)))
-def test_a_run_that_was_stopped_goes_on_to_the_same_file(whole, tmp_path, at):
+def test_a_stopped_run_continues_to_the_same_file(whole, tmp_path, at):
     def stop(done: int) -> None:
         if done >= at:
             raise Stop
@@ -89,7 +89,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_file(whole, tmp_path, at):
     assert not (tmp_path / "run" / "parts").exists()
 
 
-def test_what_there_is_is_summed_up_while_a_run_lasts(whole, tmp_path, monkeypatch):
+def test_partial_results_are_summarised_during_a_run(whole, tmp_path, monkeypatch):
     def stop(done: int) -> None:
         if done >= 1030:
             raise Stop
@@ -126,7 +126,7 @@ def test_of_a_large_block_every_batch_is_kept(tmp_path, monkeypatch):
     assert len(pd.read_parquet(tmp_path / "run" / "parts")) == made.run.batch_size
 
 
-def test_a_run_that_is_done_is_only_read(whole):
+def test_a_finished_run_is_only_read(whole):
     directory, (summary, _) = whole
     before = (directory / "summary.json").stat().st_mtime_ns
     again = study(directory)
@@ -155,7 +155,7 @@ def test_other_errors_of_the_same_names_are_another_run(whole):
         study(directory, errors=laplace)
 
 
-def test_settings_that_cannot_be_read_are_said_to_be_so(tmp_path):
+def test_unreadable_settings_are_refused(tmp_path):
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(InputError, match="holds no settings"):
         study(tmp_path)
@@ -267,7 +267,7 @@ def test_a_mistake_is_one_sentence_and_nothing_written(folder, monkeypatch, caps
 
 
 @pytest.mark.slow
-def test_killed_in_the_middle_it_goes_on_to_the_same_file(folder, tmp_path):
+def test_a_killed_run_continues_to_the_same_file(folder, tmp_path):
     program = [sys.executable, "-c", "from jaxphoto_command import main; main()", "monte-carlo", str(folder)]
     program += ["--bias", "station", "--per", "image", "--sigma-m", "0.1", "--draws", "10000"]
     subprocess.run([*program, "--out", str(tmp_path / "whole")], check=True, capture_output=True)

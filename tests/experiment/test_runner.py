@@ -157,7 +157,7 @@ def test_several_experiments_share_the_tables_and_have_a_page_each(folder, run, 
         assert "<svg" in (tmp_path / "out" / f"{name}.html").read_text()
 
 
-def test_layouts_that_cannot_be_made_are_left_out_and_told_of(folder, tmp_path):
+def test_impossible_layouts_are_skipped_with_a_message(folder, tmp_path):
     broken = tmp_path / "broken"
     broken.mkdir()
     (broken / "recipe.toml").write_text(RECIPE)
@@ -193,7 +193,7 @@ def first_coordinate(folder) -> float:
         ({"other/experiment.py": DECLARED}, "there is no experiment small.*choose other or all"),
     ],
 )
-def test_what_is_no_experiment_is_refused_with_the_mend(files, message, tmp_path):
+def test_what_is_no_experiment_is_refused(files, message, tmp_path):
     for name, text in files.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)

@@ -19,7 +19,7 @@ from tests.marks import slow_but
 
 
 @pytest.mark.parametrize("name", slow_but(("cross",), ("cross", "inner", "mount")))
-def test_what_is_compiled_meanwhile_serves_the_tables(name, monkeypatch):
+def test_concurrent_compilation_serves_the_tables(name, monkeypatch):
     monkeypatch.setattr(run, "_programs", {})
     monkeypatch.setattr(run, "_prepared", {})
     adjusted = adjust_for_tables(simulated(name).block)
@@ -33,7 +33,7 @@ def test_what_is_compiled_meanwhile_serves_the_tables(name, monkeypatch):
     assert not run._prepared
 
 
-def test_points_that_fly_away_from_a_start_that_is_far_off_come_back():
+def test_points_that_diverge_from_poor_initial_values_are_recovered():
     """Off by up to 100 m, 10 degrees and 10 % of c: a point that flew away is placed anew from where the others are."""
     block, rng = example(), np.random.default_rng(1)
     best = adjusted_example()
@@ -46,7 +46,7 @@ def test_points_that_fly_away_from_a_start_that_is_far_off_come_back():
     np.testing.assert_allclose(float(found.sum_of_squares), float(best.sum_of_squares), rtol=1e-6)
 
 
-def test_images_that_are_given_upside_down_are_oriented_by_their_points():
+def test_inverted_images_are_oriented_by_their_points():
     """omega off by 180 degrees, as between conventions: all points lie behind."""
     block = example()
     best = adjusted_example()
@@ -62,7 +62,7 @@ def test_images_that_are_given_upside_down_are_oriented_by_their_points():
     np.testing.assert_allclose(float(found.sum_of_squares), float(best.sum_of_squares), rtol=1e-6)
 
 
-def test_a_tie_point_whose_rays_meet_nowhere_is_left_out_and_said():
+def test_a_tie_point_without_intersection_is_rejected_with_a_message():
     """Mirrored in one of its three images it flies away, and took the calibration with it."""
     block = example()
     rows = block.image_points

@@ -119,7 +119,7 @@ def test_without_and_with_control_differ_by_what_their_sigmas_allow():
     assert "no systematic tendency" in said(fourth)
 
 
-def test_control_of_another_datum_bends_the_misalignment():
+def test_control_in_another_datum_biases_the_misalignment():
     """Control that leans against the stations, 2.5 m over the block: only step 4 shows what it does."""
     made = block()
     control = made.control
@@ -150,7 +150,7 @@ def test_a_major_shift_stops_at_the_second_step():
 
 
 @pytest.mark.slow
-def test_a_moderate_shift_is_carried():
+def test_a_moderate_shift_is_estimated():
     """Free in step 3, held at its value in step 4; nothing else of the strips is kept."""
     shift = 0.4
     found = steps(shift)
@@ -209,7 +209,7 @@ def test_priors_of_each_step():
         step_block(made, 5)
 
 
-def test_without_times_no_drift_is_looked_for():
+def test_without_times_no_drift_is_estimated():
     made = eqx.tree_at(lambda b: b.image_time, block(), np.zeros(10))
     assert step_block(made, 2).priors.strips["a"] == StripBias(FREE, FIXED)
 
@@ -234,7 +234,7 @@ def lone_control():
     ],
     ids=["control", "stations", "attitudes", "strips", "one-strip", "mount", "lone-control"],
 )
-def test_what_a_step_lacks_is_said_before_the_first(spoil, words, monkeypatch):
+def test_missing_data_of_any_step_are_reported_first(spoil, words, monkeypatch):
     monkeypatch.setattr(sys.modules["jaxphoto.procedures.boresight"], "adjust", None)
     with pytest.raises(BlockError) as caught:
         boresight(spoil())
@@ -279,7 +279,7 @@ def test_the_command_writes_all_four_steps(monkeypatch, capsys, tmp_path):
     assert {p.name for p in tmp_path.iterdir()} == {"block", "out"}
 
 
-def test_a_block_without_attitudes_is_one_sentence(monkeypatch, capsys, tmp_path):
+def test_a_block_without_attitudes_is_refused(monkeypatch, capsys, tmp_path):
     folder = tmp_path / "block"
     write_block(dataclasses.replace(block(), attitudes=Attitudes.none()), folder)
     code, screen, error = run(monkeypatch, capsys, "boresight", folder, "--out", tmp_path / "out")

@@ -82,7 +82,7 @@ def test_the_datum_of_the_map_is_that_of_its_coordinates():
         assert "from WGS 84 to the datum RT90" in found.sentences[0]
 
 
-def test_positions_that_jump_are_named_and_left_out():
+def test_blunders_of_positions_are_rejected():
     block, truth = network()
     position = np.array(truth.exterior.position)
     wrong = [2, 7]
@@ -96,7 +96,7 @@ def test_positions_that_jump_are_named_and_left_out():
 
 
 @pytest.mark.parametrize("stated", [(2.0, 2.0, 4.0), None])
-def test_positions_within_their_own_standard_deviations_contradict_nothing(stated):
+def test_positions_within_their_standard_deviations_are_accepted(stated):
     """Corrected positions for most, metres for the rest: what is 2 m off of these is used, what is 60 m off is not."""
     block, truth = network()
     position = np.array(truth.exterior.position)
@@ -109,7 +109,7 @@ def test_positions_within_their_own_standard_deviations_contradict_nothing(state
     assert np.median(np.abs(found.offsets_m)) < 0.3
 
 
-def test_positions_that_do_not_tell_the_turn_well_bring_the_block_to_its_place_and_hold_it_not():
+def test_positions_that_hardly_determine_the_rotation_only_place_the_block():
     block, truth = network()
     position = np.asarray(truth.exterior.position)
     found = georeference_photographs(block, recorded(position, block.images, (50.0, 50.0, 50.0)))
@@ -125,7 +125,7 @@ def test_positions_that_do_not_tell_the_turn_well_bring_the_block_to_its_place_a
     assert with_fixed_datum(worse, block.datum) is None
 
 
-def test_positions_that_scatter_less_than_is_taken_for_granted_hold_a_small_block():
+def test_positions_more_precise_than_assumed_constrain_a_small_block():
     """A block of metres: 2 m tell no turn of it, the decimetre by which its positions scatter does."""
     block, truth = network()
     rng, small = np.random.default_rng(3), np.asarray(truth.exterior.position) / 50.0
@@ -140,7 +140,7 @@ def test_positions_that_scatter_less_than_is_taken_for_granted_hold_a_small_bloc
     assert with_observed_scatter(found, {n: g._replace(sigma_m=(1.0, 1.0, 1.0)) for n, g in known.items()}) is None
 
 
-def test_mirrored_positions_do_not_turn_the_block_over():
+def test_mirrored_positions_are_refused():
     """As of a table whose X and Y have changed places: cameras that look up fit them as well as the true ones fit."""
     block, truth = network()
     mirrored = np.array(truth.exterior.position)[:, [1, 0, 2]]
@@ -183,7 +183,7 @@ def of_one_strip(block, truth, rng):
     return recorded(position[:5], block.images[:5])
 
 
-def test_a_single_strip_without_attitudes_is_put_on_the_map_as_if_it_looked_down():
+def test_a_single_strip_without_attitudes_is_levelled():
     """The first strip of the network alone; its photographs hang by up to 3 degrees about a level line."""
     whole, truth = network()
     block = some_images(whole, np.arange(10) < 5)
@@ -204,7 +204,7 @@ def test_a_single_strip_without_attitudes_is_put_on_the_map_as_if_it_looked_down
     assert held is not None and not len(held.block.stations) and held.block.datum == block.datum
 
 
-def test_a_single_strip_is_turned_by_its_attitudes():
+def test_a_single_strip_is_oriented_by_its_attitudes():
     block, truth = network()
     rng = np.random.default_rng(5)
     attitudes = strip_attitudes(block, truth, rng, common_deg=1.0)
@@ -226,7 +226,7 @@ def test_a_single_strip_is_turned_by_its_attitudes():
 @pytest.mark.parametrize(
     ("degrees", "words"), [(90, "270 degrees clockwise"), (180, "180 degrees clockwise"), (120, "contradict")]
 )
-def test_attitudes_of_pictures_that_a_program_turned_are_turned_likewise(degrees, words):
+def test_attitudes_of_rotated_pictures_are_rotated(degrees, words):
     """Recorded attitudes are those of the picture turned clockwise; by what is no quarter they are not mended."""
     block, truth = network()
     rng = np.random.default_rng(5)
@@ -242,7 +242,7 @@ def test_attitudes_of_pictures_that_a_program_turned_are_turned_likewise(degrees
 
 
 @pytest.mark.slow
-def test_positions_nearer_than_receivers_tell_contradict_no_attitudes():
+def test_positions_closer_than_their_precision_contradict_no_attitudes():
     """Two photographs taken 5 m apart, of which the second has its error north instead of east."""
     block, truth = network()
     position = np.asarray(truth.exterior.position)[[0, 0]] + [[0.0, 0.0, 0.0], [0.0, 5.0, 0.0]]
@@ -255,7 +255,7 @@ def test_positions_nearer_than_receivers_tell_contradict_no_attitudes():
     assert any("the pictures are turned by" in s for s in found.sentences)
 
 
-def test_a_single_strip_is_adjusted_with_what_attitudes_share():
+def test_a_single_strip_is_adjusted_with_a_common_attitude_error():
     block, truth = network()
     rng = np.random.default_rng(5)
     attitudes = strip_attitudes(block, truth, rng, common_deg=2.0)
@@ -284,7 +284,7 @@ def test_attitudes_beside_better_positions_are_compared_and_not_used():
     assert any("the attitudes of the files contradict the photographs" in s for s in said)
 
 
-def test_heights_from_another_zero_are_one_sentence():
+def test_heights_of_another_datum_are_one_message():
     block, truth = network()
     position = np.array(truth.exterior.position)
     position[[1, 4, 8], 2] -= 130.0

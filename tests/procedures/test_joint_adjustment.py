@@ -39,7 +39,7 @@ def estimates() -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     return labels, value, np.asarray(fitted().covariance.matrix)[-len(labels) :, -len(labels) :]
 
 
-def test_camera_and_scanner_are_found():
+def test_camera_and_scanner_are_recovered():
     """All of it together: chi squared of thirteen, because some of it is told apart badly."""
     labels, value, matrix = estimates()
     true = truth(flown())
@@ -53,7 +53,7 @@ def test_camera_and_scanner_are_found():
     assert max(v for label, v in sigma.items() if label.startswith("mounts")) < 2e-4
 
 
-def test_nothing_changes_any_more_and_weights_are_right():
+def test_the_iteration_converges_with_correct_weights():
     found = fitted()
     assert found.converged and found.adjusted.outcome is Outcome.CONVERGED
     assert float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
@@ -65,7 +65,7 @@ def test_nothing_changes_any_more_and_weights_are_right():
         assert d.planes > 50 and d.rms_m < d.noise_m
 
 
-def test_pictures_take_names_as_they_are():
+def test_plots_show_names_literally():
     """A dollar begins a formula of matplotlib, and a unit may end a name."""
     result = fitted()
     named = dataclasses.replace(result, cloud=dataclasses.replace(result.cloud, strips=("L$^$1", "b_rad", "c")))
@@ -100,7 +100,7 @@ def test_errors_along_a_strip_have_the_spread_of_their_knots():
     assert (np.abs(value - true) < 4 * sigma).all()
 
 
-def test_errors_of_the_trajectory_are_found():
+def test_trajectory_errors_are_recovered():
     labels, value, matrix = estimates()
     errors = flown().errors
     own = [k for k, label in enumerate(labels) if label.startswith("trajectory_knots")]

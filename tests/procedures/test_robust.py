@@ -73,12 +73,12 @@ def test_derivatives_go_through_the_robust_optimum(block):
     assert exact == pytest.approx(numeric, rel=1e-3)
 
 
-def test_snooping_begins_from_any_loss_and_ends_alike(block):
+def test_snooping_gives_the_same_result_from_any_loss(block):
     rows = [{(s.group, s.row) for s in snoop(block, loss=loss).left_out} for loss in (None, StudentT())]
     assert rows[0] and len(rows[0] ^ rows[1]) <= 1
 
 
-def test_a_group_that_is_none_is_refused(block):
+def test_an_unknown_group_is_refused(block):
     with pytest.raises(BlockError, match="no observations gnss"):
         robust(block, {"gnss": Huber()})
 

@@ -36,14 +36,14 @@ def of_many_rays(block, n):
     return [int(np.flatnonzero(p.point == point)[k % 3]) for k, point in enumerate(points)]
 
 
-def test_nothing_goes_where_nothing_is_wrong(block, whole):
+def test_no_observation_is_rejected_without_blunders(block, whole):
     found = snoop(block)
     assert not (found.left_out or found.points or found.exchanged)
     np.testing.assert_allclose(found.adjusted.unknowns.points, whole.unknowns.points, atol=1e-6)
     assert float(found.adjusted.sigma0) == pytest.approx(float(whole.sigma0), rel=1e-6)
 
 
-def test_blunders_of_every_kind_go_and_nothing_else(block, whole):
+def test_blunders_of_every_kind_are_rejected_and_nothing_else(block, whole):
     wrong = of_many_rays(block, 6)
 
     def spoil(xy):
@@ -76,7 +76,7 @@ def test_blunders_of_every_kind_go_and_nothing_else(block, whole):
     assert abs(float(found.adjusted.sigma0) / float(whole.sigma0) - 1) < 0.1
 
 
-def test_exchanged_names_are_put_right(block, whole):
+def test_exchanged_names_are_corrected(block, whole):
     p = block.image_points
     first = of_many_rays(block, 1)[0]
     rays = np.bincount(p.point)[p.point]
@@ -95,7 +95,7 @@ def test_exchanged_names_are_put_right(block, whole):
     np.testing.assert_allclose(found.adjusted.unknowns.points, whole.unknowns.points, atol=1e-5)
 
 
-def test_a_point_of_two_contradicting_rays_goes_as_a_whole(block, whole):
+def test_a_point_of_two_contradicting_rays_is_rejected_whole(block, whole):
     p = block.image_points
     rays = np.bincount(p.point, minlength=len(block.points))
     point = int(np.flatnonzero(rays == rays.min())[0])
@@ -112,7 +112,7 @@ def test_a_point_of_two_contradicting_rays_goes_as_a_whole(block, whole):
 
 
 @pytest.mark.parametrize("pair", [[202, 206], [202, 208]])
-def test_where_one_beginning_leads_nowhere_another_is_tried(block, pair, whole):
+def test_a_second_initial_solution_is_tried_if_the_first_fails(block, pair, whole):
     """Exchanged names in the last image, whose orientation they turn: the first beginning ends at sigma naught 180."""
 
     def exchange(xy):
@@ -161,7 +161,7 @@ def test_exchanged_names_of_points_of_two_rays():
         ("stations", "B7", "B8"),
     ],
 )  # fmt: skip
-def test_exchanged_coordinates_are_put_right(group, one, other):
+def test_exchanged_coordinates_are_corrected(group, one, other):
     block = example()
     rows = block.named_observations[group]
     names = block.points if group == "control_points" else block.images
@@ -183,7 +183,7 @@ def test_exchanged_coordinates_are_put_right(group, one, other):
         ("stations", tuple(f"B{k}" for k in range(1, 9)), ("B1",)),
     ],
 )  # fmt: skip
-def test_rows_in_another_order_are_put_right(group, names, gone):
+def test_rows_in_another_order_are_corrected(group, names, gone):
     block = example()
     rows = block.named_observations[group]
     known = block.points if group == "control_points" else block.images
@@ -214,7 +214,7 @@ def test_coordinates_that_are_wrong_are_not_taken_for_an_exchange(block):
     assert rows and rows <= set(one.tolist())
 
 
-def test_what_all_rows_are_off_by_alike_goes_and_nothing_else(block):
+def test_a_common_error_of_all_rows_is_rejected_and_nothing_else(block):
     """c and the ground take up nearly all of it; then the sound coordinates of stations contradict what looks right."""
     stations = block.stations
     heights = np.asarray(stations.axis) == 2
@@ -226,7 +226,7 @@ def test_what_all_rows_are_off_by_alike_goes_and_nothing_else(block):
     assert (finding.subject, finding.value) == ("stations along Z", heights.sum())
 
 
-def test_what_no_observations_tell_is_said_as_by_an_adjustment(block):
+def test_undetermined_parameters_are_reported_as_by_an_adjustment(block):
     """Not that too much contradicts too much: nothing does."""
     p, stations = block.image_points, block.stations
     of_two_points = (p.image != 3) | np.isin(np.arange(len(p)), np.flatnonzero(p.image == 3)[:2])

@@ -46,7 +46,7 @@ def above_ground(cloud: Cloud) -> np.ndarray:
     return cloud.xyz[some, 2] - flown().terrain.height(cloud.xyz[some, :2])
 
 
-def test_the_truth_mends_the_cloud():
+def test_true_errors_correct_the_cloud():
     flight = flown()
     off = above_ground(correct_strips(flight.cloud, flight.errors, scanner_path(flight.trajectory)))
     assert abs(off.mean()) < 0.002 and off.std() == pytest.approx(NOISE_M, rel=0.1)
@@ -98,7 +98,7 @@ def chi_squared_of_the_scanner(flight, found) -> float:
     return float(off @ np.linalg.solve(matrix[np.ix_(own, own)], off))
 
 
-def test_the_scanner_is_found():
+def test_scanner_parameters_are_recovered():
     found = fitted()
     assert chi_squared_of_the_scanner(flown(), found) < 20.5  # 99.9 %
     # All but the range offset are many sigma: not to find them would show.
@@ -106,7 +106,7 @@ def test_the_scanner_is_found():
     assert len(table) == 5 and (table.value.abs() > 4 * table.sigma).sum() >= 4
 
 
-def test_a_scanner_of_prisms_is_found_by_what_it_sees_ahead_and_behind():
+def test_a_risley_scanner_is_calibrated_by_its_two_looks():
     flight = flown_around()
     found = adjust_strips(flight.cloud, flight.trajectory, SETTINGS, PRIORS_AROUND)
     assert found.converged and float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
@@ -122,7 +122,7 @@ def test_a_scanner_of_prisms_is_found_by_what_it_sees_ahead_and_behind():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["rotating", "oscillating"])
-def test_angles_and_clock_of_a_scanner_are_found(kind):
+def test_angles_and_clock_of_a_scanner_are_recovered(kind):
     """By the options of the command, in the words of a recipe; errors of the trajectory as they drift."""
     true = {"eccentricity_deg": [0.02, -0.03], "time_offset_s": 0.005}
     drifts = {key: TRUTH[key] for key in ("drift_sigma_m", "drift_sigma_deg", "correlation_s", "knots_s")}
@@ -135,7 +135,7 @@ def test_angles_and_clock_of_a_scanner_are_found(kind):
     assert (table.value.abs() > 4 * table.sigma).all()
 
 
-def test_another_pattern_than_that_of_the_scanner_is_told():
+def test_a_wrong_scan_pattern_is_refused():
     flight, other = flown(), flown_around()
     with pytest.raises(BlockError, match="as those of a scanner that draws lines across the track"):
         check_measured_from(flight.cloud, scanner_path(flight.trajectory), "circle")
@@ -145,7 +145,7 @@ def test_another_pattern_than_that_of_the_scanner_is_told():
     check_measured_from(other.cloud, scanner_path(other.trajectory), "circle")
 
 
-def test_the_errors_of_the_trajectory_are_found():
+def test_trajectory_errors_are_recovered():
     """At the times of the flight, as far as their covariance says."""
     table, errors, w = trajectory_errors_table(fitted()), flown().errors, []
     names = ["X_m", "Y_m", "Z_m", "right_deg", "forward_deg", "up_deg"]
@@ -157,7 +157,7 @@ def test_the_errors_of_the_trajectory_are_found():
     assert np.mean(np.abs(np.concatenate(w)) < 3) > 0.95
 
 
-def test_cloud_and_trajectory_are_mended_alike():
+def test_cloud_and_trajectory_are_corrected_consistently():
     found, flight = fitted(), flown()
     assert found.cloud.strips == flight.cloud.strips
     np.testing.assert_array_equal(found.cloud.time, flight.cloud.time)
@@ -180,7 +180,7 @@ MOST = 1000
 COARSE = StripSettings(cell_m=2.0, roughness_m=0.04, returns=8, most=MOST)
 
 
-def test_without_a_trajectory_shifts_are_found():
+def test_without_a_trajectory_shifts_are_estimated():
     shift = np.array([0.15, -0.2, 0.1])
     found = adjust_strips(two_strips(shift), settings=COARSE)
     sigma = np.asarray(found.covariance.shared_sigma)
@@ -234,7 +234,7 @@ def test_what_cannot_be_adjusted():
         adjust_strips(apart, settings=COARSE)
 
 
-def test_trajectories_that_do_not_go_with_the_cloud():
+def test_inconsistent_trajectories_are_refused():
     flight = flown()
     path = flight.trajectory
     cut = dataclasses.replace(path, **{f: getattr(path, f)[:1500] for f in vars(path)})
@@ -253,7 +253,7 @@ def test_trajectories_that_do_not_go_with_the_cloud():
         adjust_strips(flight.cloud, jump)
 
 
-def test_knots_are_called_by_strip_and_time():
+def test_knots_are_named_by_strip_and_time():
     owners = list(fitted().adjusted.unknowns.more[TrajectoryKnot.kind])
     assert owners[1].startswith("1 at 0.0") and owners[-1].startswith("3 at ")
 
@@ -276,7 +276,7 @@ def test_a_trajectory_that_cannot_be_the_cloud_s_is_refused(coordinates, sentenc
         adjust_strips(flight.cloud, other, SETTINGS)
 
 
-def test_a_body_that_flies_backwards_is_told():
+def test_backward_flight_is_reported():
     flight = flown()
     back = np.asarray(flight.trajectory.quaternion)[:, [3, 2, 1, 0]] * [-1.0, 1.0, -1.0, 1.0]  # times a half turn
     odd = check_measured_from(flight.cloud, scanner_path(dataclasses.replace(flight.trajectory, quaternion=back)))
@@ -284,7 +284,7 @@ def test_a_body_that_flies_backwards_is_told():
     assert 170 < float(odd[0].split(" degrees")[0].split()[-1]) <= 180
 
 
-def test_a_trajectory_that_jumps_is_told():
+def test_a_jump_of_the_trajectory_is_reported():
     flight = flown()
     time, xyz = np.asarray(flight.trajectory.time), np.array(flight.trajectory.position)
     k = len(time) // 2

@@ -71,7 +71,7 @@ def pulls(seed: int) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_control_finds_what_strips_have_in_common_without_a_trajectory():
+def test_control_determines_common_shifts_without_a_trajectory():
     control = surveyed(on_roofs(24, 3), 3)
     control = control._replace(check=np.arange(24) % 4 == 3)
     control.coordinates[0, 2] += 0.5  # A blunder.
@@ -95,7 +95,7 @@ def test_control_finds_what_strips_have_in_common_without_a_trajectory():
     assert (used.sigma_m < used.noise_m).all() and len(used) == found.rounds[-1].control
 
 
-def test_one_strip_goes_through_control():
+def test_one_strip_is_fitted_to_control():
     both = two_strips(3)
     one = dataclasses.replace(both, xyz=both.xyz[both.strip == 0], strip=both.strip[both.strip == 0], strips=("1",))
     found = adjust_strips(one, settings=COARSE, control=surveyed(on_roofs(24, 3), 3))
@@ -112,7 +112,7 @@ def test_one_strip_goes_through_control():
     assert 0.6 < np.sqrt(np.mean(used.w**2)) < 1.4 and not told.w.isna().any()
 
 
-def test_on_level_ground_control_tells_heights_and_the_first_strip_the_rest():
+def test_on_level_ground_control_determines_heights_only():
     # No more than two points, which would not do for photographs.
     xy = np.array([[42.0, 50.0], [58.0, 50.0]])
     control = surveyed(np.column_stack([xy, level(*xy.T)]))
@@ -156,7 +156,7 @@ def raised(rise: float = 0.25) -> tuple[Simulation, StripAdjustment, StripAdjust
 
 
 @pytest.mark.slow
-def test_with_a_trajectory_control_finds_the_height_of_a_flight():
+def test_with_a_trajectory_control_determines_the_height_of_a_flight():
     flight, alone, found = raised()
     assert found.converged and found.rounds[-1].control > 40
 

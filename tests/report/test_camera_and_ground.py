@@ -100,7 +100,7 @@ def test_side_by_side_stands_what_the_long_table_says():
     assert wide.set_index("exterior").loc["omega", "yp"] == f"{one:.3f}"
 
 
-def test_an_image_that_has_the_measurements_of_another_is_told():
+def test_duplicated_images_are_reported():
     block = simulated("cross").block
     assert duplicate_images(block) == []
     rows = block.image_points
@@ -145,7 +145,7 @@ def test_the_last_step_is_shorter_than_what_ends_an_adjustment():
     assert f"by more than {last:.1e} of its standard deviation" in convergence_words(result)
 
 
-def test_where_nothing_was_iterated_nothing_is_told():
+def test_without_iterations_nothing_is_reported():
     without = dataclasses.replace(adjusted("cross"), history=None)
     assert convergence_table(without).empty and convergence_words(without) == ""
     with pytest.raises(InputError, match="adjust the block to draw its convergence"):

@@ -26,14 +26,14 @@ def without_k2():
     return verdict_of(Tables(adjust(block.fix("k2"))))
 
 
-def test_a_term_that_is_held_is_told_before_the_observations_that_it_accuses(without_k2):
+def test_a_missing_term_is_named_before_the_observations(without_k2):
     assert without_k2.colour == "red"
     first = next(k for k, text in enumerate(without_k2.texts) if "k2, which is fixed: free it" in text)
     accused = [k for k, f in enumerate(without_k2.findings) if f.code == "blunder"]
     assert accused and first < min(accused)
 
 
-def test_a_strip_that_is_off_is_told_before_its_stations():
+def test_a_shifted_strip_is_named_before_its_stations():
     """By 3 m along X; most of its stations are suspects, each alone."""
     block = example()
     rows = block.stations
@@ -48,7 +48,7 @@ def test_a_strip_that_is_off_is_told_before_its_stations():
     assert not any(f.code == "blunder" for f in others)
 
 
-def test_stations_that_are_off_each_by_itself_are_no_strip():
+def test_single_station_errors_are_no_strip_shift():
     block = example()
     rows = block.stations
     value = np.array(rows.value)
@@ -59,7 +59,7 @@ def test_stations_that_are_off_each_by_itself_are_no_strip():
     assert first.code == "blunder" and first.subject.startswith("station of image A")
 
 
-def test_of_a_drift_the_strips_that_show_it_are_told():
+def test_a_drift_is_reported_with_its_strips():
     """3 m along Y from the first image to the last: no strip is most of it."""
     block = example()
     rows, time = block.stations, np.asarray(block.flight_time)
@@ -78,7 +78,7 @@ def spoilt_control(block, axis, **errors):
     return block.with_observations({"control_points": dataclasses.replace(rows, value=value)})
 
 
-def test_what_a_blunder_does_to_its_neighbours_is_no_alarm_of_theirs():
+def test_neighbours_of_a_blunder_are_not_reported():
     """Of suspects those count that are still beyond the critical value when the worse ones are no more observed."""
     block = example()
     spoilt = spoilt_control(block, 2, T11=2.0)
@@ -111,7 +111,7 @@ def calibration_by(adjusted):
     return KnownParameters([f"interior[kodak].{name}" for name in NAMES], value, q)
 
 
-def test_a_camera_that_has_changed_since_its_calibration_is_told_first():
+def test_a_changed_camera_is_the_first_finding():
     """Stations that are all off in height would explain it about as well, and lead to the old c."""
     block = example()
     known = calibration_by(adjusted_example())
@@ -131,14 +131,14 @@ def test_a_camera_that_has_changed_since_its_calibration_is_told_first():
     assert found.p_value == pytest.approx(beta_tail(share, 2.5, (tables.adjusted.redundancy - 5) / 2), rel=0.5)
 
 
-def test_the_same_photographs_counted_twice_are_told():
+def test_photographs_counted_twice_are_reported():
     block = example()
     known = calibration_by(adjusted_example())
     verdict = verdict_of(Tables(adjust(dataclasses.replace(block, more=(known,)))))
     assert verdict.colour == "amber" and verdict.findings[0].code == "prior_counted_twice"
 
 
-def test_standard_deviations_in_another_unit_are_an_alarm():
+def test_standard_deviations_in_another_unit_are_an_error():
     """Micrometres for millimetres: sigma naught is a thousandth, and stations tell nothing any more."""
     block = example()
     p = block.image_points
@@ -198,7 +198,7 @@ def test_blunders_are_named_the_largest_first():
     assert found[0].startswith(names[0]) and found[1].startswith(names[1])
 
 
-def test_what_nothing_checks_is_told_as_such(monkeypatch):
+def test_uncontrolled_observations_are_reported(monkeypatch):
     hidden = [
         LargestMdb("stations", "station A in X", np.inf, 0.1, "m"),
         LargestMdb("stations", "station B in X", 2.0, 0.1, "m"),

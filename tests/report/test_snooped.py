@@ -22,7 +22,7 @@ def block():
     return example()
 
 
-def test_the_shift_of_a_strip_is_told_as_one(block):
+def test_the_shift_of_a_strip_is_one_finding(block):
     rows = block.stations
     in_b = np.array(block.image_strip)[rows.who] == "B"
     value = np.asarray(rows.value) + np.where(in_b & (rows.axis == 2), 3.0, 0.0)
@@ -44,7 +44,7 @@ def test_single_errors_are_no_shift(block):
     assert codes == ["rejected_observation"] * 5
 
 
-def test_a_group_all_of_whose_rows_go_is_told(block):
+def test_a_wholly_rejected_group_is_reported(block):
     """A single scale bar, which nothing is left of."""
     control = block.control
     ends = np.array([block.points.index(name) for name in ("T1", "T3")])
@@ -55,7 +55,7 @@ def test_a_group_all_of_whose_rows_go_is_told(block):
     assert left.group == "distances" and abs(left.error - 5.0) < 1.0
 
 
-def test_what_is_too_much_to_be_single_errors_is_an_alarm(block):
+def test_a_mirrored_image_is_an_error(block):
     """x and y of an image exchanged."""
     rows = block.image_points
     xy, mine = np.array(rows.xy), rows.image == block.images.index("A3")
@@ -88,7 +88,7 @@ def test_numbers_that_overflow_are_no_pattern():
     assert freedom == 0 and not inverse.any()
 
 
-def test_the_file_whose_units_are_wrong_is_left_out_and_its_mistake_named(block):
+def test_a_file_in_wrong_units_is_rejected_with_its_cause(block):
     """Heights of control in feet: the stations are right, and the search begins without control."""
     rows = block.control
     value = np.asarray(rows.value) / np.where(rows.axis == 2, 0.3048, 1.0)
@@ -119,7 +119,7 @@ def test_the_file_whose_units_are_wrong_is_left_out_and_its_mistake_named(block)
         (lambda xyz: xyz + np.array([0, 0, 48]), None),
     ],
 )
-def test_mistakes_of_a_file_are_told_from_other_errors(block, mistake, said):
+def test_mistakes_of_a_file_are_distinguished_from_other_errors(block, mistake, said):
     rows = block.stations
     xyz = np.asarray(rows.value).reshape(-1, 3)
     given = block.with_observations({"stations": dataclasses.replace(rows, value=mistake(xyz).ravel())})

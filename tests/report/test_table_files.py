@@ -190,7 +190,7 @@ def test_check_points_are_summed_up_by_axis():
     np.testing.assert_allclose(spread[["mean", "rmse", "max_abs"]], [[-0.01, 5e-4**0.5, 0.03], [0.02] * 3, [0.0] * 3])
 
 
-def test_what_is_held_is_told_whole():
+def test_fixed_values_are_shown_in_full():
     table = {"parameter": ["c_mm", "k1"], "value": [34.250186, 1.2345678e-4], "sigma": [0.0, np.nan]}
     shown = readable(pd.DataFrame(table))
     assert list(shown["value"]) == ["34.250186", "0.00012345678"] and list(shown["sigma"]) == ["", ""]

@@ -176,7 +176,7 @@ def test_approximate_positions_are_near_as_distances_are():
         ({"targets.0.grid": [7, True]}, "grid: True is not a whole number"),
     ],
 )
-def test_mistakes_are_named_with_their_mend(changes, message):
+def test_mistakes_are_named_with_a_remedy(changes, message):
     with pytest.raises(InputError, match=f"^gopro.toml.*{message}"):
         recipe_from(changed(changes, GOPRO), "gopro.toml")
 

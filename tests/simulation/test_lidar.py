@@ -153,7 +153,7 @@ WRONG = TRUTH | {
 
 
 @pytest.mark.parametrize("kind", ["oscillating", "nutating"])
-def test_all_that_is_wrong_comes_off_by_the_truth(kind):
+def test_all_errors_are_removed_by_the_truth(kind):
     simulation = made(SCENE | {"lidar": {"density_per_m2": 0.02, "pattern": kind, "truth": WRONG}})
     cloud, errors = cloud_of(simulation), simulation.errors
     ground = cloud.classification == GROUND
@@ -441,7 +441,7 @@ def test_a_mirror_that_oscillates_looks_to_and_fro_and_longer_at_the_edges():
         ({"terrain": {"kind": "rolling"}}, r"roughness_m: points 6 m .* in place of .rolling. give its waves"),
     ],
 )  # fmt: skip
-def test_mistakes_are_named_with_their_mend(changes, message):
+def test_mistakes_are_named_with_a_remedy(changes, message):
     with pytest.raises(InputError, match=f"^small.toml.*{message}") as error:
         recipe_from(changed(changes, changed(SCENE)), "small.toml")
     assert "\n" not in str(error.value)

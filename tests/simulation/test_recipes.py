@@ -163,7 +163,7 @@ STRIP = {"name": "A", "heading_deg": 0.0, "images": 3}
         ({"datum.kind": "free"}, r"\[datum\] kind: 'free' is unknown"),
     ],
 )  # fmt: skip
-def test_mistakes_are_named_with_their_mend(changes, message):
+def test_mistakes_are_named_with_a_remedy(changes, message):
     with pytest.raises(InputError, match=f"^small.toml.*{message}") as error:
         recipe_from(changed(changes), "small.toml")
     assert "\n" not in str(error.value)

@@ -57,13 +57,13 @@ def test_cameras_sit_beside_the_one_that_is_flown():
     np.testing.assert_allclose(turn, np.tile(TRUE_TURN, (14, 1)), atol=1e-9)
 
 
-def test_the_rig_bends_by_its_noise():
+def test_the_rig_has_flexure_of_its_noise():
     place, turn = poses(flown())
     for off in ((place - TRUE_PLACE) / 0.001, (turn - TRUE_TURN) / 0.001):
         assert abs(np.std(off) - 1) < 4 / np.sqrt(2 * off.size)
 
 
-def test_the_block_is_told_which_photographs_belong_together():
+def test_the_block_has_the_rows_of_its_rig():
     block = flown().block
     assert block.images[:4] == ("A_01", "A_01_oblique", "A_02", "A_02_oblique")
     assert block.image_camera[:2] == ("kodak", "oblique")
@@ -107,7 +107,7 @@ def test_it_goes_through_files(tmp_path):
         read_block(tmp_path / "block")
 
 
-def test_measured_once_more_the_rig_bends_anew():
+def test_remeasured_rigs_have_new_flexure():
     block, truth, _ = flown()
     place, _ = poses(flown())
     off = np.array([remeasure_rows(block.more[0], block, truth, jax.random.key(k)).off for k in range(40)])
@@ -158,7 +158,7 @@ def late(noisy: bool = True):
     return simulate(recipe_from(changed(RIG | LATE | exact)), 1)
 
 
-def test_a_late_camera_is_where_the_rig_has_come_to():
+def test_a_delayed_camera_is_at_the_later_pose_of_the_rig():
     """Beside the reference as it was at its own exposure: the way flown in the meantime, and the turn."""
     simulation = late(noisy=False)
     position, rotation = (np.asarray(v) for v in vars(simulation.truth.exterior).values())
@@ -175,7 +175,7 @@ def test_a_late_camera_is_where_the_rig_has_come_to():
         np.testing.assert_allclose(rotation[k + 1], own, atol=1e-12)
 
 
-def test_the_delay_of_a_camera_is_found():
+def test_the_delay_of_a_camera_is_recovered():
     adjusted = adjust(late().block)
     assert adjusted.outcome is Outcome.CONVERGED
     sigma = dict(zip(adjusted.structure.labels, np.asarray(covariance(adjusted).shared_sigma), strict=True))
@@ -246,7 +246,7 @@ def test_a_photograph_of_a_camera_outside_the_rig_is_refused():
         adjust(dataclasses.replace(block, more=(places,)))
 
 
-def test_a_rig_of_which_nobody_says_how_rigid_it_is_is_refused():
+def test_a_rig_without_rigidity_is_refused():
     unsaid = {key: value for key, value in RIG.items() if not key.startswith("sigmas")}
     with pytest.raises(InputError, match=r"\[sigmas\]: the rigidity of the rig is missing; add rig_place_m"):
         recipe_from(changed(unsaid))

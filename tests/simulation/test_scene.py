@@ -210,7 +210,7 @@ def test_no_room_is_said():
         ({"points.on_roofs": 20.0}, "on_roofs: 20.0 is too large"),
     ],
 )  # fmt: skip
-def test_mistakes_are_named_with_their_mend(changes, message):
+def test_mistakes_are_named_with_a_remedy(changes, message):
     with pytest.raises(InputError, match=f"^small.toml.*{message}") as error:
         recipe_from(changed(changes), "small.toml")
     assert "\n" not in str(error.value)
