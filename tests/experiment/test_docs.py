@@ -1,4 +1,4 @@
-"""The experiment that docs/experiments.md writes down can be read and simulated, and its measures exist."""
+"""The example of docs/experiments.md is read and simulated, and its measures exist."""
 
 import re
 from pathlib import Path

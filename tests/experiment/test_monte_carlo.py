@@ -1,4 +1,4 @@
-"""A Monte Carlo on disk: what is promised of its files, and what becomes of a run that is stopped."""
+"""Monte Carlo runs on disk: files, and resumption after a stop."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""What an experiment prints for readers: names, digits, tables and pictures say what tables.csv says."""
+"""Pages of experiments: names, digits, tables and plots agree with tables.csv."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Experiments: what is run is what was declared, and what is written is what was run."""
+"""Experiments run as declared, and results are written completely."""
 
 import numpy as np
 import pandas as pd

@@ -1,4 +1,4 @@
-"""Heights equal independent interpolations, are as good as they say, and are refused where the cloud tells none."""
+"""Heights equal independent interpolations, have correct standard deviations, and are NaN where undetermined."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Roofs: their faces told apart, with planes, outlines, centroids and ridges of known truth."""
+"""Roofs: segmentation into faces, planes, outlines, centroids and ridges of known truth."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Planes of two strips are found where both have them, and nowhere else; their gaps are as good as said."""
+"""Planes of strips: correspondence, variances, accumulation by cell, points on planes and breaklines."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""A flight of three strips with everything wrong that a strip adjustment mends, simulated once, and adjusted once."""
+"""A flight of three strips with all errors that a strip adjustment corrects, simulated and adjusted once."""
 
 import copy
 import dataclasses

@@ -1,4 +1,4 @@
-"""The main job: what is compiled ahead is what statistics then use."""
+"""Adjustment with statistics, concurrent compilation, and completion of initial values."""
 
 import dataclasses
 import warnings

@@ -1,4 +1,4 @@
-"""The boresight in four steps: truth recovered, and a stop where it makes no sense to continue."""
+"""Boresight calibration in four steps: truth recovered, and a stop after a failed step."""
 
 import dataclasses
 import functools

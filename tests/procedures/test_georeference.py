@@ -1,4 +1,4 @@
-"""Direct georeferencing of a block: the same points as an adjustment with held images, and honest covariances."""
+"""Direct georeferencing: points of an adjustment with fixed images, and correct covariances."""
 
 import dataclasses
 import functools

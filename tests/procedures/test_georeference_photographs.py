@@ -1,4 +1,4 @@
-"""Oriented photographs in the frame of their recorded positions: the truth again, jumps named, too little refused."""
+"""Georeferencing by recorded positions: truth recovered, blunders rejected, insufficient positions refused."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Halves of a block: factors that simulation confirms, bands that hold, and what both halves share."""
+"""Split-half validation: factors and bands confirmed by simulation, and the common covariance."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""Simultaneous adjustment: camera, scanner and strips are found together, and the cloud is mended."""
+"""Simultaneous adjustment of camera, scanner and strips, and correction of the cloud."""
 
 import dataclasses
 import functools

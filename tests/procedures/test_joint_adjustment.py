@@ -1,4 +1,4 @@
-"""Trajectory, scanner and camera of one flight are found at once, and are what formulas written down again say."""
+"""Joint adjustment of trajectory, scanner and camera, compared with independent formulas."""
 
 import dataclasses
 import functools

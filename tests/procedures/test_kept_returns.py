@@ -1,4 +1,4 @@
-"""Of a cloud that is larger than memory whole cells are kept, those that tell something; what is found is the same."""
+"""Clouds larger than memory: whole informative cells are kept, with the same result."""
 
 from collections.abc import Iterator
 

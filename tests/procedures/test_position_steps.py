@@ -1,4 +1,4 @@
-"""Steps of recorded positions: found where they are, not where noise is white or wanders, and taken off a block."""
+"""Steps of recorded positions: detection, false alarms by white and correlated noise, correction."""
 
 import dataclasses
 import functools

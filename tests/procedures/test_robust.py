@@ -1,4 +1,4 @@
-"""Robust adjustments are optima of what they say, have exact derivatives, and are not moved by blunders."""
+"""Robust adjustments are optima, have exact derivatives, and resist blunders."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""How photographs move, from their neighbours: strips to and fro, gaps, whole seconds, and what is refused."""
+"""Velocities of photographs from their neighbours in time: strips, gaps, whole seconds, refusals."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Blunders are found, named and left out; what is sound stays; exchanged names are put right."""
+"""Blunders are detected, identified and rejected; exchanged names are corrected."""
 
 import dataclasses
 import itertools

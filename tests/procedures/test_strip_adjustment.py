@@ -1,4 +1,4 @@
-"""Strips are fitted to each other, and what was wrong with scanner and trajectory is found."""
+"""Strip adjustment recovers the errors of scanner and trajectory."""
 
 import dataclasses
 import functools

@@ -1,4 +1,4 @@
-"""A variance component that a few blunders make is told from one of weights that are stated too high."""
+"""Variance components inflated by a few blunders are distinguished from wrong weights."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The report of a flight without a flight: a small adjusted block in the place of photographs."""
+"""The report of a small adjusted block in place of a flight."""
 
 import functools
 

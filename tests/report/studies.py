@@ -1,4 +1,4 @@
-"""What studies found, without the studies: small results with known numbers, for their pictures and pages."""
+"""Small results of studies with known numbers, for their plots and pages."""
 
 import functools
 import math

@@ -1,4 +1,4 @@
-"""What is printed of lens priors, rays that err alike, a rolling shutter, and the camera with the ground."""
+"""Reports of lens priors, correlated residuals, rolling shutter, camera and ground, duplicates and convergence."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The likeliest culprit stands first: what the model lacks accuses sound observations."""
+"""The most probable cause is the first finding."""
 
 import dataclasses
 

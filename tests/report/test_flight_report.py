@@ -1,4 +1,4 @@
-"""The page of a flight says what its adjustment has, in an order that a stranger can follow."""
+"""The page of a flight has the numbers of its adjustment, in a fixed order."""
 
 import re
 from pathlib import Path

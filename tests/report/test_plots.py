@@ -1,4 +1,4 @@
-"""Figures draw what the tables hold."""
+"""Plots have the numbers of the tables."""
 
 import equinox as eqx
 import numpy as np

@@ -1,4 +1,4 @@
-"""What was left out is told as what it is: single errors, or one that many rows have in common."""
+"""Findings on rejected observations: single errors, or one common error of many rows."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Tables of results in other formats: the numbers as they are, or as many digits of them as their sigmas allow."""
+"""Tables in other formats: full precision, or digits by standard deviation."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""A flat block without stations says in words that c and the principal point are hardly determined."""
+"""Weak determination of c and the principal point of a flat block without stations is reported."""
 
 import dataclasses
 import functools

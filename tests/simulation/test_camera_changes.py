@@ -1,4 +1,4 @@
-"""A camera that changes in a recipe: each exposure sees through the camera of its time, and the block is told so."""
+"""Cameras that change during a flight, and rolling shutters: projection, block and truth."""
 
 import dataclasses
 

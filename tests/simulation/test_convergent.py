@@ -1,4 +1,4 @@
-"""Convergent sets: cameras stand, aim and turn as asked, and the test fields of the papers are what their pages say."""
+"""Convergent sets: positions, directions and rotations as given, and the test fields of the papers."""
 
 import tomllib
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A simulated cloud lies on the ground and roofs that were scanned, but for what the truth says is wrong with it."""
+"""Simulated clouds lie on ground and roofs, except for the simulated errors."""
 
 import functools
 import tomllib

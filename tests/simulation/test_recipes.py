@@ -1,4 +1,4 @@
-"""Recipes in TOML: the twins of the papers are what their pages say, and every mistake gets one clear sentence."""
+"""Recipes in TOML: the twins of the papers, and messages for mistakes."""
 
 import re
 import tomllib

@@ -1,4 +1,4 @@
-"""A rig in a recipe: where its cameras are, what the block is told, and that the block finds them."""
+"""Rigs in recipes: poses of their cameras, observations, and recovery by adjustment."""
 
 import dataclasses
 import functools

@@ -1,4 +1,4 @@
-"""Buildings and trees: roofs are where geometry says, things stand apart, and points lie where images see them."""
+"""Terrain, buildings and trees: heights, placement, visibility of points."""
 
 import dataclasses
 

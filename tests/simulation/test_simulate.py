@@ -1,4 +1,4 @@
-"""What a simulated block holds is its truth, plus the noise and the systematic effects asked for, and no more."""
+"""Simulated blocks are their truth plus the noise and the systematic effects of the recipe."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Who sees what: against the formulas of the field, for every pair of image and point."""
+"""Visibility compared with formulas, for every pair of image and point."""
 
 import jax
 import numpy as np
