@@ -346,7 +346,7 @@ def variance_of_plane(patches: StripPatches, which: np.ndarray, place: np.ndarra
 
 # Object points on planes fitted to one strip's surrounding returns.
 #
-# The plane of a point is that of the returns in a window of one cell about it (`corresponding_planes.planes_of`), so
+# The plane of a point is that of the returns in a window of one cell about it (`planes_of`), so
 # the point is at its centre, where a plane is best determined and curvature has the least effect.
 
 
