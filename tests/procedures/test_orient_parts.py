@@ -46,9 +46,7 @@ def network_of(scene, noise_px=0.0, false=0):
     block = _block_of("scene", p.names, SENSOR, InteriorOrientation(8.0), p.features, sigmas, found)
     true = np.array([p.point_of[i][f] for i, f in zip(found.image, found.feature, strict=True)])
     network = empty_network(block)._replace(
-        positions=scene.positions.copy(),
-        camera_from_object=scene.matrices.copy(),
-        oriented=np.ones(len(p.names), bool),
+        positions=scene.positions.copy(), camera_from_object=scene.matrices.copy(), oriented=np.ones(len(p.names), bool)
     )
     return block, network, sight_of(block, network.interior), true
 
@@ -254,8 +252,7 @@ def known_start(block, there, images=(), points=()):
     pick = lambda n, which: np.isin(np.arange(n), which)  # noqa: E731
     image, point = pick(len(block.images), images), pick(len(block.points), points)
     exterior = ExteriorOrientation(
-        np.where(image[:, None], there.positions, 0.0),
-        np.where(image[:, None, None], there.matrices, np.eye(3)),
+        np.where(image[:, None], there.positions, 0.0), np.where(image[:, None, None], there.matrices, np.eye(3))
     )
     unknowns = dataclasses.replace(
         block.start.unknowns, exterior=exterior, points=np.where(point[:, None], there.points, 0.0)
