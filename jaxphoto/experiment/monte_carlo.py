@@ -118,7 +118,7 @@ class MonteCarlo:
         return self._sum_up([c for c in self.folder.columns() if c not in _OF_DRAWS])
 
     def _written(self) -> tuple[dict, pd.DataFrame] | None:
-        """The summary and table of all draws on disk; None if they are incomplete."""
+        """Return the summary and table of all draws on disk; None if they are incomplete."""
         directory = self.folder.directory
         try:
             summary, table = read_json(directory / "summary.json"), pd.read_csv(directory / "summary.csv")
@@ -208,7 +208,7 @@ class MonteCarlo:
 
 
 def _errors_line(drawn: Bias) -> str:
-    """The errors in a line: their number, the quantities, and a digest of the assignment."""
+    """Return the errors in a line: their number, the quantities, and a digest of the assignment."""
     where = sorted({path[0] if path[0] != "start" else path[2] for path in drawn.targets})
     paths = (".".join(map(str, path)).encode() for path in drawn.targets)
     digest = _digest(*drawn.index, *(np.frombuffer(path, np.uint8) for path in paths))

@@ -56,7 +56,7 @@ def kept_orient(keep: KeptPieces) -> Callable[..., Oriented]:
 
 
 def packed(oriented: Oriented) -> dict[str, np.ndarray]:
-    """The arrays of an orientation; `unpacked` knows what they mean."""
+    """Return the arrays of an orientation; `unpacked` knows what they mean."""
     block = oriented.block
     interior, priors = block.start.unknowns.interior[CAMERA], block.priors.interior[CAMERA]
     prior = [get_parameter(priors, name) for name in parameter_names(priors)]
@@ -84,7 +84,7 @@ def packed(oriented: Oriented) -> dict[str, np.ndarray]:
 
 
 def unpacked(arrays: dict[str, np.ndarray], sensor: Sensor, interior: InteriorOrientation, title: str) -> Oriented:
-    """The orientation of `packed`; `interior` is of the camera's model."""
+    """Return the orientation of `packed`; `interior` is of the camera's model."""
     names, priors = parameter_names(interior), interior
     for name, kind, known in zip(names, arrays["prior_kinds"].tolist(), arrays["prior_values"], strict=True):
         prior = _KINDS[kind] if kind in _KINDS else Weighted(np.asarray(known[0]), np.asarray(known[1]))
