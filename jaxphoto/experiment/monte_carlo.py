@@ -174,7 +174,7 @@ class MonteCarlo:
         return summary, table
 
     def _sigmas(self) -> dict[str, float]:
-        """By name of the error, angles in degrees."""
+        """Return the standard deviations by name of the error, angles in degrees."""
         pairs = zip(self.drawn.names, self.drawn.sigma, strict=True)
         return {name: float(np.degrees(v) if name.endswith("_rad") else v) for name, v in pairs}
 

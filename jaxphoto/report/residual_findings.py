@@ -382,7 +382,7 @@ def _too_many(snooped: Snooped, block: Block) -> Iterator[Finding]:
 
 
 def component_tables(components: VarianceComponents) -> dict[str, pd.DataFrame]:
-    """By file name: variance_components, and variance_component_correlation.
+    """Tables by file name: variance_components, and variance_component_correlation.
 
     Columns are group, observations, redundancy, factor, sigma_factor, degrees_of_freedom, supported; and group_a,
     group_b, rho. A group that supports no component has the factor 1 and no sigma.

@@ -92,7 +92,7 @@ REFUSED = {
     (2053, None): ["EPSG:2053", "south or west", "convert"],
     (32722, 99999): ["EPSG code 99999 is unknown", "ellipsoidal heights"],
     (32722, 4326): ["EPSG:4326", "not a vertical CRS", "5773"],
-    (32722, 5773): ["EGM96 height", "us_nga_egm96_15.tif", "not on this computer", "pyproj sync", "ellipsoidal"],
+    (32722, 5773): ["EGM96 height", "us_nga_egm96_15.tif", "not installed", "pyproj sync", "ellipsoidal"],
 }
 
 

@@ -332,7 +332,7 @@ def _system_words(chunk: ElementTree.Element) -> str:
 
 
 def _markers(path: Path, chunk: ElementTree.Element) -> tuple[SurveyRows, list[Mark]]:
-    """Those of the file, else those of markers.xml beside it."""
+    """Read the markers of the file, else of markers.xml in its folder."""
     beside = path.with_name(MARKERS_FILE)
     if chunk.find("markers//marker") is not None or not beside.is_file() or beside == path:
         return _markers_of(path.name, chunk)

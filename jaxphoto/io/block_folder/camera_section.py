@@ -163,7 +163,7 @@ def _priors(section: Section, keys: CameraKeys, interior: InteriorOrientation) -
             raise known.error("parameters", f"{quoted(name)} is unknown or given twice; use {', '.join(names)}")
         if table.values.get(name, "free") != "free":
             raise table.error(
-                name, f"it is known beforehand by [{known.path}]; remove it here, or there with its covariance"
+                name, f"it has prior information in [{known.path}]; remove it here, or there with its covariance"
             )
         priors = set_parameter(priors, name, FREE)
     return priors, KnownTogether(parameters, known.covariance("matrix", keys.known.matrix, len(parameters)))
