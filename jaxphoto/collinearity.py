@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxphoto.argument_checks import single
 from jaxphoto.arrays import from_list
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.linear_algebra import solve
 from jaxphoto.rotation import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix, rotate
 from jaxphoto.short_repr import pretty_repr
-from jaxphoto.single import single
 
 # Eager, every operation would be compiled separately; inside another program these functions are inlined.
 _compiled = functools.partial(jax.jit, inline=True)
@@ -52,7 +52,7 @@ class ExteriorOrientation(eqx.Module):
 
 
 def _single(exterior: ExteriorOrientation) -> ExteriorOrientation:
-    """Return the orientation of one image as arrays; see `jaxphoto.single`."""
+    """Return the orientation of one image as arrays; see `jaxphoto.argument_checks`."""
     return ExteriorOrientation(
         single("exterior.position", exterior.position, 3),
         single("exterior.camera_from_object", exterior.camera_from_object, 3, 3),

@@ -319,7 +319,7 @@ def calibrate(
     from jaxphoto.io.photographs import photographs, sensor_and_interior
     from jaxphoto.procedures.calibration import calibrate, distortion_model, free_parameters
     from jaxphoto.report import prepare_pictures, print_adjustment, verdict_of
-    from jaxphoto.report.calibration import print_calibration, write_calibration
+    from jaxphoto.report.target_calibration import print_calibration, write_calibration
     from jaxphoto.writing import check_folder
 
     check_folder(out, *images)

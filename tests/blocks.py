@@ -17,7 +17,7 @@ from jaxphoto import FIXED, FREE, Outcome, Unknowns, Weighted, adjust, covarianc
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import Balanced, Brown, InteriorOrientation, Sensor, Smac, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.compiling.quickly import jit_quickly
+from jaxphoto.compiling.fast_compilation import jit_quickly
 from jaxphoto.georeferencing import Mount, Scanner, StripBias
 from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints, SurfaceRows
 from jaxphoto.rotation import small_rotation

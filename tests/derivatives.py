@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from jaxphoto.compiling.quickly import jit_quickly
+from jaxphoto.compiling.fast_compilation import jit_quickly
 
 # Fourth-order central differences: their error is about 30 step^4 of the fifth derivative, plus 1e-16 / step.
 _STEP = 1e-3

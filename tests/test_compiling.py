@@ -21,11 +21,11 @@ from jaxphoto.camera import Brown, Brown14
 from jaxphoto.collinearity import project
 from jaxphoto.compiling import (
     description,
+    fast_compilation,
     jit_quickly,
     options,
     plain_tree,
     private_folder,
-    quickly,
     run,
     run_compiled,
     store,
@@ -249,7 +249,7 @@ def test_jax_forgets_traces_when_as_many_programs_have_gone_as_are_kept(kept, mo
 
 
 def test_shapes_of_what_runs_once_are_forgotten(monkeypatch):
-    monkeypatch.setattr(quickly, "_SHAPES", 3)
+    monkeypatch.setattr(fast_compilation, "_SHAPES", 3)
     traced = []
 
     @jit_quickly

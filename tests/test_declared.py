@@ -23,7 +23,7 @@ from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.adjustment.right_hand_sides import solve_many
 from jaxphoto.adjustment.solver.optimum import typical_scale
 from jaxphoto.compiling import run_compiled
-from jaxphoto.compiling.quickly import jit_quickly
+from jaxphoto.compiling.fast_compilation import jit_quickly
 from jaxphoto.observations import Correlated, KnownParameters
 from jaxphoto.parameters import numbers_of
 from jaxphoto.report import Verdict, write_results

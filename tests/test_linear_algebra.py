@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxphoto.compiling.quickly import jit_quickly
+from jaxphoto.compiling.fast_compilation import jit_quickly
 from jaxphoto.linear_algebra import (
     cholesky,
     eigh,

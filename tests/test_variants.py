@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from jaxphoto import FIXED, FREE, BlockError, Outcome, adjust
 from jaxphoto.block import Block, Datum, Motion
-from jaxphoto.compiling.quickly import jit_quickly
+from jaxphoto.compiling.fast_compilation import jit_quickly
 from jaxphoto.observations import ControlCoordinates
 from jaxphoto.simulation import remeasure
 from jaxphoto.statistics import check_discrepancies

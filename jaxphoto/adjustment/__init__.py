@@ -17,8 +17,7 @@ from jaxphoto.adjustment.normal_equations import (
     optimise,
 )
 from jaxphoto.adjustment.result import Adjustment, Outcome
-from jaxphoto.adjustment.solver.levenberg_marquardt import SolveMode, to_factor, to_optimum
-from jaxphoto.adjustment.solver.optimum import TOLERANCE
+from jaxphoto.adjustment.solver.levenberg_marquardt import TOLERANCE, SolveMode, to_factor, to_optimum
 from jaxphoto.adjustment.weak_directions import POOR, WeakDirection, weak_directions, yardsticks
 from jaxphoto.adjustment.weakness_messages import WeakUnknowns, weaknesses_of
 

@@ -25,12 +25,12 @@ from jaxphoto.adjustment.normal_equations import NormalEquations, optimise
 from jaxphoto.adjustment.precision_check import warn_of_precision_loss
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.result import Adjustment
-from jaxphoto.adjustment.side_by_side import image_row_lists
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
 from jaxphoto.adjustment.solver.levenberg_marquardt import IterationHistory, to_factor, to_optimum, zero_system
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.similarity import n_open_motions
+from jaxphoto.adjustment.vmap_rule import image_row_lists
 from jaxphoto.arrays import gathered, is_float, is_traced, to_numpy
 from jaxphoto.block import Block
 from jaxphoto.compiling import prepare, run_compiled

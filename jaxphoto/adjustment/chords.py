@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxphoto.adjustment.many import Common, Varying, image_gradients, other_gradients, states
+from jaxphoto.adjustment.draw_gradients import Common, Varying, image_gradients, other_gradients, states
 from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays
 from jaxphoto.devices import AXIS, mesh_of
 

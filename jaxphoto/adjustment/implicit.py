@@ -16,13 +16,13 @@ from jaxtyping import Array
 
 from jaxphoto.adjustment.layout.padded import PaddedStructure, PaddedValues
 from jaxphoto.adjustment.model.numbers import Increments
-from jaxphoto.adjustment.side_by_side import ImageRowLists, optimum_of
 from jaxphoto.adjustment.solver.band import factor_band
 from jaxphoto.adjustment.solver.elimination import solve_factored
 from jaxphoto.adjustment.solver.levenberg_marquardt import SolveMode
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import Optimum, typical_scale, unit_scale
 from jaxphoto.adjustment.solver.reduced import reduce_normal
+from jaxphoto.adjustment.vmap_rule import ImageRowLists, optimum_of
 
 
 def find_optimum(values: PaddedValues, structure: PaddedStructure, task: SolveMode, rows: ImageRowLists) -> Optimum:

@@ -1,6 +1,5 @@
 """Camera: sensor, interior orientation, projection, distortion."""
 
-from jaxphoto.camera.balance import rebalance, rebalance_covariance
 from jaxphoto.camera.camera_rates import RATES, AbstractCameraRates, CameraRates, ThermalRates
 from jaxphoto.camera.camera_spline import CameraSpline
 from jaxphoto.camera.distortion import *  # noqa: F403 - what is declared there is public here
@@ -28,6 +27,7 @@ from jaxphoto.camera.projection import *  # noqa: F403
 from jaxphoto.camera.projection import PROJECTIONS, AbstractProjection
 from jaxphoto.camera.rolling_shutter import ImageMotion, RollingShutter, RowMotion
 from jaxphoto.camera.sensor import Sensor, sensor_keys
+from jaxphoto.camera.smac_balance_radius import rebalance, rebalance_covariance
 from jaxphoto.camera.strip_camera import StripCamera
 
 __all__ = [

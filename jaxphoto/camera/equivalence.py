@@ -15,9 +15,9 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.camera.balance import rebalance
 from jaxphoto.camera.distortion import AbstractDistortion, Balanced, PpsRadial, Smac
 from jaxphoto.camera.interior import InteriorOrientation
+from jaxphoto.camera.smac_balance_radius import rebalance
 
 
 def exact(interior: InteriorOrientation, target: type[AbstractDistortion]) -> InteriorOrientation | None:

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxphoto.argument_checks import single
 from jaxphoto.camera.declared import Declared
 from jaxphoto.camera.distortion import AbstractDistortion, Brown, invert
 from jaxphoto.camera.projection import AbstractProjection, Perspective
@@ -15,7 +16,6 @@ from jaxphoto.camera.rolling_shutter import RowMotion
 from jaxphoto.errors import InputError
 from jaxphoto.parameters import unit_of
 from jaxphoto.short_repr import html_of, number_word
-from jaxphoto.single import single
 
 Part = TypeVar("Part", bound=Declared)
 

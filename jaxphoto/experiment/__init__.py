@@ -31,7 +31,7 @@ from jaxphoto.experiment.measures import (
     residuals,
     tie_point_differences,
 )
-from jaxphoto.experiment.monte_carlo import MonteCarlo
+from jaxphoto.experiment.monte_carlo_run import MonteCarlo
 from jaxphoto.experiment.page import comparison_figure, plot_agreement, plot_comparison, write_runs
 
 __all__ = [

@@ -8,7 +8,7 @@ from jaxphoto.georeferencing.direct import (
     direct_orientation,
     direct_partials,
 )
-from jaxphoto.georeferencing.flight_bias import FlightBias
+from jaxphoto.georeferencing.gnss_bias import FlightBias
 from jaxphoto.georeferencing.ground import RayCovariance, Surface, ground_covariance, ground_point
 from jaxphoto.georeferencing.lever_arm import (
     arm_to_camera,
@@ -30,6 +30,7 @@ from jaxphoto.georeferencing.mount import (
     sensor_position,
 )
 from jaxphoto.georeferencing.rig import RigCamera, in_rig, reference_later, rig_place, rig_turn, turn_off
+from jaxphoto.georeferencing.scan_strip_errors import StripErrors
 from jaxphoto.georeferencing.scanner import Scanner, corrected_point, raised_by_boresight
 from jaxphoto.georeferencing.scanner_calibration import (
     PATTERN_OF,
@@ -39,7 +40,6 @@ from jaxphoto.georeferencing.scanner_calibration import (
     corrected_return,
     corrected_shot,
 )
-from jaxphoto.georeferencing.strip_errors import StripErrors
 from jaxphoto.georeferencing.trajectory import Poses, Trajectory, TrajectorySpline, covered, interpolate, spline_through
 from jaxphoto.georeferencing.trajectory_knots import (
     StripSpline,

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxphoto.argument_checks import single
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.georeferencing.mount import Exposure, Mount, StripBias, body_from_camera, nominal_mount, sensor_position
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw, small_angles, small_rotation
-from jaxphoto.single import single
 
 
 class SensorCovariance(eqx.Module):

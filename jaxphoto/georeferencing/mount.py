@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxphoto.arrays import ArrayLike
 from jaxphoto.errors import InputError
+from jaxphoto.georeferencing.gnss_bias import StripBias
 from jaxphoto.parameters import AbstractParameters
 from jaxphoto.rotation import rotate, small_angles, small_rotation
 from jaxphoto.short_repr import pretty_repr
@@ -58,20 +59,6 @@ class Mount(AbstractParameters):
     def nominal(self) -> Float[np.ndarray, "3 3"]:
         """`body_from_camera` without misalignment."""
         return NOMINAL[self.image_x]
-
-
-class StripBias(AbstractParameters):
-    """Shift (m) and drift (m/s), per axis, of the GNSS positions of one strip."""
-
-    kind = "strips"
-    owner = "strip"
-    names = {  # noqa: RUF012
-        "shift": tuple(f"shift_{axis}_m" for axis in "XYZ"),
-        "drift": tuple(f"drift_{axis}_m_per_s" for axis in "XYZ"),
-    }
-
-    shift: Float[Array, "3 *images"]
-    drift: Float[Array, "3 *images"]
 
 
 @pretty_repr

@@ -31,17 +31,6 @@ from jaxphoto.initial.approximate import in_front, looking_away
 from jaxphoto.losses import AbstractLoss
 from jaxphoto.observations import Correlated
 from jaxphoto.procedures.adjust import start_of
-from jaxphoto.procedures.exchanges import (
-    Exchange,
-    coordinate_exchanges,
-    exchanged,
-    intersecting_points,
-    merge_exchanges,
-    name_exchanges,
-    reinstate_points,
-    with_dependants,
-    with_positions,
-)
 from jaxphoto.procedures.robust import (
     InitialSolution,
     RedundancyBlocks,
@@ -53,6 +42,17 @@ from jaxphoto.procedures.robust import (
     scale_weights,
     solve_without_diverged,
     without_common_errors,
+)
+from jaxphoto.procedures.swapped_observations import (
+    Exchange,
+    coordinate_exchanges,
+    exchanged,
+    intersecting_points,
+    merge_exchanges,
+    name_exchanges,
+    reinstate_points,
+    with_dependants,
+    with_positions,
 )
 from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics import LEAST_CHECKED, LEAST_SIGMA0, LEVEL, UNCHECKED, Suspect, chi_square_limit, global_test

@@ -2,6 +2,7 @@
 
 from jaxphoto.report.block_plot import block_in_space, plot_block
 from jaxphoto.report.boresight import plot_boresight, print_boresight, write_boresight
+from jaxphoto.report.distortion import plot_distortion, plot_distortion_band
 from jaxphoto.report.draws import correlation_cube, covariance_array, draws_cube, plot_draws, plot_effects
 from jaxphoto.report.findings import Finding, Verdict
 from jaxphoto.report.flight_plots import plot_photograph_residuals, plot_position_offsets, plot_time_line
@@ -15,8 +16,6 @@ from jaxphoto.report.plots import (
     plot_check_points,
     plot_convergence,
     plot_density,
-    plot_distortion,
-    plot_distortion_band,
     plot_error_ellipses,
     plot_exterior_correlation,
     plot_interior_correlation,

@@ -16,10 +16,11 @@ from jaxtyping import Float
 from jaxphoto.camera import InteriorOrientation, Sensor, constant_names, get_parameter, parameter_names, parameter_unit
 from jaxphoto.camera.conditions import Conditions
 from jaxphoto.errors import camera_words
+from jaxphoto.report.distortion import draw_distortion
 from jaxphoto.report.findings import as_sentence, symbol
 from jaxphoto.report.formatting import of_sigma, with_sigma
 from jaxphoto.report.page import Heading, Paragraph, Part, Plot, hash_table, option_word, page
-from jaxphoto.report.plots import draw_distortion, draw_format_map, draw_matrix
+from jaxphoto.report.plots import draw_format_map, draw_matrix
 from jaxphoto.report.results import assumed_pixels
 from jaxphoto.report.stability import change_verdict, parameter_changes
 from jaxphoto.report.verdict import readout_of

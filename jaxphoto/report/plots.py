@@ -14,12 +14,11 @@ from jaxtyping import Float
 
 from jaxphoto.adjustment import TOLERANCE, Adjustment
 from jaxphoto.block_edits import one_camera
-from jaxphoto.camera import Sensor, parameter_names
+from jaxphoto.camera import Sensor
 from jaxphoto.errors import InputError, camera_words, printable
 from jaxphoto.observations import AXES
 from jaxphoto.report.findings import symbol
 from jaxphoto.report.tables import Tables
-from jaxphoto.stability import NORMAL_95, DistortionCurve, distortion_curve
 from jaxphoto.statistics.block_geometry import Coverage, ImageLinks, WeakLink, coverage, image_links, weak_links
 from jaxphoto.statistics.sigma_map import SigmaMap, sigma_map
 
@@ -323,46 +322,6 @@ def correlation_figure(tables: Tables, camera: str | None = None) -> Figure:
     for axes, plot in zip(figure.subplots(1, 2), (plot_interior_correlation, plot_exterior_correlation), strict=True):
         plot(tables, camera, axes)
     return figure
-
-
-def distortion_of(tables: Tables, camera: str | None = None) -> DistortionCurve:
-    """Distortion of a camera by distance, with a posteriori sigmas."""
-    name, a = one_camera(tables.adjusted.block, camera), tables.adjusted
-    interior = a.unknowns.interior[name]
-    covariance = tables.covariance.of_interior(name, parameter_names(interior))
-    return distortion_curve(interior, a.block.sensors[name], covariance)
-
-
-def plot_distortion(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
-    """Radial distortion by distance from the principal point with its 95 % band, and the remaining distortion."""
-    ax = axes_or_new(ax)
-    draw_distortion(ax, distortion_of(tables, camera))
-    return ax
-
-
-def draw_distortion(axes: Axes, curve: DistortionCurve, factor: float = 1.0) -> None:
-    """Radial distortion (um) with its 95 % band times `factor`, and the remaining distortion."""
-    um = 1e3
-    if curve.sigma is not None:
-        half = um * NORMAL_95 * factor * curve.sigma
-        band = um * curve.radial - half, um * curve.radial + half
-        axes.fill_between(curve.r, *band, color="#9ecae1", label="95 % band", lw=0)
-    axes.plot(curve.r, um * curve.radial, "-", color="#08519c", label="radial")
-    axes.plot(curve.r, um * curve.other, "--", color="#d95f02", label="decentring, affinity (RMS)")
-    axes.axhline(0, color="0.6", lw=0.6)
-    axes.set(xlabel="distance from the principal point [mm]", ylabel="measured - ideal [µm]")
-    title(axes, "distortion")
-    axes.legend(fontsize=7)
-
-
-def plot_distortion_band(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
-    """Half width of the 95 % band of the radial distortion, which is often thinner than the line of the curve."""
-    ax, curve = axes_or_new(ax), distortion_of(tables, camera)
-    if curve.sigma is not None:
-        ax.plot(curve.r, 1e3 * NORMAL_95 * curve.sigma, "-", color="#08519c")
-    ax.set(xlabel="distance from the principal point [mm]", ylabel="95 % within +- [µm]", ylim=(0, None))
-    title(ax, "uncertainty of the radial distortion")
-    return ax
 
 
 # Contours are drawn at these times powers of ten: the first set that gives `_LINES` of them.

@@ -18,7 +18,7 @@ from jaxphoto.camera import RATES, InteriorOrientation, Sensor, get_parameter, m
 from jaxphoto.compiling.freed_memory import return_freed_memory
 from jaxphoto.errors import InputError, camera_words, counted
 from jaxphoto.observations import AXES
-from jaxphoto.report import plots
+from jaxphoto.report import distortion, plots
 from jaxphoto.report.block_plot import block_view, block_words, plot_block
 from jaxphoto.report.findings import Verdict, as_sentence, p_words
 from jaxphoto.report.formatting import (
@@ -279,10 +279,13 @@ def adjustment_sections(
         yield Heading("Distortion")
         yield Paragraph("Measured minus ideal image coordinates along the radius, for the adjusted c.")
         for camera in mapped:
-            curve, words = plots.distortion_of(tables, camera), camera_words(camera)
+            curve, words = distortion.distortion_of(tables, camera), camera_words(camera)
             yield [
-                Plot(partial(plots.draw_distortion, curve=curve, factor=factor), f"distortion of {words} by distance"),
-                Plot(partial(plots.plot_distortion_band, tables, camera), f"95 % band for {words}"),
+                Plot(
+                    partial(distortion.draw_distortion, curve=curve, factor=factor),
+                    f"distortion of {words} by distance",
+                ),
+                Plot(partial(distortion.plot_distortion_band, tables, camera), f"95 % band for {words}"),
             ]
         yield Heading("Projection uncertainty over the image format")
         yield Paragraph(

@@ -1,8 +1,8 @@
 """An adjustment as a function of its observations, priors and design: derivatives, Monte Carlo, network design."""
 
-from jaxphoto.sensitivity.draws import Draws, Readjustment, check_draws, join_draws, monte_carlo, readjust
 from jaxphoto.sensitivity.exact import Response, Sensitivity, response, sensitivity
 from jaxphoto.sensitivity.influence import DELTA0, external_reliability, station_bias, variance_shares
+from jaxphoto.sensitivity.monte_carlo import Draws, Readjustment, check_draws, join_draws, monte_carlo, readjust
 from jaxphoto.sensitivity.perturbation import PER, Bias, Perturbation, bias, noise
 
 __all__ = [

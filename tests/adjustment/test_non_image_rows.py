@@ -10,7 +10,7 @@ from jaxphoto.adjustment.model.numbers import zero_increments
 from jaxphoto.adjustment.model.observed_groups import RowsAtPoints
 from jaxphoto.adjustment.solver import inverse, non_image_rows
 from jaxphoto.adjustment.solver.optimum import unit_scale
-from jaxphoto.compiling.quickly import jit_quickly
+from jaxphoto.compiling.fast_compilation import jit_quickly
 from jaxphoto.statistics import covariance
 from tests.blocks import adjusted
 from tests.marks import slow_but

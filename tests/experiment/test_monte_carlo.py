@@ -14,7 +14,7 @@ import pytest
 
 from jaxphoto import InputError, bias
 from jaxphoto.experiment import MonteCarlo
-from jaxphoto.experiment.monte_carlo import _errors_line
+from jaxphoto.experiment.monte_carlo_run import _errors_line
 from jaxphoto.io import write_block
 from jaxphoto.sensitivity import Readjustment, noise
 from jaxphoto.sensitivity.exact import sensitivity
@@ -94,7 +94,7 @@ def test_partial_results_are_summarised_during_a_run(whole, tmp_path, monkeypatc
         if done >= 1030:
             raise Stop
 
-    monkeypatch.setattr("jaxphoto.experiment.monte_carlo._SECONDS", 0.0)
+    monkeypatch.setattr("jaxphoto.experiment.monte_carlo_run._SECONDS", 0.0)
     with pytest.raises(Stop):
         study(tmp_path / "run").draw(stop)
     directory, (_, table) = whole
@@ -114,7 +114,7 @@ def test_partial_results_are_summarised_during_a_run(whole, tmp_path, monkeypatc
 
 
 def test_of_a_large_block_every_batch_is_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxphoto.experiment.monte_carlo._PART_ROWS", 1)
+    monkeypatch.setattr("jaxphoto.experiment.monte_carlo_run._PART_ROWS", 1)
     made = study(tmp_path / "run", draws=200)
 
     def stop(done: int) -> None:

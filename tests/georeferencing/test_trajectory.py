@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxphoto.compiling.quickly import jit_quickly
+from jaxphoto.compiling.fast_compilation import jit_quickly
 from jaxphoto.georeferencing.trajectory import Trajectory, covered, interpolate
 from jaxphoto.rotation import (
     matrix_from_roll_pitch_yaw,

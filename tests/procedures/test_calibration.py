@@ -19,7 +19,7 @@ from jaxphoto.procedures.calibration.eccentricity import eccentricities
 from jaxphoto.procedures.calibration.outliers import added_sigma
 from jaxphoto.procedures.calibration.reprojection import projections
 from jaxphoto.procedures.calibration.start import flat_start, nearest_distortion
-from jaxphoto.report.calibration import findings
+from jaxphoto.report.target_calibration import findings
 from tests.derivatives import compiled
 
 SENSOR = Sensor(1280, 960, 0.0054)

@@ -10,9 +10,9 @@ import pytest
 
 from jaxphoto import InputError, adjust, bias, covariance, monte_carlo, readjust
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.many import image_gradients
+from jaxphoto.adjustment.draw_gradients import image_gradients
 from jaxphoto.sensitivity import Readjustment, noise
-from jaxphoto.sensitivity.draws import common_of
+from jaxphoto.sensitivity.monte_carlo import common_of
 from jaxphoto.unknowns import FIXED, Weighted
 from tests.blocks import adjusted, simulated
 from tests.checked_types import unchecked

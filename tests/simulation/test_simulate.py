@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxphoto.block import Block
-from jaxphoto.compiling.quickly import jit_quickly
+from jaxphoto.compiling.fast_compilation import jit_quickly
 from jaxphoto.errors import BlockError
 from jaxphoto.io import recipe_from
 from jaxphoto.simulation import Choice, Simulation, remeasure

@@ -14,6 +14,10 @@ residuals along v,
 
 and t is halved until the reduction is close to the prediction for x(t). The acceleration costs residuals and one more
 solution with the same factor.
+
+Stop rule (`LevenbergMarquardt.step`, `settled`): a step is the last if the distance to the optimum that remains after
+it, extrapolated from the last two steps, is below `TOLERANCE` standard deviations of the unknowns, and the damping did
+not shorten it. Otherwise the iteration ends at `SolveMode.max_steps` or in a flat valley (`IterationHistory.is_flat`).
 """
 
 from collections.abc import Callable
@@ -43,6 +47,8 @@ from jaxphoto.adjustment.solver.similarity import after, n_open_motions, onto_da
 from jaxphoto.arrays import ArrayLike
 from jaxphoto.short_repr import pretty_repr
 
+# No unknown misses its optimum by more than this fraction of its standard deviation.
+TOLERANCE = 1e-5
 Vector = Float[Array, "unknowns"]
 """Scaled increments as one vector: one operation to compile instead of three."""
 

@@ -17,6 +17,7 @@ from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.parameter_tables import ParameterTable
 from jaxphoto.adjustment.solver.levenberg_marquardt import (
+    TOLERANCE,
     FactoredSystem,
     IterationHistory,
     LevenbergMarquardt,
@@ -29,9 +30,6 @@ from jaxphoto.camera.camera_rates import HOUR_S
 from jaxphoto.collinearity import ExteriorOrientation, image_residual
 from jaxphoto.georeferencing import Exposure
 from jaxphoto.parameters import filled
-
-# No unknown misses its optimum by more than this fraction of its standard deviation.
-TOLERANCE = 1e-5
 
 
 class Optimum(NamedTuple):

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment import Adjustment, solve
 from jaxphoto.adjustment.chords import Found, find_optima
-from jaxphoto.adjustment.many import Common, Varying, held_in, path_name
+from jaxphoto.adjustment.draw_gradients import Common, Varying, held_in, path_name
 from jaxphoto.adjustment.model.block_values import values_of, with_datum
 from jaxphoto.adjustment.model.numbers import UnknownArrays
 from jaxphoto.adjustment.row_lists import batch_size, row_lists

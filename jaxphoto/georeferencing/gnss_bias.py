@@ -1,10 +1,24 @@
-"""Common shift and drift of the GNSS positions of a flight, in addition to those of its strips."""
+"""Shift and drift of the GNSS positions: of each strip, and of the whole flight."""
 
 from typing import Any
 
 from jaxtyping import Array, Float
 
 from jaxphoto.parameters import AbstractParameters
+
+
+class StripBias(AbstractParameters):
+    """Shift (m) and drift (m/s), per axis, of the GNSS positions of one strip."""
+
+    kind = "strips"
+    owner = "strip"
+    names = {  # noqa: RUF012
+        "shift": tuple(f"shift_{axis}_m" for axis in "XYZ"),
+        "drift": tuple(f"drift_{axis}_m_per_s" for axis in "XYZ"),
+    }
+
+    shift: Float[Array, "3 *images"]
+    drift: Float[Array, "3 *images"]
 
 
 class FlightBias(AbstractParameters):

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment.chords import chord_steps
+from jaxphoto.adjustment.draw_gradients import Common, Varying, held_in, path_name, states
 from jaxphoto.adjustment.layout.padded import PaddedStructure, PaddedValues
 from jaxphoto.adjustment.layout.padding import PaddedBlock
-from jaxphoto.adjustment.many import Common, Varying, held_in, path_name, states
 from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays
 from jaxphoto.adjustment.row_lists import RowList, batch_size, row_lists
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
