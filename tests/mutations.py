@@ -26,7 +26,7 @@ from PIL import Image
 
 from jaxphoto.camera import ImageMotion, InteriorOrientation, OpenCv, RollingShutter
 from jaxphoto.errors import JaxphotoError
-from jaxphoto.image_measurement import read_grey
+from jaxphoto.extras.photos import read_grey
 from jaxphoto.io import clouds, export, read_block, read_recipe, read_source, write_block
 from jaxphoto.io.block_folder.settings import toml_text
 from jaxphoto.io.cameras import read_camera_file, write_camera_file

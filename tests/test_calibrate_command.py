@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 
 import jaxphoto
-from jaxphoto.image_measurement.targets import read_board, rendered
+from jaxphoto.extras.photos.targets import read_board, rendered
 from jaxphoto.procedures.calibration import rounds
 from tests.commands import run
-from tests.image_measurement.test_targets import LENS, SENSOR, view
+from tests.photos.test_targets import LENS, SENSOR, view
 
 BOARD = "chessboard:8x5:square_mm=22"
 IMAGES = 5

@@ -7,7 +7,7 @@ import pytest
 
 from jaxphoto import Outcome
 from jaxphoto.camera import rebalance
-from jaxphoto.image_measurement.targets import find_targets, read_board
+from jaxphoto.extras.photos.targets import find_targets, read_board
 from jaxphoto.io.photographs import photographs, sensor_and_interior
 from jaxphoto.procedures.calibration import calibrate, interior_covariance
 from jaxphoto.stability import analyse, image_grid

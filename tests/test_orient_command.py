@@ -8,12 +8,14 @@ from PIL import Image
 
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.cli import orient as command
-from jaxphoto.image_measurement.matching import MatchedPhotographs
+from jaxphoto.extras.photos.matching import MatchedPhotographs
 from jaxphoto.io import read_block
 from jaxphoto.io.photographs import CameraStart
-from jaxphoto.procedures.orientation import finish, orient_photographs
+from jaxphoto.procedures.orientation import orient_photographs
 from tests.commands import run
 from tests.procedures.orientable import PIXEL, SENSOR, convergent, photographed
+
+pytest.importorskip("pycolmap", reason="pycolmap, which orients images, is not installed (extra photos)")
 
 
 @pytest.fixture
@@ -94,14 +96,14 @@ def test_options_for_photographs_mean_nothing_for_a_block(options, named, tmp_pa
 
 
 def test_rounds_that_do_not_settle_are_said(taken, tmp_path, monkeypatch, capsys):
-    # Not even a round that changes nothing ends them.
-    monkeypatch.setattr(finish, "_STILL", -1.0)
-    monkeypatch.setattr(finish, "_FEW", -1)
-    monkeypatch.setattr(orient_photographs, "LAST_ROUNDS", 2)
+    # Not even an iteration that rejects nothing ends them.
+    monkeypatch.setattr(orient_photographs, "_CONVERGED", -1.0)
+    monkeypatch.setattr(orient_photographs, "_FEW", -1)
+    monkeypatch.setattr(orient_photographs, "ITERATIONS", 2)
     out = tmp_path / "block"
     code, said, wrong = run(monkeypatch, capsys, "orient", *taken, "--out", out)
     assert code == 1, wrong
-    assert "warning: after" in said and "still went and came back" in said
+    assert "warning: after" in said and "still rejected" in said
     summary = json.loads((out / "orientation.json").read_text())
     assert not summary["settled"] and not summary["converged"]
     assert read_block(out).images

@@ -17,8 +17,7 @@ __all__ = ["app", "main"]
 
 # What a lean installation leaves out (docs/install.md): how it is imported, and installed.
 _LEFT_OUT = {
-    "cv2": "opencv-python-headless",
-    "faiss": "faiss-cpu",
+    "cv2": "jaxphoto[photos]",
     "laspy": "laspy[lazrs]",
     "pyarrow": "pyarrow",
     "rasterio": "rasterio",

@@ -10,8 +10,8 @@ from jaxphoto.cli.made import made_by
 from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.provenance import Provenance
 from jaxphoto.errors import InputError
-from jaxphoto.image_measurement.control_targets import target_looker
-from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
+from jaxphoto.extras.photos.control_targets import target_looker
+from jaxphoto.extras.photos.targets.on_ground import SYNTAX, read_target
 from jaxphoto.io import read_block
 from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.control_files import FORMS, read_control

@@ -16,18 +16,17 @@ from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
 from jaxphoto.cli.provenance import Provenance
 from jaxphoto.errors import InputError, counted
+from jaxphoto.extras.photos.control_targets import target_looker
+from jaxphoto.extras.photos.features import LONGEST_PX
+from jaxphoto.extras.photos.matching import match_photographs
+from jaxphoto.extras.photos.photograph_pairs import MostSimilar, photograph_pairs, usual_choice, usual_count
+from jaxphoto.extras.photos.targets.on_ground import SYNTAX, read_target
 from jaxphoto.georeferencing.geoid_heights import WGS84
 from jaxphoto.georeferencing.map_frame import check_heights
-from jaxphoto.image_measurement.control_targets import target_looker
-from jaxphoto.image_measurement.features import LONGEST_PX
-from jaxphoto.image_measurement.matching import match_photographs
-from jaxphoto.image_measurement.photograph_pairs import MostAlike, photograph_pairs, usual_choice, usual_count
-from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
 from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.control_files import FORMS, read_control
 from jaxphoto.io.exports import write_photograph_files
 from jaxphoto.io.exposures import exposure_files, located
-from jaxphoto.io.kept_orientation import kept_orient
 from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
 from jaxphoto.io.photographs import known_lens, sensor_and_interior
 from jaxphoto.io.sound_photographs import folders_not_looked_into, in_short, sound_photographs
@@ -170,7 +169,6 @@ def fly_command(
                 sorted(taken, key=lambda name: taken[name][0]) if len(taken) == len(read) else (),
             ),
             status.update,
-            kept_orient(keep),
         )
         flight = flight._replace(left_out=matched.left_out | flight.left_out)
         status.update("computing statistics")
@@ -238,7 +236,7 @@ def fly_command(
         raise typer.Exit(1)
 
 
-def _in_words(compared: list[tuple[int, int]] | MostAlike) -> str:
-    if isinstance(compared, MostAlike):
+def _in_words(compared: list[tuple[int, int]] | MostSimilar) -> str:
+    if isinstance(compared, MostSimilar):
         return f"each to compare with the {compared.number} that look most like it"
     return f"{counted(len(compared), 'pair')} to compare"

@@ -13,19 +13,18 @@ from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
 from jaxphoto.errors import InputError
-from jaxphoto.image_measurement.features import LONGEST_PX
-from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
-from jaxphoto.image_measurement.photograph_pairs import photograph_pairs, usual_choice
+from jaxphoto.extras.photos.features import LONGEST_PX
+from jaxphoto.extras.photos.matching import MatchedPhotographs, match_photographs
+from jaxphoto.extras.photos.photograph_pairs import photograph_pairs, usual_choice
 from jaxphoto.io import read_block, write_block
 from jaxphoto.io.block_folder import check_block_target, whole_block
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.json_file import read_json
-from jaxphoto.io.kept_orientation import kept_orient
 from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
 from jaxphoto.io.photographs import photographs, sensor_and_interior
 from jaxphoto.procedures.adjust import needs_orientation
 from jaxphoto.procedures.calibration import distortion_model
-from jaxphoto.procedures.orientation import Oriented, orient_block
+from jaxphoto.procedures.orientation import Oriented, orient, orient_block
 from jaxphoto.report.orientation import print_orientation, write_orientation
 
 
@@ -96,7 +95,7 @@ def orient_command(
             keep=keep,
             progress=StepsLeft(output.progress, status, FEWER_PAIRS),
         )
-        found = kept_orient(keep)(
+        found = orient(
             [p.name for p in read],
             camera.sensor,
             InteriorOrientation(start.c, start.x_p, start.y_p, distortion),

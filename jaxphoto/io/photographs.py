@@ -1,6 +1,6 @@
 """Photographs: what their files say about the camera, and the interior orientation to start from.
 
-Only sizes and EXIF are read here; the picture itself is what `jaxphoto.image_measurement` reads. A picture is taken as
+Only sizes and EXIF are read here; the picture itself is what `jaxphoto.extras.photos` reads. A picture is taken as
 it lies in the file, which is as the sensor saw it: the EXIF orientation flag turns nothing.
 """
 

@@ -1,7 +1,7 @@
 """From matched photographs of a flight to calibrations: each part that hangs together, the largest first."""
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from jaxphoto.adjustment import LEAST, Adjustment
@@ -22,8 +22,7 @@ from jaxphoto.procedures.georeference_photographs import (
 from jaxphoto.procedures.known_lens import KnownLens, with_known_lens
 from jaxphoto.procedures.matched_part import MatchedPart
 from jaxphoto.procedures.orientation import Oriented, orient
-from jaxphoto.procedures.orientation.orient_photographs import CAMERA
-from jaxphoto.procedures.orientation.related_pairs import Report
+from jaxphoto.procedures.orientation.orient_photographs import CAMERA, Report
 from jaxphoto.procedures.rolling_shutter import NEIGHBOUR_M, Moment, with_rolling_shutter
 from jaxphoto.statistics import VarianceComponents, variance_components
 
@@ -85,12 +84,11 @@ def calibrate_flight(
     interior: InteriorOrientation,
     known: KnownOfFlight,
     report: Report = lambda text: None,
-    orient: Callable[..., Oriented] = orient,
 ) -> CalibratedFlight:
     """Orient, georeference and adjust every part of the photographs of one camera, which starts at `interior`.
 
     A part is what hangs together; so do photographs that the others of their part see too little of, but they of each
-    other enough. `orient` is the function of this name, or one that keeps its outcome.
+    other enough.
 
     Photographs that cannot be oriented, and whole parts that cannot, are left out with the reason. What is `known` and
     does not fit a part, it goes without, and says why.
@@ -104,7 +102,7 @@ def calibrate_flight(
         part, number = waiting.popleft(), len(parts) + 1
         report(f"part {number} of {number + len(waiting)}")
         try:
-            parts.append(_calibrated(part, sensor, interior, known, report, orient))
+            parts.append(_calibrated(part, sensor, interior, known, report))
         except GroupsError as error:
             waiting += [part.among(group) for group in error.groups]
             left |= {name: _NO_PAIR for name in part.names if not any(name in group for group in error.groups)}
@@ -124,7 +122,7 @@ def calibrate_flight(
 
 
 def _calibrated(
-    matched: MatchedPart, sensor: Sensor, interior: InteriorOrientation, known: KnownOfFlight, report: Report, orient
+    matched: MatchedPart, sensor: Sensor, interior: InteriorOrientation, known: KnownOfFlight, report: Report
 ) -> FlightPart:
     title, lens = f"flight of {len(matched.names)} photographs", known.lens
     oriented = orient(

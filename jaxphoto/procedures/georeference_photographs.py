@@ -25,7 +25,7 @@ from jaxphoto.observations import StationRows
 from jaxphoto.procedures.attitudes_of_photographs import RecordedTurn, recorded_turn, with_attitudes
 from jaxphoto.procedures.georeferencing_words import LEVEL_WORDS, attitude_words, position_words
 from jaxphoto.procedures.level_strip import is_line, level_turn
-from jaxphoto.procedures.orientation.onto_known import Similarity, similarity_between
+from jaxphoto.procedures.orientation.known_frame import Similarity, similarity_between
 from jaxphoto.procedures.position_parts import position_parts, with_part_shifts
 from jaxphoto.variants import without_stations
 

@@ -26,18 +26,18 @@ def orientation_sentences(report: OrientationReport) -> list[str]:
     left = report.gross_errors
     said = [
         f"{len(report.order)} of {report.n_images} images oriented, from {report.n_pairs} pairs with a relative "
-        f"orientation; begun with {', '.join(report.order[:3])}",
+        "orientation",
     ]
     said += [f"image {name} is not oriented: {why}" for name, why in list(report.unoriented.items())[:_SHOWN]]
     if len(report.unoriented) > _SHOWN:
         said.append(f"and {len(report.unoriented) - _SHOWN} more: {', '.join(list(report.unoriented)[_SHOWN:])}")
     said += [
         f"{report.n_points} points from {report.n_image_points} image points",
-        f"left out of {report.n_matches} matches: {left.off_epipolar} off the epipolar line, {left.conflicting} by "
-        f"which a point would show twice in an image, {left.unoriented} of images that are not oriented",
-        f"left out of the image points they made: {left.beyond} that miss their point by more than "
-        f"{report.limit_px:.2g} px, {left.small_angle} whose rays meet at too small an angle, {left.unsupported} of "
-        f"two rays that meet where nothing near them in the images is, {left.too_few} of points with too few rays left",
+        f"rejected of {report.n_matches} matches: {left.off_epipolar} off the epipolar line, {left.untriangulated} "
+        f"without a common point, {left.unoriented} of images that are not oriented",
+        f"rejected image points: {left.beyond} with a residual of more than {report.limit_px:.2g} px, "
+        f"{left.unsupported} of two rays at a depth that neighbouring points contradict, {left.too_few} of points or "
+        "images with too few of them",
         f"residuals: {report.mean_px:.2f} px on average, sigma0 {report.sigma0:.2f}",
         *_doubts(report),
         f"free of the camera: {', '.join(report.estimated) or 'nothing'}",
@@ -53,8 +53,8 @@ def orientation_sentences(report: OrientationReport) -> list[str]:
 def _doubts(report: OrientationReport) -> Iterator[str]:
     if not report.settled:
         yield (
-            f"warning: after {report.rounds} rounds image points still went and came back; what is left is no settled "
-            "choice: false matches or a model of the lens that does not fit (--model) may be why"
+            f"warning: after {report.rounds} iterations image points were still rejected: false matches or a "
+            "distortion model that does not fit (--model) may be why"
         )
     elif not report.converged:
         yield "warning: the last adjustment did not converge; adjust the block with more iterations (--max-steps)"

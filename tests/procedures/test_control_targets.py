@@ -11,9 +11,9 @@ from jaxphoto import adjust, covariance
 from jaxphoto.block import Block, Frame
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.errors import InputError
+from jaxphoto.extras.photos.control_targets import target_looker
+from jaxphoto.extras.photos.targets.on_ground import read_target
 from jaxphoto.georeferencing.map_frame import MapFrame
-from jaxphoto.image_measurement.control_targets import target_looker
-from jaxphoto.image_measurement.targets.on_ground import read_target
 from jaxphoto.procedures.control import (
     GivenControl,
     Marks,
@@ -23,7 +23,7 @@ from jaxphoto.procedures.control import (
     control_block_with_targets,
 )
 from jaxphoto.procedures.control.search import Candidates, Looker
-from tests.image_measurement.ground import C_MM, GROUND_M, SENSOR, mapped, photograph, texture
+from tests.photos.ground import C_MM, GROUND_M, SENSOR, mapped, photograph, texture
 from tests.procedures.controlled import CODE, ORIGIN, marked_block
 
 BY_HAND = ("G0", "G16", "G32", "G34")

@@ -1,7 +1,7 @@
 """The image of a circle's centre is not the centre of the circle's image.
 
 A circle is seen as an ellipse (bent by the lens), and what is measured is the centre of the ellipse that is nearest to
-its edge (`jaxphoto.image_measurement.targets`). Both centres are computed from the adjusted orientation, the plane and
+its edge (`jaxphoto.extras.photos.targets`). Both centres are computed from the adjusted orientation, the plane and
 the radius of the circle. With the boundary b(t), 0 <= t < 2 pi, projected through the whole camera, Green's theorem
 gives area, centroid and second moments of the image,
 

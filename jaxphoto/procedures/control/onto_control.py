@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxphoto.errors import InputError, counted
-from jaxphoto.procedures.orientation.onto_known import Similarity, similarity_between
+from jaxphoto.procedures.orientation.known_frame import Similarity, similarity_between
 
 _SAMPLES = 300
 # Standard deviations, and part of the size of the control, within which a point fits.

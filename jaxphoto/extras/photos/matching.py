@@ -1,0 +1,303 @@
+"""Matches of photographs: which features of two show the same place, by their descriptors and by the epipolar lines.
+
+Descriptors are matched and pairs are verified by COLMAP: nearest neighbours both ways with Lowe's ratio test, then the
+inliers of one fundamental matrix or homography. Both need no principal distance: that of EXIF may be a third off, and
+would refuse true matches with an essential matrix.
+"""
+
+import contextlib
+import itertools
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.compiling.freed_memory import freed_memory_kept
+from jaxphoto.errors import InputError
+from jaxphoto.extras.photos.features import LONGEST_PX, METHOD, SiftFeatures, sift_features
+from jaxphoto.extras.photos.photograph_pairs import MostSimilar, largest_of, most_similar, usual_count
+from jaxphoto.io.kept_pieces import KeptPieces, name_of
+from jaxphoto.io.photographs import Photograph
+from jaxphoto.orientation.matches import PairMatches, connected_images, tracks
+from jaxphoto.orientation.rays import ideal_coordinates
+from jaxphoto.procedures.matched_part import MatchedPart
+from jaxphoto.procedures.orientation.colmap import MappedCamera, import_pycolmap, write_database
+
+MIN_MATCHES = 15
+"""Of two photographs: fewer may agree with some fundamental matrix by chance, and so may less than this ratio."""
+_MIN_RATIO = 0.3
+# Distance from the epipolar line at most, over the diagonal: 4 pixels of 1,300. Unknown distortion grows with the format.
+_OFF_LINE = 0.003
+# Scatter is measured where nine tenths lie, 1.645 standard deviations of a normal distribution: the median would be
+# blind to the long tails that features have, the square sum to nothing but the false matches left.
+_MOST, _MOST_SIGMA = 0.9, 1.6449
+_BLANK = "it shows no features: it is blank or out of focus"
+_ALONE = f"it has {MIN_MATCHES} points in common with no other photograph it was compared with"
+# Pairs that are matched at a time, and kept in one piece.
+_CHUNK = 40
+Progress = Callable[[str, int, int], None]
+"""Called with the current step, the number of items done, and of how many."""
+
+
+class MatchedPhotographs(NamedTuple):
+    """Features of photographs and their matches."""
+
+    xy_mm: list[Float[np.ndarray, "n 2"]]
+    """For each photograph, as `SiftFeatures`."""
+    sigma_mm: list[Float[np.ndarray, "n"]]
+    """Those of `SiftFeatures` times `sigma_factor`."""
+    sigma_factor: float
+    """How far the matches scatter about the epipolar lines, over what `SiftFeatures` expects."""
+    pairs: list[PairMatches]
+    """Of those that have enough in common."""
+    counts: Int[np.ndarray, "compared 4"]
+    """For all pairs compared: first, second, matches by looks, those of them kept (0 where they are too few)."""
+    left_out: dict[str, str]
+    """Photographs by name that match no other one, and why."""
+
+    @property
+    def gross(self) -> Int[np.ndarray, "compared 3"]:
+        """For all pairs compared: first, second, matches by looks that are not on the epipolar lines, or too few."""
+        return np.column_stack([self.counts[:, :2], self.counts[:, 2] - self.counts[:, 3]])
+
+    @property
+    def n_gross(self) -> int:
+        """How many those are in all."""
+        return int(self.gross[:, 2].sum())
+
+    def named(self, names: list[str]) -> MatchedPart:
+        """The same of photographs that are called so, as `calibrate_flight` takes it."""
+        return MatchedPart(names, self.xy_mm, self.sigma_mm, self.pairs, self.gross, self.sigma_factor)
+
+
+class TieFeatures(NamedTuple):
+    """Points seen in several photographs, one row for each measurement, sorted by point."""
+
+    photograph: Int[np.ndarray, "rows"]
+    """Index of the photograph, in the order given."""
+    point: Int[np.ndarray, "rows"]
+    xy_mm: Float[np.ndarray, "rows 2"]
+
+
+def match_photographs(
+    photographs: Sequence[Photograph],
+    sensor: Sensor,
+    interior: InteriorOrientation,
+    pairs: Iterable[tuple[int, int]] | MostSimilar,
+    *,
+    count: int | None = None,
+    longest_px: int = LONGEST_PX,
+    in_parts: bool = False,
+    keep: KeptPieces | None = None,
+    progress: Progress = lambda step, done, of: None,
+) -> MatchedPhotographs:
+    """SIFT features of photographs of one camera, and their matches in the `pairs` of indices.
+
+    Of each there are `count` features at most, by default 5,000, or 10,000 of up to 40 photographs; it is reduced to
+    `longest_px` before. `interior` is the known camera; only its distortion and principal point count. Results are
+    written to `keep`, and read from there where they exist: an interrupted run continues, to the same result.
+
+    A photograph that shows no features, or matches no other one, is `left_out` by name.
+
+    Raises InputError as `sift_features`, where no two photographs match, and where they fall into groups that nothing
+    joins, but not `in_parts`; BlockError where pycolmap is not installed.
+    """
+    if len(photographs) < 2:
+        raise InputError("an orientation needs two photographs that overlap, or more; give them all")
+    paths = [p.path for p in photographs]
+    matched = _matched(paths, sensor, interior, pairs, count, longest_px, keep, progress)
+    blank = [len(xy) == 0 for xy in matched.xy_mm]
+    alone = _alone([path.name for path in paths], blank, matched.pairs, in_parts)
+    return matched._replace(left_out={photographs[k].name: _BLANK if blank[k] else _ALONE for k in alone})
+
+
+def tie_features(
+    paths: list[Path], sensor: Sensor, count: int | None = None, least_photographs: int = 2
+) -> TieFeatures:
+    """Points that overlapping photographs of one camera show in common: pairs, triplets and more.
+
+    All pairs are matched as by `match_photographs` and joined as by `tracks`; points in fewer than `least_photographs`
+    are left out. Raises InputError as `sift_features`, and where no two photographs have enough in common.
+    """
+    each = itertools.combinations(range(len(paths)), 2)
+    matched = _matched(paths, sensor, InteriorOrientation(1.0), each, count, LONGEST_PX, None, lambda *step: None)
+    image, feature, point, _ = tracks([len(xy) for xy in matched.xy_mm], matched.pairs)
+    kept = np.bincount(point)[point] >= least_photographs
+    if not kept.any():
+        raise InputError(
+            f"the {len(paths)} photographs have no point in common; give such as overlap, in the same size"
+        )
+    xy_mm = np.stack([matched.xy_mm[i][f] for i, f in zip(image[kept], feature[kept], strict=True)])
+    return TieFeatures(image[kept], np.unique(point[kept], return_inverse=True)[1], xy_mm)
+
+
+class _PairResult(NamedTuple):
+    """Results of several pairs, concatenated."""
+
+    counts: Int[np.ndarray, "pairs 2"]
+    """Matches by descriptors, and verified ones."""
+    verified: Int[np.ndarray, "verified 2"]
+    off_line: Float[np.ndarray, "verified"]
+    """Distances from the epipolar lines over their sigmas."""
+
+
+def _matched(
+    paths: list[Path],
+    sensor: Sensor,
+    interior: InteriorOrientation,
+    pairs: Iterable[tuple[int, int]] | MostSimilar,
+    most: int | None,
+    longest_px: int,
+    keep: KeptPieces | None,
+    progress: Progress,
+) -> MatchedPhotographs:
+    pycolmap, count = import_pycolmap(), most or usual_count(len(paths))
+
+    def find(path: Path) -> tuple[str, SiftFeatures]:
+        name = name_of("features", *METHOD, cv2.__version__, count, longest_px, sensor, path.read_bytes())
+        kept = keep.read(name) if keep else None
+        features = SiftFeatures(**kept) if kept else sift_features(path, sensor, count, longest_px)
+        if keep and kept is None:
+            keep.write(name, **features._asdict())
+        return name, features
+
+    names, features = [], []
+    with freed_memory_kept(), ThreadPoolExecutor(os.cpu_count()) as workers:
+        for k, (name, of_photograph) in enumerate(workers.map(find, paths)):
+            names.append(name)
+            features.append(of_photograph)
+            progress("features", k + 1, len(paths))
+    if isinstance(pairs, MostSimilar):
+        largest = [largest_of(of_photograph) for of_photograph in features]
+        pairs = most_similar(
+            largest, pairs.number, lambda done, of: progress("comparing the largest features", done, of)
+        )
+    compared = sorted({(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]})
+    ideal_px = [sensor.px_from_mm(ideal_coordinates(interior, f.xy_mm)) for f in features]
+    off_line_px = _OFF_LINE * float(np.hypot(sensor.width_px, sensor.height_px))
+    results = []
+    with contextlib.ExitStack() as opened:
+        database: Path | None = None
+        for begin in range(0, len(compared), _CHUNK):
+            chunk = compared[begin : begin + _CHUNK]
+            each = [(names[k], ideal_px[k].tobytes()) for pair in chunk for k in pair]
+            name = name_of("matches", *METHOD, pycolmap.__version__, _MIN_RATIO, off_line_px, *itertools.chain(*each))
+            kept = keep.read(name) if keep else None
+            if kept is None:
+                if database is None:
+                    folder = Path(opened.enter_context(tempfile.TemporaryDirectory()))
+                    database = _database(pycolmap, folder, sensor, features, ideal_px)
+                kept = _match_pairs(pycolmap, database, chunk, features, ideal_px, sensor, off_line_px)._asdict()
+                if keep:
+                    keep.write(name, **kept)
+            results.append(_PairResult(**kept))
+            progress("matches", begin + len(chunk), len(compared))
+    numbers = np.concatenate([np.zeros((0, 2), int), *(r.counts for r in results)])
+    verified = np.concatenate([np.zeros((0, 2), int), *(r.verified for r in results)])
+    off_line = np.concatenate([np.zeros(0), *(r.off_line for r in results)])
+    by_pair = np.split(verified, np.cumsum(numbers[:, 1]))[:-1]
+    factor = float(np.quantile(np.abs(off_line), _MOST)) / _MOST_SIGMA if len(off_line) else 1.0
+    return MatchedPhotographs(
+        [f.xy_mm for f in features],
+        [factor * f.sigma_mm for f in features],
+        factor,
+        [PairMatches(*pair, found) for pair, found in zip(compared, by_pair, strict=True) if len(found)],
+        np.column_stack([np.array(compared, int).reshape(-1, 2), numbers]),
+        {},
+    )
+
+
+def _database(pycolmap: Any, folder: Path, sensor: Sensor, features: list[SiftFeatures], ideal_px: list) -> Path:
+    """A COLMAP database of descriptors; a place with several of them is there several times."""
+    camera = MappedCamera(sensor.width_px, sensor.height_px, float(sensor.width_px), False)
+    keypoints = [xy[f.feature] for xy, f in zip(ideal_px, features, strict=True)]
+    write_database(folder / "photographs.db", [camera], [0] * len(features), keypoints, (), prior_c=False)
+    with pycolmap.Database.open(folder / "photographs.db") as stored:
+        for k, f in enumerate(features):
+            kind = pycolmap.FeatureExtractorType.SIFT
+            stored.write_descriptors(k + 1, pycolmap.FeatureDescriptors(kind, f.descriptors))
+    return folder / "photographs.db"
+
+
+def _match_pairs(
+    pycolmap: Any, database: Path, pairs: list[tuple[int, int]], features, ideal_px, sensor: Sensor, off_line_px: float
+) -> _PairResult:
+    (database.parent / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in pairs))
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = str(database.parent / "pairs.txt")
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.min_num_inliers, verification.min_inlier_ratio = MIN_MATCHES, _MIN_RATIO
+    verification.ransac.max_error, verification.ransac.random_seed = off_line_px, 0
+    verification.detect_watermark = False
+    pycolmap.match_image_pairs(
+        database, pairing_options=pairing, verification_options=verification, device=pycolmap.Device.cpu
+    )
+    counts, verified, off_line = [], [np.zeros((0, 2), int)], [np.zeros(0)]
+    with pycolmap.Database.open(database) as stored:
+        for a, b in pairs:
+            found = stored.read_two_view_geometry(a + 1, b + 1).inlier_matches
+            inliers = np.asarray(found, int).reshape(-1, 2)
+            rows = _places(inliers, features[a].feature, features[b].feature)
+            if len(rows) < MIN_MATCHES:
+                rows = rows[:0]
+            matched = np.asarray(stored.read_matches(a + 1, b + 1), int).reshape(-1, 2)
+            counts.append((len(_places(matched, features[a].feature, features[b].feature)), len(rows)))
+            verified.append(rows)
+            if len(rows):
+                one, other = ideal_px[a][rows[:, 0]], ideal_px[b][rows[:, 1]]
+                sigmas = (features[k].sigma_mm[r] / sensor.pixel_mm for k, r in zip((a, b), rows.T, strict=True))
+                off_line.append(_over_sigma(one, other, *sigmas))
+    return _PairResult(np.array(counts, int).reshape(-1, 2), np.concatenate(verified), np.concatenate(off_line))
+
+
+def _places(matches: Int[np.ndarray, "n 2"], one: np.ndarray, other: np.ndarray) -> Int[np.ndarray, "places 2"]:
+    """Matches of descriptors as matches of places, each place once at most."""
+    pairs = np.unique(np.column_stack([one[matches[:, 0]], other[matches[:, 1]]]), axis=0)
+    once = np.ones(len(pairs), bool)
+    for side in pairs.T:
+        _, inverse, times = np.unique(side, return_inverse=True, return_counts=True)
+        once &= times[inverse] == 1
+    return pairs[once]
+
+
+def _over_sigma(one: np.ndarray, other: np.ndarray, *sigmas: np.ndarray) -> np.ndarray:
+    """Misclosures other' F one of verified matches over their standard deviations; `sigmas` in the same unit."""
+    matrix, _ = cv2.findFundamentalMat(one, other, cv2.FM_LMEDS)
+    if matrix is None:
+        return np.zeros(0)
+    one, other = (np.column_stack([xy, np.ones(len(xy))]) for xy in (one, other))
+    in_other, in_one = one @ matrix.T, other @ matrix
+    slopes = (np.square(line[:, :2]).sum(axis=1) for line in (in_one, in_other))
+    variance = sum(slope * sigma**2 for slope, sigma in zip(slopes, sigmas, strict=True))
+    return (in_other * other).sum(axis=1) / np.sqrt(variance)
+
+
+def _alone(names: list[str], blank: list[bool], pairs: list[PairMatches], in_parts: bool) -> list[int]:
+    """Photographs that match no other one; InputError unless all others hang together, or may be `in_parts`."""
+    groups = connected_images(len(names), pairs)
+    joined = [group for group in groups if len(group) > 1]
+    if not joined:
+        empty = [name for name, nothing in zip(names, blank, strict=True) if nothing]
+        beside = f"; {_listed(empty)} show no features: blank or out of focus" if empty else ""
+        raise InputError(
+            f"no two of the {len(names)} photographs ({_listed(names)}) have {MIN_MATCHES} points in "
+            f"common{beside}; give photographs that overlap by half at least, in sharp focus, or compare more pairs"
+        )
+    if len(joined) > 1 and not in_parts:
+        each = "; ".join(_listed([names[k] for k in group]) for group in joined)
+        raise InputError(
+            f"the photographs fall into {len(joined)} groups without matches between them ({each}); add photographs "
+            "that see both, compare more pairs, or take each group by itself"
+        )
+    return [int(group[0]) for group in groups if len(group) == 1]
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names) if len(names) <= 12 else f"{', '.join(names[:10])} and {len(names) - 10} more"

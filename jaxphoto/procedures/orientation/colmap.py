@@ -1,0 +1,239 @@
+"""Incremental mapping by COLMAP: features and their matches -> exterior orientation, object points and tracks.
+
+COLMAP (Schönberger and Frahm 2016, "Structure-from-Motion Revisited") verifies every pair by its essential or
+fundamental matrix or its homography, and adds one image after the other by resection, triangulation and local bundle
+adjustment. Here it sees ideal image coordinates of the camera as it is known, and may estimate the principal distance
+and one radial term. Its result is a set of approximate values: `jaxphoto.procedures.orientation.orient` adjusts them.
+"""
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxphoto.errors import BlockError, GroupsError
+from jaxphoto.orientation.matches import PairMatches, connected_images
+
+# Angles (deg) between rays below which COLMAP makes no point; the smaller one serves where images are missing.
+_ANGLES_DEG = (1.5, 0.4)
+# A principal distance that comes out by this factor away from its start is not determined by the images.
+_PLAUSIBLE = 1.5
+# Part of the matches of a pair that its relative orientation must agree with: fewer agree by chance.
+_MIN_INLIER_RATIO = 0.25
+
+
+_ONE_PLACE = "they were taken from one place, or see too few points at a wide enough angle"
+
+
+class MappedCamera(NamedTuple):
+    """A camera without distortion, in pixels."""
+
+    width_px: int
+    height_px: int
+    c_px: float
+    fixed: bool
+    """True if the principal distance and the radial term are not estimated."""
+
+
+class Network(NamedTuple):
+    """Images oriented in a frame of arbitrary position, rotation and scale, and the points they see."""
+
+    positions: Float[np.ndarray, "images 3"]
+    camera_from_object: Float[np.ndarray, "images 3 3"]
+    oriented: Bool[np.ndarray, " images"]
+    order: tuple[int, ...]
+    """The oriented images as COLMAP lists them."""
+    points: Float[np.ndarray, "points 3"]
+    image: Int[np.ndarray, " rows"]
+    feature: Int[np.ndarray, " rows"]
+    point: Int[np.ndarray, " rows"]
+    c_px: tuple[float, ...]
+    """By camera."""
+    verified: tuple[PairMatches, ...]
+    """Matches that agree with the relative orientation of their pair."""
+
+
+def import_pycolmap() -> Any:
+    """The module pycolmap, silenced. Raises BlockError where it is not installed."""
+    try:
+        # Loaded after pycolmap 4.2.1, OpenCV 5.0 ends the process where it writes a PNG.
+        import cv2  # noqa: F401
+        import pycolmap
+    except ImportError:
+        raise BlockError(
+            "images are oriented from their common points by COLMAP, which is not installed: "
+            "pip install 'jaxphoto[photos]'"
+        ) from None
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    return pycolmap
+
+
+def map_images(
+    names: Sequence[str],
+    cameras: Sequence[MappedCamera],
+    image_camera: Sequence[int],
+    features_px: Sequence[Float[np.ndarray, "_ 2"]],
+    matches: Sequence[PairMatches],
+    min_matches: int,
+    min_points: int,
+) -> Network:
+    """Orient the images `names` from `matches` of their features, gross errors among them.
+
+    `features_px` are ideal coordinates in pixels (column, row), `image_camera` the camera of each image. A pair needs
+    `min_matches` that agree, an image `min_points`.
+
+    Raises BlockError where no two images begin a network, and GroupsError for groups that nothing connects.
+    """
+    pycolmap = import_pycolmap()
+    if not (enough := [m for m in matches if len(m.features) >= min_matches]):
+        few = max(matches, key=lambda m: len(m.features), default=None)
+        why = (
+            "their pairs have no matches"
+            if few is None
+            else f"images {names[few.first]} and {names[few.second]} have {len(few.features)} matches, and "
+            f"{min_matches} are needed"
+        )
+        raise BlockError(_no_pair(len(names), why))
+    with tempfile.TemporaryDirectory() as folder:
+        database = f"{folder}/database.db"
+        write_database(database, cameras, image_camera, features_px, enough)
+        two_view = pycolmap.TwoViewGeometryOptions()
+        two_view.min_num_inliers, two_view.min_inlier_ratio = min_matches, _MIN_INLIER_RATIO
+        two_view.ransac.random_seed, two_view.detect_watermark = 0, False
+        # Tells pairs from one place from those over a plane.
+        two_view.compute_relative_pose = True
+        pycolmap.geometric_verification(database, two_view_geometry_options=two_view)
+        verified, n_one_place = _verified_matches(pycolmap, database)
+        if not verified and n_one_place:
+            raise BlockError(_no_pair(len(names), _ONE_PLACE))
+        _check_connected(names, verified)
+        best, score = None, (False, 0, 0)
+        wanted = len({image for m in verified for image in (m.first, m.second)})
+        attempts = [(angle, free) for angle in _ANGLES_DEG for free in (True, False)]
+        for angle, free in attempts:
+            if free and all(camera.fixed for camera in cameras):
+                continue
+            options = _options(pycolmap, cameras, angle, free, min_matches, min_points)
+            models = pycolmap.incremental_mapping(database, folder, folder, options).values()
+            for model in models:
+                found = _score(model, cameras)
+                if found > score:
+                    best, score = model, found
+            if score[:2] == (True, wanted):
+                break
+        if best is None:
+            raise BlockError(_no_pair(len(names), _ONE_PLACE))
+        return _network(best, len(names), len(cameras), verified)
+
+
+def _verified_matches(pycolmap: Any, database: str) -> tuple[tuple[PairMatches, ...], int]:
+    """The inlier matches of all pairs in a COLMAP `database`, and the number of pairs taken from one place."""
+    verified, n_one_place = [], 0
+    with pycolmap.Database.open(database) as stored:
+        for pair, geometry in zip(*stored.read_two_view_geometries(), strict=True):
+            one, other = (image - 1 for image in pycolmap.pair_id_to_image_pair(pair))
+            features = np.asarray(geometry.inlier_matches, int).reshape(-1, 2)
+            if geometry.config == pycolmap.TwoViewGeometryConfiguration.PANORAMIC.value:
+                n_one_place += 1
+            elif len(features):
+                verified.append(PairMatches(one, other, features))
+    return tuple(sorted(verified, key=lambda m: m[:2])), n_one_place
+
+
+def _no_pair(n_images: int, why: str) -> str:
+    return (
+        f"no two of the {n_images} images can be oriented to one another ({why}): take photographs that overlap by "
+        "more than half, from different places"
+    )
+
+
+def _check_connected(names: Sequence[str], verified: Sequence[PairMatches]) -> None:
+    if not verified:
+        raise BlockError(_no_pair(len(names), "no pair has enough matches that agree with one relative orientation"))
+    groups = [g for g in connected_images(len(names), list(verified)) if len(g) > 1]
+    if len(groups) > 1:
+        by_name = [[names[i] for i in group] for group in groups]
+        raise GroupsError(
+            f"the images are {len(groups)} groups that have too few points in common to be oriented to one another "
+            f"({'; '.join(map(', '.join, by_name))}): orient each by itself, or add images that connect them",
+            by_name,
+        )
+
+
+def write_database(
+    database: Path | str,
+    cameras: Sequence[MappedCamera],
+    image_camera: Sequence[int],
+    features_px: Sequence[Float[np.ndarray, "_ 2"]],
+    matches: Sequence[PairMatches],
+    prior_c: bool = True,
+) -> None:
+    """Write a COLMAP database; its ids are the indices plus one. `prior_c`: the principal distances are known."""
+    pycolmap = import_pycolmap()
+    with pycolmap.Database.open(database) as stored, pycolmap.DatabaseTransaction(stored):
+        for camera in cameras:
+            made = pycolmap.Camera.create_from_model_name(
+                0, "SIMPLE_RADIAL", camera.c_px, camera.width_px, camera.height_px
+            )
+            made.has_prior_focal_length = prior_c
+            rig = pycolmap.Rig()
+            rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, stored.write_camera(made)))
+            stored.write_rig(rig)
+        for k, (camera, features) in enumerate(zip(image_camera, features_px, strict=True)):
+            image = stored.write_image(pycolmap.Image(name=str(k), camera_id=camera + 1))
+            frame = pycolmap.Frame()
+            frame.rig_id = camera + 1
+            frame.add_data_id(pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera + 1), image))
+            stored.write_frame(frame)
+            stored.write_keypoints(image, np.asarray(features, np.float32).reshape(-1, 2))
+        for match in matches:
+            stored.write_matches(match.first + 1, match.second + 1, np.asarray(match.features, np.uint32))
+
+
+def _options(pycolmap: Any, cameras, angle: float, free: bool, min_matches: int, min_points: int) -> Any:
+    """Options of the mapping. COLMAP's own find no beginning where all images look along their path."""
+    options = pycolmap.IncrementalPipelineOptions(random_seed=0)
+    options.extract_colors, options.min_model_size, options.max_num_models = False, 2, 4
+    options.min_num_matches = min_matches
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = free
+    options.constant_cameras = {k + 1 for k, camera in enumerate(cameras) if camera.fixed}
+    options.mapper.init_max_forward_motion, options.mapper.init_min_tri_angle = 1.0, 4.0
+    options.mapper.init_min_num_inliers = min(30, 2 * min_matches)
+    options.mapper.abs_pose_min_num_inliers = min_points
+    options.mapper.filter_min_tri_angle = options.triangulation.min_angle = angle
+    options.triangulation.ignore_two_view_tracks = False
+    return options
+
+
+def _score(model: Any, cameras: Sequence[MappedCamera]) -> tuple[bool, int, int]:
+    """True if all principal distances are plausible; images; image points."""
+    ratios = [c.focal_length / cameras[k - 1].c_px for k, c in model.cameras.items()]
+    plausible = all(1 / _PLAUSIBLE < ratio < _PLAUSIBLE for ratio in ratios)
+    return plausible, model.num_reg_images(), model.compute_num_observations()
+
+
+def _network(model: Any, n_images: int, n_cameras: int, verified: tuple[PairMatches, ...]) -> Network:
+    positions, matrices = np.zeros((n_images, 3)), np.tile(np.eye(3), (n_images, 1, 1))
+    order = tuple(int(image) - 1 for image in model.reg_image_ids())
+    for k in order:
+        image = model.image(k + 1)
+        positions[k] = image.projection_center()
+        # COLMAP's camera looks along +z, with y down.
+        matrices[k] = np.diag([1.0, -1, -1]) @ image.cam_from_world().rotation.matrix()
+    tracks = [point.track.elements for point in model.points3D.values()]
+    rows = np.array([(e.image_id - 1, e.point2D_idx, p) for p, track in enumerate(tracks) for e in track], int)
+    # COLMAP may join two features of an image to one point: the first stands.
+    rows = rows.reshape(-1, 3)[np.unique(rows.reshape(-1, 3)[:, [2, 0]], axis=0, return_index=True)[1]]
+    return Network(
+        positions,
+        matrices,
+        np.isin(np.arange(n_images), order),
+        order,
+        np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3),
+        *rows.T,
+        tuple(model.camera(k + 1).focal_length for k in range(n_cameras)),
+        verified,
+    )

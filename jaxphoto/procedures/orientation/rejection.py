@@ -1,0 +1,83 @@
+"""Gross errors of an oriented network: image points by their residuals, and points of two rays by their depth.
+
+A false match along an epipolar line makes a point of two rays that fit as well as those of a true one, at any depth.
+Its neighbours in the image contradict it: over the places (x, y) of an image the inverse depth of a surface varies
+little, and that of a plane is linear. A point of two rays is rejected whose inverse depth is far from the median of its
+neighbours in both of its images, by their robust spread and its own standard deviation. At an edge, or where things
+stand before one another, neighbours spread as widely as the scene is deep, and everything stays.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxphoto.block import Block
+
+# Gross errors are beyond so many robust standard deviations, and never within the second, in a priori ones.
+_LIMIT, _MIN_LIMIT = 4.0, 1.0
+# Nearest points in the image, and by how many of their spreads a point may differ from their median.
+_NEIGHBOURS, _DEPTH_LIMIT = 12, 8.0
+# Distances that are computed at a time.
+_CHUNK = 4_000_000
+# The standard deviation of a normal distribution over its median absolute deviation, and over the median of the length
+# of errors in two axes (Rayleigh).
+_MAD, _RAYLEIGH = 1.4826, 1 / 1.1774
+
+
+def beyond_limit(block: Block, residuals: Float[np.ndarray, "2 rows"]) -> tuple[Bool[np.ndarray, " rows"], float]:
+    """Image rows whose `residuals`, over their sigmas, exceed the limit, one of each point at most; and the limit.
+
+    Residuals are divided by the root of the part of an error that n rays of a point show, (2 n - 3) / (2 n).
+    """
+    point = np.asarray(block.image_points.point)
+    rays = np.bincount(point, minlength=len(block.points))[point]
+    length = np.hypot(*residuals) / np.sqrt(1 - 1.5 / rays)
+    limit = max(_MIN_LIMIT, _LIMIT * _RAYLEIGH * float(np.median(length)))
+    largest = np.zeros(len(block.points))
+    np.maximum.at(largest, point, length)
+    return (length > limit) & (length == largest[point]), limit
+
+
+def unsupported(block: Block) -> Bool[np.ndarray, " rows"]:
+    """Image rows of the points of two rays whose depths their neighbours in both images contradict."""
+    rows, start = block.image_points, block.start.unknowns
+    image, point = np.asarray(rows.image), np.asarray(rows.point)
+    ray = np.asarray(start.points)[point] - np.asarray(start.exterior.position)[image]
+    inverse = -1 / np.einsum("ni,ni->n", np.asarray(start.exterior.camera_from_object)[image, 2], ray)
+    c = np.array([float(start.interior[camera].c) for camera in block.image_camera])[image]
+    sigma = inverse * _relative_depth_sigma(ray, point, np.sqrt(np.mean(np.asarray(rows.sigma) ** 2, axis=1)) / c)
+    two = np.bincount(point)[point] == 2
+    contradicted = np.zeros(len(point), bool)
+    for number in np.unique(image):
+        seen = np.flatnonzero(image == number)
+        if len(seen) > _NEIGHBOURS and two[seen].any():
+            contradicted[seen[two[seen]]] = _far(np.asarray(rows.xy)[seen], inverse[seen], sigma[seen], two[seen])
+    return (np.bincount(point[contradicted], minlength=len(block.points)) == 2)[point]
+
+
+def _far(xy, inverse, sigma, tested: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " tested"]:
+    """True for `tested` points of one image, at `xy` with `inverse` depths, that their neighbours contradict."""
+    near = np.concatenate(
+        [_nearest(xy, some) for some in np.array_split(xy[tested], 1 + tested.sum() * len(xy) // _CHUNK)]
+    )
+    around = inverse[near]
+    median = np.median(around, axis=1)
+    spread = _MAD * np.median(np.abs(around - median[:, None]), axis=1)
+    return np.abs(inverse[tested] - median) > _DEPTH_LIMIT * np.hypot(spread, sigma[tested])
+
+
+def _nearest(xy: Float[np.ndarray, "n 2"], to: Float[np.ndarray, "m 2"]) -> Int[np.ndarray, "m neighbours"]:
+    """The nearest of `xy` without the point itself, for each of `to`, which are among them."""
+    apart = np.sum(xy**2, axis=1) - 2 * to @ xy.T
+    order = np.argpartition(apart, _NEIGHBOURS, axis=1)[:, : _NEIGHBOURS + 1]
+    itself = np.argmin(np.take_along_axis(apart, order, axis=1), axis=1)
+    others = np.arange(_NEIGHBOURS + 1) != itself[:, None]
+    return order[others].reshape(len(to), _NEIGHBOURS)
+
+
+def _relative_depth_sigma(ray, point, sigma_rad) -> Float[np.ndarray, " rows"]:
+    """Relative standard deviation of the depths of points of two rays: the errors of both over their angle."""
+    direction = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    total = np.stack([np.bincount(point, v) for v in direction.T], axis=1)
+    # Two unit vectors at an angle g add to one of length 2 cos(g / 2).
+    half = np.arccos(np.clip(np.linalg.norm(total, axis=1) / 2, 0, 1))[point]
+    return np.sqrt(2) * sigma_rad / np.sin(np.maximum(2 * half, 1e-9))
