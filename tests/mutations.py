@@ -43,7 +43,7 @@ from jaxphoto.io.photographs import photographs
 from jaxphoto.io.photomodeler import read_photomodeler
 from jaxphoto.io.raster import read_dsm
 from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, write_sbet
-from jaxphoto.procedures.control.system import places, system_of
+from jaxphoto.procedures.control.surveyed import places, system_of
 from jaxphoto.unknowns import FIXED, FREE, Weighted
 from tests import sound_files
 from tests.io import control_files, oriented_files, test_bal, test_colmap, test_reconstructions

@@ -15,7 +15,7 @@ from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.made import made_by
 from jaxphoto.cli.output import Output, command
 from jaxphoto.errors import InputError
-from jaxphoto.extras.photos.grey_values import read_grey
+from jaxphoto.extras.photos.features import read_grey
 from jaxphoto.extras.photos.targets import SYNTAX, find_targets, read_board
 from jaxphoto.io import write_block
 from jaxphoto.io.photographs import photographs, sensor_and_interior

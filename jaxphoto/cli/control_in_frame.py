@@ -9,7 +9,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.io.clouds.placement import Placement
 from jaxphoto.io.control_files import read_control
 from jaxphoto.procedures.control import SurveyedPoints
-from jaxphoto.procedures.control.system import system_of
+from jaxphoto.procedures.control.surveyed import system_of
 from jaxphoto.procedures.lidar.strip_control import check_complete
 
 

@@ -7,7 +7,7 @@ import pandas as pd
 
 from jaxphoto.errors import counted, few
 from jaxphoto.procedures.control import ControlledBlock
-from jaxphoto.procedures.control.judged import CRITICAL
+from jaxphoto.procedures.control.control_block import CRITICAL
 from jaxphoto.report.digits import of_sigma
 from jaxphoto.report.findings import Finding, Level
 

@@ -14,7 +14,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.io import export
 from jaxphoto.io.control_files import read_control
 from jaxphoto.io.exports.map_photographs import in_map
-from jaxphoto.procedures.control.system import places, system_of
+from jaxphoto.procedures.control.surveyed import places, system_of
 from tests.io import control_files as files
 from tests.io.test_exports import photographs
 

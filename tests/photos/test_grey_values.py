@@ -10,8 +10,7 @@ import pytest
 from PIL import Image
 
 from jaxphoto import InputError, Sensor
-from jaxphoto.extras.photos.features import interest_points
-from jaxphoto.extras.photos.grey_values import read_grey
+from jaxphoto.extras.photos.features import interest_points, read_grey
 
 ROW, COLUMN = np.mgrid[:60, :80]
 GREY = (3 * COLUMN).astype(np.uint8)

@@ -15,10 +15,9 @@ from jaxphoto.procedures.calibration import (
     free_parameters,
     rounds,
 )
-from jaxphoto.procedures.calibration.eccentricity import eccentricities
-from jaxphoto.procedures.calibration.outliers import added_sigma
-from jaxphoto.procedures.calibration.reprojection import projections
+from jaxphoto.procedures.calibration.calibrate import added_sigma, eccentricities
 from jaxphoto.procedures.calibration.start import flat_start, nearest_distortion
+from jaxphoto.procedures.calibration.target_block import projections
 from jaxphoto.report.calibration import findings
 from tests.derivatives import compiled
 

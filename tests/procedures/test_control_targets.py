@@ -22,7 +22,7 @@ from jaxphoto.procedures.control import (
     control_block,
     control_block_with_targets,
 )
-from jaxphoto.procedures.control.search import Candidates, Looker
+from jaxphoto.procedures.control.targets import Candidates, Looker
 from tests.photos.ground import C_MM, GROUND_M, SENSOR, mapped, photograph, texture
 from tests.procedures.controlled import CODE, ORIGIN, marked_block
 

@@ -12,7 +12,7 @@ from matplotlib.quiver import Quiver
 from jaxphoto.camera.conditions import Conditions
 from jaxphoto.errors import camera_words
 from jaxphoto.procedures.control import ControlledBlock
-from jaxphoto.procedures.control.marked import Marked
+from jaxphoto.procedures.control.marks import Marked
 from jaxphoto.report.document import Paragraph, Pictures, Rows
 from jaxphoto.report.document_html import html_of
 from jaxphoto.report.findings import as_sentence, p_words

@@ -1,7 +1,6 @@
 """What is measured in photographs, by OpenCV and by least squares: targets of boards, features, matches of pairs."""
 
-from jaxphoto.extras.photos.features import Features, SiftFeatures, interest_points, sift_features
-from jaxphoto.extras.photos.grey_values import read_grey
+from jaxphoto.extras.photos.features import Features, SiftFeatures, interest_points, read_grey, sift_features
 from jaxphoto.extras.photos.matching import MatchedPhotographs, TieFeatures, match_photographs, tie_features
 from jaxphoto.extras.photos.photograph_pairs import photograph_pairs
 from jaxphoto.extras.photos.targets import Targets, find_targets, read_board, rendered

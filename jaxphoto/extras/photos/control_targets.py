@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.extras.photos.grey_values import read_grey
+from jaxphoto.extras.photos.features import read_grey
 from jaxphoto.extras.photos.targets.on_ground import GroundTarget
-from jaxphoto.procedures.control.predicted import Predicted
-from jaxphoto.procedures.control.search import Candidates, Looker
+from jaxphoto.procedures.control.targets import Candidates, Looker, Predicted
 
 # What blur, compression and shadows add to the standard deviation of a fit.
 _LEAST_SIGMA_PX = 0.1

@@ -33,7 +33,7 @@ from jaxphoto.procedures.orientation.colmap import MappedCamera, import_pycolmap
 MIN_MATCHES = 15
 """Of two photographs: fewer may agree with some fundamental matrix by chance, and so may less than this ratio."""
 _MIN_RATIO = 0.3
-# Distance from the epipolar line at most, over the diagonal: 4 pixels of 1,300. Unknown distortion grows with the format.
+# Distance from the epipolar line at most, over the diagonal: 4 pixels of 1,300. Unknown distortion grows with it.
 _OFF_LINE = 0.003
 # Scatter is measured where nine tenths lie, 1.645 standard deviations of a normal distribution: the median would be
 # blind to the long tails that features have, the square sum to nothing but the false matches left.
@@ -253,7 +253,7 @@ def _match_pairs(
             if len(rows):
                 one, other = ideal_px[a][rows[:, 0]], ideal_px[b][rows[:, 1]]
                 sigmas = (features[k].sigma_mm[r] / sensor.pixel_mm for k, r in zip((a, b), rows.T, strict=True))
-                off_line.append(_over_sigma(one, other, *sigmas))
+                off_line.append(_over_sigma(off_line_px, one, other, *sigmas))
     return _PairResult(np.array(counts, int).reshape(-1, 2), np.concatenate(verified), np.concatenate(off_line))
 
 
@@ -267,9 +267,10 @@ def _places(matches: Int[np.ndarray, "n 2"], one: np.ndarray, other: np.ndarray)
     return pairs[once]
 
 
-def _over_sigma(one: np.ndarray, other: np.ndarray, *sigmas: np.ndarray) -> np.ndarray:
+def _over_sigma(off_line_px: float, one: np.ndarray, other: np.ndarray, *sigmas: np.ndarray) -> np.ndarray:
     """Misclosures other' F one of verified matches over their standard deviations; `sigmas` in the same unit."""
-    matrix, _ = cv2.findFundamentalMat(one, other, cv2.FM_LMEDS)
+    # Of the sampling with the weights of MAGSAC++ (Barath and others, 2020), from a fixed seed.
+    matrix, _ = cv2.findFundamentalMat(one, other, cv2.USAC_MAGSAC, off_line_px, 0.9999, 10_000)
     if matrix is None:
         return np.zeros(0)
     one, other = (np.column_stack([xy, np.ones(len(xy))]) for xy in (one, other))

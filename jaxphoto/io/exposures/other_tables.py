@@ -30,7 +30,7 @@ from jaxphoto.io.control_files.tables import separator_of, split_row, with_point
 from jaxphoto.io.exposures.pospac import read_pospac
 from jaxphoto.io.text_tables import Table, each_row, is_number
 from jaxphoto.io.whole_text import LARGE, read_text
-from jaxphoto.procedures.control.system import ControlSystem, system_of
+from jaxphoto.procedures.control.surveyed import ControlSystem, system_of
 
 MAP, GEOGRAPHIC = ("X_m", "Y_m", "Z_m"), ("longitude_deg", "latitude_deg", "height_m")
 """Columns of positions on a map, and of geographic ones."""

@@ -21,7 +21,7 @@ from pyproj import Transformer
 
 from jaxphoto.io.control_files.rows import Cells
 from jaxphoto.io.text_tables import finite
-from jaxphoto.procedures.control.system import ControlSystem, system_of
+from jaxphoto.procedures.control.surveyed import ControlSystem, system_of
 
 _PROGRAM = re.compile(r"\bPOS Export Utility\b|\bPOSEO\b|\bApplanix\b", re.IGNORECASE)
 # The program is named in the first lines, and the head is a page at most.

@@ -37,8 +37,7 @@ from jaxphoto.io.reconstructions.on_map import WGS84, OnMap, of_the_earth, on_ma
 from jaxphoto.io.reconstructions.points_beside import PhotographCamera, joined, marks_shown, points_beside
 from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotographs, estimated, free_network
 from jaxphoto.io.whole_text import LARGE, has_words, read_text
-from jaxphoto.procedures.control.surveyed import SurveyedPoints
-from jaxphoto.procedures.control.system import ControlSystem, system_of
+from jaxphoto.procedures.control.surveyed import ControlSystem, SurveyedPoints, system_of
 
 MARKERS = "markers.xml"
 _PARAMETERS = {"f": "c_mm", "cx": "xp_mm", "cy": "yp_mm"} | {name: name for name in Agisoft.coefficients}

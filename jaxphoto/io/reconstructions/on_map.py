@@ -10,7 +10,7 @@ from jaxphoto.block import Frame
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import MapFrame, Place, place_from_geocentric
 from jaxphoto.io.reconstructions.tied_photographs import TiedPhotographs
-from jaxphoto.procedures.control.system import system_of
+from jaxphoto.procedures.control.surveyed import system_of
 from jaxphoto.procedures.georeference_photographs import utm_of
 
 WGS84 = 4326

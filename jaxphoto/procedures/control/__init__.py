@@ -2,7 +2,7 @@
 
 from jaxphoto.procedures.control.control_block import ControlledBlock, at_optimum, control_block, rejudged
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
-from jaxphoto.procedures.control.with_targets import control_block_with_targets
+from jaxphoto.procedures.control.targets import control_block_with_targets
 
 __all__ = [
     "ControlledBlock",

@@ -11,12 +11,10 @@ from jaxphoto.block import Block
 from jaxphoto.errors import InputError, JaxphotoError, few
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.procedures.control.control_block import ControlledBlock, control_block
-from jaxphoto.procedures.control.marked import images_of
-from jaxphoto.procedures.control.placed import new_code, told_system
-from jaxphoto.procedures.control.search import Looker
-from jaxphoto.procedures.control.surveyed import GivenControl
-from jaxphoto.procedures.control.system import check_near, fitting
-from jaxphoto.procedures.control.with_targets import control_block_with_targets
+from jaxphoto.procedures.control.frame import new_code, told_system
+from jaxphoto.procedures.control.marks import images_of
+from jaxphoto.procedures.control.surveyed import GivenControl, check_near, fitting
+from jaxphoto.procedures.control.targets import Looker, control_block_with_targets
 from jaxphoto.procedures.orientation.related_pairs import Report
 from jaxphoto.statistics import Selection
 

@@ -1,9 +1,26 @@
-"""What is known of control before photographs are looked at: surveyed points, and where photographs show them."""
+"""What is known of control before photographs are looked at: surveyed points, and where photographs show them.
 
+The coordinate system of control: from the words of a file to places on the ellipsoid of a block.
+
+Words are an EPSG code, with one of heights (25832+7837) or without, "WGS84 UTM 32N" and strings of PROJ as OpenDroneMap
+writes them, WKT as Metashape does, or "local" for Cartesian metres of no map.
+"""
+
+import functools
+import re
+import warnings
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from pyproj import CRS, Transformer
+from pyproj.aoi import AreaOfInterest
+from pyproj.database import query_crs_info
+from pyproj.enums import PJType
+from pyproj.exceptions import CRSError, ProjError
+
+from jaxphoto.errors import InputError, quoted
+from jaxphoto.georeferencing.map_frame import MapFrame, map_name, map_system
 
 SIGMA_M = (0.02, 0.02, 0.03)
 """Of a surveyed point, east, north and up, where its file says none: a receiver with corrections, one occupation."""
@@ -67,3 +84,170 @@ class GivenControl(NamedTuple):
 
     points: SurveyedPoints
     marks: Marks
+
+
+LOCAL = "local"
+_CODES = re.compile(r"(?:EPSG::?)?\s*(\d{1,6})(?:\s*\+\s*(?:EPSG::?)?(\d{1,6}))?\s*(?:[<#].*)?", re.IGNORECASE)
+_UTM = re.compile(r"WGS\s?84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
+_WKT = re.compile(r"\s*(GEOGCS|PROJCS|COMPD_CS|GEOGCRS|GEODCRS|PROJCRS|COMPOUNDCRS|GEOCCS)\[")
+# Those that read no files.
+_KEYS = {
+    "proj", "zone", "south", "ellps", "datum", "units", "no_defs", "type", "lat_0", "lon_0", "lat_1", "lat_2", "lat_ts",
+    "k", "k_0", "x_0", "y_0", "towgs84", "a", "b", "rf", "alpha", "gamma", "lonc", "lat_b", "pm", "vunits", "wktext",
+    "over",
+}  # fmt: skip
+_LONGEST = 20_000
+# Control of a flight lies no farther from it.
+NEAR_M = 20_000.0
+
+
+class ControlSystem(NamedTuple):
+    """A system of surveyed coordinates; `crs` None is local and Cartesian."""
+
+    crs: CRS | None
+    code: int | None
+    """EPSG code of the horizontal system; None where it has none."""
+    vertical: int | None
+    """That of the heights; None where they are above the ellipsoid, or nobody says above what."""
+
+    @property
+    def name(self) -> str:
+        """As sentences name it."""
+        if self.crs is None:
+            return "a local system"
+        code = map_name(self.code, self.vertical) if self.code else ""
+        return f"{code} ({self.crs.name})" if code else str(self.crs.name)
+
+
+@functools.lru_cache(maxsize=64)
+def system_of(words: str, place: str) -> ControlSystem:
+    """The system that `words`, read at `place`, name. Raises InputError where they name none."""
+    words = words.strip()
+    if words.lower() == LOCAL or words.startswith("LOCAL_CS["):
+        return ControlSystem(None, None, None)
+    if utm := _UTM.fullmatch(words):
+        words = f"EPSG:{32600 + int(utm[1]) + 100 * (utm[2] in 'Ss')}"
+    if codes := _CODES.fullmatch(words):
+        vertical = int(codes[2]) if codes[2] else None
+        return ControlSystem(map_system(int(codes[1])), int(codes[1]), vertical)
+    wrong = InputError(
+        f"{place}: {quoted(words)} names no coordinate system; write EPSG:25832, EPSG:25832+7837 with heights, or local"
+    )
+    keys = {part.lstrip("+").split("=")[0] for part in words.split()}
+    known = bool(_WKT.match(words)) and "EXTENSION" not in words and "GRID" not in words.upper()
+    if len(words) > _LONGEST or not (known or (words.startswith("+proj=") and keys <= _KEYS)):
+        raise wrong
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            crs = CRS.from_user_input(words)
+            parts = crs.sub_crs_list if crs.is_compound else [crs]
+            codes_of = [part.to_epsg() for part in parts]
+    except CRSError:
+        raise wrong from None
+    if not (parts[0].is_projected or parts[0].is_geographic or parts[0].is_geocentric):
+        raise wrong
+    if len(parts) > 1 and None in codes_of:
+        raise InputError(f"{place}: the system of the heights has no EPSG code; write like EPSG:25832+7837")
+    return ControlSystem(parts[0], codes_of[0], codes_of[1] if len(parts) > 1 else None)
+
+
+def places(points: SurveyedPoints, system: ControlSystem, code: int) -> Float[np.ndarray, "points 3"]:
+    """Longitude, latitude (degrees) and height (m) of the points, on the ellipsoid of the EPSG system `code`.
+
+    Unknown heights are taken as the median of the others. Raises InputError for coordinates that the system has not,
+    for heights whose geoid is not at hand, and where no point has a height.
+    """
+    crs = system.crs
+    assert crs is not None
+    xyz = filled(points)
+    if points.own_axes and crs.axis_info[0].direction == "north":
+        xyz = xyz[:, [1, 0, 2]]
+    ellipsoid = map_system(code).geodetic_crs
+    assert ellipsoid is not None
+    if system.vertical is not None and system.code is not None:
+        xyz = MapFrame(system.code, system.vertical, (0.0, 0.0, 0.0)).place(xyz)
+        own = map_system(system.code).geodetic_crs
+        assert own is not None
+        crs = own
+    try:
+        change = Transformer.from_crs(crs if crs.is_geocentric else crs.to_3d(), ellipsoid.to_3d(), always_xy=True)
+    except ProjError:
+        raise InputError(
+            f"{points.file}: PROJ knows no way from {system.name} to the ellipsoid of EPSG:{code}"
+        ) from None
+    found = np.stack(change.transform(*xyz.T), axis=1)
+    for k in np.flatnonzero(~np.isfinite(found).all(axis=1)):
+        told = ", ".join(f"{v:.10g}" for v in xyz[k])
+        raise InputError(
+            f"{points.places[k]}: {told} is no place of {system.name}; correct coordinates, their order or the system"
+        )
+    return found
+
+
+def filled(points: SurveyedPoints) -> Float[np.ndarray, "points 3"]:
+    """Coordinates with the median height where there is none. Raises InputError where no point has one."""
+    xyz = points.coordinates.copy()
+    if np.isnan(xyz[:, 2]).all():
+        raise InputError(f"{points.file}: no point has a height; add them")
+    xyz[np.isnan(xyz[:, 2]), 2] = np.nanmedian(xyz[:, 2])
+    return xyz
+
+
+def check_near(points: SurveyedPoints, system: ControlSystem, longitude: float, latitude: float) -> None:
+    """Raise InputError where the points lie far from where the photographs were taken, with what would fit."""
+    code = system.code or 4326
+    try:
+        off = distance_m(places(points, system, code), longitude, latitude)
+    except InputError as error:
+        off, far = np.inf, str(error)
+    else:
+        far = f"{points.file}: its points lie {off / 1000:,.0f} km from where the photographs were taken"
+    if off <= NEAR_M:
+        return
+    would = fitting(points, system, longitude, latitude)
+    mend = f"they would fit {would}" if would else "correct the coordinates, or the system"
+    raise InputError(f"{far}, if their system is {system.name}: {mend}")
+
+
+def fitting(points: SurveyedPoints, system: ControlSystem | None, longitude: float, latitude: float) -> str:
+    """Under which reading the points lie where the photographs were taken; "" where there is none."""
+    exchanged = points._replace(coordinates=points.coordinates[:, [1, 0, 2]])
+    if system is not None and system.crs is not None and _near(exchanged, system, longitude, latitude):
+        return f"with the first two coordinates exchanged, in {system.name}"
+    for read, order in ((points, ""), (exchanged, ", with the first two coordinates exchanged")):
+        for code in (4326, *_systems_at(longitude, latitude)):
+            other = ControlSystem(CRS.from_epsg(code), code, None)
+            if _near(read._replace(own_axes=False), other, longitude, latitude):
+                return f"{other.name}{order}"
+    return ""
+
+
+def _near(points: SurveyedPoints, system: ControlSystem, longitude: float, latitude: float) -> bool:
+    try:
+        return distance_m(places(points, system, system.code or 4326), longitude, latitude) < NEAR_M
+    except InputError:
+        return False
+
+
+def _systems_at(longitude: float, latitude: float) -> list[int]:
+    """Projected systems in metres of the place: UTM first, then the national ones."""
+    area = AreaOfInterest(longitude, latitude, longitude, latitude)
+    listed = query_crs_info("EPSG", [PJType.PROJECTED_CRS], area, contains=True)
+    codes = sorted(listed, key=lambda info: (not info.name.startswith("WGS 84 / UTM"), int(info.code)))
+    found = []
+    for info in codes:
+        try:
+            map_system(int(info.code))
+        except InputError:
+            continue
+        found.append(int(info.code))
+    return found
+
+
+def distance_m(places: Float[np.ndarray, "n 3"], longitude: float, latitude: float) -> float:
+    """Of the middle of `places` (degrees) from a place, on a sphere."""
+    there = np.deg2rad(np.median(places[:, :2], axis=0))
+    here = np.deg2rad([longitude, latitude])
+    half = np.sin((there - here) / 2) ** 2
+    return float(2 * 6.371e6 * np.arcsin(np.sqrt(min(1.0, half[1] + np.cos(here[1]) * np.cos(there[1]) * half[0]))))

@@ -16,8 +16,7 @@ from jaxphoto.georeferencing import StripErrors, TrajectoryKnot
 from jaxphoto.lidar.corresponding_planes import fitting
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.observations import StripPoints
-from jaxphoto.procedures.control.into_block import into_block
-from jaxphoto.procedures.control.marked import Marked
+from jaxphoto.procedures.control.marks import Marked, into_block
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
 from jaxphoto.procedures.lidar.strip_search import StripSearch
 from jaxphoto.procedures.lidar.tie_point_search import PointPlanes, PointSearch

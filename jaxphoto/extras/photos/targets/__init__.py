@@ -2,12 +2,9 @@
 
 from jaxphoto.extras.photos.targets.board_description import SYNTAX, read_board
 from jaxphoto.extras.photos.targets.chessboard import Chessboard
-from jaxphoto.extras.photos.targets.circle_grid import CircleGrid
-from jaxphoto.extras.photos.targets.circular_targets import CircularTargets
-from jaxphoto.extras.photos.targets.detection import Targets, find_targets
+from jaxphoto.extras.photos.targets.circles import CircleGrid, CircularTargets
 from jaxphoto.extras.photos.targets.markers import ArucoGrid, CharucoBoard
-from jaxphoto.extras.photos.targets.pattern import FoundBoard, Pattern
-from jaxphoto.extras.photos.targets.rendering import rendered
+from jaxphoto.extras.photos.targets.pattern import FoundBoard, Pattern, Targets, find_targets, rendered
 
 __all__ = [
     "SYNTAX", "ArucoGrid", "CharucoBoard", "Chessboard", "CircleGrid", "CircularTargets", "FoundBoard", "Pattern",

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from jaxphoto.errors import InputError
 from jaxphoto.extras.photos.targets.chessboard import Chessboard
-from jaxphoto.extras.photos.targets.circle_grid import CircleGrid
-from jaxphoto.extras.photos.targets.circular_targets import CircularTargets
+from jaxphoto.extras.photos.targets.circles import CircleGrid, CircularTargets
 from jaxphoto.extras.photos.targets.markers import DICTIONARIES, ArucoGrid, CharucoBoard
 from jaxphoto.extras.photos.targets.pattern import Pattern
 from jaxphoto.io.text_tables import is_number

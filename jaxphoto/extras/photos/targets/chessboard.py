@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.extras.photos.targets.corners import fit_crossings
+from jaxphoto.extras.photos.targets.patches import fit_crossings
 from jaxphoto.extras.photos.targets.pattern import FoundBoard, Pattern
 from jaxphoto.procedures.calibration import Board
 

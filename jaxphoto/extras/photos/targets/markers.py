@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.extras.photos.targets.chessboard import grid_points
-from jaxphoto.extras.photos.targets.corners import TargetPlaces, fit_crossings, fit_square_corners
+from jaxphoto.extras.photos.targets.patches import TargetPlaces, fit_crossings, fit_square_corners
 from jaxphoto.extras.photos.targets.pattern import FoundBoard, Pattern
 from jaxphoto.procedures.calibration import Board
 

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.errors import InputError
-from jaxphoto.extras.photos.targets.corners import TargetPlaces, fit_crossings
-from jaxphoto.extras.photos.targets.discs import elliptic_blobs, fit_discs
+from jaxphoto.extras.photos.targets.circles import elliptic_blobs, fit_discs
 from jaxphoto.extras.photos.targets.markers import DICTIONARIES, found_markers
+from jaxphoto.extras.photos.targets.patches import TargetPlaces, fit_crossings
 from jaxphoto.io.text_tables import is_number
 
 SYNTAX = {

@@ -1,0 +1,421 @@
+"""Where photographs should show surveyed points, with the covariance that says how far to look.
+
+    C = J_i C_i J_i' + J_X C_X J_X'
+
+J_i is by the exterior orientation of the image and the interior one of its camera, with their joint covariance from the
+adjustment; J_X by the point, with the covariance of the survey and of what survey and block may differ by in common.
+
+Targets of surveyed points looked for where photographs should show them, and believed where their rays meet.
+
+What looks into pictures gives candidates; those of a point in different photographs are of one target where their rays
+meet at one place, near enough to where the point should be. Of places that about as many photographs tell the one
+with the sharper edges is it, which targets are made to have; where that does not decide none is believed, nor what is
+far less sharp than the targets of the other points, as a round stone is.
+
+Control whose targets are found in the photographs: predicted, looked for, adjusted with, and once more from there.
+
+The first round looks as far as what is known of the block leaves open, the next ones only as far as the block with the
+targets that were found does, which decides between targets that look alike. What was found far from where the others
+have the block is looked for anew from there, and gives way to what is found: it was another thing.
+"""
+
+from collections.abc import Callable, Collection
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.arrays import still
+from jaxphoto.block import Block
+from jaxphoto.camera import parameter_names
+from jaxphoto.collinearity import ExteriorOrientation, in_field, project
+from jaxphoto.compiling import jit_quickly
+from jaxphoto.errors import InputError, counted
+from jaxphoto.georeferencing import apparent_point
+from jaxphoto.georeferencing.ground import moved_exterior, moved_interior
+from jaxphoto.orientation.block_intersection import intersect_points
+from jaxphoto.orientation.rays import padded_length, turn_to_object
+from jaxphoto.procedures.adjust import adjust_for_tables
+from jaxphoto.procedures.control.control_block import CRITICAL, ControlledBlock, control_block
+from jaxphoto.procedures.control.frame import LEAST, in_frame
+from jaxphoto.procedures.control.marks import Marked, marked, misses, rays_of
+from jaxphoto.procedures.control.surveyed import SIGMA_M, GivenControl, Marks
+from jaxphoto.statistics import covariance
+from jaxphoto.statistics.covariance import turns_of
+
+
+class Predicted(NamedTuple):
+    """Surveyed points in images; pixels from the upper-left corner, whose pixel has its centre at (0.5, 0.5)."""
+
+    image: Int[np.ndarray, "n"]
+    point: Int[np.ndarray, "n"]
+    column_row: Float[np.ndarray, "n 2"]
+    covariance: Float[np.ndarray, "n 2 2"]
+    """In px^2."""
+    px_per_m: Float[np.ndarray, "n 2 3"]
+    """How the place in the picture moves with X, Y, Z of the point."""
+
+    def take(self, chosen: np.ndarray) -> "Predicted":
+        """Those that a mask or indices choose."""
+        return Predicted(*(v[chosen] for v in self))
+
+
+def predicted(
+    adjusted: Adjustment, xyz: Float[np.ndarray, "points 3"], of_points: Float[np.ndarray, "points 3 3"]
+) -> Predicted:
+    """All places where `xyz` (m, in the frame of the block, of covariance `of_points`) are in a picture."""
+    block, unknowns = adjusted.block, adjusted.unknowns
+    joint = covariance(adjusted)
+    n, factor = len(block.images), float(joint.variance_factor)
+    matrix, labels = np.asarray(joint.matrix) * factor, list(joint.labels)
+    position, turn = still(unknowns.exterior.position), still(unknowns.exterior.camera_from_object)
+    to_angles = np.asarray(turns_of(jnp.asarray(np.moveaxis(turn, 0, -1)), joint.rotations))
+    found: list[Predicted] = []
+    image = np.arange(n).repeat(len(xyz))
+    point = np.tile(np.arange(len(xyz)), n)
+    camera = np.array(block.image_camera, object)[image]
+    for name, interior in unknowns.interior.items():
+        own = np.flatnonzero(camera == name)
+        if not len(own):
+            continue
+        i, p = image[own], point[own]
+        pad = np.resize(np.arange(len(own)), padded_length(len(own)))
+        numbers = jax.tree.map(partial(np.asarray, dtype=float), interior)
+        exterior = ExteriorOrientation(position[i[pad]], turn[i[pad]])  # type: ignore[arg-type]
+        told = _projected(numbers, exterior, xyz[p[pad]], block.corrections)
+        xy, seen, by_point, by_exterior, by_interior = (np.asarray(v)[: len(own)] for v in told)
+        free = [k for k, q in enumerate(parameter_names(interior)) if f"interior[{name}].{q}" in labels]
+        place = [labels.index(f"interior[{name}].{parameter_names(interior)[k]}") for k in free]
+        sensor = block.sensors[name]
+        half = np.array([sensor.width_mm, sensor.height_mm]) / 2
+        for k in np.flatnonzero(seen & (np.abs(xy) < half).all(axis=1)):
+            where = [*range(6 * i[k], 6 * i[k] + 6), *place]
+            by_angles = by_exterior[k, :, 3:] @ np.linalg.inv(to_angles[i[k]])
+            by = np.column_stack([by_exterior[k, :, :3], by_angles, by_interior[k][:, free]])
+            pixel = np.array([1, -1]) / sensor.pixel_mm
+            c = by @ matrix[np.ix_(where, where)] @ by.T + by_point[k] @ of_points[p[k]] @ by_point[k].T
+            found.append(
+                Predicted(
+                    i[k : k + 1],
+                    p[k : k + 1],
+                    sensor.px_from_mm(xy[k : k + 1]),
+                    (c * np.outer(pixel, pixel))[None],
+                    (by_point[k] * pixel[:, None])[None],
+                )
+            )
+    none = Predicted(
+        *(np.zeros((0, *s), t) for s, t in (((), int), ((), int), ((2,), float), ((2, 2), float), ((2, 3), float)))
+    )
+    return Predicted(*(np.concatenate(parts) for parts in zip(none, *found, strict=True)))
+
+
+@partial(jit_quickly, static_argnum=3)
+def _projected(interior, exterior, points, corrections):
+    def one(exterior, point):
+        def place(d_point, d_exterior, d_interior):
+            image = moved_exterior(exterior, d_exterior)
+            aim = apparent_point(image.position, point + d_point, corrections)
+            value = project(moved_interior(interior, d_interior), image, aim)
+            return value, value
+
+        zeros = jnp.zeros(3), jnp.zeros(6), jnp.zeros(len(parameter_names(interior)))
+        by, value = jax.jacfwd(place, argnums=(0, 1, 2), has_aux=True)(*zeros)
+        return value, in_field(interior, exterior, point), *by
+
+    return jax.vmap(one)(exterior, points)
+
+
+# Standard deviations within which a target is looked for, and pixels at least.
+_WITHIN, _LEAST_PX = 3.5, 5.0
+# Of a block that no control has placed yet, m in plan: what receivers without corrections have in common.
+COMMON_M = 3.0
+# Ties about a point whose height is that of the ground there.
+_NEAR_TIES = 8
+# By how many pixels a candidate may miss the place where the rays of its point meet.
+_MISS_PX = 2.0
+_LEAST_IMAGES, _LEAST_UNNAMED = 2, 3
+# Of the photographs that show a target, how many show another place for that to be as good.
+_ALIKE = 0.6
+_PARALLEL = np.deg2rad(0.5)
+# By which factor the fits of a target are better than those of another place that looks like it; and by which one they
+# may be worse than those of the other targets.
+_SHARPER, _DULL = 1.5, 3.0
+_MOST_PAIRS = 2000
+
+
+class Candidates(NamedTuple):
+    """What might be a target, by row of what was predicted."""
+
+    row: Int[np.ndarray, "n"]
+    column_row: Float[np.ndarray, "n 2"]
+    sigma_px: Float[np.ndarray, "n"]
+    fit_px: Float[np.ndarray, "n"]
+    """Of the fit to its grey values alone: small where its edge is sharp and strong, as a target's is."""
+
+
+class Looker(NamedTuple):
+    """What finds targets in the pictures."""
+
+    look: Callable[[Predicted, Float[np.ndarray, "n"], tuple[str, ...], tuple[str, ...]], Candidates]
+    """Candidates within the radius (px) of each place; with the names of all images and points."""
+    named: bool
+    """Whether a target tells which point it is."""
+
+
+class FoundTargets(NamedTuple):
+    """Marks of targets that were found, and what became of every point that was looked for, by its name."""
+
+    marks: Marks
+    looked: dict[str, tuple[str, ...]]
+    """In which photographs it was looked for."""
+    why_not: dict[str, str]
+    """Of those that were not found."""
+
+
+def found_marks(
+    adjusted: Adjustment,
+    ids: tuple[str, ...],
+    xyz: Float[np.ndarray, "points 3"],
+    sigma: Float[np.ndarray, "points 3"],
+    known: Collection[tuple[int, int]],
+    looker: Looker,
+    placed: bool,
+) -> FoundTargets:
+    """Targets of the points `ids` at `xyz` (m, +- `sigma`) in the images of `adjusted`, but for (image, point) `known`.
+
+    `placed`: control has placed the block; else its plan is that of receivers, and heights are those of its own ground.
+    """
+    of_points = np.einsum("ni,ij->nij", sigma**2, np.eye(3))
+    if not placed:
+        xyz, scatter = _on_own_ground(adjusted, xyz)
+        of_points = of_points + np.diag([COMMON_M**2, COMMON_M**2, scatter**2])
+    at = predicted(adjusted, xyz, of_points)
+    pairs = zip(at.image.tolist(), at.point.tolist(), strict=True)
+    at = at.take(np.array([pair not in known for pair in pairs], bool))
+    spread = np.sqrt(np.linalg.eigvalsh(at.covariance)[:, 1]) if len(at.image) else np.zeros(0)
+    radius = np.maximum(_WITHIN * spread, _LEAST_PX)
+    seen = looker.look(at, radius, adjusted.block.images, ids)
+    return _believed(adjusted, ids, xyz, of_points, at, seen, looker.named, radius)
+
+
+def _on_own_ground(adjusted: Adjustment, xyz) -> tuple[Float[np.ndarray, "points 3"], float]:
+    """`xyz` with heights shifted in common onto the ground that the block has there, and how far single ones are."""
+    ties = np.asarray(adjusted.unknowns.points, float)
+    above = []
+    for point in xyz:
+        near = np.argsort(np.linalg.norm(ties[:, :2] - point[:2], axis=1))[:_NEAR_TIES]
+        above.append(point[2] - np.median(ties[near, 2]))
+    shift = float(np.median(above))
+    scatter = 1.4826 * float(np.median(np.abs(np.array(above) - shift)))
+    return xyz - [0.0, 0.0, shift], max(scatter, 1.0)
+
+
+def _believed(adjusted, ids, xyz, of_points, at: Predicted, seen: Candidates, named: bool, radius) -> FoundTargets:
+    block, unknowns = adjusted.block, adjusted.unknowns
+    image, point = at.image[seen.row], at.point[seen.row]
+    sensors = [block.sensors[block.image_camera[i]] for i in image]
+    xy = [s.mm_from_px(place[None])[0] for s, place in zip(sensors, seen.column_row, strict=True)]
+    pixel = np.array([s.pixel_mm for s in sensors])
+    rows = Marked(image, point, np.array(xy).reshape(-1, 2), seen.sigma_px * pixel)
+    positions, matrices = (
+        np.asarray(v, float) for v in (unknowns.exterior.position, unknowns.exterior.camera_from_object)
+    )
+    directions = turn_to_object(matrices, image, rays_of(block, unknowns, rows)) if len(image) else np.zeros((0, 3))
+    c = np.array([float(unknowns.interior[block.image_camera[i]].c) for i in image])
+    limit = _MISS_PX * pixel / np.maximum(c, 1e-300)
+    taken: dict[int, list[int]] = {}
+    looked: dict[str, tuple[str, ...]] = {}
+    why_not: dict[str, str] = {}
+    for p in np.unique(at.point).tolist():
+        own = np.flatnonzero(point == p)
+        looked[ids[p]] = tuple(block.images[i] for i in at.image[at.point == p])
+        near = xyz[p], of_points[p]
+        chosen, why = _meeting(positions[image[own]], directions[own], image[own], limit[own], seen.fit_px[own], *near)
+        sure = named or radius[at.point == p].max() < 3 * _LEAST_PX
+        least = _LEAST_IMAGES if sure else _LEAST_UNNAMED
+        if not why and len(chosen) < least:
+            why = f"it was seen in {len(chosen)}, and {least} are needed" if len(own) else "it was not seen"
+        if why:
+            where = counted(len(looked[ids[p]]), "photograph")
+            why_not[ids[p]] = f"the target of {ids[p]} was looked for in {where}: {why}"
+            continue
+        taken[p] = own[chosen].tolist()
+    usual = _fit_of_others(taken, seen.fit_px)
+    for p, rows_of in list(taken.items()):
+        if not named and np.median(seen.fit_px[rows_of]) > _DULL * usual[p]:
+            del taken[p]
+            why_not[ids[p]] = (
+                f"the target of {ids[p]} was looked for: what was seen in {len(rows_of)} photographs is far less sharp "
+                "than the other targets; mark it by hand"
+            )
+    kept = [k for rows_of in taken.values() for k in rows_of]
+    marks = Marks(
+        tuple(block.images[i] for i in image[kept]),
+        tuple(ids[p] for p in point[kept]),
+        seen.column_row[kept],
+        seen.sigma_px[kept],
+        tuple(f"found in {block.images[i]}" for i in image[kept]),
+    )
+    return FoundTargets(marks, looked, why_not)
+
+
+def _fit_of_others(taken: dict[int, list[int]], fit_px: Float[np.ndarray, "n"]) -> dict[int, float]:
+    """For each point what fits of the other points' targets usually are; without bound where there are too few."""
+    own = {p: float(np.median(fit_px[rows])) for p, rows in taken.items()}
+    others = {p: [fit for q, fit in own.items() if q != p] for p in own}
+    return {p: float(np.median(fits)) if len(fits) >= _LEAST_IMAGES else np.inf for p, fits in others.items()}
+
+
+def _meeting(origins, directions, image, limit, fit, near, of_point) -> tuple[np.ndarray, str]:
+    """The candidates, one of an image, whose rays meet at one place near a point; or why there are none."""
+    one, other = np.triu_indices(len(image), 1)
+    apart = image[one] != image[other]
+    one, other = one[apart], other[apart]
+    if len(one) > _MOST_PAIRS:
+        pick = np.linspace(0, len(one) - 1, _MOST_PAIRS).astype(int)
+        one, other = one[pick], other[pick]
+    none = np.zeros(0, int)
+    if not len(one):
+        return (np.arange(len(image)) if len(image) == 1 else none), ""
+    ray = np.stack([one, other], axis=1).ravel()
+    met, sure = intersect_points(
+        origins[ray], directions[ray], np.arange(len(one)).repeat(2), len(one), min_angle=_PARALLEL
+    )
+    off = met - near
+    # Two rays may be off by more than the survey: what they are good for is in the limit.
+    room = np.linalg.norm(near - origins[one], axis=1) * limit[one] * 5
+    distance = np.sqrt(np.einsum("ni,ij,nj->n", off, np.linalg.inv(of_point + 1e-12 * np.eye(3)), off))
+    sure &= (distance < _WITHIN * 1.5) | (np.linalg.norm(off, axis=1) < room)
+    if not sure.any():
+        return none, "nothing that was seen lies where it should"
+    inside = misses(met[sure], origins, directions) < limit
+    images = np.unique(image)
+    score = np.stack([(inside & (image == i)).any(axis=1) for i in images]).sum(axis=0)
+    likely = np.flatnonzero(score >= min(score.max(), max(_LEAST_UNNAMED, _ALIKE * score.max())))
+    sharp = np.array([np.median(fit[inside[k]]) for k in likely])
+    # Of the places that are as sharp as the sharpest, which are often one, that which most photographs show.
+    miss = misses(met[sure], origins, directions).min(axis=1)
+    alike = likely[sharp <= _SHARPER * sharp.min()]
+    best = int(alike[np.argmax(score[alike] - 1e-3 * miss[alike])])
+    chosen = inside[best]
+    if not (inside[alike] & chosen).any(axis=1).all():
+        return none, f"two places or more look like it, one in {score[best]} photographs: mark it by hand"
+    miss = misses(met[sure][best][None], origins, directions)[0]
+    kept = [
+        int(np.flatnonzero(chosen & (image == i))[np.argmin(miss[chosen & (image == i)])])
+        for i in images
+        if (chosen & (image == i)).any()
+    ]
+    return np.array(kept, int), ""
+
+
+_ROUNDS = 3
+# Of what the other surveyed points are off (median): what was found so far away may be another thing.
+_FAR = 10.0
+
+
+def control_block_with_targets(
+    block: Block,
+    control: GivenControl,
+    looker: Looker,
+    *,
+    system: str | None = None,
+    code: int | None = None,
+    vertical: int | None = None,
+    elsewhere: Collection[str] = (),
+    adjust: Callable[[Block], Adjustment] = adjust_for_tables,
+    report: Callable[[str], object] = lambda text: None,
+) -> ControlledBlock:
+    """`control_block` with the marks of `control` and those that `looker` finds.
+
+    Raises InputError as it does, and for a block in a frame of its own without marks of three control points: nobody
+    knows where to look there.
+    """
+    points, ids = control.points, control.points.ids
+    sigma = np.where(np.isnan(points.sigma_m), SIGMA_M, points.sigma_m)
+    by_hand, _ = marked(block, points, control.marks, elsewhere)
+    now: ControlledBlock | None = None
+    how: dict[str, Any] = {"system": system, "code": code, "vertical": vertical, "elsewhere": elsewhere}
+    how |= {"adjust": adjust, "report": report}
+    if len(by_hand.image):
+        now = control_block(block, control, **how)
+    elif block.frame.kind != "epsg":
+        raise InputError(
+            f"{points.file}: the block has no place, so nobody knows where its photographs show the points; mark three "
+            "control points by hand, each in two photographs or more"
+        )
+    adjusted = now.adjusted if now else adjust(block)
+    looked: dict[str, set[str]] = {name: set() for name in ids}
+    seen: dict[str, set[str]] = {name: set() for name in ids}
+    why_not: dict[str, str] = {}
+    anew: dict[int, float] = {}
+    every = control.marks
+    for _ in range(_ROUNDS):
+        report("looking for targets")
+        frame = in_frame(adjusted.block, points, system, code, vertical)
+        # By marks, by targets of an earlier round, or by control that the block came with.
+        placed = len(adjusted.block.control) > 0
+        # Each but once: what is found again is no other.
+        far = {p: off for p, off in _far(now, by_hand).items() if p not in anew} if now else {}
+        rows = (by_hand, now.marks.take(~np.isin(now.marks.point, list(far)))) if now else (by_hand,)
+        known = {pair for of in rows for pair in zip(of.image.tolist(), of.point.tolist(), strict=True)}
+        found = found_marks(adjusted, ids, frame.xyz, sigma, known, looker, placed)
+        for name, images in found.looked.items():
+            looked[name] |= set(images)
+        gone = {p: off for p, off in far.items() if ids[p] in found.marks.point}
+        anew |= gone
+        seen |= {ids[p]: set() for p in gone}
+        for name, image in zip(found.marks.point, found.marks.image, strict=True):
+            seen[name].add(image)
+        why_not |= found.why_not
+        if not len(found.marks.image):
+            break
+        # Where one of an earlier round was left out, another may be found in its place; what is far goes as a whole.
+        again = set(zip(found.marks.image, found.marks.point, strict=True))
+        names = {ids[p] for p in gone}
+        kept = [(i, p) not in again and p not in names for i, p in zip(every.image, every.point, strict=True)]
+        every = Marks.joined(every.take(np.array(kept, bool)), found.marks)
+        now = control_block(block, control._replace(marks=every), **how)
+        adjusted = now.adjusted
+    texts = _told(ids, seen, looked, why_not)
+    if now is None:
+        raise InputError(f"{points.file}: no target was found; {'; '.join(texts)}")
+    still = _far(now, by_hand)
+    texts += [
+        f"the target of {ids[p]} was found anew, {off:.2g} m from what was first taken for it"
+        for p, off in anew.items()
+        if p not in still
+    ]
+    texts += [
+        f"what was found for check point {ids[p]} lies {off:.2g} m from its place: see whether it is its target, or "
+        "mark it by hand"
+        for p, off in still.items()
+        if points.check[p]
+    ]
+    return now._replace(sentences=(*texts, *now.sentences))
+
+
+def _far(now: ControlledBlock, by_hand: Marked) -> dict[int, float]:
+    """Of points that were found far from their place, not by hand, and that nothing is adjusted with: how far (m).
+
+    They stay unless another target is found: a block may be bent there, which check points are to tell.
+    """
+    state, off = np.array(now.state, object), np.linalg.norm(np.nan_to_num(now.off_m), axis=1)
+    if (state == "control").sum() < LEAST:
+        return {}
+    usual = np.median(off[np.isin(state, ["control", "check"])])
+    far = np.isin(state, ["check", "left out"]) & (np.nan_to_num(now.w).max(axis=1) > CRITICAL) & (off > _FAR * usual)
+    return {p: float(off[p]) for p in np.flatnonzero(far).tolist() if p not in by_hand.point}
+
+
+def _told(
+    ids: tuple[str, ...], seen: dict[str, set[str]], looked: dict[str, set[str]], why_not: dict[str, str]
+) -> list[str]:
+    """One sentence on what was found in all rounds, and one for each point that was found in none."""
+    found = [f"{name} in {len(seen[name])} of {len(looked[name])}" for name in ids if seen[name]]
+    count = f"{counted(len(found), 'target')} found in the photographs that should show them"
+    return [f"{count}: {', '.join(found)}"] * bool(found) + [why_not[p] for p in ids if p in why_not and not seen[p]]
