@@ -10,7 +10,7 @@ import pytest
 
 import jaxphoto
 from jaxphoto.extras.photos.targets import read_board, rendered
-from jaxphoto.procedures.calibration import rounds
+from jaxphoto.procedures.calibration import target_calibration
 from tests.commands import run
 from tests.photos.test_targets import LENS, SENSOR, view
 
@@ -83,7 +83,7 @@ def test_two_calibrations_are_compared(folder, monkeypatch, capsys, tmp_path):
 
 
 def test_rounds_that_do_not_settle_end_with_exit_code_1(folder, monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(rounds, "_ROUNDS", 1)
+    monkeypatch.setattr(target_calibration, "_ROUNDS", 1)
     arguments = (*sorted(folder.glob("p*.png")), "--board", BOARD, "--out", tmp_path / "out", "--pixel-mm", 0.008)
     code, screen, _ = run(monkeypatch, capsys, "calibrate", *arguments)
     assert code == 1

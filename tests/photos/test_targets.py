@@ -9,8 +9,8 @@ from jaxphoto.extras.photos.targets import find_targets, read_board, rendered
 from jaxphoto.extras.photos.targets.circles import elliptic_blobs, fit_discs
 from jaxphoto.io.photographs import photographs
 from jaxphoto.orientation.rays import ideal_coordinates
-from jaxphoto.procedures.calibration.calibrate import eccentricities
 from jaxphoto.procedures.calibration.target_block import projections
+from jaxphoto.procedures.calibration.target_calibration import eccentricities
 
 SENSOR = Sensor(480, 360, 0.008)
 LENS = InteriorOrientation(3.2, 0.03, -0.02, Smac(k1=-0.02, k2=-0.001))

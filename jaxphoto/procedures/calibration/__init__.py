@@ -1,6 +1,5 @@
 """Calibration of a camera from photographs of a board with known targets."""
 
-from jaxphoto.procedures.calibration.calibrate import Calibration, calibrate, eccentricity, interior_covariance
 from jaxphoto.procedures.calibration.start import distortion_model, free_parameters
 from jaxphoto.procedures.calibration.target_block import (
     CAMERA,
@@ -11,6 +10,7 @@ from jaxphoto.procedures.calibration.target_block import (
     reprojection_residuals,
     rms_px,
 )
+from jaxphoto.procedures.calibration.target_calibration import Calibration, calibrate, eccentricity, interior_covariance
 
 __all__ = [
     "CAMERA", "Board", "Calibration", "Detection", "TargetRows", "calibrate", "calibration_block",

@@ -15,7 +15,7 @@ from jaxphoto.procedures.control.frame import new_code, told_system
 from jaxphoto.procedures.control.marks import images_of
 from jaxphoto.procedures.control.surveyed import GivenControl, check_near, fitting
 from jaxphoto.procedures.control.targets import Looker, control_block_with_targets
-from jaxphoto.procedures.orientation.related_pairs import Report
+from jaxphoto.procedures.orientation.orient_photographs import Report
 from jaxphoto.statistics import Selection
 
 

@@ -182,11 +182,11 @@ def write_database(
             rig = pycolmap.Rig()
             rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, stored.write_camera(made)))
             stored.write_rig(rig)
-        for k, (camera, features) in enumerate(zip(image_camera, features_px, strict=True)):
-            image = stored.write_image(pycolmap.Image(name=str(k), camera_id=camera + 1))
+        for k, (of_camera, features) in enumerate(zip(image_camera, features_px, strict=True)):
+            image = stored.write_image(pycolmap.Image(name=str(k), camera_id=of_camera + 1))
             frame = pycolmap.Frame()
-            frame.rig_id = camera + 1
-            frame.add_data_id(pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera + 1), image))
+            frame.rig_id = of_camera + 1
+            frame.add_data_id(pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, of_camera + 1), image))
             stored.write_frame(frame)
             stored.write_keypoints(image, np.asarray(features, np.float32).reshape(-1, 2))
         for match in matches:
@@ -233,7 +233,9 @@ def _network(model: Any, n_images: int, n_cameras: int, verified: tuple[PairMatc
         np.isin(np.arange(n_images), order),
         order,
         np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3),
-        *rows.T,
+        rows[:, 0],
+        rows[:, 1],
+        rows[:, 2],
         tuple(model.camera(k + 1).focal_length for k in range(n_cameras)),
         verified,
     )

@@ -4,7 +4,7 @@
 
 e is the distance from the ellipse rho = 1 to first order. The ten unknowns (centre, the three of L, ln s, a, m, g) are
 fitted by `patches`. The centre is that of the ellipse, which is not the image of the circle's centre: see
-`jaxphoto.procedures.calibration.calibrate`.
+`jaxphoto.procedures.calibration.target_calibration`.
 
 Asymmetric grids of circles: every second row is shifted by half the distance of the circles in it.
 
