@@ -13,6 +13,7 @@ from jaxphoto.procedures.calibration import (
     distortion_model,
     eccentricity,
     free_parameters,
+    target_calibration,
 )
 from jaxphoto.procedures.calibration.start import flat_start, nearest_distortion
 from jaxphoto.procedures.calibration.target_block import projections

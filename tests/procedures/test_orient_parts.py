@@ -134,6 +134,8 @@ def elsewhere():
     """A network of six images, its block, and truth in a frame that is turned, moved and twice as large."""
     scene = convergent(6, 60)
     block, network, true = network_of(scene)
+    unknown = Start(block.start.unknowns, np.zeros(len(block.images), bool), np.zeros(len(block.points), bool))
+    block = dataclasses.replace(block, start=unknown)
     turn = np.asarray(camera_from_object(0.5, 0.4, 3.1))
     where = np.zeros((len(block.points), 3))
     where[network.point] = scene.points[true]

@@ -41,7 +41,7 @@ _MOST, _MOST_SIGMA = 0.9, 1.6449
 _BLANK = "it shows no features: it is blank or out of focus"
 _ALONE = f"it has {MIN_MATCHES} points in common with no other photograph it was compared with"
 # Pairs that are matched at a time, and kept in one piece.
-_CHUNK = 40
+_CHUNK = 200
 Progress = Callable[[str, int, int], None]
 """Called with the current step, the number of items done, and of how many."""
 

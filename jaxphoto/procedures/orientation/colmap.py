@@ -25,6 +25,8 @@ _PLAUSIBLE = 1.5
 _MIN_INLIER_RATIO = 0.25
 
 
+# Misclosure (px) up to which two images differ by a rotation only.
+_ROTATED_PX = 2.0
 _ONE_PLACE = "they were taken from one place, or see too few points at a wide enough angle"
 
 
@@ -103,11 +105,10 @@ def map_images(
         two_view = pycolmap.TwoViewGeometryOptions()
         two_view.min_num_inliers, two_view.min_inlier_ratio = min_matches, _MIN_INLIER_RATIO
         two_view.ransac.random_seed, two_view.detect_watermark = 0, False
-        # Tells pairs from one place from those over a plane.
-        two_view.compute_relative_pose = True
         pycolmap.geometric_verification(database, two_view_geometry_options=two_view)
-        verified, n_one_place = _verified_matches(pycolmap, database)
-        if not verified and n_one_place:
+        verified = _verified_matches(pycolmap, database)
+        rays = [_rays(cameras[k], xy) for k, xy in zip(image_camera, features_px, strict=True)]
+        if verified and all(_only_rotated(rays, match, cameras[0].c_px) for match in verified):
             raise BlockError(_no_pair(len(names), _ONE_PLACE))
         _check_connected(names, verified)
         best, score = None, (False, 0, 0)
@@ -129,18 +130,31 @@ def map_images(
         return _network(best, len(names), len(cameras), verified)
 
 
-def _verified_matches(pycolmap: Any, database: str) -> tuple[tuple[PairMatches, ...], int]:
-    """The inlier matches of all pairs in a COLMAP `database`, and the number of pairs taken from one place."""
-    verified, n_one_place = [], 0
+def _verified_matches(pycolmap: Any, database: str) -> tuple[PairMatches, ...]:
+    """The inlier matches of all pairs in a COLMAP `database`."""
+    verified = []
     with pycolmap.Database.open(database) as stored:
         for pair, geometry in zip(*stored.read_two_view_geometries(), strict=True):
             one, other = (image - 1 for image in pycolmap.pair_id_to_image_pair(pair))
             features = np.asarray(geometry.inlier_matches, int).reshape(-1, 2)
-            if geometry.config == pycolmap.TwoViewGeometryConfiguration.PANORAMIC.value:
-                n_one_place += 1
-            elif len(features):
+            if len(features):
                 verified.append(PairMatches(one, other, features))
-    return tuple(sorted(verified, key=lambda m: m[:2])), n_one_place
+    return tuple(sorted(verified, key=lambda m: m[:2]))
+
+
+def _rays(camera: MappedCamera, xy_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    """Unit directions of ideal coordinates, in COLMAP's camera frame."""
+    xy = (xy_px - np.array([camera.width_px, camera.height_px]) / 2) / camera.c_px
+    rays = np.column_stack([xy, np.ones(len(xy))])
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def _only_rotated(rays: list[np.ndarray], match: PairMatches, c_px: float) -> bool:
+    """True if a rotation takes the rays of one image to those of the other: both were taken from one place."""
+    one, other = rays[match.first][match.features[:, 0]], rays[match.second][match.features[:, 1]]
+    u, _, vt = np.linalg.svd(one.T @ other)
+    turned = one @ (u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return float(np.median(np.linalg.norm(turned - other, axis=1))) < _ROTATED_PX / c_px
 
 
 def _no_pair(n_images: int, why: str) -> str:
