@@ -18,7 +18,7 @@ from jaxphoto import Block, JaxphotoError
 from jaxphoto.camera import get_parameter, set_parameter
 from jaxphoto.procedures import adjust_for_tables
 from jaxphoto.procedures.adjust import start_of
-from jaxphoto.report import Level, Tables, verdict_of
+from jaxphoto.report import Tables, verdict_of
 from jaxphoto.rotation import small_rotation
 
 # Starts are off by up to so much: positions (m) and heights, angles (degrees), c (part of it).
@@ -77,7 +77,7 @@ def _end(block: Block, best: float) -> str:
         return "refused"
     if bool(found.converged) and abs(float(found.square_sum) / best - 1) < _SAME:
         return "at the optimum"
-    good = bool(found.converged) and verdict_of(Tables(found)).level < Level.ALARM
+    good = bool(found.converged) and verdict_of(Tables(found)).severity != "error"
     return "elsewhere, and said to be good" if good else "elsewhere, and red"
 
 

@@ -20,7 +20,7 @@ from jaxphoto import Adjustment, Block, Unknowns, adjust, covariance
 from jaxphoto.camera import get_parameter
 from jaxphoto.io.recipe import recipe_from
 from jaxphoto.simulation import remeasure, simulate
-from jaxphoto.statistics import detectable_errors, normalised_residuals, observation_groups, redundancy_numbers
+from jaxphoto.statistics import minimal_detectable_biases, normalised_residuals, observation_groups, redundancy_numbers
 
 RECIPE = {
     "title": "small",
@@ -91,7 +91,7 @@ def _is_found(block: Block, sound: Adjustment, q, truth: Unknowns, seed: int) ->
     """Whether one observation, off by its detectable error, is beyond the limit of the test of it alone."""
     rng = np.random.default_rng(seed)
     numbers = redundancy_numbers(sound, q)
-    detectable = detectable_errors(sound, numbers)
+    detectable = minimal_detectable_biases(sound, numbers)
     groups = {name: rows for name, rows in observation_groups(sound).items() if rows.unit}
     name = list(groups)[rng.integers(len(groups))]
     size = np.atleast_2d(detectable[name])

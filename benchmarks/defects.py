@@ -16,7 +16,6 @@ from machine import machine, markdown, sentence, write_results
 import jaxphoto
 from jaxphoto import JaxphotoError, Tables
 from jaxphoto.report import verdict_of
-from jaxphoto.report.findings import Level
 
 
 class Said(NamedTuple):
@@ -73,7 +72,7 @@ def told_of(make: Make, seed: int) -> Said:
         verdict = verdict_of(Tables(jaxphoto.adjust(make(seed))))
     except JaxphotoError as error:
         return Said(type(error).__name__, str(error), time.perf_counter() - began)
-    text = "\n".join(f.text for f in verdict.findings if f.level >= Level.WARNING)
+    text = "\n".join(f.text for f in verdict.findings if f.severity != "note")
     return Said(verdict.colour, text, time.perf_counter() - began)
 
 

@@ -56,10 +56,9 @@ def main() -> int:
     parser.add_argument("--pairs", type=int, default=10, help="times that a command runs twice at once")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    from jaxphoto.cli.app import COMMANDS
+    # Forked processes need not import it again.
+    import jaxphoto_command  # noqa: F401
 
-    for command in COMMANDS.values():
-        __import__(f"jaxphoto.cli.{command.module}")
     bad = 0
     with tempfile.TemporaryDirectory() as folder:
         inputs = Path(folder) / "inputs"

@@ -104,13 +104,12 @@ def ours(arguments: argparse.Namespace) -> dict:
     from jaxphoto.camera import InteriorOrientation
     from jaxphoto.extras.photos.matching import match_photographs
     from jaxphoto.extras.photos.photograph_pairs import photograph_pairs
-    from jaxphoto.io.photographs import known_lens, sensor_and_interior
-    from jaxphoto.io.sound_photographs import sound_photographs
+    from jaxphoto.io.photographs import known_lens, sensor_and_interior, valid_photographs
     from jaxphoto.procedures.calibration import distortion_model
     from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
     from jaxphoto.report.flight import FlightSource, report_of, write_flight
 
-    read, spoilt = sound_photographs(_files(arguments))
+    read, spoilt = valid_photographs(_files(arguments))
     camera = sensor_and_interior(read)
     compared = photograph_pairs(read, arguments.pairs)
 

@@ -2,13 +2,12 @@
 
 python benchmarks/install.py [--lean] [--out DIR]
 
-Builds the wheel, installs it into a fresh environment (with --lean without what docs/install.md says may be left out)
-and starts it some times, away from the checkout. The first import writes bytecode and does not count.
+Builds the wheel, installs it into a fresh environment (with --lean without extras) and
+starts it some times, away from the checkout. The first import writes bytecode and does not count.
 """
 
 import argparse
 import os
-import re
 import resource
 import subprocess
 import sys
@@ -28,7 +27,7 @@ _ROUNDS = 5
 def main() -> None:
     """Print both tables as Markdown."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--lean", action="store_true", help="without what may be left out")
+    parser.add_argument("--lean", action="store_true", help="without extras")
     parser.add_argument("--out", type=Path, help="folder whose results.md they are appended to")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -49,11 +48,7 @@ def measured(work: Path, lean: bool) -> str:
     pip = [beside / "python", "-m", "pip", "-q", "--disable-pip-version-check"]
     subprocess.run([*pip, "wheel", "--no-deps", "-w", work, ROOT], check=True)
     (wheel,) = work.glob("jaxphoto-*.whl")
-    if lean:
-        subprocess.run([*pip, "install", "--no-deps", wheel], check=True)
-        subprocess.run([*pip, "install", *lean_packages()], check=True)
-    else:
-        subprocess.run([*pip, "install", wheel], check=True)
+    subprocess.run([*pip, "install", wheel if lean else f"{wheel}[all]"], check=True)
     of = {path.name: size(path) for path in site.iterdir()}
     rows = [f"all of it | {sum(of.values()) - before:.0f}"]
     rows += [f"`{name}` | {of[name]:.0f}" for name in sorted(of, key=lambda n: -of[n]) if of[name] >= 20]
@@ -65,13 +60,6 @@ def measured(work: Path, lean: bool) -> str:
         "| installed | MB |", "| --- | --- |", *(f"| {row} |" for row in rows), "",
         "| start | seconds of the processor, least of 5 |", "| --- | --- |", *(f"| {row} |" for row in starts),
     ])  # fmt: skip
-
-
-def lean_packages() -> list[str]:
-    """What the page on installing says is needed by all."""
-    text = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
-    (line,) = re.findall(r"^pip install (jax .*)$", text, re.MULTILINE)
-    return line.split()
 
 
 def size(path: Path) -> float:

@@ -41,7 +41,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=5)
     arguments = parser.parse_args()
     from jaxphoto.io import read_truth
-    from jaxphoto.io.clouds import most_points
+    from jaxphoto.io.clouds import point_count
     from jaxphoto.report import recovery_table
 
     print(sentence(machine()))
@@ -61,7 +61,7 @@ def main() -> int:
     _, status, used = os.wait4(child.pid, 0)
     took = time.perf_counter() - began
     print(
-        f"{most_points(flight / 'cloud.laz') / 1e6:.1f} million returns, {took:.0f} s, "
+        f"{point_count(flight / 'cloud.laz') / 1e6:.1f} million returns, {took:.0f} s, "
         f"{used.ru_utime + used.ru_stime:.0f} s of processor, {used.ru_maxrss / 1e6:.2f} GB, exit code "
         f"{os.waitstatus_to_exitcode(status)}"
     )

@@ -26,7 +26,7 @@ from jaxphoto.parameters import numbers_of
 from jaxphoto.simulation import remeasure, simulate
 from jaxphoto.simulation.changing_cameras import drawn
 from jaxphoto.simulation.flight import fly
-from jaxphoto.statistics import SIGNIFICANCE_LEVEL, camera_drifts, camera_wanderings, strip_differences
+from jaxphoto.statistics import SIGNIFICANCE_LEVEL, camera_drifts, camera_spline_differences, strip_differences
 
 # The camera, the aircraft and how well both are known are those of the other benchmark.
 FLIGHT = {name: RECIPE[name] for name in ("cameras", "mounts", "jitter", "sigmas")} | {
@@ -86,7 +86,7 @@ def flights(case: str, n: int, first: int) -> Iterator[dict]:
             for name, own in owners.items():
                 pairs = zip(own.labels(name), numbers_of(found.unknowns.more[kind][name]), numbers_of(own), strict=True)
                 row |= {label: float((v - t) / sigma[label]) for label, v, t in pairs if label in sigma}
-        tests = [d.change for d in camera_drifts(found, cov)] + [w.more for w in camera_wanderings(found, cov)]
+        tests = [d.change for d in camera_drifts(found, cov)] + [w.more for w in camera_spline_differences(found, cov)]
         if (strips := strip_differences(found, cov)) is not None:
             tests.append(strips.more)
         yield row | {"p_value": tests[0].p_value}

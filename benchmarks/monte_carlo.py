@@ -22,7 +22,7 @@ from ours import SIGN, block_of
 import jaxphoto
 from jaxphoto.adjustment import solve
 from jaxphoto.experiment import MonteCarlo
-from jaxphoto.sensitivity import Readjustment, bias, joined_draws
+from jaxphoto.sensitivity import Readjustment, bias, join_draws
 
 HERE = Path(__file__).resolve()
 _GROWTH = (100, 1000, 10_000, 100_000)
@@ -137,7 +137,7 @@ def _readjusted(problem: Problem, drawn: np.ndarray):
     block = block_of(problem, "draws")
     nominal = solve(block, block.start.unknowns, block.priors)
     run = Readjustment(nominal, _change(problem), drawn)
-    return nominal, joined_draws(run.batches(drawn)).shared
+    return nominal, join_draws(run.batches(drawn)).shared
 
 
 def _work(problem: Problem, drawn: np.ndarray) -> None:
@@ -151,7 +151,7 @@ def _work(problem: Problem, drawn: np.ndarray) -> None:
 
 def _once(run: Readjustment, drawn: np.ndarray) -> dict:
     began = time.perf_counter()
-    draws = joined_draws(run.batches(drawn))
+    draws = join_draws(run.batches(drawn))
     seconds = time.perf_counter() - began
     return {
         "kind": "draws",

@@ -22,7 +22,7 @@ _SETUP = "import jax, jax.numpy as jnp, jaxphoto\nblock = jaxphoto.read_block('e
 def lines_of_readme(draws: int) -> dict[str, list[str]]:
     """Name each part of README.md and give the command that runs it."""
     python = re.findall(r"```python\n(.*?)```", (_ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
-    adjust, functions, derivative = python
+    adjust, derivative, functions = python
     adjusted = _SETUP + "adjusted = jaxphoto.adjust(block)\n"
     function, _ = derivative.split("jax.jit(jax.grad", 1)
     samples = f"jax.block_until_ready(jax.jit(jax.vmap(c_mm))(jnp.linspace(-0.1, 0.1, {draws})))"
@@ -32,8 +32,8 @@ def lines_of_readme(draws: int) -> dict[str, list[str]]:
             "adjust",
             "examples/cross_block",
         ],
-        "From Python": [sys.executable, "-c", adjust],
-        "Only the functions": [sys.executable, "-c", functions],
+        "Which parameters are correlated?": [sys.executable, "-c", adjust],
+        "A distortion of your own": [sys.executable, "-c", functions],
         "`adjust`, `jit(grad(c_mm))`, `jit(vmap(c_mm))` of three": [sys.executable, "-c", adjusted + derivative],
         f"`adjust`, `jit(vmap(c_mm))` of {draws:,}": [sys.executable, "-c", adjusted + function + samples],
     }

@@ -19,11 +19,11 @@ from ours import block_of
 from jaxphoto import Adjustment, adjust, covariance
 from jaxphoto.statistics import (
     blunder_test,
-    detectable_errors,
+    mdb_effects,
+    minimal_detectable_biases,
     normalised_residuals,
     redundancy_numbers,
-    trends,
-    undetected_effects,
+    systematic_effect_tests,
 )
 
 
@@ -57,11 +57,11 @@ def _timed(adjusted: Adjustment) -> dict[str, float]:
     q = of("covariances", lambda: covariance(adjusted, rows=True))
     r = of("redundancy numbers", lambda: redundancy_numbers(adjusted, q))
     of("w", lambda: normalised_residuals(adjusted, r))
-    of("detectable errors", lambda: detectable_errors(adjusted, r))
+    of("detectable errors", lambda: minimal_detectable_biases(adjusted, r))
     test = of("every w against its critical value", lambda: blunder_test(adjusted, r))
-    of("effects of undetected errors", lambda: undetected_effects(adjusted, q, r))
+    of("effects of undetected errors", lambda: mdb_effects(adjusted, q, r))
     blunders = [(s.group, s.row) for s in test.suspects]
-    of("patterns", lambda: trends(adjusted, np.asarray(q.shared_sigma), blunders))
+    of("patterns", lambda: systematic_effect_tests(adjusted, np.asarray(q.shared_sigma), blunders))
     return found
 
 

@@ -113,7 +113,7 @@ def starts(file: Path, folder: Path) -> list[dict]:
     block, cache = folder / "block", folder / "cache"
     write_block(read_block(file), block)
     environment = {"XDG_CACHE_HOME": str(cache), "JAX_COMPILATION_CACHE_DIR": str(cache / "jax")}
-    program = "import sys; from jaxphoto.cli import main; sys.argv = ['jaxphoto', *sys.argv[1:]]; main()"
+    program = "import sys; from jaxphoto_command import main; sys.argv = ['jaxphoto', *sys.argv[1:]]; main()"
     run = [sys.executable, "-c", program, "adjust", str(block), "--out", str(folder / "out")]
     records = []
     for name, command in (

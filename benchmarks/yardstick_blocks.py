@@ -83,7 +83,7 @@ def single_image_cameras() -> Blocks:
 def _experiment(name: str, *variants: str) -> Blocks:
     """The first layout of an experiment, in the variants named or all."""
     from jaxphoto.experiment import simulated
-    from jaxphoto.experiment.folder import load_experiment
+    from jaxphoto.experiment.experiment import load_experiment
 
     folder = ROOT / "experiments" / name
     experiment = load_experiment(folder)
@@ -147,9 +147,9 @@ def experiment_correlation_study() -> Blocks:
 @case
 def experiment_network_design() -> Blocks:
     design = _script("network_design/design.py")
-    of, usual = design.plan(0), design.planned_design(design.RECIPE.plan, design.CENTRE)
+    of, usual = design.plan(0), design.design_from_plan(design.RECIPE.plan, design.CENTRE)
     known = design.designs_of(pd.read_csv(ROOT / "experiments/network_design/layouts.csv"), usual)
-    measured = {name: design.measured_block(of(known[name])) for name in ("usual", "headings")}
+    measured = {name: design.block_from_layout(of(known[name])) for name in ("usual", "headings")}
     return {name: design.noisy(m.block, m.truth)(0) for name, m in measured.items()}
 
 

@@ -77,7 +77,8 @@ from jaxphoto.statistics import (
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted, default_priors
 
 if TYPE_CHECKING:
-    from jaxphoto.io import convert, read_block, read_recipe, read_source, write_block, write_simulation
+    from jaxphoto.extras.formats import convert, read_source
+    from jaxphoto.io import read_block, read_recipe, write_block, write_simulation
     from jaxphoto.procedures.calibration import calibrate
     from jaxphoto.procedures.compare import compare
     from jaxphoto.procedures.halves import halves
@@ -108,7 +109,8 @@ __all__ = [
 # Files and tables bring pandas and more, a third of a second, and studies are not for every day: they are imported when
 # first asked for, as is every room. The names of each room, as imported above for whoever reads types.
 _LATER = {
-    "io": ("convert", "read_block", "read_recipe", "read_source", "write_block", "write_simulation"),
+    "extras.formats": ("convert", "read_source"),
+    "io": ("read_block", "read_recipe", "write_block", "write_simulation"),
     "procedures.calibration": ("calibrate",),
     "procedures.compare": ("compare",),
     "procedures.halves": ("halves",),
@@ -130,7 +132,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """The names of the package and its rooms: what tab completion offers."""
+    """Return the names of the package and its subpackages, for tab completion."""
     return sorted({*__all__, *_rooms(), "__version__"})
 
 

@@ -1,7 +1,7 @@
-"""The block: observations as rows, and who observed what.
+"""Block: observations as rows, with the images and points they refer to.
 
-Observations are rows (`jaxphoto.observations`): "vertical control" is rows with axis 2, so there is no NaN and no
-infinite sigma, and the redundancy is a count. Units are metres, radians and millimetres on the image.
+Observations are rows (`jaxphoto.observations`): vertical control is rows with axis 2, so neither NaN nor infinite
+sigmas occur, and the redundancy is a count. Units are metres, radians and millimetres on the image.
 """
 
 import dataclasses
@@ -42,10 +42,10 @@ if TYPE_CHECKING:
 
 
 class Block(BlockEdits):
-    """A block of images: ids, observations, and what is known and free beforehand.
+    """Block of images: ids, observations, start values and priors.
 
-    Index arrays refer to `images`, `points`, `strips` in their order. `start` and `priors` are what
-    `jaxphoto.adjust` uses unless told otherwise. Check points never enter an adjustment.
+    Index arrays refer to `images`, `points`, `strips` in their order. `jaxphoto.adjust` uses `start` and `priors`
+    unless given others. Check points never enter an adjustment.
     """
 
     title: str = eqx.field(static=True)
@@ -71,20 +71,21 @@ class Block(BlockEdits):
     corrections: Corrections = eqx.field(static=True, default=Corrections())
     surfaces: SurfaceRows = eqx.field(default_factory=SurfaceRows.none)
     more: tuple[AbstractObservations | KnownParameters, ...] = ()
-    """Observations of further kinds, and parameters known beforehand together."""
+    """Observations of further kinds, and joint prior information on parameters."""
     flight_time: Float[Numbers, "images"] | None = None
-    """Seconds from the middle of the flight; `image_time` is from those of the strips. None: they are the same."""
+    """Seconds from the middle of the flight; `image_time` is from the middle of the strip. None: equal."""
     middle_s: float = eqx.field(static=True, default=0.0)
-    """The middle of the flight in the time that the files have (s)."""
+    """Middle of the flight in the time scale of the files (s)."""
     temperatures: Temperatures | None = None
-    """Of the cameras; None: they are not known, and no camera changes with them."""
+    """Camera temperatures; None: unknown, and no camera changes with them."""
     partitions: dict[str, tuple[str, ...]] = eqx.field(static=True, default_factory=dict, converter=StaticDict)
-    """Owners of parameters that are neither cameras nor mounts nor strips: by partition, the part that each image is in
-    ("" for none), such as intervals of time."""
+    """Owners of parameters that are neither cameras nor mounts nor strips: for each partition, the part of each image
+    ("" for none), such as intervals of time.
+    """
     converted_from: str = eqx.field(static=True, default="")
-    """The format and the file of another program that it is from, in words; "" for none."""
+    """Format and file of another program from which it was converted; "" for none."""
     breaklines: tuple[str, ...] = eqx.field(static=True, default=())
-    """Points that were measured where two smooth faces meet, such as on the ridge of a roof."""
+    """Points measured at the intersection of two smooth faces, such as the ridge of a roof."""
 
     def __check_init__(self) -> None:
         for field, kind in (
@@ -97,29 +98,29 @@ class Block(BlockEdits):
 
     @property
     def observations(self) -> tuple[AbstractObservations, ...]:
-        """All that an adjustment observes besides image points, by kind."""
+        """Return all observations except image points, by kind."""
         further = (rows for rows in self.more if isinstance(rows, AbstractObservations))
         return (self.stations, self.attitudes, self.control, self.surfaces, self.distances, *further)
 
     @property
     def doubts(self) -> list[str]:
-        """What speaks against what is known of parameters beforehand, in sentences."""
+        """Return warnings about the prior information."""
         return [known.doubt for known in self.more if isinstance(known, KnownParameters) and known.doubt]
 
     @property
     def named_observations(self) -> dict[str, AbstractObservations]:
-        """Image points and all other rows, by the names that results have for them; kinds without rows are left out."""
+        """Return image points and all other rows by group name in results; empty groups are omitted."""
         return {self.image_points.group: self.image_points, **named_rows(self.observations)}
 
     def with_observations(self, rows: Mapping[str, AbstractObservations]) -> "Block":
-        """The same with other rows in place of some of `named_observations`."""
+        """Return a copy with other rows in place of some of `named_observations`."""
         new = {id(old): rows[name] for name, old in self.named_observations.items() if name in rows}
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         changed: dict[str, Any] = {name: new[id(value)] for name, value in fields.items() if id(value) in new}
         return dataclasses.replace(self, **changed, more=tuple(new.get(id(value), value) for value in self.more))
 
     def owners(self, owner: str) -> tuple[str, ...]:
-        """Of each image, the owner of parameters that belong to its `owner`, such as "camera"; "" where it has none.
+        """Return the owner of each image's parameters of kind `owner`, such as "camera"; "" if it has none.
 
         Raises BlockError for a partition that the block does not have.
         """
@@ -129,7 +130,7 @@ class Block(BlockEdits):
             "mount": self.image_mount,
             "strip": self.image_strip,
             "block": ("",) * len(self.images),
-            # A laser scanner belongs to the block, but to none of its images.
+            # A laser scanner belongs to the block, but not to an image.
             "lidar": ("none",) * len(self.images),
             "knot": ("none",) * len(self.images),
         } | self.partitions
@@ -141,7 +142,7 @@ class Block(BlockEdits):
         return known[owner]
 
     def plot(self, ax: "Axes | None" = None, *, in_3d: bool = False) -> "Axes":
-        """The block as it starts, in plan or in space, on matplotlib axes, which are returned; new ones if none are."""
+        """Plot the start values, in plan or in space; returns the matplotlib axes, new ones unless given."""
         return from_upstairs("plot_block")(self, ax, in_3d=in_3d)
 
     __repr__ = block_repr
@@ -152,12 +153,12 @@ class Block(BlockEdits):
     @staticmethod
     @functools.wraps(block_fields)
     def of(*args: Any, **kwargs: Any) -> "Block":
-        """The block of arrays and tables: see `block_fields`."""
+        """Create a block from arrays and tables: see `block_fields`."""
         return Block(**block_fields(*args, **kwargs))
 
 
 def empty_block(title: str) -> Block:
-    """A block of nothing at all, for observations that need neither images nor points."""
+    """Return an empty block, for observations that need neither images nor points."""
     places, known = np.zeros((0, 3)), np.zeros(0, bool)
     start = Unknowns({}, ExteriorOrientation(places, np.zeros((0, 3, 3))), places, {}, {})  # type: ignore[arg-type]
     priors = Unknowns({}, ExteriorOrientation(FREE, FREE), FREE, {}, {})  # type: ignore[arg-type]
@@ -169,7 +170,7 @@ def empty_block(title: str) -> Block:
 
 
 def named_rows(groups: Iterable[AbstractObservations]) -> dict[str, AbstractObservations]:
-    """Groups that have rows by their names, with a number where several have the same."""
+    """Return non-empty groups by name, numbered if several share a name."""
     named: dict[str, AbstractObservations] = {}
     for rows in groups:
         if len(rows):
@@ -179,7 +180,7 @@ def named_rows(groups: Iterable[AbstractObservations]) -> dict[str, AbstractObse
 
 
 class SensorRows(eqx.Module):
-    """What GNSS and IMU recorded of the images that have both a whole position and an attitude; one entry an image.
+    """GNSS and IMU records of the images that have both a full position and an attitude; one entry per image.
 
     `mount`, `bias` and `exposure` have a leading axis over these images.
     """
@@ -195,7 +196,7 @@ class SensorRows(eqx.Module):
 
 
 def sensor_rows(block: Block, unknowns: Unknowns) -> SensorRows:
-    """Stations and attitudes of `block` by image, with the mounts and strips of `unknowns`."""
+    """Return stations and attitudes of `block` by image, with the mounts and strips of `unknowns`."""
     station = np.full((len(block.images), 3), -1)
     station[block.stations.who, block.stations.axis] = np.arange(len(block.stations.who))
     attitude = np.full(len(block.images), -1)
@@ -218,15 +219,15 @@ def sensor_rows(block: Block, unknowns: Unknowns) -> SensorRows:
 
 @eqx.filter_jit
 def direct_exterior(rows: SensorRows) -> ExteriorOrientation:
-    """`georeferencing.direct_orientation` of all images of `rows`."""
+    """Apply `georeferencing.direct_orientation` to all images of `rows`."""
     of_each = jax.vmap(lambda r: direct_orientation(r.station, r.roll_pitch_yaw, r.mount, r.bias, r.exposure))
     return of_each(rows)
 
 
 def mountings(block: Block, unknowns: Unknowns) -> tuple[Mount, StripBias]:
-    """Mount and strip bias of every image, with a leading axis over the images; zeros where an image has none.
+    """Return mount and strip bias of every image, with a leading axis over the images; zeros if it has none.
 
-    Where a camera's x axis points is part of `exposures`: a stack needs mounts of one kind.
+    The direction of the camera's x axis is part of `exposures`: a stack needs mounts of one kind.
     """
     none = jnp.zeros(3)
     mounts = {name: Mount(m.lever_arm, m.boresight, m.time_offset) for name, m in unknowns.mounts.items()}
@@ -237,16 +238,16 @@ def mountings(block: Block, unknowns: Unknowns) -> tuple[Mount, StripBias]:
 
 
 def _by_name(table: dict, names: tuple[str, ...], absent):
-    """The tree of each of `names` in one tree with a leading axis; `absent` where the table lacks it."""
+    """Stack the trees of `names` along a leading axis; `absent` replaces missing ones."""
     place = {name: k for k, name in enumerate(table)}
     index = np.array([place.get(name, len(place)) for name in names], int)
     return jax.tree.map(lambda *v: joined([still(x)[None] for x in v])[index], *table.values(), absent)
 
 
 def bent_cameras(block: Block, unknowns: Unknowns) -> dict[str, InteriorOrientation] | None:
-    """By camera, the interior orientation at every exposure of the block (with a leading axis over its images).
+    """Return the interior orientations at all exposures, by camera (with a leading axis over its images).
 
-    None where nothing bends any: no shutter rolls, and no camera changes during the flight.
+    None if nothing modifies them: no rolling shutter, no change of a camera during the flight.
     """
     bending = []
     for owners in unknowns.tables.values():
@@ -268,7 +269,7 @@ def bent_cameras(block: Block, unknowns: Unknowns) -> dict[str, InteriorOrientat
 
 
 def exposures(block: Block) -> Exposure:
-    """What is known of every exposure besides its observations, with a leading axis over the images."""
+    """Return the properties of every exposure that are not observed, with a leading axis over the images."""
     none = np.zeros((len(block.images), 3))
     motion = block.motion if block.motion is not None else Motion(none, none)
     mounts = block.start.unknowns.mounts

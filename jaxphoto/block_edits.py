@@ -1,4 +1,4 @@
-"""Edits of a block: other priors, cameras, control, stations. Numbers may be traced by JAX; names may not."""
+"""Edits of a block: priors, cameras, control, stations. Numbers may be traced by JAX; names may not."""
 
 import dataclasses
 from collections.abc import Callable, Collection, Mapping
@@ -23,26 +23,26 @@ from jaxphoto.unknowns import FIXED, FREE, weighted, with_prior
 
 
 class BlockEdits(eqx.Module):
-    """The methods of a `Block` that return an edited copy."""
+    """Methods of `Block` that return an edited copy."""
 
     def fix(self, *names: str, of: str | None = None) -> Self:
-        """A copy in which parameters are held at their start values: `block.fix("k2")`.
+        """Return a copy with parameters fixed at their start values: `block.fix("k2")`.
 
         Names are those of tables (`c_mm`, `k1`), fields of mounts and strips (`lever_arm`, `shift`), and `position`,
-        `rotation` (all images) and `points`. `of` names the camera, mount or strip; all that have it without. Raises
-        InputError for a parameter that the block has not, and where none is named.
+        `rotation` (all images) and `points`. `of` names the camera, mount or strip; by default all that have the
+        parameter. Raises InputError for a parameter that the block does not have, and without a name.
         """
         return self._with_priors(names, lambda start: FIXED, of)
 
     def free(self, *names: str, of: str | None = None) -> Self:
-        """A copy in which parameters are free; names as in `fix`."""
+        """Return a copy with free parameters; names as in `fix`."""
         return self._with_priors(names, lambda start: FREE, of)
 
     def weigh(self, name: str, sigma: Any, value: Any = None, of: str | None = None) -> Self:
-        """A copy in which a parameter is observed with `sigma`, in its own unit (mm, m, rad), names as in `fix`.
+        """Return a copy with a parameter observed with `sigma`, in its own unit (mm, m, rad); names as in `fix`.
 
-        The observed `value` is the start value unless one is given; that of all positions, rotations or points has to
-        be. Raises InputError for a sigma that is not above zero, and for what is no number or of another shape.
+        The observed `value` defaults to the start value; for all positions, rotations or points it is required. Raises
+        InputError for a sigma that is not positive, and for values that are not numbers or have another shape.
         """
         if value is None and name in ("position", "rotation", "points"):
             raise InputError(f"weigh({name!r}) needs a value beside its sigma: where it starts, nobody observed it")
@@ -57,11 +57,11 @@ class BlockEdits(eqx.Module):
         free: Collection[str] | None = None,
         sensor: Sensor | None = None,
     ) -> Self:
-        """A copy in which `camera` has another interior orientation, with priors for it.
+        """Return a copy in which `camera` has another interior orientation, with its priors.
 
-        `free` names the parameters that are estimated; all others are FIXED. Without it, parameters keep the priors
-        that the block has for their names, and new ones are FIXED. Raises InputError for a camera that the block does
-        not have, and for a parameter that `interior` does not have.
+        `free` names the estimated parameters; all others are FIXED. Without it, parameters keep the priors of the block
+        for their names, and new ones are FIXED. Raises InputError for a camera that the block does not have, and for a
+        parameter that `interior` does not have.
         """
         block: Any = self
         name, others = one_camera(block, camera), parameter_names(interior) if free is None else ()
@@ -70,10 +70,11 @@ class BlockEdits(eqx.Module):
         return changed if sensor is None else dataclasses.replace(changed, sensors={**block.sensors, name: sensor})
 
     def with_distortion(self, camera: str, distortion: AbstractDistortion, free: Collection[str] = ()) -> Self:
-        """A copy in which `camera` has another distortion: `block.with_distortion("kodak", Smac(), free=("k1", "k2"))`.
+        """Return a copy in which `camera` has another distortion: `block.with_distortion("kodak", Smac(), free=("k1",
+        "k2"))`.
 
-        `free` names the coefficients that are estimated; its others are FIXED, and c_mm, xp_mm and yp_mm keep their
-        priors. Raises InputError as `with_camera` does.
+        `free` names the estimated coefficients; the others are FIXED, and c_mm, xp_mm and yp_mm keep their priors.
+        Raises InputError as `with_camera` does.
         """
         block: Any = self
         name = one_camera(block, camera)
@@ -84,23 +85,23 @@ class BlockEdits(eqx.Module):
         )
 
     def shift_stations(self, shift: Any, per: str = "block") -> Self:
-        """A copy in which observed stations are shifted by (X, Y, Z) in metres: `block.shift_stations([0, 0, 0.1])`.
+        """Return a copy with stations shifted by (X, Y, Z) in metres: `block.shift_stations([0, 0, 0.1])`.
 
-        With `per` ("strip", "image", "camera" or a partition) there is a shift for each owner: rows in the order in
-        which `images` meets the owners, or a dictionary by their names.
+        With `per` ("strip", "image", "camera" or a partition) each owner has its own shift: rows in the order in which
+        `images` meets the owners, or a dictionary by their names.
         """
         return shifted_stations(self, shift, per)
 
     def with_control(self, *points: str, sigma: Any = None) -> Self:
-        """A copy in which the `points` named are control; all others that were surveyed become check points.
+        """Return a copy in which the named `points` are control points; all other surveyed points become check points.
 
-        `sigma` (m, one or one an axis) is for check coordinates that have none. Raises InputError for a point without
+        `sigma` (m, one or one per axis) applies to check coordinates without one. Raises InputError for a point without
         surveyed coordinates.
         """
         return from_upstairs("with_control", "variants")(self, points, sigma)
 
     def without_images(self, *images: str) -> Self:
-        """A copy without these images, and without points that fewer than two of the others show.
+        """Return a copy without these images, and without points that then appear in fewer than two images.
 
         Raises InputError for an image that the block does not have.
         """
@@ -119,7 +120,7 @@ class BlockEdits(eqx.Module):
 
 
 def one_camera(block: Any, camera: str | None) -> str:
-    """The camera of that name, or the only one where none is named. Raises InputError where there is none such."""
+    """Return the camera of that name, or the only one if None. Raises InputError if there is none."""
     if camera is None and len(block.sensors) == 1:
         return next(iter(block.sensors))
     if camera is None or camera not in block.sensors:
@@ -132,7 +133,7 @@ def one_camera(block: Any, camera: str | None) -> str:
 
 
 def with_interior(block: Any, camera: str, interior: InteriorOrientation, priors: InteriorOrientation) -> Any:
-    """`block` with another interior orientation of `camera`, and its priors."""
+    """Replace the interior orientation of `camera`, and its priors."""
     start = block.start.unknowns
     changed = dataclasses.replace(start, interior={**start.interior, camera: interior})
     return dataclasses.replace(
@@ -145,7 +146,7 @@ def with_interior(block: Any, camera: str, interior: InteriorOrientation, priors
 def priors_of_camera(
     interior: InteriorOrientation, known: InteriorOrientation, free: Collection[str], others: Collection[str]
 ) -> InteriorOrientation:
-    """Priors of a camera: `free` parameters are FREE, `others` have the prior that `known` has, the rest is FIXED.
+    """Return priors of a camera: `free` are FREE, `others` keep their prior in `known`, the rest are FIXED.
 
     Raises InputError for a parameter that the camera does not have.
     """
@@ -161,7 +162,7 @@ def priors_of_camera(
 
 
 def shifted_stations(block: Any, shift: Any, per: str) -> Any:
-    """`block` with stations shifted by `shift`: (3,), or a row for each owner `per` strip, image or partition.
+    """Shift the stations of `block` by `shift`: (3,), or one row for each owner `per` strip, image or partition.
 
     Raises InputError for a shift of another shape, and for a name that owns no image.
     """

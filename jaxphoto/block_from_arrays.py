@@ -1,4 +1,4 @@
-"""A block from arrays or tables in memory: only what it has is given, by the column names of a block folder.
+"""Blocks from arrays or tables in memory, with the column names of a block folder.
 
     block = Block.of(
         {"image": ["a", "b"], "point": ["1", "1"], "x_mm": [0.1, -4.2], "y_mm": [2.0, 2.1]},
@@ -6,7 +6,7 @@
         sigma_mm=0.004,
     )
 
-A table is a mapping of columns, as a pandas frame is one. Units are in the names (docs/block_folder.md).
+A table is a mapping of columns, such as a pandas DataFrame. Units are in the names (docs/block_folder.md).
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,18 +47,18 @@ def block_fields(
     datum: Datum | None = None,
     title: str = "block",
 ) -> dict[str, Any]:
-    """The block (its fields) of `image_points` (image, point, x_mm, y_mm) and `cameras`, and whatever else is known.
+    """Return the fields of a block from `image_points` (image, point, x_mm, y_mm), `cameras`, and optional tables.
 
-    `sigma_mm` serves image points without the columns sigma_x_mm, sigma_y_mm. `images` (image) says in which order
-    they stand, and gives `camera`, needed where there are several, `strip`, `time_s` and a start: X_m to Z_m and
-    omega_deg to kappa_deg. `control` (point, X_m to Z_m, NaN where not known; sigma_X_m to sigma_Z_m; role control,
-    fixed or check), `stations` (image, X_m to Z_m and their sigmas), `attitudes` (image, roll_deg to yaw_deg,
-    sigma_roll_deg to sigma_yaw_deg) and `distances` (point_a, point_b, distance_m, sigma_m) are observed; sigma_m or
-    sigma_deg stands for all three. `points` (point, X_m to Z_m) are approximate values, `mounts` by camera, `free` the
-    parameters that every camera estimates. What has no approximate value is for `adjust` to find. `datum` is minimal
-    where nothing but images and distances is given.
+    `sigma_mm` applies to image points without the columns sigma_x_mm, sigma_y_mm. `images` (image) sets their order,
+    and gives `camera`, required if there are several, `strip`, `time_s` and start values: X_m to Z_m and omega_deg to
+    kappa_deg. `control` (point, X_m to Z_m, NaN if unknown; sigma_X_m to sigma_Z_m; role control, fixed or check),
+    `stations` (image, X_m to Z_m and their sigmas), `attitudes` (image, roll_deg to yaw_deg, sigma_roll_deg to
+    sigma_yaw_deg) and `distances` (point_a, point_b, distance_m, sigma_m) are observations; sigma_m or sigma_deg
+    applies to all three. `points` (point, X_m to Z_m) are approximate values, `mounts` by camera, `free` the parameters
+    that every camera estimates. `adjust` computes missing approximate values. `datum` is minimal if only images and
+    distances are given.
 
-    Raises InputError for a column, name or number that is missing or wrong, BlockError for what makes no block.
+    Raises InputError for a missing or wrong column, name or number, BlockError if they do not form a block.
     """
     if not cameras:
         raise InputError('cameras: there is none; give {"name": (Sensor(...), InteriorOrientation(...))}')
@@ -127,7 +127,7 @@ def block_fields(
 
 
 def _cameras(images: CheckedColumns, cameras: tuple[str, ...]) -> tuple[str, ...]:
-    """The camera of every image."""
+    """Return the camera of every image."""
     if "camera" not in images:
         if len(cameras) > 1:
             raise InputError(f"images: add the column camera, as there are {len(cameras)} ({', '.join(cameras)})")
@@ -139,7 +139,7 @@ def _cameras(images: CheckedColumns, cameras: tuple[str, ...]) -> tuple[str, ...
 def _image_rows(
     seen: CheckedColumns, images: tuple[str, ...], sigma_mm: float | None
 ) -> tuple[tuple[str, ...], ImageRows]:
-    """The points in the order in which they are met, and their measurements sorted by point and image."""
+    """Return the points in order of first appearance, and their measurements sorted by point and image."""
     if not seen.n:
         raise BlockError("image_points: there are none; give what was measured in the images")
     image, ids = seen.index("image", images, "image {name} is not listed under images"), seen.ids("point")
@@ -154,7 +154,7 @@ def _image_rows(
 
 
 def _priors(unknowns: Unknowns, free: Sequence[str]) -> Unknowns:
-    """Exterior orientation and points free, and of every camera the parameters `free`."""
+    """Return priors: exterior orientation, points, and the camera parameters `free` are free."""
     priors = default_priors(unknowns)
     for camera, interior in unknowns.interior.items():
         for name in free:
@@ -168,7 +168,7 @@ def _priors(unknowns: Unknowns, free: Sequence[str]) -> Unknowns:
 def _scalars(
     table: CheckedColumns, who: np.ndarray, observed: np.ndarray | None = None, kind: Any = ControlRows
 ) -> tuple[Any, np.ndarray]:
-    """One row for each coordinate given, and the entry that it is of; those not `observed` need no sigma."""
+    """Return one row per coordinate, and the entry it belongs to; those not `observed` need no sigma."""
     value = table.numbers(*_XYZ, empty=True)
     there = ~np.isnan(value)
     needed = there if observed is None else there & observed[:, None]
@@ -178,7 +178,7 @@ def _scalars(
 
 
 def _start(ids: tuple[str, ...], near: CheckedColumns, *held: ControlRows) -> tuple[np.ndarray, np.ndarray]:
-    """Approximate coordinates of all points, those of control first, and for which points all three are known."""
+    """Return approximate coordinates of all points, control first, and which points have all three."""
     start = np.full((len(ids), 3), np.nan)
     start[near.index("point", ids, "point {name} is measured in no image")] = near.numbers(*_XYZ)
     for rows in held:

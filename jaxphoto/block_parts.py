@@ -1,4 +1,4 @@
-"""What a block holds besides its observations: datum, motion of the sensors, frame, start values."""
+"""Parts of a block besides observations: datum, sensor motion, frame, start values."""
 
 import dataclasses
 from typing import Literal
@@ -18,11 +18,11 @@ from jaxphoto.unknowns import Unknowns
 @shown
 @dataclasses.dataclass(frozen=True)
 class Datum:
-    """How position, orientation and scale are fixed where observations leave them open.
+    """Definition of position, orientation and scale where observations leave them open.
 
-    `control`: they must not be open. `minimal`: just enough coordinates of points held at their start values.
-    `inner`: inner constraints over all points, all images or the points named (`over`); `scale` None means
-    "constrain the scale if it is open".
+    `control`: they must not be open. `minimal`: the minimum number of point coordinates fixed at their start values.
+    `inner`: inner constraints over all points, all images or the named points (`over`); `scale` None means "constrain
+    the scale if it is open".
     """
 
     kind: Literal["control", "minimal", "inner"] = "control"
@@ -32,7 +32,7 @@ class Datum:
 
 @shown
 class Motion(eqx.Module):
-    """How the GNSS/IMU moves at each exposure, for a time offset to act on (`georeferencing.Exposure`)."""
+    """Motion of the GNSS/IMU at each exposure, for time offsets (`georeferencing.Exposure`)."""
 
     velocity: Float[Numbers, "images 3"]
     """In the object frame, m/s."""
@@ -42,12 +42,12 @@ class Motion(eqx.Module):
 
 @shown
 class Temperatures(eqx.Module):
-    """Of the camera at each exposure, for `camera.ThermalRates`."""
+    """Camera temperature at each exposure, for `camera.ThermalRates`."""
 
     celsius: Float[Numbers, "images"]
-    """NaN where it is not known: there the interior orientation is taken to be that of the reference."""
+    """NaN if unknown: the reference temperature is assumed."""
     reference_c: float = eqx.field(static=True)
-    """At which the interior orientation holds."""
+    """Temperature at which the interior orientation holds."""
 
     @property
     def above(self) -> Float[Numbers, "images"]:
@@ -58,11 +58,11 @@ class Temperatures(eqx.Module):
 @shown
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """The object frame of a block, and how to come back to the frame of its files.
+    """Object frame of a block, and the conversion to the frame of its files.
 
-    `local`, `enu`: Cartesian, as the files give it. `grid`: map-grid coordinates taken as they stand, which is no
+    `local`, `enu`: Cartesian, as in the files. `grid`: map-grid coordinates without conversion, which is not a
     Cartesian frame. `epsg`: files in the EPSG system `code`, with heights of the EPSG system `vertical` (None: above
-    the ellipsoid) and yaw from true or grid north, were brought to the local east-north-up frame whose origin is
+    the ellipsoid) and yaw from true or grid north, converted to the local east-north-up frame whose origin is
     (longitude, latitude in degrees, ellipsoidal height in m).
     """
 
@@ -74,7 +74,7 @@ class Frame:
 
     @property
     def map(self) -> MapFrame:
-        """To and from the map coordinates of the files; of kind `epsg` only."""
+        """Conversion to and from the map coordinates of the files; for kind `epsg` only."""
         if self.code is None or self.origin is None:
             raise ValueError(f"only a frame of kind epsg with an origin has map coordinates, this is {self}")
         return MapFrame(self.code, self.vertical, self.origin)
@@ -82,9 +82,9 @@ class Frame:
 
 @shown
 class Start(eqx.Module):
-    """Approximate unknowns, and which images and points they are truly known for.
+    """Approximate unknowns, and the images and points for which they are known.
 
-    The arrays of unknown images and points hold zeros (identity rotations) until approximations are found.
+    Arrays of unknown images and points are zero (identity rotations) until approximations are computed.
     """
 
     unknowns: Unknowns

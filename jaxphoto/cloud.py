@@ -1,4 +1,4 @@
-"""The points of a laser scanner."""
+"""Point cloud of a laser scanner."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -10,16 +10,16 @@ from jaxtyping import Bool, Float, Int, UInt8
 from jaxphoto.short_repr import shown
 
 OF_POINTS = ("xyz", "classification", "returns", "time", "strip", "withheld")
-"""What a `Cloud` says of each point."""
+"""Point-wise fields of a `Cloud`."""
 
 
 @shown
 class Cloud(eqx.Module):
     """Laser points in one Cartesian frame (m): that of the block they were read for, or that of their file.
 
-    What a file does not tell is None. `time` (s) is that of the file; `strip` is the index, in `strips`, of the flight
-    line that a point belongs to (LAS: point source ID). `returns` are the return's number and the number of returns
-    of its pulse. `withheld` are points that their file says not to use: only `rewrite_cloud` meets them.
+    Missing fields are None. `time` (s) is that of the file; `strip` is the index, in `strips`, of the flight line of a
+    point (LAS: point source ID). `returns` are return number and number of returns of the pulse. `withheld` marks
+    points that the file excludes: only `rewrite_cloud` handles them.
     """
 
     xyz: Float[np.ndarray, "n 3"]
@@ -34,12 +34,12 @@ class Cloud(eqx.Module):
         return len(self.xyz)
 
     def take(self, chosen: np.ndarray) -> "Cloud":
-        """The points that `chosen` (an index or a mask) names."""
+        """Select points by index or mask."""
         kept = {name: v[chosen] for name in OF_POINTS if (v := getattr(self, name)) is not None}
         return dataclasses.replace(self, **kept)
 
     def numbered(self, names: Sequence[str]) -> "Cloud":
-        """The same with strips numbered as in `names`, and those that are not among them after these."""
+        """Renumber strips as in `names`; others follow after these."""
         if self.strip is None:
             return self
         order = (*names, *(name for name in self.strips if name not in names))
@@ -48,7 +48,7 @@ class Cloud(eqx.Module):
 
     @staticmethod
     def joined(parts: Sequence["Cloud"]) -> "Cloud":
-        """Parts of one cloud as a whole; the strips of the last are those of all."""
+        """Concatenate parts of one cloud; the strips of the last apply to all."""
         columns = {}
         for name in OF_POINTS:
             values = [getattr(part, name) for part in parts]
@@ -58,6 +58,6 @@ class Cloud(eqx.Module):
 
     @property
     def extent(self) -> Float[np.ndarray, "2 3"]:
-        """Least and greatest X, Y, Z (m)."""
-        # Column by column: numpy takes ten times as long over an axis.
+        """Return minimum and maximum X, Y, Z (m)."""
+        # By column: NumPy takes ten times as long over an axis.
         return np.array([[v.min() for v in self.xyz.T], [v.max() for v in self.xyz.T]])

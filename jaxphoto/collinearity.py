@@ -1,10 +1,10 @@
-"""Collinearity: from an object point to its image, from an image to its ray, from rays to a point.
+"""Collinearity: projection of object points, rays of image points, intersection of rays.
 
-What a direction in the camera's frame becomes in the image is the camera's own matter (`camera.projection`): the
-perspective plane, or a fisheye's, whose rays may come from behind the image plane.
+The map from directions in the camera frame to the image belongs to the camera (`camera.projection`): perspective, or a
+fisheye whose rays may come from behind the image plane.
 
-Each function is of one image and one point (intersection: of one point and its rays); map over rows with
-`jax.vmap`. Frames, signs and units: docs/conventions.md. Source of the equations: paper 001, equation (1).
+Each function takes one image and one point (intersection: one point and its rays); map over rows with `jax.vmap`.
+Frames, signs and units: docs/conventions.md. Source of the equations: paper 001, equation (1).
 """
 
 import functools
@@ -21,9 +21,9 @@ from jaxphoto.rotation import matrix_from_omega_phi_kappa, omega_phi_kappa_from_
 from jaxphoto.short_repr import shown
 from jaxphoto.single import single
 
-# Eager, every operation would be compiled by itself; inside another program these functions are part of it.
+# Eager, every operation would be compiled separately; inside another program these functions are inlined.
 _compiled = functools.partial(jax.jit, inline=True)
-# Rounds to the row of a rolling shutter that sees a point: each leaves a hundredth of the error, or less.
+# Iterations for the row of a rolling shutter that sees a point: each reduces the error to a hundredth or less.
 _ROWS = 10
 
 
@@ -41,7 +41,7 @@ class ExteriorOrientation(eqx.Module):
     def from_angles(
         position: Float[Array, "*images 3"], omega_phi_kappa: Float[Array, "*images 3"]
     ) -> "ExteriorOrientation":
-        """From the projection centre (m) and (omega, phi, kappa) in radians."""
+        """Create from projection centre (m) and (omega, phi, kappa) in radians."""
         angles = jnp.asarray(omega_phi_kappa, float)
         return ExteriorOrientation(jnp.asarray(position, float), _matrices(angles))
 
@@ -52,7 +52,7 @@ class ExteriorOrientation(eqx.Module):
 
 
 def _single(exterior: ExteriorOrientation) -> ExteriorOrientation:
-    """The orientation of one image, of arrays; see `jaxphoto.single`."""
+    """Return the orientation of one image as arrays; see `jaxphoto.single`."""
     return ExteriorOrientation(
         single("exterior.position", exterior.position, 3),
         single("exterior.camera_from_object", exterior.camera_from_object, 3, 3),
@@ -60,21 +60,23 @@ def _single(exterior: ExteriorOrientation) -> ExteriorOrientation:
 
 
 def camera_coordinates(exterior: ExteriorOrientation, point: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Object point (m) in the camera frame: x right, y up, z out of the camera's back; z < 0 is in front."""
+    """Transform an object point (m) to the camera frame: x right, y up, z backwards; z < 0 is in front."""
     return rotate(exterior.camera_from_object, point - exterior.position)
 
 
 def project_ideal(
     interior: InteriorOrientation, exterior: ExteriorOrientation, point: Float[Array, "3"]
 ) -> Float[Array, "2"]:
-    """Ideal image coordinate (mm, from the principal point); of the perspective plane x = -c U / W, y = -c V / W."""
+    """Return the ideal image coordinate (mm, from the principal point); perspective: x = -c U / W, y = -c V / W."""
     u, v, w = camera_coordinates(exterior, point)
     return interior.ideal_from_direction(u, v, w)
 
 
 def in_field(interior: InteriorOrientation, exterior: ExteriorOrientation, point: Float[Array, "3"]) -> Bool[Array, ""]:
-    """Whether a point (m) has an image, of whatever format: its direction has (for a perspective camera it lies in
-    front), and there the distortion does not fold."""
+    """Return True if a point (m) has an image, in any format.
+
+    Its direction must have an image (a perspective camera needs it in front), and the distortion be invertible there.
+    """
     u, v, w = camera_coordinates(exterior, point)
     return interior.projection.sees(u, v, w) & interior.invertible(interior.ideal_from_direction(u, v, w))
 
@@ -82,10 +84,10 @@ def in_field(interior: InteriorOrientation, exterior: ExteriorOrientation, point
 def project(
     interior: InteriorOrientation, exterior: ExteriorOrientation, point: Float[Array, "3"]
 ) -> Float[Array, "2"]:
-    """Measured image coordinate (mm, from the image centre) of an object point (m).
+    """Return the measured image coordinate (mm, from the image centre) of an object point (m).
 
-    Of a rolling shutter it is that of the row which sees the point while it is exposed, found by iteration. Where the
-    point is not `in_field`, the value is meaningless.
+    For a rolling shutter, that of the row exposed when it sees the point, by iteration. Meaningless if the point is not
+    `in_field`.
     """
     return _project(interior, _single(exterior), single("point", point, 3))
 
@@ -103,7 +105,7 @@ def _project(interior: InteriorOrientation, exterior: ExteriorOrientation, point
 def image_ray(
     interior: InteriorOrientation, exterior: ExteriorOrientation, xy: Float[Array, "2"]
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Origin (m) and unit direction, in the object frame, of the ray of a measured image coordinate (mm)."""
+    """Return origin (m) and unit direction, in the object frame, of the ray of a measured image coordinate (mm)."""
     return _image_ray(interior, _single(exterior), single("xy", xy, 2))
 
 
@@ -120,12 +122,12 @@ def image_residual(
     point: Float[Array, "3"],
     xy: Float[Array, "2"],
 ) -> Float[Array, "2"]:
-    """Observed minus computed image coordinate, in mm, in the domain where the distortion has a closed form.
+    """Return observed minus computed image coordinate, in mm, in the domain where the distortion has a closed form.
 
-    `ideal(measured) - projection` for models in the measured coordinate; `measured - distorted projection` for
-    models in the ideal one. Where `interior.residuals` is "measured", the first is taken back into the measured image
-    by the derivative of the distortion at the measured coordinate. A rolling shutter sees the point from where the
-    camera is while the row of the measured coordinate is exposed (`camera.rolling_shutter`).
+    `ideal(measured) - projection` for models in the measured coordinate; `measured - distorted projection` for models
+    in the ideal one. If `interior.residuals` is "measured", the former is transformed to the measured image by the
+    derivative of the distortion at the measured coordinate. With a rolling shutter the camera is where it was when the
+    row of the measured coordinate was exposed (`camera.rolling_shutter`).
     """
     return camera_residual(interior, camera_coordinates(exterior, point), xy)
 
@@ -133,8 +135,8 @@ def image_residual(
 def camera_residual(
     interior: InteriorOrientation, in_camera: Float[Array, "3"] | tuple[Array, Array, Array], xy: Float[Array, "2"]
 ) -> Float[Array, "2"]:
-    """`image_residual` of a point in the camera frame (m; see `camera_coordinates`)."""
-    # By component to the end: arrays of two that are computed with in between cost an adjustment a tenth of its time.
+    """Return `image_residual` of a point in the camera frame (m; see `camera_coordinates`)."""
+    # By component: intermediate arrays of two numbers cost an adjustment a tenth of its time.
     u, v, w = in_camera
     if interior.rows is not None:
         u, v, w = interior.rows.at_row(xy[1], (u, v, w))
@@ -159,19 +161,19 @@ def intersect(
     directions: Float[Array, "rays 3"],
     weights: Float[Array, "rays"] | None = None,
 ) -> Float[Array, "3"]:
-    """Forward intersection: the point (m) nearest to all rays, `sum w (I - d d') (X - origin) = 0`.
+    """Intersect rays: the point (m) closest to all of them, `sum w (I - d d') (X - origin) = 0`.
 
-    `directions` are unit vectors; rays of weight zero do not count. Parallel rays give no point: NaN or far away.
+    `directions` are unit vectors; rays of weight zero do not count. Parallel rays give NaN or a distant point.
     """
     origins, directions = single("origins", origins, None, 3), single("directions", directions, len(origins), 3)
     w = jnp.ones(len(origins)) if weights is None else single("weights", weights, len(origins))
     across = w[:, None, None] * (jnp.eye(3) - directions[:, :, None] * directions[:, None, :])
-    # Solved about the first origin, so that large coordinates lose no digits.
+    # Relative to the first origin, so that large coordinates lose no digits.
     b = jnp.einsum("nij,nj->i", across, origins - origins[0])
     return origins[0] + solve(jnp.sum(across, 0), b)
 
 
 def intersection_angle(directions: Float[Array, "rays 3"]) -> Float[Array, ""]:
-    """The largest angle between any two rays (radians): how well they meet."""
+    """Return the largest angle between any two rays (radians)."""
     cosine = jnp.clip(directions @ directions.T, -1.0, 1.0)
     return jnp.arccos(jnp.min(jax.lax.stop_gradient(cosine)))

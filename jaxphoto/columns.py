@@ -1,4 +1,4 @@
-"""Columns of a table in memory, checked: what is missing or wrong is named by table, column and entry."""
+"""Checked columns of a table in memory; errors name table, column and entry."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, Protocol, runtime_checkable
@@ -11,7 +11,7 @@ from jaxphoto.errors import InputError
 
 @runtime_checkable
 class TableLike(Protocol):
-    """Columns by name: a dictionary of arrays, a pandas frame."""
+    """Columns by name: a dictionary of arrays or a pandas DataFrame."""
 
     def __getitem__(self, column: str, /) -> Any: ...
 
@@ -19,10 +19,10 @@ class TableLike(Protocol):
 
 
 class CheckedColumns:
-    """The columns of a table that is called `name` in messages."""
+    """Columns of a table, called `name` in messages."""
 
     def __init__(self, name: str, columns: TableLike | None, *bare: str) -> None:
-        """None is a table without entries that has the columns `bare`."""
+        """None stands for an empty table with the columns `bare`."""
         self.name = name
         given: TableLike = dict.fromkeys(bare, ()) if columns is None else columns
         self.columns = {str(key): np.asarray(given[key]) for key in given}
@@ -36,15 +36,15 @@ class CheckedColumns:
         return column in self.columns
 
     def wrong(self, entry: int | np.integer, message: str) -> InputError:
-        """An error about an entry, counted from 0 as arrays are."""
+        """Return an error about an entry, counted from 0."""
         return InputError(f"{self.name}, entry {entry}: {message}")
 
     def ids(self, column: str) -> list[str]:
-        """Names, numbers as they are written."""
+        """Return names; numbers as they are written."""
         return [str(v) for v in self._column(column).tolist()]
 
     def numbers(self, *columns: str, empty: bool = False) -> Float[np.ndarray, "n k"]:
-        """Finite numbers, one column each; NaN is allowed where `empty`."""
+        """Return finite numbers, one column each; NaN is allowed if `empty`."""
         try:
             values = np.stack([np.asarray(self._column(c), float).reshape(self.n) for c in columns], axis=1)
         except (TypeError, ValueError) as error:
@@ -57,9 +57,9 @@ class CheckedColumns:
     def sigmas(
         self, columns: Sequence[str], of_all: str, default: float | None = None, needed: np.ndarray | None = None
     ) -> Float[np.ndarray, "n k"]:
-        """Positive standard deviations: a column each, else the one column or the number that stands for all.
+        """Return positive standard deviations: one column each, or one column or number for all.
 
-        Where `needed` (n, k) is false there need be none: then it is zero.
+        Not required where `needed` (n, k) is false: zero there.
         """
         needed = np.ones((self.n, len(columns)), bool) if needed is None else needed
         if set(columns) <= set(self.columns):
@@ -76,11 +76,13 @@ class CheckedColumns:
         return np.where(needed, values, 0.0)
 
     def index(self, column: str, known: Sequence[str], message: str) -> Int[np.ndarray, "n"]:
-        """The place of each name of a column among those `known`; see `find`."""
+        """Return the index of each name of a column in `known`; see `find`."""
         return self.find(self.ids(column), known, message)
 
     def find(self, names: Sequence[str], known: Sequence[str], message: str) -> Int[np.ndarray, "n"]:
-        """The place of each of `names` among those `known`. Raises InputError, by `message` of {name}, for another."""
+        """Return the index of each of `names` in `known`. Raises InputError with `message` of {name} for an unknown
+        name.
+        """
         places = {name: k for k, name in enumerate(known)}
         for entry, name in enumerate(names):
             if name not in places:
@@ -88,7 +90,7 @@ class CheckedColumns:
         return np.array([places[name] for name in names], int)
 
     def refuse_twice(self, column: str) -> None:
-        """Raise InputError where a name stands twice in a column."""
+        """Raise InputError for a duplicate name in a column."""
         met: set[str] = set()
         for entry, name in enumerate(self.ids(column)):
             if name in met:

@@ -1,4 +1,4 @@
-"""The devices of JAX that a computation is dealt out to."""
+"""JAX devices over which a computation is sharded."""
 
 from typing import Any
 
@@ -11,16 +11,16 @@ AXIS = "devices"
 
 
 def usable(wanted: int) -> int:
-    """The most devices, up to `wanted`, that are equally many of each process; 1 where that would be none.
+    """Return the largest number of devices, up to `wanted`, with equally many per process; 1 if there is none.
 
-    With 1, every process computes all of a block by itself.
+    With 1, every process computes the whole block.
     """
     each = min(wanted // jax.process_count(), *map(len, _devices_by_process()))
     return max(1, each * jax.process_count())
 
 
 def mesh_of(shards: int) -> Mesh:
-    """`shards` devices, equally many of each process: one without any would have no part in the result."""
+    """Return a mesh of `shards` devices, equally many per process: each process needs a part of the result."""
     each = shards // jax.process_count()
     return Mesh(np.array([device for own in _devices_by_process() for device in own[:each]]), (AXIS,))
 

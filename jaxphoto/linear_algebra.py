@@ -1,8 +1,8 @@
-"""Factorisations and solutions of one matrix, safe and quick under `jax.vmap`.
+"""Factorisation and solution of one matrix, safe and fast under `jax.vmap`.
 
-jaxlib spreads a batched LAPACK call over one small pool of threads, and two such calls in one program can wait for each
-other forever (docs/solver.md has an example of ten lines). Here `jax.vmap` never makes a batched call: right-hand sides
-of one matrix become its columns, small systems are eliminated without LAPACK, and all else runs one matrix at a time.
+jaxlib distributes a batched LAPACK call over a small thread pool, and two such calls in one program can deadlock
+(docs/solver.md has an example of ten lines). Here `jax.vmap` never makes a batched call: right-hand sides of one matrix
+become its columns, small systems are eliminated without LAPACK, and all others run one matrix at a time.
 """
 
 from collections.abc import Callable
@@ -11,17 +11,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-# Systems up to this size are eliminated without LAPACK where there are many.
+# Systems up to this size are eliminated without LAPACK if there are many.
 _SMALL = 7
 
 
 def one_at_a_time(function: Callable) -> Callable:
-    """`function` whose `jax.vmap` is a loop. Its derivatives are the caller's business."""
+    """Make `jax.vmap` of `function` a loop. The caller provides derivatives."""
     return jax.custom_batching.sequential_vmap(function)
 
 
 def _solver(function: Callable, small: Callable | None = None) -> Callable:
-    """`function(matrix, right)` with a batching rule; `small` solves the same for many small matrices side by side."""
+    """Return `function(matrix, right)` with a batching rule; `small` solves many small matrices side by side."""
     solve = jax.custom_batching.custom_vmap(function)
 
     @solve.def_vmap
@@ -41,7 +41,7 @@ def _solver(function: Callable, small: Callable | None = None) -> Callable:
 
 
 def _eliminated(a: Float[Array, "n n"], b: Float[Array, "n c"]) -> Float[Array, "n c"]:
-    """Gauss-Jordan elimination with partial pivoting, unrolled."""
+    """Unrolled Gauss-Jordan elimination with partial pivoting."""
     n = len(a)
     rows, at = jnp.concatenate([a, b], axis=1), jnp.arange(n)[:, None]
     for k in range(n):
@@ -55,7 +55,7 @@ def _eliminated(a: Float[Array, "n n"], b: Float[Array, "n c"]) -> Float[Array, 
 
 _lu = _solver(jnp.linalg.solve, _eliminated)
 _lu_transposed = _solver(lambda a, b: jnp.linalg.solve(a.T, b), lambda a, b: _eliminated(a.T, b))
-# LAPACK stores by columns: the transpose of what JAX stores by rows is no copy. So it solves x' L' = b' and x' L = b'.
+# LAPACK stores by column: the transpose of a JAX array needs no copy. So solve x' L' = b' and x' L = b'.
 _down = _solver(lambda lower, b: jax.lax.linalg.triangular_solve(lower.T, b.T, left_side=False, lower=False).T)
 _up = _solver(
     lambda lower, b: jax.lax.linalg.triangular_solve(lower.T, b.T, left_side=False, lower=False, transpose_a=True).T
@@ -67,41 +67,41 @@ _factor = one_at_a_time(lambda a: jax.lax.linalg.cholesky(a, symmetrize_input=Fa
 
 
 def solve(a: Float[Array, "n n"], b: Float[Array, "n *c"]) -> Float[Array, "n *c"]:
-    """x of A x = b, of one vector or of the columns of a matrix."""
+    """Solve A x = b for a vector or for the columns of a matrix."""
     columns = b.reshape(len(b), -1)
     return _linear(lambda x: a @ x, columns, lambda b: _lu(a, b), lambda b: _lu_transposed(a, b)).reshape(b.shape)
 
 
 def inverse(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """A^-1."""
+    """Return A^-1."""
     return solve(a, unit_like(a))
 
 
 def unit_like(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The unit matrix, varying over the devices of a mesh where `a` does: a right-hand side has to."""
+    """Return the unit matrix, varying over the devices of a mesh like `a`, as a right-hand side must."""
     unit = jnp.eye(len(a))
     return jnp.where(a == a, unit, unit)
 
 
 def solve_lower(lower: Float[Array, "n n"], b: Float[Array, "n c"]) -> Float[Array, "n c"]:
-    """L^-1 b of a lower triangle."""
+    """Return L^-1 b for a lower triangle."""
     return _linear(lambda x: jnp.tril(lower) @ x, b, lambda b: _down(lower, b), lambda b: _up(lower, b))
 
 
 def solve_lower_transposed(lower: Float[Array, "n n"], b: Float[Array, "n c"]) -> Float[Array, "n c"]:
-    """L'^-1 b of a lower triangle."""
+    """Return L'^-1 b for a lower triangle."""
     return _linear(lambda x: jnp.tril(lower).T @ x, b, lambda b: _up(lower, b), lambda b: _down(lower, b))
 
 
 def solve_lower_right(lower: Float[Array, "n n"], b: Float[Array, "c n"]) -> Float[Array, "c n"]:
-    """b L'^-1 of a lower triangle."""
+    """Return b L'^-1 for a lower triangle."""
     return solve_lower(lower, b.T).T
 
 
 def solve_tridiagonal(
     lower: Float[Array, "n"], diagonal: Float[Array, "n"], upper: Float[Array, "n"], b: Float[Array, "n c"]
 ) -> Float[Array, "n c"]:
-    """x of A x = b, of A with the diagonals `lower` (from its second number on), `diagonal` and `upper`."""
+    """Solve A x = b for A with the diagonals `lower` (from its second number on), `diagonal` and `upper`."""
     bands = jnp.stack([lower, diagonal, upper])
 
     def product(x):
@@ -113,7 +113,7 @@ def solve_tridiagonal(
 
 @jax.custom_jvp
 def cholesky(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Lower Cholesky factor of a symmetric matrix, given by its lower triangle; NaN if not positive definite."""
+    """Return the lower Cholesky factor of a matrix given by its lower triangle; NaN if not positive definite."""
     return _factor(a)
 
 
@@ -129,7 +129,7 @@ def _cholesky_jvp(primals, tangents):
 
 @jax.custom_jvp
 def eigh(a: Float[Array, "n n"]) -> tuple[Float[Array, "n"], Float[Array, "n n"]]:
-    """Eigenvalues of a symmetric matrix, ascending, and its eigenvectors by column."""
+    """Return eigenvalues of a symmetric matrix, ascending, and eigenvectors by column."""
     values, vectors = _eigh(a)
     return values, vectors
 
@@ -144,7 +144,7 @@ def _eigh_jvp(primals, tangents):
 
 
 def _linear(product: Callable, b: Array, solve: Callable, transposed: Callable) -> Array:
-    """x of product(x) = b, differentiable in all that the product depends on and in b."""
+    """Solve product(x) = b, differentiable in everything that the product depends on and in b."""
     return jax.lax.custom_linear_solve(product, b, lambda _, b: solve(b), lambda _, b: transposed(b))
 
 

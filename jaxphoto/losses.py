@@ -1,12 +1,12 @@
-"""Robust losses: what a row of observations costs, where large residuals count less than their squares.
+"""Robust loss functions: large residuals of a row count less than their squares.
 
 With v the whitened residual of a row (k numbers: an image point has two) and u = v'v / (s k0)^2 for a scale s and a
-constant k0, a row costs v'v gain(u) in place of v'v. It is computed as the residual v sqrt(gain(u)), whose square that
-is: so derivatives of any order stay exact, and one solver serves all losses. The weight of the row is the derivative of
-its cost by v'v.
+constant k0, the cost of a row is v'v gain(u) in place of v'v. It is implemented as the residual v sqrt(gain(u)), whose
+square it is: derivatives of any order stay exact, and one solver serves all losses. The weight of the row is the
+derivative of its cost by v'v.
 
-k0 is chosen so that estimates from normal errors have standard deviations as if 5 % of the observations were missing:
-for single numbers these are the constants of the textbooks (Huber 1.345, Tukey 4.685).
+k0 is chosen for 95 % efficiency: estimates from normal errors have standard deviations as if 5 % of the observations
+were missing. For single numbers these are the constants of textbooks (Huber 1.345, Tukey 4.685).
 
 Sources: Huber (1981), Robust statistics; Beaton and Tukey (1974), Technometrics 16; Geman and McClure (1987), Bulletin
 of the ISI 52; Lange, Little and Taylor (1989), Robust statistical modeling using the t distribution, JASA 84.
@@ -28,54 +28,55 @@ from jaxphoto.arrays import Numbers
 from jaxphoto.compiling import call_compiled
 
 EFFICIENCY = 0.95
-"""Of estimates from normal errors, beside least squares: what k0 follows from."""
+"""Efficiency for normal errors relative to least squares; determines k0."""
 
 
 class AbstractLoss(eqx.Module):
-    """What rows of a group cost. Numbers only: others compile nothing."""
+    """Loss of the rows of a group. Numbers only: another value compiles nothing."""
 
     name: eqx.AbstractClassVar[str]
     threshold: Float[Numbers, ""] | float | None = None
-    """k0, in standard deviations: where rows begin to count less. None: by `EFFICIENCY`."""
+    """k0, in standard deviations, from which rows count less. None: by `EFFICIENCY`."""
     scale: Float[Numbers, ""] | float = 1.0
-    """s: standard deviation of whitened residuals. It says what is far, and changes no row's sigma."""
+    """s: standard deviation of whitened residuals. Defines what is far; changes no row's sigma."""
 
     @abc.abstractmethod
     def gain(self, u: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The cost of a row over its square: 1 for u = 0, and smooth there."""
+        """Return the cost of a row over its square: 1 for u = 0, and smooth there."""
 
     def for_rows_of(self, numbers: int) -> Self:
-        """The loss with k0 for rows of so many numbers, all in arrays."""
+        """Return the loss with k0 for rows of this many numbers, as arrays."""
         k0 = _usual_threshold(type(self), numbers) if self.threshold is None else self.threshold
         return jax.tree.map(lambda v: np.asarray(v, float), dataclasses.replace(self, threshold=k0))
 
     def reduced(self, *v: Float[Array, "..."]) -> tuple[Float[Array, "..."], ...]:
-        """The numbers of rows whose square sums are the rows' costs."""
+        """Return residuals whose sums of squares are the costs of the rows."""
         root = jnp.sqrt(self.factor(jnp.asarray(sum(x * x for x in v))))
         return tuple(x * root for x in v)
 
     def weights(self, square: Float[np.ndarray, "n"], numbers: int) -> Float[np.ndarray, "n"]:
-        """Of rows of so many numbers with v'v, weights: 1 counts whole, 0 not at all."""
+        """Return weights of rows with these numbers and v'v: 1 full, 0 none."""
         return np.asarray(call_compiled(_weights, self.for_rows_of(numbers), np.asarray(square, float)))
 
     def factor(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The cost of rows over their v'v."""
+        """Return the cost of rows over their v'v."""
         assert self.threshold is not None, "`for_rows_of` gives it"
         return self.gain(square / (self.scale * self.threshold) ** 2)
 
 
 class LinearisedLoss(eqx.Module):
-    """Of a loss, residuals and derivatives for normal equations: J'r is half the gradient of the cost, J'J nearly half
-    its second derivative.
+    """Linearisation of a loss for normal equations: J'r is half the gradient of the cost, J'J about half its second
+    derivative.
 
-    A row's second derivative by its whitened residual v is w across v, and w + 2 w' v'v along it, w' the derivative of
-    the weight by v'v. The latter is zero or negative where a row lies far out: at least `_LEAST_SLOPE` w is taken.
+    The second derivative of a row by its whitened residual v is w across v, and w + 2 w' v'v along it, with w' the
+    derivative of the weight by v'v. The latter is zero or negative for large residuals: at least `_LEAST_SLOPE` w is
+    used.
     """
 
     loss: AbstractLoss
 
     def reduced(self, *v: Float[Array, "..."]) -> tuple[Float[Array, "..."], ...]:
-        """The numbers of rows; their squares mean nothing."""
+        """Return residuals for normal equations; their squares are meaningless."""
         at = [jax.lax.stop_gradient(x) for x in v]
         square = jnp.asarray(sum(x * x for x in at))
         ones = jnp.ones_like(square)
@@ -88,60 +89,60 @@ class LinearisedLoss(eqx.Module):
         return tuple(root * (d + (along - 1) * both * x0 + x0 / along) for d, x0 in zip(step, at, strict=True))
 
 
-# Nearer to zero, points whose rays contradict one another leave for the horizon; 1 (reweighting) takes twice the steps.
+# Closer to zero, points with contradicting rays diverge; 1 (reweighting) takes twice as many steps.
 _LEAST_SLOPE = 0.5
 
 
 class Huber(AbstractLoss):
-    """Squares within k0, distances beyond it: one optimum, and every row goes on pulling a little."""
+    """Squares within k0, distances beyond: one optimum, and every row keeps some influence."""
 
     name: ClassVar[str] = "huber"
 
     def gain(self, u: Float[Array, "..."]) -> Float[Array, "..."]:
-        """1 up to u = 1, then (2 sqrt(u) - 1) / u."""
+        """Return 1 up to u = 1, then (2 sqrt(u) - 1) / u."""
         far = jnp.where(u > 1, u, 1.0)
         return jnp.where(u > 1, (2 * jnp.sqrt(far) - 1) / far, 1.0)
 
 
 class Tukey(AbstractLoss):
-    """Biweight: rows beyond k0 do not count at all."""
+    """Biweight: rows beyond k0 have no influence."""
 
     name: ClassVar[str] = "tukey"
 
     def gain(self, u: Float[Array, "..."]) -> Float[Array, "..."]:
-        """1 - u + u^2 / 3 up to u = 1, then 1 / (3 u)."""
+        """Return 1 - u + u^2 / 3 up to u = 1, then 1 / (3 u)."""
         near, far = jnp.minimum(u, 1.0), jnp.where(u > 1, u, 1.0)
         return jnp.where(u > 1, 1 / (3 * far), 1 - near + near**2 / 3)
 
 
 class GemanMcClure(AbstractLoss):
-    """The weight falls with the fourth power of the distance."""
+    """The weight decreases with the fourth power of the distance."""
 
     name: ClassVar[str] = "geman_mcclure"
 
     def gain(self, u: Float[Array, "..."]) -> Float[Array, "..."]:
-        """1 / (1 + u)."""
+        """Return 1 / (1 + u)."""
         return 1 / (1 + u)
 
 
 class StudentT(AbstractLoss):
     """-2 log of Student's density of `scale` s and k0^2 degrees of freedom, multivariate for rows of several numbers.
 
-    But for a factor, so that rows without residuals count as their sigmas say, beside those of other groups.
+    Up to a factor, so that rows without residuals have the weight of their sigmas relative to other groups.
     """
 
     name: ClassVar[str] = "student_t"
 
     def gain(self, u: Float[Array, "..."]) -> Float[Array, "..."]:
-        """log(1 + u) / u."""
-        # Below, the quotient loses digits; what the series leaves out is less than they.
+        """Return log(1 + u) / u."""
+        # For smaller u the quotient loses digits; the neglected terms of the series are smaller.
         small = u < 1e-3
         far = jnp.where(small, 1.0, u)
         return jnp.where(small, 1 - u / 2 + u**2 / 3 - u**3 / 4 + u**4 / 5, jnp.log1p(far) / far)
 
 
 LOSSES: dict[str, type[AbstractLoss]] = {loss.name: loss for loss in (Huber, Tukey, GemanMcClure, StudentT)}
-"""By name."""
+"""Losses by name."""
 
 
 def _cost(q, loss: AbstractLoss):
@@ -155,9 +156,10 @@ def _weights(loss: AbstractLoss, square: Array) -> Array:
 
 @functools.cache
 def _usual_threshold(kind: type[AbstractLoss], numbers: int) -> float:
-    """k0 of efficiency `EFFICIENCY` for normal errors: E[w q]^2 / (k E[w^2 q]), q being chi-square of k, by bisection.
+    """Return k0 of efficiency `EFFICIENCY` for normal errors by bisection.
 
-    (E[w q] / k is the mean second derivative, by Stein's lemma.)
+    E[w q]^2 / (k E[w^2 q]), with q chi-square of k degrees of freedom. (E[w q] / k is the mean second derivative, by
+    Stein's lemma.)
     """
     s = np.linspace(0.0, _FARTHEST, _NODES)
     density = s ** (numbers - 1) * np.exp(-(s**2) / 2)
@@ -175,5 +177,5 @@ def _usual_threshold(kind: type[AbstractLoss], numbers: int) -> float:
     return high
 
 
-# No normal row of a few numbers lies farther than this (standard deviations), for the integrals of `_usual_threshold`.
+# No normal row of few numbers lies farther out (standard deviations); limit of the integrals of `_usual_threshold`.
 _FARTHEST, _NODES = 12.0, 2401

@@ -1,8 +1,8 @@
-"""What declares unknowns: parameters that belong together and have one owner.
+"""Declared parameters: unknowns that belong together and have one owner.
 
-A file that adds an unknown holds one final subclass of `AbstractParameters`. It says whose the parameters are, what
-each number is called (the unit is the name's end), and perhaps what they do to an interior orientation or a station.
-Order, priors of every kind, scales, correlations, tables and files follow from that.
+A file that adds an unknown defines one final subclass of `AbstractParameters`. It declares the owner, the name of each
+number (ending in its unit), and possibly the effect on an interior orientation or a station. Order, priors, scales,
+correlations, tables and files follow.
 """
 
 import dataclasses
@@ -22,8 +22,9 @@ UNITS = (
 """Units that the names of declared parameters may end in; a typical scale is known of these, of `per_h` and
 `per_K` where cameras are bent."""
 Owner = Literal["image", "camera", "mount", "strip", "block"] | str
-"""Whose parameters are: of each image, of each camera and so on, or of the whole block. Any other word is a partition
-of the images that the block names (`Block.partitions`), such as intervals of time."""
+"""Owner of parameters: each image, each camera and so on, or the whole block. Any other word is a partition of the
+images that the block names (`Block.partitions`), such as intervals of time.
+"""
 
 
 @shown
@@ -31,46 +32,48 @@ class AbstractParameters(eqx.Module):
     """Parameters of one owner; fields are numbers or vectors."""
 
     kind: eqx.AbstractClassVar[str]
-    """The table that holds them: the first word of their labels, as in `strips[a].shift_X_m`."""
+    """Name of their table: the first word of their labels, as in `strips[a].shift_X_m`."""
     owner: eqx.AbstractClassVar[str]
     names: eqx.AbstractClassVar[Mapping[str, tuple[str, ...]]]
-    """The name of every number of every field. Its end is its unit: _m, _rad, _s, _ms, _mm, _m_per_s, _ppm ..."""
+    """Name of every number of every field, ending in its unit: _m, _rad, _s, _ms, _mm, _m_per_s, _ppm ..."""
     bends: ClassVar[tuple[str, ...]] = ()
-    """Fields of the interior orientation that `interior` changes, such as ("c",); then it is asked for every image."""
+    """Fields of the interior orientation that `interior` changes, such as ("c",); it is then evaluated for every image.
+    """
     sized: ClassVar[str] = ""
-    """The field that says how many numbers each of the others has, where that differs from block to block; `names` then
-    has one name for all of them, and `labels` says those of each."""
+    """Field with the number of numbers in each other field, if that differs between blocks; `names` then has one name
+    for all of them, and `labels` has one each.
+    """
 
     def __check_init__(self) -> None:
         for name, value in vars(self).items():
             object.__setattr__(self, name, from_list(value))
 
     def interior(self, interior: Any, exposure: Any) -> Any:
-        """The interior orientation of one image; a subclass that names fields in `bends` says what becomes of it."""
+        """Return the interior orientation of one image; overridden if `bends` names fields."""
         return interior
 
     def station(self, position: Any, exposure: Any) -> Any:
-        """What GNSS observes (m) of a sensor at `position`; a subclass that moves stations adds to it."""
+        """Return what GNSS observes (m) for a sensor at `position`; overridden by subclasses that move stations."""
         return position
 
     def labels(self, owner: str) -> tuple[str, ...]:
-        """Paths of the parameters, in the order of `numbers_of`."""
+        """Return the paths of the parameters, in the order of `numbers_of`."""
         place = f"{self.kind}[{owner}]" if owner else self.kind
         return tuple(f"{place}.{name}" for f in dynamic_fields(type(self)) for name in self.names[f])
 
 
 def unit_of(name: str) -> str:
-    """m of `shift_X_m`, m_per_s of `drift_X_m_per_s`; "" of a name that ends in no unit."""
+    """Return the unit of a name: m of `shift_X_m`, m_per_s of `drift_X_m_per_s`; "" without unit."""
     return next((unit for unit in sorted(UNITS, key=len, reverse=True) if name.endswith(f"_{unit}")), "")
 
 
 def dynamic_fields(cls: type) -> list[str]:
-    """The fields of a module that hold numbers."""
+    """Return the fields of a module that hold numbers."""
     return [f.name for f in dataclasses.fields(cls) if not f.metadata.get("static", False)]
 
 
 def leaves_in_order(tree: Any) -> Iterator[Any]:
-    """The leaves of modules and dicts, dicts in the order in which they were filled (JAX sorts their keys)."""
+    """Return the leaves of modules and dicts, dicts in insertion order (JAX sorts their keys)."""
     if isinstance(tree, AbstractParameters):
         for name in dynamic_fields(type(tree)):
             yield from leaves_in_order(getattr(tree, name))
@@ -82,12 +85,12 @@ def leaves_in_order(tree: Any) -> Iterator[Any]:
 
 
 def numbers_of(parameters: AbstractParameters) -> list:
-    """All numbers of the fields, one after the other."""
+    """Return all numbers of the fields, concatenated."""
     return [v for leaf in leaves_in_order(parameters) for v in (leaf if np.ndim(leaf) else (leaf,))]
 
 
 def form_of(tree: Any) -> Hashable:
-    """Everything of parameters but their numbers: what `filled` puts numbers into. It can be hashed."""
+    """Return parameters without their numbers, for `filled`; hashable."""
     if isinstance(tree, AbstractParameters):
         cls = type(tree)
         fields = tuple((name, form_of(getattr(tree, name))) for name in dynamic_fields(cls))
@@ -99,7 +102,7 @@ def form_of(tree: Any) -> Hashable:
 
 
 def filled(form: Any, numbers: Any) -> Any:
-    """The parameters of a form from their numbers, along the first axis; further axes stay."""
+    """Fill a form with numbers along the first axis; further axes stay."""
     return _filled(form, numbers, 0)[0]
 
 
@@ -116,7 +119,7 @@ def _filled(form: Any, numbers: Any, first: int) -> tuple[Any, int]:
 
 
 def size_of(form: Any) -> int:
-    """How many numbers a form holds."""
+    """Return the number of numbers of a form."""
     if form and isinstance(form[0], type):
         return sum(size_of(inner) for _, inner in form[1])
     return int(np.prod(form, dtype=int))

@@ -1,34 +1,34 @@
-"""Rotations: omega-phi-kappa, roll-pitch-yaw, quaternions and small rotations to matrices and back.
+"""Conversions between rotation matrices and omega-phi-kappa, roll-pitch-yaw, quaternions, small rotations.
 
-Frames, signs and units are those of docs/conventions.md: angles in radians; a matrix says what it takes to
-what. Every function is of one rotation and is differentiable where the rotation itself is.
+Frames, signs and units are those of docs/conventions.md: angles in radians; the name of a matrix gives its target and
+source frames. Every function takes one rotation and is differentiable where the rotation is.
 """
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-# Body axes (right, forward, up) <-> (forward, right, down), and equally ENU <-> NED: its own inverse. NumPy's, because
-# an array of JAX would start a device and compile at import.
+# Body axes (right, forward, up) <-> (forward, right, down), and ENU <-> NED: its own inverse. In NumPy, because a JAX
+# array would start a device and compile at import.
 _RFU_FRD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
-# `CROSS @ v` is [v]x: one product with constants, where components put together are a dozen operations.
+# `CROSS @ v` is [v]x: one product with constants; assembled from components it takes a dozen operations.
 _UNIT = np.eye(3)
 CROSS = np.cross(_UNIT, _UNIT[:, None])
 
 
 def rotate(matrix: Float[Array, "3 3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
-    """`matrix @ vector`, written out by component.
+    """Return `matrix @ vector`, by component.
 
-    Under `vmap` over the last axis this stays a handful of elementwise operations, several times faster on
-    a CPU than a batch of 3 x 3 products.
+    Under `vmap` over the last axis this is a handful of elementwise operations, several times faster on a CPU than a
+    batch of 3 x 3 products.
     """
     x, y, z = vector
     return jnp.stack([row[0] * x + row[1] * y + row[2] * z for row in matrix])
 
 
 def matrix_from_omega_phi_kappa(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """`camera_from_object = R3(kappa) R2(phi) R1(omega)` from (omega, phi, kappa) in radians.
+    """Return `camera_from_object = R3(kappa) R2(phi) R1(omega)` from (omega, phi, kappa) in radians.
 
     Source: paper 001, equation (1); the rows are written out in docs/models.md.
     """
@@ -43,25 +43,25 @@ def matrix_from_omega_phi_kappa(angles: Float[Array, "3"]) -> Float[Array, "3 3"
 
 
 def omega_phi_kappa_from_matrix(camera_from_object: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """(omega, phi, kappa) in radians of `camera_from_object`; omega and kappa in (-pi, pi], |phi| <= pi/2.
+    """Return (omega, phi, kappa) in radians of `camera_from_object`; omega and kappa in (-pi, pi], |phi| <= pi/2.
 
-    At phi = +-pi/2 only omega +- kappa is determined: omega and kappa are then one choice of many, and belong together.
+    At phi = +-pi/2 only omega +- kappa is determined: omega and kappa are then one choice of many, valid together.
     """
     m = camera_from_object
     omega = jnp.arctan2(-m[2, 1], m[2, 2])
-    # Of M with omega undone: near phi = 90 degrees omega and atan2(-m10, m00) are both rounding, independent of one
-    # another, and would together be another rotation.
+    # From M with omega removed: near phi = 90 degrees omega and atan2(-m10, m00) are both rounding, independent of one
+    # another, and together would be another rotation.
     s, c = jnp.sin(omega), jnp.cos(omega)
     kappa = jnp.arctan2(c * m[0, 1] + s * m[0, 2], c * m[1, 1] + s * m[1, 2])
     return jnp.stack([omega, jnp.arctan2(m[2, 0], _norm(m[2, 1], m[2, 2])), kappa])
 
 
 def matrix_from_roll_pitch_yaw(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """`object_from_body` from (roll, pitch, yaw) in radians; body right-forward-up, object east-north-up.
+    """Return `object_from_body` from (roll, pitch, yaw) in radians; body right-forward-up, object east-north-up.
 
-    Roll is right wing down positive, pitch nose up positive, yaw clockwise from north, in the sequence of
-    airborne IMUs, `P Rz(yaw) Ry(pitch) Rx(roll) P` with P between right-forward-up and forward-right-down
-    (paper 000, equations (1)-(4)).
+    Roll is right wing down positive, pitch nose up positive, yaw clockwise from north, in the sequence of airborne
+    IMUs, `P Rz(yaw) Ry(pitch) Rx(roll) P` with P between right-forward-up and forward-right-down (paper 000, equations
+    (1)-(4)).
     """
     (sr, sp, sy), (cr, cp, cy) = jnp.sin(angles), jnp.cos(angles)
     ned_from_frd = jnp.stack(
@@ -75,7 +75,7 @@ def matrix_from_roll_pitch_yaw(angles: Float[Array, "3"]) -> Float[Array, "3 3"]
 
 
 def roll_pitch_yaw_from_matrix(object_from_body: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """(roll, pitch, yaw) in radians of `object_from_body`; the inverse of `matrix_from_roll_pitch_yaw`."""
+    """Return (roll, pitch, yaw) in radians of `object_from_body`; the inverse of `matrix_from_roll_pitch_yaw`."""
     m = _RFU_FRD @ object_from_body @ _RFU_FRD
     return jnp.stack(
         [
@@ -87,7 +87,7 @@ def roll_pitch_yaw_from_matrix(object_from_body: Float[Array, "3 3"]) -> Float[A
 
 
 def matrix_from_quaternion(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:
-    """Rotation matrix of the quaternion (w, x, y, z), of any length but zero."""
+    """Return the rotation matrix of the quaternion (w, x, y, z), of any nonzero length."""
     w, x, y, z = quaternion / jnp.sqrt(jnp.sum(quaternion**2))
     return jnp.stack(
         [
@@ -99,10 +99,10 @@ def matrix_from_quaternion(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]
 
 
 def quaternion_from_matrix(matrix: Float[Array, "3 3"]) -> Float[Array, "4"]:
-    """Unit quaternion (w, x, y, z), w >= 0, of a rotation matrix.
+    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix.
 
-    Of the four equivalent formulas the one with the largest divisor is taken, so none loses digits at
-    rotations by half a turn.
+    Of the four equivalent formulas the one with the largest divisor is used, so none loses digits at rotations by half
+    a turn.
     """
     m = matrix
     t = jnp.stack([m[0, 0] + m[1, 1] + m[2, 2], m[0, 0], m[1, 1], m[2, 2]])
@@ -120,13 +120,13 @@ def quaternion_from_matrix(matrix: Float[Array, "3 3"]) -> Float[Array, "4"]:
 
 
 def small_rotation(theta: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """`exp(-[theta]x)`, theta in rad: the rotation that takes V to `V - theta x V` to first order (docs/models.md).
+    """Return `exp(-[theta]x)`, theta in rad: takes V to `V - theta x V` to first order (docs/models.md).
 
-    Exact for any angle, smooth at zero. It is how the adjustment updates every rotation, on the camera's
-    side: `camera_from_object = small_rotation(theta) @ start`, so phi = 90 degrees is no singularity.
+    Exact for any angle, smooth at zero. The adjustment updates rotations by it on the camera side: `camera_from_object
+    = small_rotation(theta) @ start`, so phi = 90 degrees is no singularity.
     """
     t2 = jnp.sum(theta**2)
-    # Double where: the series serves where the closed form is 0/0, and neither branch's derivative is NaN.
+    # Two `where`: the series replaces 0/0 of the closed form, and neither branch has NaN derivatives.
     small = t2 < 1e-6
     safe = jnp.where(small, 1.0, t2)
     t = jnp.sqrt(safe)
@@ -137,7 +137,7 @@ def small_rotation(theta: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def small_angles(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """The rotation vector theta (rad) of `small_rotation(theta) = matrix`; |theta| below half a turn."""
+    """Return the rotation vector theta (rad) of `small_rotation(theta) = matrix`; |theta| below half a turn."""
     m = matrix
     s = -0.5 * jnp.tensordot(m, CROSS)
     cosine = 0.5 * (m[0, 0] + m[1, 1] + m[2, 2] - 1)
@@ -149,7 +149,7 @@ def small_angles(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
 
 
 def _norm(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
-    """sqrt(a^2 + b^2) with derivative zero, not NaN, at the origin."""
+    """Return sqrt(a^2 + b^2) with derivative zero, not NaN, at the origin."""
     s = a * a + b * b
     zero = s == 0
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, s)))

@@ -1,6 +1,6 @@
-"""The door of functions of one image and one point: lists become arrays, and a forgotten `jax.vmap` is named.
+"""Argument checks of functions of one image and one point: convert lists, detect a missing `jax.vmap`.
 
-Under `jit` this is of the tracing alone.
+Under `jit` they run while tracing only.
 """
 
 from typing import Any
@@ -14,9 +14,9 @@ from jaxphoto.errors import InputError
 
 
 def single(name: str, values: Any, *shape: int | None) -> Float[Array, "..."]:
-    """`values` as an array of `shape`, in which None is any number.
+    """Convert `values` to an array of `shape`, in which None is any number.
 
-    Raises InputError for another shape, and for what is no array of numbers.
+    Raises InputError for another shape, and for anything but numbers.
     """
     if not isinstance(values, jax.Array | np.ndarray):
         try:

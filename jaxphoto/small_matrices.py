@@ -1,11 +1,11 @@
-"""Positive definite 3 x 3 matrices, many at a time: their Cholesky factors component by component."""
+"""Cholesky factors of many positive definite 3 x 3 matrices, by component."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
 def cholesky_3x3(v: Float[Array, "3 3 n"]) -> Float[Array, "6 n"]:
-    """Closed form: LAPACK on a batch of 3 x 3 matrices is many times slower."""
+    """Return the factor in closed form: LAPACK on a batch of 3 x 3 matrices is many times slower."""
     l11 = jnp.sqrt(v[0, 0])
     l21, l31 = v[1, 0] / l11, v[2, 0] / l11
     l22 = jnp.sqrt(v[1, 1] - l21**2)
@@ -14,7 +14,7 @@ def cholesky_3x3(v: Float[Array, "3 3 n"]) -> Float[Array, "6 n"]:
 
 
 def whiten(w, l) -> tuple[Array, Array, Array]:  # noqa: E741
-    """L^-1 w, component by component."""
+    """Return L^-1 w, by component."""
     l11, l21, l22, l31, l32, l33 = l
     y1 = w[0] / l11
     y2 = (w[1] - y1 * l21) / l22
@@ -22,7 +22,7 @@ def whiten(w, l) -> tuple[Array, Array, Array]:  # noqa: E741
 
 
 def unwhiten(w, l) -> tuple[Array, Array, Array]:  # noqa: E741
-    """L^-T w, component by component."""
+    """Return L^-T w, by component."""
     l11, l21, l22, l31, l32, l33 = l
     x3 = w[2] / l33
     x2 = (w[1] - l32 * x3) / l22

@@ -1,8 +1,8 @@
-"""Values that belong to the structure of a tree: index arrays, masks and dictionaries of descriptions.
+"""Static values in the structure of a tree: index arrays, masks and dictionaries of descriptions.
 
-`jax.jit`, `jax.vmap` and `jax.grad` treat the leaves of a tree as numbers. Indices are none: they say which rows belong
-together. A `StaticArray` is a tree without leaves, so JAX passes it on untouched and two trees with equal arrays have
-one structure, hence one compiled program.
+`jax.jit`, `jax.vmap` and `jax.grad` treat the leaves of a tree as numbers. Indices are not: they relate rows to each
+other. A `StaticArray` is a tree without leaves, so JAX does not trace it, and two trees with equal arrays have one
+structure, hence share a compiled program.
 """
 
 import functools
@@ -17,7 +17,7 @@ import numpy as np
 
 
 class Content:
-    """The content of an array as a dictionary key: compared by its numbers, hashed once."""
+    """Content of an array as a dictionary key: compared by its numbers, hashed once."""
 
     def __init__(self, array: np.ndarray):
         self.array = array
@@ -28,7 +28,7 @@ class Content:
 
     @functools.cached_property
     def digest(self) -> str:
-        """The same in every process."""
+        """Return a hash that is the same in every process."""
         return hashlib.sha256(np.ascontiguousarray(self.array).data).hexdigest()
 
     def __hash__(self) -> int:
@@ -46,12 +46,12 @@ class Content:
 
 
 class StaticArray(np.ndarray):
-    """A read-only array that JAX takes for structure, not for numbers. Results of operations are plain arrays."""
+    """Read-only array that JAX treats as structure. Results of operations are plain arrays."""
 
     _content: Content | None
 
     def __new__(cls, values: Any) -> "StaticArray":
-        """Copy `values`; a static array, and the plain one of it, are taken as they are."""
+        """Copy `values`; return a static array, or the static array of a plain view, unchanged."""
         if isinstance(values, cls) and values._content is not None:
             return values
         known = _contents.get(id(values))
@@ -77,19 +77,19 @@ class StaticArray(np.ndarray):
 
     @property
     def plain(self) -> np.ndarray:
-        """The same array to JAX's functions as any other: an argument, not structure."""
+        """The plain array for JAX functions: an argument, not structure."""
         return self.content.array
 
     @property
     def content(self) -> Content:
-        """What identifies the array."""
+        """Content that identifies the array."""
         if self._content is None:
             self._content = Content(np.array(self, subok=False))
         return self._content
 
 
 _contents: weakref.WeakValueDictionary[int, Content] = weakref.WeakValueDictionary()
-"""By the identity of the array, which each content keeps alive."""
+"""By identity of the array, which each content keeps alive."""
 
 
 def _static(content: Content) -> StaticArray:
@@ -111,17 +111,17 @@ def _plain_method(name: str) -> Callable[..., Any]:
 for _name in ("astype", "copy", "reshape", "ravel", "flatten", "transpose", "repeat", "take"):
     setattr(StaticArray, _name, _plain_method(_name))
 
-# A new object each time: `equinox.tree_at` tells the nodes of a tree apart by their identity.
+# A new object each time: `equinox.tree_at` distinguishes nodes of a tree by identity.
 jax.tree_util.register_pytree_node(StaticArray, lambda array: ((), array.content), lambda content, _: _static(content))
 
 
 def is_static(value: Any) -> bool:
-    """True if `value` is a `StaticArray`."""
+    """Return True if `value` is a `StaticArray`."""
     return isinstance(value, StaticArray)
 
 
 def map_arrays(function: Callable[[Any], Any], tree: Any) -> Any:
-    """Apply `function` to all arrays of `tree`; those that are static stay static."""
+    """Apply `function` to all arrays of `tree`; static ones stay static."""
 
     def one(value: Any) -> Any:
         return StaticArray(function(np.asarray(value))) if is_static(value) else function(value)
@@ -130,19 +130,19 @@ def map_arrays(function: Callable[[Any], Any], tree: Any) -> Any:
 
 
 def with_plain_arrays(tree: Any) -> Any:
-    """`tree` with its static arrays as leaves, as programs for blocks of any content take them."""
+    """Return `tree` with its static arrays as leaves, for programs that serve blocks of any content."""
     return jax.tree.map(lambda value: np.asarray(value) if is_static(value) else value, tree, is_leaf=is_static)
 
 
 class StaticDict(dict):
-    """A dictionary that can be hashed, for static fields of modules. It must not be changed."""
+    """Hashable dictionary for static fields of modules. It must not be changed."""
 
     def __hash__(self) -> int:  # type: ignore[override]
         return hash(frozenset(self.items()))
 
 
 def ordered(value: Any) -> Any:
-    """A dictionary as one whose order JAX keeps (it sorts the keys of a plain one); anything else as it is."""
+    """Return a dictionary whose order JAX keeps (it sorts the keys of a plain one); anything else unchanged."""
     if not isinstance(value, dict):
         return value
     return OrderedDict((key, ordered(inner)) for key, inner in value.items())

@@ -1,4 +1,4 @@
-"""What a transformation of JAX cannot pass through says so, and names the alternative."""
+"""Errors for functions that JAX transformations cannot trace, naming the alternative."""
 
 import functools
 from collections.abc import Callable
@@ -11,7 +11,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def refuse_traced(what: str, tree: Any) -> None:
-    """Raise InputError where a transformation of JAX traces any number of `tree`."""
+    """Raise InputError if a JAX transformation traces any number of `tree`."""
     if is_traced(tree):
         raise InputError(
             f"{what} needs known numbers, which jit, grad and vmap do not have: return the adjustment or the block "
@@ -20,7 +20,7 @@ def refuse_traced(what: str, tree: Any) -> None:
 
 
 def outside_transformations(function: F) -> F:
-    """`function`, which raises InputError where a transformation of JAX traces its arguments."""
+    """Make `function` raise InputError if a JAX transformation traces its arguments."""
 
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:

@@ -1,12 +1,12 @@
-"""What an adjustment solves for, and what is known of it beforehand.
+"""Unknowns of an adjustment, and prior information about them.
 
-`Unknowns` is a tree of numbers; `priors` is the same tree with FREE, FIXED or Weighted(value, sigma) in place of
-them. "The second experiment without k_2" is `block.fix("k2")`, or of the tree itself
+`Unknowns` is a tree of numbers; `priors` is the same tree with FREE, FIXED or Weighted(value, sigma) in place of them.
+"The second experiment without k_2" is `block.fix("k2")`, or for the tree itself
 
     priors = with_prior(priors, "k2", lambda start: FIXED, start)
 
-For interior orientation the leaves are scalars. `exterior.position`, `exterior.camera_from_object`, `points`, and each
-vector of declared parameters (mounts, strips, scanner, `more`) take one prior for the whole array.
+Interior orientations have scalar leaves. `exterior.position`, `exterior.camera_from_object`, `points`, and each vector
+of declared parameters (mounts, strips, scanner, `more`) take one prior for the whole array.
 """
 
 import dataclasses
@@ -46,12 +46,12 @@ UNKNOWNS: tuple[type[AbstractParameters], ...] = (
 
 
 class Prior:
-    """FREE, an unknown without prior information, or FIXED, no unknown at all. Compare with `==`.
+    """FREE, an unknown without prior information, or FIXED, not an unknown. Compare with `==`.
 
-    Part of the structure of a tree, not a number: JAX passes it on untouched, as a copy.
+    Part of the structure of a tree: JAX does not trace it.
     """
 
-    # NumPy leaves comparisons to `__eq__` below.
+    # Makes NumPy use `__eq__` below.
     __array_ufunc__ = None
 
     def __init__(self, name: str):
@@ -67,17 +67,17 @@ class Prior:
         return self.name
 
 
-# A new object each time: `equinox.tree_at` tells the nodes of a tree apart by their identity.
+# A new object each time: `equinox.tree_at` distinguishes nodes of a tree by identity.
 jax.tree_util.register_pytree_node(Prior, lambda prior: ((), prior.name), lambda name, _: Prior(name))
 FREE, FIXED = Prior("FREE"), Prior("FIXED")
 
 
 class Weighted(eqx.Module):
-    """An unknown observed beforehand as `value` with standard deviation `sigma` (its own units, arrays allowed).
+    """Unknown with prior `value` and standard deviation `sigma` (its own units, arrays allowed).
 
-    A vector may have a full `covariance` matrix instead: (3, 3), or of positions and points (n, 3, 3), one for each.
-    The value of `exterior.camera_from_object` is rotation matrices, its sigma of small rotations in the camera frame
-    (rad). What goes over several parameters at once is `observations.KnownParameters`.
+    A vector may have a full `covariance` matrix instead: (3, 3), or for positions and points (n, 3, 3), one each. The
+    value of `exterior.camera_from_object` is rotation matrices, its sigma of small rotations in the camera frame (rad).
+    Joint priors of several parameters: `observations.KnownParameters`.
     """
 
     value: Float[Numbers, "..."] | float
@@ -97,11 +97,11 @@ class Weighted(eqx.Module):
 
 
 class Unknowns(eqx.Module):
-    """All parameters of a block: per camera, per image, per point, per mount and per strip; and of a laser scanner.
+    """Parameters of a block: per camera, image, point, mount and strip; and of a laser scanner.
 
-    `exterior` has a leading axis over the block's images and `points` (m) over its points, in the block's order. `more`
+    `exterior` has a leading axis over the images and `points` (m) over the points of the block, in its order. `more`
     holds further declared parameters (`jaxphoto.parameters`) by kind and owner, `{"camera_rates": {"kodak": rates}}`.
-    The owner of what belongs to the whole block is "".
+    The owner of parameters of the whole block is "".
     """
 
     interior: dict[str, InteriorOrientation] = eqx.field(converter=ordered)
@@ -114,7 +114,7 @@ class Unknowns(eqx.Module):
 
     @property
     def words(self) -> dict[str, str]:
-        """Its shared parameters, or the priors of them, by owner: {"camera kodak": "c_mm 34.25, xp_mm FIXED ..."}."""
+        """Return shared parameters, or their priors, by owner: {"camera kodak": "c_mm 34.25, xp_mm FIXED ..."}."""
         told = {
             f"camera {camera}": numbers_words({name: get_parameter(own, name) for name in parameter_names(own)})
             for camera, own in self.interior.items()
@@ -138,20 +138,20 @@ class Unknowns(eqx.Module):
 
     @property
     def tables(self) -> dict[str, dict[str, Any]]:
-        """All declared parameters (or their priors), by kind and owner."""
+        """Declared parameters (or their priors), by kind and owner."""
         scanner: dict[str, dict[str, Any]] = {} if self.scanner is None else {"scanner": {"": self.scanner}}
         return scanner | {"mounts": self.mounts, "strips": self.strips} | self.more
 
     def with_tables(self, tables: dict[str, dict[str, Any]]) -> "Unknowns":
-        """The same with other declared parameters, of all kinds."""
+        """Replace the declared parameters of all kinds."""
         own = dict(tables)
         scanner, mounts, strips = own.pop("scanner", {"": None})[""], own.pop("mounts"), own.pop("strips")
         return Unknowns(self.interior, self.exterior, self.points, mounts, strips, scanner, own)
 
     def in_order_of(self, like: "Unknowns") -> "Unknowns":
-        """The same with cameras and owners in the order of `like`, which observations number them by.
+        """Sort cameras and owners as in `like`, to which the indices of observations refer.
 
-        JAX sorts the names of whatever it takes apart and puts together again.
+        JAX sorts the keys of dictionaries that it flattens and unflattens.
         """
         interior = {name: self.interior[name] for name in like.interior}
         own = self.tables
@@ -160,12 +160,12 @@ class Unknowns(eqx.Module):
 
 
 def is_prior(tree: Any) -> bool:
-    """Whether a node of a tree of priors is a leaf."""
+    """Return True if a node of a tree of priors is a leaf."""
     return isinstance(tree, Prior | Weighted)
 
 
 def check_prior(label: str, prior: Any) -> None:
-    """Raises InputError, which names the parameter, where `prior` is none."""
+    """Raise InputError, naming the parameter, unless `prior` is a prior."""
     if not is_prior(prior):
         given = " ".join(repr(prior).split())
         raise InputError(
@@ -174,7 +174,7 @@ def check_prior(label: str, prior: Any) -> None:
 
 
 def late_cameras(start: Unknowns, priors: Unknowns) -> list[str]:
-    """Cameras of a rig whose delay acts, because it is not zero or not held: the motion of the rig is needed then.
+    """Return cameras of a rig whose delay is nonzero or not fixed: these need the motion of the rig.
 
     Raises InputError for a delay without a prior.
     """

@@ -1,9 +1,9 @@
-"""Variants of a block, for experiments: short pure functions, block in and block out, composed by calling.
+"""Variants of a block for experiments: short pure functions from block to block, composed by calling.
 
     vertical_control(strips(block, ["north", "south"]))
 
-The modes of georeferencing of paper 004 are three of them (`MODES`): what differs is which observations there are and
-what is held, never the adjustment (docs/georeferencing.md).
+The modes of georeferencing of paper 004 are three of them (`MODES`): they differ in observations and fixed parameters,
+never in the adjustment (docs/georeferencing.md).
 """
 
 import dataclasses
@@ -34,27 +34,27 @@ from jaxphoto.observations import (
 from jaxphoto.parameters import AbstractParameters, dynamic_fields
 from jaxphoto.unknowns import FIXED, FREE, late_cameras
 
-# What GNSS, and what an IMU, observes of the exposures.
+# Observations of exposures by GNSS, and by an IMU.
 _POSITIONS: tuple[type, ...] = (StationRows, RelativePositions)
 _TURNS: tuple[type, ...] = (Attitudes, RelativeAttitudes)
 
 
 def indirect(block: Block) -> Block:
-    """Neither stations nor attitudes: control alone places the block."""
+    """Remove stations and attitudes: only control determines the position of the block."""
     return without_attitudes(without_stations(block))
 
 
 def integrated(block: Block) -> Block:
-    """Stations and attitudes are weighted observations beside the image points: the block as it is."""
+    """Keep stations and attitudes as weighted observations in addition to the image points: the block unchanged."""
     return block
 
 
 def direct(block: Block) -> Block:
-    """Exterior orientation from stations, attitudes and mounts, and held: no image point moves an image.
+    """Compute the exterior orientation from stations, attitudes and mounts, and fix it.
 
-    An image without a whole station and attitude keeps its start value. Stations and attitudes are used up: as
-    observations of what they were computed into they would only feign redundancy. Raises BlockError for an image whose
-    orientation neither sensors nor the start give.
+    An image without full station and attitude keeps its start value. Stations and attitudes are removed: as
+    observations of what was computed from them they would fake redundancy. Raises BlockError for an image whose
+    orientation neither sensors nor start values give.
     """
     rows = sensor_rows(block, block.start.unknowns)
     known = np.array(block.start.image_known, bool)
@@ -74,26 +74,26 @@ def direct(block: Block) -> Block:
 
 
 MODES: dict[str, Callable[[Block], Block]] = {"direct": direct, "integrated": integrated, "indirect": indirect}
-"""The modes of georeferencing by the name that block.toml gives them."""
+"""Modes of georeferencing by name in block.toml."""
 
 
 def without_stations(block: Block) -> Block:
-    """No GNSS positions, nor relative ones. What only they see is held: lever arms, shifts and drifts."""
+    """Remove GNSS positions, also relative ones, and fix what only they determine: lever arms, shifts and drifts."""
     return _hold_unseen(dataclasses.replace(block, stations=StationRows.none(), more=_without(block, _POSITIONS)))
 
 
 def without_attitudes(block: Block) -> Block:
-    """No observed roll, pitch and yaw, nor relative ones. What only they see well is held: the boresight."""
+    """Remove observed roll, pitch and yaw, also relative ones, and fix what only they determine well: the boresight."""
     return _hold_unseen(dataclasses.replace(block, attitudes=Attitudes.none(), more=_without(block, _TURNS)))
 
 
 def without_control(block: Block) -> Block:
-    """Control, weighted and fixed, becomes check points."""
+    """Convert control, weighted and fixed, to check points."""
     return control_only(block, ())
 
 
 def control_only(block: Block, points: Collection[str]) -> Block:
-    """Of the control only the `points` named stays; that of all others becomes check points.
+    """Keep control only at the named `points`; that of all others becomes check points.
 
     Raises ValueError for a name that has no control.
     """
@@ -112,9 +112,9 @@ def control_only(block: Block, points: Collection[str]) -> Block:
 
 
 def with_control(block: Block, points: Collection[str], sigma: float | Float[np.ndarray, "3"] | None = None) -> Block:
-    """Control at the `points` named, whether they were control or check points; all others become check points.
+    """Make the named `points` control, whether they were control or check points; all others become check points.
 
-    A check coordinate without sigma takes `sigma` (`all_control`). Raises InputError for a point without coordinates.
+    A check coordinate without sigma gets `sigma` (`all_control`). Raises InputError for a point without coordinates.
     """
     of, groups = np.array(block.points, object), (block.control, block.fixed, block.check)
     given = {name for rows in groups for name in of[rows.who]}
@@ -127,9 +127,9 @@ def with_control(block: Block, points: Collection[str], sigma: float | Float[np.
 
 
 def vertical_control(block: Block) -> Block:
-    """Control in height only: Z of control and check points is control, X and Y are check coordinates.
+    """Use control in height only: Z of control and check points is control, X and Y are check coordinates.
 
-    A check coordinate without sigma takes that of the control (`all_control`). Fixed heights stay fixed.
+    A check coordinate without sigma gets that of the control (`all_control`). Fixed heights stay fixed.
     """
     control, check, fixed = block.control, block.check, block.fixed
     upright = check.axis == 2
@@ -142,17 +142,17 @@ def vertical_control(block: Block) -> Block:
 
 
 def all_control(block: Block, sigma: float | Float[np.ndarray, "3"] | None = None) -> Block:
-    """Check points become control, each coordinate with its own sigma or, where it has none (zero), with `sigma`.
+    """Convert check points to control, each coordinate with its own sigma or, if it has none (zero), with `sigma`.
 
-    `sigma` in m, one or one an axis; None means that of the block's control on the axis. Raises ValueError where that
-    is none or several.
+    `sigma` in m, one or one per axis; None means that of the block's control on the axis. Raises ValueError if the
+    block has none or several.
     """
     promoted = _as_control(block.check, block.control, sigma)
     return dataclasses.replace(block, control=ControlRows.joined(block.control, promoted), check=ControlRows.none())
 
 
 def hold_interior(block: Block, camera: str, values: Mapping[str, float]) -> Block:
-    """The interior orientation of `camera` held: at `values` (c_mm, k1 ...), what they do not name at its start."""
+    """Fix the interior orientation of `camera` at `values` (c_mm, k1 ...); others at their start values."""
     interior = block.start.unknowns.interior[camera]
     for name, value in values.items():
         interior = set_parameter(interior, name, value)
@@ -162,9 +162,9 @@ def hold_interior(block: Block, camera: str, values: Mapping[str, float]) -> Blo
 
 
 def common_shift(block: Block, name: str = "block") -> Block:
-    """All images in one strip, `name`, whose shift is free: a datum offset between stations and control.
+    """Put all images in one strip, `name`, with a free shift: a datum offset between stations and control.
 
-    What the block knew of its strips goes.
+    Previous strips are removed.
     """
     zero = StripBias(jnp.zeros(3), jnp.zeros(3))
     known = lambda b: (b.start.unknowns.strips, b.priors.strips)  # noqa: E731
@@ -174,10 +174,10 @@ def common_shift(block: Block, name: str = "block") -> Block:
 
 
 def strips(block: Block, names: Collection[str]) -> Block:
-    """Only the images of the strips `names`, and the points that at least two of them show.
+    """Keep only the images of the strips `names`, and the points that at least two of them show.
 
-    Cameras, mounts and strips without an image go, observations of what is gone too; ids stay. Raises ValueError for a
-    name that is no strip.
+    Cameras, mounts and strips without an image are removed, as are observations of removed objects; ids stay. Raises
+    ValueError for a name that is not a strip.
     """
     if unknown := [name for name in names if not name or name not in block.image_strip]:
         known = ", ".join(sorted(set(block.image_strip) - {""}))
@@ -186,14 +186,14 @@ def strips(block: Block, names: Collection[str]) -> Block:
 
 
 def without_images(block: Block, names: Collection[str]) -> Block:
-    """Without the images named; what `some_images` says of the rest. Raises InputError for a name that is no image."""
+    """Remove the named images, as `some_images` does. Raises InputError for a name that is not an image."""
     if unknown := [name for name in names if name not in block.images]:
         raise InputError(f"there is no image {unknown[0]!r}; the block has {few(block.images)}")
     return some_images(block, np.array([image not in names for image in block.images]))
 
 
 def some_images(block: Block, chosen: Bool[np.ndarray, "images"]) -> Block:
-    """Only the images `chosen`, and the points that at least two of them show; what `strips` says of the rest."""
+    """Keep only the images `chosen`, and the points that at least two of them show, as `strips` does."""
     image = np.flatnonzero(chosen)
     seen = block.image_points.point[np.isin(block.image_points.image, image)]
     point = np.flatnonzero(np.bincount(seen, minlength=len(block.points)) >= 2)
@@ -203,9 +203,9 @@ def some_images(block: Block, chosen: Bool[np.ndarray, "images"]) -> Block:
 def without_observations(
     block: Block, left_out: Mapping[str, Bool[np.ndarray, "_"]]
 ) -> tuple[Block, Int[np.ndarray, "_"]]:
-    """The block without some of its observations, by group (`Block.named_observations`), and the points that stay.
+    """Remove some observations by group (`Block.named_observations`), and return the remaining points.
 
-    Points that are left with fewer observations than coordinates, such as one ray, go with what was observed of them.
+    Points with fewer observations left than coordinates, such as one ray, are removed with their observations.
     """
     kept = block.with_observations({name: block.named_observations[name].take(~out) for name, out in left_out.items()})
     numbers = np.zeros(len(block.points), int)
@@ -219,7 +219,7 @@ def without_observations(
 
 
 def _part(block: Block, image: np.ndarray, point: np.ndarray) -> Block:
-    """The block of some images and points, renumbered."""
+    """Return the block of some images and points, renumbered."""
     new_image, new_point = _numbers(image, len(block.images)), _numbers(point, len(block.points))
     images, points = [block.images[i] for i in image], [block.points[p] for p in point]
     camera, mount, strip = (
@@ -282,7 +282,7 @@ def _exterior(block: Block):
 
 
 def _hold_unseen(block: Block) -> Block:
-    """Mounts and strips FIXED where no observation is left that sees them; no motion where nothing acts with it."""
+    """Fix mounts and strips that no remaining observation determines; remove the motion if nothing acts with it."""
     own = {_kind(rows) for rows in block.more}
     positions = len(block.stations.who) > 0 or bool(own & {*_POSITIONS})
     turns = len(block.attitudes.image) > 0 or bool(own & {*_TURNS})
@@ -302,7 +302,7 @@ def _hold_unseen(block: Block) -> Block:
 
 
 def _without(block: Block, kinds: tuple[type, ...]) -> tuple:
-    """Further observations without those of `kinds`, in sets of correlated rows or not."""
+    """Remove further observations of `kinds`, also from sets of correlated rows."""
     return tuple(rows for rows in block.more if _kind(rows) not in kinds)
 
 
@@ -313,7 +313,7 @@ def _kind(rows: AbstractObservations | KnownParameters) -> type:
 def _as_control(
     check: ControlRows, control: ControlRows, sigma: float | Float[np.ndarray, "3"] | None = None
 ) -> ControlRows:
-    """Check coordinates as control; those without a sigma take `sigma`, or that of the control on their axis."""
+    """Convert check coordinates to control; those without a sigma get `sigma`, or that of the control on their axis."""
     own, taken = still(check.sigma), np.zeros(3)
     if not len(check):
         return check
@@ -335,7 +335,7 @@ def _as_control(
 
 
 def _numbers(kept: np.ndarray, n: int) -> np.ndarray:
-    """The new number of each of `n` things of which some are kept, -1 for the others."""
+    """Return the new index of each of `n` objects of which some are kept, -1 for the others."""
     new = np.full(n, -1)
     new[kept] = np.arange(len(kept))
     return new

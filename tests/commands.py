@@ -9,17 +9,19 @@ from pathlib import Path
 
 import pytest
 
-from jaxphoto import cli
-from jaxphoto.cli import output
+import jaxphoto_command
+from jaxphoto_command import output
 
 
 def run(monkeypatch, capsys, *arguments) -> tuple[int, str, str]:
     """Exit code, standard output and standard error of `jaxphoto ...`, in this process."""
-    # How long compiling takes hangs on the machine.
-    monkeypatch.setattr(output, "WORTH_TELLING_S", math.inf)
+    # The compile time depends on the machine.
+    monkeypatch.setattr(output, "COMPILE_NOTE_S", math.inf)
+    # Messages are not wrapped.
+    monkeypatch.setattr("typer.rich_utils.MAX_WIDTH", 1000)
     monkeypatch.setattr(sys, "argv", ["jaxphoto", *map(str, arguments)])
     with pytest.raises(SystemExit) as stop:
-        cli.main()
+        jaxphoto_command.main()
     captured = capsys.readouterr()
     return stop.value.code or 0, captured.out, captured.err
 

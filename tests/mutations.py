@@ -26,22 +26,19 @@ from PIL import Image
 
 from jaxphoto.camera import ImageMotion, InteriorOrientation, OpenCv, RollingShutter
 from jaxphoto.errors import JaxphotoError
+from jaxphoto.extras.formats import export, read_control, read_source, write_camera_file
 from jaxphoto.extras.photos import read_grey
-from jaxphoto.io import clouds, export, read_block, read_recipe, read_source, write_block
-from jaxphoto.io.block_folder.settings import toml_text
-from jaxphoto.io.cameras import read_camera_file, write_camera_file
+from jaxphoto.io import clouds, read_block, read_recipe, write_block
+from jaxphoto.io.camera_files import read_camera_file
 from jaxphoto.io.conditions import read_conditions
-from jaxphoto.io.control_files import read_control
-from jaxphoto.io.dbat import read_dbat
 from jaxphoto.io.draws_folder import DrawsFolder
-from jaxphoto.io.exports import adjusted_block, photograph_files
 from jaxphoto.io.exposures import read_exposures
 from jaxphoto.io.input_hashes import read_inputs
 from jaxphoto.io.kept_pieces import KeptPieces
 from jaxphoto.io.photograph_metadata import drone_record, xmp_fields
 from jaxphoto.io.photographs import photographs
-from jaxphoto.io.photomodeler import read_photomodeler
-from jaxphoto.io.raster import read_dsm
+from jaxphoto.io.result_folder import adjusted_block, photograph_files
+from jaxphoto.io.toml import toml_text
 from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, write_sbet
 from jaxphoto.procedures.control.surveyed import places, system_of
 from jaxphoto.unknowns import FIXED, FREE, Weighted
@@ -409,8 +406,8 @@ READERS: dict[str, Reader] = {
     ),
     "texts-bingo": Reader(written_by(oriented_files.write_bingo), lambda folder: read_source(folder, "texts")),
     "texts-patb": Reader(written_by(oriented_files.write_patb), lambda folder: read_source(folder, "texts")),
-    "dbat": Reader(text(**sound_files.DBAT), read_dbat),
-    "photomodeler": Reader(text(**sound_files.PHOTOMODELER), read_photomodeler),
+    "dbat": Reader(text(**sound_files.DBAT), lambda folder: read_source(folder, "dbat")),
+    "photomodeler": Reader(text(**sound_files.PHOTOMODELER), lambda folder: read_source(folder, "photomodeler")),
     "control-gcp-list": Reader(text(a=control_files.GCP_LIST), _control),
     "control-metashape": Reader(text(a=control_files.MARKERS), _control),
     "control-geojson": Reader(text(a=control_files.GEO_JSON), _control),
@@ -438,13 +435,8 @@ READERS: dict[str, Reader] = {
     "exposures-reference": Reader(text(a__csv=sound_files.REFERENCE), lambda folder: read_exposures(folder / "a.csv")),
     "exposures-pospac": Reader(text(eo__txt=sound_files.POSPAC), lambda folder: read_exposures(folder / "eo.txt")),
     "photograph-xmp": Reader(text(a__xmp=sound_files.XMP), lambda folder: _drone_record(folder / "a.xmp")),
-    "dsm": Reader(sound_files.surface, lambda folder: read_dsm(folder / "a.tif")),
     "cloud-ply-text": Reader(sound_files.ply_text, lambda folder: clouds.read_cloud(folder / "a.ply")),
-    **{f"cloud-{kind}": Reader(partial(sound_files.cloud, kind), _cloud(kind)) for kind in ("csv", "ply", "copc.laz")},
-    **{
-        f"cloud-{kind}-{of}": Reader(partial(sound_files.cloud, kind, of), _cloud(kind))
-        for kind, of in (("las", 3), ("las", 6), ("laz", 1), ("laz", 3), ("laz", 6), ("laz", 8), ("laz", 10))
-    },
+    **{f"cloud-{kind}": Reader(partial(sound_files.cloud, kind), _cloud(kind)) for kind in ("csv", "ply", "las")},
     **{f"picture-{kind}": Reader(partial(sound_files.picture, kind), _picture(kind)) for kind in ("jpg", "png", "tif")},
 }
 """The readers by name."""

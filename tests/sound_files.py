@@ -8,10 +8,7 @@ import numpy as np
 from PIL import Image
 
 from jaxphoto.io import clouds
-from jaxphoto.io.clouds.coordinate_system import epsg_system
-from jaxphoto.io.raster import write_dsm
-from jaxphoto.lidar.raster import Raster
-from tests.io.test_clouds import sample, write_las
+from tests.io.test_clouds import sample
 
 Files = dict[str, bytes]
 
@@ -57,15 +54,11 @@ PHOTOMODELER = {
 }
 
 
-def cloud(kind: str, point_format: int | None = None) -> Files:
-    """A cloud of some hundred points; LAS and LAZ of a format of points, by laspy alone."""
+def cloud(kind: str) -> Files:
+    """A cloud of some hundred points."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"a.{kind}"
-        few = sample(400)
-        if point_format is None:
-            clouds.write_cloud(few, path)
-        else:
-            write_las(path, few.xyz, "EPSG:32722", point_format=point_format, classification=few.classification)
+        clouds.write_cloud(sample(400), path)
         return {path.name: path.read_bytes()}
 
 
@@ -88,14 +81,6 @@ def picture(kind: str) -> Files:
         buffer, {"jpg": "JPEG", "tif": "TIFF"}.get(kind, kind), exif=exif
     )
     return {f"a.{kind}": buffer.getvalue()}
-
-
-def surface() -> Files:
-    """A surface model of a map system."""
-    with tempfile.TemporaryDirectory() as folder:
-        heights = np.add.outer(np.arange(40.0), np.arange(50.0))
-        write_dsm(Path(folder) / "a.tif", Raster(heights, 5e5, 5e6, 1.0), epsg_system(32633, "a"))
-        return {"a.tif": (Path(folder) / "a.tif").read_bytes()}
 
 
 MARKS = (

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxphoto.camera import Brown, InteriorOrientation, Sensor, parameter_names
-from jaxphoto.stability import METHODS, bundle_offsets, distortion_curve, format_sigma, image_grid
+from jaxphoto.stability import METHODS, bundle_offsets, distortion_curve, frame_sigma, image_grid
 
 CAMERA = InteriorOrientation(35.0, 0.4, -0.3, Brown(k1=-9e-5, k2=1e-7))
 SENSOR = Sensor(4500, 3000, 0.008)
@@ -27,8 +27,8 @@ def test_sigma_over_the_format_is_that_of_the_principal_point():
     plain = InteriorOrientation(35.0)
     covariance = np.diag([0, 1e-6, 4e-6, *np.zeros(len(parameter_names(plain)) - 3)])
     points = image_grid(SENSOR, 5, 3)
-    np.testing.assert_allclose(format_sigma(plain, covariance, points, "zrot"), np.sqrt(5e-6), rtol=1e-9)
-    assert format_sigma(plain, covariance, points, "rot").max() < 0.6 * np.sqrt(5e-6)
+    np.testing.assert_allclose(frame_sigma(plain, covariance, points, "zrot"), np.sqrt(5e-6), rtol=1e-9)
+    assert frame_sigma(plain, covariance, points, "rot").max() < 0.6 * np.sqrt(5e-6)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -40,4 +40,4 @@ def test_sigma_over_the_format_is_what_comparing_the_camera_with_itself_gives(me
     offsets = bundle_offsets(CAMERA, CAMERA, points, method)
     rows = np.asarray(offsets.measured_jacobian)[:, :n].reshape(len(points), 2, n)
     expected = np.sqrt(np.einsum("nip,pq,niq->n", rows, covariance, rows))
-    np.testing.assert_allclose(format_sigma(CAMERA, covariance, points, method), expected, rtol=1e-9)
+    np.testing.assert_allclose(frame_sigma(CAMERA, covariance, points, method), expected, rtol=1e-9)

@@ -61,8 +61,8 @@ def test_the_command_compares_two_results(tmp_path, monkeypatch, capsys):
     assert code == 0
     difference = np.array([TARGET_2[n] - TARGET_1[n] for n in SIGMAS]) / np.array(list(SIGMAS.values()))
     chi_square = (difference**2).sum() / 2
-    assert f"by its parameters: chi-square {chi_square:.1f} of {len(SIGMAS)}" in text
-    assert "by its bundle of rays, turned onto one another" in text
+    assert f"parameters: chi-square {chi_square:.1f} with {len(SIGMAS)} degrees" in text
+    assert "bundle of rays, turned onto one another" in text
     parameters, cells = pd.read_csv(out / "parameters.csv"), pd.read_csv(out / "cells.csv")
     own = parameters.set_index("parameter").loc[list(SIGMAS), "ratio"]
     np.testing.assert_allclose(own, difference / np.sqrt(2), rtol=1e-9)
@@ -77,13 +77,13 @@ def test_the_command_compares_two_results(tmp_path, monkeypatch, capsys):
 def test_one_calibration_is_not_compared_with_itself_and_shared_image_points_are_said(tmp_path, monkeypatch, capsys):
     a, b = (written_set(tmp_path / name, "gopro", values) for name, values in (("one", TARGET_1), ("two", TARGET_2)))
     code, _, error = run(monkeypatch, capsys, "compare", a, a)
-    assert code == 2 and "are one calibration, which tells no change" in error
+    assert code == 2 and "are one calibration" in error
     for folder, key, shared in ((a, "0", False), (b, "1", False), (b, "0", True)):
         rows = f"x/image_points.csv,9,{64 * key}\ny.csv,9,{63 * key}9\n"
         (folder / "inputs.csv").write_text(f"file,n_bytes,sha256\n{rows}")
         code, _, error = run(monkeypatch, capsys, "compare", a, b)
-        assert code == 0 and ("are of the same photographs or image points" in error) == shared
+        assert code == 0 and ("A and B share photographs or image points" in error) == shared
     # A block tells the photographs behind its image points, too.
     write_conditions([Conditions("i", "i.jpg", 64 * "1")], a, ())
     (b / "inputs.csv").write_text(f"file,n_bytes,sha256\ni.jpg,9,{64 * '1'}\n")
-    assert "are of the same photographs or image points" in run(monkeypatch, capsys, "compare", a, b)[2]
+    assert "A and B share photographs or image points" in run(monkeypatch, capsys, "compare", a, b)[2]

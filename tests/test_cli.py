@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 
 import jaxphoto
-import jaxphoto.cli
+import jaxphoto_command
 from jaxphoto.errors import InputError
 from jaxphoto.io import write_block
 from jaxphoto.writing import MARKER, check_folder
@@ -84,13 +84,12 @@ def results(folder):
     """The results of one run as a user starts it: another process, no terminal."""
     out = folder.parent / "results"
     done = subprocess.run(
-        [sys.executable, "-c", "from jaxphoto.cli import main; main()", "adjust", folder, "--out", out],
+        [sys.executable, "-c", "from jaxphoto_command import main; main()", "adjust", folder, "--out", out],
         capture_output=True,
         text=True,
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    # On a busy machine a line says now and then what is being done.
     assert not re.search("warning|error|Traceback", done.stderr, re.IGNORECASE), done.stderr
     return out, done.stdout
 
@@ -132,20 +131,18 @@ def test_files_say_what_the_adjustment_says(results, folder):
         off = tables.check_points[f"d{axis}_m"].dropna()
         if len(off):
             assert summary["check_points"][axis]["rmse_m"] == pytest.approx((off**2).mean() ** 0.5)
-            row = re.search(rf"│ {axis} +│ {len(off)} +│ \S+ +│ (\S+) +│ (\S+) +│ (\S+)", screen)
+            row = re.search(rf"│ {axis} +│ *{len(off)} *│ *\S+ *│ *(\S+) *│ *(\S+) *│ *(\S+)", screen)
             assert float(row[1]) == pytest.approx((off**2).mean() ** 0.5, rel=6e-3)
             assert float(row[2]) == pytest.approx(off.abs().max(), rel=6e-3)
             assert row[3] == tables.check_points["point"][off.abs().idxmax()]
-    assert "c_mm" in screen
+    assert re.search(r"│ c +│ +3", screen)
 
 
 def test_report_opens_without_a_network(results):
     page = (results[0] / "report.html").read_text()
     assert page.startswith("<!DOCTYPE html>")
-    # A picture's own letters may spell anything.
-    text, pictures = re.subn(r'"data:image/png;base64,[^"]*"', '""', page)
-    assert "http" not in text
-    assert pictures >= 3
+    assert not re.search(r'<(img|script|link)[^>]*(src|href)="(?!data:)', page)
+    assert page.count('<figure role="img"') >= 3
 
 
 def test_the_command_of_a_report_is_typed_again(results, folder, monkeypatch, capsys, tmp_path):
@@ -206,7 +203,7 @@ def test_blunders_are_left_out_and_written(folder, monkeypatch, capsys, tmp_path
     assert named in screen
     code, screen, _ = run(monkeypatch, capsys, "adjust", spoilt, "--out", out, "--snoop")
     assert code == 0
-    assert f"left out: {named}" in " ".join(screen.split())
+    assert f"rejected: {named}" in " ".join(screen.split())
     left = pd.read_csv(out / "left_out.csv")
     assert left["observation"].tolist() == [named]
     assert abs(left["error"][0] - 7.0) < 5 * left["sigma"][0]
@@ -290,11 +287,6 @@ def test_other_programs_get_the_summary_and_who_asks_for_silence_gets_it(folder,
     assert run(monkeypatch, capsys, "adjust", folder, "--out", out, "-q") == (0, "", "")
 
 
-def test_help_shows_arguments_in_words(monkeypatch, capsys):
-    code, said, _ = run(monkeypatch, capsys, "combine", "--help")
-    assert code == 0 and "one or more" in said and not re.search(r"<(path|list|str)", said)
-
-
 def test_version_and_help(monkeypatch, capsys):
     assert run(monkeypatch, capsys, "--version")[1].strip() == f"jaxphoto {jaxphoto.__version__}"
     assert "adjust" in run(monkeypatch, capsys, "--help")[1]
@@ -333,17 +325,17 @@ def test_results_never_take_the_place_of_what_they_are_made_of(tmp_path):
 
 @pytest.mark.parametrize("make", [np.zeros, jax.numpy.zeros])
 def test_too_little_memory_is_one_sentence(make, monkeypatch, capsys):
-    monkeypatch.setattr(jaxphoto.cli, "app", lambda **_: make((10**7, 10**8)).sum())
+    monkeypatch.setattr("jaxphoto_command.application.app", lambda **_: make((10**7, 10**8)).sum())
     code, out, err = run(monkeypatch, capsys, "adjust")
     assert (code, out) == (2, "") and err.count("\n") == 1
-    assert re.match(r"jaxphoto: memory does not suffice: [\d.]+ ?(PiB|TiB|bytes) were asked for at once; close ", err)
+    assert err.startswith("jaxphoto: not enough memory. Close other programs")
 
 
 def test_other_errors_of_xla_are_not_taken_for_it(monkeypatch, capsys):
     def broken(**_):
         raise jax.errors.JaxRuntimeError("INTERNAL: no such thing")
 
-    monkeypatch.setattr(jaxphoto.cli, "app", broken)
+    monkeypatch.setattr("jaxphoto_command.application.app", broken)
     monkeypatch.setattr(sys, "argv", ["jaxphoto"])
     with pytest.raises(jax.errors.JaxRuntimeError):
-        jaxphoto.cli.main()
+        jaxphoto_command.main()

@@ -5,7 +5,7 @@ import pytest
 
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import read_camera_file
+from jaxphoto.io.camera_files import read_camera_file
 from jaxphoto.stability import combine, parameter_vector
 from tests.commands import run
 from tests.test_stability import ONE, SIGMAS, covariance, smac
@@ -31,7 +31,7 @@ def drawn(rng, off=0.0):
 
 def test_one_calibration_says_nothing_twice():
     interiors, covariances = drawn(np.random.default_rng(1))
-    with pytest.raises(InputError, match="c and a are one calibration, which says nothing twice"):
+    with pytest.raises(InputError, match="c and a are the same calibration"):
         combine([*interiors[:2], interiors[0]], [*covariances[:2], covariances[0]], "abc")
 
 
@@ -89,15 +89,15 @@ def test_the_command_writes_a_prior(tmp_path, monkeypatch, capsys):
 
 def test_what_cannot_be_combined_is_said(tmp_path, monkeypatch, capsys):
     interiors, covariances = drawn(np.random.default_rng(1))
-    with pytest.raises(InputError, match="two calibrations at least"):
+    with pytest.raises(InputError, match="at least two calibrations"):
         combine(interiors[:1], covariances[:1], "a")
     held = covariances[1].copy()
     held[FREE[0]] = held[:, FREE[0]] = 0.0
-    with pytest.raises(InputError, match="c_mm is held in b and estimated in a"):
+    with pytest.raises(InputError, match="c_mm is fixed in b and estimated in a"):
         combine(interiors[:2], [covariances[0], held], "ab")
     sets = [written_set(tmp_path / name, "gopro", TARGET_1) for name in ("one", "two")]
     (sets[1] / "correlation.csv").unlink()
     code, _, error = run(monkeypatch, capsys, "combine", *sets, "--out", tmp_path / "camera.toml")
     assert (code, "two has no covariance" in error) == (2, True)
     code, _, error = run(monkeypatch, capsys, "combine", *sets, "--out", tmp_path / "camera.yml")
-    assert (code, "only a .toml has a place for the covariance" in error) == (2, True)
+    assert (code, "only a .toml file can hold the covariance" in error) == (2, True)

@@ -174,7 +174,7 @@ def test_a_tree_is_told_and_comes_back():
     for unknown in (Own(), object(), {1: 2}, lambda x: x, np.zeros(2), Brown):
         with pytest.raises(TypeError):
             plain_tree.told(unknown)
-    for name in ("os:system", "jaxphoto:read_block", "jaxphoto.cli:typer.Exit", "builtins:list"):
+    for name in ("os:system", "jaxphoto:read_block", "jaxphoto.io:read_block", "builtins:list"):
         with pytest.raises(TypeError):
             plain_tree.tree_of({name: []})
 

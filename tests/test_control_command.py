@@ -43,9 +43,9 @@ def test_a_block_is_adjusted_with_control(written, tmp_path, monkeypatch, capsys
     (pictures / "cut.jpg").write_bytes(b"none")
     targets = ("--targets", "circle:diameter_mm=300", "--photographs", pictures)
     _, said, warned = run(monkeypatch, capsys, "control", *given, *targets, "--out", out)
-    assert f"no target is looked for in what is left out: {pictures / 'cut.jpg'}" in warned
+    assert f"skipped in the search for targets: {pictures / 'cut.jpg'}" in warned
     assert "6 of 6 control points bring the block to their frame" in said
-    assert "3 check points are off by" in said
+    assert "3 check points: RMSE" in said
     points = pd.read_csv(out / "surveyed_points.csv")
     assert (points["state"] == ["control"] * len(CONTROL) + ["check"] * len(CHECK)).all()
     assert (points[["w_X", "w_Y", "w_Z"]].max() < 4).all()

@@ -27,7 +27,7 @@ from jaxphoto.observations import Correlated, KnownParameters
 from jaxphoto.parameters import numbers_of
 from jaxphoto.report import Verdict, write_results
 from jaxphoto.sensitivity import noise, sensitivity
-from jaxphoto.sensitivity.designs import prepare_design
+from jaxphoto.sensitivity.sweep import prepare_design
 from jaxphoto.statistics import observation_groups, redundancy_numbers
 from tests.adjustment.dense import in_order, own_order, rows_of
 from tests.declared import OWN, adjusted, own_alone, own_priors, residuals_of, simulated
@@ -313,7 +313,7 @@ def test_exact_sensitivity_is_the_difference_of_re_adjustments(group):
 
     expected = (estimates(step) - estimates(-step)) / (2 * step)
     d = derivatives()
-    shared = [d.of(label) for label in a.structure.labels]
+    shared = [d.row(label) for label in a.structure.labels]
     found = d.groups[group][shared, 1]
     sigma = np.asarray(covariance(a).shared_sigma)
     size = np.abs(expected / sigma).max()

@@ -1,6 +1,5 @@
 """What comes with jaxphoto, from a clone and from a wheel."""
 
-import importlib
 import os
 import subprocess
 import sys
@@ -12,11 +11,11 @@ import pytest
 from typer.main import get_command
 
 import jaxphoto
-from jaxphoto.cli.app import COMMANDS, app
-from jaxphoto.cli.example import _NEXT
 from jaxphoto.errors import InputError
 from jaxphoto.io import read_recipe
 from jaxphoto.io.shipped import EXAMPLES, shipped
+from jaxphoto_command import app
+from jaxphoto_command.examples import NEXT
 from tests.commands import run
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -58,9 +57,8 @@ def test_without_a_name_they_are_listed_and_a_wrong_one_is_said(tmp_path, monkey
 
 @pytest.mark.parametrize("example", EXAMPLES)
 def test_what_is_to_be_typed_next_is_a_command_and_its_options(example):
-    program, command, *words = _NEXT[example].split()
+    program, command, *words = NEXT[example].split()
     assert program == "jaxphoto"
-    importlib.import_module(f"jaxphoto.cli.{COMMANDS[command].module}")
     assert get_command(app).commands[command].make_context(command, words).params is not None
 
 
@@ -74,8 +72,9 @@ def test_the_wheel_has_all_that_its_user_needs(tmp_path):
     with zipfile.ZipFile(wheel) as packed:
         names = set(packed.namelist())
         packed.extractall(tmp_path / "site")
-    ours = {str(p.relative_to(ROOT)) for p in (ROOT / "jaxphoto").rglob("*") if p.suffix in (".py", ".toml", ".typed")}
-    assert ours | {"jaxphoto_command.py"} <= names
+    folders = (ROOT / "jaxphoto", ROOT / "jaxphoto_command")
+    files = [p for folder in folders for p in folder.rglob("*") if p.suffix in (".py", ".toml", ".typed")]
+    assert {str(p.relative_to(ROOT)) for p in files} <= names
     for folder in ("examples", "experiments"):
         tracked = subprocess.run(["git", "ls-files", folder], cwd=ROOT, capture_output=True, text=True, check=True)
         assert {f"jaxphoto/shipped/{name}" for name in tracked.stdout.split()} <= names

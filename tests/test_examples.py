@@ -12,9 +12,10 @@ import pytest
 
 import jaxphoto
 from jaxphoto.camera.distortion import DISTORTIONS
-from jaxphoto.cli import app
 from jaxphoto.io.block_folder.settings import read_settings
+from jaxphoto.io.block_folder.table_layout import LAYOUTS
 from jaxphoto.report.results import _TABLES
+from jaxphoto_command import app
 from tests.marks import slow_but
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -120,6 +121,13 @@ def test_block_folder_page_shows_a_readable_block_toml() -> None:
     assert text is not None
     keys = ["distance_m"]
     assert list(read_settings(tomllib.loads(text[1]), sigma_keys=keys).cameras) == ["kodak"]
+
+
+def test_block_folder_page_lists_the_columns_of_every_table() -> None:
+    lines = (ROOT / "docs/block_folder.md").read_text(encoding="utf-8").splitlines()
+    for name, layout in LAYOUTS.items():
+        row = next(line for line in lines if line.startswith(f"| `{name}.csv`"))
+        assert [column.name for column in layout.columns if column.name not in row] == []
 
 
 def test_pages_name_every_distortion_and_coefficient() -> None:

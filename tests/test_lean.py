@@ -1,49 +1,67 @@
-"""Without the packages that docs/install.md says may be left out: what still starts, and what the rest says."""
+"""Without the extras: what starts, and the line that a missing extra names."""
 
+import ast
+import inspect
 import os
 import re
 import subprocess
 import sys
+import textwrap
 import tomllib
 from pathlib import Path
 
-from jaxphoto.cli import _LEFT_OUT
-from jaxphoto.cli.app import COMMANDS
+import pytest
+from typer.main import get_command
+
+from jaxphoto.optional import EXTRAS
+from jaxphoto_command import app
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
 
 
-def bare(requirement):
-    return re.match(r"[\w-]+", requirement)[0]
-
-
-def without(program):
-    """A process of its own that finds none of the packages."""
-    hidden = f"import sys; sys.modules.update(dict.fromkeys({list(_LEFT_OUT)}))\n"
+def without_extras(program):
+    """Run a program in a process that finds no optional module."""
+    hidden = f"import sys; sys.modules.update(dict.fromkeys({list(EXTRAS)}))\n"
     return subprocess.run(
         [sys.executable, "-c", hidden + program], env=os.environ, capture_output=True, text=True, check=False
     )
 
 
-def test_the_lean_line_is_all_but_what_may_be_left_out():
-    needed = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
-    (line,) = re.findall(r"^pip install (jax .*)$", PAGE, re.MULTILINE)
-    assert set(line.split()) == {bare(r) for r in needed} - {bare(p) for p in _LEFT_OUT.values()}
+def imports(function):
+    """Return the imports inside a function, as lines."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    return [ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
 
 
-def test_commands_that_the_page_does_not_name_start_without():
-    (rows,) = re.findall(r"^\| left out \|.*\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
-    named = {name for name in re.findall(r"`([a-z-]+)`", rows) if name in COMMANDS}
+def test_every_extra_is_declared_and_documented():
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert set(EXTRAS.values()) <= set(declared)
+    assert set(re.findall(r"^\| `(\w+)` \(", PAGE, re.MULTILINE)) == set(EXTRAS.values())
+
+
+def test_commands_without_an_extra_start():
+    (rows,) = re.findall(r"^\| extra \|.*\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
+    commands = get_command(app).commands
+    named = {name for name in re.findall(r"`([a-z-]+)`", rows) if name in commands}
     assert {"fly", "dsm", "monte-carlo"} <= named
-    modules = {f"jaxphoto.cli.{command.module}" for name, command in COMMANDS.items() if name not in named}
-    done = without(f"import importlib\nfor module in {sorted(modules)}: importlib.import_module(module)")
+    functions = [inspect.unwrap(command.callback) for name, command in commands.items() if name not in named]
+    done = without_extras("\n".join(line for function in functions for line in imports(function)))
     assert done.returncode == 0, done.stderr
 
 
-def test_what_is_not_there_is_named_with_the_line_that_installs_it():
-    done = without("sys.argv = ['jaxphoto', 'orient', '--help']\nfrom jaxphoto.cli import main\nmain()")
-    assert done.returncode == 2
-    assert done.stderr.splitlines() == [
-        "jaxphoto: opencv-python-headless is needed for this and not there: pip install 'opencv-python-headless'"
-    ]
+@pytest.mark.parametrize(
+    ("program", "module", "extra"),
+    [
+        (
+            "sys.argv = ['jaxphoto', 'orient', 'a.jpg', '--out', 'out']\nfrom jaxphoto_command import main\nmain()",
+            "cv2",
+            "photos",
+        ),
+        ("import jaxphoto.io.raster", "rasterio", "lidar"),
+        ("import jaxphoto.io.clouds.las", "laspy", "lidar"),
+    ],
+)
+def test_a_missing_extra_is_named_with_the_line_that_installs_it(program, module, extra):
+    done = without_extras(program)
+    assert done.returncode and f"{module} is not installed: pip install 'jaxphoto[{extra}]'" in done.stderr

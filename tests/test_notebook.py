@@ -183,12 +183,12 @@ def test_what_is_not_there_is_named(call, message):
 
 
 def test_all_pictures_take_and_return_axes_by_one_name():
-    pictures = [report.to_plotly, jaxphoto.Block.plot, jaxphoto.Adjustment.plot]
+    pictures = [jaxphoto.Block.plot, jaxphoto.Adjustment.plot]
     pictures += [getattr(report, name) for name in report.__all__ if name.startswith("plot_")]
     for plot in pictures:
         signature = inspect.signature(plot)
         assert str(signature.parameters["ax"].annotation) in ("Axes | None", "Axes"), plot
-        assert signature.return_annotation == ("Figure" if plot is report.to_plotly else "Axes"), plot
+        assert signature.return_annotation == "Axes", plot
 
 
 @pytest.mark.slow

@@ -1,57 +1,120 @@
-"""The start of the command line: the list of commands is whole, and a command brings only what it needs."""
+"""The start of the command line: a quick list of commands, and examples that are valid."""
 
-import importlib
 import inspect
 import json
 import os
 import shlex
 import subprocess
 import sys
+from typing import get_args
 
 import pytest
-import typer
+from typer.main import get_command
 
-from jaxphoto.cli.app import COMMANDS, app
+from jaxphoto.camera.undistortion import Keep
+from jaxphoto.extras.formats import CAMERAS_WRITTEN, EXPORTS, FORMATS, LOSS_PX
+from jaxphoto.extras.photos.features import LONGEST_PX
+from jaxphoto.georeferencing import PATTERN_OF, ScannerCalibration
+from jaxphoto.io.clouds.cloud_reader import Returns
+from jaxphoto.io.clouds.coordinate_system import UNITS
+from jaxphoto.io.shipped import EXAMPLES
+from jaxphoto.lidar.raster import Statistic
+from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.losses import LOSSES
+from jaxphoto.parameters import dynamic_fields
+from jaxphoto.procedures.halves import CUTS
+from jaxphoto.procedures.lidar.images_and_cloud import SHIFT_SIGMA, SURFACES
+from jaxphoto.procedures.lidar.strip_adjustment import MAX_STRIP_ROUNDS
+from jaxphoto.procedures.lidar.until_still import MAX_ROUNDS
+from jaxphoto.procedures.lidar.vertical_control import METHODS
+from jaxphoto.procedures.model_choice import FOLDS
+from jaxphoto.report import TABLE_FORMATS
+from jaxphoto.sensitivity import PER
+from jaxphoto.sensitivity.influence import DELTA0, Per
+from jaxphoto.stability import METHODS as ALIGNMENTS
+from jaxphoto.statistics import EOP_NAMES
+from jaxphoto_command import app, blocks, examples, files, lidar, photographs
 from tests.commands import run
+
+COMMANDS = get_command(app).commands
+_STRIPS = StripSettings()
+# The command line states these without importing the library.
+CHOICES = [
+    (blocks.adjust, "rotations", EOP_NAMES),
+    (blocks.adjust, "robust", LOSSES),
+    (blocks.tables, "to", TABLE_FORMATS),
+    (blocks.monte_carlo, "kind", [*PER, "noise"]),
+    (blocks.sensitivity, "per", get_args(Per)),
+    (blocks.halves, "method", ALIGNMENTS),
+    (files.convert, "source_format", FORMATS),
+    (files.convert, "to", ["block", *EXPORTS]),
+    (files.camera, "out_format", CAMERAS_WRITTEN),
+    (photographs.undistort, "keep", get_args(Keep)),
+    (lidar.lidar_control, "method", METHODS),
+    (lidar.lidar_control, "returns", get_args(Returns)),
+    (lidar.lidar_control, "cloud_unit", UNITS),
+    (lidar.simultaneous, "method", SURFACES),
+    (lidar.strips, "pattern", PATTERN_OF),
+    (lidar.dsm, "statistic", get_args(Statistic)),
+]
+DEFAULTS = [
+    (blocks.sensitivity, "delta0", DELTA0),
+    (blocks.halves, "cuts", CUTS),
+    (files.camera, "loss_px", LOSS_PX),
+    (lidar.lidar_control, "max_rounds", MAX_ROUNDS),
+    (lidar.simultaneous, "shift", f"{SHIFT_SIGMA:g}"),
+    (lidar.strips, "max_rounds", MAX_STRIP_ROUNDS),
+    (lidar.strips, "most_planes", _STRIPS.most),
+    *((lidar.strips, name, getattr(_STRIPS, name)) for name in ("cell_m", "roughness_m", "knots_s", "correlation_s")),
+    *((lidar.strips, name, getattr(_STRIPS, name)) for name in ("sigma_exposure_m", "sigma_exposure_deg")),
+]
 
 
 def after(*arguments):
     """Modules that `jaxphoto ...` has imported in a process of its own, and what it printed."""
     program = (
-        "import sys\nfrom jaxphoto.cli import main\n"
+        "import sys\nfrom jaxphoto_command import main\n"
         "try:\n    main()\nexcept SystemExit:\n    print('MODULES', *sys.modules)\n"
     )
     done = subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=True)
-    said, _, modules = done.stdout.partition("MODULES")
-    return set(modules.split()), said
+    screen, _, modules = done.stdout.partition("MODULES")
+    return set(modules.split()), screen
 
 
-def test_help_lists_every_command_and_imports_none():
-    modules, said = after("--help")
-    for name, command in COMMANDS.items():
-        assert name in said
-        assert command.sentence.split()[0] in said
-        assert f"jaxphoto.cli.{command.module}" not in modules
-    assert not {"cv2", "pandas", "laspy", "rasterio", "matplotlib.figure"} & modules
+@pytest.mark.parametrize("words", [("--help",), ("--version",), ("compare", "-h")])
+def test_help_and_version_import_no_library(words):
+    modules, screen = after(*words)
+    assert not {"jax", "numpy", "jaxphoto"} & modules
+    if words == ("--help",):
+        assert all(name in screen for name in COMMANDS)
+    if words == ("compare", "-h"):
+        assert "Example: jaxphoto compare results_2025 results_2026" in screen and "zrot|rot|spr" in screen
 
 
-def test_a_command_is_imported_when_it_is_called():
-    modules, said = after("simulate", "--help")
-    assert "Simulate a block with known truth." in said
-    assert "jaxphoto.cli.simulate" in modules
-    assert not {"jaxphoto.cli.calibrate", "jaxphoto.cli.lidar", "jaxphoto.cli.adjust"} & modules
+def test_panels_come_in_their_order(monkeypatch, capsys):
+    screen = run(monkeypatch, capsys, "-h")[1]
+    titles = ("Adjustment and assessment", "monte-carlo", "Photographs", "Camera comparison", "Lidar", "Files and")
+    places = [screen.index(title) for title in titles]
+    assert places == sorted(places)
 
 
-def test_the_list_is_of_the_commands_that_there_are():
-    """Every module registers what the list says of it, under that name, and nothing else is registered."""
-    for command in COMMANDS.values():
-        importlib.import_module(f"jaxphoto.cli.{command.module}")
-    own = [known for known in app.registered_commands if known.callback.__module__ != "jaxphoto.cli.app"]
-    registered = {known.name: known.callback for known in own}
-    assert set(registered) == set(COMMANDS)
-    for name, command in COMMANDS.items():
-        assert registered[name].__module__ == f"jaxphoto.cli.{command.module}"
-        assert inspect.getdoc(registered[name]).startswith(command.sentence.rstrip(".")), name
+@pytest.mark.parametrize(("command", "option", "names"), CHOICES)
+def test_choices_are_those_of_the_library(command, option, names):
+    annotation = inspect.signature(command).parameters[option].annotation
+    literals = (annotation, *get_args(annotation), *get_args(get_args(annotation)[0]))
+    choices = next(get_args(part) for part in literals if get_args(part) and isinstance(get_args(part)[0], str))
+    assert set(choices) == set(names)
+
+
+@pytest.mark.parametrize(("command", "option", "value"), DEFAULTS)
+def test_defaults_are_those_of_the_library(command, option, value):
+    assert inspect.signature(command).parameters[option].default == value
+
+
+def test_other_names_are_those_of_the_library():
+    assert set(examples.NEXT) == set(EXAMPLES)
+    assert set(lidar.SCANNER) == {"boresight", *(n.replace("_", "-") for n in dynamic_fields(ScannerCalibration))}
+    assert (LONGEST_PX, FOLDS) == (2400, 5)
 
 
 def test_importing_needs_no_list_of_cores():
@@ -65,29 +128,22 @@ def test_importing_needs_no_list_of_cores():
     assert done.stdout.strip() == "True", done.stderr
 
 
+def _example(name):
+    return [shlex.split(line)[1:] for line in COMMANDS[name].epilog.removeprefix("Example: ").split(" && ")]
+
+
 @pytest.mark.parametrize("name", COMMANDS)
-def test_the_example_in_the_help_of_a_command_is_one(name):
-    """Its own options take it, and nothing that they need is missing."""
-    words = shlex.split(COMMANDS[name].example)
-    assert words[:2] == ["jaxphoto", name]
-    importlib.import_module(f"jaxphoto.cli.{COMMANDS[name].module}")
-    commands = typer.main.get_command(app).commands
-    assert commands[name].make_context(name, words[2:]).params is not None
+def test_the_example_in_the_help_of_a_command_is_valid(name):
+    command, *words = _example(name)[-1]
+    assert command == name
+    assert COMMANDS[name].make_context(name, words).params is not None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name, command in COMMANDS.items() if command.before])
+@pytest.mark.parametrize("name", [name for name in COMMANDS if _example(name)[0][0] == "example"])
 def test_the_example_in_the_help_of_a_command_runs(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    for words in (*COMMANDS[name].before, COMMANDS[name].example):
-        code, screen, errors = run(monkeypatch, capsys, *shlex.split(words)[1:], "--json")
+    for words in _example(name):
+        code, screen, errors = run(monkeypatch, capsys, *words, "--json")
         assert code in (0, 1), errors
         assert json.loads(screen)["written"]
-
-
-def test_help_is_short_too_and_ends_with_an_example():
-    _, said = after("compare", "-h")
-    assert "Example: jaxphoto compare results_2025 results_2026" in said and "zrot | rot | spr" in said
-    _, said = after("-h")
-    headings = [said.index(title) for title in ("Adjust and judge", "From photographs", "Lidar", "Files and formats")]
-    assert headings == sorted(headings) and headings[0] < said.index("monte-carlo") < headings[1]

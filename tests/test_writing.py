@@ -14,7 +14,7 @@ import pytest
 from jaxphoto.camera import Brown, InteriorOrientation, Sensor
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
-from jaxphoto.io import write_camera_file
+from jaxphoto.extras.formats import write_camera_file
 from jaxphoto.io.clouds import write_cloud
 from jaxphoto.io.raster import write_dsm, write_hillshade
 from jaxphoto.lidar.raster import Raster
@@ -122,7 +122,7 @@ def test_what_cannot_be_written_is_said_before_anything_is_computed(tmp_path, mo
     for check in (check_folder, check_file):
         with pytest.raises(InputError, match=r"deeper cannot be written \(Read-only file system\)"):
             check(tmp_path / "deep" / "deeper")
-    monkeypatch.setattr("jaxphoto.cli.adjust.read_block", None)
+    monkeypatch.setattr("jaxphoto.io.read_block", None)
     block = ROOT / "examples" / "cross_block"
     code, _, error = run(monkeypatch, capsys, "adjust", block, "--out", tmp_path / "x[b]")
     assert (code, error.count("\n")) == (2, 1)

@@ -18,18 +18,16 @@ import pandas as pd
 
 import jaxphoto
 from jaxphoto.block import Block
-from jaxphoto.sensitivity.network.block import measured_block
-from jaxphoto.sensitivity.network.covariance import design_covariance
-from jaxphoto.sensitivity.network.criteria import largest_correlation, point_rmse, sigma_of
+from jaxphoto.sensitivity.network.covariance import design_covariance, largest_correlation, point_rmse, sigma_of
+from jaxphoto.sensitivity.network.layout import StripDesign, StripPlan, block_from_layout, design_from_plan
 from jaxphoto.sensitivity.network.search import (
+    best_designs,
     evaluate_designs,
     grid_designs,
     optimise_design,
-    promising,
     random_designs,
-    stacked,
+    stack_designs,
 )
-from jaxphoto.sensitivity.network.strips import StripDesign, StripPlan, planned_design
 from jaxphoto.simulation import remeasure
 from jaxphoto.statistics import correlations
 from jaxphoto.unknowns import Unknowns
@@ -91,8 +89,8 @@ def control_point(of: StripPlan, usual: StripDesign) -> pd.DataFrame:
     corner = eqx.tree_at(lambda d: d.control, usual, np.array([[1200.0, 1200.0]]))
     rows = []
     for name, criterion in criteria.items():
-        ends = evaluate_designs(criterion, of, stacked(usual, corner))
-        begin = promising(criterion, of, grid_designs(low, high, GRID), 2)
+        ends = evaluate_designs(criterion, of, stack_designs(usual, corner))
+        begin = best_designs(criterion, of, grid_designs(low, high, GRID), 2)
         found = optimise_design(criterion, of, low, high, begin)
         rows.append((name, *ends, found.start_values[0], found.value, *found.best.control[0]))
         print(*rows[-1], flush=True)
@@ -115,7 +113,7 @@ def four_strips(of: StripPlan, usual: StripDesign) -> dict[str, StripDesign]:
     ):
         low, high = bounds(usual, **changes)
         known = [designs["grid of headings"]] if changes is turn and criterion is BOTH_TILTS else []
-        begin = stacked(usual, *known, *each(random_designs(low, high, STARTS, 1)))
+        begin = stack_designs(usual, *known, *each(random_designs(low, high, STARTS, 1)))
         smooth = eqx.Partial(criterion.func, **criterion.keywords, power=16.0)
         found = optimise_design(criterion, of, low, high, begin, smooth, STEPS)
         print(name, found.start_values.round(3), found.values.round(3), found.steps, flush=True)
@@ -133,12 +131,12 @@ def judged(of: StripPlan, designs: dict[str, StripDesign], draws: int) -> pd.Dat
 
     `other_flights` is the mean over ten more draws of jitter and ground points, of which the search knew nothing.
     """
-    measured = {name: measured_block(of(design)) for name, design in designs.items()}
+    measured = {name: block_from_layout(of(design)) for name, design in designs.items()}
     sizes = jaxphoto.common_sizes([m.block for m in measured.values()])
     others = [plan(seed) for seed in range(1, 11)]
     rows = []
     for name, (block, truth, _) in measured.items():
-        one = stacked(designs[name])
+        one = stack_designs(designs[name])
         planned = [float(evaluate_designs(c, of, one)[0]) for c in (BOTH_TILTS, OMEGA_ONLY)]
         elsewhere = np.nanmean([evaluate_designs(BOTH_TILTS, other, one)[0] for other in others])
         adjusted = jaxphoto.adjust(block, truth, sizes=sizes)
@@ -219,7 +217,7 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=100, help="noisy adjustments of each layout")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
-    of, usual = plan(0), planned_design(RECIPE.plan, CENTRE)
+    of, usual = plan(0), design_from_plan(RECIPE.plan, CENTRE)
     if given.layouts:
         designs = designs_of(pd.read_csv(given.layouts), usual)
     else:

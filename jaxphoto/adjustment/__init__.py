@@ -1,7 +1,7 @@
 """Least-squares adjustment of a block.
 
-What is adjusted lies in `model`; how it lies in memory, in `layout`; how it is solved, in `solver`. Whoever needs more
-of the last two than a result asks `NormalEquations`.
+`model` defines unknowns and residuals, `layout` their arrangement in memory, `solver` the solution. Other packages use
+`NormalEquations` rather than the last two.
 """
 
 from jaxphoto.adjustment.adjust import MAX_STEPS, LaidOut, common_sizes, lay_out, linearise, solve

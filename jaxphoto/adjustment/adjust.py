@@ -1,4 +1,4 @@
-"""The adjustment itself: block, start and priors in; unknowns with their normal equations out."""
+"""Least-squares adjustment: from block, start values and priors to unknowns and normal equations."""
 
 import dataclasses
 import functools
@@ -53,25 +53,25 @@ def solve(
     meanwhile: Callable[[NormalEquations, dict[str, float]], None] = lambda equations, seconds: None,
     losses: Mapping[str, AbstractLoss] = MappingProxyType({}),
 ) -> Adjustment:
-    """Least-squares adjustment of `block` from `start`, with what `priors` leaves free.
+    """Adjust `block` by least squares from `start`, with the unknowns that `priors` leaves free.
 
-    A pure function of the numbers in its arguments: `jax.grad`, `jax.jvp` and `jax.vmap` go through it (by the implicit
-    function theorem, exactly), as long as ids and index arrays stay concrete. `start` needs all images and points;
-    `jaxphoto.adjust` finds what is missing first.
+    A pure function of the numbers in its arguments. `jax.grad`, `jax.jvp` and `jax.vmap` apply (exactly, by the
+    implicit function theorem), with concrete ids and index arrays. `start` needs all images and points;
+    `jaxphoto.adjust` computes missing ones first.
 
-    `sizes` are sizes to compile for at least (`common_sizes`). `meanwhile` is called while the adjustment compiles,
-    with arrays of the types that its result will have, to `prepare` what will be wanted of it, and with its seconds.
+    `sizes` are minimum sizes to compile for (`common_sizes`). `meanwhile` is called during compilation with the
+    abstract result and its times, to `prepare` programs that will be needed.
 
-    `losses`, by group of observations, say what its rows cost in place of their squares. The unknowns are then where
-    all costs together are least, while residuals and normal equations of the result are those of least squares there:
-    `jaxphoto.robust` makes statistics of them.
+    `losses` replace squared residuals by group of observations. The unknowns then minimise the total loss, while
+    residuals and normal equations of the result are those of least squares there: `jaxphoto.robust` computes statistics
+    from them.
 
-    Raises DatumError where the observations leave the datum open and no constraint closes it, RankError where they
-    do not see an unknown or cannot tell unknowns apart.
+    Raises DatumError if the observations leave the datum open and no constraint closes it, RankError if they do not
+    determine an unknown or cannot separate unknowns.
     """
     laid = lay_out(block, start, priors, sizes)
     if not laid.traced and is_traced(block.start.unknowns):
-        # The result does not depend on them, and a derivative would be zero without a word.
+        # The result does not depend on them; a derivative would silently be zero.
         raise InputError(
             "a JAX transformation traces block.start, but the argument start was given and counts in its place: "
             "change start, or leave it out"
@@ -81,7 +81,7 @@ def solve(
     seconds: dict[str, float] = {}
     course: Course | None = None
     if laid.traced:
-        # As it is kept with the layout, it is hashed already.
+        # Stored with the layout, where it is already hashed.
         padded = dataclasses.replace(laid.padded, structure=structure) if losses else laid.padded
         found, state = _differentiable(numbers, padded, max_steps)
     else:
@@ -91,18 +91,18 @@ def solve(
             prepare(_residuals, (numbers, plain), seconds)
             meanwhile(NormalEquations(numbers, plain, _factored_like(numbers, plain)), seconds)
         found = run_compiled(_optimise, arguments, seconds, "solve")
-        # What comes back from several devices is of another type to a program than what went in.
+        # Arrays returned by several devices have another type than those passed in.
         state = UnknownArrays(*map(still, found.state))
         course = Course(*(still(v)[: int(found.steps)] for v in found.course))
     steps, converged = found.steps, found.converged
     assert steps is not None and converged is not None, "only of a tangent is this unknown"
-    # Its normal equations are the largest that there is, and made again.
+    # Its normal equations are the largest array, and are recomputed.
     del found
     adjusted = _at(state, laid, block, start, priors, seconds)
     adjusted = dataclasses.replace(adjusted, steps=steps, converged=converged, course=course, sizes=sizes)
     if laid.traced:
         return adjusted
-    # Numbers, also where a user's function around this is traced.
+    # Concrete numbers, also inside a traced function.
     with jax.ensure_compile_time_eval():
         tell_course(adjusted)
         if adjusted.astray.any():
@@ -113,16 +113,18 @@ def solve(
 
 @functools.partial(jax.jit, static_argnums=(1, 2))
 def _differentiable(values: PaddedValues, padded: PaddedBlock, max_steps: int) -> Any:
-    """The optimum and the state there. Operation by operation, its derivatives would be a thousand programs."""
+    """Return the optimum and its state as one program: operation by operation, derivatives would be a thousand
+    programs.
+    """
     s = padded.structure
     found = find_optimum(weigh_datum(values, s), s, to_optimum(max_steps), image_row_lists(padded))
     return found, state_at(found.increments, unit_scale(s), values, s)
 
 
 def linearise(block: Block, unknowns: Unknowns, priors: Unknowns, sizes: Sizes = LEAST) -> Adjustment:
-    """`block` where the unknowns are, not at its optimum: residuals and normal equations there, by `solve`'s programs.
+    """Evaluate residuals and normal equations of `block` at `unknowns`, which need not be its optimum.
 
-    What an adjustment of some of the observations says of all of them. Raises what `solve` raises before it computes.
+    Used to judge all observations after an adjustment of some. Raises what `solve` raises before it computes.
     """
     laid = lay_out(block, unknowns, priors, sizes)
     v = laid.padded_values
@@ -130,10 +132,10 @@ def linearise(block: Block, unknowns: Unknowns, priors: Unknowns, sizes: Sizes =
 
 
 def _at(state: UnknownArrays, laid: "LaidOut", block: Block, start: Unknowns, priors: Unknowns, seconds) -> Adjustment:
-    """All that an adjustment tells with the unknowns as they are in `state`."""
+    """Evaluate residuals and normal equations at `state`."""
     padded, numbers = laid.padded, with_start(laid.padded_values, state)
     structure, factored = padded.structure, None
-    # Statistics need the factored normal matrix; a derivative of the unknowns does not, and would pay for it dearly.
+    # Statistics need the factored normal matrix; derivatives of the unknowns do not, and would pay for it dearly.
     if not laid.traced:
         again = run_compiled(_optimise, (numbers, structure, to_factor()), seconds, "covariance")
         factored = gathered(again.factored)
@@ -156,7 +158,7 @@ def _at(state: UnknownArrays, laid: "LaidOut", block: Block, start: Unknowns, pr
 
 
 class LaidOut(NamedTuple):
-    """A block as it is computed with: index arrays and numbers, as given and in padded sizes."""
+    """Problem to solve: index arrays and numbers, in block order and padded."""
 
     padded: PaddedBlock
     values: Values
@@ -164,12 +166,12 @@ class LaidOut(NamedTuple):
 
     @property
     def traced(self) -> bool:
-        """Whether any number is traced by a transformation of JAX."""
+        """True if any number is traced by a JAX transformation."""
         return is_traced(self.values)
 
 
 def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAST, alone: bool = False) -> LaidOut:
-    """The block with its datum closed, in padded sizes; for one device where it is to be `alone`.
+    """Close the datum of a block and pad it; for one device if `alone`.
 
     Raises what `solve` raises before it computes.
     """
@@ -184,7 +186,7 @@ def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAS
     constraints = close_datum(block, values, structure)
     values = with_datum(values, constraints.eop, constraints.points)
     constrained, coupled = len(constraints.eop) > 0, bool(structure.coupled)
-    # Such rows may join points of two devices; of constraints, statistics have only the open motions in closed form.
+    # Such rows may join points of two devices; statistics handle constraints in closed form only for the open motions.
     alone = alone or is_traced(values) or coupled or (constrained and not n_open_motions(values, structure))
     shards = 1 if alone else _devices_worth_using(len(structure.image))
     dense = constrained or coupled
@@ -195,21 +197,21 @@ def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAS
     return LaidOut(padded, values, padded.pad(values))
 
 
-# A study may alternate between a few blocks. The index arrays of 1,000 images and a million image points are 30 MB.
+# A study may alternate between a few blocks. Index arrays of 1,000 images and a million image points take 30 MB.
 _LAYOUTS = 4
 _layouts: LruCache[tuple[Structure, dict[Hashable, PaddedBlock]]] = LruCache(_LAYOUTS)
 
 
 def _layout_key(block: Block, priors: Unknowns, observed: ObservedRows) -> Hashable:
-    """Return all that a layout depends on: ids, indices, what is free, and shapes, but no value of a number."""
+    """Return everything that a layout depends on: ids, indices, what is free, shapes, but no value of a number."""
     leaves, tree = jax.tree.flatten((block, priors))
-    # JAX sorts the keys of a dictionary, unknowns keep their order.
+    # JAX sorts dictionary keys; unknowns keep their order.
     order = tuple(entry.label for entry in observed.entries)
     return tree, order, *(np.shape(v) if is_float(v) else Content(np.asarray(v)) for v in leaves)
 
 
 def _factored_like(values: PaddedValues, structure: PaddedStructure) -> FactoredNormal:
-    """Arrays of the right types that take no memory."""
+    """Return arrays of the right types without memory."""
     zero = zero_increments(structure)
     system = jax.eval_shape(zero_system, zero, values, structure)
     reduced, factor, scale = jax.tree.map(
@@ -218,7 +220,7 @@ def _factored_like(values: PaddedValues, structure: PaddedStructure) -> Factored
     return FactoredNormal(reduced, factor, scale)
 
 
-# Image rows that keep a device busy for longer than adding its sums to those of others takes.
+# Number of image rows that keep a device busy for longer than the communication of its sums.
 _ROWS_PER_DEVICE = 20_000
 
 
@@ -227,7 +229,7 @@ def _devices_worth_using(rows: int) -> int:
 
 
 def common_sizes(blocks: Iterable[Block]) -> Sizes:
-    """Sizes that all of `blocks` fit into: `solve` with them compiles once for all that differ in numbers only."""
+    """Return sizes that fit all `blocks`: with them, `solve` compiles once for blocks that differ only in numbers."""
     return functools.reduce(operator.or_, (sizes_of(structure_of(b, b.priors)) for b in blocks), LEAST)
 
 

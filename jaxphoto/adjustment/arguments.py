@@ -1,4 +1,4 @@
-"""Checks of the arguments of an adjustment that no number is computed for: kinds, shapes, and numbers that are none."""
+"""Checks of the arguments of an adjustment: types, shapes, finite numbers."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -13,7 +13,7 @@ from jaxphoto.unknowns import Unknowns, is_prior
 
 
 def check_arguments(block: Any, start: Any, priors: Any) -> None:
-    """Raise InputError for arguments that cannot belong together; traced numbers are not looked at."""
+    """Raise InputError for inconsistent arguments; traced numbers are not examined."""
     if not isinstance(block, Block):
         raise InputError(f"adjust takes a Block first, got {type(block).__name__}")
     for name, tree, cure in (
@@ -31,7 +31,7 @@ def check_arguments(block: Any, start: Any, priors: Any) -> None:
 
 
 def _check_owners(name: str, tree: Unknowns, known: Unknowns) -> None:
-    """Raise InputError where an owner of parameters is missing."""
+    """Raise InputError if an owner of parameters is missing."""
     for camera in known.interior:
         if camera not in tree.interior:
             raise InputError(
@@ -44,11 +44,11 @@ def _check_owners(name: str, tree: Unknowns, known: Unknowns) -> None:
 
 
 def _check_models(start: Unknowns, priors: Unknowns) -> None:
-    """Raise InputError where priors are of other camera models than the start values."""
+    """Raise InputError if priors and start values belong to different camera models."""
     for camera, interior in start.interior.items():
         for part in ("distortion", "projection"):
             given, wanted = getattr(priors.interior[camera], part), getattr(interior, part)
-            # None in place of a prior is named by its parameter, later.
+            # A prior of None is reported later, by parameter.
             structure: Any = jax.tree.structure(given, is_leaf=lambda v: v is None or is_prior(v))
             if structure != jax.tree.structure(wanted):
                 found = f"another {type(given).__name__}" if type(given) is type(wanted) else type(given).__name__
@@ -72,10 +72,10 @@ def _check_shapes(block: Block, start: Unknowns) -> None:
 
 
 def _no_numbers(block: Block, start: Unknowns, priors: Unknowns) -> Iterator[str]:
-    """Labels of the numbers that are none."""
+    """Return the labels of NaN and infinite numbers."""
     for group, rows in block.named_observations.items():
         for name, values in (("value", rows.observation), ("sigma", rows.sigmas)):
-            # An infinite standard deviation means no weight.
+            # An infinite standard deviation means zero weight.
             bad = _bad(values, may_be_infinite=name == "sigma")
             if bad is not None:
                 words = np.broadcast_to(rows.words(block.images, block.points), np.shape(np.asarray(values).T))
@@ -92,7 +92,7 @@ def _no_numbers(block: Block, start: Unknowns, priors: Unknowns) -> Iterator[str
 
 
 def _bad(values: Any, may_be_infinite: bool = False) -> tuple[int, ...] | None:
-    """The index of the first number that is NaN or infinite; None where there is none, and where they are traced."""
+    """Return the index of the first NaN or infinite number; None if all are finite or traced."""
     array = still(values)
     if isinstance(array, jax.core.Tracer) or array.dtype.kind != "f":
         return None

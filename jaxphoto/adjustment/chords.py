@@ -1,11 +1,11 @@
-"""Many adjustments of one block by one factor: chord steps from the nominal optimum, with exact gradients.
+"""Many adjustments of one block with one factor: chord steps from the nominal optimum, with exact gradients.
 
 With N the nominal normal matrix, factored once, and G_i the gradient of draw i,
 
-    y <- y - N^-1 G_i(y)        until what is missing is small
+    y <- y - N^-1 G_i(y)        until the remaining distance is small
 
-converges to the optimum of draw i itself, because its gradient is exact; how fast, says how far N is from that draw's
-own. A draw whose steps do not shrink is left for a full adjustment.
+converges to the optimum of draw i itself, because its gradient is exact. The rate of convergence depends on the
+difference between N and the draw's own normal matrix. Draws whose steps do not contract need a full adjustment.
 """
 
 from typing import Any, NamedTuple
@@ -22,16 +22,16 @@ from jaxphoto.devices import AXIS, mesh_of
 
 TOLERANCE = 1e-6
 """No unknown of a draw misses its optimum by more than this fraction of its standard deviation."""
-# A draw is given up when a step is longer than this part of the one before, or after so many steps.
+# A draw is given up if a step is longer than this fraction of the previous one, or after this number of steps.
 _CONTRACTS, _MOST_STEPS = 0.5, 20
-# The part of the first step that is taken to be missing after it.
+# Fraction of the first step assumed to remain after it.
 _FIRST_RATIO = 0.1
-# What, besides measured image coordinates, moves the residuals of image rows.
+# Leaves other than image coordinates that change the residuals of image rows.
 _OF_IMAGE_ROWS = {"xy", "sigma_xy", "position", "rotation", "shared", "points"}
 
 
 class Found(NamedTuple):
-    """The unknowns of each draw (draws last), whether they are the optimum, and after how many steps."""
+    """Unknowns of each draw (draws last), convergence, and number of steps."""
 
     state: UnknownArrays
     settled: Bool[Array, "draws"]
@@ -39,13 +39,13 @@ class Found(NamedTuple):
 
 
 class Way(NamedTuple):
-    """Where the steps of each draw have led, draws last, in scaled increments from the nominal start."""
+    """State of the draws (last axis), in scaled increments from the nominal start."""
 
     y: Increments
     length: Float[Array, "draws"]
-    """Of the last step, sqrt(x' N x): at least |x| / sigma of every unknown."""
+    """Length of the last step, sqrt(x' N x): at least |x| / sigma of every unknown."""
     ratio: Float[Array, "draws"]
-    """Of the last two lengths."""
+    """Ratio of the last two lengths."""
     settled: Bool[Array, "draws"]
     failed: Bool[Array, "draws"]
     steps: Int[Array, "draws"]
@@ -53,7 +53,7 @@ class Way(NamedTuple):
 
 @eqx.filter_jit
 def find_optima(varying: Varying, common: Common, devices: int, first_only: bool) -> Found:
-    """The optimum of every draw, dealt out to `devices`; `first_only`, its first-order approximation."""
+    """Find the optimum of every draw, sharded over `devices`; `first_only` returns the first-order approximation."""
     if devices == 1:
         return _find(varying, common, first_only)
     last = lambda v: P(*[None] * (v.ndim - 1), AXIS)  # noqa: E731
@@ -73,7 +73,7 @@ def find_optima(varying: Varying, common: Common, devices: int, first_only: bool
 
 
 def _draws_last() -> Any:
-    """`Found`, dealt out along its draws."""
+    """Specify results sharded over draws."""
     each: Any = P(AXIS)
     position, rotation, shared, points = (P(*[None] * axes, AXIS) for axes in (2, 3, 1, 2))
     state: Any = (position, rotation, shared, points)
@@ -81,14 +81,13 @@ def _draws_last() -> Any:
 
 
 def _find(varying: Varying, common: Common, first_only: bool) -> Found:
-    """`find_optima` of what one device holds."""
+    """Find the optima of the draws on one device."""
     way = chord_steps(varying, common, first_only)
     return Found(states(way.y, varying, common), way.settled, way.steps)
 
 
 def chord_steps(varying: Varying, common: Common, first_only: bool = False, polished: bool = True) -> Way:
-    """Chord steps of every draw from the nominal optimum; `polished`, that is one to the last bit, where the nominal
-    gradient vanishes."""
+    """Iterate chord steps of every draw from the nominal optimum; if `polished`, its gradient is exactly zero."""
     size = next(iter(varying.values())).shape[-1]
     y = jax.tree.map(lambda v: jnp.broadcast_to(jnp.asarray(v)[..., None], (*v.shape, size)), common.at.increments)
     of_image_rows = bool(_OF_IMAGE_ROWS & set(varying))
@@ -96,7 +95,7 @@ def chord_steps(varying: Varying, common: Common, first_only: bool = False, poli
     way = Way(y, jnp.full(size, jnp.inf), jnp.zeros(size), none, none, jnp.zeros(size, int))
     if not of_image_rows:
         way = _taken(way, _others_alone(y, varying, common), common)
-        # What is left of the nominal gradient may be more than the tolerance.
+        # The remaining nominal gradient may exceed the tolerance.
         way = way if polished else way._replace(settled=none)
     elif first_only:
         way = _taken(way, _all(y, varying, common), common)
@@ -110,7 +109,7 @@ def chord_steps(varying: Varying, common: Common, first_only: bool = False, poli
 
 
 def _taken(way: Way, b: Increments, common: Common) -> Way:
-    """One step, of the draws that are still under way, by their gradients `b`."""
+    """Take one step with the gradients `b` for the draws that have not finished."""
     x = _solutions(b, common)
     length = _length(x, b)
     ratio = jnp.where(jnp.isinf(way.length), _FIRST_RATIO, length / jnp.maximum(way.length, 1e-300))
@@ -118,12 +117,12 @@ def _taken(way: Way, b: Increments, common: Common) -> Way:
     contracts = (ratio <= _CONTRACTS) & (way.steps < _MOST_STEPS)
     worst = jnp.maximum(ratio, way.ratio)
     missing = length * worst / jnp.maximum(1 - worst, 1e-3)
-    # Steps below the tolerance are rounding, which need not shrink.
+    # Steps below the tolerance are rounding, which need not contract.
     settled = active & ((missing <= TOLERANCE) & contracts | (length <= 0.1 * TOLERANCE))
     return Way(
         y=jax.tree.map(lambda a, d: jnp.where(active, a - d, a), way.y, x),
         length=length,
-        # What was assumed of the first says nothing about the second.
+        # The assumption about the first step does not apply to the second.
         ratio=jnp.where(jnp.isinf(way.length), 0.0, ratio),
         settled=way.settled | settled,
         failed=way.failed | (active & ~settled & ~contracts),
@@ -132,12 +131,12 @@ def _taken(way: Way, b: Increments, common: Common) -> Way:
 
 
 def _all(y: Increments, varying: Varying, common: Common) -> Increments:
-    """The gradient of each draw."""
+    """Return the gradient of each draw."""
     return jax.tree.map(jnp.add, image_gradients(y, varying, common), other_gradients(y, varying, common))
 
 
 def _others_alone(zero: Increments, varying: Varying, common: Common) -> Increments:
-    """The gradient at the nominal optimum of draws whose image rows are the nominal ones: these cancel there."""
+    """Return the gradient at the nominal optimum for draws with nominal image rows, which cancel there."""
     nominal = other_gradients(jax.tree.map(lambda v: v[..., :1], zero), {}, common)
     return jax.tree.map(jnp.subtract, other_gradients(zero, varying, common), nominal)
 
@@ -147,6 +146,6 @@ def _solutions(b: Increments, common: Common) -> Increments:
 
 
 def _length(x: Increments, b: Increments) -> Float[Array, "draws"]:
-    """sqrt(x' N x), of x = N^-1 b."""
+    """Return sqrt(x' N x) of x = N^-1 b."""
     along = (jnp.sum(u * v, axis=tuple(range(u.ndim - 1))) for u, v in zip(x, b, strict=True))
     return jnp.sqrt(jnp.maximum(sum(along, jnp.zeros(())), 0.0))

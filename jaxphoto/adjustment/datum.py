@@ -1,9 +1,9 @@
-"""The datum: what position, orientation and scale observations leave open, and the constraints that close it.
+"""Datum: position, orientation and scale that observations leave open, and the constraints that close it.
 
-The seven parameters of a similarity (3 shifts, 3 rotations, scale) move images and points together without
-changing any image coordinate. Only other observations (control, stations, distances ...) and fixed unknowns see them,
-perhaps together with a free shift or lever arm. What none sees is the datum defect; inner or minimal constraints fill
-it.
+The seven parameters of a similarity transformation (3 shifts, 3 rotations, scale) move images and points together
+without changing any image coordinate. Only other observations (control, stations, distances ...) and fixed unknowns
+determine them, possibly only in combination with a free shift or lever arm. What none determines is the datum defect,
+closed by inner or minimal constraints.
 """
 
 from typing import TYPE_CHECKING
@@ -26,21 +26,20 @@ from jaxphoto.observations import PRIORS, ControlRows
 if TYPE_CHECKING:
     from jaxphoto.adjustment.datum_sensitivity import SeenMotions
 
-# A rotation (rad), or a scale, that observations know no better than this is as good as open: it is no longer small.
+# A rotation (rad) or scale determined no better than this is as good as open: it is no longer small.
 _VAGUE = 0.05
 
 
 def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows:
-    """The constraints that close what the observations leave open (leading axis: the defect).
+    """Return the constraints that close the datum defect (leading axis: the defect).
 
-    Raises DatumError where the block's datum is open and its kind "control", or where the constraints asked for cannot
-    close it.
+    Raises DatumError if the datum is open and its kind is "control", or if the requested constraints cannot close it.
     """
     judged = block.datum.kind == "control" and not is_traced((values, block))
     without_place = is_traced((values.points, values.position)) and is_traced(block.start.unknowns)
     values = _concrete(values, block)
     if judged:
-        # Where things were observed to be: approximate values scatter about a line on which control lies.
+        # At observed places: approximate values scatter about a line on which control lies.
         values = _as_observed(block, values)
     if _plainly_closed(block, values, structure, _VAGUE if judged else np.inf):
         return DatumRows(np.zeros((0, 6, structure.n_images)), np.zeros((0, 3, structure.n_points)))
@@ -87,10 +86,10 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
 
 
 def _concrete(values: Values, block: Block) -> Values:
-    """The same values with numbers for what is being traced: the datum depends on where things are, roughly.
+    """Replace traced numbers: the datum depends only roughly on positions.
 
-    Where nothing says where they are, they are anywhere: what observations see of the datum is a matter of who observed
-    what, but for coincidences.
+    Unknown positions are drawn at random: whether observations determine the datum depends on which observation touches
+    what, except for coincidences.
     """
     known = block.start.unknowns
     place = {"position": known.exterior.position, "points": known.points}
@@ -98,7 +97,7 @@ def _concrete(values: Values, block: Block) -> Values:
     anywhere = np.random.default_rng(0)
 
     def number(path, v):
-        # Derivatives need the number alone, which they come with.
+        # Derivatives need only the primal number.
         v = jax.lax.stop_gradient(v)
         if not isinstance(v, jax.core.Tracer):
             return np.asarray(v)
@@ -107,14 +106,14 @@ def _concrete(values: Values, block: Block) -> Values:
             return near[name]
         if name in ("rotation", "nominal", "whitener"):
             return np.broadcast_to(np.eye(v.shape[0])[..., None], v.shape)
-        # Standard deviations weigh as one.
+        # All standard deviations equal one.
         return np.ones(v.shape) if name in ("sigma", "sigma_xy") else anywhere.normal(size=v.shape)
 
     return jax.tree_util.tree_map_with_path(number, values)
 
 
 def _as_observed(block: Block, values: Values) -> Values:
-    """The same with control points and images where they were observed to be."""
+    """Move control points and images to their observed places."""
     position, points = np.array(values.position), np.array(values.points)
     position[block.stations.axis, block.stations.who] = still(block.stations.value)
     points[block.control.axis, block.control.who] = still(block.control.value)
@@ -122,10 +121,10 @@ def _as_observed(block: Block, values: Values) -> Values:
 
 
 def _plainly_closed(block: Block, values: Values, structure: Structure, vague: float) -> bool:
-    """Three full control points (or stations without free mounts and strips) that do not lie on a line will do.
+    """Return True for three full control points (or stations without free mounts and strips) that are not collinear.
 
-    They do where the rotation about the line that fits them best is known better than `vague` (rad). Without images
-    nothing is there to move but points, and nothing at all where these are control, every one.
+    They suffice if the rotation about their line of best fit is determined better than `vague` (rad). Without images
+    only points can move, and nothing can if all of these are control.
     """
     seen = np.zeros((3, structure.n_points))
     seen[block.control.axis, block.control.who] = 1
@@ -147,7 +146,7 @@ def _plainly_closed(block: Block, values: Values, structure: Structure, vague: f
 
 
 def _check_vague(block: Block, sensitivity: "SeenMotions", named: list[str]) -> None:
-    """Raise DatumError where observations close the datum by their noise alone, as control on a line does."""
+    """Raise DatumError if observations close the datum only by their noise, as control on a line does."""
     weak, sigma = sensitivity.weak_motions(_VAGUE)
     if len(weak):
         raise DatumError(datum_sentence(weak, block, named, sigma))
@@ -163,7 +162,7 @@ def _motions(values: Values) -> DatumRows:
 def _datum_sensitivity(
     block: Block, values: Values, s: Structure, motions: DatumRows
 ) -> tuple["SeenMotions", list[str]]:
-    """What is seen of the motions, and names of the free declared unknowns that may go along with them."""
+    """Return the sensitivity of rows to the motions, and names of free declared unknowns that may compensate them."""
     from jaxphoto.adjustment.datum_sensitivity import SeenMotions, row_sensitivity
 
     own = [j for j, k in enumerate(s.free) if k >= s.n_cameras]
@@ -186,7 +185,7 @@ def _datum_sensitivity(
 
 
 def _control_sigma(values: Values, s: Structure) -> np.ndarray:
-    """Standard deviations of the control (m)."""
+    """Return the standard deviations of the control (m)."""
     groups = zip(s.observed, values.groups, strict=True)
     return np.concatenate(
         [np.zeros(0), *(np.asarray(rows_of(g, n).sigmas) for g, n in groups if g.name == ControlRows.group)]
@@ -200,7 +199,7 @@ def _combine(motions: DatumRows, combinations: np.ndarray) -> DatumRows:
 
 
 def _inner(null: DatumRows, block: Block, over) -> DatumRows:
-    """Inner constraints: the open motions themselves, restricted to the positions or points they are taken over."""
+    """Return inner constraints: the open motions, restricted to the positions or points over which they are taken."""
     if over == "images":
         eop = null.eop.copy()
         eop[:, 3:] = 0.0
@@ -218,7 +217,7 @@ def _orthonormal(rows: DatumRows) -> DatumRows:
 
 
 def _minimal(null: DatumRows, structure: Structure) -> DatumRows:
-    """As few point coordinates as the defect asks for, chosen by pivoting so that they fix it best."""
+    """Return as many fixed point coordinates as the defect requires, chosen by pivoting for best conditioning."""
     k = len(null.points)
     flat = null.points.transpose(0, 2, 1).reshape(k, -1) * structure.point_free.T.reshape(-1)
     rows = np.zeros_like(flat)

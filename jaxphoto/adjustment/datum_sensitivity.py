@@ -1,7 +1,7 @@
-"""What the observations of a block see of its seven motions, whatever the declared unknowns do.
+"""Sensitivity of the observations to the seven datum motions, for any change of the declared unknowns.
 
-Unknowns that rows of their own determine, as priors do and steps from knot to knot of a trajectory, cannot go along
-with a motion that no row sees. They may be thousands: their rows are kept sparse, and only their normal matrix is full.
+Unknowns determined by rows of their own, such as priors and steps between knots of a trajectory, cannot compensate a
+motion that no row sees. There may be thousands: their rows are sparse, only their normal matrix is full.
 """
 
 from dataclasses import dataclass, replace
@@ -23,38 +23,38 @@ from jaxphoto.compiling import jit_quickly
 
 # Singular values of a scaled sensitivity below this are zero.
 _OPEN = 1e-9
-# The same of their squares, as far as double precision tells these from zero.
+# The same for their squares, as far as double precision separates these from zero.
 _OPEN_SQUARED = 1e-13
-# Squares above this are no zeros, however they were rounded.
+# Squares above this are not zero, whatever the rounding.
 _PLAIN = 1e-10
-# Of so many rows for each column a triangle is made at once.
+# Number of rows per column that are triangularised at a time.
 _WIDE = 4
-# Numbers of rows are compiled for in steps of so many.
+# Step of the numbers of rows that are compiled for.
 _ROWS = 64
 
 
 @dataclass(frozen=True)
 class SeenMotions:
-    """d(rows / sigma) / d(motions, declared unknowns): columns of the seven motions, then one of each unknown."""
+    """d(rows / sigma) / d(motions, declared unknowns): columns of the seven motions, then one per unknown."""
 
     placed: scipy.sparse.csr_array
     """Rows that touch images or points."""
     alone: scipy.sparse.csr_array
-    """Rows that touch declared unknowns alone."""
+    """Rows that touch only declared unknowns."""
 
     def null_motions(self) -> Float[np.ndarray, "defect 7"]:
-        """Combinations of the seven motions that no row sees, orthonormal; unknowns may go along.
+        """Return orthonormal combinations of the seven motions that no row sees; unknowns may compensate them.
 
-        Those that rows of their own determine may not: else these would see it.
+        Unknowns determined by rows of their own may not: otherwise these rows would see the motion.
         """
         open_ones = np.setdiff1d(np.arange(7, self.alone.shape[1]), self.determined)
         kept = np.concatenate([np.arange(7), open_ones])
         sensitivity = scipy.sparse.vstack([self.placed, self.alone]).tocsr()[:, kept].toarray()
-        # Those that see none of these are many.
+        # Most rows see none of these.
         sensitivity = sensitivity[sensitivity.any(axis=1)]
         if not len(sensitivity):
             return np.eye(7)
-        # The motions are alike in size by construction; the unknowns are brought to the same.
+        # Motions have similar size by construction; unknowns are scaled accordingly.
         norm = np.sqrt((sensitivity**2).sum(0))
         norm[:7] = norm[:7].max()
         norm = np.where(norm > 0, norm, 1.0)
@@ -62,16 +62,17 @@ class SeenMotions:
         _, s, vt = np.linalg.svd(np.linalg.qr(sensitivity / norm, mode="r"), full_matrices=True)
         rank = int((s > _OPEN * max(s.max(initial=0.0), 1e-300)).sum())
         if np.abs(vt[rank:, :7]).max(initial=0.0) < _OPEN:
-            # What nothing sees are unknowns alone, such as a camera's rates: their parts of the motions are round-off.
+            # Motions of unknowns alone, such as a camera's rates, are unseen: their parts of the motions are rounding.
             return np.zeros((0, 7))
         null = (vt[rank:] / norm)[:, :7]
         _, s2, basis = np.linalg.svd(null / max(np.abs(null).max(initial=0.0), 1e-300), full_matrices=False)
         return basis[s2 > 1e-9]
 
     def weak_motions(self, sigma: float) -> tuple[Float[np.ndarray, "weak 7"], float]:
-        """Combinations of motions whose rotations and scale are known no better than `sigma` (rad), and the worst.
+        """Return combinations of motions whose rotations and scale are determined no better than `sigma` (rad), and the
+        worst.
 
-        All unknowns go along, as far as rows of their own let them.
+        All unknowns compensate as far as rows of their own allow.
         """
         rows = scipy.sparse.vstack([self.placed, self.alone]).tocsr()
         normal = (rows.T @ rows).toarray()
@@ -79,23 +80,23 @@ class SeenMotions:
         kept = np.setdiff1d(np.arange(len(normal)), gone)
         normal = _eliminated(normal[np.ix_(kept, kept)], normal[np.ix_(kept, gone)], normal[np.ix_(gone, gone)])
         squares, directions = np.linalg.eigh(_eliminated(normal[:7, :7], normal[:7, 7:], normal[7:, 7:]))
-        # Of the rotations and the scale in each: they are seen through the shifts that go along.
+        # Only rotations and scale: shifts that accompany them make them visible.
         found = np.linalg.norm(directions[3:], axis=0) / np.sqrt(np.maximum(squares, 1e-300))
         return directions.T[found > sigma], float(found.max())
 
     @classmethod
     def of_motions(cls, rows: Float[np.ndarray, "rows 7"]) -> "SeenMotions":
-        """Rows that see motions alone, and no unknowns."""
+        """Create from rows that see only motions."""
         return cls(scipy.sparse.csr_array(rows), scipy.sparse.csr_array((0, 7)))
 
     def with_motions(self, rows: Float[np.ndarray, "rows 7"]) -> "SeenMotions":
-        """With rows more, which see motions alone."""
+        """Append rows that see only motions."""
         more = scipy.sparse.csr_array(np.pad(rows, [(0, 0), (0, self.placed.shape[1] - 7)]))
         return replace(self, placed=scipy.sparse.vstack([self.placed, more]).tocsr())
 
     @cached_property
     def determined(self) -> Int[np.ndarray, "k"]:
-        """Columns of unknowns that their own rows determine, which is judged of all together that these join."""
+        """Return columns of unknowns determined by their own rows, judged for all that these rows join together."""
         own = self.alone[:, 7:].tocsc()
         count, part = scipy.sparse.csgraph.connected_components(own.T @ own, directed=False)
         found = [np.zeros(0, int)]
@@ -108,13 +109,13 @@ class SeenMotions:
 
 
 def _determines_all(rows: scipy.sparse.csr_array) -> bool:
-    """Whether rows determine each of their columns; of a hundred thousand rows most are never full."""
+    """Return True if rows determine each of their columns; of 100,000 rows most never become dense."""
     n = rows.shape[1]
     rows = rows @ scipy.sparse.diags_array(1 / np.sqrt(rows.power(2).sum(axis=0)))
     squares = np.linalg.eigvalsh((rows.T @ rows).toarray())
     if squares[0] > _PLAIN * squares[-1]:
         return True
-    # Of the rest squares say too little. A triangle has the singular values of the rows that it came from.
+    # Squares are inconclusive for the rest. A triangle has the singular values of its rows.
     triangle: np.ndarray = np.zeros((0, n))
     for first in range(0, rows.shape[0], _WIDE * n):
         triangle = np.asarray(np.linalg.qr(np.vstack([triangle, rows[first : first + _WIDE * n].toarray()]), mode="r"))
@@ -125,7 +126,7 @@ def _determines_all(rows: scipy.sparse.csr_array) -> bool:
 def _eliminated(
     kept: Float[np.ndarray, "n n"], cross: Float[np.ndarray, "n k"], gone: Float[np.ndarray, "k k"]
 ) -> Float[np.ndarray, "n n"]:
-    """The normal matrix without some unknowns; what nothing sees of these changes nothing."""
+    """Eliminate some unknowns from the normal matrix; unknowns that no row sees change nothing."""
     size = np.sqrt(np.diag(gone))
     size = np.where(size > 0, size, 1.0)
     values, vectors = np.linalg.eigh(gone / size / size[:, None])
@@ -137,9 +138,9 @@ def _eliminated(
 def row_sensitivity(
     values: Values, s: Structure, motions: DatumRows, chosen: Int[np.ndarray, "unknowns"]
 ) -> SeenMotions:
-    """Of all rows but those of image points, which see no motion; `chosen` are the shared unknowns that it is by."""
+    """Return the sensitivity of all rows except image rows, which see no motion; `chosen` are shared unknowns."""
     width = 7 + len(chosen)
-    # What is not chosen, and what means no unknown, has a column behind the last.
+    # Unknowns not chosen, and missing ones, have an extra last column.
     place = np.full(s.n_shared + 1, width)
     place[chosen] = 7 + np.arange(len(chosen))
     found: dict[bool, list[scipy.sparse.csr_array]] = {
@@ -160,13 +161,13 @@ def row_sensitivity(
 
 
 def _in_few_sizes(values: Values, s: Structure) -> tuple[Values, Structure]:
-    """Without image rows, and the others in sizes of which there are few.
+    """Drop image rows and pad the others to few sizes.
 
-    A search for blunders leaves out a row or two at a time, and each size is compiled for.
+    A search for blunders removes a row or two at a time, and each size is compiled separately.
     """
     observed, numbers = [], []
     for g, own in zip(s.observed, values.groups, strict=True):
-        # Of rows with many numbers a few may fill the memory.
+        # A few rows with many numbers may fill the memory.
         more = size_class(g.n_rows, max(1, _ROWS // g.components)) - g.n_rows
 
         def longer(v: Any, more: int = more) -> np.ndarray:
@@ -186,13 +187,13 @@ def _in_few_sizes(values: Values, s: Structure) -> tuple[Values, Structure]:
 
 @jit_quickly
 def _slopes(values: Values, s: Structure, motions: DatumRows):
-    """Of each group the derivatives of its rows by the motions and by the shared unknowns that each touches."""
+    """Return derivatives of the rows of each group by the motions and by the shared unknowns they touch."""
     zero = zero_increments(s)
     one = jax.tree.map(jnp.ones_like, zero)
     slopes = []
     for g, numbers in zip(s.observed, values.groups, strict=True):
         row = row_jacobian(g, numbers, zero, one, values, s)
-        # Rows last, of each an image's or point's numbers.
+        # Rows last, with the numbers of one image or point each.
         by_motion = jnp.einsum("ckar,makr->cmr", row.eop, jnp.asarray(motions.eop)[..., g.image])
         by_motion += jnp.einsum("cjar,majr->cmr", row.points, jnp.asarray(motions.points)[..., g.point])
         slopes.append((by_motion, row.shared))

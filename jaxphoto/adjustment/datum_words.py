@@ -1,4 +1,4 @@
-"""What a datum leaves open, in words: the motions by name, what there is to see them, and the mend."""
+"""Messages about an open datum: the motions by name, the observations present, and the cure."""
 
 import numpy as np
 from jaxtyping import Float
@@ -18,9 +18,9 @@ MOTIONS = (
 
 
 def motion_names(combinations: Float[np.ndarray, "n motions"]) -> list[str]:
-    """Names of the motions that combinations are made of.
+    """Return the names of the motions in combinations.
 
-    A rotation about another place than the centre is one with a shift: shifts are told only where there are more
+    A rotation about a point other than the centre includes a shift: shifts are named only if there are more
     combinations than rotations and scale.
     """
     shares = np.sqrt((combinations**2).sum(0))
@@ -30,7 +30,7 @@ def motion_names(combinations: Float[np.ndarray, "n motions"]) -> list[str]:
 
 
 def datum_sentence(null_motions: np.ndarray, block: Block, named: list[str], sigma: float = np.inf) -> str:
-    """What is open, of what there is, and the mend; `sigma` of what is closed by noise alone (rad, or a part of 1)."""
+    """Return what is open, the observations present, and the cure; `sigma` if closed by noise (rad, or relative)."""
     names = motion_names(null_motions)
     counts = {rows.group: int(np.size(rows.observation)) for rows in block.observations if len(rows)}
     if n := counts.pop(ControlRows.group, 0) + len(block.fixed.who):

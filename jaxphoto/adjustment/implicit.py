@@ -1,8 +1,8 @@
-"""The optimum of a block as a function of its numbers: its derivatives by the implicit function theorem.
+"""Derivatives of the optimum with respect to the numbers of a block, by the implicit function theorem.
 
-At the optimum the gradient G(y, v) of half the weighted square sum vanishes, so dy = -H^-1 (dG/dv) dv with H the full
-second derivative (Gauss-Newton part and curvature). H is never formed: conjugate gradients on products with it,
-preconditioned by the factored normal matrix, from which it differs by the residuals' curvature only.
+At the optimum the gradient G(y, v) of half the weighted sum of squares vanishes, so dy = -H^-1 (dG/dv) dv with H the
+full second derivative (Gauss-Newton part and curvature). H is never formed: conjugate gradients use products with it,
+preconditioned by the factored normal matrix, from which it differs only by the curvature of the residuals.
 """
 
 from functools import partial
@@ -26,11 +26,11 @@ from jaxphoto.adjustment.solver.reduced import reduce_normal
 
 
 def find_optimum(values: PaddedValues, structure: PaddedStructure, task: Task, rows: ImageRowLists) -> Optimum:
-    """Levenberg-Marquardt from the start in `values`; under `jax.vmap`, `side_by_side`.
+    """Run Levenberg-Marquardt from the start in `values`; under `jax.vmap`, use `side_by_side`.
 
     Differentiable in every number of `values`.
     """
-    # Indices stay concrete: they are no arguments of what is differentiated and mapped.
+    # Indices stay concrete: they are not arguments of the differentiated and mapped function.
     find = eqx.filter_custom_jvp(lambda values: optimum_of(values, structure, task, rows))
 
     @find.def_jvp
@@ -43,10 +43,10 @@ def find_optimum(values: PaddedValues, structure: PaddedStructure, task: Task, r
 
 
 def _derivative(values: PaddedValues, direction: Any, at: Increments, structure: PaddedStructure) -> Optimum:
-    """How the optimum, which is `at` these increments, moves with the values."""
+    """Differentiate the optimum, at these increments, with respect to the values."""
     scale = typical_scale(values, structure)
 
-    # What batching rules call again closes over no array: a rule may run in another trace.
+    # Functions called by batching rules close over no array: a rule may run in another trace.
     def gradient(increments, numbers):
         unit = unit_scale(structure)
         residuals, pull = jax.vjp(lambda y: Linearised(y, unit, numbers, structure).residuals(), increments)
@@ -55,7 +55,7 @@ def _derivative(values: PaddedValues, direction: Any, at: Increments, structure:
     moved, still = eqx.partition(values, jax.tree.map(lambda t: t is not None, direction, is_leaf=lambda t: t is None))
     _, change = jax.jvp(lambda m: gradient(at, eqx.combine(m, still)), (moved,), (direction,))
     right, unravel = ravel_pytree(jax.tree.map(lambda c, k: -c * k, change, scale))
-    # One flat vector: the transposed solve wants all of its right-hand side to depend on the direction, or none.
+    # One flat vector: the transposed solution requires that its right-hand side depends on the direction as a whole.
     flat = lambda tree: ravel_pytree(tree)[0]  # noqa: E731
 
     # jit keeps the trace for the product and for its inverse.
@@ -68,9 +68,9 @@ def _derivative(values: PaddedValues, direction: Any, at: Increments, structure:
 
     @jax.custom_batching.custom_vmap
     def solve(of_block, rights):
-        """x of H x = b, of the rows of `rights`."""
+        """Solve H x = b for the rows of `rights`."""
         values, at, scale = of_block
-        # The preconditioner belongs to the optimum: it wants its place in scaled increments.
+        # The preconditioner belongs to the optimum, and needs its place in scaled increments.
         place = jax.tree.map(lambda a, k: jnp.where(k > 0, a / jnp.where(k > 0, k, 1.0), 0.0), at, scale)
         there = Linearised(place, scale, values, structure).for_normal_equations
         a, reduced, _ = reduce_normal(there, 0.0)
@@ -85,7 +85,7 @@ def _derivative(values: PaddedValues, direction: Any, at: Increments, structure:
 
     @solve.def_vmap
     def rule(size: int, batched: list[Any], of_block: Any, rights: Array) -> tuple[Array, bool]:
-        """Many right-hand sides of one block share its factor; many blocks are solved one at a time."""
+        """Batching rule: right-hand sides of one block share its factor; several blocks are solved one at a time."""
         if not any(jax.tree.leaves(batched[0])):
             found = solve(of_block, rights.reshape(-1, rights.shape[-1]))
             return found.reshape(rights.shape), True

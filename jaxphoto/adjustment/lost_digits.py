@@ -1,4 +1,4 @@
-"""Warnings of numbers that are known to fewer digits than an adjustment needs (docs/precision.md)."""
+"""Warnings about numbers with fewer digits than an adjustment needs (docs/precision.md)."""
 
 import warnings
 
@@ -10,7 +10,7 @@ from jaxphoto.unknowns import Unknowns
 
 
 def warn_of_lost_digits(block: Block, start: Unknowns, priors: Unknowns) -> None:
-    """Warn where JAX computes in 32 bits, and where numbers were given in fewer than 64."""
+    """Warn if JAX computes in 32 bits, and about numbers given with fewer than 64."""
     if not jax.config.values["jax_enable_x64"]:
         warnings.warn(
             "JAX computes with 32 bits (jax_enable_x64 was switched off after jaxphoto was imported): an adjustment "

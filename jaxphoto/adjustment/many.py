@@ -1,15 +1,14 @@
-"""The gradients of many adjustments of one block at once.
+"""Gradients of many adjustments of one block.
 
-Adjustments that differ in numbers only are computed side by side: arrays end in the axis of the draws, so that what
-belongs to an image row is read and written in whole stretches. Unlike in the rays of a single adjustment
-(`adjustment.layout`) there is no empty slot: image rows are listed, and gather and scatter such stretches, a chunk of
-rows at a time, whose numbers stay in the cache of a core.
+Adjustments that differ only in numbers are computed side by side. The last axis runs over the draws, so the numbers of
+an image row are contiguous. Unlike the rays of a single adjustment (`adjustment.layout`) there are no empty slots:
+image rows are listed, and gather and scatter contiguous numbers in chunks that fit in the cache of a core.
 
-With u the point of an image row in the camera frame and q half the square of its weighted residuals,
+With u the point of an image row in the camera frame and q half the sum of its squared weighted residuals,
 
     dq/d(image) = (du/d(image))' dq/du,    dq/d(point) = (du/d(point))' dq/du,    dq/d(camera)
 
-all by automatic differentiation of the model of one row, each kept before it is summed: XLA computes what it fuses anew
+by automatic differentiation of the model of one row. Each is stored before it is summed: XLA recomputes what it fuses
 for every result that needs it.
 """
 
@@ -38,15 +37,15 @@ from jaxphoto.georeferencing.corrections import NO_CORRECTIONS
 from jaxphoto.rotation import rotate
 
 Varying = dict[str, Array]
-"""Leaves of `Values`, by `path_name`, that differ between draws, which are their last axis; `xy` and `sigma_xy` by row
-of the block."""
+"""Leaves of `Values`, by `path_name`, that differ between draws (last axis); `xy` and `sigma_xy` by row of the block.
+"""
 
 
 class Common(eqx.Module):
-    """What all draws have in common, in padded sizes; image rows (2, rows) by row of the block."""
+    """Data common to all draws, in padded sizes; image rows (2, rows) by row of the block."""
 
     at: Linearised
-    """The nominal optimum, from which all draws begin."""
+    """Nominal optimum, at which all draws start."""
     factored: FactoredNormal
     xy: Float[Numbers, "2 rows"]
     sigma_xy: Float[Numbers, "2 rows"]
@@ -54,26 +53,26 @@ class Common(eqx.Module):
 
     @property
     def values(self) -> PaddedValues:
-        """The nominal numbers."""
+        """Nominal numbers."""
         return self.at.values
 
     @property
     def scale(self) -> Increments:
-        """Of increments."""
+        """Scale of the increments."""
         return self.at.scale
 
     @property
     def structure(self) -> PaddedStructure:
-        """That of the nominal adjustment."""
+        """Structure of the nominal adjustment."""
         return self.at.structure
 
     def solve(self, b: Increments) -> Increments:
-        """x of N x = b, with the nominal N; of many by `jax.vmap`."""
+        """Solve N x = b with the nominal N; use `jax.vmap` for many."""
         return solve_factored(self.factored.reduced, self.factored.factor, b, self.at)
 
 
 def held_in(structure: PaddedStructure, parameters: int) -> dict[str, np.ndarray]:
-    """What is fixed, by the leaves of `Values` that unknowns start at: of these, only that tells draws apart."""
+    """Return masks of fixed values by leaf of `Values` with start values: only fixed ones distinguish draws."""
     s = structure
     return {
         "position": s.eop_free[:3] == 0,
@@ -84,7 +83,7 @@ def held_in(structure: PaddedStructure, parameters: int) -> dict[str, np.ndarray
 
 
 def states(y: Increments, varying: Varying, common: Common) -> UnknownArrays:
-    """The unknowns of every draw at its increments, draws last."""
+    """Return the unknowns of every draw at its increments, draws last."""
 
     def one(y: Increments, varying: Varying) -> UnknownArrays:
         return state_at(y, common.scale, _values_with(varying, common), common.structure)
@@ -93,7 +92,7 @@ def states(y: Increments, varying: Varying, common: Common) -> UnknownArrays:
 
 
 def other_gradients(y: Increments, varying: Varying, common: Common) -> Increments:
-    """The part of J'r, draws last, that is due to all but the image rows."""
+    """Return the part of J'r of all rows except image rows, draws last."""
 
     def one(y: Increments, varying: Varying) -> Increments:
         values = _values_with(varying, common)
@@ -104,7 +103,7 @@ def other_gradients(y: Increments, varying: Varying, common: Common) -> Incremen
 
 
 def image_gradients(y: Increments, varying: Varying, common: Common) -> Increments:
-    """The part of J'r, draws last, that is due to the image rows."""
+    """Return the part of J'r of the image rows, draws last."""
     state, pull = jax.vjp(lambda y: states(y, varying, common), y)
     xy, sigma = (jnp.asarray(varying.get(name, getattr(common, name))) for name in ("xy", "sigma_xy"))
     cotangent = jax.tree.map(jnp.zeros_like, state)
@@ -123,7 +122,7 @@ def image_gradients(y: Increments, varying: Varying, common: Common) -> Incremen
 
 
 def _bent_cameras(shared: Float[Array, "parameters draws"], varying: Varying, common: Common) -> tuple[Array, ...]:
-    """Of each group of cameras the parameters by image (images, m, draws), bent by what is declared to bend them."""
+    """Return the parameters of each camera group by image (images, m, draws), including declared modifications."""
     return jax.vmap(
         lambda shared, varying: cameras_at(shared, _values_with(varying, common), common.structure), (-1, -1), -1
     )(shared, varying)
@@ -132,29 +131,29 @@ def _bent_cameras(shared: Float[Array, "parameters draws"], varying: Varying, co
 def _values_with(varying: Varying, common: Common) -> PaddedValues:
     def of_draw(path: Any, nominal: Any) -> Any:
         name = path_name(path)
-        # Those of image rows are not in padded sizes, and nobody looks for them there.
+        # Image rows are not padded here, and their parameters are not needed.
         return nominal if name in ("xy", "sigma_xy") else varying.get(name, nominal)
 
     return jax.tree_util.tree_map_with_path(of_draw, common.values)
 
 
 def path_name(path: Any) -> str:
-    """What `Varying` calls a leaf of `Values`, such as `shared` and `groups[0].listed.value`."""
+    """Return the name of a leaf of `Values`, such as `shared` and `groups[0].listed.value`."""
     return jax.tree_util.keystr(path)[1:]
 
 
 def _each_row(function: Callable, *arrays: Any) -> Any:
-    """`function` of every row (first axis) and draw (last axis)."""
+    """Map `function` over rows (first axis) and draws (last axis)."""
     return jax.vmap(jax.vmap(function, -1, -1))(*arrays)
 
 
 class _Sums(NamedTuple):
-    """What the image rows of a group add up to: derivatives of the sum of q, draws last."""
+    """Sums over the image rows of a group: derivatives of the sum of q, draws last."""
 
     centre: Float[Array, "images 3 draws"]
     turn: Float[Array, "images 3 draws"]
     cameras: Float[Array, "owners m draws"]
-    """By camera of the group; by image where something bends them."""
+    """By camera of the group; by image if declared parameters modify it."""
     points: Float[Array, "points 3 draws"]
 
 
@@ -166,8 +165,11 @@ def _group_cotangent(
     seen: tuple[Array, Array],
     s: PaddedStructure,
 ) -> tuple[UnknownArrays, Array]:
-    """Derivatives of the sum of q over the rows of a group with respect to the state, and to `bent`, the parameters of
-    the cameras by image where something bends them (those of the state are zero then)."""
+    """Differentiate the sum of q over the rows of a group with respect to the state and to `bent`.
+
+    `bent` holds the camera parameters by image if declared parameters modify them; derivatives by the state's camera
+    parameters are then zero.
+    """
     n, size = state.position.shape[1:]
     of_images = jnp.concatenate([state.rotation.reshape(9, n, size), state.position]).transpose(1, 0, 2)
     of_points = state.points.transpose(1, 0, 2)
@@ -177,14 +179,14 @@ def _group_cotangent(
     table = state.shared[own].reshape(cameras, m, size) if bent is None else bent
     zero = _Sums(nothing, nothing, jnp.zeros_like(table), jnp.zeros_like(of_points))
     if bent is not None:
-        # Every image is a camera of its own.
+        # Each image is a camera of its own.
         rows = eqx.tree_at(lambda r: r.camera, rows, rows.image)
 
     def add(sums: _Sums, rows: RowList) -> tuple[_Sums, None]:
         return _with_chunk(sums, group, rows, of_images, of_points, table, seen, s), None
 
     sums, _ = jax.lax.scan(add, zero, rows)
-    # Of all cotangents of a matrix R that changes by -t x R, the one along such changes.
+    # Of the cotangent of a matrix R that changes by -t x R, the part along such changes.
     rotation = -0.5 * jnp.cross(sums.turn.transpose(1, 0, 2)[:, None], state.rotation, axis=0)
     shared = jnp.zeros_like(state.shared)
     if bent is None:
@@ -203,7 +205,7 @@ def _with_chunk(
     seen: tuple[Array, Array],
     s: PaddedStructure,
 ) -> _Sums:
-    """The sums with one chunk of rows added."""
+    """Add the sums of one chunk of rows."""
     rotation_of = lambda image: image[:9].reshape(3, 3)  # noqa: E731
 
     def aim_of(image, point):
@@ -213,12 +215,12 @@ def _with_chunk(
         return tuple(camera_coordinates(ExteriorOrientation(image[9:], rotation_of(image)), aim_of(image, point)))
 
     def back_to_aim(image, to_u):
-        """By the place that the ray aims at, in the object frame."""
+        """Differentiate by the point that the ray aims at, in the object frame."""
         here = lambda aim: tuple(rotate(rotation_of(image), aim))  # noqa: E731
         return jax.linear_transpose(here, jnp.zeros(3))(to_u)[0]
 
     def back_to_turn(u, to_u):
-        """By a small rotation t of the image, which adds u x t to u."""
+        """Differentiate by a small rotation t of the image, which adds u x t to u."""
 
         def turned(t):
             return u[1] * t[2] - u[2] * t[1], u[2] * t[0] - u[0] * t[2], u[0] * t[1] - u[1] * t[0]
@@ -248,7 +250,7 @@ def _with_chunk(
 
 
 def _units(of: tuple[Array, ...]) -> list[tuple[Array, ...]]:
-    """The unit vectors of a tuple of scalars, as such tuples."""
+    """Return the unit vectors of a tuple of scalars, as such tuples."""
     return [tuple(jnp.ones(()) if j == k else jnp.zeros(()) for j in range(len(of))) for k in range(len(of))]
 
 
@@ -268,7 +270,7 @@ def _camera_cotangent(
     seen: tuple[Array, Array],
     s: PaddedStructure,
 ) -> tuple[Array, tuple[Array, ...]]:
-    """dq/d(table), summed over the rows of a group, and dq/du of each."""
+    """Return dq/d(table), summed over the rows of a group, and dq/du of each row."""
     cameras, m = table.shape[:2]
     # One camera: the same for all rows.
     leaves = [table[rows.camera, k] if cameras > 1 else table[0, k] for k in range(m)]
@@ -282,7 +284,7 @@ def _camera_cotangent(
     def weighed(chosen, u, leaves, xy, weight):
         return tuple(w * w * r for w, r in zip(weight, residual(chosen, u, leaves, xy), strict=True))
 
-    # Two numbers' derivatives along each of a few scalars: less than half the work of going backwards.
+    # Forward derivatives of two numbers by a few scalars: less than half the work of reverse mode.
     def back(function: Callable, at: tuple[Array, ...], to_residual) -> tuple[Array, ...]:
         along = (jax.jvp(function, (at,), (unit,))[1] for unit in _units(at))
         return tuple(_dot(to_residual, slope) for slope in along)

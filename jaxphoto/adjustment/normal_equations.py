@@ -1,6 +1,6 @@
-"""The normal equations of a block at its optimum: the one door from statistics and sensitivity to the solver.
+"""Normal equations of a block at its optimum: the interface of statistics and sensitivity to the solver.
 
-All is in scaled increments and in padded order; `Adjustment.padded` brings it back to the order of the block.
+In scaled increments and padded order; `Adjustment.padded` converts to the order of the block.
 """
 
 import dataclasses
@@ -45,120 +45,124 @@ class NormalEquations(eqx.Module):
     """N x = b at the optimum, undamped and factored."""
 
     values: PaddedValues
-    """Their start is the optimum."""
+    """Their start values are the optimum."""
     structure: PaddedStructure
     factored: FactoredNormal
     is_weighed: bool = eqx.field(static=True, default=False)
-    """Whether the constraints of the datum are as `at` wants them: what runs many times weighs them once, before."""
+    """True if the datum constraints are already scaled as `at` needs them."""
 
     @property
     def scale(self) -> Increments:
-        """Of increments; zero for what is held fixed."""
+        """Scale of the increments; zero for fixed unknowns."""
         return self.factored.scale
 
     @property
     def at(self) -> Linearised:
-        """Where the equations are linearised: at no increments, with the constraints of the datum weighed."""
+        """Place of linearisation: zero increments, with scaled datum constraints."""
         s = self.structure
         values = self.values if self.is_weighed else weigh_datum(self.values, s)
         return Linearised(jax.tree.map(jnp.zeros_like, self.scale), self.scale, values, s)
 
     @property
     def weighed(self) -> "NormalEquations":
-        """The same with the constraints of the datum as `at` has them."""
+        """Scale the datum constraints once, for programs that run many times."""
         if self.is_weighed or not self.values.datum_eop.shape[0]:
             return dataclasses.replace(self, is_weighed=True)
         return dataclasses.replace(self, values=call_compiled(_weighed, self.values, self.structure), is_weighed=True)
 
     @property
     def on_one_device(self) -> "NormalEquations":
-        """The same for programs that no other device has a part in."""
+        """Convert to one device."""
         values, factored = jax.tree.map(still, (self.values, self.factored))
         return dataclasses.replace(self, values=values, structure=self.structure.on_one_device, factored=factored)
 
     def solve(self, b: Increments) -> Increments:
-        """x of N x = b; of many by `jax.vmap`."""
+        """Solve N x = b; use `jax.vmap` for many."""
         return solve_factored(self.factored.reduced, self.factored.factor, b, self.at)
 
     def pull(self, z: PaddedResiduals) -> Increments:
-        """J' z of many residuals over their sigmas, along a leading axis."""
+        """Return J'z of many weighted residual vectors (leading axis)."""
         return pull(z, self.at)
 
     def push(self, x: Increments) -> PaddedResiduals:
-        """J x of many, along a leading axis: how what was adjusted moves, over its sigmas, with the unknowns."""
+        """Return J x of many increments (leading axis): changes of the adjusted observations over their sigmas."""
         return push(x, self.at)
 
     def pull_others(self, z: NonImageResiduals) -> Increments:
-        """J' z of all but image rows, without a look at these; of many along a leading axis."""
+        """Return J'z of all rows except image rows (leading axis)."""
         return pull_others(z, self.at)
 
     def push_others(self, x: Increments) -> NonImageResiduals:
-        """J x of all but image rows; of many along a leading axis."""
+        """Return J x of all rows except image rows (leading axis)."""
         return push_others(x, self.at)
 
     def cofactors(self, of_rows: bool) -> tuple[Cofactors, RowCofactors | None]:
-        """The inverse of N for images, shared unknowns and each point, and of rows, if these are wanted."""
+        """Return the inverse of N for images, shared unknowns and each point, and of rows if requested."""
         return cofactors_of(self.at, self.factored, of_rows)
 
     def row_variances(self, q: Cofactors, of_rows: RowCofactors) -> tuple[Array, tuple[Array, ...]]:
-        """J Q J' of image rows, and of the numbers of each other row with one another (c, c, ...)."""
+        """Return J Q J' of image rows, and of the numbers of each other row (c, c, ...)."""
         return row_variances(self.at, q, of_rows, self.factored)
 
     def reduce(self, b: Increments) -> tuple[Float[Array, "reduced"], Float[Array, "constraints"]]:
-        """A right-hand side taken down to the reduced unknowns, and to those that couple points."""
+        """Eliminate points from a right-hand side; returns the parts for the reduced unknowns and for mu."""
         return reduce_right(self.factored.reduced, b, self.at)
 
     def expand(
         self, right: Float[Array, "reduced"], d: Float[Array, "constraints"], b_points: Float[Array, "3 points"]
     ) -> Increments:
-        """x of a right-hand side that `reduce` has taken down."""
+        """Solve for x, given a right-hand side from `reduce`."""
         return solve_reduced(self.factored.reduced, self.factored.factor, right, d, b_points, self.at)
 
     def solve_reduced_matrix(self, right: Float[Array, "reduced *c"]) -> Float[Array, "reduced *c"]:
-        """A^-1 right, of the reduced unknowns alone."""
+        """Return A^-1 right, for the reduced unknowns."""
         return solve_band(self.factored.factor, right)
 
     def cholesky_factor(self) -> Float[Array, "reduced reduced"]:
-        """M of the reduced normal matrix A = M M'."""
+        """Return M of the reduced normal matrix A = M M'."""
         return jnp.tril(dense(Band(*self.factored.factor)))
 
     def inverse_of_reduced(self) -> Float[Array, "reduced reduced"]:
-        """A^-1."""
+        """Return A^-1."""
         return invert_band(self.factored.factor)
 
     def pivots(self) -> Float[Array, "reduced"]:
-        """What is left of each reduced unknown when those before it are eliminated: 1 unharmed, 0 at a rank defect."""
+        """Return the remaining information of each reduced unknown after elimination of those before: 1 full, 0 rank
+        defect.
+        """
         return call_compiled(_pivots, self.factored.reduced.diagonal, self.factored.factor)
 
     def least_pivot(self) -> Float[Array, ""]:
-        """That of the weakest."""
+        """Return the smallest pivot."""
         return jnp.min(self.pivots())
 
     def gradient(self, increments: Increments) -> tuple[Increments, Float[Array, ""]]:
-        """b = J'r at other increments, and the square sum r'r there."""
+        """Return b = J'r at other increments, and the sum of squares r'r there."""
         at = self.at._replace(increments=increments)
         residuals = at.residuals()
         b = pull(jax.tree.map(lambda v: v[None], residuals), at)
         return jax.tree.map(lambda v: v[0], b), added(jnp.sum(v**2) for v in jax.tree.leaves(residuals))
 
     def constraints(self) -> Increments:
-        """Derivatives of the constraints of the datum, along a leading axis."""
+        """Return derivatives of the datum constraints, along a leading axis."""
         return self.at.constraints()
 
 
 class Met(NamedTuple):
-    """What points meet, as places among the reduced unknowns and the k constraints; beyond these where it is none."""
+    """Unknowns coupled with points, as places among the reduced unknowns and k constraints; beyond these if none."""
 
     of_images: Int[Array, "images e"]
-    """The unknowns that an image is eliminated with: its exterior orientation, or its camera's, too."""
+    """Unknowns that an image is eliminated with: exterior orientation, and its camera's if `RayLists.by_image`."""
     of_points: Int[Array, "points c"]
-    """Interior unknowns, constraints, a right-hand side (none), and what rows at the points of a group touch."""
+    """Interior unknowns, constraints, the right-hand side (none), and unknowns that rows at the points of a group
+    touch.
+    """
     interior: int
-    """How many of these are interior unknowns."""
+    """Number of interior unknowns among these."""
 
     @classmethod
     def of(cls, s: PaddedStructure, k: int) -> "Met":
-        """Those of a block."""
+        """Return those of a block."""
         of_images, of_groups = reduced_columns(s, k)
         return cls(of_images, jnp.repeat(of_groups, GROUP, axis=0), interior_in_border(s))
 
@@ -166,14 +170,14 @@ class Met(NamedTuple):
     def products(
         f: Float[Array, "batches m p 3 e"], border: Float[Array, "points 3 c"], s: PaddedStructure, k: int
     ) -> Float[Array, "size size"]:
-        """F F' of rays and points, at all reduced unknowns and the k constraints."""
+        """Return F F' of rays and points, for all reduced unknowns and k constraints."""
         n, each = s.n_images, jnp.arange(s.n_images)
         sums = ProductSums.of(border, s, k)
         sums, _ = s.each(lambda sums, own: (sums.with_rays(*own, border, s, k), ()), sums, (f,))
         sums = sums.with_pairs(f, s, k)
         columns, last = sums.band
         width, size = len(last), s.n_shared + k
-        # Of a pair of images one half is there.
+        # Only one half of each pair of images is stored.
         none = jnp.zeros((0, 6 * (n - width)))
         pairs = dense(Band(columns.reshape(-1, 12 * width, 6 * width), none, last.reshape(6 * width, -1)))
         own = sums.own.reshape(n, -1, sums.across.shape[2])[:, :6, :6]
@@ -182,20 +186,20 @@ class Met(NamedTuple):
         return jnp.block([[own - pairs, across.T], [across, sums.border[:size, :size]]])
 
 
-# Operation by operation they would compile each of these, and the first takes half a second every time.
+# Without jit each operation would be compiled separately, and the first takes half a second every time.
 _weighed = eqx.filter_jit(weigh_datum)
 _pivots = eqx.filter_jit(pivots)
 
 
 def factor_normal(values: PaddedValues, structure: PaddedStructure) -> FactoredNormal:
-    """The normal equations of values that are at their optimum."""
+    """Factor the normal equations of values at their optimum."""
     values, scale = weigh_datum(values, structure), typical_scale(values, structure)
     a, reduced, _ = reduce_normal(Linearised(zero_increments(structure), scale, values, structure), 0.0)
     return FactoredNormal(reduced, factor_band(a), scale)
 
 
 class Optimised(eqx.Module):
-    """Where an iteration ended, and the normal equations that it had last."""
+    """End of an iteration, and its last normal equations."""
 
     state: UnknownArrays
     steps: Int[Array, ""]
@@ -205,7 +209,7 @@ class Optimised(eqx.Module):
 
 
 def optimise(values: PaddedValues, structure: PaddedStructure, task: Task) -> Optimised:
-    """The optimum; or, of values that are at theirs, the undamped normal equations, factored."""
+    """Find the optimum; or factor the undamped normal equations of values at their optimum."""
     optimum, system, scale = iterate(weigh_datum(values, structure), structure, task)
     state = state_at(optimum.increments, unit_scale(structure), values, structure)
     factored = FactoredNormal(system.reduced, system.factor, scale)

@@ -1,4 +1,4 @@
-"""Rank: unknowns that the observations cannot tell apart, named."""
+"""Rank defects: unknowns that the observations cannot determine or separate, by name."""
 
 import math
 from collections.abc import Iterable
@@ -24,19 +24,19 @@ from jaxphoto.observations import AbstractObservations, Correlated, RigPlaces, R
 from jaxphoto.parameters import dynamic_fields
 from jaxphoto.unknowns import FREE, Unknowns, late_cameras
 
-# A pivot of the unit-diagonal reduced matrix below this is a rank defect: at float64 it is rounding, not geometry.
+# Pivots of the unit-diagonal reduced matrix below this are a rank defect: rounding of float64, not geometry.
 DEFECT = 1e-13
 
 
 def check_priors(block: Block, priors: Unknowns) -> None:
-    """Raise RankError or DatumError where something is free that nothing in the block can see.
+    """Raise RankError or DatumError for free unknowns that no observation can determine.
 
-    It looks at who observed what, not at numbers, so nothing need be compiled to find it.
+    Uses only which observation touches which unknown, so nothing is compiled.
     """
     _check_scales(priors)
     with_station = _images_of_stations(block)
     with_attitude = set(np.asarray(block.attitudes.image).tolist())
-    # What else touches an image may see its mount, as the trajectory that a scanner has in common with it.
+    # Another observation of an image may determine its mount, as the trajectory shared with a scanner does.
     further = _images_touched(block)
     _check_mounts(block, priors, with_station | further, with_attitude | further)
     _check_strips(block, priors, with_station)
@@ -48,22 +48,22 @@ def check_priors(block: Block, priors: Unknowns) -> None:
 
 
 def _images_of_stations(block: Block) -> set[int]:
-    """The images whose stations are observed, one by one or in sets that covariances join."""
+    """Return the images whose stations are observed, individually or in sets with a joint covariance."""
     joint = [of.rows.who for of in block.more if isinstance(of, Correlated) and isinstance(of.rows, StationRows)]
     return {int(i) for who in (block.stations.who, *joint) for i in np.ravel(np.asarray(who))}
 
 
 def _images_touched(block: Block) -> set[int]:
-    """The images that further observations touch."""
+    """Return the images that further observations touch."""
     rows = [of for of in block.more if isinstance(of, AbstractObservations)]
     return {int(i) for of in rows for what, index in of.indices() if what == "image" for i in np.ravel(index)}
 
 
 def _check_scales(priors: Unknowns) -> None:
-    """A camera's principal distance and a coefficient that does the same cannot both be free.
+    """Raise RankError if a camera's principal distance and a coefficient of the same effect are both free.
 
-    The normal matrix would not show it: residuals are of ideal coordinates, so a smaller scale makes smaller residuals
-    and the square sum has no minimum at all.
+    The normal matrix would not show it: residuals refer to ideal coordinates, so a smaller scale reduces the residuals,
+    and the sum of squares has no minimum.
     """
     for camera, interior in priors.interior.items():
         for name in interior.distortion.scales:
@@ -120,7 +120,7 @@ def _check_strips(block: Block, priors: Unknowns, with_station: set[int]) -> Non
 
 
 def _check_shifts(block: Block, priors: Unknowns, with_station: set[int]) -> None:
-    """Stations that may all shift do not hold the block."""
+    """Raise an error if free shifts of all stations leave the position of the block open."""
     if block.datum.kind != "control" or not with_station:
         return
     if len(block.control.who) + len(block.fixed.who) + len(block.surfaces.point):
@@ -156,7 +156,7 @@ def _check_camera_rates(block: Block, priors: Unknowns) -> None:
         owners, what = priors.more.get(rates.kind, {}), rates.along.split("_")[0]
         if not owners:
             continue
-        # Numbers, also where a user's function around this is traced.
+        # Concrete numbers, also inside a traced function.
         with jax.ensure_compile_time_eval():
             along = still(rates.argument(exposures(block)))
         for name, prior in owners.items():
@@ -176,7 +176,7 @@ def _check_camera_rates(block: Block, priors: Unknowns) -> None:
 
 
 def _check_camera_splines(block: Block) -> None:
-    """Splines have to reach the ends of their flight, and have one interval: they are computed side by side."""
+    """Check that splines cover their flight and share one interval: they are evaluated side by side."""
     splines: Any = block.start.unknowns.more.get(CameraSpline.kind, {})
     if not splines:
         return
@@ -197,7 +197,7 @@ def _check_camera_splines(block: Block) -> None:
 
 
 def _check_rigs(block: Block, priors: Unknowns) -> None:
-    """Photographs that rows put into a rig are those of its cameras; how they move is known where one exposes late."""
+    """Check that images of a rig belong to its cameras, and that their motion is known if one exposes late."""
     known = block.start.unknowns.more.get(RigCamera.kind, {})
     late = late_cameras(block.start.unknowns, priors)
     if late and block.motion is None:
@@ -216,12 +216,12 @@ def _check_rigs(block: Block, priors: Unknowns) -> None:
 
 
 def _images_of(name: str, names: Iterable[str]) -> set[int]:
-    """Indices of the images whose mount or strip is `name`."""
+    """Return the indices of the images whose mount or strip is `name`."""
     return {i for i, other in enumerate(names) if other == name}
 
 
 def check_rank(adjusted: Adjustment) -> None:
-    """Raise RankError where the normal matrix at the optimum is singular, with what is open and the mend."""
+    """Raise RankError if the normal matrix at the optimum is singular, naming what is open and the cure."""
     if adjusted.factored is None or not bool(adjusted.converged):
         return
     if adjusted.equations.least_pivot() > DEFECT:
@@ -234,7 +234,7 @@ def check_rank(adjusted: Adjustment) -> None:
 
 @eqx.filter_jit
 def reduced_matrix(equations: NormalEquations) -> Band:
-    """The undamped reduced normal matrix itself; the solver keeps its factor, which a defect leaves unfinished."""
+    """Return the undamped reduced normal matrix; the solver keeps only its factor, which is incomplete at a defect."""
 
     def of_device(at: Linearised) -> Band:
         return reduce_normal(at, 0.0)[0]

@@ -1,4 +1,4 @@
-"""What an adjustment gives: unknowns, residuals, sigma naught, redundancy, the normal equations, an outcome."""
+"""Result of an adjustment: unknowns, residuals, sigma0, redundancy, normal equations, outcome."""
 
 import enum
 from typing import TYPE_CHECKING
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Outcome(enum.Enum):
-    """How the adjustment ended; the member's value is the sentence shown to the user."""
+    """Outcome of the adjustment; the member's value is the message for the user."""
 
     CONVERGED = "converged: every unknown is within a hundred-thousandth of its standard deviation of the optimum"
     STEPS = (
@@ -51,15 +51,15 @@ class Outcome(enum.Enum):
     )
 
 
-# Times the median distance of a point: float64 resolves the directions of a base no longer than a few nanoradians.
+# Relative to the median distance of a point: float64 resolves directions over a base of a few nanoradians.
 _FARTHEST = 1e7
-# Of the image coordinates of one adjustment: batches, x and y, chunks, rays.
+# Image coordinates of one adjustment: batches, x and y, chunks, rays.
 _DIMENSIONS = 4
 _factored = eqx.filter_jit(factor_normal)
 
 
 class Seconds(dict):
-    """Seconds by what was done. All are equal to JAX, so that no program depends on them."""
+    """Seconds by activity. All compare equal, so that no JAX program depends on them."""
 
     def __hash__(self) -> int:  # type: ignore[override]
         return 0
@@ -69,7 +69,7 @@ class Seconds(dict):
 
 
 class Adjustment(eqx.Module):
-    """The result of `jaxphoto.adjust`; see `jaxphoto.statistics` for what can be asked of it.
+    """Result of `jaxphoto.adjust`; see `jaxphoto.statistics` for statistics of it.
 
     `residuals` are observed minus computed over the a priori sigma, by group. `sigma0` is the square root of the a
     posteriori variance factor v'Pv / redundancy.
@@ -83,17 +83,17 @@ class Adjustment(eqx.Module):
     padded: PaddedBlock = eqx.field(static=True)
     padded_values: PaddedValues
     factored: FactoredNormal | None
-    """None in an adjustment that is being differentiated or mapped over; see `equations`."""
+    """None in an adjustment that is differentiated or mapped; see `equations`."""
     steps: Int[Numbers, ""]
     converged: Bool[Numbers, ""]
     seconds: dict[str, float] = eqx.field(static=True, converter=lambda v: v if isinstance(v, Seconds) else Seconds(v))
     left_out: tuple[str, ...] = eqx.field(static=True, default=())
-    """Tie points of the block as it was given that this adjustment goes without: their rays meet nowhere."""
+    """Tie points of the given block that are omitted: their rays do not intersect."""
     sizes: Sizes = eqx.field(static=True, default=LEAST)
-    """That it was asked to be compiled for at least; with them the block is adjusted again by the same program."""
+    """Minimum sizes it was compiled for; with them the block is re-adjusted by the same program."""
 
     course: Course | None = None
-    """How the iteration went, step by step; None inside a transformation of JAX and where nothing was iterated."""
+    """Iteration history; None inside a JAX transformation and if nothing was iterated."""
 
     __repr__ = adjustment_repr
 
@@ -101,26 +101,26 @@ class Adjustment(eqx.Module):
         return adjustment_html(self, self.unknowns.words)
 
     def verdict(self) -> "Verdict":
-        """Whether it may be used, green, amber or red, and the findings for that (docs/trust.md)."""
+        """Verdict (green, amber or red) and the findings behind it (docs/trust.md)."""
         return from_upstairs("verdict_of")(from_upstairs("Tables")(self))
 
     def plot(self, ax: "Axes | None" = None, *, in_3d: bool = False) -> "Axes":
-        """The adjusted block, in plan or in space, on matplotlib axes, which are returned; new ones if none are."""
+        """Plot the adjusted block, in plan or in space; returns the matplotlib axes, new ones unless given."""
         return from_upstairs("plot_block")(self, ax, in_3d=in_3d)
 
     @property
     def structure(self) -> Structure:
-        """Index arrays and sizes of the block as given."""
+        """Index arrays and sizes in block order."""
         return self.padded.own
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Paths of all shared parameters, free or not, in the order of `values.shared`."""
+        """Paths of all shared parameters, free or fixed, in the order of `values.shared`."""
         return tuple(e.label for e in observed_in(self.block, self.priors).entries)
 
     @property
     def equations(self) -> NormalEquations:
-        """What statistics are computed from; inside a transformation of JAX they are factored anew each time."""
+        """Normal equations for statistics; factored anew each time inside a JAX transformation."""
         s, v = self.padded.structure, self.padded_values
         if self.factored is not None:
             return NormalEquations(v, s, self.factored)
@@ -132,12 +132,12 @@ class Adjustment(eqx.Module):
 
     @property
     def square_sum(self) -> Float[Numbers, ""] | float:
-        """v'Pv: the weighted square sum of all observations' residuals."""
+        """v'Pv: the weighted sum of squared residuals of all observations."""
         return sum(((v**2).sum() for v in self.residuals.named.values()), np.zeros(()))
 
     @property
     def outcome(self) -> Outcome:
-        """Converged or not, and why; a member of `Outcome`."""
+        """Outcome of the adjustment: converged or not, and why."""
         refuse_traced("Adjustment.outcome", self.residuals)
         if bool(self.converged):
             return Outcome.CONVERGED
@@ -151,9 +151,9 @@ class Adjustment(eqx.Module):
 
     @property
     def astray(self) -> Bool[np.ndarray, "points"]:
-        """Which points lie so far from an image of theirs, beside the others, that no difference of directions is left.
+        """True for points so far away, compared with the others, that the directions of their rays do not differ.
 
-        Their standard deviations are larger still, so that by them any such place is as good as the optimum.
+        Their standard deviations are larger still, so that any such place is as good as the optimum.
         """
         s, u = self.structure, self.unknowns
         x, y, z = (still(u.points)[s.point] - still(u.exterior.position)[s.image]).T
@@ -166,14 +166,14 @@ class Adjustment(eqx.Module):
 
     @property
     def n_observations(self) -> dict[str, int]:
-        """Observations by group: image_points, those of `Block.observations`, priors; 0 where there are none."""
+        """Number of observations by group: image_points, those of `Block.observations`, priors; 0 if none."""
         groups = (self.block.image_points, *self.block.observations)
         none = {rows.group: 0 for rows in groups} | {PRIORS: 0}
         return none | {name: int(np.size(v)) for name, v in self.residuals.named.items()}
 
     @property
     def n_unknowns(self) -> dict[str, int]:
-        """Unknowns by kind: interior, scanner, mounts, strips and further declared ones, exterior, points."""
+        """Number of unknowns by kind: interior, scanner, mounts, strips and further declared ones, exterior, points."""
         s = self.structure
         declared = {"scanner": 0} | dict.fromkeys(self.unknowns.tables, 0)
         for t in s.tables:
@@ -188,16 +188,16 @@ class Adjustment(eqx.Module):
 
     @property
     def n_constraints(self) -> int:
-        """Constraints that close the datum."""
+        """Number of constraints that close the datum."""
         return self.residuals.datum.shape[0]
 
     @property
     def redundancy(self) -> int:
-        """Observations plus constraints of the datum minus unknowns."""
+        """Observations plus datum constraints minus unknowns."""
         return sum(self.n_observations.values()) + self.n_constraints - sum(self.n_unknowns.values())
 
     @property
     def sigma0(self) -> Float[Numbers, ""] | float:
-        """Square root of the a posteriori variance factor; 1 where there is no redundancy."""
+        """Square root of the a posteriori variance factor; 1 without redundancy."""
         redundancy = self.redundancy
         return (self.square_sum / redundancy) ** 0.5 if redundancy > 0 else self.square_sum * 0 + 1.0

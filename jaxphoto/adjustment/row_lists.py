@@ -1,4 +1,4 @@
-"""The image rows of a block in lists, as many draws are computed with: how many rows and draws at a time."""
+"""Lists of image rows for many draws, and numbers of rows and draws processed at a time."""
 
 import equinox as eqx
 import numpy as np
@@ -7,24 +7,24 @@ from jaxtyping import Float, Int
 from jaxphoto.adjustment.layout.rays import Places
 from jaxphoto.adjustment.model.structure import Structure
 
-# Draws that a device computes side by side. Vectors end in them: 32 are enough for that, and for what is made anew for
-# all of them (see `solver.elimination`); more, up to 64, pay where image rows x draws stay below this number, fewer
-# only where unknowns x draws would be more than this, of which memory holds several.
+# Draws that a device computes side by side (last axis). 32 suffice for vectorisation and for recomputed intermediates
+# (see `solver.elimination`); up to 64 pay off while image rows x draws stay below this number, fewer only if unknowns x
+# draws exceed this one, of which memory holds several.
 _FEW, _MOST, _LEAST = 32, 64, 8
 _ROWS, _UNKNOWNS = 100_000, 8_000_000
-# Image rows x draws that are computed with at a time: what that needs stays in the cache of a core.
+# Image rows x draws that are processed at a time, so that intermediate arrays stay in the cache of a core.
 _AT_ONCE = 16_384
 
 
 def batch_size(structure: Structure) -> int:
-    """Draws of a block that a device computes side by side."""
+    """Return the number of draws of a block that a device computes side by side."""
     s = structure
     rows, unknowns = max(len(s.image), 1), max(int(s.eop_free.sum() + len(s.free) + s.point_free.sum()), 1)
     return int(max(_LEAST, min(np.clip(_ROWS // rows, _FEW, _MOST), _UNKNOWNS // unknowns)))
 
 
 class RowList(eqx.Module):
-    """Image rows of the cameras of one group, in chunks: their number in the block, and what they touch.
+    """Image rows of the cameras of one group, in chunks: index in the block, and what they touch.
 
     Images and points are those of a padded structure, points ascending. The last chunk repeats its last row, without
     weight.
@@ -34,13 +34,13 @@ class RowList(eqx.Module):
     image: Int[np.ndarray, "chunks rows"]
     point: Int[np.ndarray, "chunks rows"]
     camera: Int[np.ndarray, "chunks rows"]
-    """Within the group."""
+    """Camera within the group."""
     counts: Float[np.ndarray, "chunks rows"]
-    """1, and 0 where a row is a repetition."""
+    """1; 0 for a repeated row."""
 
 
 def row_lists(s: Structure, places: Places, at_once: int | None = None) -> tuple[RowList, ...]:
-    """The image rows of each group of cameras; `at_once` of them are computed with at a time."""
+    """Return the image rows of each camera group; `at_once` of them are processed at a time."""
     at_once = at_once or _AT_ONCE // batch_size(s)
     lists = []
     for group in s.groups:

@@ -1,9 +1,9 @@
-"""Many adjustments of one block side by side: what `jax.vmap` makes of the solver.
+"""Many adjustments of one block: the batching rule of the solver under `jax.vmap`.
 
 The first draw is adjusted by Levenberg-Marquardt. With its factored normal matrix all others take chord steps from its
-optimum to their own (`chords`), some draws at a time. The first draw that does not contract is adjusted by itself in
-turn, and its factor tried on those that are left; after a few factors the last ones are adjusted one by one. So all of
-them end where a loop over single adjustments would, and memory grows by the results alone.
+optimum to their own (`chords`), some draws at a time. The first draw that does not contract is adjusted by itself, and
+its factor is tried on the remaining draws; after a few factors the last ones are adjusted individually. All draws end
+where a loop over single adjustments would, and memory grows only with the results.
 """
 
 from typing import Any, NamedTuple
@@ -26,33 +26,33 @@ from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import Optimum, iterate
 from jaxphoto.rotation import small_angles
 
-# Factors that draws are tried with before the last ones are adjusted one by one.
+# Number of factors tried before the remaining draws are adjusted individually.
 _FACTORS = 3
-# Leaves of the values that unknowns start at, and those that follow from the start.
+# Leaves of the values with start values, and those derived from the start.
 _STARTS, _DATUM = {"position", "rotation", "shared", "points"}, {"datum_eop", "datum_points"}
 
 
 class ImageRowLists(NamedTuple):
-    """The image rows of a block as `many` computes with them, and which rays they are."""
+    """Image rows of a block for `many`, and the rays they correspond to."""
 
     lists: tuple[RowList, ...]
     slot: Int[np.ndarray, "rows"]
-    """Number of the ray."""
+    """Index of the ray."""
     draws: int
-    """That are computed side by side."""
+    """Number of draws computed side by side."""
 
 
 def image_row_lists(padded: PaddedBlock) -> ImageRowLists:
-    """Those of a block."""
+    """Return those of a block."""
     return ImageRowLists(row_lists(padded.own, padded.places), padded.places.row, batch_size(padded.own))
 
 
 def optimum_of(values: PaddedValues, structure: PaddedStructure, task: Task, rows: ImageRowLists) -> Optimum:
-    """The optimum from the start in `values`, without its course; of many draws under `jax.vmap`, side by side."""
+    """Find the optimum from the start in `values`, without history; for many draws under `jax.vmap`."""
 
     @jax.custom_batching.custom_vmap
     def one(values: PaddedValues) -> Optimum:
-        # How it went has no derivative, and nobody asks it of what is differentiated.
+        # The history has no derivative, and is not needed where something is differentiated.
         return iterate(values, structure, task)[0]._replace(course=None)
 
     @one.def_vmap
@@ -64,41 +64,41 @@ def optimum_of(values: PaddedValues, structure: PaddedStructure, task: Task, row
 
 
 class _Draws(NamedTuple):
-    """What is known of draws before they are computed."""
+    """Draws before they are computed."""
 
     number: int
     batched: PaddedValues
-    """Whether each leaf has an axis of draws, its first."""
+    """True for each leaf with an axis of draws, its first."""
     structure: PaddedStructure
     task: Task
     rows: ImageRowLists
 
     @property
     def names(self) -> set[str]:
-        """Leaves that tell draws apart; the constraints of the datum follow from others."""
+        """Names of leaves that differ between draws; datum constraints follow from others."""
         leaves = jax.tree_util.tree_leaves_with_path(self.batched)
         return {path_name(path) for path, batched in leaves if batched} - _DATUM
 
     def together(self, values: PaddedValues) -> bool:
-        """Whether draws may begin at each other's optimum."""
+        """Return True if draws may start at each other's optimum."""
         if self.structure.has_losses or self.names <= {"position", "rotation", "points"}:
-            # Who varies nothing but the start wants to know where each leads.
+            # If only the start varies, the user asks where each start leads.
             return False
-        # A datum about the start is another one for every start.
+        # A datum about the start differs for every start.
         return not (self.names & _STARTS and values.datum_eop.shape[-3])
 
     def some(self, values: PaddedValues, begin: Array, size: int) -> PaddedValues:
-        """The values of `size` draws from `begin` on."""
+        """Return the values of `size` draws from `begin` on."""
         cut = lambda v, batched: jax.lax.dynamic_slice_in_dim(v, begin, size) if batched else v  # noqa: E731
         return jax.tree.map(cut, values, self.batched)
 
     def one(self, values: PaddedValues, draw: Array) -> PaddedValues:
-        """The values of a draw."""
+        """Return the values of a draw."""
         return jax.tree.map(lambda v, b: v[0] if b else v, self.some(values, draw, 1), self.batched)
 
 
 def _optima(draws: _Draws, values: PaddedValues) -> Optimum:
-    """The optimum of every draw, draws first."""
+    """Find the optimum of every draw, draws first."""
 
     @jax.custom_batching.custom_vmap
     def many(values: PaddedValues) -> Optimum:
@@ -106,7 +106,7 @@ def _optima(draws: _Draws, values: PaddedValues) -> Optimum:
 
     @many.def_vmap
     def rule(outer: int, outer_batched: list[Any], values: PaddedValues) -> tuple[Optimum, Optimum]:
-        """Draws of draws are so many more draws."""
+        """Draws of draws are flattened."""
         n = draws.number
 
         def joined(v: Array, is_outer: bool, is_inner: bool) -> Array:
@@ -129,7 +129,7 @@ class _Found(NamedTuple):
     optima: Optimum
     done: Bool[Array, "draws"]
     factors: Int[Array, ""]
-    """That were tried on all draws left."""
+    """Number of factors tried on all remaining draws."""
 
 
 def _found(draws: _Draws, values: PaddedValues) -> Optimum:
@@ -137,7 +137,7 @@ def _found(draws: _Draws, values: PaddedValues) -> Optimum:
 
     def adjust_next(found: _Found) -> _Found:
         k = jnp.argmin(found.done)
-        # What XLA must not know to be positive, see `compiling.once`, is known of a constant.
+        # XLA must not know it to be positive (see `compiling.once`); it would know that of a constant.
         free = draws.structure.eop_free * jnp.where(k >= 0, 1.0, 0.0)
         own = draws._replace(structure=eqx.tree_at(lambda s: s.eop_free, draws.structure, free))
         nominal = draws.one(values, k)
@@ -162,7 +162,7 @@ def _found(draws: _Draws, values: PaddedValues) -> Optimum:
 def _common(
     nominal: PaddedValues, optimum: Optimum, system: FactoredSystem, scale: Increments, draws: _Draws
 ) -> Common:
-    """What draws have in common that begin at the optimum of one of them."""
+    """Return data common to draws that start at the optimum of one of them."""
     at = jax.tree.map(lambda x, k: jnp.where(k > 0, x / jnp.where(k > 0, k, 1.0), 0.0), optimum.increments, scale)
     xy, sigma = (_by_row(v[None], draws.rows.slot)[..., 0] for v in (nominal.xy, nominal.sigma_xy))
     factored = FactoredNormal(system.reduced, system.factor, scale)
@@ -170,11 +170,11 @@ def _common(
 
 
 def _with_chords(draws: _Draws, values: PaddedValues, common: Common, found: _Found) -> _Found:
-    """All that chord steps lead to their optimum, of the draws that are not done."""
+    """Apply chord steps to the draws that are not done, and keep those that converge."""
     size = min(draws.rows.draws, draws.number)
 
     def batch(k: Array, found: _Found) -> _Found:
-        # The last one overlaps that before it, of which no draw is taken twice.
+        # The last batch overlaps the one before; no draw is taken twice.
         begin = jnp.minimum(k * size, draws.number - size)
         cut = lambda v: jax.lax.dynamic_slice_in_dim(v, begin, size)  # noqa: E731
         done = cut(found.done)
@@ -202,7 +202,7 @@ def _with_chords(draws: _Draws, values: PaddedValues, common: Common, found: _Fo
 
 
 def _varying(draws: _Draws, values: PaddedValues, common: Common) -> Varying:
-    """What tells the draws apart, draws last: of what unknowns start at, that which is fixed."""
+    """Return what differs between draws, draws last: of leaves with start values, only fixed ones."""
     held = held_in(draws.structure, values.shared.shape[-1])
     varying = {}
     for path, v in jax.tree_util.tree_leaves_with_path(values):
@@ -220,7 +220,7 @@ def _varying(draws: _Draws, values: PaddedValues, common: Common) -> Varying:
 
 
 def _from_start(values: PaddedValues, state: UnknownArrays, draws: _Draws) -> Increments:
-    """Increments that lead from the start of each draw to a state, draws first."""
+    """Return increments from the start of each draw to a state, draws first."""
     s = draws.structure
 
     def whole(name: str, axis: int) -> Array:
@@ -236,7 +236,7 @@ def _from_start(values: PaddedValues, state: UnknownArrays, draws: _Draws) -> In
 
 
 def _by_row(v: Float[Array, "draws batches 2 chunks p"], ray: Int[np.ndarray, "rows"]) -> Float[Array, "2 rows draws"]:
-    """Numbers of rays by image row, draws last."""
+    """Return numbers of rays by image row, draws last."""
     return jnp.moveaxis(v, 2, 0).reshape(2, len(v), -1)[:, :, ray].transpose(0, 2, 1)
 
 

@@ -1,4 +1,4 @@
-"""What an adjustment tells of its iteration to whoever listens to the logger `jaxphoto.adjustment` (level INFO)."""
+"""Log of the iteration for the logger `jaxphoto.adjustment` (level INFO)."""
 
 import logging
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ LOGGER = logging.getLogger("jaxphoto.adjustment")
 
 
 def tell_course(adjusted: Adjustment) -> None:
-    """Log what was adjusted, and a line a step."""
+    """Log the sizes of the adjustment, and one line per step."""
     if LOGGER.isEnabledFor(logging.INFO):
         images, points = len(adjusted.block.images), len(adjusted.block.points)
         LOGGER.info("adjusted %d images, %d points: %s", images, points, adjusted.outcome.value)
@@ -18,14 +18,14 @@ def tell_course(adjusted: Adjustment) -> None:
 
 
 def step_lines(adjusted: Adjustment) -> Iterator[str]:
-    """A line a step: sigma naught before it, and by how many standard deviations it moves; the last of the end."""
+    """Return one line per step: sigma0 before it and its length in standard deviations; the last one is the outcome."""
     course, redundancy = adjusted.course, max(adjusted.redundancy, 1)
     if course is None:
         return
-    for k, (square_sum, length, damping, accepted, bent) in enumerate(zip(*course, strict=True), 1):
+    for k, (before, length, damping, accepted, bent) in enumerate(zip(*course, strict=True), 1):
         along = f", {bent:.2g} of it along a curve" if bent > 0 else ""
         refused = "" if accepted > 0 else ", refused"
         moved = f"moves {length:.2g} sigmas, damping {damping:.1g}{along}{refused}"
-        yield f"step {k}: sigma naught {(square_sum / redundancy) ** 0.5:.6g}, {moved}"
+        yield f"step {k}: sigma naught {(before / redundancy) ** 0.5:.6g}, {moved}"
     if len(course.length) == int(adjusted.steps):
         yield f"end: sigma naught {(float(adjusted.square_sum) / redundancy) ** 0.5:.6g}"

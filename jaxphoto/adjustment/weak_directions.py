@@ -1,15 +1,14 @@
-"""Weak directions: combinations of unknowns that the observations hardly see, from the normal equations.
+"""Weak directions: combinations of unknowns that the observations hardly determine, from the normal equations.
 
-Unknowns are measured in yardsticks: what moves an image point by about its standard deviation, or, where that is more,
-the standard deviation of the observed positions or attitudes. With C the covariance of all unknowns in yardsticks,
+Unknowns are scaled by yardsticks: the change that moves an image point by about its standard deviation or, if larger,
+the standard deviation of the observed positions or attitudes. With C the covariance of all scaled unknowns,
 
     C u = mu u,    |u| = 1
 
-a direction u of large mu is one along which the block gives way: within one standard deviation unknown k moves by
-u_k sqrt(mu). A standard deviation in yardsticks is what GNSS calls a dilution of precision: by how much the geometry
-makes the errors of observations larger. Found by subspace iteration with the factored normal matrix, which is damped
-where it might be singular, by so little that a direction which nothing sees comes out with an enormous standard
-deviation instead of none.
+a direction u of large mu is weak: within one standard deviation unknown k moves by u_k sqrt(mu). A standard deviation
+in yardsticks is the dilution of precision of GNSS: the factor by which geometry amplifies observation errors. Found by
+subspace iteration with the factored normal matrix. Where that may be singular, slight damping gives an unseen direction
+a very large standard deviation instead of none.
 """
 
 import dataclasses
@@ -33,22 +32,23 @@ from jaxphoto.arrays import still
 from jaxphoto.compiling import call_compiled
 
 POOR = 20.0
-"""Standard deviation in yardsticks above which an unknown is weak. GNSS calls a dilution of precision above 20 poor:
-such positions are to be thrown away (Langley, Dilution of precision, GPS World 10(5), 1999)."""
+"""Standard deviation in yardsticks above which an unknown is weak. In GNSS a dilution of precision above 20 is poor
+(Langley, Dilution of precision, GPS World 10(5), 1999).
+"""
 OPEN = 1e4
-"""Above this nothing sees it at all: what is left is the damping, or noise."""
-# Relative to the diagonal of N: rounding is smaller, what any observation sees is larger.
+"""Above this the direction is unseen: only damping or noise remains."""
+# Relative to the diagonal of N: larger than rounding, smaller than any observation's contribution.
 _DAMPING = 1e-12
-# Where all pivots of the reduced unknowns are above this, it would change theirs by a millionth, and the adjustment's
-# own equations will do. Points whose rays are nearly parallel are then as the adjustment has them.
+# If all pivots of the reduced unknowns exceed this, damping would change them by a millionth, and the equations of the
+# adjustment suffice. Points with nearly parallel rays are then as in the adjustment.
 _FELT = 1e-6
 _DIRECTIONS, _ITERATIONS = 12, 6
-# The part of a direction's largest motion from which on an unknown takes part in it.
+# Fraction of a direction's largest motion from which an unknown participates.
 _MOVES = 0.1
 
 
 class Yardsticks(NamedTuple):
-    """Of positions and points (m), rotations (rad), and each shared unknown (its own unit)."""
+    """Scales of positions and points (m), rotations (rad), and each shared unknown (its own unit)."""
 
     ground: float
     angle: float
@@ -56,7 +56,7 @@ class Yardsticks(NamedTuple):
 
 
 class MovedUnknowns(NamedTuple):
-    """Of all unknowns, in the block's order and in yardsticks."""
+    """Motions of all unknowns, in block order and in yardsticks."""
 
     exterior: Float[np.ndarray, "images 6"]
     """X, Y, Z and a small rotation in the camera frame."""
@@ -65,7 +65,7 @@ class MovedUnknowns(NamedTuple):
 
     @property
     def largest(self) -> float:
-        """Of all absolute numbers."""
+        """Largest absolute value."""
         return max(float(np.abs(v).max(initial=0.0)) for v in self)
 
 
@@ -74,12 +74,13 @@ class WeakDirection(NamedTuple):
 
     moved: MovedUnknowns
     share: Float[np.ndarray, "shared"]
-    """The part of each shared unknown's variance that this direction makes: the square of their correlation. Held, the
-    unknown takes that part of the direction's variance with it."""
+    """Fraction of each shared unknown's variance due to this direction: the square of their correlation. Fixing the
+    unknown reduces the direction's variance by that fraction.
+    """
 
     @property
     def sigma(self) -> float:
-        """That of the unknown which moves most, in yardsticks."""
+        """Standard deviation of the unknown that moves most, in yardsticks."""
         return self.moved.largest
 
     def _moves(self, motion: Float[np.ndarray, "n k"]) -> np.ndarray:
@@ -87,24 +88,24 @@ class WeakDirection(NamedTuple):
 
     @property
     def images(self) -> np.ndarray:
-        """Images that take part."""
+        """Images that participate."""
         return self._moves(self.moved.exterior)
 
     @property
     def points(self) -> np.ndarray:
-        """Points that take part."""
+        """Points that participate."""
         return self._moves(self.moved.points)
 
     @property
     def shared(self) -> np.ndarray:
-        """Shared unknowns that take part, and those that it makes most of the variance of."""
+        """Shared unknowns that participate, and those most of whose variance is due to this direction."""
         moves = np.abs(self.moved.shared) > _MOVES * self.sigma
         return np.flatnonzero((self.share > 0.5) | (moves & (self.share > _MOVES)))
 
 
 def yardsticks(adjusted: Adjustment) -> Yardsticks:
-    """What unknowns of `adjusted` are measured in."""
-    # An optimum that fits nothing may have a camera turned inside out, with c and these below zero.
+    """Return the yardsticks of the unknowns of `adjusted`."""
+    # A camera may be turned inside out, with negative c and yardsticks, if the optimum does not fit.
     scale, block = jax.tree.map(lambda v: np.abs(still(v)), adjusted.equations.scale), adjusted.block
     ground = float(max(scale.eop[:3].max(initial=0.0), scale.points.max(initial=0.0)))
     angle = float(scale.eop[3:].max(initial=0.0))
@@ -117,7 +118,7 @@ def yardsticks(adjusted: Adjustment) -> Yardsticks:
 
 
 def _unit(label: str) -> str:
-    """That of a declared parameter, by the end of its name; "" for an interior orientation."""
+    """Return the unit of a declared parameter from the end of its name; "" for an interior orientation."""
     if label.startswith("interior["):
         return ""
     ends = ("m_per_s", "rad_per_s", "m", "rad", "s")
@@ -125,17 +126,17 @@ def _unit(label: str) -> str:
 
 
 def weak_directions(adjusted: Adjustment, least: float = POOR) -> list[WeakDirection]:
-    """Directions whose standard deviation is above `least` yardsticks, the weakest first; a dozen at most.
+    """Return directions with standard deviations above `least` yardsticks, the weakest first, a dozen at most.
 
-    Where the unknowns of `adjusted` are: at the optimum, or wherever the solver stopped. None where numbers are
-    infinite there. The standard deviations are a priori.
+    Evaluated at the unknowns of `adjusted`: the optimum, or wherever the solver stopped. None if numbers there are
+    infinite. The standard deviations are a priori.
     """
     equations, padded = _sound(adjusted), adjusted.padded
     yard = yardsticks(adjusted)
     scale = jax.tree.map(still, equations.scale)
     sizes = np.repeat([yard.ground, yard.angle], 3)[:, None]
     units = _increments(np.where(scale.eop > 0, sizes, 0.0), yard.shared, np.where(scale.points > 0, yard.ground, 0.0))
-    # Yardsticks in scaled increments, and their reciprocals; zero for what is held.
+    # Yardsticks in scaled increments, and their reciprocals; zero for fixed unknowns.
     over = jax.tree.map(lambda s, u: np.where(u > 0, s / np.where(u > 0, u, 1.0), 0.0), scale, units)
     flat = _flat(over)
     rng, free = np.random.default_rng(0), np.flatnonzero(flat > 0)
@@ -173,7 +174,7 @@ def _direction(of: Increments, variance: np.ndarray, padded: PaddedBlock) -> Wea
 
 
 def _increments(eop: Any, shared: Any, points: Any) -> Increments:
-    """Increments of NumPy's arrays."""
+    """Return increments of NumPy arrays."""
     return Increments(eop, shared, points)
 
 
@@ -182,19 +183,19 @@ def _flat(tree: Increments) -> np.ndarray:
 
 
 def _columns(tree: Increments) -> np.ndarray:
-    """Increments along a leading axis as columns."""
+    """Return increments along a leading axis as columns."""
     return np.concatenate([still(v).reshape(len(v), math.prod(np.shape(v)[1:])) for v in tree], axis=1).T
 
 
 def _tree(columns: np.ndarray, like: Increments) -> Increments:
-    """The reverse of `_columns`."""
+    """Invert `_columns`."""
     ends = np.cumsum([v.size for v in like])[:-1]
     parts = zip(np.split(columns.T, ends, axis=1), like, strict=True)
     return _increments(*(part.reshape(len(part), *v.shape) for part, v in parts))
 
 
 def _sound(adjusted: Adjustment) -> NormalEquations:
-    """Those of `adjusted`, with a damping that rounding cannot turn negative where they might be singular."""
+    """Return the normal equations of `adjusted`, damped against rounding if they may be singular."""
     equations = adjusted.equations.on_one_device.weighed
     determined = adjusted.converged and equations.least_pivot() > _FELT
     return equations if determined else call_compiled(_damped, equations)

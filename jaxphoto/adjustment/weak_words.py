@@ -1,8 +1,8 @@
-"""Weak directions in words: which unknowns give way together, how far, and the cheapest cure.
+"""Messages about weak directions: which unknowns move together, how far, and the simplest cure.
 
-What a direction is called follows from what moves in it: points alone, an image, the block or a part of it as a rigid
-body, or shared parameters with what the images do to make good for them. A parameter is to be held only where that
-leaves the direction no weaker than `POOR`, and control is proposed only where points move.
+A direction is named by what moves in it: points alone, an image, the block or a part of it as a rigid body, or shared
+parameters with compensating motions of the images. Fixing a parameter is proposed only if that leaves the direction no
+weaker than `POOR`, and control only if points move.
 """
 
 from typing import NamedTuple
@@ -17,11 +17,11 @@ from jaxphoto.adjustment.weak_directions import OPEN, POOR, WeakDirection, weak_
 from jaxphoto.arrays import still
 from jaxphoto.errors import counted, few
 
-# A motion that a similarity explains to this part of its square is one.
+# Fraction of the squared motion that a similarity must explain.
 _RIGID = 0.9
-# Image points whose second principal extent is below this part of the first lie on a line.
+# Image points whose second principal extent is below this fraction of the first are collinear.
 _LINE = 0.15
-# A motion of more than this part of all images is one of the whole block.
+# A motion of more than this fraction of all images is one of the whole block.
 _WHOLE = 0.9
 _SHOWN = 3
 _SENTENCES = 3
@@ -29,18 +29,18 @@ _HEADING = "fly strips in opposite directions"
 
 
 class WeakUnknowns(NamedTuple):
-    """What is hardly determined, in one sentence with its cure, and the shared unknowns that take part."""
+    """Weakly determined unknowns: message with its cure, and the shared unknowns that participate."""
 
     sentence: str
     labels: frozenset[str]
     sigma: float
     """In yardsticks."""
     points: tuple[int, ...] = ()
-    """Points that lie anywhere along their rays, where nothing else takes part."""
+    """Points that may lie anywhere along their rays, if nothing else participates."""
 
 
 def weaknesses_of(adjusted: Adjustment, least: float = POOR) -> list[WeakUnknowns]:
-    """`weak_directions` in words, the weakest first; directions of the same unknowns make one sentence."""
+    """Describe `weak_directions`, the weakest first; directions of the same unknowns share one message."""
     words = _Words(adjusted)
     alike: dict[tuple[str, ...], list[WeakDirection]] = {}
     for direction in weak_directions(adjusted, least):
@@ -48,13 +48,13 @@ def weaknesses_of(adjusted: Adjustment, least: float = POOR) -> list[WeakUnknown
             continue
         alike.setdefault(words.kind(direction), []).append(direction)
     told = [words.told(kind, directions) for kind, directions in list(alike.items())[:_SENTENCES]]
-    # Where hardly a point is placed, nothing else needs a cure of its own.
+    # If hardly any point is determined, nothing else needs a cure of its own.
     nowhere = next(iter(alike), ()) == ("points",) and 2 * len(next(iter(alike.values()))[0].points) > len(words.xyz)
     return told[:1] if nowhere else told
 
 
 class _Words:
-    """What is known of a block, to describe its directions with."""
+    """Data of a block needed to describe its directions."""
 
     def __init__(self, adjusted: Adjustment) -> None:
         self.block, self.structure = adjusted.block, adjusted.structure
@@ -65,7 +65,7 @@ class _Words:
         self.cameras = adjusted.unknowns.interior
 
     def kind(self, d: WeakDirection) -> tuple[str, ...]:
-        """What directions must have in common to be told together."""
+        """Key of directions that share one message."""
         images, fields = tuple(self.block.images[i] for i in d.images), _fields(self._labels(d))
         if not images:
             return ("shared", *fields) if fields else ("points",)
@@ -76,14 +76,14 @@ class _Words:
         return ("images", *fields)
 
     def harmless(self, d: WeakDirection) -> bool:
-        """Whether images alone move, and so that what they show stays: a tilt makes good for a shift.
+        """Return True if only images move and what they show remains: a tilt compensates a shift.
 
-        Images of few points do so in sound blocks; where they would place a new point in the middle or a corner moves
-        by less than `POOR` yardsticks, seen from the image.
+        Images of few points do so in valid blocks, if the place of a new point in the middle or a corner, seen from the
+        image, changes by less than `POOR` yardsticks.
         """
         images = d.images
         if not (len(images) or len(d.shared) or len(d.points)):
-            # What moves most is a parameter of which another direction makes most of the variance: it is told there.
+            # If the parameter that moves most owes most of its variance to another direction, that one reports it.
             return True
         if not len(images) or len(d.shared) or np.abs(d.moved.points).max(initial=0.0) > POOR:
             return False
@@ -103,7 +103,7 @@ class _Words:
         return bool(np.linalg.norm(across, axis=2).max() < POOR * self.yard.ground)
 
     def told(self, kind: tuple[str, ...], directions: list[WeakDirection]) -> WeakUnknowns:
-        """The sentence of directions of one kind, after the weakest."""
+        """Return the message about directions of one kind, led by the weakest."""
         d = directions[0]
         labels = list(dict.fromkeys(label for one in directions for label in self._labels(one)))
         if kind[0] in ("block", "part"):
@@ -178,7 +178,7 @@ class _Words:
         return f"the whole block: {_and(names)}{joint} {_hardly(d)} ({self._sigmas(d)}): {_or(cures)}"
 
     def _farthest(self, d: WeakDirection) -> str:
-        """The point that moves most."""
+        """Return the point that moves most."""
         return self.block.points[int(np.abs(d.moved.points).max(axis=1).argmax())]
 
     def _images(self, d: WeakDirection, labels: list[str]) -> str:
@@ -198,7 +198,7 @@ class _Words:
         return f"{what}: {_hardly(d)} ({self._sigmas(d)}) and not told apart: {_or(cures)}"
 
     def _holding(self, d: WeakDirection, labels: list[str]) -> str:
-        """Those that would do if held, one at a time."""
+        """Return the unknowns that suffice if fixed, one at a time."""
         enough = {label for label, left in zip(self.structure.labels, self._left(d), strict=True) if left < POOR}
         will_do = [label for label in labels if label in enough]
         if will_do:
@@ -206,11 +206,11 @@ class _Words:
         return f"hold {few(labels, ' and ')} fixed at values that are known, or give them weights"
 
     def _left(self, d: WeakDirection) -> np.ndarray:
-        """What is left of the direction's sigma if each shared unknown were held."""
+        """Return the remaining fraction of the direction's sigma for each shared unknown fixed."""
         return np.sqrt(1 - d.share) * d.sigma
 
     def _as_body(self, d: WeakDirection) -> Float[np.ndarray, "motions"] | None:
-        """The similarity that what moves makes; None where it makes none."""
+        """Return the similarity of the motion; None if it is not one."""
         images, points = d.images, d.points
         places = self.xyz[points] if len(points) else self.position[images]
         centre = places.mean(axis=0)
@@ -228,11 +228,11 @@ class _Words:
         seen = np.concatenate([d.moved.exterior[images].ravel(), d.moved.points[points].ravel()])
         found, *_ = np.linalg.lstsq(columns, seen, rcond=None)
         left = np.sum((seen - columns @ found) ** 2) / np.sum(seen**2)
-        # Without points the images alone say little: a similarity takes its points along.
+        # Without points, images alone determine little: a similarity moves their points along.
         return found / np.abs(found).max() if left < 1 - _RIGID and len(points) else None
 
     def _coordinates(self, d: WeakDirection) -> str:
-        """X, Y, Z and rotations about the object's axes in which the images move."""
+        """Return the motion of the images as X, Y, Z and rotations about the object axes."""
         moved = d.moved.exterior[d.images]
         turned = np.einsum("nij,ni->nj", self.rotation[d.images], moved[:, 3:])
         parts = np.sqrt((np.concatenate([moved[:, :3], turned], axis=1) ** 2).mean(axis=0))
@@ -240,7 +240,7 @@ class _Words:
         return _and([name for name, part in zip(names, parts, strict=True) if part > 0.3 * parts.max()])
 
     def _sigmas(self, d: WeakDirection) -> str:
-        """How far what takes part moves."""
+        """Return the motions of what participates."""
         if d.sigma > OPEN:
             return "nothing sees it"
         moved, yard, found = d.moved, self.yard, []
@@ -254,7 +254,7 @@ class _Words:
         return f"sigma of {', '.join(found)}"
 
     def _angle(self, point: int) -> float:
-        """The largest angle between two rays of a point, in degrees."""
+        """Return the largest angle between two rays of a point, in degrees."""
         s = self.structure
         to = self.position[s.image[s.point == point]] - self.xyz[point]
         to /= np.linalg.norm(to, axis=1, keepdims=True)
@@ -262,17 +262,17 @@ class _Words:
 
 
 def _those(names: tuple[str, ...], which: np.ndarray) -> str:
-    """Some of the names by their numbers."""
+    """Return some of the names by index."""
     return few([names[k] for k in which])
 
 
 def _fields(labels: list[str]) -> tuple[str, ...]:
-    """The parameters without their axes: mounts[a].lever_arm; both coordinates of a principal point are one."""
+    """Return parameter names without axes: mounts[a].lever_arm; both principal point coordinates become one."""
     return tuple(sorted({label.replace("yp_mm", "xp_mm").rsplit("_", 2)[0] for label in labels}))
 
 
 def _turns_with_heading(labels: list[str]) -> bool:
-    """Whether what these do on the ground turns with the aircraft, so that strips flown both ways tell them."""
+    """Return True if the effect on the ground rotates with the heading: strips flown both ways reveal it."""
     ours = any(label.startswith(("mounts[", "interior[")) for label in labels)
     return ours and not any(label.endswith(("lever_arm_up_m", "c_mm")) for label in labels)
 

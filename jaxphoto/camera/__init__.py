@@ -1,4 +1,4 @@
-"""What the camera does to light: sensor, interior orientation, projection, distortion."""
+"""Camera: sensor, interior orientation, projection, distortion."""
 
 from jaxphoto.camera.balance import rebalance, rebalance_covariance
 from jaxphoto.camera.camera_rates import RATES, AbstractCameraRates, CameraRates, ThermalRates

@@ -1,13 +1,13 @@
-"""A camera that changes during a flight: principal distance, principal point and K1 as straight lines.
+"""Linear change of a camera during a flight: principal distance, principal point and K1.
 
-Along time or along the temperature of the camera, t, an exposure sees through
+For time or temperature t of the camera, the interior orientation of an exposure is
 
     c + dc t,    x_p + dx_p t,    y_p + dy_p t,    K1 + dK1 t
 
-Time counts in hours from the middle of the flight, the mean time of all its exposures; temperature in kelvins from the
-reference of the block (`Temperatures`), the mean of all exposures unless it names another. So the interior orientation
-that is estimated beside the rates is that of the middle of the flight, or at the reference temperature. A positive rate
-of c is a principal distance that grows. What these can be taken for: docs/live_cameras.md.
+Time is in hours from the middle of the flight, the mean time of all exposures; temperature in kelvins from the
+reference of the block (`Temperatures`), by default the mean of all exposures. The interior orientation estimated along
+with the rates is that of the middle of the flight, or at the reference temperature. A positive rate of c is an
+increasing principal distance. Effects that rates may absorb: docs/live_cameras.md.
 """
 
 import abc
@@ -21,17 +21,17 @@ from jaxphoto.parameters import AbstractParameters
 
 Scalar = Float[Array, "*images"] | float
 HOUR_S = 3600.0
-"""Seconds of an hour."""
+"""Seconds per hour."""
 
 
 class AbstractCameraRates(AbstractParameters):
-    """Rates of one camera: of c, x_p, y_p in mm, of K1 in its own unit (mm^-2 of `Brown`), over the unit of `along`.
+    """Rates of one camera: of c, x_p, y_p in mm, of K1 in its own unit (mm^-2 for `Brown`), per unit of `along`.
 
-    A distortion without a coefficient k1 has no use for the last, which then has to be held.
+    K1 must be fixed for a distortion without a coefficient k1.
     """
 
     along: eqx.AbstractClassVar[str]
-    """What a camera changes with: a word, and after it the unit."""
+    """Independent variable: a word, followed by its unit."""
     owner = "camera"
     bends = ("c", "x_p", "y_p", "k1")
 
@@ -43,10 +43,10 @@ class AbstractCameraRates(AbstractParameters):
     @staticmethod
     @abc.abstractmethod
     def argument(exposure: Any) -> Any:
-        """How far the exposure (or each of many) is along the line, from where the interior orientation holds."""
+        """Return the independent variable of an exposure (or of many), zero where the interior orientation holds."""
 
     def interior(self, interior: Any, exposure: Any) -> Any:
-        """The interior orientation at the exposure."""
+        """Return the interior orientation at the exposure."""
         t, distortion = self.argument(exposure), interior.distortion
         if "k1" in distortion.coefficients:
             distortion = dataclasses.replace(distortion, k1=distortion.k1 + self.k1_rate * t)
@@ -60,7 +60,7 @@ class AbstractCameraRates(AbstractParameters):
 
 
 class CameraRates(AbstractCameraRates):
-    """Rates of one camera in an hour."""
+    """Rates of one camera per hour."""
 
     kind = "camera_rates"
     along = "time_h"
@@ -73,15 +73,15 @@ class CameraRates(AbstractCameraRates):
 
     @staticmethod
     def argument(exposure: Any) -> Any:
-        """Hours from the middle of the flight."""
+        """Return hours from the middle of the flight."""
         return exposure.in_flight / HOUR_S
 
 
 class ThermalRates(AbstractCameraRates):
-    """Rates of one camera with its temperature, for a kelvin.
+    """Rates of one camera per kelvin of its temperature.
 
-    Source: Smith and Cope (2010), The effects of temperature variation on single-lens-reflex digital camera
-    calibration parameters, ISPRS Archives 38 (5).
+    Source: Smith and Cope (2010), The effects of temperature variation on single-lens-reflex digital camera calibration
+    parameters, ISPRS Archives 38 (5).
     """
 
     kind = "thermal_rates"
@@ -95,9 +95,9 @@ class ThermalRates(AbstractCameraRates):
 
     @staticmethod
     def argument(exposure: Any) -> Any:
-        """Kelvins above the reference of the block."""
+        """Return kelvins above the reference of the block."""
         return exposure.temperature
 
 
 RATES: tuple[type[AbstractCameraRates], ...] = (CameraRates, ThermalRates)
-"""All that a camera may change with along a line."""
+"""All kinds of linear change."""

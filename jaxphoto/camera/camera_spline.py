@@ -28,13 +28,13 @@ from jaxphoto.camera.camera_rates import HOUR_S
 from jaxphoto.parameters import AbstractParameters, dynamic_fields
 
 MOST = 100
-"""Knots of a camera; each is a parameter of all its images."""
-# No flight takes thirty years; and times of knots remain finite.
+"""Maximum number of knots of a camera; each is a parameter of all its images."""
+# No flight takes thirty years; knot times remain finite.
 _LONGEST_S = 1e9
 
 
 class CameraSpline(AbstractParameters):
-    """Coefficients of what one camera has more than its interior orientation: of c, x_p and y_p (mm).
+    """Coefficients added to one camera's interior orientation: of c, x_p and y_p (mm).
 
     `knots` is an even number of them, 4 or more, `interval_s` the time from one to the next.
     """
@@ -58,18 +58,18 @@ class CameraSpline(AbstractParameters):
             raise ValueError(f"interval_s = {self.interval_s!r} is no positive number of seconds up to {_LONGEST_S:g}")
 
     def labels(self, owner: str) -> tuple[str, ...]:
-        """Such as `camera_splines[kodak].c_3_mm`."""
+        """Labels such as `camera_splines[kodak].c_3_mm`."""
         ends = [self.names[field][0].split("_") for field in dynamic_fields(type(self))]
         return tuple(f"{self.kind}[{owner}].{name}_{k + 1}_{unit}" for name, unit in ends for k in range(self.knots))
 
     def interior(self, interior: Any, exposure: Any) -> Any:
-        """The interior orientation at the exposure."""
+        """Return the interior orientation at the exposure."""
         weights = self.weights(exposure.in_flight)
         c, x_p, y_p = (jnp.sum(weights * v) for v in (self.c_spline, self.xp_spline, self.yp_spline))
         return dataclasses.replace(interior, c=interior.c + c, x_p=interior.x_p + x_p, y_p=interior.y_p + y_p)
 
     def weights(self, time: Numbers | float) -> Float[Numbers, "knots"]:
-        """By how much each knot counts at a time from the middle of the flight (s)."""
+        """Return the weight of each knot at a time from the middle of the flight (s)."""
         end = (self.knots - 3) / 2
         d = jnp.abs(jnp.clip(time / self.interval_s, -end, end) - self.times / self.interval_s)
         near, far = (4 - 6 * d**2 + 3 * d**3) / 6, jnp.maximum(2 - d, 0.0) ** 3 / 6
@@ -77,12 +77,12 @@ class CameraSpline(AbstractParameters):
 
     @property
     def times(self) -> Float[np.ndarray, "knots"]:
-        """Where each knot counts most, from the middle of the flight (s)."""
+        """Return the time of the largest weight of each knot, from the middle of the flight (s)."""
         return (np.arange(self.knots) - (self.knots - 1) / 2) * self.interval_s
 
     @property
     def walk(self) -> Float[np.ndarray, "knots knots"]:
-        """The covariance of the coefficients of a camera that wanders by 1 mm in an hour (mm^2)."""
+        """Return the covariance of the coefficients of a camera that drifts by 1 mm in an hour (mm^2)."""
         hours = self.times / HOUR_S
         least = np.minimum(np.abs(hours)[:, None], np.abs(hours))
         return np.where(np.sign(hours)[:, None] == np.sign(hours), least, 0.0)

@@ -1,36 +1,36 @@
-"""How a photograph was taken, as its file says: what a certificate of the camera has to state."""
+"""Conditions of a photograph, as recorded in its file: required in a calibration certificate."""
 
 from typing import NamedTuple
 
 
 class Conditions(NamedTuple):
-    """One photograph; "" and None stand for what its file does not say."""
+    """Conditions of one photograph; "" and None where its file does not record them."""
 
     image: str
     file: str
-    """Its name, without folders."""
+    """File name, without folders."""
     sha256: str
     used: bool = True
-    """Whether it is an image of the block."""
+    """True if it is an image of the block."""
     time: str = ""
-    """As the camera's clock had it, such as 2016-10-11 10:23:45.50+02:00; the offset only where the file has one."""
+    """By the camera's clock, such as 2016-10-11 10:23:45.50+02:00; offset only if the file has one."""
     make: str = ""
     model: str = ""
     serial: str = ""
-    """Of the body."""
+    """Serial number of the body."""
     lens: str = ""
     lens_serial: str = ""
     drone: str = ""
-    """Its model and serial number."""
+    """Model and serial number of the drone."""
     firmware: str = ""
     focal_length_mm: float | None = None
     f_number: float | None = None
     exposure_s: float | None = None
     iso: float | None = None
     subject_distance_m: float | None = None
-    """Where the lens was focused."""
+    """Focus distance."""
     temperature_c: float | None = None
-    """Of the air."""
+    """Air temperature."""
     lens_temperature_c: float | None = None
     sensor_temperature_c: float | None = None
     humidity_percent: float | None = None
@@ -38,7 +38,7 @@ class Conditions(NamedTuple):
 
     @property
     def camera(self) -> str:
-        """Maker and model. Some makers write their name into the model again."""
+        """Return maker and model. Some makers repeat their name in the model."""
         name = next(iter(self.make.split()), "")
         told = self.model.lower().startswith(name.lower())
         return self.model if told else f"{self.make} {self.model}".strip()

@@ -1,4 +1,4 @@
-"""The same camera with another distortion model: exactly where the models allow it (`exact`), otherwise fitted."""
+"""Conversion of a camera to another distortion model: exact where possible (`exact`), otherwise fitted."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
 
 from jaxphoto.camera.distortion import AbstractDistortion, invert
 from jaxphoto.camera.equivalence import exact
@@ -14,31 +13,32 @@ from jaxphoto.camera.interior import InteriorOrientation, get_parameter, paramet
 from jaxphoto.camera.projection import AbstractProjection
 from jaxphoto.camera.sensor import Sensor
 from jaxphoto.compiling import call_compiled
+from jaxphoto.least_squares import least_squares
 from jaxphoto.linear_algebra import solve
 
 # Image points along each side of the format, corners included, at which cameras are compared.
 _SIDE = 25
-# A fit without the terms that are rarely needed is taken where it misses by no more than this.
+# A fit without rarely needed terms is accepted if its error does not exceed this.
 _GOOD_PX = 0.01
-# Where a fit ends: rational models lie in a flat valley, in which only the coefficients change any more.
-_UNTIL = {"ftol": 1e-10, "xtol": 1e-13, "gtol": 1e-13, "max_nfev": 300}
+# Rational models lie in a flat valley and take many.
+_MAX_STEPS = 300
 
 
 class Conversion(NamedTuple):
-    """A camera written with another model, and by how much its image points are displaced for the same rays (px)."""
+    """Camera converted to another model, and the displacement of image points for the same rays (px)."""
 
     interior: InteriorOrientation
     rms_px: float
-    """Over the format, of the length of the displacement; 0 where the conversion is exact."""
+    """RMS length of the displacement over the format; 0 for an exact conversion."""
     max_px: float
     covered: float
-    """The part of the format that was compared; below 1 where the given camera says nothing of its corners."""
+    """Fraction of the format that was compared; below 1 where the given camera is not defined in its corners."""
     worst_px: tuple[float, float] | None = None
-    """Column and row of the image point that is displaced most; None where the conversion is exact."""
+    """Column and row of the image point with the largest displacement; None for an exact conversion."""
 
     @property
     def lost(self) -> str:
-        """What the conversion loses, in words."""
+        """Describe what the conversion loses."""
         if self.worst_px is None:
             return "the conversion is exact"
         column, row = self.worst_px
@@ -55,9 +55,9 @@ def converted(
     held: tuple[str, ...] = (),
     projection: AbstractProjection | None = None,
 ) -> Conversion:
-    """`exact` where it exists, otherwise `fitted`; `held` names coefficients of `target` that must be 0.
+    """Return `exact` where it exists, otherwise `fitted`; `held` names coefficients of `target` that must be 0.
 
-    `projection` is that of the result, the camera's own where it is None. Raises what `fitted` raises.
+    `projection` is that of the result; None keeps the camera's own. Raises what `fitted` raises.
     """
     own = projection is None or eqx.tree_equal(projection, interior.projection) is True
     same = exact(interior, target) if own else None
@@ -73,15 +73,15 @@ def fitted(
     held: tuple[str, ...] = (),
     projection: AbstractProjection | None = None,
 ) -> Conversion:
-    """The camera with the model `target` whose rays are nearest to those of `interior`, by least squares in the image.
+    """Fit the model `target` to the rays of `interior` by least squares in the image.
 
-    c, x_p, y_p and the coefficients of `target` but `held` are fitted to 25 x 25 evenly spaced image points of the
-    format, all of one weight; the camera is not turned. Rare terms (affinity, rational and highest ones) are taken only
-    where others leave more than 0.01 px. R0 of SMAC and of the balanced model is 0. `projection` is that of the result,
-    the camera's own where it is None.
+    c, x_p, y_p and the coefficients of `target` except `held` are fitted to 25 x 25 evenly spaced image points of the
+    format with equal weights; the camera is not rotated. Rare terms (affinity, rational and highest ones) are used only
+    if the others leave more than 0.01 px. R0 of SMAC and of the balanced model is 0. `projection` is that of the
+    result; None keeps the camera's own.
 
-    Raises ValueError where `interior` says nothing of more than half of the format, where it sees directions there that
-    `projection` does not, or the fitted model folds in it.
+    Raises ValueError if `interior` is undefined in more than half of the format, if it sees directions there that
+    `projection` does not, or if the fitted model is not invertible there.
     """
     points, rays, covered = _sampled(interior, sensor)
     scales = (*held, *target.scales)
@@ -95,7 +95,7 @@ def fitted(
     found = _fit(first, sensor, points, rays, (*scales, *rare))
     if rare and not found.max_px <= _GOOD_PX:
         fuller = _fit(found.interior, sensor, points, rays, scales)
-        # A fold makes max_px NaN: any other is better.
+        # A model that is not invertible has max_px NaN: any other is better.
         found = fuller if not found.rms_px <= fuller.rms_px else found
     if not np.isfinite(found.max_px):
         raise ValueError(
@@ -106,7 +106,7 @@ def fitted(
 
 
 def _sampled(interior: InteriorOrientation, sensor: Sensor) -> tuple[np.ndarray, np.ndarray, float]:
-    """Image points (mm) of the format that the camera maps, their directions, and their part of all."""
+    """Return image points (mm) of the format that the camera maps, their directions, and their fraction of all."""
     x, y = (np.linspace(-0.5, 0.5, _SIDE) * side for side in (sensor.width_mm, sensor.height_mm))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     rays, good = (np.asarray(v) for v in call_compiled(_rays, _arrays(interior), points))
@@ -120,7 +120,7 @@ def _sampled(interior: InteriorOrientation, sensor: Sensor) -> tuple[np.ndarray,
 
 @eqx.filter_jit
 def _rays(interior: InteriorOrientation, points):
-    """Directions, over c, of image points, and whether the model is invertible there."""
+    """Return directions, over c, of image points, and True where the model is invertible."""
     d, c = interior.distortion, interior.c
 
     def of_one(xy):
@@ -129,7 +129,7 @@ def _rays(interior: InteriorOrientation, points):
         if d.domain == "ideal":
             good = invert(d, reduced / unit)[1]
         else:
-            # The inverse of an inverse: only within the monotone range does it lead back.
+            # The inverse of an inverse returns the point only within the monotone range.
             back, monotone = invert(d, ideal / unit)
             good = monotone & (jnp.max(jnp.abs(unit * back - reduced)) < 1e-6 * c)
         ray = jnp.stack(interior.direction_from_ideal(ideal)) / c
@@ -141,39 +141,32 @@ def _rays(interior: InteriorOrientation, points):
 def _fit(
     first: InteriorOrientation, sensor: Sensor, points: np.ndarray, rays: np.ndarray, held: tuple[str, ...]
 ) -> Conversion:
-    """All parameters of `first` but `held` fitted, from its values."""
+    """Fit all parameters of `first` except `held`, from its values."""
     names = parameter_names(first)
     free = np.array([name not in held for name in names])
     begin = np.array([float(get_parameter(first, name)) for name in names])
     data = (_arrays(first), np.array(sensor.pixel_mm), _padded(points), _padded(rays))
-
-    # All parameters go in, held ones too: one program serves a model.
-    def whole(values):
-        full = begin.copy()
-        full[free] = values
-        return full
-
-    def residuals(values):
-        return np.asarray(call_compiled(_displacements, whole(values), *data)).ravel()
-
-    def jacobian(values):
-        return np.asarray(call_compiled(_jacobian, whole(values), *data)).reshape(-1, len(names))[:, free]
-
-    solved = scipy.optimize.least_squares(residuals, begin[free], jacobian, method="lm", x_scale="jac", **_UNTIL)
-    interior = _with(first, whole(solved.x))
+    # All parameters are arguments, fixed ones too: one program serves a model.
+    interior = _with(first, np.asarray(call_compiled(_fitted_values, begin, free, *data)))
     moved = np.asarray(call_compiled(_moved, _arrays(interior), *data[1:]))[: len(points)]
     column, row = sensor.px_from_mm(points[[np.argmax(moved)]])[0].tolist()
     return Conversion(interior, float(np.sqrt(np.mean(moved**2))), float(np.max(moved)), 1.0, (column, row))
 
 
 def _padded(values: np.ndarray) -> np.ndarray:
-    """NaN in place of the points of a format that were left out: one program serves all."""
+    """Replace the omitted points of a format by NaN: one program serves all."""
     return np.concatenate([values, np.full((_SIDE**2 - len(values), values.shape[1]), np.nan)])
 
 
 @eqx.filter_jit
+def _fitted_values(start, free, first: InteriorOrientation, pixel_mm, points, rays):
+    """Parameters of least squares of the displacements, from `start`; only those that are `free` change."""
+    displacements = lambda v, _: _displacements(jnp.where(free, v, start), first, pixel_mm, points, rays)  # noqa: E731
+    return least_squares(displacements, start, atol=1e-9, max_steps=_MAX_STEPS).unknowns
+
+
 def _displacements(values, first: InteriorOrientation, pixel_mm, points, rays):
-    """By how much the image points of the given rays lie elsewhere (px), to first order for measured-domain models."""
+    """Return the displacements (px) of image points of the given rays, to first order for measured-domain models."""
     interior = _with(first, values)
 
     def of_one(xy, ray):
@@ -183,23 +176,18 @@ def _displacements(values, first: InteriorOrientation, pixel_mm, points, rays):
         if interior.distortion.domain == "ideal":
             apart = interior.measured_from_ideal(aimed) - xy
         else:
-            # Ideal coordinates over c; the model's own derivative takes their difference to the image.
+            # Ideal coordinates over c; the model's derivative transforms their difference to the image.
             ideal = lambda m: interior.ideal_from_measured(m) / interior.c  # noqa: E731
             j = jax.lax.stop_gradient(jax.jacfwd(ideal)(xy))
             apart = solve(j, aimed / interior.c - ideal(xy))
         return jnp.where(here, apart / pixel_mm, 0.0)
 
-    return jax.vmap(of_one)(points, rays)
-
-
-@eqx.filter_jit
-def _jacobian(values, *rest):
-    return jax.jacfwd(lambda v: _displacements(v, *rest))(values)
+    return jax.vmap(of_one)(points, rays).ravel()
 
 
 @eqx.filter_jit
 def _moved(interior: InteriorOrientation, pixel_mm, points, rays):
-    """Lengths of the displacements (px), exactly; NaN where the model folds."""
+    """Return the exact lengths of the displacements (px); NaN where the model is not invertible."""
 
     def of_one(xy, ray):
         ideal = interior.ideal_from_direction(*ray)
@@ -212,7 +200,7 @@ def _moved(interior: InteriorOrientation, pixel_mm, points, rays):
 def _plain(
     interior: InteriorOrientation, target: type[AbstractDistortion], sensor: Sensor, projection: AbstractProjection
 ) -> InteriorOrientation:
-    """The camera without distortion, as a `target`, and whether or not its own projection is another."""
+    """Return the camera without distortion, as a `target`, and True if its projection differs."""
     plain = target.plain(sensor)
     camera = InteriorOrientation(interior.c, interior.x_p, interior.y_p, plain, projection=projection)
     return jax.tree.map(lambda v: jnp.asarray(v, float), camera)

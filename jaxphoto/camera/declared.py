@@ -1,4 +1,4 @@
-"""What a part of a camera declares of itself, so that readers, writers and tables need to know no list of models."""
+"""Self-description of camera models, so that readers, writers and tables need no list of models."""
 
 import dataclasses
 import inspect
@@ -13,15 +13,15 @@ Kind = TypeVar("Kind", bound="Declared")
 
 
 class Declared(eqx.Module):
-    """A model of a kind (a distortion, a projection) that files know by its name.
+    """Model of a kind (a distortion, a projection) that files identify by its name.
 
-    `name` is what files and commands call it. `coefficients` names the fields that an adjustment may estimate;
+    `name` is its name in files and commands. `coefficients` names the fields that an adjustment may estimate;
     `constants` those that it never does, by their names in files, which end in the unit (`{"r0_mm": "r0"}`); `choices`
-    names static fields, with the words that they may be. `powers` says in which power of mm a coefficient is: -2 of one
-    in mm^-2, 0 of one without unit; one that it does not name has an unknown unit in tables.
+    names static fields, with their possible values. `powers` gives the power of mm of a coefficient: -2 for mm^-2, 0
+    for a number without unit; coefficients it does not name have an unknown unit in tables.
 
-    A class is known from its definition on: nothing has to be registered, and a cell of a notebook that is run again
-    replaces what it defined before.
+    A class is known once defined, without registration; a notebook cell that is run again replaces its previous
+    definition.
     """
 
     name: eqx.AbstractClassVar[str]
@@ -32,7 +32,7 @@ class Declared(eqx.Module):
 
     def __init_subclass__(cls, **options) -> None:
         super().__init_subclass__(**options)
-        # Equinox makes subclasses of its own for a moment: they declare nothing.
+        # Equinox makes temporary subclasses, which declare nothing.
         if "name" in cls.__dict__:
             _check(cls)
             of_kind = _KNOWN.setdefault(_kind(cls), {})
@@ -46,12 +46,12 @@ class Declared(eqx.Module):
 
     @classmethod
     def known(cls: type[Kind]) -> Mapping[str, type[Kind]]:
-        """Every model of this kind by its name: those of jaxphoto, then those defined elsewhere."""
+        """Return every model of this kind by name: those of jaxphoto, then user-defined ones."""
         return dict(_KNOWN.get(cls, {}))
 
     @classmethod
     def called(cls: type[Kind], name: str) -> type[Kind]:
-        """The model of this kind with that name. Raises InputError where there is none."""
+        """Return the model of this kind by name. Raises InputError if there is none."""
         known = cls.known()
         if name not in known:
             kind = cls.__name__.removeprefix("Abstract").lower()
@@ -60,12 +60,12 @@ class Declared(eqx.Module):
 
     @classmethod
     def power(cls, coefficient: str) -> int | None:
-        """The power of mm that is the unit of a coefficient; None where the model does not say."""
+        """Return the power of mm that is the unit of a coefficient; None if undeclared."""
         return cls.powers.get(coefficient)
 
     @classmethod
     def needed(cls) -> dict[str, str]:
-        """Those of `constants` that have no default: positive lengths without which the model says nothing."""
+        """Return the `constants` without default: positive lengths that the model needs."""
         without = {f.name for f in dataclasses.fields(cls) if f.default is dataclasses.MISSING}
         return {name: field for name, field in cls.constants.items() if field in without}
 
@@ -74,12 +74,12 @@ _KNOWN: dict[type, dict[str, type]] = {}
 
 
 def _kind(cls: type) -> type:
-    """The abstract class right below `Declared` that `cls` is of."""
+    """Return the abstract class right below `Declared` that `cls` derives from."""
     return next(base for base in cls.__mro__ if Declared in base.__bases__)
 
 
 def _check(cls: type[Declared]) -> None:
-    """Raise InputError where what a class declares is not what its fields are."""
+    """Raise InputError if the declarations of a class do not match its fields."""
     fields = {name for base in cls.__mro__ for name in _annotated(base)}
     listed = (*cls.coefficients, *cls.constants.values(), *cls.choices)
     if wrong := [name for name in listed if name not in fields]:
@@ -101,7 +101,7 @@ def _check(cls: type[Declared]) -> None:
 
 
 def _annotated(cls: type) -> list[str]:
-    """The fields that the body of a class gives: what is annotated and belongs to no class variable."""
+    """Return the fields in the body of a class: annotations except class variables."""
     hints = inspect.get_annotations(cls)
     return [name for name, hint in hints.items() if "ClassVar" not in str(hint)]
 

@@ -1,13 +1,12 @@
-"""Distortion models that are the same polynomial in other names, signs, units or scale: exact conversions.
+"""Exact conversions between distortion models that are the same polynomial in other names, signs, units or scale.
 
-Most models are one of two polynomials, D being Brown's decentring and (x, y) with y up:
+Most models are one of two polynomials, with D Brown's decentring distortion and (x, y) with y up:
 
     measured    ideal = x - x q - t D(P1, P2) - affinity(b1, b2),             x measured, in mm
     ideal       measured = c (p + p q + t D(P1, P2) + affinity(b1, b2)),      p = ideal / c
 
 with q = K1 r^2 + K2 r^4 + ... and t = 1 + P3 r^2 + P4 r^4. A camera of one of them converts exactly to every model of
-the same direction that has the terms it needs, whatever its R0. Which coefficients those are, each model declares
-(`AbstractDistortion.terms`).
+the same direction that has the required terms, for any R0. Each model declares its terms (`AbstractDistortion.terms`).
 """
 
 import dataclasses
@@ -22,7 +21,9 @@ from jaxphoto.camera.interior import InteriorOrientation
 
 
 def exact(interior: InteriorOrientation, target: type[AbstractDistortion]) -> InteriorOrientation | None:
-    """The same bundle of rays with the model `target` (SMAC: subtracted; R0 = 0), None where no exact one is known."""
+    """Convert to the model `target` with the same rays (SMAC: subtracted; R0 = 0); None if no exact conversion is
+    known.
+    """
     d = interior.distortion
     if type(d) is target:
         return interior
@@ -44,7 +45,7 @@ def exact(interior: InteriorOrientation, target: type[AbstractDistortion]) -> In
 
 
 def with_sign(interior: InteriorOrientation, sign: Literal["subtract", "add"]) -> InteriorOrientation:
-    """The same camera with a SMAC that is subtracted, as in paper 002, or added, as in reports of the USGS.
+    """Convert SMAC to the sign "subtract" (paper 002) or "add" (reports of the USGS).
 
     K0 to K4, P1 and P2 change their sign. Raises ValueError for a distortion other than SMAC.
     """
@@ -59,7 +60,7 @@ def with_sign(interior: InteriorOrientation, sign: Literal["subtract", "add"]) -
 
 
 def _common(interior: InteriorOrientation) -> tuple[float, dict[str, float]]:
-    """c and the terms other than 0 of one of the two polynomials."""
+    """Return c and the nonzero terms of one of the two polynomials."""
     scale = 1.0
     if isinstance(interior.distortion, Smac):
         interior = with_sign(rebalance(interior, 0.0), "subtract")

@@ -1,4 +1,4 @@
-"""Interior orientation: principal distance, principal point, projection and a distortion."""
+"""Interior orientation: principal distance, principal point, projection and distortion."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -21,15 +21,14 @@ Part = TypeVar("Part", bound=Declared)
 
 
 class InteriorOrientation(eqx.Module):
-    """Principal distance c > 0, principal point (x_p, y_p) and distortion, all in mm on the image, and the projection.
+    """Principal distance c > 0, principal point (x_p, y_p) and distortion, all in mm on the image, and projection.
 
-    `projection` takes a direction in the camera's frame to the ideal image and back; the perspective plane where none
-    is named.
-    `ideal = distortion.ideal_from_measured(measured - (x_p, y_p))`; for a `normalised` distortion both are divided by c
+    `projection` maps directions in the camera frame to the ideal image and back; perspective by default. `ideal =
+    distortion.ideal_from_measured(measured - (x_p, y_p))`; for a `normalised` distortion both are divided by c
     (docs/conventions.md).
 
-    `residuals` says in which image an adjustment measures its residuals: that of the model, where the distortion has a
-    closed form, or always the measured one, whose noise it is. They differ where a wide-angle lens stretches the image.
+    `residuals` selects the image in which residuals are measured: that of the model, where the distortion has a closed
+    form, or always the measured image, where the noise is. They differ where a wide-angle lens stretches the image.
     """
 
     c: Float[Array, ""] | float
@@ -39,7 +38,7 @@ class InteriorOrientation(eqx.Module):
     residuals: Literal["model", "measured"] = eqx.field(static=True, default="model")
     projection: AbstractProjection = dataclasses.field(default_factory=Perspective)
     rows: RowMotion | None = None
-    """How the camera moves while rows are exposed: only within an adjustment that knows of it (`RollingShutter`)."""
+    """Motion of the camera while rows are exposed: only within an adjustment with `RollingShutter`."""
 
     def __check_init__(self) -> None:
         if both := set(self.projection.coefficients) & set(self.distortion.coefficients):
@@ -49,25 +48,27 @@ class InteriorOrientation(eqx.Module):
             )
 
     def ideal_from_measured(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Ideal image coordinate (mm, from the principal point) of a measured one (mm, from the centre)."""
+        """Convert a measured image coordinate (mm, from the centre) to the ideal one (mm, from the principal point)."""
         return self._in_mm(self.distortion.ideal_from_measured, single("xy", xy, 2) - self.principal_point)
 
     def measured_from_ideal(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Measured image coordinate (mm, from the centre) of an ideal one (mm, from the principal point)."""
+        """Convert an ideal coordinate (mm, from the principal point) to the measured one (mm, from the centre)."""
         return self._in_mm(self.distortion.measured_from_ideal, single("xy", xy, 2)) + self.principal_point
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """The distortion's own direction (see its `domain`), of one coordinate in mm from the principal point."""
+        """Apply the distortion in its closed-form direction (see `domain`) to a coordinate in mm from the principal
+        point.
+        """
         return self._in_mm(self.distortion.closed_form, xy)
 
     def valid(self, xy: Float[Array, "2"]) -> Bool[Array, ""]:
-        """Whether the ideal coordinate `xy` lies in the range in which the distortion can be inverted."""
+        """Return True if the distortion is invertible at the ideal coordinate `xy`."""
         if self.distortion.domain == "ideal":
             return jnp.array(True)
         return invert(self.distortion, xy / self.c if self.distortion.normalised else xy)[1]
 
     def invertible(self, xy: Float[Array, "2"]) -> Bool[Array, ""]:
-        """`valid`, and the same where the distortion is one of the ideal coordinate: far outside, that folds, too."""
+        """Return `valid`; also for distortions of the ideal coordinate, which are not invertible far outside either."""
         if self.distortion.domain == "measured":
             return self.valid(xy)
         there = xy / self.c if self.distortion.normalised else xy
@@ -75,12 +76,12 @@ class InteriorOrientation(eqx.Module):
         return sure & (jnp.abs(back - there).max() < 1e-9 * (1 + jnp.abs(there).max()))
 
     def direction_from_ideal(self, xy: Float[Array, "2"]) -> tuple[Array, Array, Array]:
-        """The direction (u, v, w) in the camera's frame, of any length, of an ideal coordinate (mm)."""
+        """Return the direction (u, v, w) in the camera frame, of any length, of an ideal coordinate (mm)."""
         u, v, w = self.projection.direction_from_ideal(jnp.asarray(self.c, xy.dtype), xy[0], xy[1])
         return u, v, w
 
     def ideal_from_direction(self, u: Array, v: Array, w: Array) -> Float[Array, "2"]:
-        """Ideal image coordinate (mm, from the principal point) of a direction, or point, in the camera's frame."""
+        """Return the ideal coordinate (mm, from the principal point) of a direction or point in the camera frame."""
         return jnp.stack(self.projection.ideal_from_direction(self.c, u, v, w))
 
     @property
@@ -100,7 +101,7 @@ class InteriorOrientation(eqx.Module):
         return jnp.stack([jnp.asarray(self.x_p), jnp.asarray(self.y_p)])
 
     def _in_mm(self, of_model: Callable, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """A map of the distortion, which has a unit of its own, as one of millimetres."""
+        """Convert a map of the distortion, in its own unit, to millimetres."""
         if not self.distortion.normalised:
             return of_model(xy)
         x, y = of_model(jnp.stack([xy[0] / self.c, xy[1] / self.c]))
@@ -108,7 +109,7 @@ class InteriorOrientation(eqx.Module):
 
 
 def parameter_names(interior: InteriorOrientation) -> tuple[str, ...]:
-    """The estimable parameters in the order of the model: c_mm, xp_mm, yp_mm and the coefficients.
+    """Return the estimable parameters in the order of the model: c_mm, xp_mm, yp_mm and the coefficients.
 
     These are the names of `block.toml` and of every table (docs/block_folder.md).
     """
@@ -116,12 +117,12 @@ def parameter_names(interior: InteriorOrientation) -> tuple[str, ...]:
 
 
 def constant_names(interior: InteriorOrientation) -> tuple[str, ...]:
-    """The constants of its models, by their names in files (`r0_mm`)."""
+    """Return the constants of its models, by their names in files (`r0_mm`)."""
     return (*interior.distortion.constants, *interior.projection.constants)
 
 
 def parameter_unit(interior: InteriorOrientation, name: str) -> str:
-    """The unit of a parameter or constant: mm, 1/mm^2; "1" of a number without unit, "" where no model says it."""
+    """Return the unit of a parameter or constant: mm, 1/mm^2; "1" without unit, "" if unknown."""
     for part in (interior.distortion, interior.projection):
         if name in part.coefficients:
             power = part.power(name)
@@ -130,14 +131,15 @@ def parameter_unit(interior: InteriorOrientation, name: str) -> str:
 
 
 def power_of_mm(power: int) -> str:
-    """mm, 1, 1/mm, 1/mm^2 ..."""
+    """Format a power of mm: mm, 1, 1/mm, 1/mm^2 ..."""
     words = {1: "mm", 0: "1", -1: "1/mm"}
     return words.get(power, f"1/mm^{-power}" if power < 0 else f"mm^{power}")
 
 
 def model_keys(interior: InteriorOrientation) -> dict[str, str]:
-    """The keys by which files tell the models of a camera: distortion, projection (a perspective one goes without
-    saying), and what is chosen of each."""
+    """Return the keys by which files identify the models of a camera: distortion, projection (if not perspective),
+    choices.
+    """
     keys = {"distortion": interior.distortion.name}
     if type(interior.projection) is not Perspective:
         keys["projection"] = interior.projection.name
@@ -147,9 +149,9 @@ def model_keys(interior: InteriorOrientation) -> dict[str, str]:
 
 
 def empty_camera(told: Mapping[str, Any], constant: float = 1.0) -> InteriorOrientation:
-    """A camera of the models that `model_keys` told, zeros for numbers, every constant being `constant`.
+    """Return a camera of the models in `model_keys`: parameters zero, all constants `constant`.
 
-    Raises InputError for models that are not known, KeyError where no distortion is told.
+    Raises InputError for unknown models, KeyError without a distortion.
     """
     distortion = _empty(AbstractDistortion.called(told["distortion"]), told, constant)
     projection = _empty(AbstractProjection.called(told.get("projection", Perspective.name)), told, constant)
@@ -162,15 +164,15 @@ def _empty(kind: type[Part], told: Mapping[str, Any], constant: float) -> Part:
 
 
 def get_parameter(interior: InteriorOrientation, name: str):
-    """The value (or, in a tree of priors, the prior) that `name` of `parameter_names` stands for; constants, too.
+    """Return the value (or, in a tree of priors, the prior) of the parameter or constant `name`.
 
-    Raises InputError for a name that the camera has not.
+    Raises InputError for a name that the camera does not have.
     """
     return getattr(*_place(interior, name))
 
 
 def set_parameter(interior: InteriorOrientation, name: str, value) -> InteriorOrientation:
-    """A copy of `interior` in which the parameter `name` is `value`. Raises InputError for a name that it has not."""
+    """Return a copy of `interior` with the parameter `name` set to `value`. Raises InputError for an unknown name."""
 
     def where(tree):
         return getattr(*_place(tree, name))

@@ -1,8 +1,8 @@
-"""What is known of a lens before anything was measured with it: by make and model, or by class of camera.
+"""Prior information about a lens before any measurement: by make and model, or by class of camera.
 
-A flat block at one height cannot tell the principal distance from its own height, nor a barrel from a dome. What
-decides then is how far lenses are from what EXIF says of them: the table `lens_priors.toml`, with the source of each
-figure.
+A flat block at one height determines neither the principal distance apart from its own height nor barrel distortion
+apart from a dome. The result then depends on how far lenses deviate from EXIF: table `lens_priors.toml`, with the
+source of each figure.
 """
 
 import functools
@@ -19,40 +19,40 @@ from jaxtyping import Float
 from jaxphoto.camera.interior import InteriorOrientation, parameter_names, set_parameter
 from jaxphoto.camera.sensor import Sensor
 
-# Places on the edge of the format at which a coefficient shows what it does.
+# Places on the edge of the format at which the effect of a coefficient is evaluated.
 _ON_AN_EDGE = 9
 
 
 class LensPrior(NamedTuple):
-    """How far the lenses of a model, or of a class of cameras, are from what EXIF says; standard deviations."""
+    """Standard deviations of the lenses of a model, or of a class of cameras, about the values of EXIF."""
 
     name: str
     c_percent: float
-    """Of c, from the focal length of EXIF."""
+    """Of c about the focal length in EXIF."""
     point_percent: float
-    """Of the longer side of the format: of the principal point from its middle, in x and in y."""
+    """Of the principal point about the centre, in x and in y, relative to the longer side of the format."""
     radial_percent: float
-    """Of the distance of the corner: what each radial term of the distortion does there."""
+    """Effect of each radial distortion term at the corner, relative to the distance of the corner."""
     decentring_percent: float
-    """Likewise of all other terms."""
+    """The same for all other terms."""
     drift_ppm_per_K: float
-    """By how much c changes with the temperature."""
+    """Change of c with temperature."""
     published: bool
-    """Whether the figures rest on published ones."""
+    """True if the figures rest on published ones."""
     source: str
 
 
 @functools.cache
 def lens_priors() -> tuple[tuple[tuple[str, ...], tuple[str, ...], LensPrior], ...]:
-    """The table: models, beginnings of makes (and models), and the prior; the first that fits is taken."""
+    """Return the table of models or beginnings of makes (and models) with their priors; the first match is used."""
     table = tomllib.loads(resources.files(__package__).joinpath("lens_priors.toml").read_text("utf-8"))
     return tuple((tuple(row.pop("models", ())), tuple(row.pop("makes", ())), LensPrior(**row)) for row in table["lens"])
 
 
 def lens_prior(make: str | None, model: str | None) -> LensPrior:
-    """The prior of a camera by the make and model of its EXIF (None: EXIF does not say)."""
+    """Return the prior of a camera by make and model in EXIF (None if EXIF lacks them)."""
     make, model = (make or "").strip(), (model or "").strip()
-    # Some makers write their name into the model again.
+    # Some makers repeat their name in the model.
     told = {f"{make} {model}".lower(), f"{make.split(' ')[0]} {model}".lower(), model.lower()}
     for models, makes, prior in lens_priors():
         if model in models or any(name.startswith(own.lower()) for own in makes for name in told):
@@ -63,10 +63,10 @@ def lens_prior(make: str | None, model: str | None) -> LensPrior:
 def prior_sigmas(
     prior: LensPrior, interior: InteriorOrientation, sensor: Sensor, rounding: float = 0.0
 ) -> dict[str, float]:
-    """Standard deviations of the parameters of `interior` about its own values, by name (their own units).
+    """Return standard deviations of the parameters of `interior` about its values, by name (their own units).
 
-    `rounding` is the relative standard deviation of c that comes from how it was noted. A coefficient has that by which
-    its term moves the edge of the format, where it moves it most, by the percentage that the table says.
+    `rounding` is the relative standard deviation of c due to its rounding in EXIF. A coefficient has the standard
+    deviation whose largest displacement at the edge of the format is the percentage of the table.
     """
     c = float(interior.c)
     point = prior.point_percent / 100 * max(sensor.width_mm, sensor.height_mm)
@@ -81,19 +81,19 @@ def prior_sigmas(
         most = np.hypot(*moved.T).max()
         radial = across < 1e-6 * corner * most
         percent = prior.radial_percent if radial else prior.decentring_percent
-        # What moves nothing is the place that distortion is about, where there is none yet: as the principal point.
+        # Without effect: the centre of a distortion that is zero. Treat it as the principal point.
         found[name] = percent / 100 * corner / most if most > 0 else point
     return found
 
 
 def _edge(sensor: Sensor) -> Float[np.ndarray, "places 2"]:
-    """Places along two edges of the format and its corner (mm, from the middle)."""
+    """Return places along two edges of the format and its corner (mm, from the centre)."""
     half, part = np.array([sensor.width_mm, sensor.height_mm]) / 2, np.linspace(0.0, 1.0, _ON_AN_EDGE)
     ones = np.ones_like(part)
     return half * np.concatenate([np.column_stack([part, ones]), np.column_stack([ones, part])])
 
 
 def _moved(interior: InteriorOrientation, name: str, edge: np.ndarray) -> Float[np.ndarray, "places 2"]:
-    """What a coefficient moves places by (mm), for each of its units."""
+    """Return the displacement (mm) per unit of a coefficient."""
     move = lambda v: jax.vmap(set_parameter(interior, name, v).closed_form)(jnp.asarray(edge))  # noqa: E731
     return np.asarray(jax.jit(lambda: jax.jvp(move, (0.0,), (1.0,))[1])())

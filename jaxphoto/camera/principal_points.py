@@ -1,12 +1,12 @@
-"""The principal points of autocollimation (PPA) and of symmetry (PPS), and decentring in place of the latter.
+"""Principal points of autocollimation (PPA) and of symmetry (PPS), and their equivalence to decentring distortion.
 
 The PPA is the foot of the perpendicular from the projection centre: (x_p, y_p) of every camera here. The PPS is the
 centre of the radial distortion, S from the PPA. With delta_i(x) = x |x|^2i, to first order in S,
 
     sum Ki delta_i(x - S) = sum Ki delta_i(x) - K1 (S r^2 + 2 x (x.S)) - K2 r^2 (S r^2 + 4 x (x.S)) - ...
 
-The K1 term is decentring distortion with P = -K1 S, so a lens may be written either way; the terms of K2, K3 and of
-S^2 are not of that form. A conversion drops them, and `conversion_error` says how much that is. Source: maths in
+The K1 term is decentring distortion with P = -K1 S, so a lens may be described either way; the terms of K2, K3 and of
+S^2 do not have that form. A conversion omits them, and `conversion_error` gives their size. Source: derivation in
 docs/models.md; the two points in paper 003, section 2.4.
 """
 
@@ -22,15 +22,12 @@ from jaxtyping import Array, Float
 from jaxphoto.camera.distortion import Brown, PpsRadial
 from jaxphoto.camera.interior import InteriorOrientation, get_parameter, parameter_names, set_parameter
 from jaxphoto.camera.sensor import Sensor
+from jaxphoto.least_squares import least_squares
 from jaxphoto.rotation import small_rotation
 from jaxphoto.short_repr import shown
 
 # Image points along each side of the format, corners included, at which two cameras are compared.
 _SIDE = 25
-# Gauss-Newton steps of a re-fit: it is nearly linear, and the tests find nothing left to improve after these.
-_STEPS = 6
-# Columns of a re-fit nearer to dependence than this say nothing of either: the shortest solution is taken.
-_DEPENDENT = 1e-10
 
 
 @shown
@@ -43,7 +40,7 @@ class PrincipalPoints(NamedTuple):
 
 @shown
 class ConversionError(NamedTuple):
-    """What one camera misses of another: the largest and RMS image displacement over the format, in mm.
+    """Difference between two cameras: the largest and RMS image displacement over the format, in mm.
 
     `interior` is the second camera, as compared.
     """
@@ -54,7 +51,7 @@ class ConversionError(NamedTuple):
 
 
 def principal_points(interior: InteriorOrientation) -> PrincipalPoints:
-    """PPA and PPS of a camera with `PpsRadial` (exact) or `Brown` (to first order: S = -P / K1).
+    """Return PPA and PPS of a camera with `PpsRadial` (exact) or `Brown` (to first order: S = -P / K1).
 
     Raises ValueError for other distortions, and an equinox error for decentring without K1, which has no PPS.
     """
@@ -66,12 +63,12 @@ def principal_points(interior: InteriorOrientation) -> PrincipalPoints:
 
 
 def symmetry_from_decentring(interior: InteriorOrientation) -> InteriorOrientation:
-    """The camera with `PpsRadial` in place of `Brown`: S = -P / K1; c, the PPA and K1 to K3 stay.
+    """Convert `Brown` to `PpsRadial`: S = -P / K1; c, the PPA and K1 to K3 stay.
 
-    First order in S. Neglected: the K2 and K3 terms, of which the K2 term -K2 r^2 (S r^2 + 4 x (x.S)) is not of
-    decentring form, and everything of order S^2; `conversion_error` gives their size.
-    Raises ValueError for a distortion other than Brown, and an equinox error for decentring without K1 and for affinity
-    or shear, which `PpsRadial` does not have.
+    First order in S. Neglects the K2 and K3 terms, of which the K2 term -K2 r^2 (S r^2 + 4 x (x.S)) does not have
+    decentring form, and everything of order S^2; `conversion_error` gives their size. Raises ValueError for a
+    distortion other than Brown, and an equinox error for decentring without K1 and for affinity or shear, which
+    `PpsRadial` does not have.
     """
     d = _checked(interior, Brown)
     s = _symmetry_point(d)
@@ -81,7 +78,7 @@ def symmetry_from_decentring(interior: InteriorOrientation) -> InteriorOrientati
 
 
 def decentring_from_symmetry(interior: InteriorOrientation) -> InteriorOrientation:
-    """The camera with `Brown` in place of `PpsRadial`: P = -K1 S; c, the PPA and K1 to K3 stay.
+    """Convert `PpsRadial` to `Brown`: P = -K1 S; c, the PPA and K1 to K3 stay.
 
     Neglects what `symmetry_from_decentring`, its inverse, neglects. Raises ValueError for a distortion other than
     PpsRadial.
@@ -94,11 +91,11 @@ def decentring_from_symmetry(interior: InteriorOrientation) -> InteriorOrientati
 def conversion_error(
     before: InteriorOrientation, after: InteriorOrientation, sensor: Sensor, refit: bool = False
 ) -> ConversionError:
-    """Largest and RMS displacement between the ideal coordinates that two cameras give to the same image points.
+    """Return the largest and RMS displacement between the ideal coordinates of two cameras for the same image points.
 
     Taken over 25 x 25 points of the format, to its corners, at the scale of `before.c`; both cameras as they are. With
     `refit`, c, x_p, y_p, every coefficient of `after` and a small rotation of the camera are first fitted to `before`
-    by least squares: what is left is what no self-calibration of `after` can take up.
+    by least squares: the remainder is what self-calibration with the model of `after` cannot absorb.
     """
     x, y = (np.linspace(-0.5, 0.5, _SIDE) * side for side in (sensor.width_mm, sensor.height_mm))
     points = jnp.asarray(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
@@ -117,15 +114,9 @@ def conversion_error(
         turned = rays @ small_rotation(theta).T
         return (jax.vmap(before.ideal_from_direction)(*turned.T) - wanted).ravel()
 
-    def improved(_, unknowns):
-        jacobian = jax.jacfwd(displacement)(unknowns)
-        length = jnp.linalg.norm(jacobian, axis=0)
-        length = jnp.where(length > 0, length, 1.0)
-        return unknowns - jnp.linalg.lstsq(jacobian / length, displacement(unknowns), rcond=_DEPENDENT)[0] / length
-
     unknowns = jnp.stack([*jnp.zeros(3), *(jnp.asarray(get_parameter(after, name), float) for name in names)])
     if refit:
-        unknowns = jax.lax.fori_loop(0, _STEPS, improved, unknowns)
+        unknowns = least_squares(lambda u, _: displacement(u), unknowns, damping=1e-6).unknowns
     moved = jnp.linalg.norm(displacement(unknowns).reshape(-1, 2), axis=1)
     return ConversionError(jnp.max(moved), jnp.sqrt(jnp.mean(moved**2)), camera(unknowns[3:]))
 

@@ -1,18 +1,18 @@
-"""Rolling shutter: rows of a photograph are exposed one after another while the camera moves and turns.
+"""Rolling shutter: rows of a photograph are exposed one after another while the camera moves and rotates.
 
 The exterior orientation is that of the middle row. A row with the image coordinate y (mm, up, from the centre of the
 format of height h) is exposed
 
     t = -readout y / h = readout (row / rows - 1/2)
 
-after it: the time from the first row of the file to the last is `readout`, negative where the last comes first. Then
-the camera is at C + R' v t and its rotation is small_rotation(w t) R, so that a point that lies at p in the camera of
-the middle row lies, for that row, at
+after it: `readout` is the time from the first row of the file to the last, negative if the last comes first. The camera
+is then at C + R' v t with the rotation small_rotation(w t) R, so a point at p in the camera frame of the middle row is,
+for that row, at
 
     p(t) = small_rotation(w t) (p - v t)
 
-with the velocity v (m/s) and the rate of turn w (rad/s) in the axes of the camera. y is the measured coordinate:
-nothing is iterated. v and w are those of the camera over the ground, so where points move, too, nothing is known.
+with the velocity v (m/s) and the rotation rate w (rad/s) in the camera axes. y is the measured coordinate, so nothing
+is iterated. v and w are those of the camera over the ground: object points are assumed not to move.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ Scalar = Float[Array, "*images"] | float
 
 
 class RowMotion(eqx.Module):
-    """How the camera moves from row to row: what parameters add to the interior orientation of an image."""
+    """Motion of the camera from row to row: added to the interior orientation of an image."""
 
     time_per_mm: Scalar = 0.0
     """Readout over the height of the format (s/mm)."""
@@ -41,7 +41,7 @@ class RowMotion(eqx.Module):
     rate_z: Scalar = 0.0
 
     def at_row(self, y: Array, in_camera: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        """A point in the frame of the camera of the middle row, in that of the row with the measured `y` (mm)."""
+        """Transform a point from the camera frame of the middle row to that of the row with the measured `y` (mm)."""
         t = -self.time_per_mm * y
         velocity = jnp.stack([jnp.asarray(v) for v in (self.velocity_x, self.velocity_y, self.velocity_z)])
         rate = jnp.stack([jnp.asarray(w) for w in (self.rate_x, self.rate_y, self.rate_z)])
@@ -50,7 +50,7 @@ class RowMotion(eqx.Module):
 
 
 class RollingShutter(AbstractParameters):
-    """Time (ms) from the first row of a photograph to the last, of one camera; negative where the last comes first."""
+    """Time (ms) from the first row of a photograph to the last, of one camera; negative if the last comes first."""
 
     kind = "shutters"
     owner = "camera"
@@ -60,16 +60,16 @@ class RollingShutter(AbstractParameters):
     readout: Scalar
 
     def interior(self, interior: Any, exposure: Any) -> Any:
-        """The interior orientation, which now knows when its rows are exposed."""
+        """Return the interior orientation with the exposure times of its rows."""
         rows = interior.rows or RowMotion()
         rows = dataclasses.replace(rows, time_per_mm=1e-3 * self.readout / exposure.height)
         return dataclasses.replace(interior, rows=rows)
 
 
 class ImageMotion(AbstractParameters):
-    """Velocity (m/s) and rate of turn (rad/s) of one image in the axes of its camera: x right, y up, z out of its back.
+    """Velocity (m/s) and rotation rate (rad/s) of one image in its camera axes: x right, y up, z out of its back.
 
-    The rate is that of the camera: a positive one about z turns it counter-clockwise as seen from behind.
+    The rate is that of the camera: a positive one about z rotates it counter-clockwise as seen from behind.
     """
 
     kind = "motions"
@@ -84,7 +84,7 @@ class ImageMotion(AbstractParameters):
     rate: Float[Array, "3 *images"]
 
     def interior(self, interior: Any, exposure: Any) -> Any:
-        """The interior orientation, which now knows how its rows move."""
+        """Return the interior orientation with the motion of its rows."""
         rows = interior.rows or RowMotion()
         moving = dict(zip(self.bends, [*self.velocity, *self.rate], strict=True))
         return dataclasses.replace(interior, rows=dataclasses.replace(rows, **moving))

@@ -1,4 +1,4 @@
-"""The sensor: its format in pixels and millimetres, and image coordinates in either."""
+"""Sensor: its format in pixels and millimetres, and image coordinates in either."""
 
 from typing import Any
 
@@ -11,13 +11,13 @@ from jaxphoto.short_repr import html_of
 
 
 class Sensor(eqx.Module):
-    """A frame sensor of `width_px` x `height_px` square pixels of `pixel_mm` millimetres."""
+    """Frame sensor of `width_px` x `height_px` square pixels of `pixel_mm` millimetres."""
 
     width_px: int
     height_px: int
     pixel_mm: float
     pixel_assumed: bool = eqx.field(static=True, default=False)
-    """Whether the size of a pixel was chosen, as no file tells it: all millimetres of the camera scale with it."""
+    """True if the pixel size is assumed, because no file states it: all millimetres of the camera scale with it."""
 
     def __check_init__(self) -> None:
         if self.width_px <= 0 or self.height_px <= 0 or not self.pixel_mm > 0:
@@ -44,7 +44,7 @@ class Sensor(eqx.Module):
         return self.height_px * self.pixel_mm
 
     def mm_from_px(self, column_row: Float[Numbers, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Millimetres, origin at the image centre, x right, y up, from (column, row) in pixels.
+        """Convert (column, row) in pixels to millimetres, origin at the image centre, x right, y up.
 
         The centre of the upper-left pixel is (0.5, 0.5) (docs/conventions.md).
         """
@@ -52,12 +52,12 @@ class Sensor(eqx.Module):
         return (np.asarray(column_row) - centre) * np.array([self.pixel_mm, -self.pixel_mm])
 
     def px_from_mm(self, xy_mm: Float[Numbers, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """(column, row) in pixels from millimetres: the inverse of `mm_from_px`."""
+        """Convert millimetres to (column, row) in pixels: the inverse of `mm_from_px`."""
         centre = np.array([self.width_px, self.height_px]) / 2
         return np.asarray(xy_mm) / np.array([self.pixel_mm, -self.pixel_mm]) + centre
 
 
 def sensor_keys(sensor: Sensor) -> dict[str, Any]:
-    """The keys by which files tell a sensor; that its pixel is not assumed goes without saying."""
+    """Return the keys by which files describe a sensor; `pixel_assumed` only if true."""
     size = {"width_px": sensor.width_px, "height_px": sensor.height_px, "pixel_mm": sensor.pixel_mm}
     return size | ({"pixel_assumed": True} if sensor.pixel_assumed else {})

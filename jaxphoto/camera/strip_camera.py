@@ -1,10 +1,9 @@
-"""A camera that is another one in every strip: strip-variant principal distance and principal point.
+"""Strip-variant principal distance and principal point.
 
-The interior orientation of the camera is what all strips have in common; each strip adds its own c, x_p and y_p to it.
-Where all of these are free, only what strips differ by can be told: know them about zero, which leaves the camera the
-mean of its strips, or from strip to strip (`observations.StripCameraSteps`).
-Source: Moniwa (1981), The concept of photo-variant self-calibration and its application in block adjustment with
-bundles, Photogrammetria 36.
+The interior orientation of the camera is common to all strips; each strip adds its own c, x_p and y_p. If all are free,
+only differences between strips are determined: observe them as zero, which makes the camera the mean of its strips, or
+constrain them from strip to strip (`observations.StripCameraSteps`). Source: Moniwa (1981), The concept of
+photo-variant self-calibration and its application in block adjustment with bundles, Photogrammetria 36.
 """
 
 import dataclasses
@@ -18,7 +17,7 @@ Scalar = Float[Array, "*images"] | float
 
 
 class StripCamera(AbstractParameters):
-    """What the camera of a strip has more than the camera of the block: of c, x_p and y_p (mm)."""
+    """Additions of a strip to the camera of the block: to c, x_p and y_p (mm)."""
 
     kind = "strip_cameras"
     owner = "strip"
@@ -30,7 +29,7 @@ class StripCamera(AbstractParameters):
     yp_more: Scalar
 
     def interior(self, interior: Any, exposure: Any) -> Any:
-        """The interior orientation of the strip."""
+        """Return the interior orientation of the strip."""
         return dataclasses.replace(
             interior,
             c=interior.c + self.c_more,

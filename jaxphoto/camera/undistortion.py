@@ -1,4 +1,4 @@
-"""The pinhole camera in the place of one with distortion, and where each of its pixels is in the given photograph."""
+"""Distortion-free pinhole camera of a given camera, and the source position of each of its pixels."""
 
 from typing import Literal, NamedTuple
 
@@ -15,32 +15,32 @@ from jaxphoto.camera.sensor import Sensor
 from jaxphoto.compiling import call_compiled
 
 Keep = Literal["crop", "all"]
-# Points along each side of the border.
+# Number of points along each side of the border.
 _ALONG = 200
-# Of the given sides: what is larger is the horizon of a fisheye.
+# Largest ratio of new to given sides: anything larger is the horizon of a fisheye.
 _LARGEST = 4.0
-# So far apart (px) are the places that are computed; between them a spline is truer than the rounding of the result.
+# Spacing (px) of exactly computed positions; between them a spline is more accurate than the rounding of the result.
 _STEP = 16
 _NOWHERE = -1e6
-# Places that go through the compiled program at once.
+# Number of positions per call of the compiled program.
 _CHUNK = 1 << 16
 
 
 class Pinhole(NamedTuple):
-    """A camera without distortion: c and the size of a pixel are those of the given one, the format is another."""
+    """Camera without distortion: c and pixel size of the given one, in another format."""
 
     sensor: Sensor
     interior: InteriorOrientation
 
 
 def pinhole(sensor: Sensor, interior: InteriorOrientation, keep: Keep = "crop") -> Pinhole:
-    """The camera of undistorted photographs.
+    """Return the camera of undistorted photographs.
 
-    `crop`: the largest format that the given one fills within its four sides, `all`: the smallest that holds it. Raises
-    ValueError where the distortion folds at the border of the given format, where that looks at 90 degrees from the
-    axis or more, and where the new format would be more than four times as wide or high.
+    `crop`: the largest format filled by the given one, `all`: the smallest that contains it. Raises ValueError if the
+    distortion is not invertible at the border of the given format, if the border is 90 degrees or more from the axis,
+    and if the new format would be more than four times as wide or high.
     """
-    # What fills the new format is interpolated between centres of pixels.
+    # Interpolation needs pixel centres on all sides.
     x, y = _border(sensor, interior, 1.0 if keep == "crop" else 0.0)
     if keep == "crop":
         low = np.array([x[3].max(), y[0].max()])
@@ -64,9 +64,10 @@ def pinhole(sensor: Sensor, interior: InteriorOrientation, keep: Keep = "crop") 
 def source_pixels(
     sensor: Sensor, interior: InteriorOrientation, new: Pinhole
 ) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
-    """Of every pixel of the new camera its column and row in the given photograph, the centre of the first being 0.
+    """Return column and row in the given photograph of every pixel of the new camera; the centre of the first pixel is
+    0.
 
-    Far outside the format where the given camera has no image, or its distortion folds.
+    Far outside the format where the given camera has no image, or its distortion is not invertible.
     """
     rows, columns = (np.arange(n) + 0.5 for n in (new.sensor.height_px, new.sensor.width_px))
     coarse = [np.linspace(v[0], v[-1], max(len(v) // _STEP, 4)) for v in (rows, columns)]
@@ -74,7 +75,7 @@ def source_pixels(
     if np.isfinite(found).all():
         column, row = (scipy.interpolate.RectBivariateSpline(*coarse, found[k])(rows, columns) for k in (0, 1))
     else:
-        # Where nothing is to be seen, nothing can be interpolated.
+        # Pixels without an image cannot be interpolated.
         column, row = np.nan_to_num(_at(sensor, interior, new, rows, columns), nan=_NOWHERE)
     return column.astype(np.float32), row.astype(np.float32)
 
@@ -82,11 +83,11 @@ def source_pixels(
 def _at(
     sensor: Sensor, interior: InteriorOrientation, new: Pinhole, rows: np.ndarray, columns: np.ndarray
 ) -> Float[np.ndarray, "2 rows columns"]:
-    """Column and row in the given photograph of the places on the lines `rows` and `columns` (px); NaN for none."""
+    """Return column and row in the given photograph of the grid of `rows` and `columns` (px); NaN for none."""
     px = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     parts = []
     for begin in range(0, len(px), _CHUNK):
-        # Of one size, for one program.
+        # Equal size, for one program.
         part = px[np.minimum(np.arange(begin, begin + _CHUNK), len(px) - 1)]
         parts.append(call_compiled(_measured, interior, new.interior, new.sensor.mm_from_px(part)))
     xy = np.concatenate([np.asarray(part) for part in parts])[: len(px)]
@@ -94,9 +95,10 @@ def _at(
 
 
 def _border(sensor: Sensor, interior: InteriorOrientation, less_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """x and y (mm, from the principal point) on the perspective plane of bottom, right, top and left: (4, points).
+    """Return x and y (mm, from the principal point) on the perspective plane of bottom, right, top and left: (4,
+    points).
 
-    Of the border of a format that is `less_px` smaller both ways.
+    For the border of a format that is `less_px` smaller in both directions.
     """
     size = np.array([sensor.width_mm, sensor.height_mm]) - less_px * sensor.pixel_mm
     t = np.linspace(-0.5, 0.5, _ALONG)
@@ -113,7 +115,7 @@ def _border(sensor: Sensor, interior: InteriorOrientation, less_px: float) -> tu
 
 @eqx.filter_jit
 def _plane(interior: InteriorOrientation, measured: Float[Array, "n 2"]):
-    """Coordinates on the perspective plane, and whether the camera sees them there."""
+    """Return coordinates on the perspective plane, and True where the camera sees them there."""
 
     def of_one(xy):
         ideal = interior.ideal_from_measured(xy)
@@ -127,7 +129,7 @@ def _plane(interior: InteriorOrientation, measured: Float[Array, "n 2"]):
 
 @eqx.filter_jit
 def _measured(interior: InteriorOrientation, new: InteriorOrientation, xy: Float[Array, "n 2"]):
-    """Measured coordinates (mm) in the given camera of those (mm) in the new one; NaN where there are none."""
+    """Convert coordinates (mm) in the new camera to measured ones (mm) in the given camera; NaN if none."""
 
     def of_one(one):
         x, y = one - new.principal_point

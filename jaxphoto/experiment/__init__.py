@@ -1,8 +1,21 @@
 """Experiments: variants of simulated blocks whose tables stand beside what papers print."""
 
-from jaxphoto.experiment.comparison import compare, read_published, side_by_side
-from jaxphoto.experiment.declaration import Cells, Experiment, Measure, Results, Variant
-from jaxphoto.experiment.folder import find_experiments, load_experiment, write_runs
+from jaxphoto.experiment.experiment import (
+    Cells,
+    Experiment,
+    Measure,
+    Results,
+    Run,
+    Variant,
+    compare,
+    find_experiments,
+    load_experiment,
+    read_published,
+    run_experiment,
+    side_by_side,
+    simulated,
+    summary,
+)
 from jaxphoto.experiment.measures import (
     boresight_correlation,
     check_points,
@@ -19,8 +32,7 @@ from jaxphoto.experiment.measures import (
     tie_point_differences,
 )
 from jaxphoto.experiment.monte_carlo import MonteCarlo
-from jaxphoto.experiment.plots import comparison_figure, plot_agreement, plot_comparison
-from jaxphoto.experiment.runner import Run, run_experiment, simulated, summary
+from jaxphoto.experiment.page import comparison_figure, plot_agreement, plot_comparison, write_runs
 
 __all__ = [
     "Cells", "Experiment", "Measure", "MonteCarlo", "Results", "Run", "Variant", "boresight_correlation",

@@ -1,4 +1,4 @@
-"""A Monte Carlo on disk: draws streamed to Parquet, continued where they stopped, summed up beside the prediction."""
+"""A Monte Carlo on disk: draws streamed to Parquet, resumed where they stopped, and compared with the prediction."""
 
 import dataclasses
 import hashlib
@@ -26,23 +26,22 @@ from jaxphoto.report.draws import (
     moments,
     summary_table,
 )
-from jaxphoto.report.made import versions
-from jaxphoto.sensitivity import Bias, Readjustment, joined_draws
+from jaxphoto.report.page import versions
+from jaxphoto.sensitivity import Bias, Readjustment, join_draws
 from jaxphoto.writing import whole_file
 
-# Draws of a part, which a run that is stopped loses at most; fewer where they are more numbers than this, or more image
-# rows, which take some seconds.
+# Largest part, which is what an interrupted run loses: draws, numbers, image rows (some seconds).
 _PART, _PART_NUMBERS, _PART_ROWS = 1000, 5_000_000, 12_000_000
-# A run sums up what it has when there are so many draws, and so many seconds, or so many times as long as summing up
-# takes, have gone into drawing since it did so last.
+# An intermediate summary is written from so many draws on, after so many seconds of drawing, or so many times the
+# duration of the last summary.
 _FIRST_DRAWS, _SECONDS, _TIMES = 100, 10.0, 20
-# Columns of all draws that are read at a time.
+# Columns of the draws that are read at a time.
 _AT_ONCE = 200
-# What a summary and its table have at least.
-_TOLD = ("draws", "converged", "fallbacks", "draws_per_second")
+# Keys of a summary and columns of its table.
+_NUMBERS = ("draws", "converged", "fallbacks", "draws_per_second")
 _COLUMNS = {"quantity", "unit", "nominal", "mean", "sd", "predicted_sigma", "ratio"}
 _OF_DRAWS = ("draw", "converged", "iterations", "fallback")
-# Errors of which the effect of each by itself is worth its time, and errors of a picture.
+# Most errors whose individual effects are predicted, and drawn in a figure.
 _PREDICTED, _PICTURED = 20_000, 60
 
 
@@ -59,8 +58,8 @@ class MonteCarlo:
         rows = len(run.adjusted.structure.image)
         parts = min(_PART, _PART_NUMBERS // widest, _PART_ROWS // rows) // run.batch_size
         settings = {
-            "block": digest_of(block), "errors": _told(drawn), "sigma": _sigma_told(drawn), "seed": seed,
-            # What the distribution, which has no name, makes of the seed.
+            "block": digest_of(block), "errors": _errors_line(drawn), "sigma": _sigma_line(drawn), "seed": seed,
+            # The distribution has no name: its first draws identify it.
             "first_draws": _digest(np.asarray(self.keys(np.arange(4)))),
             "exterior": run.exterior, "points": run.points, "batch": run.batch_size, "devices": run.devices,
             "thorough": run.many, "versions": versions(),
@@ -69,7 +68,7 @@ class MonteCarlo:
         self.computed, self.seconds = 0, 0.0
 
     def draw(self, progress: Callable[[int], object] = lambda done: None) -> None:
-        """Draw what is missing; `progress` is told how many draws there are.
+        """Draw what is missing; `progress` is called with the number of draws.
 
         Raises InputError where another process draws into the folder.
         """
@@ -92,64 +91,64 @@ class MonteCarlo:
             done = (part + 1) * folder.per_part
             if since >= pause and _FIRST_DRAWS <= done < folder.draws:
                 began = time.perf_counter()
-                self._sum_up(self._columns_of_few)
+                self._sum_up(self._shared_columns)
                 since, pause = 0.0, max(_SECONDS, _TIMES * (time.perf_counter() - began))
         folder.join()
         folder.tidy()
 
     def _draw_part(self, part: int, numbers: np.ndarray, progress: Callable[[int], object]) -> None:
-        """Draw those of `numbers` that are asked for; these are always as many, so that they are compiled for once."""
+        """Draw the requested ones of `numbers`, whose length is constant to compile once."""
         errors, batches, done = np.asarray(self.keys(numbers))[numbers < self.folder.draws], [], int(numbers[0])
         for batch in self.run.batches(errors):
             batches.append(batch)
             done += len(batch.steps)
             progress(done)
         recorded = dict(zip(self.drawn.names, errors.T, strict=True)) if self.drawn.recorded else {}
-        draws = dataclasses.replace(joined_draws(batches), recorded=recorded)
+        draws = dataclasses.replace(join_draws(batches), recorded=recorded)
         self.folder.write_part(part, draws_table(draws, self.run.adjusted, int(numbers[0])))
         self.computed += len(errors)
 
     def write(self) -> tuple[dict, pd.DataFrame]:
-        """Write summary.csv, effects.csv, pictures and, last, summary.json; gives the summary and its table.
+        """Write summary.csv, effects.csv, figures and, last, summary.json; return the summary and its table.
 
-        Where all that was written before and nothing was drawn since, it is only read.
+        They are only read if nothing was drawn since they were written.
         """
         if self.computed == 0 and (written := self._written()) is not None:
             return written
         return self._sum_up([c for c in self.folder.columns() if c not in _OF_DRAWS])
 
     def _written(self) -> tuple[dict, pd.DataFrame] | None:
-        """The summary and its table as they were written of all draws; None where they are not there as a whole."""
+        """The summary and table of all draws on disk; None if they are incomplete."""
         directory = self.folder.directory
         try:
             summary, table = read_json(directory / "summary.json"), pd.read_csv(directory / "summary.csv")
             table = table.fillna({"unit": ""})
         except (ValueError, OSError):
             return None
-        # Not what was summed up on the way.
-        numbers = all(isinstance(summary.get(key), int | float) for key in _TOLD)
+        # Not an intermediate summary.
+        numbers = all(isinstance(summary.get(key), int | float) for key in _NUMBERS)
         columns = {"quantity", "unit", *table.select_dtypes("number").columns} & set(table.columns)
         whole = numbers and summary["draws"] == self.folder.draws and columns >= _COLUMNS
         return (summary, table) if whole else None
 
     @property
-    def _columns_of_few(self) -> list[str]:
-        """Errors and shared parameters: what is summed up on the way, when every column would take too long."""
+    def _shared_columns(self) -> list[str]:
+        """Errors and shared parameters: the columns of an intermediate summary."""
         errors = [in_degrees(f"bias.{name}") for name in self.drawn.names] if self.drawn.recorded else []
         return errors + [column_of(label) for label in self.run.adjusted.structure.labels]
 
     def _sum_up(self, names: list[str]) -> tuple[dict, pd.DataFrame]:
-        """Write what `write` does of these columns of the draws there are."""
+        """Write summary, effects and figures of these columns."""
         directory, folder = self.folder.directory, self.folder
         nominal, effects, predicted = self._prediction
-        told = folder.read(["converged", "fallback"])
-        good = told["converged"]
+        flags = folder.read(["converged", "fallback"])
+        good = flags["converged"]
         predicted = predicted | {in_degrees(f"bias.{name}"): v for name, v in self._sigmas().items()}
-        found: dict[str, Moments] = {}
+        statistics: dict[str, Moments] = {}
         for first in range(0, len(names), _AT_ONCE):
             some = folder.read(names[first : first + _AT_ONCE])
-            found |= {name: moments(values[good]) for name, values in some.items()}
-        table = summary_table(found, nominal, predicted, self.run.adjusted.unknowns.interior)
+            statistics |= {name: moments(values[good]) for name, values in some.items()}
+        table = summary_table(statistics, nominal, predicted, self.run.adjusted.unknowns.interior)
         with whole_file(directory / "summary.csv") as work:
             table.to_csv(work, index=False)
         if len(effects):
@@ -169,7 +168,7 @@ class MonteCarlo:
             "draws": len(good),
             "draws_asked_for": folder.draws,
             "converged": int(good.sum()),
-            "fallbacks": int(told["fallback"].sum()),
+            "fallbacks": int(flags["fallback"].sum()),
             "computed_now": self.computed,
             "seconds": {"compile": self.run.seconds["compile"], "draws": self.seconds},
             "draws_per_second": self.computed / self.seconds if self.seconds else 0.0,
@@ -186,9 +185,9 @@ class MonteCarlo:
 
     @cached_property
     def _prediction(self) -> tuple[dict[str, float], pd.DataFrame, dict[str, float]]:
-        """The nominal estimates; what one sigma of each error does to each; and the standard deviations of that.
+        """The nominal estimates, the effect of one sigma of each error on each, and the standard deviations of these.
 
-        To first order, for errors that are independent of one another; empty where these are too many.
+        First order, for independent errors; empty if there are too many errors.
         """
         run, names = self.run, self.drawn.names
         nominal = draws_table(run.first_order(np.zeros((1, len(names)))), run.adjusted).iloc[0]
@@ -213,18 +212,18 @@ class MonteCarlo:
         return values, effects, dict(zip(quantities, np.sqrt(squares), strict=True))
 
 
-def _told(drawn: Bias) -> str:
-    """What is drawn, in a line: how many errors, of what, and a digest of which gets which."""
+def _errors_line(drawn: Bias) -> str:
+    """The errors in a line: their number, the quantities, and a digest of the assignment."""
     where = sorted({path[0] if path[0] != "start" else path[2] for path in drawn.targets})
     paths = (".".join(map(str, path)).encode() for path in drawn.targets)
     digest = _digest(*drawn.index, *(np.frombuffer(path, np.uint8) for path in paths))
     return f"{len(drawn.names)} of {', '.join(where)}, {digest[:12]}"
 
 
-def _sigma_told(drawn: Bias) -> str:
+def _sigma_line(drawn: Bias) -> str:
     different = np.unique(drawn.sigma)
-    told = ", ".join(f"{v:g}" for v in different[:4]) + (" ..." if len(different) > 4 else "")
-    return f"{told}, {_digest(drawn.sigma)[:12]}"
+    values = ", ".join(f"{v:g}" for v in different[:4]) + (" ..." if len(different) > 4 else "")
+    return f"{values}, {_digest(drawn.sigma)[:12]}"
 
 
 def _digest(*arrays: np.ndarray) -> str:

@@ -1,1 +1,1 @@
-"""Optional parts, each with an extra of its own: `pip install 'jaxphoto[photos]'`."""
+"""Optional parts: photographs (extra `photos`) and formats of other programs."""

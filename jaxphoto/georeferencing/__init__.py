@@ -1,4 +1,4 @@
-"""Where the camera is: trajectory, mounting (lever arm, boresight, time offset), shift and drift, corrections."""
+"""Georeferencing: trajectory, mount (lever arm, boresight, time offset), shift and drift, corrections, map frames."""
 
 from jaxphoto.georeferencing.corrections import Corrections, apparent_point, refraction_constant
 from jaxphoto.georeferencing.direct import (

@@ -1,9 +1,9 @@
-"""Attitudes of cameras as drones write them, as matrices: no angle is lost where two of them turn about one axis.
+"""Attitudes of cameras recorded by drones, as rotation matrices.
 
-Two habits are in use. A gimbal counts from a camera that looks to the north, level: yaw, pitch and roll turn the axes
-forward (optical axis), right, down, and the nadir is at pitch -90 degrees, where yaw and roll are one turn. A camera in
-the belly counts from one that looks down with the top of its picture to the north. Both are turned about down, right
-and forward in this order, the frame being north, east, down.
+Two conventions are in use. Gimbal angles are zero if the camera looks level to the north: yaw, pitch and roll rotate
+the axes forward (optical axis), right, down, and the nadir is at pitch -90 degrees, where yaw and roll are degenerate.
+Angles of a camera in the belly are zero if it looks down with the top of its picture to the north. Both rotate about
+down, right and forward in this order, in north, east, down.
 """
 
 from typing import NamedTuple
@@ -18,17 +18,17 @@ _ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _FROM_GIMBAL = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _FROM_BELLY = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 USUAL_SIGMA_DEG = (1.0, 1.0, 5.0)
-"""Of roll, pitch and yaw where the file says none: a gimbal holds tenths of a degree to its own accelerometers, whose
-zero it knows less well, and takes yaw from a compass."""
+"""Roll, pitch and yaw, for files without them: a gimbal keeps tenths of a degree relative to accelerometers with a zero
+error, and yaw is that of a compass."""
 
 
 class CameraAttitude(NamedTuple):
-    """How the camera was turned at the exposure."""
+    """Attitude of the camera at the exposure."""
 
     level_from_camera: Float[np.ndarray, "3 3"]
     """From x right, y up in the picture, z back to east, true north, up at the place of the photograph."""
     sigma_deg: tuple[float, float, float] = USUAL_SIGMA_DEG
-    """Of roll, pitch and yaw of a camera in the belly."""
+    """Roll, pitch and yaw of a camera in the belly."""
 
 
 def level_from_gimbal(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Float[np.ndarray, "3 3"]:

@@ -1,7 +1,7 @@
 """Atmospheric refraction and earth curvature as displacements of the object point, for any tilt of the camera.
 
-For a vertical image both are, to first order, the textbook's radial image displacements (docs/frames.md). They are
-models that a block switches on; curvature belongs to map-grid coordinates alone.
+For a vertical image both are, to first order, the textbook's radial image displacements (docs/frames.md). A block
+enables them; curvature applies only to map-grid coordinates.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ EARTH_RADIUS_M = 6_371_000.0
 @shown
 @dataclasses.dataclass(frozen=True)
 class Corrections:
-    """Which corrections are on. `sea_level_m` is the Z of the sea: refraction wants heights above it."""
+    """Enabled corrections. `sea_level_m` is the Z of the sea: refraction needs heights above it."""
 
     refraction: bool = False
     curvature: bool = False
@@ -30,10 +30,10 @@ NO_CORRECTIONS = Corrections()
 def apparent_point(
     position: Float[Array, "3 *many"], point: Float[Array, "3 *many"], corrections: Corrections
 ) -> Float[Array, "3 *many"]:
-    """Where a straight ray from the projection centre aims to meet the image of `point` (m); of many with a last axis.
+    """Return the point at which a straight ray must aim to meet the image of `point` (m); of many with a last axis.
 
-    Curvature lowers the point by d^2 / 2R, with d its horizontal distance. Refraction turns the ray outward by
-    K tan(a), a its angle off the nadir: the point moves by K d (1 + tan(a)^2).
+    Curvature lowers the point by d^2 / 2R, with d its horizontal distance. Refraction rotates the ray outward by K
+    tan(a), a its angle from the nadir: the point moves by K d (1 + tan(a)^2).
     """
     if not (corrections.refraction or corrections.curvature):
         return point
@@ -51,9 +51,9 @@ def apparent_point(
 def refraction_constant(
     camera_height: Float[Array, "*many"], point_height: Float[Array, "*many"]
 ) -> Float[Array, "*many"]:
-    """K (rad) of the standard atmosphere for heights above the sea in m: the image moves outward by K r (1 + r^2/c^2).
+    """Return K (rad) of the standard atmosphere for heights above the sea in m: the image moves by K r (1 + r^2/c^2).
 
-    K = 0.00241 [Z0 / (Z0^2 - 6 Z0 + 250) - Z^2 / (Z0 (Z^2 - 6 Z + 250))]     heights in km
+    K = 0.00241 [Z0 / (Z0^2 - 6 Z0 + 250) - Z^2 / (Z0 (Z^2 - 6 Z + 250))] heights in km
     """
     z0, z = camera_height / 1000, point_height / 1000
     return 0.00241 * (z0 / (z0 * z0 - 6 * z0 + 250) - z * z / (z0 * (z * z - 6 * z + 250)))

@@ -1,4 +1,4 @@
-"""Longitude, latitude and height of WGS 84, which receivers give, to the datum of a map system and back, by PROJ."""
+"""Conversion of WGS 84 positions of receivers to the datum of a map system and back, by PROJ."""
 
 import warnings
 from typing import NamedTuple
@@ -13,45 +13,45 @@ from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import map_system
 
 _WGS84_3D = 4979
-# Half the side (degrees) of the area in which a way between two systems has to serve.
+# Half the side (degrees) of the area in which a transformation must be valid.
 _ABOUT = 0.1
-# A way that PROJ knows no better than this is said, even where it changes nothing.
+# A transformation of lower accuracy is reported even if it changes nothing.
 _SURE_M = 1.0
 
 
 class DatumChange(NamedTuple):
-    """The best way that PROJ has on this computer from WGS 84 to the datum of a map system, about a place."""
+    """Best installed PROJ transformation from WGS 84 to the datum of a map system, near a place."""
 
     transformer: Transformer
     datum: str
     name: str
-    """Of the operation, as EPSG has it."""
+    """EPSG name of the operation."""
     accuracy_m: float | None
-    """None where nobody says it."""
+    """None if unknown."""
     meridian_deg: float
-    """From Greenwich to where the datum counts longitudes from."""
+    """Prime meridian of the datum, from Greenwich."""
     better: tuple[str, float] | None
-    """The grid of a better way that is not on this computer, and the accuracy (m) of that."""
+    """Grid of a better transformation that is not installed, and its accuracy (m)."""
 
     def places(
         self, wgs84: Float[np.ndarray, "n 3"], with_height: bool | Bool[np.ndarray, "n"] = True
     ) -> Float[np.ndarray, "n 3"]:
-        """Longitude, latitude (degrees) and height (m) on the datum of the map system.
+        """Return longitude, latitude (degrees) and height (m) on the datum of the map system.
 
-        Heights that are not above the ellipsoid (`with_height` False) stay as they are.
+        Heights that are not ellipsoidal (`with_height` False) are not changed.
         """
         return self._changed(wgs84, with_height, "FORWARD")
 
     def wgs84(
         self, places: Float[np.ndarray, "n 3"], with_height: bool | Bool[np.ndarray, "n"] = True
     ) -> Float[np.ndarray, "n 3"]:
-        """The inverse of `places`."""
+        """Invert `places`."""
         return self._changed(places, with_height, "INVERSE")
 
     def sentences(
         self, wgs84: Float[np.ndarray, "n 3"], with_height: bool | Bool[np.ndarray, "n"] = True
     ) -> tuple[str, ...]:
-        """What the change does to positions and how sure it is; none where it does nothing and is known to a metre."""
+        """Describe the change and its accuracy; nothing if it is zero and known to a metre."""
         known = self.accuracy_m
         if known is None:
             return (
@@ -83,7 +83,10 @@ class DatumChange(NamedTuple):
 
 
 def datum_change(code: int, longitude_deg: float, latitude_deg: float) -> DatumChange:
-    """From WGS 84 to the datum of the EPSG system `code` about a place. Raises InputError where PROJ has no way."""
+    """Return the transformation from WGS 84 to the datum of the EPSG system `code` near a place.
+
+    Raises InputError if PROJ has none.
+    """
     system = map_system(code)
     geodetic = system.geodetic_crs
     assert geodetic is not None
@@ -103,7 +106,7 @@ def datum_change(code: int, longitude_deg: float, latitude_deg: float) -> DatumC
         if not grid.available
     ]
     steps = [step for step in best.description.split(" + ") if not step.startswith("axis order change")]
-    # PROJ from 9.6 on says of each step in which order pyproj has the axes.
+    # PROJ 9.6 and later report for each step the axis order of pyproj.
     name = " + ".join(step.removeprefix("Inverse of ").split(" (with axis order")[0] for step in steps)
     better_one = min(better, key=lambda b: b[1], default=None)
     return DatumChange(best, geodetic.name, name, accuracy, _meridian_deg(geodetic), better_one)
@@ -112,9 +115,9 @@ def datum_change(code: int, longitude_deg: float, latitude_deg: float) -> DatumC
 def wgs84_places(
     code: int, places: Float[np.ndarray, "n 3"], with_height: bool | Bool[np.ndarray, "n"] = True
 ) -> Float[np.ndarray, "n 3"]:
-    """Longitude, latitude (degrees) and height (m) of WGS 84 of `places` on the datum of the EPSG system `code`.
+    """Return longitude, latitude (degrees) and height (m) of WGS 84 of `places` on the datum of the EPSG system `code`.
 
-    Raises as `datum_change` does.
+    Raises what `datum_change` raises.
     """
     geodetic = map_system(code).geodetic_crs
     assert geodetic is not None
@@ -123,10 +126,10 @@ def wgs84_places(
 
 
 def ways(source: CRS, target: CRS, longitude_deg: float, latitude_deg: float) -> TransformerGroup:
-    """The ways of PROJ between two systems about a place, the best that this computer can go first."""
+    """Return the PROJ transformations between two systems near a place, the best installed one first."""
     longitude = (longitude_deg + 180) % 360 - 180
     here = AreaOfInterest(longitude - _ABOUT, latitude_deg - _ABOUT, longitude + _ABOUT, latitude_deg + _ABOUT)
-    # pyproj warns of better ways whose grids are missing: said where it matters.
+    # pyproj warns of better ones whose grids are missing: reported where it matters.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         return TransformerGroup(source, target, always_xy=True, area_of_interest=here)  # type: ignore[arg-type]

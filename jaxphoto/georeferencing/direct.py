@@ -1,4 +1,4 @@
-"""Direct georeferencing: from GNSS/IMU and mount to the exterior orientation, with its covariance.
+"""Direct georeferencing: exterior orientation from GNSS/IMU and mount, with its covariance.
 
 Functions of one image. Frames and signs: docs/conventions.md; source: papers 000 and 004, equation (1).
 """
@@ -17,14 +17,14 @@ from jaxphoto.single import single
 
 
 class SensorCovariance(eqx.Module):
-    """Covariances of what direct georeferencing starts from: each is known independently of the others."""
+    """Covariances of the inputs of direct georeferencing, mutually independent."""
 
     station: Float[Array, "3 3"]
     """Of the GNSS position (m)."""
     attitude: Float[Array, "3 3"]
     """Of roll, pitch and yaw (rad)."""
     mount: Float[Array, "7 7"]
-    """Of lever arm (m), boresight (rad) and time offset (s), in this order; zeros where the mount is taken as given."""
+    """Of lever arm (m), boresight (rad) and time offset (s), in this order; zeros for a mount without errors."""
 
 
 def direct_orientation(
@@ -34,10 +34,10 @@ def direct_orientation(
     bias: StripBias,
     exposure: Exposure,
 ) -> ExteriorOrientation:
-    """Exterior orientation from the GNSS position (m) and the attitude (rad) at the recorded time.
+    """Return the exterior orientation from the GNSS position (m) and the attitude (rad) at the recorded time.
 
-    X = GNSS - R l - shift - drift (t - t0) + v tau, the attitude turned on by rate tau and then through the boresight
-    (papers 000 and 004, equation (1)).
+    X = GNSS - R l - shift - drift (t - t0) + v tau, the attitude rotated by rate tau and then by the boresight (papers
+    000 and 004, equation (1)).
     """
     station, roll_pitch_yaw = single("station", station, 3), single("roll_pitch_yaw", roll_pitch_yaw, 3)
     turned = matrix_from_roll_pitch_yaw(roll_pitch_yaw) @ small_rotation(exposure.rate * mount.time_offset).T
@@ -47,7 +47,7 @@ def direct_orientation(
 
 
 class DirectPartials(NamedTuple):
-    """Derivatives of X, Y, Z (m) and of a small rotation in the camera frame (rad), by what they come from."""
+    """Derivatives of X, Y, Z (m) and of a small rotation in the camera frame (rad), by the inputs."""
 
     station: Float[Array, "6 3"]
     attitude: Float[Array, "6 3"]
@@ -62,7 +62,7 @@ def direct_partials(
     bias: StripBias,
     exposure: Exposure,
 ) -> DirectPartials:
-    """How the result of `direct_orientation` moves with its arguments."""
+    """Differentiate the result of `direct_orientation` by its arguments."""
     at = direct_orientation(station, roll_pitch_yaw, mount, bias, exposure)
 
     def moved(d_station, d_attitude, d_mount):
@@ -82,10 +82,10 @@ def direct_covariance(
     exposure: Exposure,
     covariance: SensorCovariance,
 ) -> Float[Array, "6 6"]:
-    """Covariance of the result of `direct_orientation`: X, Y, Z (m) and a small rotation in the camera frame (rad).
+    """Return the covariance of `direct_orientation`: X, Y, Z (m) and a small rotation in the camera frame (rad).
 
-    First-order propagation. Images of one mount share its error, so they are correlated, which this does not say:
-    `direct_partials` lets one carry it along.
+    First-order propagation. Images of one mount share its error, so they are correlated; `direct_partials` allows for
+    it.
     """
     by = direct_partials(station, roll_pitch_yaw, mount, bias, exposure)
     sensors = by.station @ covariance.station @ by.station.T + by.attitude @ covariance.attitude @ by.attitude.T

@@ -1,57 +1,59 @@
-"""Which exposure of a receiver's record is which photograph, by the times of two clocks that differ by a constant.
+"""Match photographs with exposures of a receiver by the times of two clocks that differ by a constant.
 
-The clock of a camera is in some time zone, counts UTC or not, and is seconds off; a receiver counts GPS time. Of all
-differences between the times of photographs and those of exposures the one that most photographs share is the
-difference of the clocks: a gap, a missing or a surplus exposure moves no other. Where exposures follow at equal
-intervals a shift by one fits nearly as well: then the positions that the photographs themselves know decide, and where
-they have none nothing does.
+The clock of a camera is in some time zone and seconds off; a receiver counts GPS time. The difference of the clocks is
+the one that most photographs share: a gap, a missing or a surplus exposure does not change it. At equal intervals a
+shift by one exposure fits nearly as well: then the photographs' own positions decide.
 """
 
+from datetime import datetime
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-GPS_EPOCH_UNIX_S = 315_964_800.0
-"""Midnight of 6 January 1980 UTC, where GPS weeks begin."""
 LEAP_SECONDS = 18.0
 """GPS time minus UTC since 2017."""
 WEEK_S = 604_800.0
 _HOUR_S, DAY_S = 3600.0, 86_400.0
 ZONES_S = 15 * _HOUR_S
-"""A clock is no farther from UTC, or from GPS time: the farthest zone is 14 hours ahead."""
-# A camera's clock is set by hand, or by the receiver: what is left besides zone and leap seconds.
+"""Largest difference of a clock to UTC: the farthest zone is 14 hours ahead."""
+# Error of a camera's clock besides zone and leap seconds.
 _NEAR_ZONE_S = 300.0
 # Zones are quarters of an hour.
 _ZONE_S = 900.0
-# Differences that are looked at; of more photographs every second tells the constant as well.
+# Largest number of differences; of more photographs every n-th is used.
 _MOST_PAIRS = 2_000_000
 WORSE = 1.5
-"""Exposures whose positions miss by this many times the best's are no candidates."""
+"""Offsets whose positions differ by this multiple of the best offset's are rejected."""
+
+
+def gps_seconds(at: datetime) -> float:
+    """Seconds since 1980-01-06, in the time zone of `at`, without leap seconds."""
+    return (at - datetime(1980, 1, 6)).total_seconds()
 
 
 class Taken(NamedTuple):
-    """When a photograph was taken, as its file says."""
+    """Time of exposure in the file of a photograph."""
 
     clock_s: float
-    """Seconds since 1980-01-06 of the camera's own clock, in whatever zone it is set to."""
+    """Seconds since 1980-01-06 of the camera's clock, in its time zone."""
     resolution_s: float
-    """1 where the file counts whole seconds."""
+    """1 for whole seconds."""
     ahead_of_utc_s: float | None = None
-    """By how much that clock is ahead of UTC, where the file tells."""
+    """Offset of the clock to UTC; None if unknown."""
 
 
 class Matched(NamedTuple):
-    """The exposure of every photograph, and how the clocks differ."""
+    """The exposure of every photograph, and the difference of the clocks."""
 
     exposure: Int[np.ndarray, "photographs"]
-    """Index of the exposure; -1 where there is none."""
+    """Index of the exposure; -1 for none."""
     offset_s: float
-    """The clock of the photographs minus that of the exposures; NaN where they are joined without times."""
+    """Clock of the photographs minus that of the exposures; NaN if matched without times."""
 
 
 class Ambiguous(NamedTuple):
-    """Two differences of the clocks that fit as many photographs."""
+    """Two differences of the clocks that fit equally many photographs."""
 
     offsets_s: tuple[float, float]
     fitted: int
@@ -64,10 +66,10 @@ def match_times(
     photographs_at: Float[np.ndarray, "photographs 3"] | None = None,
     exposures_at: Float[np.ndarray, "exposures 3"] | None = None,
 ) -> Matched | Ambiguous | None:
-    """The exposure of each photograph by times that differ by a constant; NaN where one has no time.
+    """Match photographs and exposures whose times (NaN: unknown) differ by a constant.
 
-    `tolerance_s` is that of a single difference. `photographs_at` and `exposures_at` (m, NaN where unknown) decide
-    between constants that fit equally many. None where no two photographs share a constant.
+    `tolerance_s` is that of a single difference. `photographs_at` and `exposures_at` (m, NaN: unknown) decide between
+    constants that fit equally many. None if no two photographs share a constant.
     """
     known = np.flatnonzero(np.isfinite(photographs_s))
     order = known[np.argsort(photographs_s[known], kind="stable")]
@@ -79,12 +81,11 @@ def match_times(
     most = max(int((found >= 0).sum()) for found, _ in tried)
     if most < 2:
         return None
-    # One photograph less may be the end of a shifted row.
     near = [(found, offset) for found, offset in tried if (found >= 0).sum() >= most]
     if photographs_at is not None and exposures_at is not None:
         off = [_apart(photographs_at[order], exposures_at[rank], found) for found, _ in tried]
         if np.isfinite(off).any():
-            # Positions tell a row that is shifted, also by one that fits more times.
+            # Positions decide against a shift, even if it fits more times.
             enough = [k for k, (found, _) in enumerate(tried) if (found >= 0).sum() >= 0.8 * most]
             best = min(enough, key=lambda k: off[k])
             near = [tried[k] for k in enough if off[k] <= WORSE * off[best]]
@@ -100,7 +101,7 @@ def match_times(
 
 
 def _offsets(times: np.ndarray, events: np.ndarray, tolerance_s: float, most: int = 12) -> list[float]:
-    """Constants that many pairs share, the most shared first: middles of windows, as seconds are cut off evenly."""
+    """Constants by the number of pairs within the tolerance, the largest first: middles of windows."""
     times = times[:: 1 + len(times) * len(events) // _MOST_PAIRS]
     every = np.sort((times[:, None] - events[None, :]).ravel())
     count = np.searchsorted(every, every + 2 * tolerance_s, side="right") - np.arange(len(every))
@@ -115,10 +116,9 @@ def _offsets(times: np.ndarray, events: np.ndarray, tolerance_s: float, most: in
 
 
 def _joined(times: np.ndarray, events: np.ndarray, offset: float, tolerance_s: float) -> tuple[np.ndarray, float]:
-    """The exposure of each time, each once and in order, and the constant of those joined."""
+    """The exposure of each time, each used once and in order, and the refined constant."""
     best, left = _in_order(times, events, offset, tolerance_s)
-    # The window may lie at the edge of what it should hold: its mean is the middle of fine times, half way between the
-    # first and the last that of seconds cut off.
+    # Refine the window: its middle is the mean of fine times, and the midrange of truncated seconds.
     for _ in range(2):
         for middle in (np.mean, lambda v: (np.min(v) + np.max(v)) / 2):
             if not len(left):
@@ -133,7 +133,7 @@ def _joined(times: np.ndarray, events: np.ndarray, offset: float, tolerance_s: f
 def _in_order(
     times: np.ndarray, events: np.ndarray, offset: float, tolerance_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """With windows of one width the first exposure that is free makes the most pairs; and what is left of each."""
+    """Pair each time with the first unused exposure in its window; return pairs and their residuals."""
     found, k = np.full(len(times), -1), 0
     for i, time in enumerate(times):
         while k < len(events) and time - events[k] - offset > tolerance_s:
@@ -145,17 +145,14 @@ def _in_order(
 
 
 def _apart(at: np.ndarray, there: np.ndarray, found: np.ndarray) -> float:
-    """Median distance of the positions of those joined; infinite where none is known.
-
-    What they have in common is left in it: of a single strip it is all that a shift by one changes.
-    """
+    """Median distance of matched positions, including a common shift; infinite if unknown."""
     d = (at - there[found])[found >= 0]
     d = d[np.isfinite(d).all(axis=1)]
     return float(np.median(np.linalg.norm(d, axis=1))) if len(d) >= 3 else np.inf
 
 
 def clock_words(offset_s: float) -> str:
-    """What a difference to GPS time is made of: hours of a time zone, leap seconds, the rest."""
+    """Describe a difference to GPS time: hours of a time zone, leap seconds, remainder."""
     best = min(
         ((zone, leap) for zone in _near_zones(offset_s) for leap in (-LEAP_SECONDS, 0.0, LEAP_SECONDS)),
         key=lambda parts: (round(abs(offset_s - sum(parts))), parts[1]),

@@ -1,4 +1,4 @@
-"""Shift and drift of GNSS that a whole flight has in common, beside those of its strips."""
+"""Common shift and drift of the GNSS positions of a flight, in addition to those of its strips."""
 
 from typing import Any
 
@@ -10,9 +10,8 @@ from jaxphoto.parameters import AbstractParameters
 class FlightBias(AbstractParameters):
     """Shift (m) and drift (m/s) of the GNSS positions of the whole block: a datum offset, a reference station.
 
-    Strips may have biases of their own beside it. Then one of the two has to be known: weighted strip biases scatter
-    about that of the flight, which control determines. Time is that of the flight
-    (`Exposure.in_flight`).
+    Strips may have biases in addition. One of the two then needs prior information: weighted strip biases scatter about
+    that of the flight, which control determines. Time is that of the flight (`Exposure.in_flight`).
     """
 
     kind = "flight_bias"
@@ -26,5 +25,5 @@ class FlightBias(AbstractParameters):
     drift: Float[Array, "3 *images"]
 
     def station(self, position: Any, exposure: Any) -> Any:
-        """The sensor's position (m), shifted and drifted."""
+        """Return the sensor's position (m) with shift and drift."""
         return position + self.shift + self.drift * exposure.in_flight

@@ -1,4 +1,4 @@
-"""What a photograph's file, or one beside it, says of where the photograph was taken."""
+"""Recorded GNSS positions of photographs."""
 
 from typing import Literal, NamedTuple
 
@@ -6,51 +6,49 @@ import numpy as np
 from jaxtyping import Float
 
 Heights = Literal["ellipsoid", "geoid", "take-off", "unknown"]
-"""What heights are above; a geoid is that of some model, mean sea level in common words."""
+"""Reference of heights; a geoid is that of any model (mean sea level)."""
 HEIGHTS: dict[Heights, str] = {
     "ellipsoid": "above the ellipsoid",
     "geoid": "above a geoid (mean sea level)",
     "take-off": "above take-off",
     "unknown": "above what the files do not say",
 }
-"""In words."""
+"""Names in messages."""
 Fix = Literal["fixed", "float", "single", "integrated", "unknown"]
-"""How a receiver solved for the position: with corrections and whole ambiguities, with real ones, or without both;
-or GNSS and IMU together, afterwards."""
+"""Kind of solution: integer ambiguities, real ambiguities, code only, or GNSS and IMU integrated in post-processing."""
 FIX_SIGMA_M: dict[Fix, tuple[float, float, float]] = {
     "fixed": (0.02, 0.02, 0.04),
     "float": (0.3, 0.3, 0.6),
     "integrated": (0.05, 0.05, 0.1),
 }
-"""East, north and up, where the file says the solution but no standard deviations.
+"""East, north and up, for files with the kind of solution but without standard deviations.
 
-A fixed solution has 1 cm + 1 ppm in plan and 1.5 cm + 1 ppm in height (DJI, specifications of the Phantom 4 RTK) while
-nothing else errs, a float one decimetres (DJI, manuals: RtkFlag); twice the former allows for base and interpolation.
-What is integrated afterwards has 2 to 5 cm in plan and 5 to 10 in height (Applanix, specifications of APX-15 and POS
-AV, post-processed); an SBET does not say its own.
+A fixed solution has 1 cm + 1 ppm in plan and 1.5 cm + 1 ppm in height (DJI, specifications of the Phantom 4 RTK), a
+float one decimetres (DJI, manuals: RtkFlag); twice the former allows for base station and interpolation. An integrated
+one has 2 to 5 cm in plan and 5 to 10 in height (Applanix, specifications of APX-15 and POS AV, post-processed).
 """
 
 
 class Gps(NamedTuple):
-    """A position of the projection centre that a receiver gave, metres off where it had no corrections."""
+    """A recorded position of the projection centre."""
 
     latitude_deg: float
     longitude_deg: float
     altitude_m: float | None
     sigma_m: tuple[float, float, float] | None = None
-    """East, north and up, where the file says them."""
+    """East, north and up, if the file has them."""
     heights: Heights = "unknown"
-    """What `altitude_m` is above."""
+    """Reference of `altitude_m`."""
     fix: Fix = "unknown"
 
     @property
     def stated_sigma_m(self) -> tuple[float, float, float] | None:
-        """East, north and up: those of the file, else those of the kind of solution; None where it tells neither."""
+        """East, north and up: those of the file, else those of the kind of solution; None without either."""
         return self.sigma_m or FIX_SIGMA_M.get(self.fix)
 
 
 def moved(gps: Gps, east_north_up_m: Float[np.ndarray, "3"]) -> Gps:
-    """`gps` a lever arm farther (metres on WGS 84, to micrometres for arms of metres)."""
+    """The position shifted by a lever arm (m, on WGS 84)."""
     east, north, up = np.asarray(east_north_up_m, float).tolist()
     s = np.sin(np.deg2rad(gps.latitude_deg))
     w = 1 - _E2 * s * s

@@ -1,4 +1,4 @@
-"""From an image coordinate to the ground: on a horizontal plane or a surface, with its covariance.
+"""Projection of image coordinates to the ground, a horizontal plane or a surface, with covariance.
 
 Functions of one image and one point (monoplotting). Frames and units: docs/conventions.md, equations: docs/models.md.
 """
@@ -16,14 +16,14 @@ from jaxphoto.georeferencing.corrections import NO_CORRECTIONS, Corrections, app
 from jaxphoto.rotation import small_rotation
 from jaxphoto.short_repr import shown
 
-# Refraction and curvature bend a ray by some 1e-4: each round gains four digits.
+# Refraction and curvature bend a ray by about 1e-4: each iteration gains four digits.
 _ROUNDS = 4
 _MAX_STEPS = 60
 
 
 @shown
 class Surface(eqx.Module):
-    """The ground as a height Z (m) over X and Y (m), differentiable, between the heights `low` and `high`."""
+    """Ground as a height Z (m) over X and Y (m), differentiable, between the heights `low` and `high`."""
 
     height: Callable[[Float[Array, ""], Float[Array, ""]], Float[Array, ""]]
     low: Float[Array, ""] | float
@@ -35,12 +35,12 @@ Ground = Surface | Float[Array, ""] | float
 
 
 class RayCovariance(eqx.Module):
-    """Covariances of what a ground point comes from: each is known independently of the others."""
+    """Covariances of the inputs of a ground point, mutually independent."""
 
     exterior: Float[Array, "6 6"]
-    """Of X, Y, Z (m) and a small rotation in the camera frame (rad), as `direct_covariance` gives it."""
+    """Of X, Y, Z (m) and a small rotation in the camera frame (rad), from `direct_covariance`."""
     interior: Float[Array, "k k"]
-    """Of the interior orientation, in the order of `camera.parameter_names`; zeros where it is taken as given."""
+    """Of the interior orientation, in the order of `camera.parameter_names`; zeros if without errors."""
     image: Float[Array, "2 2"]
     """Of the measured image coordinate (mm)."""
     height: Float[Array, ""] | float
@@ -54,18 +54,18 @@ def ground_point(
     ground: Ground,
     corrections: Corrections = NO_CORRECTIONS,
 ) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
-    """Where the ray of the measured image coordinate `xy` (mm) meets the ground (m), and whether it does.
+    """Intersect the ray of the measured image coordinate `xy` (mm) with the ground (m); False if it does not meet it.
 
         X = X_s + s M' (x', y', -c)',    s = (Z - Z_s) / third component
 
-    On a surface, safeguarded Newton on the height finds Z = height(X, Y), and the implicit function theorem its
-    derivatives. It needs a surface that is continuous along the ray; of several meetings, as behind a ridge, it finds
-    some one. False, and a point that means nothing, where the ray is parallel to the plane or meets the ground behind
-    the camera or nowhere between `low` and `high`. Source: paper 001, equation (1), inverted.
+    On a surface, a safeguarded Newton iteration on the height finds Z = height(X, Y), and the implicit function theorem
+    its derivatives. The surface must be continuous along the ray; of several intersections, as behind a ridge, any one
+    is found. False, with a meaningless point, if the ray is parallel to the plane or meets the ground behind the camera
+    or nowhere between `low` and `high`. Source: paper 001, equation (1), inverted.
     """
     origin, direction = image_ray(interior, exterior, xy)
     upright = direction[2] == 0
-    # Double where: a horizontal ray has no NaN derivative either.
+    # Two `where`: a horizontal ray must not have NaN derivatives either.
     fall = jnp.where(upright, 1.0, direction[2])
 
     def at_height(height: Float[Array, ""]) -> Float[Array, "3"]:
@@ -94,9 +94,9 @@ def ground_covariance(
     covariance: RayCovariance,
     corrections: Corrections = NO_CORRECTIONS,
 ) -> Float[Array, "3 3"]:
-    """Covariance (m^2) of the result of `ground_point`, by first-order propagation.
+    """Return the covariance (m^2) of `ground_point`, by first-order propagation.
 
-    On a surface, the error of its height shifts it as a whole: the point moves along the ray.
+    On a surface, its height error shifts it as a whole: the point moves along the ray.
     """
 
     def moved(d_exterior, d_interior, d_xy, d_height):
@@ -116,21 +116,21 @@ def ground_covariance(
 
 
 def moved_exterior(exterior: ExteriorOrientation, step: Float[Array, "6"]) -> ExteriorOrientation:
-    """The orientation after a shift (m) and a small rotation in the camera frame (rad)."""
+    """Return the orientation after a shift (m) and a small rotation in the camera frame (rad)."""
     return ExteriorOrientation(
         exterior.position + step[:3], small_rotation(step[3:]) @ jnp.asarray(exterior.camera_from_object)
     )
 
 
 def moved_interior(interior: InteriorOrientation, step: Float[Array, "k"]) -> InteriorOrientation:
-    """The interior orientation with `step` added to its parameters, in the order of `camera.parameter_names`."""
+    """Return the interior orientation with `step` added to its parameters, in the order of `camera.parameter_names`."""
     for k, name in enumerate(parameter_names(interior)):
         interior = set_parameter(interior, name, get_parameter(interior, name) + step[k])
     return interior
 
 
 def _root(f: Callable, low: Float[Array, ""], high: Float[Array, ""]) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """The z in [low, high] with f(z) = 0, f(low) <= 0 <= f(high), and whether there is one; differentiable."""
+    """Return z in [low, high] with f(z) = 0, f(low) <= 0 <= f(high), and True if it exists; differentiable."""
     low, high = jax.lax.stop_gradient((low, high))
     enough = 1e-12 * (1 + jnp.maximum(jnp.abs(low), jnp.abs(high)))
 

@@ -1,13 +1,12 @@
-"""Forward intersection of held images with the covariance of the points, correlations by common errors included.
+"""Forward intersection from fixed images with the covariance of the points, including common errors.
 
-The residual r (mm) of a ray depends on its point X, on errors e of its own (image noise, its image's orientation) and
-on errors m that many rays share (a mount, a camera). Weighted by the image sigmas, as an adjustment with held images
-does,
+The residual r (mm) of a ray depends on its point X, on its own errors e (image noise, orientation of its image) and on
+errors m common to many rays (a mount, a camera). Weighted by the image sigmas, as in an adjustment with fixed images,
 
     dX = - sum J r,    J = (sum A' P A)^-1 A' P,    A = dr / dX
     Q  = sum J (dr/de Q_e dr/de') J' + (sum J dr/dm) Q_m (sum J dr/dm)'
 
-`ray_partials` is of one image and one point; the others are of all rows at once, summed over the rows of each point.
+`ray_partials` takes one image and one point; the others take all rows, summed over the rows of each point.
 """
 
 from typing import NamedTuple
@@ -41,7 +40,7 @@ def ray_partials(
     xy: Float[Array, "2"],
     corrections: Corrections = NO_CORRECTIONS,
 ) -> RayPartials:
-    """How the residual of the measured image coordinate `xy` (mm) of `point` (m) moves with everything."""
+    """Differentiate the residual of the measured image coordinate `xy` (mm) of `point` (m)."""
 
     def residual(d_point, d_exterior, d_interior):
         image = moved_exterior(exterior, d_exterior)
@@ -57,27 +56,27 @@ def ray_partials(
 def intersection_gain(
     by_point: Float[Array, "rows 2 3"], sigma: Float[Array, "rows 2"], point: Int[Array, "rows"], n_points: int
 ) -> Float[Array, "rows 3 2"]:
-    """J of every row: a point moves by -sum J r. `sigma` (mm) of the image coordinates, `point` of each row.
+    """Return J of every row: a point moves by -sum J r. `sigma` (mm) of the image coordinates, `point` of each row.
 
-    NaN or huge where the rays of a point are parallel.
+    NaN or very large if the rays of a point are parallel.
     """
     weighted = by_point.transpose(0, 2, 1) / sigma[:, None, :] ** 2
     normal = jax.ops.segment_sum(weighted @ by_point, point, n_points)
-    # A point without rows has no normal matrix, and no row to ask for its inverse.
+    # A point without rows has no normal matrix, and no row that needs its inverse.
     return jax.vmap(inverse)(normal)[point] @ weighted
 
 
 def intersection_step(
     gain: Float[Array, "rows 3 2"], residual: Float[Array, "rows 2"], point: Int[Array, "rows"], n_points: int
 ) -> Float[Array, "points 3"]:
-    """The Gauss-Newton step (m) of every point."""
+    """Return the Gauss-Newton step (m) of every point."""
     return -jax.ops.segment_sum(jnp.einsum("nij,nj->ni", gain, residual), point, n_points)
 
 
 def own_covariance(
     gain: Float[Array, "rows 3 2"], own: Float[Array, "rows 2 2"], point: Int[Array, "rows"], n_points: int
 ) -> Float[Array, "points 3 3"]:
-    """What errors that each ray has alone, of covariance `own` (mm^2) in its residual, do to the points (m^2)."""
+    """Propagate independent errors of each ray, of covariance `own` (mm^2) in its residual, to the points (m^2)."""
     return jax.ops.segment_sum(gain @ own @ gain.transpose(0, 2, 1), point, n_points)
 
 
@@ -88,9 +87,9 @@ def shared_covariance(
     point: Int[Array, "rows"],
     n_points: int,
 ) -> Float[Array, "points 3 3"]:
-    """What errors of the given `covariance` that the rays share do to the points (m^2).
+    """Propagate common errors of the given `covariance` to the points (m^2).
 
-    `by_shared` is dr/dm; zeros for rays that do not have the error.
+    `by_shared` is dr/dm; zeros for rays without the error.
     """
     by = jax.ops.segment_sum(gain @ by_shared, point, n_points)
     return by @ covariance @ by.transpose(0, 2, 1)

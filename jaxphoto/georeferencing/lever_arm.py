@@ -1,7 +1,7 @@
-"""The lever arm by equation (1) of paper 004 and by its approximation (2)-(4), and what the approximation costs.
+"""Lever arm offset by equation (1) of paper 004, its approximation (2)-(4), and the error of the latter.
 
 The arm of papers 000 and 004 runs from the sensor to the camera; `Mount.lever_arm` runs from the camera to the sensor.
-`arm_to_camera` turns one into the other. Both are in the body's axes right, forward, up (m). Functions of one image.
+`arm_to_camera` converts between them. Both are in the body axes right, forward, up (m). Functions of one image.
 """
 
 import jax
@@ -14,12 +14,12 @@ from jaxphoto.rotation import matrix_from_roll_pitch_yaw, rotate
 
 
 def arm_to_camera(mount: Mount) -> Float[Array, "3"]:
-    """(dX, dY, dZ) of papers 000 and 004, Table 1 (m): the camera as seen from the sensor."""
+    """Return (dX, dY, dZ) of papers 000 and 004, Table 1 (m): the camera relative to the sensor."""
     return -jnp.asarray(mount.lever_arm)
 
 
 def exact_offset(arm: Float[Array, "3"], roll_pitch_yaw: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Camera minus sensor in the object frame (m): R(roll, pitch, yaw) (dX, dY, dZ)'.
+    """Return camera minus sensor in the object frame (m): R(roll, pitch, yaw) (dX, dY, dZ)'.
 
     `arm` runs from the sensor to the camera. Source: paper 004, equation (1).
     """
@@ -27,12 +27,12 @@ def exact_offset(arm: Float[Array, "3"], roll_pitch_yaw: Float[Array, "3"]) -> F
 
 
 def level_offset(arm: Float[Array, "3"], azimuth: Float[Array, ""]) -> Float[Array, "3"]:
-    """Camera minus sensor (m) as if the flight were level, from the azimuth alone (rad, clockwise from north).
+    """Return camera minus sensor (m) for level flight, from the azimuth alone (rad, clockwise from north).
 
         X = d sin(azimuth + atan2(dX, dY)),  Y = d cos(azimuth + atan2(dX, dY)),  Z = dZ,  d^2 = dX^2 + dY^2
 
-    `arm` runs from the sensor to the camera. Source: paper 004, equations (2)-(4), whose arctan(dX / dY) is wrong
-    where dY < 0. Computed by the addition theorem, which also holds, and has derivatives, where dX = dY = 0.
+    `arm` runs from the sensor to the camera. Source: paper 004, equations (2)-(4), whose arctan(dX / dY) is wrong for
+    dY < 0. Computed by the addition theorem, which also holds, and has derivatives, for dX = dY = 0.
     """
     right, forward, up = arm
     s, c = jnp.sin(azimuth), jnp.cos(azimuth)
@@ -40,16 +40,17 @@ def level_offset(arm: Float[Array, "3"], azimuth: Float[Array, ""]) -> Float[Arr
 
 
 def level_error(arm: Float[Array, "3"], roll: Float[Array, ""], pitch: Float[Array, ""]) -> Float[Array, "3"]:
-    """`level_offset` minus `exact_offset` (m) at this roll and pitch (rad): right, forward of the azimuth, and up.
+    """Return `level_offset` minus `exact_offset` (m) at this roll and pitch (rad): right, forward of the azimuth, and
+    up.
 
-    It does not depend on the azimuth. To first order the height is off by dX sin(roll) - dY sin(pitch).
+    Independent of the azimuth. To first order the height error is dX sin(roll) - dY sin(pitch).
     """
     level = jnp.zeros(())
     return level_offset(arm, level) - exact_offset(arm, jnp.stack([roll, pitch, level]))
 
 
 def worst_level_error(arm: Float[Array, "3"], tilt: Float[Array, ""]) -> Float[Array, "2"]:
-    """Largest horizontal and vertical `level_error` (m) at |roll| = |pitch| = `tilt` (rad), of whatever signs."""
+    """Return the largest horizontal and vertical `level_error` (m) at |roll| = |pitch| = `tilt` (rad), of any signs."""
     right, forward, up = jax.vmap(lambda signs: level_error(arm, *(signs * tilt)))(_SIGNS).T
     return jnp.stack([jnp.hypot(right, forward).max(), jnp.abs(up).max()])
 

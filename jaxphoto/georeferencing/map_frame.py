@@ -1,7 +1,7 @@
-"""Coordinates of a map or geographic system to and from a local east-north-up frame, by PROJ.
+"""Conversion of map or geographic coordinates to and from a local east-north-up frame, by PROJ.
 
-The local frame is Cartesian: its origin is a place, Z the normal of the ellipsoid there, Y towards true north. No datum
-is changed on the way: longitudes, latitudes and ellipsoidal heights are those of the system's own datum.
+The local frame is Cartesian: Z is the normal of the ellipsoid at its origin, Y points to true north. The datum is not
+changed: longitudes, latitudes and ellipsoidal heights are those of the system's own datum.
 """
 
 import functools
@@ -15,9 +15,9 @@ from pyproj.transformer import TransformerGroup
 
 from jaxphoto.errors import InputError
 
-# Half the step along a grid line that tells its direction: rounding is then 1e-11 rad, curvature of the line less.
+# Half the step along a grid line that gives its direction: rounding is then 1e-11 rad, curvature of the line less.
 _STEP_M, _STEP_DEG = 50.0, 5e-4
-# Where it is said: of a block, of a flight.
+# Where it is declared: in a block, in a flight.
 _ON_ELLIPSOID = 'vertical = "ellipsoidal" in block.toml, --heights ellipsoid of a flight'
 
 Place = tuple[float, float, float]
@@ -25,12 +25,11 @@ Place = tuple[float, float, float]
 
 
 class MapFrame:
-    """The local frame at `origin` of files in the EPSG system `code`, heights of the EPSG system `vertical`.
+    """Local frame at `origin` of files in the EPSG system `code`, heights of the EPSG system `vertical`.
 
     `vertical` None means heights above the ellipsoid. Map coordinates are (easting, northing, height) in m, or
-    (longitude, latitude, height) in degrees and m where `geographic`. Where a system does not reach, results are
-    infinite. Raises InputError for codes that are unknown or serve another purpose, and for heights whose geoid is not
-    at hand.
+    (longitude, latitude, height) in degrees and m if `geographic`. Outside the area of a system, results are infinite.
+    Raises InputError for unknown or unsuitable codes, and for heights whose geoid is not installed.
     """
 
     def __init__(self, code: int, vertical: int | None, origin: Place):
@@ -41,35 +40,35 @@ class MapFrame:
         self._to_local = _topocentric(system, origin)
 
     def place(self, coordinates: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Longitude, latitude (degrees) and ellipsoidal height (m) of map coordinates."""
+        """Return longitude, latitude (degrees) and ellipsoidal height (m) of map coordinates."""
         return _transformed(self._to_place, coordinates, "FORWARD")
 
     def local_from_place(self, place: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Local X, Y, Z (m) of longitude, latitude and ellipsoidal height."""
+        """Return local X, Y, Z (m) of longitude, latitude and ellipsoidal height."""
         return _transformed(self._to_local, place, "FORWARD")
 
     def local(self, coordinates: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Local X, Y, Z (m) of map coordinates."""
+        """Return local X, Y, Z (m) of map coordinates."""
         return self.local_from_place(self.place(coordinates))
 
     def map(self, local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Map coordinates of local X, Y, Z (m); the inverse of `local`."""
+        """Return map coordinates of local X, Y, Z (m); the inverse of `local`."""
         return _transformed(self._to_place, self._place_from_local(local), "INVERSE")
 
     def local_from_level(self, local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
-        """From axes east, true north, up (normal of the ellipsoid) at local positions to those of the local frame."""
+        """Return rotations from east, true north, up (ellipsoid normal) at local positions to the local frame."""
         here = _geocentric_from_level(np.array([self.origin]))[0]
         return here.T @ _geocentric_from_level(self._place_from_local(local))
 
     def local_from_grid(self, local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
-        """The same from axes right of grid north, grid north, up: turned by the convergence of the meridians."""
+        """Return rotations from grid east, grid north, up to the local frame: includes meridian convergence."""
         g = self.convergence(local)
         c, s, zero, one = np.cos(g), np.sin(g), np.zeros(len(g)), np.ones(len(g))
         level_from_grid = np.stack([c, s, zero, -s, c, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)
         return self.local_from_level(local) @ level_from_grid
 
     def convergence(self, local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        """Convergence of the meridians (rad) at local positions: grid north lies so far east of true north."""
+        """Return the meridian convergence (rad) at local positions: the angle of grid north east of true north."""
         step = np.array([0.0, _STEP_DEG if self.geographic else _STEP_M, 0.0])
         at = self.map(local)
         line = self.local(at + step) - self.local(at - step)
@@ -77,12 +76,14 @@ class MapFrame:
         return np.arctan2(east, north)
 
     def geocentric_from_local(self) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-        """Rotation and translation (m): X, Y, Z from the centre of the ellipsoid = rotation @ local + translation."""
+        """Return rotation and translation (m): X, Y, Z from the centre of the ellipsoid = rotation @ local +
+        translation.
+        """
         origin = np.array([self.origin], float)
         return _geocentric_from_level(origin)[0], _transformed(_geocentric(map_system(self.code)), origin, "FORWARD")[0]
 
     def sea_level(self) -> float:
-        """Local Z (m) of height zero at the origin; of the ellipsoid where heights are above it."""
+        """Return local Z (m) of height zero at the origin; of the ellipsoid if heights are ellipsoidal."""
         easting, northing, _ = self.map(np.zeros((1, 3)))[0]
         return float(self.local(np.array([[easting, northing, 0.0]]))[0, 2])
 
@@ -91,14 +92,15 @@ class MapFrame:
 
 
 def place_from_geocentric(code: int, xyz: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Longitude, latitude (degrees) and height (m) on the ellipsoid of the EPSG system `code`, of X, Y, Z from its
-    centre."""
+    """Return longitude, latitude (degrees) and height (m) on the ellipsoid of the EPSG system `code` of geocentric X,
+    Y, Z.
+    """
     return _transformed(_geocentric(map_system(code)), xyz, "INVERSE")
 
 
 @functools.cache
 def map_system(code: int) -> CRS:
-    """The projected or geographic system of an EPSG code. Raises InputError for any other code."""
+    """Return the projected or geographic system of an EPSG code. Raises InputError for any other code."""
     try:
         system = CRS.from_epsg(code)
     except CRSError:
@@ -123,18 +125,18 @@ def map_system(code: int) -> CRS:
 
 
 def check_heights(code: int, vertical: int) -> None:
-    """Raise InputError where heights of the EPSG system `vertical` cannot be brought to the ellipsoid of `code`."""
+    """Raise InputError if heights of the EPSG system `vertical` cannot be converted to the ellipsoid of `code`."""
     _to_place(code, vertical)
 
 
 def map_name(code: int, vertical: int | None) -> str:
-    """A map system with its heights, as programs of surveyors and PROJ write it: EPSG:25832+7837."""
+    """Return the name of a map system with its heights, as used by PROJ: EPSG:25832+7837."""
     return f"EPSG:{code}" + (f"+{vertical}" if vertical is not None else "")
 
 
 @functools.cache
 def _to_place(code: int, vertical: int | None) -> Transformer:
-    """From map coordinates to longitude, latitude and ellipsoidal height of the same datum."""
+    """Return the conversion of map coordinates to longitude, latitude and ellipsoidal height of the same datum."""
     system = map_system(code)
     geodetic = system.geodetic_crs
     assert geodetic is not None
@@ -151,7 +153,7 @@ def _to_place(code: int, vertical: int | None) -> Transformer:
             f"EPSG:{vertical} ({heights.name}) is no system of heights; give the code of one (5773 is EGM96), or "
             "heights above the ellipsoid"
         )
-    # pyproj warns of what is said below as an error.
+    # pyproj warns where an error is raised below.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         group = TransformerGroup(f"EPSG:{code}+{vertical}", geodetic.to_3d(), always_xy=True)
@@ -195,7 +197,7 @@ def _transformed(transformer: Transformer, values: np.ndarray, direction: str) -
 
 
 def _geocentric_from_level(places: np.ndarray) -> np.ndarray:
-    """Columns: east, north and up at longitude and latitude, in geocentric axes."""
+    """Return columns east, north and up at longitude and latitude, in geocentric axes."""
     (sl, sp), (cl, cp) = np.sin(np.deg2rad(places[:, :2])).T, np.cos(np.deg2rad(places[:, :2])).T
     rows = [-sl, -sp * cl, cp * cl, cl, -sp * sl, cp * sl, 0 * sl, cp, sp]
     return np.stack(rows, axis=1).reshape(-1, 3, 3)

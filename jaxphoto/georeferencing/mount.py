@@ -1,4 +1,4 @@
-"""The mounting of a camera beside a GNSS/IMU: lever arm, boresight, time offset; shift and drift of the positions.
+"""Mount of a camera relative to the GNSS/IMU: lever arm, boresight, time offset; shift and drift of the positions.
 
 Functions of one image. Frames and signs: docs/conventions.md; source: paper 000, equations (1)-(4), paper 003.
 """
@@ -18,7 +18,7 @@ from jaxphoto.rotation import rotate, small_angles, small_rotation
 from jaxphoto.short_repr import shown
 
 ImageX = Literal["forward", "left", "back", "right"]
-"""Where the camera's x axis points in the aircraft."""
+"""Direction of the camera's x axis in the aircraft."""
 # Columns: the camera's x, y and z axis in body axes right, forward, up; z is always up (docs/models.md).
 NOMINAL: dict[str, np.ndarray] = {
     "forward": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
@@ -30,11 +30,11 @@ IMAGE_X = tuple(NOMINAL)
 
 
 class Mount(AbstractParameters):
-    """How a camera sits beside the GNSS/IMU, and how its clock runs.
+    """Position, orientation and clock of a camera relative to the GNSS/IMU.
 
     `lever_arm` from the projection centre to the GNSS/IMU reference (m: right, forward, up), `boresight` as a small
     rotation in the camera frame (rad), `time_offset` of the true exposure after the recorded one (s). `image_x` is the
-    nominal mount: where the camera's x axis points.
+    nominal mount: the direction of the camera's x axis.
     """
 
     kind = "mounts"
@@ -76,15 +76,14 @@ class StripBias(AbstractParameters):
 
 @shown
 class Exposure(eqx.Module):
-    """What is known of an exposure besides its observations; of many with a leading (in an adjustment: last) axis.
+    """Properties of an exposure that are not observed; of many with a leading (in an adjustment: last) axis.
 
-    `time` from the strip's reference time (s), `velocity` of the GNSS/IMU in the object frame (m/s), `rate` of turn
-    about the body's right, forward and up axes (rad/s). Velocity and rate are what a time offset, and a delay in a rig,
-    act with. `nominal` is needed only where mounts of several kinds are stacked (`Mount.image_x` is one for all): the
-    `Mount.nominal` of each.
-    `flight_time` is that from the middle of the flight (s), for what changes from strip to strip; None: as `time`.
-    `height` is that of the camera's format (mm), which a rolling shutter reads row by row. `temperature` is that of the
-    camera above the reference of its block (K).
+    `time` from the strip's reference time (s), `velocity` of the GNSS/IMU in the object frame (m/s), rotation `rate`
+    about the body's right, forward and up axes (rad/s). Velocity and rate are needed for a time offset, and for a delay
+    in a rig. `nominal` is needed only if mounts of several kinds are stacked (`Mount.image_x` is one for all): the
+    `Mount.nominal` of each. `flight_time` is that from the middle of the flight (s), for changes from strip to strip;
+    None: equal to `time`. `height` is that of the camera's format (mm), for a rolling shutter. `temperature` is that of
+    the camera above the reference of its block (K).
     """
 
     time: Float[Array, "*images"] | float
@@ -102,9 +101,9 @@ class Exposure(eqx.Module):
 
 
 def nominal_mount(mount: Mount, exposure: Exposure) -> Float[Numbers, "3 3"]:
-    """`body_from_camera` without misalignment: what the exposure says, else the mount.
+    """Return `body_from_camera` without misalignment: from the exposure if given, else from the mount.
 
-    Raises InputError (under `jit` an error of Equinox) where a mount that is not "forward" and the exposure differ.
+    Raises InputError (under `jit` an error of Equinox) if a mount that is not "forward" contradicts the exposure.
     """
     if exposure.nominal is None or mount.image_x == "forward":
         return mount.nominal if exposure.nominal is None else exposure.nominal
@@ -119,14 +118,14 @@ def nominal_mount(mount: Mount, exposure: Exposure) -> Float[Numbers, "3 3"]:
 
 
 def body_from_camera(boresight: Float[Array, "3"], nominal: Float[Numbers, "3 3"]) -> Float[Array, "3 3"]:
-    """Nominal mount times the misalignment (small rotation in the camera frame, rad)."""
+    """Return the nominal mount times the misalignment (small rotation in the camera frame, rad)."""
     return jnp.matmul(nominal, small_rotation(boresight))
 
 
 def object_from_body(
     camera_from_object: Float[Array, "3 3"], boresight: Float[Array, "3"], nominal: Float[Numbers, "3 3"]
 ) -> Float[Array, "3 3"]:
-    """Attitude of the body from the orientation of the camera and the boresight misalignment."""
+    """Return the attitude of the body from the orientation of the camera and the boresight misalignment."""
     return camera_from_object.T @ body_from_camera(boresight, nominal).T
 
 
@@ -137,7 +136,7 @@ def sensor_position(
     bias: StripBias,
     exposure: Exposure,
 ) -> Float[Array, "3"]:
-    """What GNSS observes at the recorded time, in m: X + R l + shift + drift (t - t0) - v tau.
+    """Return what GNSS observes at the recorded time, in m: X + R l + shift + drift (t - t0) - v tau.
 
     tau is the mount's time offset. Source: paper 000, equation (1).
     """
@@ -146,7 +145,7 @@ def sensor_position(
 
 
 def recorded_attitude(camera_from_object: Float[Array, "3 3"], mount: Mount, exposure: Exposure) -> Float[Array, "3 3"]:
-    """`object_from_body` at the recorded time: an offset tau before the exposure, with `rate * tau` still to turn."""
+    """Return `object_from_body` at the recorded time, tau before the exposure: rotated back by `rate * tau`."""
     body = object_from_body(camera_from_object, mount.boresight, nominal_mount(mount, exposure))
     return body @ small_rotation(exposure.rate * mount.time_offset)
 
@@ -154,7 +153,7 @@ def recorded_attitude(camera_from_object: Float[Array, "3 3"], mount: Mount, exp
 def attitude_residual(
     observed_object_from_body: Float[Array, "3 3"], computed_object_from_body: Float[Array, "3 3"]
 ) -> Float[Array, "3"]:
-    """Observed minus computed attitude as a small rotation about (forward, right, down), in rad.
+    """Return observed minus computed attitude as a small rotation about (forward, right, down), in rad.
 
     These are the axes of roll, pitch and yaw, so near level flight each component is one angle's residual.
     """

@@ -1,64 +1,61 @@
-"""Positions of photographs before anything is computed of them: what cannot be is named, what can be mended is.
+"""Checks and corrections of the positions that receivers record in photographs.
 
-The photographs of a flight lie within kilometres. A receiver without a position writes (0, 0); latitude and longitude
-that have changed places lie elsewhere on the earth and come back where they are changed again; heights above take-off
-among heights above a datum differ from their own height above take-off by nothing where the others' differ by the
-height of the place.
+The photographs of a flight lie within kilometres. A receiver without a position writes (0, 0); exchanged latitude and
+longitude lie elsewhere on the earth. Heights above take-off among heights above a datum equal the photograph's own
+height above take-off.
 """
 
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float
 
-from jaxphoto.errors import few
-from jaxphoto.georeferencing.geoid_heights import above_ellipsoid
+from jaxphoto.errors import InputError, few, quoted
 from jaxphoto.georeferencing.gps import HEIGHTS, Gps, Heights
+from jaxphoto.georeferencing.map_frame import MapFrame
 
 Positions = dict[str, Gps | None]
-
+WGS84 = 4326
+"""EPSG code of longitude and latitude of receivers."""
 _EARTH_M = 6_371_000.0
-# No flight that hangs together is larger.
 _FAR_M = 50_000.0
-# Some hundred metres about (0, 0), where nobody flies.
+# Some hundred metres about (0, 0).
 _NOWHERE_DEG = 1e-3
-# A height that is the one above take-off; zeros of the same flight that are two; metres.
+# Tolerance of equal heights above take-off; difference of zeros that are two.
 _SAME_M, _APART_M = 0.5, 5.0
 
 
 def plausible_positions(positions: Mapping[str, Gps | None]) -> tuple[Positions, list[str]]:
-    """The positions that can be, latitude and longitude in their places, and a sentence of each kind of mend."""
-    found: Positions = dict(positions)
-    said = []
-    absent = [name for name, gps in found.items() if gps is None]
-    nowhere = [n for n, g in found.items() if g and max(abs(g.latitude_deg), abs(g.longitude_deg)) < _NOWHERE_DEG]
-    found |= dict.fromkeys(nowhere, None)
-    turned = [n for n, g in found.items() if g and abs(g.latitude_deg) > 90]
-    found |= {n: _changed(g) for n in turned if (g := found[n])}
-    known = {n: g for n, g in found.items() if g}
+    """The plausible positions, exchanged latitudes and longitudes corrected, and a message for each kind of change."""
+    result: Positions = dict(positions)
+    absent = [name for name, gps in result.items() if gps is None]
+    nowhere = [n for n, g in result.items() if g and max(abs(g.latitude_deg), abs(g.longitude_deg)) < _NOWHERE_DEG]
+    result |= dict.fromkeys(nowhere, None)
+    exchanged = [n for n, g in result.items() if g and abs(g.latitude_deg) > 90]
+    result |= {n: _exchanged(g) for n in exchanged if (g := result[n])}
+    known = {n: g for n, g in result.items() if g}
+    lost: list[str] = []
     if known:
-        at = {n: _on_sphere(g) for n, g in known.items()}
-        middle = np.median(np.array(list(at.values())), axis=0)
-        far = [n for n, p in at.items() if np.linalg.norm(p - middle) > _FAR_M]
-        back = [n for n in far if (g := _changed(known[n])) and np.linalg.norm(_on_sphere(g) - middle) <= _FAR_M]
-        found |= {n: _changed(known[n]) for n in back}
-        # A majority is needed to say who is far.
-        lost = [n for n in far if n not in back] if len(far) < len(known) / 2 else []
-        found |= dict.fromkeys(lost, None)
-        turned += back
-        if lost:
-            said.append(
-                f"the positions of {_named(lost)} are more than {_FAR_M / 1000:g} km from the others and are not used"
-            )
-    if turned:
-        said.append(f"latitude and longitude of {_named(turned)} have changed places; they are changed back")
+        middle = np.median([_on_sphere(g) for g in known.values()], axis=0)
+        near = lambda g: g is not None and np.linalg.norm(_on_sphere(g) - middle) <= _FAR_M  # noqa: E731
+        far = [n for n, g in known.items() if not near(g)]
+        back = [n for n in far if near(_exchanged(known[n]))]
+        result |= {n: _exchanged(known[n]) for n in back}
+        exchanged += back
+        # A majority decides which are far.
+        lost = [n for n in far if n not in back] if 2 * len(far) < len(known) else []
+        result |= dict.fromkeys(lost, None)
+    messages = []
+    if lost:
+        messages.append(f"the positions of {_names(lost)} are more than {_FAR_M / 1000:g} km from the others: not used")
+    if exchanged:
+        messages.append(f"latitude and longitude of {_names(exchanged)} have changed places; they are exchanged")
     if nowhere:
-        said.append(f"the positions of {_named(nowhere)} are (0, 0), which receivers write without one: not used")
+        messages.append(f"the positions of {_names(nowhere)} are (0, 0), which means none: not used")
     if absent:
-        n, have = len(positions), "have" if len(absent) > 1 else "has"
-        some = f"{len(absent)} of {n} photographs {have} no position ({few(absent)})"
-        said.append(some if len(absent) < n else f"all {n} photographs have no position")
-    return found, said
+        some = f"{len(absent)} of {len(positions)} photographs {'have' if len(absent) > 1 else 'has'} no position"
+        every = f"all {len(positions)} photographs have no position"
+        messages.append(f"{some} ({few(absent)})" if len(absent) < len(positions) else every)
+    return result, messages
 
 
 def one_height(
@@ -66,51 +63,44 @@ def one_height(
     above_takeoff_m: Mapping[str, float | None],
     wanted: Heights | int | None = None,
 ) -> tuple[Positions, list[str]]:
-    """The positions with heights above one thing, and what that is in a sentence.
+    """The positions with heights of one reference, and messages about it.
 
-    `wanted` take-off takes the heights that drones note above it; any other says what the files do not, an EPSG code of
-    heights so that its geoid is added. Without it, heights of two kinds are brought together by those above take-off,
-    where photographs have both. Raises what `above_ellipsoid` does.
+    `wanted` "take-off" selects the heights above take-off; others are the reference of heights without one, an EPSG
+    code that of a geoid, which is added. If None, heights of two references are joined by those above take-off.
     """
-    found: Positions = dict(positions)
-    known = {n: g for n, g in found.items() if g and g.altitude_m is not None}
-    zero = {
-        n: h - above
-        for n, g in known.items()
-        if (h := g.altitude_m) is not None and (above := above_takeoff_m.get(n)) is not None
-    }
-    if wanted == "take-off" and any(above_takeoff_m.get(n) is not None for n in found):
-        found = {n: g and g._replace(altitude_m=above_takeoff_m.get(n), heights=wanted) for n, g in found.items()}
-        lost = [n for n, g in found.items() if g and g.altitude_m is None]
-        return found, [_sentence(found), *([f"{_named(lost)} have no height above take-off"] if lost else [])]
-    said = []
+    result: Positions = dict(positions)
+    above = {n: h for n in result if (h := above_takeoff_m.get(n)) is not None}
+    known = {n: (g, g.altitude_m) for n, g in result.items() if g and g.altitude_m is not None}
+    zero = {n: h - above[n] for n, (_, h) in known.items() if n in above}
+    if wanted == "take-off" and above:
+        result = {n: g and g._replace(altitude_m=above.get(n), heights=wanted) for n, g in result.items()}
+        lost = [n for n, g in result.items() if g and g.altitude_m is None]
+        return result, [_reference(result), *([f"{_names(lost)} have no height above take-off"] if lost else [])]
+    messages = []
     relative = [n for n, v in zero.items() if abs(v) < _SAME_M]
-    others = [v for n, v in zero.items() if n not in relative]
-    if relative and others and abs(np.median(others)) > _APART_M:
-        own = float(np.median(others))
-        found |= {
-            n: g._replace(altitude_m=g.altitude_m + own) for n in relative if (g := known[n]).altitude_m is not None
-        }
-        said.append(
-            f"the heights of {_named(relative)} are above take-off, those of the others {own:+.1f} m from there, which "
-            "is added"
+    takeoff = [v for n, v in zero.items() if n not in relative]
+    if relative and takeoff and abs(shift := float(np.median(takeoff))) > _APART_M:
+        result |= {n: known[n][0]._replace(altitude_m=known[n][1] + shift) for n in relative}
+        zero |= dict.fromkeys(relative, shift)
+        messages.append(
+            f"the heights of {_names(relative)} are above take-off, those of the others {shift:+.1f} m from there, "
+            "which is added"
         )
-        zero |= dict.fromkeys(relative, own)
     if isinstance(wanted, int):
-        found, more = above_ellipsoid(found, wanted)
-        said += more
+        result, more = _above_ellipsoid(result, wanted)
+        messages += more
     elif wanted is not None:
         if wanted == "take-off" and known:
-            said.append("no photograph notes a height above take-off: those of the files are taken as such (--heights)")
-        found = {n: g and g._replace(heights=wanted) for n, g in found.items()}
+            messages.append("no photograph has a height above take-off: those of the files are taken as such")
+        result = {n: g and g._replace(heights=wanted) for n, g in result.items()}
     else:
-        found, more = _joined(found, zero)
-        said += more
-    return found, [_sentence(found), *said] if known else said
+        result, more = _joined(result, zero)
+        messages += more
+    return result, [_reference(result), *messages] if known else messages
 
 
 def _joined(positions: Positions, zero: Mapping[str, float]) -> tuple[Positions, list[str]]:
-    """Heights of the rarer kind brought to those of the usual one, where their zeros tell how far they are apart."""
+    """Heights of rare references reduced to the usual one, if the heights of take-off are known in both."""
     kinds: dict[Heights, list[str]] = {}
     for n, g in positions.items():
         if g and g.altitude_m is not None:
@@ -118,58 +108,85 @@ def _joined(positions: Positions, zero: Mapping[str, float]) -> tuple[Positions,
     if len(kinds) < 2:
         return positions, []
     usual = max(kinds, key=lambda kind: len(kinds[kind]))
-    said, found = [], dict(positions)
+    messages, result = [], dict(positions)
     for kind, names in kinds.items():
         if kind == usual:
             continue
+        both = f"the heights of {_names(names)} are {HEIGHTS[kind]}, those of most {HEIGHTS[usual]}"
         here, there = ([zero[n] for n in kinds[k] if n in zero] for k in (kind, usual))
-        if here and there and abs(apart := float(np.median(there) - np.median(here))) <= _APART_M:
-            apart = 0.0
-        elif not (here and there):
-            found |= {n: g._replace(altitude_m=None) for n in names if (g := found[n])}
-            said.append(
-                f"the heights of {_named(names)} are {HEIGHTS[kind]}, those of most {HEIGHTS[usual]}, and nothing "
-                "tells how far these are apart: the former are not used (--heights says above what they are)"
-            )
-            continue
+        shift = float(np.median(there) - np.median(here)) if here and there else None
+        if shift is None:
+            messages.append(f"{both}, and their difference is unknown: the former are not used (--heights gives it)")
+        elif abs(shift) > _APART_M:
+            messages.append(f"{both}; {shift:+.1f} m brings them together (by the heights above take-off)")
         else:
-            said.append(
-                f"the heights of {_named(names)} are {HEIGHTS[kind]}, those of most {HEIGHTS[usual]}; {apart:+.1f} m "
-                "brings them together (by the heights above take-off)"
+            shift = 0.0
+        for n in names:
+            if (g := result[n]) and g.altitude_m is not None:
+                result[n] = g._replace(
+                    altitude_m=None if shift is None else g.altitude_m + shift,
+                    heights=g.heights if shift is None else usual,
+                )
+    return result, messages
+
+
+def _above_ellipsoid(positions: Positions, vertical: int) -> tuple[Positions, list[str]]:
+    """Heights of the EPSG system `vertical` reduced to the ellipsoid: h = H + N, N the height of its geoid (m).
+
+    Raises InputError for a code that is not one of heights, for a geoid that is not installed, and for a place outside.
+    """
+    # A wrong code is an error even if no height needs it.
+    system = MapFrame(WGS84, vertical, (0.0, 0.0, 0.0))
+    places = {
+        n: (g.longitude_deg, g.latitude_deg, g.altitude_m)
+        for n, g in positions.items()
+        if g and g.altitude_m is not None and g.heights != "ellipsoid"
+    }
+    if not places:
+        any_height = any(g and g.altitude_m is not None for g in positions.values())
+        reason = "all are above the ellipsoid by their files" if any_height else "no photograph has one"
+        return positions, [f"no height needs the geoid of EPSG:{vertical}: {reason}"]
+    given = np.array(list(places.values()), float)
+    heights = system.place(given)[:, 2]
+    for name, place, height in zip(places, given, heights, strict=True):
+        if not np.isfinite(height):
+            raise InputError(
+                f"the geoid of the heights EPSG:{vertical} does not reach the photograph {quoted(name)} at "
+                f"{place[0]:.4f}, {place[1]:.4f} degrees; give the system of heights of that place"
             )
-        found |= {n: _raised(g, apart)._replace(heights=usual) for n in names if (g := found[n])}
-    return found, said
+    result = dict(positions)
+    for name, height in zip(places, heights.tolist(), strict=True):
+        if gps := result[name]:
+            result[name] = gps._replace(altitude_m=height, heights="ellipsoid")
+    added = heights - given[:, 2]
+    return result, [
+        f"the heights of {len(places)} photographs are taken as those of EPSG:{vertical}; its geoid, "
+        f"{added.min():+.2f} to {added.max():+.2f} m, is added"
+    ]
 
 
-def _sentence(positions: Positions) -> str:
+def _reference(positions: Positions) -> str:
     kinds: list[Heights] = [g.heights for g in positions.values() if g and g.altitude_m is not None]
     kind: Heights = kinds[0] if kinds else "unknown"
     if kind == "ellipsoid":
         return "heights are above the ellipsoid"
     if kind == "unknown":
-        return (
-            "heights are as the files have them, which do not say above what (--heights says it): the block is as high "
-            "as they say"
-        )
-    return f"heights are {HEIGHTS[kind]}; nothing is added to bring them to the ellipsoid, and the block is as high"
+        return "heights are as in the files, which do not say above what (--heights says it)"
+    return f"heights are {HEIGHTS[kind]}; nothing is added to bring them to the ellipsoid"
 
 
-def _raised(gps: Gps, by_m: float) -> Gps:
-    return gps._replace(altitude_m=None if gps.altitude_m is None else gps.altitude_m + by_m)
-
-
-def _changed(gps: Gps) -> Gps | None:
-    """Latitude and longitude in each other's place; None where that cannot be."""
+def _exchanged(gps: Gps) -> Gps | None:
+    """Latitude and longitude in each other's place; None if impossible."""
     if abs(gps.longitude_deg) > 90:
         return None
     return gps._replace(latitude_deg=gps.longitude_deg, longitude_deg=gps.latitude_deg)
 
 
-def _on_sphere(gps: Gps) -> Float[np.ndarray, "3"]:
+def _on_sphere(gps: Gps) -> np.ndarray:
     longitude, latitude = np.deg2rad([gps.longitude_deg, gps.latitude_deg])
     level = np.cos(latitude)
     return _EARTH_M * np.array([level * np.cos(longitude), level * np.sin(longitude), np.sin(latitude)])
 
 
-def _named(names: list[str]) -> str:
+def _names(names: list[str]) -> str:
     return f"{len(names)} photographs ({few(names)})" if len(names) > 1 else names[0]

@@ -1,21 +1,21 @@
-"""A rig: cameras that are exposed together and sit still beside one another, such as a nadir camera with oblique heads.
+"""Rig: rigidly connected cameras with common exposures, such as a nadir camera with oblique heads.
 
-One of them is the reference. Of every other the rig has the place of its projection centre in the frame of the
-reference camera, l (m), and a turn t (rad), the rotation vector of its orientation beside that of the reference:
+One of them is the reference. Every other camera has the position of its projection centre in the frame of the reference
+camera, l (m), and a rotation t (rad), the rotation vector of its orientation relative to the reference:
 
     X = X_ref + R_ref' l,    R = small_rotation(t) R_ref        (R takes the object frame to the camera)
 
-`small_rotation` is exact for any angle below a whole turn, so heads may look anywhere. What a photograph is off by is
+`small_rotation` is exact for any angle below a full turn, so heads may point anywhere. The deviation of a photograph is
 
     p = R_ref (X - X_ref) - l (m, in the axes of the reference),    r: small_rotation(r) = R R_ref' small_rotation(t)'
 
-which is nothing where the rig is rigid. A camera that exposes a delay tau after the reference does so beside the
-reference as it is by then, by the velocity v of the GNSS/IMU, its lever arm a and the rate of turn w (both in the axes
-of the body), and M, which takes the camera to the body:
+which is zero for a rigid rig. A camera that exposes a delay tau after the reference refers to the pose of the reference
+at that time, by the velocity v of the GNSS/IMU, its lever arm a and the rotation rate w (both in body axes), and M,
+which takes the camera to the body:
 
     X_ref(tau) = X_ref + (v - R_ref' M' (w x a)) tau,    R_ref(tau) = small_rotation(M' w tau) R_ref
 
-Frames and signs: docs/conventions.md; what is known of rigs: docs/rigs.md.
+Frames and signs: docs/conventions.md; use of rigs: docs/rigs.md.
 """
 
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ from jaxphoto.rotation import rotate, small_angles, small_rotation
 
 
 class RigCamera(AbstractParameters):
-    """Where a camera sits beside the reference camera of its rig, and how it is turned; that has none of its own.
+    """Position and orientation of a camera relative to the reference camera of its rig, which has none itself.
 
     `place` of its projection centre in the axes of the reference camera (m: x right, y up, z out of its back), `turn`
     about these axes (rad), the rotation vector of `camera_from_reference = small_rotation(turn)`, `delay` of its
@@ -55,9 +55,9 @@ def reference_later(
     mount: Mount,
     exposure: Exposure,
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Position (m) and orientation of the reference camera `delay` seconds after its exposure."""
+    """Return position (m) and orientation of the reference camera `delay` seconds after its exposure."""
     body = body_from_camera(mount.boresight, nominal_mount(mount, exposure))
-    # Of the GNSS/IMU, which a lever arm carries about the camera.
+    # Velocity of the camera; the GNSS/IMU is a lever arm away from it.
     velocity = exposure.velocity - rotate(camera_from_object.T @ body.T, jnp.cross(exposure.rate, mount.lever_arm))
     turn = small_rotation(rotate(body.T, exposure.rate) * delay)
     return position + velocity * delay, turn @ camera_from_object
@@ -66,19 +66,21 @@ def reference_later(
 def rig_place(
     reference: Float[Array, "3"], camera_from_object: Float[Array, "3 3"], position: Float[Array, "3"]
 ) -> Float[Array, "3"]:
-    """Where a projection centre is in the frame of the reference camera (m); the first two are of the reference."""
+    """Return a projection centre in the frame of the reference camera (m); the first two arguments are of the
+    reference.
+    """
     return rotate(camera_from_object, position - reference)
 
 
 def rig_turn(reference: Float[Array, "3 3"], camera_from_object: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """The rotation vector (rad) of a camera beside the reference; both are `camera_from_object`."""
+    """Return the rotation vector (rad) of a camera relative to the reference; both are `camera_from_object`."""
     return small_angles(camera_from_object @ reference.T)
 
 
 def in_rig(
     position: Float[Array, "3"], camera_from_object: Float[Array, "3 3"], camera: RigCamera
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Position and orientation of a camera of a rig whose reference is there."""
+    """Return position and orientation of a camera of a rig, given its reference."""
     there = position + rotate(camera_from_object.T, camera.place)
     return there, small_rotation(camera.turn) @ camera_from_object
 
@@ -86,5 +88,5 @@ def in_rig(
 def turn_off(
     reference: Float[Array, "3 3"], camera_from_object: Float[Array, "3 3"], turn: Float[Array, "3"]
 ) -> Float[Numbers, "3"]:
-    """By how much a camera is turned beside its place in the rig (rad, about its own axes)."""
+    """Return the rotation of a camera relative to its place in the rig (rad, about its own axes)."""
     return small_angles(camera_from_object @ reference.T @ small_rotation(turn).T)

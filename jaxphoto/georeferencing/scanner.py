@@ -1,4 +1,4 @@
-"""A laser scanner beside the GNSS/IMU: its boresight, and the shifts of its strips.
+"""Boresight of a laser scanner relative to the GNSS/IMU, and shifts of its strips.
 
 Functions of one laser point; frames and signs are those of a camera's mount (docs/conventions.md).
 """
@@ -14,10 +14,10 @@ from jaxphoto.static_values import ordered
 
 
 class Scanner(AbstractParameters):
-    """What is wrong with a cloud that was georeferenced without it.
+    """Errors of a cloud georeferenced without boresight and shifts.
 
     `boresight` is the misalignment, a small rotation about the body's right, forward and up axes (rad); `shifts` holds,
-    for each lidar strip by name, what its points are off the object frame by (m).
+    for each lidar strip by name, the offset of its points from the object frame (m).
     """
 
     kind = "scanner"
@@ -28,7 +28,7 @@ class Scanner(AbstractParameters):
     shifts: dict[str, Float[Array, "3"]] = eqx.field(converter=ordered)
 
     def labels(self, owner: str) -> tuple[str, ...]:
-        """Boresight, then the shifts of the lidar strips, each by its name."""
+        """Return labels: boresight, then the shift of each lidar strip."""
         shifts = (f"{self.kind}[{name}].shift_{axis}_m" for name in self.shifts for axis in "XYZ")
         return (*(f"{self.kind}.{name}" for name in self.names["boresight"]), *shifts)
 
@@ -40,10 +40,9 @@ def corrected_point(
     boresight: Float[Array, "3"],
     shift: Float[Array, "3"],
 ) -> Float[Array, "3"]:
-    """A laser point (m) as it is: `position + R small_rotation(boresight) R' (point - position) - shift`.
+    """Return a corrected laser point (m): `position + R small_rotation(boresight) R' (point - position) - shift`.
 
-    `position` and `object_from_body` (R) are those of the scanner when it measured the point, as the trajectory gave
-    them.
+    `position` and `object_from_body` (R) are those of the scanner at the time of the point, by the trajectory.
     """
     in_body = rotate(object_from_body.T, point - position)
     return position + rotate(object_from_body, rotate(small_rotation(boresight), in_body)) - shift
@@ -55,7 +54,7 @@ def raised_by_boresight(
     position: Float[Array, "3"],
     object_from_body: Float[Array, "3 3"],
 ) -> Float[Array, "3"]:
-    """By how much each component of a boresight not accounted for has raised a laser point along `normal` (m per rad).
+    """Return the rise of a laser point along `normal` per component of an uncorrected boresight (m per rad).
 
     To first order; `position` and `object_from_body` are as in `corrected_point`.
     """

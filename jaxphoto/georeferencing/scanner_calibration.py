@@ -1,30 +1,30 @@
-"""A laser return: where it lies by the trajectory at its time, and by what is wrong with its scanner.
+"""Correction of laser returns for errors of trajectory and scanner.
 
-A cloud holds X, and a trajectory the position p and attitude R of the scanner at the time of X; range and angle of the
-shot are those of s = R' (X - p), in the axes of the body (right, forward, up):
+A cloud holds X, and a trajectory the position p and attitude R of the scanner at the time of X. Range and angle of the
+pulse are those of s = R' (X - p), in the body axes (right, forward, up):
 
-    rho = |s|,    theta = atan2(s_right, -s_up)        from the nadir, about the axis that points forward
+    rho = |s|,    theta = atan2(s_right, -s_up)        from the nadir, about the forward axis
 
-of a scanner whose mirror oscillates or turns, line by line across the track. Of one that looks all around its nadir,
-through the two prisms of Risley or over a mirror that nutates,
+for a scanner with an oscillating or rotating mirror, line by line across track. For circular patterns around the nadir
+(Risley prisms or a nutating mirror),
 
     theta = atan2(h, -s_up), h = hypot(s_right, s_forward)    from the nadir,    alpha = atan2(s_right, s_forward)
 
-What each of them is off by is estimated and taken off. With the corrections of a trajectory dp, da at that time
-(`TrajectoryKnot`), the boresight b of `Scanner` and `ScannerCalibration` the return lies at
+Their errors are estimated and removed. With the trajectory errors dp, da at that time (`TrajectoryKnot`), the boresight
+b of `Scanner` and `ScannerCalibration`, the return lies at
 
     X' = p - dp + v dt + R S(da - w dt) (S(b) s' - l),       S = rotation.small_rotation
-    s'  is s, of length rho (1 - m) - d, turned about the forward axis by -(k theta + e1 cos theta + e2 sin theta);
-        all around: turned towards the nadir by k theta, and about it by -(e1 cos alpha + e2 sin alpha)
+    s'  is s, of length rho (1 - m) - d, rotated about the forward axis by -(k theta + e1 cos theta + e2 sin theta);
+        circular: rotated towards the nadir by k theta, and about it by -(e1 cos alpha + e2 sin alpha)
 
-An offset of the encoder is a boresight about the forward axis (of the other sign), all around one about the axis that
-points up, and is found as such. k of two prisms is by how much their wedges or their glass deflect more than assumed.
-dt is the time by which the scanner's clock is behind that of the trajectory: its pose, to first order in dt, is that of
-a time so much later, by the velocity v and the rate of turn w.
+An encoder offset is equivalent to a boresight about the forward axis (opposite sign), for circular patterns about the
+up axis, and is estimated as such. k of two prisms is the error of their deflection by wedge angle or refractive index.
+dt is the delay of the scanner's clock relative to that of the trajectory: its pose, to first order in dt, is that of a
+time later by dt, by the velocity v and the rotation rate w.
 
-Sources: Skaloud and Lichti (2006), Rigorous approach to bore-sight self-calibration in airborne laser
-scanning; Glira, Pfeifer and Mandlburger (2016), Rigorous strip adjustment of UAV-based laserscanning data including
-time-dependent correction of trajectory errors. Frames and signs: docs/conventions.md.
+Sources: Skaloud and Lichti (2006), Rigorous approach to bore-sight self-calibration in airborne laser scanning; Glira,
+Pfeifer and Mandlburger (2016), Rigorous strip adjustment of UAV-based laserscanning data including time-dependent
+correction of trajectory errors. Frames and signs: docs/conventions.md.
 """
 
 from typing import Literal, get_args
@@ -37,7 +37,7 @@ from jaxphoto.parameters import AbstractParameters
 from jaxphoto.rotation import rotate, small_rotation
 
 Pattern = Literal["line", "circle"]
-"""What a scanner draws on the ground: lines across the track, or figures all around its nadir."""
+"""Scan pattern on the ground: lines across track, or circular figures around the nadir."""
 PATTERNS: tuple[Pattern, ...] = get_args(Pattern)
 PATTERN_OF: dict[str, Pattern] = {
     **{pattern: pattern for pattern in PATTERNS},
@@ -46,18 +46,17 @@ PATTERN_OF: dict[str, Pattern] = {
     "risley": "circle",
     "nutating": "circle",
 }
-"""Kinds of scanners, and the pattern by whose angles each is corrected; a pattern stands for any of its kinds."""
+"""Kinds of scanners with the pattern whose angles are corrected; a pattern stands for any of its kinds."""
 _PPM = 1e-6
 _AXES = ("right", "forward", "up")
 
 
 class ScannerCalibration(AbstractParameters):
-    """What is wrong with the scanner besides its boresight, all of which makes its cloud wrong by so much.
+    """Errors of the scanner except its boresight, as they appear in its cloud.
 
-    `lever_arm` of the scanner beside the one used (m: right, forward, up); `range_offset` (m) and `range_scale` (ppm)
-    of measured ranges; `angle_scale` (ppm) of theta and `eccentricity` (rad, of cos and sin) of theta, of a `pattern`
-    that is a "circle" of alpha; `time_offset` (s) of the true time of a return, on the clock of the trajectory, after
-    the recorded one.
+    `lever_arm` relative to the one used (m: right, forward, up); `range_offset` (m) and `range_scale` (ppm) of measured
+    ranges; `angle_scale` (ppm) of theta and `eccentricity` (rad, of cos and sin) of theta, for the pattern "circle" of
+    alpha; `time_offset` (s) of the true time of a return, on the clock of the trajectory, after the recorded one.
     """
 
     kind = "scanner_calibration"
@@ -85,14 +84,14 @@ class ScannerCalibration(AbstractParameters):
 
 
 def corrected_shot(shot: Float[Array, "3"], calibration: ScannerCalibration) -> Float[Array, "3"]:
-    """From the scanner to the return (m, in the body's axes), by the range and the angle as they should be."""
+    """Return the vector from scanner to return (m, in body axes), with corrected range and angle."""
     distance = jnp.sqrt(jnp.sum(shot**2))
     turned = _turned_across(shot, calibration) if calibration.pattern == "line" else _turned_around(shot, calibration)
     return turned * (1 - _PPM * calibration.range_scale - calibration.range_offset / distance)
 
 
 def _turned_across(shot: Float[Array, "3"], calibration: ScannerCalibration) -> Float[Array, "3"]:
-    """By the angle of a line."""
+    """Rotate by the angle of a line pattern."""
     right, forward, up = shot
     angle = jnp.arctan2(right, -up)
     by_cos, by_sin = calibration.eccentricity
@@ -102,10 +101,10 @@ def _turned_across(shot: Float[Array, "3"], calibration: ScannerCalibration) -> 
 
 
 def _turned_around(shot: Float[Array, "3"], calibration: ScannerCalibration) -> Float[Array, "3"]:
-    """By both angles of a circle."""
+    """Rotate by both angles of a circular pattern."""
     right, forward, up = shot
     square = right**2 + forward**2
-    # Straight down nothing is aside, and the root has no derivative.
+    # At the nadir the horizontal distance is zero, and the root has no derivative.
     aside = jnp.sqrt(jnp.where(square > 0, square, 1.0))
     by_cos, by_sin = calibration.eccentricity
     around = (by_cos * forward + by_sin * right) / aside
@@ -132,10 +131,10 @@ def corrected_return(
     boresight: Float[Array, "3"],
     calibration: ScannerCalibration,
 ) -> Float[Array, "3"]:
-    """A laser point (m) as it is; `position` and `object_from_body` are the scanner's, as the trajectory gave them.
+    """Correct a laser point (m); `position` and `object_from_body` are those of the scanner by the trajectory.
 
     `velocity` (m/s, in the object frame) and `rate` (rad/s, about the body's axes) are those of `georeferencing.Poses`;
-    `off_position` (m) and `off_attitude` (rad) are what the trajectory is off by at its time.
+    `off_position` (m) and `off_attitude` (rad) are the trajectory errors at its time.
     """
     shot = corrected_shot(rotate(object_from_body.T, point - position), calibration)
     in_body = rotate(small_rotation(boresight), shot) - calibration.lever_arm

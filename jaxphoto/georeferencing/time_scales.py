@@ -1,4 +1,4 @@
-"""What the numbers of two clocks look like, and by how much one must be shifted to fit the other."""
+"""Recognition of time scales, and the shift between two of them."""
 
 import math
 from itertools import product
@@ -10,25 +10,25 @@ DAY, WEEK = 86_400, 604_800
 # GPS minus UTC since 1999; 18 s since 2017.
 LEAP_SECONDS = (18, 17, 16, 15, 14, 13)
 LAS_OFFSET = 1e9
-"""What LAS files take off full GPS time (s)."""
+"""Subtracted from full GPS time in LAS files (s)."""
 _OF_LAS = "full GPS time less 1e9 s, as in LAS files"
 
 
 def looks_like(times: Float[np.ndarray, "n"], origin: str = "the first exposure") -> str:
-    """In words, what seconds of this size usually count from; small ones perhaps from `origin`."""
+    """Describe the usual origin of times of this size; small ones may refer to `origin`."""
     first, last = float(np.min(times)), float(np.max(times))
     return f"{first:.3f} to {last:.3f} s ({_kind(first, last, origin)})"
 
 
 def shift_that_fits(times: Float[np.ndarray, "n"], start: float, end: float) -> float | None:
-    """The shift between two common clocks (s) that brings all `times` into [start, end], None if there is none.
+    """Return the shift between two common clocks (s) that brings all `times` into [start, end], None if there is none.
 
-    Tried are whole days (seconds of day, of week, full GPS time), the 1e9 s that LAS takes off, and leap seconds;
-    else the only whole second that fits is taken, if no others do.
+    Candidates are whole days (seconds of day, of week, full GPS time), the 1e9 s of LAS, and leap seconds; otherwise
+    the only whole second that fits, if there is one.
     """
     first, last = float(np.min(times)), float(np.max(times))
     middle = (start + end) / 2 - (first + last) / 2
-    # What the numbers look like goes first: within a long flight other differences fit as well.
+    # The apparent time scale has priority: for a long flight other differences fit as well.
     likely = LAS_OFFSET * ((_kind(first, last) == _OF_LAS) - (_kind(start, end) == _OF_LAS))
     bases = dict.fromkeys((likely, 0.0, LAS_OFFSET, -LAS_OFFSET))
     for base, leap in product(bases, (0, *LEAP_SECONDS, *(-s for s in LEAP_SECONDS))):

@@ -1,19 +1,17 @@
-"""Angles in radians that are read as degrees, told by the direction of flight."""
+"""Detection of angles in radians read as degrees, by the direction of flight."""
 
 import numpy as np
 from jaxtyping import Float
 
-# Means of the cosine between yaw and course: the crab angle leaves more than the first, and both readings are told
-# apart below the second.
+# Mean cosine between yaw and course: the crab angle leaves more than the first; the readings differ below the second.
 _ALIKE, _UNLIKE = 0.8, 0.7
 _FEWEST = 4
 
 
 def counts_in_radians(yaw: Float[np.ndarray, "n"], course: Float[np.ndarray, "n"]) -> bool:
-    """Whether the numbers `yaw` follow the `course` (rad) when read as radians, and do not when read as degrees.
+    """Return True if the numbers `yaw` follow the `course` (rad) when read as radians, but not when read as degrees.
 
-    Honest degrees are safe: read as degrees they follow the flight themselves, whatever the wind, because no aircraft
-    flies sideways.
+    Valid degrees are never misjudged: they follow the flight, whatever the wind, because no aircraft flies sideways.
     """
     if len(course) < _FEWEST or np.abs(yaw).max() > 2 * np.pi:
         return False

@@ -1,134 +1,110 @@
-"""How photographs were taken, from EXIF and XMP, and the table conditions.csv of a result folder.
+"""Conditions of exposure from EXIF and XMP, and the table conditions.csv of a result folder.
 
-Tags are those of EXIF 2.32 (CIPA DC-008): body and lens serial numbers, temperature, humidity and pressure, times with
-fractions and offset. DJI writes the serial numbers of camera and drone, and the temperatures of lens and sensor, into
-XMP.
+DJI writes the serial numbers of camera and drone, and the temperatures of lens and sensor, into XMP.
 """
 
-import math
 import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
-from PIL import ExifTags, Image
 
 from jaxphoto.camera.conditions import NUMBERS, TEXTS, Conditions
 from jaxphoto.errors import InputError
 from jaxphoto.io.names import LONGEST, harm_in
-from jaxphoto.io.photograph_metadata import xmp_fields
-from jaxphoto.io.picture_size import pictures_of_any_size
-from jaxphoto.io.text_tables import LARGEST, read_csv
+from jaxphoto.io.photograph_metadata import TAG, Exif, number, open_picture, read_exif, text
 from jaxphoto.writing.inputs import input_file
 
 CONDITIONS = "conditions.csv"
-_TAG = ExifTags.Base
-# EXIF 2.31 and later; Pillow has no names for them.
+# Tags of EXIF 2.31 that Pillow does not name.
 _TEMPERATURE, _HUMIDITY, _PRESSURE = 0x9400, 0x9401, 0x9402
 _TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)")
-_SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 def conditions_of(path: Path, used: bool = True) -> Conditions:
-    """What the file of one photograph says of how it was taken; damaged EXIF says nothing."""
-    read = input_file(path)
-    known = Conditions(path.stem, path.name, read.sha256, used)
+    """Read the conditions of one photograph; damaged EXIF has none."""
+    known = Conditions(path.stem, path.name, input_file(path).sha256, used)
     try:
-        with pictures_of_any_size(), Image.open(path) as picture:
-            top = picture.getexif()
-            return known._replace(**_said(top, top.get_ifd(ExifTags.IFD.Exif), _xmp(picture.info.get("xmp"))))
-    # On bytes that are not what they should be Pillow raises what its formats do, each in its own way.
+        with open_picture(path) as picture:
+            return known._replace(**_conditions(read_exif(picture)))
+    # Pillow raises many errors for damaged bytes.
     except Exception:
         return known
 
 
-def _said(top: Any, taken: dict, xmp: dict[str, str]) -> dict[str, Any]:
-    lens = (taken.get(_TAG.LensMake), taken.get(_TAG.LensModel))
-    return {
-        "time": _time(taken),
-        "make": _words(top.get(_TAG.Make)),
-        "model": _words(top.get(_TAG.Model)),
-        "serial": _words(taken.get(_TAG.BodySerialNumber)) or _words(xmp.get("CameraSerialNumber")),
-        "lens": " ".join(filter(None, map(_words, lens))),
-        "lens_serial": _words(taken.get(_TAG.LensSerialNumber)),
-        "drone": " ".join(filter(None, (_words(xmp.get(k)) for k in ("DroneModel", "DroneSerialNumber")))),
-        "firmware": _words(top.get(_TAG.Software)),
-        "focal_length_mm": _number(taken.get(_TAG.FocalLength), positive=True),
-        "f_number": _number(taken.get(_TAG.FNumber), positive=True),
-        "exposure_s": _number(taken.get(_TAG.ExposureTime), positive=True),
-        "iso": _number(_first(taken.get(_TAG.ISOSpeedRatings)), positive=True),
-        "subject_distance_m": _number(taken.get(_TAG.SubjectDistance), positive=True),
-        "temperature_c": _number(taken.get(_TEMPERATURE)),
-        "lens_temperature_c": _number(xmp.get("LensTemperature")),
-        "sensor_temperature_c": _number(xmp.get("SensorTemperature")),
-        "humidity_percent": _number(taken.get(_HUMIDITY)),
-        "pressure_hpa": _number(taken.get(_PRESSURE)),
+def _conditions(exif: Exif) -> dict[str, Any]:
+    top, shot = exif.top, exif.shot
+    xmp = {key.partition(":")[2]: value for key, value in exif.xmp.items()}
+    iso = shot.get(TAG.ISOSpeedRatings)
+    positive = {
+        "focal_length_mm": shot.get(TAG.FocalLength),
+        "f_number": shot.get(TAG.FNumber),
+        "exposure_s": shot.get(TAG.ExposureTime),
+        "iso": iso[0] if isinstance(iso, tuple) and iso else iso,
+        "subject_distance_m": shot.get(TAG.SubjectDistance),
+    }
+    return {name: number(value, positive=True) for name, value in positive.items()} | {
+        "time": _time(shot),
+        "make": _text(top.get(TAG.Make)),
+        "model": _text(top.get(TAG.Model)),
+        "serial": _text(shot.get(TAG.BodySerialNumber)) or _text(xmp.get("CameraSerialNumber")),
+        "lens": " ".join(filter(None, (_text(shot.get(tag)) for tag in (TAG.LensMake, TAG.LensModel)))),
+        "lens_serial": _text(shot.get(TAG.LensSerialNumber)),
+        "drone": " ".join(filter(None, (_text(xmp.get(key)) for key in ("DroneModel", "DroneSerialNumber")))),
+        "firmware": _text(top.get(TAG.Software)),
+        "temperature_c": number(shot.get(_TEMPERATURE)),
+        "lens_temperature_c": number(xmp.get("LensTemperature")),
+        "sensor_temperature_c": number(xmp.get("SensorTemperature")),
+        "humidity_percent": number(shot.get(_HUMIDITY)),
+        "pressure_hpa": number(shot.get(_PRESSURE)),
     }
 
 
-def _time(taken: dict) -> str:
-    found = _TIME.match(_words(taken.get(_TAG.DateTimeOriginal)))
-    if not found:
+def _time(shot: Any) -> str:
+    match = _TIME.match(text(shot.get(TAG.DateTimeOriginal)))
+    if not match:
         return ""
-    fraction = _words(taken.get(_TAG.SubsecTimeOriginal))
-    # Not as words are looked at: those that begin with a plus sign could be formulas.
-    offset = str(taken.get(_TAG.OffsetTimeOriginal, "")).strip("\0 ")
-    said = "{}-{}-{} {}".format(*found.groups())
-    said += f".{fraction}" if fraction.isascii() and fraction.isdigit() else ""
-    return said + (offset if re.fullmatch(r"[+-]\d\d:\d\d|Z", offset) else "")
+    fraction, offset = text(shot.get(TAG.SubsecTimeOriginal)), text(shot.get(TAG.OffsetTimeOriginal))
+    time = "{}-{}-{} {}".format(*match.groups()) + (f".{fraction}" if re.fullmatch(r"[0-9]+", fraction) else "")
+    return time + (offset if re.fullmatch(r"[+-]\d\d:\d\d|Z", offset) else "")
 
 
-def _xmp(packet: Any) -> dict[str, str]:
-    """The attributes of a drone's packet by their names, whatever the namespace."""
-    return {key.partition(":")[2]: value for key, value in xmp_fields(packet).items()}
-
-
-def _words(value: Any) -> str:
-    """A text of a file, "" where there is none or it would do harm where results show it."""
-    words = " ".join(value.replace("\0", " ").split()) if isinstance(value, str) else ""
+def _text(value: Any) -> str:
+    """A text of a file; "" if a spreadsheet would read it as a formula."""
+    words = text(value)
     return "" if len(words) > LONGEST or harm_in(words) else words
 
 
-def _first(value: Any) -> Any:
-    return value[0] if isinstance(value, tuple) and value else value
-
-
-def _number(value: Any, positive: bool = False) -> float | None:
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    known = math.isfinite(number) and abs(number) <= LARGEST and (number > 0 or not positive)
-    return number if known else None
-
-
 def marked(conditions: Sequence[Conditions], used: Collection[str]) -> list[Conditions]:
-    """The same, those of the images `used` marked as that, and no others."""
+    """The conditions, with `used` set for the images `used` of a block."""
     return [one._replace(used=one.image in used) for one in conditions]
 
 
 def write_conditions(conditions: Sequence[Conditions], folder: Path, used: Collection[str]) -> None:
-    """conditions.csv: a row each photograph, columns as of `Conditions`; `used` are the images of the block."""
-    rows = marked(conditions, used)
-    pd.DataFrame(rows, columns=Conditions._fields).to_csv(folder / CONDITIONS, index=False)
+    """Write conditions.csv, one row per photograph; `used` are the images of the block."""
+    pd.DataFrame(marked(conditions, used), columns=Conditions._fields).to_csv(folder / CONDITIONS, index=False)
 
 
 def read_conditions(path: Path) -> list[Conditions]:
-    """The rows of a conditions.csv. Raises InputError for what is none."""
-    words = ("image", "file", "sha256", "used", *TEXTS)
-    table = read_csv(path, ("image", "file", "sha256", "used"), (*TEXTS, *NUMBERS), text=words)
-    columns = {name: table.names(name).tolist() for name in words}
-    columns |= {
-        name: [None if math.isnan(v) else v for v in table.numbers(name, empty=True).tolist()] for name in NUMBERS
-    }
-    for line, (digest, used) in enumerate(zip(columns["sha256"], columns["used"], strict=True)):
-        if not _SHA256.fullmatch(digest):
-            raise table.bad(line, "sha256 is not 64 hexadecimal digits; write the results anew")
-        if used not in ("True", "False"):
-            raise table.bad(line, "used is neither True nor False; write the results anew")
-    columns["used"] = [used == "True" for used in columns["used"]]
-    rows = [Conditions(**dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)]
-    if not rows:
-        raise InputError(f"{path.name}: there is no photograph in it; write the results anew")
-    return rows
+    """Read conditions.csv. Raises InputError for a file without its columns or photographs."""
+    try:
+        table = pd.read_csv(path, dtype=str, keep_default_na=False)
+        numbers = {name: pd.to_numeric(table[name]) for name in NUMBERS if name in table}
+        valid = table["sha256"].str.fullmatch("[0-9a-f]{64}") & table["used"].isin(["True", "False"])
+        table = table.assign(used=table["used"] == "True")[
+            ["image", "file", "sha256", "used", *table.columns.intersection(list(TEXTS))]
+        ]
+    except OSError:
+        raise
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path.name}: not a table of photographs ({error}); write the results again") from None
+    if not valid.all() or table.empty:
+        where = f", row {int(np.argmin(valid)) + 2}" if len(table) else ""
+        raise InputError(f"{path.name}{where}: no photograph with sha256 and used; write the results again")
+    rows = table.to_dict("records")
+    for name, values in numbers.items():
+        for row, value in zip(rows, values.tolist(), strict=True):
+            row[name] = value if np.isfinite(value) else None
+    return [Conditions(**{str(key): value for key, value in row.items()}) for row in rows]

@@ -45,7 +45,7 @@ def write_inputs(files: Sequence[InputFile], folder: Path) -> None:
 def read_inputs(path: Path) -> list[InputFile]:
     """The rows of an inputs.csv. Raises InputError for what is none."""
     table = read_csv(path, InputFile._fields, text=("file", "sha256"))
-    names, digests = table.names("file").tolist(), table.text("sha256").tolist()
+    names, digests = table.text("file").tolist(), table.text("sha256").tolist()
     sizes = table.numbers("n_bytes").tolist()
     for line, (size, digest) in enumerate(zip(sizes, digests, strict=True)):
         if not _SHA256.fullmatch(digest):

@@ -18,8 +18,6 @@ _UNSEEN = "\x00-\x09\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff"
 _CONTROL = re.compile(f"[\n{_UNSEEN}]")
 # A signed word or number (-1, +5a) is what it looks like.
 _FORMULA = re.compile(r"\s*(?:[=@]|[-+](?![\w.]*$))")
-# What may be any of these, in names joined by line ends.
-_SUSPECT = re.compile(f"^\\s*[=@+-]|[{_UNSEEN}]|.{{{LONGEST + 1}}}", re.MULTILINE)
 
 
 def harm_in(name: str) -> str:
@@ -45,9 +43,3 @@ def points_called(points: Sequence[str], names: Iterable[str], where: str) -> tu
 def control_in(text: str) -> bool:
     """Whether a text has characters that are commands, or that cannot be written."""
     return _CONTROL.search(text) is not None
-
-
-def harmless(names: list[str]) -> bool:
-    """Whether `harm_in` finds nothing in any of many names; False where one has to look."""
-    joined = "\n".join(names)
-    return joined.count("\n") == max(len(names) - 1, 0) and _SUSPECT.search(joined) is None

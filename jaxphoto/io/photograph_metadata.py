@@ -1,27 +1,30 @@
-"""What drones write into the XMP packet of a photograph, as far as positions and attitudes need it.
+"""Metadata of photographs: EXIF by Pillow, and the XMP packets of drones.
 
 | make | namespace | position | attitude |
 | --- | --- | --- | --- |
-| DJI | drone-dji | AbsoluteAltitude, RelativeAltitude, AltitudeType, RtkFlag, RtkStdLon to Hgt | GimbalYawDegree ... |
-| | | GpsLatitude, GpsLongitude or GpsLongtitude | |
-| Autel | drone, drone-autel | the same names | the same names, or Camera |
-| senseFly, Parrot, others | Camera (Pix4D) | GPSXYAccuracy, GPSZAccuracy | Yaw, Pitch, Roll, IMU...Accuracy |
+| DJI | drone-dji | AbsoluteAltitude, RelativeAltitude, AltitudeType, RtkFlag, RtkStdLon to Hgt, | GimbalYawDegree ... |
+| | | GpsLatitude, GpsLongitude or GpsLongtitude, UTCAtExposure | FlightYawDegree ... |
+| Autel | drone, drone-autel | as DJI | as DJI, or Camera |
+| senseFly, Parrot, others | Camera (Pix4D) | GPSXYAccuracy, GPSZAccuracy, VertCS | Yaw, Pitch, Roll, IMU...Accuracy |
 | Parrot | drone-parrot | | CameraYawDegree, CameraPitchDegree, CameraRollDegree |
 | Skydio | drone-skydio | Latitude, Longitude, AbsoluteAltitude, RelativeAltitude | CameraOrientationNED: Yaw ... |
 
-Sources: DJI, manuals of the Zenmuse P1 and the Mavic 3E ("XMP Data List": GimbalPitchDegree and others in north, east,
-down, order ZYX; RtkFlag 0 none, 16 single, 32 to 49 float, 50 fixed; AbsoluteAltitude "geodetic height"); Pix4D,
-"Specifications of XMP Camera tags"; Parrot, "Embedded photo metadata" (accuracies as fractions; Camera.Pitch 38.0 where
-CameraPitchDegree is -52.0); Skydio, "Camera and metadata overview".
+Sources: DJI, manuals of the Zenmuse P1 and the Mavic 3E ("XMP Data List": gimbal angles in north, east, down, order
+ZYX; RtkFlag 0 none, 16 single, 32 to 49 float, 50 fixed); Pix4D, "Specifications of XMP Camera tags"; Parrot, "Embedded
+photo metadata" (accuracies as fractions); Skydio, "Camera and metadata overview"; EXIF 2.32 (CIPA DC-008).
 """
 
+import math
 import re
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import datetime
 from fractions import Fraction
+from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
+from PIL import ExifTags, Image
 
 from jaxphoto.georeferencing.camera_attitude import (
     USUAL_SIGMA_DEG,
@@ -29,31 +32,99 @@ from jaxphoto.georeferencing.camera_attitude import (
     level_from_belly,
     level_from_gimbal,
 )
-from jaxphoto.georeferencing.gps import Fix, Heights
+from jaxphoto.georeferencing.exposure_times import Taken, gps_seconds
+from jaxphoto.georeferencing.gps import Fix, Gps, Heights
 
-# Attributes or elements, however the packet is laid out: an XML parser refuses packets that cameras cut off.
+TAG = ExifTags.Base
+# Attributes or elements. Cameras write packets that are not well-formed XML, or cut off: no XML parser reads these.
 _FIELD = re.compile(
-    rb"(?<![/\w-])(drone-(?:dji|autel|parrot|skydio)|drone|[Cc]amera|CRSInfo):(\w+)"
-    rb"\s*(?:=\s*[\"']([^\"']{0,100})[\"']|>([^<]{0,100})<)"
+    r"(?<![/\w-])(drone-(?:dji|autel|parrot|skydio)|drone|[Cc]amera|CRSInfo):(\w+)"
+    r"\s*(?:=\s*[\"']([^\"']{0,100})[\"']|>([^<]{0,100})<)"
 )
-# The three angles are written for several frames, one element each.
+# Skydio writes the angles in several frames.
 _SKYDIO = re.compile(
-    rb"<drone-skydio:CameraOrientationNED\b(.{0,2000}?)(?:/>|</drone-skydio:CameraOrientationNED)", re.DOTALL
+    r"<drone-skydio:CameraOrientationNED\b(.{0,2000}?)(?:/>|</drone-skydio:CameraOrientationNED)", re.DOTALL
 )
-# Of a packet, what is looked at; it lies in one segment of 64 kilobytes in a JPEG.
-_MOST_BYTES = 1_000_000
 _DJI_LIKE = ("drone-dji", "drone-autel", "drone")
-_FULL_TURN_DEG = 360.0
+_ANGLES = ("Yaw", "Pitch", "Roll")
+
+
+@contextmanager
+def open_picture(path: Path) -> Iterator[Image.Image]:
+    """Open a picture of any size: Pillow refuses more than 179 million pixels, which aerial cameras have."""
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    try:
+        with warnings.catch_warnings():
+            # About damaged EXIF.
+            warnings.simplefilter("ignore")
+            with Image.open(path) as picture:
+                yield picture
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
+
+
+class Exif(NamedTuple):
+    """The tags of a photograph; empty where its EXIF is missing or damaged."""
+
+    top: Mapping[int, Any]
+    shot: Mapping[int, Any]
+    gps: Mapping[int, Any]
+    xmp: Mapping[str, str]
+    """Attributes of drones by `namespace:name`."""
+
+
+def read_exif(picture: Image.Image) -> Exif:
+    """Read EXIF and XMP."""
+    try:
+        top = picture.getexif()
+        shot, gps = top.get_ifd(ExifTags.IFD.Exif), top.get_ifd(ExifTags.IFD.GPSInfo)
+        return Exif(top, shot, gps, xmp_fields(picture.info.get("xmp")))
+    # Pillow raises many errors for damaged bytes.
+    except Exception:
+        return Exif({}, {}, {}, {})
+
+
+def number(value: Any, positive: bool = False) -> float | None:
+    """A finite number of EXIF or XMP (Parrot writes fractions); None for anything else."""
+    try:
+        result = float(Fraction(value)) if isinstance(value, str) and "/" in value else float(value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return result if math.isfinite(result) and (result > 0 or not positive) else None
+
+
+def text(value: Any) -> str:
+    """A text of EXIF without padding, "" for anything else."""
+    return " ".join(value.replace("\0", " ").split()) if isinstance(value, str) else ""
+
+
+def xmp_fields(packet: Any) -> dict[str, str]:
+    """The attributes of drones in an XMP packet by `namespace:name`."""
+    if isinstance(packet, bytes):
+        packet = packet.decode("utf-8", "replace")
+    if not isinstance(packet, str):
+        return {}
+    fields = _fields(packet)
+    if match := _SKYDIO.search(packet):
+        fields |= {f"CameraOrientationNED:{key.partition(':')[2]}": value for key, value in _fields(match[1]).items()}
+    return fields
+
+
+def _fields(packet: str) -> dict[str, str]:
+    return {
+        f"{'Camera' if space == 'camera' else space}:{name}": (attribute or element).strip()
+        for space, name, attribute, element in _FIELD.findall(packet)
+    }
 
 
 class DroneRecord(NamedTuple):
-    """What an XMP packet says; None where it does not."""
+    """Position and attitude of an XMP packet; None where it has none."""
 
     latitude_longitude_deg: tuple[float, float] | None = None
     altitude_m: float | None = None
     above_takeoff_m: float | None = None
     heights: Heights = "unknown"
-    """Of `altitude_m`, or of the height of EXIF where the packet has none."""
+    """Reference of `altitude_m`, or of the height of EXIF if the packet has none."""
     sigma_m: tuple[float, float, float] | None = None
     """East, north and up."""
     fix: Fix = "unknown"
@@ -61,125 +132,132 @@ class DroneRecord(NamedTuple):
     aircraft_deg: tuple[float, float, float] | None = None
     """Roll, pitch and yaw."""
     utc: datetime | None = None
-    """Of the exposure, to the microsecond where DJI writes it; without a zone."""
-
-
-def xmp_fields(packet: Any) -> dict[str, str]:
-    """The attributes of drones in a packet by `namespace:name`; none where it is absent or another's."""
-    if not isinstance(packet, bytes | str):
-        return {}
-    content = (packet.encode("utf-8", "replace") if isinstance(packet, str) else packet)[:_MOST_BYTES]
-    fields = _fields(_FIELD.findall(content))
-    if found := _SKYDIO.search(content):
-        turned = _fields(_FIELD.findall(found[1]))
-        fields |= {f"CameraOrientationNED:{key.partition(':')[2]}": value for key, value in turned.items()}
-    return fields
-
-
-def _fields(found: list[tuple[bytes, bytes, bytes, bytes]]) -> dict[str, str]:
-    named = {}
-    for space, name, given, inner in found:
-        prefix = "Camera" if space == b"camera" else space.decode()
-        named[f"{prefix}:{name.decode()}"] = (given or inner).decode("utf-8", "replace").strip()
-    return named
+    """Time of exposure."""
 
 
 def drone_record(fields: Mapping[str, str]) -> DroneRecord:
-    """What the attributes say of position and attitude; numbers that are none say nothing."""
+    """Position and attitude in the attributes of a packet."""
+    value = lambda name: number(fields.get(name, ""))  # noqa: E731
     space = next((s for s in _DJI_LIKE if any(key.startswith(f"{s}:") for key in fields)), "")
-    record = _dji(fields, space) if space else DroneRecord()
-    if (skydio := _number(fields, "drone-skydio:AbsoluteAltitude")) is not None:
-        record = record._replace(altitude_m=skydio, above_takeoff_m=_number(fields, "drone-skydio:RelativeAltitude"))
-    plan, height = _number(fields, "Camera:GPSXYAccuracy"), _number(fields, "Camera:GPSZAccuracy")
-    if record.sigma_m is None and plan and height and min(plan, height) > 0:
-        record = record._replace(sigma_m=(plan, plan, height))
-    if record.heights == "unknown":
-        record = record._replace(heights=_vertical(fields))
-    return record._replace(attitude=_attitude(fields, space), latitude_longitude_deg=_plan(fields, space))
-
-
-def _plan(fields: Mapping[str, str], space: str) -> tuple[float, float] | None:
-    for latitude, longitude in (
-        (f"{space}:GpsLatitude", f"{space}:GpsLongitude"),
-        # As DJI wrote it for years.
-        (f"{space}:GpsLatitude", f"{space}:GpsLongtitude"),
-        ("drone-skydio:Latitude", "drone-skydio:Longitude"),
-    ):
-        north, east = _number(fields, latitude), _number(fields, longitude)
-        if north is not None and east is not None:
-            return north, east
-    return None
-
-
-def _dji(fields: Mapping[str, str], space: str) -> DroneRecord:
-    """The packet of DJI, or of another with the same names."""
-    number = lambda name: _number(fields, f"{space}:{name}")  # noqa: E731
-    flag = number("RtkFlag")
-    sigma = [number(f"RtkStd{axis}") for axis in ("Lon", "Lat", "Hgt")]
-    flown = [number(f"Flight{axis}Degree") for axis in ("Roll", "Pitch", "Yaw")]
-    # Without corrections it is the barometer's, or a mixture, whose zero DJI does not document.
-    ellipsoid = fields.get(f"{space}:AltitudeType", "") == "RtkAlt" or (flag is not None and flag > 0)
+    flag = value(f"{space}:RtkFlag")
+    # Without corrections, heights are barometric or mixed, and standard deviations are not those of the position.
+    corrected = fields.get(f"{space}:AltitudeType") == "RtkAlt" or (flag is not None and flag > 0)
+    sigma = None if flag == 0 else _three([value(f"{space}:RtkStd{axis}") for axis in ("Lon", "Lat", "Hgt")], 0.0)
+    plan, height = value("Camera:GPSXYAccuracy"), value("Camera:GPSZAccuracy")
+    vertical = fields.get("CRSInfo:VERTCRS") or fields.get("Camera:VertCS") or fields.get("Camera:VerticalCS") or ""
+    heights: Heights = "unknown"
+    if corrected or re.search(r"ellips|^WGS ?84$", vertical, re.IGNORECASE):
+        heights = "ellipsoid"
+    elif re.search(r"EGM|NAVD|MSL|geoid|EPSG:5\d{3}", vertical, re.IGNORECASE):
+        heights = "geoid"
+    above = "drone-skydio" if value("drone-skydio:AbsoluteAltitude") is not None else space
+    try:
+        # "2023-04-05T06:07:08.123456", or with a blank.
+        utc = datetime.fromisoformat(fields.get(f"{space}:UTCAtExposure", "").rstrip("Z")).replace(tzinfo=None)
+    except ValueError:
+        utc = None
     return DroneRecord(
-        altitude_m=number("AbsoluteAltitude"),
-        above_takeoff_m=number("RelativeAltitude"),
-        heights="ellipsoid" if ellipsoid else "unknown",
-        # Without corrections they are not those of the position.
-        sigma_m=None if flag == 0 else _three(sigma, least=0.0),
-        fix=fix_of(flag),
-        aircraft_deg=_three(flown, most=_FULL_TURN_DEG),
-        utc=_utc(fields.get(f"{space}:UTCAtExposure", "")),
+        _plan(value, space),
+        value(f"{above}:AbsoluteAltitude"),
+        value(f"{above}:RelativeAltitude"),
+        heights,
+        sigma or (_three([plan, plan, height], 0.0) if plan and height else None),
+        fix_of(flag),
+        _attitude(value, space),
+        _three([value(f"{space}:Flight{axis}Degree") for axis in ("Roll", "Pitch", "Yaw")]),
+        utc,
     )
 
 
 def fix_of(flag: float | None) -> Fix:
-    """The kind of solution of DJI's flag: 16 single, 32 to 49 float, 50 and more fixed."""
+    """Kind of solution of DJI's flag: 16 single, 32 to 49 float, 50 and more fixed."""
     if flag is None or not flag > 0:
         return "unknown"
     return "single" if flag < 32 else "float" if flag < 50 else "fixed"
 
 
-def _vertical(fields: Mapping[str, str]) -> Heights:
-    said = fields.get("CRSInfo:VERTCRS") or fields.get("Camera:VertCS") or fields.get("Camera:VerticalCS") or ""
-    if "ellips" in said.lower() or said.strip().upper() in ("WGS84", "WGS 84"):
-        return "ellipsoid"
-    return "geoid" if re.search(r"EGM|NAVD|MSL|geoid|EPSG:5\d{3}", said, re.IGNORECASE) else "unknown"
-
-
-def _attitude(fields: Mapping[str, str], space: str) -> CameraAttitude | None:
-    gimbal = [f"{space}:Gimbal{axis}Degree" for axis in ("Yaw", "Pitch", "Roll")]
-    upside_down = any((_number(fields, f"{space}:{name}") or 0) != 0 for name in ("CamReverse", "GimbalReverse"))
-    for names, matrix, skipped in (
-        (gimbal, level_from_gimbal, upside_down),
-        ([f"drone-parrot:Camera{axis}Degree" for axis in ("Yaw", "Pitch", "Roll")], level_from_gimbal, False),
-        ([f"CameraOrientationNED:{axis}" for axis in ("Yaw", "Pitch", "Roll")], level_from_gimbal, False),
-        ([f"Camera:{axis}" for axis in ("Yaw", "Pitch", "Roll")], level_from_belly, False),
+def _plan(value: Callable[[str], float | None], space: str) -> tuple[float, float] | None:
+    for latitude, longitude in (
+        (f"{space}:GpsLatitude", f"{space}:GpsLongitude"),
+        (f"{space}:GpsLatitude", f"{space}:GpsLongtitude"),
+        ("drone-skydio:Latitude", "drone-skydio:Longitude"),
     ):
-        angles = _three([_number(fields, name) for name in names], most=_FULL_TURN_DEG)
-        if angles is not None and not skipped:
-            said = _three([_number(fields, f"Camera:IMU{a}Accuracy") for a in ("Roll", "Pitch", "Yaw")], least=0.0)
-            return CameraAttitude(matrix(*angles), said or USUAL_SIGMA_DEG)
+        north, east = value(latitude), value(longitude)
+        if north is not None and east is not None:
+            return north, east
     return None
 
 
-def _three(values: list[float | None], least: float | None = None, most: float = np.inf):
-    """The three numbers, None unless all are there, more than `least` and of no larger size than `most`."""
-    known = [v for v in values if v is not None and (least is None or v > least) and abs(v) <= most]
-    return (known[0], known[1], known[2]) if len(known) == 3 else None
+def _attitude(value: Callable[[str], float | None], space: str) -> CameraAttitude | None:
+    reversed_gimbal = any(value(f"{space}:{name}") for name in ("CamReverse", "GimbalReverse"))
+    for names, matrix in (
+        ("" if reversed_gimbal else f"{space}:Gimbal{{}}Degree", level_from_gimbal),
+        ("drone-parrot:Camera{}Degree", level_from_gimbal),
+        ("CameraOrientationNED:{}", level_from_gimbal),
+        ("Camera:{}", level_from_belly),
+    ):
+        angles = _three([value(names.format(axis)) for axis in _ANGLES])
+        if angles is not None and max(map(abs, angles)) <= 360:
+            sigma = _three([value(f"Camera:IMU{axis}Accuracy") for axis in ("Roll", "Pitch", "Yaw")], 0.0)
+            return CameraAttitude(matrix(*angles), sigma or USUAL_SIGMA_DEG)
+    return None
 
 
-def _number(fields: Mapping[str, str], name: str) -> float | None:
-    """A finite number, which Parrot writes as a fraction."""
-    text = fields.get(name, "")
+def _three(values: Sequence[float | None], above: float = -math.inf) -> tuple[float, float, float] | None:
+    """The three numbers if all exist and exceed `above`."""
+    a, b, c = values
+    return None if a is None or b is None or c is None or min(a, b, c) <= above else (a, b, c)
+
+
+def gps_position(tags: Mapping[int, Any], drone: DroneRecord) -> Gps | None:
+    """Position of EXIF, else of the drone's packet, with the height and accuracy of the latter.
+
+    Latitudes beyond the poles stay: `georeferencing.recorded_positions` recognises exchanged coordinates.
+    """
     try:
-        value = float(Fraction(text)) if re.fullmatch(r"-?\d{1,15}/\d{1,15}", text) else float(text)
-    except (ValueError, ZeroDivisionError, OverflowError):
+        latitude, longitude = (
+            sum(float(part) / 60**k for k, part in enumerate(tags[tag]))
+            * (-1 if text(tags.get(tag - 1)).upper()[:1] in ("S", "W") else 1)
+            for tag in (2, 4)
+        )
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        if drone.latitude_longitude_deg is None:
+            return None
+        latitude, longitude = drone.latitude_longitude_deg
+    if not max(abs(latitude), abs(longitude)) <= 180:
         return None
-    return value if np.isfinite(value) else None
+    altitude = drone.altitude_m
+    if altitude is None and (exif := number(tags.get(6))) is not None:
+        altitude = -exif if tags.get(5) in (1, b"\x01") else exif
+    return Gps(latitude, longitude, altitude, drone.sigma_m, drone.heights, drone.fix)
 
 
-def _utc(text: str) -> datetime | None:
-    """DJI writes 2023-04-05T06:07:08.123456, or with blanks."""
+def time_of_exposure(shot: Mapping[int, Any], gps: Mapping[int, Any], utc: datetime | None) -> Taken | None:
+    """Time of exposure: UTC of a drone's packet, else DateTimeOriginal; None without either.
+
+    The offset of the camera's clock to UTC is OffsetTimeOriginal, else that to the receiver's time of the position.
+    """
+    if utc is not None:
+        return Taken(gps_seconds(utc), 1e-6 if utc.microsecond else 1.0, 0.0)
     try:
-        return datetime.fromisoformat(text.strip().rstrip("Z")).replace(tzinfo=None)
+        clock = gps_seconds(datetime.strptime(text(shot.get(TAG.DateTimeOriginal))[:19], "%Y:%m:%d %H:%M:%S"))
     except ValueError:
         return None
+    digits = text(shot.get(TAG.SubsecTimeOriginal))
+    has_fraction = bool(re.fullmatch(r"[0-9]{1,9}", digits)) and int(digits) > 0
+    if has_fraction:
+        clock += int(digits) / 10 ** len(digits)
+    return Taken(clock, 10.0 ** -len(digits) if has_fraction else 1.0, _ahead_of_utc(shot, gps, clock))
+
+
+def _ahead_of_utc(shot: Mapping[int, Any], gps: Mapping[int, Any], clock: float) -> float | None:
+    if zone := re.match(r"([+-])(\d\d):(\d\d)", text(shot.get(TAG.OffsetTimeOriginal))):
+        return (-1.0 if zone[1] == "-" else 1.0) * (3600 * int(zone[2]) + 60 * int(zone[3]))
+    try:
+        hour, minute, second = (float(part) for part in gps[7])
+        day = gps_seconds(datetime.strptime(text(gps.get(29))[:10], "%Y:%m:%d"))
+    except (KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    ahead = clock - (day + 3600 * hour + 60 * minute + second)
+    # Receivers note the time of their last position: only the time zone is certain.
+    return 900.0 * round(ahead / 900.0) if abs(ahead) < 15 * 3600 else None

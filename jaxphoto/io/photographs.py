@@ -1,46 +1,54 @@
-"""Photographs: what their files say about the camera, and the interior orientation to start from.
+"""Photographs: metadata of their files, the initial interior orientation, and the valid ones of a folder.
 
-Only sizes and EXIF are read here; the picture itself is what `jaxphoto.extras.photos` reads. A picture is taken as
-it lies in the file, which is as the sensor saw it: the EXIF orientation flag turns nothing.
+A picture is taken as stored, which is as the sensor saw it: the EXIF orientation does not rotate it.
 """
 
 import math
-import warnings
-from collections.abc import Callable, Hashable, Sequence
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
-
-from PIL import ExifTags, Image
+from typing import NamedTuple
 
 from jaxphoto.camera import AbstractDistortion, InteriorOrientation, Sensor
 from jaxphoto.camera.lens_prior import lens_prior
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, counted, few
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.exposure_times import Taken
 from jaxphoto.georeferencing.gps import Gps
-from jaxphoto.io.photograph_metadata import DroneRecord, drone_record, xmp_fields
-from jaxphoto.io.photograph_times import taken
-from jaxphoto.io.picture_size import check_pixels, pictures_of_any_size
+from jaxphoto.io.photograph_metadata import (
+    TAG,
+    Exif,
+    drone_record,
+    gps_position,
+    number,
+    open_picture,
+    read_exif,
+    text,
+    time_of_exposure,
+)
 from jaxphoto.procedures.known_lens import KnownLens
+from jaxphoto.writing import MARKER
+from jaxphoto.writing.inputs import input_file
 
 _DIAGONAL_35_MM = math.hypot(36, 24)
-# What lenses there are for it: fields of 154 to half a degree. Some cameras note 1 or 65535 where they do not know.
+# Some cameras write 1 or 65535 if the focal length on film is unknown.
 _FILM_MM = (5.0, 5000.0)
-# Of the longer side: the start of many programs where nothing is known, a field of 45 degrees.
-_USUAL_C = 1.2
-# Fields of 20 to 80 degrees are usual: c of 0.6 to 2.8 times the longer side.
-_GUESSED = 0.5
-# Of a pixel whose size is not known; c in pixels is what matters then.
+# Without EXIF: c over the longer side (a field of 45 degrees), and its relative sigma (fields of 20 to 80 degrees).
+_USUAL_C, _USUAL_C_SIGMA = 1.2, 0.5
 _NOMINAL_PIXEL_MM = 0.005
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-_TAG = ExifTags.Base
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+"""File name extensions of pictures."""
+_RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".rw2", ".orf", ".raf", ".srw", ".pef")
 
 
 class Photograph(NamedTuple):
-    """What the file of a photograph says; None where its EXIF does not."""
+    """Metadata of a photograph; None if its EXIF has none."""
 
     name: str
-    """Of the file, without its ending: the id of the image."""
+    """File name without extension: the id of the image."""
     path: Path
     width_px: int
     height_px: int
@@ -48,283 +56,307 @@ class Photograph(NamedTuple):
     model: str | None = None
     focal_length_mm: float | None = None
     focal_length_35mm_mm: float | None = None
-    """Of the lens that gives the same field on film of 36 mm x 24 mm."""
+    """Focal length with the same field on film of 36 mm x 24 mm."""
     sensor_width_mm: float | None = None
-    """From the focal plane resolution and the size that EXIF notes, which a file made smaller may keep."""
+    """From the focal plane resolution and the size in EXIF."""
     orientation: int = 1
-    """The flag by which viewers turn the picture, 1 to 8; 1 where there is none."""
+    """EXIF orientation flag, 1 to 8."""
     gps: Gps | None = None
     above_takeoff_m: float | None = None
-    """The height above take-off, which drones note beside that of `gps`."""
     attitude: CameraAttitude | None = None
     aircraft_deg: tuple[float, float, float] | None = None
-    """Roll, pitch and yaw of the aircraft, where its camera hangs in a gimbal."""
+    """Roll, pitch and yaw of the aircraft, if its camera is in a gimbal."""
     taken: Taken | None = None
     serial: str | None = None
-    """Number of the camera's body."""
+    """Serial number of the body."""
     digital_zoom: float = 1.0
-    """By how much a part of the picture was enlarged."""
 
 
 class CameraStart(NamedTuple):
-    """The camera that photographs were taken with, as far as it is known before a calibration."""
+    """The camera of photographs before a calibration."""
 
     sensor: Sensor
     interior: InteriorOrientation
     origin: str
-    """A sentence that says where pixel size and principal distance come from."""
+    """Origin of pixel size and principal distance, a sentence."""
     c_rounding: float = 0.0
-    """Relative standard deviation of c, in pixels, that is due to how it was noted."""
+    """Relative standard deviation of c, in pixels, due to rounding."""
 
 
 def photographs(paths: Sequence[str | Path]) -> list[Photograph]:
-    """The photographs in the files `paths`, in this order.
-
-    Raises InputError for a file that is missing or no picture, and for two whose names differ in the folder or the
-    ending only.
-    """
+    """Read the photographs `paths`. Raises InputError for missing files, other files than pictures, and equal names."""
     read: dict[str, Photograph] = {}
     for path in map(Path, paths):
         photograph = read_photograph(path)
         other = read.setdefault(path.stem, photograph)
         if other is not photograph:
-            raise InputError(
-                f"{other.path} and {path} would both be the image {path.stem!r}; give each photograph once, and "
-                "rename one of two that are different"
-            )
+            raise InputError(f"{other.path} and {path} would both be the image {path.stem!r}; rename one, or omit it")
     return list(read.values())
+
+
+def read_photograph(path: Path) -> Photograph:
+    """Read the metadata of a photograph. Raises InputError for a file that is missing or not a picture."""
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; name its photographs, for example {path}/*.jpg")
+    if not path.is_file():
+        problem = "the target of this link is missing" if path.is_symlink() else "there is no such photograph"
+        raise InputError(f"{path}: {problem}; correct the name")
+    try:
+        with open_picture(path) as picture:
+            return _photograph(path, *picture.size, read_exif(picture))
+    # Pillow raises many errors for damaged bytes.
+    except Exception as error:
+        raise InputError(f"{path}: this is no picture that can be read; give a TIFF, PNG or JPEG") from error
+
+
+def _photograph(path: Path, width_px: int, height_px: int, exif: Exif) -> Photograph:
+    top, shot = exif.top, exif.shot
+    drone = drone_record(exif.xmp)
+    film = number(shot.get(TAG.FocalLengthIn35mmFilm), positive=True)
+    flag = top.get(TAG.Orientation, 1)
+    serial = next((value for key, value in exif.xmp.items() if key.endswith(":CameraSerialNumber")), "")
+    return Photograph(
+        path.stem,
+        path,
+        width_px,
+        height_px,
+        text(top.get(TAG.Make)) or None,
+        text(top.get(TAG.Model)) or None,
+        number(shot.get(TAG.FocalLength), positive=True),
+        film if film is not None and _FILM_MM[0] <= film <= _FILM_MM[1] else None,
+        _sensor_width(shot, width_px, height_px),
+        flag if flag in range(1, 9) else 1,
+        gps_position(exif.gps, drone),
+        drone.above_takeoff_m,
+        drone.attitude,
+        drone.aircraft_deg,
+        time_of_exposure(shot, exif.gps, drone.utc),
+        text(shot.get(TAG.BodySerialNumber)) or serial or None,
+        # 0 means no zoom.
+        number(shot.get(TAG.DigitalZoomRatio), positive=True) or 1.0,
+    )
+
+
+def _sensor_width(shot: Mapping, width_px: int, height_px: int) -> float | None:
+    """Width (mm) of the size in EXIF at the focal plane resolution; None for a picture that was cropped since."""
+    resolution = number(shot.get(TAG.FocalPlaneXResolution), positive=True)
+    unit = _UNIT_MM.get(shot.get(TAG.FocalPlaneResolutionUnit, 2))
+    if resolution is None or unit is None:
+        return None
+    width = number(shot.get(TAG.ExifImageWidth), positive=True) or width_px
+    height = number(shot.get(TAG.ExifImageHeight), positive=True) or height_px
+    cropped = abs(width * height_px / (height * width_px) - 1) > 0.01
+    return None if cropped else width / resolution * unit
 
 
 def sensor_and_interior(
     photographs: Sequence[Photograph], pixel_mm: float | None = None, c_mm: float | None = None
 ) -> CameraStart:
-    """The camera of `photographs`, all taken with one: what is given counts, then what EXIF says.
+    """The camera of `photographs`, all of one: from the arguments, else from EXIF.
 
     The pixel size is that of the focal plane resolution, or follows from the focal length f and that of the same field
-    on film, f35: the diagonal of the sensor is 43.27 mm f / f35. The principal distance is f; with a pixel size that is
-    given it follows from f35 first, which no change of the picture's size alters. Where EXIF says neither it starts at
-    1.2 times the longer side. The distortion starts at zero.
+    on film, f35: the diagonal of the sensor is 43.27 mm f / f35. The principal distance is f; with a given pixel size
+    it follows from f35 if possible, which resizing does not change. Without EXIF it is 1.2 times the longer side. The
+    distortion is zero.
 
-    Raises InputError for no photographs, for such as differ in what `ONE_CAMERA` names, and for
-    a c_mm of pixels whose size nobody says.
+    Raises InputError for no photographs, for different cameras (`ONE_CAMERA`), and for c_mm without a pixel size.
     """
     if not photographs:
-        raise InputError("no photograph is given; name the files of those that one camera took")
-    for what, given in (("pixel_mm", pixel_mm), ("c_mm", c_mm)):
-        if given is not None and not (math.isfinite(given) and given > 0):
-            raise InputError(f"{what} is {given:g}; give a positive number of millimetres")
-    _check_one_camera(photographs, c_mm)
+        raise InputError("no photographs; name the files of one camera")
+    for name, value in (("pixel_mm", pixel_mm), ("c_mm", c_mm)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise InputError(f"{name} is {value:g}; give a positive number of millimetres")
+    for name, value_of, cure in ONE_CAMERA if c_mm is None else ONE_CAMERA[:-1]:
+        groups: dict[Hashable, list[str]] = {}
+        for p in photographs:
+            if value_of(p) is not None:
+                groups.setdefault(value_of(p), []).append(p.path.name)
+        if len(groups) > 1:
+            listed = "; ".join(f"{value}: {few(names)}" for value, names in groups.items())
+            raise InputError(f"the photographs of one camera have different {name}s ({listed}); {cure}")
     first = next((p for p in photographs if p.focal_length_35mm_mm or p.focal_length_mm), photographs[0])
-    longer = max(first.width_px, first.height_px)
-    pixel, pixel_origin = _pixel(first, pixel_mm)
-    if pixel is None and c_mm is not None:
-        raise InputError(
-            f"c_mm is given, but neither a pixel size nor EXIF that tells it ({first.path}); give pixel_mm as well"
-        )
-    if pixel is None:
-        pixel = _NOMINAL_PIXEL_MM
+    f, f35 = first.focal_length_mm, first.focal_length_35mm_mm
+    diagonal_px = math.hypot(first.width_px, first.height_px)
+    if pixel_mm is not None:
+        pixel, pixel_origin = pixel_mm, "pixel size as given"
+    elif first.sensor_width_mm:
+        pixel = first.sensor_width_mm / first.width_px
+        pixel_origin = "pixel size from the focal plane resolution (EXIF)"
+    elif f and f35:
+        pixel = _DIAGONAL_35_MM * f / f35 / diagonal_px
+        pixel_origin = f"pixel size from the focal lengths {f:g} mm and, on film, {f35:g} mm (EXIF)"
+    elif c_mm is not None:
+        raise InputError(f"c_mm is given, but no pixel size ({first.path} has none in EXIF); give pixel_mm as well")
+    else:
+        pixel, pixel_origin = _NOMINAL_PIXEL_MM, "pixel size nominal (not in EXIF); only c in pixels matters"
+    assumed = "nominal" in pixel_origin
     if c_mm is not None:
         c, c_origin, rounding = c_mm, "c as given", 0.0
-    elif pixel_mm is None and first.focal_length_mm and pixel_origin:
-        c, c_origin = first.focal_length_mm, "c is the focal length of EXIF"
-        # A pixel size that follows from both focal lengths is as good as the one that is noted in whole millimetres.
-        rounding = _rounded(c if first.sensor_width_mm else first.focal_length_35mm_mm or c)
-    elif first.focal_length_35mm_mm:
-        c = first.focal_length_35mm_mm / _DIAGONAL_35_MM * math.hypot(first.width_px, first.height_px) * pixel
-        c_origin = f"c from {first.focal_length_35mm_mm:g} mm on film of 36 mm x 24 mm (EXIF)"
-        rounding = _rounded(first.focal_length_35mm_mm)
-    elif pixel_mm is not None and first.focal_length_mm:
-        c, c_origin = first.focal_length_mm, "c is the focal length of EXIF"
-        rounding = _rounded(c)
+    elif f35 and (assumed or pixel_mm is not None or not f):
+        c = f35 / _DIAGONAL_35_MM * diagonal_px * pixel
+        c_origin, rounding = f"c from {f35:g} mm on film of 36 mm x 24 mm (EXIF)", _rounding(f35)
+    elif f and not assumed:
+        # A pixel size from both focal lengths is as precise as the one on film, in whole millimetres.
+        c, c_origin = f, "c is the focal length of EXIF"
+        rounding = _rounding(f if first.sensor_width_mm or pixel_mm is not None else f35 or f)
     else:
-        c = _USUAL_C * longer * pixel
-        c_origin = f"c a guess, {_USUAL_C:g} times the longer side: EXIF does not tell it"
-        rounding = _GUESSED
-    sensor = Sensor(first.width_px, first.height_px, pixel, pixel_assumed=not pixel_origin)
-    pixel_origin = pixel_origin or "pixel size nominal: EXIF does not tell it, and only c in pixels matters"
-    sentence = f"c = {c:.6g} mm ({c / pixel:.5g} pixels of {pixel:.4g} mm): {c_origin}; {pixel_origin}."
-    return CameraStart(sensor, InteriorOrientation(c), sentence, rounding)
+        c = _USUAL_C * max(first.width_px, first.height_px) * pixel
+        c_origin, rounding = f"c a guess, {_USUAL_C:g} times the longer side (not in EXIF)", _USUAL_C_SIGMA
+    sensor = Sensor(first.width_px, first.height_px, pixel, pixel_assumed=assumed)
+    origin = f"c = {c:.6g} mm ({c / pixel:.5g} pixels of {pixel:.4g} mm): {c_origin}; {pixel_origin}."
+    return CameraStart(sensor, InteriorOrientation(c), origin, rounding)
 
 
-def known_lens(photographs: Sequence[Photograph], camera: CameraStart, distortion: AbstractDistortion) -> KnownLens:
-    """What is known of the lens of the photographs by make and model, about `camera` without any distortion."""
-    told = next((p for p in photographs if p.make or p.model), photographs[0])
-    nominal = InteriorOrientation(camera.interior.c, 0.0, 0.0, distortion)
-    return KnownLens(nominal, lens_prior(told.make, told.model), camera.c_rounding)
-
-
-def _rounded(mm: float) -> float:
-    """The relative standard deviation of a focal length as it is written: uniform within its last digit."""
+def _rounding(mm: float) -> float:
+    """Relative standard deviation of a focal length, uniform within its last digit."""
     step = next((step for step in (1.0, 0.1) if abs(mm / step - round(mm / step)) < 1e-6), 0.01)
     return step / math.sqrt(12) / mm
 
 
-def _pixel(photograph: Photograph, given_mm: float | None) -> tuple[float | None, str]:
-    """The size of a pixel and where it comes from; None where nothing says it."""
-    if given_mm is not None:
-        return given_mm, "pixel size as given"
-    if photograph.sensor_width_mm:
-        return photograph.sensor_width_mm / photograph.width_px, "pixel size from the focal plane resolution (EXIF)"
-    if photograph.focal_length_mm and photograph.focal_length_35mm_mm:
-        diagonal_mm = _DIAGONAL_35_MM * photograph.focal_length_mm / photograph.focal_length_35mm_mm
-        pixel = diagonal_mm / math.hypot(photograph.width_px, photograph.height_px)
-        return pixel, (
-            f"pixel size from the focal lengths {photograph.focal_length_mm:g} mm and, on film, "
-            f"{photograph.focal_length_35mm_mm:g} mm (EXIF)"
-        )
-    return None, ""
+def known_lens(photographs: Sequence[Photograph], camera: CameraStart, distortion: AbstractDistortion) -> KnownLens:
+    """Prior information about the lens by make and model, at `camera` without distortion."""
+    first = next((p for p in photographs if p.make or p.model), photographs[0])
+    nominal = InteriorOrientation(camera.interior.c, 0.0, 0.0, distortion)
+    return KnownLens(nominal, lens_prior(first.make, first.model), camera.c_rounding)
 
 
-ONE_CAMERA: list[tuple[str, Callable[["Photograph"], Hashable], str]] = [
-    (
-        "size",
-        lambda p: f"{p.width_px} x {p.height_px} px",
-        "give those of one camera as they were taken: turn back what was turned, leave out what was cut or made "
-        "smaller",
-    ),
+ONE_CAMERA: list[tuple[str, Callable[[Photograph], Hashable], str]] = [
+    ("size", lambda p: f"{p.width_px} x {p.height_px} px", "give those of one camera, neither cropped nor resized"),
     (
         "orientation flag",
-        # What still has to be turned by a quarter lies as the sensor saw it, as do others of its size: a program that
-        # had turned some by quarters would have exchanged width and height.
+        # A picture that is to be rotated by 90 degrees and has the size of the others was not rotated yet.
         lambda p: None if p.orientation > 4 and p.width_px != p.height_px else p.orientation,
-        "pictures are read as they lie in the file, and a program may have turned some: where all are as the "
-        "sensor saw them, set one flag (exiftool -n -Orientation=1 FILES), else leave the odd ones out",
+        "a program may have rotated some: if all are as the sensor saw them, set one flag (exiftool -n -Orientation=1 "
+        "FILES), else omit the rotated ones",
     ),
     ("camera", lambda p: " ".join(filter(None, (p.make, p.model))) or None, "give the photographs of one camera"),
-    (
-        "serial number",
-        lambda p: p.serial,
-        "two cameras of one model differ as much as its lenses do: give the photographs of one",
-    ),
+    ("serial number", lambda p: p.serial, "give the photographs of one camera: lenses of one model differ"),
     ("digital zoom", lambda p: f"{p.digital_zoom:.4g}", "give those of one zoom"),
     ("focal length", lambda p: p.focal_length_mm and f"{p.focal_length_mm:.4g} mm", "give those of one zoom"),
 ]
-"""What all photographs of one camera have in common, and the mend where they have not."""
+"""Properties that the photographs of one camera share, and the cure if they differ."""
 
 
-def _check_one_camera(photographs: Sequence[Photograph], c_mm: float | None) -> None:
-    for what, of, mend in ONE_CAMERA if c_mm is None else ONE_CAMERA[:-1]:
-        groups: dict[Any, list[Photograph]] = {}
-        for p in photographs:
-            if of(p) is not None:
-                groups.setdefault(of(p), []).append(p)
-        if len(groups) > 1:
-            listed = "; ".join(f"{value}: {_some(group)}" for value, group in groups.items())
-            raise InputError(f"the photographs of one camera have different {what}s ({listed}); {mend}")
+def valid_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], dict[str, str]]:
+    """The photographs of one camera in files and folders `paths`, and the reason for each skipped file.
+
+    Skipped are files that are not pictures or cut off, second files of one name, identical and edited copies, and those
+    that differ from most in a property of `ONE_CAMERA`. Raises InputError for a path that does not exist, and if no
+    photograph is left.
+    """
+    files = picture_files(paths)
+    if missing := [file for file in files if not (file.is_file() or file.is_symlink())]:
+        raise InputError(f"{missing[0]}: there is no such photograph or folder; correct the name")
+    skipped: dict[str, str] = {}
+    identical: dict[str, list[Photograph]] = {}
+    for file in files:
+        try:
+            photograph = read_photograph(file)
+            _check_complete(file)
+        except InputError as error:
+            skipped[str(file)] = str(error)
+        else:
+            identical.setdefault(input_file(file).sha256, []).append(photograph)
+    # Of copies, the usual name is that of the photograph: "DJI_0002", not "DJI_0002 (1)".
+    series = Counter(_series(file.stem) for file in files)
+    by_name: dict[str, Photograph] = {}
+    originals = [min(copies, key=lambda p: (-series[_series(p.name)], len(p.name))) for copies in identical.values()]
+    for original, copies in zip(originals, identical.values(), strict=True):
+        for p in (p for p in copies if p is not original):
+            name = original.path if original.path.name == p.path.name else original.path.name
+            skipped[str(p.path)] = f"{p.path}: it is a copy of {name}"
+    position = {file: k for k, file in enumerate(files)}
+    for p in sorted(originals, key=lambda p: position[p.path]):
+        if by_name.setdefault(p.name, p) is not p:
+            skipped[str(p.path)] = f"{p.path}: {by_name[p.name].path} has the same name; rename one of them"
+    for p in by_name.values():
+        for other in (by_name.get(p.name[:k]) for k in range(1, len(p.name)) if not p.name[k].isalnum()):
+            if other and (p.taken, p.gps) == (other.taken, other.gps) != (None, None):
+                skipped[str(p.path)] = f"{p.path}: it is an edited copy of {other.path.name} (same time and position)"
+    valid = [p for p in by_name.values() if str(p.path) not in skipped]
+    for name, value_of, cure in ONE_CAMERA:
+        values = Counter(v for p in valid if (v := value_of(p)) is not None)
+        usual = values.most_common(1)[0][0] if values else None
+        for p in valid:
+            if (v := value_of(p)) is not None and v != usual:
+                skipped[str(p.path)] = f"{p.path}: its {name} is {v}, that of most is {usual}; {cure}"
+        valid = [p for p in valid if str(p.path) not in skipped]
+    if not valid:
+        hints = list(skipped.values())[:1] or _hints(paths)
+        raise InputError("; ".join([f"{', '.join(map(str, paths))}: there is no photograph that can be read", *hints]))
+    return valid, skipped
 
 
-def _some(group: list[Photograph]) -> str:
-    names = ", ".join(p.path.name for p in group[:3])
-    return names if len(group) <= 3 else f"{names} and {len(group) - 3} more"
+def skipped_messages(skipped: Mapping[str, str]) -> list[str]:
+    """The reasons for skipped files, one message for more than three files with the same reason."""
+    files: dict[str, list[str]] = {}
+    for path, reason in skipped.items():
+        files.setdefault(reason.removeprefix(f"{path}: "), []).append(path)
+    messages = []
+    for reason, paths in files.items():
+        if len(paths) > 3:
+            messages.append(f"{len(paths)} files ({few([Path(path).name for path in paths])}), each: {reason}")
+        else:
+            messages += [skipped[path] for path in paths]
+    return messages
 
 
-def read_photograph(path: Path) -> Photograph:
-    """What the file of one photograph says. Raises InputError for a file that is missing or no picture."""
-    if path.is_dir():
-        raise InputError(f"{path} is a folder; name its photographs, for example {path}/*.jpg")
-    if path.is_symlink() and not path.exists():
-        raise InputError(f"{path}: what this links to is not there; bring that file here, or remove the link")
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such photograph; correct the name")
-    try:
-        with pictures_of_any_size(), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            # The lengths within a PNG, which OpenCV believes; it cannot be read after that.
-            with Image.open(path) as picture:
-                picture.verify()
-            with Image.open(path) as picture:
-                check_pixels(path, *picture.size)
-                return Photograph(path.stem, path, *picture.size, **_exif(picture))
-    except InputError:
-        raise
-    # On bytes that are not what they should be Pillow raises what its formats do, each in its own way.
-    except Exception as error:
-        raise InputError(f"{path}: this is no picture that can be read; give a TIFF, PNG or JPEG") from error
+def picture_files(paths: Sequence[str | Path]) -> list[Path]:
+    """The files among `paths`, and all pictures of the folders among them, by name; hidden files are skipped."""
+    files = []
+    for path in map(Path, paths):
+        inner = sorted(f for f in path.iterdir() if not f.name.startswith(".")) if path.is_dir() else []
+        files += [f for f in inner if f.suffix.lower() in SUFFIXES and not f.is_dir()] if path.is_dir() else [path]
+    return files
 
 
-def _exif(picture: Image.Image) -> dict[str, Any]:
-    """The fields of `Photograph` after the first four, from EXIF that may be absent or damaged."""
-    try:
-        top = picture.getexif()
-        shot, gps = top.get_ifd(ExifTags.IFD.Exif), top.get_ifd(ExifTags.IFD.GPSInfo)
-    except Exception:
-        return {}
-    flag, film = top.get(_TAG.Orientation, 1), _positive(shot.get(_TAG.FocalLengthIn35mmFilm))
-    fields = xmp_fields(picture.info.get("xmp"))
-    drone = drone_record(fields)
-    in_packet = next((value for key, value in fields.items() if key.endswith(":CameraSerialNumber")), None)
+def skipped_subfolders(paths: Sequence[str | Path]) -> dict[str, str]:
+    """Subfolders with pictures of folders in `paths` that are not in `paths`, with a message each."""
+    named = {Path(path).resolve() for path in paths}
     return {
-        "make": _words(top.get(_TAG.Make)),
-        "model": _words(top.get(_TAG.Model)),
-        "focal_length_mm": _positive(shot.get(_TAG.FocalLength)),
-        "focal_length_35mm_mm": film if film is not None and _FILM_MM[0] <= film <= _FILM_MM[1] else None,
-        "sensor_width_mm": _sensor_width(shot, *picture.size),
-        "orientation": flag if flag in range(1, 9) else 1,
-        "gps": _gps(gps, drone),
-        "above_takeoff_m": drone.above_takeoff_m,
-        "attitude": drone.attitude,
-        "aircraft_deg": drone.aircraft_deg,
-        "taken": taken(shot, gps, drone.utc),
-        "serial": _words(shot.get(_TAG.BodySerialNumber)) or _words(in_packet),
-        # 0 says that there was none.
-        "digital_zoom": _positive(shot.get(_TAG.DigitalZoomRatio)) or 1.0,
+        str(inner): f"{inner}: {counted(n, 'picture')} in a folder that is not named; name it, too"
+        for path in map(Path, paths)
+        for inner, n in _subfolders(path)
+        if inner.resolve() not in named
     }
 
 
-def _sensor_width(taken: dict, width_px: int, height_px: int) -> float | None:
-    """In mm along x: the width that EXIF notes over the focal plane resolution; None for a picture cut since."""
-    resolution = _positive(taken.get(_TAG.FocalPlaneXResolution))
-    unit = _UNIT_MM.get(taken.get(_TAG.FocalPlaneResolutionUnit, 2))
-    if resolution is None or unit is None:
-        return None
-    width = _positive(taken.get(_TAG.ExifImageWidth)) or width_px
-    height = _positive(taken.get(_TAG.ExifImageHeight)) or height_px
-    cut = abs(width * height_px / (height * width_px) - 1) > 0.01
-    return None if cut else width / resolution * unit
+def _subfolders(folder: Path) -> list[tuple[Path, int]]:
+    """Subfolders with pictures of cameras, without folders that jaxphoto wrote, and the numbers of pictures."""
+    counts = []
+    for inner in sorted(folder.iterdir()) if folder.is_dir() else ():
+        readable = inner.is_dir() and os.access(inner, os.R_OK | os.X_OK) and not inner.name.startswith(".")
+        if readable and not (inner / MARKER).exists():
+            n = sum(f.suffix.lower() in SUFFIXES and f.suffix.lower() != ".png" for f in inner.iterdir())
+            counts += [(inner, n)] if n else []
+    return counts
 
 
-def _positive(value: Any) -> float | None:
+def _hints(paths: Sequence[str | Path]) -> list[str]:
+    """Messages about subfolders and raw files in folders without pictures."""
+    folders = [path for path in map(Path, paths) if path.is_dir()]
+    inner = [str(path) for folder in folders for path, _ in _subfolders(folder)]
+    raw = [file.name for folder in folders for file in folder.iterdir() if file.suffix.lower() in _RAW]
+    hints = [f"there are pictures in {few(inner)}: name these folders"] if inner else []
+    if raw:
+        hints.append(f"raw files such as {raw[0]} are not read: develop all alike, without lens correction")
+    return hints
+
+
+def _series(name: str) -> str:
+    """A name without its numbers."""
+    return re.sub(r"\d+", "#", name)
+
+
+def _check_complete(file: Path) -> None:
+    """Raise InputError for a JPEG or PNG that is cut off; a TIFF shows it when it is read."""
     try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if math.isfinite(number) and number > 0 else None
-
-
-def _words(value: Any) -> str | None:
-    words = value.replace("\0", "").strip() if isinstance(value, str) else ""
-    return words or None
-
-
-def _gps(tags: dict, drone: DroneRecord) -> Gps | None:
-    """The position of EXIF, else of the drone's packet, with the height and what else that says.
-
-    (0, 0) is a receiver's nothing. Latitudes beyond the poles stay: `georeferencing.recorded_positions` knows two
-    numbers that changed places.
-    """
-    try:
-        latitude, longitude = (_degrees(tags[k]) * _sign(tags.get(k - 1)) for k in (2, 4))
-    except (KeyError, TypeError, ValueError, ZeroDivisionError):
-        if drone.latitude_longitude_deg is None:
-            return None
-        latitude, longitude = drone.latitude_longitude_deg
-    if not (math.isfinite(latitude) and math.isfinite(longitude) and max(abs(latitude), abs(longitude)) <= 180):
-        return None
-    altitude = drone.altitude_m if drone.altitude_m is not None else _altitude(tags)
-    known = altitude if altitude is not None and math.isfinite(altitude) else None
-    return Gps(latitude, longitude, known, drone.sigma_m, drone.heights, drone.fix)
-
-
-def _altitude(tags: dict) -> float | None:
-    try:
-        return float(tags[6]) * (-1 if tags.get(5) in (1, b"\x01") else 1)
-    except (KeyError, TypeError, ValueError, ZeroDivisionError):
-        return None
-
-
-def _degrees(parts: Any) -> float:
-    return sum(float(part) / 60**k for k, part in enumerate(parts))
-
-
-def _sign(reference: Any) -> int:
-    return -1 if str(reference).strip("\0 ").upper()[:1] in ("S", "W") else 1
+        with open_picture(file) as picture:
+            if picture.format == "JPEG":
+                # Decoded at an eighth of its size.
+                picture.draft("L", (512, 512))
+                picture.load()
+            else:
+                picture.verify()
+    except (OSError, SyntaxError) as error:
+        raise InputError(f"{file}: the picture is cut off or damaged ({error}); copy it again") from error

@@ -28,7 +28,7 @@ def reservation(summary: Mapping[str, Any]) -> str:
     if summary.get("verdict") == "red":
         told = summary.get("findings")
         found = [f for f in told if isinstance(f, dict)] if isinstance(told, list) else []
-        alarms = [f.get("text") for f in found if f.get("level") == "alarm"]
+        alarms = [f.get("text") for f in found if f.get("severity") == "error"]
         return f"the verdict on this adjustment is red: {_told(alarms[0] if alarms else None)}"
     test = summary.get("global_test")
     if isinstance(test, dict) and test.get("passed") is False:

@@ -1,22 +1,21 @@
-"""Tables of text files: every line keeps its file and row, so that whatever is wrong in it can be named.
+"""Tables of text files, read by pandas: every line keeps its file and row, which messages name.
 
 A row is counted as a spreadsheet counts it: header, comments and empty lines included, from 1.
 """
 
-import collections
-import csv
 import dataclasses
+import io
 import math
+import re
 import warnings
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
 
 from jaxphoto.errors import BlockError, InputError, RowError, quoted, shown
-from jaxphoto.io.names import LONGEST, harm_in, harmless
 from jaxphoto.io.whole_text import LARGE, read_text
 
 T = TypeVar("T")
@@ -25,31 +24,27 @@ Line = int | np.integer
 # The columns in which a comma is not a decimal comma.
 _TEXT = frozenset({"image", "camera", "strip", "point", "role"})
 LARGEST = 1e30
-"""No length, angle, time or coefficient is larger; the square of it is a number yet."""
+"""No length, angle, time or coefficient is larger; its square is still a number."""
 # What fits into 64 bits.
 _DIGITS = 18
-# Cells of a column that are mostly different, as numbers are: a fifth of what Python's own texts need.
-_PACKED = np.dtypes.StringDType()
-# So many lines are taken apart at a time: memory for their cells then serves for the next ones as well.
-_PIECE = 10_000
 MOST_COLUMNS, LONGEST_LINE = 1_000, 100_000
-"""Columns of a table, the widest of which has some fifty, and characters of a row."""
+"""Columns of a table, and characters of a row."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """Columns of equal length; text, or floats where a reader has them already.
+    """Columns of equal length: arrays of text or of floats (NaN: empty), or pandas' arrays of text.
 
-    `files` and `rows` (both (n,)) say where each line stands, `file` where the table as a whole does.
+    `files` and `rows` (both (n,)) give the place of each line, `file` that of the whole table.
     """
 
     file: str
-    columns: dict[str, np.ndarray]
+    columns: dict[str, Any]
     files: np.ndarray
     rows: np.ndarray
 
     @staticmethod
-    def of(file: str, columns: dict[str, np.ndarray], rows: np.ndarray | None = None) -> "Table":
+    def of(file: str, columns: dict[str, Any], rows: np.ndarray | None = None) -> "Table":
         """A table all of whose lines stand in one file (`rows` None: one after the other from 1)."""
         n = len(next(iter(columns.values()))) if columns else 0
         return Table(file, columns, np.full(n, file, object), np.arange(1, n + 1) if rows is None else rows)
@@ -86,40 +81,39 @@ class Table:
     def text(self, column: str) -> np.ndarray:
         """A column as text; empty everywhere where the file has no such column."""
         cells = self.columns.get(column)
-        if cells is None:
-            return np.full(len(self), "", object)
-        return cells.astype(object) if cells.dtype == _PACKED else cells
+        return np.full(len(self), "", object) if cells is None else np.asarray(cells, object)
 
     def ids(self, column: str) -> np.ndarray:
         """A column of ids, none of them empty."""
-        values = self.names(column)
+        values = self.text(column)
         self.check(values == "", lambda line: f"the {column} is empty; give its id or delete the row")
         return values
 
-    def names(self, column: str) -> np.ndarray:
-        """A column of ids, some of which may be empty; none does harm where results show it (`jaxphoto.io.names`)."""
-        values = self.text(column)
-        if not harmless(pd.unique(values).tolist()):
-            harm = [harm_in(name) for name in values]
-            self.check(np.array(list(map(bool, harm))), lambda k: f"the {column} {quoted(values[k])} {harm[int(k)]}")
-        return values
+    def find(self, column: str, known: Sequence[str], message: Callable[[str], str]) -> np.ndarray:
+        """The index in `known` of the id in each line. Raises BlockError with the `message` about an unknown id."""
+        named = self.ids(column)
+        index = pd.Index(np.array(known, object)).get_indexer(pd.Index(named))
+        for line in np.flatnonzero(index < 0)[:1]:
+            raise self.misfit(line, message(named[line]))
+        return index
 
     def numbers(self, column: str, *, empty: bool = False) -> np.ndarray:
         """A column of finite numbers; NaN stands for an empty cell or a missing column where `empty` allows it."""
-        if column not in self.columns:
+        cells = self.columns.get(column)
+        if cells is None:
             return np.full(len(self), np.nan)
-        cells = self.columns[column]
-        if cells.dtype in (object, _PACKED):
-            cells = self._parsed(column, cells)
-        else:
-            self.check(~np.isfinite(cells), lambda line: f"{column} is {cells[line]}; give a finite number")
+        values = cells if cells.dtype == float else self._parsed(column, cells)
         self.check(
-            np.abs(cells) > LARGEST,
-            lambda line: f"{column} is {cells[line]:g}, larger than any number can be here; correct it",
+            np.abs(values) > LARGEST,
+            lambda line: f"{column} is {values[line]:g}, not a finite number that can be measured; correct it",
         )
         if not empty:
-            self.check(np.isnan(cells), lambda line: f"{column} is empty; give a number or delete the row")
-        return cells
+            self.check(np.isnan(values), lambda line: f"{column} is empty; give a number or delete the row")
+        return values
+
+    def matrix(self, columns: Sequence[str], *, empty: bool = False) -> np.ndarray:
+        """Columns of numbers beside each other, (n, columns)."""
+        return np.stack([self.numbers(column, empty=empty) for column in columns], axis=1)
 
     def sigmas(self, column: str) -> np.ndarray:
         """A column of standard deviations, positive where given and NaN where not."""
@@ -130,19 +124,17 @@ class Table:
         )
         return values
 
-    def _parsed(self, column: str, cells: np.ndarray) -> np.ndarray:
-        filled = cells != ""
-        values = np.full(len(cells), np.nan)
+    def _parsed(self, column: str, cells: Any) -> np.ndarray:
+        cells = np.asarray(cells, object)
         try:
-            # Python's own conversion: it rounds correctly, so a number written by repr comes back exactly.
-            values[filled] = cells[filled].astype(float)
-            # The one thing it reads that is no number in a table is 1_000.
-            bad = np.strings.find(cells.astype(_PACKED), "_") >= 0
+            # Python's conversion rounds correctly: a number written by repr comes back exactly.
+            values = np.where(cells == "", "nan", cells).astype(float)
+            wrong = np.array(["_" in cell for cell in cells], bool)
         except ValueError:
-            bad = np.array([cell != "" and not is_number(cell) for cell in cells], bool)
-        self.check(bad, lambda line: f"{column} is {quoted(cells[line])}, not a number; write it like 12.34")
+            wrong = np.array([cell != "" and not is_number(cell) for cell in cells], bool)
+        self.check(wrong, lambda line: f"{column} is {quoted(cells[line])}, not a number; write it like 12.34")
         self.check(
-            filled & ~np.isfinite(values),
+            (cells != "") & ~np.isfinite(values),
             lambda k: f"{column} is {quoted(cells[k])}; give a finite number, or leave the cell empty if it is unknown",
         )
         return values
@@ -167,59 +159,59 @@ def read_csv(
     text: Sequence[str] = (),
     without: Container[int] = (),
 ) -> Table:
-    """A CSV with a header: separated by commas, or by semicolons or tabs (then decimal commas are read too).
+    """A CSV file with a header: separated by commas, or by semicolons or tabs (then with decimal commas, too).
 
-    Lines that start with `#` and empty lines are passed over, blanks around a cell are stripped, a byte order mark
-    and any line ends are accepted. Columns in neither list are left out, with a UserWarning. A comma in the columns
-    `text` is not a decimal comma.
+    Lines that start with `#`, empty lines and rows `without` are skipped. Columns in neither list are left out, with a
+    UserWarning. A comma in the columns `text` is not a decimal comma.
 
-    Raises InputError where the file, a needed column or a cell is missing, too many or too long.
+    Raises InputError where the file or a needed column is missing, or a row has too many cells.
     """
     lines, rows = content_lines(path, without)
     if not lines:
         raise InputError(f"{path.name}: the file is empty; give it a header with the columns {', '.join(needed)}")
     separator = ";" if ";" in lines[0] else "\t" if "\t" in lines[0] and "," not in lines[0] else ","
-    header = [name.strip() for name in _record(path, lines[0], rows[0], separator)]
-    for name, count in collections.Counter(header).items():
-        if name and count > 1:
+    cells = _cells(path, lines, rows, separator)
+    header = cells.iloc[0].str.strip().tolist()
+    for name in filter(None, header):
+        if header.count(name) > 1:
             raise InputError(f"{path.name}, row {rows[0]}: the column {name} stands there twice; keep one of them")
     for name in needed:
         if name not in header:
-            found = ", ".join(filter(None, header))
-            raise InputError(f"{path.name}, row {rows[0]}: the column {name} is missing (found {found}); add it")
-    known = {name: j for j, name in enumerate(header) if name in needed or name in optional}
-    if unknown := [name for name in header if name and name not in known]:
+            listed = ", ".join(filter(None, header))
+            raise InputError(f"{path.name}, row {rows[0]}: the column {name} is missing (found {listed}); add it")
+    if unknown := [name for name in header if name and name not in needed and name not in optional]:
         message = f"{path.name}: columns that jaxphoto does not know are not used: {', '.join(unknown)}"
         warnings.warn(shown(message), UserWarning, stacklevel=2)
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in known}
-    named = {name: dict[str, str]() for name in known if name in _TEXT or name in text}
-    for piece in _pieces(path, lines, rows, separator, len(header)):
-        for name, j in known.items():
-            cells = [cell.strip() for cell in piece[j]]
-            if name in named:
-                # Ids come again and again: each is kept once.
-                parts[name].append(_objects([named[name].setdefault(cell, cell) for cell in cells]))
+    columns: dict[str, Any] = {}
+    for j, name in enumerate(header):
+        if name in needed or name in optional:
+            column = cells[j].iloc[1:].str.strip()
+            if name in _TEXT or name in text:
+                # Ids repeat: each is kept once.
+                codes, ids = pd.factorize(column)
+                columns[name] = ids.to_numpy(object)[codes]
             else:
-                plain = [cell.replace(",", ".") for cell in cells] if separator != "," else cells
-                parts[name].append(np.array(plain, _PACKED))
-    columns = {name: np.concatenate(several) if several else _objects([]) for name, several in parts.items()}
-    return _of_short_cells(Table.of(path.name, columns, np.array(rows[1:], int)))
+                columns[name] = (column if separator == "," else column.str.replace(",", ".", regex=False)).array
+    return Table.of(path.name, columns, np.array(rows[1:], int))
 
 
-def read_columns(path: Path, columns: Sequence[str], separator: str | None = ",") -> Table:
-    """A file without a header whose columns are named by the caller; `separator` None means blanks."""
-    lines, rows = content_lines(path)
-    records = []
-    for line, row in zip(lines, rows, strict=True):
-        record = [cell.strip() for cell in line.split(separator)]
-        if len(record) != len(columns):
-            raise InputError(
-                f"{path.name}, row {row}: {len(record)} cells instead of {len(columns)} ({', '.join(columns)}); "
-                "complete the row or correct the format"
-            )
-        records.append(record)
-    cells = {name: _objects([record[j] for record in records]) for j, name in enumerate(columns)}
-    return _of_short_cells(Table.of(path.name, cells, np.array(rows, int)))
+def _cells(path: Path, lines: list[str], rows: list[int], separator: str) -> pd.DataFrame:
+    """All cells as text. Raises RowError for a row with too many cells or an open quotation."""
+    try:
+        return pd.read_csv(
+            io.StringIO("\n".join(lines)), sep=separator, header=None, dtype=str, na_filter=False, skipinitialspace=True
+        )
+    except pd.errors.ParserError as error:
+        surplus = re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", str(error))
+        quotation = next((k for k, line in enumerate(lines) if line.count('"') % 2), len(lines) - 1)
+    if surplus is not None and int(surplus[2]) <= quotation + 1:
+        row, hint = rows[int(surplus[2]) - 1], ""
+        if separator == ",":
+            hint = " (decimal commas need semicolons between the columns)"
+        message = f"{surplus[3]} cells, but the header has {surplus[1]}; remove the surplus ones{hint}"
+    else:
+        row, message = rows[quotation], "the quotation marks do not pair; close or remove them in that row"
+    raise RowError(f"{path.name}, row {row}: {message}", [row])
 
 
 def content_lines(path: Path, without: Container[int] = ()) -> tuple[list[str], list[int]]:
@@ -243,69 +235,6 @@ def each_row(read: Callable[[int, str], T], numbered: Iterable[tuple[int, str]])
             rows.update(error.rows)
     if first is not None:
         raise RowError(str(first), rows)
-    return values
-
-
-def _pieces(path: Path, lines: list[str], rows: list[int], separator: str, width: int) -> Iterator[list[list[str]]]:
-    """The cells of all lines but the first, some thousand lines at a time, by column."""
-    for at in range(1, len(lines), _PIECE):
-        piece = lines[at : at + _PIECE]
-        text = separator.join(piece)
-        plain = '"' not in text and "\r" not in text and max(map(len, piece)) <= LONGEST_LINE
-        if plain and all(line.count(separator) == width - 1 for line in piece):
-            # Without a list for each line, of which Python would have to keep account.
-            cells = text.split(separator)
-            yield [cells[j::width] for j in range(width)]
-        else:
-            numbered = zip(rows[at : at + _PIECE], piece, strict=True)
-            records = each_row(lambda row, line: _record(path, line, row, separator, width), numbered)
-            yield list(map(list, zip(*records, strict=True)))
-
-
-def _record(path: Path, line: str, row: int, separator: str, width: int = 0) -> list[str]:
-    """The cells of a line, as many as `width` (0: as there are, of the first line)."""
-    if len(line) > LONGEST_LINE:
-        raise RowError(
-            f"{path.name}, row {row}: the row has {len(line)} characters, and one of a table has at most "
-            f"{LONGEST_LINE}; correct it",
-            [row],
-        )
-    try:
-        (record,) = csv.reader([line], delimiter=separator, skipinitialspace=True, strict=True)
-    except csv.Error:
-        raise RowError(
-            f"{path.name}, row {row}: the quotation marks do not pair; close or remove them in that row", [row]
-        ) from None
-    width = width or len(record)
-    if width > MOST_COLUMNS:
-        raise InputError(
-            f"{path.name}, row {row}: the header has {width} columns, and a table has at most {MOST_COLUMNS}; "
-            "correct it"
-        )
-    if len(record) > width:
-        raise RowError(
-            f"{path.name}, row {row}: {len(record)} cells, but the header has {width}; remove the surplus ones"
-            + (" (decimal commas need semicolons between the columns)" if separator == "," else ""),
-            [row],
-        )
-    # Some spreadsheets leave out empty cells at the end of a row.
-    return record + [""] * (width - len(record))
-
-
-def _of_short_cells(table: Table) -> Table:
-    """The table. Raises InputError for a cell that is longer than any id or number: arrays of text would explode."""
-    for column, cells in table.columns.items():
-        if max(map(len, cells), default=0) > LONGEST:
-            line, cell = next((k, cell) for k, cell in enumerate(cells) if len(cell) > LONGEST)
-            raise table.bad(
-                line, f"{column} is {quoted(cell)} of {len(cell)} characters, the most are {LONGEST}; correct it"
-            )
-    return table
-
-
-def _objects(cells: list[str]) -> np.ndarray:
-    values = np.empty(len(cells), object)
-    values[:] = cells
     return values
 
 

@@ -11,8 +11,7 @@ from PIL import ExifTags, Image
 from jaxphoto.camera import Sensor
 from jaxphoto.camera.undistortion import Keep, Pinhole, pinhole, source_pixels
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras.camera_file import CameraFile
-from jaxphoto.io.cameras.own_cameras import CAMERA, write_block_camera
+from jaxphoto.io.camera_files import CAMERA, CameraFile, write_block_camera
 from jaxphoto.io.photographs import Photograph
 from jaxphoto.io.raster import read_photograph
 from jaxphoto.writing import whole_folder

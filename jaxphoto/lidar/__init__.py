@@ -1,4 +1,4 @@
-"""Laser points: their index, and what is known of the ground from them."""
+"""Laser point clouds: spatial index, heights, planes, strips, surface models."""
 
 from jaxphoto.lidar.block_control import BlockControl, pseudo_control_of_block
 from jaxphoto.lidar.grid import Grid, Nearest, around, index_cloud, nearest

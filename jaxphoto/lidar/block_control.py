@@ -1,8 +1,8 @@
-"""Pseudo control points of a whole block: heights for the points that its images measured.
+"""Pseudo control points of a whole block: heights for its measured image points.
 
-A point is seen in several images, and each would give it a height. They share their laser points, so a mean of them is
-little better than one; the image that sees the point from nearest above tells it best, because there an error of the
-orientation moves the place least with the height, and little stands in the way.
+A point appears in several images, each of which gives it a height. These share laser points, so their mean is hardly
+better than one; the image that sees the point most steeply is best, because an orientation error there changes the
+place least, and occlusions are rare.
 """
 
 import equinox as eqx
@@ -26,13 +26,13 @@ class BlockControl(eqx.Module):
     """Pseudo control of the points of a block, one entry each."""
 
     point: Int[np.ndarray, "n"]
-    """Indices into the block's points."""
+    """Indices of the block's points."""
     image: Int[np.ndarray, "n"]
-    """The image that each was taken from."""
+    """Image used for each."""
     control: PseudoControl
 
     def rows(self) -> ControlRows:
-        """Vertical control: Z of the points that have one, with its standard deviation."""
+        """Return vertical control: Z of the determined points, with its standard deviation."""
         good = np.flatnonzero(np.isfinite(self.control.sigma_z))
         z, sigma = self.control.xyz[good, 2], self.control.sigma_z[good]
         return ControlRows(self.point[good], np.full(len(good), 2), z, sigma)
@@ -47,11 +47,11 @@ def pseudo_control_of_block(
     *,
     interpolation: Interpolation = "weighted",
 ) -> BlockControl:
-    """Heights from the cloud of `grid`, in the block's frame, for the `points` (by index; all) that images measured.
+    """Return heights from the cloud of `grid`, in the block's frame, for measured `points` (by index; all by default).
 
-    Interior and exterior orientation are those of `unknowns`; as they change, so does the control. Of the images that
-    show a point and tell its height, the one that sees it from nearest above is taken.
-    Raises BlockError where no image measured any of the points.
+    Interior and exterior orientation are those of `unknowns`; the control changes with them. Of the images that
+    determine the height of a point, the one with the steepest ray is used. Raises BlockError if no image measured any
+    of the points.
     """
     rows = block.image_points
     chosen = np.isin(rows.point, points) if points is not None else np.ones(len(rows.point), bool)
@@ -74,7 +74,7 @@ def pseudo_control_of_block(
     back = np.argsort(np.concatenate([of for of, _, _ in found]))
     control = jax.tree.map(lambda *parts: np.concatenate(parts)[back], *(part for _, part, _ in found))
     fall = np.concatenate([steep for _, _, steep in found])[back]
-    # By point, heights before refused ones, steepest first: the first row of each point.
+    # By point, valid heights before refused ones, steepest first: the first row of each point.
     order = np.lexsort((fall, np.isnan(control.sigma_z), point))
     first = order[np.unique(point[order], return_index=True)[1]]
     return BlockControl(point[first], image[first], jax.tree.map(lambda v: v[first], control))
@@ -82,5 +82,5 @@ def pseudo_control_of_block(
 
 @eqx.filter_jit
 def _falls(interior, exterior: ExteriorOrientation, xy: Float[Array, "n 2"]) -> Float[Array, "n"]:
-    """Third components of the rays: -1 straight down."""
+    """Return the third components of the rays: -1 straight down."""
     return jax.vmap(lambda image, at: image_ray(interior, image, at)[1][2])(exterior, xy)

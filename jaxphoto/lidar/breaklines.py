@@ -1,4 +1,4 @@
-"""Whether the points around a place lie on two surfaces: both sides of a wall, a ridge, a kerb."""
+"""Detection of two surfaces around a place: both sides of a wall, a ridge, a kerb."""
 
 import equinox as eqx
 import jax
@@ -9,23 +9,23 @@ from jaxtyping import Array, Bool, Float
 from jaxphoto.lidar.local_surface import Neighbours
 
 _DIRECTIONS = np.pi * np.arange(12) / 12
-# Where the ground is parted, in units of the farthest point.
+# Positions of the dividing line, in units of the farthest point.
 _OFFSETS = np.array([-0.45, -0.3, -0.15, 0.0, 0.15, 0.3, 0.45])
-# Points on each side, at least: two more than a plane has coefficients.
+# Minimum number of points on each side: two more than a plane has coefficients.
 _FEWEST = 5
-# The determinant of a side's normal matrix over that of points all around: less is a line.
+# Determinant of a side's normal matrix relative to that of surrounding points: less is a line.
 _LINE = 1e-4
-# Two planes explain the points where they leave less than this share of the variance that one surface leaves: parted by
-# a line; and by height, which of any points leaves a quarter.
+# Two planes must leave less than this fraction of the variance of one surface: divided by a line; and by height, which
+# leaves a quarter for any points.
 _BY_LINE, _BY_HEIGHT = 0.4, 0.1
 
 
 @eqx.filter_jit
 def lie_on_two_planes(near: Neighbours, variance: Float[Array, "places"]) -> Bool[Array, "places"]:
-    """Whether two planes leave far less than the `variance` (m^2) that one surface leaves, place by place.
+    """Return True where two planes leave far less than the `variance` (m^2) of one surface.
 
-    On either side of a straight line, of which 12 directions and 7 distances from the place are tried, less than 0.4 of
-    it; of the points above and below the largest gap between heights, where a wall stands, less than 0.1.
+    For a dividing line, of 12 directions and 7 distances from the place, less than 0.4 of it; for the points above and
+    below the largest gap between heights, as at a wall, less than 0.1.
     """
     return jax.vmap(_two_planes)(near, variance)
 
@@ -44,7 +44,7 @@ def _two_planes(near: Neighbours, variance: Float[Array, ""]) -> Bool[Array, ""]
 
 
 def _gap(near: Neighbours) -> Float[Array, ""]:
-    """The middle of the largest gap between heights."""
+    """Return the middle of the largest gap between heights."""
     z = jnp.sort(jnp.where(near.there, near.z, jnp.inf))
     gap = jnp.where(jnp.isfinite(z[1:]), z[1:] - z[:-1], 0.0)
     k = jnp.argmax(gap)
@@ -52,7 +52,7 @@ def _gap(near: Neighbours) -> Float[Array, ""]:
 
 
 def _left_by_plane(sums: Float[Array, "2 lines 4 4"]) -> Float[Array, "2 lines"]:
-    """Residual sums of squares of planes; infinite of too few points, or points on a line.
+    """Return residual sums of squares of planes; infinite for too few points, or collinear points.
 
     About the mean, z'z - r' C^-1 r with C the sums of products of x and y, and r those with z.
     """

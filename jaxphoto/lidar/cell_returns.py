@@ -1,8 +1,8 @@
-"""The returns of a strip, cell by cell of a grid: their number, mean and scatter, which can be added up in parts.
+"""Returns of a strip by grid cell: number, mean and scatter, which can be accumulated in parts.
 
-Of two parts of a cell with numbers n, means m and scatters S about them, the whole has the mean of all, and
-S = sum (S_k + n_k (m_k - m) (m_k - m)'): no digits are lost to squares of coordinates. Source: Chan, Golub and LeVeque
-(1979), Updating formulae and a pairwise algorithm for computing sample variances.
+For parts of a cell with numbers n, means m and scatters S about them, the total has the common mean, and S = sum (S_k +
+n_k (m_k - m) (m_k - m)'): no digits are lost to squares of coordinates. Source: Chan, Golub and LeVeque (1979),
+Updating formulae and a pairwise algorithm for computing sample variances.
 """
 
 from collections.abc import Sequence
@@ -13,19 +13,19 @@ from jaxtyping import Float, Int
 
 from jaxphoto.lidar.strip_settings import StripSettings
 
-# Parts are joined when so many have come: often enough to hold few, seldom enough not to join for ever.
+# Number of parts after which they are merged: a compromise between memory and time.
 _PARTS = 8
 
 
 class CellReturns(NamedTuple):
-    """What the planes of a strip follow from, by cell in ascending order."""
+    """Sums from which the planes of a strip follow, by cell in ascending order."""
 
     cell: Int[np.ndarray, "n"]
     returns: Int[np.ndarray, "n"]
     mean: Float[np.ndarray, "n 3"]
-    """Of the returns (m)."""
+    """Mean of the returns (m)."""
     measured: Float[np.ndarray, "n 3"]
-    """The same of the returns as they were measured."""
+    """Mean of the returns as measured."""
     time: Float[np.ndarray, "n"]
     """Mean time of the returns (s)."""
     scatter: Float[np.ndarray, "n 3 3"]
@@ -33,13 +33,13 @@ class CellReturns(NamedTuple):
 
 
 def cells_of(xyz: Float[np.ndarray, "n 3"], settings: StripSettings) -> Int[np.ndarray, "n"]:
-    """The cell of each return, of a grid through the origin: of whatever part of a cloud, the same cells."""
+    """Return the cell of each return in a grid through the origin, independent of the part of the cloud."""
     column, up = np.floor(xyz[:, :2] / settings.cell_m).astype(np.int64).T
     return (column << 32) + up
 
 
 def columns_and_rows(cell: Int[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-    """Of cells of `cells_of`, how many lie between each and the origin in X and in Y, negative before it."""
+    """Return column and row of cells of `cells_of` relative to the origin."""
     up = ((cell + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)
     return (cell - up) >> 32, up
 
@@ -50,13 +50,13 @@ def gathered(
     time: Float[np.ndarray, "n"],
     cell: Int[np.ndarray, "n"],
 ) -> CellReturns:
-    """Returns `xyz` (m), corrected, by the cell of each; `measured` is where they were, `time` (s) when."""
+    """Accumulate returns `xyz` (m), corrected, by cell; `measured` are the original ones, `time` (s) their times."""
     cells, of = np.unique(cell, return_inverse=True)
     return _together(cells, of, np.ones(len(of), int), xyz, measured, time, None)
 
 
 def joined(parts: Sequence[CellReturns]) -> CellReturns:
-    """Cells of parts of one strip, those that several parts have as one."""
+    """Merge the cells of parts of one strip."""
     columns = (np.concatenate(of_parts) for of_parts in zip(*parts, strict=True))
     cell, count, mean, measured, time, scatter = columns
     cells, of = np.unique(cell, return_inverse=True)
@@ -72,7 +72,7 @@ def _together(
     time: Float[np.ndarray, "n"],
     scatter: Float[np.ndarray, "n 3 3"] | None,
 ) -> CellReturns:
-    """Means of `count` returns each, and their scatters (None: of one return each), of the cells `cells[of]`."""
+    """Merge means of `count` returns each, and their scatters (None: single returns), of the cells `cells[of]`."""
     total = np.bincount(of, count, len(cells))
 
     def average(values: np.ndarray) -> np.ndarray:
@@ -91,14 +91,14 @@ def _together(
 
 
 class CellTally:
-    """Returns of several strips that come in parts, cell by cell: of the returns themselves nothing is kept."""
+    """Accumulated cells of several strips; the returns themselves are not stored."""
 
     def __init__(self, settings: StripSettings) -> None:
         self.settings = settings
         self._parts: dict[str, list[CellReturns]] = {}
 
     def add(self, key: str, xyz: Float[np.ndarray, "n 3"]) -> None:
-        """Returns (m) of the strip `key`."""
+        """Add returns (m) of the strip `key`."""
         parts = self._parts.setdefault(key, [])
         parts.append(gathered(xyz, xyz, np.zeros(len(xyz)), cells_of(xyz, self.settings)))
         if len(parts) > _PARTS:
@@ -106,5 +106,5 @@ class CellTally:
 
     @property
     def strips(self) -> dict[str, CellReturns]:
-        """The cells of each strip, in the order in which they came."""
+        """Return the cells of each strip, in order of arrival."""
         return {key: joined(parts) for key, parts in self._parts.items()}

@@ -1,4 +1,4 @@
-"""A cloud and its trajectory, corrected by what an adjustment has found of the scanner."""
+"""Correction of a cloud and its trajectory by the estimated scanner parameters."""
 
 import dataclasses
 from collections.abc import Callable
@@ -17,13 +17,13 @@ from jaxphoto.georeferencing import Scanner, Trajectory, TrajectorySpline, corre
 from jaxphoto.lidar.coverage import longest_interval, not_covered
 
 PORTION = 1 << 17
-"""Laser points at once, whose numbers stay in the processor's cache; fewer are padded to a power of two."""
-# Of fewer than these, computing costs nothing, and each size would compile programs of its own.
+"""Laser points processed at a time, within the processor's cache; fewer are padded to a power of two."""
+# Below this number computing costs nothing, and each size would compile programs of its own.
 _FEW = 1 << 11
 
 
 class ScannerPoses(eqx.Module):
-    """Where the scanner was when it measured laser points: one entry a point."""
+    """Poses of the scanner at the times of laser points: one entry per point."""
 
     position: Float[np.ndarray, "n 3"]
     """Metres, in the object frame."""
@@ -31,20 +31,20 @@ class ScannerPoses(eqx.Module):
 
 
 class ScannerPath(eqx.Module):
-    """The trajectory of a scanner, ready to say where each of millions of laser points was measured from."""
+    """Trajectory of a scanner, prepared for the poses of millions of laser points."""
 
     trajectory: Trajectory
     spline: TrajectorySpline
 
 
 def scanner_path(trajectory: Trajectory) -> ScannerPath:
-    """The path along `trajectory`, which is on the clock of the laser points."""
+    """Prepare `trajectory`, which is on the clock of the laser points."""
     max_gap = np.array(longest_interval(trajectory))
     return ScannerPath(trajectory, call_compiled(_spline, trajectory, max_gap))
 
 
 def scanner_poses(path: ScannerPath, time: Float[np.ndarray, "n"]) -> ScannerPoses:
-    """Interpolated at the times of laser points (s).
+    """Interpolate poses at the times of laser points (s).
 
     Raises BlockError for times that the trajectory does not cover.
     """
@@ -57,7 +57,7 @@ def scanner_poses(path: ScannerPath, time: Float[np.ndarray, "n"]) -> ScannerPos
 
 
 def scanner_motions(path: ScannerPath, time: Float[np.ndarray, "n"]) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity (m/s) and rate of turn (rad/s), (n, 3) each, at one or more times (s) that the trajectory covers."""
+    """Return velocity (m/s) and rotation rate (rad/s), (n, 3) each, at one or more covered times (s)."""
     velocity, rate = _along(_motions, path, time)
     return velocity, rate
 
@@ -68,7 +68,7 @@ def corrected_xyz(
     boresight: Float[Numbers, "3"],
     shift: Float[Numbers, "3"],
 ) -> Float[np.ndarray, "n 3"]:
-    """`georeferencing.corrected_point` of many points; without poses a boresight has no effect."""
+    """Apply `georeferencing.corrected_point` to many points; without poses a boresight has no effect."""
     shift = np.asarray(shift)
     if poses is None or not np.any(np.asarray(boresight)):
         return xyz - shift
@@ -76,9 +76,9 @@ def corrected_xyz(
 
 
 def correct_cloud(cloud: Cloud, scanner: Scanner, path: ScannerPath | None) -> Cloud:
-    """The cloud that the scanner would have measured without its boresight and the shifts of its strips.
+    """Correct a cloud for the boresight of its scanner and the shifts of its strips.
 
-    A strip that the scanner does not know stays where it is, but for the boresight. Raises as `scanner_poses`.
+    A strip without a shift is corrected for boresight only. Raises what `scanner_poses` raises.
     """
     xyz = np.array(cloud.xyz)
     turned = path is not None and bool(np.any(np.asarray(scanner.boresight)))
@@ -91,7 +91,7 @@ def correct_cloud(cloud: Cloud, scanner: Scanner, path: ScannerPath | None) -> C
 
 
 def correct_trajectory(trajectory: Trajectory, cloud: Cloud, scanner: Scanner) -> Trajectory:
-    """The trajectory less the shift of the strip that was flown then; between two strips, of that nearer in time."""
+    """Subtract from the trajectory the shift of the strip at that time; between strips, of the one closer in time."""
     if cloud.time is None:
         return trajectory
     time = np.asarray(trajectory.time)
@@ -108,7 +108,7 @@ def correct_trajectory(trajectory: Trajectory, cloud: Cloud, scanner: Scanner) -
 
 
 def _strips(cloud: Cloud, scanner: Scanner) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The points of each strip of a cloud, and the shift of that strip."""
+    """Return the points of each strip of a cloud, and the shift of that strip."""
     names = cloud.strips or tuple(scanner.shifts)
     strip = cloud.strip if cloud.strip is not None else np.zeros(len(cloud), int)
     return [
@@ -119,20 +119,20 @@ def _strips(cloud: Cloud, scanner: Scanner) -> list[tuple[np.ndarray, np.ndarray
 def in_portions(
     function: Callable, points: tuple[Float[np.ndarray, "n ..."], ...], *common: Any
 ) -> Float[np.ndarray, "n 3"]:
-    """`function` of the rows of `points`, made by `eqx.filter_jit`, and of what all have in `common`, bit by bit."""
+    """Apply `function`, made by `eqx.filter_jit`, to the rows of `points` in portions, and to `common` data."""
     result = np.empty((len(points[0]), 3))
     for first in range(0, len(result), PORTION):
         own = slice(first, first + PORTION)
         some = [v[own] for v in points]
         n = len(some[0])
         padded = (np.concatenate([v, np.broadcast_to(v[:1], (padded_size(n) - n, *v.shape[1:]))]) for v in some)
-        # A part of JAX's array would be a program for each length.
+        # Slicing a JAX array would compile a program for each length.
         result[own] = np.asarray(call_compiled(function, *padded, *common))[:n]
     return result
 
 
 def _along(function: Callable, path: ScannerPath, time: Float[np.ndarray, "n"]) -> list[np.ndarray]:
-    """What `function`, made by `eqx.filter_jit`, says of the spline at one or more times, bit by bit."""
+    """Evaluate `function`, made by `eqx.filter_jit`, of the spline at one or more times in portions."""
     parts = []
     for first in range(0, len(time), PORTION):
         some = np.asarray(time[first : first + PORTION], float)
@@ -142,7 +142,7 @@ def _along(function: Callable, path: ScannerPath, time: Float[np.ndarray, "n"]) 
 
 
 def padded_size(n: int) -> int:
-    """How many laser points a program is compiled for that takes `n`."""
+    """Round up the number of laser points to the size of a program."""
     return max(_FEW, min(1 << max(n - 1, 0).bit_length(), PORTION))
 
 

@@ -1,4 +1,4 @@
-"""Whether a trajectory says where the scanner was at the times of all laser points; and if not, in words why."""
+"""Coverage of laser points by a trajectory; where incomplete, a message with the likely cause."""
 
 from collections.abc import Sequence
 
@@ -10,41 +10,42 @@ from jaxphoto.errors import BlockError, InputError, few
 from jaxphoto.georeferencing import Trajectory
 from jaxphoto.georeferencing.time_scales import DAY, LAS_OFFSET, LEAP_SECONDS, looks_like, shift_that_fits
 
-# An interval is a gap from this many times the usual interval: one record may be lost.
+# An interval is a gap from this multiple of the usual interval on: one record may be lost.
 _GAP = 2.5
-# Slower than this (m/s) nothing tells a clock that jumps from records that are lost.
+# Below this speed (m/s) a clock jump cannot be distinguished from lost records.
 _FLYING = 1.0
-# Records to either side of a gap that tell how fast the scanner flies.
+# Number of records on either side of a gap from which the speed is estimated.
 _BESIDE = 20
-# Cosine of half the angle (30 degrees) that an aircraft may turn from one record to the next where its clock jumps.
+# Cosine of half the angle (30 degrees) by which an aircraft may turn between records at a clock jump.
 _STRAIGHT = 0.966
 _START = "a start of their own"
 
 
 def longest_interval(trajectory: Trajectory) -> float:
-    """Between two records (s): a longer one is a gap."""
+    """Longest interval between two records (s) that is not a gap."""
     return _GAP * float(np.median(np.diff(np.asarray(trajectory.time))))
 
 
 class CoveredTimes:
-    """The times of laser points that pass in parts, strip by strip, against the pieces of a trajectory without gaps."""
+    """Times of laser points, received in parts and by strip, relative to the contiguous pieces of a trajectory."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         time = np.asarray(trajectory.time)
         self._trajectory = trajectory
         self._gaps = np.flatnonzero(np.diff(time) > longest_interval(trajectory))
         self._begins, self._ends = time[np.r_[0, self._gaps + 1]], time[np.r_[self._gaps, len(time) - 1]]
-        # Of each strip by place: 0 before the trajectory, odd in a piece, even in the gap after it or behind the end.
+        # For each strip, counts by place: 0 before the trajectory, odd in a piece, even in the gap after it or beyond
+        # the end.
         self._first: dict[str, np.ndarray] = {}
         self._last: dict[str, np.ndarray] = {}
         self._several: dict[str, bool] = {}
 
     def covers(self, time: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
-        """Which times (s) lie within the trajectory and in no gap of it."""
+        """Return True for times (s) within the trajectory and outside its gaps."""
         return self._place(time) % 2 == 1
 
     def add(self, part: Cloud) -> None:
-        """Laser points more; those without times say nothing."""
+        """Add laser points; those without times are ignored."""
         if part.time is None or not len(part):
             return
         if part.strip is None:
@@ -54,7 +55,7 @@ class CoveredTimes:
             self.add_times(part.time[part.strip == k], part.strips[k])
 
     def add_times(self, time: Float[np.ndarray, "n"], strip: str = "") -> None:
-        """Times (s) of points of a strip, or of a cloud without strips."""
+        """Add times (s) of points of a strip, or of a cloud without strips."""
         empty = np.full(2 * len(self._begins) + 1, np.inf)
         first = self._first.setdefault(strip, empty)
         last = self._last.setdefault(strip, -empty)
@@ -62,27 +63,27 @@ class CoveredTimes:
         ends = np.array([time.min(), time.max()])
         place = self._place(ends)
         if place[0] != place[1]:
-            # Here alone every time has to be looked at.
+            # Only here every time must be examined.
             ends, place = time, self._place(time)
         np.minimum.at(first, place, ends)
         np.maximum.at(last, place, ends)
 
     def check(self, shift_s: float = 0.0) -> None:
-        """Raise InputError or BlockError where cloud and trajectory do not go together.
+        """Raise InputError or BlockError if cloud and trajectory do not match.
 
-        `shift_s` has been taken off the times of the trajectory, as given.
+        `shift_s` has been subtracted from the given times of the trajectory.
         """
         error = self._of_one_time() or self.uncovered(shift_s) or self._of_two_lines()
         if error is not None:
             raise error
 
     def uncovered(self, shift_s: float = 0.0) -> BlockError | None:
-        """That points were measured before, after or in a gap of the trajectory; None where none were."""
+        """Return an error about points before, after or in a gap of the trajectory; None if there are none."""
         return self._outside(shift_s) or self._in_a_gap()
 
     def _place(self, time: Float[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
         piece = np.searchsorted(self._begins, time, side="right")
-        # A record between two gaps alone says nothing of its time.
+        # An isolated record between two gaps gives no information about its time.
         within = (time <= self._ends[piece - 1]) & (self._begins[piece - 1] < self._ends[piece - 1])
         return 2 * piece - ((piece > 0) & within)
 
@@ -157,11 +158,11 @@ class CoveredTimes:
         return f"laser points{of and f' of {of}'} were measured where the trajectory has no records"
 
     def _jump(self, record: int) -> float | None:
-        """By how much (s) the clock jumps in the gap after a record; None where records are lost."""
+        """Return the clock jump (s) in the gap after a record; None if records are lost."""
         time, position = np.asarray(self._trajectory.time), np.asarray(self._trajectory.position)
         before, after = np.asarray(self._trajectory.quaternion)[record : record + 2]
         if abs(before @ after) < _STRAIGHT:
-            # It turned, and is back where the last strip ended.
+            # The aircraft turned, and is back at the end of the last strip.
             return None
         near = slice(max(record - _BESIDE, 0), record + _BESIDE + 2)
         lasts = np.diff(time[near])
@@ -188,14 +189,14 @@ class CoveredTimes:
 
 
 def check_covered(cloud: Cloud, trajectory: Trajectory, shift_s: float = 0.0) -> None:
-    """`CoveredTimes.check` of a whole cloud."""
+    """Apply `CoveredTimes.check` to a whole cloud."""
     coverage = CoveredTimes(trajectory)
     coverage.add(cloud)
     coverage.check(shift_s)
 
 
 def not_covered(trajectory: Trajectory, time: Float[np.ndarray, "n"]) -> BlockError:
-    """The error about times (s) of laser points of which the trajectory does not cover all."""
+    """Return the error about times (s) of laser points that the trajectory does not cover."""
     coverage = CoveredTimes(trajectory)
     coverage.add_times(time)
     error = coverage.uncovered()
@@ -204,7 +205,7 @@ def not_covered(trajectory: Trajectory, time: Float[np.ndarray, "n"]) -> BlockEr
 
 
 def _strips(names: Sequence[str]) -> str:
-    """What strips are called; nothing for the points of a cloud without strips."""
+    """Return the names of strips; nothing for points of a cloud without strips."""
     if not any(names):
         return ""
     return f"strip {names[0]}" if len(names) == 1 else f"strips {few(names)}"

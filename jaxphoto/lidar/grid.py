@@ -1,9 +1,8 @@
-"""The spatial index of a cloud: its points sorted by the square cell of the ground that they lie over.
+"""Spatial index of a cloud: points sorted by square cells in plan.
 
-Cells are numbered row by row, so those of a window that lie beside each other hold one run of points: a window of
-(2 reach + 1)^2 cells is read as 2 reach + 1 runs. A point outside the grid, and a place outside it, belong to the cell
-of the border that is nearest. That only brings them nearer to each other, so no window misses a point for it, and a
-few points far away cannot make the grid large.
+Cells are numbered row by row, so those of a window in one row hold one run of points: a window of (2 reach + 1)^2 cells
+is read as 2 reach + 1 runs. A point or place outside the grid belongs to the nearest border cell. That only brings them
+closer together, so no window misses a point, and a few distant points cannot make the grid large.
 """
 
 import equinox as eqx
@@ -16,31 +15,31 @@ from jaxphoto.arrays import Numbers
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 
-# Points of a cell that is not empty, on average.
+# Mean number of points in a nonempty cell.
 _PER_CELL = 4
-# Points that tell the size of a cell.
+# Number of points from which the cell size is determined.
 _SAMPLE = 200_000
-# Share of the points beyond each border where a few would otherwise make the grid too large.
+# Fraction of the points beyond each border if a few would otherwise make the grid too large.
 _OUTSIDE = 1e-3
-# Places times candidates that are looked at together.
+# Places times candidates processed at a time.
 _AT_ONCE = 1_000_000
-# Low, medium and high vegetation, the classes of LAS.
+# Low, medium and high vegetation (LAS classes).
 _VEGETATION = (3, 4, 5)
 # Ground, buildings, water and bridge decks.
 _SURFACES = (2, 6, 9, 17)
-# Beyond, a search is left to a tree.
+# Larger windows are searched by a tree.
 _REACH = 16
 
 
 class Grid(eqx.Module):
-    """Points of a cloud sorted by cells. Arrays are padded, so that clouds of about the same size share programs."""
+    """Points of a cloud sorted by cells. Arrays are padded, so that clouds of similar size share programs."""
 
     xyz: Float[Numbers, "padded 3"]
-    """Points in the order of the cells (m); those too many repeat the last."""
+    """Points in the order of the cells (m); padding repeats the last."""
     order: Int[Numbers, "padded"]
-    """Where each of them is in the cloud; -1 of those too many."""
+    """Index of each in the cloud; -1 for padding."""
     start: Int[Numbers, "offsets"]
-    """Where each cell begins; the last ones are the number of points."""
+    """First point of each cell; the last ones are the number of points."""
     corner: Float[Numbers, "2"]
     """X, Y (m) of the lower left corner."""
     cell_m: Float[Numbers, ""]
@@ -48,32 +47,30 @@ class Grid(eqx.Module):
     shape: Int[Numbers, "2"]
     """Rows and columns."""
     leafy: Bool[Numbers, "padded"]
-    """Whether a point is classified as vegetation (LAS classes 3, 4, 5) or one of several returns of its pulse."""
+    """True for points classified as vegetation (LAS classes 3, 4, 5) or one of several returns of a pulse."""
     most: int = eqx.field(static=True)
-    """Room for the points of any three cells beside each other."""
+    """Capacity for the points of any three neighbouring cells in a row."""
 
     def __len__(self) -> int:
         return int(self.start[-1])
 
 
 class Nearest(eqx.Module):
-    """The points nearest to places, nearest first; where a cloud has too few, the distance is infinite."""
+    """Points nearest to places, nearest first; the distance is infinite if a cloud has too few."""
 
     index: Int[np.ndarray, "places k"]
-    """Into the sorted points of the grid."""
+    """Index of the sorted points of the grid."""
     distance: Float[np.ndarray, "places k"]
     """Horizontal (m)."""
 
 
 def index_cloud(cloud: Cloud | Float[np.ndarray, "n 3"], cell_m: float | None = None) -> Grid:
-    """The index of a cloud, or of bare points (m), in square cells of side `cell_m`.
+    """Index a cloud, or bare points (m), in square cells of side `cell_m`.
 
-    By default a cell that is not empty holds some 4 points. There are never more than twice as many cells as points,
-    and a few: where the ground is too large for that, points far from all others count to the border of the grid, and
-    cells are larger.
+    By default a nonempty cell holds about 4 points. There are at most about twice as many cells as points: if the area
+    is too large for that, isolated points are assigned to the border of the grid, and cells are larger.
 
-    Raises InputError for a cloud without points or with coordinates that are no numbers, and for a cell size that is
-    not positive.
+    Raises InputError for a cloud without points or with NaN coordinates, and for a cell size that is not positive.
     """
     xyz = np.asarray(cloud.xyz if isinstance(cloud, Cloud) else cloud, float)
     if not len(xyz):
@@ -111,15 +108,15 @@ def index_cloud(cloud: Cloud | Float[np.ndarray, "n 3"], cell_m: float | None = 
 
 
 def around(grid: Grid, xy: Float[Array, "2"], reach: int = 1) -> tuple[Int[Array, "k"], Bool[Array, "k"]]:
-    """The points of the (2 reach + 1)^2 cells around one place (m), and which of these numbers are points at all.
+    """Return the points of the (2 reach + 1)^2 cells around one place (m), and which of these are valid.
 
-    Numbers are those of the sorted points: `grid.xyz[index]`, and `grid.order[index]` in the cloud. There are always
-    as many of them, `(2 reach + 1) ceil((2 reach + 1) / 3) grid.most`, so that it runs compiled and in a `vmap`. All
-    points nearer than `reach` cells are among them.
+    Indices are those of the sorted points: `grid.xyz[index]`, and `grid.order[index]` in the cloud. Their number is
+    always `(2 reach + 1) ceil((2 reach + 1) / 3) grid.most`, as compilation and `vmap` require. All points closer than
+    `reach` cells are among them.
     """
     rows, columns = grid.shape[0], grid.shape[1]
     at = jnp.floor((xy - grid.corner) / grid.cell_m)
-    # In floating point until it is inside: a place far away has a number that no integer holds.
+    # In floating point until clipped: the cell of a distant place exceeds any integer.
     column = jnp.clip(at[0], 0, columns - 1).astype(int)
     row = jnp.clip(at[1], 0, rows - 1).astype(int) + jnp.arange(-reach, reach + 1)
     inside = (row >= 0) & (row < rows)
@@ -134,10 +131,10 @@ def around(grid: Grid, xy: Float[Array, "2"], reach: int = 1) -> tuple[Int[Array
 
 
 def nearest(grid: Grid, xy: Float[np.ndarray, "places 2"], k: int) -> Nearest:
-    """The `k` points nearest to places (m) in plan, exactly, nearest first.
+    """Return the `k` points nearest to places (m) in plan, exactly, nearest first.
 
-    A window is enlarged until the circle through the k-th point lies in it. Places far from all points are looked up
-    in a tree of SciPy.
+    A window is enlarged until the circle through the k-th point lies in it. Places far from all points are searched by
+    a SciPy tree.
     """
     xy = np.asarray(xy, float).reshape(-1, 2)
     index, distance = np.zeros((len(xy), k), np.int32), np.full((len(xy), k), np.inf)
@@ -155,7 +152,7 @@ def nearest(grid: Grid, xy: Float[np.ndarray, "places 2"], k: int) -> Nearest:
             of = by_total[some]
             distance[left[of]], index[left[of]] = _nearest_of(grid, xy[left[of]], begin[of], end[of], k)
         last = distance[left, -1]
-        # Known to hold the k-th: as many cells as the circle through the k-th so far takes.
+        # Certain to hold the k-th: as many cells as the circle through the current k-th needs.
         wanted = np.where(np.isfinite(last), np.ceil(last / float(grid.cell_m) + 1e-6), 2 * reach[left])
         reach[left] = np.minimum(np.maximum(wanted, reach[left] + 1), _REACH + 1)
         left = left[last > safe]
@@ -176,7 +173,7 @@ def _leafy(cloud: Cloud) -> np.ndarray:
 
 
 def _extent(xy: np.ndarray, cell_m: float | None) -> tuple[np.ndarray, np.ndarray, float]:
-    """Lower left and upper right corner of the grid, and the side of its cells (m)."""
+    """Return the lower left and upper right corner of the grid, and the side of its cells (m)."""
     low, high = xy.min(axis=0), xy.max(axis=0)
     some = xy[:: max(1, len(xy) // _SAMPLE)]
     limit = 2 * len(xy) + 1024
@@ -193,7 +190,7 @@ def _cells(low: np.ndarray, high: np.ndarray, cell: float) -> float:
 
 
 def _cell_side(some: np.ndarray, n: int) -> float:
-    """The side (m) at which the cells that are not empty hold `_PER_CELL` of `n` points, found with some of them."""
+    """Return the side (m) at which nonempty cells hold `_PER_CELL` of `n` points, determined from some of them."""
     span = np.ptp(some, axis=0)
     area = max(float(np.prod(span)), float(span.max()) ** 2 / len(some))
     if area == 0:
@@ -208,25 +205,25 @@ def _cell_side(some: np.ndarray, n: int) -> float:
 
 
 def _fullest(start: np.ndarray, shape: np.ndarray) -> int:
-    """Points of the three cells beside each other that hold most."""
+    """Return the largest number of points in three neighbouring cells of a row."""
     each = np.diff(start).reshape(shape)
     sums = np.convolve(each.ravel(), [1, 1, 1]) if shape[1] > 2 else each.sum(axis=1)
     return int(sums.max())
 
 
 def _room(n: int) -> int:
-    """At least `n`, of eight sizes between a power of two and the next."""
+    """Round up `n` to one of eight sizes between a power of two and the next."""
     step = 1 << max(n.bit_length() - 4, 2)
     return -(-n // step) * step
 
 
 def _first_reach(k: int) -> int:
-    """The window that most often holds `k` points safely."""
+    """Return the window that most often holds `k` points for certain."""
     return max(1, int(np.ceil(np.sqrt(1.5 * k / (_PER_CELL * np.pi)))))
 
 
 def _window(grid: Grid, xy: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The runs of points of the window of each place, and how far (m) it holds all points."""
+    """Return the runs of points of the window of each place, and the radius (m) within which it is complete."""
     rows, columns = (int(v) for v in grid.shape)
     place = np.clip((xy - grid.corner) / grid.cell_m, 0, [columns, rows])
     cell = np.minimum(np.floor(place).astype(int), [columns - 1, rows - 1])
@@ -238,14 +235,14 @@ def _window(grid: Grid, xy: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, 
     base = np.where(inside, row, 0) * columns
     begin = np.where(inside, grid.start[base + np.maximum(left, 0)], 0)
     end = np.where(inside, grid.start[base + np.minimum(right, columns - 1) + 1], 0)
-    # Beyond the border of the grid there is nothing that was not moved into it.
+    # Beyond the border of the grid everything was moved into it.
     low, high = cell - reach[:, None], cell + reach[:, None] + 1
     sides = [np.where(low <= 0, np.inf, place - low), np.where(high >= [columns, rows], np.inf, high - place)]
     return begin, end, np.min(np.concatenate(sides, axis=1), axis=1) * float(grid.cell_m)
 
 
 def _portions(total: np.ndarray) -> list[slice]:
-    """Places one after the other, so many that their tables of candidates are not too large; `total` is ascending."""
+    """Split places into portions whose tables of candidates are not too large; `total` is ascending."""
     portions, first = [], 0
     while first < len(total):
         many = max(1, int(np.searchsorted((np.arange(first, len(total)) - first + 1) * total[first:], _AT_ONCE)))
@@ -255,7 +252,7 @@ def _portions(total: np.ndarray) -> list[slice]:
 
 
 def _nearest_of(grid: Grid, xy: np.ndarray, begin: np.ndarray, end: np.ndarray, k: int):
-    """Distances of the nearest among the points of runs, and these points."""
+    """Return the distances of the nearest among the points of runs, and these points."""
     length = end - begin
     total = length.sum(axis=1)
     ends = np.cumsum(length.ravel())
@@ -275,7 +272,7 @@ def _nearest_of(grid: Grid, xy: np.ndarray, begin: np.ndarray, end: np.ndarray, 
 
 
 def _from_tree(grid: Grid, xy: np.ndarray, k: int):
-    # Sorted as the points are, a simple tree is as good as a balanced one, and sooner made.
+    # The points are sorted: an unbalanced tree is as good as a balanced one, and built faster.
     tree = scipy.spatial.KDTree(grid.xyz[: len(grid), :2], balanced_tree=False, compact_nodes=False)
     distance, index = tree.query(xy, k=np.arange(1, k + 1))
     return distance, np.where(np.isfinite(distance), index, 0)

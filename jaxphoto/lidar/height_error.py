@@ -1,19 +1,19 @@
-"""How far a height between laser points may be off: noise, and what interpolation leaves out.
+"""Error of an interpolated height: noise and interpolation bias.
 
-A height is a weighted sum of those of the points, H = sum w_i Z_i. With the local surface Z(x) that `local_surface`
-fits, the noise v of a height and A = `rows`,
+A height is a weighted sum of those of the points, H = sum w_i Z_i. With the local surface Z(x) of `local_surface`, the
+noise v of a height and A = `rows`,
 
-    v = sigma_Z^2 + |g|^2 sigma_XY^2    (+ what the residuals show beyond it)
+    v = sigma_Z^2 + |g|^2 sigma_XY^2    (+ the excess that the residuals show)
     b = sum w_i Z(x_i) - Z(0) + sigma_XY^2 (h_xx + h_yy) / 2
 
-where b is the bias: of weights that do not reproduce a slope or a curve, and of horizontal errors, over which the cloud
-averages a curve. It is known with a variance of its own, t^2, and counts as far as it stands out from that: the error
-is taken for normal,
+where b is the bias: of weights that do not reproduce a slope or curvature, and of horizontal errors, over which the
+cloud averages a curved surface. It has a variance itself, t^2, and counts as far as it exceeds that: the error is
+assumed normal,
 
     N(k b, s^2),    k = max(0, 1 - 2 t^2 / b^2),    s^2 = |w - k c A|^2 v + k (1 - k) t^2 + roughness
 
-where c b is the bias per coefficient. The standard deviation given is that of the normal distribution about zero within
-whose 1.96 sigma lie 95 % of it, just as of the true one.
+where c b is the bias per coefficient. The returned standard deviation is that of the zero-mean normal distribution with
+the same probability of 95 % within 1.96 sigma.
 """
 
 from typing import NamedTuple
@@ -34,18 +34,18 @@ class LidarNoise(NamedTuple):
 
 
 def noise_variance(fit: LocalFit, noise: LidarNoise) -> Float[Numbers, ""]:
-    """Variance of a point's height over the surface (m^2): on a slope, horizontal errors count as well."""
+    """Return the variance of a point's height over the surface (m^2): on a slope, horizontal errors contribute."""
     slope = jnp.sum(fit.coefficients[1:3] ** 2)
     on_slope = noise.sigma_z**2 + slope * noise.sigma_xy**2
-    # A slope that is only noise is no slope.
+    # A slope that is not significant is none.
     by_chance = on_slope * jnp.sum(fit.rows[1:3] ** 2)
     return noise.sigma_z**2 + jnp.maximum(slope - by_chance, 0.0) * noise.sigma_xy**2
 
 
 def excess(fit: LocalFit, variance: Float[Numbers, ""], quantile: float) -> Float[Array, ""]:
-    """Residual variance over the expected one, in units of what chance exceeds beyond the normal `quantile`.
+    """Return the residual variance over the expected one, relative to the normal `quantile` of chance.
 
-    The quantile of chi-square over its freedom is that of Wilson and Hilferty (1931).
+    The quantile of chi-square over its degrees of freedom is that of Wilson and Hilferty (1931).
     """
     part = 2 / (9 * jnp.maximum(fit.freedom, 1.0))
     return fit.variance / (variance * (1 - part + quantile * jnp.sqrt(part)) ** 3)
@@ -54,7 +54,7 @@ def excess(fit: LocalFit, variance: Float[Numbers, ""], quantile: float) -> Floa
 def height_sigma(
     near: Neighbours, weight: Float[Numbers, "points"], fit: LocalFit, noise: LidarNoise
 ) -> Float[Array, ""]:
-    """Standard deviation (m) of the height with these weights, as above."""
+    """Return the standard deviation (m) of the height with these weights, as above."""
     expected = noise_variance(fit, noise)
     rough = excess(fit, expected, _ONE_IN_TWENTY) > 1
     variance = jnp.where(rough, fit.variance, expected)
@@ -70,18 +70,18 @@ def height_sigma(
 
 
 _ONE_IN_TWENTY = 1.645
-# Variances by which a bias must stand out, to count at all.
+# Multiple of its variance that a squared bias must exceed.
 _DOUBT = 2.0
 
 
 def normal_equivalent(mean: Float[Array, ""], sigma: Float[Array, ""]) -> Float[Array, ""]:
-    """The standard deviation s for which |e| <= 1.96 s in 95 % of errors e of N(mean, sigma^2)."""
-    # Without noise the bias alone counts.
+    """Return s for which |e| <= 1.96 s in 95 % of errors e of N(mean, sigma^2)."""
+    # Without noise only the bias counts.
     sigma = jnp.maximum(sigma, 1e-9 * jnp.abs(mean) + 1e-300)
     t = jnp.abs(mean) / sigma
     q = jnp.maximum(_BOUND, t + _ONE_IN_TWENTY)
     for _ in range(4):
-        # Newton; the probability is concave in q, so it comes from below.
+        # Newton's method; the probability is concave in q, so it converges from below.
         within = norm.cdf(q - t) - norm.cdf(-q - t)
         q = q + (0.95 - within) / (norm.pdf(q - t) + norm.pdf(q + t))
     return sigma * q / _BOUND

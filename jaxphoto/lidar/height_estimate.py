@@ -1,4 +1,4 @@
-"""The height of one place from the points nearest to it: weights, standard deviation, and what speaks against it."""
+"""Height of one place from its nearest points: weights, standard deviation, flags."""
 
 from typing import NamedTuple
 
@@ -14,20 +14,20 @@ from jaxphoto.lidar.local_surface import LocalFit, Neighbours, fit_surface
 from jaxphoto.lidar.sight import empty_about, surrounded
 from jaxphoto.lidar.tin import delaunay_triangle
 
-# Points around a place that tell slope, curvature and roughness: at least so many, and so many times those used.
+# Number of points that determine slope, curvature and roughness: a minimum, and a multiple of those used.
 WIDE, TIMES = 24, 3
-# And all points nearer than so many horizontal standard deviations, as far as they are given.
+# Also all available points within this number of horizontal standard deviations.
 APART = 4.75
 # Quantiles of the normal distribution: 1 in 20, and 1 in 1000.
 _SELDOM, _HARDLY = 1.645, 3.09
-# Residuals in units of the lidar's noise that are no surface's.
+# Residuals in units of the lidar's noise beyond which there is no surface.
 _ROUGH = 3.0
 # Standard deviation of the weights of moving least squares, in units of the farthest point.
 _WIDTH = 0.5
 
 
 class HeightNumbers(NamedTuple):
-    """Settings, as numbers that programs are not compiled for."""
+    """Numerical settings, for which programs are not recompiled."""
 
     points: Int[Numbers, ""]
     power: Float[Numbers, ""]
@@ -37,38 +37,38 @@ class HeightNumbers(NamedTuple):
 
 
 class HeightEstimate(NamedTuple):
-    """What one place comes to."""
+    """Estimate for one place."""
 
     height: Float[Numbers, ""]
-    """Over the nearest point (m); NaN where the points do not give one."""
+    """Over the nearest point (m); NaN if undetermined."""
     sigma: Float[Numbers, ""]
     used: Int[Numbers, ""]
     density: Float[Numbers, ""]
     roughness: Float[Numbers, ""]
     gradient: Float[Numbers, "2"]
     leafy: Float[Numbers, ""]
-    """Share of the points used that are vegetation."""
+    """Fraction of vegetation among the points used."""
     hole: Bool[Numbers, ""]
     surrounded: Bool[Numbers, ""]
     plane: Bool[Numbers, ""]
-    """Whether `local` had to take a plane."""
+    """True if `local` used a plane."""
     misfit: Bool[Numbers, ""]
-    """Whether the points scatter about the surface more than the lidar's noise lets them."""
+    """True if the points scatter about the surface more than the lidar's noise explains."""
     rough: Bool[Numbers, ""]
-    """Whether they do so by far."""
+    """True if they do so by far."""
     wide: Int[Numbers, ""]
-    """How many points told the surface."""
+    """Number of points that determined the surface."""
     one_surface: Float[Numbers, ""]
-    """Variance (m^2) that one smooth surface leaves of them."""
+    """Residual variance (m^2) of one smooth surface."""
     final: Bool[Numbers, ""]
-    """Whether more points would change nothing."""
+    """True if more points would not change the result."""
 
 
 @eqx.filter_jit
 def estimate_heights(
     near: Neighbours, leafy: Bool[Array, "places points"], numbers: HeightNumbers, method: str
 ) -> HeightEstimate:
-    """Every place by `method`; arrays of `near` have a leading axis over the places."""
+    """Estimate every place by `method`; arrays of `near` have a leading axis over the places."""
     return jax.vmap(lambda n, of: _estimate(n, of, numbers, method))(near, leafy)
 
 
@@ -76,7 +76,7 @@ def _estimate(near: Neighbours, leafy: Bool[Array, "points"], numbers: HeightNum
     in_radius = near.there & (near.distance <= numbers.radius)
     n_used = jnp.where(numbers.radius > 0, jnp.sum(in_radius), numbers.points)
     n_around = jnp.maximum(WIDE, TIMES * n_used)
-    # No curve can be told of points whose horizontal errors are as large as their distances.
+    # Points whose horizontal errors equal their distances determine no curvature.
     n_wide = jnp.maximum(n_around, jnp.sum(near.there & (near.distance <= APART * numbers.noise.sigma_xy)))
     rank = jnp.arange(len(near.z))
     used, around = near.there & (rank < n_used), near.there & (rank < n_around)
@@ -89,7 +89,7 @@ def _estimate(near: Neighbours, leafy: Bool[Array, "points"], numbers: HeightNum
     def misfit(fit: LocalFit, quantile: float) -> Bool[Array, ""]:
         return excess(fit, noise_variance(fit, numbers.noise), quantile) > 1
 
-    # A plane nearby where a break is not far: what lies beyond tells nothing of the place.
+    # A local plane close to a break: points beyond it are irrelevant.
     take_flat = ~curved.interpolates | (misfit(curved, _HARDLY) & flat.interpolates & ~misfit(flat, _SELDOM))
     fit = jax.tree.map(lambda a, b: jnp.where(take_flat, a, b), flat, curved)
     final = interpolates = jnp.array(True)

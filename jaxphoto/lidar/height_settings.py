@@ -1,4 +1,4 @@
-"""How heights are interpolated, and what may be wrong with one."""
+"""Settings of height interpolation, and flags of heights."""
 
 import enum
 
@@ -9,32 +9,31 @@ from jaxphoto.errors import InputError
 
 
 class HeightFlag(enum.IntFlag):
-    """What is wrong with a height; several may hold."""
+    """Problems of a height; several may apply."""
 
     OK = 0
     HOLE = 1
-    """No point is near enough, for the density of the points around."""
+    """No point is close enough, given the density of the surrounding points."""
     EDGE = 2
-    """The points near it do not surround the place: it would be extrapolated."""
+    """The nearest points do not surround the place: it would be extrapolated."""
     VEGETATION = 4
-    """Points near it are vegetation or of several returns, or too rough for a surface."""
+    """The nearest points are vegetation or of several returns, or too rough for a surface."""
     BREAKLINE = 8
-    """The points near it lie on two surfaces: wall, ridge, kerb."""
+    """The nearest points lie on two surfaces: wall, ridge, kerb."""
     PLANE = 16
-    """`local` fitted a plane to the nearest points, which bear no quadratic; not refused."""
+    """`local` fitted a plane to the nearest points, which do not determine a quadratic; not refused."""
 
 
 REFUSED = HeightFlag.HOLE | HeightFlag.EDGE | HeightFlag.VEGETATION | HeightFlag.BREAKLINE
 
 
 class HeightSettings(eqx.Module):
-    """How heights are interpolated, and what is known of the lidar.
+    """Settings of height interpolation, and errors of the lidar.
 
-    `points` is the number of nearest points of `idw` and `plane`; where `radius_m` is given they use all points within
-    it instead. `local` uses three times `points`, at least 24. `power` is that of `idw`. Standard deviations are those
-    of a laser point in Z and in each of X and Y, and of what all its points have in common. Places of which
-    `leafy_share` of the points used are vegetation or of several returns are flagged; heights with a flag of `refuse`
-    are NaN.
+    `points` is the number of nearest points of `idw` and `plane`; if `radius_m` is given they use all points within it
+    instead. `local` uses three times `points`, at least 24. `power` is that of `idw`. Standard deviations are those of
+    a laser point in Z and in each of X and Y, and of the common error of all points. A place is flagged if the fraction
+    `leafy_share` of the points used is vegetation or of several returns; heights with a flag of `refuse` are NaN.
     """
 
     points: int = 8

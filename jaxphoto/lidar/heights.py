@@ -1,13 +1,13 @@
-"""Height at XY from a cloud, with its standard deviation, refused where the cloud does not tell it.
+"""Heights at X, Y from a cloud, with standard deviations; refused where the cloud does not determine them.
 
-Four ways to weight the heights of points around a place, H = sum w_i Z_i:
+Four interpolations of the heights of points around a place, H = sum w_i Z_i:
 
-- `idw`: w ~ distance^-power over the nearest points (that point alone where one is at the place),
-- `plane`: least squares through the nearest points,
-- `tin`: linear in the triangle of the Delaunay triangulation of the whole cloud (`tin`),
-- `local`: moving least squares, a quadratic with Gaussian weights; a plane where the points do not bear a quadratic.
+- `idw`: w ~ distance^-power over the nearest points (only the point at the place, if there is one), - `plane`: least
+squares through the nearest points, - `tin`: linear in the triangle of the Delaunay triangulation of the whole cloud
+(`tin`), - `local`: moving least squares, a quadratic with Gaussian weights; a plane if the points do not determine a
+quadratic.
 
-Where the error comes from: `height_error`. What is written and drawn of it: docs/lidar_heights.md.
+Error model: `height_error`; files and figures: docs/lidar_heights.md.
 """
 
 from typing import Literal, get_args
@@ -28,29 +28,29 @@ from jaxphoto.lidar.height_settings import HeightFlag, HeightSettings
 from jaxphoto.lidar.local_surface import Neighbours
 
 Method = Literal["idw", "plane", "tin", "local"]
-# Places of a call, padded to one of these: few programs.
+# Places of a call are padded to one of these: few programs.
 _PLACES = (64, 512, 4096)
-# Points among which the triangle over a place is looked for: so many times more, again and again, up to a limit.
+# Points among which the triangle over a place is searched: multiplied repeatedly, up to a limit.
 _MORE, _MOST = 4, 384
-# Points that tell the surface, at most, where a cloud is far denser than its horizontal errors.
+# Maximum number of points that determine the surface, if a cloud is much denser than its horizontal errors.
 _MOST_WIDE = 4 * WIDE
 
 
 class Heights(eqx.Module):
-    """Heights of places (m), and what they rest on; NaN where a height is refused or cannot be told."""
+    """Heights of places (m) and their properties; NaN where refused or undetermined."""
 
     z: Float[Numbers, "places"]
     sigma: Float[Numbers, "places"]
     flag: Integer[Numbers, "places"]
     """Sums of `HeightFlag`."""
     count: Int[Numbers, "places"]
-    """Points that the height comes from."""
+    """Number of points used."""
     density: Float[Numbers, "places"]
     """Points per m^2 around the place."""
     roughness: Float[Numbers, "places"]
     """Standard deviation (m) of the points about the local surface."""
     gradient: Float[Numbers, "places 2"]
-    """Rise of the local surface by X and Y."""
+    """Gradient of the local surface by X and Y."""
 
     def __len__(self) -> int:
         return len(self.z)
@@ -61,7 +61,7 @@ class Heights(eqx.Module):
         return np.hypot(*np.asarray(self.gradient).T)
 
     def flagged(self, flag: HeightFlag) -> Bool[np.ndarray, "places"]:
-        """Places with any flag of `flag`."""
+        """Return True for places with any flag of `flag`."""
         return (np.asarray(self.flag) & int(flag)) != 0
 
 
@@ -71,12 +71,12 @@ def heights_at(
     method: Method = "idw",
     settings: HeightSettings | None = None,
 ) -> Heights:
-    """Heights of the cloud at places X, Y (m), by one of four methods, with standard deviations and flags.
+    """Return heights of the cloud at places X, Y (m), by one of four methods, with standard deviations and flags.
 
-    A `Grid` saves indexing the cloud again. Places that `settings.refuse` names are NaN; all places are told apart by
-    `Heights.flag`. The standard deviation is such that 95 % of the errors are within 1.96 sigma.
+    A `Grid` saves indexing the cloud again. Places with a flag of `settings.refuse` are NaN; `Heights.flag` gives the
+    reason. The standard deviation is such that 95 % of the errors are within 1.96 sigma.
 
-    Raises InputError for an unknown method, places that are no pairs of numbers, and an empty cloud.
+    Raises InputError for an unknown method, places that are not pairs of numbers, and an empty cloud.
     """
     settings = HeightSettings() if settings is None else settings
     if method not in get_args(Method):
@@ -93,14 +93,14 @@ def heights_at(
 
 
 def _points_of_noise(grid: Grid, sigma_xy_m: float) -> int:
-    """How many points lie nearer to a place than horizontal errors matter, on average; a multiple of `WIDE`."""
+    """Return the mean number of points closer to a place than horizontal errors matter; a multiple of `WIDE`."""
     covered = np.count_nonzero(np.diff(grid.start)) * float(grid.cell_m) ** 2
     many = np.pi * (APART * sigma_xy_m) ** 2 * len(grid) / covered
     return min(WIDE * int(np.ceil(many / WIDE)), _MOST_WIDE)
 
 
 def _points_of_radius(grid: Grid, xy: np.ndarray, radius_m: float, wide: int) -> int:
-    """How many nearest points hold `TIMES` those of the radius, at every place."""
+    """Return the number of nearest points that hold `TIMES` those of the radius, at every place."""
     while wide < len(grid):
         within = (nearest(grid, xy, wide).distance <= radius_m).sum(axis=1).max(initial=0)
         if TIMES * within <= wide:
@@ -110,7 +110,7 @@ def _points_of_radius(grid: Grid, xy: np.ndarray, radius_m: float, wide: int) ->
 
 
 def _estimates(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSettings, k: int) -> HeightEstimate:
-    """All places, and again with more points those whose triangle might be another one then."""
+    """Estimate all places, and with more points again those whose triangle might change."""
     found = _with_points(grid, xy, method, settings, k)
     refused = found.hole * HeightFlag.HOLE | ~found.surrounded * HeightFlag.EDGE
     left = np.flatnonzero(~found.final & (refused & settings.refuse == 0))
@@ -126,13 +126,13 @@ def _estimates(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSetti
 
 
 def _with_points(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSettings, k: int) -> HeightEstimate:
-    """Places from their `k` nearest points, in portions of few sizes."""
+    """Estimate places from their `k` nearest points, in portions of few sizes."""
     most = max(1, _PLACES[-1] * WIDE // k)
     noise = LidarNoise(np.array(settings.sigma_z_m), np.array(settings.sigma_xy_m))
     numbers = HeightNumbers(
         np.array(settings.points), np.array(settings.power), np.array(settings.radius_m or 0.0), noise
     )
-    # None at all are one portion as well.
+    # No places are one portion, too.
     parts, sizes = [], [*(size for size in _PLACES if size < most), most]
     for first in range(0, max(len(xy), 1), most):
         some = xy[first : first + most]
@@ -146,7 +146,7 @@ def _with_points(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSet
 
 
 def _neighbours(grid: Grid, xy: np.ndarray, k: int) -> tuple[Neighbours, Numbers, Numbers]:
-    """The nearest points of places, the height of the nearest of all, and which of them are vegetation."""
+    """Return the nearest points of places, the height of the nearest of all, and which of them are vegetation."""
     found = nearest(grid, xy, k)
     points = grid.xyz[found.index]
     there = np.isfinite(found.distance)
@@ -156,7 +156,7 @@ def _neighbours(grid: Grid, xy: np.ndarray, k: int) -> tuple[Neighbours, Numbers
 
 
 def _judged(found: HeightEstimate, broken: np.ndarray, settings: HeightSettings) -> Heights:
-    """Flags put together, and what they refuse taken out."""
+    """Combine flags, and remove refused heights."""
     rough = found.misfit & found.rough & ~broken
     of_leaves = (found.leafy > 0) & (found.leafy >= settings.leafy_share)
     flag = found.hole * HeightFlag.HOLE | ~(found.surrounded & np.isfinite(found.height)) * HeightFlag.EDGE
@@ -175,7 +175,7 @@ def _judged(found: HeightEstimate, broken: np.ndarray, settings: HeightSettings)
 
 
 def _broken(grid: Grid, xy: np.ndarray, found: HeightEstimate, k: int) -> np.ndarray:
-    """Which places lie where two surfaces meet, of those where one smooth surface does not fit."""
+    """Return True for places at the border of two surfaces, among those where one smooth surface does not fit."""
     broken = np.zeros(len(xy), bool)
     doubtful = np.flatnonzero(found.misfit)
     for first in range(0, len(doubtful), _PLACES[1]):

@@ -1,11 +1,11 @@
-"""The surface near a place, by least squares through the points around it.
+"""Local least-squares surface through the points around a place.
 
 With x, y the offsets of a point from the place (m), and its height Z over some reference,
 
     Z = h + g_x x + g_y y + (h_xx x^2 + 2 h_xy x y + h_yy y^2) / 2
 
-is a quadratic; without its last term, a plane. What is fitted is linear in the heights: `coefficients = rows @ z`, so
-that every standard deviation follows from `rows`.
+is a quadratic; without its last term, a plane. The fit is linear in the heights: `coefficients = rows @ z`, so every
+standard deviation follows from `rows`.
 """
 
 from typing import NamedTuple
@@ -15,12 +15,12 @@ from jaxtyping import Array, Bool, Float
 
 from jaxphoto.arrays import Numbers
 
-# A pivot's share of its diagonal element: points on a line to some 1e-4 of their distances.
+# Ratio of a pivot to its diagonal element: points collinear to 1e-4 of their distances.
 _SINGULAR = 1e-8
 
 
 class Neighbours(NamedTuple):
-    """The points nearest to one place, nearest first; those that are not `there` fill the array."""
+    """Points nearest to one place, nearest first; padded with points that are not `there`."""
 
     xy: Float[Numbers, "points 2"]
     """Offsets from the place (m)."""
@@ -31,39 +31,39 @@ class Neighbours(NamedTuple):
 
 
 class LocalFit(NamedTuple):
-    """A fitted surface."""
+    """Fitted surface."""
 
     coefficients: Float[Array, "6"]
     """h (m), g_x, g_y, h_xx, h_xy, h_yy (1/m)."""
     rows: Float[Array, "6 points"]
     variance: Float[Array, ""]
-    """Residual sum of squares over the freedom (m^2)."""
+    """Residual sum of squares over the degrees of freedom (m^2)."""
     freedom: Float[Array, ""]
-    """Points less coefficients."""
+    """Number of points minus number of coefficients."""
     determined: Bool[Array, ""]
-    """Whether there are more points than coefficients, and not on a line or conic."""
+    """True if there are more points than coefficients, and they do not lie on a line or conic."""
 
     @property
     def interpolates(self) -> Bool[Array, ""]:
-        """Whether the height at the place is better than that of a single point: else it was extrapolated."""
+        """Return True if the height at the place is better than a single point: otherwise it is extrapolated."""
         return self.determined & (jnp.sum(self.rows[0] ** 2) <= 1)
 
 
 def terms(xy: Float[Numbers, "points 2"]) -> Float[Array, "points 6"]:
-    """What the coefficients are multiplied by."""
+    """Return the monomials of the coefficients."""
     x, y = xy[:, 0], xy[:, 1]
     return jnp.stack([jnp.ones_like(x), x, y, x**2 / 2, x * y, y**2 / 2], axis=1)
 
 
 def fit_surface(near: Neighbours, weight: Float[Numbers, "points"], quadratic: bool) -> LocalFit:
-    """Least squares with weights; those of points that are not there are taken for zero.
+    """Fit by weighted least squares; the weights of missing points are zero.
 
     The residual variance is that of the points of positive weight, each counted once.
     """
     weight = jnp.where(near.there, weight, 0.0)
     used = weight > 0
     n_used = jnp.sum(used)
-    # About their middle and in units of the farthest, so that the normal matrix is as well conditioned as can be.
+    # Centred and in units of the farthest point, for the best condition of the normal matrix.
     middle = jnp.sum(jnp.where(used[:, None], near.xy, 0.0), axis=0) / jnp.maximum(n_used, 1)
     offset = jnp.where(used[:, None], near.xy - middle, 0.0)
     unit = jnp.sqrt(jnp.max(jnp.sum(offset**2, axis=1)))
@@ -87,7 +87,7 @@ def fit_surface(near: Neighbours, weight: Float[Numbers, "points"], quadratic: b
 
 
 def _seen_from_place(at: Float[Array, "2"], unit: Float[Array, ""]) -> Float[Array, "6 6"]:
-    """Coefficients about the place (per m) of those about the middle (per unit), from which the place is at `at`."""
+    """Transform coefficients about the centre (per unit) to those about the place (per m), which is at `at`."""
     x, y = at
     zero, one = jnp.zeros(()), jnp.ones(())
     by_x, by_y = jnp.stack([zero, one, zero, x, y, zero]), jnp.stack([zero, zero, one, zero, x, y])
@@ -98,9 +98,9 @@ def _seen_from_place(at: Float[Array, "2"], unit: Float[Array, ""]) -> Float[Arr
 def _solve(
     normal: Float[Array, "n n"], right: Float[Array, "n points"]
 ) -> tuple[Float[Array, "n points"], Bool[Array, ""]]:
-    """The solution by Cholesky's factors, and whether no pivot is next to nothing.
+    """Solve by Cholesky factorisation; False if a pivot is close to zero.
 
-    Written out: of many places at once, every step is one operation on long vectors, where LAPACK is called for each.
+    Written out: for many places each step is one operation on long vectors, while LAPACK is called once per place.
     """
     n = len(normal)
     factor: list[list[Array]] = [[] for _ in range(n)]

@@ -1,13 +1,13 @@
-"""Variances from few values, each drawn towards what all of them have in common.
+"""Moderated variances (empirical Bayes) from few values each.
 
-Of v degrees of freedom a variance s^2 is too small as often as too large, and where it is a weight the small ones count
-most. If true variances scatter as those of a scaled inverse chi squared distribution with v0 degrees of freedom about
-s0^2, the expected one given s^2 is
+With v degrees of freedom a variance s^2 is too small as often as too large, and as weights the small ones count most.
+If true variances follow a scaled inverse chi-squared distribution with v0 degrees of freedom about s0^2, the expected
+one given s^2 is
 
     (v0 s0^2 + v s^2) / (v0 + v)
 
-v0 and s0^2 follow from mean and variance of log s^2 over all; no more scatter than chance has makes v0 infinite, and
-all variances one. Source: Smyth (2004), Linear models and empirical Bayes methods for assessing differential
+v0 and s0^2 follow from mean and variance of log s^2 over all; if these scatter no more than by chance, v0 is infinite,
+and all variances are equal. Source: Smyth (2004), Linear models and empirical Bayes methods for assessing differential
 expression in microarray experiments.
 """
 
@@ -19,7 +19,7 @@ _ROUNDS = 50
 
 
 def moderated_variances(variance: Float[np.ndarray, "n"], freedom: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """The expected variances of positive `variance` with `freedom` degrees of freedom each (one or more)."""
+    """Return the expected variances of positive `variance` with `freedom` degrees of freedom each (one or more)."""
     if len(variance) < 2:
         return variance
     half = freedom / 2
@@ -33,7 +33,7 @@ def moderated_variances(variance: Float[np.ndarray, "n"], freedom: Int[np.ndarra
 
 
 def _inverse_trigamma(value: float) -> float:
-    """Newton on 1 / trigamma, which is nearly a line and convex: it comes from one side."""
+    """Newton's method on 1 / trigamma, which is nearly linear and convex: it converges from one side."""
     x = 0.5 + 1 / value
     for _ in range(_ROUNDS):
         slope = scipy.special.polygamma(1, x)

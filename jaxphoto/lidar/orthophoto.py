@@ -1,4 +1,4 @@
-"""Orthophoto of one image: every cell of a surface model looked up in the photograph, unless the surface hides it."""
+"""Orthophoto of one image: every visible cell of a surface model, resampled from the photograph."""
 
 from collections.abc import Callable
 
@@ -15,14 +15,14 @@ from jaxphoto.georeferencing.corrections import NO_CORRECTIONS, Corrections, app
 from jaxphoto.lidar.raster import Raster
 
 _CHUNK = 1 << 16
-# A line of sight that passes so little (m) above the surface sees: heights in files are rounded.
+# Clearance (m) of a line of sight above the surface: heights in files are rounded.
 _GRAZING_M = 1e-3
 
 Frames = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
 
 
 class Picture(eqx.Module):
-    """Pixels of the cells of a raster, and which cells the image sees; zero where it does not."""
+    """Pixels of the cells of a raster, and the visibility of the cells; zero if not visible."""
 
     pixels: np.ndarray
     """(bands, rows, columns), of the photograph's type."""
@@ -40,12 +40,12 @@ def orthophoto(
     map_from_object: Frames = lambda xyz: xyz,
     corrections: Corrections = NO_CORRECTIONS,
 ) -> Picture:
-    """The `photograph` (bands, height, width) of one image, resampled bilinearly to the cells of `raster`.
+    """Resample the `photograph` (bands, height, width) of one image bilinearly to the cells of `raster`.
 
-    `object_from_map` takes coordinates (m) of the raster's system to the object frame, `map_from_object` back. A cell
-    is not seen where it has no height, lies behind the camera or beyond the centres of the outermost pixels, where the
-    distortion cannot be inverted (`InteriorOrientation.valid`), and where the surface stands between it and the camera
-    (`hidden`). The collinearity equations are those of `jaxphoto.project`.
+    `object_from_map` converts coordinates (m) of the raster's system to the object frame, `map_from_object` back. A
+    cell is not visible if it has no height, lies behind the camera or beyond the centres of the outermost pixels, where
+    the distortion is not invertible (`InteriorOrientation.valid`), and where the surface hides it (`hidden`). The
+    collinearity equations are those of `jaxphoto.project`.
     """
     rows, columns = raster.heights.shape
     bands = len(photograph)
@@ -74,7 +74,7 @@ def orthophoto(
 
 
 def hidden(raster: Raster, points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "n"]:
-    """Whether the surface stands between each of `points`, centres of cells, and `camera`; X, Y, Z of the raster (m).
+    """Return True where the surface hides `points`, cell centres, from `camera`; X, Y, Z of the raster (m).
 
     The line of sight is followed from cell to cell. Wherever it crosses a line of centres, its height is compared with
     that of the surface between the two nearest; a cell without height hides nothing.
@@ -83,7 +83,7 @@ def hidden(raster: Raster, points: Float[np.ndarray, "n 3"], camera: Float[np.nd
     column = (points[:, 0] - raster.west) / raster.cell_m - 0.5
     down, across = (points[:, 1] - camera[1]) / raster.cell_m, (camera[0] - points[:, 0]) / raster.cell_m
     up, found = camera[2] - points[:, 2], np.zeros(len(points), bool)
-    # Steps go from line to line of the axis along which the way is longer.
+    # Steps go from line to line of the axis along which the distance is larger.
     by_row = np.abs(down) >= np.abs(across)
     for chosen, heights, way in (
         (by_row, raster.heights, (row, down, column, across)),
@@ -102,11 +102,11 @@ def _blocked(
     z: np.ndarray,
     up: np.ndarray,
 ) -> np.ndarray:
-    """`hidden` from a `place` in a `line` of `heights`, at `z`, of a camera `lines`, `places` and `up` away."""
+    """Apply `hidden` from a `place` in a `line` of `heights`, at `z`, of a camera `lines`, `places` and `up` away."""
     steps = np.maximum(np.abs(lines), 1e-12)
     forward, shift, rise = np.sign(lines).astype(int), places / steps, up / steps
     n, m = np.array(heights.shape) - 1
-    # No further than the camera, the edges, and where the line of sight is above everything.
+    # At most to the camera, the edges, and where the line of sight is above everything.
     with np.errstate(divide="ignore", invalid="ignore"):
         limits = [
             np.ceil(steps) - 1,
@@ -124,7 +124,7 @@ def _blocked(
         at, here = line[left] + k * forward[left], place[left] + k * shift[left]
         low = np.floor(np.maximum(here, 0)).astype(int)
         a, b = heights[at, low], heights[at, np.minimum(low + 1, m)]
-        # Next to a cell without height the other one stands alone.
+        # Next to a cell without height only the other one counts.
         a, b = np.where(np.isnan(a), b, a), np.where(np.isnan(b), a, b)
         blocked = a + (here - low) * (b - a) > z[left] + k * rise[left] + _GRAZING_M
         found[left[blocked]] = True
@@ -135,7 +135,7 @@ def _blocked(
 def _imaged(
     interior: InteriorOrientation, exterior: ExteriorOrientation, points: np.ndarray, corrections: Corrections
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Image coordinates (mm) of points, and whether they mean anything; in portions of one size, compiled once."""
+    """Return image coordinates (mm) of points, and their validity; in portions of one size, compiled once."""
     arrays = jax.tree.map(np.float64, interior)
     xy, good = np.empty((len(points), 2)), np.empty(len(points), bool)
     for begin in range(0, len(points), _CHUNK):

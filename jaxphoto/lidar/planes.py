@@ -1,14 +1,14 @@
-"""A plane through laser points that are off in X, Y and Z, blunders among them.
+"""Robust plane through laser points with errors in X, Y and Z.
 
-With S = diag(sigma_xy^2, sigma_xy^2, sigma_z^2) the points are y = S^-1/2 x with errors of 1 in every direction, and
-the most likely plane is that of least squared distances in y: through the mean, its normal m the eigenvector of the
-least eigenvalue of sum (y - mean) (y - mean)'. In metres it is
+With S = diag(sigma_xy^2, sigma_xy^2, sigma_z^2) the points are y = S^-1/2 x with unit errors in every direction, and
+the most likely plane minimises the squared distances in y: through the mean, its normal m the eigenvector of the
+smallest eigenvalue of sum (y - mean) (y - mean)'. In metres it is
 
     n . (x - centroid) = 0,    n = S^-1/2 m / |S^-1/2 m|
 
-Three points drawn again and again (RANSAC) give a start that blunders cannot spoil; then the plane through the points
-within three standard deviations of it is taken until those stay the same. Regression of Z on X and Y would see every
-slope too small: the horizontal errors widen the patch, and not its heights.
+Random samples of three points (RANSAC) give a start value that is robust to blunders; then the plane through the points
+within three standard deviations is re-fitted until these do not change. Regression of Z on X and Y would underestimate
+every slope: horizontal errors widen the patch but not its heights.
 """
 
 import equinox as eqx
@@ -17,17 +17,17 @@ from jaxtyping import Bool, Float
 
 from jaxphoto.errors import InputError
 
-# Of 200 draws none is of three good points once in 10^11 times where half are blunders, once in 230 where 70 % are.
+# All of 200 samples contain a blunder once in 10^11 cases at 50 % blunders, once in 230 at 70 %.
 _DRAWS = 200
 _SCORED = 4000
 _CUT = 3.0
-# Variance of a normal distribution that is cut off at +-3 standard deviations.
+# Variance of a normal distribution truncated at +-3 standard deviations.
 _CUT_VARIANCE = 0.9733
 _ROUNDS = 30
 
 
 class Plane(eqx.Module):
-    """A plane `normal . (x - centroid) = 0` through laser points (m)."""
+    """Plane `normal . (x - centroid) = 0` through laser points (m)."""
 
     normal: Float[np.ndarray, "3"]
     """Unit vector, upwards."""
@@ -35,18 +35,18 @@ class Plane(eqx.Module):
     covariance: Float[np.ndarray, "4 4"]
     """Of the normal and of the offset (m) at the centroid, a posteriori; singular along the normal, of length 1."""
     sigma0: float
-    """Spread of the points over that of the stated standard deviations: 1 where these and the plane are true."""
+    """Ratio of the points' spread to the stated standard deviations: 1 if these and the plane are correct."""
     inliers: Bool[np.ndarray, "n"]
-    """Which of the points given it goes through."""
+    """True for the points used."""
 
 
 def fit_plane(xyz: Float[np.ndarray, "n 3"], sigma_xy_m: float, sigma_z_m: float) -> Plane:
-    """The plane through the greater part of laser points `xyz` (m), by a robust start and total least squares.
+    """Fit a plane to the majority of laser points `xyz` (m), by a robust start and total least squares.
 
     `sigma_xy_m`, of X and of Y, and `sigma_z_m` are the standard deviations of a laser point. The points should be all
-    that a surface returned: a window cut out by measured X and Y from a larger slope makes it a little too steep. The
-    draws are the same each time. Raises InputError for fewer than four points, points on a line, or sigmas that are
-    not positive.
+    returns of a surface: a window cut by measured X and Y from a larger slope makes it slightly too steep. The samples
+    are the same each time. Raises InputError for fewer than four points, collinear points, or sigmas that are not
+    positive.
     """
     sigma = point_sigma(sigma_xy_m, sigma_z_m)
     if len(xyz) < 4:
@@ -68,7 +68,7 @@ def fit_plane(xyz: Float[np.ndarray, "n 3"], sigma_xy_m: float, sigma_z_m: float
             f"the {len(xyz)} laser points lie on a line within their standard deviations and determine no plane; take "
             "a larger patch"
         )
-    # Of the tilts towards the two long axes and of the offset: widened by what errors along those axes add to them.
+    # Variances of the tilts about both long axes and of the offset, enlarged by errors along these axes.
     variance = sigma0**2 * np.array([s / (s - noise) ** 2 for s in squares[1:]] + [1 / n])
     stretched = axes / sigma[:, None]
     length = np.linalg.norm(stretched[:, 0]) * (1 if stretched[2, 0] >= 0 else -1)
@@ -80,9 +80,9 @@ def fit_plane(xyz: Float[np.ndarray, "n 3"], sigma_xy_m: float, sigma_z_m: float
 
 
 def point_sigma(sigma_xy_m: float, sigma_z_m: float) -> Float[np.ndarray, "3"]:
-    """Standard deviations (m) of a laser point in X, Y and Z; InputError for wrong ones.
+    """Return standard deviations (m) of a laser point in X, Y and Z; raises InputError for invalid ones.
 
-    Zero there counts as a thousandth of that in Z: a plane is then regression on X and Y, to a millionth.
+    Zero in X and Y is replaced by a thousandth of that in Z: a plane is then regression on X and Y, to a millionth.
     """
     if not (sigma_z_m > 0 and sigma_xy_m >= 0):
         raise InputError(
@@ -95,7 +95,7 @@ def point_sigma(sigma_xy_m: float, sigma_z_m: float) -> Float[np.ndarray, "3"]:
 def plane_distance(
     plane: Plane, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Distance (m) of `points` (m) above the plane, along its normal, and its sigma (m) by that of the plane."""
+    """Return the distance (m) of `points` (m) above the plane, along its normal, and its sigma (m) due to the plane."""
     off = points - plane.centroid
     by = np.column_stack([off, -np.ones(len(off))])
     return off @ plane.normal, np.sqrt(np.einsum("ni,ij,nj->n", by, plane.covariance, by))
@@ -104,7 +104,7 @@ def plane_distance(
 def plane_feet(
     plane: Plane, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
-    """What says that `points` (m) lie on the plane: their feet on it (m), its normal and its sigma there (m), each.
+    """Return observations that `points` (m) lie on the plane: their feet on it (m), its normal and its sigma there (m).
 
     A row of an adjustment is then `normal . (point - foot) = 0 +- sigma`. Its sigma is that of the plane alone, and
     common to all points of one plane.
@@ -115,7 +115,7 @@ def plane_feet(
 
 
 def _start(scaled: np.ndarray) -> np.ndarray:
-    """Distances of all points from the best of the planes through three of them."""
+    """Return distances of all points from the best of the planes through three of them."""
     rng = np.random.default_rng(0)
     corners = scaled[rng.integers(0, len(scaled), (_DRAWS, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -131,7 +131,7 @@ def _start(scaled: np.ndarray) -> np.ndarray:
 
 
 def _principal(scaled: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean, square sums along the principal axes, least first, and these axes as columns."""
+    """Return the mean, sums of squares along the principal axes, smallest first, and these axes as columns."""
     mean = scaled.mean(axis=0)
     return mean, *np.linalg.eigh((scaled - mean).T @ (scaled - mean))
 

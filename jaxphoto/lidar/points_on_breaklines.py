@@ -1,10 +1,10 @@
-"""Object points on a breakline: the two smooth faces of a strip that meet in it, such as those of a roof in its ridge.
+"""Object points on breaklines: two smooth faces of a strip that intersect, such as those of a roof in its ridge.
 
-The returns in a window of two cells about a point are parted by a straight line, of whatever direction, so that two
-planes leave as little as they can; then by the line in which these planes meet, until it stays where it is. Each face
-is a plane of its own, on which the point lies: both together leave it free along the line alone. Source: Habib, Ghanma,
-Morgan and Al-Ruzouq (2005), Photogrammetric and lidar data registration using linear features, where roofs give the
-lines of the lidar likewise.
+The returns in a window of two cells about a point are divided by a straight line, of any direction, that minimises the
+residuals of two planes; then by the intersection of these planes, until it does not change. Each face is a plane on
+which the point lies: both together leave it free only along the line. Source: Habib, Ghanma, Morgan and Al-Ruzouq
+(2005), Photogrammetric and lidar data registration using linear features, where roofs give the lines of the lidar as
+well.
 """
 
 import dataclasses
@@ -15,21 +15,22 @@ from jaxtyping import Float, Int
 from jaxphoto.lidar.points_on_planes import returns_about
 from jaxphoto.lidar.strip_settings import StripSettings
 
-# Directions of the line that are tried, and turns until it stays.
+# Number of directions of the line that are tried, and of iterations.
 _DIRECTIONS = np.pi * np.arange(12) / 12
 _TURNS = 10
-# Planes that differ in slope by less (a tangent) make no breakline.
+# Planes whose slopes differ by less (a tangent) form no breakline.
 _BREAK = 0.15
-# As parts of the cell: returns so near to the line may be of either face; a line farther from the point is another one.
+# As fractions of the cell: returns this close to the line may be of either face; a line farther from the point is
+# another one.
 _NEAR, _FAR = 0.1, 0.5
-# Returns so many robust standard deviations from their face are of something else, such as a chimney.
+# Returns beyond this number of robust standard deviations from their face belong to another object, such as a chimney.
 _OTHER = 4.0
 
 
 def faces_about(
     xyz: Float[np.ndarray, "returns 3"], points: Float[np.ndarray, "points 3"], settings: StripSettings
 ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-    """Returns of the two faces about each point, and which face each is of: 2 k and 2 k + 1 are those of point k.
+    """Return the returns of the two faces about each point, and their faces: 2 k and 2 k + 1 are those of point k.
 
     A point without two such faces has none.
     """
@@ -44,7 +45,7 @@ def faces_about(
 
 
 def _sides(off: Float[np.ndarray, "n 3"], settings: StripSettings) -> Int[np.ndarray, "n"]:
-    """0 and 1 for the returns of either face about the origin; -1 of neither."""
+    """Return 0 and 1 for the returns of either face about the origin; -1 for neither."""
     none = np.full(len(off), -1)
     tried = [off[:, :2] @ np.array([np.cos(a), np.sin(a)]) > 0 for a in _DIRECTIONS]
     tried = [first for first in tried if _enough(first, settings)]
@@ -59,7 +60,7 @@ def _sides(off: Float[np.ndarray, "n 3"], settings: StripSettings) -> Int[np.nda
             return none
         beyond = (constant + off[:, :2] @ slope) / size
         parted = beyond > 0
-        # A ridge has the lower of its planes on either side, a valley the higher.
+        # A ridge is the lower of its planes on either side, a valley the higher.
         parted = parted if np.mean(parted == first) > 0.5 else ~parted
         if not _enough(parted, settings):
             return none
@@ -76,7 +77,7 @@ def _enough(first: np.ndarray, settings: StripSettings) -> bool:
 
 
 def _fitted(off: Float[np.ndarray, "n 3"], first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Height at the origin and slopes of the planes of both sides, and by how much each return lies above its own."""
+    """Return height at the origin and slopes of the planes of both sides, and the residual of each return."""
     rows, residual, planes = np.column_stack([np.ones(len(off)), off[:, :2]]), np.empty(len(off)), []
     for side in (first, ~first):
         planes.append(np.linalg.lstsq(rows[side], off[side, 2])[0])

@@ -1,7 +1,7 @@
-"""Object points on the plane of one strip's returns about each of them.
+"""Object points on planes fitted to one strip's surrounding returns.
 
-The plane of a point is that of the returns in a window of one cell about it (`corresponding_planes.planes_of`), so that
-the point lies in its middle, where a plane is known best and a curved ground least off it.
+The plane of a point is that of the returns in a window of one cell about it (`corresponding_planes.planes_of`), so the
+point is at its centre, where a plane is best determined and curvature has the least effect.
 """
 
 from typing import NamedTuple
@@ -15,30 +15,30 @@ from jaxphoto.lidar.strip_settings import StripSettings
 
 
 class PointsOnPlanes(NamedTuple):
-    """Points of which a strip has the plane, and how far they are from it."""
+    """Points with a plane of a strip, and their distances from it."""
 
     patch: Int[np.ndarray, "n"]
-    """Of the `StripPatches`."""
+    """Index of `StripPatches`."""
     point: Int[np.ndarray, "n"]
-    """Of those looked for."""
+    """Index of the given points."""
     foot: Float[np.ndarray, "n 3"]
-    """The place on the plane (m), corrected."""
+    """Point on the plane (m), corrected."""
     gap: Float[np.ndarray, "n"]
-    """By how much the point lies above the plane, along its normal (m)."""
+    """Height of the point above the plane, along its normal (m)."""
     sigma: Float[np.ndarray, "n"]
-    """Of the plane there (m), by its roughness."""
+    """Of the plane there (m), from its roughness."""
 
 
 def returns_about(
     xyz: Float[np.ndarray, "returns 3"], points: Float[np.ndarray, "points 3"], settings: StripSettings
 ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-    """Returns in the window of each point, one cell wide, and the point that each of these is about."""
+    """Return the returns in the window of each point, one cell wide, and the point of each."""
     half = settings.cell_m / 2
     cell = cells_of(xyz, settings)
     order = np.argsort(cell, kind="stable")
     ordered = cell[order]
     found: list[np.ndarray] = []
-    # A window is as wide as a cell: it reaches into the cells of its four corners, and into no other.
+    # A window is as wide as a cell: it overlaps the cells of its four corners, and no others.
     for corner in ((-half, -half, 0.0), (-half, half, 0.0), (half, -half, 0.0), (half, half, 0.0)):
         at = cells_of(points + np.array(corner), settings)
         first, last = np.searchsorted(ordered, at, "left"), np.searchsorted(ordered, at, "right")
@@ -52,16 +52,16 @@ def returns_about(
 
 
 def windows_of_returns(index: Int[np.ndarray, "n"], point: Int[np.ndarray, "n"]) -> Float[np.ndarray, "points"]:
-    """In how many windows a return about each point lies on average; of those of `returns_about`.
+    """Return the mean number of windows, from `returns_about`, that a return about each point belongs to.
 
-    The variances of planes times this say of points that are close together what all their returns say, once.
+    Variances of planes times this number count the returns of close points once.
     """
     often = np.bincount(index)[index]
     return np.bincount(point, often) / np.maximum(np.bincount(point), 1)
 
 
 def on_planes(patches: StripPatches, points: Float[np.ndarray, "points 3"]) -> PointsOnPlanes:
-    """The points whose plane a strip has; the cells of `patches` are the numbers of the points."""
+    """Match points with planes of a strip; the cells of `patches` are the indices of the points."""
     patch, place = np.arange(len(patches.cell)), points[patches.cell]
     up = up_to_plane(patches, patch, place, patches.normal)
     sigma = np.sqrt(variance_of_plane(patches, patch, place))

@@ -1,27 +1,27 @@
-"""Pseudo control points: features of an image that take their height from the laser points around them.
+"""Pseudo control points: image features with heights from surrounding laser points.
 
 For a feature at (x, y) in an image of known orientation (paper 001, equations (1)-(3); docs/pseudo_control.md):
 
-1. down the ray, cell by cell, to the first that has a laser point as high as the ray: the visible surface (`sight`);
-2. the laser points around that place, projected into the image; where they lie on two levels, as at a building, those
-   of the level that the image shows; both again at the height found, until the place stays;
-3. with d_i the distances in the image of the nearest,
+1. down the ray, cell by cell, to the first with a laser point as high as the ray: the visible surface (`sight`); 2.
+project the laser points around that place into the image; if they lie on two levels, as at a building, those of the
+level that the image shows; repeat both at the height found, until the place does not change; 3. with d_i the distances
+in the image of the nearest,
 
        Z = sum w_i Z_i,    w_i = d_i^-p / sum d_j^-p
 
 4. X and Y from the ray at that Z.
 
-Which points are the nearest is a choice and has no derivative; weights and ray have one, by every parameter of interior
-and exterior orientation.
+The choice of the nearest points has no derivative; weights and ray have, by every parameter of interior and exterior
+orientation.
 
 Standard deviation. Let t = d(X, Y)/dZ of the ray, q_i the horizontal offset of a laser point from the ray *at the
-point's own height*, and g the slope of the ground. Seen along the ray, the surface is
+height of the point*, and g the slope of the ground. Seen along the ray, the surface is
 
     Z = Z_0 + h . q,    h = g / (1 - g . t)
 
-and a laser point is off it by (1 + h . t) e_Z - h . e_XY: over q it is a surface of slope h, measured with errors
-(1 + h . t) sigma_Z and sigma_XY. What weights make of those, and of a slope that they do not reproduce, is
-`height_error`. It is the height of the surface where the ray meets it: how the ray itself is off is not in it.
+and the error of a laser point is (1 + h . t) e_Z - h . e_XY: over q it is a surface of slope h, measured with errors (1
++ h . t) sigma_Z and sigma_XY. `height_error` propagates these with the weights, and a slope that the weights do not
+reproduce. The result is the height of the surface where the ray meets it, without errors of the ray itself.
 """
 
 from typing import Literal, NamedTuple, get_args
@@ -49,33 +49,33 @@ from jaxphoto.lidar.sight import Skyline, empty_about, first_met, levels, skylin
 
 Interpolation = Literal["weighted", "plane"]
 
-# Candidates a point: enough for a slope, and for neighbours left where half of them are hidden.
+# Candidates per point: enough for a slope, and for neighbours if half of them are hidden.
 _CANDIDATES = 3
-# The first place is half a cell off, and each round leaves slope times run of what is left.
+# The first place has an error of half a cell, and each iteration leaves slope times run of it.
 _ROUNDS = 5
-# Residuals beyond the lidar's noise: met once in 1000 places by chance, and so large that they are no surface's.
+# Residuals beyond the lidar's noise: once in 1000 places by chance, and so large that there is no surface.
 _HARDLY, _ROUGH = 3.09, 3.0
-# Features computed together: what fits into a processor's cache; and where there are few.
+# Features processed at a time: what fits into a processor's cache; and for few features.
 _AT_ONCE, _FEW = 512, 64
 
 
 class PseudoControl(eqx.Module):
-    """Where the rays of features meet a cloud, one a feature; NaN where that is refused or cannot be told."""
+    """Intersections of the rays of features with a cloud, one per feature; NaN where refused or undetermined."""
 
     xyz: Float[Numbers, "*n 3"]
-    """X, Y, Z (m); X and Y are only as good as the orientation (docs/pseudo_control.md)."""
+    """X, Y, Z (m); X and Y are only as accurate as the orientation (docs/pseudo_control.md)."""
     sigma_z: Float[Numbers, "*n"]
     """Standard deviation of Z (m): 95 % of the errors are within 1.96 of it."""
     flag: Integer[Numbers, "*n"]
-    """Sums of `HeightFlag`: HOLE where a ray does not meet the cloud, too."""
+    """Sums of `HeightFlag`: HOLE also where a ray does not meet the cloud."""
     gradient: Float[Numbers, "*n 2"]
-    """Rise of the surface by X and Y."""
+    """Gradient of the surface by X and Y."""
     roughness: Float[Numbers, "*n"]
     """Standard deviation (m) of the laser points about the plane through them."""
 
 
 class _Numbers(NamedTuple):
-    """The numbers among the settings."""
+    """Numerical settings."""
 
     power: Float[Array, ""]
     sigma_z: Float[Array, ""]
@@ -86,7 +86,7 @@ class _Numbers(NamedTuple):
 
 
 class _Ray(NamedTuple):
-    """The ray of a feature: X, Y = place + run (Z - origin's)."""
+    """Ray of a feature: X, Y = place + run (Z - origin's)."""
 
     origin: Float[Array, "3"]
     direction: Float[Array, "3"]
@@ -97,7 +97,7 @@ class _Ray(NamedTuple):
         return self.direction[:2] / jnp.where(self.direction[2] < 0, self.direction[2], -1.0)
 
     def at(self, z: Float[Array, "*n"]) -> Float[Array, "*n 2"]:
-        """X and Y (m) at heights."""
+        """Return X and Y (m) at heights."""
         return self.origin[:2] + self.run * (z - self.origin[2])[..., None]
 
 
@@ -119,15 +119,15 @@ def pseudo_control_points(
     interpolation: Interpolation = "weighted",
     corrections: Corrections = NO_CORRECTIONS,
 ) -> PseudoControl:
-    """The pseudo control points of features measured at `xy` (mm) with one camera, in a cloud.
+    """Return the pseudo control points of features measured at `xy` (mm) with one camera, in a cloud.
 
     A `Grid` saves indexing the cloud again. `exterior` is that of one image, or has a leading axis over the features.
-    `settings.points` are the nearest that are weighted by the paper's d^-`settings.power`; by `interpolation` "plane"
-    three times as many carry a plane in the image, which is better by half where the ground is a plane so far around.
-    One compiled program serves all features.
+    `settings.points` are the nearest, weighted by the paper's d^-`settings.power`; with `interpolation` "plane", three
+    times as many determine a plane in the image, which is better by half where the ground is planar. One compiled
+    program serves all features.
 
-    `xyz` has derivatives by `interior`, `exterior` and `xy`, exact but where another point becomes one of the nearest;
-    what describes it (`sigma_z` and the rest) has none. Raises InputError for an unknown interpolation, a radius in
+    `xyz` has derivatives by `interior`, `exterior` and `xy`, exact except where the set of nearest points changes; its
+    properties (`sigma_z` and the rest) have none. Raises InputError for an unknown interpolation, a radius in
     `settings`, and no feature. Source: paper 001, section 3.1.
     """
     settings = HeightSettings() if settings is None else settings
@@ -202,7 +202,7 @@ def _choose(
     reach: int,
     corrections: Corrections,
 ) -> tuple[_Candidates, Bool[Array, ""]]:
-    """The candidates of a feature, and whether its ray meets the cloud."""
+    """Return the candidates of a feature, and True if its ray meets the cloud."""
     ideal = interior.ideal_from_measured(xy)
     ray = _Ray(*image_ray(interior, exterior, xy))
     place, met = first_met(ray.origin, ray.direction, sky, grid)
@@ -227,7 +227,7 @@ def _choose(
         new, z = candidates(place)
         near = new.seen & (jnp.cumsum(new.seen) <= points)
         mean = jnp.sum(jnp.where(near, z, 0)) / jnp.maximum(near.sum(), 1)
-        # A step that the ray passes on its way may be what the image shows.
+        # The image may show a step that the ray passes on its way.
         new = _Candidates(new.index, new.seen, new.broken | found.broken)
         return jnp.where(near.any(), ray.at(mean), place), new
 
@@ -248,7 +248,7 @@ def _interpolated(
     interpolation: Interpolation,
     corrections: Corrections,
 ) -> PseudoControl:
-    """The pseudo control point of a feature from its candidates."""
+    """Interpolate the pseudo control point of a feature from its candidates."""
     xyz = jnp.asarray(grid.xyz)[chosen.index]
     ray = _Ray(*image_ray(interior, exterior, xy))
     base = jnp.sum(jnp.where(chosen.seen, xyz[:, 2], 0)) / jnp.maximum(chosen.seen.sum(), 1)
@@ -286,7 +286,7 @@ def _described(
     numbers: _Numbers,
     points: int,
 ) -> tuple[Float[Array, ""], Int[Array, ""], Float[Array, "2"], Float[Array, ""]]:
-    """Standard deviation, flags, gradient and roughness."""
+    """Return standard deviation, flags, gradient and roughness."""
     slope = fit.coefficients[1:3]
     noise = LidarNoise(jnp.abs(1 + slope @ ray.run) * numbers.sigma_z, numbers.sigma_xy)
     expected = noise_variance(fit, noise)
@@ -300,7 +300,7 @@ def _described(
 
 
 def _room(n: int) -> int:
-    """At least `n`: 64, or whole portions of `_AT_ONCE`, of four sizes between a power of two and the next."""
+    """Round up `n`: 64, or whole portions of `_AT_ONCE`, of four sizes between a power of two and the next."""
     if n <= _FEW:
         return _FEW
     step = max(_AT_ONCE, 1 << n.bit_length() - 3)

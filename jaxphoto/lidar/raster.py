@@ -1,6 +1,6 @@
-"""Surface models: cells of a map with a height each, from laser points; their small holes and their shading.
+"""Surface models: heights in map cells from laser points; filling of small holes, hillshade.
 
-Cells are counted from the north-west corner: row 0 lies in the north, column 0 in the west.
+Cells are counted from the north-west corner: row 0 is in the north, column 0 in the west.
 """
 
 import dataclasses
@@ -15,12 +15,12 @@ from jaxtyping import Float
 from jaxphoto.errors import InputError
 
 Statistic = Literal["highest", "mean", "lowest"]
-"""Which height of its points a cell gets."""
+"""Height of a cell from its points."""
 _MOST_CELLS = 500_000_000
 
 
 class Raster(eqx.Module):
-    """Heights (m) of square cells, NaN where there is none; `west` and `north` (m) are outer edges of cell (0, 0)."""
+    """Heights (m) of square cells, NaN if missing; `west` and `north` (m) are outer edges of cell (0, 0)."""
 
     heights: Float[np.ndarray, "rows columns"]
     west: float
@@ -29,13 +29,13 @@ class Raster(eqx.Module):
 
     @property
     def extent(self) -> Float[np.ndarray, "2 2"]:
-        """Least and greatest X, Y (m) of the outer edges."""
+        """Minimum and maximum X, Y (m) of the outer edges."""
         rows, columns = self.heights.shape
         east, south = self.west + columns * self.cell_m, self.north - rows * self.cell_m
         return np.array([[self.west, south], [east, self.north]])
 
     def centres(self, rows: slice = slice(None)) -> Float[np.ndarray, "n 3"]:
-        """X, Y (m) of the cells' centres and their heights, row by row; `rows` chooses some."""
+        """Return X, Y (m) of the cell centres and their heights, row by row; `rows` selects some."""
         heights = self.heights[rows]
         x = self.west + (np.arange(heights.shape[1]) + 0.5) * self.cell_m
         y = self.north - (np.arange(len(self.heights))[rows] + 0.5) * self.cell_m
@@ -48,13 +48,13 @@ def surface_model(
     cell_m: float,
     statistic: Statistic = "highest",
 ) -> Raster:
-    """The highest, mean or lowest height of the points in every cell; NaN in cells without points.
+    """Return the highest, mean or lowest height of the points in every cell; NaN in cells without points.
 
-    `parts` are X, Y, Z (m) in portions of any size, so that a cloud need not lie in memory. `extent` is the least and
-    greatest X and Y that count: points outside it are left out, and so are empty rows and columns at its edges. Edges
-    of cells lie at whole multiples of `cell_m`; a point on an edge belongs to the cell in the east or north of it.
+    `parts` are X, Y, Z (m) in portions of any size, so that a cloud need not fit in memory. `extent` is the minimum and
+    maximum X and Y: points outside are ignored, and empty rows and columns at its edges are removed. Edges of cells lie
+    at integer multiples of `cell_m`; a point on an edge belongs to the cell east or north of it.
 
-    Raises InputError for a cell that is not positive, or that makes too many, and where there is no point at all.
+    Raises InputError for a cell size that is not positive, or gives too many cells, and without points.
     """
     if statistic not in get_args(Statistic):
         raise InputError(f"the statistic {statistic!r} is unknown; choose one of {', '.join(get_args(Statistic))}")
@@ -84,7 +84,7 @@ def surface_model(
 
 
 def _span(there) -> tuple[int, int]:
-    """From the first to after the last place where there is something."""
+    """Return the range from the first to after the last nonempty place."""
     places = np.flatnonzero(there)
     if not len(places):
         raise InputError("no point lies in the extent of the surface model; take the extent of the cloud")
@@ -92,11 +92,11 @@ def _span(there) -> tuple[int, int]:
 
 
 def filled(raster: Raster, distance_m: float) -> Raster:
-    """Small holes closed by the mean of heights around, weighted by the inverse square of the distance.
+    """Fill small holes by the mean of surrounding heights, weighted by the inverse square of the distance.
 
-    A hole is a group of cells without height that meet along edges. It is closed as a whole, from cells no farther than
-    `distance_m` from each, or not at all: where one of its cells is farther than that from any height, and where it
-    reaches the edge of the raster, which is the outside of the cloud.
+    A hole is a group of cells without height connected by edges. It is filled completely, from cells at most
+    `distance_m` away from each, or not at all: if one of its cells is farther from any height, and if it reaches the
+    edge of the raster, which is outside the cloud.
     """
     empty = np.isnan(raster.heights)
     holes, n = scipy.ndimage.label(empty)
@@ -130,11 +130,12 @@ def filled(raster: Raster, distance_m: float) -> Raster:
 def hillshade(
     raster: Raster, azimuth_deg: float = 315.0, altitude_deg: float = 45.0
 ) -> Float[np.ndarray, "rows columns"]:
-    """How bright the surface is under a sun in `azimuth_deg` (from north, clockwise) at `altitude_deg`: 0 to 1.
+    """Return the illumination of the surface by a sun in `azimuth_deg` (from north, clockwise) at `altitude_deg`: 0 to
+    1.
 
         n . s,   n = (-dZ/dX, -dZ/dY, 1) normalised, s towards the sun
 
-    Central differences; NaN where a height that they want is missing.
+    Central differences; NaN where a required height is missing.
     """
     south, east = (
         np.gradient(raster.heights, raster.cell_m, axis=axis) if raster.heights.shape[axis] > 1 else 0.0

@@ -1,10 +1,9 @@
-"""Planar patches of a cloud, the faces of roofs above all: found by growing, with their planes, outlines and centroids.
+"""Planar patches of a cloud, mainly roof faces, by region growing; planes, outlines and centroids.
 
-From a point whose neighbours lie on a plane, a patch grows: the plane through its points; all points within three
-standard deviations of it that hang together with them by neighbours; the plane through these, until they stay the same.
-Of the patches that some points grow to the largest is kept, and then the next of what is left. Along a ridge the patch
-that comes first has taken points of the other. In the end each point so goes to the nearest of the planes that its
-neighbours belong to.
+From a point whose neighbours are coplanar a patch grows: the plane through its points; all connected points within
+three standard deviations of it; the plane through these, until they do not change. The largest patch from several seeds
+is kept, and then the next of the remaining points. Along a ridge the first patch takes points of the other; therefore
+each point is finally assigned to the nearest of the planes of its neighbours.
 """
 
 import equinox as eqx
@@ -15,41 +14,42 @@ from jaxtyping import Float, Int
 from jaxphoto.errors import InputError
 from jaxphoto.lidar.planes import Plane, fit_plane, plane_distance, point_sigma
 
-# Neighbours that make a seed, and by which points hang together.
+# Number of neighbours of a seed, and for connectivity.
 _SEED, _GRAPH = 12, 8
-# Points hang together over so many times the usual distance of the farthest neighbour.
+# Points are connected up to this multiple of the usual distance of the farthest neighbour.
 _GAP = 2.0
-# Residual variance of a seed, over that of the lidar: once in a thousand by chance.
+# Residual variance of a seed relative to that of the lidar: once in a thousand by chance.
 _PLANAR = 2.7
 _CUT = 3.0
 _ROUNDS, _SHARED = 12, 3
-# Seeds of which the largest patch is taken: one on a ridge grows over a part of either face.
+# Number of seeds of which the largest patch is used: one on a ridge grows over parts of both faces.
 _TRIED = 6
-# Spread across a face, in horizontal standard deviations, that is more than noise: it is then some six of them wide.
+# Spread across a face, in horizontal standard deviations, that is more than noise: a width of about six of them.
 _WIDTH = 2.0
-# sigma naught of a face at most; that of points evenly spread between -3 and 3 standard deviations is 1.73.
+# Largest sigma0 of a face; points uniformly between -3 and 3 standard deviations have 1.73.
 _SPREAD = 1.35
 
 
 class Patch(eqx.Module):
-    """Laser points on one plane that hang together."""
+    """Connected coplanar laser points."""
 
     index: Int[np.ndarray, "n"]
-    """Of its points, in the order of those given."""
+    """Indices of its points, in the given order."""
     plane: Plane
     """Through its points; `plane.inliers` are all of them."""
     outline: Float[np.ndarray, "corners 3"]
-    """Convex hull in X and Y, counterclockwise, on the plane (m): a little too large by the horizontal noise."""
+    """Convex hull in X and Y, counterclockwise, on the plane (m): slightly enlarged by horizontal noise."""
 
 
 def planar_patches(
     xyz: Float[np.ndarray, "n 3"], sigma_xy_m: float, sigma_z_m: float, least_points: int = 20
 ) -> list[Patch]:
-    """The planar patches of at least `least_points` laser points `xyz` (m), that of most points first.
+    """Find the planar patches of at least `least_points` laser points `xyz` (m), largest first.
 
-    Standard deviations are those of a laser point, and tell what is planar: they should be true. Give it the points of
+    Standard deviations are those of a laser point and define planarity: they should be correct. Pass the points of
     buildings (LAS class 6), or a window of all: level ground is a plane as well. A face narrower than six `sigma_xy_m`
-    is not told from noise. Raises InputError for fewer points than a patch needs and, as `fit_plane`, for wrong sigmas.
+    cannot be distinguished from noise. Raises InputError for fewer points than a patch needs and, like `fit_plane`, for
+    invalid sigmas.
     """
     if len(xyz) < max(least_points, _SEED):
         raise InputError(
@@ -65,7 +65,7 @@ def planar_patches(
     )
     graph = (graph + graph.T).tocsr()
     even = _unevenness(xyz[near], sigma) < _PLANAR
-    # House by house: what does not hang together has no face in common.
+    # House by house: unconnected points have no face in common.
     _, house = scipy.sparse.csgraph.connected_components(graph, directed=False)
     by_house = np.split(np.argsort(house, kind="stable"), np.cumsum(np.bincount(house))[:-1])
     place = np.full(len(xyz), -1)
@@ -80,11 +80,12 @@ def planar_patches(
 
 
 def roof_centroid(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Centroid (m) of a roof face, or of a roof, from all its laser points, and its covariance (m^2): scatter over n.
+    """Return the centroid (m) of a roof face, or of a roof, from its laser points, and its covariance (m^2): scatter
+    over n.
 
-    It is that of the area in plan, if points lie alike all over it: they then are draws from it, and their mean is off
-    by what few draws are off. Where strips overlap over a part of the roof, the mean is drawn there, and no covariance
-    tells: take the points of one strip. Points hidden from the lidar, behind a chimney, draw it away.
+    It is that of the area in plan for uniformly distributed points, a sample of the area. If strips overlap over a part
+    of the roof, the mean is shifted there, and the covariance does not show it: use the points of one strip. Points
+    hidden from the lidar, behind a chimney, shift it, too.
     """
     if len(points) < 4:
         raise InputError(f"the centroid of a roof needs 4 laser points, got {len(points)}")
@@ -92,7 +93,7 @@ def roof_centroid(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "
 
 
 def ridge_line(first: Plane, second: Plane) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """The line in which two roof faces meet: the point (m) of it between them, and its unit direction.
+    """Return the intersection of two roof faces: a point (m) of it between them, and its unit direction.
 
     Raises InputError for planes that are parallel within three standard deviations.
     """
@@ -115,7 +116,7 @@ def _plane(xyz: np.ndarray, sigma: np.ndarray) -> Plane:
 def _of_house(
     xyz: np.ndarray, near: np.ndarray, even: np.ndarray, graph: "scipy.sparse.csr_matrix", sigma: np.ndarray, least: int
 ) -> list[Patch]:
-    """The patches of points that hang together; `near` are the neighbours of each, -1 where they are not among them."""
+    """Return the patches of connected points; `near` are the neighbours of each, -1 if not among them."""
     members: list[np.ndarray] = []
     free, scaled = np.ones(len(xyz), bool), xyz / sigma
     seeds = np.random.default_rng(0).permutation(np.flatnonzero(even))
@@ -138,10 +139,10 @@ def _of_house(
 def _faces(
     xyz: np.ndarray, members: list[np.ndarray], least: int, sigma: np.ndarray
 ) -> tuple[list[np.ndarray], list[Plane]]:
-    """Those of `members` that are faces, with their planes.
+    """Return those of `members` that are faces, with their planes.
 
-    A face has enough points, is more than what noise leaves in a strip along a ridge or the eaves, and its points lie
-    about its plane as the lidar's noise lets them, and do not fill the band that they were taken from.
+    A face has enough points, exceeds what noise leaves in a strip along a ridge or the eaves, and its points scatter
+    about its plane as the lidar's noise does, without filling the band from which they were taken.
     """
     faces, planes = [], []
     for found in members:
@@ -163,7 +164,7 @@ def _patch(members: np.ndarray, plane: Plane, xyz: np.ndarray) -> Patch:
 
 
 def _unevenness(around: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Variance of each point's neighbours about their plane, over that of the lidar."""
+    """Return the variance of each point's neighbours about their plane, relative to that of the lidar."""
     scaled = (around - around.mean(axis=1, keepdims=True)) / sigma
     return np.linalg.eigvalsh(np.swapaxes(scaled, 1, 2) @ scaled)[:, 0] / (around.shape[1] - 3)
 
@@ -171,7 +172,7 @@ def _unevenness(around: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 def _grown(
     scaled: np.ndarray, seed: np.ndarray, free: np.ndarray, graph: "scipy.sparse.csr_matrix"
 ) -> Int[np.ndarray, "n"]:
-    """The free points that a patch grows to from `seed`; `scaled` are all, in standard deviations of X, Y and Z."""
+    """Return the free points of a patch grown from `seed`; `scaled` are all, in standard deviations of X, Y and Z."""
     patch = seed
     for _ in range(_ROUNDS):
         if len(patch) < 4:
@@ -191,7 +192,7 @@ def _grown(
 def _shared(
     xyz: np.ndarray, members: list[np.ndarray], planes: list[Plane], graph: "scipy.sparse.csr_matrix", sigma: np.ndarray
 ) -> list[np.ndarray]:
-    """Each point to the nearest of the planes of its neighbours and its own."""
+    """Assign each point to the nearest of the planes of its neighbours and its own."""
     distance = np.abs(np.stack([_scaled_distance(xyz, plane, sigma) for plane in planes]))
     for k, found in enumerate(members):
         member = np.zeros(len(xyz))
@@ -203,5 +204,5 @@ def _shared(
 
 
 def _scaled_distance(xyz: np.ndarray, plane: Plane, sigma: np.ndarray) -> np.ndarray:
-    """Distances from a plane in standard deviations of a laser point along its normal."""
+    """Return distances from a plane in standard deviations of a laser point along its normal."""
     return (xyz - plane.centroid) @ plane.normal / np.linalg.norm(sigma * plane.normal)

@@ -1,7 +1,7 @@
-"""What the ray of an image meets in a cloud: the visible surface, and the laser points that show it.
+"""Intersection of image rays with a cloud: the visible surface, and its laser points.
 
 Functions of one ray, to be mapped over many. `q` is the offset (m) of a laser point from the ray in X and Y, at the
-point's own height: where q = 0 the image shows the point in the place of the feature.
+height of the point: at q = 0 the image shows the point at the place of the feature.
 """
 
 from typing import NamedTuple
@@ -15,36 +15,36 @@ from jaxtyping import Array, Bool, Float
 from jaxphoto.arrays import Numbers
 from jaxphoto.lidar.grid import Grid
 
-# A gap between heights that makes two levels: in standard deviations of one point, and of the points of either level.
+# Gap between heights that separates two levels: in standard deviations of one point, and of the points of either level.
 _GAP_NOISE = 6.0
 _GAP_SPREAD = 3.0
-# Of a half disc the centre of gravity is 0.42 radii from the middle.
+# The centroid of a half disc is 0.42 radii from the centre.
 _BALANCED = 0.35
 _EMPTY = 1e-4
-# Cells around a place, where a cloud is that uneven.
+# Window of cells around a place for a cloud of uneven density.
 _FARTHEST = 4
 
 
 class Skyline(NamedTuple):
-    """The highest point of every cell of a grid (m), and the heights between which its points lie."""
+    """Highest point of every grid cell (m), and the range of heights."""
 
     tops: Float[np.ndarray, "cells"]
-    """In the order of `Grid.start`, pits narrower than three cells filled; -inf where there is no point."""
+    """In the order of `Grid.start`, with pits narrower than three cells filled; -inf without points."""
     low: Float[np.ndarray, ""]
     high: Float[np.ndarray, ""]
 
 
 class Levels(NamedTuple):
-    """Laser points around a ray where the ground, or a roof, is on one level or on two."""
+    """Laser points around a ray, where ground or roof has one level or two."""
 
     seen: Bool[Array, "m"]
-    """Those of the level that the image shows in the place of the feature."""
+    """True for points of the level that the image shows at the place of the feature."""
     broken: Bool[Array, ""]
-    """Whether the feature is so near to where the level changes that it may be on either."""
+    """True if the feature is so close to a step that it may be on either level."""
 
 
 def skyline(grid: Grid) -> Skyline:
-    """The highest points of the cells of `grid`."""
+    """Return the highest points of the cells of `grid`."""
     rows, columns = (int(v) for v in grid.shape)
     start, z = np.asarray(grid.start[: rows * columns + 1]), np.asarray(grid.xyz[: len(grid), 2])
     some = np.flatnonzero(np.diff(start))
@@ -56,7 +56,7 @@ def skyline(grid: Grid) -> Skyline:
 
 
 def window_reach(grid: Grid, wanted: int) -> int:
-    """How many cells around a place (`around`) hold `wanted` points, at nine in ten of the cells that are not empty."""
+    """Return how many cells around a place (`around`) hold `wanted` points, for nine of ten nonempty cells."""
     rows, columns = (int(v) for v in grid.shape)
     count = np.diff(np.asarray(grid.start[: rows * columns + 1])).reshape(rows, columns)
     for reach in range(1, _FARTHEST):
@@ -70,9 +70,10 @@ def window_reach(grid: Grid, wanted: int) -> int:
 def first_met(
     origin: Float[Array, "3"], direction: Float[Array, "3"], sky: Skyline, grid: Grid
 ) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
-    """X and Y (m) of the first place, from the camera downwards, where a cell is as high as the ray; and if any is.
+    """Return X and Y (m) of the first place, from the camera downwards, where a cell is as high as the ray; True if
+    any.
 
-    By steps of half a cell in plan, so it is off by a quarter. A ray that does not go down meets nothing.
+    In steps of half a cell in plan, so the mean error is a quarter. A ray that does not descend meets nothing.
     """
     down = direction[2] < 0
     run = direction[:2] / jnp.where(down, direction[2], -1.0)
@@ -87,7 +88,7 @@ def first_met(
 
     high = jnp.minimum(sky.high, origin[2])
     z = jax.lax.while_loop(lambda z: (z > sky.low) & (top(z) < z), lambda z: z - step, jnp.where(down, high, sky.low))
-    # Passed by half a step, on average.
+    # Overshoot of half a step, on average.
     return origin[:2] + run * (jnp.minimum(z + step / 2, high) - origin[2]), down & (top(z) >= z)
 
 
@@ -99,13 +100,13 @@ def levels(
     neighbours: int,
     sigma_z: Float[Array, ""],
 ) -> Levels:
-    """Which of the laser points nearest to a ray, at heights `z` (m), show what the image shows; nearest first.
+    """Select the laser points nearest to a ray, at heights `z` (m), that the image shows; nearest first.
 
-    The heights are cut at the largest gap between two of them, if it is larger than noise and slope can make it. The
-    upper level hides the lower wherever it lies about the feature. Where neither does, or where the ray is too steep
-    (`run` is d(X, Y)/dZ) for the lower level to appear *behind* the upper, the feature is at the step between them.
+    The heights are separated at the largest gap between two of them, if noise and slope cannot explain it. The upper
+    level hides the lower wherever it surrounds the feature. If neither does, or if the ray is too steep (`run` is d(X,
+    Y)/dZ) for the lower level to appear *behind* the upper, the feature is at the step between them.
     """
-    # From each point to the next higher one; all with all is sooner compiled than a sort, and they are few.
+    # From each point to the next higher one; comparing all pairs compiles faster than a sort, and they are few.
     higher = jnp.min(jnp.where(there & (z > z[:, None]), z, jnp.inf), axis=1)
     gaps = jnp.where(there & jnp.isfinite(higher), higher - z, 0)
     widest = jnp.argmax(gaps)
@@ -124,9 +125,9 @@ def levels(
 
 
 def surrounded(q: Float[Numbers, "m 2"], which: Bool[Numbers, "m"]) -> Bool[Array, ""]:
-    """Whether the points `which` lie on all sides of q = 0: whether each has another less than half a turn on.
+    """Return True if the points `which` surround q = 0: each has another less than half a turn on.
 
-    A point at q = 0 itself lies on no side.
+    A point at q = 0 is on no side.
     """
     x, y = q[:, 0], q[:, 1]
     which = which & ((x != 0) | (y != 0))
@@ -135,16 +136,17 @@ def surrounded(q: Float[Numbers, "m 2"], which: Bool[Numbers, "m"]) -> Bool[Arra
 
 
 def empty_about(distance: Float[Numbers, "m"], which: Bool[Numbers, "m"]) -> Bool[Array, ""]:
-    """Whether no point is near enough: so large an empty circle is met once in ten thousand places of one density.
+    """Return True if no point is close enough: at uniform density such an empty circle occurs once in ten thousand
+    places.
 
-    The nearest of n points in a circle, as a share of its area, is beyond x with probability (1 - x)^(n-1).
+    The nearest of n points in a circle, as a fraction of its area, is beyond x with probability (1 - x)^(n-1).
     """
     near, far = jnp.min(jnp.where(which, distance, jnp.inf)), jnp.max(jnp.where(which, distance, 0))
     return (near / jnp.where(far > 0, far, 1)) ** 2 > 1 - _EMPTY ** (1 / jnp.maximum(which.sum() - 1, 1))
 
 
 class _Place(NamedTuple):
-    """How the points of one level lie about the feature."""
+    """Position of the points of one level relative to the feature."""
 
     balanced: Bool[Array, ""]
     nearest: Float[Array, ""]

@@ -1,4 +1,4 @@
-"""A cloud and its trajectory, corrected by what a strip adjustment has found of the scanner and of the trajectory."""
+"""Correction of a cloud and its trajectory by the result of a strip adjustment."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ def corrected_strip(
     errors: StripErrors,
     path: ScannerPath | None,
 ) -> Float[np.ndarray, "n 3"]:
-    """`georeferencing.corrected_return` of returns of one strip; without a path its constant shift alone.
+    """Apply `georeferencing.corrected_return` to returns of one strip; without a path, its constant shift alone.
 
     Raises BlockError for times (s) that the trajectory does not cover.
     """
@@ -37,7 +37,7 @@ def corrected_strip(
 
 
 def correct_strips(cloud: Cloud, errors: StripErrors, path: ScannerPath | None) -> Cloud:
-    """The cloud that the scanner would have measured without these errors; all its other fields are kept."""
+    """Correct a cloud for these errors; all its other fields are kept."""
     xyz = np.array(cloud.xyz)
     for k in range(len(errors.splines)):
         own = np.flatnonzero(cloud.strip == k) if cloud.strip is not None else np.arange(len(cloud))
@@ -47,7 +47,7 @@ def correct_strips(cloud: Cloud, errors: StripErrors, path: ScannerPath | None) 
 
 
 def correct_flight(trajectory: Trajectory, errors: StripErrors) -> Trajectory:
-    """The trajectory without its errors; between two strips, by those of the end that is nearer in time."""
+    """Correct a trajectory; between two strips, by the errors of the strip end closer in time."""
     time = np.asarray(trajectory.time)
     ends = np.array([(s.start, s.start + s.interval * max(s.size - 3, 0)) for s in errors.splines])
     away = np.maximum(ends[:, :1] - time, time - ends[:, 1:])
@@ -63,7 +63,7 @@ def correct_flight(trajectory: Trajectory, errors: StripErrors) -> Trajectory:
 
 
 def times_of(cloud: Cloud) -> Float[np.ndarray, "n"]:
-    """Of the points (s); zero where the cloud has none, of which a constant shift needs none."""
+    """Return the times of the points (s); zero if the cloud has none, as a constant shift needs none."""
     return np.zeros(len(cloud)) if cloud.time is None else cloud.time
 
 

@@ -1,8 +1,8 @@
-"""Where strips differ, and by how much: a map of the gaps between their planes, cell by cell.
+"""Map of the height differences between strips, by cell.
 
-In a cell that several strips have a plane in, the gap is by how much the plane of the later strip lies above that of
-the earlier one, in height at the place that both share; of more than two strips that of the two that differ most. Rough
-ground and cells that a strip fills in part only have no plane and no gap, so that slopes and trees make none.
+In a cell with planes of several strips, the gap is the height of the plane of the later strip above that of the earlier
+one at their common place; of more than two strips that of the two that differ most. Rough ground and partly covered
+cells have no plane and no gap, so slopes and trees cause none.
 """
 
 from collections.abc import Iterable
@@ -18,9 +18,9 @@ from jaxphoto.lidar.strip_settings import StripSettings
 
 
 def strip_differences(strips: Cloud | Iterable[CellReturns], settings: StripSettings) -> Raster | None:
-    """The gaps (m) of strips in their cells of `settings.cell_m`, NaN where none is; None without any.
+    """Return the gaps (m) of strips in cells of `settings.cell_m`, NaN if there is none; None without any.
 
-    Of a cloud that is larger than memory its cells alone will do.
+    For a cloud larger than memory its accumulated cells suffice.
     """
     cells = _cells(strips, settings) if isinstance(strips, Cloud) else strips
     patches = [planes_from(own, settings) for own in cells]

@@ -1,4 +1,4 @@
-"""How strips are compared, and what their trajectory may be off by."""
+"""Settings of the comparison of strips, and prior standard deviations of trajectory errors."""
 
 import dataclasses
 
@@ -14,13 +14,13 @@ _POSITIVE = (
 
 @dataclasses.dataclass(frozen=True)
 class StripSettings:
-    """Planes are sought in cells of `cell_m` with `returns` or more, of a roughness of `roughness_m` at most.
+    """Planes are fitted in cells of `cell_m` with at least `returns` returns, and a roughness of at most `roughness_m`.
 
-    Of two strips their normals agree to `normals_deg`; at most `most` planes of all pairs of strips together are
-    observed. A gap of more than `outlier` standard deviations is none of one plane. The trajectory's knots are
-    `knots_s` apart; its errors have `sigma_position_m`, `sigma_attitude_deg` (about right and forward) and
-    `sigma_heading_deg`, and `correlation_s` as correlation time (`observations.knot_steps`). What it gives an exposure
-    of a photograph is off by that and, independently, by `sigma_exposure_m` and `sigma_exposure_deg`.
+    Normals of two strips agree to `normals_deg`; at most `most` planes of all pairs of strips together are observed. A
+    gap of more than `outlier` standard deviations is rejected. The trajectory's knots are `knots_s` apart; its errors
+    have `sigma_position_m`, `sigma_attitude_deg` (about right and forward) and `sigma_heading_deg`, and the correlation
+    time `correlation_s` (`observations.knot_steps`). Poses of exposures have these errors and, independently,
+    `sigma_exposure_m` and `sigma_exposure_deg`.
     """
 
     cell_m: float = 3.0

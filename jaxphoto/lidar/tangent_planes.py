@@ -1,4 +1,4 @@
-"""The plane that touches a cloud's surface at a place: what a point there is observed to lie on."""
+"""Tangent planes of a cloud's surface, on which points are observed to lie."""
 
 import equinox as eqx
 import numpy as np
@@ -10,10 +10,10 @@ from jaxphoto.lidar.heights import Method, heights_at
 
 
 class TangentPlanes(eqx.Module):
-    """Planes at places; NaN where the cloud does not tell the surface (see `heights_at`)."""
+    """Planes at places; NaN where the cloud does not determine the surface (see `heights_at`)."""
 
     foot: Float[np.ndarray, "places 3"]
-    """On the surface above or below the place (m)."""
+    """Point on the surface above or below the place (m)."""
     normal: Float[np.ndarray, "places 3"]
     """Unit vectors, upwards."""
     sigma: Float[np.ndarray, "places"]
@@ -21,16 +21,16 @@ class TangentPlanes(eqx.Module):
     flag: Integer[np.ndarray, "places"]
     """Sums of `HeightFlag`."""
     nearest: Int[np.ndarray, "places"]
-    """The laser point nearest to the place, in the order of the cloud."""
+    """Laser point nearest to the place, in the order of the cloud."""
 
 
 def tangent_planes(
     grid: Grid, xy: Float[np.ndarray, "places 2"], method: Method, settings: HeightSettings
 ) -> TangentPlanes:
-    """The tangent planes of the surface at places X, Y (m).
+    """Return the tangent planes of the surface at places X, Y (m).
 
-    With the gradient g of the surface, the normal is (-g, 1) / sqrt(1 + g.g), and so is what its height is off by along
-    it. Raises as `heights_at`.
+    With the gradient g of the surface, the normal is (-g, 1) / sqrt(1 + g.g), and its height error is projected
+    accordingly. Raises what `heights_at` raises.
     """
     heights = heights_at(grid, xy, method, settings)
     normal = np.column_stack([-heights.gradient, np.ones(len(xy))])

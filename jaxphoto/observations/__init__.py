@@ -12,7 +12,7 @@ from jaxphoto.observations.base import AbstractObservations as AbstractObservati
 from jaxphoto.observations.base import ImageState as ImageState
 from jaxphoto.observations.base import touching as touching
 
-# In the order of tables and files.
+# Order of tables and files.
 # ruff: isort: off
 from jaxphoto.observations.image_points import ImageRows as ImageRows
 from jaxphoto.observations.stations import StationRows as StationRows
@@ -46,17 +46,17 @@ from jaxphoto.observations.priors import ParameterRows as ParameterRows
 
 
 def _has_a_table(kind: object) -> bool:
-    """Whether it is a class of rows that files can say: with a name, and not of parameters, which have no ids."""
+    """Return True for classes with files: they have a name and do not refer to parameters, which have no ids."""
     if not (isinstance(kind, type) and issubclass(kind, AbstractObservations) and kind.__dict__.get("group")):
         return False
     return all(f.metadata.get("touches") != "parameter" for f in dataclasses.fields(kind))
 
 
 OBSERVATIONS: tuple[type[AbstractObservations], ...] = tuple(filter(_has_a_table, list(globals().values())))
-"""The classes whose tables a block folder may hold; a class of your own is given to `read_block`."""
+"""Classes whose tables a block folder may hold; pass classes of your own to `read_block`."""
 
 if not TYPE_CHECKING:
-    # Checkers of types would take a list that is computed for an empty one; the aliases above tell them the same.
+    # Type checkers would take a computed list for an empty one; the aliases above serve them.
     __all__ = sorted(
         name
         for name, what in globals().items()

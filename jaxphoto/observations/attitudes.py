@@ -1,4 +1,4 @@
-"""Attitudes: roll, pitch and yaw that an IMU observed at the exposures."""
+"""Attitudes: roll, pitch and yaw observed by an IMU at the exposures."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,10 +29,10 @@ class Attitudes(AbstractObservations):
     sigma: Float[Numbers, "n 3"]
 
     def residual(self, image: ImageState) -> Float[Numbers, "3"]:
-        """Observed minus computed as a small rotation (rad); see `georeferencing.attitude_residual`."""
+        """Return observed minus computed as a small rotation (rad); see `georeferencing.attitude_residual`."""
         computed = recorded_attitude(image.camera_from_object, image.mount, image.exposure)
         return attitude_residual(matrix_from_roll_pitch_yaw(jnp.asarray(self.roll_pitch_yaw)), computed)
 
     def words(self, images, points) -> np.ndarray:
-        """Such as "roll of image 12"."""
+        """Labels such as "roll of image 12"."""
         return np.array([[f"{axis} of image {images[i]}" for i in self.image] for axis in self.axes], object)

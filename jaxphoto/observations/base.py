@@ -1,7 +1,7 @@
-"""What declares an observation: rows, what one row touches, and the residual of one row.
+"""Base class of observations: rows, what one row touches, and the residual of one row.
 
-A file that adds an observation holds one final subclass of `AbstractObservations`. Derivatives, elimination, padding,
-redundancy numbers, noise, sensitivities, datum, tables and files follow from what it declares.
+A file that adds an observation defines one final subclass of `AbstractObservations`. Derivatives, elimination, padding,
+redundancy numbers, noise, sensitivities, datum, tables and files follow from its declarations.
 
     class HeightDifferences(AbstractObservations):
         group = "height_differences"
@@ -16,10 +16,10 @@ redundancy numbers, noise, sensitivities, datum, tables and files follow from wh
 
 Its file is height_differences.csv with the columns start, end, value_m and sigma_m (`observations.columns`).
 
-Inside `residual` the module is *one* row: `self.value` is a number. It is given what the fields marked `touching` point
-at, in their order (a field of several numbers a row gives a stack with a leading axis), then what `also` names. A point
-is its three coordinates (m), an image an `ImageState`; any kind of declared unknowns (`jaxphoto.parameters`) gives
-parameters of that kind.
+Inside `residual` the module is *one* row: `self.value` is a number. Its arguments are what the fields marked `touching`
+refer to, in order (a field of several indices per row gives a stack with a leading axis), then the kinds in `also`. A
+point is its three coordinates (m), an image an `ImageState`; any kind of declared unknowns (`jaxphoto.parameters`)
+gives parameters of that kind.
 """
 
 import abc
@@ -44,21 +44,21 @@ AXES = ("X", "Y", "Z")
 
 
 def touching(what: str) -> Any:
-    """A field of indices: of "image", "point", or a kind of declared unknowns such as "strips"."""
+    """Declare a field of indices: of "image", "point", or a kind of declared unknowns such as "strips"."""
     return eqx.field(metadata={"touches": what})
 
 
 class ImageState(eqx.Module):
-    """What is known of one image while its rows are computed."""
+    """State of one image while its rows are evaluated."""
 
     position: Float[Array, "3"]
     """Projection centre (m)."""
     camera_from_object: Float[Array, "3 3"]
     exposure: Exposure
     parameters: dict[str, Any]
-    """Declared unknowns of the image, by kind; zeros where the image has none of a kind that others have."""
+    """Declared unknowns of the image, by kind; zeros if the image has none of a kind that others have."""
     interior: Any = None
-    """Interior orientation, for rows whose class says `through_camera`."""
+    """Interior orientation, for rows whose class sets `through_camera`."""
 
     @property
     def mount(self) -> Mount:
@@ -74,33 +74,33 @@ class ImageState(eqx.Module):
 @shown
 @dataclass_transform(field_specifiers=(touching, eqx.field))
 class AbstractObservations(eqx.Module):
-    """Rows of one kind, one along the first axis of every field; they need `sigma`, in the unit of the residual."""
+    """Rows of one kind, along the first axis of every field; requires `sigma`, in the unit of the residual."""
 
     group: eqx.AbstractClassVar[str]
-    """What tables, files and results call them."""
+    """Name of the group in tables, files and results."""
     unit: eqx.AbstractClassVar[str]
     """m, mm, rad, s ...; tables show rad in degrees."""
     axes: ClassVar[tuple[str, ...]] = ("",)
     """Names of the numbers of a row."""
     also: ClassVar[tuple[str, ...]] = ()
-    """Kinds of unknowns of the whole block that a row touches besides; None where the block has none."""
+    """Kinds of unknowns of the whole block that a row touches in addition; None if the block has none."""
     observed: ClassVar[str] = "value"
-    """The field that was observed: what noise is added to, and derivatives are taken by."""
+    """Observed field: noise is added to it, and derivatives are taken by it."""
     rigid: ClassVar[bool] = False
-    """Whether no row notices that everything is shifted and turned together."""
+    """True if the residuals are invariant under rigid-body motion."""
     through_camera: ClassVar[bool] = False
-    """Whether a row touches the interior orientation of its image."""
+    """True if a row touches the interior orientation of its image."""
     columns: ClassVar[Mapping[str, str | tuple[str, ...]]] = MappingProxyType({})
-    """Columns in files, by field, that are not called as `observations.columns` says."""
+    """Column names in files, by field, that differ from those of `observations.columns`."""
     once: ClassVar[bool] = False
-    """Whether files may list what a row touches, in whatever order, only once."""
+    """True if files may list what a row touches, in any order, only once."""
 
     def __getattribute__(self, name: str) -> Any:
         value = object.__getattribute__(self, name)
         return value.plain if isinstance(value, StaticArray) else value
 
     def __check_init__(self) -> None:
-        # What says which rows belong together is structure; only numbers are leaves.
+        # Indices are structure; only numbers are leaves.
         whole = whole_fields(type(self))
         for name, value in vars(self).items():
             if name in whole and not isinstance(value, jax.core.Tracer):
@@ -110,51 +110,51 @@ class AbstractObservations(eqx.Module):
 
     @abc.abstractmethod
     def residual(self, *touched: Any) -> Float[Numbers, "..."]:
-        """Observed minus computed of one row, in the unit."""
+        """Return observed minus computed of one row, in the unit."""
 
     def whitened(self, residual: Float[Numbers, "..."]) -> Float[Numbers, "..."]:
-        """The residual of one row over its standard deviation."""
+        """Return the residual of one row over its standard deviation."""
         return residual / self.sigma  # type: ignore[attr-defined]
 
     def with_sigmas_times(self, factor: Float[Numbers, "..."]) -> Self:
-        """The same rows with `factor` times the standard deviations, number by number: (n,) or (n, axes)."""
+        """Scale the standard deviations by `factor`, by number: (n,) or (n, axes)."""
         return eqx.tree_at(lambda rows: rows.sigma, self, self.sigmas * factor)
 
     def without_weight(self) -> Self:
-        """The same rows, which count for nothing: what padding is made of."""
+        """Return rows of zero weight, used as padding."""
         return eqx.tree_at(lambda rows: rows.sigma, self, np.full(np.shape(self.sigmas), np.inf))
 
     def indices(self) -> list[tuple[str, Int[Numbers, "..."]]]:
-        """What the rows touch, and which: (n,), or more axes where a row touches several."""
+        """Return kinds and indices of what the rows touch: (n,), or more axes if a row touches several."""
         return [
             (f.metadata["touches"], getattr(self, f.name)) for f in dataclasses.fields(self) if "touches" in f.metadata
         ]
 
     @property
     def observation(self) -> Numbers:
-        """The numbers that were observed: (n,), or (n, axes)."""
+        """Return the observed numbers: (n,), or (n, axes)."""
         return getattr(self, self.observed)
 
     def with_observation(self, value: Numbers) -> Self:
-        """The same rows with other numbers observed."""
+        """Replace the observed numbers."""
         return eqx.tree_at(lambda rows: getattr(rows, self.observed), self, value)
 
     def physical(self, whitened: Float[Numbers, "..."]) -> Float[np.ndarray, "..."]:
-        """Residuals over their standard deviations, (n,) or (axes, n), brought back to the unit."""
+        """Convert residuals over their standard deviations, (n,) or (axes, n), to the unit."""
         return np.asarray(whitened) * np.asarray(self.sigmas).T
 
     @classmethod
     def none(cls) -> Self:
-        """No rows."""
+        """Return no rows."""
         return cls(**{f.name: np.zeros((0, *f.shape), int if f.whole else float) for f in row_fields(cls)})
 
     def flaws(self) -> Iterator[tuple[int, str]]:
-        """Rows that cannot be, by number, and what is wrong and the mend; who reads them says where they stand."""
+        """Yield (row, message) for every invalid row."""
         return iter(())
 
     @property
     def sigmas(self) -> Any:
-        """Standard deviations of the observed numbers (n,) or (n, axes)."""
+        """Return standard deviations of the observed numbers (n,) or (n, axes)."""
         return self.sigma  # type: ignore[attr-defined]
 
     def __len__(self) -> int:
@@ -162,15 +162,15 @@ class AbstractObservations(eqx.Module):
 
     @classmethod
     def joined(cls, *parts: Self) -> Self:
-        """The rows of all `parts`, in this order."""
+        """Concatenate the rows of all `parts`."""
         return cls(**{f.name: joined([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(cls)})
 
     def take(self, chosen: np.ndarray) -> Self:
-        """The rows that `chosen` (an index or a mask) names."""
+        """Select rows by index or mask."""
         return map_arrays(lambda v: still(v)[chosen], self)
 
     def renumbered(self, **new: np.ndarray) -> Self:
-        """The rows whose images and points are kept: `new` gives, by what is touched, the new number of each or -1."""
+        """Keep rows whose images and points remain: `new` gives, by kind, the new index of each or -1."""
         touched = {f.name: f.metadata["touches"] for f in dataclasses.fields(self) if "touches" in f.metadata}
         fields = {name: new[what] for name, what in touched.items() if what in new}
         kept = np.ones(len(self), bool)
@@ -180,16 +180,16 @@ class AbstractObservations(eqx.Module):
         return dataclasses.replace(some, **{name: number[getattr(some, name)] for name, number in fields.items()})
 
     def axis_names(self) -> np.ndarray:
-        """The name of the axis of each observed number: (n,), or (axes, 1) where a row has several."""
+        """Return the axis name of each observed number: (n,), or (axes, 1) if a row has several."""
         return np.array(self.axes)[:, None] if len(self.axes) > 1 else np.full(len(self), self.axes[0], object)
 
     @property
     def axis_of_numbers(self) -> np.ndarray:
-        """The name of the axis of each observed number, (axes, n) for whichever rows."""
+        """Return the axis name of each observed number, (axes, n)."""
         return np.atleast_2d(np.broadcast_to(self.axis_names(), np.shape(self.observation)[::-1]))
 
     def names_of(self, what: str, names: Sequence[str] | np.ndarray) -> np.ndarray:
-        """Of each row (n,), or number (axes, n), the names of the images or points that it touches, hyphens between."""
+        """Return the hyphenated names of the images or points of each row (n,), or number (axes, n)."""
         table, parts = np.array([*names, ""], object), []
         for touched, index in self.indices():
             if touched == what:
@@ -197,7 +197,7 @@ class AbstractObservations(eqx.Module):
         return np.array(["-".join(of) for of in zip(*parts, strict=True)] if parts else [""] * len(self), object)
 
     def words(self, images: Sequence[str], points: Sequence[str]) -> np.ndarray:
-        """What a sentence calls each observed number, shaped like the residuals: "station of image 12 in Z"."""
+        """Return labels of the observed numbers, shaped like the residuals: "station of image 12 in Z"."""
         whose = [
             " ".join(part for part in ("image " + i if i else "", "point " + p if p else "") if part)
             for i, p in zip(self.names_of("image", images), self.names_of("point", points), strict=True)
@@ -215,9 +215,9 @@ class AbstractObservations(eqx.Module):
         images: Sequence[str],
         points: Sequence[str],
     ) -> list[str]:
-        """What a sentence calls some numbers, one of each of `rows`: all `words` of millions are hundreds of MB."""
+        """Return labels of one number in each of `rows`: all labels of millions take hundreds of MB."""
         numbered = not any(what in ("image", "point") for what, _ in self.indices())
-        # Of rows without images and points, `words` may tell their place among all.
+        # Labels of rows without images and points may contain their index among all.
         some, at = (self, rows) if numbered else (self.take(rows), np.arange(len(rows)))
         words = np.broadcast_to(some.words(images, points), (len(self.axes), len(some)))
         return [str(word) for word in words[numbers, at]]
@@ -232,5 +232,5 @@ class AbstractCoordinates(AbstractObservations):
     sigma: eqx.AbstractVar[Numbers]
 
     def axis_names(self) -> np.ndarray:
-        """X, Y or Z of each row."""
+        """Return X, Y or Z of each row."""
         return np.array(AXES, object)[self.axis]

@@ -1,12 +1,12 @@
-"""The table of a class of observations in a block folder: its columns follow from the fields.
+"""Columns of the table of an observation class in a block folder, derived from its fields.
 
-    touching("point"), one a row        start                           an id
-    touching("point"), m a row          points_1, points_2              ids
-    whole numbers                       axis
-    numbers, one a row                  value_m                         unit of the class; rad are degrees in files
-    numbers, one an axis                value_X_m, value_Y_m, value_Z_m
+    touching("point"), one per row      start                           an id
+    touching("point"), m per row        points_1, points_2              ids
+    integers                            axis
+    numbers, one per row                value_m                         unit of the class; rad are degrees in files
+    numbers, one per axis               value_X_m, value_Y_m, value_Z_m
 
-`columns` of the class names those of a field otherwise; () means that the field is zero and in no file.
+`columns` of the class renames those of a field; () means that the field is zero and has no column.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ import numpy as np
 from jaxphoto.arrays import annotated
 
 FILE_UNITS = {"rad": "deg", "rad_per_s": "deg_per_s"}
-"""Units that files have in place of those of computations."""
+"""Units of files in place of those of computations."""
 
 
 class Column(NamedTuple):
@@ -29,21 +29,21 @@ class Column(NamedTuple):
     name: str
     field: str
     place: tuple[int, ...]
-    """Which of the field's numbers of a row; () for the only one."""
+    """Index of the number within a row of the field; () for a single one."""
     touches: str
-    """What an id in it names; "" where it holds numbers."""
+    """Kind of object that its ids name; "" for numbers."""
     whole: bool
     scale: float
-    """What its numbers are multiplied by."""
+    """Factor of its numbers."""
 
     @property
     def of_rows(self) -> tuple[Any, ...]:
-        """The index of its numbers in the field of all rows."""
+        """Return the index of its numbers in the field of all rows."""
         return (slice(None), *self.place)
 
 
 class RowField(NamedTuple):
-    """What one row has of a field."""
+    """Part of a field that belongs to one row."""
 
     name: str
     touches: str
@@ -53,7 +53,7 @@ class RowField(NamedTuple):
 
 @functools.cache
 def row_fields(cls: type) -> list[RowField]:
-    """The fields of a class of observations as annotated: `Int[np.ndarray, "n 2"]` is two indices a row."""
+    """Return the annotated fields of an observation class: `Int[np.ndarray, "n 2"]` is two indices per row."""
     hints, found = typing.get_type_hints(cls), []
     for field in dataclasses.fields(cls):
         touches = field.metadata.get("touches", "")
@@ -69,9 +69,9 @@ def row_fields(cls: type) -> list[RowField]:
 
 @functools.cache
 def whole_fields(cls: type) -> tuple[str, ...]:
-    """The fields of a class of observations that hold indices: those that touch something, and whole numbers."""
+    """Return the fields that hold indices: those that touch something, and integers."""
     fields = dataclasses.fields(cls)
-    # Names in the annotations of a class within a function may be out of reach.
+    # Names in the annotations of a class within a function may be out of scope.
     hints = (
         typing.get_type_hints(cls) if any(isinstance(f.type, str) for f in fields) else {f.name: f.type for f in fields}
     )
@@ -80,7 +80,7 @@ def whole_fields(cls: type) -> tuple[str, ...]:
 
 
 def columns_of(cls: Any) -> tuple[Column, ...]:
-    """The columns of the table of a class of observations, in their order."""
+    """Return the columns of the table of an observation class, in order."""
     found: list[Column] = []
     for field in row_fields(cls):
         names = cls.columns.get(field.name, _names(cls, field))
@@ -97,13 +97,13 @@ def columns_of(cls: Any) -> tuple[Column, ...]:
 
 
 def file_unit(cls: Any) -> str:
-    """The unit of a class of observations as columns end in it: _m, _deg; "" where it has none."""
+    """Return the unit of an observation class as in column names: _m, _deg; "" if it has none."""
     unit = FILE_UNITS.get(cls.unit, cls.unit)
     return f"_{unit}" if unit else ""
 
 
 def sigma_key(cls: Any) -> str:
-    """The key under [sigmas] of block.toml that stands for sigmas which a table leaves out: distance_m."""
+    """Return the key under [sigmas] of block.toml for omitted sigmas: distance_m."""
     return cls.group.removesuffix("s") + file_unit(cls)
 
 

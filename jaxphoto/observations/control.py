@@ -10,7 +10,7 @@ from jaxphoto.observations.base import AXES, AbstractCoordinates, touching
 class ControlRows(AbstractCoordinates):
     """Surveyed coordinates of point `who`: `axis` (0, 1, 2), `value` and `sigma` (m).
 
-    "Vertical control" is rows with axis 2. Check coordinates, and those held fixed, have such rows, too.
+    Vertical control is rows with axis 2. Check coordinates, and fixed ones, use the same class.
     """
 
     group = "control_points"
@@ -23,10 +23,10 @@ class ControlRows(AbstractCoordinates):
     sigma: Float[Numbers, "n"]
 
     def residual(self, point: Float[Array, "3"]) -> Float[Numbers, ""]:
-        """Surveyed minus computed (m)."""
+        """Return surveyed minus computed (m)."""
         return self.value - point[self.axis]
 
     def words(self, images, points) -> np.ndarray:
-        """Such as "control point T11 in Z"."""
+        """Labels such as "control point T11 in Z"."""
         rows = zip(self.who, self.axis, strict=True)
         return np.array([f"control point {points[p]} in {AXES[a]}" for p, a in rows], object)

@@ -1,8 +1,8 @@
-"""Correlated observations: rows that a full covariance matrix joins by small sets.
+"""Correlated observations: small sets of rows with a full covariance matrix.
 
 The three axes of a station from GNSS processing, a point from another adjustment, stations of a strip with exponential
 correlation in time: a set of m rows of any kind has the covariance matrix C = L L'. Its residuals are multiplied by
-L^-1, once, so the solver meets nothing but rows of unit weight.
+L^-1, computed once, so the solver sees only rows of unit weight.
 """
 
 from collections.abc import Sequence
@@ -19,9 +19,9 @@ from jaxphoto.static_values import map_arrays
 
 
 class Correlated(AbstractObservations):
-    """Sets of rows: fields of `rows` have the leading axes (sets, m); made by `correlated`.
+    """Sets of rows: fields of `rows` have the leading axes (sets, m); created by `correlated`.
 
-    `covariance` (sets, m k, m k) goes over the rows of a set, and over the k numbers of each.
+    `covariance` (sets, m k, m k) covers the rows of a set, and the k numbers of each.
     """
 
     rows: AbstractObservations
@@ -36,27 +36,27 @@ class Correlated(AbstractObservations):
     through_camera: bool = eqx.field(static=True)  # type: ignore[misc]
 
     def residual(self, *touched: Any) -> Float[Numbers, "n"]:
-        """The residuals of the rows of one set, one after the other."""
+        """Return the residuals of the rows of one set, concatenated."""
         n = len(self.rows.indices())
         each = jax.vmap(lambda row, *own: row.residual(*own, *touched[n:]))(self.rows, *touched[:n])
         return each.reshape(-1)
 
     def whitened(self, residual: Float[Numbers, "n"]) -> Float[Numbers, "n"]:
-        """L^-1 times the residuals."""
+        """Return L^-1 times the residuals."""
         return self.whitener @ residual
 
     def with_sigmas_times(self, factor: Float[Numbers, "sets n"]) -> "Correlated":
-        """The same sets with D C D for the covariance C, D the diagonal matrix of `factor`: correlations stay."""
+        """Replace the covariance C by D C D, with D the diagonal matrix of `factor`: correlations stay."""
         where = lambda sets: (sets.covariance, sets.whitener)  # noqa: E731
         new = self.covariance * factor[:, :, None] * factor[:, None], self.whitener / factor[:, None]
         return eqx.tree_at(where, self, new)
 
     def without_weight(self) -> "Correlated":
-        """The same sets, which count for nothing."""
+        """Return sets of zero weight."""
         return eqx.tree_at(lambda sets: sets.whitener, self, np.zeros(np.shape(self.whitener)))
 
     def indices(self) -> list[tuple[str, Int[Numbers, "..."]]]:
-        """What the rows of a set touch, along the axes after the first."""
+        """Return what the rows of a set touch, along the axes after the first."""
         return self.rows.indices()
 
     @property
@@ -65,7 +65,7 @@ class Correlated(AbstractObservations):
         return self.rows.observation.reshape(len(self), -1)
 
     def with_observation(self, value: Numbers) -> "Correlated":
-        """The same sets with other numbers observed."""
+        """Replace the observed numbers."""
         inner = self.rows.with_observation(value.reshape(self.rows.observation.shape))
         return eqx.tree_at(lambda sets: sets.rows, self, inner)
 
@@ -75,7 +75,7 @@ class Correlated(AbstractObservations):
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
     def physical(self, whitened: Float[Numbers, "n sets"]) -> Float[np.ndarray, "n sets"]:
-        """L times the whitened residuals."""
+        """Return L times the whitened residuals."""
         return np.linalg.solve(np.asarray(self.whitener), np.asarray(whitened).T[..., None])[..., 0].T
 
     def __len__(self) -> int:
@@ -95,7 +95,7 @@ class Correlated(AbstractObservations):
 
     @property
     def flat(self) -> AbstractObservations:
-        """All rows, one set after the other."""
+        """Return all rows, set after set."""
         return map_arrays(lambda v: np.asarray(v).reshape(-1, *np.shape(v)[2:]), self.rows)
 
     def _by_set(self, names: np.ndarray) -> np.ndarray:
@@ -107,10 +107,10 @@ class Correlated(AbstractObservations):
 def correlated(
     rows: AbstractObservations, sets: Sequence[Sequence[int]] | np.ndarray, covariance: Float[np.ndarray, "sets n n"]
 ) -> Correlated:
-    """`rows` in sets of equal length (lists of row numbers), each with its covariance matrix (m2, rad2 ...).
+    """Combine `rows` in sets of equal length (lists of row indices), each with its covariance matrix (m2, rad2 ...).
 
-    The covariance of a set goes over its rows in their order, and over the numbers of each row. The standard deviations
-    that `rows` have do not count. Raises ValueError for matrices that are none.
+    The covariance of a set covers its rows in their order, and the numbers of each row. Standard deviations of `rows`
+    are ignored. Raises ValueError for invalid matrices.
     """
     index, covariance = np.asarray(sets, int), np.asarray(covariance, float)
     n = index.shape[1] * len(rows.axes) if index.ndim == 2 else 0
@@ -139,13 +139,13 @@ def correlated(
 def exponential_covariance(
     time: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"] | float, correlation_time: float
 ) -> Float[np.ndarray, "n n"]:
-    """sigma_i sigma_j exp(-|t_i - t_j| / T): a first-order Gauss-Markov process at `time` (s), T in s."""
+    """Return sigma_i sigma_j exp(-|t_i - t_j| / T): a first-order Gauss-Markov process at `time` (s), T in s."""
     time, sigma = np.asarray(time, float), np.broadcast_to(np.asarray(sigma, float), np.shape(time))
     return sigma[:, None] * sigma * np.exp(-np.abs(time[:, None] - time) / correlation_time)
 
 
 def is_covariance(matrix: Float[np.ndarray, "n n"]) -> bool:
-    """Whether a symmetric matrix is positive definite, in whatever units its numbers are: by its correlations."""
+    """Return True if a symmetric matrix is positive definite, judged by its correlations, for any units."""
     variance = matrix.diagonal()
     if not (variance > 0).all():
         return False

@@ -24,15 +24,15 @@ class Distances(AbstractObservations):
     sigma: Float[Numbers, "n"]
 
     def residual(self, ends: Float[Array, "2 3"]) -> Float[Numbers, ""]:
-        """Observed minus computed (m)."""
+        """Return observed minus computed (m)."""
         return self.value - jnp.sqrt(jnp.sum((ends[0] - ends[1]) ** 2))
 
     def words(self, images, points) -> np.ndarray:
-        """Such as "distance A to B"."""
+        """Labels such as "distance A to B"."""
         return np.array([f"distance {points[a]} to {points[b]}" for a, b in self.points], object)
 
     def flaws(self) -> Iterator[tuple[int, str]]:
-        """Between a point and itself, or not positive."""
+        """Yield distances from a point to itself, and those not positive."""
         for row in np.flatnonzero(self.points[:, 0] == self.points[:, 1]):
             yield int(row), "the distance runs from a point to itself; correct point_a or point_b"
         for row in np.flatnonzero(np.asarray(self.value) <= 0):

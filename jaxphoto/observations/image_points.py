@@ -1,4 +1,4 @@
-"""Image points: the observations that an adjustment is made of, and its fast path (`adjustment.solver.ray_rows`)."""
+"""Image points, the main observations of an adjustment; evaluated by `adjustment.solver.ray_rows`."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,11 +25,11 @@ class ImageRows(AbstractObservations):
     sigma: Float[Numbers, "n 2"]
 
     def residual(self, image: ImageState, point: Float[Array, "3"]) -> Float[Numbers, "2"]:
-        """Observed minus computed (mm), without refraction and curvature; see `collinearity.image_residual`."""
+        """Return observed minus computed (mm), without refraction and curvature; see `collinearity.image_residual`."""
         exterior = ExteriorOrientation(image.position, image.camera_from_object)
         return image_residual(image.interior, exterior, point, jnp.asarray(self.xy))
 
     def words(self, images, points) -> np.ndarray:
-        """Such as "point 7 in image 12", for both coordinates: a point in an image is one blunder."""
+        """Labels such as "point 7 in image 12", for both coordinates: a blunder affects both."""
         names = [f"point {points[p]} in image {images[i]}" for i, p in zip(self.image, self.point, strict=True)]
         return np.broadcast_to(np.array(names, object), (2, len(names)))

@@ -1,12 +1,12 @@
-"""Steps of a trajectory's error from knot to knot: how GNSS and IMU drift, by which it is regularised.
+"""Steps of the trajectory error from knot to knot: a drift model of GNSS and IMU that regularises it.
 
-A process of Gauss and Markov with standard deviation s and correlation time T goes on from c[k] to
+A Gauss-Markov process with standard deviation s and correlation time T proceeds from c[k] to
 
     c[k + 1] = f c[k] + noise,    f = exp(-h / T),    noise with standard deviation s sqrt(1 - f^2)
 
-after h seconds. T without end is a constant; s and T that grow together, s^2 / T = q / 2, a random walk of q (m^2/s),
-which is what accelerometers and gyros leave. The first knot of a strip is known beforehand to s. Source: Gelb (1974),
-Applied optimal estimation; Cucci, Rehak and Skaloud (2017) have the raw inertial measurements in its place.
+after h seconds. Infinite T is a constant; s and T that grow together, s^2 / T = q / 2, a random walk of q (m^2/s), as
+accelerometers and gyros produce. The first knot of a strip has a prior of zero with s. Source: Gelb (1974), Applied
+optimal estimation; Cucci, Rehak and Skaloud (2017) use raw inertial measurements instead.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ from jaxphoto.observations.base import AXES, AbstractObservations, touching
 
 
 class AbstractKnotSteps(AbstractObservations):
-    """What an error at knot `end` is beside `kept` of that at `start`: nothing, to `sigma`."""
+    """Difference of the error at knot `end` from `kept` times that at `start`: zero, with `sigma`."""
 
     _words: eqx.AbstractClassVar[tuple[str, str]]
     observed = "step"
@@ -34,7 +34,7 @@ class AbstractKnotSteps(AbstractObservations):
     step: Float[Numbers, "n 3"]
 
     def flaws(self) -> Iterator[tuple[int, str]]:
-        """A part that no process keeps."""
+        """Yield fractions that no process has."""
         kept = np.asarray(self.kept)
         for row in np.flatnonzero((kept < 0) | (kept > 1)):
             yield (
@@ -43,7 +43,7 @@ class AbstractKnotSteps(AbstractObservations):
             )
 
     def words(self, images, points) -> np.ndarray:
-        """Such as "step 12 of the trajectory in Z"."""
+        """Labels such as "step 12 of the trajectory in Z"."""
         step, along = self._words
         return np.array(
             [[f"{step} {k + 1} of the trajectory {along} {a}" for k in range(len(self))] for a in self.axes], object
@@ -51,7 +51,7 @@ class AbstractKnotSteps(AbstractObservations):
 
 
 class PositionSteps(AbstractKnotSteps):
-    """Steps of the position's error (m)."""
+    """Steps of the position error (m)."""
 
     group = "position_steps"
     unit = "m"
@@ -59,12 +59,12 @@ class PositionSteps(AbstractKnotSteps):
     _words = ("step", "in")
 
     def residual(self, start: TrajectoryKnot, end: TrajectoryKnot) -> Float[Numbers, "3"]:
-        """Observed minus computed step (m)."""
+        """Return observed minus computed step (m)."""
         return self.step - (end.position - self.kept * start.position)
 
 
 class AttitudeSteps(AbstractKnotSteps):
-    """Steps of the attitude's error, about the body's right, forward and up axes (rad)."""
+    """Steps of the attitude error, about the body's right, forward and up axes (rad)."""
 
     group = "attitude_steps"
     unit = "rad"
@@ -72,5 +72,5 @@ class AttitudeSteps(AbstractKnotSteps):
     _words = ("turn", "about")
 
     def residual(self, start: TrajectoryKnot, end: TrajectoryKnot) -> Float[Numbers, "3"]:
-        """Observed minus computed step (rad)."""
+        """Return observed minus computed step (rad)."""
         return self.step - (end.attitude - self.kept * start.attitude)

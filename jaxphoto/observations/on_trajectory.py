@@ -1,4 +1,4 @@
-"""What files call that of rows on a trajectory, and what of them cannot be."""
+"""Column names and validation of rows on a trajectory."""
 
 from collections.abc import Iterator
 
@@ -7,17 +7,17 @@ from jaxtyping import Float
 
 from jaxphoto.arrays import Numbers
 
-# By how much weights may miss 1, and the length of a normal: more than rounding of a few written digits.
+# Tolerance of the sum of weights about 1, and of the length of a normal: rounding of a few written digits.
 _OFF = 1e-3
 
 
 def knot_columns(side: str = "") -> dict[str, tuple[str, ...]]:
-    """Columns of knots and their weights."""
+    """Return the columns of knots and their weights."""
     return {f"{name}s{side}": tuple(f"{name}{side}_{k}" for k in range(1, 5)) for name in ("knot", "weight")}
 
 
 def pose_columns(place: str, side: str = "") -> dict[str, tuple[str, ...]]:
-    """Columns of a measured place, and of pose and motion of the scanner that measured it."""
+    """Return the columns of a measured point, and of pose and motion of the scanner that measured it."""
     return {
         **{f"{name}{side}": tuple(f"{name}{side}_{x}_m" for x in "XYZ") for name in (place, "scanner")},
         f"roll_pitch_yaw{side}": tuple(f"{angle}{side}_deg" for angle in ("roll", "pitch", "yaw")),
@@ -30,14 +30,14 @@ NORMAL = {"normal": ("normal_X", "normal_Y", "normal_Z")}
 
 
 def weight_flaws(weights: Float[Numbers, "n 4"]) -> Iterator[tuple[int, str]]:
-    """Rows whose weights do not make up one correction."""
+    """Yield rows whose weights do not add up to one correction."""
     total = np.asarray(weights).sum(axis=1)
     for row in np.flatnonzero(np.abs(total - 1) > _OFF):
         yield int(row), f"the weights of its knots add up to {total[row]:.4f}; give weights that add up to 1"
 
 
 def normal_flaws(normal: Float[Numbers, "n 3"]) -> Iterator[tuple[int, str]]:
-    """Rows whose normal is no unit vector."""
+    """Yield rows whose normal is not a unit vector."""
     length = np.linalg.norm(np.asarray(normal), axis=1)
     for row in np.flatnonzero(np.abs(length - 1) > _OFF):
         yield int(row), f"the normal has the length {length[row]:.4f}; give a unit vector"

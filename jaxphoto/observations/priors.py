@@ -1,4 +1,4 @@
-"""What is known of unknowns beforehand, as observations of them."""
+"""Prior information on unknowns, as observations."""
 
 from collections.abc import Sequence
 
@@ -17,7 +17,7 @@ PRIORS = "priors"
 
 
 class ParameterRows(AbstractObservations):
-    """Parameters that were known beforehand as `value` with `sigma`, in their own units."""
+    """Parameters with prior `value` and `sigma`, in their own units."""
 
     group = PRIORS
     unit = ""
@@ -27,12 +27,12 @@ class ParameterRows(AbstractObservations):
     sigma: Float[Numbers, "n"]
 
     def residual(self, parameter: Float[Array, ""]) -> Float[Numbers, ""]:
-        """Known beforehand minus estimated."""
+        """Return prior minus estimated value."""
         return self.value - parameter
 
 
 class PositionRows(AbstractObservations):
-    """Projection centres (m) of `image` that were known beforehand."""
+    """Prior projection centres (m) of `image`."""
 
     group = "prior_positions"
     unit = "m"
@@ -43,12 +43,12 @@ class PositionRows(AbstractObservations):
     sigma: Float[Numbers, "n 3"]
 
     def residual(self, image: ImageState) -> Float[Numbers, "3"]:
-        """Known beforehand minus estimated (m)."""
+        """Return prior minus estimated value (m)."""
         return self.value - image.position
 
 
 class RotationRows(AbstractObservations):
-    """Rotations `camera_from_object` of `image` known beforehand; sigma is of a small rotation in its frame (rad)."""
+    """Prior rotations `camera_from_object` of `image`; sigma is of a small rotation in its frame (rad)."""
 
     group = "prior_rotations"
     unit = "rad"
@@ -60,15 +60,15 @@ class RotationRows(AbstractObservations):
     value: Float[Numbers, "n 3 3"]
     sigma: Float[Numbers, "n 3"]
     turn: Float[Numbers, "n 3"]
-    """What was observed besides `value`: zero, unless somebody adds an error to it."""
+    """Observed rotation in addition to `value`: zero, unless an error is simulated."""
 
     def residual(self, image: ImageState) -> Float[Numbers, "3"]:
-        """Known beforehand minus estimated, a small rotation in the camera frame (rad)."""
+        """Return prior minus estimated rotation, a small rotation in the camera frame (rad)."""
         return self.turn + small_angles(jnp.asarray(self.value) @ image.camera_from_object.T)
 
 
 class PointRows(AbstractObservations):
-    """Object points (m) known beforehand."""
+    """Prior object points (m)."""
 
     group = "prior_points"
     unit = "m"
@@ -79,15 +79,15 @@ class PointRows(AbstractObservations):
     sigma: Float[Numbers, "n 3"]
 
     def residual(self, point: Float[Array, "3"]) -> Float[Numbers, "3"]:
-        """Known beforehand minus estimated (m)."""
+        """Return prior minus estimated value (m)."""
         return self.value - point
 
 
 @shown
 class KnownParameters(eqx.Module):
-    """Parameters known beforehand together: a calibration of last year, with its correlations.
+    """Joint prior of parameters: an earlier calibration, with its correlations.
 
-    `labels` are paths such as `interior[kodak].c_mm` and `strips[a].shift_Z_m` (of every table that shows parameters),
+    `labels` are paths such as `interior[kodak].c_mm` and `strips[a].shift_Z_m` (as in every table of parameters),
     `value` and `covariance` in their own units. For `adjust(block, more=...)`; the parameters are FREE in `priors`.
     """
 
@@ -95,7 +95,7 @@ class KnownParameters(eqx.Module):
     value: Float[Numbers, "n"]
     covariance: Float[Numbers, "n n"]
     reservation: str = eqx.field(static=True)
-    """What speaks against where they are from, such as a calibration whose verdict is red; "" for nothing."""
+    """Reservation about their source, such as a calibration with a red verdict; "" for none."""
 
     def __init__(
         self,
@@ -114,7 +114,7 @@ class KnownParameters(eqx.Module):
 
     @property
     def doubt(self) -> str:
-        """The reservation with what it is of, in words; "" for none."""
+        """Return the reservation with the parameters' source; "" for none."""
         if not self.reservation:
             return ""
         own = [label.removeprefix("interior[") for label in self.labels if label.startswith("interior[")]

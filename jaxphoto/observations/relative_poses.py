@@ -1,15 +1,15 @@
-"""Relative control: by how much position and attitude of the GNSS/IMU change from one exposure to another.
+"""Relative control: changes of position and attitude of the GNSS/IMU between exposures.
 
-Carrier phases tell how far an antenna moved between two exposures to millimetres, and gyros how far the body turned,
-where positions and attitudes themselves are off by what drifts. With the sensor's position P = X + R l - v tau
+Carrier phases determine the motion of an antenna between two exposures to millimetres, and gyros the rotation of the
+body, while positions and attitudes themselves drift. With the sensor's position P = X + R l - v tau
 (`georeferencing.sensor_position`) and the body's attitude B, which takes body to object,
 
     d = P_2 - P_1,    A = B_1' B_2
 
-Shift and drift of strips and flight are errors of the positions and not in d, so it says nothing of them: what all
-positions of a strip have in common cancels. Sources: Skaloud, Rehak and Lichti (2014), Mapping with MAV: experimental
-study on the contribution of absolute and relative aerial position control; Cucci, Rehak and Skaloud (2017), Bundle
-adjustment with raw inertial observations in UAV applications.
+Shift and drift of strips and flight are errors of the positions and do not enter d: what all positions of a strip have
+in common cancels. Sources: Skaloud, Rehak and Lichti (2014), Mapping with MAV: experimental study on the contribution
+of absolute and relative aerial position control; Cucci, Rehak and Skaloud (2017), Bundle adjustment with raw inertial
+observations in UAV applications.
 """
 
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ _NO_BIAS = StripBias(np.zeros(3), np.zeros(3))  # type: ignore[arg-type]
 
 
 class AbstractRelativeRows(AbstractObservations):
-    """What the GNSS/IMU at `image_2` has beside that at `image_1`."""
+    """Pose of the GNSS/IMU at `image_2` relative to that at `image_1`."""
 
     once = True
 
@@ -36,19 +36,19 @@ class AbstractRelativeRows(AbstractObservations):
     image_2: Int[np.ndarray, "n"] = touching("image")
 
     def flaws(self) -> Iterator[tuple[int, str]]:
-        """An image beside itself."""
+        """Yield images paired with themselves."""
         for row in np.flatnonzero(self.image_1 == self.image_2):
             yield int(row), "image_1 and image_2 are the same; name two exposures"
 
     def words(self, images, points) -> np.ndarray:
-        """Such as "relative position of images 12 and 13 in Z"."""
+        """Labels such as "relative position of images 12 and 13 in Z"."""
         thing, along = self.group.replace("_", " ").removesuffix("s"), "in" if self.axes == AXES else "about"
         pairs = [f"images {images[a]} and {images[b]}" for a, b in zip(self.image_1, self.image_2, strict=True)]
         return np.array([[f"{thing} of {pair} {along} {axis}" for pair in pairs] for axis in self.axes], object)
 
 
 class RelativePositions(AbstractRelativeRows):
-    """By how much the GNSS antenna moved from `image_1` to `image_2` (m, object frame), lever arms included."""
+    """Motion of the GNSS antenna from `image_1` to `image_2` (m, object frame), lever arms included."""
 
     group = "relative_positions"
     unit = "m"
@@ -59,12 +59,12 @@ class RelativePositions(AbstractRelativeRows):
     sigma: Float[Numbers, "n 3"]
 
     def residual(self, image_1: ImageState, image_2: ImageState) -> Float[Numbers, "3"]:
-        """Observed minus computed (m)."""
+        """Return observed minus computed (m)."""
         return self.value - (_antenna(image_2) - _antenna(image_1))
 
 
 class RelativeAttitudes(AbstractRelativeRows):
-    """How the body turned from `image_1` to `image_2`: its roll, pitch and yaw (rad) as body 1 sees body 2.
+    """Rotation of the body from `image_1` to `image_2`: roll, pitch and yaw (rad) of body 2 relative to body 1.
 
     The angles of B_1' B_2, as if right, forward and up of body 1 were east, north and up. The residual is a small
     rotation about forward, right and down of body 2, and so are the sigmas.
@@ -81,7 +81,7 @@ class RelativeAttitudes(AbstractRelativeRows):
     sigma: Float[Numbers, "n 3"]
 
     def residual(self, image_1: ImageState, image_2: ImageState) -> Float[Array, "3"]:
-        """Observed minus computed as a small rotation (rad); see `georeferencing.attitude_residual`."""
+        """Return observed minus computed as a small rotation (rad); see `georeferencing.attitude_residual`."""
         observed = matrix_from_roll_pitch_yaw(jnp.asarray(self.roll_pitch_yaw))
         return attitude_residual(observed, _body(image_1).T @ _body(image_2))
 

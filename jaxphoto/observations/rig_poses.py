@@ -1,8 +1,8 @@
-"""Cameras of a rig sit still: what each exposure says of it, to what the rig bends by (`georeferencing.RigCamera`).
+"""Rigid cameras of a rig: observations of each exposure that regularise it (`georeferencing.RigCamera`).
 
-A row is a photograph and that of the reference camera of the same event. The poses of both are unknown, and the place
-of the camera in the rig may be: so a rig without GNSS and IMU holds its photographs together, and one with a trajectory
-of its reference needs none of the others.
+A row refers to a photograph and to that of the reference camera at the same event. Both poses are unknown, and the
+camera's place in the rig may be: a rig without GNSS and IMU connects its photographs, and one with a trajectory of its
+reference camera needs none for the others.
 """
 
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ from jaxphoto.observations.base import AXES, AbstractObservations, ImageState, t
 
 
 class AbstractRigRows(AbstractObservations):
-    """What a photograph is off its place in the rig by: nothing, to `sigma`."""
+    """Deviation of a photograph from its place in the rig: zero, with `sigma`."""
 
     observed = "off"
     columns = {"off": ()}  # noqa: RUF012
@@ -28,7 +28,7 @@ class AbstractRigRows(AbstractObservations):
     sigma: Float[Numbers, "n 3"]
 
     def flaws(self) -> Iterator[tuple[int, str]]:
-        """A photograph beside itself."""
+        """Yield photographs paired with themselves."""
         for row in np.flatnonzero(self.reference == self.image):
             yield int(row), "the image is its own reference; name that of the reference camera of the same event"
 
@@ -41,13 +41,13 @@ class RigPlaces(AbstractRigRows):
     axes = tuple(axis.lower() for axis in AXES)
 
     def residual(self, reference: ImageState, image: ImageState) -> Float[Numbers, "3"]:
-        """Observed minus computed (m)."""
+        """Return observed minus computed (m)."""
         own = _camera_of(image)
         return self.off - (rig_place(*_reference_for(reference, own), image.position) - own.place)
 
 
 class RigTurns(AbstractRigRows):
-    """Turns of cameras in their rigs (rad), about the axes of the camera."""
+    """Rotations of cameras in their rigs (rad), about the axes of the camera."""
 
     group = "rig_turns"
     unit = "rad"
@@ -55,14 +55,14 @@ class RigTurns(AbstractRigRows):
     axes = ("rx", "ry", "rz")
 
     def residual(self, reference: ImageState, image: ImageState) -> Float[Numbers, "3"]:
-        """Observed minus computed (rad)."""
+        """Return observed minus computed (rad)."""
         own = _camera_of(image)
         _, turned = _reference_for(reference, own)
         return self.off - turn_off(turned, image.camera_from_object, own.turn)
 
 
 def _reference_for(reference: ImageState, own: RigCamera) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Position and orientation of the reference camera when the other one exposes."""
+    """Return position and orientation of the reference camera when the other one exposes."""
     at = reference.position, reference.camera_from_object
     return reference_later(own.delay, *at, reference.mount, reference.exposure)
 

@@ -1,4 +1,4 @@
-"""Camera stations: what GNSS observed at the exposures."""
+"""Camera stations: GNSS observations at the exposures."""
 
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -9,9 +9,9 @@ from jaxphoto.observations.base import AXES, AbstractCoordinates, ImageState, to
 
 
 def station_of(image: ImageState) -> Float[Array, "3"]:
-    """What GNSS would observe without error at the exposure of an image (m); see `georeferencing.sensor_position`."""
+    """Return the error-free GNSS observation at the exposure of an image (m); see `georeferencing.sensor_position`."""
     if not image.parameters:
-        # Neither mounts nor strips: a station is the projection centre itself.
+        # Without mounts and strips a station is the projection centre.
         return image.position
     at = sensor_position(image.position, image.camera_from_object, image.mount, image.strip, image.exposure)
     for own in image.parameters.values():
@@ -32,10 +32,10 @@ class StationRows(AbstractCoordinates):
     sigma: Float[Numbers, "n"]
 
     def residual(self, image: ImageState) -> Float[Numbers, ""]:
-        """Observed minus computed (m)."""
+        """Return observed minus computed (m)."""
         return self.value - station_of(image)[self.axis]
 
     def words(self, images, points) -> np.ndarray:
-        """Such as "station of image 12 in Z"."""
+        """Labels such as "station of image 12 in Z"."""
         rows = zip(self.who, self.axis, strict=True)
         return np.array([f"station of image {images[i]} in {AXES[a]}" for i, a in rows], object)

@@ -1,7 +1,7 @@
-"""Steps of a camera from strip to strip: a random walk of its interior orientation, by which it is held together.
+"""Constraints on the camera from strip to strip: a random walk of its interior orientation.
 
-A random walk of q (mm^2/h) moves on in the time h between the middles of two strips by nothing, with the standard
-deviation sqrt(q h). Source: Gelb (1974), Applied optimal estimation.
+A random walk of q (mm^2/h) changes in the time h between the middles of two strips by zero, with the standard deviation
+sqrt(q h). Source: Gelb (1974), Applied optimal estimation.
 """
 
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from jaxphoto.observations.base import AbstractObservations, touching
 
 
 class StripCameraSteps(AbstractObservations):
-    """By how much c, x_p and y_p of strip `end` are more than those of strip `start` (mm)."""
+    """Differences of c, x_p and y_p of strip `end` from those of strip `start` (mm)."""
 
     group = "strip_camera_steps"
     unit = "mm"
@@ -26,6 +26,6 @@ class StripCameraSteps(AbstractObservations):
     sigma: Float[Numbers, "n 3"]
 
     def residual(self, start: StripCamera, end: StripCamera) -> Float[Numbers, "3"]:
-        """Observed minus computed step (mm)."""
+        """Return observed minus computed step (mm)."""
         steps = (end.c_more - start.c_more, end.xp_more - start.xp_more, end.yp_more - start.yp_more)
         return self.value - jnp.stack([jnp.asarray(step) for step in steps])

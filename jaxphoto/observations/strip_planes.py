@@ -1,4 +1,4 @@
-"""Strip planes: what two laser strips measured of one plane."""
+"""Strip planes: one plane measured by two laser strips."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -24,7 +24,7 @@ def return_at(
     scanner: Scanner | None,
     calibration: ScannerCalibration | None,
 ) -> Float[Array, "3"]:
-    """`georeferencing.corrected_return` of a place as a strip has it (m), seen from a scanner's pose that is `off`."""
+    """Apply `georeferencing.corrected_return` to a point of a strip (m), for a scanner pose with the error `off`."""
     boresight = jnp.zeros(3) if scanner is None else scanner.boresight
     known = ScannerCalibration(jnp.zeros(3)) if calibration is None else calibration
     turn = matrix_from_roll_pitch_yaw(jnp.asarray(roll_pitch_yaw))
@@ -32,15 +32,15 @@ def return_at(
 
 
 class StripPlanes(AbstractObservations):
-    """A place of a plane as one strip has it (a) and as another has it (b): corrected, they lie on one plane.
+    """Point of a plane measured by strip a and by strip b: after correction, both lie on one plane.
 
         normal . (X'_a - X'_b) = gap
 
-    with standard deviation `sigma` (m). `point_a` (m) is the place on strip a's plane as measured, `scanner_a` and
-    `roll_pitch_yaw_a` the pose of the scanner when it was, by the trajectory, `velocity_a` (m/s) and `rate_a` (rad/s,
-    about the body's axes) its motion; `knots_a` and `weights_a` give what that
-    is off by (`georeferencing.StripSpline.weights`). X' is `georeferencing.corrected_return`. `gap` is what was
-    observed: zero, unless somebody adds an error to it. Without a trajectory a scanner may stand anywhere above.
+    with standard deviation `sigma` (m). `point_a` (m) is the point on strip a's plane as measured, `scanner_a` and
+    `roll_pitch_yaw_a` the pose of the scanner at that time by the trajectory, `velocity_a` (m/s) and `rate_a` (rad/s,
+    about the body's axes) its motion; `knots_a` and `weights_a` define the trajectory error then
+    (`georeferencing.StripSpline.weights`). X' is `georeferencing.corrected_return`. `gap` is the observation: zero,
+    unless an error is simulated. Without a trajectory the scanner position above is arbitrary.
     """
 
     group = "strip_planes"
@@ -82,7 +82,7 @@ class StripPlanes(AbstractObservations):
         scanner: Scanner | None,
         calibration: ScannerCalibration | None,
     ) -> Float[Numbers, ""]:
-        """By how much a's plane lies below b's (m), along the normal."""
+        """Return the height of b's plane above a's (m), along the normal."""
         known = scanner, calibration
         off_a, off_b = weighted_knot(knots_a, self.weights_a), weighted_knot(knots_b, self.weights_b)
         motion_a, motion_b = (self.velocity_a, self.rate_a), (self.velocity_b, self.rate_b)
@@ -91,11 +91,11 @@ class StripPlanes(AbstractObservations):
         return self.gap - jnp.sum(self.normal * (a - b))
 
     def flaws(self) -> Iterator[tuple[int, str]]:
-        """Weights and normals that are none."""
+        """Yield invalid weights and normals."""
         yield from weight_flaws(self.weights_a)
         yield from weight_flaws(self.weights_b)
         yield from normal_flaws(self.normal)
 
     def words(self, images, points) -> np.ndarray:
-        """Such as "plane 12 of two strips"."""
+        """Labels such as "plane 12 of two strips"."""
         return np.array([f"plane {k + 1} of two strips" for k in range(len(self))], object)

@@ -1,4 +1,4 @@
-"""Strip points: tie points of images on planes that a laser strip measured."""
+"""Strip points: tie points of images on planes measured by a laser strip."""
 
 from collections.abc import Iterator
 
@@ -14,15 +14,15 @@ from jaxphoto.observations.strip_planes import return_at
 
 
 class StripPoints(AbstractObservations):
-    """Object points that lie on the plane of the returns of one strip about them, once these are corrected.
+    """Object points on the plane of the surrounding returns of one strip, after correction of the returns.
 
         normal . (X - F') = rise
 
-    with standard deviation `sigma` (m). `foot` F (m) is a place on the strip's plane as measured, `scanner` and
-    `roll_pitch_yaw` the pose of the scanner when it was, by the trajectory, `velocity` (m/s) and `rate` (rad/s, about
-    the body's axes) its motion; `knots` and `weights` give what that pose is off by
-    (`georeferencing.StripSpline.weights`), and F' is `georeferencing.corrected_return`. `rise` is what was observed:
-    zero, unless somebody adds an error to it.
+    with standard deviation `sigma` (m). `foot` F (m) is a point on the plane as measured by the strip, `scanner` and
+    `roll_pitch_yaw` the pose of the scanner at that time by the trajectory, `velocity` (m/s) and `rate` (rad/s, about
+    the body's axes) its motion; `knots` and `weights` define the trajectory error then
+    (`georeferencing.StripSpline.weights`), and F' is `georeferencing.corrected_return`. `rise` is the observation:
+    zero, unless an error is simulated.
     """
 
     group = "strip_points"
@@ -51,17 +51,17 @@ class StripPoints(AbstractObservations):
         scanner: Scanner | None,
         calibration: ScannerCalibration | None,
     ) -> Float[Numbers, ""]:
-        """By how much the point lies below the plane (m), along its normal."""
+        """Return the height of the plane above the point (m), along its normal."""
         off = weighted_knot(knots, self.weights)
         pose = self.scanner, self.roll_pitch_yaw, self.velocity, self.rate
         foot = return_at(self.foot, *pose, off, scanner, calibration)
         return self.rise - jnp.sum(self.normal * (point - foot))
 
     def flaws(self) -> Iterator[tuple[int, str]]:
-        """Weights and normals that are none."""
+        """Yield invalid weights and normals."""
         yield from weight_flaws(self.weights)
         yield from normal_flaws(self.normal)
 
     def words(self, images, points) -> np.ndarray:
-        """Such as "point 12 on its plane of a strip"."""
+        """Labels such as "point 12 on its plane of a strip"."""
         return np.array([f"point {points[p]} on its plane of a strip" for p in self.point], object)

@@ -1,4 +1,4 @@
-"""Surfaces: points observed to lie on what a laser scanner measured."""
+"""Surfaces: points observed to lie on a surface measured by a laser scanner."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,13 +10,13 @@ from jaxphoto.observations.base import AbstractObservations, touching
 
 
 class SurfaceRows(AbstractObservations):
-    """Points observed to lie on the surface that a laser scanner measured: on the plane through `foot` (m).
+    """Points observed to lie on a surface measured by a laser scanner: on the plane through `foot` (m).
 
         normal . (X - foot + shift) + turn . boresight = rise
 
-    with standard deviation `sigma` (m), and the shift of the lidar strip and the boresight of `Unknowns.scanner`, where
-    the block has one. `turn` (m) is by how much a unit of boresight has raised `foot` along `normal`
-    (`georeferencing.raised_by_boresight`). `rise` is what was observed: zero, unless somebody adds an error to it.
+    with standard deviation `sigma` (m), and the shift of the lidar strip and the boresight of `Unknowns.scanner`, if
+    the block has one. `turn` (m/rad) is the rise of `foot` along `normal` per unit of boresight
+    (`georeferencing.raised_by_boresight`). `rise` is the observation: zero, unless an error is simulated.
     """
 
     group = "surfaces"
@@ -33,7 +33,7 @@ class SurfaceRows(AbstractObservations):
 
     point: Int[np.ndarray, "n"] = touching("point")
     strip: Int[np.ndarray, "n"]
-    """Of `Unknowns.scanner.shifts`, in their order; 0 in a block without a scanner."""
+    """Index in `Unknowns.scanner.shifts`; 0 in a block without a scanner."""
     foot: Float[Numbers, "n 3"]
     normal: Float[Numbers, "n 3"]
     turn: Float[Numbers, "n 3"]
@@ -46,7 +46,7 @@ class SurfaceRows(AbstractObservations):
         self.rise = np.zeros(np.shape(sigma)) if rise is None else rise
 
     def residual(self, point: Float[Array, "3"], scanner: Scanner | None) -> Float[Numbers, ""]:
-        """By how much the point lies below the surface (m), along its normal."""
+        """Return the height of the surface above the point (m), along its normal."""
         apart, rise = point - self.foot, jnp.zeros(())
         if scanner is not None:
             shifts = list(scanner.shifts.values())
@@ -55,5 +55,5 @@ class SurfaceRows(AbstractObservations):
         return self.rise - (jnp.sum(self.normal * apart) + rise)
 
     def words(self, images, points) -> np.ndarray:
-        """Such as "point 12 on its surface"."""
+        """Labels such as "point 12 on its surface"."""
         return np.array([f"point {points[p]} on its surface" for p in self.point], object)

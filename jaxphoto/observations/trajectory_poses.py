@@ -1,7 +1,7 @@
-"""Poses of exposures on the trajectory of a laser scanner, whose errors they share.
+"""Poses of exposures on the trajectory of a laser scanner, with common errors.
 
-What GNSS and IMU say of an exposure is off by what the trajectory is off by at that time, dp and da
-(`georeferencing.TrajectoryKnot`, of the knots about it), and by little of its own:
+GNSS and IMU observations of an exposure share the errors of the trajectory at that time, dp and da
+(`georeferencing.TrajectoryKnot`, of the surrounding knots), and have little noise of their own:
 
     p = X + R l + dp + noise,    R_p S(da) = R + noise
 
@@ -27,10 +27,10 @@ from jaxphoto.rotation import matrix_from_roll_pitch_yaw, small_rotation
 
 
 class TrajectoryStations(AbstractCoordinates):
-    """Coordinates that the trajectory gives the exposure of image `who`: `axis` (0, 1, 2), `value` and `sigma` (m).
+    """Coordinates of the trajectory at the exposure of image `who`: `axis` (0, 1, 2), `value` and `sigma` (m).
 
-    `knots` and `weights` make up what the trajectory is off by then (`georeferencing.StripSpline.weights`); `sigma` is
-    of what remains.
+    `knots` and `weights` define the trajectory error then (`georeferencing.StripSpline.weights`); `sigma` is that of
+    the remaining noise.
     """
 
     group = "trajectory_stations"
@@ -45,24 +45,24 @@ class TrajectoryStations(AbstractCoordinates):
     sigma: Float[Numbers, "n"]
 
     def residual(self, image: ImageState, knots: TrajectoryKnot) -> Float[Numbers, ""]:
-        """Observed minus computed (m)."""
+        """Return observed minus computed (m)."""
         off = weighted_knot(knots, self.weights)
         return self.value - (station_of(image) + off.position)[self.axis]
 
     def flaws(self) -> Iterator[tuple[int, str]]:
-        """Weights that are none, and an axis that there is not."""
+        """Yield invalid weights and axes."""
         yield from weight_flaws(self.weights)
         for row in np.flatnonzero(~np.isin(self.axis, (0, 1, 2))):
             yield int(row), f"axis is {self.axis[row]}; it is 0, 1 or 2, for X, Y or Z"
 
     def words(self, images, points) -> np.ndarray:
-        """Such as "trajectory at image 12 in Z"."""
+        """Labels such as "trajectory at image 12 in Z"."""
         rows = zip(self.who, self.axis, strict=True)
         return np.array([f"trajectory at image {images[i]} in {AXES[a]}" for i, a in rows], object)
 
 
 class TrajectoryAttitudes(AbstractObservations):
-    """Roll, pitch and yaw (rad) that the trajectory gives the exposure of `image`; else as `TrajectoryStations`."""
+    """Roll, pitch and yaw (rad) of the trajectory at the exposure of `image`; otherwise like `TrajectoryStations`."""
 
     group = "trajectory_attitudes"
     unit = "rad"
@@ -77,18 +77,18 @@ class TrajectoryAttitudes(AbstractObservations):
     sigma: Float[Numbers, "n 3"]
 
     def residual(self, image: ImageState, knots: TrajectoryKnot) -> Float[Array, "3"]:
-        """Observed minus computed as a small rotation (rad); see `georeferencing.attitude_residual`."""
+        """Return observed minus computed as a small rotation (rad); see `georeferencing.attitude_residual`."""
         off = weighted_knot(knots, self.weights)
         observed = matrix_from_roll_pitch_yaw(jnp.asarray(self.roll_pitch_yaw))
         computed = recorded_attitude(image.camera_from_object, image.mount, image.exposure)
         return attitude_residual(jnp.matmul(observed, small_rotation(off.attitude)), computed)
 
     def flaws(self) -> Iterator[tuple[int, str]]:
-        """Weights that are none."""
+        """Yield invalid weights."""
         return weight_flaws(self.weights)
 
     def words(self, images, points) -> np.ndarray:
-        """Such as "roll of the trajectory at image 12"."""
+        """Labels such as "roll of the trajectory at image 12"."""
         return np.array(
             [[f"{axis} of the trajectory at image {images[i]}" for i in self.image] for axis in self.axes], object
         )

@@ -1,4 +1,4 @@
-"""What a photogrammetrist does with all this, as short scripts over the rooms below."""
+"""Procedures: short scripts that combine the packages below."""
 
 from jaxphoto.procedures.adjust import adjust, adjust_for_tables
 from jaxphoto.procedures.boresight import boresight, step_block

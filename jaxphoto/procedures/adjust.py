@@ -15,10 +15,10 @@ from jaxphoto.arrays import is_traced
 from jaxphoto.block import Block, sensor_rows
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError, DatumError, RankError, few
+from jaxphoto.initial import approximate
+from jaxphoto.initial.approximate import PointsBehind, completed, intersected
+from jaxphoto.initial.rays import camera_rays, turn_to_object
 from jaxphoto.observations import AbstractObservations, KnownParameters
-from jaxphoto.orientation import approximate
-from jaxphoto.orientation.approximate import PointsBehind, completed, intersected
-from jaxphoto.orientation.rays import camera_rays, turn_to_object
 from jaxphoto.procedures.orientation import orient_block
 from jaxphoto.statistics import prepare_statistics
 from jaxphoto.unknowns import FREE, Unknowns

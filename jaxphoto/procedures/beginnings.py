@@ -1,9 +1,9 @@
-"""Where a search for blunders begins: estimates that blunders hardly move, the likeliest to be one first.
+"""Initial solutions of a search for blunders: estimates that are robust to blunders, the most likely first.
 
-Weights fall with the residual (Huber), again and again: many blunders hide one another from the test of a single one,
-but hardly move such an estimate. Where that leads to nothing that fits (enormous errors in an image of few points),
-Tukey's loss forgets them; or control and stations are taken for hardly more than the datum; or all control, or all
-stations, for nothing, as if their file was in other units or its rows in another order.
+Weights decrease with the residual (Huber), iteratively: many blunders mask one another in tests of single observations,
+but hardly affect such an estimate. If no observation set fits (very large errors in an image of few points), Tukey's
+loss ignores them; or control and stations serve as little more than the datum; or all control, or all stations, are
+ignored, as if their file had other units or permuted rows.
 
 Source: Huber (1981), Robust statistics.
 """
@@ -29,28 +29,28 @@ from jaxphoto.procedures.robust import (
     robust,
     solve_placed,
 )
-from jaxphoto.statistics import LEAST_CHECKED, LEVEL, covariance, trends
+from jaxphoto.statistics import LEAST_CHECKED, LEVEL, covariance, systematic_effect_tests
 from jaxphoto.unknowns import Unknowns
 from jaxphoto.variants import without_observations
 
-# Huber's constant: residuals of so many standard deviations count whole (95 % efficient where all are normal).
+# Huber's constant: residuals up to this number of standard deviations have full weight (95 % efficiency).
 _HUBER = 1.345
 _ROBUST_STEPS = 10
-# Weight of control and stations where they are hardly more than the datum (sigma times 100), and where they are nothing
-# (a million times), but for what nothing else tells.
+# Sigma factors of control and stations that serve as little more than the datum, and that are ignored, except where
+# nothing else determines the block.
 _LOOSE, _NOTHING = 1e-4, 1e-12
-# A weight that changes by less, in a robust step, no longer changes what is suspected.
+# A smaller change of weights in a robust iteration does not change the suspects.
 _STILL = 0.02
 
 
 class Begun(NamedTuple):
-    """Where a search begins."""
+    """Initial solution of a search."""
 
     at: Adjustment
-    """The whole block, linearised."""
+    """Whole block, linearised."""
     redundancy: Blocks
     left: Masks
-    """What is out at first: image points of points that flew away, and groups that were taken for nothing."""
+    """Initially rejected: image points of diverged points, and ignored groups."""
 
 
 def beginnings(
@@ -61,7 +61,7 @@ def beginnings(
     sizes: Sizes,
     report: Callable[[str], object],
 ) -> Iterator[Callable[[], Begun]]:
-    """To be tried in turn until something fits; with a `loss` this only. Each raises what `adjust` raises."""
+    """Yield initial solutions, to be tried until one fits; with a `loss` only that one. Raises what `adjust` raises."""
 
     def robustly(loss: AbstractLoss) -> Begun:
         begun = robust(block, loss, from_all(), max_steps=max_steps, sizes=sizes, report=report)
@@ -91,13 +91,13 @@ def without_what_is_alike(
     sizes: Sizes,
     report: Callable[[str], object],
 ) -> Iterator[tuple[Masks, Callable[[], Begun]]]:
-    """Where to begin again, and what is out then, if what was left in is off by alike along an axis of a group.
+    """Return an initial solution without rows that share an error along an axis of their group.
 
-    Other unknowns take up most of such an error, and then sound rows contradict what looks right.
+    Other unknowns absorb most of such an error, and then valid rows contradict plausible ones.
     """
-    tested = trends(found, np.asarray(covariance(found).shared_sigma))
+    tested = systematic_effect_tests(found, np.asarray(covariance(found).shared_sigma))
     for trend in tested:
-        if trend.p_value < LEVEL / len(tested) and (axes := [h.term.name for h in trend.alike]):
+        if trend.p_value < LEVEL / len(tested) and (axes := [h.term.name for h in trend.significant_terms]):
             rows = block.named_observations[trend.pattern.group]
             out = {trend.pattern.group: np.any(np.isin(rows.axis_of_numbers, axes), axis=0)}
             yield out, partial(_without, block, start, max_steps, sizes, report, out)
@@ -111,7 +111,7 @@ def _without(
     report: Callable[[str], object],
     out: Masks,
 ) -> Begun:
-    """Where the block leads without some rows."""
+    """Adjust the block without some rows."""
     none = {name: out.get(name, np.zeros(len(rows), bool)) for name, rows in block.named_observations.items()}
     start = start_of(without_observations(block, none)[0], report) if start is None else start
     least = {name: np.where(own, _NOTHING, 1.0) for name, own in out.items()}
@@ -127,7 +127,7 @@ def _reweighted(
     report: Callable[[str], object],
     least: Mapping[str, float | np.ndarray],
 ) -> Begun:
-    """Where weights have led that fall with the residual, from `least` on by group, or from 1."""
+    """Adjust with weights that decrease with the residual, from `least` on by group, or from 1."""
     rows, unknowns = block.named_observations, start
     weight = {name: np.broadcast_to(least.get(name, 1.0), len(own)) for name, own in rows.items()}
     least = weight
@@ -151,13 +151,13 @@ def _reweighted(
 
 
 def weighed(rows: AbstractObservations, weight: Float[np.ndarray, "_"]) -> AbstractObservations:
-    """The rows with other weights, one factor a row."""
+    """Scale the weights of rows, one factor per row."""
     factor = (weight**-0.5).reshape(-1, *[1] * (np.ndim(rows.sigmas) - 1))
     return rows.with_sigmas_times(np.broadcast_to(factor, np.shape(rows.sigmas)))
 
 
 def _largest(at: Adjustment, name: str, r: Blocks) -> Float[np.ndarray, "_"]:
-    """Of each row, the largest |v| / sqrt(r); tiny where hardly anything checks it."""
+    """Return the largest |v| / sqrt(r) of each row; very small if hardly anything checks it."""
     own = np.diagonal(r[name], axis1=1, axis2=2).T
     checked = own > LEAST_CHECKED
     size = np.abs(np.atleast_2d(at.residuals[name])) / np.sqrt(np.where(checked, own, 1.0))

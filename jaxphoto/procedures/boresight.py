@@ -1,12 +1,12 @@
-"""The boresight misalignment of a camera in four steps, each with its judgement.
+"""Boresight misalignment of a camera in four steps, each with a judgement.
 
-1. Neither stations nor attitudes: are image measurements and control sound?
-2. Stations, with shift and drift of every strip, and no attitudes: is the GNSS trajectory sound?
-3. Stations and attitudes, boresight free: the misalignment.
-4. The same without control, which becomes check points: does control bend the misalignment?
+1. Neither stations nor attitudes: are image measurements and control valid? 2. Stations, with shift and drift of every
+strip, and no attitudes: is the GNSS trajectory valid? 3. Stations and attitudes, free boresight: the misalignment. 4.
+The same without control, which becomes check points: does control distort the misalignment?
 
-A shift or drift that step 2 finds significant but not major stays: free in step 3, held at the value found there in
-step 4, where without control nothing else would place the block. Source: paper 003, section 2.3; docs/boresight.md.
+A shift or drift that is significant but not major in step 2 is kept: free in step 3, fixed at that value in step 4,
+where without control nothing else determines the position of the block. Source: paper 003, section 2.3;
+docs/boresight.md.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from jaxphoto.adjustment import MAX_STEPS
 from jaxphoto.block import Block, Start
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Mount, StripBias
-from jaxphoto.orientation import approximate
+from jaxphoto.initial import approximate
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.boresight_judgement import Biases, Step, judge
 from jaxphoto.tracing import outside_transformations
@@ -37,11 +37,11 @@ def boresight(
     max_steps: int = MAX_STEPS,
     report: Callable[[str], object] = lambda text: None,
 ) -> tuple[Step, ...]:
-    """Boresight misalignment of `block` in four steps; the last one returned is the last that was made.
+    """Determine the boresight misalignment of `block` in four steps; returns the steps made.
 
-    It stops after a step whose judgement says that it makes no sense to continue, unless `go_on`, and after one that
-    does not converge; `report` is told of each. Interior orientation is estimated as the block's priors say. Raises
-    BlockError where the block lacks what one of the steps needs, and what `jaxphoto.adjust` raises.
+    Stops after a step whose judgement is that continuing is pointless, unless `go_on`, and after one that does not
+    converge; `report` receives progress. Interior orientation is estimated according to the block's priors. Raises
+    BlockError if the block lacks what one of the steps needs, and what `jaxphoto.adjust` raises.
     """
     for number in STEPS:
         _check(block, number)
@@ -60,11 +60,11 @@ def boresight(
 
 
 def step_block(block: Block, number: int, biases: Biases = (), before: Unknowns | None = None) -> Block:
-    """`block` as step `number` (1 to 4) adjusts it.
+    """Return `block` as adjusted in step `number` (1 to 4).
 
-    `biases` are the shifts and drifts that step 2 told to keep (`Step.biases`); `before` the unknowns of the step
-    before, which serve as start values and, in step 4, as the values those shifts and drifts are held at. Where it is
-    None, the block's own start is taken. Raises BlockError where the block lacks what the step needs.
+    `biases` are the shifts and drifts kept from step 2 (`Step.biases`); `before` the unknowns of the previous step,
+    used as start values and, in step 4, as the fixed values of those shifts and drifts. If None, the block's own start
+    values are used. Raises BlockError if the block lacks what the step needs.
     """
     _check(block, number)
     free = strip_biases(block) if number == 2 else biases if number == 3 else ()
@@ -88,7 +88,9 @@ def step_block(block: Block, number: int, biases: Biases = (), before: Unknowns 
 
 
 def strip_biases(block: Block) -> Biases:
-    """The shifts and drifts that stations can show: of strips with one station, and with two at different times."""
+    """Return the shifts and drifts that stations determine: of strips with one station, and with two at different
+    times.
+    """
     whole = np.bincount(block.stations.who, minlength=len(block.images)) == 3
     found: list[tuple[str, str]] = []
     for name in dict.fromkeys(block.image_strip):
@@ -101,14 +103,16 @@ def strip_biases(block: Block) -> Biases:
 
 
 def _mount_prior(prior: Mount, number: int) -> Mount:
-    """Step 3 is the first that sees a mount; without attitudes a lever arm and the shifts would be hard to tell."""
+    """Return the prior of a mount: without attitudes a lever arm and the shifts are hardly separable, so from step 3
+    on.
+    """
     if number < 3:
         return dataclasses.replace(prior, lever_arm=FIXED, boresight=FIXED, time_offset=FIXED)  # type: ignore[arg-type]
     return dataclasses.replace(prior, boresight=FREE)  # type: ignore[arg-type]
 
 
 def _check(block: Block, number: int) -> None:
-    """Raise BlockError, with the mend, where `block` lacks what step `number` needs."""
+    """Raise BlockError, with the cure, if `block` lacks what step `number` needs."""
     if number not in STEPS:
         raise ValueError(f"the steps of the boresight are 1, 2, 3 and 4, got {number!r}")
     what = f"step {number} of the boresight needs"

@@ -1,6 +1,6 @@
-"""What a photogrammetrist concludes from each of the four steps of a boresight calibration, with the numbers.
+"""Judgement of the four steps of a boresight calibration.
 
-Thresholds and why they are so: docs/boresight.md. Source: paper 003, section 2.3.
+Thresholds and their reasons: docs/boresight.md. Source: paper 003, section 2.3.
 """
 
 from typing import NamedTuple
@@ -25,11 +25,11 @@ Biases = tuple[tuple[str, str], ...]
 """Shifts and drifts: (strip, "shift" or "drift")."""
 
 SIGNIFICANT = 3.0
-"""Standard deviations from which on a shift, a drift, a misalignment or a difference of two is significant."""
+"""Standard deviations from which a shift, a drift, a misalignment or a difference of two is significant."""
 MAJOR = 10.0
-"""Times the stations' sigma from which on a significant shift, or drift over half a strip, is major."""
+"""Multiple of the stations' sigma from which a significant shift, or drift over half a strip, is major."""
 HIGH = 0.9
-"""|rho| from which on two unknowns are hard to tell apart."""
+"""|rho| from which two unknowns are hardly separable."""
 _SHOWN = 4
 TITLES = {
     1: "neither stations nor attitudes: image measurements and control",
@@ -43,7 +43,7 @@ _UNITS = {"_m_per_s": "m/s", "_mm": "mm", "_deg": "deg", "_m": "m", "_s": "s"}
 
 @shown
 class BoresightEstimate(NamedTuple):
-    """One number that a step gives, in `unit` (angles in degrees); sigma is a posteriori."""
+    """Estimate of a step, in `unit` (angles in degrees); sigma is a posteriori."""
 
     parameter: str
     value: float
@@ -53,11 +53,10 @@ class BoresightEstimate(NamedTuple):
 
 @shown
 class Step(eqx.Module):
-    """One step of a boresight calibration: its adjustment and what is concluded from it.
+    """Step of a boresight calibration: its adjustment and conclusions.
 
-    `go_on` says whether it makes sense to continue, after step 4 whether the misalignment can be used. `biases` are
-    the shifts and drifts that the steps to come must keep. `estimates` are all shared unknowns and, in step 4, the
-    differences from step 3.
+    `go_on` is True if continuing makes sense, after step 4 if the misalignment is usable. `biases` are the shifts and
+    drifts that later steps must keep. `estimates` are all shared unknowns and, in step 4, the differences from step 3.
     """
 
     number: int = eqx.field(static=True)
@@ -70,19 +69,19 @@ class Step(eqx.Module):
 
     @property
     def title(self) -> str:
-        """What the step adjusts and looks for."""
+        """Description of the step."""
         return TITLES[self.number]
 
 
 class _Known(NamedTuple):
-    """The shared unknowns of a step: label -> value and sigma, in metres, radians, millimetres."""
+    """Shared unknowns of a step: label -> value and sigma, in metres, radians, millimetres."""
 
     value: dict[str, float]
     sigma: dict[str, float]
 
 
 def judge(number: int, adjusted: Adjustment, last: Step | None = None) -> Step:
-    """The judgement of step `number`, whose block was adjusted; `last` is the step before (step 4 needs step 3)."""
+    """Judge step `number`, whose block was adjusted; `last` is the previous step (step 4 needs step 3)."""
     cov = covariance(adjusted)
     known = _known(adjusted, cov)
     estimates = [_estimate(label, known.value[label], known.sigma[label]) for label in known.value]
@@ -132,7 +131,7 @@ def _estimate(label: str, value: float, sigma: float) -> BoresightEstimate:
 
 
 def _shifts(adjusted: Adjustment, cov: Covariance, known: _Known) -> tuple[list[str], Biases, bool]:
-    """Significant and major shifts and drifts, in words; which to keep; and whether one is major."""
+    """Return messages about significant and major shifts and drifts; which to keep; and True if one is major."""
     labels = [label for label in known.value if label.startswith("strips[")]
     owners = [_owner(label) for label in labels]
     note = [] if any(what == "drift" for _, what in owners) else ["no drift is looked for: the images have no times"]
@@ -156,11 +155,11 @@ def _shifts(adjusted: Adjustment, cov: Covariance, known: _Known) -> tuple[list[
 def _significant(
     labels: list[str], owners: list[tuple[str, str]], cov: Covariance, known: _Known
 ) -> tuple[Biases, np.ndarray, np.ndarray, float]:
-    """Which shifts and drifts are not zero, their values and sigmas with the others zero, and the least p of a test.
+    """Return the nonzero shifts and drifts, their values and sigmas with the others zero, and the smallest p of a test.
 
-    One at a time: the shift or drift (three axes) that lowers v'Pv / sigma0^2 most joins those kept, while it lowers it
-    by more than chance does. Tested alone they would hide behind each other, and behind a free principal point, which
-    one strip cannot tell from its shift.
+    Forward selection: the shift or drift (three axes) that reduces v'Pv / sigma0^2 most is added while the reduction is
+    significant. Tested individually they would mask one another, and be masked by a free principal point, which one
+    strip cannot separate from its shift.
     """
     place = [cov.labels.index(label) for label in labels]
     q = np.asarray(cov.matrix)[np.ix_(place, place)] * float(cov.variance_factor)
@@ -188,13 +187,13 @@ def _significant(
 
 
 def _owner(label: str) -> tuple[str, str]:
-    """(strip, "shift" or "drift") of the label of a strip's unknown."""
+    """Return (strip, "shift" or "drift") of the label of a strip's unknown."""
     strip, parameter = label.removeprefix("strips[").rsplit("].", 1)
     return strip, parameter.split("_")[0]
 
 
 def _size(adjusted: Adjustment, strip: str, what: str, axis: str) -> float:
-    """What a shift of 1 m, or a drift of 1 m/s from a strip's middle to its end, is over the stations' sigma."""
+    """Return a shift of 1 m, or a drift of 1 m/s over half a strip, relative to the stations' sigma."""
     block, stations = adjusted.block, adjusted.block.stations
     mine = (np.array(block.image_strip)[stations.who] == strip) & (stations.axis == AXES.index(axis))
     span = 1.0 if what == "shift" else float(np.ptp(np.asarray(block.image_time)[stations.who[mine]])) / 2
@@ -202,7 +201,7 @@ def _size(adjusted: Adjustment, strip: str, what: str, axis: str) -> float:
 
 
 def _inseparable(cov: Covariance) -> list[str]:
-    """Which part of a shift an interior orientation may have taken."""
+    """Return messages about shifts that an interior orientation may have absorbed."""
     plan = "a shift of every strip along its own heading would pass for it; relief helps, or a held principal point"
     height = "hold c fixed, or fly at two heights"
     found = []
@@ -239,7 +238,7 @@ def _misalignment(adjusted: Adjustment, cov: Covariance, known: _Known) -> list[
 
 
 def _strongest(cov: Covariance, first, second) -> tuple[float, str, str]:
-    """The largest correlation of an unknown that `first` takes with one that `second` takes; empty names if none."""
+    """Return the largest correlation of an unknown of `first` with one of `second`; empty names if none."""
     rho = correlation_matrix(cov)
     one = [k for k, label in enumerate(cov.labels) if first(label)]
     two = [k for k, label in enumerate(cov.labels) if second(label)]
@@ -253,11 +252,11 @@ def _strongest(cov: Covariance, first, second) -> tuple[float, str, str]:
 def _differences(
     adjusted: Adjustment, cov: Covariance, known: _Known, last: Step | None, biases: Biases
 ) -> tuple[list[BoresightEstimate], str, bool]:
-    """Step 4 minus step 3 of every boresight angle.
+    """Return step 4 minus step 3 of every boresight angle.
 
-    Step 3 has all observations of step 4, so the difference has the variance Q4 - Q3. Where step 4 holds shifts that
-    step 3 estimated, that is Q4 - C Q3 C' with C = [1, d boresight / d shift]: at most Q4, which is taken. sigma0 is
-    that of step 4, which bad control does not raise.
+    Step 3 has all observations of step 4, so the difference has the variance Q4 - Q3. Where step 4 fixes shifts that
+    step 3 estimated, it is Q4 - C Q3 C' with C = [1, d boresight / d shift]: at most Q4, which is used. sigma0 is that
+    of step 4, which control errors do not increase.
     """
     if last is None or last.number != 3:
         raise ValueError("step 4 is judged against step 3: give it as `last`")
@@ -283,7 +282,7 @@ def _differences(
 
 
 def _checks(adjusted: Adjustment, cov: Covariance) -> list[str]:
-    """Discrepancies at the check points, which the control has become."""
+    """Return messages about discrepancies at the former control points."""
     check = check_discrepancies(adjusted)
     if not len(check.who):
         return []

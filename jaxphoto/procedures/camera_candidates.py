@@ -1,4 +1,4 @@
-"""Candidates for the distortion of a block: a model of which some coefficients are estimated, others held at 0."""
+"""Candidate distortion models of a block: a model with some coefficients estimated, others fixed at 0."""
 
 import dataclasses
 from typing import NamedTuple
@@ -16,21 +16,21 @@ from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
 
 
 class Candidate(NamedTuple):
-    """A distortion model of which only `free` is estimated; its other coefficients are held at 0."""
+    """Distortion model of which only `free` is estimated; its other coefficients are fixed at 0."""
 
     name: str
     distortion: type[AbstractDistortion]
     free: tuple[str, ...]
 
     def within(self, other: "Candidate") -> bool:
-        """Whether `other` is this candidate with more coefficients."""
+        """Return True if `other` is this candidate with more coefficients."""
         return self.distortion is other.distortion and set(self.free) < set(other.free)
 
 
 def candidate_of(text: str) -> Candidate:
-    """`brown` (its usual coefficients), `brown:all`, `brown:none` or `brown:k1+k2`.
+    """Parse `brown` (its usual coefficients), `brown:all`, `brown:none` or `brown:k1+k2`.
 
-    Raises InputError for a model or coefficient that there is not.
+    Raises InputError for an unknown model or coefficient.
     """
     model, _, listed = text.strip().partition(":")
     kind = AbstractDistortion.called(model)
@@ -45,12 +45,12 @@ def candidate_of(text: str) -> Candidate:
 
 
 def with_candidate(block: Block, candidate: Candidate, known: Unknowns | None) -> Block:
-    """The block with the candidate for all cameras, from `known` orientations and points if there are any.
+    """Return the block with the candidate for all cameras, starting at `known` orientations and points if given.
 
-    c, x_p and y_p stay what the block says of them: a weighted value is carried over where the conversion to another
-    model moves them, as SMAC's c does with R0. The coefficients of the candidate are free, weighted ones too: those who
-    have them would else explain an observation more than those who do not. They start from the block's distortion,
-    converted where its model is another. Residuals are of measured coordinates, for every model.
+    c, x_p and y_p keep their priors: a weighted value is transformed if the conversion to another model changes it, as
+    SMAC's c with R0. All coefficients of the candidate are free, even weighted ones: otherwise models with a prior
+    would explain an additional observation. They start from the block's distortion, converted if its model differs.
+    Residuals are of measured coordinates, for every model.
     """
     interior, priors = {}, {}
     for name, given in block.start.unknowns.interior.items():
@@ -70,10 +70,10 @@ def _start(given: InteriorOrientation, candidate: Candidate, sensor: Sensor) -> 
     held = tuple(name for name in kind.coefficients if name not in candidate.free)
     try:
         same = exact(given, kind)
-        # A fit must know what is held: the rational terms of a full one mean nothing without each other.
+        # A fit must know the fixed coefficients: rational terms are meaningless without each other.
         interior = same if same is not None else fitted(given, kind, sensor, held).interior
     except ValueError:
-        # What does not follow the given distortion starts without any.
+        # A candidate that does not fit the given distortion starts without distortion.
         interior = dataclasses.replace(given, distortion=kind.plain(sensor))
     interior = dataclasses.replace(interior, residuals="measured")
     for name in held:
@@ -82,13 +82,13 @@ def _start(given: InteriorOrientation, candidate: Candidate, sensor: Sensor) -> 
 
 
 def _priors(given: InteriorOrientation, priors, interior: InteriorOrientation, free: tuple[str, ...]):
-    """Those of the candidate, whose camera `interior` was made of the `given` one."""
+    """Return priors of the candidate, whose camera `interior` was converted from the `given` one."""
     own = jax.tree.map(lambda _: FIXED, interior)
     scale = float(interior.c) / float(given.c)
     for name, factor in (("c_mm", scale), ("xp_mm", 1.0), ("yp_mm", 1.0)):
         prior = get_parameter(priors, name)
         if isinstance(prior, Weighted):
-            # As far from the start as it was, in the unit that c now has.
+            # At the same distance from the start, in the unit that c now has.
             start, before = (float(get_parameter(camera, name)) for camera in (interior, given))
             prior = Weighted(start + factor * (float(prior.value) - before), factor * float(prior.sigma))
         own = set_parameter(own, name, prior)

@@ -1,4 +1,4 @@
-"""Has a camera changed between two adjustments?"""
+"""Test for a camera change between two adjustments."""
 
 import numpy as np
 from jaxtyping import Float
@@ -23,11 +23,11 @@ def compare(
     points: Float[Numbers, "points 2"] | None = None,
     method: Method = "rot",
 ) -> Change:
-    """Compare a camera in two adjustments of different photographs: parameter by parameter, and by its bundle of rays.
+    """Compare a camera in two adjustments of different photographs: by parameters, and by its bundle of rays.
 
-    `camera` and `camera_b` name it in either where a block has several. `points` (mm from the centre) are those of the
-    format at which rays are compared, 15 x 11 from edge to edge where they are not given; `method` is what the
-    orientation of images may take up (docs/stability.md). `jaxphoto.report.change` has tables and words of the result.
+    `camera` and `camera_b` name it in each if a block has several. `points` (mm from the centre) are the places of the
+    format at which rays are compared, 15 x 11 from edge to edge by default; `method` defines which orientation is
+    estimated between the bundles (docs/stability.md). `jaxphoto.report.stability` has its tables and messages.
     Raises InputError for adjustments that did not converge, formats that differ, and bundles that cannot be compared.
     """
     for adjusted in (first, second):

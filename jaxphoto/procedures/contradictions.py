@@ -1,4 +1,4 @@
-"""How much each observation contradicts the others, those that were left out too."""
+"""Test statistics of all observations, including rejected ones."""
 
 import numpy as np
 from jaxtyping import Float
@@ -8,16 +8,16 @@ from jaxphoto.procedures.beginnings import weighed
 from jaxphoto.procedures.robust import Blocks, Masks, checked_parts
 from jaxphoto.statistics import LEAST_CHECKED, LEVEL, UNCHECKED, chi_square_limit
 
-# Standard deviations of what is left out times this are next to nothing, and yet known to many digits.
+# Factor of standard deviations of rejected rows: negligible weight, without loss of digits.
 _WEAK = 1000.0
 
 
 def row_sizes(at: Adjustment, r: Blocks, predicted: bool = False) -> dict[str, Float[np.ndarray, "_"]]:
-    """Of each row, sqrt(v' R^-1 v) over the root of its chi-square quantile: above 1 it is a blunder.
+    """Return, for each row, sqrt(v' R^-1 v) over the root of its chi-square quantile: above 1 it is a blunder.
 
-    Or sqrt(v' R v), of rows that were left out and are `predicted` by the others. Only directions that the others check
-    count: a point of two rays is checked across the plane of these, and not along it. A prediction checks hardly what
-    is hardly known, but rounding is no part of it.
+    Or sqrt(v' R v), for rejected rows, which the others `predict`. Only directions that the others check count: a point
+    of two rays is checked across their epipolar plane, not along it. A prediction hardly checks what is hardly
+    determined, but rounding does not enter.
     """
     axes = {name: np.linalg.eigh(own) for name, own in r.items()}
     least = UNCHECKED if predicted else LEAST_CHECKED
@@ -34,14 +34,14 @@ def row_sizes(at: Adjustment, r: Blocks, predicted: bool = False) -> dict[str, F
 
 
 def predicted_parts(at: Adjustment, left: Masks, sizes: Sizes) -> Blocks:
-    """`checked_parts`, of rows left out as if each was in beside those that are: with it they are predicted."""
+    """Return `checked_parts`, of rejected rows as if each was added to the others, which then predict it."""
     rows = at.block.named_observations
     weak = {name: weighed(own, np.where(left[name], _WEAK**-2, 1.0)) for name, own in rows.items()}
     r = checked_parts(linearise(at.block.with_observations(weak), at.unknowns, at.block.priors, sizes))
     for name, out in left.items():
         if out.any():
             values, vectors = np.linalg.eigh(r[name][out])
-            # 1 / r = 1 + q, of a prediction of the variance q, beside the row's own of 1; here the own is _WEAK^2.
+            # 1 / r = 1 + q, for a prediction of the variance q, relative to the row's own of 1; here that is _WEAK^2.
             values = np.clip(values, 0.0, 1.0)
             values = values / (values + _WEAK**2 * (1 - values))
             r[name] = r[name].copy()

@@ -1,7 +1,7 @@
-"""k-fold cross-validation of an adjustment: image points left out, and predicted from all others.
+"""k-fold cross-validation of an adjustment: image points predicted from all others.
 
-Image measurements are left out point by point, so that every point keeps at least two rays: the block without them is
-adjusted, and what it predicts of them with its cameras, orientations and points is compared with what was measured.
+Image points are omitted such that every object point keeps at least two rays. The block without them is adjusted, and
+their prediction by its cameras, orientations and points is compared with the measurements.
 """
 
 import dataclasses
@@ -25,10 +25,10 @@ _LEAST_RAYS = 2
 
 
 def folds(block: Block, k: int, seed: int = 0) -> Int[np.ndarray, "rows"]:
-    """In which fold (0 ... k - 1) each image row is left out; -1 for those that never are.
+    """Return the fold (0 ... k - 1) in which each image row is omitted; -1 for rows that never are.
 
-    Rows of a point go to the folds in turn and at random, no more to each than leave the point two rays. Raises
-    BlockError where no point was measured in three images.
+    Rows of a point are assigned to the folds in turn and at random, leaving the point two rays in each. Raises
+    BlockError if no point was measured in three images.
     """
     point = np.asarray(block.image_points.point)
     rng = np.random.default_rng(seed)
@@ -50,22 +50,22 @@ def folds(block: Block, k: int, seed: int = 0) -> Int[np.ndarray, "rows"]:
 
 
 def without_rows(block: Block, left_out: Bool[np.ndarray, "rows"]) -> Block:
-    """The block without some of its image points."""
+    """Remove some image points of the block."""
     kept, p = ~left_out, block.image_points
     rows = ImageRows(p.image[kept], p.point[kept], still(p.xy)[kept], still(p.sigma)[kept])
     return dataclasses.replace(block, image_points=rows)
 
 
 def fold_blocks(block: Block, fold: Int[np.ndarray, "rows"]) -> tuple[list[Block], Sizes]:
-    """The block without each of the folds, and sizes that these and the block itself fit into."""
+    """Return the block without each of the folds, and sizes that fit these and the block itself."""
     parts = [without_rows(block, fold == k) for k in range(fold.max() + 1)]
     return parts, common_sizes([block, *parts])
 
 
 def measured_discrepancies(block: Block, unknowns: Unknowns) -> Float[np.ndarray, "rows 2"]:
-    """Measured minus predicted image coordinate (mm) of every image row, whatever the direction of the distortion.
+    """Return measured minus predicted image coordinate (mm) of every image row, whatever the domain of the distortion.
 
-    It is the residual "measured" of `InteriorOrientation`, by which all models are compared by the same numbers.
+    It is the residual "measured" of `InteriorOrientation`, so that all models are compared by the same numbers.
     """
     p = block.image_points
     found = np.zeros((len(p.image), 2))

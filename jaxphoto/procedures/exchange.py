@@ -1,4 +1,4 @@
-"""Rows of a block that have each other's numbers, and the block with these exchanged."""
+"""Exchange of observations between rows of a block."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -10,33 +10,33 @@ from jaxtyping import Float
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
-from jaxphoto.orientation.rays import camera_rays, turn_to_object
+from jaxphoto.initial.rays import camera_rays, turn_to_object
 from jaxphoto.procedures.robust import Masks
 from jaxphoto.short_repr import shown
 
 
 @shown
 class Exchange(NamedTuple):
-    """Rows of a group to exchange with one another: what was observed, and its standard deviation."""
+    """Rows of a group that exchange observed values and standard deviations."""
 
     group: str
     rows: tuple[tuple[int, ...], ...]
-    """Two or more each: the first gets what was observed in the second, and so on; the last what was in the first."""
+    """Two or more each: the first receives the observation of the second, and so on; the last that of the first."""
     words: str
-    """Such as "points 12 and 31 of image A2 had each other's name"."""
+    """Message such as "points 12 and 31 of image A2 had each other's name"."""
     back: dict[str, tuple[int, ...]]
-    """By group, rows that are in again, once these are exchanged."""
+    """Rows that are accepted again after the exchange, by group."""
     out: tuple[int, ...] = ()
-    """Rows of the group that have what belongs to none of them, and go."""
+    """Rows of the group that belong to none of them, and are removed."""
 
     @property
     def undone(self) -> "Exchange":
-        """Everything as it was; nothing is in again, or goes."""
+        """Return the exchange of nothing."""
         return self._replace(rows=tuple(rows[::-1] for rows in self.rows), back={}, out=())
 
 
 def exchanged(block: Block, left: Masks, exchange: Exchange) -> tuple[Block, Masks]:
-    """The block with these rows exchanged, and what is no longer left out."""
+    """Exchange these rows, and accept rows again."""
     rows = block.named_observations[exchange.group]
     order = np.arange(len(rows))
     for own in exchange.rows:
@@ -49,7 +49,7 @@ def exchanged(block: Block, left: Masks, exchange: Exchange) -> tuple[Block, Mas
 
 
 def with_what_rests_on_them(done: Sequence[Exchange], wrong: Sequence[bool]) -> list[Exchange]:
-    """The exchanges that are wrong, and those after them of the same rows."""
+    """Return wrong exchanges, and later ones of the same rows."""
     found: list[Exchange] = []
     rows: set[tuple[str, int]] = set()
     for exchange, bad in zip(done, wrong, strict=True):
@@ -61,7 +61,7 @@ def with_what_rests_on_them(done: Sequence[Exchange], wrong: Sequence[bool]) -> 
 
 
 def with_places(at: Adjustment, places: Mapping[int, Float[np.ndarray, "3"]]) -> Adjustment:
-    """`at` with points at these places (m)."""
+    """Return `at` with points at these places (m)."""
     points = np.array(still(at.unknowns.points))
     for point, place in places.items():
         points[point] = place
@@ -71,7 +71,9 @@ def with_places(at: Adjustment, places: Mapping[int, Float[np.ndarray, "3"]]) ->
 def rays_of(
     at: Adjustment,
 ) -> tuple[Float[np.ndarray, "rows 3"], Float[np.ndarray, "rows 3"], Float[np.ndarray, "rows"]]:
-    """Of each image point, where its ray begins (m), its direction in the object frame, and c (mm) of its camera."""
+    """Return for each image point the origin (m) and direction of its ray in the object frame, and c (mm) of its
+    camera.
+    """
     block, exterior = at.block, at.unknowns.exterior
     p, measured = block.image_points, still(block.image_points.xy)
     camera, rays, c = np.array(block.image_camera, object)[p.image], np.zeros((len(p), 3)), np.ones(len(p))

@@ -1,8 +1,8 @@
-"""Control points that have one another's coordinates, or images one another's stations: two, or a file off by a row.
+"""Detection of exchanged coordinates of control points or stations: two of them, or a file shifted by a row.
 
-The images alone say where each is: a point, where its rays meet; an image, from where it sees its points. Where one
-lies where another is said to be, that other's coordinates are its own. As well may the names of the points have been
-exchanged in all images: no measurement tells one from the other, and the camera is the same.
+The images determine the position of each: a point, from its rays; an image, from its points. If one lies where another
+is said to be, it has that other's coordinates. Alternatively, the names of the points were exchanged in all images: no
+measurement distinguishes these, and the camera is the same.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,29 +17,29 @@ from jaxphoto.arrays import still
 from jaxphoto.block import Block
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError, few
+from jaxphoto.initial import resect
+from jaxphoto.initial.intersection import intersect_points
 from jaxphoto.observations import AbstractCoordinates
-from jaxphoto.orientation import resect
-from jaxphoto.orientation.block_intersection import intersect_points
 from jaxphoto.procedures.exchange import Exchange, rays_of, with_places
 from jaxphoto.procedures.exchanged_names import points_that_meet
 from jaxphoto.procedures.robust import Masks
 
-# One may have another's coordinates where it lies as near to those, beside the next nearest.
+# Maximum ratio of the distance from another's coordinates to that from the next nearest.
 _NEAR = 0.2
-# So much nearer where all of a group is out: then it turns nothing, and what is seen is as good as the rest.
+# The same if all of a group is rejected: it then distorts nothing, and the positions are accurate.
 _NEARER = 0.05
-# A resection needs so many points.
+# Number of points required for a resection.
 _ENOUGH = 4
-# An image may have another's station where more of its points than this part contradict the others.
+# Fraction of contradicting points from which an image may have another's station.
 _DOUBTED = 0.25
 
 
 def coordinate_exchanges(
     at: Adjustment, left: Masks, gone: Int[np.ndarray, "points"], sizes: Sizes
 ) -> tuple[list[Exchange], Adjustment]:
-    """The exchanges that put right what is `left` out, and points that are `gone`, of `at`: the block linearised.
+    """Return exchanges that resolve rejected rows `left` and points that are `gone`; `at` is the linearised block.
 
-    And `at` with what they are of where the images place it.
+    Also returns `at` with positions from the images.
     """
     found: list[Exchange] = []
     for group, rows in at.block.named_observations.items():
@@ -50,7 +50,7 @@ def coordinate_exchanges(
         if len(doubted) < 2:
             continue
         if what == "point":
-            # However badly their rays meet: an image that these have turned puts them near enough.
+            # However large the misclosure of their rays: an image distorted by these still gives a close position.
             places = points_that_meet(at, left, doubted, np.inf)
             by_images, placed = with_places(at, places), list(places)
         else:
@@ -64,9 +64,9 @@ def coordinate_exchanges(
 
 
 def as_one(block: Block, done: Sequence[Exchange], left: Masks) -> list[Exchange]:
-    """Exchanges of coordinates that were found one after the other as what they come to; all others as they are.
+    """Merge exchanges of coordinates found successively; all others unchanged.
 
-    Who has all rows `left` out in the end has nothing that is its own.
+    Objects all of whose rows are rejected in the end have no coordinates of their own.
     """
     found = []
     for group, rows in block.named_observations.items():
@@ -89,7 +89,7 @@ def as_one(block: Block, done: Sequence[Exchange], left: Masks) -> list[Exchange
 
 
 def _rounds_of(order: Int[np.ndarray, "rows"], last: set[int]) -> Iterator[tuple[int, ...]]:
-    """The rows that take each other's numbers, `order[k]` those of row k; one of `last` at the end."""
+    """Return cycles of rows, `order[k]` the source of row k; ending with one of `last`."""
     seen: set[int] = set()
     for first in np.flatnonzero(order != np.arange(len(order))).tolist():
         if first in seen:
@@ -124,7 +124,7 @@ def _exchange(
     else:
         stood = [f"{a}'s stood at {b}" for a, b in zip(names, names[1:] + names[:1], strict=True)]
         stood = stood[: -1 if lacks else None]
-        # In the order of the block, but for the turn from one end to the other.
+        # In the order of the block, except for the closing link.
         off = int((np.abs(np.diff([*ids, ids[0]])) == 1).sum()) >= len(ids) - 1
         words = (
             f"{len(ids)} {many} had one another's {has}, {few(stood)}"
@@ -136,7 +136,7 @@ def _exchange(
 def _doubted(
     block: Block, left: Masks, group: str, what: str, who: Int[np.ndarray, "rows"], gone
 ) -> Int[np.ndarray, "doubted"]:
-    """Points or images of the group of which something contradicts the others."""
+    """Return points or images of the group with a contradicting observation."""
     p = block.image_points
     out, theirs = left[p.group], p.point if what == "point" else p.image
     seen, wrong = (np.bincount(theirs[k], minlength=int(np.max(who)) + 1) for k in (np.s_[:], out))
@@ -148,10 +148,9 @@ def _doubted(
 def _placed_images(
     at: Adjustment, images: Int[np.ndarray, "doubted"], gone: Int[np.ndarray, "points"]
 ) -> tuple[Adjustment, list[int]]:
-    """`at` with these images where they see their points from, and which of them have enough of them.
+    """Return `at` with these images resected from their points, and True for those with enough points.
 
-    Points are taken where other images see them, as far as these are enough: an image whose station is wrong has drawn
-    them with it.
+    Points are intersected from other images, if these suffice: an image with a wrong station has distorted them.
     """
     block, exterior = at.block, at.unknowns.exterior
     p, points = block.image_points, still(at.unknowns.points)
@@ -172,7 +171,7 @@ def _placed_images(
         placed.append(image)
     new = ExteriorOrientation(jnp.asarray(positions), jnp.asarray(matrices))
     at = eqx.tree_at(lambda a: a.unknowns.exterior, at, new)
-    # What they see goes with them: from where wrong stations had drawn it, it would draw them back.
+    # Its points move along: they were distorted by wrong stations, and would pull it back.
     known = np.unique(p.point[np.isin(p.image, placed)])
     met, told = _met(at, known, np.isin(p.point, known))
     return with_places(at, dict(zip(known[told].tolist(), met[told], strict=True))), placed
@@ -181,18 +180,18 @@ def _placed_images(
 def _met(
     at: Adjustment, points: Int[np.ndarray, "n"], rows: Bool[np.ndarray, "rows"]
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
-    """Where the rays of these rows meet (m), point by point, and whether they do."""
+    """Return the intersections of the rays of these rows (m), by point, and True where they are valid."""
     origins, directions, _ = rays_of(at)
     which = np.searchsorted(points, at.block.image_points.point[rows])
     return intersect_points(origins[rows], directions[rows], which, len(points))
 
 
 def _rounds(rows: AbstractCoordinates, who, doubted, off: Float[np.ndarray, "rows"], near: float) -> Iterator[tuple]:
-    """Of the doubted, those of which each lies where the next is said to be, and their rows, axis by axis.
+    """Return cycles in which each lies where the next is said to be, and their rows, axis by axis.
 
-    `off` is observed minus seen (m), and no number where the images do not tell. The last lies where the first is said
-    to be; or is not seen, and coordinates are then not of a single axis; or lies elsewhere, and what it gets has to go:
-    a file that is off by a row lacks one, and one row may be there twice.
+    `off` is observed minus determined (m), NaN if undetermined by the images. The last lies where the first is said to
+    be; or is not determined, and coordinates are then not of a single axis; or lies elsewhere, and its observation is
+    removed: a file shifted by a row lacks one row, and may contain one twice.
     """
     own = {int(k): np.flatnonzero(who == k) for k in doubted}
     own = {k: mine[np.argsort(rows.axis[mine])] for k, mine in own.items()}
@@ -212,7 +211,7 @@ def _rounds(rows: AbstractCoordinates, who, doubted, off: Float[np.ndarray, "row
 def _lying_at(
     rows: AbstractCoordinates, own: dict[int, Int[np.ndarray, "axes"]], off: Float[np.ndarray, "rows"], near: float
 ) -> dict[int, int]:
-    """Which is seen where which other one is said to be."""
+    """Return the pairs of positions and stated coordinates that coincide."""
     found: list[tuple[float, int, int]] = []
     for axes in {tuple(rows.axis[mine].tolist()) for mine in own.values()}:
         ids = [k for k, mine in own.items() if tuple(rows.axis[mine].tolist()) == axes]
@@ -222,7 +221,7 @@ def _lying_at(
         for k in told.tolist() if len(ids) > 1 else ():
             miss = np.abs(said - seen[k]).max(axis=1)
             nearest, second = np.argsort(miss)[:2].tolist()
-            # Who lies where it is said to be has its own; and of many some lie near another's by chance.
+            # Correct ones have their own; and some of many lie close to another's by chance.
             if nearest != k and miss[nearest] < near * miss[second]:
                 found.append((float(miss[nearest]), ids[k], ids[nearest]))
     after: dict[int, int] = {}

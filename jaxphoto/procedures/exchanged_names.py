@@ -1,9 +1,8 @@
-"""Two image points of one image that have each other's name: found among what contradicts the others, and put right.
+"""Detection of exchanged names of two image points in one image, among contradicting observations.
 
-A point that has other rays enough says where in the image it should be. One that had two rays, of which one is wrong,
-is gone with them: with the other's measurement its rays must meet, in front of the cameras and as far away as other
-points are. Where both points had their two rays in the same two images, nobody can tell in which of these the names
-were exchanged; the points are the same.
+Other rays of a point predict its image. A point with two rays, one of which is wrong, is lost with them: with the
+other's measurement its rays must intersect, in front of the cameras and at the distance of other points. If both points
+have their two rays in the same two images, the image of the exchange is ambiguous; the points are the same.
 """
 
 from collections.abc import Iterable
@@ -15,40 +14,39 @@ from jaxtyping import Bool, Float, Int
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
-from jaxphoto.orientation.block_intersection import intersect_points
+from jaxphoto.initial.intersection import intersect_points
 from jaxphoto.procedures.cross_validation import measured_discrepancies
 from jaxphoto.procedures.exchange import Exchange, exchanged, rays_of, with_places
 from jaxphoto.procedures.robust import Blocks, Masks
 from jaxphoto.statistics import LEVEL, chi_square_limit
 
-# Two image points may have each other's name where one lies as near to the prediction of the other, beside how far
-# apart they are.
+# Maximum ratio of the distance from the other's prediction to the distance of the two image points.
 _NEAR = 0.2
-# Points are this much nearer or farther than any other of the image at most.
+# Maximum ratio of a point's distance to the nearest or farthest other point of the image.
 _DEPTH = 1.5
 
 
 class _Seen(NamedTuple):
-    """What tells whether a measurement suits a point."""
+    """Data to judge whether a measurement matches a point."""
 
     block: Block
     measured: Float[np.ndarray, "rows 2"]
     predicted: Float[np.ndarray, "rows 2"]
-    """Where the points of the rows should be, of points that are not gone."""
+    """Predicted image coordinates of the points of the rows, except lost ones."""
     gone: Bool[np.ndarray, "points"]
     left: Bool[np.ndarray, "rows"]
     origins: Float[np.ndarray, "rows 3"]
     directions: Float[np.ndarray, "rows 3"]
-    """Of the rays in the object frame."""
+    """Ray directions in the object frame."""
     sigma: Float[np.ndarray, "rows"]
-    """Of a ray's direction (rad)."""
+    """Standard deviation of a ray's direction (rad)."""
     depths: Float[np.ndarray, "images 2"]
-    """The nearest and the farthest point of each image (m)."""
+    """Distances of the nearest and the farthest point of each image (m)."""
     limit: float
-    """Of the square sum of one number over its variance."""
+    """Limit of a squared number over its variance."""
 
     def partners(self, row: int) -> Int[np.ndarray, "others"]:
-        """The other rays of the point of a row: those that are in, or else all."""
+        """Return the other rays of the point of a row: accepted ones, or else all."""
         p = self.block.image_points
         own = np.flatnonzero((p.point == p.point[row]) & (np.arange(len(p)) != row))
         return own[~self.left[own]] if not self.left[own].all() else own
@@ -57,9 +55,9 @@ class _Seen(NamedTuple):
 def name_exchanges(
     at: Adjustment, left: Masks, gone: Int[np.ndarray, "points"], sigma0: float, r: Blocks
 ) -> tuple[list[Exchange], Adjustment]:
-    """The exchanges that put right what is `left` out, and points that are `gone`, of `at`: the block linearised.
+    """Return exchanges that resolve rejected rows `left` and points that are `gone`; `at` is the linearised block.
 
-    And `at` with points that were gone where their rays meet.
+    Also returns `at` with lost points at their intersections.
     """
     seen, block = _seen(at, left, gone, sigma0), at.block
     group, point = block.image_points.group, block.image_points.point
@@ -85,7 +83,7 @@ def name_exchanges(
 def points_that_meet(
     at: Adjustment, left: Masks, gone: Int[np.ndarray, "points"], sigma0: float
 ) -> dict[int, Float[np.ndarray, "3"]]:
-    """Of the points that are `gone`, those all of whose rays meet after all, and where (m)."""
+    """Return lost points all of whose rays intersect after all, and where (m)."""
     seen, p = _seen(at, left, gone, sigma0), at.block.image_points
     met = {point: np.flatnonzero(p.point == point) for point in gone.tolist()}
     places = {point: _meeting(seen, rays) for point, rays in met.items() if len(rays) > 1}
@@ -93,7 +91,7 @@ def points_that_meet(
 
 
 def put_back(block: Block, left: Masks, points: Iterable[int]) -> Masks:
-    """`left` without the image points of these."""
+    """Return `left` without the image points of these."""
     p = block.image_points
     return left | {p.group: left[p.group] & ~np.isin(p.point, list(points))}
 
@@ -124,7 +122,7 @@ def _seen(at: Adjustment, left: Masks, gone: Int[np.ndarray, "points"], sigma0: 
 
 
 def _candidates(seen: _Seen) -> Int[np.ndarray, "pairs 2"]:
-    """Pairs of suspected rows of an image that may have each other's name, as far as a look tells."""
+    """Return candidate pairs of suspected rows of an image."""
     p = seen.block.image_points
     suspected = np.flatnonzero(seen.left | seen.gone[p.point])
     pairs = [np.zeros((0, 2), int)]
@@ -140,7 +138,7 @@ def _candidates(seen: _Seen) -> Int[np.ndarray, "pairs 2"]:
 
 
 def _may_be(seen: _Seen, row: Int[np.ndarray, "n"], other: Int[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
-    """Whether the point of each `row` may be what was measured in the `other` one of its image."""
+    """Return True if the measurement `other` of its image may belong to the point of `row`."""
     p = seen.block.image_points
     apart = np.abs(seen.measured[row] - seen.measured[other]).max(axis=1, initial=0.0)
     near = np.abs(seen.measured[other] - seen.predicted[row]).max(axis=1, initial=0.0) < _NEAR * apart
@@ -152,27 +150,29 @@ def _may_be(seen: _Seen, row: Int[np.ndarray, "n"], other: Int[np.ndarray, "n"])
 
 
 def _off_plane(seen: _Seen, one: int, other: int) -> float:
-    """By how many standard deviations two rays miss each other."""
+    """Return the distance of two rays in standard deviations."""
     base = seen.origins[other] - seen.origins[one]
     normal = np.cross(seen.directions[one], seen.directions[other])
     length = np.linalg.norm(normal) * np.linalg.norm(base)
     if length == 0:
         return np.inf
-    # The angle between a ray and the plane of the base and the other one, both rays alike uncertain.
+    # Angle between a ray and the plane of the base and the other one, both rays of equal uncertainty.
     plane = np.cross(base, seen.directions[one])
     off = abs(float(seen.directions[other] @ plane)) / max(float(np.linalg.norm(plane)), 1e-300)
     return off / float(np.hypot(seen.sigma[one], seen.sigma[other]))
 
 
 def _met(seen: _Seen, row: int, other: int) -> tuple[int, Float[np.ndarray, "3"], list[int]] | None:
-    """The point of `row`, where its rays meet if it was measured in `other`, and these; None where they do not meet."""
+    """Return the point of `row` if it was measured in `other`, and its rays; None if they do not intersect."""
     partners = seen.partners(row)
     place = _meeting(seen, np.array([other, *partners])) if len(partners) else None
     return None if place is None else (int(seen.block.image_points.point[row]), place, partners.tolist())
 
 
 def _meeting(seen: _Seen, rays: Int[np.ndarray, "rays"]) -> Float[np.ndarray, "3"] | None:
-    """Where the rays of these rows meet, two at least; None where they do not, or not where other points are."""
+    """Return the intersection of these rows, at least two; None if there is none, or not at the distance of other
+    points.
+    """
     origins, directions = seen.origins[rays], seen.directions[rays]
     places, determined = intersect_points(origins, directions, np.zeros(len(rays), int), 1)
     if not determined[0]:
@@ -188,14 +188,14 @@ def _meeting(seen: _Seen, rays: Int[np.ndarray, "rays"]) -> Float[np.ndarray, "3
 
 
 def _predicted(at: Adjustment, seen: _Seen, pair: tuple[int, int], r: Blocks, sigma0: float) -> bool:
-    """Whether those of the pair whose points are not gone lie where these are predicted, once exchanged."""
+    """Return True if the points of the pair that are not lost agree with their predictions after the exchange."""
     p = at.block.image_points
     staying = [k for k in pair if not seen.gone[p.point[k]]]
     if not staying:
         return True
-    # So far from where it was predicted, a difference is no measure: once more with the names exchanged.
+    # Far from the prediction a difference is not a measure: repeat with exchanged names.
     block, _ = exchanged(at.block, {}, Exchange(p.group, (pair,), "", {}))
     off = (measured_discrepancies(block, at.unknowns) / still(p.sigma))[staying]
-    # Both coordinates of a point are tested; as all others, against all others.
+    # Both coordinates of a point are tested; like all others, against all others.
     limit = sigma0**2 * float(chi_square_limit(np.array(2), LEVEL / len(p)))
     return bool(np.all(np.einsum("ni,nij,nj->n", off, r[p.group][staying], off) < limit))

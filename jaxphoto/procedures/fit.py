@@ -1,4 +1,4 @@
-"""Does an adjustment fit the standard deviations it was given: sigma naught, blunders, residuals of control."""
+"""Agreement of an adjustment with its a priori standard deviations: sigma0, blunders, residuals of control."""
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.statistics import (
@@ -11,12 +11,12 @@ from jaxphoto.statistics import (
 )
 
 LARGE_SIGMA0 = 1.5
-"""A rejected sigma0 is a contradiction only above this: below, the a priori sigmas are merely somewhat hopeful."""
+"""A rejected sigma0 is a contradiction only above this: below, a priori sigmas are merely optimistic."""
 _SHOWN = 4
 
 
 def fit(adjusted: Adjustment, cov: Covariance) -> tuple[list[str], bool]:
-    """sigma0 against the a priori sigmas, blunders and residuals of control in words; and whether all that is sound."""
+    """Return messages about sigma0, blunders and residuals of control; and True if all is consistent."""
     sigma0, redundancy = float(adjusted.sigma0), adjusted.redundancy
     p = chi_square_p(float(adjusted.square_sum), redundancy)
     found = f"sigma0 {sigma0:.3f} with redundancy {redundancy}"

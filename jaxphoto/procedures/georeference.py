@@ -32,9 +32,9 @@ from jaxphoto.georeferencing.intersection_covariance import (
     ray_partials,
     shared_covariance,
 )
+from jaxphoto.initial import intersect_points
+from jaxphoto.initial.rays import camera_rays, padded_length, turn_to_object
 from jaxphoto.observations import ControlRows
-from jaxphoto.orientation import intersect_points
-from jaxphoto.orientation.rays import camera_rays, padded_length, turn_to_object
 from jaxphoto.short_repr import shown
 from jaxphoto.tracing import outside_transformations
 from jaxphoto.unknowns import Weighted

@@ -9,24 +9,29 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
-import scipy
 from jaxtyping import Bool, Float
 from pyproj.aoi import AreaOfInterest
 from pyproj.database import query_utm_crs_info
 
 from jaxphoto.block import Block, Datum, Frame
+from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.datum_change import datum_change
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.map_frame import MapFrame, map_name
+from jaxphoto.initial.rays import padded, padded_length
+from jaxphoto.least_squares import least_squares
 from jaxphoto.observations import StationRows
 from jaxphoto.procedures.attitudes_of_photographs import RecordedTurn, recorded_turn, with_attitudes
 from jaxphoto.procedures.georeferencing_words import LEVEL_WORDS, attitude_words, position_words
 from jaxphoto.procedures.level_strip import is_line, level_turn
 from jaxphoto.procedures.orientation.known_frame import Similarity, similarity_between
 from jaxphoto.procedures.position_parts import position_parts, with_part_shifts
+from jaxphoto.rotation import small_angles, small_rotation
 from jaxphoto.variants import without_stations
 
 SIGMA_M = (2.0, 2.0, 4.0)
@@ -323,23 +328,29 @@ def _nearest(
     An adjustment that began elsewhere would have to turn the whole block, in steps that images allow: hundreds.
     """
 
-    def at(x: np.ndarray) -> Similarity:
-        turn = scipy.spatial.transform.Rotation.from_rotvec(x[3:6]).as_matrix() @ start.turn
-        return Similarity(x[:3], turn, float(np.exp(x[6])))
-
-    # The shift is that of the middle, which a turn leaves where it is.
+    # The shift is that of the middle, which a rotation leaves where it is.
     middle = there.mean(axis=0)
+    n = padded_length(len(here))
+    weight = padded(1 / sigma, n) * (np.arange(n) < len(here))[:, None]
+    turn, turn_weight = (start.turn, 0.0) if recorded is None else (recorded.turn, 1 / recorded.turn_sigma_rad)
+    begin = start.of(middle[None])[0], start.turn, np.asarray(start.scale)
+    rows = padded(there - middle, n), padded(here, n), weight
+    shift, matrix, scale = map(
+        np.asarray, call_compiled(_fitted_similarity, *begin, *rows, turn, np.asarray(turn_weight))
+    )
+    return Similarity(shift - scale * matrix @ middle, matrix, float(scale))
 
-    def residual(x: np.ndarray) -> np.ndarray:
-        off = np.ravel((here - at(x).of(there - middle)) / sigma)
-        if recorded is None:
-            return off
-        apart = (
-            scipy.spatial.transform.Rotation.from_matrix(at(x).turn @ recorded.turn.T).as_rotvec()
-            / recorded.turn_sigma_rad
-        )
-        return np.concatenate([off, apart])
 
-    begin = np.concatenate([start.of(middle[None])[0], np.zeros(3), [np.log(start.scale)]])
-    best = at(scipy.optimize.least_squares(residual, begin, x_scale="jac").x)
-    return best._replace(shift=best.shift - best.scale * best.turn @ middle)
+@eqx.filter_jit
+def _fitted_similarity(shift, matrix, scale, there, here, weight, turn, turn_weight):
+    """Shift, rotation and scale of least squares of the offsets, and of the angles to the rotation `turn`."""
+
+    def at(x):
+        return shift + x[:3], small_rotation(x[3:6]) @ matrix, scale * jnp.exp(x[6])
+
+    def residuals(x, _):
+        shift, matrix, scale = at(x)
+        offsets = (here - shift - scale * there @ matrix.T) * weight
+        return jnp.concatenate([offsets.ravel(), small_angles(matrix @ turn.T) * turn_weight])
+
+    return at(least_squares(residuals, jnp.zeros(7), damping=1e-6).unknowns)

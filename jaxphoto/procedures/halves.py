@@ -27,10 +27,10 @@ from jaxphoto.stability import (
     Differences,
     ErrorBand,
     Method,
-    band_of,
     bundle_offsets,
     check_rays,
     concentration,
+    error_band,
     leading_unit,
     overlap,
 )
@@ -151,7 +151,7 @@ def halves(
     whole = _by_cell(jacobian, own)
     found = Differences(
         offsets=np.stack([cut.offsets_px for cut in cuts]),
-        promised=np.stack([_by_cell(cut.jacobian_px, cut.covariance) for cut in cuts]),
+        covariances=np.stack([_by_cell(cut.jacobian_px, cut.covariance) for cut in cuts]),
         concentration=float(np.mean([concentration(cut.jacobian_px, cut.covariance) for cut in cuts])),
         overlap=overlap(first[good], size),
     )
@@ -165,7 +165,7 @@ def halves(
         promised_px=np.sqrt(np.trace(whole, axis1=1, axis2=2)),
         cuts=cuts,
         failed=tuple(cut for cut in done if cut.problem),
-        band=band_of(found, whole),
+        band=error_band(found, whole),
     )
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.orientation.matches import PairMatches, connected_images
+from jaxphoto.initial.matches import PairMatches, connected_images
 
 
 class MatchedPart(NamedTuple):

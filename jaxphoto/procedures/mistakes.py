@@ -12,10 +12,10 @@ from jaxtyping import Float
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError
+from jaxphoto.initial import resect
+from jaxphoto.initial.rays import ideal_coordinates
+from jaxphoto.initial.resection import reprojection_errors
 from jaxphoto.observations import AbstractCoordinates
-from jaxphoto.orientation import resect
-from jaxphoto.orientation.rays import ideal_coordinates
-from jaxphoto.orientation.resection import reprojection_errors
 from jaxphoto.procedures.snooping import Snooped, mostly_out
 
 # What was given, over what it should be. The US survey foot differs from the international one by 2 ppm, which only

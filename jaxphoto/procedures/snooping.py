@@ -23,9 +23,9 @@ from jaxphoto.adjustment import MAX_STEPS, Adjustment, Sizes, common_sizes, line
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError, DatumError, JaxphotoError, RankError, counted
+from jaxphoto.initial.approximate import in_front, looking_away
 from jaxphoto.losses import AbstractLoss
 from jaxphoto.observations import Correlated
-from jaxphoto.orientation.approximate import in_front, looking_away
 from jaxphoto.procedures.adjust import start_of
 from jaxphoto.procedures.beginnings import Begun, beginnings, without_what_is_alike
 from jaxphoto.procedures.contradictions import predicted_parts, row_sizes

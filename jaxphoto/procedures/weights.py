@@ -17,7 +17,7 @@ from jaxphoto.statistics import (
     VarianceComponents,
     blunder_test,
     covariance,
-    parts_of,
+    partition_observations,
     redundancy_numbers,
     variance_components,
 )
@@ -77,7 +77,8 @@ def made_by_blunders(
 
 def _out_of(adjusted: Adjustment, snooped: Snooped, partition: Partition, part: int) -> tuple[int, tuple[str, ...]]:
     """How many numbers of a part went or were exchanged, and what they are."""
-    own = {name: np.atleast_2d(parts) == part for name, parts in parts_of(adjusted, partition).of.items()}
+    parts = partition_observations(adjusted, partition).part_of
+    own = {name: np.atleast_2d(part_of) == part for name, part_of in parts.items()}
     out = [(s.words, own[s.group][:, s.row]) for s in snooped.left_out]
     out += [(e.words, own[e.group][:, np.ravel(e.rows)]) for e in snooped.exchanged]
     out = [(words, numbers) for words, numbers in out if numbers.any()]

@@ -1,349 +1,377 @@
-"""A certificate of calibration: what German and European practice states of a camera, and what nobody told.
+"""A certificate of calibration: camera, flight, conditions, method, results and inputs, with gaps stated.
 
-The order is that of certificates after DIN 18740 and of EuroSDR's reports on camera calibration: camera, flight,
-conditions, method, interior orientation, distortion, precision over the format, correlations, stability, inputs. No
-conformity is claimed by it. Nothing of the hour in which it is written is in it: the same inputs give the same bytes.
+The order follows certificates after DIN 18740 and EuroSDR's reports on camera calibration; no conformity is claimed. It
+contains no time of writing: equal inputs give equal bytes.
 """
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
+from jaxtyping import Float
 
-from jaxphoto.camera import constant_names, get_parameter, parameter_names, parameter_unit
+from jaxphoto.camera import InteriorOrientation, Sensor, constant_names, get_parameter, parameter_names, parameter_unit
+from jaxphoto.camera.conditions import Conditions
 from jaxphoto.errors import camera_words
-from jaxphoto.report.certificate_conditions import condition_rows, flight_rows
-from jaxphoto.report.certificate_figures import draw_correlations, draw_curve, draw_map
-from jaxphoto.report.certified import Certified
-from jaxphoto.report.change import change_verdict
-from jaxphoto.report.digits import of_p, of_sigma, with_sigma
-from jaxphoto.report.document import Document, DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
 from jaxphoto.report.findings import as_sentence, symbol
-from jaxphoto.report.made import option_word
-from jaxphoto.report.rolling_shutter import readout_of
-from jaxphoto.report.source_words import assumed_pixels
-from jaxphoto.stability import LEVEL, NORMAL_95, Method, change, distortion_curve, format_sigma, image_grid
+from jaxphoto.report.formatting import of_sigma, with_sigma
+from jaxphoto.report.page import Heading, Paragraph, Part, Plot, hash_table, option_word, page
+from jaxphoto.report.plots import draw_distortion, draw_format_map, draw_matrix
+from jaxphoto.report.results import assumed_pixels
+from jaxphoto.report.stability import change_verdict, parameter_changes
+from jaxphoto.report.verdict import readout_of
+from jaxphoto.stability import LEVEL, NORMAL_95, Method, change, distortion_curve, frame_sigma, image_grid
+from jaxphoto.statistics import AxisErrors
 from jaxphoto.statistics.correlation import high_pairs
-from jaxphoto.writing.inputs import digest_of_all
+from jaxphoto.writing.inputs import InputFile, digest_of_all
 
-_COLUMNS, _ROWS = 15, 11
-_SHARED = (
-    "Both are of the same photographs, or share some of them: they cannot but agree, and that nothing has changed is "
-    "not shown. Compare with a calibration by other photographs."
-)
-# Steps of the table of distortion: every second of the curve.
+_GRID = (15, 11)
+# Every third row of the distortion curve is tabulated.
 _EVERY = 3
 _HIGH = 0.9
-# What the user of a calibration may estimate anew, so that errors of the camera go into it.
-_GIVEN_UP: tuple[tuple[Method, str], ...] = (
+# What a user of the calibration estimates, which absorbs errors of the camera.
+_ALIGNMENTS: tuple[tuple[Method, str], ...] = (
     ("zrot", "position and attitude known"),
-    ("rot", "attitude estimated anew"),
+    ("rot", "attitude re-estimated"),
+)
+_UNKNOWN = "not in the image files"
+_QUANTITIES = (
+    ("exposure", "exposure_s", "s"),
+    ("f-number", "f_number", ""),
+    ("sensitivity", "iso", "ISO"),
+    ("focal length", "focal_length_mm", "mm (as stated by the lens)"),
+    ("focus distance", "subject_distance_m", "m"),
+    ("temperature", "temperature_c", "degrees Celsius"),
+    ("relative humidity", "humidity_percent", "%"),
+    ("air pressure", "pressure_hpa", "hPa"),
 )
 
 
-def certificate_of(given: Certified) -> Document:
-    """The certificate. Raises InputError for a camera that folds inside its format, and what `change` raises."""
-    elements = [e for section in _SECTIONS for e in section(given)]
-    sha = digest_of_all(_all_inputs(given))
+class LastCalibration(NamedTuple):
+    """An earlier calibration of the same camera."""
+
+    name: str
+    interior: InteriorOrientation
+    covariance: Float[np.ndarray, "q q"] | None
+    input: InputFile
+    """The file it was read from."""
+    shared: bool = False
+    """True if it has images in common with the certified one."""
+
+
+class FormatBand(NamedTuple):
+    """Split-half validation of the same camera (`jaxphoto halves`): 95 % of the errors over the image format."""
+
+    cells_mm: Float[np.ndarray, "cells 2"]
+    band_px: Float[np.ndarray, "cells"]
+    factor: float
+    sigma_factor: float
+    input: InputFile
+
+
+class ExteriorCorrelation(NamedTuple):
+    """Correlation of an exterior with an interior parameter over all images."""
+
+    exterior: str
+    interior: str
+    mean_abs: float
+    max_abs: float
+
+
+class Certified(NamedTuple):
+    """A calibrated camera, and how it was calibrated."""
+
+    camera: str
+    sensor: Sensor
+    interior: InteriorOrientation
+    covariance: Float[np.ndarray, "p p"] | None
+    """A posteriori, of `parameter_names(interior)`, zero where fixed."""
+    summary: Mapping[str, Any]
+    """summary.json."""
+    with_exterior: Sequence[ExteriorCorrelation]
+    conditions: Sequence[Conditions]
+    """Conditions of the images, if their files were read."""
+    inputs: Sequence[InputFile]
+    all_inputs: bool
+    """True if all input files are known; image files alone are not all."""
+    last: LastCalibration | None = None
+    band: FormatBand | None = None
+
+    @property
+    def sigma_factor(self) -> float:
+        """Factor of sigmas for spatially correlated residuals; 1 if unknown."""
+        factor = self.summary.get("sigma_factor", 1.0)
+        return float(factor) if isinstance(factor, int | float) and math.isfinite(factor) and factor > 1 else 1.0
+
+    @property
+    def shifted_axes(self) -> list[str]:
+        """Axes with a significant mean error of check points."""
+        errors = dict(self.summary.get("check_points", {})).items()
+        numbers = {axis: [of.get(key, math.nan) for key in ("n", "mean_m", "rmse_m")] for axis, of in errors}
+        return [axis for axis, (n, mean, rmse) in numbers.items() if AxisErrors(axis, n, mean, rmse).biased]
+
+    @property
+    def files(self) -> list[InputFile]:
+        """All known input files."""
+        return sorted({*self.inputs, *(part.input for part in (self.last, self.band) if part is not None)})
+
+    @property
+    def findings(self) -> list[tuple[str, str]]:
+        """Severities and sentences of the findings in summary.json."""
+        rows = self.summary.get("findings", [])
+        return [(str(f.get("severity", "")), str(f.get("text", ""))) for f in rows if isinstance(f, dict)]
+
+
+def certificate_page(given: Certified) -> str:
+    """The certificate as HTML. Raises InputError for a non-invertible distortion, and what `change` raises."""
     model = next((f"{c.camera} {c.serial}".strip() for c in given.conditions if c.camera), "")
+    foot = f"inputs SHA-256 {digest_of_all(given.files)[:16]}" if given.all_inputs else "inputs unknown"
+    parts = [part for section in _SECTIONS for part in section(given)]
     title = f"Certificate of calibration: {model or camera_words(given.camera)}"
-    return Document(title, f"inputs SHA-256 {sha[:16]}" if given.all_inputs else "inputs not told", tuple(elements))
+    return page(title, parts, _statement(given), foot=foot)
 
 
-def _statement(given: Certified) -> Iterator[Element]:
-    colour, findings = given.summary.get("verdict"), _findings(given)
-    worst = [text for level, text in findings if level == "alarm"]
+def _statement(given: Certified) -> tuple[str, str]:
+    """The first sentence and its colour."""
+    colour, severities = given.summary.get("verdict"), [severity for severity, _ in given.findings]
     if given.covariance is None:
-        yield Paragraph("Not to be signed: nothing of this camera was estimated, or no correlations are kept.", "alarm")
-    elif colour == "red":
-        why = f" The first: {worst[0]}" if worst else ""
-        yield Paragraph(f"Not to be signed: the verdict on the adjustment is red.{why}", "verdict red")
-    elif colour == "amber":
-        n = sum(level == "warning" for level, _ in findings)
-        those = "1 reservation, which is" if n == 1 else f"{n} reservations, which are"
-        yield Paragraph(f"Calibrated with {those} listed under Findings.", "verdict amber")
-    elif axes := ", ".join(given.shifted_axes):
-        yield Paragraph(f"Calibrated; check points are shifted in {axes}: see there before signing.", "verdict amber")
-    else:
-        yield Paragraph("Calibrated; no test of the adjustment objects.", "verdict green")
+        return "Not to be signed: nothing of this camera was estimated, or no correlations are kept.", "red"
+    if colour == "red":
+        first = next((f" First error: {text}" for severity, text in given.findings if severity == "error"), "")
+        return f"Not to be signed: the verdict on the adjustment is red.{first}", "red"
+    if colour == "amber":
+        return f"Calibrated with {severities.count('warning')} warnings, which are listed under Findings.", "amber"
+    if axes := ", ".join(given.shifted_axes):
+        return f"Calibrated; check points are shifted in {axes}: look into this before signing.", "amber"
+    return "Calibrated; all tests of the adjustment are passed.", "green"
+
+
+def _camera(given: Certified) -> Iterator[Part]:
     if given.sigma_factor > 1:
         yield Paragraph(
-            f"Neighbouring rays err alike: standard deviations and bands of this certificate are those of the "
+            "Residuals are spatially correlated: standard deviations and bands of this certificate are those of the "
             f"adjustment times {given.sigma_factor:.2f}."
         )
-
-
-def _camera(given: Certified) -> Iterator[Element]:
     yield Heading("Camera")
-    s = given.sensor
-    said = partial(_one, given.conditions)
-    yield _names(
-        ("make", said("make")),
-        ("model", said("model")),
-        ("serial number", said("serial")),
-        ("lens", said("lens")),
-        ("serial number of the lens", said("lens_serial")),
-        ("firmware", said("firmware")),
-        ("format", f"{s.width_px} x {s.height_px} pixels, {s.width_mm:.4g} x {s.height_mm:.4g} mm"),
-        ("pixel", f"{1e3 * s.pixel_mm:.5g} µm (scale of all lengths below; not calibrated)"),
-        ("called in the block", given.camera),
-    )
+    s, fields = given.sensor, {}
+    for name, field in (
+        ("make", "make"), ("model", "model"), ("serial number", "serial"), ("lens", "lens"),
+        ("serial number of the lens", "lens_serial"), ("firmware", "firmware"),
+    ):  # fmt: skip
+        values = dict.fromkeys(getattr(c, field) for c in given.conditions if getattr(c, field))
+        fields[name] = ", ".join(values) or (_UNKNOWN if given.conditions else "unknown: no image files were read")
+    yield fields | {
+        "format": f"{s.width_px} x {s.height_px} pixels, {s.width_mm:.4g} x {s.height_mm:.4g} mm",
+        "pixel": f"{1e3 * s.pixel_mm:.5g} µm (scale of all lengths below; not calibrated)",
+        "name in the block": given.camera,
+    }
     yield from assumed_pixels({given.camera: s})
 
 
-def _flight(given: Certified) -> Iterator[Element]:
+def _flight(given: Certified) -> Iterator[Part]:
+    conditions, known = given.conditions, dict(known_conditions(given.conditions))
     yield Heading("Flight and conditions")
-    yield _names(*flight_rows(given), *condition_rows(given.conditions))
+    images = f"{sum(c.used for c in conditions)} of {len(conditions)} used" if conditions else ""
+    flight = given.summary.get("flight")
+    yield {
+        "flight": str(given.summary.get("title") or "without a title"),
+        "date": dates(conditions),
+        "images": images or str(given.summary.get("n_images", "unknown")),
+        "aircraft": ", ".join(dict.fromkeys(c.drone for c in conditions if c.drone)) or _UNKNOWN,
+        **({str(k): str(v) for k, v in flight.items()} if isinstance(flight, dict) else {}),
+        **{name: known.get(name, _UNKNOWN) for name, _, _ in _QUANTITIES},
+    }
 
 
-def _method(given: Certified) -> Iterator[Element]:
+def dates(conditions: Sequence[Conditions]) -> str:
+    """First and last exposure by the clock of the camera."""
+    times = sorted(c.time for c in conditions if c.time)
+    if not times:
+        return _UNKNOWN
+    zone = "" if len(times[0]) > 19 and times[0][-6] in "+-" else ", by the camera's clock (time zone unknown)"
+    return f"{times[0]} to {times[-1]}{zone}"
+
+
+def known_conditions(conditions: Sequence[Conditions]) -> Iterator[tuple[str, str]]:
+    """Ranges of exposure, aperture, sensitivity, focus and weather over the used images, where known."""
+    for name, field, unit in _QUANTITIES:
+        values = [v for c in conditions if c.used and (v := getattr(c, field)) is not None]
+        if values:
+            low, middle, high = min(values), float(np.median(values)), max(values)
+            text = f"{middle:.4g}" if low == high else f"{low:.4g} to {high:.4g}, median {middle:.4g}"
+            yield name, f"{text} {unit}".strip()
+
+
+def _method(given: Certified) -> Iterator[Part]:
     yield Heading("Method")
-    of = given.summary
-    n = of.get("n_observations", {})
-    counts = ", ".join(f"{v} of {k.replace('_', ' ')}" for k, v in n.items() if k != "total" and v)
-    options = ", ".join(f"{k} {option_word(v)}" for k, v in dict(of.get("method", {})).items())
-    versions = ", ".join(f"{k} {v}" for k, v in dict(of.get("versions", {})).items())
-    distortion, projection = given.interior.distortion.name, given.interior.projection.name
-    yield _names(
-        ("adjustment", "self-calibrating bundle adjustment by least squares, all covariances exact"),
-        ("model", f"projection {projection}, distortion {distortion} (docs/models.md)"),
-        ("observations", f"{counts}; redundancy {of.get('redundancy', 'not told')}"),
-        ("sigma naught", _number(of.get("sigma0"), "{:.4g}") + " (1 is expected of sigmas that are right)"),
-        ("outcome", str(of.get("outcome", "not told"))),
-        ("options", options or "not told"),
-        ("software", versions or "not told"),
+    of, sigma0 = given.summary, given.summary.get("sigma0")
+    counts = ", ".join(
+        f"{v} of {k.replace('_', ' ')}" for k, v in of.get("n_observations", {}).items() if k != "total" and v
     )
+    distortion, projection = given.interior.distortion.name, given.interior.projection.name
+    yield {
+        "adjustment": "self-calibrating bundle adjustment by least squares, exact covariances",
+        "model": f"projection {projection}, distortion {distortion} (docs/models.md)",
+        "observations": f"{counts}; redundancy {of.get('redundancy', 'unknown')}",
+        "sigma naught": f"{sigma0:.4g} (expected 1)" if isinstance(sigma0, int | float) else "unknown",
+        "outcome": str(of.get("outcome", "unknown")),
+        "options": ", ".join(f"{k} {option_word(v)}" for k, v in dict(of.get("method", {})).items()) or "unknown",
+        "software": ", ".join(f"{k} {v}" for k, v in dict(of.get("versions", {})).items()) or "unknown",
+    }
 
 
-def _interior(given: Certified) -> Iterator[Element]:
+def _interior(given: Certified) -> Iterator[Part]:
     yield Heading("Interior orientation")
-    names = parameter_names(given.interior)
+    names, pixel = parameter_names(given.interior), given.sensor.pixel_mm
     sigmas = np.zeros(len(names)) if given.covariance is None else np.sqrt(np.diagonal(given.covariance))
     rows = []
     for name, sigma in zip(names, sigmas * given.sigma_factor, strict=True):
-        value = float(get_parameter(given.interior, name))
+        value, in_px = float(get_parameter(given.interior, name)), ""
+        if name.endswith("_mm"):
+            in_px = with_sigma(value / pixel, sigma / pixel) + (f", {of_sigma(sigma / pixel)}" if sigma else "")
         if sigma > 0 or value:
-            told = (with_sigma(value, sigma), of_sigma(sigma) or "held", parameter_unit(given.interior, name))
-            rows.append((name, *told, _in_px(given, name, sigma)))
-    rows += [
-        (n, f"{float(get_parameter(given.interior, n)):.8g}", "constant", parameter_unit(given.interior, n), "")
-        for n in constant_names(given.interior)
-    ]
+            unit = parameter_unit(given.interior, name)
+            rows.append((name, with_sigma(value, sigma), of_sigma(sigma) or "fixed", unit, in_px))
+    for name in constant_names(given.interior):
+        value, unit = float(get_parameter(given.interior, name)), parameter_unit(given.interior, name)
+        rows.append((name, f"{value:.8g}", "constant", unit, ""))
     readout = dict(given.summary.get("georeferencing", {})).get(readout_of(given.camera), {})
     value, sigma = readout.get("value"), readout.get("sigma")
     if isinstance(value, int | float) and isinstance(sigma, int | float):
         rows.append(("readout_ms", with_sigma(value, sigma), of_sigma(sigma), "ms", ""))
-    yield Rows(("parameter", "value", "sigma", "unit", "in pixels: value, sigma"), tuple(rows))
+    yield pd.DataFrame(rows, columns=["name", "value", "sigma", "unit", "in pixels: value, sigma"])
     yield Paragraph(
-        "x_p to the right and y_p up from the centre of the format; the unit 1 is that of a number without one "
-        "(docs/models.md). Standard deviations are a posteriori."
+        "x_p to the right and y_p up from the centre of the format; the unit 1 is dimensionless (docs/models.md). "
+        "Standard deviations are a posteriori."
     )
 
 
-def _distortion(given: Certified) -> Iterator[Element]:
+def _distortion(given: Certified) -> Iterator[Part]:
     yield Heading("Distortion")
-    curve = distortion_curve(given.interior, given.sensor, given.covariance)
-    factor = given.sigma_factor
-    picture = DocumentPicture(
-        lambda axes: draw_curve(axes, curve, factor),
-        f"Curve of radial distortion, {1e3 * np.abs(curve.radial).max():.3g} µm at most, with its 95 % band",
-    )
-    yield Pictures((picture,))
-    rows = []
-    for k in range(0, len(curve.r), _EVERY):
-        band = "" if curve.sigma is None else f"{1e3 * NORMAL_95 * factor * curve.sigma[k]:.3f}"
-        rows.append((f"{curve.r[k]:.3f}", f"{1e3 * curve.radial[k]:.3f}", band, f"{1e3 * curve.other[k]:.3f}"))
-    columns = ("distance [mm]", "radial [µm]", "95 % within +- [µm]", "decentring, affinity [µm]")
-    yield Rows(columns, tuple(rows))
+    curve, factor = distortion_curve(given.interior, given.sensor, given.covariance), given.sigma_factor
+    alt = f"Radial distortion, at most {1e3 * np.abs(curve.radial).max():.3g} µm, with its 95 % band"
+    yield [Plot(partial(draw_distortion, curve=curve, factor=factor), alt)]
+    columns = {"distance [mm]": curve.r, "radial [µm]": 1e3 * curve.radial}
+    if curve.sigma is not None:
+        columns["95 % within +- [µm]"] = 1e3 * NORMAL_95 * factor * curve.sigma
+    columns["decentring, affinity [µm]"] = 1e3 * curve.other
+    yield pd.DataFrame(columns)[::_EVERY].map("{:.3f}".format)
     yield Paragraph(
-        "Measured minus ideal, from the principal point, for the calibrated c; mean of 36 directions. The band holds "
-        "at each distance by itself and follows from the covariance of all parameters."
+        "Measured minus ideal, from the principal point, for the calibrated c; mean of 36 directions. The band is "
+        "pointwise, by the covariance of all parameters."
     )
 
 
-def _precision(given: Certified) -> Iterator[Element]:
+def _precision(given: Certified) -> Iterator[Part]:
     yield Heading("Precision over the format")
     if given.covariance is None:
-        yield Paragraph("Not known: no covariance.")
+        yield Paragraph("Unknown: no covariance.")
         return
-    points = image_grid(given.sensor, _COLUMNS, _ROWS)
-    per_mm = given.sigma_factor / given.sensor.pixel_mm
-    found = [(words, per_mm * format_sigma(given.interior, given.covariance, points, how)) for how, words in _GIVEN_UP]
-    panels = [
-        DocumentPicture(
-            partial(draw_map, sensor=given.sensor, cells_mm=points, values=sigma, title=f"sigma [px], {words}"),
-            f"Map of standard deviations over the format, {sigma.min():.2g} to {sigma.max():.2g} pixels, {words}",
-        )
-        for words, sigma in found
-    ]
+    points, scale = image_grid(given.sensor, *_GRID), given.sigma_factor / given.sensor.pixel_mm
+    maps = {words: scale * frame_sigma(given.interior, given.covariance, points, how) for how, words in _ALIGNMENTS}
+    plots = [_map(given, points, sigma, f"sigma [px], {words}") for words, sigma in maps.items()]
     if given.band:
-        b = given.band
-        panels.append(
-            DocumentPicture(
-                partial(
-                    draw_map, sensor=given.sensor, cells_mm=b.cells_mm, values=b.band_px, title="95 % by halves [px]"
-                ),
-                f"Map of the radius that holds 95 % of the errors by halves, {b.band_px.min():.2g} to "
-                f"{b.band_px.max():.2g} pixels",
-            )
-        )
-    yield Pictures(tuple(panels))
-    rows = tuple((w, f"{s.min():.3g}", f"{np.median(s):.3g}", f"{s.max():.3g}") for w, s in found)
-    yield Rows(("root mean square error of a ray [px]", "least", "median", "most"), rows)
-    if given.band:
-        yield Paragraph(
-            f"Random halves of the block ({given.band.input.file}): standard deviations are to be multiplied by "
-            f"{given.band.factor:.2f} +- {given.band.sigma_factor:.2f}; the third map has 95 % of the errors."
-        )
-    else:
-        yield Paragraph("By the covariance of the adjustment; no halves of the block were compared (jaxphoto halves).")
+        plots.append(_map(given, given.band.cells_mm, given.band.band_px, "95 % by split halves [px]"))
+    yield plots
+    rows = [(w, *(f"{v:.3g}" for v in (s.min(), np.median(s), s.max()))) for w, s in maps.items()]
+    yield pd.DataFrame(rows, columns=["RMS error of a ray [px]", "least", "median", "most"])
+    yield Paragraph(
+        f"Random halves of the block ({given.band.input.file}): standard deviations are to be multiplied by "
+        f"{given.band.factor:.2f} +- {given.band.sigma_factor:.2f}."
+        if given.band
+        else "By the covariance of the adjustment; no split-half validation (jaxphoto halves)."
+    )
 
 
-def _correlations(given: Certified) -> Iterator[Element]:
+def _map(given: Certified, cells_mm: np.ndarray, values: np.ndarray, name: str) -> Plot:
+    draw = partial(draw_format_map, sensor=given.sensor, cells_mm=cells_mm, name=name, values=values)
+    return Plot(draw, f"Map over the format: {name}, {values.min():.2g} to {values.max():.2g}")
+
+
+def _correlations(given: Certified) -> Iterator[Part]:
     yield Heading("Correlations")
     if given.covariance is None:
-        yield Paragraph("Not known: no covariance.")
+        yield Paragraph("Unknown: no covariance.")
         return
     sigma = np.sqrt(np.diagonal(given.covariance))
     free = np.flatnonzero(sigma > 0)
     names = [parameter_names(given.interior)[k] for k in free]
     rho = given.covariance[np.ix_(free, free)] / sigma[free, None] / sigma[free]
     high = [f"{symbol(a)} and {symbol(b)} {r:+.3f}" for a, b, r in high_pairs(names, rho, _HIGH)]
-    said = f"Above {_HIGH}: {', '.join(high)}." if high else f"None is above {_HIGH}."
-    yield Pictures(
-        (DocumentPicture(lambda axes: draw_correlations(axes, names, rho), f"Matrix of correlations. {said}", 3.6),)
-    )
-    yield Paragraph(f"{said} Only together do parameters that are so correlated mean anything.")
+    words = f"Above {_HIGH}: {', '.join(high)}; interpret these jointly." if high else f"None is above {_HIGH}."
+    draw = partial(draw_matrix, values=rho, rows=names, columns=names, name="correlation of the interior orientation")
+    yield [Plot(draw, f"Matrix of correlations. {words}", 3.8)]
+    yield Paragraph(words)
     if given.with_exterior:
-        table: dict[str, dict[str, str]] = {}
-        for c in given.with_exterior:
-            table.setdefault(c.interior, {})[c.exterior] = f"{c.mean_abs:.2f} ({c.max_abs:.2f})"
-        across = tuple(dict.fromkeys(c.exterior for c in given.with_exterior))
-        rows = tuple((p, *(of.get(e, "") for e in across)) for p, of in table.items())
-        yield Rows(("mean (largest) |rho| over the images", *across), rows)
+        table = pd.DataFrame(given.with_exterior)
+        cells = table.assign(rho=[f"{c.mean_abs:.2f} ({c.max_abs:.2f})" for c in given.with_exterior])
+        wide = cells.pivot_table("rho", "interior", "exterior", aggfunc="first", sort=False).fillna("")
+        yield wide.reset_index(names="mean (largest) |rho| over the images")
 
 
-def _stability(given: Certified) -> Iterator[Element]:
+def _stability(given: Certified) -> Iterator[Part]:
     yield Heading("Stability since the last calibration")
     last = given.last
     if last is None:
         yield Paragraph("No earlier calibration was given (--last).")
         return
-    points = image_grid(given.sensor, _COLUMNS, _ROWS)
+    points = image_grid(given.sensor, *_GRID)
     widened = None if given.covariance is None else given.covariance * given.sigma_factor**2
-    found = change(last.interior, given.interior, points, (last.covariance, widened))
+    changed = change(last.interior, given.interior, points, (last.covariance, widened))
     yield Paragraph(f"Compared with {last.name} (first: that, second: this).")
     if last.shared:
-        yield Paragraph(_SHARED)
-    for sentence in change_verdict(found, given.sensor):
-        yield Paragraph(as_sentence(sentence))
-    offset = found.offset_mm / given.sensor.pixel_mm
-    yield Pictures(
-        (
-            DocumentPicture(
-                partial(draw_map, sensor=given.sensor, cells_mm=points, values=offset, title="offset of rays [px]"),
-                f"Map of the offsets of rays since the last calibration, at most {offset.max():.2g} pixels",
-            ),
-            DocumentPicture(
-                partial(
-                    draw_map, sensor=given.sensor, cells_mm=points, values=found.offset_mm / found.limit_mm,
-                    title=f"over what {100 * LEVEL:.0f} % stay below",
-                ),
-                "Map of the same over the limit for one and the same camera",
-            ),
+        yield Paragraph(
+            "Both calibrations have images in common: their agreement does not show that nothing has changed. Compare "
+            "with a calibration by other images."
         )
-    )  # fmt: skip
-    rows = tuple(
-        (p.parameter, with_sigma(p.first, p.sigma), with_sigma(p.second, p.sigma),
-         with_sigma(p.difference, p.sigma), of_sigma(p.sigma), p.unit, of_p(p.p_value))
-        for p in found.parameters if p.sigma > 0
-    )  # fmt: skip
-    if rows:
-        yield Rows(("parameter", "last", "this", "difference", "sigma of it", "unit", "p"), rows)
+    yield from (Paragraph(as_sentence(sentence)) for sentence in change_verdict(changed, given.sensor))
+    yield [
+        _map(given, points, changed.offset_mm / given.sensor.pixel_mm, "offset of rays [px]"),
+        _map(given, points, changed.offset_mm / changed.limit_mm, f"offset over its {100 * LEVEL:.0f} % limit"),
+    ]
+    table = parameter_changes(changed).drop(columns="ratio")
+    if len(table := table[table["sigma"] > 0]):
+        yield table
 
 
-def _accuracy(given: Certified) -> Iterator[Element]:
+def _accuracy(given: Certified) -> Iterator[Part]:
+    sentences = given.summary.get("positional_accuracy")
     yield Heading("Check points")
-    said = given.summary.get("positional_accuracy")
-    if not said:
-        yield Paragraph("None: no positional accuracy was tested.")
-    for sentence in said if isinstance(said, list) else []:
-        yield Paragraph(str(sentence))
+    yield from (Paragraph(str(sentence)) for sentence in sentences or ["None: no positional accuracy was tested."])
 
 
-def _found(given: Certified) -> Iterator[Element]:
+def _findings(given: Certified) -> Iterator[Part]:
     yield Heading("Findings")
-    findings = _findings(given)
-    if not findings:
-        yield Paragraph("None.")
-    for level, text in findings:
-        yield Paragraph(f"{level.capitalize()}: {text}.", level)
+    yield from [Paragraph(f"{s.capitalize()}: {as_sentence(t)}", s) for s, t in given.findings] or [Paragraph("None.")]
 
 
-def _inputs(given: Certified) -> Iterator[Element]:
+def _inputs(given: Certified) -> Iterator[Part]:
     yield Heading("Inputs")
-    files = _all_inputs(given)
+    files = given.files
     if not files:
-        yield Paragraph("Not told: the results were written without hashes of their inputs; adjust anew.")
+        yield Paragraph("Unknown: the results have no hashes of their inputs; repeat the adjustment.")
         return
     if not given.all_inputs:
-        yield Paragraph(
-            "These are not all: the results were written without hashes of their inputs, and nothing can be said of "
-            "whether they come again; adjust anew."
-        )
+        yield Paragraph("Incomplete: the results have no hashes of their inputs; repeat the adjustment.")
     else:
-        again = "The same inputs, options and software give the numbers of this certificate to the printed digit."
         yield Paragraph(
-            f"SHA-256 of all {len(files)} together ({digest_of_all(files)}) is that of the lines below as sha256sum "
-            "writes them, in the order of their names."
-            + (f" {again}" if given.summary.get("method") else " The options are not told.")
+            f"SHA-256 of all {len(files)} together ({digest_of_all(files)}) is that of the lines below as written by "
+            "sha256sum, in the order of their names."
         )
-    yield Rows(
-        ("file", "bytes", "SHA-256"), tuple((f.file, str(f.n_bytes) if f.n_bytes else "", f.sha256) for f in files)
-    )
+        equal = "The same inputs, options and software give the numbers of this certificate to the printed digit."
+        yield Paragraph(equal if given.summary.get("method") else "The options are unknown.")
+    yield hash_table(files)
 
 
-def _signature(given: Certified) -> Iterator[Element]:
+def _signature(given: Certified) -> Iterator[Part]:
     yield Heading("Signature")
-    yield _names(*((what, "_" * 40) for what in ("calibrated by", "place and date", "signature")))
+    yield dict.fromkeys(("calibrated by", "place and date", "signature"), "_" * 40)
 
 
 _SECTIONS = (
-    _statement, _camera, _flight, _method, _interior, _distortion, _precision, _correlations, _stability, _accuracy,
-    _found, _inputs, _signature,
+    _camera, _flight, _method, _interior, _distortion, _precision, _correlations, _stability, _accuracy, _findings,
+    _inputs, _signature,
 )  # fmt: skip
-
-
-def _in_px(given: Certified, name: str, sigma: float) -> str:
-    if not name.endswith("_mm"):
-        return ""
-    pixel = given.sensor.pixel_mm
-    value = float(get_parameter(given.interior, name)) / pixel
-    return with_sigma(value, sigma / pixel) + (f", {of_sigma(sigma / pixel)}" if sigma else "")
-
-
-def _all_inputs(given: Certified) -> list:
-    more = [part.input for part in (given.last, given.band) if part is not None]
-    return sorted({*given.inputs, *more})
-
-
-def _findings(given: Certified) -> list[tuple[str, str]]:
-    found = given.summary.get("findings", [])
-    return [(str(f.get("level", "")), str(f.get("text", ""))) for f in found if isinstance(f, dict)]
-
-
-def _one(conditions: Sequence, field: str) -> str:
-    """What all photographs say of the camera; several where they differ."""
-    said = list(dict.fromkeys(getattr(c, field) for c in conditions if getattr(c, field)))
-    if not conditions:
-        return "not told: no photographs were read"
-    return ", ".join(said) or "not said by the photographs"
-
-
-def _names(*rows: tuple[str, str]) -> Rows:
-    return Rows(("", ""), rows)
-
-
-def _number(value: Any, digits: str) -> str:
-    return digits.format(value) if isinstance(value, int | float) else "not told"

@@ -1,6 +1,6 @@
-"""Tables of more than two dimensions, as xarray: correlations by image, draws by image and point.
+"""Arrays of more than two dimensions as xarray: correlations by image, draws by image and point.
 
-Values are in radians, metres and millimetres, as the names along the axes say.
+Values are in radians, metres and millimetres, as the coordinate names say.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def correlation_cube(correlations: Correlations) -> xr.Dataset:
     """The correlations of a camera: `interior` (parameter, with_parameter), `exterior` (image, element, parameter) and
     `within_image` (image, element, with_element).
     """
-    # Here, because its import takes a third of a second that most uses of jaxphoto need not wait for.
+    # Imported here because it takes a third of a second.
     import xarray as xr
 
     c = correlations
@@ -47,7 +47,7 @@ def correlation_cube(correlations: Correlations) -> xr.Dataset:
 
 def covariance_array(known: Covariance) -> xr.DataArray:
     """All correlations of exterior orientations and shared unknowns: (unknown, with_unknown), with `sigma` (unknown),
-    a posteriori, in the units of the labels. What is held has a sigma of zero, and no correlation.
+    a posteriori, in the units of the labels. A fixed unknown has a sigma of zero, and no correlation.
     """
     import xarray as xr
 
@@ -59,7 +59,7 @@ def covariance_array(known: Covariance) -> xr.DataArray:
 
 def draws_cube(draws: Draws, adjusted: Adjustment) -> xr.Dataset:
     """A Monte Carlo: `shared` (draw, parameter), `error` (draw, of_error), `converged`, `iterations` and `fallback`
-    (draw); where they were kept `exterior` (draw, image, element) and `points` (draw, point, axis).
+    (draw); if kept, `exterior` (draw, image, element) and `points` (draw, point, axis).
     """
     import xarray as xr
 

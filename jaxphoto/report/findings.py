@@ -1,113 +1,136 @@
-"""What is said of an adjustment, by how much it matters: alarm, warning, information."""
+"""Findings about a result as a table: code, severity, subject, value, limit, hint; and the verdict they give.
 
-import enum
+The sentence of a finding follows from its numbers by the template of its code (templates/findings.toml).
+"""
+
+import dataclasses
+import math
 import re
-from collections.abc import Iterable
-from html import escape
-from typing import NamedTuple
+import tomllib
+from collections.abc import Iterable, Mapping
+from importlib.resources import files
+from typing import Any, Literal
+
+import pandas as pd
 
 from jaxphoto.errors import camera_words
-from jaxphoto.report.digits import of_p, without_powers
+from jaxphoto.report.formatting import of_p, without_powers
 
-
-class Level(enum.IntEnum):
-    """How much a finding matters; the worst gives the verdict its colour."""
-
-    INFORMATION = 0
-    """To be known; nothing need be done."""
-    WARNING = 1
-    """Results hold with a reservation."""
-    ALARM = 2
-    """Results are not to be used before this is mended."""
-
-
-MARKS = {Level.INFORMATION: "-", Level.WARNING: "!", Level.ALARM: "!!"}
+Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+"""The worst first: an error makes results unusable, a warning is a reservation, a note needs no action."""
+COLOURS: dict[Severity, str] = {"error": "red", "warning": "amber", "note": "green"}
+MARKS: dict[Severity, str] = {"error": "!!", "warning": "!", "note": "-"}
 _SYMBOLS = {"c_mm": "c", "xp_mm": "x_p", "yp_mm": "y_p"}
-COLOURS = {Level.INFORMATION: "green", Level.WARNING: "amber", Level.ALARM: "red"}
+_TEMPLATES: dict[str, str] = tomllib.loads(
+    (files("jaxphoto.report") / "templates" / "findings.toml").read_text(encoding="utf-8")
+)
 
 
-class Finding(NamedTuple):
-    """One sentence, with its mend."""
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """One finding; `numbers` are further numbers and words of its sentence."""
 
-    level: Level
-    text: str
+    code: str
+    severity: Severity
+    subject: str = ""
+    value: float = math.nan
+    limit: float = math.nan
+    hint: str = ""
+    numbers: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def text(self) -> str:
+        """The finding as a sentence, followed by its hint."""
+        fields = {"subject": self.subject, "value": self.value, "limit": self.limit}
+        fact = _TEMPLATES[self.code].format_map(fields | dict(self.numbers))
+        return without_powers(in_symbols(f"{fact}. {self.hint}" if self.hint else fact))
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """The finding as a row of `Verdict.table`; missing numbers are None."""
+        numbers = {name: v if math.isfinite(v := float(getattr(self, name))) else None for name in ("value", "limit")}
+        words = {name: getattr(self, name) for name in ("code", "severity", "subject")}
+        return words | numbers | {"hint": self.hint, "text": self.text}
 
 
-class Verdict(NamedTuple):
-    """All findings, the worst first; within a level in the order in which they were found."""
+@dataclasses.dataclass(frozen=True, repr=False)
+class Verdict:
+    """All findings, the worst first; within a severity in the order of the tests."""
 
     findings: tuple[Finding, ...]
 
-    def __repr__(self) -> str:
-        return "\n".join([self.headline, *(f"{MARKS[f.level]} {f.text}" for f in self.findings)])
-
-    def _repr_html_(self) -> str:
-        """The headline, and below it the findings with their marks."""
-        rows = "".join(f"<tr><td>{MARKS[f.level]}</td><td>{escape(f.text)}</td></tr>" for f in self.findings)
-        return f"<b>{escape(self.headline)}</b><table>{rows}</table>"
-
     @classmethod
     def of(cls, findings: Iterable[Finding]) -> "Verdict":
-        """The findings in order, parameters called as sentences call them, large numbers written out."""
-        told = (Finding(f.level, without_powers(in_symbols(f.text))) for f in findings)
-        return cls(tuple(sorted(told, key=lambda f: -f.level)))
+        """Sort findings by severity."""
+        return cls(tuple(sorted(findings, key=lambda f: SEVERITIES.index(f.severity))))
+
+    def __repr__(self) -> str:
+        return "\n".join([self.headline, *(f"{MARKS[f.severity]} {f.text}" for f in self.findings)])
+
+    def _repr_html_(self) -> str:
+        return f"<b>{self.headline}</b>{self.table[['severity', 'text']].to_html(index=False, header=False, border=0)}"
 
     @property
-    def level(self) -> Level:
-        """The worst of all."""
-        return max((f.level for f in self.findings), default=Level.INFORMATION)
+    def table(self) -> pd.DataFrame:
+        """One row per finding: code, severity, subject, value, limit, hint, text."""
+        columns = ["code", "severity", "subject", "value", "limit", "hint", "text"]
+        return pd.DataFrame([f.row for f in self.findings], columns=columns)
+
+    @property
+    def severity(self) -> Severity:
+        """The worst severity."""
+        return self.findings[0].severity if self.findings else "note"
 
     @property
     def colour(self) -> str:
         """green, amber or red."""
-        return COLOURS[self.level]
+        return COLOURS[self.severity]
 
     @property
     def headline(self) -> str:
         """The verdict in one line."""
-        n = sum(f.level == self.level for f in self.findings)
-        if self.level == Level.ALARM:
-            return f"red: not to be used before {'this is' if n == 1 else f'these {n} are'} mended"
-        if self.level == Level.WARNING:
-            return f"amber: {'one reservation' if n == 1 else f'{n} reservations'}"
-        return "green: the observations agree with one another and with their standard deviations"
+        n = sum(f.severity == self.severity for f in self.findings)
+        several = f"{n} {self.severity}{'s' * (n > 1)}"
+        if self.severity == "error":
+            return f"red: do not use this result; {several}"
+        if self.severity == "warning":
+            return f"amber: usable with reservations; {several}"
+        return "green: the observations agree with each other and with their standard deviations"
 
     @property
     def summary(self) -> dict:
-        """What a summary.json says of it."""
-        told = [{"level": f.level.name.lower(), "text": f.text} for f in self.findings]
-        return {"verdict": self.colour, "findings": told}
+        """The verdict in summary.json."""
+        return {"verdict": self.colour, "findings": [f.row for f in self.findings]}
 
     @property
     def texts(self) -> list[str]:
-        """The sentences alone."""
+        """The sentences."""
         return [f.text for f in self.findings]
 
 
 def as_sentence(text: str) -> str:
-    """A finding as it stands among others on a page: with a capital, but for symbols (c, k2), and a full stop."""
+    """A text with a capital (except for symbols such as c and k2) and a full stop."""
     first = text.split(maxsplit=1)[0] if text.strip() else ""
-    begun = text if len(first) == 1 or re.search(r"[_\d]", first) else f"{text[:1].upper()}{text[1:]}"
-    return begun if begun.endswith((".", "!", "?")) else f"{begun}."
+    start = text if len(first) == 1 or re.search(r"[_\d]", first) else f"{text[:1].upper()}{text[1:]}"
+    return start if start.endswith((".", "!", "?")) else f"{start}."
 
 
 def symbol(parameter: str) -> str:
-    """A parameter as papers and sentences call it: c, which tables name with its unit, c_mm."""
+    """The symbol of a parameter: c of c_mm."""
     return _SYMBOLS.get(parameter, parameter)
 
 
-def parameter_words(path: str) -> str:
-    """The parameter at a path, as a sentence calls it: k1 of camera kodak."""
-    of_camera = re.fullmatch(r"interior\[(.*)\]\.(\w+)", path)
-    return f"{symbol(of_camera[2])} of {camera_words(of_camera[1])}" if of_camera else path
-
-
 def in_symbols(text: str) -> str:
-    """A sentence with paths of cameras' parameters as sentences call them."""
-    return re.sub(r"interior\[[^\]]*\]\.\w+", lambda path: parameter_words(path[0]), text)
+    """Replace parameter paths by symbols: k1 of camera kodak."""
+
+    def words(path: re.Match) -> str:
+        return f"{symbol(path[2])} of {camera_words(path[1])}"
+
+    return re.sub(r"interior\[([^\]]*)\]\.(\w+)", words, text)
 
 
 def p_words(p_value: float, digits: int = 1) -> str:
-    """The p-value of a test, as a sentence tells it."""
-    said = of_p(p_value, digits)
-    return f"p {said}" if said.startswith("<") else f"p = {said}"
+    """A p-value in a sentence."""
+    text = of_p(p_value, digits)
+    return f"p {text}" if text.startswith("<") else f"p = {text}"

@@ -1,4 +1,4 @@
-"""The choice of a distortion model as tables, a picture, a page and words in the terminal."""
+"""Choice of a distortion model: tables, plot, page and terminal output."""
 
 from __future__ import annotations
 
@@ -11,75 +11,55 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 from rich.console import Console
-from rich.table import Table
 
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError
 from jaxphoto.procedures.model_choice import ModelChoice
-from jaxphoto.report.digits import of_p
-from jaxphoto.report.document import Heading, rows_of
-from jaxphoto.report.made import Made, made_section, versions
-from jaxphoto.report.plots import axes_or_new, drawn, new_figure
-from jaxphoto.report.results import write_summary
-from jaxphoto.report.source_words import assumed_pixels
-from jaxphoto.report.study_page import WholePicture, study_page
+from jaxphoto.report.formatting import of_p, to_rich, without_empty
+from jaxphoto.report.page import Heading, Made, Part, Plot
+from jaxphoto.report.plots import axes_or_new, label, new_figure, title
+from jaxphoto.report.results import assumed_pixels, rounded, write_study
+from jaxphoto.report.terminal import print_lines
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# The page shows these of `choice_table`, so written; the terminal a few of them.
+# Columns of `choice_table` on the page, with their formats; the terminal shows a few of them.
 _SHOWN: dict[str, Callable[[Any], str]] = {
     "model": str, "parameters": str, "sigma0": "{:.3f}".format, "rms_px": "{:.4f}".format,
     "cv_rms_px": "{:.4f}".format, "cv_excess_se": "{:.1f}".format, "delta_aicc": "{:.1f}".format,
     "delta_bic": "{:.1f}".format, "smaller": str, "f": "{:.2f}".format, "f_p": of_p, "weakest": str,
     "weakest_ratio": "{:.1f}".format,
 }  # fmt: skip
-
 _IN_TERMINAL = ("model", "parameters", "rms_px", "cv_rms_px", "cv_excess_se", "delta_bic", "f_p")
-# Differences of BIC below this say nothing (Kass and Raftery 1995).
-_ALIKE = 2.0
-# On the axis of these, which is logarithmic; from `_FAR` on, tenths say nothing.
+# Differences of BIC below this are not significant (Kass and Raftery 1995).
+_EQUAL = 2.0
+# Ticks of the logarithmic axis; numbers from `_FAR` on are shown without decimals.
 _MARKS = (0, 2, 10, 100, 1000, 10_000, 100_000, 1_000_000)
 _FAR = 100.0
 
 
 def choice_table(choice: ModelChoice) -> pd.DataFrame:
-    """One row a candidate; `delta_` are differences from the smallest, empty cells what there is not.
+    """One row per candidate; `delta_` are differences from the smallest, NaN where undefined.
 
-    model, distortion, coefficients, parameters, observations, redundancy, v'Pv, sigma0, rms_px, cv_rms_px,
+    model, distortion, coefficients, parameters, observations, redundancy, square_sum (v'Pv), sigma0, rms_px, cv_rms_px,
     cv_excess_se, aic, aicc, bic, delta_aic, delta_aicc, delta_bic, smaller, f, f_p, weakest, weakest_ratio, weakest_p,
-    problem: as `jaxphoto.procedures.model_choice` says.
+    problem: see `jaxphoto.procedures.model_choice`.
     """
     rows = []
     for j in choice.judged:
         weakest = j.weakest
-        rows.append(
-            {
-                "model": j.candidate.name,
-                "distortion": j.candidate.distortion.__name__,
-                "coefficients": " ".join(j.candidate.free),
-                "parameters": j.n_parameters,
-                "observations": j.n_effective,
-                "redundancy": j.redundancy,
-                "square_sum": j.square_sum,
-                "sigma0": j.sigma0,
-                "rms_px": j.rms_px,
-                "cv_rms_px": j.cv_rms_px,
-                "cv_excess_se": j.cv_excess,
-                "aic": j.aic,
-                "aicc": j.aicc,
-                "bic": j.bic,
-                "smaller": j.smaller,
-                "f": j.f,
-                "f_p": j.f_p,
-                "weakest": weakest.parameter if weakest else "",
-                "weakest_ratio": weakest.ratio if weakest else np.nan,
-                "weakest_p": weakest.p_value if weakest else np.nan,
-                "problem": j.problem,
-            }
-        )
+        rows.append({
+            "model": j.candidate.name, "distortion": j.candidate.distortion.__name__,
+            "coefficients": " ".join(j.candidate.free), "parameters": j.n_parameters, "observations": j.n_effective,
+            "redundancy": j.redundancy, "square_sum": j.square_sum, "sigma0": j.sigma0, "rms_px": j.rms_px,
+            "cv_rms_px": j.cv_rms_px, "cv_excess_se": j.cv_excess, "aic": j.aic, "aicc": j.aicc, "bic": j.bic,
+            "smaller": j.smaller, "f": j.f, "f_p": j.f_p, "weakest": weakest.parameter if weakest else "",
+            "weakest_ratio": weakest.ratio if weakest else np.nan,
+            "weakest_p": weakest.p_value if weakest else np.nan, "problem": j.problem,
+        })  # fmt: skip
     table = pd.DataFrame(rows)
     place = table.columns.tolist().index("bic") + 1
     for k, name in enumerate(("aic", "aicc", "bic")):
@@ -88,8 +68,7 @@ def choice_table(choice: ModelChoice) -> pd.DataFrame:
 
 
 def parameter_table(choice: ModelChoice) -> pd.DataFrame:
-    """model, camera, parameter, value, sigma (a posteriori), unit, ratio, p_value of every estimated interior
-    parameter."""
+    """model, camera, parameter, value, sigma (a posteriori), unit, ratio, p_value of every interior parameter."""
     rows = [
         (j.candidate.name, s.camera, s.parameter, s.value, s.sigma, s.unit, s.ratio, s.p_value)
         for j in choice.judged
@@ -103,19 +82,19 @@ def choice_verdict(choice: ModelChoice) -> list[str]:
     if not choice.by_bic:
         return ["no model could be adjusted; see the column problem"]
     best = min(j.bic for j in choice.judged if math.isfinite(j.bic))
-    alike = [j.candidate.name for j in choice.judged if j.bic <= best + _ALIKE and j.candidate.name != choice.by_bic]
-    said = [f"BIC prefers {choice.by_bic}" + f", and hardly less {', '.join(alike)}" * bool(alike)]
+    equal = [j.candidate.name for j in choice.judged if j.bic <= best + _EQUAL and j.candidate.name != choice.by_bic]
+    also = f"; not significantly worse: {', '.join(equal)}" if equal else ""
+    sentences = [f"BIC prefers {choice.by_bic}{also}"]
     if choice.by_prediction:
-        said.append(
-            f"of {choice.n_left_out} image points left out, {choice.by_prediction} is the smallest model that predicts "
+        sentences.append(
+            f"{choice.by_prediction} is the smallest model that predicts {choice.n_left_out} held-out image points "
             "within one standard error of the best"
         )
-    said += [f"{j.candidate.name} could not be judged: {j.problem}" for j in choice.judged if j.problem]
-    return said
+    return sentences + [f"{j.candidate.name} could not be adjusted: {j.problem}" for j in choice.judged if j.problem]
 
 
 def choice_figure(choice: ModelChoice) -> Figure:
-    """Both pictures of `plot_models`, one beside the other; empty where no model could be adjusted."""
+    """Both plots of `plot_models` side by side; empty if no model could be adjusted."""
     known = [j for j in choice.judged if math.isfinite(j.bic)]
     figure = new_figure(9.6, 1.2 + 0.36 * max(len(known), 3))
     if known:
@@ -125,10 +104,9 @@ def choice_figure(choice: ModelChoice) -> Figure:
 
 
 def plot_models(choice: ModelChoice, ax: Axes | None = None, *, rms: bool = False) -> Axes:
-    """BIC above the smallest, model by model, or the `rms` of adjusted and of left-out image points (px).
+    """BIC above the smallest by model, or the `rms` of adjusted and held-out image points (px).
 
-    Behind each name stands how many interior parameters are estimated. Raises InputError where no model could be
-    adjusted.
+    The number of interior parameters stands behind each name. Raises InputError if no model could be adjusted.
     """
     judged = [j for j in choice.judged if math.isfinite(j.bic)]
     if not judged:
@@ -137,26 +115,27 @@ def plot_models(choice: ModelChoice, ax: Axes | None = None, *, rms: bool = Fals
     if rms:
         ax.plot([j.rms_px for j in judged], at, "o", color="0.5", label="adjusted")
         if choice.n_left_out:
-            ax.plot([j.cv_rms_px for j in judged], at, "D", color="tab:blue", label="left out")
+            ax.plot([j.cv_rms_px for j in judged], at, "D", color="tab:blue", label="held out")
         ax.set_xlabel("RMS of image points [px]", fontsize=9)
         ax.legend(fontsize=8)
         ax.grid(axis="x", lw=0.3)
-        ax.set_title("how well image points fit, and are predicted", loc="left", fontsize=10)
+        title(ax, "fit and prediction of image points")
     else:
         above = np.array([j.bic for j in judged])
         above -= above.min()
-        # From one on: the smallest is at zero, which a logarithmic axis does not have.
+        # Bars start at one because a logarithmic axis has no zero.
         ax.barh(at, above, left=1.0, color="tab:blue")
         for k, one in enumerate(above):
             ax.text(1 + one, k, f" {one:.1f}" if one < _FAR else f" {one:,.0f}", va="center", fontsize=8)
         ax.set_xscale("log")
-        ax.set_xlim(1.0, 4 * (1 + max(above.max(), _MARKS[1])))
-        marks = [mark for mark in _MARKS if mark <= max(above.max(), _MARKS[1])]
+        most = max(above.max(), _MARKS[1])
+        ax.set_xlim(1.0, 4 * (1 + most))
+        marks = [mark for mark in _MARKS if mark <= most]
         ax.set_xticks([1.0 + mark for mark in marks], [f"{mark:g}" for mark in marks], minor=False)
         ax.minorticks_off()
         ax.set_xlabel("BIC above the smallest", fontsize=9)
-        ax.set_title(f"what BIC prefers: {drawn(choice.by_bic)}", loc="left", fontsize=10)
-    ax.set_yticks(at, [drawn(f"{j.candidate.name} ({j.n_parameters})") for j in judged], fontsize=8)
+        title(ax, f"BIC prefers {label(choice.by_bic)}")
+    ax.set_yticks(at, [label(f"{j.candidate.name} ({j.n_parameters})") for j in judged], fontsize=8)
     ax.set_ylim(len(judged) - 0.5, -0.5)
     return ax
 
@@ -164,60 +143,44 @@ def plot_models(choice: ModelChoice, ax: Axes | None = None, *, rms: bool = Fals
 def write_model_choice(
     choice: ModelChoice, block: Block, directory: Path, seconds: dict[str, float], made: Made
 ) -> None:
-    """models.csv, parameters.csv, models.png, report.html and summary.json, in `directory` only when all is written.
+    """models.csv, parameters.csv, models.png, report.html and summary.json.
 
-    Raises InputError where `directory` holds something that is not an earlier result.
+    Raises InputError if `directory` holds something else than an earlier result.
     """
-    began = time.perf_counter()
-    table, parameters, verdict = choice_table(choice), parameter_table(choice), choice_verdict(choice)
-    alt = "BIC above the smallest, and RMS of image points adjusted and left out, model by model"
-    picture = WholePicture.of(choice_figure(choice), alt)
-    title = block.title
-    parts = (
+    began, verdict, figure = time.perf_counter(), choice_verdict(choice), choice_figure(choice)
+    table, parameters = choice_table(choice), parameter_table(choice)
+    parts: list[Part] = [
         *assumed_pixels(block.sensors),
         Heading("Models"),
-        rows_of(_shown(table)),
-        picture,
+        _shown(table),
+        Plot(figure, "BIC above the smallest, and RMS of image points adjusted and held out, by model"),
         Heading("Estimated parameters of every model"),
-        rows_of(parameters),
-        *made_section(made),
-    )
+        parameters,
+    ]
+    summary = {
+        "title": block.title,
+        "verdict": verdict,
+        "by_bic": choice.by_bic,
+        "by_prediction": choice.by_prediction,
+        "n_left_out": choice.n_left_out,
+        "models": table["model"].tolist(),
+        "seconds": rounded(seconds | {"write": time.perf_counter() - began}),
+    }
     with whole_folder(directory) as work:
-        table.to_csv(work / "models.csv", index=False)
-        parameters.to_csv(work / "parameters.csv", index=False)
-        (work / "models.png").write_bytes(picture.png)
-        page = study_page(f"{title or 'block'}: models", verdict, parts)
-        (work / "report.html").write_text(page, encoding="utf-8")
-        summary = {
-            "title": title,
-            "verdict": verdict,
-            "by_bic": choice.by_bic,
-            "by_prediction": choice.by_prediction,
-            "n_left_out": choice.n_left_out,
-            "models": table["model"].tolist(),
-            "seconds": {k: round(v, 6) for k, v in (seconds | {"write": time.perf_counter() - began}).items()},
-            "versions": versions(),
-        }
-        write_summary(summary, work)
+        write_study(
+            work, f"{block.title or 'block'}: models", (". ".join(verdict), ""), parts, summary, made,
+            {"models": table, "parameters": parameters}, {"models": figure},
+        )  # fmt: skip
 
 
 def print_model_choice(choice: ModelChoice, console: Console) -> None:
-    """Print the choice, then the table."""
-    for sentence in choice_verdict(choice):
-        console.print(sentence, highlight=False, markup=False)
+    """Print the choice and its table."""
+    print_lines(choice_verdict(choice), console)
     shown = _shown(choice_table(choice))
-    shown = shown[[name for name in _IN_TERMINAL if name in shown]]
-    table = Table(*map(str, shown.columns))
-    for row in shown.itertuples(index=False):
-        table.add_row(*row)
-    console.print(table)
+    console.print(to_rich(shown[[name for name in _IN_TERMINAL if name in shown]]))
 
 
 def _shown(table: pd.DataFrame) -> pd.DataFrame:
-    """The columns for people, as text; those of which no model has a number are left out."""
-    columns = {}
-    for name, form in _SHOWN.items():
-        cells = ["" if pd.isna(v) else form(v) for v in table[name]]
-        if any(cells):
-            columns[name] = cells
-    return pd.DataFrame(columns)
+    """The columns for reading, as text."""
+    columns = {name: ["" if pd.isna(v) else form(v) for v in table[name]] for name, form in _SHOWN.items()}
+    return without_empty(pd.DataFrame(columns))

@@ -1,254 +1,214 @@
-"""The HTML report: one file that opens offline, judgement first, then tables and pictures."""
+"""HTML pages: one self-contained file each, from headings, paragraphs, tables (DataFrames) and figures.
+
+All pages share one template, style sheet and script (templates/). Figures are inline SVG, drawn by matplotlib.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import partial
-from typing import TYPE_CHECKING
+import base64
+import datetime
+import io
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+from urllib.parse import quote
 
-import numpy as np
 import pandas as pd
-from jinja2 import Environment
+from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
 
-from jaxphoto.errors import camera_words
-from jaxphoto.report.certificate_figures import draw_band, draw_curve
-from jaxphoto.report.check_points import check_spread
-from jaxphoto.report.convergence import convergence_section
-from jaxphoto.report.correlation_tables import side_by_side
-from jaxphoto.report.document import (
-    BlockInSpace,
-    DocumentPicture,
-    Heading,
-    Paragraph,
-    Pictures,
-    rows_of,
-    verdict_paragraphs,
-)
-from jaxphoto.report.document_html import contents, html_of
-from jaxphoto.report.error_ellipses import ellipses_figure
-from jaxphoto.report.figures import curve_of
+from jaxphoto.errors import InputError
 from jaxphoto.report.findings import Verdict, as_sentence
-from jaxphoto.report.interactive import library
-from jaxphoto.report.made import PROVENANCE, Made, made_section
-from jaxphoto.report.maps import png_of
-from jaxphoto.report.object_points import points_section
-from jaxphoto.report.page_head import page_head
-from jaxphoto.report.plots import (
-    check_points_figure,
-    correlation_figure,
-    mean_residuals_figure,
-    residuals_figure,
-)
-from jaxphoto.report.positional_accuracy import accuracy_sentences
-from jaxphoto.report.recovery import recovery_spread
-from jaxphoto.report.residual_plots import draw_residuals_by_radius, draw_station_residuals
-from jaxphoto.report.sigma_map import sigma_map_figure, sigma_map_words
-from jaxphoto.report.source_words import assumed_pixel_words, assumed_pixels, report_title
-from jaxphoto.report.tables import Tables
-from jaxphoto.statistics import LEAST_CHECKED
-from jaxphoto.statistics.format_coverage import format_coverage
+from jaxphoto.report.formatting import head_of, numeric_columns, readable
+from jaxphoto.report.plots import new_figure
+from jaxphoto.writing.inputs import InputFile
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_PAGE = """{{ head(title) }}<body>
-<h1>{{ title }}</h1>
-{% for e in verdict %}{{ e }}{% endfor %}
-<p>{{ outcome }} ({{ steps }} iterations)</p>
-<p>&sigma;<sub>0</sub> = <b>{{ sigma0 }}</b>, redundancy {{ redundancy }}: {{ counts }}.
-Standard deviations are a posteriori (times &sigma;<sub>0</sub>). Correlations refer to the rotations
-{{ rotations }}.</p>
-{{ contents }}
-{% for heading, body in sections %}{{ heading }}
-{{ body }}
-{% endfor %}{{ library }}</body></html>
-"""
-_SIGMA_MAP = (
-    "Standard deviation of where the calibrated camera says that a point is seen, interior and exterior orientation "
-    "taken together, in the direction in which it is largest (sigma_map.csv). Of a direction the whole error of the "
-    "principal distance counts; of a point as far away as those that were seen, only what its distance does not make "
-    "good."
-)
-_DISTORTION = (
-    "Measured minus ideal image coordinates along the radius, for the c that was found; the band of 95 % is of the "
-    "covariance of all parameters."
-)
-_RECOVERY = (
-    "Estimate minus truth in standard deviations (recovery.csv): about 1 in the root mean square, and 5 % beyond 2, "
-    "where the model of the adjustment is that of the simulation."
-)
-_LARGEST_RHO = (
-    "The largest correlation over the images, without its sign; the means are in the picture of the interior "
-    "orientation, and both in correlation_summary.csv."
-)
-_LARGEST = 20
-# Cameras of which there are pictures: seven each, a second of work and more.
-_PICTURED = 6
+_TEMPLATES = Environment(loader=PackageLoader("jaxphoto.report"), autoescape=True, trim_blocks=True)
+_PACKAGES = ("jaxphoto", "jax", "optimistix", "equinox", "lineax", "numpy", "pandas")
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "msedge")
+# A cell that is read as a number, with its unit or standard deviation.
+_NUMBER = re.compile(r"(< ?)?[-+]?(\d|-$)")
+# Text without ids of its own, so that a page holds many drawings; no date, so that equal input gives equal bytes.
+_SVG: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "jaxphoto"}
+_NO_METADATA: dict[str, Any] = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 
 
-def report_page(tables: Tables, verdict: Verdict, made: Made | None = None) -> str:
-    """The whole report as HTML: pictures, and what makes them and the tables answer, inside."""
-    a = tables.adjusted
-    counts = [f"{n} observations of {group.replace('_', ' ')}" for group, n in a.n_observations.items() if n]
-    counts += [f"{a.n_constraints} constraints of the datum"] if a.n_constraints else []
-    sections = [(heading, Markup("\n").join(body)) for heading, body in _sections(tables)]
-    if made:
-        _, *body = made_section(made)
-        if a.block.converted_from:
-            said = f"The block was converted from {a.block.converted_from}. {assumed_pixel_words(a.block.sensors)}"
-            body.append(Paragraph(said.strip()))
-        sections.append((PROVENANCE, Markup("\n").join(map(html_of, body))))
-    return (
-        Environment(autoescape=True)
-        .from_string(_PAGE)
-        .render(
-            head=page_head,
-            title=report_title(a.block),
-            outcome=as_sentence(a.outcome.value).removesuffix("."),
-            steps=int(a.steps),
-            sigma0=f"{float(a.sigma0):.6g}",
-            redundancy=a.redundancy,
-            counts=", ".join(counts) + f"; {sum(a.n_unknowns.values())} unknowns",
-            rotations=tables.rotations.replace("_", ", "),
-            verdict=[html_of(e) for e in verdict_paragraphs(verdict)],
-            contents=contents([heading for heading, body in sections]),
-            sections=[(html_of(Heading(heading)), body) for heading, body in sections],
-            library=library([body for _, body in sections]),
+class Heading(NamedTuple):
+    """Heading of a section."""
+
+    text: str
+
+
+class Paragraph(NamedTuple):
+    """Text; `kind` is "" or a class of the style sheet, such as a severity."""
+
+    text: str
+    kind: str = ""
+
+
+class Plot(NamedTuple):
+    """A figure, a function that draws one panel on axes, or a PNG file."""
+
+    figure: Figure | Callable[[Axes], object] | Path
+    alt: str
+    """Description for readers who do not see it."""
+    height: float = 3.4
+    """Height of a panel (inches); its width is 4.8."""
+
+
+class Link(NamedTuple):
+    """Link to a page in a folder next to this one."""
+
+    text: str
+    page: str
+
+
+class PictureFile(NamedTuple):
+    """A picture in a folder next to the page."""
+
+    alt: str
+    file: str
+
+
+Part = Heading | Paragraph | pd.DataFrame | dict[str, str] | Plot | list[Plot] | Link | PictureFile | Markup
+"""A part of a page: a dict is a list of names and values, a list of plots stands side by side, Markup as it is."""
+
+
+class Made(NamedTuple):
+    """How results came about: the command line without its output path, and the files that were read."""
+
+    command: str
+    inputs: Sequence[InputFile] = ()
+
+
+def page(
+    title: str, parts: Iterable[Part], verdict: tuple[str, str] = ("", ""), style: str = "", foot: str = ""
+) -> str:
+    """The page as HTML; `verdict` is its first sentence and its colour (green, amber, red or none).
+
+    Paragraphs before the first heading stand above the contents. `style` are additional rules.
+    """
+    parts = list(parts)
+    first = next((k for k, part in enumerate(parts) if isinstance(part, Heading)), 0)
+    headings = [part.text for part in parts if isinstance(part, Heading)]
+    return _TEMPLATES.get_template("page.html").render(
+        title=title, verdict=as_sentence(verdict[0]) if verdict[0] else "", colour=verdict[1], style=Markup(style),
+        summary=map(html, parts[:first]), parts=map(html, parts[first:]), foot=foot,
+        contents=[(anchor(text), text) for text in headings] if len(headings) > 1 else [],
+    )  # fmt: skip
+
+
+def html(part: Part) -> Markup:
+    """One part of a page."""
+    if isinstance(part, Markup):
+        return part
+    if isinstance(part, Heading):
+        return Markup('<h2 id="{}">{}</h2>').format(anchor(part.text), part.text)
+    if isinstance(part, Paragraph):
+        return Markup('<p class="{}">{}</p>' if part.kind else "<p{}>{}</p>").format(part.kind, part.text)
+    if isinstance(part, Link):
+        return Markup('<p><a href="{}">{}</a></p>').format(quote(part.page), part.text)
+    if isinstance(part, PictureFile):
+        return Markup('<div class="wide"><img loading="lazy" alt="{}" src="{}"></div>').format(
+            part.alt, quote(part.file)
+        )
+    if isinstance(part, Plot):
+        return Markup('<div class="wide">{}</div>').format(_svg(part))
+    if isinstance(part, list):
+        return Markup('<div class="plots">{}</div>').format(Markup("").join(map(_svg, part)))
+    if isinstance(part, dict):
+        return Markup(_TEMPLATES.get_template("table.html").render(names=part))
+    shown = readable(part)
+    kinds = [
+        "number" if number or _mostly_numbers(shown.iloc[:, k]) else "text"
+        for k, number in enumerate(numeric_columns(part))
+    ]
+    rows = list(shown.itertuples(index=False, name=None))
+    return Markup(
+        _TEMPLATES.get_template("table.html").render(
+            heads=[head_of(str(name)) for name in part.columns], kinds=kinds, rows=rows
         )
     )
 
 
-def _sections(tables: Tables) -> Iterator[tuple[str, list[Markup]]]:
-    """Headings with what is below them, of what there is."""
-    check, pictured = tables.check_points, pictured_cameras(tables)
-    yield "Interior orientation", _interior(tables, pictured)
-    if mapped := [camera for camera in tables.sigma_maps if camera in pictured]:
-        curves = (html_of(_distortion(tables, camera)) for camera in mapped)
-        yield "Distortion", [_said(_DISTORTION), *curves]
-        yield "How sure the camera is, over its format", [_said(_SIGMA_MAP), *_sigma_maps(tables, mapped)]
-    if tables.truth:
-        interior = tables.recovery[tables.recovery["parameter"].str.startswith("interior[")]
-        yield (
-            "Beside the truth of the simulation",
-            [_said(_RECOVERY), _html(recovery_spread(tables.recovery)), _html(interior)],
-        )
-    if len(tables.georeferencing):
-        yield "Mounts and strips", [_html(tables.georeferencing)]
-    yield "Block", [html_of(BlockInSpace(tables))]
-    yield "Residuals", _residuals(tables, pictured)
-    _, *points = points_section(tables)
-    yield "Object points", [html_of(element) for element in points]
-    if len(check):
-        accuracy = [_said(s) for s in accuracy_sentences(tables.tested_accuracy)]
-        picture = _wide(_picture(check_points_figure({"": tables}), "discrepancies at check points"))
-        body = [_html(check_spread(check)), *accuracy, _html(tables.positional_accuracy), picture, _html(check)]
-        yield "Check points: surveyed minus computed", body
-    ellipses = _picture(ellipses_figure(tables), "error ellipses of the projection centres in plan")
-    yield "Exterior orientation", [ellipses, _html(tables.exterior)]
-    # What is held moves with nothing.
-    if len(summary := tables.correlation_summary):
-        largest = side_by_side(summary, ["camera", "exterior"], "interior", "max_abs_rho")
-        yield "Correlation of exterior and interior orientation over the images", [_said(_LARGEST_RHO), _html(largest)]
-    ground = tables.correlation_ground
-    if len(ground := ground[ground["sigma_m"] > 0]):
-        ground = ground.assign(ground=ground["ground"].str.replace("_", " "))
-        ground = side_by_side(ground, ["camera", "ground", "sigma_m"], "parameter", "rho")
-        yield "Correlation of the interior orientation and the ground as a whole", [_html(ground)]
-    if steps := list(convergence_section(tables.adjusted))[1:]:
-        yield "Convergence", [html_of(element) for element in steps]
+def _mostly_numbers(column: pd.Series) -> bool:
+    cells = [str(cell) for cell in column if cell]
+    return sum(bool(_NUMBER.match(cell)) and len(cell) < 40 for cell in cells) > len(cells) / 2
 
 
-def pictured_cameras(tables: Tables) -> list[str]:
-    """The cameras that pictures are of: all, or of many those with the most image points."""
-    block, structure = tables.adjusted.block, tables.adjusted.structure
-    cameras, of_image = list(tables.adjusted.unknowns.interior), np.array(block.image_camera)
-    seen = np.bincount(structure.image, minlength=len(of_image))
-    most = sorted(cameras, key=lambda camera: -int(seen[of_image == camera].sum()))[:_PICTURED]
-    return [camera for camera in cameras if camera in most]
+def _svg(plot: Plot) -> Markup:
+    """A figure as inline SVG that scales to the width of the page."""
+    from matplotlib import rc_context
+
+    figure = plot.figure
+    if isinstance(figure, Path):
+        content = base64.b64encode(figure.read_bytes()).decode()
+        return Markup('<img alt="{}" src="data:image/png;base64,{}">').format(plot.alt, content)
+    if callable(figure):
+        draw, figure = figure, new_figure(4.8, plot.height)
+        draw(figure.subplots())
+    drawing = io.StringIO()
+    with rc_context(_SVG):
+        figure.savefig(drawing, format="svg", metadata=_NO_METADATA)
+    svg = drawing.getvalue()
+    return Markup('<figure role="img" aria-label="{}">{}</figure>').format(plot.alt, Markup(svg[svg.index("<svg") :]))
 
 
-def _interior(tables: Tables, pictured: list[str]) -> list[Markup]:
-    table = tables.interior
-    alt = "correlations of the interior orientation with itself and with the exterior one"
-    used = [c for c, corr in tables.correlations.items() if c in pictured and corr.parameters and corr.images]
-    pictures = [_wide(_picture(correlation_figure(tables, c), alt)) for c in used]
-    reach = [_said(_reach(tables, camera)) for camera in pictured]
-    if (n := len(tables.adjusted.unknowns.interior)) > len(pictured):
-        reach.append(
-            _said(
-                f"Pictures are of {len(pictured)} of {n} cameras, those with the most image points: "
-                f"{', '.join(pictured)}. Tables have all; in Python plot_residuals and others draw any of them."
-            )
-        )
-    assumed = map(html_of, assumed_pixels(tables.adjusted.block.sensors))
-    return [_html(table[table["sigma"].notna() | (table["value"] != 0)]), *assumed, *reach, *pictures]
+def anchor(heading: str) -> str:
+    """The link target of a section."""
+    return re.sub(r"\W+", "-", heading.lower()).strip("-")
 
 
-def _distortion(tables: Tables, camera: str) -> Pictures:
-    curve, of = curve_of(tables, camera), f"of {camera_words(camera)} by distance"
-    whole = DocumentPicture(partial(draw_curve, curve=curve, factor=1.0), f"distortion {of}")
-    return Pictures((whole, DocumentPicture(partial(draw_band, curve=curve), f"half the width of its band {of}")))
+def verdict_parts(verdict: Verdict) -> list[Part]:
+    """The findings, each with its severity."""
+    return [Paragraph(as_sentence(f.text), f.severity) for f in verdict.findings]
 
 
-def _reach(tables: Tables, camera: str) -> str:
-    found = format_coverage(tables.adjusted, camera)
-    if not len(found.images):
-        return f"No image point is of {camera_words(camera)}."
-    part = 100 * found.images
-    return (
-        f"Image points of {camera_words(camera)} reach {100 * found.whole:.0f} % of its format, those of an image "
-        f"{np.median(part):.0f} % (median; {part.min():.0f} % at least): beyond, the distortion is an extrapolation."
-    )
+def provenance(made: Made) -> list[Part]:
+    """Section of date, command, versions and hashes of the input files."""
+    about = {
+        "computed": datetime.date.today().isoformat(),
+        "command": made.command,
+        "versions": ", ".join(f"{name} {number}" for name, number in versions().items()),
+    }
+    return [Heading("Provenance"), about, *([hash_table(made.inputs)] if made.inputs else [])]
 
 
-def _sigma_maps(tables: Tables, mapped: list[str]) -> Iterator[Markup]:
-    for camera in mapped:
-        words = sigma_map_words(tables.adjusted.block.sensors[camera], tables.sigma_maps[camera])
-        yield _said(as_sentence(words))
-        yield _wide(_picture(sigma_map_figure(tables, camera), words))
+def hash_table(files: Iterable[InputFile]) -> pd.DataFrame:
+    """Files with their sizes and SHA-256."""
+    rows = [(f.file, str(f.n_bytes) if f.n_bytes else "", f.sha256) for f in files]
+    return pd.DataFrame(rows, columns=["file", "bytes", "SHA-256"])
 
 
-def _residuals(tables: Tables, pictured: list[str]) -> list[Markup]:
-    figures = [
-        _picture(figure(tables, c), f"{what} of {camera_words(c)} over its format")
-        for c in pictured
-        for figure, what in ((residuals_figure, "image residuals"), (mean_residuals_figure, "mean image residuals"))
-    ]
-    panels = [
-        DocumentPicture(
-            partial(draw_residuals_by_radius, tables=tables, camera=c), f"residuals of {camera_words(c)} by distance"
-        )
-        for c in pictured
-        if c in tables.sigma_maps
-    ]
-    if len(tables.adjusted.block.stations.who):
-        panels.append(DocumentPicture(partial(draw_station_residuals, tables=tables), "residuals of stations by time"))
-    checked = tables.residuals["redundancy_number"] > LEAST_CHECKED
-    largest = tables.residuals.loc[tables.residuals["w"].abs()[checked].nlargest(_LARGEST).index]
-    title = Markup("<h3>{}</h3>").format
-    trends = [title("Patterns: what the images have in common, and time and strips"), _html(tables.trends)]
-    return [
-        _html(tables.residual_spread),
-        *figures,
-        *([html_of(Pictures(tuple(panels)))] if panels else []),
-        *(trends if len(tables.trends) else []),
-        title("Largest normalised residuals"),
-        _html(largest),
-    ]
+def versions() -> dict[str, str]:
+    """Versions of jaxphoto and of the packages its numbers depend on."""
+    return {name: version(name) for name in _PACKAGES}
 
 
-def _html(table: pd.DataFrame) -> Markup:
-    return html_of(rows_of(table))
+def write_pdf(text: str, path: Path) -> None:
+    """Print a page to PDF by a Chromium-based browser. Raises InputError if none is installed."""
+    browser = next(filter(None, map(shutil.which, _BROWSERS)), None)
+    if browser is None:
+        raise InputError("no Chromium, Chrome or Edge found to print a PDF: write HTML and print it in a browser")
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        source = Path(folder, "page.html")
+        source.write_text(text, encoding="utf-8")
+        options = ("--headless", "--no-sandbox", "--disable-gpu", "--no-pdf-header-footer", f"--user-data-dir={folder}")
+        command = [browser, *options, f"--print-to-pdf={path.resolve()}", source.as_uri()]
+        subprocess.run(command, check=True, capture_output=True, timeout=120)
 
 
-def _said(text: str) -> Markup:
-    return html_of(Paragraph(text))
-
-
-def _picture(figure: Figure, alt: str) -> Markup:
-    return Markup('<img alt="{}" src="{}">').format(alt, png_of(figure)[1])
-
-
-def _wide(picture: Markup) -> Markup:
-    return Markup('<div class="wide">{}</div>').format(picture)
+def option_word(value: Any) -> str:
+    """Format the value of an option."""
+    if value is None or isinstance(value, bool):
+        return {None: "none", True: "yes", False: "no"}[value]
+    return " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)

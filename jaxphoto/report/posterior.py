@@ -1,4 +1,4 @@
-"""The posterior beside its Gaussian: a table of both, and a picture of where they part."""
+"""Posterior samples compared with the Gaussian approximation: table and plots."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from jaxphoto.report.plots import drawn, new_figure
+from jaxphoto.report.plots import label, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,11 +21,11 @@ _NORMAL_97_5 = 1.959964
 
 
 def posterior_table(posterior: Posterior) -> pd.DataFrame:
-    """What least squares and the posterior say of each parameter; both a priori.
+    """Least squares and posterior of each parameter; both a priori.
 
     Columns: parameter, optimum, laplace_sigma, laplace_2.5_percent, laplace_97.5_percent, posterior_mean,
-    posterior_sigma, posterior_2.5_percent, posterior_97.5_percent, skewness, rhat, ess. Units stand in the parameters'
-    names, angles in degrees; skewness, R-hat and effective sample size have none.
+    posterior_sigma, posterior_2.5_percent, posterior_97.5_percent, skewness, rhat, ess. Units are in the parameters'
+    names, angles in degrees.
     """
     names, factor = _names(posterior)
     optimum, sigma = posterior.optimum * factor, np.sqrt(np.diagonal(posterior.laplace)) * factor
@@ -49,7 +49,7 @@ def posterior_table(posterior: Posterior) -> pd.DataFrame:
 
 
 def posterior_figure(posterior: Posterior) -> Figure:
-    """Each parameter's sample with the Gaussian over it, and the pair that departs most from its 95 % ellipse."""
+    """The sample of each parameter with its Gaussian, and the pair that deviates most from its 95 % ellipse."""
     names, factor = _names(posterior)
     k = len(names)
     panels = k + (k > 1)
@@ -60,12 +60,12 @@ def posterior_figure(posterior: Posterior) -> Figure:
     laplace = posterior.laplace * np.outer(factor, factor)
     for j, axes in enumerate(places[:k]):
         _marginal(axes, draws[:, j], optimum[j], np.sqrt(laplace[j, j]))
-        axes.set_xlabel(drawn(names[j]), fontsize=8)
+        axes.set_xlabel(label(names[j]), fontsize=8)
     if k > 1:
         pair = list(np.unravel_index(np.argmax(posterior.outside), posterior.outside.shape))
         _pair(places[k], draws[:, pair], optimum[pair], laplace[np.ix_(pair, pair)])
-        places[k].set_xlabel(drawn(names[pair[0]]), fontsize=8)
-        places[k].set_ylabel(drawn(names[pair[1]]), fontsize=8)
+        places[k].set_xlabel(label(names[pair[0]]), fontsize=8)
+        places[k].set_ylabel(label(names[pair[1]]), fontsize=8)
         places[k].set_title(f"{100 * posterior.outside[tuple(pair)]:.0f} % outside, not 5 %", fontsize=8)
     for axes in places:
         axes.tick_params(labelsize=7)
@@ -75,7 +75,7 @@ def posterior_figure(posterior: Posterior) -> Figure:
 
 
 def _names(posterior: Posterior) -> tuple[list[str], np.ndarray]:
-    """Names with units, and what brings values to these."""
+    """Names with units, and factors to these units."""
     names, factor = [], np.ones(len(posterior.parameters))
     for j, parameter in enumerate(posterior.parameters):
         last = parameter.rsplit(".", 1)[-1]

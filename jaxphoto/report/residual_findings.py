@@ -1,321 +1,412 @@
-"""What the residuals say, as findings: sigma naught, observations that contradict the others, patterns; and what no
-test of them could say.
-"""
+"""Findings from residuals: sigma naught, blunders, systematic effects; from reliability, rejections and weights."""
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import scipy
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
 from jaxphoto.camera import get_parameter, parameter_names
-from jaxphoto.errors import camera_words, counted
-from jaxphoto.observations import PRIORS
+from jaxphoto.errors import camera_words, few
+from jaxphoto.observations import PRIORS, AbstractObservations, Correlated
+from jaxphoto.procedures import Snooped
 from jaxphoto.procedures.adjust import ABSURD
-from jaxphoto.report.findings import Finding, Level, p_words, parameter_words, symbol
-from jaxphoto.report.residual_table import in_file_unit
+from jaxphoto.procedures.mistakes import coordinate_mistakes, is_mirrored
+from jaxphoto.procedures.snooping import SEVERAL, images_out, mostly_out
+from jaxphoto.procedures.weights import MadeByBlunders
+from jaxphoto.report.findings import SEVERITIES, Finding, Severity, p_words, symbol
+from jaxphoto.report.formatting import in_file_unit
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import (
     DELTA0,
     LEVEL,
-    MOST_PARTS,
-    SURE,
-    Hint,
-    PatternTerm,
-    ResidualPattern,
+    MAX_GROUPS,
+    SIGNIFICANT_RATIO,
+    EffectTerm,
     Suspect,
-    culprits,
+    SystematicEffect,
+    TermEstimate,
+    VarianceComponents,
+    expected_residual_scale,
     global_test,
     group_factors,
-    most_felt,
-    stretch,
-    worst_checked,
+    largest_interior_effects,
+    largest_mdbs,
+    multiple_outlier_test,
 )
 from jaxphoto.unknowns import Weighted
 
 ANOTHER_UNIT = 0.1
-"""A sigma naught below this says that standard deviations were given in another unit."""
+"""Sigma naught below which standard deviations are in another unit."""
 NOTHING_FITS = 3.0
-"""A rejected sigma naught above this is no question of weights: something is wrong."""
+"""Sigma naught above which weights are not the cause: something is wrong."""
+MOST_OF_IT = 0.5
+"""Fraction of the square sum of a systematic effect that one term explains to be named."""
 _SHOWN = 3
 _NOT_DISTORTION = ("c_mm", "xp_mm", "yp_mm")
-# A suspect is no reservation but an alarm beyond this times the critical value, or where it moves an interior parameter
-# by more than `_SPOILT` of its standard deviations; below `_TOLD` that is not worth telling.
-_FAR_OUT, _SPOILT, _TOLD = 1.25, 0.5, 0.05
-# What is expected of sigma naught may be off from 1 by this; beyond, it is said.
+# A suspect is an error beyond this factor times the critical value, or if it moves an interior parameter by more than
+# `_SPOILT` sigma; effects below `_REPORTED` are not reported.
+_FAR_OUT, _SPOILT, _REPORTED = 1.25, 0.5, 0.05
+# Deviation of the expected sigma naught from 1 that is reported.
 _STRETCHED = 0.01
-# A pattern matters where it is more than this of the observations' standard deviation, or moves an interior parameter
-# by more than `_MOVED` of its own; smaller ones are found in many observations, and change nothing.
-_VISIBLE, _MOVED = 0.25, 1.0
-# A pattern is an alarm where its term moves an interior parameter by more than this: by what standard deviations are
-# taken for, results are then wrong beyond doubt.
-_SPOILT_BY_A_PATTERN = 10.0
-# A camera that has changed looks much like stations that are off alike; where either explains about as much (logarithms
-# of p-values within a tenth), what is known of the camera is doubted first: it is older.
-_AS_GOOD = 1.1
-# Of a pattern's square sum, what one term must explain to be named.
-MOST_OF_IT = 0.5
-# An observation whose detectable error is more than this times its sigma is checked by hardly anything (r < 0.17).
+# A systematic effect is a warning above this fraction of the sigma of its observations, or if it moves an interior
+# parameter by more than `_MOVED` sigma, and an error if by more than `_SPOILT_BY_EFFECT` sigma.
+_VISIBLE, _MOVED, _SPOILT_BY_EFFECT = 0.25, 1.0, 10.0
+# A changed camera looks like a common bias of stations; where p-values are similar (logarithms within a tenth), the
+# prior of the camera is questioned first, because it is older.
+_SIMILAR = 1.1
+# MDB over sigma above which an observation is hardly checked (r < 0.17).
 _HIDDEN = 10.0
 
 
-def of_residuals(tables: Tables) -> Iterator[Finding]:
-    """Whether they fit their standard deviations, which of them do not, and whether they follow a pattern."""
+def residual_findings(tables: Tables) -> Iterator[Finding]:
+    """Tests of sigma naught, of single residuals and of systematic effects."""
     yield from _global_test(tables)
     fits = global_test(tables.adjusted, tables.redundancy).sigma <= ABSURD
-    patterns, some = list(_trends(tables, fits)), tables.blunders.suspects
-    # What one term explains, and more certainly than any blunder, is the likelier culprit: it makes blunders of many.
-    # Where the place is wrong, what is computed to first order there does not tell the two apart.
-    first = [p for p in patterns if p.chance < _chance_of_the_worst(tables)] if some and fits else []
-    worst = max((f.level for f in _blunders(tables, tables.culprits)), default=Level.INFORMATION) if first else 0
-    yield from (p.finding._replace(level=Level(max(p.finding.level, worst))) for p in first)
-    beside = [pair for p in first[:1] for pair in p.terms]
-    yield from _blunders(tables, culprits(tables.adjusted, tables.blunders, beside) if beside else tables.culprits)
-    yield from (p.finding for p in patterns if all(p is not one for one in first))
+    effects, suspects = list(_systematic(tables, fits)), tables.blunders.suspects
+    # An effect that is more certain than the worst suspect comes first: it makes blunders of many observations. Where
+    # nothing fits, first-order theory does not separate the two.
+    first = [e for e in effects if e.chance < _chance_of_the_worst(tables)] if suspects and fits else []
+    blunders = list(_blunders(tables, tables.culprits)) if first else []
+    worst = min((SEVERITIES.index(f.severity) for f in blunders), default=len(SEVERITIES) - 1)
+    for effect in first:
+        severity = SEVERITIES[min(SEVERITIES.index(effect.severity), worst)]
+        yield _systematic_finding(effect, severity)
+    terms = [pair for effect in first[:1] for pair in effect.terms]
+    yield from _blunders(
+        tables, multiple_outlier_test(tables.adjusted, tables.blunders, terms) if terms else tables.culprits
+    )
+    yield from (_systematic_finding(e, e.severity) for e in effects if all(e is not one for one in first))
 
 
 def contradictions(tables: Tables) -> Iterator[Finding]:
-    """Whether residuals fit their standard deviations, and which do not."""
+    """Tests of sigma naught and of single residuals."""
     yield from _global_test(tables)
     yield from _blunders(tables, tables.culprits)
 
 
-def _of_such_lenses(block: Block) -> bool:
-    """Whether what is known is how far lenses of a kind lie apart: wide for a good one, and of no photographs."""
-    # Which observes every distortion as none; who has measured one has found some.
-    known = [
+def _priors_of_lens_type(block: Block) -> bool:
+    """True if the priors are the spread of a lens type, which has zero distortion as its mean."""
+    values = [
         float(prior.value)
         for priors in block.priors.interior.values()
         for name in parameter_names(priors)
         if name not in _NOT_DISTORTION and isinstance(prior := get_parameter(priors, name), Weighted)
     ]
-    return bool(known) and not any(known)
+    return bool(values) and not any(values)
 
 
 def _global_test(tables: Tables) -> Iterator[Finding]:
-    """Sigma naught against 1, and which groups of observations it comes from."""
+    """Sigma naught against its expectation, and the groups of observations that cause a deviation."""
     whole = global_test(tables.adjusted, tables.redundancy)
     if whole.redundancy <= 0:
-        yield Finding(
-            Level.WARNING,
-            "the redundancy is 0: nothing checks anything, and standard deviations rest on those that were given; "
-            "add observations",
-        )
+        yield Finding("no_redundancy", "warning", hint="Add observations")
         return
     tested = group_factors(tables.adjusted, tables.redundancy)
     factors = [f for f in tested if f.p_value < LEVEL / len(tested)]
     if whole.p_value >= LEVEL:
-        # Of few observations beside many, sigma naught shows nothing.
+        # A few observations among many do not show in sigma naught.
         for f in factors:
-            if f.group.startswith(PRIORS):
-                if f.sigma < 1 and not (f.group == PRIORS and _of_such_lenses(tables.adjusted.block)):
-                    yield Finding(
-                        Level.WARNING,
-                        "what was known of parameters beforehand agrees with this block better than chance allows "
-                        f"({p_words(f.p_value)}): if it comes of the same photographs, they count twice and standard "
-                        "deviations are too small; leave it out",
-                    )
-                continue
-            size = f"{1 / f.sigma:.2g} times as large as" if f.sigma < 1 else f"{f.sigma:.2g} times smaller than"
-            yield Finding(
-                Level.WARNING,
-                f"the standard deviations of {f.group.replace('_', ' ')} are {size} their residuals say "
-                f"({p_words(f.p_value)}), while all observations together fit: correct them (--weights estimates them)",
-            )
+            p = {"p": p_words(f.p_value)}
+            if not f.group.startswith(PRIORS):
+                factor, size = (1 / f.sigma, "large") if f.sigma < 1 else (f.sigma, "small")
+                hint = "Correct them (--weights estimates them)"
+                numbers = p | {"factor": factor, "size": size}
+                yield Finding("group_sigma", "warning", f.group.replace("_", " "), f.sigma, 1.0, hint, numbers)
+            elif f.sigma < 1 and not (f.group == PRIORS and _priors_of_lens_type(tables.adjusted.block)):
+                hint = "If it comes from the same images they count twice and sigmas are too small: remove it"
+                yield Finding("prior_counted_twice", "warning", value=f.sigma, limit=1.0, hint=hint, numbers=p)
         return
     groups = ", ".join(f"{f.group.replace('_', ' ')} {f.sigma:.3g}" for f in factors)
-    of_groups = f"; by group of observations: {groups}" if groups else ""
-    said = f"sigma naught {whole.factor**0.5:.3g}, expected {whole.expected**0.5:.3g} ({p_words(whole.p_value)})"
+    numbers = {"p": p_words(whole.p_value), "groups": f"; by group: {groups}" if groups else ""}
+    severity: Severity = "warning"
     if whole.sigma < 1:
-        # With one group alone, too large a sigma is made good by the variance factor; with several, weights are wrong.
-        unit = whole.sigma < ANOTHER_UNIT and sum(n > 0 for n in tables.adjusted.n_observations.values()) > 1
-        yield Finding(
-            Level.ALARM if unit else Level.WARNING,
-            f"{said}: residuals are smaller than the standard deviations that were given{of_groups}; those are too "
-            "large, and where they are not all so by the same factor, the weights are wrong: correct them"
-            + ("; so much is no guess but another unit (micrometres or pixels for millimetres)" if unit else ""),
-        )
+        # With a single group the variance factor absorbs a wrong sigma; with several, the weights are wrong.
+        several = sum(n > 0 for n in tables.adjusted.n_observations.values()) > 1
+        unit = whole.sigma < ANOTHER_UNIT and several
+        code, severity = ("sigma0_unit", "error") if unit else ("sigma0_small", "warning")
+        hint = "Correct the standard deviations: unless all are too large by one factor, weights are wrong"
     elif whole.sigma <= NOTHING_FITS:
-        yield Finding(
-            Level.WARNING,
-            f"{said}: residuals are larger than the standard deviations that were given{of_groups}; these are "
-            "too small, or there are blunders, or the camera model lacks something",
-        )
+        code, hint = "sigma0_large", "Standard deviations are too small, or there are blunders or an incomplete model"
     else:
-        yield Finding(
-            Level.ALARM,
-            f"{said}: the observations contradict one another or the model{of_groups}; look at approximate values, "
-            "units, point ids and the largest residuals, and at what jaxphoto adjust --snoop leaves out",
+        code, severity = "sigma0_contradiction", "error"
+        hint = (
+            "Check approximate values, units, point ids and the largest residuals; jaxphoto adjust --snoop rejects "
+            "blunders"
         )
+    yield Finding(code, severity, value=whole.factor**0.5, limit=whole.expected**0.5, hint=hint, numbers=numbers)
 
 
-def of_stretched_residuals(adjusted: Adjustment) -> Iterator[Finding]:
-    """Which sigma naught is expected of corrected image coordinates, where it is not 1."""
-    for camera, factor in stretch(adjusted).items() if adjusted.redundancy > 0 else ():
+def stretch_findings(adjusted: Adjustment) -> Iterator[Finding]:
+    """Cameras whose distortion stretches residuals, so that sigma naught is not expected to be 1."""
+    for camera, factor in expected_residual_scale(adjusted).items() if adjusted.redundancy > 0 else ():
         if abs(factor - 1) > _STRETCHED:
-            yield Finding(
-                Level.INFORMATION,
-                f"{camera_words(camera)}: residuals are of corrected image coordinates, which its distortion "
-                f"{'stretches' if factor > 1 else 'shrinks'}; sigma naught of its image points is expected to be "
-                f'{factor:.3g}, not 1: say residuals = "measured" in [cameras.{camera}]',
-            )
+            hint = f'Set residuals = "measured" in [cameras.{camera}]'
+            yield Finding("stretched", "note", camera_words(camera), factor, 1.0, hint)
 
 
-def _blunders(tables: Tables, accused: Sequence[Suspect]) -> Iterator[Finding]:
-    """The likeliest culprit first, and no suspect that worse ones (or a pattern that stands before them) explain.
+def _blunders(tables: Tables, suspects: Sequence[Suspect]) -> Iterator[Finding]:
+    """The most likely blunders.
 
-    An alarm where it is far beyond the critical value or moves the interior orientation; else a reservation: of many
-    thousand real observations some are a little too far out.
+    An error if far beyond the critical value or if it moves the interior orientation, otherwise a warning: of many
+    thousand real observations a few are slightly beyond.
     """
     limit = tables.blunders.limit
-    effects = [(s, *_effect(tables, s)) for s in accused]
-    judged = [(abs(s.w) > _FAR_OUT * limit or moved > _SPOILT, s, what, moved) for s, what, moved in effects]
-    for alarming, s, what, moved in sorted(judged, key=lambda j: not j[0])[:_SHOWN]:
+    effects = [(s, *_effect(tables, s)) for s in suspects]
+    judged = [(abs(s.w) > _FAR_OUT * limit or moved > _SPOILT, s, name, moved) for s, name, moved in effects]
+    for severe, s, name, moved in sorted(judged, key=lambda j: not j[0])[:_SHOWN]:
         factor, unit = in_file_unit(s.unit)
-        told = f"; that moves {what} by {moved:.1g} of its sigma" if moved > _TOLD else ""
-        yield Finding(
-            Level.ALARM if alarming else Level.WARNING,
-            f"{s.words} contradicts the other observations: if it alone is wrong, by {factor * s.error:+.3g} +- "
-            f"{factor * s.sigma:.2g} {unit} (w {s.w:.1f}, critical {limit:.1f}){told}",
-        )
-    if beside := len(tables.blunders.suspects) - len(judged):
-        yield Finding(
-            Level.INFORMATION,
-            f"{counted(beside, 'more observation')} {'is' if beside == 1 else 'are'} beyond the critical value, too, "
-            "but not once what stands before is mended",
-        )
+        numbers = {
+            "sigma": factor * s.sigma, "unit": unit, "w": s.w,
+            "effect": f"; it moves {symbol(name)} by {moved:.1g} sigma" if moved > _REPORTED else "",
+        }  # fmt: skip
+        severity: Severity = "error" if severe else "warning"
+        yield Finding("blunder", severity, s.words, factor * s.error, limit, "Check this observation", numbers)
+    if explained := len(tables.blunders.suspects) - len(judged):
+        yield Finding("explained_suspects", "note", value=explained, limit=limit)
     if len(judged) > _SHOWN:
-        yield Finding(
-            Level.ALARM if any(alarming for alarming, *_ in judged) else Level.WARNING,
-            f"{len(judged)} of {tables.blunders.n} observations are beyond the critical value, each although the "
-            "worse ones are out: jaxphoto adjust --snoop leaves out what must go",
-        )
+        severity = "error" if any(severe for severe, *_ in judged) else "warning"
+        hint = "jaxphoto adjust --snoop rejects blunders"
+        numbers = {"n": tables.blunders.n}
+        yield Finding("many_blunders", severity, value=len(judged), limit=limit, hint=hint, numbers=numbers)
 
 
 def _effect(tables: Tables, suspect: Suspect) -> tuple[str, float]:
-    """The interior parameter that moves most with the error of a suspect, in a posteriori standard deviations."""
+    """The interior parameter that the error of a suspect moves most, in a posteriori sigmas."""
     moved = {
-        parameter: np.atleast_2d(of[suspect.group])[suspect.number, suspect.row] * abs(suspect.w) / DELTA0
+        parameter: float(np.atleast_2d(of[suspect.group])[suspect.number, suspect.row]) * abs(suspect.w) / DELTA0
         for parameter, of in tables.undetected.interior.items()
     }
-    known = {parameter: float(v) for parameter, v in moved.items() if np.isfinite(v)}
-    return max(known.items(), key=lambda item: item[1], default=("", 0.0))
+    return max(((p, v) for p, v in moved.items() if np.isfinite(v)), key=lambda item: item[1], default=("", 0.0))
 
 
 def _chance_of_the_worst(tables: Tables) -> float:
-    """Of a normalised residual among all that there are."""
+    """Probability of the largest normalised residual among all."""
     w = max(abs(s.w) for s in tables.blunders.suspects)
     return tables.blunders.n * float(scipy.special.erfc(w / np.sqrt(2)))
 
 
-class _Pattern(NamedTuple):
-    """A pattern that is beyond chance."""
+class _Effect(NamedTuple):
+    """A significant systematic effect."""
 
     chance: float
-    """Its p-value: 1 where no usual term explains it, or it does not matter, and 0 where it explains most of what looks
-    like blunders."""
-    finding: Finding
-    terms: tuple[tuple[ResidualPattern, PatternTerm], ...]
-    """That are most of it."""
+    """Its p-value: 1 if no usual term explains it or it does not matter, 0 if it explains most of the suspects."""
+    severity: Severity
+    subject: str
+    value: float
+    limit: float
+    numbers: dict[str, Any]
+    terms: tuple[tuple[SystematicEffect, EffectTerm], ...]
+    """Terms that are most of it."""
 
 
-def _trends(tables: Tables, fits: bool) -> Iterator[_Pattern]:
-    """Patterns that are beyond chance, the most certain first. Where nothing `fits`, cameras are not looked at."""
+def _systematic_finding(effect: _Effect, severity: Severity) -> Finding:
+    return Finding("systematic", severity, effect.subject, effect.value, effect.limit, numbers=effect.numbers)
+
+
+def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
+    """Significant systematic effects, the most certain first; those of cameras only where the block `fits`."""
     level = LEVEL / max(len(tables.tested_trends), 1)
-    # Of images that do not fit at all, the pattern is what the misfit makes of them, and no term of the camera.
-    told = (t for t in tables.tested_trends if t.p_value < level and (fits or not t.pattern.camera))
-    for t in sorted(told, key=lambda t: t.p_value ** (_AS_GOOD if t.pattern.begins else 1.0)):
+    found = (t for t in tables.tested_trends if t.p_value < level and (fits or not t.pattern.camera))
+    for t in sorted(found, key=lambda t: t.p_value ** (_SIMILAR if t.pattern.begins else 1.0)):
         factor, unit = in_file_unit(t.pattern.unit)
-        said = t.pattern.begins or f"residuals of {t.pattern.what} follow a pattern"
-        said += f" ({p_words(t.p_value)})"
+        detail, likely, spoilt = "", list[TermEstimate](), False
         if t.size > 0 and unit:
-            said += f" of {factor * t.size:.2g} {unit} ({t.size / t.sigma:.2g} of their sigma)"
-        matters, spoilt, likely = t.size > _VISIBLE * t.sigma, False, list[Hint]()
-        alike = t.alike
-        # What estimated parameters nearly take up is seen so badly that its size is lost in its noise.
-        matters |= any(abs(h.amount) > _VISIBLE * t.sigma for h in alike)
-        if alike or (t.hints and t.hints[0].share > MOST_OF_IT):
-            likely = alike or [t.hints[0]]
-            share = "" if alike else f"{100 * t.hints[0].share:.0f} % of it "
-            said += f", {share}{_told(t.pattern, likely)}"
+            detail = f", size {factor * t.size:.2g} {unit} ({t.size / t.sigma:.2g} sigma)"
+        together = t.significant_terms
+        # Estimated parameters absorb part of an effect, so that its size is lost in noise.
+        matters = t.size > _VISIBLE * t.sigma or any(abs(h.amount) > _VISIBLE * t.sigma for h in together)
+        if together or (t.hints and t.hints[0].share > MOST_OF_IT):
+            likely = together or [t.hints[0]]
+            fraction = "" if together else f"{100 * t.hints[0].share:.0f} % of it "
+            detail += f", {fraction}{_terms(t.pattern, likely)}"
             moves = {path: abs(sum(h.moves[path] for h in likely)) for path in likely[0].moves}
             path = max(moves, key=lambda path: moves[path], default="")
             if path and (moved := moves[path]) > _MOVED:
-                matters, spoilt = True, moved > _SPOILT_BY_A_PATTERN
-                said += f"; {parameter_words(path)} would move by {moved:.1f} of its sigma"
+                matters, spoilt = True, moved > _SPOILT_BY_EFFECT
+                detail += f"; {path} would move by {moved:.1f} sigma"
         elif t.pattern.camera:
-            said += ": no single usual term is most of it; try a distortion of more terms (docs/model_choice.md)"
-        elif several := [h for h in t.hints if abs(h.amount) > SURE * h.sigma][:_SHOWN]:
-            said += f", each alone {_told(t.pattern, several)}"
-        level = Level.ALARM if spoilt else Level.WARNING if matters else Level.INFORMATION
-        # Blunders that the term would make are none: beside them, what is left of its rows says the same.
-        most = t.blunders_alike >= _SHOWN and t.blunders_alike > len(tables.blunders.suspects) / 2
-        chance = 0.0 if most else t.p_value
+            detail += ": no single usual term is most of it; try a distortion of more terms (docs/model_choice.md)"
+        elif several := [h for h in t.hints if abs(h.amount) > SIGNIFICANT_RATIO * h.sigma][:_SHOWN]:
+            detail += f", each alone {_terms(t.pattern, several)}"
+        # Suspects that the term explains are no blunders.
+        most = t.matching_blunders >= _SHOWN and t.matching_blunders > len(tables.blunders.suspects) / 2
+        chance = (0.0 if most else t.p_value) if matters and likely else 1.0
+        subject = t.pattern.begins or f"systematic residuals of {t.pattern.what}"
+        numbers = {"p": p_words(t.p_value), "detail": detail}
+        severity: Severity = "error" if spoilt else "warning" if matters else "note"
         terms = tuple((t.pattern, h.term) for h in likely)
-        yield _Pattern(chance if matters and likely else 1.0, Finding(level, said), terms)
+        yield _Effect(chance, severity, subject, factor * t.size, _VISIBLE * factor * t.sigma, numbers, terms)
 
 
-def _hidden_in_common(tables: Tables) -> Iterator[Finding]:
-    """Of errors that all rows of a group have in common, how large they may be unseen, and what they then do."""
+def _terms(pattern: SystematicEffect, likely: list[TermEstimate]) -> str:
+    """The likely terms with their amounts, and the cure."""
+    factor, unit = in_file_unit(pattern.unit)
+    amounts = (f" {factor * h.amount:+.3g} +- {factor * h.sigma:.2g} {unit}".rstrip() for h in likely)
+    names = ", ".join(h.term.name + (a if h.term.report_amount else "") for h, a in zip(likely, amounts, strict=True))
+    cure = likely[0].term.cure
+    return f"{names}, {cure}" if cure else names
+
+
+# Reliability -----------------------------------------------------------------------------------------------------
+
+
+def reliability_findings(tables: Tables) -> Iterator[Finding]:
+    """Points of two rays, external reliability, and observations with large MDBs."""
+    adjusted = tables.adjusted
+    if (n := len(adjusted.block.sensors)) > MAX_GROUPS:
+        yield Finding("not_tested_by_camera", "note", value=n, limit=MAX_GROUPS)
+    rays = np.bincount(adjusted.structure.point, minlength=len(adjusted.block.points))
+    if two := int((rays == 2).sum()):
+        yield Finding("two_rays", "note", value=two, numbers={"n": len(rays)})
+    if felt := [f for f in largest_interior_effects(adjusted, tables.undetected) if f.moved > _MOVED]:
+        subject = ", ".join(f"{symbol(f.parameter)} by up to {f.moved:.1f} sigma ({f.words})" for f in felt)
+        yield Finding("external_reliability", "note", subject, max(f.moved for f in felt), _MOVED)
+    yield from _common_biases(tables)
+    for hidden in largest_mdbs(adjusted, tables.redundancy):
+        if hidden.group != IMAGE_POINTS and hidden.mdb > _HIDDEN * hidden.sigma:
+            factor, unit = in_file_unit(hidden.unit)
+            code = "mdb" if np.isfinite(hidden.mdb) else "unchecked"
+            mdb, sigma = factor * hidden.mdb, factor * hidden.sigma
+            yield Finding(code, "note", hidden.words, mdb, _HIDDEN * sigma, numbers={"sigma": sigma, "unit": unit})
+
+
+def _common_biases(tables: Tables) -> Iterator[Finding]:
+    """MDB of a bias common to all rows of a group, and its effect on the interior orientation."""
     for t in (t for t in tables.tested_trends if t.pattern.group):
-        worst: tuple[float, str, Hint] | None = None
+        worst: tuple[float, str, TermEstimate] | None = None
         for h in (h for h in t.hints if h.amount != 0.0):
             for path, moved in h.moves.items():
-                # Of an error that is found with a probability of 80 %.
                 size = abs(moved / h.amount) * DELTA0 * h.sigma
                 worst = max(worst or (0.0, "", h), (size, path, h), key=lambda w: w[0])
         if worst is not None and worst[0] > _MOVED:
             size, path, h = worst
             factor, unit = in_file_unit(t.pattern.unit)
-            least = f"{factor * DELTA0 * h.sigma:.2g} {unit}"
-            yield Finding(
-                Level.INFORMATION,
-                f"{t.pattern.what}: an error in {h.term.name} that they have in common would be found with a "
-                f"probability of 80 % from {least} on, and one of that size moves {parameter_words(path)} by "
-                f"{size:.2g} of its sigma",
-            )
+            numbers = {"term": h.term.name, "unit": unit, "parameter": path, "moved": size}
+            yield Finding("common_bias", "note", t.pattern.what, factor * DELTA0 * h.sigma, _MOVED, numbers=numbers)
 
 
-def _told(pattern: ResidualPattern, likely: list[Hint]) -> str:
-    """The likeliest terms, their amounts where these are in the observations' own unit, and what cures them."""
-    factor, unit = in_file_unit(pattern.unit)
-    amounts = (f" {factor * h.amount:+.3g} +- {factor * h.sigma:.2g} {unit}".rstrip() for h in likely)
-    names = ", ".join(h.term.name + (a if h.term.amount_told else "") for h, a in zip(likely, amounts, strict=True))
-    cure = likely[0].term.cure
-    return f"{names}, {cure}" if cure else names
+# Rejected observations -------------------------------------------------------------------------------------------
+
+_REJECTED_SHOWN = 5
+# Errors have a common bias if they scatter by no more than so many sigmas.
+_COMMON = 3.0
 
 
-def of_what_is_not_checked(tables: Tables) -> Iterator[Finding]:
-    """What no test could find: points of two rays, and how large an error of each further group may stay hidden."""
-    adjusted = tables.adjusted
-    if (n := len(adjusted.block.sensors)) > MOST_PARTS:
-        yield Finding(
-            Level.INFORMATION,
-            f"of {n} cameras neither patterns over their formats nor what undetected errors do to each are looked at; "
-            f"of up to {MOST_PARTS} they are",
-        )
-    rays = np.bincount(adjusted.structure.point, minlength=len(adjusted.block.points))
-    if twice := int((rays == 2).sum()):
-        yield Finding(
-            Level.INFORMATION,
-            f"{twice} of {len(rays)} points are in two images only: an error along the plane of their rays shows "
-            "nowhere",
-        )
-    if felt := [f for f in most_felt(adjusted, tables.undetected) if f.moved > _MOVED]:
-        told = ", ".join(f"{symbol(f.parameter)} by up to {f.moved:.1f} of its sigma ({f.words})" for f in felt)
-        yield Finding(Level.INFORMATION, f"an error that no test finds (power 80 %) would move {told}")
-    yield from _hidden_in_common(tables)
-    for hidden in worst_checked(adjusted, tables.redundancy):
-        if hidden.group != IMAGE_POINTS and hidden.detectable > _HIDDEN * hidden.sigma:
-            factor, unit = in_file_unit(hidden.unit)
-            told = (
-                f"an error of {factor * hidden.detectable:.2g} {unit} would be found with a probability of 80 % only, "
-                "a smaller one less often"
-                if np.isfinite(hidden.detectable)
-                else "nothing checks it, and no error of it would be found, however large"
-            )
-            text = f"{hidden.words}: {told} (its sigma is {factor * hidden.sigma:.2g} {unit})"
-            yield Finding(Level.INFORMATION, text)
+def left_out_table(snooped: Snooped, block: Block) -> pd.DataFrame:
+    """group, image, point, observation, error, sigma, unit, w of everything rejected, the worst first.
+
+    `error` is observed minus predicted by the others. Points that were rejected as a whole follow without numbers.
+    """
+    groups, rows = block.named_observations, list[tuple]()
+    for s in snooped.left_out:
+        names = []
+        for what, known in (("image", block.images), ("point", block.points)):
+            found = groups[s.group].names_of(what, known)
+            names.append(str(found[..., s.row] if found.ndim == 1 else found[0, s.row]))
+        factor, unit = in_file_unit(s.unit)
+        rows.append((s.group, *names, s.words, factor * s.error, factor * s.sigma, unit, s.w))
+    rows += [("", "", point, f"point {point}", None, None, "", None) for point in snooped.points]
+    columns = ["group", "image", "point", "observation", "error", "sigma", "unit", "w"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def snooped_findings(snooped: Snooped, block: Block) -> list[Finding]:
+    """What was corrected and rejected, systematic errors first."""
+    found = [*_too_many(snooped, block)]
+    found += [Finding("exchanged", "warning", exchange.words) for exchange in snooped.exchanged]
+    found += _common(snooped, block)
+    for s in snooped.left_out[:_REJECTED_SHOWN]:
+        factor, unit = in_file_unit(s.unit)
+        numbers = {"sigma": factor * s.sigma, "unit": unit, "w": s.w}
+        found.append(Finding("rejected_observation", "warning", s.words, factor * s.error, numbers=numbers))
+    if (more := len(snooped.left_out) - _REJECTED_SHOWN) > 0:
+        found.append(Finding("rejected_more", "warning", value=more))
+    if snooped.points:
+        found.append(Finding("rejected_points", "warning", few(snooped.points), len(snooped.points)))
+    return found
+
+
+def _common(snooped: Snooped, block: Block) -> Iterator[Finding]:
+    """Rejected rows of a group (besides image points) with a common bias along an axis, overall or in a strip."""
+    for name, rows in block.named_observations.items():
+        left = [s for s in snooped.left_out if s.group == name]
+        if name != IMAGE_POINTS and not isinstance(rows, Correlated) and len(left) >= SEVERAL:
+            yield from _common_of(name, rows, left, block)
+
+
+def _common_of(name: str, rows: AbstractObservations, left: list[Suspect], block: Block) -> Iterator[Finding]:
+    axes = rows.axis_of_numbers
+    strips = np.broadcast_to(rows.names_of("image", block.image_strip), axes.shape)
+    of_strips = sorted({(str(axes[s.number, s.row]), str(strips[s.number, s.row])) for s in left})
+    reported: set[str] = set()
+    for axis, strip in [*((axis, None) for axis in dict.fromkeys(a for a, _ in of_strips)), *of_strips]:
+        part = (axes == axis) & ((strips == strip) if strip is not None else True)
+        own = [s for s in left if part[s.number, s.row]]
+        error, sigma = (np.array([getattr(s, field) for s in own]) for field in ("error", "sigma"))
+        mean = float(np.average(error, weights=sigma**-2.0))
+        scatter = float(np.sqrt(np.mean(((error - mean) / sigma) ** 2)))
+        if axis not in reported and len(own) >= SEVERAL and len(own) > part.sum() / 2 and scatter < _COMMON:
+            # A bias of all strips is reported once.
+            reported |= {axis} if strip is None else set()
+            factor, unit = in_file_unit(own[0].unit)
+            subject = f"{name.replace('_', ' ')}{f' in strip {strip}' if strip else ''} along {axis}"
+            numbers = {"n": len(own), "bias": factor * mean, "unit": unit}
+            hint = "Estimate it (such as a shift), or correct it at its source"
+            yield Finding("rejected_bias", "warning", subject, float(part.sum()), hint=hint, numbers=numbers)
+
+
+def _too_many(snooped: Snooped, block: Block) -> Iterator[Finding]:
+    """Images and groups of which too much is rejected to be single errors."""
+    most = images_out(snooped, block)
+    mirrored = [k for k in most if is_mirrored(snooped, block, k)]
+    for which, hint in (
+        (mirrored, "They fit mirrored: x and y are exchanged, or one of them has the wrong sign"),
+        ([k for k in most if k not in mirrored], "Check its point names, axes, camera and station, or remove it"),
+    ):
+        if images := [f"{block.images[k]} ({most[k][0]} of {most[k][1]})" for k in which]:
+            yield Finding("rejected_images", "error", few(images), len(images), hint=hint)
+    mistakes = coordinate_mistakes(snooped, block)
+    for name, counts in mostly_out(snooped, block).items():
+        many = ", ".join(f"{n} of {of} in {axis}" for axis, (n, of) in counts.items())
+        hint = "Check their units, axes, names and signs, and what is held fixed"
+        if name in mistakes:
+            hint = f"They fit if {mistakes[name]}: correct them at their source"
+        yield Finding("rejected_group", "error", f"{name.replace('_', ' ')}, {many}", hint=hint)
+
+
+# Variance components ---------------------------------------------------------------------------------------------
+
+
+def component_tables(components: VarianceComponents) -> dict[str, pd.DataFrame]:
+    """By file name: variance_components, and variance_component_correlation.
+
+    Columns are group, observations, redundancy, factor, sigma_factor, degrees_of_freedom, supported; and group_a,
+    group_b, rho. A group that supports no component has the factor 1 and no sigma.
+    """
+    c = components
+    columns = {
+        "group": c.labels, "observations": c.observations, "redundancy": c.redundancy, "factor": c.factor,
+        "sigma_factor": c.sigma, "degrees_of_freedom": c.degrees, "supported": c.supported,
+    }  # fmt: skip
+    known = [(k, label) for k, label in enumerate(c.labels) if c.supported[k]]
+    rows = [(a, b, c.correlation[j, k]) for j, a in known for k, b in known if j != k]
+    correlation = pd.DataFrame(rows, columns=["group_a", "group_b", "rho"])
+    return {"variance_components": pd.DataFrame(columns), "variance_component_correlation": correlation}
+
+
+def component_findings(components: VarianceComponents, blunders: Sequence[MadeByBlunders] = ()) -> list[Finding]:
+    """Components caused by blunders, missing convergence, and groups that support no component."""
+    found = []
+    for made in blunders:
+        hint = "Blunders are no measure of precision: adjust with --snoop as well"
+        numbers = {"words": few(list(made.words))}
+        found.append(Finding("component_blunder", "error", made.label, made.factor, made.without, hint, numbers))
+    if not components.converged:
+        hint = "Estimate them for fewer groups"
+        found.append(Finding("components_not_converged", "warning", value=components.iterations, hint=hint))
+    return found + [Finding("component", "warning", sentence) for sentence in components.warnings.values()]

@@ -1,42 +1,68 @@
-"""The result folder of an adjustment, written whole or not at all."""
+"""The result folder of an adjustment: tables, summary.json and the report."""
 
 import json
+import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from jaxphoto.adjustment import Adjustment
-from jaxphoto.camera import RATES, model_keys, sensor_keys
+import numpy as np
+import pandas as pd
+
+from jaxphoto.adjustment import Adjustment, Outcome
+from jaxphoto.block import Block
+from jaxphoto.camera import RATES, InteriorOrientation, Sensor, get_parameter, model_keys, parameter_names, sensor_keys
 from jaxphoto.compiling.freed_memory import return_freed_memory
-from jaxphoto.errors import InputError
-from jaxphoto.report.check_points import check_spread
-from jaxphoto.report.findings import Verdict
-from jaxphoto.report.made import Made, versions
-from jaxphoto.report.page import report_page
-from jaxphoto.report.positional_accuracy import accuracy_sentences
-from jaxphoto.report.table_files import check_table_format, write_table
-from jaxphoto.report.tables import Tables
-from jaxphoto.statistics import LEVEL, global_test
+from jaxphoto.errors import InputError, camera_words, counted
+from jaxphoto.observations import AXES
+from jaxphoto.report import plots
+from jaxphoto.report.block_plot import block_view, block_words, plot_block
+from jaxphoto.report.findings import Verdict, as_sentence, p_words
+from jaxphoto.report.formatting import (
+    check_table_format,
+    of_sigma,
+    plus_minus,
+    readable,
+    with_sigma,
+    without_empty,
+    write_table,
+)
+from jaxphoto.report.page import Heading, Made, Paragraph, Part, Plot, page, provenance, verdict_parts, versions
+from jaxphoto.report.tables import Tables, check_spread, recovery_spread, side_by_side, with_correlated_sigma
+from jaxphoto.statistics import (
+    LEAST_CHECK_POINTS,
+    LEAST_CHECKED,
+    LEVEL,
+    ComponentAccuracy,
+    PositionalAccuracy,
+    global_test,
+)
+from jaxphoto.statistics.block_geometry import format_coverage
 from jaxphoto.writing import whole_folder
 
 _TABLES = (
-    "interior",
-    "exterior",
-    "object_points",
-    "residuals",
-    "trends",
-    "check_points",
-    "positional_accuracy",
-    "correlation",
-    "correlation_summary",
-    "correlation_ground",
-    "sigma_map",
-    "convergence",
-)
-# Written beside them where the files of the block were in an EPSG system.
+    "interior", "exterior", "object_points", "residuals", "trends", "check_points", "positional_accuracy",
+    "correlation", "correlation_summary", "correlation_ground", "sigma_map", "convergence",
+)  # fmt: skip
+# Written as well if the files of the block are in an EPSG system.
 _MAP_TABLES = ("exterior_map", "object_points_map")
+# Cameras that are plotted, rows of the largest residuals and of the iteration history, findings at the top.
+_PLOTTED, _LARGEST, _STEPS, _TOP = 6, 20, 40, 3
+_RELIABILITY = {
+    "c_moves": "c moves [sigma]", "xp_moves": "xp moves [sigma]", "yp_moves": "yp moves [sigma]",
+    "most_moves": "any moves [sigma]", "redundancy_number": "r", "detectable": "MDB",
+}  # fmt: skip
+_EFFECTS = {"pattern": "systematic effect", "freedom": "degrees of freedom", "share": "fraction", "amount": "estimate"}
+# Classes of the table of object points: numbers of rays from each to below the next.
+_RAYS = (2, 3, 4, 6, 11, 21)
+_SMALL_DEG = 2.0
+_STANDARD = "ASPRS Positional Accuracy Standards for Digital Geospatial Data, Edition 2 (2023)"
+
+
+# Files -----------------------------------------------------------------------------------------------------------
 
 
 def write_results(
@@ -47,10 +73,10 @@ def write_results(
     told: Mapping[str, Any] = MappingProxyType({}),
     made: Made | None = None,
 ) -> None:
-    """Write the files of docs/block_folder.md into `directory`, replacing earlier results only when all is written.
+    """Write the files of docs/block_folder.md into `directory`, replacing earlier results when all is written.
 
-    `seconds` (read, compile, solve, covariance) goes into summary.json with the time of writing, and so does what is
-    `told` of how the results came about; the report says how they were `made`. Raises what `whole_folder` raises.
+    `seconds` (read, compile, solve, covariance) and `told` (how the results came about) go into summary.json; `made` is
+    the provenance in the report. Raises what `whole_folder` raises.
     """
     began = time.perf_counter()
     with whole_folder(directory) as work:
@@ -64,21 +90,21 @@ def write_results(
 
 
 def table_names(tables: Tables) -> tuple[str, ...]:
-    """What the result folder of an adjustment has tables of."""
+    """The tables in the result folder of an adjustment."""
     in_map = tables.adjusted.block.frame.kind == "epsg"
-    changing = any(rates.kind in tables.adjusted.unknowns.more for rates in RATES)
+    drifting = any(rates.kind in tables.adjusted.unknowns.more for rates in RATES)
     return (
         *_TABLES,
-        *(("camera_drift",) if changing else ()),
+        *(("camera_drift",) if drifting else ()),
         *(_MAP_TABLES if in_map else ()),
         *(("recovery",) if tables.truth else ()),
     )
 
 
 def write_tables(tables: Tables, directory: str | Path, kind: str = "csv", names: Sequence[str] = ()) -> None:
-    """Write the tables of an adjustment, or those of `names`, as csv, parquet, markdown or latex into a folder.
+    """Write all tables of an adjustment, or those of `names`, as csv, parquet, markdown or latex into a folder.
 
-    Raises InputError for a format or a table that there is not, and what `whole_folder` raises.
+    Raises InputError for an unknown format or table, and what `whole_folder` raises.
     """
     check_table_format(kind)
     known = table_names(tables)
@@ -90,14 +116,15 @@ def write_tables(tables: Tables, directory: str | Path, kind: str = "csv", names
 
 
 def write_summary(summary: dict, directory: Path) -> None:
-    """summary.json."""
+    """Write summary.json."""
     (directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 
 def summary_of(tables: Tables, verdict: Verdict, seconds: dict[str, float]) -> dict:
-    """What summary.json says."""
+    """The content of summary.json."""
     adjusted = tables.adjusted
     observations, unknowns = adjusted.n_observations, adjusted.n_unknowns
+    test = _global_test(tables)
     return {
         "title": adjusted.block.title,
         **verdict.summary,
@@ -105,14 +132,17 @@ def summary_of(tables: Tables, verdict: Verdict, seconds: dict[str, float]) -> d
         "outcome": adjusted.outcome.value,
         "n_images": len(adjusted.block.images),
         "sigma0": float(adjusted.sigma0),
-        **_tested(tables),
-        **({"doubts": told} if (told := adjusted.block.doubts) else {}),
+        **({"global_test": test} if test else {}),
+        **({"doubts": doubts} if (doubts := adjusted.block.doubts) else {}),
         "redundancy": adjusted.redundancy,
         "n_observations": {"total": sum(observations.values()), **observations},
         "n_constraints": adjusted.n_constraints,
         "n_unknowns": {"total": sum(unknowns.values()), **unknowns},
         "iterations": int(adjusted.steps),
-        "cameras": _cameras(adjusted),
+        "cameras": {
+            name: sensor_keys(adjusted.block.sensors[name]) | model_keys(interior)
+            for name, interior in adjusted.unknowns.interior.items()
+        },
         "georeferencing": {p: {"value": v, "sigma": s} for p, v, s in tables.georeferencing.itertuples(index=False)},
         "check_points": {
             axis: {"n": int(n), "mean_m": mean, "rmse_m": rmse, "max_abs_m": most}
@@ -120,23 +150,420 @@ def summary_of(tables: Tables, verdict: Verdict, seconds: dict[str, float]) -> d
             if n
         },
         "positional_accuracy": accuracy_sentences(tables.tested_accuracy),
-        "seconds": {name: round(value, 6) for name, value in seconds.items()},
+        "seconds": rounded(seconds),
         "versions": versions(),
     }
 
 
-def _tested(tables: Tables) -> dict:
-    """The test of sigma naught, where there is an optimum and anything checks it."""
+def write_study(
+    work: Path,
+    title: str,
+    verdict: tuple[str, str],
+    parts: Iterable[Part],
+    summary: Mapping[str, Any],
+    made: Made,
+    tables: Mapping[str, pd.DataFrame] = MappingProxyType({}),
+    figures: Mapping[str, Any] = MappingProxyType({}),
+) -> None:
+    """Write tables (CSV), figures (PNG), report.html and summary.json of a study into the folder `work`."""
+    for name, table in tables.items():
+        table.to_csv(work / f"{name}.csv", index=False)
+    for name, figure in figures.items():
+        figure.savefig(work / f"{name}.png")
+    text = page(title, [*parts, *provenance(made)], verdict)
+    (work / "report.html").write_text(text, encoding="utf-8")
+    write_summary({**summary, "versions": versions()}, work)
+
+
+def rounded(seconds: Mapping[str, float]) -> dict[str, float]:
+    """Times to the microsecond."""
+    return {name: round(value, 6) for name, value in seconds.items()}
+
+
+def _global_test(tables: Tables) -> dict[str, Any]:
+    """The test of sigma naught, if the adjustment converged and has redundancy."""
     if not bool(tables.adjusted.converged) or tables.adjusted.redundancy <= 0:
         return {}
     test = global_test(tables.adjusted, tables.redundancy)
-    told = {"expected_sigma0": test.expected**0.5, "p_value": test.p_value, "passed": test.p_value >= LEVEL}
-    return {"global_test": told}
+    return {"expected_sigma0": test.expected**0.5, "p_value": test.p_value, "passed": test.p_value >= LEVEL}
 
 
-def _cameras(adjusted: Adjustment) -> dict:
-    """Sensor and models of every camera, by which interior.csv can be read."""
-    told = {}
-    for name, interior in adjusted.unknowns.interior.items():
-        told[name] = sensor_keys(adjusted.block.sensors[name]) | model_keys(interior)
-    return told
+# Report ----------------------------------------------------------------------------------------------------------
+
+
+def report_page(tables: Tables, verdict: Verdict, made: Made | None = None) -> str:
+    """The report as HTML: verdict, summary, at most three findings, then all sections."""
+    block = tables.adjusted.block
+    parts: list[Part] = [summary_table(tables), *verdict_parts(verdict)[:_TOP]]
+    if len(verdict.findings) > _TOP:
+        parts += [Heading("All findings"), *verdict_parts(verdict)]
+    parts += adjustment_sections(tables)
+    if made:
+        parts += provenance(made)
+        if block.converted_from:
+            parts.append(Paragraph(f"The block was converted from {block.converted_from}."))
+    return page(report_title(block), parts, (verdict.headline, verdict.colour))
+
+
+def summary_table(tables: Tables) -> dict[str, str]:
+    """Images, points, flying height, camera, sigma naught, residuals, control and check points."""
+    a, block = tables.adjusted, tables.adjusted.block
+    rays = len(a.structure.image) / max(len(np.unique(a.structure.point)), 1)
+    rows = {
+        "images": str(len(block.images)),
+        "object points": f"{len(block.points)}, {len(a.structure.image)} image points, {rays:.1f} rays per point",
+    }
+    if (height := flying_height(a)) is not None:
+        rows["flying height"] = f"{height[0]:.4g} m (median), ground sample distance {100 * height[1]:.3g} cm"
+    for name, interior in list(a.unknowns.interior.items())[:_PLOTTED]:
+        sensor = block.sensors[name]
+        rows[camera_words(name)] = (
+            f"{sensor.width_px} x {sensor.height_px} px of {1e3 * sensor.pixel_mm:.4g} µm, c = {float(interior.c):.5g} "
+            f"mm, {interior.projection.name}, {interior.distortion.name}"
+        )
+    pixel = np.array([block.sensors[c].pixel_mm for c in block.image_camera])[a.structure.image]
+    sigma, v = np.asarray(a.values.sigma_xy), np.asarray(a.residuals.image) * np.asarray(a.values.sigma_xy)
+    test, sigma0 = _global_test(tables), float(a.sigma0)
+    rows["sigma naught"] = f"{sigma0:.6g} = {sigma0 * np.median(sigma / pixel) if sigma.size else np.nan:.2g} px" + (
+        f", expected {test['expected_sigma0']:.3g}, {p_words(test['p_value'], 2)}" if test else ""
+    )
+    if v.size:
+        mm, px = (float(np.sqrt(np.mean(values**2))) for values in (v, v / pixel))
+        largest = float(np.hypot(*(v / pixel)).max())
+        rows["image residuals"] = f"RMS {px:.2g} px = {1e3 * mm:.3g} µm per axis, largest {largest:.2g} px"
+    counts = [f"{n} {group.replace('_', ' ')}" for group, n in a.n_observations.items() if n]
+    counts += [f"{a.n_constraints} constraints of the datum"] if a.n_constraints else []
+    rows["observations"] = f"{', '.join(counts)}; {sum(a.n_unknowns.values())} unknowns, redundancy {a.redundancy}"
+    control = len(np.union1d(block.control.who, block.fixed.who))
+    rows["control points"] = str(control) if control else "none"
+    spread = check_spread(tables.check_points)
+    rmse = ", ".join(f"{axis} {of_sigma(r)}" for axis, r, n in spread[["axis", "rmse", "n"]].to_numpy() if n)
+    rows["check points"] = f"{len(tables.check_points)}, RMSE {rmse} m" if rmse else "none"
+    rows["iteration"] = as_sentence(f"{a.outcome.value} ({counted(int(a.steps), 'iteration')})")
+    return rows
+
+
+def flying_height(adjusted: Adjustment) -> tuple[float, float] | None:
+    """Median height above the seen points and ground sample distance (m); None without metric, vertical images."""
+    block, s = adjusted.block, adjusted.structure
+    known = len(block.stations.who) + len(block.control.who) + len(block.fixed.who)
+    if not known or not len(s.image):
+        return None
+    exterior, points = adjusted.unknowns.exterior, np.asarray(adjusted.unknowns.points)
+    away = points[s.point] - np.asarray(exterior.position)[s.image]
+    depth = -np.einsum("nk,nk->n", np.asarray(exterior.camera_from_object)[s.image][:, 2], away)
+    scale = {c: block.sensors[c].pixel_mm / float(i.c) for c, i in adjusted.unknowns.interior.items()}
+    height = float(np.median(-away[:, 2]))
+    if height < 0.7 * np.median(depth):
+        return None
+    return height, float(np.median(depth * np.array([scale[c] for c in block.image_camera])[s.image]))
+
+
+def adjustment_sections(
+    tables: Tables, start: InteriorOrientation | None = None, factor: float = 1.0, unit: str = "m"
+) -> Iterator[Part]:
+    """All sections of an adjustment; `start` are initial values of the camera, `factor` widens its sigmas."""
+    a, cameras = tables.adjusted, plotted_cameras(tables)
+    yield from _interior(tables, cameras, start, factor)
+    if mapped := [camera for camera in tables.sigma_maps if camera in cameras]:
+        yield Heading("Distortion")
+        yield Paragraph("Measured minus ideal image coordinates along the radius, for the adjusted c.")
+        for camera in mapped:
+            curve, words = plots.distortion_of(tables, camera), camera_words(camera)
+            yield [
+                Plot(partial(plots.draw_distortion, curve=curve, factor=factor), f"distortion of {words} by distance"),
+                Plot(partial(plots.plot_distortion_band, tables, camera), f"95 % band for {words}"),
+            ]
+        yield Heading("Projection uncertainty over the image format")
+        yield Paragraph(
+            "Standard deviation of a projected point by interior and exterior orientation, in the worst direction "
+            "(sigma_map.csv). At infinity the error in c propagates fully; at the object distance it is partly "
+            "compensated by the camera position."
+        )
+        for camera in mapped:
+            sensor = a.block.sensors[camera]
+            yield [Plot(partial(plots.draw_sigma_map, sensor=sensor, one=one), _map_words(sensor, one))
+                   for one in tables.sigma_maps[camera]]  # fmt: skip
+    if tables.truth:
+        recovery = tables.recovery
+        yield Heading("Recovery of the true values")
+        yield Paragraph(
+            "Estimate minus truth in standard deviations (recovery.csv): an RMS of about 1, and 5 % beyond 2, if the "
+            "model of the adjustment is that of the simulation."
+        )
+        yield recovery_spread(recovery)
+        yield recovery[recovery["parameter"].str.startswith("interior[")]
+    if len(tables.georeferencing):
+        yield Heading("Mounts and strips")
+        yield tables.georeferencing
+    yield Heading("Block")
+    yield [Plot(partial(plot_block, a), block_words(a.block), 4.2)]
+    if (view := block_view(a, tables.covariance)) is not None:
+        yield view
+    yield from _residuals(tables, cameras)
+    yield from points_section(tables, unit)
+    yield from _check_points(tables)
+    yield Heading("Exterior orientation")
+    yield [Plot(partial(plots.plot_error_ellipses, tables, unit=unit), "error ellipses of projection centres", 4)]
+    yield tables.exterior
+    yield from _correlations(tables)
+    if len(tables.convergence):
+        yield Heading("Convergence")
+        yield Paragraph(convergence_words(a))
+        yield [
+            Plot(partial(plots.plot_convergence, tables), "sigma naught before each step and at the end", 3),
+            Plot(partial(plots.plot_convergence, tables, steps=True), "length of each step and tolerance", 3),
+        ]
+        yield tables.convergence.tail(_STEPS).rename(columns={"length": "step in sigmas"})
+
+
+def plotted_cameras(tables: Tables) -> list[str]:
+    """The cameras that are plotted: of many those with the most image points."""
+    block, structure = tables.adjusted.block, tables.adjusted.structure
+    cameras, of_image = list(tables.adjusted.unknowns.interior), np.array(block.image_camera)
+    n_points = np.bincount(structure.image, minlength=len(of_image))
+    most = sorted(cameras, key=lambda camera: -int(n_points[of_image == camera].sum()))[:_PLOTTED]
+    return [camera for camera in cameras if camera in most]
+
+
+def interior_table(tables: Tables, start: InteriorOrientation | None = None, factor: float = 1.0) -> pd.DataFrame:
+    """Interior parameters for reading: initial values, estimates, sigmas (times `factor`), in pixels, significance."""
+    table = with_correlated_sigma(tables.interior, tables.adjusted, factor)
+    rows = []
+    for p in table[table["sigma"].notna() | (table["value"] != 0)].to_dict("records"):
+        name, pixel, estimated = p["parameter"], tables.adjusted.block.sensors[p["camera"]].pixel_mm, p["sigma"] > 0
+        in_px = plus_minus(p["value"] / pixel, p["sigma_alike"] / pixel) if estimated and name.endswith("_mm") else ""
+        rows.append({
+            "camera": p["camera"], "parameter": name,
+            "initial": f"{float(get_parameter(start, name)):.6g}" if start and name in parameter_names(start) else "",
+            "value": with_sigma(p["value"], p["sigma"]), "sigma": of_sigma(p["sigma"]) if estimated else "fixed",
+            "sigma (correlated residuals)": of_sigma(p["sigma_alike"]) if estimated and factor > 1 else "",
+            "unit": p["unit"], "in pixels": in_px, "significant": {True: "yes", False: "no"}.get(p["significant"], ""),
+        })  # fmt: skip
+    shown = pd.DataFrame(rows)
+    several = len(tables.adjusted.unknowns.interior) > 1
+    return shown.drop(columns=[c for c in shown if not shown[c].any() or (c == "camera" and not several)])
+
+
+def _interior(
+    tables: Tables, cameras: Sequence[str], start: InteriorOrientation | None, factor: float
+) -> Iterator[Part]:
+    block = tables.adjusted.block
+    yield Heading("Interior orientation")
+    yield interior_table(tables, start, factor)
+    yield Paragraph(
+        "Lengths in mm, x to the right and y up from the centre of the format. Standard deviations are a posteriori "
+        f"(times sigma naught); correlations refer to the rotations {tables.rotations.replace('_', ', ')}."
+    )
+    yield from assumed_pixels(block.sensors)
+    for camera in cameras:
+        reached = format_coverage(tables.adjusted, camera)
+        yield Paragraph(
+            f"Image points of {camera_words(camera)} cover {100 * reached.whole:.0f} % of the format, those of an "
+            f"image {100 * np.median(reached.images):.0f} % (median; minimum {100 * reached.images.min():.0f} %): "
+            "beyond, the distortion is extrapolated."
+            if len(reached.images)
+            else f"{camera_words(camera)} has no image points."
+        )
+    if (n := len(tables.adjusted.unknowns.interior)) > len(cameras):
+        some = ", ".join(cameras)
+        yield Paragraph(f"Plots show {len(cameras)} of {n} cameras, those with the most image points: {some}.")
+    for camera, c in tables.correlations.items():
+        if camera in cameras and c.parameters:
+            matrices = [("correlation of IOP", c.interior, c.parameters)]
+            matrices += [("mean |correlation| of EOP and IOP", c.mean_abs, c.eop_names)] if c.images else []
+            yield [
+                Plot(partial(plots.draw_matrix, values=v, rows=rows, columns=c.parameters, name=name), name, 3.8)
+                for name, v, rows in matrices
+            ]
+
+
+def _map_words(sensor: Sensor, one) -> str:
+    worst = one.worst[np.isfinite(one.worst)] / sensor.pixel_mm
+    spread = f"median {np.median(worst):.2g} px, worst {worst.max():.2g} px" if len(worst) else "unknown"
+    return f"{camera_words(one.camera)}: sigma {plots.distance_words(one.distance_m)}, {spread}"
+
+
+def _residuals(tables: Tables, cameras: Sequence[str]) -> Iterator[Part]:
+    a = tables.adjusted
+    yield Heading("Residuals")
+    yield tables.residual_spread
+    for camera in cameras:
+        words = camera_words(camera)
+        panels = [
+            Plot(partial(plots.plot_residuals, tables, camera), f"image residuals of {words}", 3.8),
+            Plot(partial(plots.plot_mean_residuals, tables, camera), f"mean residuals of {words}", 3.8),
+            Plot(partial(plots.plot_density, tables, camera), f"image points of {words} by cell"),
+        ]
+        if camera in tables.sigma_maps:
+            by_radius = partial(plots.plot_residuals_by_radius, tables, camera)
+            panels.append(Plot(by_radius, f"residuals of {words} by distance from the principal point"))
+        yield panels
+    if len(a.block.stations.who):
+        yield [Plot(partial(plots.plot_station_residuals, tables), "residuals of stations in order of time")]
+    if len(tables.trends):
+        yield Paragraph("Systematic residuals, by image format, time and strip:")
+        yield without_empty(readable(tables.trends)).rename(columns=_EFFECTS)
+    checked = tables.residuals["redundancy_number"] > LEAST_CHECKED
+    largest = tables.residuals.loc[tables.residuals["w"].abs()[checked].nlargest(_LARGEST).index]
+    yield Paragraph(
+        "Largest normalised residuals. r is the redundancy number, MDB the minimal detectable bias (power 80 %); the "
+        "last columns are its external reliability: by how many sigmas a bias of one MDB moves an estimate."
+    )
+    yield readable(largest).rename(columns=_RELIABILITY)
+
+
+def points_section(tables: Tables, unit: str = "m") -> Iterator[Part]:
+    """Rays, intersection angles and standard deviations of the measured object points."""
+    table = tables.object_points
+    table = table[table["n_images"] > 0]
+    if table.empty:
+        return
+    yield Heading("Object points")
+    rows = []
+    classes = [(low, high) for low, high in zip(_RAYS, (*_RAYS[1:], math.inf), strict=True)]
+    for low, high in [*classes, (0, math.inf)]:
+        of = table[(table["n_images"] >= low) & (table["n_images"] < high)]
+        name = str(low) if high == low + 1 else f"{low} to {high - 1}" if high < math.inf else f"{low} or more"
+        sigmas = {f"median sigma {axis} [{unit}]": of_sigma(of[f"sigma_{axis}_m"].median()) for axis in AXES}
+        counts = {"points": len(of), "fraction": f"{100 * len(of) / len(table):.1f} %"}
+        angle = {"median angle [deg]": f"{of['angle_deg'].median():.1f}"}
+        row = {"rays": name if low else "all", **counts, **angle, **sigmas}
+        rows += [row] if len(of) else []
+    yield pd.DataFrame(rows)
+    small = int((table["angle_deg"] < _SMALL_DEG).sum())
+    yield Paragraph(
+        f"{table['n_images'].mean():.2f} rays per point on average. The angle is the largest between two rays; {small} "
+        f"points have less than {_SMALL_DEG:g} degrees."
+    )
+    panels = [
+        Plot(partial(plots.plot_intersection_angles, tables), "histogram of intersection angles"),
+        Plot(partial(plots.plot_rays, tables), "number of points by number of rays"),
+    ]
+    in_z = table["sigma_Z_m"][table["sigma_Z_m"] > 0]
+    if len(in_z):
+        words = f"standard deviations of points; 95 % have less than {in_z.quantile(0.95):.3g} {unit} in Z"
+        panels.append(Plot(partial(plots.plot_point_sigmas, tables, unit=unit), words))
+    yield panels
+
+
+def _check_points(tables: Tables) -> Iterator[Part]:
+    control = tables.residuals[tables.residuals["group"] == "control_points"]
+    if len(control):
+        yield Heading("Control points")
+        yield Paragraph("Residuals (m): surveyed minus adjusted.")
+        wide = control.astype({"axis": str, "point": str}).pivot_table("residual", "point", "axis", sort=False)
+        yield wide.rename(columns="d{}_m".format).assign(total_m=np.sqrt((wide**2).sum(axis=1))).reset_index()
+    if len(tables.check_points):
+        yield Heading("Check points: surveyed minus computed")
+        yield check_spread(tables.check_points)
+        yield from map(Paragraph, accuracy_sentences(tables.tested_accuracy))
+        yield tables.positional_accuracy
+        yield [
+            Plot(partial(plots.plot_check_points, tables, upright=up),
+                 f"discrepancies at check points in {'height' if up else 'plan'}", 3.8)
+            for up in (False, True)
+        ]  # fmt: skip
+        yield tables.check_points
+
+
+def _correlations(tables: Tables) -> Iterator[Part]:
+    if len(summary := tables.correlation_summary):
+        yield Heading("Correlation of exterior and interior orientation over the images")
+        yield Paragraph("The largest absolute correlation over the images; means are in correlation_summary.csv.")
+        yield side_by_side(summary, ["camera", "exterior"], "interior", "max_abs_rho")
+    ground = tables.correlation_ground
+    if len(ground := ground[ground["sigma_m"] > 0]):
+        yield Heading("Correlation of the interior orientation and the ground as a whole")
+        ground = ground.assign(ground=ground["ground"].str.replace("_", " "))
+        yield side_by_side(ground, ["camera", "ground", "sigma_m"], "parameter", "rho")
+
+
+def convergence_words(adjusted: Adjustment) -> str:
+    """Number of steps and the reason of the end."""
+    course, n = adjusted.course, int(adjusted.steps)
+    if course is None or not n:
+        return ""
+    refused = int((course.accepted == 0).sum())
+    bent = int(((course.bent > 0) & (course.accepted > 0)).sum())
+    words = counted(n, "step") + (f", {bent} of them along a curve (weakly determined unknowns)" if bent else "")
+    words += f", {refused} of them rejected and repeated with more damping" if refused else ""
+    last = course.length[-1] if len(course.length) == n else np.nan
+    if adjusted.outcome is Outcome.CONVERGED:
+        return f"{words}. Converged: the last moved no unknown by more than {last:.1e} of its standard deviation."
+    if adjusted.outcome is Outcome.STEPS:
+        moved = f"; the last would still move unknowns by up to {last:.2g} sigma" if np.isfinite(last) else ""
+        return f"{words}, which is the limit (--max-steps){moved}."
+    return f"{words}. {adjusted.outcome.value.partition(': ')[2]}."
+
+
+def report_title(block: Block) -> str:
+    """The title of a block and its source."""
+    name = block.title or "jaxphoto adjustment"
+    return f"{name}, converted from {block.converted_from}" if block.converted_from else name
+
+
+def assumed_pixels(sensors: Mapping[str, Sensor]) -> list[Part]:
+    """A paragraph on cameras whose pixel size is assumed, if there are any."""
+    return [Paragraph(words)] if (words := assumed_pixel_words(sensors)) else []
+
+
+def assumed_pixel_words(sensors: Mapping[str, Sensor]) -> str:
+    """A sentence on cameras whose pixel size is assumed; "" if there are none."""
+    cameras = [name for name, sensor in sensors.items() if sensor.pixel_assumed]
+    if not cameras:
+        return ""
+    which = "of every camera" if len(cameras) == len(sensors) else f"of {', '.join(cameras)}"
+    return (
+        f"The pixel size {which} is unknown: {sensors[cameras[0]].pixel_mm:g} mm is assumed. c, the principal point "
+        "and all else in mm or its powers scale with it; numbers in pixels and on the ground do not."
+    )
+
+
+# Positional accuracy ---------------------------------------------------------------------------------------------
+
+
+def accuracy_sentences(accuracy: PositionalAccuracy) -> list[str]:
+    """The tested accuracy class of each component, and why it cannot be claimed; empty without check points."""
+    if not accuracy.tested:
+        return []
+    sentences = [f"Positional accuracy by the {_STANDARD}; survey errors of the check points are included where known."]
+    sentences += class_sentences(accuracy)
+    if unknown := [t.name for t in accuracy.tested if math.isnan(t.survey_m) and t.n >= LEAST_CHECK_POINTS]:
+        sentences.append(
+            f"Survey standard deviations are missing for some check points ({', '.join(unknown)}): add them to "
+            "control_points.csv to claim the class."
+        )
+    for axis in accuracy.axes:
+        if axis.biased:
+            sentences.append(
+                f"The mean error in {axis.axis}, {_cm(axis.mean_m)}, exceeds a quarter of its RMSE "
+                f"({_cm(axis.rmse_m)}): look for a shift, such as of a datum or of a geoid, before signing."
+            )
+    if weak := [t.name for t in accuracy.tested[:2] if t.survey_m > t.rmse_m / 2]:
+        sentences.append(
+            f"The survey of the check points is not twice as accurate as the tested product ({', '.join(weak)}), as "
+            "the standard requires: survey them better."
+        )
+    return sentences
+
+
+def class_sentences(accuracy: PositionalAccuracy) -> list[str]:
+    """The accuracy class of each component, horizontal first."""
+    return [_class_sentence(t) for t in accuracy.tested]
+
+
+def _class_sentence(t: ComponentAccuracy) -> str:
+    survey = "unknown" if math.isnan(t.survey_m) else _cm(t.survey_m)
+    measured = f"{t.symbol} = {_cm(t.rmse_m)} (block to check points {_cm(t.fit_m)}, survey {survey})"
+    accuracy_class = f"the {t.class_cm:g}-cm {t.symbol} {t.name} positional accuracy class"
+    points = counted(t.n, "check point")
+    if t.claimed:
+        return f"Tested with {points} to meet {accuracy_class}: {measured}."
+    few = f"tested with {points} only, where the standard asks for {LEAST_CHECK_POINTS}"
+    why = few if t.n < LEAST_CHECK_POINTS else f"tested with {points} whose survey errors are not all known"
+    return f"Cannot be claimed: {why}: {measured}, which would be {accuracy_class}."
+
+
+def _cm(metres: float) -> str:
+    return f"{100 * metres:.3g} cm"

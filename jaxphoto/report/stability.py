@@ -1,43 +1,41 @@
-"""A stability analysis as a table, a map of the offsets over the image, a page, and a screen of text."""
+"""Two calibrations of a camera compared: stability of the bundle of rays, and change of parameters and rays."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from rich.console import Console
-from rich.table import Table
 
 from jaxphoto.camera import InteriorOrientation, Sensor
-from jaxphoto.report.document import Heading, Paragraph, rows_of
-from jaxphoto.report.made import Made, made_section, versions
-from jaxphoto.report.maps import outline
-from jaxphoto.report.plots import axes_or_new, new_figure
-from jaxphoto.report.results import write_summary
-from jaxphoto.report.source_words import assumed_pixel_words
-from jaxphoto.report.study_page import WholePicture, study_page
-from jaxphoto.stability import ALIGNED, Analysis, Method
+from jaxphoto.report.findings import as_sentence, p_words
+from jaxphoto.report.formatting import to_rich
+from jaxphoto.report.page import Heading, Made, Paragraph, Part, Plot
+from jaxphoto.report.plots import axes_or_new, draw_format, draw_format_map, new_figure, title
+from jaxphoto.report.results import assumed_pixel_words, write_study
+from jaxphoto.report.terminal import print_lines
+from jaxphoto.stability import ALIGNED, LEVEL, Analysis, Change, Method
+from jaxphoto.stability.comparison import change_meaning
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
-# The largest offset has the colour of the middle of the scale, or a little more.
+# Range of the colour scale over the largest offset: light colours, on which arrows are visible.
 _LIGHT = 1.7
 
 
 class Compared(NamedTuple):
-    """Which of the two sets is meant, for tables and pictures."""
+    """One of the two calibrations."""
 
     name: str
     interior: InteriorOrientation
     known: bool
-    """Whether its covariance is known."""
+    """True if its covariance is known."""
     sensor: Sensor
 
     def __str__(self) -> str:
@@ -45,11 +43,26 @@ class Compared(NamedTuple):
         return f"{self.name}: {model}, c = {float(self.interior.c):.6g} mm, {how} covariance"
 
 
-def stability_table(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_mm: float) -> pd.DataFrame:
-    """One row a method: method, unknowns, rmse_offset_mm, rmse_offset_px, rmse_measured_mm, largest_mm, similar, ...
+def about_sets(sets: tuple[Compared, Compared]) -> list[str]:
+    """Both calibrations, the source of the uncertainty, and assumed pixel sizes."""
+    without = [one.name for one in sets if not one.known]
+    uncertainty = "Uncertainty by the covariances of both sets, which are assumed to be of different images."
+    if len(without) == 1:
+        uncertainty = f"{without[0]} has no covariance and is assumed exact: the uncertainty is that of the other set."
+    elif without:
+        uncertainty = "Neither set has a covariance: no uncertainty is given."
+    assumed = assumed_pixel_words({one.name: one.sensor for one in sets})
+    return [str(sets[0]), str(sets[1]), uncertainty, *([assumed] if assumed else [])]
 
-    The uncertainty follows (sigma_mm to unexplained_mm, see `OffsetUncertainty`), empty where no covariance is known,
-    then the alignment: rotations in degrees, positions as parts of the object's distance.
+
+# Stability -------------------------------------------------------------------------------------------------------
+
+
+def stability_table(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_mm: float) -> pd.DataFrame:
+    """One row per method: method, unknowns, rmse_offset_mm, rmse_offset_px, rmse_measured_mm, largest_mm, similar, ...
+
+    The uncertainty follows (sigma_mm to unexplained_mm, see `OffsetUncertainty`) if a covariance is known, then the
+    alignment: rotations in degrees, positions as fractions of the object distance.
     """
     rows = []
     for method, one in analyses.items():
@@ -72,37 +85,43 @@ def stability_table(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_
     return pd.DataFrame(rows)
 
 
+def by_method(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_mm: float) -> pd.DataFrame:
+    """The same for reading, in micrometres, with a column per method."""
+    table = stability_table(analyses, pixel_mm, noise_mm).set_index("method")
+    um = {"RMSE_offset": "rmse_offset_mm", "as measured": "rmse_measured_mm", "largest": "largest_mm"}
+    known = "sigma_mm" in table
+    um |= (
+        {"sigma": "sigma_mm", "95 % from": "low_mm", "95 % to": "high_mm", "one camera": "expected_of_one_mm"}
+        if known
+        else {}
+    )
+    rows = {f"{name} [um]": (1e3 * table[column]).map("{:.4g}".format) for name, column in um.items()}
+    rows["in pixels"] = table["rmse_offset_px"].map("{:.4g}".format)
+    rows |= {"p": table["p_value"].map("{:.2g}".format)} if known else {}
+    return pd.DataFrame(rows).T.reset_index(names="quantity")
+
+
 def offsets_table(analysis: Analysis) -> pd.DataFrame:
-    """x_mm, y_mm of the grid, dx_mm, dy_mm on the virtual image plane, and in the image as it is measured."""
+    """x_mm, y_mm of the grid, dx_mm, dy_mm on the virtual image plane, and in the measured image."""
     v = analysis.offsets
     columns = ["x_mm", "y_mm", "dx_mm", "dy_mm", "dx_measured_mm", "dy_measured_mm"]
     return pd.DataFrame(np.hstack([v.points, v.offsets, v.measured]), columns=columns)
 
 
-def offsets_figure(analysis: Analysis, sensor: Sensor) -> Figure:
-    """The map of RMSE_offset, as `plot_ray_offsets` draws it."""
-    figure = new_figure(7.2, 5.4)
-    plot_ray_offsets(analysis, sensor, figure.subplots())
-    return figure
-
-
 def plot_ray_offsets(analysis: Analysis, sensor: Sensor, ax: Axes | None = None) -> Axes:
-    """Offsets of corresponding rays over the format of a camera (um): their size as colour, themselves as arrows."""
+    """Offsets of corresponding rays over the image format (um): size as colour, vectors as arrows."""
     ax = axes_or_new(ax)
     points, v = np.asarray(analysis.offsets.points), 1e3 * np.asarray(analysis.offsets.offsets)
     size = np.linalg.norm(v, axis=1)
     if size.max() > 0:
-        # Light colours, on which dark arrows are seen.
-        shown = ax.tricontourf(
-            points[:, 0], points[:, 1], size, levels=12, cmap="YlGnBu", vmin=0.0, vmax=_LIGHT * size.max()
-        )
-        ax.figure.colorbar(shown, ax=ax, label="offset of corresponding rays [µm]", shrink=0.85)
+        colours: dict[str, Any] = {"levels": 12, "cmap": "YlGnBu", "vmin": 0.0, "vmax": _LIGHT * size.max()}
+        filled = ax.tricontourf(points[:, 0], points[:, 1], size, **colours)
+        ax.figure.colorbar(filled, ax=ax, label="offset of corresponding rays [µm]", shrink=0.85)
     arrows = ax.quiver(*points.T, *v.T, angles="xy", color="0.15", width=0.0025)
     key = float(f"{max(size.mean(), 1e-12):.0e}")
     ax.quiverkey(arrows, 0.86, 1.03, key, f"{key:g} µm", labelpos="E")
-    outline(ax, sensor)
-    rmse = 1e3 * float(analysis.offsets.rmse_mm)
-    ax.set_title(f"{analysis.method}: RMSE_offset {rmse:.3g} µm", loc="left", fontsize=10)
+    draw_format(ax, sensor)
+    title(ax, f"{analysis.method}: RMSE_offset {1e3 * float(analysis.offsets.rmse_mm):.3g} µm")
     return ax
 
 
@@ -110,79 +129,48 @@ def print_stability(
     analyses: Mapping[Method, Analysis], sets: tuple[Compared, Compared], pixel_mm: float, noise_mm: float,
     method: Method, console: Console,
 ) -> None:  # fmt: skip
-    """Both sets, a column for each method in micrometres, and the verdict by `method`."""
-    for line in about_sets(sets):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
-    table = Table(title=f"stability (um); noise {1e3 * noise_mm:.4g} um = {noise_mm / pixel_mm:.4g} px")
-    table.add_column("", no_wrap=True)
-    for name in analyses:
-        table.add_column(name, justify="right", no_wrap=True)
-    shown = [_shown(row) for row in stability_table(analyses, pixel_mm, noise_mm).to_dict("records")]
-    # A method a column: with a row each, a screen of 80 characters would cut the numbers off.
-    for measure in shown[0]:
-        table.add_row(measure, *(of_method[measure] for of_method in shown))
-    console.print(table)
-    chosen = analyses[method]
-    colour = "green" if chosen.similar(noise_mm) else "red"
-    verdict = chosen.verdict(noise_mm)
-    console.print(f"{method}: {verdict}", style=colour, highlight=False, markup=False, soft_wrap=True)
-
-
-def _shown(row: Mapping[Hashable, Any]) -> dict[str, str]:
-    """A row of `stability_table` in micrometres; what needs a covariance is empty without."""
-    um = lambda name, digits: f"{1e3 * row[name]:.{digits}g}"  # noqa: E731
-    found = {
-        "RMSE_offset": um("rmse_offset_mm", 4),
-        "in pixels": f"{row['rmse_offset_px']:.4g}",
-        "as measured": um("rmse_measured_mm", 4),
-        "largest": um("largest_mm", 4),
-    }
-    if "sigma_mm" not in row:
-        return found | dict.fromkeys(("sigma", "95 %", "of one camera", "p"), "")
-    return found | {
-        "sigma": um("sigma_mm", 3),
-        "95 %": f"{um('low_mm', 3)}-{um('high_mm', 3)}",
-        "of one camera": um("expected_of_one_mm", 3),
-        "p": f"{row['p_value']:.2g}",
-    }
+    """Print both calibrations, a column per method, and the verdict by `method`."""
+    print_lines(about_sets(sets), console)
+    name = f"stability; noise {1e3 * noise_mm:.4g} um = {noise_mm / pixel_mm:.4g} px"
+    console.print(to_rich(by_method(analyses, pixel_mm, noise_mm), name))
+    colour = "green" if analyses[method].similar(noise_mm) else "red"
+    verdict = f"{method}: {analyses[method].verdict(noise_mm)}"
+    console.print(verdict, style=colour, highlight=False, markup=False, soft_wrap=True)
 
 
 def write_stability(
     analyses: Mapping[Method, Analysis], sets: tuple[Compared, Compared], sensor: Sensor, noise_mm: float,
     method: Method, directory: Path, made: Made,
 ) -> None:  # fmt: skip
-    """stability.csv, and of `method` offsets.csv and offsets.png; report.html and summary.json of it all.
+    """stability.csv, and of `method` offsets.csv and offsets.png; report.html and summary.json.
 
-    Raises InputError where `directory` holds something that is not an earlier result.
+    Raises InputError if `directory` holds something else than an earlier result.
     """
-    table = stability_table(analyses, sensor.pixel_mm, noise_mm)
-    chosen = analyses[method]
-    picture = WholePicture.of(offsets_figure(chosen, sensor), "offsets of the two bundles over the image")
-    methods = "The bundles of rays are compared " + "; ".join(f"{ALIGNED[name]} ({name})" for name in analyses) + "."
-    parts = [
+    chosen, figure = analyses[method], new_figure(7.2, 5.4)
+    plot_ray_offsets(chosen, sensor, figure.subplots())
+    methods = "The bundles of rays are aligned " + "; ".join(f"{ALIGNED[name]} ({name})" for name in analyses) + "."
+    parts: list[Part] = [
         *map(Paragraph, about_sets(sets)),
         Heading("By method"),
         Paragraph(methods),
-        rows_of(table),
-        picture,
-        *made_section(made),
+        by_method(analyses, sensor.pixel_mm, noise_mm),
+        Plot(figure, "offsets of the two bundles over the image"),
     ]
+    # A terminal may lack the letter.
+    verdict = f"Bundles {ALIGNED[method]} ({method}): {chosen.verdict(noise_mm)}".replace(" um", " µm")
+    tables = {"stability": stability_table(analyses, sensor.pixel_mm, noise_mm), "offsets": offsets_table(chosen)}
     colour = "green" if chosen.similar(noise_mm) else "amber"
-    # A terminal may not have the letter.
-    said = [f"Bundles {ALIGNED[method]} ({method}): {chosen.verdict(noise_mm)}".replace(" um", " µm")]
     with whole_folder(directory) as work:
-        table.to_csv(work / "stability.csv", index=False)
-        offsets_table(chosen).to_csv(work / "offsets.csv", index=False)
-        (work / "offsets.png").write_bytes(picture.png)
-        page = study_page("Stability of interior orientation", said, parts, colour)
-        (work / "report.html").write_text(page, encoding="utf-8")
-        write_summary(stability_summary(analyses, sets, noise_mm, method) | {"versions": versions()}, work)
+        write_study(
+            work, "Stability of interior orientation", (verdict, colour), parts,
+            stability_summary(analyses, sets, noise_mm, method), made, tables, {"offsets": figure},
+        )  # fmt: skip
 
 
 def stability_summary(
     analyses: Mapping[Method, Analysis], sets: tuple[Compared, Compared], noise_mm: float, method: Method
 ) -> dict[str, Any]:
-    """The comparison in numbers."""
+    """The comparison in summary.json."""
     chosen = analyses[method]
     return {
         "verdict": f"{method}: {chosen.verdict(noise_mm)}",
@@ -195,17 +183,130 @@ def stability_summary(
     }
 
 
-def about_sets(sets: tuple[Compared, Compared]) -> list[str]:
-    """What both sets are, what the uncertainty is made of, and whose pixel was assumed."""
-    assumed = assumed_pixel_words({one.name: one.sensor for one in sets})
-    return [str(sets[0]), str(sets[1]), missing_covariances(sets), *([assumed] if assumed else [])]
+# Change ----------------------------------------------------------------------------------------------------------
 
 
-def missing_covariances(sets: tuple[Compared, Compared]) -> str:
-    """What the uncertainty is made of."""
-    without = [one.name for one in sets if not one.known]
-    if len(without) == 2:
-        return "Neither set has a covariance: no uncertainty is given."
-    if without:
-        return f"{without[0]} has no covariance and is taken as exact: the uncertainty is that of the other set alone."
-    return "Uncertainty by the covariances of both sets, which are taken to be of different images."
+def parameter_changes(change: Change) -> pd.DataFrame:
+    """parameter, first, second, difference (second minus first), sigma (of it), ratio, p_value, unit; empty for
+    different models."""
+    columns = ["parameter", "first", "second", "difference", "sigma", "p_value", "unit"]
+    table = pd.DataFrame(change.parameters, columns=columns)
+    known = table["sigma"] > 0
+    table.insert(5, "ratio", table["difference"].where(known) / table["sigma"].where(known))
+    return table
+
+
+def change_cells(change: Change, sensor: Sensor) -> pd.DataFrame:
+    """One row per point of the format: x_mm, y_mm; dx_px, dy_px (first minus second bundle, aligned, in the measured
+    image), offset_px, limit_px (95 % for two calibrations of one camera), beyond."""
+    v = change.field.offsets
+    columns = ["x_mm", "y_mm", "dx_px", "dy_px"]
+    table = pd.DataFrame(np.hstack([v.points, np.asarray(v.measured) / sensor.pixel_mm]), columns=columns)
+    return table.assign(
+        offset_px=change.offset_mm / sensor.pixel_mm, limit_px=change.limit_mm / sensor.pixel_mm, beyond=change.beyond
+    )
+
+
+def change_verdict(change: Change, sensor: Sensor) -> list[str]:
+    """The tests in sentences."""
+    sentences = []
+    if change.degrees_of_freedom:
+        sentences.append(
+            f"parameters: chi-square {change.chi_square:.1f} with {change.degrees_of_freedom} degrees of freedom, "
+            f"{p_words(change.p_parameters, 2)}: {change_meaning(change.p_parameters)}"
+        )
+    elif not change.parameters:
+        sentences.append("the calibrations are of different models, so their parameters are not compared")
+    if held := [one.parameter for one in change.parameters if one.sigma == 0 and one.difference != 0]:
+        sentences.append(f"fixed at different values and not tested: {', '.join(held)}")
+    field = change.field.uncertainty
+    if field is not None:
+        rmse = float(change.field.offsets.rmse_measured_mm) / sensor.pixel_mm
+        sentences.append(
+            f"bundle of rays, {ALIGNED[change.field.method]}: RMS {rmse:.3g} px over the format, "
+            f"{p_words(field.p_value, 2)}: {change_meaning(field.p_value)}"
+        )
+    worst = int(np.argmax(change.offset_mm / change.limit_mm))
+    x, y = np.asarray(change.field.offsets.points)[worst]
+    offset, limit = (v[worst] / sensor.pixel_mm for v in (change.offset_mm, change.limit_mm))
+    n = len(change.limit_mm)
+    sentences.append(
+        f"the offset exceeds the {100 * LEVEL:.0f} % limit for one camera at {change.beyond.sum()} of {n} points "
+        f"(expected {(1 - LEVEL) * n:.0f}); largest at x {x:.3g}, y {y:.3g} mm: {offset:.3g} px, limit {limit:.3g} px"
+    )
+    return sentences
+
+
+def change_headline(change: Change) -> str:
+    """The result of both tests: the camera has changed if one of them says so."""
+    return change_meaning(float(np.nanmin([change.p_parameters, change.p_field])))
+
+
+def plot_change(change: Change, sensor: Sensor, ax: Axes | None = None, *, over_usual: bool = False) -> Axes:
+    """Offsets of the rays of two calibrations over the format (px), or relative to the limit for one camera."""
+    ax = axes_or_new(ax)
+    name = f"offset over its {100 * LEVEL:.0f} % limit" if over_usual else "offset [px]"
+    values = change.offset_mm / (change.limit_mm if over_usual else sensor.pixel_mm)
+    draw_format_map(ax, sensor, np.asarray(change.field.offsets.points), name, values)
+    return ax
+
+
+def change_figure(change: Change, sensor: Sensor) -> Figure:
+    """Both maps of `plot_change` side by side."""
+    figure = new_figure(9.6, 3.9)
+    for axes, usual in zip(figure.subplots(1, 2), (False, True), strict=True):
+        plot_change(change, sensor, axes, over_usual=usual)
+    return figure
+
+
+def change_table(change: Change) -> pd.DataFrame:
+    """The changed parameters for reading; fixed ones without p."""
+    table = parameter_changes(change).drop(columns="ratio")
+    return table[(table["sigma"] > 0) | (table["first"] != 0) | (table["second"] != 0)]
+
+
+def print_change(change: Change, sets: tuple[Compared, Compared], sensor: Sensor, console: Console) -> None:
+    """Print both calibrations, the parameters and the tests."""
+    print_lines(about_sets(sets), console)
+    if change.parameters:
+        console.print(
+            to_rich(change_table(change).rename(columns={"first": "A", "second": "B", "difference": "B - A"}))
+        )
+    print_lines(change_verdict(change, sensor), console)
+
+
+def write_change(change: Change, sets: tuple[Compared, Compared], sensor: Sensor, directory: Path, made: Made) -> None:
+    """parameters.csv, cells.csv, change.png, report.html and summary.json.
+
+    Raises InputError if `directory` holds something else than an earlier result.
+    """
+    parameters, figure = parameter_changes(change), change_figure(change, sensor)
+    parts: list[Part] = [
+        *(Paragraph(as_sentence(sentence)) for sentence in change_verdict(change, sensor)),
+        *map(Paragraph, about_sets(sets)),
+        Heading("Over the format"),
+        Plot(figure, "maps over the image format: offsets of rays (px), and offsets over their limit"),
+        Heading("Parameters"),
+        parameters,
+    ]
+    tables = {"parameters": parameters, "cells": change_cells(change, sensor)}
+    verdict = change_headline(change), "amber" if change.changed else "green"
+    with whole_folder(directory) as work:
+        write_study(
+            work, "Change of a camera", verdict, parts, change_summary(change, sensor), made, tables, {"change": figure}
+        )
+
+
+def change_summary(change: Change, sensor: Sensor) -> dict[str, Any]:
+    """The comparison in summary.json."""
+    field = change.field.uncertainty
+    return {
+        "verdict": change_verdict(change, sensor),
+        "method": change.field.method,
+        "chi_square": change.chi_square if change.degrees_of_freedom else None,
+        "degrees_of_freedom": change.degrees_of_freedom,
+        "p_parameters": change.p_parameters if change.degrees_of_freedom else None,
+        "p_field": None if field is None else field.p_value,
+        "n_beyond": int(change.beyond.sum()),
+        "n_points": len(change.limit_mm),
+    }

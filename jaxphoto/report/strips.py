@@ -1,37 +1,58 @@
-"""What a strip adjustment found: its verdict; tables of strips, scanner and trajectory; the lines on a screen."""
+"""Strip adjustment: verdict, tables of strips, scanner and trajectory, plots, result folder, terminal output."""
 
-from collections.abc import Iterator, Sequence
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
 from rich.console import Console
 
+from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import TrajectoryKnot
+from jaxphoto.lidar.raster import Raster
 from jaxphoto.observations import AttitudeSteps, PositionSteps
 from jaxphoto.procedures.lidar import StripAdjustment, StripDifference, StripRound
 from jaxphoto.procedures.lidar.strip_adjustment import PHOTOGRAPHS
 from jaxphoto.procedures.lidar.strip_control import CHECK, CONTROL
 from jaxphoto.procedures.lidar.surveyed_gaps import SurveyedGap
-from jaxphoto.report.digits import of_sigma, with_sigma
-from jaxphoto.report.findings import Finding, Level, Verdict, p_words
+from jaxphoto.report.draws import in_degrees
+from jaxphoto.report.findings import Finding, Severity, Verdict, p_words
+from jaxphoto.report.formatting import label_unit, of_sigma, with_sigma
+from jaxphoto.report.page import Heading, Made, Paragraph, Part, Plot, verdict_parts
+from jaxphoto.report.plots import axes_or_new, draw_matrix, label, new_figure
+from jaxphoto.report.results import write_results, write_study
 from jaxphoto.report.tables import Tables
-from jaxphoto.report.units import label_unit
+from jaxphoto.report.terminal import print_lines
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.statistics import LEVEL, correlation_matrix
 from jaxphoto.statistics.global_test import global_test
+from jaxphoto.writing import whole_folder
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 _OF_POINTS = (PHOTOGRAPHS, CONTROL, CHECK)
-# Times their noise by which strips may be off surveyed points, of a few by this number of standard deviations.
+# Gaps to surveyed points over their noise that are a warning; for few planes plus this number of sigmas.
 _FAR, _BEYOND = 2.0, 3.0
-# Times what is expected from which on what was given contradicts itself, and nothing found of it is of use.
+# Deviation over expectation from which on the input contradicts itself and no result is usable.
 _CONTRADICTS = 10.0
-# From jaxphoto's units of a knot (m, rad) to those of files.
+# From internal units of a knot (m, rad) to those of files.
 _IN_FILES = np.array([1.0, 1.0, 1.0, 180 / np.pi, 180 / np.pi, 180 / np.pi])
+_COLUMNS = ["X_m", "Y_m", "Z_m", "right_deg", "forward_deg", "up_deg"]
+
+
+# Tables ----------------------------------------------------------------------------------------------------------
 
 
 def differences_table(differences: Sequence[StripDifference]) -> pd.DataFrame:
-    """One row for two strips: planes, mean and root mean square of their gaps (m) before and after."""
+    """One row per pair of strips: planes, mean and RMS of their gaps (m) before and after."""
     return pd.DataFrame(differences, columns=list(StripDifference._fields))
 
 
@@ -41,68 +62,63 @@ def strip_rounds_table(rounds: Sequence[StripRound]) -> pd.DataFrame:
 
 
 def surveyed_table(result: StripAdjustment) -> pd.DataFrame:
-    """One row for a surveyed point in a strip, what is farthest off for its standard deviation first."""
+    """One row per surveyed point in a strip, the largest normalised gap first."""
     table = pd.DataFrame(result.surveyed, columns=list(SurveyedGap._fields))
     return table.sort_values("w", key=np.abs, ascending=False, kind="stable", ignore_index=True)
 
 
 def all_correlations(result: StripAdjustment) -> pd.DataFrame:
-    """Of all unknowns of scanner, trajectory and cameras: a row and a column each, named by `parameter`."""
+    """Correlation matrix of all unknowns of scanner, trajectory and cameras, indexed by `parameter`."""
     labels = list(result.adjusted.structure.labels)
     rho = correlation_matrix(result.covariance)[-len(labels) :, -len(labels) :]
     return pd.DataFrame(rho, columns=labels).set_index(pd.Index(labels, name="parameter"))
 
 
 def calibration_table(result: StripAdjustment) -> pd.DataFrame:
-    """parameter, value, sigma, the parameter that it is least told from: `with`, rho; and unit. Angles in degrees.
+    """parameter, value, sigma, with (the most correlated parameter), rho, unit of scanner, cameras and mounts.
 
-    Of scanner, cameras and mounts: of all unknowns but the trajectory's.
+    Angles in degrees.
     """
     known, s = result.covariance, result.adjusted.structure
     rho, sigma = correlation_matrix(known), np.asarray(known.shared_sigma)
     value = np.asarray(result.adjusted.values.shared)[s.free]
     first, rows = len(rho) - len(s.free), []
-    for k, label in enumerate(s.labels):
-        if label.startswith(TrajectoryKnot.kind):
+    for k, path in enumerate(s.labels):
+        if path.startswith(TrajectoryKnot.kind):
             continue
-        to = np.abs(rho[first + k, first:])
-        to[k] = -1.0
-        other = int(np.argmax(to))
-        unit, correlation = 180 / np.pi if label.endswith("_rad") else 1.0, rho[first + k, first + other]
-        names = _in_degrees(label), _in_degrees(s.labels[other])
-        told = label_unit(names[0], result.adjusted.unknowns.interior)
-        rows.append((names[0], unit * value[k], unit * sigma[k], names[1], correlation, told))
+        others = np.abs(rho[first + k, first:])
+        others[k] = -1.0
+        other = int(np.argmax(others))
+        factor = 180 / np.pi if path.endswith("_rad") else 1.0
+        name, unit = in_degrees(path), label_unit(in_degrees(path), result.adjusted.unknowns.interior)
+        correlation = rho[first + k, first + other]
+        rows.append((name, factor * value[k], factor * sigma[k], in_degrees(s.labels[other]), correlation, unit))
     return pd.DataFrame(rows, columns=["parameter", "value", "sigma", "with", "rho", "unit"])
 
 
-def _in_degrees(label: str) -> str:
-    return f"{label.removesuffix('_rad')}_deg" if label.endswith("_rad") else label
-
-
 def trajectory_errors_table(result: StripAdjustment) -> pd.DataFrame:
-    """strip, time_s, and the coefficients of its spline there with sigmas: X_m ... right_deg ...; 0 where held."""
+    """strip, time_s, spline coefficients X_m ... up_deg and their sigmas; a sigma of 0 if fixed."""
     errors, labels, rows = result.errors, _knot_labels(result), []
-    of_label = dict(zip(result.adjusted.structure.labels, np.asarray(result.covariance.shared_sigma), strict=True))
+    sigmas = dict(zip(result.adjusted.structure.labels, np.asarray(result.covariance.shared_sigma), strict=True))
     for name, spline in zip(result.cloud.strips, errors.splines, strict=True):
-        for k, time in enumerate(spline.times, spline.first):
-            sigma = np.array([of_label.get(label, 0.0) for label in labels[k]])
+        for k, at in enumerate(spline.times, spline.first):
+            sigma = np.array([sigmas.get(path, 0.0) for path in labels[k]])
             value = np.concatenate([errors.position[k], errors.attitude[k]])
-            rows.append((name, time, *(value * _IN_FILES), *(sigma * _IN_FILES)))
-    columns = ["X_m", "Y_m", "Z_m", "right_deg", "forward_deg", "up_deg"]
-    return pd.DataFrame(rows, columns=["strip", "time_s", *columns, *(f"sigma_{c}" for c in columns)])
+            rows.append((name, at, *(value * _IN_FILES), *(sigma * _IN_FILES)))
+    return pd.DataFrame(rows, columns=["strip", "time_s", *_COLUMNS, *(f"sigma_{c}" for c in _COLUMNS)])
 
 
 def errors_along(
-    result: StripAdjustment, strip: int, time: Float[np.ndarray, "n"]
+    result: StripAdjustment, strip: int, time: Float[np.ndarray, n]
 ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 6"]]:
-    """What the trajectory was off by at times (s) of a strip: X, Y, Z (m), right, forward, up (degrees), and sigmas."""
+    """Trajectory errors at times (s) of a strip: X, Y, Z (m), right, forward, up (degrees), and their sigmas."""
     value = np.concatenate(result.errors.at(strip, time), axis=1)
     spline, labels = result.errors.splines[strip], _knot_labels(result)
     _, weights = spline.all_weights(time)
-    place = {label: k for k, label in enumerate(result.adjusted.structure.labels)}
+    place = {path: k for k, path in enumerate(result.adjusted.structure.labels)}
     covariances, variance = np.asarray(result.covariance.matrix)[-len(place) :, -len(place) :], np.zeros_like(value)
     for c in range(value.shape[1]):
-        # A knot that is held has no label among the estimated ones.
+        # Fixed knots are not among the estimated ones.
         own = np.array([place.get(labels[k][c], -1) for k in range(spline.first, spline.first + spline.size)])
         known, by = own[own >= 0], weights[:, own >= 0]
         variance[:, c] = np.einsum("ni,ij,nj->n", by, covariances[np.ix_(known, known)], by)
@@ -110,32 +126,31 @@ def errors_along(
 
 
 def _knot_labels(result: StripAdjustment) -> list[list[str]]:
-    """Of every knot of all strips the labels of its six numbers."""
+    """The paths of the six numbers of every knot of all strips."""
     zero = np.zeros(3)
     knot = TrajectoryKnot(zero, zero)  # type: ignore[arg-type]
     return [list(knot.labels(owner)) for owner in result.adjusted.unknowns.more[TrajectoryKnot.kind]]
 
 
+# Verdict ---------------------------------------------------------------------------------------------------------
+
+
 def strips_verdict(result: StripAdjustment, tables: Tables | None) -> Verdict:
-    """What is to be known of it first; `tables` are those of the adjustment where photographs are in it."""
-    found = _of_strips(result) if tables is None else verdict_of(tables).findings
-    odd = (Finding(Level.WARNING, sentence) for sentence in result.odd)
-    return Verdict.of((*_of_rounds(result), *_of_steps(result), *odd, *_of_surveyed(result), *found))
+    """Judge a strip adjustment; `tables` are those of the adjustment if it has images."""
+    found = _sigma_naught(result) if tables is None else verdict_of(tables).findings
+    odd = (Finding("message", "warning", sentence) for sentence in result.odd)
+    return Verdict.of((*_lookups(result), *_steps(result), *odd, *_surveyed(result), *found))
 
 
-def _of_rounds(result: StripAdjustment) -> Iterator[Finding]:
+def _lookups(result: StripAdjustment) -> Iterator[Finding]:
     if not result.still:
-        change = result.rounds[-1].largest_change
-        yield Finding(
-            Level.ALARM,
-            f"planes were looked up {len(result.rounds)} times and it still changes (by {change:.2g} standard "
-            "deviations the last time): ask for more rounds",
-        )
+        n, change = len(result.rounds), result.rounds[-1].largest_change
+        hint = "Ask for more iterations"
+        yield Finding("lookups_not_converged", "error", value=change, hint=hint, numbers={"n": n})
 
 
-def _of_steps(result: StripAdjustment) -> Iterator[Finding]:
-    """Whether the trajectory had to be bent by many times what it is known by, so that strips come to lie on others."""
-    strips = result.cloud.strips
+def _steps(result: StripAdjustment) -> Iterator[Finding]:
+    """Trajectories that are bent far beyond their standard deviations to fit the strips."""
     for steps, errors, unit in (
         (PositionSteps, result.errors.position, "m"),
         (AttitudeSteps, np.rad2deg(result.errors.attitude), "degrees"),
@@ -143,117 +158,300 @@ def _of_steps(result: StripAdjustment) -> Iterator[Finding]:
         over_sigma = np.abs(result.adjusted.residuals.named.get(steps.group, np.zeros(1))).max()
         if over_sigma > _CONTRADICTS:
             largest = [np.abs(errors[s.first : s.first + s.size]).max() for s in result.errors.splines]
-            worst = int(np.argmax(largest))
+            k = int(np.argmax(largest))
+            hint = "Check the heights and the system of this strip, and its trajectory"
+            numbers = {"unit": unit, "change": over_sigma}
             yield Finding(
-                Level.ALARM,
-                f"strips lie on one another where the trajectory of strip {strips[worst]} is off by "
-                f"{largest[worst]:.2g} {unit}, which changes by {over_sigma:.0f} times its standard deviation on the "
-                "way: look at the heights and the system of this strip, and at its trajectory",
+                "strip_contradiction", "error", result.cloud.strips[k], float(largest[k]), hint=hint, numbers=numbers
             )
 
 
-def _of_surveyed(result: StripAdjustment) -> Iterator[Finding]:
-    """How far strips are from control and check points, and whether that is more than these let expect."""
-    for what, told in surveyed_summary(result).items():
-        rms, noise, planes = told["rms_m"], told["noise_m"], told["planes"]
+def _surveyed(result: StripAdjustment) -> Iterator[Finding]:
+    """Gaps to control and check points compared with their expectation."""
+    for what, of in surveyed_summary(result).items():
+        rms, noise, planes = of["rms_m"], of["noise_m"], int(of["planes"])
         far = rms > max(_FAR, 1 + _BEYOND / np.sqrt(2 * planes)) * noise
-        yield Finding(
-            Level.ALARM if rms > _CONTRADICTS * noise else Level.WARNING if far else Level.INFORMATION,
-            f"{what.replace('_', ' ')} {rms:.3f} m off the strips (RMS of {planes} planes), {told['rms_before_m']:.3f} "
-            f"m before; plane and survey let expect {noise:.3f}"
-            + (
-                f": {_worst(result, what)}look at the points, their standard deviations and the trajectory's"
-                if far
-                else ""
-            ),
-        )
-
-
-def _worst(result: StripAdjustment, what: str) -> str:
-    """Which of the points is farthest off for its standard deviation."""
-    table = surveyed_table(result)
-    first = table[(table.role == "control") == (what == "control")].iloc[0]
-    return f"most at {first.point}, {first.gap_m:+.3f} m on strip {first.strip} ({abs(first.w):.1f} of its sigma); "
+        severity: Severity = "error" if rms > _CONTRADICTS * noise else "warning" if far else "note"
+        table, worst = surveyed_table(result), ""
+        if far:
+            first = table[(table.role == "control") == (what == "control")].iloc[0]
+            worst = f"; largest at {first.point}, {first.gap_m:+.3f} m on strip {first.strip} (w = {abs(first.w):.1f})"
+        hint = "Check the points, their standard deviations and those of the trajectory" if far else ""
+        numbers = {"planes": planes, "before": of["rms_before_m"], "worst": worst}
+        yield Finding("surveyed_gap", severity, what.replace("_", " "), rms, noise, hint, numbers)
 
 
 def surveyed_summary(result: StripAdjustment) -> dict[str, dict[str, float]]:
-    """Of control and of check points over all strips: planes, RMS of their gaps (m) before and after, and their noise.
-
-    Nothing of what there is not.
-    """
+    """Control and check points over all strips: planes, RMS of their gaps (m) before and after, and noise."""
     summary: dict[str, dict[str, float]] = {}
     for what in (CONTROL, CHECK):
         own = [d for d in result.differences if d.one == what]
         if own:
             now, then = ([getattr(d, name) for d in own] for name in ("planes", "planes_before"))
-            pooled = {"rms_before_m": then, "rms_m": now, "noise_m": now}
-            told = {name: _pooled([getattr(d, name) for d in own], counts) for name, counts in pooled.items()}
-            summary[what.replace(" ", "_")] = {"planes": sum(now), **told}
+            counts = {"rms_before_m": then, "rms_m": now, "noise_m": now}
+            pooled = {name: _pooled([getattr(d, name) for d in own], n) for name, n in counts.items()}
+            summary[what.replace(" ", "_")] = {"planes": sum(now), **pooled}
     return summary
 
 
 def _pooled(rms: Sequence[float], counts: Sequence[int]) -> float:
-    """Root mean square of several together; what is none has an rms that is no number."""
+    """RMS of several sets; NaN of an empty set is skipped."""
     return float(np.sqrt(np.nansum(np.square(rms) * counts) / max(sum(counts), 1)))
 
 
-def _of_strips(result: StripAdjustment) -> Iterator[Finding]:
-    """Convergence and sigma naught of planes and trajectory alone."""
+def _sigma_naught(result: StripAdjustment) -> Iterator[Finding]:
+    """Convergence and sigma naught of planes and trajectory."""
     if not bool(result.adjusted.converged):
-        yield Finding(Level.ALARM, result.adjusted.outcome.value)
+        yield Finding("not_converged", "error", result.adjusted.outcome.value)
         return
     whole = global_test(result.adjusted)
     if whole.redundancy > 0 and whole.p_value < LEVEL:
         small = whole.factor < 1
-        lie = f"planes lie {'nearer to' if small else 'farther from'} one another than their roughness"
+        gaps = f"gaps of planes are {'smaller' if small else 'larger'} than expected by their roughness"
         if result.trajectory is None:
-            why = f"{lie} lets expect" + (
-                "" if small else " after a shift of each strip: what else is wrong its trajectory tells (--trajectory)"
-            )
+            hint = "" if small else "Further errors than shifts need a trajectory (--trajectory)"
         else:
-            why = f"{lie} and the trajectory's standard deviations let expect; these are too " + (
-                "large" if small else "small, or knots too far apart"
-            )
-        said = f"sigma naught {whole.factor**0.5:.3g}, expected 1 ({p_words(whole.p_value)})"
-        # Shifts alone leave what the trajectory is off by, and may be all that there is.
+            gaps += " and the trajectory's standard deviations"
+            hint = "These are too large" if small else "These are too small, or knots too far apart"
+        # Shifts alone leave other trajectory errors, and may be all that is possible.
         absurd = result.trajectory is not None and whole.factor > _CONTRADICTS**2
-        yield Finding(Level.ALARM if absurd else Level.WARNING, f"{said}: {why}")
+        severity: Severity = "error" if absurd else "warning"
+        numbers = {"p": p_words(whole.p_value)}
+        yield Finding("strips_sigma0", severity, gaps, whole.factor**0.5, 1.0, hint, numbers)
+
+
+# Plots -----------------------------------------------------------------------------------------------------------
+
+_GAP = "later strip above earlier (cm)"
+# Places of a curve per knot, and strips per row of panels.
+_PLACES, _ABREAST = 12, 4
+_COMPONENTS = (("position (cm)", 100.0, ("X", "Y", "Z")), ("attitude (mdeg)", 1000.0, ("right", "forward", "up")))
+# Okabe and Ito (2008): distinguishable by colour-blind readers.
+_COLOURS = ("#0072B2", "#E69F00", "#009E73")
+
+
+def differences_figure(before: Raster, after: Raster) -> Figure:
+    """Gaps of strips before and after, in the same colours, which span 95 % of the gaps before."""
+    figure = new_figure(10.0, 4.6)
+    both = figure.subplots(1, 2, sharex=True, sharey=True)
+    for axes, raster, name in zip(both, (before, after), ("before", "after"), strict=True):
+        shown = _draw_differences(axes, raster, _limit(before))
+        axes.set_title(f"{name}: {axes.get_title(loc='left')}", loc="left")
+    figure.colorbar(shown, ax=list(both), label=_GAP, shrink=0.8)
+    return figure
+
+
+def plot_strip_differences(gaps: Raster, ax: Axes | None = None, *, limit_m: float | None = None) -> Axes:
+    """Gaps of strips over the ground (`lidar.strip_differences`), in colours up to `limit_m` (default: 95 %)."""
+    ax = axes_or_new(ax)
+    shown = _draw_differences(ax, gaps, _limit(gaps) if limit_m is None else 100 * limit_m)
+    ax.figure.colorbar(shown, ax=ax, label=_GAP, shrink=0.8)
+    return ax
+
+
+def _limit(gaps: Raster) -> float:
+    return 100 * float(np.nanpercentile(np.abs(gaps.heights), 95)) or 1.0
+
+
+def _draw_differences(axes: Axes, gaps: Raster, limit: float) -> AxesImage:
+    """Gaps in centimetres, as is `limit`."""
+    (west, south), (east, north) = gaps.extent
+    shown = axes.imshow(100 * gaps.heights, extent=(west, east, south, north), cmap="RdBu_r", vmin=-limit, vmax=limit)
+    axes.set_title(f"{100 * float(np.sqrt(np.nanmean(gaps.heights**2))):.2g} cm RMS", loc="left")
+    axes.set(xlabel="X (m)", ylabel="Y (m)", aspect="equal")
+    axes.ticklabel_format(useOffset=False, style="plain")
+    return shown
+
+
+def plot_scanner_correlation(result: StripAdjustment, ax: Axes | None = None, *, itself: bool = False) -> Axes:
+    """Correlations of the scanner with cameras and mounts, or with `itself`.
+
+    Raises InputError if none of these are estimated.
+    """
+    rho, scanner, others = _scanner_and_others(result)
+    columns = scanner if itself else others
+    if not scanner or not columns:
+        raise InputError(f"nothing of {'the scanner' if not scanner else 'cameras and mounts'} is estimated here")
+    ax, name = axes_or_new(ax), f"scanner with {'itself' if itself else 'camera and mount'}"
+    draw_matrix(ax, rho.loc[scanner, columns].to_numpy(), _short(scanner), _short(columns), name)
+    return ax
+
+
+def scanner_correlation_figure(result: StripAdjustment) -> Figure:
+    """Correlations of the scanner with cameras and mounts, and with itself."""
+    _, scanner, others = _scanner_and_others(result)
+    sets = [(itself, names) for itself, names in ((False, others), (True, scanner)) if names]
+    figure = new_figure(3.4 + 0.52 * sum(len(names) for _, names in sets), 1.9 + 0.33 * len(scanner))
+    panels = figure.subplots(1, len(sets), squeeze=False, width_ratios=[len(names) for _, names in sets])[0]
+    for axes, (itself, _) in zip(panels, sets, strict=True):
+        plot_scanner_correlation(result, axes, itself=itself)
+    return figure
+
+
+def _scanner_and_others(result: StripAdjustment) -> tuple[pd.DataFrame, list[str], list[str]]:
+    """All correlations, the unknowns of the scanner, and those of cameras and mounts."""
+    rho = all_correlations(result)
+    labels = [name for name in rho.index if not name.startswith(TrajectoryKnot.kind)]
+    scanner = [name for name in labels if name.startswith("scanner")]
+    return rho, scanner, [name for name in labels if name not in scanner]
+
+
+def _short(labels: list[str]) -> list[str]:
+    """Parameter names without units, with the owner's name only where they repeat."""
+    short = [name.split(".")[-1].removesuffix("_rad") for name in labels]
+    owners = [name.rsplit(".", 1)[0].partition("[")[2].removesuffix("]") for name in labels]
+    return [f"{o} {name}" if short.count(name) > 1 and o else name for o, name in zip(owners, short, strict=True)]
+
+
+def plot_trajectory_errors(
+    result: StripAdjustment, strip: str, ax: Axes | None = None, *, attitude: bool = False
+) -> Axes:
+    """Position errors (cm), or those of the `attitude` (mdeg), along a strip, with bands of two sigmas.
+
+    Raises InputError for an unknown strip.
+    """
+    if strip not in result.cloud.strips:
+        raise InputError(f"there is no strip {strip!r}; there are {', '.join(result.cloud.strips)}")
+    ax, k, (unit, factor, names) = axes_or_new(ax), result.cloud.strips.index(strip), _COMPONENTS[attitude]
+    spline = result.errors.splines[k]
+    at = np.linspace(spline.times[0], spline.times[-1], _PLACES * spline.size)
+    value, sigma = errors_along(result, k, at)
+    for c, (axis, colour) in enumerate(zip(names, _COLOURS, strict=True), 3 * attitude):
+        v, s = factor * value[:, c], 2 * factor * sigma[:, c]
+        ax.fill_between(at, v - s, v + s, color=colour, alpha=0.18, lw=0)
+        ax.plot(at, v, color=colour, lw=1.3, label=axis)
+    ax.set_title(f"strip {label(strip)}", loc="left", fontsize=10)
+    ax.set(xlabel="time (s)", ylabel=unit)
+    ax.legend(fontsize=7)
+    return ax
+
+
+def trajectory_errors_figure(result: StripAdjustment) -> Figure:
+    """Position and attitude errors along each strip."""
+    names = result.cloud.strips
+    rows, columns = 2 * -(-len(names) // _ABREAST), min(len(names), _ABREAST)
+    figure = new_figure(1.2 + 2.6 * columns, 0.6 + 1.9 * rows)
+    panels = figure.subplots(rows, columns, squeeze=False)
+    for k, name in enumerate(names):
+        for part in (False, True):
+            panel = panels[2 * (k // _ABREAST) + part, k % _ABREAST]
+            plot_trajectory_errors(result, name, panel, attitude=part)
+            panel.tick_params(labelsize=7)
+    for panel in panels.flat:
+        panel.set_visible(panel.has_data())
+    return figure
+
+
+# Files and terminal ----------------------------------------------------------------------------------------------
+
+# Shifts of strips without a trajectory.
+_SHIFTS = ["strip", "X_m", "Y_m", "Z_m", "sigma_X_m", "sigma_Y_m", "sigma_Z_m"]
+# Digits of correlations, and surveyed points on the page.
+_DIGITS, _SHOWN = 6, 20
+_PATTERNS = {
+    "line": "Angles are those of scan lines across the track.",
+    "circle": "Angles are those of a scanner around its nadir; forward and backward looks are compared.",
+}
+
+
+def write_strips(
+    result: StripAdjustment,
+    tables: Tables | None,
+    verdict: Verdict,
+    directory: Path,
+    write_corrected: Callable[[Path], tuple[Raster, Raster] | None],
+    made: Made,
+) -> None:
+    """Tables, differences.png, report.html, summary.json; with images the folder `adjustment`.
+
+    `tables` are those of the adjustment if it has images. `write_corrected` writes cloud and trajectory into the folder
+    and returns the gaps of the strips before and after. Raises InputError if `directory` holds something else than an
+    earlier result.
+    """
+    began, seconds = time.perf_counter(), dict(result.adjusted.seconds)
+    files = {
+        "strips": differences_table(result.differences), "rounds": strip_rounds_table(result.rounds),
+        "scanner": calibration_table(result), "trajectory_errors": trajectory_errors_table(result),
+    }  # fmt: skip
+    files |= {"surveyed_points": surveyed_table(result)} if result.surveyed else {}
+    with whole_folder(directory) as work:
+        if tables is not None:
+            write_results(tables, verdict, work / "adjustment", seconds, made=made)
+        all_correlations(result).round(_DIGITS).to_csv(work / "correlation.csv")
+        gaps = write_corrected(work)
+        figures = {} if gaps is None else {"differences": differences_figure(*gaps)}
+        n = len(result.cloud.strips)
+        name = f"{n} strip{'s' * (n > 1)}{' and photographs' if result.before else ''}: strip adjustment"
+        summary = verdict.summary | {
+            "rounds": len(result.rounds), "came_to_rest": result.still, "sigma0": float(result.adjusted.sigma0),
+            "pattern": result.errors.calibration.pattern, **surveyed_summary(result),
+            "seconds": seconds | {"write": time.perf_counter() - began},
+        }  # fmt: skip
+        parts = [*verdict_parts(verdict), *_sections(result, files, figures.get("differences"))]
+        write_study(work, name, (verdict.headline, verdict.colour), parts, summary, made, files, figures)
+
+
+def _sections(result: StripAdjustment, files: dict[str, pd.DataFrame], gaps: Figure | None) -> Iterator[Part]:
+    yield Heading("Strips before and after")
+    yield _in_tenths_of_mm(files["strips"])
+    if gaps is not None:
+        yield Plot(gaps, "gaps of strips over the ground, before and after")
+    if "surveyed_points" in files:
+        yield Heading("Control and check points")
+        yield Paragraph(
+            f"Surveyed minus strip, over the plane of each strip: the {_SHOWN} largest w (normalised gaps; 1 of 1000 "
+            "exceeds 3.3). surveyed_points.csv has all."
+        )
+        yield _in_tenths_of_mm(files["surveyed_points"].head(_SHOWN))
+    if len(scanner := files["scanner"]):
+        yield Heading("Scanner and cameras" if result.before else "Scanner")
+        pattern = _PATTERNS[result.errors.calibration.pattern]
+        yield Paragraph(f"Estimates, each with its most correlated parameter (with, rho). {pattern}")
+        yield scanner
+    if scanner["parameter"].str.startswith("scanner").any():
+        yield Heading("Correlations of the scanner")
+        yield Paragraph(
+            "Parameters with correlations near 1 or -1 are not separable. correlation.csv has all unknowns."
+        )
+        yield Plot(scanner_correlation_figure(result), "correlations of the scanner")
+    if result.trajectory is None:
+        yield Heading("Shifts of the strips")
+        yield files["trajectory_errors"][_SHIFTS]
+    else:
+        yield Heading("Errors of the trajectory")
+        yield Paragraph(
+            "Trajectory errors along each strip with bands of two standard deviations. Most of these is a common shift "
+            "or rotation of all strips, which overlaps do not determine; between strips far less is undetermined."
+        )
+        yield Plot(trajectory_errors_figure(result), "errors of the trajectory along each strip")
+    yield Heading("Iterations")
+    yield files["rounds"]
+
+
+def _in_tenths_of_mm(table: pd.DataFrame) -> pd.DataFrame:
+    """Numbers rounded to a tenth of a millimetre, without minus zeros."""
+    numbers = table.select_dtypes(float).round(4) + 0.0
+    return table.assign(**{str(name): numbers[name] for name in numbers})
 
 
 def print_strips(result: StripAdjustment, console: Console) -> None:
-    """What the rounds came to, how far strips were apart, and the scanner, a line each."""
+    """Print iterations, gaps of strips, and the scanner."""
     last = result.rounds[-1]
-    end = "nothing changes any more" if result.still else "it still changes: ask for more rounds"
+    end = f"{'' if result.still else 'not '}converged after {last.number} iterations"
     ties = f" and {last.points} tie points on them" if last.points else ""
     ties += f" and {last.control} of control" if last.control else ""
-    said = f"{last.number} rounds, {end}; {last.planes} planes{ties}, {last.left_out} left out"
-    console.print(said, highlight=False, soft_wrap=True)
+    lines = [f"{end}; {last.planes} planes{ties}, {last.left_out} rejected"]
     for d in result.differences:
         before = f"{d.rms_before_m:.3f} m" if np.isfinite(d.rms_before_m) else "unknown"
-        strips = f"{d.one} and strip {d.other}" if d.one in _OF_POINTS else f"strips {d.one} and {d.other}"
-        console.print(
-            f"  {strips}: from {before} to {d.rms_m:.3f} m apart (RMS of {d.planes} planes, whose "
-            f"noise is {d.noise_m:.3f} m)",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
+        pair = f"{d.one} and strip {d.other}" if d.one in _OF_POINTS else f"strips {d.one} and {d.other}"
+        lines.append(
+            f"  {pair}: gap {before} before, {d.rms_m:.3f} m after (RMS of {d.planes} planes, noise {d.noise_m:.3f} m)"
         )
     if result.trajectory is None:
-        for line in _shift_lines(result):
-            console.print(line, highlight=False, markup=False, soft_wrap=True)
-    scanner = calibration_table(result)
-    numbers = scanner[["value", "sigma"]].to_numpy(float)
-    for parameter, (value, sigma) in zip(scanner["parameter"], numbers, strict=True):
-        said = f"  {parameter}: {with_sigma(value, sigma)} (sigma {of_sigma(sigma)})"
-        console.print(said, highlight=False, markup=False, soft_wrap=True)
-
-
-def _shift_lines(result: StripAdjustment) -> Iterator[str]:
-    """By how much each strip is off where nothing else is estimated."""
-    for one in trajectory_errors_table(result).to_dict("records"):
-        axes = [axis for axis in "XYZ" if one[f"sigma_{axis}_m"] > 0]
-        told = ((axis, one[f"{axis}_m"], one[f"sigma_{axis}_m"]) for axis in axes)
-        said = ", ".join(
-            f"{axis} {with_sigma(value, sigma)} m (sigma {of_sigma(sigma)})" for axis, value, sigma in told
-        )
-        yield f"  strip {one['strip']} {'is off by ' + said if said else 'is held'}"
+        for one in trajectory_errors_table(result).to_dict("records"):
+            known = [(a, one[f"{a}_m"], one[f"sigma_{a}_m"]) for a in "XYZ" if one[f"sigma_{a}_m"] > 0]
+            shift = ", ".join(f"{a} {with_sigma(v, s)} m (sigma {of_sigma(s)})" for a, v, s in known)
+            lines.append(f"  strip {one['strip']}: {'shift ' + shift if shift else 'fixed'}")
+    for parameter, value, sigma in calibration_table(result)[["parameter", "value", "sigma"]].itertuples(index=False):
+        lines.append(f"  {parameter}: {with_sigma(value, sigma)} (sigma {of_sigma(sigma)})")
+    print_lines(lines, console)

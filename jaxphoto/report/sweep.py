@@ -1,4 +1,4 @@
-"""A sweep of designs as a tidy table and as pictures."""
+"""A sweep of designs as a tidy table and as plots."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import pandas as pd
 
 from jaxphoto.errors import InputError
 from jaxphoto.observations import AXES
-from jaxphoto.report.plots import axes_or_new, drawn, log_ticks, new_figure
-from jaxphoto.report.units import without_unit
+from jaxphoto.report.formatting import without_unit
+from jaxphoto.report.plots import axes_or_new, label, log_ticks, new_figure
 from jaxphoto.sensitivity.sweep import Sweep
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_OWN = ("design", "converged", "determined", "quantity", "of", "value", "unit")
+_COLUMNS = ("design", "converged", "determined", "quantity", "of", "value", "unit")
 _DEG = 180 / np.pi
-# From this ratio of largest to smallest value on, numbers are drawn on a logarithmic scale.
+# Ratio of largest to smallest value from which on an axis is logarithmic.
 _FAR_APART = 20.0
 
 
 class _Column(NamedTuple):
-    """One number of every design: what it is, and the values."""
+    """One quantity of every design."""
 
     quantity: str
     of: str
@@ -34,7 +34,7 @@ class _Column(NamedTuple):
 
 
 def sweep_table(sweep: Sweep) -> pd.DataFrame:
-    """One row a number: the design's parameters, design, converged, determined, quantity, of, value, unit.
+    """One row per number: the design's parameters, design, converged, determined, quantity, of, value, unit.
 
     | quantity | of |
     | --- | --- |
@@ -47,10 +47,10 @@ def sweep_table(sweep: Sweep) -> pd.DataFrame:
 
     Standard deviations are a priori; times `sigma0` they are a posteriori. Unknowns go by their last name, `c_mm`, and
     by their whole path, `interior[kodak].c_mm`, where two have the same. Rows of a design that did not converge, or
-    cannot tell its unknowns apart, have NaN as value. Raises InputError for a parameter that is called like a column.
+    cannot tell its unknowns apart, have NaN as value. Raises InputError for a parameter with the name of a column.
     """
     names = list(sweep.parameters[0])
-    taken = [name for name in names if name in _OWN]
+    taken = [name for name in names if name in _COLUMNS]
     if taken:
         raise InputError(f"a parameter of the designs is called {taken[0]}, like a column of the table: rename it")
     columns = list(_columns(sweep))
@@ -62,7 +62,7 @@ def sweep_table(sweep: Sweep) -> pd.DataFrame:
     table["quantity"], table["of"] = [c.quantity for c in columns] * n, [c.of for c in columns] * n
     table["value"] = np.stack([c.values for c in columns], axis=1).ravel()
     table["unit"] = [c.unit for c in columns] * n
-    # What a useful design has no value of, it does not have.
+    # NaN of a determined design means that it lacks the quantity.
     kept = table["value"].notna() | ~(table["converged"] & table["determined"])
     return table[kept].reset_index(drop=True)
 
@@ -94,14 +94,14 @@ def _shared_names(labels: Sequence[str]) -> tuple[list[str], list[float]]:
 
 
 def _unit(name: str) -> str:
-    """The unit that a name ends with; none of a coefficient, which has that of its model (docs/models.md)."""
+    """The unit at the end of a name; none of a coefficient (docs/models.md)."""
     return without_unit(name)[1]
 
 
 def sweep_figure(table: pd.DataFrame, x: str, shown: Sequence[tuple[str, str]], by: Sequence[str] = ()) -> Figure:
     """One panel for each (quantity, of) of `shown`: its value against the parameter `x`, one line for each `by`.
 
-    `table` is that of `sweep_table`, or a part of it in which `x` and `by` tell all designs apart. Raises InputError
+    `table` is that of `sweep_table`, or a part of it in which `x` and `by` identify each design. Raises InputError
     where they do not, where there is no such column, or where nothing of `shown` is in the table.
     """
     figure = new_figure(3.4 * min(len(shown), 3), 2.9 * -(-len(shown) // 3))
@@ -131,7 +131,7 @@ def plot_sweep(
 
 
 def _chosen(table: pd.DataFrame, x: str, quantity: str, of: str, by: Sequence[str]) -> pd.DataFrame:
-    """The rows that are drawn."""
+    """The rows to be drawn."""
     for column in (x, *by):
         if column not in table:
             raise InputError(f"the table has no column {column}: choose among {', '.join(map(str, table.columns))}")
@@ -140,8 +140,8 @@ def _chosen(table: pd.DataFrame, x: str, quantity: str, of: str, by: Sequence[st
         raise InputError(f"the table has no {quantity} of {of}: look at table[['quantity', 'of']].drop_duplicates()")
     if rows.duplicated([x, *by]).any():
         raise InputError(
-            f"several designs have the same {', '.join([x, *by])}: take a part of the table in which these tell "
-            "all designs apart, or name more parameters in by"
+            f"several designs have the same {', '.join([x, *by])}: take a part of the table in which these "
+            "identify each design, or name more parameters in by"
         )
     return rows
 
@@ -150,9 +150,9 @@ def _lines(axes: Axes, rows: pd.DataFrame, x: str, by: Sequence[str]) -> None:
     places = rows[x].drop_duplicates()
     numbers = pd.api.types.is_numeric_dtype(places) and not pd.api.types.is_bool_dtype(places)
     for name, line in rows.groupby(list(by), sort=False) if by else [((), rows)]:
-        label = drawn(", ".join(f"{p} {v}" for p, v in zip(by, name, strict=True)))
+        name_of_line = label(", ".join(f"{p} {v}" for p, v in zip(by, name, strict=True)))
         at = line.sort_values(x) if numbers else line
-        axes.plot(at[x] if numbers else at[x].astype(str).map(drawn), at["value"], "o-", ms=3, lw=1, label=label)
+        axes.plot(at[x] if numbers else at[x].astype(str).map(label), at["value"], "o-", ms=3, lw=1, label=name_of_line)
     if numbers and _far_apart(places):
         log_ticks(axes)
     if rows["quantity"].iloc[0].endswith("abs_rho"):
@@ -160,8 +160,8 @@ def _lines(axes: Axes, rows: pd.DataFrame, x: str, by: Sequence[str]) -> None:
     elif _far_apart(rows["value"]):
         axes.set_yscale("log")
     quantity, of, unit = rows[["quantity", "of", "unit"]].iloc[0]
-    axes.set_title(drawn(f"{quantity} {of}" + f" [{unit}]" * bool(unit)), fontsize=9)
-    axes.set_xlabel(drawn(x), fontsize=8)
+    axes.set_title(label(f"{quantity} {of}" + f" [{unit}]" * bool(unit)), fontsize=9)
+    axes.set_xlabel(label(x), fontsize=8)
     axes.tick_params(labelsize=7)
     axes.grid(lw=0.3)
 

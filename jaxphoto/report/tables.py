@@ -1,66 +1,72 @@
-"""The tables of an adjustment as pandas frames: the columns of the result folder (docs/block_folder.md)."""
+"""The tables of an adjustment as DataFrames, with the columns of the result folder (docs/block_folder.md)."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
+from typing import Any
 
+import equinox as eqx
+import jax
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import Residuals
 from jaxphoto.arrays import Numbers
-from jaxphoto.observations import AXES
-from jaxphoto.report.camera_drift_table import camera_drift_table
-from jaxphoto.report.check_points import check_point_table
-from jaxphoto.report.convergence_table import convergence_table
-from jaxphoto.report.correlation_tables import correlation_ground_table, correlation_summary_table
-from jaxphoto.report.interior_table import interior_table
-from jaxphoto.report.map_tables import angles_deg, exterior_map_table, map_coordinates
-from jaxphoto.report.positional_accuracy import accuracy_table
-from jaxphoto.report.recovery import recovery_table
-from jaxphoto.report.residual_table import in_file_unit, residual_table
-from jaxphoto.report.sigma_map_table import sigma_map_table
+from jaxphoto.camera import RATES, constant_names, get_parameter, parameter_names, parameter_unit
+from jaxphoto.compiling import call_compiled
+from jaxphoto.observations import AXES, AbstractObservations
+from jaxphoto.parameters import unit_of
+from jaxphoto.report.findings import symbol
+from jaxphoto.report.formatting import in_file_unit, label_unit
+from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.statistics import (
     BlunderTest,
     CameraDrift,
     Correlations,
     Covariance,
+    EffectTest,
     GroundCorrelations,
+    MdbEffects,
     PositionalAccuracy,
     Redundancy,
     Rotations,
     Significance,
     Suspect,
-    Trend,
-    UndetectedEffects,
+    a_priori_sigmas,
     blunder_test,
     camera_drifts,
     check_discrepancies,
     correlations,
     covariance,
-    culprits,
     ground_correlations,
+    mdb_effects,
+    minimal_detectable_biases,
+    multiple_outlier_test,
     normalised_residuals,
+    observation_groups,
+    physical_residuals,
     positional_accuracy,
     prepare_statistics,
     redundancy_numbers,
     residual_spread,
     significance,
-    trends,
-    undetected_effects,
+    systematic_effect_tests,
 )
-from jaxphoto.statistics.intersection_angles import intersection_angles
+from jaxphoto.statistics.block_geometry import intersection_angles
+from jaxphoto.statistics.correlation import FORMS
 from jaxphoto.statistics.sigma_map import SigmaMap, sigma_maps
 from jaxphoto.tracing import refuse_traced
+from jaxphoto.unknowns import Weighted
 
 
 class Tables:
-    """An adjustment as tables, each computed when first asked for.
+    """An adjustment as tables, each computed at first use.
 
-    `rotations` says which rotations the correlations mean (see `jaxphoto.covariance`). Sigmas are a posteriori (times
-    sigma0) unless a column says otherwise; units stand in the column names or in a column `unit`. `truth` is that of a
-    simulation (`jaxphoto.io.truth_tables`, `read_truth`), for `recovery`. `known` is the covariance of
-    this adjustment with omega, phi, kappa, where that was computed already, best with its `rows`.
+    `rotations` selects the rotations of the correlations (see `jaxphoto.covariance`). Sigmas are a posteriori (times
+    sigma0) unless a column says otherwise; units are in the column names or in a column `unit`. `truth` is that of a
+    simulation (`jaxphoto.io.truth_tables`, `read_truth`), for `recovery`. `known` is the covariance of this adjustment
+    with omega, phi, kappa, if already computed, preferably with its `rows`.
     """
 
     def __init__(
@@ -79,25 +85,24 @@ class Tables:
         self._known = known
 
     def __repr__(self) -> str:
-        names = [name for name, own in vars(Tables).items() if _is_table(own)]
+        names = [name for name, member in vars(Tables).items() if _is_table(member)]
         return f"Tables of {self.adjusted!r};\n  {', '.join(names)}"
 
     def _repr_html_(self) -> str:
-        """The interior orientation and the spread of residuals; the others are named."""
-        shown = "".join(
-            table.to_html(index=False, border=0, na_rep="") for table in (self.interior, self.residual_spread)
-        )
-        return f"{self.adjusted._repr_html_()}{shown}"
+        """The interior orientation and the spread of residuals."""
+        shown = (t.to_html(index=False, border=0, na_rep="") for t in (self.interior, self.residual_spread))
+        return f"{self.adjusted._repr_html_()}{''.join(shown)}"
+
+    # Statistics as arrays ----------------------------------------------------------------------------------------
 
     @cached_property
     def covariance(self) -> Covariance:
         """Covariance with omega, phi, kappa."""
-        # Most tables need redundancy numbers, too.
         prepare_statistics(self.adjusted.equations, self.adjusted.seconds)
         return covariance(self.adjusted, rows=True) if self._known is None else self._known
 
-    def _told(self, sigma: Numbers) -> np.ndarray:
-        """Standard deviations, but none of what did not converge: they would be of some other place."""
+    def _if_converged(self, sigma: Numbers) -> np.ndarray:
+        """Standard deviations; NaN where the adjustment did not converge."""
         return np.where(bool(self.adjusted.converged), np.asarray(sigma), np.nan)
 
     @cached_property
@@ -112,67 +117,77 @@ class Tables:
 
     @cached_property
     def blunders(self) -> BlunderTest:
-        """Every normalised residual against the critical value of all together."""
+        """Test of every normalised residual against the critical value for all of them."""
         return blunder_test(self.adjusted, self.redundancy)
 
     @cached_property
     def culprits(self) -> tuple[Suspect, ...]:
-        """The suspects among them that the worse ones do not explain."""
-        return culprits(self.adjusted, self.blunders)
+        """Suspects that larger blunders do not explain."""
+        return multiple_outlier_test(self.adjusted, self.blunders)
 
     @cached_property
-    def tested_trends(self) -> list[Trend]:
-        """Patterns that the residuals may follow, tested; what contradicts the others has no part in them."""
+    def tested_trends(self) -> list[EffectTest]:
+        """Tested systematic effects in the residuals, suspects excluded."""
         suspects = [(s.group, s.row) for s in self.blunders.suspects]
-        return trends(self.adjusted, np.asarray(self.covariance.shared_sigma), suspects)
+        return systematic_effect_tests(self.adjusted, np.asarray(self.covariance.shared_sigma), suspects)
 
     @cached_property
-    def trends(self) -> pd.DataFrame:
-        """One row a pattern: pattern, freedom, p_value, rms, unit; term, share, amount and sigma of what explains most.
-
-        `rms` is of what the pattern explains of the residuals, without its noise, and NaN where that is nothing; units
-        of terms are the camera's.
-        """
-        columns = ["pattern", "freedom", "p_value", "rms", "unit", "term", "share", "amount", "sigma"]
-        rows = []
-        for t in self.tested_trends:
-            factor, unit = in_file_unit(t.pattern.unit)
-            best = t.hints[0][:4] if t.hints else None
-            told = (best[0].name, *best[1:]) if best else ("", np.nan, np.nan, np.nan)
-            rms = factor * t.size if t.size > 0 else np.nan
-            rows.append((t.pattern.what, t.freedom, t.p_value, rms, unit, *told))
-        return pd.DataFrame(rows, columns=columns)
-
-    @cached_property
-    def undetected(self) -> UndetectedEffects:
-        """What an error that no test finds does to the result."""
-        return undetected_effects(self.adjusted, self.covariance, self.redundancy)
+    def undetected(self) -> MdbEffects:
+        """External reliability: effects of biases of one MDB."""
+        return mdb_effects(self.adjusted, self.covariance, self.redundancy)
 
     @cached_property
     def correlations(self) -> dict[str, Correlations]:
-        """Correlations by camera, as arrays."""
+        """Correlations by camera."""
         chosen = self.covariance if self.rotations == "omega_phi_kappa" else covariance(self.adjusted, self.rotations)
         return correlations(self.adjusted, chosen)
 
     @cached_property
     def significance(self) -> list[Significance]:
-        """Ratio and t-test of every estimated interior parameter; none where the adjustment did not converge."""
-        if not bool(self.adjusted.converged):
-            return []
-        return significance(self.adjusted, self.covariance)
+        """Ratio and t-test of every estimated interior parameter; none if the adjustment did not converge."""
+        return significance(self.adjusted, self.covariance) if bool(self.adjusted.converged) else []
+
+    @cached_property
+    def tested_drifts(self) -> list[CameraDrift]:
+        """Drift test of every camera with estimated rates."""
+        return camera_drifts(self.adjusted, self.covariance)
+
+    @cached_property
+    def tested_accuracy(self) -> PositionalAccuracy:
+        """Positional accuracy at the check points."""
+        return positional_accuracy(check_discrepancies(self.adjusted))
+
+    @cached_property
+    def ground_correlations(self) -> dict[str, GroundCorrelations]:
+        """Correlations of each camera with height and doming of the ground."""
+        return ground_correlations(self.adjusted, self.covariance)
+
+    @cached_property
+    def sigma_maps(self) -> dict[str, tuple[SigmaMap, SigmaMap]]:
+        """Projection uncertainty of each estimated camera, at infinity and at the distance of its points."""
+        return sigma_maps(self.adjusted)
+
+    # Tables ------------------------------------------------------------------------------------------------------
 
     @cached_property
     def interior(self) -> pd.DataFrame:
-        """camera, parameter, value, sigma, significant, unit; fixed parameters have no sigma, nor has any
-        that did not converge."""
-        return interior_table(self.adjusted, self.significance)
+        """camera, parameter, value, sigma, significant, unit; without sigma if fixed or not converged."""
+        tests = {(s.camera, s.parameter): s for s in self.significance}
+        rows = []
+        for camera, interior in self.adjusted.unknowns.interior.items():
+            for name in (*parameter_names(interior), *constant_names(interior)):
+                test = tests.get((camera, name))
+                tested = (test.sigma, test.significant) if test else (np.nan, None)
+                value = float(get_parameter(interior, name))
+                rows.append((camera, name, value, *tested, parameter_unit(interior, name)))
+        return pd.DataFrame(rows, columns=["camera", "parameter", "value", "sigma", "significant", "unit"])
 
     @cached_property
     def georeferencing(self) -> pd.DataFrame:
-        """parameter, value, sigma of what was estimated of scanner, mounts and strips; units stand in the names."""
+        """parameter, value, sigma of the estimated parameters of scanner, mounts and strips; units in the names."""
         s = self.adjusted.structure
         rows = []
-        for k, label, sigma in zip(s.free, s.labels, self._told(self.covariance.shared_sigma), strict=True):
+        for k, label, sigma in zip(s.free, s.labels, self._if_converged(self.covariance.shared_sigma), strict=True):
             if k >= s.n_cameras:
                 factor = 180 / np.pi if label.endswith(("_rad", "_rad_per_s")) else 1.0
                 value = float(self.adjusted.values.shared[k])
@@ -180,24 +195,30 @@ class Tables:
         return pd.DataFrame(rows, columns=["parameter", "value", "sigma"])
 
     @cached_property
-    def tested_drifts(self) -> list[CameraDrift]:
-        """Of every camera with estimated rates, whether it changed during the flight."""
-        return camera_drifts(self.adjusted, self.covariance)
-
-    @cached_property
     def camera_drift(self) -> pd.DataFrame:
-        """camera, along, span, parameter, change, sigma, p_value, detectable, unit: from end to end.
+        """camera, along, span, parameter, change (over the span), sigma, p_value, detectable (MDB), unit.
 
-        `p_value` and `detectable` (found with a probability of 80 %) are of a change of this parameter alone.
+        `span` is in the unit that ends `along`; `p_value` and `detectable` are of a change of this parameter alone.
         """
-        return camera_drift_table(self.tested_drifts)
+        units = {
+            name.split("_")[0]: unit_of(name).rpartition("per_")[0].removesuffix("_")
+            for rates in RATES
+            for (name,) in rates.names.values()
+        }
+        rows = [
+            (d.camera, d.rates.along, d.span, name, *numbers, units[name])
+            for d in self.tested_drifts
+            for name, *numbers in zip(d.parameters, *d.change[:4], strict=True)
+        ]
+        columns = ["camera", "along", "span", "parameter", "change", "sigma", "p_value", "detectable", "unit"]
+        return pd.DataFrame(rows, columns=columns)
 
     @cached_property
     def exterior(self) -> pd.DataFrame:
         """image, X_m ... kappa_deg and their sigmas."""
         exterior = self.adjusted.unknowns.exterior
         angles = angles_deg(np.asarray(exterior.camera_from_object))
-        sigma = self._told(self.covariance.exterior_sigma) * [1, 1, 1, *[180 / np.pi] * 3]
+        sigma = self._if_converged(self.covariance.exterior_sigma) * [1, 1, 1, *[180 / np.pi] * 3]
         names = ["X_m", "Y_m", "Z_m", "omega_deg", "phi_deg", "kappa_deg"]
         values = np.hstack([np.asarray(exterior.position), angles, sigma])
         table = pd.DataFrame(values, columns=[*names, *(f"sigma_{n}" for n in names)])
@@ -207,20 +228,31 @@ class Tables:
     @cached_property
     def exterior_map(self) -> pd.DataFrame:
         """image, position in the system of the block's files, and omega, phi, kappa against grid east, north and up."""
-        return exterior_map_table(self.adjusted)
+        exterior, system = self.adjusted.unknowns.exterior, self.adjusted.block.frame.map
+        position = np.asarray(exterior.position)
+        table = self._in_map(position)
+        camera_from_grid = np.asarray(exterior.camera_from_object) @ system.local_from_grid(position)
+        table[["omega_deg", "phi_deg", "kappa_deg"]] = angles_deg(camera_from_grid)
+        table.insert(0, "image", self.adjusted.block.images)
+        return table
 
     @cached_property
     def object_points_map(self) -> pd.DataFrame:
         """point and its coordinates in the system of the block's files."""
-        table = map_coordinates(self.adjusted, np.asarray(self.adjusted.unknowns.points))
+        table = self._in_map(np.asarray(self.adjusted.unknowns.points))
         table.insert(0, "point", self.adjusted.block.points)
         return table
 
+    def _in_map(self, local: Float[np.ndarray, "n 3"]) -> pd.DataFrame:
+        system = self.adjusted.block.frame.map
+        names = ["longitude_deg", "latitude_deg", "height_m"] if system.geographic else ["E_m", "N_m", "H_m"]
+        return pd.DataFrame(system.map(local), columns=names)
+
     @cached_property
     def object_points(self) -> pd.DataFrame:
-        """point, coordinates, sigmas, in how many images it was measured, the largest angle between two of its rays."""
+        """point, coordinates, sigmas, n_images, angle_deg (largest angle between two rays)."""
         names = [f"{a}_m" for a in AXES]
-        values = np.hstack([np.asarray(self.adjusted.unknowns.points), self._told(self.covariance.point_sigma)])
+        values = np.hstack([np.asarray(self.adjusted.unknowns.points), self._if_converged(self.covariance.point_sigma)])
         table = pd.DataFrame(values, columns=[*names, *(f"sigma_{n}" for n in names)])
         table.insert(0, "point", self.adjusted.block.points)
         table["n_images"] = np.bincount(self.adjusted.structure.point, minlength=len(table))
@@ -229,24 +261,93 @@ class Tables:
 
     @cached_property
     def residuals(self) -> pd.DataFrame:
-        """One row an observation: group, image, point, axis, residual, sigma, unit, redundancy_number, w, detectable,
+        """One row per observation: group, image, point, axis, residual, sigma, unit, redundancy_number, w, detectable,
         c_moves, xp_moves, yp_moves, most_moves.
 
-        `sigma` is a priori; `w` is the residual over its own standard deviation, sigma0 sigma sqrt(redundancy_number);
-        `detectable` is the least error in it alone that the test of w finds with a probability of 80 %, and the last
-        four by how many standard deviations that error moves c, x_p, y_p, and anything at most.
+        `sigma` is a priori; `w` is the normalised residual, v / (sigma0 sigma sqrt(r)); `detectable` is the minimal
+        detectable bias (power 80 %). The last four are the external reliability: how many standard deviations a bias of
+        one MDB moves c, x_p, y_p, and any unknown at most. Names are categories, and each column is built on its own,
+        because millions of observations would otherwise take ten times the memory.
         """
-        return residual_table(self.adjusted, self.redundancy, self.w, self.undetected)
+        adjusted, block, s = self.adjusted, self.adjusted.block, self.adjusted.structure
+        residual, sigma = physical_residuals(adjusted), a_priori_sigmas(adjusted)
+        detectable = minimal_detectable_biases(adjusted, self.redundancy)
+        labels = np.full(len(adjusted.values.shared), "", object)
+        labels[s.free] = s.labels
+        groups = {name: rows for name, rows in observation_groups(adjusted).items() if np.size(residual[name])}
+
+        def column(of: Callable[[str, AbstractObservations], Any]) -> np.ndarray:
+            # Rows run along the last axis; the components of a row stand together.
+            flat = (np.broadcast_to(of(g, rows), np.shape(residual[g])).T.ravel() for g, rows in groups.items())
+            return np.concatenate(list(flat))
+
+        def names(of: Callable[[str, AbstractObservations], Any]) -> pd.Categorical:
+            return pd.Categorical(column(lambda g, rows: np.asarray(of(g, rows), object)))
+
+        def numbers(values: Mapping[str, Numbers]) -> np.ndarray:
+            return column(lambda g, rows: values[g])
+
+        def in_units(values: Mapping[str, Numbers]) -> np.ndarray:
+            return column(lambda g, rows: in_file_unit(rows.unit)[0] * np.asarray(values[g]))
+
+        def axis(group: str, rows: AbstractObservations) -> np.ndarray:
+            axes = rows.axis_names()
+            return np.where(axes == "", rows.names_of("parameter", labels), axes)
+
+        columns = {
+            "group": names(lambda g, rows: g),
+            "image": names(lambda g, rows: rows.names_of("image", block.images)),
+            "point": names(lambda g, rows: rows.names_of("point", block.points)),
+            "axis": names(axis),
+            "residual": in_units(residual),
+            "sigma": in_units(sigma),
+            "unit": names(lambda g, rows: in_file_unit(rows.unit)[1]),
+            "redundancy_number": numbers(self.redundancy.named),
+            "w": numbers(self.w.named),
+            "detectable": in_units(detectable),
+            **{f"{p.removesuffix('_mm')}_moves": numbers(v) for p, v in self.undetected.interior.items()},
+            "most_moves": numbers(self.undetected.most),
+        }
+        return pd.DataFrame(columns, copy=False)
+
+    @cached_property
+    def trends(self) -> pd.DataFrame:
+        """One row per systematic effect: pattern, freedom (degrees of freedom), p_value, rms, unit; term, share,
+        amount and sigma of the term that explains most.
+
+        `rms` is the explained part of the residuals without noise, NaN if none.
+        """
+        rows = []
+        for t in self.tested_trends:
+            factor, unit = in_file_unit(t.pattern.unit)
+            best = t.hints[0][:4] if t.hints else None
+            term = (best[0].name, *best[1:]) if best else ("", np.nan, np.nan, np.nan)
+            rows.append((t.pattern.what, t.freedom, t.p_value, factor * t.size if t.size > 0 else np.nan, unit, *term))
+        columns = ["pattern", "freedom", "p_value", "rms", "unit", "term", "share", "amount", "sigma"]
+        return pd.DataFrame(rows, columns=columns)
+
+    @cached_property
+    def residual_spread(self) -> pd.DataFrame:
+        """group, axis, n, mean, rmse, max_abs, unit (paper 000, Table 3)."""
+        columns = ["group", "axis", "n", "mean", "rmse", "max_abs", "unit"]
+        return pd.DataFrame([[getattr(s, c) for c in columns] for s in residual_spread(self.adjusted)], columns=columns)
 
     @cached_property
     def check_points(self) -> pd.DataFrame:
-        """point, dX_m, dY_m, dZ_m: surveyed minus computed; sigma_dX_m, ...; empty where an axis was not surveyed."""
-        return check_point_table(self.adjusted, self.covariance)
+        """point; dX_m, dY_m, dZ_m (surveyed minus computed); sigma_dX_m, ... of survey and adjustment combined.
 
-    @cached_property
-    def tested_accuracy(self) -> PositionalAccuracy:
-        """Positional accuracy by the check points."""
-        return positional_accuracy(check_discrepancies(self.adjusted))
+        NaN where an axis was not surveyed.
+        """
+        rows = check_discrepancies(self.adjusted)
+        points = list(dict.fromkeys(rows.who.tolist()))
+        place = {p: k for k, p in enumerate(points)}
+        at = [place[p] for p in rows.who.tolist()], rows.axis
+        off, sigma = np.full((len(points), 3), np.nan), np.full((len(points), 3), np.nan)
+        off[at] = rows.value
+        sigma[at] = np.hypot(np.asarray(rows.sigma), np.asarray(self.covariance.point_sigma)[rows.who, rows.axis])
+        columns: dict[str, Any] = {"point": [self.adjusted.block.points[p] for p in points]}
+        columns |= {f"d{axis}_m": off[:, k] for k, axis in enumerate(AXES)}
+        return pd.DataFrame(columns | {f"sigma_d{axis}_m": sigma[:, k] for k, axis in enumerate(AXES)})
 
     @cached_property
     def positional_accuracy(self) -> pd.DataFrame:
@@ -260,55 +361,204 @@ class Tables:
         for camera, c in self.correlations.items():
             labels = [f"interior[{camera}].{p}" for p in c.parameters]
             rows += [(a, b, c.interior[i, j]) for i, a in enumerate(labels) for j, b in enumerate(labels) if i != j]
-            for image, rho, own in zip(c.images, c.exterior, c.within_image, strict=True):
+            for image, rho, within in zip(c.images, c.exterior, c.within_image, strict=True):
                 eop = [f"exterior[{image}].{name}" for name in c.eop_names]
                 rows += [(a, b, rho[i, j]) for i, a in enumerate(eop) for j, b in enumerate(labels)]
-                rows += [(a, b, own[i, j]) for i, a in enumerate(eop) for j, b in enumerate(eop) if i != j]
+                rows += [(a, b, within[i, j]) for i, a in enumerate(eop) for j, b in enumerate(eop) if i != j]
         return pd.DataFrame(rows, columns=["parameter_a", "parameter_b", "rho"])
 
     @cached_property
     def correlation_summary(self) -> pd.DataFrame:
         """camera, exterior, interior, mean_abs_rho, max_abs_rho over the camera's images (paper 000, Table 4)."""
-        return correlation_summary_table(self.correlations)
-
-    @cached_property
-    def ground_correlations(self) -> dict[str, GroundCorrelations]:
-        """By camera, how it goes with height and dome of the ground, as arrays."""
-        return ground_correlations(self.adjusted, self.covariance)
+        rows = [
+            (camera, name, parameter, c.mean_abs[i, j], c.max_abs[i, j])
+            for camera, c in self.correlations.items()
+            if c.images and c.parameters
+            for i, name in enumerate(c.eop_names)
+            for j, parameter in enumerate(c.parameters)
+        ]
+        return pd.DataFrame(rows, columns=["camera", "exterior", "interior", "mean_abs_rho", "max_abs_rho"])
 
     @cached_property
     def correlation_ground(self) -> pd.DataFrame:
         """camera, ground (height, flying_height, dome), sigma_m, parameter, rho; of the parameter `all` the multiple
-        correlation with all of the camera. Empty where photographs do not look down."""
-        return correlation_ground_table(self.ground_correlations)
-
-    @cached_property
-    def sigma_maps(self) -> dict[str, tuple[SigmaMap, SigmaMap]]:
-        """By camera that was estimated, at infinity and at the distance of its points, as arrays."""
-        return sigma_maps(self.adjusted)
+        correlation with all of the camera. Empty if the images do not look down."""
+        rows = [
+            (camera, form, g.sigma_m[k], parameter, rho)
+            for camera, g in self.ground_correlations.items()
+            for k, form in enumerate(FORMS)
+            for parameter, rho in zip((*g.parameters, "all"), (*g.rho[k], g.together[k]), strict=True)
+        ]
+        return pd.DataFrame(rows, columns=["camera", "ground", "sigma_m", "parameter", "rho"])
 
     @cached_property
     def sigma_map(self) -> pd.DataFrame:
-        """camera, distance_m (inf: a direction), x_mm, y_mm, sigma_x_px, sigma_y_px, worst_px; a row a cell."""
-        maps = (one for both in self.sigma_maps.values() for one in both)
-        return sigma_map_table(maps, self.adjusted.block.sensors)
+        """camera, distance_m (inf: a direction), x_mm, y_mm, sigma_x_px, sigma_y_px, worst_px; one row per cell."""
+        names = ["distance_m", "x_mm", "y_mm", "sigma_x_px", "sigma_y_px", "worst_px"]
+        frames = [pd.DataFrame({"camera": [], **dict.fromkeys(names, np.zeros(0))})]
+        for one in (one for both in self.sigma_maps.values() for one in both):
+            in_mm = np.column_stack([np.sqrt(np.diagonal(one.covariance, axis1=1, axis2=2)), one.worst])
+            sigma = in_mm / self.adjusted.block.sensors[one.camera].pixel_mm
+            rows = np.column_stack([np.full(len(sigma), one.distance_m), one.points, sigma])
+            frames.append(pd.DataFrame(rows, columns=names).assign(camera=one.camera))
+        return pd.concat(frames[1:] or frames, ignore_index=True)[["camera", *names]]
 
     @cached_property
     def convergence(self) -> pd.DataFrame:
-        """step, sigma0, length, damping, taken: a row a step, the last of how it ended."""
+        """step, sigma0, length, damping, bent, taken; the last row is the end of the iteration."""
         return convergence_table(self.adjusted)
 
     @cached_property
     def recovery(self) -> pd.DataFrame:
-        """parameter, estimate, truth, error, sigma, ratio: of a simulation, what was found beside what is true."""
+        """parameter, estimate, truth, error, sigma, ratio, unit of a simulation."""
         return recovery_table(self, self.truth or {})
-
-    @cached_property
-    def residual_spread(self) -> pd.DataFrame:
-        """group, axis, n, mean, rmse, max_abs, unit (paper 000, Table 3)."""
-        columns = ["group", "axis", "n", "mean", "rmse", "max_abs", "unit"]
-        return pd.DataFrame([[getattr(s, c) for c in columns] for s in residual_spread(self.adjusted)], columns=columns)
 
 
 def _is_table(member: object) -> bool:
     return isinstance(member, cached_property) and member.func.__annotations__["return"] is pd.DataFrame
+
+
+def angles_deg(camera_from_object: Float[np.ndarray, "images 3 3"]) -> Float[np.ndarray, "images 3"]:
+    """omega, phi, kappa (degrees)."""
+    return np.degrees(np.asarray(call_compiled(_angles, camera_from_object)))
+
+
+@eqx.filter_jit
+def _angles(camera_from_object):
+    return jax.vmap(omega_phi_kappa_from_matrix)(camera_from_object)
+
+
+def convergence_table(adjusted: Adjustment) -> pd.DataFrame:
+    """step, sigma0 before it, length (standard deviations), damping, bent, taken (yes, no); empty if unknown.
+
+    `length` bounds the move of every unknown in its standard deviations. `bent` is the fraction of the step that was
+    tried along its curve (geodesic acceleration), NaN for a straight step. The last row is the end.
+    """
+    course, redundancy = adjusted.course, max(adjusted.redundancy, 1)
+    if course is None:
+        return pd.DataFrame(columns=["step", "sigma0", "length", "damping", "bent", "taken"])
+    n = len(course.length)
+    # A very long iteration keeps its first steps; the end is known in any case.
+    end = n == int(adjusted.steps)
+    sums = np.append(course.square_sum, float(adjusted.square_sum)) if end else course.square_sum
+    columns = {
+        "step": pd.Series([*map(str, range(1, n + 1)), *(["end"] if end else [])]),
+        "sigma0": pd.Series(np.sqrt(sums / redundancy)),
+        "length": pd.Series(course.length),
+        "damping": pd.Series(course.damping),
+        "bent": pd.Series(np.where(course.bent > 0, course.bent, np.nan)),
+        "taken": pd.Series(np.where(course.accepted > 0, "yes", "no")),
+    }
+    return pd.DataFrame(columns).fillna({"taken": ""})
+
+
+def check_spread(check: pd.DataFrame) -> pd.DataFrame:
+    """axis, n, mean, rmse, max_abs, unit of the discrepancies at check points."""
+    values = check[[f"d{axis}_m" for axis in AXES]].set_axis(AXES, axis=1)
+    columns = {
+        "n": values.count(),
+        "mean": values.mean(),
+        "rmse": np.sqrt((values**2).mean()),
+        "max_abs": values.abs().max(),
+    }
+    return pd.DataFrame(columns).reset_index(names="axis").assign(unit="m")
+
+
+def accuracy_table(accuracy: PositionalAccuracy) -> pd.DataFrame:
+    """component, check_points, fit_m, survey_m, rmse_m (survey included), class_cm, claimed."""
+    columns = ["component", "check_points", "fit_m", "survey_m", "rmse_m", "class_cm", "claimed"]
+    rows = [(t.symbol, t.n, t.fit_m, t.survey_m, t.rmse_m, t.class_cm, t.claimed) for t in accuracy.tested]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def side_by_side(table: pd.DataFrame, rows: list[str], column: str, value: str) -> pd.DataFrame:
+    """Pivot a table of correlations for reading; the camera is dropped if there is only one."""
+    names = table[column].map(lambda name: symbol(name).replace("_", ""))
+    texts = table.assign(**{column: names, value: table[value].map("{:.3f}".format)})
+    wide = texts.pivot_table(value, rows, column, aggfunc="first", sort=False).fillna("").reset_index()
+    return wide if len(wide["camera"].unique()) > 1 else wide.drop(columns="camera")
+
+
+def with_correlated_sigma(interior: pd.DataFrame, adjusted: Adjustment, factor: float) -> pd.DataFrame:
+    """The interior orientations with the column `sigma_alike`: `sigma` for spatially correlated residuals.
+
+    The information of the rays is divided by `factor`^2, that of priors is not: with sigma s and prior p, the rays
+    alone give 1 / d^2 = 1 / s^2 - 1 / p^2, and `sigma_alike` combines p and `factor` d, parameter by parameter.
+    """
+    weights = []
+    for camera, parameter in interior[["camera", "parameter"]].itertuples(index=False):
+        prior = get_parameter(adjusted.block.priors.interior[camera], parameter)
+        weights.append(1 / float(prior.sigma) ** 2 if isinstance(prior, Weighted) else 0.0)
+    before, sigma = np.array(weights), interior["sigma"].to_numpy(float)
+    total = before + np.maximum(1 / sigma**2 - before, 0.0) / max(factor, 1.0) ** 2
+    scaled = np.where(total > 0, 1 / np.sqrt(np.where(total > 0, total, 1.0)), sigma)
+    return interior.assign(sigma_alike=np.where(np.isfinite(sigma), np.maximum(scaled, sigma), np.nan))
+
+
+# Recovery of a simulation: (estimate - truth) / sigma is standard normal if the model is right, except for the datum.
+
+# Tables with one column per quantity: the column of names, and the prefix of the labels.
+_WIDE = {"exterior": ("image", "exterior"), "object_points": ("point", "points")}
+_COLUMNS = ("parameter", "estimate", "truth", "sigma")
+
+
+def recovery_table(tables: Tables, truth: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """parameter, estimate, truth, error (estimate - truth), sigma, ratio (error / sigma), unit of all estimates.
+
+    `truth` are the tables of `jaxphoto.io.truth_tables(simulation)`, with columns as in the result tables. Quantities
+    that one side lacks are skipped.
+    """
+    frames = [_long(getattr(tables, name), truth[name]) for name in ("interior", "georeferencing") if name in truth]
+    frames += [_wide(getattr(tables, k), truth[k], *names) for k, names in _WIDE.items() if k in truth]
+    empty = pd.DataFrame({c: pd.Series([], dtype=str if c == "parameter" else float) for c in _COLUMNS})
+    rows = pd.concat([f for f in frames if len(f)] or [empty], ignore_index=True)
+    rows = rows[rows["sigma"] > 0].reset_index(drop=True)
+    error = rows["estimate"] - rows["truth"]
+    error = error.where(~rows["parameter"].str.endswith("_deg"), (error + 180) % 360 - 180)
+    cameras = tables.adjusted.unknowns.interior
+    units = [label_unit(label, cameras) for label in rows["parameter"]]
+    return rows.assign(error=error, ratio=error / rows["sigma"], unit=np.array(units, object))[
+        ["parameter", "estimate", "truth", "error", "sigma", "ratio", "unit"]
+    ]
+
+
+def recovery_spread(recovery: pd.DataFrame) -> pd.DataFrame:
+    """group, n, rms_ratio, beyond_2_sigma of a `recovery_table`: about 1 and 5 % where the model is right.
+
+    Groups are each camera, mount and strip, and each coordinate and angle of all images and of all points.
+    """
+    label = recovery["parameter"]
+    many = label.str.extract(r"^(exterior|points)\[.*\]\.(.+)$")
+    group = (many[0] + " " + many[1]).fillna(label.str.replace(r"\]\..*$", "]", regex=True))
+    grouped = recovery["ratio"].groupby(group, sort=False)
+    columns = {
+        "n": grouped.size(),
+        "rms_ratio": np.sqrt(grouped.apply(lambda r: float(np.mean(np.square(r))))),
+        "beyond_2_sigma": grouped.apply(lambda r: float(np.mean(np.abs(r) > 2))),
+    }
+    return pd.DataFrame(columns).reset_index(names="group")
+
+
+def _long(table: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
+    """Recovery of tables with one number per row: cameras, or mounts and strips."""
+    keys = [c for c in ("camera", "parameter") if c in table and c in truth]
+    both = table.merge(truth, on=keys, suffixes=("", "_true"))
+    label = both["parameter"]
+    if "camera" in both:
+        label = "interior[" + both["camera"].astype(str) + "]." + label
+    columns = {"parameter": label, "estimate": both["value"], "truth": both["value_true"], "sigma": both["sigma"]}
+    return pd.DataFrame(columns)
+
+
+def _wide(table: pd.DataFrame, truth: pd.DataFrame, key: str, prefix: str) -> pd.DataFrame:
+    """Recovery of tables with one row per image or point."""
+    names = [c for c in truth.columns if c != key]
+    both = table.assign(**{key: table[key].astype(str)}).merge(
+        truth.assign(**{key: truth[key].astype(str)}), on=key, suffixes=("", "_true")
+    )
+    label = np.array([f"{prefix}[{one}].{name}" for one in both[key] for name in names], object)
+    numbers = {
+        column: both[[pattern.format(n) for n in names]].to_numpy(float).ravel()
+        for column, pattern in (("estimate", "{}"), ("truth", "{}_true"), ("sigma", "sigma_{}"))
+    }
+    return pd.DataFrame({"parameter": label, **numbers})

@@ -1,42 +1,42 @@
-"""One screen of text: outcome, sigma naught, warnings first, then the interior orientation."""
+"""Terminal output: verdict, sigma naught, interior orientation, residuals."""
 
 import numpy as np
+import pandas as pd
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
-from jaxphoto.errors import printable
-from jaxphoto.report.check_points import check_spread
-from jaxphoto.report.digits import in_figures, of_p, of_sigma, with_sigma
-from jaxphoto.report.findings import MARKS, Level, Verdict
-from jaxphoto.report.recovery import recovery_spread
-from jaxphoto.report.tables import Tables
-from jaxphoto.statistics import residual_spread
+from jaxphoto.errors import counted, printable
+from jaxphoto.report.findings import MARKS, Verdict
+from jaxphoto.report.formatting import to_rich
+from jaxphoto.report.tables import Tables, check_spread, recovery_spread
+from jaxphoto.statistics import VarianceComponents
 
-_FINDINGS = 12
-_COLOURS = {Level.INFORMATION: "green", Level.WARNING: "yellow", Level.ALARM: "red"}
-_PARAMETERS = 18
-# Of more standard deviations nobody reads tenths.
-_MANY = 100
+_FINDINGS, _PARAMETERS = 12, 18
+_COLOURS = {"note": "green", "warning": "yellow", "error": "red"}
 
 
 def plain(text: str) -> Text:
-    """Names of files as they are: what is markup of rich's in them stays text."""
+    """Text without rich markup."""
     return Text(printable(text))
 
 
+def print_lines(lines, console: Console) -> None:
+    """Print sentences as they are, one per line."""
+    for line in lines:
+        console.print(plain(line), soft_wrap=True)
+
+
 def print_verdict(verdict: Verdict, console: Console) -> None:
-    """Print a verdict with its first reasons."""
-    console.print(Text(verdict.headline, f"bold {_COLOURS[verdict.level]}"))
+    """Print a verdict with its first findings."""
+    console.print(Text(verdict.headline, f"bold {_COLOURS[verdict.severity]}"))
     for finding in verdict.findings[:_FINDINGS]:
-        mark = Text(f"{MARKS[finding.level]} ", _COLOURS[finding.level])
-        console.print(mark + plain(finding.text))
-    if len(verdict.findings) > _FINDINGS:
-        console.print(f"and {len(verdict.findings) - _FINDINGS} more in report.html")
+        console.print(Text(f"{MARKS[finding.severity]} ", _COLOURS[finding.severity]) + plain(finding.text))
+    if (more := len(verdict.findings) - _FINDINGS) > 0:
+        console.print(f"and {more} more in report.html")
 
 
 def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None:
-    """Print the verdict on an adjustment with its reasons, and the interior orientation with its sigmas."""
+    """Print the verdict on an adjustment, sigma naught, interior orientation, residuals and check points."""
     adjusted = tables.adjusted
     n, u = sum(adjusted.n_observations.values()), sum(adjusted.n_unknowns.values())
     console.print(plain(adjusted.block.title or "block"), style="bold")
@@ -48,52 +48,35 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
         + f" - {u} unknowns"
     )
     if tables.significance:
-        table = Table(
-            "camera", "parameter", "value", "sigma", "unit", "|value| / sigma", "p",
-            title="interior orientation (a posteriori)",
-        )  # fmt: skip
-        for s in tables.significance:
-            table.add_row(
-                plain(s.camera),
-                plain(s.parameter),
-                with_sigma(s.value, s.sigma),
-                of_sigma(s.sigma),
-                s.unit,
-                f"{s.ratio:.0f}" if s.ratio > _MANY else f"{s.ratio:.1f}",
-                of_p(s.p_value),
-            )
-        console.print(table)
-    if len(tables.georeferencing):
-        table = Table("parameter", "value", "sigma", title="mounts and strips (a posteriori)")
-        for parameter, value, sigma in tables.georeferencing.head(_PARAMETERS).itertuples(index=False):
-            table.add_row(plain(parameter), with_sigma(value, sigma), of_sigma(sigma))
-        console.print(table)
-    spread = Table("group", "axis", "n", "RMSE", "maximum", "unit", title="residuals")
-    for v in residual_spread(adjusted):
-        spread.add_row(
-            v.group.replace("_", " "), v.axis, str(v.n), in_figures(v.rmse, 3), in_figures(v.max_abs, 3), v.unit
+        rows = [(s.camera, s.parameter, s.value, s.sigma, s.unit, s.ratio, s.p_value) for s in tables.significance]
+        table = pd.DataFrame(
+            rows, columns=["camera", "parameter", "value", "sigma", "unit", "value / sigma", "p_value"]
         )
-    console.print(spread)
-    if len(tables.check_points):
-        console.print(_check_points(tables))
+        console.print(to_rich(table, "interior orientation (a posteriori)"))
+    if len(tables.georeferencing):
+        console.print(to_rich(tables.georeferencing.head(_PARAMETERS), "mounts and strips (a posteriori)"))
+    console.print(to_rich(tables.residual_spread.drop(columns="mean"), "residuals"))
+    if len(points := tables.check_points):
+        spread = check_spread(points)
+        spread = spread[spread["n"] > 0].drop(columns="unit").rename(columns=lambda c: f"{c}_m" if c[0] in "mr" else c)
+        off = [(points[f"d{a}_m"], points[f"sigma_d{a}_m"]) for a in spread["axis"]]
+        spread["largest at"] = [str(points["point"].iloc[int(np.nanargmax(np.abs(d)))]) for d, _ in off]
+        spread["RMS / sigma"] = [f"{np.sqrt(np.nanmean((d / s) ** 2)):.2f}" for d, s in off]
+        console.print(to_rich(spread, "check points"))
     if tables.truth:
-        found = Table("group", "n", "rms ratio", "beyond 2 sigma", title="(estimate - truth) / sigma")
-        for group, n, ratio, beyond in recovery_spread(tables.recovery).itertuples(index=False):
-            found.add_row(plain(group), str(n), in_figures(ratio, 3), f"{beyond:.1%}")
-        console.print(found)
+        recovery = recovery_spread(tables.recovery)
+        recovery["beyond_2_sigma"] = recovery["beyond_2_sigma"].map("{:.1%}".format)
+        console.print(to_rich(recovery, "(estimate - truth) / sigma"))
 
 
-def _check_points(tables: Tables) -> Table:
-    """By how much check points are off, and that over what their standard deviations allow."""
-    points = tables.check_points
-    shown = Table("axis", "n", "mean m", "RMSE m", "maximum m", "of point", "rms / sigma", title="check points")
-    for axis, n, mean, rmse, most, _ in check_spread(points).itertuples(index=False):
-        if n:
-            off, sigma = points[f"d{axis}_m"].to_numpy(), points[f"sigma_d{axis}_m"].to_numpy()
-            farthest = plain(str(points["point"].iloc[np.nanargmax(np.abs(off))]))
-            ratio = np.sqrt(np.nanmean((off / sigma) ** 2))
-            shown.add_row(axis, str(n), *(in_figures(v, 3) for v in (mean, rmse, most)), farthest, f"{ratio:.2f}")
-    return shown
+def print_components(components: VarianceComponents, console: Console) -> None:
+    """Print the variance component of each group."""
+    c = components
+    console.print(f"variance components, adjusted with them ({counted(c.iterations, 'iteration')}):")
+    for k, label in enumerate(c.labels):
+        factor = f"standard deviations x {c.factor[k] ** 0.5:.3g}, variances x {c.factor[k]:.3g} +- {c.sigma[k]:.2g}"
+        size = f"({counted(c.observations[k], 'observation')}, redundancy {c.redundancy[k]:.1f})"
+        console.print(plain(f"  {label}: {factor if c.supported[k] else 'as stated'} {size}"), soft_wrap=True)
 
 
 def print_warning(warning: str, console: Console, **options) -> None:

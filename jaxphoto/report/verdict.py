@@ -1,10 +1,8 @@
-"""What a person should know first: findings about an adjustment, the worst first, each with what to do.
+"""The verdict on an adjustment: findings by tests of convergence, residuals, geometry and reliability."""
 
-Red, amber or green follows from tests, not from convergence: of sigma naught as a whole and by group, of every
-normalised residual, of patterns in them (`residual_findings`), of what the geometry leaves open.
-"""
-
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,75 +10,80 @@ import numpy as np
 
 from jaxphoto.adjustment import POOR, Adjustment, weaknesses_of, yardsticks
 from jaxphoto.block import Block
-from jaxphoto.camera import Sensor
+from jaxphoto.camera import RollingShutter, Sensor, ThermalRates, get_parameter
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words, few
+from jaxphoto.initial.approximate import in_front, looking_away
 from jaxphoto.procedures.adjust import left_out_words
-from jaxphoto.report.behind import behind_findings
-from jaxphoto.report.camera_drift import drift_findings
-from jaxphoto.report.doubled import doubled_findings
-from jaxphoto.report.findings import Finding, Level, Verdict, symbol
-from jaxphoto.report.ground import ground_findings
-from jaxphoto.report.residual_findings import (
-    NOTHING_FITS,
-    of_residuals,
-    of_stretched_residuals,
-    of_what_is_not_checked,
-)
-from jaxphoto.report.rolling_shutter import shutter_findings
+from jaxphoto.report.findings import Finding, Severity, Verdict, p_words, symbol
+from jaxphoto.report.formatting import of_sigma, plus_minus
+from jaxphoto.report.residual_findings import NOTHING_FITS, reliability_findings, residual_findings, stretch_findings
 from jaxphoto.report.tables import Tables
-from jaxphoto.report.weakness import FELT, at_corner, weaknesses
-from jaxphoto.statistics import Correlations, Significance, if_zero, prepare_responses
-from jaxphoto.statistics.correlation import high_pairs
+from jaxphoto.statistics import (
+    SIGNIFICANCE_LEVEL,
+    CameraDifferences,
+    CameraDrift,
+    Correlations,
+    Significance,
+    ZeroTest,
+    camera_spline_differences,
+    fix_at_zero,
+    prepare_hat_matrix,
+    strip_differences,
+)
+from jaxphoto.statistics.correlation import FORMS, high_pairs
+from jaxphoto.unknowns import FIXED, Weighted
 
 HIGH_CORRELATION = 0.9
 HIGH_OWN_CORRELATION = 0.95
-# What tells a parameter of a camera from the exterior orientation of its images.
-_OF_POINT = "strips in both directions with stations (GNSS), relief or oblique images"
+WEAK_CORRELATION = 0.9
+FLAT = 0.2
+"""Height range over flying height below which the ground is nearly flat."""
+NEAR_VERTICAL_DEG = 15.0
+FELT = 10.0
+"""Standard deviations of an image point by which an interior parameter may move the corner of the image.
+
+Half of `adjustment.POOR`: up to here GNSS calls a dilution of precision moderate. Well-determined blocks over flat
+ground stay below 8, undetermined ones begin at 15 (benchmarks/defects.py).
+"""
+SEEN = 3.0
+"""Standard deviations from which on a rolling-shutter readout is significant."""
+_FOR_POINT = "strips in both directions with stations (GNSS), relief or oblique images"
 _CURES = {
     "c_mm": "stations (GNSS) that do not shift, relief, a second flying height or oblique images",
-    "xp_mm": _OF_POINT,
-    "yp_mm": _OF_POINT,
+    "xp_mm": _FOR_POINT,
+    "yp_mm": _FOR_POINT,
 }
-_OF_DISTORTION = "image points towards the corners, more overlap or cross strips"
-_OF_A_FIELD = "photographs turned by 90 degrees about the line of sight, and tilted ones"
+_FOR_DISTORTION = "image points towards the corners, more overlap or cross strips"
+_FOR_FIELD = "images rotated by 90 degrees about the line of sight, and tilted ones"
+# Rows of the correlations: positions, then rotations.
+_PLAN, _HEIGHT, _TILTS = slice(0, 2), slice(2, 3), slice(3, 5)
+_C, _POINT = ("c_mm",), ("xp_mm", "yp_mm")
 
 
 def verdict_of(tables: Tables) -> Verdict:
-    """Convergence, sigma naught, blunders, weaknesses, high correlations, what may be zero, what no test finds."""
+    """Judge an adjustment: convergence, residuals, weak geometry, correlations, significance, reliability."""
     return Verdict.of(_findings(tables))
 
 
 def _findings(tables: Tables) -> Iterator[Finding]:
     adjusted = tables.adjusted
     if not bool(adjusted.converged):
-        yield Finding(Level.ALARM, adjusted.outcome.value)
-        if names := [adjusted.block.points[p] for p in np.flatnonzero(adjusted.astray)]:
-            yield Finding(Level.ALARM, f"gone astray: point {few(names)}")
-        # Observations that fit one another where it stopped: then it is no bad start, but what the block cannot tell.
-        if float(adjusted.sigma0) <= NOTHING_FITS:
-            yield from (Finding(Level.ALARM, w.sentence) for w in weaknesses_of(adjusted))
-        elif np.isfinite(adjusted.sigma0):
-            yield Finding(
-                Level.ALARM,
-                f"nothing fits where it stopped (sigma naught {float(adjusted.sigma0):.3g}): approximate values, "
-                "units, axes or names are wrong; jaxphoto adjust --snoop looks for what contradicts the others, and "
-                "says which mistake of a file it is",
-            )
-        # Nothing that is said of an optimum holds elsewhere.
+        yield from _not_converged(adjusted)
+        # Statistics hold at an optimum only.
         return
-    prepare_responses(adjusted.equations, adjusted.seconds)
-    yield from (Finding(Level.WARNING, doubt) for doubt in adjusted.block.doubts)
+    prepare_hat_matrix(adjusted.equations, adjusted.seconds)
+    yield from (Finding("prior_information", "warning", doubt) for doubt in adjusted.block.doubts)
     if adjusted.left_out:
-        yield Finding(Level.WARNING, left_out_words(adjusted))
+        yield Finding("rejected", "warning", left_out_words(adjusted))
     yield from behind_findings(adjusted)
-    yield from doubled_findings(adjusted.block)
-    yield from of_residuals(tables)
+    yield from duplicate_findings(adjusted.block)
+    yield from residual_findings(tables)
     of_cameras = {camera: weaknesses(tables, camera, c) for camera, c in tables.correlations.items()}
     yield from _weak(tables, frozenset().union(*(w.labels for weak in of_cameras.values() for w in weak)))
     for camera, c in tables.correlations.items():
         weak = of_cameras[camera]
-        yield from (Finding(Level.WARNING, w.sentence) for w in weak)
+        yield from (w.finding for w in weak)
         explained = frozenset().union(*(w.explains for w in weak))
         felt = {name for name, moved in at_corner(tables, camera).items() if moved > FELT}
         yield from _correlated(camera, c, explained, felt, _all_known(adjusted.block))
@@ -89,18 +92,173 @@ def _findings(tables: Tables) -> Iterator[Finding]:
     yield from drift_findings(tables)
     yield from (_not_significant(tables, s) for s in tables.significance if not s.significant)
     for name, sensor in adjusted.block.sensors.items():
-        if _folds(adjusted, name, sensor):
-            yield Finding(
-                Level.WARNING,
-                f"{camera_words(name)}: its distortion folds inside the format; image points beyond the fold mean "
-                "nothing, use fewer coefficients or more points in the corners",
-            )
-    yield from of_what_is_not_checked(tables)
-    yield from of_stretched_residuals(adjusted)
+        if not _invertible(adjusted, name, sensor):
+            hint = "Estimate fewer coefficients or measure more points in the corners"
+            yield Finding("distortion_not_invertible", "warning", camera_words(name), hint=hint)
+    yield from reliability_findings(tables)
+    yield from stretch_findings(adjusted)
 
 
-def _weak(tables: Tables, told: frozenset[str]) -> Iterator[Finding]:
-    """What gives way by more than `POOR`, but for interior orientations that are `told` already."""
+def _not_converged(adjusted: Adjustment) -> Iterator[Finding]:
+    yield Finding("not_converged", "error", adjusted.outcome.value)
+    if names := [adjusted.block.points[p] for p in np.flatnonzero(adjusted.astray)]:
+        yield Finding("diverged_points", "error", few(names), len(names), hint="Check their image measurements")
+    sigma0 = float(adjusted.sigma0)
+    # Where the observations fit at the stop, it is no bad start but a direction the block does not determine.
+    if sigma0 <= NOTHING_FITS:
+        yield from (Finding("undetermined", "error", w.sentence) for w in weaknesses_of(adjusted))
+    elif np.isfinite(sigma0):
+        hint = "jaxphoto adjust --snoop looks for observations that contradict the others, and for mistakes of files"
+        yield Finding("nothing_fits", "error", value=sigma0, limit=NOTHING_FITS, hint=hint)
+
+
+def behind_findings(adjusted: Adjustment) -> Iterator[Finding]:
+    """Images that look away from their points, and single points behind images."""
+    block = adjusted.block
+    rows, seen = block.image_points, in_front(block, adjusted.unknowns)
+    away = looking_away(block, seen)
+    if names := [block.images[k] for k in away]:
+        hint = (
+            "It is mirrored: x and y of its image points are exchanged or one of them has the wrong sign; if this "
+            "holds for all images, the vertical direction is wrong"
+        )
+        yield Finding("mirrored_image", "error", few(names), len(names), hint=hint)
+    behind = np.flatnonzero(~seen & ~np.isin(rows.image, away))
+    if len(behind):
+        names = [f"{block.points[rows.point[k]]} in {block.images[rows.image[k]]}" for k in behind]
+        hint = "Their rays are nearly parallel or wrong: remove them"
+        yield Finding("points_behind", "warning", few(names), len(names), hint=hint)
+
+
+def duplicate_images(block: Block) -> list[tuple[str, str, int]]:
+    """Pairs of images of which most image points are equal to a tenth of their sigma, and the number of these."""
+    least_count, least_fraction, tolerance = 4, 0.5, 0.1
+    rows = block.image_points
+    x, y = np.asarray(rows.xy).T
+    order = np.lexsort([rows.image, y, x, rows.point])
+    near = tolerance * np.asarray(rows.sigma).min(axis=1)[order][1:]
+    point, image, x, y = (v[order] for v in (rows.point, rows.image, x, y))
+    equal = (point[1:] == point[:-1]) & (image[1:] != image[:-1]) & (np.diff(x) <= near) & (abs(np.diff(y)) <= near)
+    pairs, count = np.unique(np.sort(np.stack([image[1:], image[:-1]])[:, equal], axis=0), axis=1, return_counts=True)
+    n_points = np.bincount(rows.image, minlength=len(block.images))
+    enough = (count >= least_count) & (count > least_fraction * n_points[pairs].max(axis=0))
+    return [
+        (block.images[a], block.images[b], int(n)) for (a, b), n in zip(pairs.T[enough], count[enough], strict=True)
+    ]
+
+
+def duplicate_findings(block: Block) -> Iterator[Finding]:
+    """The first pair of duplicate images, and the number of further ones."""
+    if pairs := duplicate_images(block):
+        one, other, n = pairs[0]
+        others = f"; {len(pairs) - 1} further pairs" if len(pairs) > 1 else ""
+        hint = "Delete one of each pair: counted twice, it makes standard deviations too small"
+        subject = f"{one} and {other}"
+        yield Finding("duplicate_images", "warning", subject, n, hint=hint, numbers={"others": others})
+
+
+# Weak geometry ---------------------------------------------------------------------------------------------------
+
+
+class Weakness(NamedTuple):
+    """A poorly determined interior parameter, and the (exterior, interior) pairs whose correlation it explains."""
+
+    finding: Finding
+    explains: frozenset[tuple[str, str]]
+    labels: frozenset[str]
+    """Paths of its parameters."""
+
+
+def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
+    """Interior parameters that near-vertical images over flat ground do not determine.
+
+    There, a longer principal distance and a higher flight give the same images, and so do a shifted principal point and
+    a shifted, tilted camera. The criteria are a correlation above `WEAK_CORRELATION` with the exterior orientation and
+    a sigma that moves the corner of the image by more than `FELT` sigmas of an image point (docs/statistics.md).
+    """
+    adjusted = tables.adjusted
+    images = np.flatnonzero(np.array(adjusted.block.image_camera) == camera)
+    relief, tilt_deg = _geometry(adjusted, images)
+    if not (relief < FLAT and tilt_deg < NEAR_VERTICAL_DEG):
+        return []
+    geometry = f"nearly flat ground (relief {100 * relief:.0f} % of the flying height) in near-vertical images"
+    sigma = {s.parameter: s.sigma for s in tables.significance if s.camera == camera}
+    corner, words, found = at_corner(tables, camera), camera_words(camera), []
+
+    def add(code: str, parameters: tuple[str, ...], value: float, hint: str, numbers: dict[str, Any]) -> None:
+        finding = Finding(code, "warning", words, value, hint=hint, numbers={"geometry": geometry, **numbers})
+        pairs = frozenset((e, p) for e in c.eop_names for p in c.parameters if p in parameters)
+        found.append(Weakness(finding, pairs, frozenset(f"interior[{camera}].{name}" for name in parameters)))
+
+    rho = _strongest(c, _HEIGHT, _C)
+    if rho > WEAK_CORRELATION and corner["c_mm"] > FELT:
+        why, cure = _stations(adjusted, images, (2,))
+        percent = 100 * sigma["c_mm"] / float(adjusted.unknowns.interior[camera].c)
+        hint = f"{cure}, relief, a second flying height or oblique images, or hold c fixed"
+        add("c_weak", _C, sigma["c_mm"], hint, {"percent": percent, "rho": rho, "why": why})
+    tilt, shift = _strongest(c, _TILTS, _POINT), _strongest(c, _PLAN, _POINT)
+    moved = max((corner[name] for name in _POINT if name in corner), default=0.0)
+    if max(tilt, shift) > WEAK_CORRELATION and moved > FELT:
+        why, cure = _stations(adjusted, images, (0, 1))
+        sigmas = ", ".join(f"sigma of {symbol(name)} {sigma[name]:.3g} mm" for name in _POINT if name in sigma)
+        hint = f"{cure} with strips in both directions, relief or oblique images, or hold it fixed"
+        numbers = {"sigmas": sigmas, "tilts": " and ".join(c.eop_names[_TILTS]), "tilt": tilt, "shift": shift}
+        add("principal_point_weak", _POINT, max(sigma.get(n, 0.0) for n in _POINT), hint, {**numbers, "why": why})
+    return found
+
+
+def at_corner(tables: Tables, camera: str) -> dict[str, float]:
+    """Shift of the image corner by one sigma of each estimated parameter, in sigmas of an image point.
+
+    c acts along the radius, the principal point directly; coefficients are in yardsticks (`adjustment.yardsticks`).
+    """
+    adjusted = tables.adjusted
+    sensor, rows = adjusted.block.sensors[camera], adjusted.block.image_points
+    mine = np.isin(adjusted.structure.image, np.flatnonzero(np.array(adjusted.block.image_camera) == camera))
+    measured = float(np.median(np.asarray(rows.sigma)[mine])) if mine.any() else 1.0
+    tangent = np.hypot(sensor.width_mm, sensor.height_mm) / 2 / float(adjusted.unknowns.interior[camera].c)
+    units = dict(zip(adjusted.structure.labels, yardsticks(adjusted).shared.tolist(), strict=True))
+    units |= {f"interior[{camera}].c_mm": measured / tangent}
+    units |= {f"interior[{camera}].{name}": measured for name in _POINT}
+    own = [s for s in tables.significance if s.camera == camera]
+    return {s.parameter: s.sigma / units[f"interior[{camera}].{s.parameter}"] for s in own}
+
+
+def _geometry(adjusted: Adjustment, images: np.ndarray) -> tuple[float, float]:
+    """Relief over flying height, and the largest tilt (degrees); infinite if the images do not look down."""
+    rows = adjusted.structure
+    seen = np.unique(rows.point[np.isin(rows.image, images)])
+    heights = np.asarray(adjusted.unknowns.points)[seen, 2]
+    flying = np.asarray(adjusted.unknowns.exterior.position)[images, 2].mean() - heights.mean() if len(seen) else 0.0
+    if not flying > 0:
+        return math.inf, math.inf
+    axis = np.asarray(adjusted.unknowns.exterior.camera_from_object)[images][:, 2, 2]
+    return float(np.ptp(heights) / flying), float(np.degrees(np.arccos(np.clip(axis, -1.0, 1.0))).max())
+
+
+def _stations(adjusted: Adjustment, images: np.ndarray, axes: tuple[int, ...]) -> tuple[str, str]:
+    """Why stations on `axes` do not separate the interior orientation, and the cure."""
+    block, priors = adjusted.block, adjusted.priors
+    rows = np.isin(block.stations.who, images) & np.isin(block.stations.axis, axes)
+    observed = np.unique(block.stations.who[rows]).tolist()
+    if not observed:
+        return "no station separates them", "Add camera stations (GNSS)"
+    loose = {name for name, bias in priors.strips.items() if bias.shift != FIXED}
+    swung = {name for name, mount in priors.mounts.items() if mount.lever_arm != FIXED}
+    if all(block.image_strip[i] in loose or block.image_mount[i] in swung for i in observed):
+        why = "stations separate them only as well as their shifts and lever arms are known"
+        return why, "Hold these fixed, or add camera stations (GNSS) that do not shift"
+    sigma = float(np.median(np.asarray(block.stations.sigma)[rows]))
+    return f"stations of sigma {sigma:.2g} m hardly separate them", "Add better camera stations (GNSS)"
+
+
+def _strongest(c: Correlations, rows: slice, parameters: tuple[str, ...]) -> float:
+    columns = [k for k, name in enumerate(c.parameters) if name in parameters]
+    return float(c.max_abs[rows][:, columns].max(initial=0.0)) if len(c.images) else 0.0
+
+
+def _weak(tables: Tables, reported: frozenset[str]) -> Iterator[Finding]:
+    """Unknowns with a sigma above `POOR` yardsticks, except interior orientations `reported` already."""
     adjusted, q = tables.adjusted, tables.covariance
     yard, a_priori = yardsticks(adjusted), 1 / np.sqrt(float(q.variance_factor))
     in_yardsticks = (
@@ -110,90 +268,225 @@ def _weak(tables: Tables, told: frozenset[str]) -> Iterator[Finding]:
         q.shared_sigma / yard.shared,
     )
     if max(a_priori * np.max(v, initial=0.0) for v in in_yardsticks) > POOR:
-        found = weaknesses_of(adjusted)
-        yield from (Finding(Level.WARNING, w.sentence) for w in found if not w.labels & told)
+        weak = (w for w in weaknesses_of(adjusted) if not w.labels & reported)
+        yield from (Finding("undetermined", "warning", w.sentence) for w in weak)
+
+
+# Correlations and significance -----------------------------------------------------------------------------------
 
 
 def _not_significant(tables: Tables, s: Significance) -> Finding:
-    """What holding a parameter at zero would change, for whoever wants fewer of them."""
-    adjusted = tables.adjusted
-    change = if_zero(adjusted, tables.covariance, s)
-    sensor = adjusted.block.sensors[s.camera]
+    """The effect of holding an insignificant parameter at zero."""
+    change, sensor = fix_at_zero(tables.adjusted, tables.covariance, s), tables.adjusted.block.sensors[s.camera]
     others = {name: abs(v) for name, v in change.in_sigmas.items() if name != s.parameter}
     most = max(others, key=lambda name: others[name], default="")
-    moved = f"{symbol(most)} by {others[most]:.1f} of its sigma and " if most else ""
-    pixels = f"{change.corner_mm / sensor.pixel_mm:.2g} px"
-    return Finding(
-        Level.INFORMATION,
-        f"{symbol(s.parameter)} of {camera_words(s.camera)} may be zero (p = {s.p_value:.2g}); held there, it would "
-        f"move {moved}the corner of the image by {pixels}",
-    )
+    moved = f"{symbol(most)} by {others[most]:.1f} sigma and " if most else ""
+    effect = f"{moved}the corner of the image by {change.corner_mm / sensor.pixel_mm:.2g} px"
+    subject = f"{symbol(s.parameter)} of {camera_words(s.camera)}"
+    return Finding("not_significant", "note", subject, s.p_value, SIGNIFICANCE_LEVEL, numbers={"effect": effect})
 
 
 def _all_known(block: Block) -> bool:
-    """Whether all points are known beforehand: a field of targets."""
+    """True if all points are known in advance: a field of targets."""
     return len(np.union1d(block.control.who, block.fixed.who)) == len(block.points)
 
 
 def _correlated(
     camera: str, c: Correlations, explained: frozenset[tuple[str, str]], felt: set[str], field: bool
 ) -> Iterator[Finding]:
-    """High correlations, but for the pairs of exterior and interior orientation that are `explained` already.
+    """High correlations, except pairs that are `explained` already.
 
-    They are a reservation where a parameter is so badly known that images feel it (`felt`), else to be known. What
-    cures them depends on the parameter, and on whether all images show a `field` of known targets.
+    A warning where the images feel the parameter (`felt`), otherwise a note. The cure depends on the parameter and on
+    whether all images show a `field` of known targets.
     """
-    usual = "usual without camera stations or attitudes, their effects on the ground cancel"
-    if field:
-        usual = "usual where targets alone orient an image, their effects on it cancel"
-    pairs = high_pairs(c.parameters, c.interior, HIGH_CORRELATION)
-    if pairs:
-        names = few([f"{symbol(a)} and {symbol(b)} {rho:+.3f}" for a, b, rho in pairs])
-        yield Finding(
-            Level.INFORMATION,
-            f"high correlation within the interior orientation of {camera_words(camera)}: {names}; a change of one "
-            "makes good for the other, and only together they mean much",
-        )
+    subject = camera_words(camera)
+
+    def finding(code: str, severity: Severity, value: float, pairs: Sequence[str], hint: str = "", **more: str):
+        numbers = {"pairs": few(pairs), **more}
+        limit = HIGH_OWN_CORRELATION if code == "correlation_image" else HIGH_CORRELATION
+        return Finding(code, severity, subject, value, limit, hint, numbers)
+
+    if pairs := high_pairs(c.parameters, c.interior, HIGH_CORRELATION):
+        names = [f"{symbol(a)} and {symbol(b)} {rho:+.3f}" for a, b, rho in pairs]
+        yield finding("correlation_interior", "note", pairs[0][2], names)
     if len(c.images) == 0:
         return
-    told = [[(e, p) in explained for p in c.parameters] for e in c.eop_names]
-    worst = np.where(np.reshape(told, c.max_abs.shape), 0.0, c.max_abs)
+    known = [[(e, p) in explained for p in c.parameters] for e in c.eop_names]
+    worst = np.where(np.reshape(known, c.max_abs.shape), 0.0, c.max_abs)
     high = sorted(np.argwhere(worst > HIGH_CORRELATION).tolist(), key=lambda k: -worst[k[0], k[1]])
     if high:
         images = [c.images[int(np.abs(c.exterior[:, i, j]).argmax())] for i, j in high]
-        where = zip(high, images, strict=True)
-        names = few(
-            [f"{c.eop_names[i]} with {symbol(c.parameters[j])} {worst[i, j]:.3f} (image {k})" for (i, j), k in where]
-        )
-        open_ = [p for p in dict.fromkeys(c.parameters[j] for _, j in high) if p in felt]
-        cures = [_OF_A_FIELD] if field else list(dict.fromkeys(_CURES.get(p, _OF_DISTORTION) for p in open_))
-        said = (
-            f"add {', or '.join(cures)}"
-            if open_
-            else f"what is open moves no corner of an image by {FELT:g} of its sigmas"
-        )
-        yield Finding(
-            Level.WARNING if open_ else Level.INFORMATION,
-            f"high correlation of exterior with interior orientation of {camera_words(camera)}: {names}; {said}",
-        )
+        names = [
+            f"{c.eop_names[i]} with {symbol(c.parameters[j])} {worst[i, j]:.3f} (image {image})"
+            for (i, j), image in zip(high, images, strict=True)
+        ]
+        weak = [p for p in dict.fromkeys(c.parameters[j] for _, j in high) if p in felt]
+        cures = [_FOR_FIELD] if field else list(dict.fromkeys(_CURES.get(p, _FOR_DISTORTION) for p in weak))
+        hint = f"Add {', or '.join(cures)}" if weak else f"Its uncertainty moves no image corner by {FELT:g} sigma"
+        severity: Severity = "warning" if weak else "note"
+        yield finding("correlation_exterior", severity, float(worst.max()), names, hint)
     own = np.abs(c.within_image).max(axis=0)
     strong = [(own[i, j], i, j) for i in range(6) for j in range(i) if own[i, j] > HIGH_OWN_CORRELATION]
     if strong:
-        names = few([f"{c.eop_names[j]} and {c.eop_names[i]} (up to {r:.3f})" for r, i, j in sorted(strong)[::-1]])
-        yield Finding(
-            Level.INFORMATION, f"exterior orientation of single images is highly correlated: {names}; {usual}"
-        )
+        names = [f"{c.eop_names[j]} and {c.eop_names[i]} (up to {r:.3f})" for r, i, j in sorted(strong)[::-1]]
+        reason = "usual without camera stations or attitudes, their effects on the ground cancel"
+        if field:
+            reason = "usual where targets alone orient an image, their effects cancel"
+        yield finding("correlation_image", "note", max(strong)[0], names, reason=reason)
 
 
-def _folds(adjusted: Adjustment, name: str, sensor: Sensor) -> bool:
-    """Whether the corner of the format lies beyond the monotone range of the adjusted distortion."""
-    interior = adjusted.unknowns.interior[name]
+def ground_findings(tables: Tables) -> Iterator[Finding]:
+    """Correlation of c with heights, and of the camera with doming of the ground."""
+    flown, dome = len(tables.adjusted.block.stations.who) > 0, FORMS.index("dome")
+    for camera, g in tables.ground_correlations.items():
+        sigma = tables.interior[tables.interior["camera"] == camera].set_index("parameter")["sigma"]
+        if "c_mm" in g.parameters:
+            rho = g.rho[:2, g.parameters.index("c_mm")]
+            k = int(np.abs(rho).argmax())
+            # Without stations nobody flies, or the flying height is of no interest.
+            height = flown or k == 0
+            above = "the flying height over the ground" if height else "the distance of the images from the points"
+            numbers = {
+                "what": "the height of the ground" if k == 0 else above, "length": "height" if height else "distance",
+                "sigma": sigma["c_mm"], "effect": abs(rho[k]) * g.sigma_m[k],
+            }  # fmt: skip
+            if abs(rho[k]) > HIGH_CORRELATION:
+                hint = (
+                    "Known heights on the ground, another flying height or oblique images separate them"
+                    if flown
+                    else "Images from other distances, or tilted ones, separate them"
+                )
+                words = camera_words(camera)
+                yield Finding("ground_c", "note", words, float(rho[k]), HIGH_CORRELATION, hint, numbers)
+        if (rho_dome := float(g.together[dome])) > HIGH_CORRELATION:
+            hint = "Control in the middle and at the edge, oblique images or cross strips separate them"
+            numbers = {"effect": g.sigma_m[dome]}
+            yield Finding("ground_dome", "note", camera_words(camera), rho_dome, HIGH_CORRELATION, hint, numbers)
+
+
+def _invertible(adjusted: Adjustment, name: str, sensor: Sensor) -> bool:
+    """True if the corner of the format lies within the monotonic range of the distortion."""
     corner = np.array([sensor.width_mm, sensor.height_mm]) / 2
     r = np.linspace(0.0, 1.0, 65)[:, None] * corner
-    out = np.asarray(call_compiled(_closed_form, interior, r))
-    return bool((np.diff(np.linalg.norm(out, axis=1)) <= 0).any())
+    out = np.asarray(call_compiled(_closed_form, adjusted.unknowns.interior[name], r))
+    return not bool((np.diff(np.linalg.norm(out, axis=1)) <= 0).any())
 
 
 @eqx.filter_jit
 def _closed_form(interior, xy):
     return jax.vmap(interior.closed_form)(xy)
+
+
+# Priors, rolling shutter, drift ----------------------------------------------------------------------------------
+
+
+def lens_findings(tables: Tables) -> Iterator[Finding]:
+    """Adjusted c compared with its prior; a warning if the block hardly adds to the prior."""
+    adjusted, little = tables.adjusted, 0.7
+    if not bool(adjusted.converged):
+        return
+    interior = tables.interior.set_index(["camera", "parameter"])
+    for camera, priors in adjusted.block.priors.interior.items():
+        prior = get_parameter(priors, "c_mm")
+        value, sigma = (float(interior[column][camera, "c_mm"]) for column in ("value", "sigma"))
+        if not isinstance(prior, Weighted) or not np.isfinite(sigma):
+            continue
+        known, words = float(prior.sigma), camera_words(camera)
+        if sigma > little * known:
+            hint = "Another flying height, oblique images or known heights on the ground would determine it"
+            yield Finding("lens_prior_only", "warning", words, sigma, known, hint)
+        else:
+            change = value - float(prior.value)
+            numbers = {"change": change, "ratio": abs(change) / known}
+            yield Finding("lens_prior", "note", words, sigma, known, numbers=numbers)
+
+
+def readout_of(camera: str) -> str:
+    """The parameter name of a camera's rolling-shutter readout."""
+    return f"{RollingShutter.kind}[{camera}].readout_ms"
+
+
+def shutter_findings(tables: Tables) -> Iterator[Finding]:
+    """The estimated readout of every rolling shutter, and whether it is significant."""
+    table = tables.georeferencing
+    for label, value, sigma in table[table["parameter"].str.startswith(f"{RollingShutter.kind}[")].to_numpy():
+        words = camera_words(label.split("[", 1)[1].rsplit("]", 1)[0])
+        if abs(value) < SEEN * sigma:
+            yield Finding("no_rolling_shutter", "note", words, value, SEEN * sigma, numbers={"sigma": sigma})
+        else:
+            numbers = {"sigma": sigma, "order": "first row first" if value > 0 else "last row first"}
+            yield Finding("rolling_shutter", "note", words, abs(value), SEEN * sigma, numbers=numbers)
+
+
+def drift_findings(tables: Tables) -> Iterator[Finding]:
+    """Changes of cameras with estimated rates or splines, and differences between strips."""
+    yield from map(drift_finding, tables.tested_drifts)
+    yield from map(differences_finding, camera_spline_differences(tables.adjusted, tables.covariance))
+    if (strips := strip_differences(tables.adjusted, tables.covariance)) is not None:
+        yield differences_finding(strips)
+
+
+def drift_finding(drift: CameraDrift) -> Finding:
+    """Change of one camera: the significant parameters if any, otherwise the MDBs."""
+    test = drift.change
+    if drift.rates is ThermalRates:
+        over = f"with its temperature over {drift.span:.2g} K"
+    else:
+        over = f"over {drift.span:.2g} h" if drift.span > 1.5 else f"over {60 * drift.span:.2g} min"
+    if not test.rejected:
+        return _drift(camera_words(drift.camera), over, test, _mdbs(drift.parameters, test.detectable.tolist()))
+    significant = [k for k, p in enumerate(test.p_values) if p < SIGNIFICANCE_LEVEL] or range(len(drift.parameters))
+    changes = ", ".join(
+        f"{_symbol(drift.parameters[k])} by {_signed(drift.parameters[k], test, k)}" for k in significant
+    )
+    return _drift(camera_words(drift.camera), over, test, changes)
+
+
+def differences_finding(differences: CameraDifferences) -> Finding:
+    """Differences between the cameras of all strips, or between all knots of a spline."""
+    test, names, spline = differences.more, np.array(differences.parameters), bool(differences.camera)
+    words = camera_words(differences.camera) if spline else "the camera"
+    over = "from knot to knot of its spline" if spline else "from strip to strip"
+    each = [(name, np.flatnonzero(names == name)) for name in dict.fromkeys(differences.parameters)]
+    if not test.rejected:
+        return _drift(
+            words, over, test, _mdbs([n for n, _ in each], [float(test.detectable[k].max()) for _, k in each])
+        )
+    changes = []
+    for name, own in each:
+        ends = (int(own[end(test.value[own])]) for end in (np.argmin, np.argmax))
+        place = "at {} min" if spline else "in strip {}"
+        texts = (f"{_signed(name, test, k)} {place.format(differences.at[k])}" for k in ends)
+        changes.append(f"{_symbol(name)} from {' to '.join(texts)}")
+    return _drift(words, over, test, ", ".join(changes))
+
+
+def _drift(subject: str, over: str, test: ZeroTest, changes: str) -> Finding:
+    numbers = {"over": over, "p": p_words(test.p_value), "changes": changes}
+    code = "drift" if test.rejected else "no_drift"
+    return Finding(code, "note", subject, test.p_value, SIGNIFICANCE_LEVEL, numbers=numbers)
+
+
+def _mdbs(names: Sequence[str], sizes: Sequence[float]) -> str:
+    return ", ".join(
+        f"{_symbol(name)} {of_sigma(_scale(name, size)[0] * size)}{_scale(name, size)[1]}"
+        if math.isfinite(size)
+        else f"{_symbol(name)} none"
+        for name, size in zip(names, sizes, strict=True)
+    )
+
+
+def _signed(name: str, test: ZeroTest, k: int) -> str:
+    factor, unit = _scale(name, float(test.sigma[k]))
+    return plus_minus(factor * float(test.value[k]), factor * float(test.sigma[k])) + unit
+
+
+def _symbol(name: str) -> str:
+    return {"c": "c", "xp": "x_p", "yp": "y_p", "k1": "k1"}[name]
+
+
+def _scale(name: str, size: float) -> tuple[float, str]:
+    """Factor and unit in which a change of `size` (mm) is shown: micrometres below a tenth of a millimetre."""
+    if name == "k1":
+        return 1.0, ""
+    return (1.0, " mm") if size >= 0.0995 else (1e3, " um")

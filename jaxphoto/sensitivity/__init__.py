@@ -1,13 +1,12 @@
 """An adjustment as a function of its observations, priors and design: derivatives, Monte Carlo, network design."""
 
-from jaxphoto.sensitivity.draws import Draws, Readjustment, check_draws, joined_draws, monte_carlo, readjust
-from jaxphoto.sensitivity.exact import Sensitivity, sensitivity
+from jaxphoto.sensitivity.draws import Draws, Readjustment, check_draws, join_draws, monte_carlo, readjust
+from jaxphoto.sensitivity.exact import Response, Sensitivity, response, sensitivity
 from jaxphoto.sensitivity.influence import DELTA0, external_reliability, station_bias, variance_shares
 from jaxphoto.sensitivity.perturbation import PER, Bias, Perturbation, bias, noise
-from jaxphoto.sensitivity.response import Response, response
 
 __all__ = [
     "DELTA0", "PER", "Bias", "Draws", "Perturbation", "Readjustment", "Response", "Sensitivity", "bias", "check_draws",
-    "external_reliability", "joined_draws", "monte_carlo", "noise", "readjust", "response", "sensitivity",
+    "external_reliability", "join_draws", "monte_carlo", "noise", "readjust", "response", "sensitivity",
     "station_bias", "variance_shares",
 ]  # fmt: skip

@@ -1,18 +1,18 @@
-"""Second derivatives of half the weighted square sum of image rows, listed as they are: no slot is empty.
+"""Second derivatives of half the weighted square sum of image rows, as a list without empty slots.
 
-A row depends on its image and its point through u alone, the point in the camera frame; besides on the parameters t of
-its camera and on what was measured, m. With J the derivatives of its two weighted residuals r by z = (u, t, m), and U
+A row depends on its image and its point through u alone, the point in the camera frame; further on the parameters t of
+its camera and on the measurement m. With J the derivatives of its two weighted residuals r by z = (u, t, m), and U
 those of u by the unknowns y of the image and of the point,
 
     G = J'J + sum_r r d2r/dz2       H_yy = U' G_uu U + sum_k g_k d2u_k/dy2,   g = J_u' r
                                     H_ty = G_tu U,   B_ym = U' G_um,   B_tm = G_tm
 
-G by automatic differentiation, in three and a few directions. A small rotation theta of the image takes u to
-u + u x theta + (u x theta) x theta / 2, so that
+G is computed by automatic differentiation, in three and a few directions. A small rotation theta of the image takes u
+to u + u x theta + (u x theta) x theta / 2, so that
 
-    sum_k g_k d2u_k / dtheta dy = g . (du/dy x dtheta)        of y = theta the mean of that and its transpose
+    sum_k g_k d2u_k / dtheta dy = g . (du/dy x dtheta)        for y = theta the mean of that and its transpose
 
-Arrays end in the rows.
+The last axis of all arrays is the rows.
 """
 
 from collections.abc import Iterable, Sequence
@@ -35,14 +35,14 @@ from jaxphoto.georeferencing import Corrections, apparent_point
 from jaxphoto.georeferencing.corrections import NO_CORRECTIONS
 
 Scalars = tuple[Array, ...]
-"""One number of every row each. Joined to one array they would be computed number by number, not as vectors."""
+"""One component of every row each; separate arrays, so that XLA vectorises over the rows."""
 
-# Rows that are computed with at a time.
-_AT_ONCE = 8192
+# Rows per batch.
+_BATCH = 8192
 
 
 class ListedRows(NamedTuple):
-    """Image rows in the block's order, then at least one of no weight; what they touch in a padded structure."""
+    """Image rows in the block's order, then at least one row of zero weight; indices of a padded structure."""
 
     image: Int[Numbers, "rows"]
     point: Int[Numbers, "rows"]
@@ -50,29 +50,29 @@ class ListedRows(NamedTuple):
     weight: Float[Numbers, "2 rows"]
     """1 / sigma (1/mm)."""
     of_slot: Int[np.ndarray, "batches chunks p"]
-    """The row of each ray; the last one where it is none."""
+    """Row of each ray; the last row for padding."""
 
 
 class RowProducts(NamedTuple):
-    """H of the rows, by what is wanted of it, and B by the measured x and y (mm)."""
+    """Sums of H over the rows, and B by the measured x and y (mm)."""
 
     eop: Float[Array, "images 6 6"]
-    """Sums by image; symmetric when the transpose is added and half of it taken."""
+    """Sums by image; to be symmetrised with the transpose."""
     shared_eop: Float[Array, "images colours 6"]
     shared: Float[Array, "images colours colours"]
     by_point: Float[Array, "touched 3 rows"]
-    """Of each row's eop (6), point (3) and colours with its point."""
+    """H of each row's eop (6), point (3) and colours with its point."""
     measured: Float[Array, "rows 2 touched"]
     """-B of each row's eop (6), point (3) and colours."""
 
 
 def image_rows(adjusted: Adjustment) -> ListedRows:
-    """The image rows of an adjustment."""
+    """List the image rows of an adjustment."""
     s, places, rays = adjusted.structure, adjusted.padded.places, adjusted.padded.structure.rays
     n, size = len(s.image), _size(len(s.image) + 1)
 
     def pad(values: np.ndarray) -> np.ndarray:
-        # Rows of no weight repeat the first: whatever is computed of them stays finite.
+        # Rows of zero weight repeat the first, so all their values are finite.
         return np.concatenate([values, np.repeat(values[..., :1], size - n, axis=-1)], axis=-1)
 
     weight = pad(1 / still(adjusted.values.sigma_xy))
@@ -84,77 +84,75 @@ def image_rows(adjusted: Adjustment) -> ListedRows:
 
 
 def _size(rows: int) -> int:
-    """Sizes come in classes, each at most an eighth larger than the one before; then multiples of the last."""
-    step = min(1 << max((rows - 1).bit_length() - 4, 0), _AT_ONCE) if rows <= _AT_ONCE else _AT_ONCE
+    """Padded number of rows: classes at most an eighth apart, then multiples of the batch."""
+    step = min(1 << max((rows - 1).bit_length() - 4, 0), _BATCH) if rows <= _BATCH else _BATCH
     return -(-rows // step) * step
 
 
 def row_products(
     values: PaddedValues, scale: Increments, rows: ListedRows, curved: Float[Numbers, ""], s: PaddedStructure
 ) -> RowProducts:
-    """H and B of all rows at the values, in scaled increments; without the terms that carry r where `curved` is 0."""
-    count = -(-len(rows.image) // _AT_ONCE)
+    """H and B of all rows at the values, in scaled increments; without the terms in r if `curved` is 0."""
+    count = -(-len(rows.image) // _BATCH)
     if count == 1:
-        return _of_some(values, scale, rows, curved, s)
-    whole = (rows.image, rows.point, rows.xy, rows.weight)
-    split = tuple(jnp.moveaxis(jnp.reshape(v, (*v.shape[:-1], count, -1)), -2, 0) for v in whole)
+        return _batch_products(values, scale, rows, curved, s)
+    arrays = (rows.image, rows.point, rows.xy, rows.weight)
+    split = tuple(jnp.moveaxis(jnp.reshape(v, (*v.shape[:-1], count, -1)), -2, 0) for v in arrays)
 
-    def of_some(some: tuple[Array, Array, Array, Array]) -> RowProducts:
-        image, point, xy, weight = some
-        return _of_some(values, scale, ListedRows(image, point, xy, weight, rows.of_slot), curved, s)
+    def batch_products(batch: tuple[Array, Array, Array, Array]) -> RowProducts:
+        image, point, xy, weight = batch
+        return _batch_products(values, scale, ListedRows(image, point, xy, weight, rows.of_slot), curved, s)
 
-    found = jax.lax.map(of_some, split)
-    by_point = jnp.moveaxis(found.by_point, 0, 2)
+    batches = jax.lax.map(batch_products, split)
+    by_point = jnp.moveaxis(batches.by_point, 0, 2)
     return RowProducts(
-        found.eop.sum(0),
-        found.shared_eop.sum(0),
-        found.shared.sum(0),
+        batches.eop.sum(0),
+        batches.shared_eop.sum(0),
+        batches.shared.sum(0),
         by_point.reshape(*by_point.shape[:2], -1),
-        found.measured.reshape(-1, *found.measured.shape[2:]),
+        batches.measured.reshape(-1, *batches.measured.shape[2:]),
     )
 
 
-def _of_some(
+def _batch_products(
     values: PaddedValues, scale: Increments, rows: ListedRows, curved: Float[Numbers, ""], s: PaddedStructure
 ) -> RowProducts:
     image, point = rows.image, rows.point
     q, zero = s.n_image_colours, jax.tree.map(jnp.zeros_like, scale)
-    scene, slopes = (
-        orientations_of(state_at(zero, scale, values, s), values, s),
-        orientation_derivatives(zero, scale, values, s),
-    )
+    scene = orientations_of(state_at(zero, scale, values, s), values, s)
+    slopes = orientation_derivatives(zero, scale, values, s)
     ends = jnp.concatenate([_at(values.position, image), _at(values.points, point)])
-    rotation, of_image, of_point = _at(values.rotation, image), _at(scale.eop, image), _at(scale.points, point)
-    u, by_place = once(partial(_places, s.corrections), s.eop_free, rotation, ends, of_image, of_point)
+    rotation, image_step, point_step = _at(values.rotation, image), _at(scale.eop, image), _at(scale.points, point)
+    u, du = once(partial(_camera_points, s.corrections), s.eop_free, rotation, ends, image_step, point_step)
 
-    g, to_u = jnp.zeros(()), (jnp.zeros(()),) * 3
+    g, g_u = jnp.zeros(()), (jnp.zeros(()),) * 3
     for group, camera, slope in zip(s.groups, scene.cameras, slopes.cameras, strict=True):
         if by_image(group, s):
             camera, slope = camera[image].T, jnp.moveaxis(slope[image], 0, -1)
         weight = tuple(jnp.where(jnp.asarray(group.member)[image], rows.weight, 0.0))
-        of_group = once(partial(_by_camera, group), s.eop_free, camera, slope, u, tuple(rows.xy), weight, curved)
-        g, to_u = g + of_group[0], tuple(a + b for a, b in zip(to_u, of_group[1], strict=True))
+        g_group, g_u_group = once(
+            partial(_camera_second, group), s.eop_free, camera, slope, u, tuple(rows.xy), weight, curved
+        )
+        g, g_u = g + g_group, tuple(a + b for a, b in zip(g_u, g_u_group, strict=True))
 
-    across = once(lambda g, by_place: sum(g[k, :, None] * d for k, d in enumerate(by_place)), s.eop_free, g, by_place)
-    turned = curved * of_image[3:, None] * jnp.stack(_cross(to_u, by_place))
-    eop = added(d[:6, None] * across[k, None, :6] for k, d in enumerate(by_place))
-    by_point = added(d[:, None] * across[k, None, 6:] for k, d in enumerate(by_place))
-    # Twice, because of the transpose: only its rows are here.
-    eop = eop.at[3:].add(turned[:, :6]).at[3:, :3].add(turned[:, :3])
-    by_point = by_point.at[3:6].add(turned[:, 6:])
+    cross = once(lambda g, du: sum(g[k, :, None] * d for k, d in enumerate(du)), s.eop_free, g, du)
+    rotated = curved * image_step[3:, None] * jnp.stack(_cross(g_u, du))
+    eop = added(d[:6, None] * cross[k, None, :6] for k, d in enumerate(du))
+    by_point = added(d[:, None] * cross[k, None, 6:] for k, d in enumerate(du))
+    # Twice the lower triangle: symmetrised with the transpose later.
+    eop = eop.at[3:].add(rotated[:, :6]).at[3:, :3].add(rotated[:, :3])
+    by_point = by_point.at[3:6].add(rotated[:, 6:])
     if s.corrections != NO_CORRECTIONS:
-        to_ray = _dot(to_u, rotation)
-        bent = curved * _bent_rays(s.corrections, ends, to_ray, jnp.concatenate([of_image[:3], of_point]))
-        eop = eop.at[:3, :3].add(bent[:3, :3])
-        by_point = by_point.at[:3].add(bent[:3, 3:]).at[6:].add(bent[3:, 3:])
-    wanted = eop, across[3 : 3 + q, :6], g[3:, 3 : 3 + q]
-    sums = [jax.ops.segment_sum(v.reshape(-1, len(image)).T, image, s.n_images) for v in wanted]
-    own, shared_eop, shared = (
-        v.reshape(s.n_images, *of_rows.shape[:2]) for v, of_rows in zip(sums, wanted, strict=True)
-    )
-    measured = jnp.concatenate([across[3 + q :], g[3:, 3 + q :].swapaxes(0, 1)], axis=1)
+        g_ray = _dot(g_u, rotation)
+        bending = curved * _ray_second(s.corrections, ends, g_ray, jnp.concatenate([image_step[:3], point_step]))
+        eop = eop.at[:3, :3].add(bending[:3, :3])
+        by_point = by_point.at[:3].add(bending[:3, 3:]).at[6:].add(bending[3:, 3:])
+    by_row = eop, cross[3 : 3 + q, :6], g[3:, 3 : 3 + q]
+    sums = [jax.ops.segment_sum(v.reshape(-1, len(image)).T, image, s.n_images) for v in by_row]
+    eop, shared_eop, shared = (v.reshape(s.n_images, *rows_.shape[:2]) for v, rows_ in zip(sums, by_row, strict=True))
+    measured = jnp.concatenate([cross[3 + q :], g[3:, 3 + q :].swapaxes(0, 1)], axis=1)
     return RowProducts(
-        own, shared_eop, shared, jnp.concatenate([by_point, across[3 : 3 + q, 6:]]), -measured.transpose(2, 0, 1)
+        eop, shared_eop, shared, jnp.concatenate([by_point, cross[3 : 3 + q, 6:]]), -measured.transpose(2, 0, 1)
     )
 
 
@@ -170,50 +168,49 @@ def _cross(a: Sequence[Array] | Array, b: Sequence[Array] | Array) -> Scalars:
     return tuple(a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1)))
 
 
-def _places(
+def _camera_points(
     corrections: Corrections,
     rotation: Float[Array, "3 3 rows"],
     ends: Float[Array, "6 rows"],
-    of_image: Float[Array, "6 rows"],
-    of_point: Float[Array, "3 rows"],
+    image_step: Float[Array, "6 rows"],
+    point_step: Float[Array, "3 rows"],
 ) -> tuple[Scalars, Scalars]:
     """u of every row, and its derivatives (9, rows) by scaled increments of image and point."""
     ray = _rays(corrections, ends)
     u = tuple(_dot(row, ray) for row in rotation)
-    turned = _cross(u, jnp.eye(3)[:, :, None])
+    by_rotation = _cross(u, jnp.eye(3)[:, :, None])
     if corrections == NO_CORRECTIONS:
-        moved = (jnp.concatenate([-row, row]) for row in rotation)
+        by_ends = (jnp.concatenate([-row, row]) for row in rotation)
     else:
         unit = jnp.broadcast_to(jnp.eye(6)[:, :, None], (6, *ends.shape))
-        by_ends = jax.vmap(lambda d: jax.jvp(partial(_rays, corrections), (ends,), (d,))[1])(unit)
-        moved = (_dot(row, by_ends.swapaxes(0, 1)) for row in rotation)
-    step = (of_image[:3], of_image[3:], of_point)
-    by_place = (
-        jnp.concatenate([by_end[:3] * step[0], by_turn * step[1], by_end[3:] * step[2]])
-        for by_end, by_turn in zip(moved, turned, strict=True)
+        rays = jax.vmap(lambda d: jax.jvp(partial(_rays, corrections), (ends,), (d,))[1])(unit)
+        by_ends = (_dot(row, rays.swapaxes(0, 1)) for row in rotation)
+    du = (
+        jnp.concatenate([by_end[:3] * image_step[:3], by_turn * image_step[3:], by_end[3:] * point_step])
+        for by_end, by_turn in zip(by_ends, by_rotation, strict=True)
     )
-    return u, tuple(by_place)
+    return u, tuple(du)
 
 
 def _rays(corrections: Corrections, ends: Float[Array, "6 rows"]) -> Float[Array, "3 rows"]:
-    """From the projection centres to where they see their points, in the object frame."""
+    """Vectors from the projection centres to the apparent points, in the object frame."""
     return apparent_point(ends[:3], ends[3:], corrections) - ends[:3]
 
 
-def _bent_rays(
-    corrections: Corrections, ends: Float[Array, "6 rows"], to_ray: Float[Array, "3 rows"], step: Float[Array, "6 rows"]
+def _ray_second(
+    corrections: Corrections, ends: Float[Array, "6 rows"], g_ray: Float[Array, "3 rows"], step: Float[Array, "6 rows"]
 ) -> Float[Array, "6 6 rows"]:
-    """Second derivatives of the rays' components, weighted and added, by scaled increments of both ends."""
-    weighed = lambda ends: _dot(to_ray, _rays(corrections, ends))  # noqa: E731
+    """Second derivatives of the components of the rays, summed with weights, by scaled increments of both ends."""
+    weighted = lambda ends: _dot(g_ray, _rays(corrections, ends))  # noqa: E731
 
     def second(seed: Array, other: Array) -> Array:
-        return jax.jvp(lambda ends: jax.jvp(weighed, (ends,), (seed,))[1], (ends,), (other,))[1]
+        return jax.jvp(lambda ends: jax.jvp(weighted, (ends,), (seed,))[1], (ends,), (other,))[1]
 
     seeds = jnp.eye(6)[:, :, None] * step
     return jax.vmap(jax.vmap(second, (None, 0)), (0, None))(seeds, seeds)
 
 
-def _by_camera(
+def _camera_second(
     group: CameraGroup,
     camera: Array,
     slope: Array,
@@ -231,25 +228,25 @@ def _by_camera(
         leaves = list(camera)
         for k, leaf in enumerate(group.free_leaves):
             leaves[leaf] = leaves[leaf] + _dot(z[3 : 3 + q], slope[:, k])
-        # Row by row: what is written for one image point need not know of many.
-        of_one = jax.vmap(
-            lambda own, u, xy: camera_residual(interior_of(group, own), u, xy),
+        # vmap over rows: camera models are written for one image point.
+        by_row = jax.vmap(
+            lambda parameters, u, xy: camera_residual(interior_of(group, parameters), u, xy),
             ([0 if jnp.ndim(leaf) else None for leaf in leaves], 0, -1),
             -1,
         )
-        r = of_one(leaves, z[:3], jnp.stack(z[3 + q :]))
+        r = by_row(leaves, z[:3], jnp.stack(z[3 + q :]))
         return tuple(w * v for w, v in zip(weight, r, strict=True))
 
     r, j = residual(z), jax.vmap(lambda seed: jax.jvp(residual, (z,), (seed,))[1])(seeds)
-    weighed = lambda z: _dot(r, residual(z))  # noqa: E731
+    weighted = lambda z: _dot(r, residual(z))  # noqa: E731
 
     def second(seed: Scalars, other: Scalars) -> Array:
-        return jax.jvp(lambda z: jax.jvp(weighed, (z,), (seed,))[1], (z,), (other,))[1]
+        return jax.jvp(lambda z: jax.jvp(weighted, (z,), (seed,))[1], (z,), (other,))[1]
 
-    # Every pair once: G is symmetric.
-    one, other = np.triu_indices(3 + q, m=len(z))
-    number = np.zeros((len(z), len(z)), int)
-    number[one, other] = number[other, one] = np.arange(len(one))
-    bent = jax.vmap(second)(tuple(seed[one] for seed in seeds), tuple(seed[other] for seed in seeds))
-    g = _dot((v[one] for v in j), (v[other] for v in j)) + curved * bent
-    return g[number[: 3 + q]], tuple(_dot(r, tuple(v[k] for v in j)) for k in range(3))
+    # G is symmetric: every pair once.
+    row, column = np.triu_indices(3 + q, m=len(z))
+    index = np.zeros((len(z), len(z)), int)
+    index[row, column] = index[column, row] = np.arange(len(row))
+    curvature = jax.vmap(second)(tuple(seed[row] for seed in seeds), tuple(seed[column] for seed in seeds))
+    g = _dot((v[row] for v in j), (v[column] for v in j)) + curved * curvature
+    return g[index[: 3 + q]], tuple(_dot(r, tuple(v[k] for v in j)) for k in range(3))

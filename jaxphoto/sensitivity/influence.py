@@ -1,6 +1,6 @@
-"""What follows from a `Sensitivity`: where a station bias ends, what an estimate's variance hangs on, reliability.
+"""Influence of observations on estimates: station bias, variance fractions, external reliability.
 
-Each function takes the derivatives A (an estimate a row, an observation a column) that `sensitivity` gives, exact or of
+Each function takes the derivatives A (one row per estimate, one column per observation) of `sensitivity`, exact or of
 first order, and the a priori standard deviations of the observations.
 """
 
@@ -13,17 +13,17 @@ from jaxtyping import Float
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.errors import InputError
 from jaxphoto.observations import AbstractObservations, Correlated
-from jaxphoto.sensitivity.biased_numbers import OBSERVED
 from jaxphoto.sensitivity.exact import Sensitivity
+from jaxphoto.sensitivity.perturbation import OBSERVED
 from jaxphoto.short_repr import shown
-from jaxphoto.statistics import DELTA0, covariance, detectable_errors, observation_groups, redundancy_numbers
+from jaxphoto.statistics import DELTA0, covariance, minimal_detectable_biases, observation_groups, redundancy_numbers
 
 Per = Literal["block", "strip", "image"]
 
 
 @shown
 class StationBias(eqx.Module):
-    """Change of every estimate (as `Sensitivity.labels`) where all stations of a unit are off along one axis."""
+    """Change of every estimate (`Sensitivity.labels`) for a bias of all stations of a unit along one axis."""
 
     change: Float[np.ndarray, "estimates units 3"]
     units: tuple[str, ...] = eqx.field(static=True)
@@ -32,10 +32,10 @@ class StationBias(eqx.Module):
 
 @shown
 class VarianceShares(eqx.Module):
-    """Shares of each estimate's variance by observation; over all groups a row sums to 1.
+    """Fraction of each estimate's variance due to each observation; over all groups a row sums to 1.
 
-    Shaped like `Sensitivity.groups`; rows of what is held fixed are zero. `variance` is their common measure: the a
-    priori variance A diag(sigma^2) A' of the estimate, in its unit squared.
+    Shaped like `Sensitivity.groups`; rows of fixed parameters are zero. `variance` is the a priori variance
+    A diag(sigma^2) A' of each estimate, in its unit squared.
     """
 
     groups: dict[str, Float[np.ndarray, "estimates _"]]
@@ -43,19 +43,19 @@ class VarianceShares(eqx.Module):
 
     @property
     def by_group(self) -> dict[str, Float[np.ndarray, "estimates"]]:
-        """The shares of whole groups of observations."""
-        return {name: share.sum(axis=1) for name, share in self.groups.items()}
+        """Fractions of whole groups of observations."""
+        return {name: fraction.sum(axis=1) for name, fraction in self.groups.items()}
 
 
 @shown
 class ExternalReliability(eqx.Module):
-    """Minimal detectable errors, and what one of that size does to every estimate if it is not detected.
+    """Minimal detectable biases (MDB), and the effect of each on every estimate if it is not detected.
 
-    Shaped like `Sensitivity.groups`, in the observations' and the estimates' units. Infinite where nothing checks an
-    observation: no error there would be found.
+    Shaped like `Sensitivity.groups`, in the units of observations and estimates. Infinite for observations with
+    redundancy number zero, whose errors are undetectable.
     """
 
-    detectable: dict[str, Float[np.ndarray, "_"]]
+    mdb: dict[str, Float[np.ndarray, "_"]]
     effect: dict[str, Float[np.ndarray, "estimates _"]]
     delta0: float = eqx.field(static=True)
 
@@ -63,27 +63,27 @@ class ExternalReliability(eqx.Module):
 def station_bias(
     adjusted: Adjustment, derivatives: Sensitivity, per: Per = "strip", bias_m: float = 0.10
 ) -> StationBias:
-    """What a bias (m) of all observed stations of the block, of each strip, or of each image does to the estimates.
+    """Change of the estimates due to a bias (m) of all observed stations of the block, of each strip, or of each image.
 
-    Of exposures on the trajectory of a scanner, too: they alone have it, its laser returns have not.
+    Stations include exposures on the trajectory of a scanner; its laser returns are not affected.
 
         change = bias sum_k A_k     over the station rows k of the unit along one axis, X, Y or Z
 
-    Raises InputError for another `per`, where no station is observed, and where no image has a strip.
+    Raises InputError for another `per`, without observed stations, and without strips.
     """
     block = adjusted.block
-    whose = {"block": ("block",) * len(block.images), "strip": block.image_strip, "image": block.images}
-    if per not in whose:
-        raise InputError(f"a station bias is per {', '.join(whose)}, not per {per}: name one of these")
+    unit_of = {"block": ("block",) * len(block.images), "strip": block.image_strip, "image": block.images}
+    if per not in unit_of:
+        raise InputError(f"a station bias per {per} is unknown: choose among {', '.join(unit_of)}")
     stations = {name: rows for name, rows in block.named_observations.items() if isinstance(rows, OBSERVED["station"])}
     if not stations:
-        raise InputError("the block has no observed stations that could have a bias: add stations")
-    of_row = [whose[per][i] for rows in stations.values() for i in rows.who]  # type: ignore[attr-defined]
-    units = tuple(unit for unit in dict.fromkeys(of_row) if unit)
+        raise InputError("the block has no observed stations: add stations to compute a station bias")
+    row_units = [unit_of[per][i] for rows in stations.values() for i in rows.who]  # type: ignore[attr-defined]
+    units = tuple(unit for unit in dict.fromkeys(row_units) if unit)
     if not units:
-        raise InputError("no image with an observed station has a strip: ask for the bias per block or per image")
+        raise InputError("no image with an observed station has a strip: compute the bias per block or per image")
     place = {unit: k for k, unit in enumerate(units)}
-    unit = np.array([place.get(name, len(units)) for name in of_row])
+    unit = np.array([place.get(name, len(units)) for name in row_units])
     change = np.zeros((len(units) + 1, 3, len(derivatives.labels)))
     axis = np.concatenate([rows.axis for rows in stations.values()])  # type: ignore[attr-defined]
     by_row = np.concatenate([derivatives[name].T for name in stations])
@@ -92,16 +92,16 @@ def station_bias(
 
 
 def variance_shares(adjusted: Adjustment, derivatives: Sensitivity) -> VarianceShares:
-    """Which observations an estimate hangs on: the share A_k^2 sigma_k^2 of each in the estimate's variance."""
+    """Fraction A_k^2 sigma_k^2 of each observation in the variance of every estimate."""
     rows = observation_groups(adjusted)
     parts = {name: _shares(a, rows[name]) for name, a in derivatives.groups.items()}
     variance = np.sum([part.sum(axis=1) for part in parts.values()], axis=0)
-    known = np.where(variance > 0, variance, 1.0)[:, None]
-    return VarianceShares({name: part / known for name, part in parts.items()}, variance)
+    divisor = np.where(variance > 0, variance, 1.0)[:, None]
+    return VarianceShares({name: part / divisor for name, part in parts.items()}, variance)
 
 
 def _shares(a: Float[np.ndarray, "estimates n"], rows: AbstractObservations) -> Float[np.ndarray, "estimates n"]:
-    """What each observation adds to A C A', whose sum over the observations it is."""
+    """Contribution of each observation to A C A'; they sum to it."""
     if isinstance(rows, Correlated):
         by_set = a.reshape(len(a), len(rows), -1)
         return (by_set * np.einsum("esn,snm->esm", by_set, np.asarray(rows.covariance))).reshape(a.shape)
@@ -109,26 +109,22 @@ def _shares(a: Float[np.ndarray, "estimates n"], rows: AbstractObservations) -> 
 
 
 def external_reliability(adjusted: Adjustment, derivatives: Sensitivity, delta0: float = DELTA0) -> ExternalReliability:
-    """The effect on every estimate of an error that the test of normalised residuals just fails to detect (Baarda).
+    """Compute the effect on every estimate of an error at the detection limit (external reliability, Baarda).
 
-        detectable_k = delta0 sigma_k / sqrt(r_k),   effect_k = A_k detectable_k
+        MDB_k = delta0 sigma_k / sqrt(r_k),   effect_k = A_k MDB_k
 
-    with the redundancy number r_k of the observation. `delta0` is the non-centrality of the test: 4.13 for a level of
+    with the redundancy number r_k of the observation. `delta0` is the noncentrality of the test: 4.13 for a level of
     0.1 % and a power of 80 %.
 
     Raises InputError for a delta0 that is not positive.
     """
     if not delta0 > 0:
-        raise InputError(f"delta0 is the shift that a test detects, a positive number, not {delta0}")
+        raise InputError(f"delta0, the noncentrality of the test, must be positive, got {delta0}")
     numbers = redundancy_numbers(adjusted, covariance(adjusted, rows=True))
-    detectable, effect = {}, {}
-    for name, errors in detectable_errors(adjusted, numbers, delta0).items():
-        detectable[name] = _in_rows(errors)
+    mdb, effect = {}, {}
+    for name, values in minimal_detectable_biases(adjusted, numbers, delta0).items():
+        # Components of a row in turn.
+        mdb[name] = values.T.ravel()
         a = derivatives.groups[name]
-        effect[name] = np.multiply(a, detectable[name], out=np.zeros_like(a), where=a != 0)
-    return ExternalReliability(detectable, effect, delta0)
-
-
-def _in_rows(values: np.ndarray) -> Float[np.ndarray, "n"]:
-    """Components first, rows last, as one list: the components of a row in turn."""
-    return values.T.ravel()
+        effect[name] = np.multiply(a, mdb[name], out=np.zeros_like(a), where=a != 0)
+    return ExternalReliability(mdb, effect, delta0)

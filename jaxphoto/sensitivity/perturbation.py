@@ -1,14 +1,21 @@
-"""What is drawn in a Monte Carlo: errors of observations and of parameters that the adjustment holds.
+"""Perturbations for Monte Carlo: errors of observations and of fixed or weighted parameters.
 
-A perturbation is any function of a key and a block that returns the block with other numbers in it, alone or with a
-dict of numbers to record:
+A perturbation is any function of a key and a block that returns the block with other values, alone or with a dict of
+scalars to record:
 
     def perturb(key, block):
         rise = 0.1 * jax.random.normal(key)
         heights = block.stations.value + rise * (block.stations.axis == 2)
         return eqx.tree_at(lambda b: b.stations.value, block, heights), {"rise_m": rise}
 
-`bias` makes the usual ones.
+`bias` and `noise` make the usual ones.
+
+A trajectory with the constant error b shifts laser returns and exposures. Because the weights of the knots sum to 1,
+this equals knots c' = c - b instead of the knots c: the prior of the first knot of a strip becomes -b, and
+
+    c[k + 1] - f c[k] = 0    becomes    c'[k + 1] - f c'[k] = -(1 - f) b
+
+(`observations.knot_steps`). This is exact for positions and of first order in the error for attitudes.
 """
 
 import dataclasses
@@ -24,16 +31,129 @@ from jaxtyping import Array, Float, Int
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names
 from jaxphoto.errors import InputError
-from jaxphoto.observations import Correlated, KnownParameters
+from jaxphoto.georeferencing import TrajectoryKnot, strip_of_knot
+from jaxphoto.observations import (
+    ATTITUDE_AXES,
+    AXES,
+    Attitudes,
+    AttitudeSteps,
+    Correlated,
+    KnownParameters,
+    PositionSteps,
+    StationRows,
+    TrajectoryAttitudes,
+    TrajectoryStations,
+)
 from jaxphoto.rotation import small_rotation
-from jaxphoto.sensitivity.biased_numbers import LABELS, TRAJECTORY, observed_numbers, trajectory_numbers
 from jaxphoto.short_repr import shown
 from jaxphoto.unknowns import FIXED, FREE, Weighted, is_prior
+
+Steps = type[PositionSteps] | type[AttitudeSteps]
+OBSERVED = {
+    "station": (StationRows, TrajectoryStations),
+    "attitude": (Attitudes, TrajectoryAttitudes),
+}
+"""Kinds of bias of GNSS and IMU, and the observations they apply to."""
+TRAJECTORY: dict[str, tuple[str, Steps]] = {
+    "trajectory": ("position", PositionSteps),
+    "trajectory-attitude": ("attitude", AttitudeSteps),
+}
+"""Kinds of bias of a scanner's trajectory: the field of its knots, and the changes from knot to knot."""
+LABELS = {
+    "station": tuple(f"{a}_m" for a in AXES),
+    "attitude": tuple(f"{a}_rad" for a in ATTITUDE_AXES),
+    "control": tuple(f"{a}_m" for a in AXES),
+    "image-points": ("x_mm", "y_mm"),
+    **{kind: TrajectoryKnot.names[field] for kind, (field, _) in TRAJECTORY.items()},
+}
+"""Labels of the errors of one owner."""
+
+
+class BiasedArray(NamedTuple):
+    """An array of a block, with the owner and the axis of the error of each element."""
+
+    path: tuple[Any, ...]
+    """From the block."""
+    owner: list[str]
+    axis: Int[np.ndarray, "numbers"]
+    factor: Float[np.ndarray, "sets 3 3"] | None = None
+    """Multiplies the errors of each three elements."""
+
+
+def observed_arrays(block: Block, kind: str, per: str) -> list[BiasedArray]:
+    """Arrays of stations, attitudes, control or image points."""
+    kinds = OBSERVED.get(kind, ())
+    if not kinds:
+        name = kind.replace("-", "_")
+        return [_observed_array(block, getattr(block, name), (name,), kind, per)]
+    groups: list[tuple[tuple[Any, ...], Any]] = [((name,), getattr(block, name)) for name in ("stations", "attitudes")]
+    groups += [(("more", k), rows) for k, rows in enumerate(block.more)]
+    return [
+        _observed_array(block, rows, path, kind, per) for path, rows in groups if isinstance(rows, kinds) and len(rows)
+    ]
+
+
+def _observed_array(block: Block, rows: Any, path: tuple[Any, ...], kind: str, per: str) -> BiasedArray:
+    labels = LABELS[kind]
+    if hasattr(rows, "who"):
+        index, axis = rows.who, rows.axis
+    else:
+        index, axis = np.repeat(rows.image, len(labels)), np.tile(np.arange(len(labels)), len(rows))
+    path = (*path, rows.observed)
+    if per == "observation":
+        point = np.repeat(rows.point, len(labels))
+        owner = [f"{block.images[i]}.{block.points[p]}" for i, p in zip(index, point, strict=True)]
+        return BiasedArray(path, owner, axis)
+    names = {"image": block.images, "camera": block.image_camera, "strip": block.image_strip, "point": block.points}
+    return BiasedArray(path, ["block" if per == "block" else names[per][k] for k in index], axis)
+
+
+def trajectory_arrays(block: Block, kind: str, per: str) -> list[BiasedArray]:
+    """Arrays that an error of the trajectory of each strip of a laser scanner changes.
+
+    Raises InputError for a block without a trajectory, and for a scalar prior of three axes.
+    """
+    field, steps = TRAJECTORY[kind]
+    if not any(isinstance(rows, steps) and len(rows) for rows in block.more):
+        raise InputError(
+            f"block {block.title!r} has no trajectory of a laser scanner for a bias of kind {kind}: use the block of a "
+            "strip adjustment (docs/joint.md), or --bias station"
+        )
+    return [*_knots(block, field, per), *_steps(block, steps, per)]
+
+
+def _knots(block: Block, field: str, per: str) -> Iterator[BiasedArray]:
+    """Knots that are fixed or have priors."""
+    kind = TrajectoryKnot.kind
+    for owner, knot in block.priors.more[kind].items():
+        prior = getattr(knot, field)
+        weighted = isinstance(prior, Weighted)
+        if weighted and np.shape(prior.value) != (3,):
+            raise InputError(f"{field} of {owner}: the prior is one value for three axes, give three")
+        if weighted or prior == FIXED:
+            leaf = ("more", kind, owner, field)
+            path = ("priors", *leaf, "value") if weighted else ("start", "unknowns", *leaf)
+            yield BiasedArray(path, [_owner(owner, per)] * 3, np.arange(3), -np.eye(3)[None])
+
+
+def _steps(block: Block, steps: Steps, per: str) -> Iterator[BiasedArray]:
+    knots = list(block.start.unknowns.more[TrajectoryKnot.kind])
+    for k, rows in enumerate(block.more):
+        if isinstance(rows, steps):
+            decay = 1 - np.asarray(rows.kept)
+            owner = [_owner(knots[start], per) for start in rows.start]
+            axis, factor = np.tile(np.arange(3), len(rows)), -decay[:, None, None] * np.eye(3)
+            yield BiasedArray(("more", k, rows.observed), [name for name in owner for _ in range(3)], axis, factor)
+
+
+def _owner(knot: str, per: str) -> str:
+    return "block" if per == "block" else strip_of_knot(knot)
+
 
 Recorded = dict[str, Array]
 Perturbation = Callable[[Any, Block], Block | tuple[Block, Recorded]]
 Distribution = Callable[[Any, tuple[int, ...]], Array]
-"""Numbers of mean 0 and standard deviation 1 from a key and a shape."""
+"""Variates of mean 0 and standard deviation 1 from a key and a shape."""
 
 PER = {
     "station": ("block", "strip", "image"),
@@ -46,61 +166,60 @@ PER = {
     "boresight": ("mount",),
     "interior": ("camera",),
 }
-"""Kinds of bias, and whose own each may be."""
+"""Kinds of bias, and the units that can have independent errors."""
 _AXES = {"lever-arm": ("right_m", "forward_m", "up_m"), "boresight": ("x_rad", "y_rad", "z_rad")}
 
 
 @shown
 class Bias(eqx.Module):
-    """Errors added to some numbers of a block: `sigma` times independent draws of `distribution`.
+    """Errors added to values of a block: `sigma` times independent variates of `distribution`.
 
-    Called with a key and a block it is a perturbation; `applied` adds given numbers.
+    Called with a key and a block it is a perturbation; `applied` adds prescribed errors.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
-    """Of the errors drawn, such as `E1.X_m`; angles in rad."""
+    """Names of the errors, such as `E1.X_m`; angles in rad."""
     sigma: Float[np.ndarray, "errors"]
     """In the units of the names."""
     targets: tuple[tuple[Any, ...], ...] = eqx.field(static=True)
     """Paths, from the block, of the arrays that the errors are added to."""
     index: tuple[Int[np.ndarray, "..."], ...]
-    """The error that each number of these arrays gets; the number of errors where it gets none."""
+    """Index of the error of each element of these arrays; the number of errors for none."""
     distribution: Distribution = eqx.field(static=True, default=jax.random.normal)
     recorded: bool = eqx.field(static=True, default=True)
-    """Whether each error is worth a record of its own."""
+    """True if each error is recorded."""
     mixed: tuple[Float[np.ndarray, "_ _ _"] | None, ...] = ()
-    """Of arrays that get no error as drawn, L (sets, n, n), which makes theirs of those drawn: of correlated errors
-    that of their covariance L L'."""
+    """Factors L (sets, n, n) of the errors of each array, None for one; L L' is the covariance of correlated errors."""
 
     def __call__(self, key, block: Block) -> tuple[Block, Recorded]:
-        """`block` with errors drawn by `key`, and the errors by name."""
+        """`block` with random errors, and the errors by name."""
         errors = self.drawn(key)
         return self.applied(errors, block), dict(zip(self.names, errors, strict=True)) if self.recorded else {}
 
     def drawn(self, key) -> Float[Array, "errors"]:
-        """The errors that a key draws."""
+        """Errors of a key."""
         return jnp.asarray(self.sigma) * self.distribution(key, self.sigma.shape)
 
     def applied(self, errors: Float[Array, "errors"], block: Block) -> Block:
-        """`block` with given errors, in the order of `names`."""
-        added = jnp.append(errors, 0.0)
-        where = lambda b: [_follow(b, path) for path in self.targets]  # noqa: E731
-        mixed = self.mixed or (None,) * len(self.targets)
+        """`block` with prescribed errors, in the order of `names`."""
+        padded = jnp.append(errors, 0.0)
+        targets = lambda b: [_follow(b, path) for path in self.targets]  # noqa: E731
+        factors = self.mixed or (None,) * len(self.targets)
         new = [
-            _with_errors(v, added[k] if factor is None else jnp.einsum("nij,nj->ni", factor, added[k]))
-            for v, k, factor in zip(where(block), self.index, mixed, strict=True)
+            _with_errors(v, padded[k] if factor is None else jnp.einsum("nij,nj->ni", factor, padded[k]))
+            for v, k, factor in zip(targets(block), self.index, factors, strict=True)
         ]
-        return in_order_of(block, eqx.tree_at(where, block, new))
+        return in_order_of(block, eqx.tree_at(targets, block, new))
 
 
 def in_order_of(block: Block, changed: Block) -> Block:
-    """`changed` with its unknowns in the order that they have in `block`."""
+    """`changed` with its unknowns in the order of `block`."""
     start = dataclasses.replace(changed.start, unknowns=changed.start.unknowns.in_order_of(block.start.unknowns))
     return dataclasses.replace(changed, start=start, priors=changed.priors.in_order_of(block.priors))
 
 
 def _with_errors(values: Any, errors: Array) -> Array:
-    """Numbers with errors added; rotation matrices turned by them, small rotations."""
+    """Values plus errors; rotation matrices are multiplied by small rotations."""
     if errors.size == np.size(values):
         return jnp.asarray(values) + errors.reshape(np.shape(values))
     turn = jax.vmap(small_rotation)(errors.reshape(-1, 3))
@@ -119,59 +238,58 @@ def bias(
 ) -> Bias:
     """Errors of one kind, independent for each axis and each strip, image, point, mount or camera.
 
-    `kind` is one of `PER`, `per` one of what it lists there (its first if not given). `sigma`: m for stations, control
+    `kind` is one of `PER`, `per` one of its entries there (by default the first). `sigma`: m for stations, control
     and lever arms; rad for attitudes and boresights; mm for image points; own units for the interior `parameter`
-    (`c_mm`, `k1` ...); one, or one an axis. `of` names those that get errors, all if empty. Lever arms, boresights and
-    interior parameters must be FIXED (the value that is held changes) or Weighted (the value given beforehand changes).
+    (`c_mm`, `k1` ...); one value, or one per axis. `of` names the units that get errors, by default all. Lever arms,
+    boresights and interior parameters must be FIXED (the fixed value changes) or Weighted (the prior value changes).
 
-    Errors of `station` and `attitude` are those of exposures alone. `trajectory` (m) and `trajectory-attitude` (rad,
-    about right, forward and up) are what the trajectory of a laser scanner is off by, of the whole flight or of each
-    laser strip: its returns and the exposures on it have them alike (`sensitivity.biased_numbers`).
+    Errors of `station` and `attitude` apply to exposures only. `trajectory` (m) and `trajectory-attitude` (rad, about
+    right, forward and up) are errors of the trajectory of a laser scanner, of the whole flight or of each laser strip:
+    they apply to its returns and to the exposures on it (`BiasedArray`).
 
-    Raises InputError for a kind, a name or a sigma that cannot be.
+    Raises InputError for an invalid kind, name or sigma.
     """
     if kind not in PER:
-        raise InputError(f"there is no bias of kind {kind!r}; there are {', '.join(PER)}")
+        raise InputError(f"unknown kind of bias {kind!r}: choose among {', '.join(PER)}")
     per = PER[kind][0] if per is None else per
     if per not in PER[kind]:
         raise InputError(f"a bias of kind {kind} is drawn per {' or '.join(PER[kind])}, not per {per}")
     if (parameter != "") != (kind == "interior"):
-        raise InputError("a bias of kind interior, and no other, needs the name of a parameter, such as c_mm")
+        raise InputError("a parameter name, such as c_mm, is required by a bias of kind interior, and by no other")
     if kind in ("lever-arm", "boresight", "interior"):
         return _parameters(block, kind, sigma, of, parameter, distribution)
     axes = LABELS[kind]
-    places = (trajectory_numbers if kind in TRAJECTORY else observed_numbers)(block, kind, per)
-    known = list(dict.fromkeys(name for place in places for name in place.owner))
-    if not known:
-        raise InputError(f"the block {block.title!r} has no observation that a bias of kind {kind} could be added to")
-    if known == [""]:
-        raise InputError(f"the images of the block {block.title!r} belong to no {per}: name it in images.csv")
-    chosen = _chosen(of, known, kind, per)
+    arrays = (trajectory_arrays if kind in TRAJECTORY else observed_arrays)(block, kind, per)
+    owners = list(dict.fromkeys(name for array in arrays for name in array.owner))
+    if not owners:
+        raise InputError(f"block {block.title!r} has no observation for a bias of kind {kind}")
+    if owners == [""]:
+        raise InputError(f"the images of block {block.title!r} belong to no {per}: name it in images.csv")
+    chosen = _chosen(of, owners, kind, per)
     first = {name: len(axes) * k for k, name in enumerate(chosen)}
     indices = []
-    for place in places:
-        index = np.array([first.get(name, -1) for name in place.owner], int)
-        index = np.where(index < 0, len(axes) * len(chosen), index + place.axis)
-        indices.append(index if place.factor is None else index.reshape(-1, 3))
+    for array in arrays:
+        index = np.array([first.get(name, -1) for name in array.owner], int)
+        index = np.where(index < 0, len(axes) * len(chosen), index + array.axis)
+        indices.append(index if array.factor is None else index.reshape(-1, 3))
     names = tuple(f"{name}.{label}" for name in chosen for label in axes)
-    own = per != "observation"
-    paths, mixed = tuple(place.path for place in places), tuple(place.factor for place in places)
-    return Bias(names, _sigmas(sigma, axes, len(chosen)), paths, tuple(indices), distribution, own, mixed)
+    paths, factors = tuple(array.path for array in arrays), tuple(array.factor for array in arrays)
+    sigmas, recorded = _sigmas(sigma, axes, len(chosen)), per != "observation"
+    return Bias(names, sigmas, paths, tuple(indices), distribution, recorded, factors)
 
 
 class _Noisy(NamedTuple):
-    """Where observed numbers are, their standard deviations, and what mixes errors of unit size if correlated."""
+    """Path of observed values, their standard deviations, and the Cholesky factor of correlated ones."""
 
     path: tuple[Any, ...]
     sigma: np.ndarray
-    mixed: np.ndarray | None = None
+    factor: np.ndarray | None = None
 
 
 def noise(block: Block) -> Bias:
-    """Errors of all observations and of all values given beforehand, each with its own standard deviation.
+    """Errors of all observations and of all prior values, each with its own standard deviation.
 
-    It is what the covariance of the block is about. Raises InputError for a value given beforehand as one for several
-    numbers.
+    They are consistent with the covariance of the block. Raises InputError for a scalar prior of several values.
     """
     parts = [part for part in (*_observed(block), *_weighted(block)) if np.size(part.sigma)]
     starts = np.cumsum([0, *(np.size(part.sigma) for part in parts)])
@@ -181,21 +299,21 @@ def noise(block: Block) -> Bias:
         for start, part in zip(starts, parts, strict=False)
     )
     sigma = np.concatenate([np.ravel(part.sigma) for part in parts])
-    mixed = tuple(part.mixed for part in parts)
-    return Bias(names, sigma, tuple(part.path for part in parts), index, recorded=False, mixed=mixed)
+    factors = tuple(part.factor for part in parts)
+    return Bias(names, sigma, tuple(part.path for part in parts), index, recorded=False, mixed=factors)
 
 
 def _observed(block: Block) -> Iterator[_Noisy]:
-    """All observations, wherever the block holds them."""
-    own = (block.image_points, *block.observations)
-    places: list[tuple[tuple[Any, ...], Any]] = [((f.name,), getattr(block, f.name)) for f in dataclasses.fields(block)]
-    places += [(("more", k), rows) for k, rows in enumerate(block.more)]
-    for path, rows in places:
+    """Observations of all groups of the block."""
+    groups = (block.image_points, *block.observations)
+    fields: list[tuple[tuple[Any, ...], Any]] = [((f.name,), getattr(block, f.name)) for f in dataclasses.fields(block)]
+    fields += [(("more", k), rows) for k, rows in enumerate(block.more)]
+    for path, rows in fields:
         if isinstance(rows, KnownParameters):
             yield _correlated((*path, "value"), rows.covariance[None])
         elif isinstance(rows, Correlated):
             yield _correlated((*path, "rows", rows.rows.observed), rows.covariance)
-        elif any(rows is other for other in own):
+        elif any(rows is group for group in groups):
             yield _Noisy((*path, rows.observed), np.asarray(rows.sigmas))
 
 
@@ -205,16 +323,16 @@ def _correlated(path: tuple[Any, ...], covariance: Any) -> _Noisy:
 
 
 def _weighted(block: Block) -> Iterator[_Noisy]:
-    """Values given beforehand."""
+    """Prior values."""
     paths = jax.tree_util.tree_leaves_with_path(block.priors, is_leaf=is_prior)
-    known = block.start.unknowns
+    unknowns = block.start.unknowns
     for keys, prior in paths:
         if isinstance(prior, Weighted):
             path = tuple(getattr(key, "name", getattr(key, "key", None)) for key in keys)
-            value = _follow(known, path)
+            value = _follow(unknowns, path)
             if np.shape(prior.value) != np.shape(value):
                 raise InputError(
-                    f"{_label(path)} is known beforehand by one value for {np.size(value)} numbers: give each its own"
+                    f"{_label(path)}: the prior is one value for {np.size(value)} numbers, give one for each"
                 )
             rotations = path[-1] == "camera_from_object"
             shape = (*np.shape(value)[:-1],) if rotations else np.shape(value)
@@ -226,7 +344,7 @@ def _weighted(block: Block) -> Iterator[_Noisy]:
 
 
 def _label(path: tuple[Any, ...]) -> str:
-    """Such as "shift of a" and "exterior.position"."""
+    """Label for messages, such as "shift of a" and "exterior.position"."""
     return (
         f"{path[-1]} of {path[-2]}" if path[0] in ("mounts", "strips", "scanner", "more") else ".".join(map(str, path))
     )
@@ -235,26 +353,24 @@ def _label(path: tuple[Any, ...]) -> str:
 def _parameters(block: Block, kind: str, sigma, of: Collection[str], parameter: str, distribution: Distribution):
     unknowns, priors = block.start.unknowns, block.priors
     table: Any = unknowns.interior if kind == "interior" else unknowns.mounts
-    of_priors: Any = priors.interior if kind == "interior" else priors.mounts
+    prior_table: Any = priors.interior if kind == "interior" else priors.mounts
     if not table:
-        raise InputError(f"the block {block.title!r} has no mount that a bias of kind {kind} could be added to")
+        raise InputError(f"block {block.title!r} has no mount for a bias of kind {kind}")
     chosen = _chosen(of, list(table), kind, PER[kind][0])
     field = {"lever-arm": "lever_arm", "boresight": "boresight", "interior": parameter}[kind]
     axes = (parameter,) if kind == "interior" else tuple(f"{field}_{a}" for a in _AXES[kind])
     targets = []
     for name in chosen:
         if kind == "interior" and parameter not in parameter_names(table[name]):
-            known = ", ".join(parameter_names(table[name]))
-            raise InputError(f"camera {name} has no parameter {parameter!r}; it has {known}")
-        prior = _leaf(of_priors[name], field)
+            choices = ", ".join(parameter_names(table[name]))
+            raise InputError(f"camera {name} has no parameter {parameter!r}: choose among {choices}")
+        prior = _leaf(prior_table[name], field)
         if prior == FREE:
-            raise InputError(
-                f"{field} of {name} is free, so the adjustment does not take the value that a bias changes"
-            )
-        at = ("start", "unknowns") if prior == FIXED else ("priors",)
+            raise InputError(f"{field} of {name} is free, so a bias of its value has no effect: fix it or weight it")
+        root = ("start", "unknowns") if prior == FIXED else ("priors",)
         if prior != FIXED and np.shape(prior.value) != (() if kind == "interior" else (3,)):
-            raise InputError(f"{field} of {name} is known beforehand by one value for three axes: give it three")
-        path = (*at, "interior" if kind == "interior" else "mounts", name, field)
+            raise InputError(f"{field} of {name}: the prior is one value for three axes, give three")
+        path = (*root, "interior" if kind == "interior" else "mounts", name, field)
         targets.append(path if prior == FIXED else (*path, "value"))
     index = tuple(len(axes) * k + np.arange(len(axes)) for k in range(len(chosen)))
     names = tuple(f"{name}.{axis}" for name in chosen for axis in axes)
@@ -262,7 +378,7 @@ def _parameters(block: Block, kind: str, sigma, of: Collection[str], parameter: 
 
 
 def _follow(tree: Any, path: tuple[Any, ...]) -> Any:
-    """The leaf at a path of fields, keys, numbers and names of interior parameters."""
+    """Leaf at a path of fields, keys, indices and names of interior parameters."""
     for step in path:
         tree = tree[step] if isinstance(tree, dict | tuple) else _leaf(tree, step)
     return tree
@@ -274,22 +390,20 @@ def _leaf(tree: Any, name: str) -> Any:
     return get_parameter(tree, name) if named else getattr(tree, name)
 
 
-def _chosen(of: Collection[str], known: list[str], kind: str, per: str) -> list[str]:
+def _chosen(of: Collection[str], owners: list[str], kind: str, per: str) -> list[str]:
     if isinstance(of, str):
         of = (of,)
     for name in of:
-        if name not in known:
-            some = ", ".join(known[:8]) + (" ..." if len(known) > 8 else "")
-            raise InputError(
-                f"there is no {per} {name!r} that a bias of kind {kind} could be added to; there are {some}"
-            )
-    return [name for name in known if name != "" and (not of or name in of)]
+        if name not in owners:
+            examples = ", ".join(owners[:8]) + (" ..." if len(owners) > 8 else "")
+            raise InputError(f"unknown {per} {name!r} for a bias of kind {kind}: there are {examples}")
+    return [name for name in owners if name != "" and (not of or name in of)]
 
 
 def _sigmas(sigma: float | Collection[float], axes: tuple[str, ...], n: int) -> np.ndarray:
-    given = np.atleast_1d(np.asarray(sigma, float))
-    if len(given) not in (1, len(axes)):
-        raise InputError(f"sigma is one number, or one for each of {', '.join(axes)}; got {len(given)}")
-    if not (np.isfinite(given).all() and (given >= 0).all() and given.any()):
-        raise InputError(f"sigma is a standard deviation above zero, got {', '.join(f'{v:g}' for v in given)}")
-    return np.tile(np.broadcast_to(given, len(axes)), n)
+    values = np.atleast_1d(np.asarray(sigma, float))
+    if len(values) not in (1, len(axes)):
+        raise InputError(f"sigma must be one value, or one for each of {', '.join(axes)}; got {len(values)}")
+    if not (np.isfinite(values).all() and (values >= 0).all() and values.any()):
+        raise InputError(f"sigma must be a standard deviation above zero, got {', '.join(f'{v:g}' for v in values)}")
+    return np.tile(np.broadcast_to(values, len(axes)), n)

@@ -1,8 +1,9 @@
-"""A sweep: many designs of a block, all adjusted and judged by one compiled program.
+"""Sweep over designs: many simulated blocks, adjusted and evaluated by one compiled program.
 
-A design is a block that is not flown yet: simulated, so that its observations and the truth of its points are known.
-Strips, overlap, heights, control and standard deviations may differ from design to design, and with them the numbers
-of images and points; blocks are padded to common sizes.
+A design is a simulated block with known observations and true points. Strips, overlap, heights, control and standard
+deviations may differ from design to design, and with them the numbers of images and points: blocks are padded to common
+sizes. The program runs over the designs with `jax.lax.map` on all devices and returns the statistics of each; normal
+matrices are not kept.
 """
 
 import time
@@ -11,22 +12,207 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jax.sharding import PartitionSpec as P
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxphoto.adjustment import MAX_STEPS, common_sizes
+from jaxphoto.adjustment import (
+    MAX_STEPS,
+    NormalEquations,
+    PaddedStructure,
+    PaddedValues,
+    Sizes,
+    Task,
+    common_sizes,
+    lay_out,
+    optimise,
+    to_factor,
+    to_optimum,
+)
+from jaxphoto.adjustment.model.block_values import with_start
+from jaxphoto.adjustment.model.numbers import UnknownArrays
 from jaxphoto.adjustment.rank import DEFECT
+from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block
+from jaxphoto.compiling import run_compiled
+from jaxphoto.devices import AXIS, mesh_of, usable
 from jaxphoto.errors import InputError, JaxphotoError
-from jaxphoto.sensitivity.designs import Findings, Prepared, alike, find, prepare_design
-from jaxphoto.statistics import EOP_NAMES, Rotations
+from jaxphoto.initial import approximate
+from jaxphoto.statistics.covariance import EOP_NAMES, Rotations, physical_covariance
 from jaxphoto.unknowns import Unknowns
+
+# Designs per call of the program, at least one per device.
+_BATCH = 32
+
+
+class CheckPoints(NamedTuple):
+    """Indices of check points in the padded arrays, and their true coordinates (m), NaN if unknown.
+
+    `weight` is 1, and 0 for padding.
+    """
+
+    point: Int[Numbers, "check"]
+    weight: Float[Numbers, "check"]
+    truth: Float[Numbers, "check 3"]
+
+
+class PreparedDesign(NamedTuple):
+    """Padded arrays of one design, with its labels and redundancy."""
+
+    values: PaddedValues
+    structure: PaddedStructure
+    check: CheckPoints
+    labels: tuple[str, ...]
+    """Of the shared unknowns."""
+    redundancy: int
+
+
+class DesignStatistics(NamedTuple):
+    """Statistics of one design; in metres, radians and the unknowns' own units, a priori."""
+
+    converged: Bool[Numbers, ""]
+    least_pivot: Float[Numbers, ""]
+    """Smallest pivot relative to its diagonal element: 1 for independent unknowns, 0 for a rank defect."""
+    steps: Int[Numbers, ""]
+    square_sum: Float[Numbers, ""]
+    """v'Pv."""
+    covariance: Float[Numbers, "shared shared"]
+    exterior_variance: Float[Numbers, "6"]
+    """X, Y, Z and three rotations, mean over the images."""
+    mean_abs: Float[Numbers, "6 shared"]
+    """|rho| of X, Y, Z and three rotations with each shared unknown, mean over its images."""
+    max_abs: Float[Numbers, "6 shared"]
+    check_variance: Float[Numbers, "3"]
+    """Mean over the check points of the variance of computed coordinates."""
+    check_square: Float[Numbers, "3"]
+    """Mean over the check points of (true - computed) squared."""
+
+
+def prepare_design(block: Block, truth: Unknowns | None, sizes: Sizes, n_check: int) -> PreparedDesign:
+    """Add approximate values, datum and padding to `block`, as `jaxphoto.adjust` does.
+
+    `sizes` and `n_check`, the length of the list of check points, are common to all designs. Raises the errors of
+    `jaxphoto.adjust`: BlockError, DatumError, RankError.
+    """
+    problem = lay_out(block, approximate(block), block.priors, sizes, alone=True)
+    s, constraints = problem.padded.own, len(problem.values.datum_eop)
+    points = np.unique(block.check.who)
+    check = CheckPoints(np.zeros(n_check, np.int32), np.zeros(n_check), np.full((n_check, 3), np.nan))
+    check.point[: len(points)], check.weight[: len(points)] = problem.padded.places.point[points], 1.0
+    if truth is not None:
+        check.truth[: len(points)] = np.asarray(truth.points)[points]
+    observed = 2 * len(s.image) + sum(g.components * g.n_rows for g in s.observed) + constraints
+    unknown = s.n_shared + s.eop_free.sum() + s.point_free.sum()
+    return PreparedDesign(problem.padded_values, problem.padded.structure, check, s.labels, int(observed - unknown))
+
+
+def group_by_program(designs: Sequence[PreparedDesign]) -> list[list[int]]:
+    """Indices of the designs that share one compiled program, by program."""
+    groups: dict[object, list[int]] = {}
+    for k, design in enumerate(designs):
+        arrays, rest = eqx.partition((design.values, design.structure), eqx.is_array)
+        types = tuple((v.shape, v.dtype.str) for v in jax.tree.leaves(arrays))
+        key = (types, jax.tree.structure(arrays), tuple(jax.tree.leaves(rest)))
+        groups.setdefault(key, []).append(k)
+    return list(groups.values())
+
+
+def evaluate(
+    designs: Sequence[PreparedDesign], rotations: Rotations, max_steps: int, seconds: dict[str, float]
+) -> DesignStatistics:
+    """Statistics of designs of one program, as NumPy arrays with a leading axis over them."""
+    devices = usable(_BATCH)
+    per_device = -(-_BATCH // devices)
+    size = per_device * devices
+    # Interleaved over the devices: a last batch of few designs keeps all devices busy.
+    order = np.arange(size).reshape(per_device, devices).T.ravel()
+    parts = []
+    for begin in range(0, len(designs), size):
+        valid = begin + order < len(designs)
+        batch = [designs[k] for k in np.where(valid, begin + order, begin)]
+        arrays = jax.tree.map(lambda *v: np.stack(v), *((d.values, d.structure, d.check) for d in batch))
+        statistics = run_compiled(_evaluate, (*arrays, valid, devices, rotations, max_steps), seconds, "designs")
+        inverse = np.argsort(order)[: len(designs) - begin]
+        parts.append(jax.tree.map(lambda v: np.asarray(v)[inverse], statistics))  # noqa: B023
+    return jax.tree.map(lambda *v: np.concatenate(v), *parts)
+
+
+@eqx.filter_jit
+def _evaluate(
+    values: PaddedValues,
+    s: PaddedStructure,
+    check: CheckPoints,
+    valid: Array,
+    devices: int,
+    rotations: Rotations,
+    max_steps: int,
+) -> DesignStatistics:
+    arrays, rest = eqx.partition((values, s, check), eqx.is_array)
+
+    # jit within jit: traced once, for its shapes and for its values.
+    @jax.jit
+    def evaluate_one(arrays):
+        values, s, check = eqx.combine(arrays, rest)
+        return _statistics(values, s, check, rotations, max_steps)
+
+    def evaluate_each(arrays, valid):
+        shapes = jax.eval_shape(evaluate_one, jax.tree.map(lambda v: v[0], arrays))
+        zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
+        return jax.lax.map(lambda d: jax.lax.cond(d[1], evaluate_one, lambda _: zeros, d[0]), (arrays, valid))
+
+    if devices == 1:
+        return evaluate_each(arrays, valid)
+    by_design: Any = P(AXIS)
+    run = jax.shard_map(evaluate_each, mesh=mesh_of(devices), in_specs=by_design, out_specs=by_design, check_vma=False)
+    return run(arrays, valid)
+
+
+def _statistics(
+    values: PaddedValues, s: PaddedStructure, check: CheckPoints, rotations: Rotations, max_steps: int
+) -> DesignStatistics:
+    """Adjust, factorise at the optimum, and compute covariance and statistics."""
+
+    def solve(start: UnknownArrays, task: Task):
+        optimum = optimise(with_start(values, start), s, task)
+        return optimum.state, optimum
+
+    # To the optimum, then once more for the undamped factor: a loop, so the code is compiled once.
+    tasks = jax.tree.map(lambda *each: np.stack(each), to_optimum(max_steps), to_factor())
+    start = UnknownArrays(values.position, values.rotation, values.shared, values.points)
+    state, optima = jax.lax.scan(solve, start, tasks)
+    at_optimum, factored = with_start(values, state), jax.tree.map(lambda v: v[1], optima.factored)
+    equations = NormalEquations(at_optimum, s, factored)
+    cofactors, _ = equations.cofactors(of_rows=False)
+    covariance, points = physical_covariance(cofactors, equations.scale, at_optimum.rotation, rotations)
+
+    n = 6 * s.n_images
+    variance = jnp.maximum(jnp.diagonal(covariance), 0.0)
+    inverse = jnp.where(variance > 0, 1 / jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0)
+    rho = jnp.abs(covariance[:n, n:] * inverse[:n, None] * inverse[n:]).reshape(s.n_images, 6, -1)
+    touches = jnp.any(jnp.asarray(s.column)[:, :, None] == jnp.arange(s.n_shared), axis=1)
+    rho = jnp.where(touches[:, None], rho, 0.0)
+    free = (jnp.sum(jnp.asarray(s.eop_free), axis=0) > 0).astype(float)
+    is_check, n_check = check.weight[:, None] > 0, jnp.sum(check.weight)
+    error = check.truth - at_optimum.points[:, check.point].T
+    return DesignStatistics(
+        converged=optima.converged[0],
+        least_pivot=equations.least_pivot(),
+        steps=optima.steps[0],
+        square_sum=equations.at.square_sum(),
+        covariance=covariance[n:, n:],
+        exterior_variance=free @ variance[:n].reshape(-1, 6) / jnp.sum(free),
+        mean_abs=jnp.sum(rho, axis=0) / jnp.sum(touches, axis=0),
+        max_abs=jnp.max(rho, axis=0),
+        check_variance=check.weight @ jnp.diagonal(points[check.point], axis1=1, axis2=2) / n_check,
+        check_square=jnp.sum(jnp.where(is_check, error**2, 0.0), axis=0) / n_check,
+    )
 
 
 class Design(NamedTuple):
-    """What tells a design from the others of its sweep, by name (`{"station_m": 0.1, "cross": True}`), and its block.
+    """A block with the parameters that distinguish it in its sweep, by name (`{"station_m": 0.1, "cross": True}`).
 
-    `truth` gives the check points' true coordinates (`simulation.Simulation.truth`); None where nobody knows them.
+    `truth` has the check points' true coordinates (`simulation.Simulation.truth`); None if unknown.
     """
 
     parameters: Mapping[str, Any]
@@ -37,9 +223,9 @@ class Design(NamedTuple):
 class Sweep(eqx.Module):
     """Standard deviations, correlations and check points of every design, with a leading axis over the designs.
 
-    Standard deviations are a priori (sigma naught 1), because a design is judged before it is measured; in metres,
-    radians, mm and the coefficients' own units. What a design does not have (an unknown that is fixed in it, check
-    points) is NaN, and so is everything of a design that did not converge or that cannot tell its unknowns apart.
+    Standard deviations are a priori (sigma naught 1), as for any design; in metres, radians, mm and the coefficients'
+    own units. Quantities that a design lacks (a fixed unknown, check points) are NaN, and so is everything of a design
+    that did not converge or has a rank defect.
     """
 
     parameters: tuple[Mapping[str, Any], ...] = eqx.field(static=True)
@@ -49,7 +235,7 @@ class Sweep(eqx.Module):
     """X, Y, Z and three rotations."""
     converged: Bool[np.ndarray, "designs"]
     determined: Bool[np.ndarray, "designs"]
-    """Whether the observations can tell all unknowns apart."""
+    """True without rank defect."""
     steps: Int[np.ndarray, "designs"]
     redundancy: Int[np.ndarray, "designs"]
     sigma0: Float[np.ndarray, "designs"]
@@ -64,52 +250,52 @@ class Sweep(eqx.Module):
     check_sigma: Float[np.ndarray, "designs 3"]
     """Predicted standard deviation of X, Y, Z (m): root mean square over the check points."""
     check_rmse: Float[np.ndarray, "designs 3"]
-    """Root mean square of true minus computed X, Y, Z (m) of the check points, of the simulated observations."""
+    """Root mean square of true minus computed X, Y, Z (m) of the check points, with the simulated observations."""
     programs: int = eqx.field(static=True)
-    """How many programs served all designs."""
+    """Number of compiled programs."""
     seconds: dict[str, float] = eqx.field(static=True)
-    """What took how long: prepare (approximate values, padding), compile (or loading what was), designs (computing)."""
+    """Time of prepare (approximate values, padding), compile (or load) and designs (computation)."""
 
     def __len__(self) -> int:
         return len(self.parameters)
 
 
 def sweep(designs: Sequence[Design], rotations: Rotations = "omega_phi_kappa", *, max_steps: int = MAX_STEPS) -> Sweep:
-    """Adjust every design and judge it: what `adjust`, `covariance` and `correlations` say of each by itself.
+    """Adjust and evaluate every design, with the results of `adjust`, `covariance` and `correlations`.
 
-    `rotations` says which rotations correlations mean (see `jaxphoto.covariance`). One program serves all designs that
-    have the same unknowns shared by images (cameras, mounts, strips with shifts) and the same kinds of observations;
-    more are compiled where they differ. A design that does not converge is no error: see `Sweep.converged`.
+    `rotations` selects the rotations of the correlations (see `jaxphoto.covariance`). One program serves all designs
+    with the same unknowns shared by images (cameras, mounts, strips with shifts) and the same kinds of observations;
+    others are compiled as needed. A design that does not converge is no error: see `Sweep.converged`.
 
-    Raises InputError where there is no design, where parameters' names or the unknowns of the cameras differ from
-    design to design, or where a truth is not of its block; and what `jaxphoto.adjust` raises, naming the design, where
-    one has no datum, has nothing to see a free unknown by, or has no approximate values.
+    Raises InputError without designs, for parameter names or camera unknowns that differ from design to design, and for
+    a truth of another block; and the errors of `jaxphoto.adjust`, naming the design, for one without datum, with an
+    undetermined free unknown, or without approximate values.
     """
     _check(designs, rotations)
     seconds: dict[str, float] = {}
     prepared = _prepared(designs, seconds)
     _check_cameras(designs, prepared)
-    groups = alike(prepared)
+    groups = group_by_program(prepared)
     labels = tuple(dict.fromkeys(label for design in prepared for label in design.labels))
-    parts = [
-        _in_common(find(alike_ones, rotations, max_steps, seconds), alike_ones, labels)
-        for alike_ones in ([prepared[k] for k in group] for group in groups)
-    ]
+    parts = []
+    for group in groups:
+        same = [prepared[k] for k in group]
+        parts.append(_with_labels(evaluate(same, rotations, max_steps, seconds), same, labels))
     order = np.argsort(np.concatenate(groups))
-    found = jax.tree.map(lambda *v: np.concatenate(v)[order], *parts)
+    statistics = jax.tree.map(lambda *v: np.concatenate(v)[order], *parts)
     redundancy = np.array([design.redundancy for design in prepared])
-    return _swept(designs, found, redundancy, labels, rotations, len(groups), seconds)
+    return _sweep(designs, statistics, redundancy, labels, rotations, len(groups), seconds)
 
 
 def _check(designs: Sequence[Design], rotations: Rotations) -> None:
     if rotations not in EOP_NAMES:
-        raise ValueError(f"rotations is one of {', '.join(EOP_NAMES)}, got {rotations!r}")
+        raise ValueError(f"rotations must be one of {', '.join(EOP_NAMES)}, got {rotations!r}")
     if not len(designs):
-        raise InputError("a sweep needs one design at least, but got none: give a list of Design(parameters, block)")
+        raise InputError("a sweep needs at least one design: give a list of Design(parameters, block)")
     for k, design in enumerate(designs):
         if list(design.parameters) != list(designs[0].parameters):
             raise InputError(
-                f"{_name(k, design)} is told by the parameters {_listed(design.parameters)}, but the first design by "
+                f"{_name(k, design)} has the parameters {_listed(design.parameters)}, but the first design has "
                 f"{_listed(designs[0].parameters)}: give all designs of a sweep the same, in the same order"
             )
         n = len(design.block.points)
@@ -120,7 +306,7 @@ def _check(designs: Sequence[Design], rotations: Rotations) -> None:
             )
 
 
-def _prepared(designs: Sequence[Design], seconds: dict[str, float]) -> list[Prepared]:
+def _prepared(designs: Sequence[Design], seconds: dict[str, float]) -> list[PreparedDesign]:
     began = time.perf_counter()
     sizes = common_sizes(design.block for design in designs)
     n_check = max(len(np.unique(design.block.check.who)) for design in designs)
@@ -134,72 +320,74 @@ def _prepared(designs: Sequence[Design], seconds: dict[str, float]) -> list[Prep
     return prepared
 
 
-def _check_cameras(designs: Sequence[Design], prepared: Sequence[Prepared]) -> None:
-    """Raise InputError where the cameras' unknowns are not those of the first design."""
-    of_cameras = [[label for label in design.labels if label.startswith("interior[")] for design in prepared]
-    for k, labels in enumerate(of_cameras):
-        if labels != of_cameras[0]:
+def _check_cameras(designs: Sequence[Design], prepared: Sequence[PreparedDesign]) -> None:
+    """Raise InputError unless all designs have the camera unknowns of the first."""
+    parameters = [[label for label in design.labels if label.startswith("interior[")] for design in prepared]
+    for k, labels in enumerate(parameters):
+        if labels != parameters[0]:
             raise InputError(
                 f"{_name(k, designs[k])} estimates {_listed(labels)}, but the first design "
-                f"{_listed(of_cameras[0])}: give all designs of a sweep the same cameras with the same unknowns"
+                f"{_listed(parameters[0])}: give all designs of a sweep the same cameras with the same unknowns"
             )
 
 
-def _in_common(found: Findings, designs: Sequence[Prepared], labels: tuple[str, ...]) -> Findings:
-    """The findings of `designs` with axes over all `labels`, NaN where a design lacks one."""
+def _with_labels(
+    statistics: DesignStatistics, designs: Sequence[PreparedDesign], labels: tuple[str, ...]
+) -> DesignStatistics:
+    """Statistics with axes over all `labels`, NaN for those that a design lacks."""
     n, q = len(designs), len(labels)
     covariance, mean_abs, max_abs = (np.full((n, rows, q), np.nan) for rows in (q, 6, 6))
     for k, design in enumerate(designs):
-        # Designs of one program share shapes, not names: their strips may be called otherwise.
-        place = np.array([labels.index(label) for label in design.labels], int)
-        covariance[k][np.ix_(place, place)] = found.covariance[k]
-        mean_abs[k][:, place], max_abs[k][:, place] = found.mean_abs[k], found.max_abs[k]
-    return found._replace(covariance=covariance, mean_abs=mean_abs, max_abs=max_abs)
+        # Designs of one program share shapes, not labels: their strips may have other names.
+        index = np.array([labels.index(label) for label in design.labels], int)
+        covariance[k][np.ix_(index, index)] = statistics.covariance[k]
+        mean_abs[k][:, index], max_abs[k][:, index] = statistics.mean_abs[k], statistics.max_abs[k]
+    return statistics._replace(covariance=covariance, mean_abs=mean_abs, max_abs=max_abs)
 
 
-def _swept(
+def _sweep(
     designs: Sequence[Design],
-    found: Findings,
+    statistics: DesignStatistics,
     redundancy: np.ndarray,
     labels: tuple[str, ...],
     rotations: Rotations,
     programs: int,
     seconds: dict[str, float],
 ) -> Sweep:
-    converged = np.asarray(found.converged)
-    determined = np.asarray(found.least_pivot) > DEFECT
-    useful = converged & determined
+    converged = np.asarray(statistics.converged)
+    determined = np.asarray(statistics.least_pivot) > DEFECT
+    valid = converged & determined
 
-    def kept(values):
-        """NaN of designs that say nothing."""
-        return np.where(useful.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
+    def masked(values):
+        """Replace values of invalid designs by NaN."""
+        return np.where(valid.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
 
-    variance = np.maximum(np.diagonal(found.covariance, axis1=1, axis2=2), 0.0)
-    sigma = kept(np.sqrt(variance))
+    variance = np.maximum(np.diagonal(statistics.covariance, axis1=1, axis2=2), 0.0)
+    sigma = masked(np.sqrt(variance))
     return Sweep(
         parameters=tuple(design.parameters for design in designs),
         labels=labels,
         eop_names=EOP_NAMES[rotations],
         converged=converged,
         determined=determined,
-        steps=np.asarray(found.steps),
+        steps=np.asarray(statistics.steps),
         redundancy=redundancy,
-        sigma0=kept(np.where(redundancy > 0, np.sqrt(found.square_sum / np.maximum(redundancy, 1)), 1.0)),
+        sigma0=masked(np.where(redundancy > 0, np.sqrt(statistics.square_sum / np.maximum(redundancy, 1)), 1.0)),
         sigma=sigma,
-        correlation=found.covariance / (sigma[:, :, None] * sigma[:, None, :]),
-        exterior_sigma=kept(np.sqrt(found.exterior_variance)),
-        mean_abs=kept(found.mean_abs),
-        max_abs=kept(found.max_abs),
-        check_sigma=kept(np.sqrt(found.check_variance)),
-        check_rmse=kept(np.sqrt(found.check_square)),
+        correlation=statistics.covariance / (sigma[:, :, None] * sigma[:, None, :]),
+        exterior_sigma=masked(np.sqrt(statistics.exterior_variance)),
+        mean_abs=masked(statistics.mean_abs),
+        max_abs=masked(statistics.max_abs),
+        check_sigma=masked(np.sqrt(statistics.check_variance)),
+        check_rmse=masked(np.sqrt(statistics.check_square)),
         programs=programs,
         seconds=seconds,
     )
 
 
 def _name(k: int, design: Design) -> str:
-    told = ", ".join(f"{name} {value}" for name, value in design.parameters.items())
-    return f"design {k + 1} ({told})" if told else f"design {k + 1}"
+    parameters = ", ".join(f"{name} {value}" for name, value in design.parameters.items())
+    return f"design {k + 1} ({parameters})" if parameters else f"design {k + 1}"
 
 
 def _listed(names: Iterable[str]) -> str:

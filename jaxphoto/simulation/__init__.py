@@ -1,4 +1,4 @@
-"""Blocks and observations with known truth."""
+"""Simulation of blocks and observations with known truth."""
 
 from jaxphoto.simulation.buildings import ROOFS, Building
 from jaxphoto.simulation.convergent_plan import ConvergentPlan, Field, Station

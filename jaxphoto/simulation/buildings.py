@@ -1,7 +1,7 @@
-"""Buildings: upright prisms over rectangles, under a flat, a gable or a monopitch roof.
+"""Buildings: upright prisms over rectangles with flat, gable or monopitch roofs.
 
-Each is convex, so that it is the space behind six planes, `normal . X <= offset`: its walls, and one or two sides of
-the roof. Heights under the roof and the places where rays enter follow from these.
+Each is convex, the intersection of six half-spaces, `normal . X <= offset`: its walls, and one or two sides of the
+roof. Roof heights and intersections with rays follow from these.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from jaxphoto.simulation.nearby import pairs_near
 
 Roof = Literal["flat", "gable", "monopitch"]
-"""Level; two sides that meet in a ridge over the middle line; one side that rises to the right."""
+"""Level; two sides that meet in a ridge over the centre line; one side that rises to the right."""
 ROOFS: tuple[Roof, ...] = ("flat", "gable", "monopitch")
 # The first faces of a building are its walls.
 _WALLS = 4
@@ -22,7 +22,7 @@ _WALLS = 4
 
 @dataclasses.dataclass(frozen=True)
 class Building:
-    """A rectangle of `length_m` along `heading_deg` (from north) by `width_m` across, about `centre_m` (X, Y).
+    """Rectangle of `length_m` along `heading_deg` (from north) by `width_m` across, about `centre_m` (X, Y).
 
     Its eaves, those on the left of a monopitch roof, are at Z = `eaves_m`; from there the roof rises by `slope_deg`.
     """
@@ -48,7 +48,7 @@ class Building:
 
     @property
     def radius_m(self) -> float:
-        """From the centre to a corner."""
+        """Distance from the centre to a corner."""
         return float(np.hypot(*self.half))
 
 
@@ -60,13 +60,13 @@ class Solids(NamedTuple):
     top: Float[np.ndarray, "buildings"]
     """Z of the ridge (m)."""
     normal: Float[np.ndarray, "buildings 6 3"]
-    """Outward: of four walls, of unit length; of two sides of the roof, of Z component 1 (a single side twice)."""
+    """Outward normals: four walls, of unit length; two sides of the roof, of Z component 1 (a single side twice)."""
     offset: Float[np.ndarray, "buildings 6"]
 
 
 @functools.lru_cache(maxsize=4)
 def solids(buildings: tuple[Building, ...]) -> Solids:
-    """The planes that bound `buildings`."""
+    """Return the planes that bound `buildings`."""
     each = [_planes(b) for b in buildings]
     centre = np.array([b.centre_m for b in buildings]).reshape(-1, 2)
     radius = np.array([b.radius_m for b in buildings])
@@ -78,7 +78,7 @@ def solids(buildings: tuple[Building, ...]) -> Solids:
 
 
 def roof_height(buildings: tuple[Building, ...], xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-    """Z (m) of the roofs above places (east, north), minus infinity where there is none."""
+    """Return Z (m) of the roofs above places (east, north), minus infinity if there is none."""
     z = np.full(len(xy), -np.inf)
     if buildings:
         all_of_them = solids(buildings)
@@ -93,7 +93,7 @@ def roof_height(buildings: tuple[Building, ...], xy: Float[np.ndarray, "n 2"]) -
 def wall_distance(
     buildings: tuple[Building, ...], xy: Float[np.ndarray, "n 2"], within_m: float
 ) -> Float[np.ndarray, "n"]:
-    """Horizontal distance (m) to the nearest wall, from inside or outside; infinity where it is beyond `within_m`."""
+    """Return the horizontal distance (m) to the nearest wall, from inside or outside; infinity beyond `within_m`."""
     nearest = np.full(len(xy), np.inf)
     if buildings:
         which, place = pairs_near(xy, *solids(buildings)[:2], within_m)
@@ -110,7 +110,7 @@ def wall_distance(
 def entered(
     planes: Solids, which: Int[np.ndarray, "n"], origin: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """How far along each ray building `which` is entered by a roof, and how far by a wall; infinity where it is not.
+    """Return the distance at which each ray enters building `which` by a roof, and by a wall; infinity if it does not.
 
     Source: Cyrus and Beck (1978), clipping of a line by a convex polyhedron.
     """
@@ -135,7 +135,7 @@ def _planes(b: Building) -> tuple[np.ndarray, np.ndarray]:
     walls = np.stack([along, -along, right, -right])
     reach = walls @ centre + np.repeat(half, 2)
     slope = np.tan(np.deg2rad(b.slope_deg))
-    # Z falls by these along X and Y; over the middle line the planes are at `middle`.
+    # Decrease of Z along X and Y; at the centre line the planes are at `middle`.
     falls = {"flat": (0 * right, 0 * right), "gable": (slope * right, -slope * right)}.get(
         b.roof, (-slope * right,) * 2
     )

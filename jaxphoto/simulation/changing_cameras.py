@@ -1,7 +1,7 @@
-"""Cameras that are not the same in all images of a simulation: where they see points, and what the block knows of it.
+"""Simulation of changing cameras: their image points, and the model of the block.
 
-A camera changes during the flight, with its temperature or from strip to strip; while the rows of a rolling shutter are
-exposed it moves on.
+A camera changes during the flight, with its temperature or from strip to strip; with a rolling shutter it moves while
+rows are exposed.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ _WALKING = dynamic_fields(StripCamera)
 
 
 def drawn(recipe: Recipe, flight: Flight, clock: Float[np.ndarray, "images"], seed: int) -> Changes:
-    """The changes of the recipe with their truth: each owner's own deviations, and the walk from strip to strip."""
+    """Return the changes of the recipe with their truth: deviations of each owner, and the walk between strips."""
     changes = {kind: deviated(owners, seed) for kind, owners in recipe.changes.items()}
     if recipe.walk is not None:
         strips, hours = _strip_hours(flight, clock)
@@ -47,7 +47,7 @@ def drawn(recipe: Recipe, flight: Flight, clock: Float[np.ndarray, "images"], se
 
 
 def deviated(owners: Mapping[str, SimulatedChange], seed: int) -> dict[str, SimulatedChange]:
-    """The changes with the deviations of each owner in their truth."""
+    """Return the changes with the deviations of each owner in their truth."""
     found = {}
     for name, own in owners.items():
         rng, moved = stream(seed, f"{type(own.truth).kind} of {name}"), {}
@@ -66,7 +66,7 @@ def deviated(owners: Mapping[str, SimulatedChange], seed: int) -> dict[str, Simu
 def camera_steps(
     recipe: Recipe, flight: Flight, clock: Float[np.ndarray, "images"], start: Unknowns
 ) -> tuple[StripCameraSteps, ...]:
-    """What the block says of the walk from each strip whose camera it knows to the next."""
+    """Return the block's random walk constraints between successive strips whose camera it models."""
     if recipe.walk is None or recipe.walk.stated is None:
         return ()
     known = list(start.more.get(StripCamera.kind, {}))
@@ -77,13 +77,13 @@ def camera_steps(
 
 
 def _strip_hours(flight: Flight, clock: Float[np.ndarray, "images"]) -> tuple[list[str], Float[np.ndarray, "strips"]]:
-    """The strips in their order, and their middles in hours."""
+    """Return the strips in order, and their middles in hours."""
     strips, of = list(dict.fromkeys(flight.strips)), np.array(flight.strips)
     return strips, np.array([clock[of == strip].mean() for strip in strips]) / HOUR_S
 
 
 class Circumstances(eqx.Module):
-    """Of each image: the time from the middle of the flight (s), and the temperature above the reference (K)."""
+    """Time from the middle of the flight (s) of each image, and temperature above the reference (K)."""
 
     time: Float[np.ndarray, "images"]
     above: Float[np.ndarray, "images"]
@@ -98,9 +98,9 @@ def seen_by_changing(
     when: Circumstances,
     changes: Changes,
 ) -> Rays:
-    """The rays as cameras see them that change; those of all others as they are.
+    """Return the rays as seen by changing cameras; unchanged for all others.
 
-    `motions` are those of the images (`camera_motions`). A point at the edge of the format may be seen a little beyond
+    `motions` are those of the images (`camera_motions`). A point at the edge of the format may end up slightly beyond
     it.
     """
     xy, own_of = rays.xy.copy(), [_of_images(owners, flight) for owners in changes.values()]
@@ -131,7 +131,7 @@ def seen_by_changing(
 
 
 def _of_images(owners: Mapping[str, SimulatedChange], flight: Flight) -> tuple[np.ndarray, AbstractParameters]:
-    """Whether each image has an owner that changes, and by what; by nothing, where it has none."""
+    """Return True for each image with a changing owner, and its change; zero where it has none."""
     any_of = next(iter(owners.values())).truth
     names = {"camera": flight.cameras, "strip": flight.strips}[any_of.owner]
     none = jax.tree.map(np.zeros_like, any_of)
@@ -142,7 +142,7 @@ def _of_images(owners: Mapping[str, SimulatedChange], flight: Flight) -> tuple[n
 @jax.jit
 def _seen(interior, bending, time_per_mm, motion, in_flight, above, position, camera_from_object, point):
     def one(bending, time_per_mm, motion, in_flight, above, position, camera_from_object, point):
-        # What changes a camera asks nothing else of an exposure.
+        # Changes of a camera depend on nothing else of an exposure.
         exposure, changed = Exposure(in_flight, motion[:3], motion[3:], temperature=above), interior
         for own in bending:
             changed = own.interior(changed, exposure)
@@ -155,7 +155,7 @@ def _seen(interior, bending, time_per_mm, motion, in_flight, above, position, ca
 def with_changes(
     changes: Changes, start: Unknowns, priors: Unknowns, truth: Unknowns
 ) -> tuple[Unknowns, Unknowns, Unknowns]:
-    """Start, priors and truth with what changes cameras; the truth has what the block does not know, too."""
+    """Return start, priors and truth with the changes; the truth includes those that the block does not model."""
 
     def more(unknowns: Unknowns, own_of: Mapping[str, dict[str, AbstractParameters]]) -> Unknowns:
         return dataclasses.replace(unknowns, more=unknowns.more | {kind: own for kind, own in own_of.items() if own})

@@ -1,4 +1,4 @@
-"""Compiled functions over rows of any number: rows go in chunks of one size, so that each compiles once only."""
+"""Compiled functions over any number of rows: chunks of equal size, so that each compiles once."""
 
 from collections.abc import Callable
 
@@ -7,10 +7,10 @@ import numpy as np
 
 
 def in_chunks(function: Callable, size: int, *rows):
-    """`function(*rows)` for trees of arrays (or numbers) with a leading axis of one length, `size` rows at a time.
+    """Apply `function(*rows)` to trees of arrays (or numbers) with a leading axis, `size` rows at a time.
 
-    `function` is compiled and takes `size` rows; the last chunk is filled up with copies of its first row. The result
-    is a tree of numpy arrays.
+    `function` is compiled and takes `size` rows; the last chunk is padded with copies of its first row. The result is a
+    tree of NumPy arrays.
     """
     n = len(jax.tree.leaves(rows)[0])
     parts = []

@@ -1,4 +1,4 @@
-"""Convergent images as taken: a flight that stands still."""
+"""Convergent images: a flight without motion."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from jaxphoto.simulation.streams import stream
 
 
 def take_images(plan: ConvergentPlan, jitter: Jitter, mean_height: float, seed: int) -> Flight:
-    """Take the images of `plan`, with jitter; the middle of the field is `mean_height` (m) above zero."""
+    """Take the images of `plan`, with jitter; the centre of the field is at the height `mean_height` (m)."""
     stations, rng = plan.stations, stream(seed, "flight")
     n = len(stations)
     middle = np.array([0.0, 0.0, mean_height])

@@ -1,4 +1,4 @@
-"""Exposures on the trajectory of the scanner that flies with the camera: when, and what it says of them."""
+"""Exposures on the trajectory of a scanner flown with the camera."""
 
 import jax
 import numpy as np
@@ -15,10 +15,10 @@ _CHUNK = 64
 
 
 def exposure_times(paths: list[Path], flight: Flight) -> Float[np.ndarray, "images"]:
-    """Of all images, on the clock of the paths (s)."""
+    """Return the times of all images, on the clock of the paths (s)."""
     time, of = np.zeros(len(flight.images)), np.array(flight.strips)
     for path in paths:
-        # A path leads on before its first exposure and after its last.
+        # A path extends beyond its first and last exposure.
         time[of == path.strip] = path.node[1:-1]
     return time
 
@@ -31,7 +31,7 @@ def recorded_on_path(
     flight: Flight,
     errors: StripErrors,
 ) -> tuple[Float[np.ndarray, "images 3"], Float[np.ndarray, "images 3"]]:
-    """Positions (m) and angles (rad) of the exposures with what the trajectory is off by at their times."""
+    """Return positions (m) and angles (rad) of the exposures with the trajectory errors at their times."""
     off, turn, of = np.zeros_like(position), np.zeros_like(position), np.array(flight.strips)
     for k, path in enumerate(paths):
         own = of == path.strip

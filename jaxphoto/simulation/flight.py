@@ -1,4 +1,4 @@
-"""The flight as flown: where the cameras truly were, and what GNSS and IMU would record of it without noise."""
+"""Flight as flown: true camera positions, and error-free records of GNSS and IMU."""
 
 from typing import NamedTuple
 
@@ -30,12 +30,12 @@ from jaxphoto.simulation.streams import stream
 
 NO_BIAS = StripBias(np.zeros(3), np.zeros(3))  # type: ignore[arg-type]
 NO_MOUNT = Mount(np.zeros(3), np.zeros(3))  # type: ignore[arg-type]
-"""Of strips and cameras that have none."""
+"""For strips and cameras that have none."""
 _CHUNK = 64
 
 
 class Flight(NamedTuple):
-    """One entry per image, in the order of the flight; `time` in seconds from the mean time of the strip.
+    """One entry per image, in order of flight; `time` in seconds from the mean time of the strip.
 
     Images that belong to no strip have the strip "".
     """
@@ -49,10 +49,10 @@ class Flight(NamedTuple):
 
 
 def fly(recipe: Recipe, plan: FlightPlan, mean_height: float, seed: int, purpose: str = "flight") -> Flight:
-    """Fly `plan` `mean_height` (m) above zero, with the recipe's jitter, drawn for this `purpose` (`stream`).
+    """Fly `plan` at `mean_height` (m) above zero, with the recipe's jitter, drawn for this `purpose` (`stream`).
 
-    Every exposure is off its plan by normal deviations. The body's attitude is roll, pitch, yaw = heading + crab; the
-    camera follows it through the true mount.
+    Every exposure deviates normally from its plan. The body's attitude is roll, pitch, yaw = heading + crab; the camera
+    follows it through the true mount.
     """
     strips = plan.strips
     of = np.repeat(np.arange(len(strips)), [s.images for s in strips])
@@ -80,7 +80,8 @@ def fly(recipe: Recipe, plan: FlightPlan, mean_height: float, seed: int, purpose
 
 
 def record(flight: Flight, mounts: list[Mount], biases: list[StripBias]) -> tuple[np.ndarray, np.ndarray]:
-    """GNSS position (images, 3) in m and roll, pitch, yaw (images, 3) in rad at the recorded times, without noise.
+    """Return GNSS position (images, 3) in m and roll, pitch, yaw (images, 3) in rad at the recorded times, without
+    noise.
 
     `mounts` and `biases` are those of each image.
     """
@@ -93,7 +94,7 @@ def record(flight: Flight, mounts: list[Mount], biases: list[StripBias]) -> tupl
 
 
 def recorded(position, camera_from_object, mount: Mount, bias: StripBias, exposure: Exposure) -> tuple[Array, Array]:
-    """GNSS position (m) and roll, pitch, yaw (rad) of one image at its recorded time."""
+    """Return GNSS position (m) and roll, pitch, yaw (rad) of one image at its recorded time."""
     body = recorded_attitude(camera_from_object, mount, exposure)
     return sensor_position(position, camera_from_object, mount, bias, exposure), roll_pitch_yaw_from_matrix(body)
 
@@ -102,12 +103,12 @@ _recorded_of_many = jax.jit(jax.vmap(recorded))
 
 
 def turned(exterior: ExteriorOrientation, theta: Float[np.ndarray, "images 3"]) -> Float[np.ndarray, "images 3 3"]:
-    """`camera_from_object` turned by small rotations `theta` (rad) about the camera's axes."""
+    """Rotate `camera_from_object` by small rotations `theta` (rad) about the camera's axes."""
     return in_chunks(_turned, _CHUNK, exterior.camera_from_object, theta)
 
 
 def omega_phi_kappa(exterior: ExteriorOrientation) -> Float[np.ndarray, "images 3"]:
-    """(omega, phi, kappa) of every image, in rad."""
+    """Return (omega, phi, kappa) of every image, in rad."""
     return in_chunks(_omega_phi_kappa, _CHUNK, exterior.camera_from_object)
 
 

@@ -1,4 +1,4 @@
-"""The flight as planned: straight strips over level ground, their exposures, and the ground they cover.
+"""Flight plan: straight strips over level ground, their exposures, and the ground they cover.
 
 Headings are in degrees clockwise from north, lengths in metres, object frame east-north-up (docs/conventions.md).
 """
@@ -13,12 +13,12 @@ from jaxphoto.camera import Sensor
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing.mount import ImageX
 
-# So often 4 n places are drawn for n: enough where strips are a thousandth of the ground between them.
+# Number of attempts to draw n places from 4 n candidates: enough if strips cover a thousandth of the area.
 _TRIES = 1_000
 
 
 class Footprint(NamedTuple):
-    """The ground that a vertical image covers, along and across the flight (m)."""
+    """Ground coverage of a vertical image, along and across the flight (m)."""
 
     along: float
     across: float
@@ -26,10 +26,10 @@ class Footprint(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Strip:
-    """A straight run of `images` exposures, `base_m` apart, flown towards `heading_deg` at a constant height.
+    """Straight run of `images` exposures, `base_m` apart, flown towards `heading_deg` at a constant height.
 
-    The middle of the run lies `along_m` ahead and `across_m` to the right of the origin, as seen by one who flies it.
-    `height_m` is above the mean terrain, `footprint` is that of an exposure there.
+    The centre of the run is `along_m` ahead and `across_m` to the right of the origin, in flight direction. `height_m`
+    is above the mean terrain, `footprint` is that of an exposure there.
     """
 
     name: str
@@ -50,12 +50,12 @@ class Strip:
 
     @property
     def along(self) -> Float[np.ndarray, "images"]:
-        """How far ahead of the middle of the strip each exposure is (m)."""
+        """Distance of each exposure ahead of the centre of the strip (m)."""
         return (np.arange(self.images) - (self.images - 1) / 2) * self.base_m
 
     @property
     def middle(self) -> Float[np.ndarray, "2"]:
-        """Of the run, (east, north) in m."""
+        """Centre of the run, (east, north) in m."""
         return np.array([self.along_m, self.across_m]) @ self.axes
 
     @property
@@ -66,7 +66,7 @@ class Strip:
 
 @dataclasses.dataclass(frozen=True)
 class FlightPlan:
-    """Strips in the order of their flight, at a ground speed, with turns between them.
+    """Strips in order of flight, with ground speed and turns between them.
 
     `turn_s` is the time from the last exposure of a strip to the first of the next.
     """
@@ -77,7 +77,7 @@ class FlightPlan:
 
     @property
     def clock(self) -> Float[np.ndarray, "images"]:
-        """The time of every exposure from the mean of all (s)."""
+        """Return the time of every exposure from the mean of all (s)."""
         times, begin = [], 0.0
         for strip in self.strips:
             own = strip.along / self.speed_m_per_s
@@ -88,20 +88,20 @@ class FlightPlan:
 
     @property
     def cameras(self) -> set[str]:
-        """Those that are flown."""
+        """Cameras used."""
         return {strip.camera for strip in self.strips}
 
     @property
     def n_images(self) -> int:
-        """In all strips."""
+        """Number of images in all strips."""
         return sum(strip.images for strip in self.strips)
 
 
 @dataclasses.dataclass(frozen=True)
 class Swaths:
-    """The ground between the first and last exposure of each strip, over a part of its width.
+    """Ground between the first and last exposure of each strip, over a fraction of its width.
 
-    `across` is that part; `ends` is the part of half a footprint that is added beyond the first and last exposure.
+    `across` is that fraction; `ends` is the fraction of half a footprint added beyond the first and last exposure.
     """
 
     strips: tuple[Strip, ...]
@@ -115,7 +115,7 @@ class Swaths:
 
     @property
     def directions(self) -> Float[np.ndarray, "directions 2"]:
-        """Unit vectors (east, north) along which strips are flown, one way or the other."""
+        """Unit vectors (east, north) along the strips, in one direction each."""
         headings = np.deg2rad(np.unique([round(s.heading_deg % 180, 3) for s in self.strips]))
         return np.column_stack([np.sin(headings), np.cos(headings)])
 
@@ -125,20 +125,20 @@ class Swaths:
         return np.array([length, self.across * strip.footprint.across / 2])
 
     def contain(self, xy: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
-        """Whether places (east, north) lie in any of the swaths."""
+        """Return True for places (east, north) in any of the swaths."""
         inside = np.zeros(len(xy), bool)
         for strip in self.strips:
             inside |= np.all(np.abs((xy - strip.middle) @ strip.axes.T) <= self.half(strip), axis=1)
         return inside
 
     def extent(self, axes: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
-        """Least and greatest coordinate of all swaths, (least or greatest, axis) in m along the unit vectors `axes`."""
+        """Minimum and maximum coordinate of all swaths, (minimum or maximum, axis) in m along `axes`."""
         signs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
         corners = np.vstack([s.middle + signs * self.half(s) @ s.axes for s in self.strips]) @ axes.T
         return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
     def draw(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n 2"]:
-        """Places (east, north) of uniform density over the union of the swaths. Raises BlockError if that is empty."""
+        """Draw places (east, north) uniformly over the union of the swaths. Raises BlockError if that is empty."""
         if not any(np.all(self.half(strip) > 0) for strip in self.strips):
             raise BlockError(
                 "strips of one image each leave no ground between their first and last exposure; "
@@ -155,6 +155,6 @@ class Swaths:
 
 
 def footprint(sensor: Sensor, c_mm: float, height_m: float, image_x: ImageX) -> Footprint:
-    """The ground that a vertical image covers from `height_m`: format times height over principal distance."""
+    """Return the coverage of a vertical image from `height_m`: format times height over principal distance."""
     sides = np.array([sensor.width_mm, sensor.height_mm]) * height_m / c_mm
     return Footprint(*map(float, sides if image_x in ("forward", "back") else sides[::-1]))

@@ -1,4 +1,4 @@
-"""Observations of further kinds measured anew: what their own residual says of the truth, and fresh noise."""
+"""Simulation of further observations: true values from their residual functions, and new noise."""
 
 from typing import Any
 
@@ -16,9 +16,9 @@ Rows = AbstractObservations | KnownParameters
 
 
 def observed_anew(rows: Rows, block: Block, truth: Unknowns, key: PRNGKeyArray) -> Rows:
-    """The rows with what they would observe under `truth`, plus normal noise of their sigmas.
+    """Return the rows with their observations under `truth`, plus normal noise of their sigmas.
 
-    Those that covariances join, and those that touch what `truth` does not have, stay as they are.
+    Rows with joint covariances, and those that touch parameters `truth` does not have, are not changed.
     """
     if isinstance(rows, Correlated | KnownParameters) or rows.also or rows.through_camera or not len(rows):
         return rows

@@ -1,4 +1,4 @@
-"""The way of a laser scanner: smooth between exposures, or nodes of a flight of its own, and with their motion."""
+"""Path of a laser scanner: interpolated between exposures, or of a flight of its own."""
 
 from typing import NamedTuple, cast
 
@@ -20,42 +20,42 @@ _GAP_S = 60.0
 
 
 class Path(NamedTuple):
-    """Where the scanner truly is during one strip."""
+    """True path of the scanner during one strip."""
 
     strip: str
     height_m: float
-    """As planned, above the mean terrain."""
+    """Planned height above the mean terrain."""
     length_m: float
-    """As planned, over ground."""
+    """Planned length over ground."""
     node: Float[np.ndarray, "nodes"]
-    """Times (s), from the begin to the end of the strip."""
+    """Times (s), from the beginning to the end of the strip."""
     position: Float[np.ndarray, "nodes 3"]
     velocity: Float[np.ndarray, "nodes 3"]
     """Metres and metres per second."""
     quaternion: Float[np.ndarray, "nodes 4"]
     turn: Float[np.ndarray, "nodes 4"]
-    """(w, x, y, z) of `object_from_body`, of signs that follow one another, and its derivative (1/s)."""
+    """(w, x, y, z) of `object_from_body`, with continuous signs, and its derivative (1/s)."""
 
     def pose(self, time: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 4"]]:
-        """Position (m) and unit quaternion of `object_from_body` at times (s)."""
+        """Return position (m) and unit quaternion of `object_from_body` at times (s)."""
         quaternion = _hermite(self.node, self.quaternion, self.turn, time)
         length = np.linalg.norm(quaternion, axis=1, keepdims=True)
         return _hermite(self.node, self.position, self.velocity, time), quaternion / length
 
 
 def matrices(quaternion: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    """Rotation matrices of quaternions."""
+    """Return rotation matrices of quaternions."""
     return in_chunks(_matrices, _MANY, quaternion)
 
 
 def paths(recipe: Recipe, plan: ScanPlan, flight: Flight, mean_height: float, seed: int) -> list[Path]:
-    """The path of every strip that `plan` scans, one after the other, from time zero: of `flight` or of its own.
+    """Return the path of every strip of `plan`, consecutively from time zero: of `flight` or of its own.
 
-    Where exposures lie on the trajectory of the scanner, time zero is the mean of theirs.
+    If exposures lie on the trajectory of the scanner, time zero is their mean.
 
-    The scanner sits where GNSS and IMU refer to, and has their true positions. Positions and quaternions are cubic
-    Hermite splines: at each exposure they have its velocity and its rate of turn. Over the ground that the first and
-    last image show, the path leads on straight beyond their exposures. Nodes of a flight of its own leave the plan as
+    The scanner is at the reference point of GNSS and IMU, at their true positions. Positions and quaternions are cubic
+    Hermite splines through each exposure with its velocity and rotation rate. Over the ground of the first and last
+    image the path is extended straight beyond their exposures. Nodes of a separate flight deviate from the plan as
     exposures do.
     """
     flown = cast(FlightPlan, recipe.plan)
@@ -64,7 +64,7 @@ def paths(recipe: Recipe, plan: ScanPlan, flight: Flight, mean_height: float, se
         flight = fly(recipe, flown, mean_height, seed, "flight of the scanner")
     names = [recipe.mount_of(camera) for camera in flight.cameras]
     true = [recipe.mounts[name].truth if name else NO_MOUNT for name in names]
-    # At the time of the exposure, whatever the camera's clock says.
+    # At the true time of the exposure, whatever the camera's clock.
     mounts = [Mount(m.lever_arm, m.boresight, 0.0, m.image_x) for m in true]
     position, attitude = record(flight, mounts, [NO_BIAS] * len(mounts))
     quaternion = in_chunks(_quaternions, _CHUNK, attitude)
@@ -84,9 +84,9 @@ def paths(recipe: Recipe, plan: ScanPlan, flight: Flight, mean_height: float, se
 
 
 def _led(lead: float, time, position, velocity, quaternion, turn) -> tuple[np.ndarray, ...]:
-    """The nodes of one strip and, `lead` seconds before and after, two more; signs of quaternions follow one another.
+    """Return the nodes of one strip and two more, `lead` seconds before and after; signs of quaternions are continuous.
 
-    There the velocity and the attitude are those of the first and the last exposure, and the attitude rests.
+    There the velocity and the attitude are those of the first and the last exposure, without rotation.
     """
     turned = np.einsum("ni,ni->n", quaternion[1:], quaternion[:-1]) < 0
     sign = np.concatenate([[1.0], np.cumprod(np.where(turned, -1.0, 1.0))])[:, None]
@@ -100,7 +100,7 @@ def _led(lead: float, time, position, velocity, quaternion, turn) -> tuple[np.nd
 
 
 def _turn(quaternion: Float[np.ndarray, "n 4"], rate: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4"]:
-    """Derivative of the quaternion: q (0, rate / 2), the rate about the body's axes (rad/s)."""
+    """Return the derivative of the quaternion: q (0, rate / 2), the rate about the body's axes (rad/s)."""
     (w, v), half = (quaternion[:, :1], quaternion[:, 1:]), rate / 2
     return np.hstack([-np.sum(v * half, axis=1, keepdims=True), w * half + np.cross(v, half)])
 
@@ -120,7 +120,7 @@ def _matrices(quaternion):
 def _hermite(
     node: Float[np.ndarray, "k"], value: Float[np.ndarray, "k m"], slope: Float[np.ndarray, "k m"], at: np.ndarray
 ) -> Float[np.ndarray, "n m"]:
-    """The cubics that have `value` and `slope` at every node."""
+    """Return the cubics with `value` and `slope` at every node."""
     i = np.clip(np.searchsorted(node, at, side="right") - 1, 0, len(node) - 2)
     step = (node[i + 1] - node[i])[:, None]
     u = (at - node[i])[:, None] / step

@@ -74,7 +74,7 @@ def _seen_often(
     rng: np.random.Generator,
     draw: Callable[[int], np.ndarray],
 ) -> np.ndarray:
-    """The first `n` of the open places that `draw` gives, on ground or roofs, that enough images see."""
+    """Return the first `n` open places from `draw`, on ground or roofs, that enough images see."""
     found = np.zeros((0, 3))
     for _ in range(_TRIES):
         if len(found) >= n:

@@ -1,6 +1,6 @@
-"""What a simulation is made from: everything but the seed.
+"""Recipe of a simulation: everything but the seed.
 
-What the block says and what is true are told apart everywhere: `Assumed` for parameters, `Sigmas` twice for noise.
+The model of the block and the truth are separate: `Assumed` for parameters, `Sigmas` twice for noise.
 """
 
 import dataclasses
@@ -21,14 +21,14 @@ from jaxphoto.simulation.settlement import Settlement
 from jaxphoto.simulation.terrain import Terrain
 
 Role = Literal["control", "vertical", "check", "tie"]
-"""What a target is: control in X, Y and Z, control in Z only, a check point, or a tie point as good as a target."""
+"""Role of a target: control in X, Y and Z, control in Z only, check point, or tie point of a target's precision."""
 ROLES: tuple[Role, ...] = ("control", "vertical", "check", "tie")
 T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
 class Assumed(Generic[T]):
-    """Parameters as they are (`truth`), as the block starts with (`start`), and its priors for them."""
+    """Parameters: `truth`, `start` of the block, and its priors."""
 
     truth: T
     start: T
@@ -39,8 +39,8 @@ class Assumed(Generic[T]):
 class SimulatedBias:
     """Shift (m) and drift (m/s) of the GNSS positions of a strip.
 
-    Truth is `truth` plus, for each strip by itself, normal shifts and drifts of `shift_sigma_m` and
-    `drift_sigma_m_per_s`. `model` is the block's start and prior, None where the block knows of no bias.
+    Truth is `truth` plus normal shifts and drifts of `shift_sigma_m` and `drift_sigma_m_per_s` for each strip. `model`
+    is the block's start and prior, None if the block models no bias.
     """
 
     truth: StripBias
@@ -51,10 +51,10 @@ class SimulatedBias:
 
 @dataclasses.dataclass(frozen=True)
 class SimulatedShutter:
-    """The rolling shutter of a camera; `model` is the block's start and prior, None where the block knows of none.
+    """Rolling shutter of a camera; `model` is the block's start and prior, None if the block models none.
 
-    Motions of its images are told to the block with normal errors of `velocity_m_per_s` and `rate_deg_per_s`, and
-    observed with these standard deviations; exactly, and held, where these are zero.
+    The block receives motions of its images with normal errors of `velocity_m_per_s` and `rate_deg_per_s`, observed
+    with these standard deviations; exact and fixed if these are zero.
     """
 
     truth: RollingShutter
@@ -65,10 +65,10 @@ class SimulatedShutter:
 
 @dataclasses.dataclass(frozen=True)
 class SimulatedChange:
-    """How a camera changes during the flight, or in a strip.
+    """Change of a camera during the flight, or in a strip.
 
-    Truth is `truth`, plus what is drawn where the same field of `spread`, a tree of priors, is `Weighted`. `model` is
-    the block's start and prior, None where it knows of no change.
+    Truth is `truth`, plus a random part where the same field of `spread`, a tree of priors, is `Weighted`. `model` is
+    the block's start and prior, None if it models no change.
     """
 
     truth: AbstractParameters
@@ -78,10 +78,9 @@ class SimulatedChange:
 
 @dataclasses.dataclass(frozen=True)
 class CameraWalk:
-    """A random walk of c, x_p and y_p (mm) from strip to strip: standard deviations of a step of an hour.
+    """Random walk of c, x_p and y_p (mm) from strip to strip: standard deviations of a step of an hour.
 
-    `truth` is how far cameras of strips truly walk, `stated` what the block says of it in `StripCameraSteps`; None
-    where it says nothing.
+    `truth` is the true walk, `stated` that of the block's `StripCameraSteps`; None if it has none.
     """
 
     truth: Triple
@@ -90,10 +89,10 @@ class CameraWalk:
 
 @dataclasses.dataclass(frozen=True)
 class Cooling:
-    """The temperature of the cameras (degrees Celsius): it approaches that of the air by Newton's law of cooling.
+    """Camera temperature (degrees Celsius), approaching that of the air by Newton's law of cooling.
 
-    t after the first exposure it is air + (begin - air) exp(-t / time constant). The block knows it, and takes the
-    interior orientation to be that at `reference_c`.
+    t after the first exposure it is air + (begin - air) exp(-t / time constant). The block knows it; its interior
+    orientation refers to `reference_c`.
     """
 
     begin_c: float
@@ -102,17 +101,17 @@ class Cooling:
     reference_c: float
 
     def at(self, time: Float[np.ndarray, "images"]) -> Float[np.ndarray, "images"]:
-        """At times (s) on any clock, of which the first is the least."""
+        """Return temperatures at times (s) on any clock; the earliest is the first exposure."""
         gone = (time - np.min(time)) / self.time_constant_s
         return self.air_c + (self.begin_c - self.air_c) * np.exp(-gone)
 
 
 @dataclasses.dataclass(frozen=True)
 class Jitter:
-    """Standard deviations by which a flight, or a convergent set, leaves its plan.
+    """Standard deviations of a flight, or a convergent set, about its plan.
 
     `position_m` per axis X, Y, Z; `angle_deg` of roll and of pitch; `crab_deg` of yaw against the track (the track
-    stays); `rate_deg_per_s` of the rates of turn about right, forward and up. In a convergent set `angle_deg` is that
+    stays); `rate_deg_per_s` of the rotation rates about right, forward and up. In a convergent set `angle_deg` is that
     of the aim, about the camera's x and y axes, and `crab_deg` that of the roll.
     """
 
@@ -124,12 +123,12 @@ class Jitter:
 
 @dataclasses.dataclass(frozen=True)
 class PointPlan:
-    """How many tie points there are, where, and what is measured.
+    """Number, area and visibility of tie points.
 
-    Points lie in the swaths (`Swaths`: `across`, `ends`) or the `Field`, and are seen in `min_images` images at least,
-    with `margin_mm` to the edge of the format. Every image that sees a point measures it, unless `mean_rays` says to
-    how many images a point, on average over all points, rays are thinned out by chance. Where there are buildings, the
-    part `on_roofs` of the tie points lies on them, the others on ground and roofs alike; none is near a wall or crown.
+    Points lie in the swaths (`Swaths`: `across`, `ends`) or the `Field`, and are visible in at least `min_images`
+    images, `margin_mm` from the edge of the format. Every such image measures the point, unless `mean_rays` sets the
+    average number of rays per point, to which rays are thinned at random. With buildings, the fraction `on_roofs` of
+    the tie points lies on them, the others on ground and roofs alike; none is close to a wall or crown.
     """
 
     ties: int
@@ -143,10 +142,10 @@ class PointPlan:
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """Targets of a group that play another role: the `outermost` of each arm, the one at the `centre`, the `first`.
+    """Targets of a group with another role: the `outermost` of each arm, the one at the `centre`, the `first`.
 
-    Arms lead from the middle of the block both ways along each direction in which strips are flown, or each side of a
-    field. A target is chosen once: the rule that comes to it later takes its next one.
+    Arms lead from the centre of the block in both directions of the strips, or along each side of a field. A target is
+    chosen once: a later rule takes its next one.
     """
 
     role: Role
@@ -157,10 +156,10 @@ class Choice:
 
 @dataclasses.dataclass(frozen=True)
 class TargetPlan:
-    """Signalised points of one role: `count` of them uniform over the ground, and those at given places.
+    """Signalised points of one role: `count` uniformly distributed, and those at given places.
 
-    `at_m` gives (X, Y) or (X, Y, Z) in m; `at` gives places as parts of half the block's length and width, along and
-    to the right of the first strip's heading, from the middle of the block; in a field along X and Y.
+    `at_m` gives (X, Y) or (X, Y, Z) in m; `at` gives places as fractions of half the block's length and width, along
+    and to the right of the first strip's heading, from the centre of the block; in a field along X and Y.
     """
 
     role: Role
@@ -174,9 +173,9 @@ class TargetPlan:
 @dataclasses.dataclass(frozen=True)
 class Sigmas:
     """Standard deviations of tie points and targets in the images, control, stations, attitudes, laser points,
-    places and turns of cameras in their rig, positions and attitudes beside those of the exposure before.
+    positions and rotations of rig cameras, and relative positions and attitudes of successive exposures.
 
-    None where these are not observed.
+    None if not observed.
     """
 
     image_mm: float
@@ -193,7 +192,7 @@ class Sigmas:
 
 @dataclasses.dataclass(frozen=True)
 class Approximation:
-    """Standard deviations of the approximate values: of orientations, and of all points where they are given."""
+    """Standard deviations of the approximate values: of orientations, and of all points if given."""
 
     position_m: float = 5.0
     angle_deg: float = 1.0
@@ -203,13 +202,12 @@ class Approximation:
 @shown
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-    """A simulation but for its seed.
+    """Recipe of a simulation, without its seed.
 
     `mounts` are by name, "default" or that of a camera, `shutters` by camera; `biases` by name, "default" or that of a
-    strip; `changes` of cameras by kind and owner; `rig` has the cameras of a rig beside the one that is flown. `stated`
-    sigmas are those of the block's observations, `noise` those by which these are truly off. `datum_offset_m` is added
-    to all observed stations and is in no model. `settlement` is what stands on the terrain; `lidar` scans both, in
-    strips.
+    strip; `changes` of cameras by kind and owner; `rig` has the other cameras of a rig. `stated` sigmas are those of
+    the block's observations, `noise` those of their true errors. `datum_offset_m` is added to all observed stations and
+    is not modelled. `settlement` are buildings and trees on the terrain; `lidar` scans both, in strips.
     """
 
     title: str
@@ -237,16 +235,16 @@ class Recipe:
 
     @property
     def ground(self) -> Swaths | Field:
-        """Where points lie."""
+        """Area of the points."""
         if isinstance(self.plan, ConvergentPlan):
             return self.plan.field
         return Swaths(self.plan.strips, self.points.across, self.points.ends)
 
     def mount_of(self, camera: str) -> str:
-        """The name of a camera's mount: its own, "default", or "" without any."""
+        """Return the name of a camera's mount: its own, "default", or "" without any."""
         return camera if camera in self.mounts else "default" if "default" in self.mounts else ""
 
 
 def triple(values: Triple) -> Float[np.ndarray, "3"]:
-    """A triple of the recipe as an array."""
+    """Return a triple of the recipe as an array."""
     return np.array(values, float)

@@ -1,4 +1,4 @@
-"""Relative control in a simulation: positions and attitudes beside those of the exposure before, in the same strip."""
+"""Simulation of relative control: positions and attitudes relative to the exposure before, in the same strip."""
 
 from typing import Any
 
@@ -20,9 +20,9 @@ _CHUNK = 64
 def relative_rows(
     recipe: Recipe, flight: Flight, mounts: list[Mount], seed: int
 ) -> tuple[RelativePositions | RelativeAttitudes, ...]:
-    """What carrier phases and gyros tell of successive exposures of each strip, by noise of its own only.
+    """Return relative observations by carrier phases and gyros of successive exposures of each strip.
 
-    Nothing that positions and attitudes of a strip are off by, biases or a trajectory's errors, is in it.
+    Only their own noise: biases of a strip or trajectory errors do not enter.
     """
     stated, noise = recipe.stated, recipe.noise
     if stated.relative_position_m is None and stated.relative_attitude_deg is None:
@@ -49,5 +49,5 @@ def relative_rows(
 @jax.jit
 @jax.vmap
 def _relative_angles(first, second):
-    """Roll, pitch and yaw of one body as the other sees it."""
+    """Return roll, pitch and yaw of one body relative to another."""
     return roll_pitch_yaw_from_matrix(matrix_from_roll_pitch_yaw(first).T @ matrix_from_roll_pitch_yaw(second))

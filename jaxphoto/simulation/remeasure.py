@@ -1,4 +1,4 @@
-"""Measure a block anew: the same rows, computed from known unknowns, with fresh noise of their own sigmas."""
+"""Simulation of new observations of a block: the same rows, from known unknowns, with new noise of their sigmas."""
 
 import dataclasses
 
@@ -18,12 +18,11 @@ from jaxphoto.unknowns import Unknowns
 
 
 def remeasure(block: Block, truth: Unknowns, key: PRNGKeyArray) -> Block:
-    """`block` with every observation replaced by its true value under `truth` plus normal noise of its sigma.
+    """Replace every observation of `block` by its true value under `truth` plus normal noise of its sigma.
 
     Image points, stations, attitudes, control, surfaces, distances and further rows are drawn independently; check and
-    fixed coordinates become true ones; weighted priors and what covariances join stay. Pure and differentiable in
-    `truth`; `vmap` over keys gives many blocks at once. Which unknowns it is called with is what an adjustment of it
-    should recover.
+    fixed coordinates become true ones; weighted priors and joint covariances stay. Pure and differentiable in `truth`;
+    `vmap` over keys gives many blocks at once. An adjustment should recover `truth`.
     """
     keys = jax.random.split(key, 5)
     draw = lambda k, value, sigma: value + jnp.asarray(sigma) * jax.random.normal(k, value.shape)  # noqa: E731
@@ -51,7 +50,7 @@ def remeasure(block: Block, truth: Unknowns, key: PRNGKeyArray) -> Block:
 
 
 def _feet(surfaces: SurfaceRows, truth: Unknowns, key: PRNGKeyArray) -> Float[Array, "rows 3"]:
-    """Laser points of the surfaces: off by shift and boresight of the scanner, and by noise along the normal."""
+    """Return laser points of the surfaces with shift and boresight of the scanner, and noise along the normal."""
     foot = jnp.asarray(truth.points)[surfaces.point]
     rise = jnp.asarray(surfaces.sigma) * jax.random.normal(key, surfaces.sigma.shape)
     if truth.scanner is not None:
@@ -62,7 +61,7 @@ def _feet(surfaces: SurfaceRows, truth: Unknowns, key: PRNGKeyArray) -> Float[Ar
 
 
 def image_coordinates(block: Block, truth: Unknowns) -> Float[Array, "rows 2"]:
-    """Measured image coordinates (mm, without noise) of every image row under `truth`."""
+    """Return image coordinates (mm, without noise) of every image row under `truth`."""
     image, point = np.asarray(block.image_points.image), np.asarray(block.image_points.point)
     camera = np.array(block.image_camera)[image]
     exterior, points = jax.tree.map(jnp.asarray, (truth.exterior, truth.points))
@@ -78,7 +77,7 @@ def image_coordinates(block: Block, truth: Unknowns) -> Float[Array, "rows 2"]:
 
 
 def _georeferenced(block: Block, truth: Unknowns) -> tuple[Float[Array, "stations"], Float[Array, "attitudes 3"]]:
-    """What GNSS and IMU would observe, without noise."""
+    """Return error-free GNSS and IMU observations."""
     arrays = (truth.exterior, *mountings(block, truth), exposures(block))
     exterior, mount, strip, exposure = jax.tree.map(jnp.asarray, arrays)
     sensors, angles = jax.vmap(recorded)(exterior.position, exterior.camera_from_object, mount, strip, exposure)

@@ -1,4 +1,4 @@
-"""A rig in a simulation: every exposure of the reference camera is one of all cameras of the rig."""
+"""Simulation of a rig: every exposure of the reference camera is one of all cameras of the rig."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -24,9 +24,9 @@ _CHUNK = 64
 def rigged(
     recipe: Recipe, flight: Flight, cameras: Mapping[str, SimulatedChange], seed: int
 ) -> tuple[Flight, Int[np.ndarray, "images"]]:
-    """The flight with the photographs of the other cameras after each of the reference; the exposure of each image.
+    """Add the photographs of the other cameras after each of the reference; returns the exposure of each image.
 
-    The rig bends by the noise of the recipe, anew in every exposure.
+    The rig is deformed by the noise of the recipe, independently in every exposure.
     """
     if not cameras:
         return flight, np.arange(len(flight.images))
@@ -35,7 +35,7 @@ def rigged(
     noise = np.array([triple(recipe.noise.rig_place_m), np.deg2rad(triple(recipe.noise.rig_turn_deg))])  # type: ignore[arg-type]
     truths: list[Any] = [own.truth for own in cameras.values()]
     place = np.array([own.place for own in truths]) + noise[0] * bent[:, :, 0]
-    # Turned on from its place in the rig.
+    # Rotated from its place in the rig.
     turn, off = np.broadcast_to([own.turn for own in truths], place.shape), noise[1] * bent[:, :, 1]
     at = np.repeat(np.arange(n), m - 1)
     reference = np.asarray(exterior.position)[at], np.asarray(exterior.camera_from_object)[at]
@@ -66,13 +66,13 @@ def rigged(
 
 
 def _after_each(own: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """The values of each exposure, then those of the other cameras in it."""
+    """Interleave the values of each exposure and those of the other cameras in it."""
     n, shape = len(own), own.shape[1:]
     return np.concatenate([own[:, None], new.reshape(n, -1, *shape)], axis=1).reshape(-1, *shape)
 
 
 def rig_rows(recipe: Recipe, flight: Flight) -> tuple[RigPlaces | RigTurns, ...]:
-    """What the block says of the photographs whose places in the rig it knows to have one."""
+    """Return the block's rig observations of photographs whose cameras it models in the rig."""
     known = [name for name, own in recipe.rig.items() if own.model]
     m, image = len(recipe.rig) + 1, np.flatnonzero(np.isin(flight.cameras, known))
     if not len(image):
@@ -86,14 +86,14 @@ def rig_rows(recipe: Recipe, flight: Flight) -> tuple[RigPlaces | RigTurns, ...]
 
 
 def runs_late(cameras: Mapping[str, SimulatedChange]) -> bool:
-    """Whether a camera of the rig may expose after the others: then the block needs to know how they move."""
+    """Return True if a camera of the rig may expose late: the block then needs its motion."""
     known: list[Any] = [own.model for own in cameras.values() if own.model]
     delays = [own.truth.delay for own in cameras.values()] + [start.delay for start, _ in known]  # type: ignore[attr-defined]
     return any(float(delay) != 0 for delay in delays) or any(prior.delay != FIXED for _, prior in known)
 
 
 def with_gnss(recipe: Recipe, flight: Flight) -> Int[np.ndarray, "n"]:
-    """The images of which stations and attitudes are observed: all, or those of the reference camera of a rig."""
+    """Return the images with observed stations and attitudes: all, or those of the reference camera of a rig."""
     return np.arange(0, len(flight.images), len(recipe.rig) + 1)
 
 

@@ -1,4 +1,4 @@
-"""A rolling shutter in a simulation: how cameras move while rows are exposed, and what the block knows of it."""
+"""Simulation of a rolling shutter: camera motion while rows are exposed, and the model of the block."""
 
 import dataclasses
 
@@ -15,8 +15,10 @@ from jaxphoto.unknowns import FIXED, Unknowns, Weighted
 
 
 def camera_motions(exterior: ExteriorOrientation, velocity, rate, mounts: list[Mount]) -> Float[np.ndarray, "images 6"]:
-    """Velocity (m/s) and rate of turn (rad/s) in the axes of the camera, of a velocity in the object frame and a rate
-    about the body's right, forward and up axes."""
+    """Return velocity (m/s) and rotation rate (rad/s) in the axes of the camera.
+
+    From a velocity in the object frame and a rate about the body's right, forward and up axes.
+    """
     turned = np.einsum("nij,nj->ni", np.asarray(exterior.camera_from_object), velocity)
     camera = np.stack([np.asarray(body_from_camera(m.boresight, m.nominal)).T for m in mounts])
     return np.hstack([turned, np.einsum("nij,nj->ni", camera, rate)])
@@ -25,9 +27,10 @@ def camera_motions(exterior: ExteriorOrientation, velocity, rate, mounts: list[M
 def with_shutters(
     recipe: Recipe, flight: Flight, motions: np.ndarray, seed: int, start: Unknowns, priors: Unknowns, truth: Unknowns
 ) -> tuple[Unknowns, Unknowns, Unknowns]:
-    """Start, priors and truth with the shutters and, of images whose camera the block knows to have one, the motions.
+    """Return start, priors and truth with the shutters and the motions of images whose camera the block models with
+    one.
 
-    The block is told each motion with the error that it states, or exactly where it holds it.
+    The block receives each motion with the error that it states, or exactly if it is fixed.
     """
     if not recipe.shutters:
         return start, priors, truth

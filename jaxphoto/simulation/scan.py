@@ -1,8 +1,7 @@
-"""A cloud of laser points as a scanner measures it over ground, buildings and trees, with its trajectory and its truth.
+"""Simulation of a laser scan of ground, buildings and trees, with its trajectory and truth.
 
-Every pulse goes from the scanner along a ray that turns with the aircraft. It ends at the roof or on the ground,
-whatever it meets first; what meets a wall gives no return, so that buildings throw shadows. On its way it may meet
-leaves.
+Every pulse travels from the scanner along a ray fixed in the aircraft. It ends at a roof or on the ground, whichever
+comes first; a hit on a wall gives no return, so buildings cast shadows. On its way it may hit leaves.
 """
 
 from typing import NamedTuple
@@ -26,33 +25,33 @@ from jaxphoto.simulation.terrain import Terrain
 from jaxphoto.simulation.trees import met_leaves
 
 GROUND, VEGETATION, ROOF = 2, 5, 6
-"""Classes of LAS (ASPRS): ground, high vegetation, building."""
+"""LAS classes (ASPRS): ground, high vegetation, building."""
 _RATE_HZ = 100.0
-# Of the two prisms, whose figure does not come back within a strip; of the first alone a mirror that nutates.
+# Frequencies of the two prisms, whose pattern does not repeat within a strip; a nutating mirror has only the first.
 _PRISMS_HZ = (121.7, -77.3)
-# Rays meet the ground to this (m) or, where it is too steep for them, not at all.
+# Tolerance (m) of the intersection with the ground; steeper ground is not hit.
 _ENOUGH_M = 1e-7
 _ROUNDS = 60
-# Pulses worked on at once: bounds the memory.
+# Pulses processed at a time: bounds the memory.
 _CHUNK = 500_000
 _CHUNK_RECORDS = 65_536
-# What a computer can hold of a cloud, and of a trajectory.
+# Limits of the memory of a cloud, and of a trajectory.
 _PULSES, _RECORDS = 1e8, 2e7
 
 
 class Scan(NamedTuple):
-    """A cloud as measured, the trajectory as GNSS and IMU gave it, and what is wrong with both."""
+    """Measured cloud, trajectory of GNSS and IMU, and the errors of both."""
 
     cloud: Cloud
     trajectory: Trajectory
     scanner: Scanner
     """Boresight and the shifts of the strips, without their drifts."""
     errors: StripErrors
-    """All of it."""
+    """All errors."""
 
 
 class _Returns(NamedTuple):
-    """Where pulses were reflected: which, how far along the ray (m), by what (class)."""
+    """Reflections: index of the pulse, distance along the ray (m), class."""
 
     pulse: Int[np.ndarray, "returns"]
     at: Float[np.ndarray, "returns"]
@@ -68,9 +67,9 @@ def scan(
 ) -> Scan:
     """Scan `terrain`, which is drawn and settled, from the path of every strip; strips are called 1, 2 ... in turn.
 
-    The trajectory is off by shift and drift of each strip, the shots by boresight and calibration: with these,
+    The trajectory has shift and drift errors by strip, the shots those of boresight and calibration: with these,
     `corrected_return` of every point is the point that was hit plus normal noise of `noise_m` (X, Y, Z). Raises
-    BlockError where nothing comes back, and where more would than can be held.
+    BlockError without returns, and with more than memory can hold.
     """
     errors = drawn_errors(plan, paths, seed)
     leaves, noise = stream(seed, "laser returns from crowns"), stream(seed, "noise of laser points")
@@ -86,7 +85,7 @@ def scan(
     if not sum(len(part["time"]) for part in parts):
         raise BlockError("no laser pulse reaches the ground; raise density_per_m2, or scan longer strips over it")
     of_points = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    # Numbers, because files of clouds have nothing else.
+    # Integers, as cloud files require.
     names = tuple(f"{number + 1}" for number in range(len(paths)))
     shifts = [drawn_shift(plan, path.strip, seed) for path in paths]
     truth = Scanner(errors.boresight, dict(zip(names, shifts, strict=True)))  # type: ignore[arg-type]
@@ -94,7 +93,7 @@ def scan(
 
 
 def _pulses(plan: ScanPlan, paths: list[Path]) -> list[float]:
-    """How many of every path. Raises BlockError for what cannot be held, or is not flown."""
+    """Return the number of pulses of every path. Raises BlockError for too many, and for a strip not flown."""
     pulses_of = [plan.density_per_m2 * 2 * plan.half_width * path.height_m * path.length_m for path in paths]
     if not sum(pulses_of) <= _PULSES:
         raise BlockError(
@@ -117,27 +116,27 @@ def _pulses(plan: ScanPlan, paths: list[Path]) -> list[float]:
 def _pattern(
     plan: ScanPlan, path: Path, pulses: Int[np.ndarray, "n"], of: int
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 2"]]:
-    """Time (s) of pulses, and the tangents of their angles to the right and ahead."""
-    # Both the time and the recorded one lie on the path.
+    """Return the time (s) of pulses, and the tangents of their angles to the right and ahead."""
+    # Both the true time and the recorded one lie on the path.
     begin, end = path.node[[0, -1]] + np.clip(plan.time_offset_s, (0.0, -np.inf), (np.inf, 0.0))
     time = begin + (pulses + 0.5) / of * (end - begin)
     if PATTERN_OF[plan.pattern] == "circle":
         return time, _around(plan, time)
-    # Lines are as far apart on level ground as their pulses are.
+    # On level ground, lines are as far apart as their pulses.
     per_line = max(1, round(2 * plan.half_width * path.height_m * np.sqrt(plan.density_per_m2)))
     across = _across(plan, (pulses + 0.5) / per_line)
     return time, np.column_stack([across, np.zeros(len(across))])
 
 
 def _across(plan: ScanPlan, line: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """After so many lines: each from left to right at even steps, or to and fro as the sine that an angle swings by."""
+    """Return lines: each from left to right at even steps, or oscillating as a sine."""
     if plan.pattern == "oscillating":
         return -np.tan(np.deg2rad(plan.scan_angle_deg) * np.cos(np.pi * line))
     return plan.half_width * (2 * (line % 1) - 1)
 
 
 def _around(plan: ScanPlan, time: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
-    """A turning arrow; two prisms that deflect alike, to first order, add one each."""
+    """Return circles: a rotating vector; two prisms add, to first order, one each."""
     turning = _PRISMS_HZ[:1] if plan.pattern == "nutating" else _PRISMS_HZ
     angles = 2 * np.pi * np.outer(time, turning)
     return plan.half_width / len(turning) * np.column_stack([np.sin(angles).sum(1), np.cos(angles).sum(1)])
@@ -154,7 +153,7 @@ def _measured(
     leaves: np.random.Generator,
     noise: np.random.Generator,
 ) -> dict[str, np.ndarray]:
-    """The fields of the cloud of some pulses, in the order of time and returns."""
+    """Return the fields of the cloud of some pulses, sorted by time and return."""
     position, quaternion = path.pose(time)
     object_from_body = believed_turn = matrices(quaternion)
     recorded, believed_position = time - errors.calibration.time_offset, position
@@ -163,7 +162,7 @@ def _measured(
         believed_turn = matrices(quaternion)
     origin = position - object_from_body @ errors.calibration.lever_arm
     body_from_scanner = np.asarray(_small_rotation(errors.boresight))
-    # The scanner believes that its axes are those of the body.
+    # The scanner assumes its axes are those of the body.
     believed = np.column_stack([aside, -np.ones(len(aside))])
     believed /= np.linalg.norm(believed, axis=1, keepdims=True)
     ray = _rotated(object_from_body, believed @ body_from_scanner.T)
@@ -172,7 +171,7 @@ def _measured(
     pulse, at, by = (a[order] for a in returns)
     _, first, of_pulse, count = np.unique(pulse, return_index=True, return_inverse=True, return_counts=True)
     number = np.arange(len(pulse)) - first[of_pulse] + 1
-    # As `corrected_return` has it, resolved for the point of the file; noise is that of the corrected point.
+    # Solve `corrected_return` for the recorded point; noise is that of the corrected point.
     hit = ray[pulse] * at[:, None] + origin[pulse] - position[pulse] + noise.standard_normal((len(pulse), 3)) * noise_m
     shot = measured_shot(
         _rotated(object_from_body[pulse].transpose(0, 2, 1), hit), errors.boresight, errors.calibration
@@ -203,7 +202,7 @@ def _returned(
 
 
 def _ground(origin: np.ndarray, ray: np.ndarray, terrain: Terrain) -> Float[np.ndarray, "n"]:
-    """How far along each ray the ground is: the height at the last place, until it stays; else infinity."""
+    """Return the distance of the ground along each ray by fixed-point iteration; else infinity."""
     at = np.full(len(ray), np.nan)
     z = terrain.height(origin[:, :2])
     left, down = np.arange(len(ray)), -ray[:, 2]
@@ -221,7 +220,7 @@ def _ground(origin: np.ndarray, ray: np.ndarray, terrain: Terrain) -> Float[np.n
 def _built(
     origin: np.ndarray, ray: np.ndarray, ground: np.ndarray, terrain: Terrain
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """How far along each ray the first building is entered by its roof, and by a wall."""
+    """Return the distance at which each ray first enters a building by its roof, and by a wall."""
     planes = solids(terrain.buildings)
     seen = np.flatnonzero(np.isfinite(ground))
     hit = origin[seen] + ground[seen, None] * ray[seen]
@@ -235,7 +234,7 @@ def _built(
 
 
 def _trajectory(paths: list[Path], errors: StripErrors) -> Trajectory:
-    """As recorded: `_RATE_HZ` records a second from begin to end of every path, off by the errors of its strip."""
+    """Return the recorded trajectory: `_RATE_HZ` records per second of every path, with the errors of its strip."""
     ends = [(path.node[0], path.node[-1]) for path in paths]
     times = [np.linspace(begin, end, int(np.ceil((end - begin) * _RATE_HZ)) + 1) for begin, end in ends]
     poses = [path.pose(time) for path, time in zip(paths, times, strict=True)]

@@ -1,4 +1,4 @@
-"""What a simulated cloud is off by, drawn, and where the file of the cloud has a point that was truly hit."""
+"""Simulated errors of a cloud, and the recorded place of a point that was hit."""
 
 from typing import Any
 
@@ -14,14 +14,14 @@ from jaxphoto.simulation.scan_plan import ScanPlan, of_strip
 from jaxphoto.simulation.streams import stream
 
 _CHUNK = 65_536
-# Steps from a corrected shot to the one measured: each leaves a part of what is left as small as the errors are.
+# Iterations from a corrected shot to the measured one: each reduces the error by a factor of the errors' size.
 _STEPS = 3
 
 
 def drawn_errors(plan: ScanPlan, paths: list[Path], seed: int) -> StripErrors:
-    """The errors of the scanner of `plan`, and those of its trajectory: shifts, and what drifts about them.
+    """Draw the errors of the scanner of `plan`, and those of its trajectory: shifts, and drifts about them.
 
-    Drifts are processes of Gauss and Markov (`observations.knot_steps`) from knot to knot.
+    Drifts are Gauss-Markov processes (`observations.knot_steps`) from knot to knot.
     """
     splines: list[StripSpline] = []
     position, attitude = [], []
@@ -29,7 +29,7 @@ def drawn_errors(plan: ScanPlan, paths: list[Path], seed: int) -> StripErrors:
         first = sum(s.size for s in splines)
         splines.append(StripSpline.over(first, float(path.node[0]), float(path.node[-1]), plan.knots_s))
         drift = _drift(splines[-1], plan.correlation_s, stream(seed, f"drift of lidar strip {path.strip}"))
-        # A straight line in the times of the coefficients is one in time.
+        # Linear in the times of the coefficients is linear in time.
         gone = (splines[-1].times - np.mean(path.node[[0, -1]]))[:, None]
         shift = drawn_shift(plan, path.strip, seed) + gone * of_strip(plan.drift_m_per_s, path.strip)
         turn = of_strip(plan.attitude_deg, path.strip) + gone * of_strip(plan.attitude_drift_deg_per_s, path.strip)
@@ -48,7 +48,7 @@ def drawn_errors(plan: ScanPlan, paths: list[Path], seed: int) -> StripErrors:
 
 
 def drawn_shift(plan: ScanPlan, strip: str, seed: int) -> Float[np.ndarray, "3"]:
-    """The shift of a strip (m), about which it drifts."""
+    """Draw the shift of a strip (m), about which it drifts."""
     drawn = stream(seed, f"shift of lidar strip {strip}").standard_normal(3)
     return of_strip(plan.shift_m, strip) + np.array(plan.shift_sigma_m) * drawn
 
@@ -56,7 +56,7 @@ def drawn_shift(plan: ScanPlan, strip: str, seed: int) -> Float[np.ndarray, "3"]
 def measured_shot(
     in_body: Float[np.ndarray, "n 3"], boresight: Float[np.ndarray, "3"], calibration: ScannerCalibration
 ) -> Float[np.ndarray, "n 3"]:
-    """The shots (m) that georeferencing takes for true, of those that lead from the trajectory to what was hit.
+    """Return the shots (m) as georeferencing assumes them, from those between trajectory and hit.
 
     The inverse of `georeferencing.corrected_return` at a trajectory without error.
     """
@@ -71,12 +71,12 @@ def measured_shot(
 def turned_by(
     object_from_body: Float[np.ndarray, "n 3 3"], attitude: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3 3"]:
-    """The attitudes of a trajectory that is off by `attitude` (rad)."""
+    """Return the attitudes of a trajectory with the error `attitude` (rad)."""
     return object_from_body @ in_chunks(_rotations, _CHUNK, -attitude) if np.any(attitude) else object_from_body
 
 
 def _drift(spline: StripSpline, correlation_s: float, rng: np.random.Generator) -> Float[np.ndarray, "knots 6"]:
-    """Six processes of standard deviation 1."""
+    """Draw six processes of standard deviation 1."""
     noise = rng.standard_normal((spline.size, 6))
     kept = np.exp(-spline.interval / correlation_s)
     for k in range(1, spline.size):

@@ -58,5 +58,5 @@ class ScanPlan:
 
 
 def of_strip(values: dict[str, Triple], strip: str) -> Float[np.ndarray, "3"]:
-    """What a plan says of a strip, by its name or "default", without chance."""
+    """Return the planned value of a strip, by its name or "default", without random parts."""
     return np.array(values.get(strip, values.get("default", _ZERO)))

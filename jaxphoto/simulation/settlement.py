@@ -1,4 +1,4 @@
-"""Where buildings and trees stand: at given places, or at places of chance on the ground of a block."""
+"""Places of buildings and trees: given, or random within the area of a block."""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,18 +15,18 @@ from jaxphoto.simulation.terrain import Terrain
 from jaxphoto.simulation.trees import Tree
 
 Range = tuple[float, float]
-"""Least and greatest of sizes that are drawn uniformly in between."""
-# Between two buildings, or a building and a crown, at least (m).
+"""Smallest and largest of uniformly drawn sizes."""
+# Minimum distance between two buildings, or a building and a crown (m).
 _GAP_M = 2.0
-# Places drawn at once, and how often, before one more building or tree is given up.
+# Places drawn at a time, and number of attempts, before a building or tree is given up.
 _PLACES, _TRIES = 64, 20
 
 
 @dataclasses.dataclass(frozen=True)
 class Buildings:
-    """A group of buildings of one kind of roof: `count` of them at places of chance, and those at `at_m` (X, Y).
+    """Group of buildings with one kind of roof: `count` at random places, and those at `at_m` (X, Y).
 
-    Each is built level: `height_m` is that of the eaves above the ground in its middle.
+    Each is level: `height_m` is that of the eaves above the ground at its centre.
     """
 
     roof: Roof = "flat"
@@ -41,7 +41,7 @@ class Buildings:
 
 @dataclasses.dataclass(frozen=True)
 class Trees:
-    """A group of trees: `count` of them at places of chance, and those at `at_m` (X, Y)."""
+    """Group of trees: `count` at random places, and those at `at_m` (X, Y)."""
 
     count: int = 0
     at_m: tuple[tuple[float, float], ...] = ()
@@ -57,10 +57,10 @@ class Settlement:
     trees: tuple[Trees, ...] = ()
 
     def settled(self, terrain: Terrain, ground: Swaths | Field, seed: int) -> Terrain:
-        """`terrain`, whose waves are `drawn`, with buildings and trees.
+        """Return `terrain`, whose waves are `drawn`, with buildings and trees.
 
-        Buildings of chance keep clear of all others and crowns of chance of buildings, crowns may overlap. Raises
-        BlockError where there is no room.
+        Random buildings keep clear of all others and random crowns of buildings; crowns may overlap. Raises BlockError
+        if there is no room.
         """
         seed = seed if terrain.seed is None else terrain.seed
         for number, group in enumerate(self.buildings):
@@ -117,7 +117,7 @@ def _planted(row: Trees, terrain: Terrain, ground: Swaths | Field, rng: np.rando
 def _places(
     free: Callable[[np.ndarray], np.ndarray], ground: Swaths | Field, rng: np.random.Generator, n: int, what: str
 ) -> Float[np.ndarray, "n 2"]:
-    """The first `n` places drawn that are free."""
+    """Return the first `n` free places."""
     found = np.zeros((0, 2))
     for _ in range(_TRIES):
         if len(found) >= n:

@@ -157,8 +157,7 @@ def _scanned(recipe: Recipe, flown: list[Path], terrain: Terrain, seed: int) -> 
 
 
 def _clock(recipe: Recipe, event: Int[np.ndarray, "images"]) -> Float[np.ndarray, "images"] | None:
-    """The time of every exposure from the middle of the flight (s); None where that from the middle of its strip
-    does."""
+    """Return the time of every exposure from the middle of the flight (s); None if that of its strip suffices."""
     changing = recipe.changes or recipe.temperature
     return recipe.plan.clock[event] if changing and isinstance(recipe.plan, FlightPlan) else None
 
@@ -169,7 +168,7 @@ def _temperatures(recipe: Recipe, times: Float[np.ndarray, "images"]) -> Tempera
 
 
 def _seen(recipe: Recipe, flight: Flight, scene: TruePoints, seed: int) -> TruePoints:
-    """The scene after thinning. Raises BlockError for an image that cannot be oriented."""
+    """Return the scene after thinning. Raises BlockError for an image that cannot be oriented."""
     points, rays = recipe.points, scene.rays
     if points.mean_rays is not None:
         rays = thinned(rays, len(scene.ids), points.min_images, points.mean_rays, stream(seed, "thinning"))
@@ -211,7 +210,7 @@ def _georeferencing(
     of: Int[np.ndarray, "n"],
     seed: int,
 ) -> tuple[StationRows, Attitudes]:
-    """What GNSS and IMU observe of the exposures `of` some images, at `position` (m) and roll, pitch, yaw (rad)."""
+    """Return GNSS and IMU observations `of` some images, at `position` (m) and roll, pitch, yaw (rad)."""
     n = len(of)
     stations, attitudes = StationRows.none(), Attitudes.none()
     if recipe.stated.station_m is not None:

@@ -1,4 +1,4 @@
-"""Random streams: one per purpose, all of one seed, so that what one draws does not move another."""
+"""Independent random streams of one seed, one per purpose."""
 
 import zlib
 
@@ -6,9 +6,9 @@ import numpy as np
 
 
 def stream(seed: int, purpose: str) -> np.random.Generator:
-    """The generator of `purpose` ("terrain", "noise of stations", ...) under `seed`.
+    """Return the generator of `purpose` ("terrain", "noise of stations", ...) under `seed`.
 
-    Streams of different purposes are independent (NumPy's `SeedSequence` with the purpose as spawn key), and a
-    purpose's stream does not depend on which others are used.
+    Streams of different purposes are independent (NumPy's `SeedSequence` with the purpose as spawn key), and do not
+    depend on which others are used.
     """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(zlib.crc32(purpose.encode()),)))

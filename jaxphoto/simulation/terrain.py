@@ -1,4 +1,4 @@
-"""The ground, level, sloping or wavy, and rough; and what stands on it."""
+"""Terrain: level, sloping or wavy ground with roughness, buildings and trees."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ from jaxphoto.short_repr import shown
 from jaxphoto.simulation.buildings import Building, roof_height, wall_distance
 from jaxphoto.simulation.trees import Tree, under_crown
 
-# Points keep so far from walls and crowns (m).
+# Distance of points from walls and crowns (m).
 _CLEARANCE_M = 1.0
 
 
@@ -25,9 +25,9 @@ class Wave:
 
 @dataclasses.dataclass(frozen=True)
 class RandomWaves:
-    """So many waves of one root mean square height together: headings and phases of chance.
+    """Random waves with a common root mean square height: random headings and phases.
 
-    Lengths are spread evenly, on a logarithmic scale, around `length_m` by a factor of two.
+    Lengths are evenly spaced, on a logarithmic scale, around `length_m` by a factor of two.
     """
 
     count: int
@@ -35,7 +35,7 @@ class RandomWaves:
     length_m: float
 
     def draw(self, rng: np.random.Generator) -> tuple[Wave, ...]:
-        """The waves."""
+        """Draw the waves."""
         heading, phase = rng.uniform(0, 360, (2, self.count))
         length = self.length_m * 2.0 ** rng.uniform(-1, 1, self.count)
         amplitude = self.rms_m * np.sqrt(2 / self.count)
@@ -45,10 +45,10 @@ class RandomWaves:
 @shown
 @dataclasses.dataclass(frozen=True)
 class Terrain:
-    """Z = height + slope . (X, Y) + waves, and at every point by itself a uniform roughness within +- `roughness_m`.
+    """Z = height + slope . (X, Y) + waves, with an independent uniform roughness of +- `roughness_m` at every point.
 
-    `slope` is in metres per metre to the east and to the north. `seed` keeps random waves, and buildings and trees
-    placed by chance, when the simulation's seed changes.
+    `slope` is in metres per metre to the east and to the north. `seed` keeps random waves, buildings and trees when the
+    simulation's seed changes.
     """
 
     height_m: float = 0.0
@@ -61,14 +61,14 @@ class Terrain:
     trees: tuple[Tree, ...] = ()
 
     def drawn(self, rng: np.random.Generator) -> "Terrain":
-        """The same ground with its random waves settled."""
+        """Return the terrain with its random waves drawn."""
         if self.random is None:
             return self
         rng = rng if self.seed is None else np.random.default_rng(self.seed)
         return dataclasses.replace(self, waves=self.waves + self.random.draw(rng), random=None)
 
     def height(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Z (m) of the smooth ground at (east, north); random waves must have been `drawn`."""
+        """Return Z (m) of the smooth ground at (east, north); random waves must have been `drawn`."""
         z = self.height_m + xy @ np.array(self.slope)
         for wave in self.waves:
             heading = np.deg2rad(wave.heading_deg)
@@ -77,21 +77,21 @@ class Terrain:
         return z
 
     def surface(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Z (m) of the smooth ground, or of the roof above it, at (east, north)."""
+        """Return Z (m) of the smooth ground, or of the roof above it, at (east, north)."""
         return np.maximum(self.height(xy), roof_height(self.buildings, xy))
 
     def open(self, xy: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
-        """Whether a place (east, north) is 1 m or more away from walls and crowns, on the ground or on a roof."""
+        """Return True if a place (east, north) is at least 1 m from walls and crowns, on the ground or on a roof."""
         near_wall = np.isfinite(wall_distance(self.buildings, xy, _CLEARANCE_M))
         return ~near_wall & ~under_crown(self.trees, xy, _CLEARANCE_M)
 
     def place(self, xy: Float[np.ndarray, "n 2"], rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
-        """Points on the rough ground, or on smooth roofs, at (east, north), in m."""
+        """Return points on the rough ground, or on smooth roofs, at (east, north), in m."""
         rough = rng.uniform(-1, 1, len(xy)) * self.roughness_m
         return np.column_stack([xy, np.maximum(self.height(xy) + rough, roof_height(self.buildings, xy))])
 
     def on_roofs(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n 2"]:
-        """Places (east, north) of uniform density over the roofs, 1 m or more from their edges; there is a building."""
+        """Draw places (east, north) uniformly over the roofs, 1 m or more from their edges; requires a building."""
         half = np.maximum(np.stack([b.half for b in self.buildings]) - 1.01 * _CLEARANCE_M, 0)
         area = half.prod(axis=1)
         which = rng.choice(len(half), n, p=area / area.sum() if area.any() else None)
@@ -103,4 +103,4 @@ class Terrain:
 ROLLING = Terrain(
     waves=(Wave(14.0, 2 * np.pi * 420.0, 90.0), Wave(10.0, 2 * np.pi * 310.0, 0.0, 90.0)), roughness_m=6.0
 )
-"""14 sin(X / 420 m) + 10 cos(Y / 310 m) +- 6 m: gentle country with about 57 m between its extremes."""
+"""14 sin(X / 420 m) + 10 cos(Y / 310 m) +- 6 m: hills of about 57 m between extremes."""

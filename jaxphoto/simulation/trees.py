@@ -1,7 +1,7 @@
-"""Trees: crowns in the shape of upright ellipsoids, which laser pulses enter and may pass.
+"""Trees: upright ellipsoidal crowns, which laser pulses penetrate.
 
-A pulse meets leaves after a way within crowns that is exponentially distributed; each time something of it comes back,
-and half of the pulses go on.
+A pulse hits leaves after exponentially distributed distances within crowns; each hit gives a return, and half of the
+pulses continue.
 """
 
 import dataclasses
@@ -13,16 +13,16 @@ from jaxtyping import Bool, Float, Int
 
 from jaxphoto.simulation.nearby import pairs_along, pairs_near
 
-# Of the height of a tree, what its stem is bare.
+# Bare fraction of the height of a tree.
 _BARE = 0.3
-# Mean way from leaf to leaf (m), and the most returns of a pulse from crowns.
+# Mean distance between leaves (m), and maximum number of returns of a pulse from crowns.
 _WAY_M = 2.5
 _RETURNS = 3
 
 
 @dataclasses.dataclass(frozen=True)
 class Tree:
-    """A tree at `at_m` (X, Y) on ground of Z = `foot_m`, `height_m` high, with a crown of `radius_m`."""
+    """Tree at `at_m` (X, Y) on ground of Z = `foot_m`, `height_m` high, with a crown of `radius_m`."""
 
     at_m: tuple[float, float]
     foot_m: float
@@ -38,7 +38,7 @@ class Crowns(NamedTuple):
 
 
 class Leaves(NamedTuple):
-    """Where pulses met leaves: which pulse, how far along its ray (m); and which pulses went no further."""
+    """Hits of leaves: index of the pulse, distance along its ray (m); and the pulses that ended there."""
 
     pulse: Int[np.ndarray, "returns"]
     at: Float[np.ndarray, "returns"]
@@ -46,7 +46,7 @@ class Leaves(NamedTuple):
 
 
 def crowns(trees: Sequence[Tree]) -> Crowns:
-    """The crowns of `trees`."""
+    """Return the crowns of `trees`."""
     upright = [(1 - _BARE) / 2 * t.height_m for t in trees]
     centre = [(*t.at_m, t.foot_m + t.height_m - up) for t, up in zip(trees, upright, strict=True)]
     half = [(t.radius_m, t.radius_m, up) for t, up in zip(trees, upright, strict=True)]
@@ -54,7 +54,7 @@ def crowns(trees: Sequence[Tree]) -> Crowns:
 
 
 def under_crown(trees: Sequence[Tree], xy: Float[np.ndarray, "n 2"], margin_m: float) -> Bool[np.ndarray, "n"]:
-    """Whether a place (east, north) lies under a crown or within `margin_m` of one."""
+    """Return True if a place (east, north) lies under a crown or within `margin_m` of one."""
     under = np.zeros(len(xy), bool)
     if trees:
         centre, half = crowns(trees)
@@ -69,14 +69,14 @@ def met_leaves(
     end: Float[np.ndarray, "pulses"],
     rng: np.random.Generator,
 ) -> Leaves:
-    """What pulses along unit vectors meet in crowns before they would end (`end`, m along each).
+    """Return the hits of pulses along unit vectors in crowns before their `end` (m along each).
 
-    Crowns may overlap: the ways in all of them count, so leaves are twice as dense there.
+    Crowns may overlap: their path lengths add up, as if leaves were twice as dense.
     """
     pulse, into, way = _chords(trees, origin, direction, end)
     order = np.lexsort((into, pulse))
     pulse, into, way = pulse[order], into[order], way[order]
-    # Ways in crowns one after the other, all pulses on one line: where a pulse is after so many metres of leaves.
+    # Concatenate the paths in crowns of all pulses on one line: place of a pulse after a distance within leaves.
     line = np.concatenate([[0.0], np.cumsum(way)])
     which, first, count = np.unique(pulse, return_index=True, return_counts=True)
     begin, length = line[first], line[first + count] - line[first]
@@ -99,7 +99,7 @@ def met_leaves(
 def _chords(
     trees: Sequence[Tree], origin: np.ndarray, direction: np.ndarray, end: np.ndarray
 ) -> tuple[Int[np.ndarray, "chords"], Float[np.ndarray, "chords"], Float[np.ndarray, "chords"]]:
-    """The pulse, where along it a crown begins (m), and its way within (m)."""
+    """Return the pulse, the distance along it at which a crown begins (m), and its path within (m)."""
     if not trees:
         return np.zeros(0, int), np.zeros(0), np.zeros(0)
     centre, half = crowns(trees)

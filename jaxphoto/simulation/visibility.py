@@ -1,4 +1,4 @@
-"""Which image sees which point, and where: no noise; buildings hide points, trees and the ground hide none."""
+"""Visibility of points in images, without noise; buildings hide points, trees and terrain do not."""
 
 import functools
 from collections.abc import Mapping, Sequence
@@ -15,11 +15,11 @@ from jaxphoto.simulation.chunks import in_chunks
 from jaxphoto.simulation.nearby import pairs_along
 
 _CHUNK = 1024
-# Images times points worked on at once: bounds the memory.
+# Images times points processed at a time: bounds the memory.
 _PAIRS = 2_000_000
-# Places on the format, along each side, from which is seen how far ideal coordinates reach; 31 x 31 fill a chunk.
+# Grid of the format, per side, on which the range of ideal coordinates is determined; 31 x 31 fill a chunk.
 _PLACES = 31
-# A point on a roof is not hidden by it: what is entered less than this (m) before a point is what the point is on.
+# Obstacles closer than this (m) to a point do not hide it: a roof does not hide its own points.
 _ON_IT_M = 1e-3
 
 
@@ -31,11 +31,11 @@ class Rays(NamedTuple):
     xy: Float[np.ndarray, "rays 2"]
 
     def take(self, chosen: np.ndarray) -> "Rays":
-        """The rays of a mask or of indices."""
+        """Select rays by mask or indices."""
         return Rays(self.image[chosen], self.point[chosen], self.xy[chosen])
 
     def per_point(self, n: int) -> Int[np.ndarray, "points"]:
-        """In how many images each of `n` points is seen."""
+        """Return the number of images of each of `n` points."""
         return np.bincount(self.point, minlength=n)
 
 
@@ -47,11 +47,11 @@ def photograph(
     points: Float[np.ndarray, "points 3"],
     margin_mm: float = 0.0,
 ) -> Rays:
-    """The rays of all points that images see.
+    """Return the rays of all visible points.
 
-    A point is seen where its direction has an image (`AbstractProjection.sees`; in front of a perspective camera),
-    where the distortion can be inverted (`InteriorOrientation.invertible`), and inside the format by more than
-    `margin_mm`. Coordinates are those of `jaxphoto.collinearity.project`.
+    A point is visible if its direction has an image (`AbstractProjection.sees`; in front of a perspective camera), the
+    distortion is invertible (`InteriorOrientation.invertible`), and it is inside the format by more than `margin_mm`.
+    Coordinates are those of `jaxphoto.collinearity.project`.
     """
     at_once = max(1, _PAIRS // max(len(image_camera), 1))
     begins = range(0, max(len(points), 1), at_once)
@@ -70,7 +70,7 @@ def _photograph(
     points: Float[np.ndarray, "points 3"],
     margin_mm: float,
 ) -> Rays:
-    """As `photograph`, all points at once."""
+    """Apply `photograph` to all points at once."""
     position, matrix = np.asarray(exterior.position), np.asarray(exterior.camera_from_object)
     # (images, points, 3), in the camera frame
     seen = np.einsum("kij,knj->kni", matrix, points[None] - position[:, None])
@@ -96,7 +96,7 @@ def _photograph(
 
 
 def _reach(interior: InteriorOrientation, half: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-    """Bounds of |ideal coordinates| on the format, so that the distortion is not asked about every pair."""
+    """Return bounds of |ideal coordinates| on the format, so that the distortion is not evaluated for every pair."""
     grid = np.stack(np.meshgrid(*np.linspace(-half, half, _PLACES).T), axis=-1).reshape(-1, 2)
     ideal = np.abs(in_chunks(functools.partial(_ideal, interior), _CHUNK, grid))
     return 1.05 * np.max(ideal, axis=0, initial=0.0, where=np.isfinite(ideal))
@@ -116,7 +116,7 @@ def _measured(interior: InteriorOrientation, ideal):
 def unhidden(
     rays: Rays, exterior: ExteriorOrientation, points: Float[np.ndarray, "points 3"], buildings: tuple[Building, ...]
 ) -> Rays:
-    """The rays that no building stands in the way of."""
+    """Remove rays that a building blocks."""
     if not buildings or not len(rays.point):
         return rays
     origin, end = np.asarray(exterior.position)[rays.image], points[rays.point]
@@ -131,7 +131,7 @@ def unhidden(
 
 
 def thinned(rays: Rays, n_points: int, min_images: int, mean_rays: float, rng: np.random.Generator) -> Rays:
-    """Rays left out by chance until points have `mean_rays` on average; each keeps `min_images` at least."""
+    """Remove rays at random until points have `mean_rays` on average; each keeps at least `min_images`."""
     surplus = len(rays.point) - round(mean_rays * n_points)
     if surplus <= 0:
         return rays

@@ -1,153 +1,387 @@
-"""Two interior orientations compared by their bundles of rays: offsets after alignment, and their RMSE."""
+"""Comparison of calibrations: uncertainty of RMSE_offset, stability analysis, change of a camera, combination.
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
+Uncertainty. The offsets are v = v0 + J e with the errors e of both parameter sets, e ~ N(0, Q), and J exact
+(`BundleOffsets.jacobian`). RMSE_offset is a norm: for nearly equal bundles it is not normal, and its first derivative
+is meaningless. v'v is therefore treated as a quadratic form in normal variables (`QuadraticForm`): about the estimated
+offsets (v0 = v) for the uncertainty, about zero (v0 = 0) for the hypothesis of one camera.
+
+Combination. With the parameters x_i and covariances Q_i of n independent calibrations
+
+    Q = (sum Q_i^-1)^-1,   x = Q sum Q_i^-1 x_i,   T = sum (x_i - x)' Q_i^-1 (x_i - x)
+
+and T follows chi-square of (n - 1) p if they are from one camera. An inconsistent one is identified by its difference d
+from the combination of all others, which has the covariance Q_i + Q_others: d' (Q_i + Q_others)^-1 d follows chi-square
+of p.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Array, Bool, Float
+import scipy
+from jaxtyping import Bool, Float
 
-from jaxphoto.arrays import Numbers, still
-from jaxphoto.camera import InteriorOrientation, invert
-from jaxphoto.compiling import call_compiled
+from jaxphoto.arrays import Numbers
+from jaxphoto.camera import (
+    InteriorOrientation,
+    constant_names,
+    get_parameter,
+    model_keys,
+    parameter_names,
+    parameter_unit,
+)
 from jaxphoto.errors import InputError
-from jaxphoto.linear_algebra import solve
-from jaxphoto.short_repr import shown
-from jaxphoto.stability.alignment import UNKNOWNS, Method, align, offsets_of
-from jaxphoto.stability.bundles import image_rays, parameter_vector, with_parameters
+from jaxphoto.short_repr import change_html, change_repr, shown
+from jaxphoto.stability.band import LEVEL, square_radius
+from jaxphoto.stability.bundles import (
+    METHODS,
+    BundleOffsets,
+    Method,
+    bundle_offsets,
+    check_rays,
+    parameter_vector,
+    with_parameters,
+)
+from jaxphoto.stability.quadratic_form import QuadraticForm
 
 
 @shown
-class BundleOffsets(eqx.Module):
-    """What remains between two bundles after alignment, on the first one's virtual image plane, in mm.
+class OffsetUncertainty(NamedTuple):
+    """Distribution of RMSE_offset by the covariances of both sets; in mm, except the probability."""
 
-    `alignment` is (small rotation in rad, position in units of the object's distance), as much of it as the method
-    leaves free. `jacobian` is dv/dp of the offsets, point by point x then y, by `parameter_vector` of the first and
-    then of the second interior orientation, the alignment being found anew: what covariances are propagated with.
+    sigma_mm: float
+    """Standard deviation of RMSE_offset over repeated calibrations of these two cameras."""
+    low_mm: float
+    """2.5 % quantile over repeated calibrations."""
+    high_mm: float
+    """97.5 % quantile over repeated calibrations."""
+    expected_of_one_mm: float
+    """Mean RMSE_offset of two such calibrations of one camera."""
+    limit_of_one_mm: float
+    """95 % quantile of RMSE_offset of two such calibrations of one camera."""
+    p_value: float
+    """Probability that two calibrations of one camera differ as much as these or more."""
+    unexplained_mm: float
+    """Part of RMSE_offset that covariances do not explain: sqrt((v'v - E) / (2n - u)), E = tr(J Q J'); 0 if E > v'v."""
+
+
+def offset_uncertainty(
+    offsets: BundleOffsets,
+    first: Float[Numbers, "p p"] | None = None,
+    second: Float[Numbers, "p p"] | None = None,
+) -> OffsetUncertainty | None:
+    """Compute the uncertainty of RMSE_offset from the covariances of the parameter sets; None if both are None.
+
+    `first` and `second` are a posteriori covariances in the order of `jaxphoto.camera.parameter_names`, with zero rows
+    for fixed parameters; a set without one counts as exact. The sets must be independent: from different images. Raises
+    ValueError for a covariance of another size than its parameters.
     """
+    if first is None and second is None:
+        return None
+    jacobian = np.asarray(offsets.jacobian)
+    # If one is missing, its size follows from the other.
+    p1 = len(first) if first is not None else jacobian.shape[1] - len(second)  # type: ignore[arg-type]
+    p2 = jacobian.shape[1] - p1
+    if (second is not None and len(second) != p2) or p1 < 0:
+        sizes = " and ".join(str(len(q)) for q in (first, second) if q is not None)
+        raise ValueError(f"covariances of {sizes} parameters, but the two sets have {jacobian.shape[1]} together")
+    covariance = np.zeros((p1 + p2, p1 + p2))
+    covariance[:p1, :p1] = 0.0 if first is None else first
+    covariance[p1:, p1:] = 0.0 if second is None else second
+    v, f = np.asarray(offsets.offsets).ravel(), offsets.redundancy
+    estimated = QuadraticForm.of_normal(v, jacobian, covariance)
+    one_camera = QuadraticForm.of_normal(np.zeros_like(v), jacobian, covariance)
 
-    points: Float[Array, "points 2"]
-    offsets: Float[Array, "points 2"]
-    measured: Float[Array, "points 2"]
-    """The offsets carried back through the first distortion into the image as it is measured: free of R0."""
-    alignment: Float[Array, "u"]
-    jacobian: Float[Array, "2*points parameters"]
-    stretch: Float[Array, "points 2 2"]
-    """d(ideal) / d(measured) coordinate of the first camera: `offsets` are `stretch` times `measured`."""
-    converged: Bool[Array, ""]
+    def root(square_sum: float) -> float:
+        return float(np.sqrt(square_sum / f))
 
-    @property
-    def measured_jacobian(self) -> Float[Array, "coordinates parameters"]:
-        """dv/dp like `jacobian`, of the offsets in the image as it is measured, to first order."""
-        by_point = self.jacobian.reshape(len(self.points), 2, -1)
-        return jax.vmap(solve)(self.stretch, by_point).reshape(self.jacobian.shape)
-
-    @property
-    def redundancy(self) -> int:
-        """2 n - u: coordinates of the grid less unknowns of the alignment."""
-        return 2 * len(self.points) - len(self.alignment)
-
-    @property
-    def rmse_mm(self) -> Float[Array, ""]:
-        """RMSE_offset = sqrt(v'v / (2 n - u)), in mm (paper 002)."""
-        return ((self.offsets**2).sum() / self.redundancy) ** 0.5
-
-    @property
-    def rmse_measured_mm(self) -> Float[Array, ""]:
-        """The same of `measured`: it compares with the noise of measured coordinates where distortion is large."""
-        return ((self.measured**2).sum() / self.redundancy) ** 0.5
+    tail = (1 - LEVEL) / 2
+    square_sum = float(v @ v)
+    return OffsetUncertainty(
+        sigma_mm=estimated.sigma_of_root / f**0.5,
+        low_mm=root(estimated.quantile(tail)),
+        high_mm=root(estimated.quantile(1 - tail)),
+        expected_of_one_mm=one_camera.mean_of_root / f**0.5,
+        limit_of_one_mm=root(one_camera.quantile(LEVEL)),
+        p_value=one_camera.tail_probability(square_sum),
+        unexplained_mm=root(max(square_sum - one_camera.mean, 0.0)),
+    )
 
 
-def rmse_offset(
+# p-value below which a change is significant.
+SIGNIFICANT_P = 0.05
+# Smallest p-value reported.
+_MIN_P = 1e-300
+
+
+@shown
+class Analysis(NamedTuple):
+    """Two parameter sets compared by one method; `uncertainty` is None without covariances."""
+
+    method: Method
+    offsets: BundleOffsets
+    uncertainty: OffsetUncertainty | None
+
+    def similar(self, noise_mm: float) -> bool:
+        """True if RMSE_offset is within the noise of image coordinates (paper 002: about one pixel)."""
+        return bool(self.offsets.rmse_mm <= noise_mm)
+
+    def verdict(self, noise_mm: float) -> str:
+        """Result of the comparison in one or two sentences."""
+        rmse, uncertainty = float(self.offsets.rmse_mm), self.uncertainty
+        result, side = ("similar", "within") if self.similar(noise_mm) else ("not similar", "beyond")
+        text = f"{result}: RMSE_offset of {1e3 * rmse:.3g} um is {side} the noise of {1e3 * noise_mm:.3g} um"
+        if uncertainty is None:
+            return text + "; its uncertainty is unknown without covariances."
+        if uncertainty.low_mm <= noise_mm <= uncertainty.high_mm:
+            low, high = 1e3 * uncertainty.low_mm, 1e3 * uncertainty.high_mm
+            text += f", but repeated calibrations would give {low:.3g} to {high:.3g} um"
+        expected = f"Two calibrations of one camera would differ by {1e3 * uncertainty.expected_of_one_mm:.3g} um"
+        p_value, meaning = max(uncertainty.p_value, _MIN_P), change_meaning(uncertainty.p_value)
+        return f"{text}. {expected}, and by as much as this with p = {p_value:.2g}: {meaning}."
+
+
+def change_meaning(p_value: float) -> str:
+    """Conclusion from the probability `p_value` that two calibrations of one camera differ as much."""
+    changed = "the camera has changed, or many image points of a calibration share errors (see jaxphoto halves)"
+    return changed if p_value < SIGNIFICANT_P else "no significant change"
+
+
+def analyse(
     first: InteriorOrientation,
     second: InteriorOrientation,
     points: Float[Numbers, "points 2"],
-    method: Method = "rot",
-    depth: Float[Numbers, "points"] | None = None,
-) -> Float[Array, ""]:
-    """RMSE_offset (mm) of two interior orientations over image points (mm, from the centre; see `image_grid`).
+    covariances: tuple[Float[Numbers, "p p"] | None, Float[Numbers, "q q"] | None] = (None, None),
+    relief: float = 0.0,
+) -> dict[Method, Analysis]:
+    """Compare two parameter sets by zrot, rot and spr over image points (mm from the centre; see `image_grid`).
 
-    `sqrt(v'v / (2 n - u))`, of any distortion models. `depth` is that of the object points of the method spr, in units
-    of their mean distance; flat where it is None. A pure function for `jax.jit`, `jax.grad` and `jax.vmap`; at equal
-    bundles it is a norm at zero and has no derivative: there differentiate `bundle_offsets`.
-    Source: paper 002, section on stability analysis; Habib et al. (2006).
+    `covariances` are a posteriori, in the order of `parameter_names` of either set. The object points of spr lie at
+    alternating distances, greater and smaller by the fraction `relief`. Raises InputError for points where a distortion
+    is not invertible and for bundles too different to be aligned, ValueError for a `relief` of 1 or more.
     """
-    v = _aligned(first, second, points, method, _depths(points, depth))[0]
-    return jnp.sqrt(jnp.sum(v**2) / (2 * len(points) - UNKNOWNS[method]))
+    if not 0 <= relief < 1:
+        raise ValueError(f"relief, a fraction of the object distance, must be at least 0 and below 1, got {relief:g}")
+    for name, interior in (("the first camera", first), ("the second camera", second)):
+        check_rays(interior, points, name)
+    depth = 1 + relief * (-1.0) ** np.arange(len(points))
+    analyses = {}
+    for method in METHODS:
+        offsets = bundle_offsets(first, second, points, method, depth)
+        if not bool(offsets.converged):
+            raise InputError(f"the two bundles cannot be aligned by {method}: they are not from one camera")
+        analyses[method] = Analysis(method, offsets, offset_uncertainty(offsets, *covariances))
+    return analyses
 
 
-def bundle_offsets(
+# Eigenvalues of a correlation matrix below this fraction of the largest are rounding.
+_ROUNDING = 1e-12
+
+
+@shown
+class ParameterChange(NamedTuple):
+    """One parameter in two calibrations, in its own unit: second minus first, with its significance."""
+
+    parameter: str
+    first: float
+    second: float
+    difference: float
+    sigma: float
+    """Standard deviation of the difference; 0 if both are fixed."""
+    p_value: float
+    """Probability of a larger difference without a change of the parameter; NaN if both are fixed."""
+    unit: str
+    """mm, 1/mm^2, or "1" if dimensionless."""
+
+
+class Change(NamedTuple):
+    """Comparison of two calibrations of a camera."""
+
+    parameters: tuple[ParameterChange, ...]
+    """None for different models."""
+    chi_square: float
+    """d' Q^-1 d of all differences, Q the sum of both covariances; NaN without parameters."""
+    degrees_of_freedom: int
+    p_parameters: float
+    """Probability of a larger chi-square without a change of the camera."""
+    field: Analysis
+    """The two bundles of rays after alignment, with the same probability for their difference."""
+    limit_mm: Float[np.ndarray, "points"]
+    """95 % quantile of the offsets of two such calibrations of one camera at each point, in the measured image."""
+
+    @property
+    def offset_mm(self) -> Float[np.ndarray, "points"]:
+        """Lengths of the offsets in the measured image."""
+        return np.linalg.norm(np.asarray(self.field.offsets.measured), axis=1)
+
+    @property
+    def beyond(self) -> Bool[np.ndarray, "points"]:
+        """True where offsets exceed `limit_mm`: at one point in twenty without a change of the camera."""
+        return self.offset_mm > self.limit_mm
+
+    @property
+    def p_field(self) -> float:
+        """Probability of a larger difference of the bundles without a change of the camera; NaN without covariances."""
+        uncertainty = self.field.uncertainty
+        return float("nan") if uncertainty is None else float(uncertainty.p_value)
+
+    @property
+    def changed(self) -> bool:
+        """True if a test, of parameters or of bundles, is significant."""
+        return self.p_parameters < SIGNIFICANT_P or self.p_field < SIGNIFICANT_P
+
+    def __repr__(self) -> str:
+        return change_repr(self)
+
+    def _repr_html_(self) -> str:
+        return change_html(self)
+
+
+def change(
     first: InteriorOrientation,
     second: InteriorOrientation,
-    points: Float[Numbers, "points 2"],
+    points: Float[np.ndarray, "points 2"],
+    covariances: tuple[Float[np.ndarray, "p p"] | None, Float[np.ndarray, "q q"] | None],
     method: Method = "rot",
-    depth: Float[Numbers, "points"] | None = None,
-) -> BundleOffsets:
-    """The offsets of two bundles after alignment, with their derivatives; arguments as in `rmse_offset`.
+) -> Change:
+    """Compare two calibrations from independent images: parameters, and bundles over image points (mm).
 
-    Raises ValueError for fewer points than the alignment needs.
+    `covariances` are a posteriori, in the order of `parameter_names`; a set without one counts as exact. Raises
+    InputError if both are None, for points where a distortion is not invertible, and for bundles that cannot be
+    aligned.
     """
-    if 2 * len(points) <= UNKNOWNS[method]:
-        raise ValueError(f"{len(points)} image points leave nothing to compare after {UNKNOWNS[method]} unknowns")
-    points = jnp.asarray(points, float)
-    return call_compiled(_compared, as_arrays(first), as_arrays(second), points, method, _depths(points, depth))
+    if covariances[0] is None and covariances[1] is None:
+        raise InputError("neither calibration has a covariance: a change cannot be tested")
+    for name, interior in (("the first camera", first), ("the second camera", second)):
+        check_rays(interior, points, name)
+    offsets = bundle_offsets(first, second, points, method)
+    if not bool(offsets.converged):
+        raise InputError(f"the two bundles cannot be aligned by {method}: they are not from one camera")
+    names = [parameter_names(interior) for interior in (first, second)]
+    q1, q2 = (
+        np.zeros((len(n), len(n))) if q is None else np.asarray(q) for n, q in zip(names, covariances, strict=True)
+    )
+    p = len(q1)
+    rows = np.asarray(offsets.measured_jacobian).reshape(len(points), 2, -1)
+    by_point = np.einsum("nip,pq,njq->nij", rows[..., :p], q1, rows[..., :p])
+    by_point += np.einsum("nip,pq,njq->nij", rows[..., p:], q2, rows[..., p:])
+    parameters: tuple[ParameterChange, ...] = ()
+    chi_square, freedom, p_value = float("nan"), 0, float("nan")
+    if same_model(first, second):
+        parameters = _parameters(first, second, q1 + q2)
+        chi_square, freedom = mahalanobis(np.array([p.difference for p in parameters]), q1 + q2)
+        p_value = float(scipy.special.chdtrc(freedom, chi_square)) if freedom else float("nan")
+    field = Analysis(method, offsets, offset_uncertainty(offsets, *covariances))
+    return Change(parameters, chi_square, freedom, p_value, field, np.sqrt(square_radius(by_point)))
 
 
-def check_rays(interior: InteriorOrientation, points: Float[Numbers, "points 2"], name: str) -> None:
-    """Raise InputError where the distortion of `interior`, called `name`, folds or has no ray at some of `points`."""
-    good = regular_rays(interior, points)
-    if not good.all():
-        reach = np.hypot(*np.asarray(points)[~good].T).min()
-        raise InputError(
-            f"{name}: its distortion means nothing at {(~good).sum()} of {len(good)} points of the grid, or they look "
-            f"behind the camera, the nearest {reach:.3g} mm from the image centre; compare over a smaller extent"
-        )
+def mahalanobis(difference: Float[np.ndarray, "n"], covariance: Float[np.ndarray, "n n"]) -> tuple[float, int]:
+    """d' Q^-1 d and its degrees of freedom, over the directions in which Q is not zero."""
+    free = np.diagonal(covariance) > 0
+    sigma = np.sqrt(np.diagonal(covariance)[free])
+    values, axes = np.linalg.eigh(covariance[np.ix_(free, free)] / sigma[:, None] / sigma)
+    positive = values > _ROUNDING * values.max(initial=0.0)
+    along = (difference[free] / sigma) @ axes[:, positive]
+    return float((along**2 / values[positive]).sum()), int(positive.sum())
 
 
-def regular_rays(interior: InteriorOrientation, points: Float[Numbers, "points 2"]) -> Bool[Numbers, "points"]:
-    """At which image points (mm) the distortion does not fold, and the ray looks ahead."""
-    return still(call_compiled(_regular, as_arrays(interior), jnp.asarray(points, float)))
+def same_model(first: InteriorOrientation, second: InteriorOrientation) -> bool:
+    """True if the parameters of both have the same meaning."""
+    constants = [{n: float(get_parameter(i, n)) for n in constant_names(i)} for i in (first, second)]
+    return model_keys(first) == model_keys(second) and constants[0] == constants[1]
 
 
-@eqx.filter_jit
-def _compared(first, second, points, method, depth) -> BundleOffsets:
-    def offsets(p1, p2):
-        v, *others = _aligned(with_parameters(first, p1), with_parameters(second, p2), points, method, depth)
-        return v.ravel(), (v, *others)
-
-    p1, p2 = parameter_vector(first), parameter_vector(second)
-    (j1, j2), (v, alignment, converged) = jax.jacfwd(offsets, argnums=(0, 1), has_aux=True)(p1, p2)
-    stretch = jax.vmap(jax.jacfwd(first.ideal_from_measured))(points)
-    measured = jax.vmap(solve)(stretch, v)
-    return BundleOffsets(points, v, measured, alignment, jnp.hstack([j1, j2]), stretch, converged)
-
-
-@eqx.filter_jit
-def _regular(interior, points):
-    """Whether the map from measured to ideal coordinates keeps its orientation at the points, and they look ahead."""
-
-    def one(xy):
-        _, _, w = interior.direction_from_ideal(interior.ideal_from_measured(xy))
-        return unfolded(xy) & (w < 0)
-
-    def unfolded(xy):
-        if interior.distortion.domain == "ideal":
-            reduced = xy - interior.principal_point
-            return invert(interior.distortion, reduced / interior.c if interior.distortion.normalised else reduced)[1]
-        return jnp.linalg.det(jax.jacfwd(interior.ideal_from_measured)(xy)) > 0
-
-    return jax.vmap(one)(points)
+def _parameters(
+    first: InteriorOrientation, second: InteriorOrientation, covariance: Float[np.ndarray, "n n"]
+) -> tuple[ParameterChange, ...]:
+    vectors = (np.asarray(parameter_vector(interior)) for interior in (first, second))
+    sigma = np.sqrt(np.diagonal(covariance))
+    changes = []
+    for name, a, b, s in zip(parameter_names(first), *vectors, sigma, strict=True):
+        p_value = 2 * float(scipy.special.ndtr(-abs(b - a) / s)) if s > 0 else float("nan")
+        values = float(a), float(b), float(b - a), float(s), p_value
+        changes.append(ParameterChange(name, *values, parameter_unit(first, name)))
+    return tuple(changes)
 
 
-def _aligned(first, second, points, method, depth):
-    rays = image_rays(first, points), image_rays(second, points)
-    alignment, converged = align(*rays, depth, method)
-    return offsets_of(alignment, *rays, depth, method), alignment, converged
+@shown
+class Combination(NamedTuple):
+    """Weighted mean of several calibrations."""
+
+    interior: InteriorOrientation
+    covariance: Float[np.ndarray, "p p"]
+    """In the order of `parameter_names`; zero rows for fixed parameters."""
+    chi_square: float
+    degrees_of_freedom: int
+    p_value: float
+    """Probability of a larger chi-square if all are from one camera."""
+    against_others: tuple[float, ...]
+    """p-value of the difference of each calibration from the combination of all others."""
+
+    def disagreeing(self, level: float) -> list[int]:
+        """Indices of calibrations that differ from the others, with the overall error probability `level`."""
+        n = len(self.against_others)
+        return [k for k, p in enumerate(self.against_others) if p < level / n]
 
 
-def _depths(points, depth):
-    return jnp.ones(len(points)) if depth is None else jnp.asarray(depth, float)
+def combine(
+    interiors: Sequence[InteriorOrientation], covariances: Sequence[Float[np.ndarray, "p p"]], names: Sequence[str]
+) -> Combination:
+    """Combine independent calibrations; `names` are their labels in messages.
+
+    `covariances` are in the order of `parameter_names`, with zero rows for fixed parameters. Raises InputError for
+    fewer than two, a repeated one, different models, and different sets or values of fixed parameters.
+    """
+    if len(interiors) < 2:
+        raise InputError("a combination needs at least two calibrations: name another one")
+    parameters = parameter_names(interiors[0])
+    free = np.diagonal(covariances[0]) > 0
+    for interior, covariance, name in zip(interiors[1:], covariances[1:], names[1:], strict=True):
+        if not same_model(interiors[0], interior):
+            raise InputError(f"{name} and {names[0]} have different camera models: combine calibrations of one model")
+        for parameter, free_first, free_here in zip(parameters, free, np.diagonal(covariance) > 0, strict=True):
+            if free_first != free_here:
+                fixed, estimated = (names[0], name) if free_here else (name, names[0])
+                raise InputError(
+                    f"{parameter} is fixed in {fixed} and estimated in {estimated}: readjust one of them to match"
+                )
+            values = [float(get_parameter(i, parameter)) for i in (interiors[0], interior)]
+            if not free_first and values[0] != values[1]:
+                raise InputError(f"{parameter} is fixed at {values[0]:g} in {names[0]} and at {values[1]:g} in {name}")
+        if np.array_equal(covariance, covariances[0]) and all(
+            float(get_parameter(interior, p)) == float(get_parameter(interiors[0], p)) for p in parameters
+        ):
+            raise InputError(f"{name} and {names[0]} are the same calibration: name it once")
+    index = np.ix_(free, free)
+    vectors = np.array([[float(get_parameter(interior, name)) for name in parameters] for interior in interiors])
+    x = vectors[:, free]
+    q = np.stack([np.asarray(covariance)[index] for covariance in covariances])
+    mean, combined = _mean(x, q)
+    tests = [mahalanobis(x_i - mean, q_i) for x_i, q_i in zip(x, q, strict=True)]
+    chi_square, freedom = sum(test[0] for test in tests), sum(test[1] for test in tests[1:])
+    against = []
+    for k in range(len(x)):
+        others, q_others = _mean(np.delete(x, k, axis=0), np.delete(q, k, axis=0))
+        square, n = mahalanobis(x[k] - others, q[k] + q_others)
+        against.append(float(scipy.special.chdtrc(n, square)))
+    vector = vectors[0].copy()
+    vector[free] = mean
+    covariance = np.zeros((len(parameters), len(parameters)))
+    covariance[index] = combined
+    return Combination(
+        with_parameters(interiors[0], vector),  # type: ignore[arg-type]
+        covariance,
+        chi_square,
+        freedom,
+        float(scipy.special.chdtrc(freedom, chi_square)),
+        tuple(against),
+    )
 
 
-def as_arrays(interior: InteriorOrientation) -> InteriorOrientation:
-    """Numbers as arrays, so that another value is not another program."""
-    return jax.tree.map(lambda v: jnp.asarray(v, float), interior)
+def _mean(x: Float[np.ndarray, "n p"], q: Float[np.ndarray, "n p p"]) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted mean and its covariance, computed in units of standard deviations."""
+    unit = np.sqrt(np.diagonal(q[0]))
+    weights = np.linalg.inv(q / unit[:, None] / unit)
+    combined = np.linalg.inv(weights.sum(axis=0))
+    mean = combined @ np.einsum("npq,nq->p", weights, (x - x[0]) / unit)
+    return x[0] + unit * mean, unit[:, None] * (combined + combined.T) / 2 * unit

@@ -1,12 +1,12 @@
-"""The distortion of a camera against the distance from its principal point, and how sure it is.
+"""Distortion of a camera as a function of the distance from its principal point, with its uncertainty.
 
-With the directions u_k, as many as there are here, at the measured distance r from the principal point,
+With K directions u_k at the measured distance r from the principal point,
 
     radial(r) = mean over k of u_k . d(r u_k),   d = measured - ideal
 
-is the radial distortion of the part that is alike all around, in the image of the calibrated c (Brown 1971): another c
-would add a straight line to it. What is not alike, decentring and affinity, is the root mean square of d without
-radial(r) u_k. The band of radial is that of the covariance of all parameters, by exact derivatives.
+is the rotationally symmetric radial distortion for the calibrated c (Brown 1971): another c would add a linear term.
+The asymmetric part (decentring and affinity) is reported as the root mean square of d - radial(r) u_k. The band of
+radial follows from the covariance of all parameters, by exact derivatives.
 """
 
 from typing import NamedTuple
@@ -20,12 +20,12 @@ from jaxtyping import Array, Float
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.compiling import call_compiled
 from jaxphoto.short_repr import shown
-from jaxphoto.stability.bundles import parameter_vector, with_parameters
+from jaxphoto.stability.bundles import as_arrays, parameter_vector, with_parameters
 
 _DIRECTIONS = 36
 _STEPS = 25
 NORMAL_95 = 1.959963984540054
-"""Of a normal variable, 95 % are within so many standard deviations."""
+"""Two-sided 95 % quantile of the standard normal distribution."""
 
 
 @shown
@@ -35,24 +35,22 @@ class DistortionCurve(NamedTuple):
     r: Float[np.ndarray, "steps"]
     radial: Float[np.ndarray, "steps"]
     sigma: Float[np.ndarray, "steps"] | None
-    """Of `radial`; None where no covariance is known."""
+    """Standard deviation of `radial`; None without a covariance."""
     other: Float[np.ndarray, "steps"]
-    """Root mean square of what is not radial and alike all around."""
+    """Root mean square of the asymmetric part."""
 
 
 def distortion_curve(
     interior: InteriorOrientation, sensor: Sensor, covariance: Float[np.ndarray, "p p"] | None
 ) -> DistortionCurve:
-    """The curve from the principal point to the corner of the format that is nearest to it.
+    """Compute the curve from the principal point to the nearest corner of the format.
 
-    `covariance` is that of `parameter_names(interior)`, a posteriori.
+    `covariance` is a posteriori, in the order of `parameter_names(interior)`.
     """
     half = np.array([sensor.width_mm, sensor.height_mm]) / 2
-    farthest = float(np.hypot(*(half - np.abs(np.asarray(interior.principal_point)))))
-    r = np.linspace(0.0, farthest, _STEPS)
-    # Numbers as arrays, so that another value is not another program.
-    arrays = jax.tree.map(lambda v: jnp.asarray(v, float), interior)
-    (radial, other), jacobian = call_compiled(_curve, arrays, jnp.asarray(r))
+    radius = float(np.hypot(*(half - np.abs(np.asarray(interior.principal_point)))))
+    r = np.linspace(0.0, radius, _STEPS)
+    (radial, other), jacobian = call_compiled(_curve, as_arrays(interior), jnp.asarray(r))
     sigma = None
     if covariance is not None:
         jacobian = np.asarray(jacobian)
@@ -69,12 +67,12 @@ def _curve(
 
     def curves(vector):
         camera = with_parameters(interior, vector)
-        # From the principal point as it is: where it lies is no distortion.
-        at = lambda xy: xy - camera.ideal_from_measured(xy + camera.principal_point)  # noqa: E731
-        d = jax.vmap(jax.vmap(at))(r[:, None, None] * u)
-        along = (d * u).sum(axis=2).mean(axis=1)
-        rest = d - along[:, None, None] * u
-        return along, jnp.sqrt((rest**2).sum(axis=2).mean(axis=1))
+        # From the principal point of the camera: its position is no distortion.
+        distortion = lambda xy: xy - camera.ideal_from_measured(xy + camera.principal_point)  # noqa: E731
+        d = jax.vmap(jax.vmap(distortion))(r[:, None, None] * u)
+        radial = (d * u).sum(axis=2).mean(axis=1)
+        rest = d - radial[:, None, None] * u
+        return radial, jnp.sqrt((rest**2).sum(axis=2).mean(axis=1))
 
     vector = parameter_vector(interior)
     return curves(vector), jax.jacfwd(lambda v: curves(v)[0])(vector)

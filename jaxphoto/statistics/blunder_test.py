@@ -1,14 +1,23 @@
-"""Which observation contradicts the others: the normalised residual of every one against what no correct one reaches.
+"""Blunder test: normalised residuals against the critical value of their maximum, for one and for several outliers.
 
 An error e in observation i alone is estimated by (P v)_i / (P Q_vv P)_ii with the standard deviation
-sigma0 / sqrt((P Q_vv P)_ii), and w_i is their ratio. Where sigma naught is estimated from the same residuals, w follows
-the tau distribution; of n of them the largest is compared with its quantile of level alpha / n (Bonferroni).
+sigma0 / sqrt((P Q_vv P)_ii), and w_i is their ratio. If sigma naught is estimated from the same residuals, w follows
+the tau distribution; the largest of n is compared with its quantile of level alpha / n (Bonferroni).
+
+Several outliers: a blunder inflates the residuals around it. The suspects are therefore selected one after another,
+largest first, each as an unknown error of its row. For another suspect i beside the selected ones, S, and with
+C = P Q_vv P of whitened observations and u = v,
+
+    u_i|S = u_i - C_iS C_SS^-1 u_S,     c_i|S = C_ii - C_iS C_SS^-1 C_Si,     w_i|S = u_i|S / (s_S sqrt(c_i|S))
+
+where s_S^2 = (v'v - u_S' C_SS^-1 u_S) / (r - f_S) is the variance factor without them.
 
 Sources: Baarda (1968), A testing procedure for use in geodetic networks; Pope (1976), The statistics of residuals and
-the detection of outliers, NOAA Technical Report NOS 65 NGS 1.
+the detection of outliers, NOAA Technical Report NOS 65 NGS 1; Kok (1984), On data snooping and multiple outlier
+testing, NOAA Technical Report NOS NGS 30.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
@@ -18,38 +27,44 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.arrays import still
 from jaxphoto.short_repr import shown
 from jaxphoto.statistics.discrepancy import observation_groups
+from jaxphoto.statistics.hat_matrix import HatMatrix
 from jaxphoto.statistics.quantiles import student_limit
-from jaxphoto.statistics.reliability import LEAST_CHECKED, UNCHECKED, Redundancy, error_precision, normalised_residuals
+from jaxphoto.statistics.reliability import LEAST_CHECKED, Redundancy, error_precision, normalised_residuals
+from jaxphoto.statistics.systematic_effects import (
+    MIN_FRACTION,
+    EffectTerm,
+    SystematicEffect,
+    candidate_effects,
+    truncated_inverse,
+)
 
 LEVEL = 1e-3
-"""Error probability of a test of the whole adjustment: of sigma naught, and of all normalised residuals together."""
+"""Error probability of a test of the whole adjustment: of sigma naught, and of all normalised residuals jointly."""
 LEAST_SIGMA0 = 1e-3
-"""Below this, residuals are the rounding of exact numbers, and none of them contradicts another."""
-DELTA0 = 4.13
-"""Shift of a normalised residual that a test of level 0.1 % finds with a power of 80 % (Baarda)."""
+"""Sigma naught below which residuals are the rounding of exact values; no blunder test is made."""
 
 
 @shown
 class Suspect(eqx.Module):
-    """An observation that contradicts the others, and by how much it is off if it alone is."""
+    """An observation whose normalised residual exceeds the critical value, and its error if it is the only outlier."""
 
     group: str
     row: int
-    """Of its group in the block."""
+    """Index in its group of the block."""
     number: int
-    """Which of the numbers of its row shows it."""
+    """Component of the row with the largest normalised residual."""
     words: str
-    """What a sentence calls it."""
+    """Label for messages."""
     w: float
     error: float
     sigma: float
-    """Of `error`, a posteriori; both in `unit`."""
+    """A posteriori standard deviation of `error`; both in `unit`."""
     unit: str
 
 
 @shown
 class BlunderTest(eqx.Module):
-    """The `suspects`, rows with a number beyond `limit`, the worst first; `n` normalised residuals were tested."""
+    """`suspects`: rows with a component beyond `limit`, largest first; `n` normalised residuals were tested."""
 
     suspects: tuple[Suspect, ...]
     limit: float
@@ -57,35 +72,35 @@ class BlunderTest(eqx.Module):
 
 
 def blunder_test(adjusted: Adjustment, redundancy: Redundancy, level: float = LEVEL) -> BlunderTest:
-    """All observations of `adjusted` against the critical value of |w| for all of them together.
+    """Test all normalised residuals of `adjusted` against the critical value of their maximum.
 
-    What is known of parameters beforehand is no observation; what hardly anything checks is not tested.
+    Prior information and observations with a redundancy number below `LEAST_CHECKED` are not tested.
     """
     w, precision = normalised_residuals(adjusted, redundancy), error_precision(adjusted, redundancy)
     sigma0 = float(adjusted.sigma0)
     groups = {name: rows for name, rows in observation_groups(adjusted).items() if rows.unit}
-    sizes = {name: np.where(still(redundancy[name]) > LEAST_CHECKED, np.abs(w[name]), 0.0) for name in groups}
-    n = sum(int((v > 0).sum()) for v in sizes.values())
-    limit, block, found = critical_w(n, adjusted.redundancy, level), adjusted.block, []
+    absolute = {name: np.where(still(redundancy[name]) > LEAST_CHECKED, np.abs(w[name]), 0.0) for name in groups}
+    n = sum(int((v > 0).sum()) for v in absolute.values())
+    limit, block, suspects = critical_w(n, adjusted.redundancy, level), adjusted.block, []
     if sigma0 < LEAST_SIGMA0:
         return BlunderTest((), limit, n)
     for name, rows in groups.items():
-        size = np.atleast_2d(sizes[name])
-        bad = np.flatnonzero(size.max(axis=0, initial=0.0) > limit)
-        if not len(bad):
+        absolute_w = np.atleast_2d(absolute[name])
+        rejected = np.flatnonzero(absolute_w.max(axis=0, initial=0.0) > limit)
+        if not len(rejected):
             continue
-        # The largest number of a row speaks for it: a point in an image is one blunder, whichever coordinate shows it.
-        worst = size[:, bad].argmax(axis=0)
-        words = rows.words_of(worst, bad, block.images, block.points)
-        of_worst = (np.atleast_2d(v)[worst, bad] for v in (w[name], precision[name]))
-        for row, number, word, value, p in zip(bad.tolist(), worst.tolist(), words, *of_worst, strict=True):
-            sigma, ratio = sigma0 / float(p) ** 0.5, float(value)
-            found.append(Suspect(name, row, number, word, ratio, ratio * sigma, sigma, rows.unit))
-    return BlunderTest(tuple(sorted(found, key=lambda s: -abs(s.w))), limit, n)
+        # One suspect per row: both coordinates of an image point belong to the same blunder.
+        worst = absolute_w[:, rejected].argmax(axis=0)
+        labels = rows.words_of(worst, rejected, block.images, block.points)
+        values = (np.atleast_2d(v)[worst, rejected] for v in (w[name], precision[name]))
+        for row, component, label, value, p in zip(rejected.tolist(), worst.tolist(), labels, *values, strict=True):
+            sigma, w_i = sigma0 / float(p) ** 0.5, float(value)
+            suspects.append(Suspect(name, row, component, label, w_i, w_i * sigma, sigma, rows.unit))
+    return BlunderTest(tuple(sorted(suspects, key=lambda s: -abs(s.w))), limit, n)
 
 
 def critical_w(n: int, redundancy: int, level: float = LEVEL) -> float:
-    """What the largest of `n` normalised residuals exceeds with probability `level` at most (Pope's tau).
+    """Critical value of the largest of `n` normalised residuals at error probability `level` (Pope's tau).
 
     With nu the redundancy and t the quantile of Student's distribution of nu - 1 degrees of freedom,
     tau = t sqrt(nu) / sqrt(nu - 1 + t^2); infinite below a redundancy of 2, where all |w| are 1.
@@ -96,41 +111,71 @@ def critical_w(n: int, redundancy: int, level: float = LEVEL) -> float:
     return t * redundancy**0.5 / (redundancy - 1 + t * t) ** 0.5
 
 
-def detectable_errors(
-    adjusted: Adjustment, redundancy: Redundancy, delta0: float = DELTA0
-) -> dict[str, Float[np.ndarray, "..."]]:
-    """By group, the least error that the test of one normalised residual finds with its power: delta0 / sqrt(P Q_vv P).
+# Maximum number of suspects in the multiple outlier test; of larger sets, iterative data snooping decides.
+_MAX_SUSPECTS = 24
 
-    In the unit of each observation; infinite where nothing checks it.
+
+def multiple_outlier_test(
+    adjusted: Adjustment, test: BlunderTest, effects: Sequence[tuple[SystematicEffect, EffectTerm]] = ()
+) -> tuple[Suspect, ...]:
+    """Return the suspects that stay beyond the critical value when larger ones are modelled as unknown errors.
+
+    Largest first. Terms of systematic `effects` are unknowns from the start, so what they explain is no blunder.
+    Suspects beyond the first 24 are returned untested.
     """
-    found = {}
-    for name, p in error_precision(adjusted, redundancy).items():
-        checked = still(redundancy[name]) > UNCHECKED
-        found[name] = np.where(checked, delta0 / np.sqrt(np.where(checked, p, 1.0)), np.inf)
-    return found
+    tested, others = test.suspects[:_MAX_SUSPECTS], test.suspects[_MAX_SUSPECTS:]
+    if len(tested) + len(effects) < 2 or not tested:
+        return test.suspects
+    hat_matrix = HatMatrix.of(adjusted)
+    rows = [np.ravel(hat_matrix.places[s.group][..., s.row]) for s in tested]
+    largest_component = [int(np.atleast_2d(hat_matrix.places[s.group])[s.number, s.row]) for s in tested]
+    at, n = np.concatenate(rows), len(effects)
+    effect_columns = _columns(hat_matrix, effects)
+
+    def column(k: int) -> np.ndarray:
+        return (
+            effect_columns[k] if k < n else np.bincount(at[k - n : k - n + 1], minlength=hat_matrix.count).astype(float)
+        )
+
+    unadjusted = np.eye(n + len(at))
+    unadjusted[:n, :n], unadjusted[:n, n:], unadjusted[n:, :n] = (
+        effect_columns @ effect_columns.T,
+        effect_columns[:, at],
+        effect_columns[:, at].T,
+    )
+    c = unadjusted - hat_matrix.products(column, n + len(at))[0]
+    v = hat_matrix.residuals
+    square_sum, unknowns = float(v @ v), [n + np.flatnonzero(np.isin(at, row_index)) for row_index in rows]
+    u = np.concatenate([effect_columns @ v, v[at]])
+    min_fraction = min([MIN_FRACTION, *(pattern.min_fraction for pattern, _ in effects)])
+    chosen: list[int] = [] if n else [0]
+    while len(chosen) < len(tested):
+        s = np.concatenate([np.arange(n), *(unknowns[i] for i in chosen)])
+        inverse, freedom = truncated_inverse(c[np.ix_(s, s)], unadjusted[np.ix_(s, s)], min_fraction)
+        errors, redundancy = inverse @ u[s], adjusted.redundancy - freedom
+        remaining = square_sum - float(u[s] @ errors)
+        if redundancy < 1 or remaining <= LEAST_SIGMA0**2 * redundancy:
+            break
+        w = np.zeros(len(tested))
+        for i in (i for i in range(len(tested)) if i not in chosen):
+            k = n + int(np.flatnonzero(at == largest_component[i])[0])
+            variance = float(c[k, k] - c[k, s] @ inverse @ c[s, k])
+            if variance > MIN_FRACTION * c[k, k]:
+                w[i] = abs(u[k] - c[k, s] @ errors) / (remaining / redundancy * variance) ** 0.5
+        if w.max() <= test.limit:
+            break
+        chosen.append(int(w.argmax()))
+    return (*(tested[i] for i in chosen), *others)
 
 
-@shown
-class Hidden(NamedTuple):
-    """The observation of a group whose errors are found worst: `detectable` is infinite where none ever is."""
-
-    group: str
-    words: str
-    detectable: float
-    sigma: float
-    """A priori; both in `unit`."""
-    unit: str
-
-
-def worst_checked(adjusted: Adjustment, redundancy: Redundancy) -> list[Hidden]:
-    """Of each group of observations, that of the largest detectable error beside its standard deviation."""
-    found, block = [], adjusted.block
-    detectable = detectable_errors(adjusted, redundancy)
-    for name, rows in observation_groups(adjusted).items():
-        if rows.unit and len(rows):
-            size, sigma = np.atleast_2d(detectable[name]), np.atleast_2d(still(rows.sigmas).T)
-            k = np.unravel_index(np.argmax(size / sigma), size.shape)
-            number, row = np.reshape(k, (2, 1))
-            (words,) = rows.words_of(number, row, block.images, block.points)
-            found.append(Hidden(name, words, float(size[k]), float(sigma[k]), rows.unit))
-    return found
+def _columns(
+    hat_matrix: HatMatrix, effects: Sequence[tuple[SystematicEffect, EffectTerm]]
+) -> Float[np.ndarray, "terms count"]:
+    """Terms of systematic effects as whitened errors of all observations; `effects` may come without their columns."""
+    columns, labels = np.zeros((len(effects), hat_matrix.count)), [(e.what, e.camera) for e, _ in effects]
+    for effect in candidate_effects(hat_matrix.adjusted, hat_matrix.places) if effects else ():
+        for row, (label, (_, term)) in enumerate(zip(labels, effects, strict=True)):
+            if label == (effect.what, effect.camera):
+                used = ((k, float(a)) for k, a in enumerate(term.coefficients) if a != 0.0)
+                columns[row] = sum((a * effect.column(k, hat_matrix.count) for k, a in used), columns[row])
+    return columns

@@ -1,19 +1,40 @@
-"""Correlations: interior with interior orientation, and each image's exterior with its camera's interior.
+"""Correlations: of interior and exterior orientation, and of the camera with the ground as a whole.
 
-Source: paper 000, Table 4 (mean absolute correlation over the images, per angle or coordinate and IOP).
+Source of the image-wise correlations: paper 000, Table 4 (mean absolute correlation over the images, per angle or
+coordinate and IOP).
+
+Over flat ground imaged from one height, a longer c is equivalent to a greater flying height, and radial distortion to
+a dome of the ground: neither leaves residuals. Correlations with the exterior orientation of single images do not show
+this, because all images and points move together. Each of the forms below is a linear function f = g' x of the
+coordinates of points and stations, so
+
+    cov(f, u) = sigma0^2 g' N^-1 e_u,   var(f) = sigma0^2 g' N^-1 g.
+
+    height          mean Z of the points
+    flying_height   mean Z of the projection centres minus that of the points
+    dome            height of the centre of the ground over its edge: of Z = a + b X + c Y + d (X^2 + Y^2),
+                    fitted to the points, -d R^2 with the distance R from the centre to the farthest point
+
+Source: the dome as the typical deformation of flat blocks, M. R. James and S. Robson, Mitigating systematic error in
+topographic models derived from UAV and ground-based image networks, Earth Surface Processes and Landforms 39 (2014).
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.arrays import namespace, still
+from jaxphoto.adjustment.model.numbers import Increments
+from jaxphoto.adjustment.right_hand_sides import solve_many
+from jaxphoto.arrays import Numbers, is_traced, namespace, still
 from jaxphoto.short_repr import shown
 from jaxphoto.statistics.covariance import EOP_NAMES, Covariance
+from jaxphoto.statistics.hat_matrix import inner_products
 
 
 @shown
@@ -28,7 +49,7 @@ class Correlations(eqx.Module):
     interior: Float[Any, "iop iop"]
     exterior: Float[Any, "images 6 iop"]
     within_image: Float[Any, "images 6 6"]
-    """Of each image's exterior orientation with itself."""
+    """Correlations within each image's exterior orientation."""
 
     @property
     def mean_abs(self) -> Float[Any, "6 iop"]:
@@ -42,7 +63,7 @@ class Correlations(eqx.Module):
 
 
 def correlation_matrix(covariance: Covariance) -> Float[Any, "reduced reduced"]:
-    """Correlations of everything in `covariance.labels`; zero for what is fixed."""
+    """Correlation matrix of `covariance.labels`; zero for fixed unknowns."""
     matrix = still(covariance.matrix)
     xp, variance = namespace(matrix), matrix.diagonal()
     inverse = xp.where(variance > 0, 1 / xp.sqrt(xp.where(variance > 0, variance, 1.0)), 0.0)
@@ -58,8 +79,8 @@ def correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, Corr
         prefix = f"interior[{camera}]."
         columns = [k for k, label in enumerate(covariance.labels) if k >= n and label.startswith(prefix)]
         images = [i for i, c in enumerate(adjusted.block.image_camera) if c == camera]
-        own = 6 * np.array(images, int)[:, None] + np.arange(6)
-        exterior = rho[own][:, :, np.array(columns, int)]
+        rows = 6 * np.array(images, int)[:, None] + np.arange(6)
+        exterior = rho[rows][:, :, np.array(columns, int)]
         result[camera] = Correlations(
             camera,
             tuple(covariance.labels[k].removeprefix(prefix) for k in columns),
@@ -67,13 +88,130 @@ def correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, Corr
             tuple(adjusted.block.images[i] for i in images),
             rho[np.ix_(columns, columns)],
             exterior,
-            rho[own[:, :, None], own[:, None]],
+            rho[rows[:, :, None], rows[:, None]],
         )
     return result
 
 
 def high_pairs(names: Sequence[str], rho: Float[np.ndarray, "n n"], above: float) -> list[tuple[str, str, float]]:
-    """Pairs of parameters whose correlation is larger than `above`, either sign, and it; the largest first."""
+    """Pairs of parameters with |correlation| larger than `above`, and the correlation; the largest first."""
     lower = [(i, j) for i in range(len(names)) for j in range(i)]
     pairs = [(names[i], names[j], float(rho[i, j])) for i, j in lower if abs(rho[i, j]) > above]
     return sorted(pairs, key=lambda pair: -abs(pair[2]))
+
+
+@shown
+class LinearForms(NamedTuple):
+    """Covariances of linear functions of unknowns, with one another and with the shared unknowns."""
+
+    variance: Float[Any, "forms forms"]
+    with_shared: Float[Any, "forms shared"]
+
+
+def linear_forms(
+    adjusted: Adjustment,
+    n_forms: int,
+    *,
+    points: Float[Numbers, "forms points 3"] | None = None,
+    exterior: Float[Numbers, "forms images 6"] | None = None,
+    shared: Float[Numbers, "forms shared"] | None = None,
+) -> LinearForms:
+    """A posteriori covariances of `n_forms` linear functions f = g' x of the unknowns; omitted weights g are zero.
+
+    cov(f, h) = sigma0^2 g' N^-1 h with the normal matrix N. Unknowns are the coordinates of points (m), of each image
+    its position (m) and small rotations about the axes of its camera (rad), and the shared unknowns in the order of
+    `Structure.labels`, in their own units.
+    """
+    equations, places = adjusted.equations.on_one_device.weighed, adjusted.padded.places
+    scale = jax.tree.map(still, equations.scale)
+
+    def weights(g: Any, index: Any, scale: Any) -> Any:
+        if g is None:
+            return np.zeros((n_forms, *scale.shape))
+        if is_traced((g, scale)):
+            return jnp.zeros((n_forms, *scale.shape)).at[..., index].set(g) * scale
+        padded = np.zeros((n_forms, *scale.shape))
+        padded[..., index] = g
+        return padded * scale
+
+    b = Increments(
+        weights(None if exterior is None else exterior.swapaxes(1, 2), places.image, scale.eop),
+        weights(shared, np.arange(0 if shared is None else shared.shape[1]), scale.shared),
+        weights(None if points is None else points.swapaxes(1, 2), places.point, scale.points),
+    )
+    x, factor = solve_many(equations, b, adjusted.seconds), adjusted.sigma0**2
+    return LinearForms(factor * inner_products(b, x), factor * x.shared * scale.shared)
+
+
+FORMS = ("height", "flying_height", "dome")
+# Minimum number of rays of the points used, if there are enough of these: points of two rays would dominate the
+# variance of a mean.
+_MIN_RAYS, _MIN_POINTS = 3, 10
+# Minimum mean cosine of the tilt of near-vertical photographs.
+_MIN_COSINE = 0.7
+# Fraction of the largest point variance below which the variance of a form is rounding: the datum fixes it.
+_ROUNDING = 1e-9
+
+
+@shown
+class GroundCorrelations(eqx.Module):
+    """Correlations of the `FORMS` of the ground with the interior orientation of a camera."""
+
+    camera: str = eqx.field(static=True)
+    parameters: tuple[str, ...] = eqx.field(static=True)
+    """The camera's estimated interior parameters (c_mm ...)."""
+    sigma_m: Float[np.ndarray, "forms"]
+    """Standard deviation of each of `FORMS`; zero where the datum fixes it."""
+    rho: Float[np.ndarray, "forms iop"]
+    together: Float[np.ndarray, "forms"]
+    """Multiple correlation with all interior parameters of the camera."""
+
+
+def ground_correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, GroundCorrelations]:
+    """Correlations by camera; empty for oblique blocks and for fewer than five points."""
+    rays = np.bincount(adjusted.structure.point, minlength=len(adjusted.block.points))
+    chosen = rays >= _MIN_RAYS if (rays >= _MIN_RAYS).sum() >= _MIN_POINTS else rays > 0
+    cosine = np.mean(np.asarray(adjusted.unknowns.exterior.camera_from_object)[:, 2, 2])
+    if not cosine > _MIN_COSINE or chosen.sum() < 5:
+        return {}
+    points, positions = _weights(np.asarray(adjusted.unknowns.points), chosen, len(adjusted.block.images))
+    exterior = np.concatenate([positions, np.zeros_like(positions)], axis=2)
+    forms = linear_forms(adjusted, len(FORMS), points=points, exterior=exterior)
+    variance, n = np.diagonal(forms.variance), 6 * covariance.n_images
+    variable = variance > _ROUNDING * np.max(np.square(covariance.point_sigma), initial=0.0)
+    sigma = np.where(variable, np.sqrt(np.maximum(variance, 0.0)), 0.0)
+    labels, matrix = covariance.labels[n:], np.asarray(covariance.matrix)[n:, n:] * float(covariance.variance_factor)
+    result = {}
+    for camera in adjusted.unknowns.interior:
+        prefix = f"interior[{camera}]."
+        columns = [k for k, label in enumerate(labels) if label.startswith(prefix)]
+        if not columns:
+            continue
+        cross, interior = forms.with_shared[:, columns], matrix[np.ix_(columns, columns)]
+        size = np.where(variable, sigma, np.inf)[:, None] * np.sqrt(np.diagonal(interior))
+        rho = cross / size
+        correlation = interior / np.sqrt(np.outer(np.diagonal(interior), np.diagonal(interior)))
+        square = np.einsum("fi,fi->f", rho, np.linalg.solve(correlation, rho.T).T)
+        result[camera] = GroundCorrelations(
+            camera,
+            tuple(labels[k].removeprefix(prefix) for k in columns),
+            sigma,
+            rho,
+            np.sqrt(np.clip(square, 0.0, 1.0)),
+        )
+    return result
+
+
+def _weights(
+    xyz: Float[np.ndarray, "points 3"], chosen: np.ndarray, n_images: int
+) -> tuple[Float[np.ndarray, "3 points 3"], Float[np.ndarray, "3 images 3"]]:
+    """Weights of the coordinates of points and of projection centres in each of `FORMS`."""
+    points, positions = np.zeros((3, *xyz.shape)), np.zeros((3, n_images, 3))
+    points[0, chosen, 2] = 1 / chosen.sum()
+    points[1], positions[1, :, 2] = -points[0], 1 / n_images
+    plan = xyz[chosen, :2] - xyz[chosen, :2].mean(axis=0)
+    square = (plan**2).sum(axis=1)
+    farthest = max(float(square.max()), np.finfo(float).tiny)
+    terms = np.column_stack([np.ones(len(plan)), plan / np.sqrt(farthest), square / farthest])
+    points[2, chosen, 2] = -np.linalg.pinv(terms)[3]
+    return points, positions

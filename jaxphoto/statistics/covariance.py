@@ -1,4 +1,10 @@
-"""Covariances of all unknowns, in their own units, from the cofactors of the normal equations."""
+"""Covariances of all unknowns, in their own units, from the cofactors of the normal equations.
+
+Covariance of two adjustments that share observations: two halves of a block have no image in common, but both use
+control, distances and prior information. To first order an estimate has the error -w'e, with e the errors of the
+observations over their standard deviations and w = J N^-1 e_p its weights. Two estimates therefore have the covariance
+w1'w2, summed over the rows in both.
+"""
 
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -7,10 +13,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxphoto.adjustment import Adjustment, Cofactors, NormalEquations, RowCofactors
+from jaxphoto.adjustment import Adjustment, Cofactors, NormalEquations, PaddedResiduals, RowCofactors
 from jaxphoto.adjustment.model.numbers import Increments
+from jaxphoto.adjustment.model.structure import observed_in
 from jaxphoto.arrays import Numbers, gathered, still
 from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.errors import counted
@@ -37,22 +44,22 @@ class Covariance(eqx.Module):
     points: Float[Numbers, "points 3 3"]
     variance_factor: Float[Numbers, ""] | float
     cofactors: Cofactors
-    """In padded sizes, see `Adjustment.padded`."""
+    """In padded sizes; see `Adjustment.padded`."""
     rows: RowCofactors | None
-    """j Q j' of observations, likewise, where they were asked for."""
+    """j Q j' of the observations, in padded sizes, if requested."""
     labels: tuple[str, ...] = eqx.field(static=True)
     n_images: int = eqx.field(static=True)
     rotations: Rotations = eqx.field(static=True)
     converged: Bool[Numbers, ""]
-    """Else it is that of where the adjustment stopped, and says nothing of how near the truth that is."""
+    """False: the covariance is evaluated where the adjustment stopped and is no measure of accuracy."""
 
     def __repr__(self) -> str:
-        # Anything may stand for an array while JAX maps over it.
+        # Inside a transformation of JAX the fields are tracers.
         if np.ndim(self.converged) or not isinstance(self.converged, bool | np.generic | np.ndarray):
             return "Covariance inside a transformation of JAX: its numbers are arrays"
         of = f"{counted(self.n_images, 'image')}, {counted(len(self.points), 'point')}"
         shared = counted(len(self.labels) - 6 * self.n_images, "shared unknown")
-        where = "" if self.converged else ";\n  not converged: of where the adjustment stopped, no standard deviations"
+        where = "" if self.converged else ";\n  not converged: evaluated where the adjustment stopped, do not use"
         return f"Covariance of {of} and {shared}, a priori; variance factor {float(self.variance_factor):.4g}{where}"
 
     _repr_html_ = fields_html
@@ -66,12 +73,12 @@ class Covariance(eqx.Module):
     def positions(self) -> Float[np.ndarray, "images 3 3"]:
         """A priori covariance of each projection centre (m^2)."""
         n = self.n_images
-        own = np.asarray(self.matrix)[: 6 * n, : 6 * n].reshape(n, 6, n, 6)
-        return own[np.arange(n), :3, np.arange(n), :3]
+        matrix = np.asarray(self.matrix)[: 6 * n, : 6 * n].reshape(n, 6, n, 6)
+        return matrix[np.arange(n), :3, np.arange(n), :3]
 
     @property
     def shared_sigma(self) -> Float[Numbers, "shared"]:
-        """A posteriori standard deviations of the shared unknowns, in the order of `labels`' end."""
+        """A posteriori standard deviations of the shared unknowns, in the order of the last `labels`."""
         return self._sigma(self.matrix.diagonal())[6 * self.n_images :]
 
     @property
@@ -80,42 +87,44 @@ class Covariance(eqx.Module):
         return self._sigma(self.points.diagonal(axis1=1, axis2=2))
 
     def of_interior(self, camera: str, parameters: Sequence[str]) -> Float[np.ndarray, "parameters parameters"]:
-        """A posteriori covariance of a camera's interior orientation in the order of `parameters`; zero where held."""
-        first, own = 6 * self.n_images, f"interior[{camera}]."
-        place = {
-            label.removeprefix(own): first + k for k, label in enumerate(self.labels[first:]) if label.startswith(own)
+        """A posteriori covariance of a camera's interior orientation in the order of `parameters`; zero where fixed."""
+        first, prefix = 6 * self.n_images, f"interior[{camera}]."
+        index = {
+            label.removeprefix(prefix): first + k
+            for k, label in enumerate(self.labels[first:])
+            if label.startswith(prefix)
         }
-        which = [k for k, name in enumerate(parameters) if name in place]
-        where = [place[parameters[k]] for k in which]
-        found = np.zeros((len(parameters), len(parameters)))
-        found[np.ix_(which, which)] = np.asarray(self.matrix)[np.ix_(where, where)] * float(self.variance_factor)
-        return found
+        free = [k for k, name in enumerate(parameters) if name in index]
+        columns = [index[parameters[k]] for k in free]
+        covariance = np.zeros((len(parameters), len(parameters)))
+        covariance[np.ix_(free, free)] = np.asarray(self.matrix)[np.ix_(columns, columns)] * float(self.variance_factor)
+        return covariance
 
     def _sigma(self, variance: Numbers) -> Any:
         xp = jnp if isinstance(variance * self.variance_factor, jax.Array) else np
-        # What is held comes out as zero or, by rounding, on either side of it. What is no number stays none.
-        # Double where: the root of zero has no derivative.
-        held = variance <= 0
-        return xp.where(held, 0.0, xp.sqrt(xp.where(held, 1.0, variance) * self.variance_factor))
+        # The variance of a fixed unknown is zero or, by rounding, slightly negative. NaN stays NaN.
+        # `where` twice: the square root has no derivative at zero.
+        fixed = variance <= 0
+        return xp.where(fixed, 0.0, xp.sqrt(xp.where(fixed, 1.0, variance) * self.variance_factor))
 
 
 def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa", *, rows: bool = False) -> Covariance:
     """Covariance of exterior orientations, shared unknowns and points.
 
-    `rotations` says which rotations the exterior rows mean: omega, phi, kappa; small rotations about the axes of the
-    object frame; or about those of the camera. With `rows` it holds what `redundancy_numbers` wants, which
-    then need not compute it all again.
+    `rotations` selects the rotations of the exterior rows: omega, phi, kappa; small rotations about the axes of the
+    object frame; or about those of the camera. `rows` stores the row cofactors, which saves `redundancy_numbers` from
+    computing them again.
     """
     if rotations not in EOP_NAMES:
-        raise ValueError(f"rotations is one of {', '.join(EOP_NAMES)}, got {rotations!r}")
-    cofactors, matrix, points, of_rows = _run(adjusted, rotations, of_rows=rows)
+        raise ValueError(f"rotations must be one of {', '.join(EOP_NAMES)}, got {rotations!r}")
+    cofactors, matrix, points, rows_cofactors = _run(adjusted, rotations, with_rows=rows)
     labels = [f"exterior[{i}].{n}" for i in adjusted.block.images for n in EOP_NAMES[rotations]]
     return Covariance(
         matrix=adjusted.padded.crop_reduced(matrix),
         points=still(points)[adjusted.padded.places.point],
         variance_factor=adjusted.sigma0**2,
         cofactors=cofactors,
-        rows=of_rows,
+        rows=rows_cofactors,
         labels=(*labels, *adjusted.structure.labels),
         n_images=adjusted.structure.n_images,
         rotations=rotations,
@@ -124,50 +133,50 @@ def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa", *
 
 
 def prepare_covariance(equations: NormalEquations, seconds: dict[str, float]) -> None:
-    """Have what `covariance` needs compiled in the background."""
+    """Compile the program of `covariance` in the background."""
     prepare(_covariance, (equations, "omega_phi_kappa", True), seconds)
 
 
 def row_cofactors(adjusted: Adjustment, rotations: Rotations) -> RowCofactors:
-    """j Q j' of rows that are computed with their points, by the program that `covariance` has run with `rotations`."""
-    return _run(adjusted, rotations, of_rows=True)[3]
+    """j Q j' of the rows that are computed with their points, by the compiled program of `covariance`."""
+    return _run(adjusted, rotations, with_rows=True)[3]
 
 
-def _run(adjusted: Adjustment, rotations: Rotations, of_rows: bool):
-    given = adjusted.equations, rotations, of_rows
-    return gathered(run_compiled(_covariance, given, adjusted.seconds, "covariance"))
+def _run(adjusted: Adjustment, rotations: Rotations, with_rows: bool):
+    arguments = adjusted.equations, rotations, with_rows
+    return gathered(run_compiled(_covariance, arguments, adjusted.seconds, "covariance"))
 
 
 @eqx.filter_jit
 def _covariance(
-    equations: NormalEquations, rotations: Rotations, of_rows: bool
+    equations: NormalEquations, rotations: Rotations, with_rows: bool
 ) -> tuple[Cofactors, Array, Array, RowCofactors | None]:
-    """Cofactors; the same in units of the unknowns; and j Q j' of rows if these are wanted."""
-    q, rows = equations.cofactors(of_rows)
-    return q, *in_units(q, equations.scale, equations.values.rotation, rotations), rows
+    """Cofactors, covariances in the units of the unknowns and, if requested, j Q j' of the rows."""
+    q, rows = equations.cofactors(with_rows)
+    return q, *physical_covariance(q, equations.scale, equations.values.rotation, rotations), rows
 
 
-def in_units(q: Cofactors, scale: Increments, rotation: Float[Array, "3 3 images"], rotations: Rotations):
-    """Covariances of reduced unknowns and of points (3 x 3 each), in metres, radians and the unknowns' own units."""
+def physical_covariance(q: Cofactors, scale: Increments, rotation: Float[Array, "3 3 images"], rotations: Rotations):
+    """Covariances of reduced unknowns and of points (3 x 3 each), in m, rad and the coefficients' own units."""
     n = rotation.shape[2]
     factors = jnp.concatenate([scale.eop.T.reshape(-1), scale.shared])
     matrix = q.reduced * factors[:, None] * factors[None, :]
 
-    turns = turns_of(rotation, rotations)
+    jacobians = rotation_jacobians(rotation, rotations)
     blocks = matrix[: 6 * n].reshape(n, 2, 3, -1)
-    blocks = jnp.stack([blocks[:, 0], jnp.einsum("nij,njk->nik", turns, blocks[:, 1])], axis=1)
+    blocks = jnp.stack([blocks[:, 0], jnp.einsum("nij,njk->nik", jacobians, blocks[:, 1])], axis=1)
     rows = jnp.concatenate([blocks.reshape(6 * n, -1), matrix[6 * n :]]).T
     blocks = rows[: 6 * n].reshape(n, 2, 3, -1)
-    blocks = jnp.stack([blocks[:, 0], jnp.einsum("nij,njk->nik", turns, blocks[:, 1])], axis=1)
+    blocks = jnp.stack([blocks[:, 0], jnp.einsum("nij,njk->nik", jacobians, blocks[:, 1])], axis=1)
     matrix = jnp.concatenate([blocks.reshape(6 * n, -1), rows[6 * n :]])
     points = q.points * scale.points.T[:, :, None] * scale.points.T[:, None, :]
     return matrix, points
 
 
-def turns_of(rotation: Float[Array, "3 3 images"], rotations: Rotations) -> Float[Array, "images 3 3"]:
-    """What takes an image's small rotation in the camera frame (rad) to the change of its three `rotations` (rad)."""
+def rotation_jacobians(rotation: Float[Array, "3 3 images"], rotations: Rotations) -> Float[Array, "images 3 3"]:
+    """Derivatives of the three `rotations` (rad) of each image by its small rotation in the camera frame (rad)."""
 
-    def turn(camera_from_object):
+    def jacobian(camera_from_object):
         if rotations == "camera":
             return jnp.eye(3)
         if rotations == "object":
@@ -175,4 +184,76 @@ def turns_of(rotation: Float[Array, "3 3 images"], rotations: Rotations) -> Floa
         angles = lambda theta: omega_phi_kappa_from_matrix(small_rotation(theta) @ camera_from_object)  # noqa: E731
         return jax.jacfwd(angles)(jnp.zeros(3))
 
-    return jax.vmap(turn, in_axes=2)(rotation)
+    return jax.vmap(jacobian, in_axes=2)(rotation)
+
+
+Weights = dict[tuple[str, str, int], Float[np.ndarray, "parameters"]]
+"""By group, label of the row, and a count for repeated labels."""
+
+
+def common_covariance(
+    first: Adjustment, second: Adjustment, camera: str, parameters: Sequence[str]
+) -> Float[np.ndarray, "parameters parameters"]:
+    """A priori covariance of the interior orientations of `camera` in two adjustments without a common image.
+
+    Rows are `parameters` of the first, columns those of the second, in their own units; zero for fixed parameters and
+    for adjustments that share no observation.
+    """
+    first_weights, second_weights = (_weights(adjusted, camera, parameters) for adjusted in (first, second))
+    covariance = np.zeros((len(parameters), len(parameters)))
+    for row in first_weights.keys() & second_weights.keys():
+        covariance += np.outer(first_weights[row], second_weights[row])
+    return covariance
+
+
+def _weights(adjusted: Adjustment, camera: str, parameters: Sequence[str]) -> Weights:
+    """w of the parameters, for every observation that involves no image."""
+    labels = _labels(adjusted)
+    if not labels:
+        return {}
+    index = {label: k for k, label in enumerate(adjusted.structure.labels)}
+    columns = np.array([index.get(f"interior[{camera}].{name}", -1) for name in parameters])
+    free = np.flatnonzero(columns >= 0)
+    arguments = adjusted.equations.on_one_device, columns.astype(np.int32)[free]
+    padded = run_compiled(_influences, arguments, adjusted.seconds, "covariance")
+    influences = [adjusted.padded.crop_residuals(jax.tree.map(lambda v: v[k], padded)) for k in range(len(free))]  # noqa: B023
+    weights: Weights = {}
+    for group, names in labels.items():
+        w = np.zeros((len(parameters), len(names)))
+        w[free] = [np.ravel(influence[group]) for influence in influences]
+        counts: dict[str, int] = {}
+        for column, name in enumerate(names):
+            counts[name] = counts.get(name, 0) + 1
+            weights[group, name, counts[name]] = w[:, column]
+    return weights
+
+
+def _labels(adjusted: Adjustment) -> dict[str, list[str]]:
+    """Labels of the observations of every group that involves no image; the same in every part of a block."""
+    block = adjusted.block
+    observed, labels = observed_in(block, adjusted.priors), {}
+    parameters = [entry.label for entry in observed.entries]
+    for group, rows in observed.named:
+        indices = {kind: np.asarray(index) for kind, index in rows.indices()}
+        if "image" in indices:
+            continue
+        if "parameter" in indices:
+            labels[group] = [parameters[k] for k in indices["parameter"].ravel()]
+        else:
+            shape = np.shape(adjusted.residuals[group])
+            labels[group] = list(np.broadcast_to(rows.words(block.images, block.points), shape).ravel())
+    return labels
+
+
+@eqx.filter_jit
+def _influences(equations: NormalEquations, shared: Int[Array, "parameters"]) -> PaddedResiduals:
+    """J N^-1 e of some shared unknowns, in their own units, along a leading axis."""
+    at = equations.at
+    _, j_product = jax.linearize(lambda y: at._replace(increments=y).residuals(), at.increments)
+    zero = jax.tree.map(jnp.zeros_like, at.increments)
+
+    def influence(k):
+        unit = zero.shared.at[k].set(equations.scale.shared[k])
+        return j_product(equations.solve(eqx.tree_at(lambda y: y.shared, zero, unit)))
+
+    return jax.lax.map(influence, shared)

@@ -1,7 +1,20 @@
-"""Residuals by group and axis, discrepancies at check points, and differences between two adjustments.
+"""Residuals by group and axis, discrepancies at check points, differences between adjustments, positional accuracy.
 
 Source: paper 000, Tables 3 (residual RMSE), 5 (check points), 6 and 7 (points and angles of two experiments).
+
+Positional accuracy by check points follows ASPRS Edition 2 and includes the error of the survey:
+
+    RMSE_H = sqrt(RMSE_x^2 + RMSE_y^2 + s_H^2),  RMSE_V = sqrt(RMSE_z^2 + s_V^2),  RMSE_3D = sqrt(RMSE_H^2 + RMSE_V^2)
+
+RMSE_x, RMSE_y, RMSE_z are root mean squares of the discrepancies at check points, s_H and s_V those of the survey's
+standard deviations. An accuracy class is any number of centimetres. A claim requires at least thirty check points, and
+a mean error beyond a quarter of the RMSE requires an investigation. With few check points such a mean occurs by chance
+(with three points in three of four cases), so it must also exceed the limit of Student's t.
+Source: ASPRS Positional Accuracy Standards for Digital Geospatial Data, Edition 2, Version 1.0 (August 2023).
 """
+
+import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,11 +27,12 @@ from jaxphoto.adjustment.model.row_functions import rows_of
 from jaxphoto.observations import AXES, AbstractObservations, ControlRows
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.short_repr import shown
+from jaxphoto.statistics.quantiles import student_limit
 
 
 @shown
 class Spread(eqx.Module):
-    """Number, mean, root mean square and largest absolute value of one group along one axis."""
+    """Number, mean, root mean square and maximum absolute value of one group along one axis."""
 
     group: str
     axis: str
@@ -30,7 +44,7 @@ class Spread(eqx.Module):
 
 
 def observation_groups(adjusted: Adjustment) -> dict[str, AbstractObservations]:
-    """The rows of every group of `adjusted.residuals`, image points first, with the numbers they were adjusted with."""
+    """Rows of every group of `adjusted.residuals`, image points first, with the values used in the adjustment."""
     s, block = adjusted.structure, adjusted.block
     groups = zip(s.observed, adjusted.values.groups, strict=True)
     first_last = lambda v: np.moveaxis(np.asarray(v), -1, 0)  # noqa: E731
@@ -45,21 +59,21 @@ def physical_residuals(adjusted: Adjustment) -> dict[str, Float[np.ndarray, "...
 
 
 def a_priori_sigmas(adjusted: Adjustment) -> dict[str, Float[np.ndarray, "..."]]:
-    """Standard deviations of the observations as given, by group, in the units of `physical_residuals`."""
+    """A priori standard deviations of the observations by group, in the units of `physical_residuals`."""
     return {name: np.asarray(rows.sigmas).T for name, rows in observation_groups(adjusted).items()}
 
 
 def residual_spread(adjusted: Adjustment) -> list[Spread]:
-    """RMSE of the residuals per group and axis (paper 000, Table 3); RMSE divides by n."""
-    found = []
+    """Statistics of the residuals per group and axis (paper 000, Table 3); RMSE divides by n."""
+    spreads = []
     groups = observation_groups(adjusted)
     for group, v in physical_residuals(adjusted).items():
         rows = groups[group]
         if v.size and rows.unit:
             axis = np.broadcast_to(rows.axis_names(), v.shape)
             names = [a for a in dict.fromkeys((*AXES, *rows.axes, *axis.ravel())) if (axis == a).any()]
-            found += [spread_of(group, "" if len(names) == 1 else a, v[axis == a], rows.unit) for a in names]
-    return found
+            spreads += [spread_of(group, "" if len(names) == 1 else a, v[axis == a], rows.unit) for a in names]
+    return spreads
 
 
 def check_discrepancies(adjusted: Adjustment) -> ControlRows:
@@ -70,13 +84,13 @@ def check_discrepancies(adjusted: Adjustment) -> ControlRows:
 
 
 def point_differences(first: Adjustment, second: Adjustment) -> tuple[tuple[str, ...], Float[np.ndarray, "n 3"]]:
-    """First minus second: coordinates (m) of the points that both hold (paper 000, Table 6)."""
+    """First minus second: coordinates (m) of the common points (paper 000, Table 6)."""
     common, a, b = _common(first.block.points, second.block.points)
     return common, np.asarray(first.unknowns.points)[a] - np.asarray(second.unknowns.points)[b]
 
 
 def angle_differences(first: Adjustment, second: Adjustment) -> tuple[tuple[str, ...], Float[np.ndarray, "n 3"]]:
-    """First minus second: omega, phi, kappa (rad, in (-pi, pi]) of the images that both hold (paper 000, Table 7)."""
+    """First minus second: omega, phi, kappa (rad, in (-pi, pi]) of the common images (paper 000, Table 7)."""
     common, a, b = _common(first.block.images, second.block.images)
     angles = jax.vmap(omega_phi_kappa_from_matrix)
     one, two = (np.asarray(angles(x.unknowns.exterior.camera_from_object)) for x in (first, second))
@@ -84,19 +98,116 @@ def angle_differences(first: Adjustment, second: Adjustment) -> tuple[tuple[str,
 
 
 def spread_of(group: str, axis: str, values: np.ndarray, unit: str) -> Spread:
-    """Mean, RMSE (over n) and maximum of some values; they must not be empty."""
-    return Spread(
-        group,
-        axis,
-        len(values),
-        float(values.mean()),
-        float(np.sqrt((values**2).mean())),
-        float(np.abs(values).max()),
-        unit,
-    )
+    """Number, mean, RMSE (over n) and maximum of values that are not empty."""
+    rmse, max_abs = float(np.sqrt((values**2).mean())), float(np.abs(values).max())
+    return Spread(group, axis, len(values), float(values.mean()), rmse, max_abs, unit)
 
 
 def _common(first: tuple[str, ...], second: tuple[str, ...]) -> tuple[tuple[str, ...], list[int], list[int]]:
     place = {name: k for k, name in enumerate(second)}
-    both = [(name, k, place[name]) for k, name in enumerate(first) if name in place]
-    return tuple(n for n, _, _ in both), [a for _, a, _ in both], [b for _, _, b in both]
+    common = [(name, k, place[name]) for k, name in enumerate(first) if name in place]
+    return tuple(n for n, _, _ in common), [a for _, a, _ in common], [b for _, _, b in common]
+
+
+LEAST_CHECK_POINTS = 30
+"""Minimum number of check points for a claim of accuracy."""
+SUSPECT_MEAN = 0.25
+"""Fraction of the RMSE of an axis beyond which a mean error requires an investigation."""
+# Error probability of Student's t-test of the mean.
+_LEVEL = 0.05
+# Significant digits of a class in centimetres; the tested value is rounded up.
+_DIGITS = 2
+
+
+@shown
+class ComponentAccuracy(NamedTuple):
+    """Tested accuracy of one component; metres."""
+
+    name: str
+    """horizontal, vertical or three-dimensional."""
+    symbol: str
+    n: int
+    """Number of check points surveyed in all its axes."""
+    fit_m: float
+    """Root mean square of surveyed minus computed, summed over the axes."""
+    survey_m: float
+    """Root mean square of the standard deviations of the survey, summed likewise; NaN if one of them is unknown."""
+
+    @property
+    def rmse_m(self) -> float:
+        """RMSE including the survey's standard deviations, if these are complete."""
+        return math.hypot(self.fit_m, 0.0 if math.isnan(self.survey_m) else self.survey_m)
+
+    @property
+    def class_cm(self) -> float:
+        """Accuracy class: `rmse_m` in centimetres, rounded up to two digits."""
+        cm = 100 * self.rmse_m
+        if cm == 0:
+            return 0.0
+        step = 10.0 ** (math.floor(math.log10(cm)) + 1 - _DIGITS)
+        # Rounding to nine digits first: the rounding error of the root must not raise the class.
+        return float(f"{math.ceil(round(cm / step, 9)) * step:.10g}")
+
+    @property
+    def claimed(self) -> bool:
+        """True with enough check points and all sigmas of their survey."""
+        return self.n >= LEAST_CHECK_POINTS and not math.isnan(self.survey_m)
+
+
+@shown
+class AxisErrors(NamedTuple):
+    """Surveyed minus computed along one axis: number of check points, mean and root mean square (m)."""
+
+    axis: str
+    n: int
+    mean_m: float
+    rmse_m: float
+
+    @property
+    def biased(self) -> bool:
+        """True if the mean exceeds both the limit of the standard and that of Student's t."""
+        if self.n < 2 or abs(self.mean_m) <= SUSPECT_MEAN * self.rmse_m:
+            return False
+        scatter = math.sqrt(max(self.rmse_m**2 - self.mean_m**2, 0.0) / (self.n - 1))
+        return abs(self.mean_m) > student_limit(self.n - 1, _LEVEL) * scatter
+
+
+@shown
+class PositionalAccuracy(NamedTuple):
+    """Accuracy of an adjusted block at its check points."""
+
+    tested: tuple[ComponentAccuracy, ...]
+    """Horizontal, vertical and three-dimensional, if check points have the axes."""
+    axes: tuple[AxisErrors, ...]
+
+
+def positional_accuracy(discrepancies: ControlRows) -> PositionalAccuracy:
+    """Positional accuracy from `discrepancies`, surveyed minus computed with the survey's sigmas.
+
+    See `check_discrepancies`. A sigma of zero is unknown.
+    """
+    points, row = np.unique(discrepancies.who, return_inverse=True)
+    error, sigma = np.full((2, len(points), 3), np.nan)
+    error[row, discrepancies.axis] = np.asarray(discrepancies.value, float)
+    survey = np.asarray(discrepancies.sigma, float)
+    sigma[row, discrepancies.axis] = np.where(survey > 0, survey, np.nan)
+    horizontal = _tested("horizontal", "RMSE_H", error[:, :2], sigma[:, :2])
+    vertical = _tested("vertical", "RMSE_V", error[:, 2:], sigma[:, 2:])
+    combined = [math.hypot(h, v) for h, v in zip(horizontal[3:], vertical[3:], strict=True)]
+    spatial = ComponentAccuracy("three-dimensional", "RMSE_3D", min(horizontal.n, vertical.n), *combined)
+    axes = []
+    for k, axis in enumerate(AXES):
+        d = error[np.isfinite(error[:, k]), k]
+        if len(d):
+            axes.append(AxisErrors(axis, len(d), float(d.mean()), float(np.sqrt((d**2).mean()))))
+    return PositionalAccuracy(tuple(t for t in (horizontal, vertical, spatial) if t.n), tuple(axes))
+
+
+def _tested(
+    name: str, symbol: str, error: Float[np.ndarray, "points axes"], sigma: Float[np.ndarray, "points axes"]
+) -> ComponentAccuracy:
+    complete = np.isfinite(error).all(axis=1)
+    if not complete.any():
+        return ComponentAccuracy(name, symbol, 0, math.nan, math.nan)
+    rms = lambda v: math.sqrt(float((v[complete] ** 2).sum(axis=1).mean()))  # noqa: E731
+    return ComponentAccuracy(name, symbol, int(complete.sum()), rms(error), rms(sigma))

@@ -1,45 +1,294 @@
-"""Variance components: how much larger or smaller the variances of parts of the observations are than was stated.
+"""Variance components of parts of the observations, by restricted maximum likelihood (REML).
 
-REML of normal observations. With v_k' P_k v_k and S of `partial_redundancy` at the present weights, Helmert's step is
+Partition. The parts are declared by splits of the groups of observations, or by a selection of observations for each
+label:
 
-    s = S^-1 q,    q_k = v_k' P_k v_k,    covariance 2 S^-1,
+    variance_components(adjusted, ("xy-z", "camera"))
+    variance_components(adjusted, {"height": Selection("control_points", axes="Z"), "GNSS": Selection("stations")})
 
-after which the sigmas of part k are multiplied by sqrt(s_k) and the block is adjusted anew (by half the step where it
-leads back), until all s_k are one: then q_k = r_k for every part, the equation of restricted maximum likelihood. As r_k
-is exact, so are the components; only their standard deviations depend on random vectors, where S does. Where a step
-would lead to a variance that is not positive, it is Foerstner's: s_k = q_k / r_k.
+Prior information (`Weighted`, `KnownParameters`) is no sample and keeps its weight.
 
-Sources: F. R. Helmert, Die Ausgleichungsrechnung (1907); W. Foerstner, Ein Verfahren zur Schaetzung von Varianz- und
+Partial redundancy. With R = I - H, H = J Q J' of whitened observations, and R_kl the block of the rows of part k and
+the columns of part l,
+
+    S_kl = tr(R_k R_l) = |R_kl|^2 (sum of squares),    r_k = tr R_kk = sum_l S_kl,    E[v_k' P_k v_k] = sum_l S_kl s_l
+
+where s_l is the variance factor of part l; the second follows because R is idempotent. Off the diagonal |R_kl| = |H_kl|
+is computed from products H z (`HatMatrix`): exactly, with z each unit vector of part k in turn; or, for a large part,
+as the mean of |H_l z|^2 over vectors z of random signs in part k (Hutchinson). Its standard deviation is below
+sqrt(S_kl / (2 p)) for p vectors, because no singular value of an off-diagonal block of a projector exceeds 1/2. The
+diagonal follows from the redundancy numbers, which are exact; so does the largest part, for which no vector is spent.
+If that part holds all image points, their rows are skipped: |H z|^2 = z'H z gives their sum.
+
+Variance components. With v_k' P_k v_k and S at the current weights, Helmert's step is
+
+    s = S^-1 q,    q_k = v_k' P_k v_k,    covariance 2 S^-1.
+
+The sigmas of part k are multiplied by sqrt(s_k) and the block is readjusted (half the step after an overshoot), until
+all s_k are one: then q_k = r_k for every part, the equation of restricted maximum likelihood. As r_k is exact, so are
+the components; only their standard deviations depend on random vectors, through S. A step that leads to a variance that
+is not positive is replaced by Förstner's: s_k = q_k / r_k.
+
+Sources: F. R. Helmert, Die Ausgleichungsrechnung (1907); W. Förstner, Ein Verfahren zur Schätzung von Varianz- und
 Kovarianzkomponenten (1979); K. R. Koch, Parameter Estimation and Hypothesis Testing in Linear Models (1999), 3.6;
-H. D. Patterson and R. Thompson, Recovery of inter-block information when block sizes are unequal, Biometrika 58 (1971).
+H. D. Patterson and R. Thompson, Recovery of inter-block information when block sizes are unequal, Biometrika 58 (1971);
+M. F. Hutchinson (1989), A stochastic estimator of the trace of the influence matrix.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxphoto.adjustment import MAX_STEPS, Adjustment, solve
+from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError, counted
-from jaxphoto.observations import AbstractObservations
+from jaxphoto.observations import AXES, AbstractObservations, Correlated, ImageRows
 from jaxphoto.short_repr import shown
-from jaxphoto.statistics.partial_redundancy import PROBES, PartialRedundancy, partial_redundancy
-from jaxphoto.statistics.partition import Partition, Parts, parts_of
+from jaxphoto.statistics.covariance import covariance
+from jaxphoto.statistics.discrepancy import observation_groups
+from jaxphoto.statistics.hat_matrix import HatMatrix
+from jaxphoto.statistics.reliability import redundancy_numbers
 from jaxphoto.tracing import outside_transformations
 
-MAX_ROUNDS = 60
-LEAST_DEGREES = 2.0
-"""Degrees of freedom at which a component's standard deviation is as large as itself. With no more than these, it is
-not told from zero, and the weight that follows from it, 1 / s, has no mean."""
-# A round changes a variance by no more than this factor: further off, S is another.
-_FARTHEST = 4.0
-# No component is off from the optimum by more than this part of its standard deviation.
+
+@shown
+class Selection(NamedTuple):
+    """Observations of one group: all of them, or those of some axes, cameras, images or points."""
+
+    group: str
+    axes: Collection[str] = ()
+    cameras: Collection[str] = ()
+    images: Collection[str] = ()
+    points: Collection[str] = ()
+
+
+Partition = Sequence[str] | Mapping[str, Selection | Sequence[Selection]]
+"""Splits of `SPLITS` (none: one part a group), or the selections of each label."""
+
+
+@shown
+class Parts(NamedTuple):
+    """A partition of the observations of one adjustment."""
+
+    labels: tuple[str, ...]
+    part_of: dict[str, Int[np.ndarray, "..."]]
+    """Part of every observation by group name, shaped like the residuals; the number of parts for observations in
+    none."""
+
+    @property
+    def counts(self) -> Int[np.ndarray, "parts"]:
+        """Number of observations of each part."""
+        parts = np.concatenate([np.ravel(v) for v in self.part_of.values()])
+        return np.bincount(parts, minlength=len(self.labels) + 1)[: len(self.labels)]
+
+
+Names = Shaped[np.ndarray, "..."]
+_Split = Callable[[AbstractObservations, Block], Names | None]
+
+
+def _by_axis(rows: AbstractObservations, block: Block) -> Names | None:
+    return None if isinstance(rows, Correlated) else rows.axis_names()
+
+
+def _plan_and_height(rows: AbstractObservations, block: Block) -> Names | None:
+    axis = _by_axis(rows, block)
+    if axis is None or not set(axis.ravel()) <= set(AXES):
+        return None
+    return np.where(axis == "Z", "Z", "X-Y").astype(object)
+
+
+def _by_camera(rows: AbstractObservations, block: Block) -> Names | None:
+    return rows.names_of("image", block.image_camera) if rows.group == IMAGE_POINTS else None
+
+
+def _by_image(rows: AbstractObservations, block: Block) -> Names | None:
+    return rows.names_of("image", block.images) if rows.group == IMAGE_POINTS else None
+
+
+SPLITS: dict[str, _Split] = {"xy-z": _plan_and_height, "axis": _by_axis, "camera": _by_camera, "image": _by_image}
+"""X and Y versus Z; every axis; image points by camera; image points by image."""
+
+
+def observed_rows(adjusted: Adjustment) -> dict[str, AbstractObservations]:
+    """Groups of observations that may have variance components: all but prior information."""
+    groups = observation_groups(adjusted)
+    return {name: groups[name] for name in adjusted.block.named_observations}
+
+
+def partition_observations(adjusted: Adjustment, partition: Partition) -> Parts:
+    """The parts of an adjustment's observations, in the order of the partition.
+
+    Raises InputError for an unknown split, group or name, a label without observations, observations with two labels,
+    and correlated rows in different parts.
+    """
+    rows = observed_rows(adjusted)
+    if isinstance(partition, Mapping):
+        names, labels = _selected(adjusted, rows, partition), tuple(partition)
+    else:
+        names = _split(adjusted, rows, partition)
+        labels = tuple(dict.fromkeys(label for part in names.values() for label in part.ravel().tolist()))
+    number = {"": len(labels)} | {label: k for k, label in enumerate(labels)}
+    index = {name: np.full(np.shape(v), len(labels)) for name, v in adjusted.residuals.named.items()}
+    return Parts(
+        labels, index | {name: np.vectorize(number.__getitem__, otypes=[int])(part) for name, part in names.items()}
+    )
+
+
+def _split(adjusted: Adjustment, rows: Mapping[str, AbstractObservations], splits: Sequence[str]) -> dict[str, Names]:
+    splits = (splits,) if isinstance(splits, str) else splits
+    if unknown := [split for split in splits if split not in SPLITS]:
+        raise InputError(f"unknown split {unknown[0]!r} of observations: choose among {', '.join(SPLITS)}")
+    labels = {}
+    for name, observations in rows.items():
+        label = np.full(np.shape(adjusted.residuals[name]), name, object)
+        for split in splits:
+            names = SPLITS[split](observations, adjusted.block)
+            if names is not None and len(set(names.ravel())) > 1:
+                label = label + " " + names
+        labels[name] = label
+    return labels
+
+
+def _selected(
+    adjusted: Adjustment, rows: Mapping[str, AbstractObservations], partition: Mapping[str, Any]
+) -> dict[str, Names]:
+    labels = {name: np.full(np.shape(adjusted.residuals[name]), "", object) for name in rows}
+    for label, selections in partition.items():
+        for selection in [selections] if isinstance(selections, Selection) else selections:
+            if selection.group not in rows:
+                raise InputError(
+                    f"{label}: group {selection.group!r} is not observed in this block or cannot have a variance "
+                    f"component: choose among {', '.join(rows)}"
+                )
+            mask = _mask(label, selection, rows[selection.group], adjusted.block, labels[selection.group].shape)
+            if twice := set(labels[selection.group][mask]) - {""}:
+                raise InputError(f"{label} and {min(twice)} share observations: remove them from one of the two")
+            labels[selection.group][mask] = label
+        if not label or not any((part == label).any() for part in labels.values()):
+            raise InputError(f"part {label!r} of the partition has no name or no observations: remove it")
+    for name, observations in rows.items():
+        if isinstance(observations, Correlated) and labels[name].ndim > 1 and (labels[name] != labels[name][:1]).any():
+            raise InputError(f"{name}: correlated rows must share a variance component; select whole sets")
+    return labels
+
+
+def _mask(
+    label: str, selection: Selection, rows: AbstractObservations, block: Block, shape: tuple[int, ...]
+) -> np.ndarray:
+    """Mask of the selected observations of a group. Raises InputError for names that no row has."""
+    names_by_kind = {
+        "axes": rows.axis_names(),
+        "cameras": rows.names_of("image", block.image_camera),
+        "images": rows.names_of("image", block.images),
+        "points": rows.names_of("point", block.points),
+    }
+    mask = np.ones(shape, bool)
+    for kind, names in names_by_kind.items():
+        selected = getattr(selection, kind)
+        selected = (selected,) if isinstance(selected, str) else tuple(selected)
+        if missing := set(selected) - set(names.ravel().tolist()):
+            raise InputError(f"{label}: no row of {selection.group} has the {kind} {', '.join(sorted(missing))}")
+        if selected:
+            mask &= np.broadcast_to(np.isin(names, selected), shape)
+    return mask
+
+
+PROBES = 64
+"""Random vectors per part; parts of no more observations are exact. Only the standard deviations of the components
+depend on them: their error is below one per cent for parts with a redundancy of some tens."""
+
+
+@shown
+class PartialRedundancy(eqx.Module):
+    """Redundancy by parts of a partition; the last entry is all observations in none."""
+
+    square_sums: Float[np.ndarray, "parts"]
+    """v_k' P_k v_k."""
+    redundancy: Float[np.ndarray, "parts"]
+    """r_k; they sum to the redundancy."""
+    matrix: Float[np.ndarray, "parts parts"]
+    """S."""
+    uncertainty: Float[np.ndarray, "parts parts"]
+    """Upper bound of the standard deviation of each element of `matrix`; zero where exact."""
+
+
+def partial_redundancy(adjusted: Adjustment, parts: Parts, probes: int = PROBES) -> PartialRedundancy:
+    """Compute S, r and v'Pv by part, with `probes` random vectors for each part with more observations than that."""
+    n = len(parts.labels) + 1
+    numbers = {k: np.asarray(v) for k, v in redundancy_numbers(adjusted, covariance(adjusted, rows=True)).named.items()}
+    squares = {name: np.asarray(v) ** 2 for name, v in adjusted.residuals.named.items()}
+    estimate, weight = _products(adjusted, parts, probes)
+    # The better of two estimates; the mean of equally good ones.
+    share = np.where(weight[:, None] == weight, 0.5, weight[:, None] > weight)
+    off_diagonal = share * estimate + share.T * estimate.T
+    np.fill_diagonal(off_diagonal, 0.0)
+    redundancy = _by_part(numbers, parts, n)
+    exact = np.maximum(weight[:, None], weight) == np.inf
+    uncertainty = np.where(
+        exact, 0.0, np.sqrt(off_diagonal / (2 * probes) * np.where(weight[:, None] == weight, 0.5, 1.0))
+    )
+    np.fill_diagonal(uncertainty, 0.0)
+    return PartialRedundancy(
+        square_sums=_by_part(squares, parts, n),
+        redundancy=redundancy,
+        matrix=off_diagonal + np.diag(redundancy - off_diagonal.sum(axis=1)),
+        uncertainty=uncertainty + np.diag(np.sqrt((uncertainty**2).sum(axis=1))),
+    )
+
+
+def _by_part(numbers: dict[str, np.ndarray], parts: Parts, n: int) -> Float[np.ndarray, "parts"]:
+    pairs = ((index, numbers[name]) for name, index in parts.part_of.items())
+    return np.sum([np.bincount(np.ravel(index), np.ravel(v), minlength=n) for index, v in pairs], axis=0)
+
+
+def _products(adjusted: Adjustment, parts: Parts, probes: int) -> tuple[np.ndarray, np.ndarray]:
+    """|H_kl|^2 off the diagonal, row by row, and the weight of each row: infinite if exact, zero for the largest."""
+    n = len(parts.labels) + 1
+    largest = int(np.argmax(sum(np.bincount(np.ravel(index), minlength=n) for index in parts.part_of.values())))
+    # The largest part gets no vectors. If it holds all image points, their share is the rest of z'Hz = |Hz|^2.
+    skip_images = all((index == largest).all() for name, index in parts.part_of.items() if name == ImageRows.group)
+    hat_matrix = HatMatrix.of(adjusted, image_rows=not skip_images)
+    # Datum constraints count as one more part.
+    part = np.full(hat_matrix.count, n)
+    for name, place in hat_matrix.places.items():
+        part[place] = parts.part_of[name]
+    at = [np.flatnonzero(part == k) for k in range(n)]
+    weight = np.array([np.inf if len(places) <= probes else 1.0 for places in at])
+    weight[largest] = 0.0
+    # Index of each unit vector of a part, or -1 for random signs.
+    units = [places if w == np.inf else np.full((w > 0) * probes, -1) for places, w in zip(at, weight, strict=True)]
+    part_of_unit, unit = np.repeat(np.arange(n), [len(u) for u in units]), np.concatenate(units)
+
+    def vector(k: int) -> Float[np.ndarray, "n"]:
+        z, support = np.zeros(hat_matrix.count), at[part_of_unit[k]] if unit[k] < 0 else unit[k : k + 1]
+        z[support] = np.random.default_rng(k).choice([-1.0, 1.0], len(support)) if unit[k] < 0 else 1.0
+        return z
+
+    squares = np.zeros((n, n))
+    for j, (_, h) in enumerate(hat_matrix.apply(vector, len(part_of_unit))):
+        by_part = np.bincount(part, h**2, minlength=n + 1)
+        if skip_images:
+            # Rounding may leave a negative rest for a part that is nearly independent of the largest.
+            by_part[largest] = max(0.0, vector(j) @ h - by_part.sum() + by_part[largest])
+        squares[part_of_unit[j]] += by_part[:n]
+    return squares / np.where(weight == 1.0, probes, 1.0)[:, None], weight
+
+
+MAX_ITERATIONS = 60
+MIN_DEGREES = 2.0
+"""Degrees of freedom at which the standard deviation of a component equals the component. With no more than these, it
+does not differ significantly from zero, and its weight 1 / s has no mean."""
+# Largest factor of a variance per iteration: further away S changes.
+_MAX_FACTOR = 4.0
+# Convergence: largest change of a component in its standard deviations.
 _TOLERANCE = 1e-3
-# Rounds in which a part has too few degrees of freedom and its variance falls, which leaves it fewer: it goes to zero.
-_FALLS = 3
-# A part of less redundancy is not checked at all: what is left of it is rounding.
+# Iterations with too few degrees of freedom and a decreasing variance after which a component is diagnosed as zero.
+_MAX_DECREASES = 3
+# Redundancy below which a part is uncontrolled: the rest is rounding.
 _UNCHECKED = 1e-6
 # Smallest eigenvalue of S, scaled to a unit diagonal, that is not rounding.
 _SINGULAR = 1e-10
@@ -49,37 +298,37 @@ _SINGULAR = 1e-10
 class VarianceComponents(eqx.Module):
     """Variance components of the parts of a partition, and the adjustment with them.
 
-    A `factor` multiplies the variances that were stated, sqrt(factor) their standard deviations. A part that cannot
-    support one keeps the stated ones (factor 1, no sigma); `sentences` say why.
+    `factor` multiplies the a priori variances, sqrt(factor) the standard deviations. A part that cannot support a
+    component keeps the a priori ones (factor 1, no sigma); `warnings` say why.
     """
 
     labels: tuple[str, ...] = eqx.field(static=True)
     factor: Float[np.ndarray, "parts"]
     sigma: Float[np.ndarray, "parts"]
-    """Standard deviations of the factors; NaN where a part keeps what was stated."""
+    """Standard deviations of the factors; NaN for unsupported parts."""
     correlation: Float[np.ndarray, "parts parts"]
-    """Of the factors; NaN likewise."""
+    """Of the factors; NaN for unsupported parts."""
     observations: Int[np.ndarray, "parts"]
     redundancy: Float[np.ndarray, "parts"]
-    """Of the parts, after the adjustment with the components."""
+    """After the adjustment with the components."""
     sigma_uncertainty: Float[np.ndarray, "parts"]
-    """Relative standard deviations of `sigma` from random vectors; zero where traces are exact."""
+    """Relative standard deviations of `sigma` due to random vectors; zero for exact traces."""
     supported: Bool[np.ndarray, "parts"]
-    sentences: dict[str, str] = eqx.field(static=True)
-    """Of each part that cannot support a component, why, and what to do."""
+    warnings: dict[str, str] = eqx.field(static=True)
+    """Reason and cure for each part that cannot support a component."""
     adjusted: Adjustment
-    """Converged with standard deviations times sqrt(factor), which its block has."""
-    rounds: int = eqx.field(static=True)
+    """Converged with standard deviations times sqrt(factor); its block has them."""
+    iterations: int = eqx.field(static=True)
     converged: bool = eqx.field(static=True)
 
     @property
     def degrees(self) -> Float[np.ndarray, "parts"]:
-        """Degrees of freedom: a factor scatters as chi-square over these does, with the variance 2 / degrees."""
+        """Degrees of freedom of the factors: each has the variance 2 / degrees, as chi-square over its degrees."""
         return 2 * (self.factor / self.sigma) ** 2
 
 
 class _Step(NamedTuple):
-    """Helmert's step of the parts that are estimated, at the present weights, where every factor is one."""
+    """Helmert's step of the estimated parts at the current weights, where every factor is one."""
 
     change: Float[np.ndarray, "free"]
     """s - 1."""
@@ -93,12 +342,12 @@ class _Step(NamedTuple):
 
     @property
     def is_weak(self) -> Bool[np.ndarray, "free"]:
-        """Whether there are no more than `LEAST_DEGREES` degrees of freedom."""
-        return self.sigma**2 >= 2 / LEAST_DEGREES
+        """True with at most `MIN_DEGREES` degrees of freedom."""
+        return self.sigma**2 >= 2 / MIN_DEGREES
 
     @property
-    def falls(self) -> Bool[np.ndarray, "free"]:
-        """Whether a part has no more than these, and less after the step, while those that have more stay about."""
+    def decreases(self) -> Bool[np.ndarray, "free"]:
+        """True for a weak part whose variance decreases while all other parts are near their optimum."""
         moving = ~self.is_weak & (np.abs(self.change) > self.sigma)
         return self.is_weak & (self.change < 0) & ~moving.any()
 
@@ -108,104 +357,105 @@ def variance_components(
     adjusted: Adjustment,
     partition: Partition = ("xy-z",),
     *,
-    max_rounds: int = MAX_ROUNDS,
+    max_iterations: int = MAX_ITERATIONS,
     max_steps: int = MAX_STEPS,
     probes: int = PROBES,
 ) -> VarianceComponents:
     """Estimate a variance component for every part of the observations, and adjust with them.
 
-    `partition` is a sequence of splits (`SPLITS`; none for one part a group), or observations by label
-    (`Selection`); observations of no label keep their weight, as what is known beforehand does. A component that cannot
-    be told from zero (no more than `LEAST_DEGREES` degrees of freedom) is not estimated. Traces take `probes` random
-    vectors in parts that have more observations.
+    `partition` is a sequence of splits (`SPLITS`; none: one part a group), or observations by label (`Selection`).
+    Observations without a label and prior information keep their weight. A component that does not differ from zero
+    (at most `MIN_DEGREES` degrees of freedom) is not estimated. Traces use `probes` random vectors for parts with more
+    observations.
 
-    Raises InputError for an adjustment that has not converged, for a partition that is none, and without a round.
+    Raises InputError for an adjustment that has not converged, an invalid partition, and no iteration.
     """
-    if max_rounds < 1 or probes < 1:
-        raise InputError(f"max_rounds and probes are 1 at least, got {max_rounds} and {probes}")
+    if max_iterations < 1 or probes < 1:
+        raise InputError(f"max_iterations and probes must be positive, got {max_iterations} and {probes}")
     if not bool(adjusted.converged):
-        raise InputError(f"variance components are those of an optimum, but the block is {adjusted.outcome.value}")
-    block, priors, sizes, parts = adjusted.block, adjusted.priors, adjusted.sizes, parts_of(adjusted, partition)
+        raise InputError(f"variance components need a converged adjustment, but the block is {adjusted.outcome.value}")
+    block, priors, sizes = adjusted.block, adjusted.priors, adjusted.sizes
+    parts = partition_observations(adjusted, partition)
     factor, free = np.ones(len(parts.labels)), np.ones(len(parts.labels), bool)
-    sentences: dict[str, str] = {}
-    falls, last, rounds, settled = np.zeros(len(factor), int), np.zeros(len(factor)), 0, False
-    while rounds < max_rounds:
-        rounds += 1
-        now = partial_redundancy(adjusted, parts, probes)
-        step = _helmert(now, free)
-        settled = bool((np.abs(step.change) <= _TOLERANCE * step.sigma).all())
-        falls[free] = np.where(step.falls, falls[free] + 1, 0)
-        weak = _cannot(parts, factor, free, falls, now, step, settled)
-        if settled and weak is None:
+    warnings: dict[str, str] = {}
+    decreases, last, iterations, converged = np.zeros(len(factor), int), np.zeros(len(factor)), 0, False
+    while iterations < max_iterations:
+        iterations += 1
+        current = partial_redundancy(adjusted, parts, probes)
+        step = _helmert(current, free)
+        converged = bool((np.abs(step.change) <= _TOLERANCE * step.sigma).all())
+        decreases[free] = np.where(step.decreases, decreases[free] + 1, 0)
+        weak = _unsupported(parts, factor, free, decreases, current, step, converged)
+        if converged and weak is None:
             break
         before = factor.copy()
         if weak is not None:
-            k, sentences[parts.labels[k]] = weak
+            k, warnings[parts.labels[k]] = weak
             factor[k], free[k] = 1.0, False
         else:
-            # A step back was too far before: where few observations speak, residuals bend more than they should.
+            # Halve the step after an overshoot: the residuals of small parts respond nonlinearly.
             change = np.where(step.change * last[free] < 0, step.change / 2, step.change)
-            factor[free] *= _positive(change, now, free)
+            factor[free] *= _positive(change, current, free)
             last[free] = step.change
-        settled = False
+        converged = False
         if (factor != before).any():
-            # Of a large block an adjustment is hundreds of megabytes: the last one goes before the next is made.
-            reached, adjusted = adjusted.unknowns, None  # type: ignore[assignment]
-            adjusted = solve(_reweighted(block, parts, factor), reached, priors, max_steps, sizes)
+            # An adjustment of a large block takes hundreds of MB: discard the last one before the next.
+            unknowns, adjusted = adjusted.unknowns, None  # type: ignore[assignment]
+            adjusted = solve(_reweighted(block, parts, factor), unknowns, priors, max_steps, sizes)
         if not bool(adjusted.converged):
             break
-    return _result(parts, factor, free, sentences, adjusted, now, rounds, settled)
+    return _result(parts, factor, free, warnings, adjusted, current, iterations, converged)
 
 
-def _helmert(now: PartialRedundancy, free: np.ndarray) -> _Step:
-    """The step of the parts that are `free`; what S cannot tell apart has a standard deviation that shows it."""
-    s = now.matrix[:-1, :-1][np.ix_(free, free)]
+def _helmert(current: PartialRedundancy, free: np.ndarray) -> _Step:
+    """Helmert's step of the `free` parts; parts that S cannot separate get a large standard deviation."""
+    s = current.matrix[:-1, :-1][np.ix_(free, free)]
     unit = 1 / np.sqrt(np.maximum(np.diagonal(s), _UNCHECKED**2))
     value, vector = np.linalg.eigh(s * unit[:, None] * unit)
     inverse = (vector / np.maximum(value, _SINGULAR)) @ vector.T * unit[:, None] * unit
-    return _Step(inverse @ (now.square_sums - now.redundancy)[:-1][free], 2 * inverse)
+    return _Step(inverse @ (current.square_sums - current.redundancy)[:-1][free], 2 * inverse)
 
 
-def _cannot(
+def _unsupported(
     parts: Parts,
     factor: np.ndarray,
     free: np.ndarray,
-    falls: np.ndarray,
-    now: PartialRedundancy,
+    decreases: np.ndarray,
+    current: PartialRedundancy,
     step: _Step,
-    settled: bool,
+    converged: bool,
 ) -> tuple[int, str] | None:
-    """The part that supports a component least, if it supports none, and the sentence that says so.
+    """The part with the weakest unsupported component, if any, and the warning.
 
-    One at a time: without it, others may be told apart. What has not settled is not judged by its standard deviation:
-    a part that was stated far too precise has next to no redundancy at first.
+    One at a time: without it, others may become separable. Before convergence the standard deviation is no criterion:
+    a part with far too small a priori sigmas has little redundancy at first.
     """
-    known = np.flatnonzero(free).tolist()
-    if not known:
+    candidates = np.flatnonzero(free).tolist()
+    if not candidates:
         return None
-    least = min(known, key=lambda k: now.redundancy[k])
-    if now.redundancy[least] < _UNCHECKED:
-        return least, _sentence(parts, least, "no other observation checks it")
-    judged = step.is_weak & (settled | (falls[free] >= _FALLS))
-    if not judged.any():
+    least = min(candidates, key=lambda k: current.redundancy[k])
+    if current.redundancy[least] < _UNCHECKED:
+        return least, _warning(parts, least, "no other observation checks it")
+    rejected = step.is_weak & (converged | (decreases[free] >= _MAX_DECREASES))
+    if not rejected.any():
         return None
-    worst = int(np.argmax(np.where(judged, step.sigma, 0.0)))
-    k, sigma = known[worst], factor[free][worst] * step.sigma[worst]
-    told = f"its estimate {factor[k]:.2g} has the standard deviation {sigma:.2g}"
-    return k, _sentence(parts, k, f"{told}, with redundancy {now.redundancy[k]:.2g}")
+    worst = int(np.argmax(np.where(rejected, step.sigma, 0.0)))
+    k, sigma = candidates[worst], factor[free][worst] * step.sigma[worst]
+    estimate = f"its estimate {factor[k]:.2g} has the standard deviation {sigma:.2g}"
+    return k, _warning(parts, k, f"{estimate}, with redundancy {current.redundancy[k]:.2g}")
 
 
-def _sentence(parts: Parts, k: int, why: str) -> str:
+def _warning(parts: Parts, k: int, reason: str) -> str:
     return (
-        f"{parts.labels[k]} ({counted(parts.counts[k], 'observation')}) cannot support a variance component: {why}; "
-        "the standard deviations stay as stated, join it with another part or observe more"
+        f"{parts.labels[k]} ({counted(parts.counts[k], 'observation')}) cannot support a variance component: {reason}; "
+        "its a priori standard deviations are kept, join it with another part or observe more"
     )
 
 
-def _positive(change: np.ndarray, now: PartialRedundancy, free: np.ndarray) -> np.ndarray:
-    """By what to multiply the variances: Helmert's components, or Foerstner's where these are no variances."""
-    foerstner = now.square_sums[:-1][free] / now.redundancy[:-1][free]
-    return np.clip(np.where(change > -1, 1 + change, foerstner), 1 / _FARTHEST, _FARTHEST)
+def _positive(change: np.ndarray, current: PartialRedundancy, free: np.ndarray) -> np.ndarray:
+    """Factors of the variances: Helmert's components, or Förstner's where these are not positive."""
+    foerstner = current.square_sums[:-1][free] / current.redundancy[:-1][free]
+    return np.clip(np.where(change > -1, 1 + change, foerstner), 1 / _MAX_FACTOR, _MAX_FACTOR)
 
 
 def _reweighted(block: Block, parts: Parts, factor: np.ndarray) -> Block:
@@ -213,7 +463,7 @@ def _reweighted(block: Block, parts: Parts, factor: np.ndarray) -> Block:
     scale = np.sqrt(np.append(factor, 1.0))
 
     def scaled(name: str, rows: AbstractObservations) -> AbstractObservations:
-        return rows.with_sigmas_times(scale[parts.of[name]].T.reshape(np.shape(rows.sigmas)))
+        return rows.with_sigmas_times(scale[parts.part_of[name]].T.reshape(np.shape(rows.sigmas)))
 
     return block.with_observations({name: scaled(name, rows) for name, rows in block.named_observations.items()})
 
@@ -222,19 +472,19 @@ def _result(
     parts: Parts,
     factor: np.ndarray,
     free: np.ndarray,
-    sentences: dict[str, str],
+    warnings: dict[str, str],
     adjusted: Adjustment,
-    now: PartialRedundancy,
-    rounds: int,
-    settled: bool,
+    current: PartialRedundancy,
+    iterations: int,
+    converged: bool,
 ) -> VarianceComponents:
-    step, n = _helmert(now, free), len(factor)
+    step, n = _helmert(current, free), len(factor)
     sigma, uncertainty, correlation = (np.full(shape, np.nan) for shape in (n, n, (n, n)))
     sigma[free] = factor[free] * step.sigma
     correlation[np.ix_(free, free)] = step.covariance / step.sigma[:, None] / step.sigma
-    # d(S^-1) = -S^-1 dS S^-1; a number off the diagonal of S stands there twice.
+    # d(S^-1) = -S^-1 dS S^-1; every off-diagonal element of S occurs twice.
     products = (step.covariance[:, :, None] * step.covariance[:, None]) ** 2 / 4
-    spread = np.einsum("kij,ij->k", products, now.uncertainty[:-1, :-1][np.ix_(free, free)] ** 2)
+    spread = np.einsum("kij,ij->k", products, current.uncertainty[:-1, :-1][np.ix_(free, free)] ** 2)
     uncertainty[free] = np.sqrt(2 * spread) / (2 * step.sigma**2)
     return VarianceComponents(
         labels=parts.labels,
@@ -242,11 +492,11 @@ def _result(
         sigma=sigma,
         correlation=correlation,
         observations=parts.counts,
-        redundancy=now.redundancy[:-1],
+        redundancy=current.redundancy[:-1],
         sigma_uncertainty=uncertainty,
         supported=free,
-        sentences=sentences,
+        warnings=warnings,
         adjusted=adjusted,
-        rounds=rounds,
-        converged=settled,
+        iterations=iterations,
+        converged=converged,
     )

@@ -21,9 +21,8 @@ except ImportError:  # Windows: nothing is locked there, so leftovers stay.
     fcntl = None  # type: ignore[assignment]
 
 _PREFIX, _NEW, _OLD = ".jaxphoto-", "new", "old"
-_under_way: set[Path] = set()
 _placing = threading.RLock()
-"""Held while something takes its place; and for good by `discard_all`, after which nothing does."""
+"""Held while something is moved into place."""
 
 
 @contextmanager
@@ -31,13 +30,11 @@ def work_place(target: Path) -> Iterator[Path]:
     """A path of the name of `target`, whose folder is there already, in a work place beside it; both go at the end."""
     clear_leftovers(target.parent)
     place, lock = _made(target.parent)
-    _under_way.add(place)
     try:
         (place / _NEW).mkdir()
         yield place / _NEW / target.name
     finally:
         _clear(place)
-        _under_way.discard(place)
         if lock is not None:
             os.close(lock)
 
@@ -78,16 +75,6 @@ def clear_leftovers(folder: Path) -> None:
 def is_place(name: str) -> bool:
     """Whether a file or folder of that name is a work place."""
     return name.startswith(_PREFIX)
-
-
-def discard_all() -> None:
-    """For a process that ends at once: remove all its work places. Nothing takes its place from here on."""
-    # Those who hold it need a moment only.
-    _placing.acquire(timeout=1.0)
-    for place in list(_under_way):
-        # Another thread may still write there.
-        for _ in range(3):
-            _clear(place)
 
 
 @contextmanager

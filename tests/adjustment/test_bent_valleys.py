@@ -17,8 +17,8 @@ from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import typical_scale
 from jaxphoto.adjustment.solver.reduced import linearise_rows, reduce_normal
 from jaxphoto.adjustment.told import step_lines
-from jaxphoto.report.convergence import convergence_words
-from jaxphoto.report.convergence_table import convergence_table
+from jaxphoto.report.results import convergence_words
+from jaxphoto.report.tables import convergence_table
 from tests.adjustment.dense import in_one_list
 from tests.blocks import adjusted, simulated
 from tests.marks import slow_but

@@ -126,6 +126,6 @@ def test_a_coordinate_that_is_fixed_moves_the_point():
     label = f"points[{block.points[block.fixed.who[k]]}].{'XYZ'[block.fixed.axis[k]]}"
     by = every.fixed[:, every.fixed_labels.index(label)]
     position = np.asarray(found.exterior.position)
-    expected = np.stack([by[[every.of(f"exterior[{i}].{x}") for x in "XYZ"]] for i in block.images])
+    expected = np.stack([by[[every.row(f"exterior[{i}].{x}") for x in "XYZ"]] for i in block.images])
     np.testing.assert_allclose(position / step, expected, rtol=1e-6, atol=1e-9)
     assert np.abs(expected).max() > 1e-3

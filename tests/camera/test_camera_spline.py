@@ -11,8 +11,8 @@ from jaxphoto import InputError, Outcome, RankError, Weighted, adjust, covarianc
 from jaxphoto.camera import CameraSpline
 from jaxphoto.georeferencing import StripSpline
 from jaxphoto.io import read_block, write_block
-from jaxphoto.report.camera_drift import differences_words
-from jaxphoto.statistics import camera_wanderings
+from jaxphoto.report.verdict import differences_finding
+from jaxphoto.statistics import camera_spline_differences
 from tests.camera.test_camera_rates import TRUE, at, changing_block
 
 STRAIGHT = dataclasses.replace(TRUE, k1_rate=0.0)
@@ -80,7 +80,7 @@ def test_the_interior_orientation_is_bent_by_the_spline():
 def test_it_is_tested_without_what_was_known():
     """Of the changes as the photographs alone have them; what all knots have in common is the camera's own."""
     adjusted, cov = found()
-    (wander,) = camera_wanderings(adjusted, cov)
+    (wander,) = camera_spline_differences(adjusted, cov)
     at_ = [k for k, label in enumerate(cov.labels) if label.startswith("camera_splines[")]
     value = np.concatenate(
         [np.asarray(v) for v in adjusted.unknowns.more["camera_splines"]["one"].__dict__.values()][:3]
@@ -98,11 +98,11 @@ def test_it_is_tested_without_what_was_known():
 
 
 def test_words():
-    (wander,) = camera_wanderings(*found())
-    assert differences_words(wander).startswith("camera one wandered during its flight (p ")
-    assert " mm at -50 min to " in differences_words(wander)
+    (wander,) = camera_spline_differences(*found())
+    finding = differences_finding(wander)
+    assert (finding.code, finding.subject) == ("drift", "camera one") and " mm at -50 min to " in finding.text
     still = wander._replace(more=wander.more._replace(p_value=0.4))
-    assert differences_words(still).startswith("no wandering of camera one is seen (p = 0.4); any one knot alone would")
+    assert differences_finding(still).code == "no_drift"
 
 
 def test_it_comes_back_from_a_block_folder(tmp_path):
@@ -121,7 +121,7 @@ def test_it_comes_back_from_a_block_folder(tmp_path):
         ("interval_s = -1.0", r"interval_s = -1\.0 is no positive number"),
         ("interval_s = 1e308", r"interval_s = 1e\+308 is no positive number of seconds up to 1e\+09"),
         ("yp_spline = { walk_mm = 1, sigma = 2 }", r"yp_spline\] sigma: no such key is known; use walk_mm"),
-        ("c_spline_mm = [1.0]", r"c_spline_mm: \[1\.0\] is not a list of 6 numbers"),
+        ("c_spline_mm = [1.0]", r"c_spline_mm: \[1\.0\] has 1 entries; give 6"),
     ):
         key = wrong.split(" = ")[0]
         toml.write_text(

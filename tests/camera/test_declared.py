@@ -28,7 +28,8 @@ from jaxphoto.camera import (
 from jaxphoto.camera.conversion import converted
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
-from jaxphoto.io.block_folder.settings import read_settings, toml_text
+from jaxphoto.io.block_folder.settings import read_settings
+from jaxphoto.io.toml import toml_text
 from jaxphoto.procedures.calibration import distortion_model
 from jaxphoto.procedures.camera_candidates import candidate_of
 from jaxphoto.unknowns import FIXED, FREE
@@ -102,8 +103,8 @@ def test_block_toml_holds_it_and_gives_it_back():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"way": "up"}, '\'up\' is neither "out" nor "in"; choose one of them'),
-        ({"sign": "add"}, "no such key is known; use width_px, .*, way, interior, unknowns"),
+        ({"way": "up"}, 'way: \'up\' is unknown; write "out" or "in"'),
+        ({"sign": "add"}, "no such key is known; use width_px, .*, interior, unknowns, .*, way"),
         ({"projection": "fish"}, "no projection model is called 'fish'; choose one of perspective, equidistant"),
         ({"distortion": "tangend"}, "no distortion model is called 'tangend'; choose one of brown, affine_brown"),
         ({"interior": {"c_mm": 35.0, "a": 0.1}}, "s_mm: the key is missing"),

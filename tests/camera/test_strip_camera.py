@@ -11,7 +11,7 @@ import pytest
 from jaxphoto import ExteriorOrientation, Outcome, Weighted, adjust, covariance, project
 from jaxphoto.camera import StripCamera
 from jaxphoto.observations import StripCameraSteps
-from jaxphoto.report.camera_drift import differences_words
+from jaxphoto.report.verdict import differences_finding
 from jaxphoto.statistics import strip_differences
 from tests.blocks import BROWN, simulated
 
@@ -90,10 +90,9 @@ def test_steps_hold_the_strips_together():
 
 def test_words():
     _, strips = found(0.1)
-    assert differences_words(strips).startswith("the camera is not the same in all strips (p = ")
-    assert " um in strip a to " in differences_words(strips) and " um in strip b to " in differences_words(strips)
+    finding = differences_finding(strips)
+    assert (finding.code, finding.value) == ("drift", strips.more.p_value)
+    assert " um in strip a to " in finding.text and " um in strip b to " in finding.text
     alike = strips._replace(more=strips.more._replace(p_value=0.4, detectable=np.array([4, 3, 2, 5, 1, 1]) * 1e-3))
-    assert differences_words(alike) == (
-        "no difference between the cameras of strips is seen (p = 0.4); any one strip alone would have shown, with a "
-        "probability of 80%, 5.0 um of c, 3.0 um of x_p, 2.0 um of y_p"
-    )
+    finding = differences_finding(alike)
+    assert finding.code == "no_drift" and finding.numbers["changes"] == "c 5.0 um, x_p 3.0 um, y_p 2.0 um"

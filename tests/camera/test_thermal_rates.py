@@ -12,7 +12,7 @@ from jaxphoto.camera import ThermalRates
 from jaxphoto.camera.conditions import Conditions
 from jaxphoto.io import read_block, write_block
 from jaxphoto.io.conditions import write_conditions
-from jaxphoto.report.camera_drift import drift_words
+from jaxphoto.report.verdict import drift_finding
 from jaxphoto.statistics import camera_drifts
 from jaxphoto.unknowns import FIXED
 from jaxphoto.variants import some_images
@@ -57,11 +57,9 @@ def test_it_is_tested_and_told_from_the_coldest_exposure_to_the_warmest():
     (drift,) = camera_drifts(found(), covariance(found()))
     assert (drift.rates, drift.span) == (ThermalRates, pytest.approx(PER_HOUR))
     assert drift.change.rejected
-    assert drift_words(drift).startswith("camera one changed as it warmed by 4 K (p ")
+    assert drift_finding(drift).text.startswith("camera one changed with its temperature over 4 K (p ")
     still = drift._replace(change=drift.change._replace(p_value=0.3, detectable=np.array([4e-3, 3e-3, 2e-3, 1e-6])))
-    assert drift_words(still).startswith(
-        "no change of camera one with its temperature is seen (p = 0.3); over its 4 K this flight would have shown"
-    )
+    assert (drift_finding(still).code, drift_finding(still).value) == ("no_drift", 0.3)
     table = Tables(found()).camera_drift
     assert list(table.along) == ["temperature_K"] * 4 and list(table.unit) == ["mm", "mm", "mm", ""]
 
@@ -102,7 +100,7 @@ def in_table(folder, change) -> None:
     [
         (
             "",
-            "row 4: image i2 has no temperature_c, but its camera one changes .* add the temperature",
+            "row 4: image i2 has no temperature_c, but in .*thermal_rates.* its camera one drifts; add the temperature",
         ),
         ("293.15", r"row 4: temperature_c = 293\.15 is that of no camera; give it in degrees Celsius"),
     ],

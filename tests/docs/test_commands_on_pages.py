@@ -1,6 +1,5 @@
 """Every command line on the pages is one that the program knows; those that need no file of others run, to the end."""
 
-import importlib
 import re
 import shlex
 from pathlib import Path
@@ -8,9 +7,10 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
-from jaxphoto.cli.app import COMMANDS, app
+from jaxphoto_command import app
 from tests.commands import run_script
 
+COMMANDS = get_command(app).commands
 ROOT = Path(__file__).resolve().parents[2]
 # extending.md declares commands of its own.
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if p.stem != "extending")]
@@ -32,8 +32,7 @@ def test_command_lines_are_commands_with_options_that_exist(page):
     for line in command_lines(page):
         command, *words = shlex.split(line.replace("[", "").replace("]", ""), comments=True)
         assert command in COMMANDS, f"{page.name}: jaxphoto {line}"
-        importlib.import_module(f"jaxphoto.cli.{COMMANDS[command].module}")
-        known = get_command(app).commands[command]
+        known = COMMANDS[command]
         options = {name for parameter in known.params for name in (*parameter.opts, *parameter.secondary_opts)}
         assert {word for word in words if word.startswith("--")} <= options, f"{page.name}: jaxphoto {line}"
         # What may be left out stands in brackets, with words for what the user puts there.

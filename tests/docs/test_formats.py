@@ -1,17 +1,26 @@
-"""docs/formats.md names every reader and writer that the code declares; a new format fails here until it has a row."""
+"""docs/formats.md names every registered reader and writer, and each sample is recognised by one reader only."""
 
-import importlib
-import pkgutil
 import re
 from pathlib import Path
 
 import pytest
 
-from jaxphoto.io import FORMATS, control_files
-from jaxphoto.io.cameras import CAMERA_FORMATS, camera_reader
-from jaxphoto.io.clouds import cloud_reader, copc
-from jaxphoto.io.exports import EXPORTS
+from jaxphoto.extras.formats import CAMERAS_WRITTEN, CONTROL_FORMATS, EXPORTS, FORMATS, export, recognise
+from jaxphoto.io.camera_files import CAMERA_READERS
+from jaxphoto.io.clouds import cloud_reader
+from jaxphoto.io.exposures import files
 from jaxphoto.io.trajectory import is_sbet
+from tests import sound_files
+from tests.io import (
+    control_files,
+    oriented_files,
+    test_bal,
+    test_cameras,
+    test_colmap,
+    test_reconstructions,
+    test_robotics_cameras,
+)
+from tests.io.conftest import FILES
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/formats.md"
 COLUMNS = ["format", "read", "written", "signs and units", "lost", "source", "its own files"]
@@ -33,31 +42,24 @@ def named(column):
     return [(command, name) for command, names in parts for name in re.findall("`([^`]+)`", names)]
 
 
-def control_forms():
-    """The modules of control files that tell a form by its content, and the one of tables, which takes the rest."""
-    modules = [name for _, name, _ in pkgutil.iter_modules(control_files.__path__)]
-    told = [n for n in modules if hasattr(importlib.import_module(f"{control_files.__name__}.{n}"), "recognises")]
-    return [*told, "tables"]
-
-
-EXPOSURES = importlib.import_module("jaxphoto.io.exposures.located")
 SBET = [("trajectory", end) for end in (".sbet", ".out") if is_sbet(Path(f"a{end}"))]
-CLOUDS = [("cloud", end) for end in (*cloud_reader._OPENERS, copc._ENDING)]
+CLOUDS = [("cloud", suffix) for suffix in cloud_reader.SUFFIXES]
 DECLARED = {
     "read": [
         *(("convert", name) for name in FORMATS),
-        *(("camera", name) for name in camera_reader._FORMATS),
-        *(("control", name) for name in control_forms()),
-        *(("exposures", name) for name in (*EXPOSURES._SUFFIXES, *EXPOSURES._TABLES)),
+        *(("camera", name) for name in CAMERA_READERS),
+        *(("control", name) for name in (*CONTROL_FORMATS, "tables")),
+        *(("exposures", name) for name in (*files.SUFFIXES, *files.NAMES)),
         *SBET,
         ("trajectory", ".csv"),
         *CLOUDS,
+        ("cloud", ".copc.laz"),
         ("raster", "dsm"),
     ],
     "written": [
         ("convert", "block"),
         *(("convert", name) for name in EXPORTS),
-        *(("camera", name) for name in CAMERA_FORMATS),
+        *(("camera", name) for name in CAMERAS_WRITTEN),
         *SBET,
         ("trajectory", ".csv"),
         *CLOUDS,
@@ -83,3 +85,79 @@ def test_every_format_of_another_program_says_signs_losses_and_a_source():
         assert "](http" in row["source"] or row["source"] in ("here", "there") or ".md#" in row["source"], row["format"]
         if row["source"] not in ("here", "there"):
             assert row["its own files"], row["format"]
+
+
+def _texts(files):
+    def write(folder):
+        for name, text in files.items():
+            (folder / name).write_text(text, encoding="utf-8")
+
+    return write
+
+
+def _exported(format):
+    def write(folder):
+        p = oriented_files.inside("opencv", "local")
+        export(p._replace(files=tuple(name.replace(" ", "_") for name in p.files)), folder / "out", format)
+
+    return write
+
+
+PROJECTS = {
+    "block": [_texts(FILES)],
+    "dbat": [_texts(sound_files.DBAT)],
+    "photomodeler": [_texts(sound_files.PHOTOMODELER)],
+    "aicon": [_texts(sound_files.AICON)],
+    "bal": [_texts({"problem.txt": "\n".join(test_bal.lines_of())}), _exported("bal")],
+    "colmap": [test_colmap.write_text, test_colmap.write_binary, _exported("colmap")],
+    "opensfm": [test_reconstructions.write_open_sfm, _exported("opensfm")],
+    "openmvg": [test_reconstructions.write_open_mvg, _exported("openmvg")],
+    "blocksexchange": [test_reconstructions.write_blocks_exchange, _exported("blocksexchange")],
+    "bundler": [test_reconstructions.write_bundler, _exported("bundler")],
+    "pix4d": [test_reconstructions.write_pix4d],
+    "metashape": [oriented_files.write_metashape, oriented_files.write_metashape_beside],
+    "texts": [oriented_files.write_angles, oriented_files.write_patb, oriented_files.write_bingo, _exported("opk")],
+    "nerfstudio": [oriented_files.write_nerfstudio],
+    "orthority": [oriented_files.write_orthority, _exported("orthority")],
+}
+CAMERAS = {
+    "interior": ("interior.csv", test_cameras.INTERIOR), "block": ("a.toml", test_cameras.TOML),
+    "agisoft": ("a.xml", test_cameras.AGISOFT), "smac": ("a.txt", test_cameras.SMAC),
+    "colmap": ("cameras.txt", test_cameras.COLMAP), "opencv": ("a.yml", test_cameras.OPENCV),
+    "mrcal": ("a", test_robotics_cameras.mrcal("OPENCV8", test_robotics_cameras.RATIONAL)),
+    "kalibr": ("a.yaml", test_robotics_cameras.KALIBR),
+}  # fmt: skip
+CONTROL = {
+    "gcp_list": control_files.GCP_LIST, "metashape": control_files.MARKERS, "geo_json": control_files.GEO_JSON,
+    "bingo": control_files.GEOIN,
+}  # fmt: skip
+TABLES = (control_files.REFERENCE, control_files.PIX4D, control_files.PIX4D_MARKS, control_files.OWN)
+
+
+def _folder(source):
+    """The folder in which a writer put the project."""
+    return source / "out" if (source / "out").is_dir() else source
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_project_is_recognised_by_its_format_alone(tmp_path, name):
+    for k, write in enumerate(PROJECTS[name]):
+        (tmp_path / str(k)).mkdir()
+        write(tmp_path / str(k))
+        assert recognise(_folder(tmp_path / str(k))) == [name]
+
+
+def test_every_camera_and_control_file_is_recognised_by_its_format_alone(tmp_path):
+    assert CAMERAS.keys() == CAMERA_READERS.keys() and {*CONTROL, "geo_package"} == CONTROL_FORMATS.keys()
+    for name, (file, text) in CAMERAS.items():
+        assert [key for key, reader in CAMERA_READERS.items() if reader.recognise(Path(file), text)] == [name]
+        assert recognise(tmp_path) == []
+    path = tmp_path / "a"
+    for name, text in [*CONTROL.items(), *(("", text) for text in TABLES)]:
+        path.write_text(text, encoding="utf-8")
+        names = [key for key, format in CONTROL_FORMATS.items() if format.recognise(path, text)]
+        assert names == ([name] if name else [])
+        assert recognise(path) == (["metashape"] if name == "metashape" else [])
+    _exported("geopackage")(tmp_path)
+    path = tmp_path / "out" / "photographs.gpkg"
+    assert [key for key, format in CONTROL_FORMATS.items() if format.recognise(path, "")] == ["geo_package"]

@@ -14,7 +14,7 @@ import pytest
 
 from jaxphoto import InputError, bias
 from jaxphoto.experiment import MonteCarlo
-from jaxphoto.experiment.monte_carlo import _told
+from jaxphoto.experiment.monte_carlo import _errors_line
 from jaxphoto.io import write_block
 from jaxphoto.sensitivity import Readjustment, noise
 from jaxphoto.sensitivity.exact import sensitivity
@@ -181,7 +181,7 @@ def test_noise_is_predicted_by_the_observations_own_sigmas(tmp_path):
     groups = {"image_points": block.image_points, "stations": block.stations, "control_points": block.control}
     variance = sum((derivatives.groups[name] ** 2) @ np.ravel(rows.sigma) ** 2 for name, rows in groups.items())
     for label in nominal.structure.labels:
-        expected = np.sqrt(variance[derivatives.of(label)])
+        expected = np.sqrt(variance[derivatives.row(label)])
         assert of[label.replace("interior[one]", "one")] == pytest.approx(expected, rel=2e-3)
 
 
@@ -212,13 +212,13 @@ def test_a_block_that_estimates_a_scanner(tmp_path):
         assert [of[f"scanner.{strip}.shift_{axis}_m"] for axis in "XYZ"] == pytest.approx(np.asarray(shift), rel=1e-9)
 
 
-def test_noise_of_observations_of_further_kinds_is_told(tmp_path):
+def test_errors_of_further_kinds_of_observations_are_listed(tmp_path):
     """They are found by their number in `Block.more`."""
     nominal = adjusted("cross")
     levelled = HeightDifferences(np.array([0]), np.array([1]), np.zeros(1), np.array([0.01]))
     drawn = noise(dataclasses.replace(nominal.block, more=(levelled,)))
     assert ("more", 0, "value") in drawn.targets
-    assert _told(drawn).startswith(f"{len(drawn.names)} of control, image_points, more, stations, ")
+    assert _errors_line(drawn).startswith(f"{len(drawn.names)} of control, image_points, more, stations, ")
 
 
 @pytest.fixture(scope="module")
@@ -237,9 +237,9 @@ def test_the_command(folder, monkeypatch, capsys, tmp_path):
     assert code == 0
     assert "20 draws, 20 converged" in printed
     page = (out / "report.html").read_text(encoding="utf-8")
-    assert "20 draws, of which 20 converged." in page and "--sigma-m 0.05,0.05,0.1" in page
+    assert "20 draws, 20 converged." in page and "--sigma-m 0.05,0.05,0.1" in page
     assert (
-        "Images, points and knots of trajectories stand in summary.csv." in page
+        "Images, points and trajectory knots are in summary.csv." in page
         and f"exterior.{simulated(NOMINAL).block.images[0]}" not in page
     )
     draws = pd.read_parquet(out / "draws.parquet")
@@ -255,17 +255,17 @@ def test_the_command(folder, monkeypatch, capsys, tmp_path):
 @pytest.mark.parametrize(
     "options, words",
     [
-        (("--bias", "station", "--sigma-m", "0.1", "--on", "S9", "--per", "strip"), "no strip 'S9'"),
-        (("--bias", "station", "--sigma-m", "0.1", "--draws", "0"), "1 at least, got 0"),
-        (("--bias", "station", "--sigma-m", "0.1", "--draws", "-5"), "1 at least, got -5"),
+        (("--bias", "station", "--sigma-m", "0.1", "--on", "S9", "--per", "strip"), "unknown strip 'S9'"),
+        (("--bias", "station", "--sigma-m", "0.1", "--draws", "0"), "must be positive, got 0"),
+        (("--bias", "station", "--sigma-m", "0.1", "--draws", "-5"), "must be positive, got -5"),
         (("--bias", "station", "--sigma-deg", "0.1"), "takes --sigma-m"),
         (("--bias", "station"), "takes --sigma-m"),
         (("--bias", "station", "--sigma-m", "much"), "--sigma-m much"),
         (("--bias", "station", "--sigma-m", "-1"), "above zero"),
-        (("--bias", "wind", "--sigma-m", "1"), "--bias wind: there are station"),
-        (("--bias", "noise", "--sigma-m", "1"), "takes no --sigma-m"),
-        (("--bias", "noise", "--per", "strip"), "takes no --per"),
-        (("--bias", "station", "--sigma-m", "1", "--with", "all"), "--with all: there are exterior, points"),
+        (("--bias", "wind", "--sigma-m", "1"), "'wind' is not one of 'station'"),
+        (("--bias", "noise", "--sigma-m", "1"), "omit --sigma-m"),
+        (("--bias", "noise", "--per", "strip"), "omit --per"),
+        (("--bias", "station", "--sigma-m", "1", "--with", "all"), "--with all: choose from exterior, points"),
     ],
 )
 def test_a_mistake_is_one_sentence_and_nothing_written(folder, monkeypatch, capsys, tmp_path, options, words):
@@ -278,7 +278,7 @@ def test_a_mistake_is_one_sentence_and_nothing_written(folder, monkeypatch, caps
 
 @pytest.mark.slow
 def test_killed_in_the_middle_it_goes_on_to_the_same_file(folder, tmp_path):
-    program = [sys.executable, "-c", "from jaxphoto.cli import main; main()", "monte-carlo", str(folder)]
+    program = [sys.executable, "-c", "from jaxphoto_command import main; main()", "monte-carlo", str(folder)]
     program += ["--bias", "station", "--per", "image", "--sigma-m", "0.1", "--draws", "10000"]
     subprocess.run([*program, "--out", str(tmp_path / "whole")], check=True, capture_output=True)
     killed = subprocess.Popen(

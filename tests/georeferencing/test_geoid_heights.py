@@ -6,15 +6,16 @@ import struct
 
 import numpy as np
 import pytest
+import typer
 from pyproj import datadir
 
-from jaxphoto.cli.exposure_options import heights_of
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import map_frame
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.recorded_positions import one_height
 from jaxphoto.procedures.control.frame import in_frame
 from jaxphoto.procedures.georeference_photographs import georeference_photographs
+from jaxphoto_command.photographs import height_reference
 from tests.procedures.controlled import CODE, marked_block
 from tests.procedures.test_georeference_photographs import network, recorded
 
@@ -111,6 +112,7 @@ def test_a_code_of_no_heights_is_refused():
 
 
 def test_what_the_option_takes():
-    assert [heights_of(text) for text in ("take-off", "5773", "EPSG:7837", None)] == ["take-off", 5773, 7837, None]
-    with pytest.raises(InputError, match="--heights is 'sea'; give ellipsoid, geoid, take-off, or the EPSG code"):
-        heights_of("sea")
+    values = [height_reference(text) for text in ("take-off", "5773", "EPSG:7837", None)]
+    assert values == ["take-off", 5773, 7837, None]
+    with pytest.raises(typer.BadParameter, match="--heights sea: give ellipsoid, geoid, take-off"):
+        height_reference("sea")

@@ -64,7 +64,7 @@ def test_heights_that_are_wanted_or_said():
     assert (found["a"].altitude_m, found["b"].altitude_m) == (60.0, None)
     assert "above take-off" in said[0] and "b have no height above take-off" in said[1]
     found, said = one_height(given, {}, "take-off")
-    assert found["a"] == HERE._replace(heights="take-off") and "no photograph notes a height above take-off" in said[1]
+    assert found["a"] == HERE._replace(heights="take-off") and "no photograph has a height above take-off" in said[1]
     found, said = one_height(given, above, "geoid")
     assert found["b"] == HERE._replace(heights="geoid") and "above a geoid" in said[0]
 

@@ -9,11 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.io import export
+from jaxphoto.extras.formats import ControlPoints, ProjectCamera, export
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
-from jaxphoto.io.exports import ExportCamera
-from jaxphoto.io.exports.control_points import ControlPoints
-from jaxphoto.io.exports.map_photographs import in_map
 from tests.formulas import camera_from_object
 from tests.io.test_exports import SENSOR, photographs
 
@@ -100,7 +97,7 @@ def write_patb(folder, kind="local", turned=False, change=lambda text: text):
     p = inside("opencv", kind)
     write_angles(folder, kind, points="patb")
     (folder / "exterior.txt").unlink()
-    on_map = in_map(p).exterior
+    on_map = p.in_map().exterior
     lines = []
     for name, at, r in zip(p.images, *map(np.asarray, (on_map.position, on_map.camera_from_object)), strict=True):
         a = [f"{value:.17g}" for value in (r if turned else r.T).ravel()]
@@ -114,7 +111,7 @@ def write_bingo(folder, kind="local", axes="YXZ", unit=0.9, change=lambda text: 
     p = inside("opencv", kind)
     write_angles(folder, kind)
     (folder / "exterior.txt").unlink()
-    on_map = in_map(p).exterior
+    on_map = p.in_map().exterior
     lines = ["* phi omega kappa", *(f"CORD {k} {k}.5 2.5 3.5" for k in range(60))]
     for name, at, r in zip(p.images, *map(np.asarray, (on_map.position, on_map.camera_from_object)), strict=True):
         angles = Rotation.from_matrix(r.T).as_euler(axes, degrees=True) / unit
@@ -168,7 +165,7 @@ def posed(values, interior):
     """Photographs so oriented, and points anywhere."""
     turn = np.stack([camera_from_object(*row[3:]) for row in values])
     exterior = ExteriorOrientation(np.array(values)[:, :3], turn)
-    return photographs("brown", "local")._replace(exterior=exterior, cameras={"one": ExportCamera(SENSOR, interior)})
+    return photographs("brown", "local")._replace(exterior=exterior, cameras={"one": ProjectCamera(SENSOR, interior)})
 
 
 def come_back(p, tables, names):

@@ -8,8 +8,9 @@ import pytest
 from jaxphoto.block import Datum
 from jaxphoto.camera import BundlerRadial, get_parameter, parameter_names
 from jaxphoto.collinearity import image_residual
-from jaxphoto.errors import BlockError, InputError
-from jaxphoto.io import convert, read_block, read_source
+from jaxphoto.errors import InputError
+from jaxphoto.extras.formats import convert, read_source
+from jaxphoto.io import read_block
 from jaxphoto.unknowns import FREE
 from tests.derivatives import compiled
 from tests.formulas import turns
@@ -128,7 +129,7 @@ def fewer_rays(lines):
 
 
 def test_points_of_fewer_than_two_images_are_left_out(write):
-    with pytest.warns(UserWarning, match=r"pre\.txt: 2 point\(s\) are .* fewer than two images .* not used: 3, 4$"):
+    with pytest.warns(UserWarning, match=r"pre\.txt: .* 1 point\(s\) that fewer than two images show"):
         block = read_source(write(fewer_rays))
     assert block.points == ("0", "1", "2")
     assert len(block.image_points.point) == 9
@@ -148,46 +149,42 @@ def shortened(lines):
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "place"),
     [
-        (replaced(1, "3 5"), ("row 1:", "cameras, points and observations", "write these three")),
-        (replaced(1, "3 5 0"), ("row 1:", "write these three")),
-        (replaced(1, "3 5 " + "9" * 5000), ("row 1:", "write these three")),
-        (replaced(4, "0 " + "9" * 5000 + " 1.0 2.0"), ("row 4: point is '999", "counted from 0 to 4")),
-        (replaced(1, "3 5 14.0"), ("row 1:", "write these three")),
-        (replaced(4, None), ("row 15: 1 cells instead of 4", "complete the row, or correct the 14")),
-        (replaced(1, "3 5 13"), ("46 numbers follow", "have 42", "correct that row")),
-        (replaced(57, None), ("41 numbers follow", "have 42 (9 a camera, 3 a point)", "complete the file")),
-        (shortened, ("ends after 9 of 14 observations", "complete it")),
-        (replaced(3, "3 0 1.0 2.0"), ("row 3: camera is '3'", "from 0 to 2")),
-        (replaced(3, "1 -1 1.0 2.0"), ("row 3: point is '-1'", "from 0 to 4")),
-        (replaced(3, "1 0 1.0 2,0"), ("row 3: y is '2,0', not a number", "12.34")),
-        (replaced(3, "1 0 nan 2.0"), ("row 3: x is 'nan'", "finite")),
-        (replaced(20, "1.0e"), ("row 20: '1.0e' is not a number", "12.34")),
-        (replaced(20, "inf"), ("row 20: 'inf' is not finite", "finite number")),
-        (replaced(31, "-500.0"), ("row 31: f of camera 1 is -500", "correct it")),
-        (replaced(3, "0 0 1.0 2.0"), ("row 3: point 0 is measured twice in image 0", "row 2", "delete one")),
+        (replaced(1, "3 5"), "row 1"),
+        (replaced(1, "3 5 0"), "row 1"),
+        (replaced(1, "3 5 " + "9" * 5000), "row 1"),
+        (replaced(4, "0 " + "9" * 5000 + " 1.0 2.0"), "row 4"),
+        (replaced(4, None), "row 15: .* is not 4 numbers"),
+        (replaced(1, "3 5 13"), "46 numbers follow .* have 42 .* row 1"),
+        (replaced(57, None), r"41 numbers follow .* have 42 \(9 a camera, 3 a point\)"),
+        (shortened, "ends after 9 of 14 observations"),
+        (replaced(3, "3 0 1.0 2.0"), "row 3: camera is 3; .* from 0 to 2"),
+        (replaced(3, "1 -1 1.0 2.0"), "row 3: point is -1; .* from 0 to 4"),
+        (replaced(3, "1 0 1.0 2,0"), "row 3"),
+        (replaced(3, "1 0 nan 2.0"), "row 3"),
+        (replaced(20, "1.0e"), "row 20"),
+        (replaced(20, "inf"), "row 20"),
+        (replaced(31, "-500.0"), "row 31: f of camera 1 is -500"),
+        (replaced(3, "0 0 1.0 2.0"), "row 3: point 0 is measured twice in image 0"),
     ],
-)  # fmt: skip
-def test_a_bad_problem_is_refused(write, change, words):
-    path = write(change)
-    with pytest.raises(InputError) as caught:
-        read_source(path, "bal")
-    for word in (path.name, *words):
-        assert word in str(caught.value), str(caught.value)
+)
+def test_a_bad_problem_is_refused(write, change, place):
+    with pytest.raises(InputError, match=f"problem-3-5-pre.txt.* {place}"):
+        read_source(write(change), "bal")
 
 
-def test_an_image_of_two_points_is_refused(write):
+def test_an_image_of_two_points_is_skipped(write):
     def two_left(lines):
         lines[1:15] = [line for line in lines[1:15] if line[0] != "2" or line[2] in "01"]
         lines[0] = "3 5 12"
 
-    with pytest.raises(BlockError, match=r"pre\.txt, row 32: image 2 has 2 point\(s\)"):
-        read_source(write(two_left))
+    with pytest.warns(UserWarning, match=r"pre\.txt: 1 image\(s\) with fewer than 3 points are left out: '2'"):
+        assert read_source(write(two_left)).images == ("0", "1")
 
 
 def test_a_folder_of_two_problems_is_refused(write):
     path = write()
     (path.parent / "other.txt").write_text(path.read_text())
-    with pytest.raises(InputError, match=r"holds 2 BAL problems .*; name one"):
+    with pytest.raises(InputError, match=r"holds 2 files of bal .*; name one"):
         read_source(path.parent, "bal")

@@ -11,9 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxphoto.errors import InputError
-from jaxphoto.io import export
-from jaxphoto.io.control_files import read_control
-from jaxphoto.io.exports.map_photographs import in_map
+from jaxphoto.extras.formats import export, read_control
 from jaxphoto.procedures.control.surveyed import places, system_of
 from tests.io import control_files as files
 from tests.io.test_exports import photographs
@@ -130,7 +128,7 @@ def test_our_own_tables(tmp_path):
             "row 3: the point 'G1' stands in a, row 2, too",
         ),
         (files.GCP_LIST.replace("DJI_0003.JPG", "=DJI()"), None, "begins like a formula"),
-        (files.MARKERS[:900], None, "the XML is broken"),
+        (files.MARKERS[:900], None, "a: damaged"),
         (files.MARKERS.replace('camera_id="0"', 'camera_id="5"'), None, "the file has no such camera"),
         (files.MARKERS.replace('x="100.25"', 'x="nan"'), None, "x is 'nan', not a number"),
     ],
@@ -200,7 +198,7 @@ def test_points_of_a_geo_package_come_back(tmp_path_factory, xyz, kind):
         export(p, folder, "geopackage")
     points = read_control(folder / "photographs.gpkg").points
     assert points.ids == p.points and points.system == ("EPSG:32633" if kind == "epsg" else "local")
-    np.testing.assert_allclose(points.coordinates, in_map(p).xyz, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(points.coordinates, p.in_map().xyz, rtol=0, atol=1e-9)
 
 
 def _geo(old, new):
@@ -214,7 +212,7 @@ GEO_REFUSED = {
     "role": (_geo('"check"', '"both"'), "a, feature 2: the role 'both' is unknown"),
     "twice": (_geo('"G2"', '"G1"'), "a, feature 2: the point 'G1' stands in a, feature 1, too"),
     "system": (_geo("EPSG::32633", "ESRI::102100"), "the system 'urn:ogc:def:crs:ESRI::102100' is no EPSG code"),
-    "cut": (files.GEO_JSON[:-20], "no JSON that can be read"),
+    "cut": (files.GEO_JSON[:-20], "JSON"),
     "no feature": ('{"type": "FeatureCollection", "features": []}', "there are no features"),
 }  # fmt: skip
 

@@ -11,8 +11,10 @@ from jaxphoto.block import Datum
 from jaxphoto.camera import AffineBrown, Balanced, get_parameter, parameter_names
 from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.errors import InputError
-from jaxphoto.io import FORMATS, convert, read_block, read_source, write_block
+from jaxphoto.extras.formats import FORMATS, convert, read_source, read_tables, recognise
+from jaxphoto.io import read_block, write_block
 from jaxphoto.unknowns import FIXED, FREE
+from tests.sound_files import DBAT
 
 
 def residuals(block, exterior, points):
@@ -173,7 +175,7 @@ def test_unknown_formats_list_the_known_ones(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("</document>", "", ("project.xml", "line", "correct the XML")),
+        ("</document>", "", ("project.xml", "line")),
         ("<model>3</model>", "<model>6</model>", ("project.xml", "model 6", "use one of")),
         ("<image>2272,1704</image>", "<image>2272</image>", ("project.xml", "<image>", "2 numbers")),
         ("auto,5.43764", "auto,auto", ("project.xml", "<sensor>", "give width,height")),
@@ -184,7 +186,7 @@ def test_unknown_formats_list_the_known_ones(tmp_path):
             "<image>0,1704</image>",
             ("project.xml", "<image> is 0 x 1704", "give the format"),
         ),
-        ('encoding="', 'encoding="X', ("project.xml", "unknown encoding", "correct the XML")),
+        ('encoding="', 'encoding="X', ("project.xml", "unknown encoding")),
         ("<skew>false</skew>", "<focus>false</focus>", ("project.xml", "<focus>", "use all")),
         ("<skew>false</skew>", "<skew>no</skew>", ("project.xml", "<skew>", "true or false")),
         ("im,id,x,y,sxy", "im,id,x,y,s", ("project.xml", "markpts.txt", "add sxy")),
@@ -192,7 +194,7 @@ def test_unknown_formats_list_the_known_ones(tmp_path):
         ("im,id,x,y,sxy", "im,label,x,y,sxy", ("project.xml", "image_pts", "no id")),
         ("camcal-fixed.txt", "camcal-free.txt", ("camcal-free.txt", "add it")),
         ("<ctrl_pts>", "<extra/><ctrl_pts>", ("project.xml", "<extra>", "remove it")),
-        ("<ctrl_pts>", "<prior_eo/><ctrl_pts>", ("project.xml", "<prior_eo> names 0 files", "put all")),
+        ("<ctrl_pts>", "<prior_eo/><ctrl_pts>", ("project.xml", "<prior_eo> names 0 files")),
         ('base_dir="$HERE"', 'base_dir="$DBAT"', ("project.xml", "$DBAT", "$HERE")),
         ("<project_unit>m<", "<project_unit>ft<", ("project.xml", "'ft'", "use one of m")),
     ],
@@ -227,7 +229,7 @@ def test_a_bad_row_of_an_aicon_file_is_named(data_dir, tmp_path):
         (0, "-28.78507", "c", r"example\.ior, row 1: a cell is not a finite number; correct it"),
         (4, "35.96800", "9" * 400, r"example\.ior, row 5: a cell is not a finite number; correct it"),
         (4, "35.96800", "0", r"example\.ior, row 5: the format in mm and pixels is positive; correct it"),
-        (4, "35.96800", "0.035968", r"pixel_mm: a pixel of .* cannot be"),
+        (4, "35.96800", "0.035968", r"pixel_mm: .* is no size of a pixel"),
     ],
 )
 def test_a_bad_camera_of_an_aicon_project_is_named(data_dir, tmp_path, line, old, new, message):
@@ -245,7 +247,7 @@ def test_a_bad_camera_of_an_aicon_project_is_named(data_dir, tmp_path, line, old
 
 def test_an_aicon_project_needs_its_files(data_dir, tmp_path):
     shutil.copy(data_dir / "aicon" / "example.phc", tmp_path)
-    with pytest.raises(InputError, match=r"holds 0 AICON projects .*; name one file"):
+    with pytest.raises(InputError, match=r"example\.ior"):
         read_source(tmp_path / "example.phc", "aicon")
 
 
@@ -254,7 +256,7 @@ def test_an_aicon_project_needs_its_files(data_dir, tmp_path):
     [
         ("   0      333 2158.2500", "   9      333 2158.2500", r"pmexport\.txt, row \d+: image 9 is not among"),
         ("0.000500 20 8858 12996", "0.000500 20 8858", "is of no format that is known"),
-        ("0.000500 20 8858 12996", "0.000500 20 1e999 12996", r"pmexport\.txt, row 2: 4 numbers are expected"),
+        ("0.000500 20 8858 12996", "0.000500 20 1e999 12996", r"pmexport\.txt, row 2: .* is not 4 numbers"),
         ("0.000500 20 8858 12996", "0.000500 20 0 12996", r"the format of the camera is not positive"),
     ],
 )
@@ -267,3 +269,15 @@ def test_a_bad_export_is_refused(data_dir, tmp_path, old, new, message):
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(InputError, match=message):
         read_source(folder)
+
+
+def test_the_only_recogniser_of_a_text_export_of_photomodeler_is_its_own(data_dir):
+    """Orientations of PATB begin alike."""
+    assert recognise(data_dir / "sxb/prior_eo/wsmart-with-orient-pmexport.txt") == ["photomodeler"]
+
+
+def test_names_in_the_old_code_page_of_windows_are_read(tmp_path):
+    script = DBAT | {"images.txt": "1,a/Müller.jpg\n2,a/two.jpg\n"}
+    for name, content in script.items():
+        (tmp_path / name).write_text(content, encoding="cp1252" if name == "images.txt" else "utf-8")
+    assert read_tables(tmp_path, "dbat").tables["images"].text("image").tolist() == ["Müller", "two"]

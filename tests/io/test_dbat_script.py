@@ -4,10 +4,15 @@ import numpy as np
 import pytest
 
 from jaxphoto.errors import InputError
+from jaxphoto.extras.formats import read_tables
 from jaxphoto.io.block_folder.camera_section import read_camera
-from jaxphoto.io.block_folder.section import Section
-from jaxphoto.io.dbat import read_dbat
+from jaxphoto.io.toml import Section
 from tests.sound_files import DBAT
+
+
+def _read(folder):
+    return read_tables(folder, "dbat")
+
 
 PIXEL, C = 5.4 / 1704, 7.457
 PX, PY, K, P, ASPECT = 3.61687, 2.61329, (4.6e-3, -4.5e-5, -2e-6), (-6.1e-5, -4.4e-5), 1 - 0.0039
@@ -42,7 +47,7 @@ def corrected(column, row, model):
 
 @pytest.mark.parametrize("model", [1, 2, 3, 4, 5])
 def test_a_lens_model_of_dbat_is_what_it_computes(tmp_path, model):
-    tables = read_dbat(script(tmp_path, model, ASPECT if model > 2 else 1.0))
+    tables = _read(script(tmp_path, model, ASPECT if model > 2 else 1.0))
     ((name, values),) = tables.settings["cameras"].items()
     sensor, interior, *_ = read_camera(Section("a", name, dict(values)))
     for column, row in ((1.0, 1.0), (2272.0, 30.0), (700.5, 1704.0)):
@@ -53,7 +58,7 @@ def test_a_lens_model_of_dbat_is_what_it_computes(tmp_path, model):
 
 def test_the_principal_point_of_model_5_is_that_of_model_3_in_the_reports_of_dbat(tmp_path):
     """Of one calibration by both: 3.61687 mm with as 0.000389598, and 3.61546 mm."""
-    tables = read_dbat(script(tmp_path, 5, 1 - 0.000389598))
+    tables = _read(script(tmp_path, 5, 1 - 0.000389598))
     (values,) = tables.settings["cameras"].values()
     assert values["interior"]["xp_mm"] + PIXEL * (2272 / 2 + 0.5) == pytest.approx(3.61546, abs=5e-6)
 
@@ -68,7 +73,7 @@ def test_the_principal_point_of_model_5_is_that_of_model_3_in_the_reports_of_dba
 )
 def test_a_lens_model_that_has_no_equal_is_refused(tmp_path, model, aspect, estimated, message):
     with pytest.raises(InputError, match=message):
-        read_dbat(script(tmp_path, model, aspect, estimated))
+        _read(script(tmp_path, model, aspect, estimated))
 
 
 def eo_script(folder, form="id,x,y,z,omega,phi,kappa", units="gon", rows="2,1.5,2.5,9,10,-20,100\n1,1,2,8,5,0,50\n"):
@@ -86,12 +91,12 @@ def eo_script(folder, form="id,x,y,z,omega,phi,kappa", units="gon", rows="2,1.5,
 def test_a_camera_in_a_file_is_that_of_the_script(tmp_path):
     (tmp_path / "one").mkdir()
     (tmp_path / "two").mkdir()
-    one, two = read_dbat(script(tmp_path / "one", 3)), read_dbat(eo_script(tmp_path / "two"))
+    one, two = _read(script(tmp_path / "one", 3)), _read(eo_script(tmp_path / "two"))
     assert one.settings["cameras"] == two.settings["cameras"]
 
 
 def test_prior_orientations_are_where_images_start(tmp_path):
-    images = read_dbat(eo_script(tmp_path)).tables["images"]
+    images = _read(eo_script(tmp_path)).tables["images"]
     assert images.text("image").tolist() == ["one", "two"]
     names = ("X_m", "Y_m", "Z_m", "omega_deg", "phi_deg", "kappa_deg")
     found = np.stack([images.numbers(name) for name in names], axis=1)
@@ -99,7 +104,7 @@ def test_prior_orientations_are_where_images_start(tmp_path):
 
 
 def test_prior_positions_with_standard_deviations_are_stations(tmp_path):
-    tables = read_dbat(eo_script(tmp_path, "id,x,y,z,sxyz", "", "2,1.5,2.5,9,0.05\n")).tables
+    tables = _read(eo_script(tmp_path, "id,x,y,z,sxyz", "", "2,1.5,2.5,9,0.05\n")).tables
     assert "X_m" not in tables["images"] and tables["stations"].ids("image").tolist() == ["two"]
     assert [tables["stations"].numbers(name)[0] for name in ("Z_m", "sigma_X_m", "sigma_Z_m")] == [9, 0.05, 0.05]
 
@@ -108,7 +113,7 @@ def test_a_dependent_datum_is_a_minimal_one(tmp_path):
     path = script(tmp_path, 3) / "a.xml"
     datum = '<operation><set_datum ref_cam="1" ref_base="longest">depend</set_datum></operation></operations>'
     path.write_text(path.read_text().replace("</operations>", datum))
-    assert read_dbat(tmp_path).settings["datum"] == {"kind": "minimal"}
+    assert _read(tmp_path).settings["datum"] == {"kind": "minimal"}
 
 
 @pytest.mark.parametrize(
@@ -121,10 +126,10 @@ def test_a_dependent_datum_is_a_minimal_one(tmp_path):
 )
 def test_prior_orientations_that_cannot_be_are_refused(tmp_path, change, message):
     with pytest.raises(InputError, match=message):
-        read_dbat(eo_script(tmp_path, **change))
+        _read(eo_script(tmp_path, **change))
 
 
 def test_a_camera_file_without_camera_is_refused(tmp_path):
     (eo_script(tmp_path) / "camera.txt").write_text("<document/>")
     with pytest.raises(InputError, match=r"camera.txt has no <cameras><camera>; name a camera file of DBAT"):
-        read_dbat(tmp_path)
+        _read(tmp_path)

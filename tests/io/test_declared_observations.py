@@ -287,7 +287,7 @@ def test_what_files_cannot_say_is_refused(block, tmp_path):
     ):
         write_block(dataclasses.replace(block, more=(second,)), tmp_path / "copy")
     tilted = dataclasses.replace(rows_of(Everything, 1), offset=np.ones(1))
-    with pytest.raises(BlockError, match="everything: offset is in no file, where it counts as zero"):
+    with pytest.raises(BlockError, match="everything: offset is in no file, which means zero"):
         write_block(dataclasses.replace(block, more=(tilted,)), tmp_path / "copy")
     assert not (tmp_path / "copy").exists()
 
@@ -314,7 +314,7 @@ def test_groups_of_one_class_share_a_table(block, tmp_path):
     [
         (("1,2,1,", "1,7,1,"), r"covariance\.csv, row 3: a and b count the numbers of set 1, 1 to 2; correct 7, 1"),
         (("1,2,2,", "2,2,2,"), r"covariance\.csv, row 4: set 2 is not in correlated_height_differences\.csv"),
-        (("1,2,2,4.0", "1,1,2,0.5\n1,2,2,4.0"), r"row 4: the covariance of 1 and 2 of set 1 stands there with two"),
+        (("1,2,2,4.0", "1,1,2,0.5\n1,2,2,4.0"), r"row 4: the covariance of 1 and 2 of set 1 is given with two"),
         (("1,2,2,4.0", "1,2,2,0.5"), r"the covariance matrix of set 1 is not positive definite; give a variance"),
     ],
 )

@@ -15,7 +15,7 @@ from jaxphoto.block import Block, Motion, Temperatures
 from jaxphoto.camera import ImageMotion, RollingShutter
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import read_block, write_block
-from jaxphoto.io.block_folder.declared_unknowns import keys_of, known_unknowns, static_fields
+from jaxphoto.io.block_folder.parameters import keys_of, known_unknowns, static_fields
 from jaxphoto.parameters import AbstractParameters, leaves_in_order
 from jaxphoto.unknowns import FIXED, FREE, UNKNOWNS, Weighted, is_prior
 
@@ -228,7 +228,7 @@ model = "ciddor"
             r"\[unknowns\.camera_rates\] leica: no such key is known; use default, kodak",
         ),
         ([section("[unknowns.flight_bias]\nshift_mm = 1")], r"flight_bias\] shift_mm: no such key is known"),
-        ([section("[unknowns.flight_bias]\nshift_m = [1, 2]")], r"shift_m: \[1, 2\] is not a list of three numbers"),
+        ([section("[unknowns.flight_bias]\nshift_m = [1, 2]")], r"shift_m: \[1, 2\] has 2 entries; give 3"),
         ([section('[unknowns.flight_bias]\nshift = "open"')], r"shift: 'open' is no status"),
         (
             [section("[unknowns.flight_bias]\nshift = { covariance = [[1.0]] }")],
@@ -244,24 +244,24 @@ model = "ciddor"
         ),
         (
             [section('[unknowns.shutters.kodak]\nreadout_ms = 20000.0\nreadout = "free"')],
-            r"\[unknowns\.shutters\.kodak\] readout_ms: 20000 ms cannot be; give milliseconds",
+            r"\[unknowns\.shutters\.kodak\] readout_ms: 20000 ms is no readout time; give milliseconds",
         ),
-        ([section("[unknowns.shutters.kodak]\nreadout_ms = 0.03")], r"readout_ms: 0\.03 ms cannot be; give"),
+        ([section("[unknowns.shutters.kodak]\nreadout_ms = 0.03")], r"readout_ms: 0\.03 ms is no readout time; give"),
         (
             [section("[unknowns.shutters.default]\nreadout_ms = 30.0\n[unknowns.motions.a]\n[unknowns.motions.c]")],
-            r"shutters\.kodak\]: 1 photograph of this camera \(b\) would stand still; give velocity_m_per_s",
+            r"shutters\.kodak\]: 1 photograph of this camera \(b\) have no motion; give velocity_m_per_s",
         ),
         (
             [section("[unknowns.motions.default]\nvelocity_m_per_s = [0.0, 10.0, 0.0]")],
-            r"\[unknowns\.motions\]: how photographs move shows only in rows .* add \[unknowns\.shutters\.CAMERA\]",
+            r"\[unknowns\.motions\]: motion during .* only; add \[unknowns\.shutters\.CAMERA\]",
         ),
         (
             [section("[unknowns.refractivity.default]")],
-            r"\[unknowns\.refractivity\]: these belong to a part of the images called hour; add the column hour",
+            r"\[unknowns\.refractivity\]: their owner is a part of the images called hour; add the column hour",
         ),
         ([TOP], r"images\.csv, row 1: the column hour is missing"),
         ([("block.toml", 'title = "small"', 'partitions = ["strip"]')], r"partitions: strip has a meaning already"),
-        ([("block.toml", 'title = "small"', 'partitions = "hour"')], r"partitions: 'hour' is not a list of text"),
+        ([("block.toml", 'title = "small"', 'partitions = "hour"')], r"partitions: 'hour' is not a list"),
         (
             [*HOURS[:3], ("images.csv", "c,kodak", "default,c,kodak"), TOP],
             r"images\.csv, row 4: the hour default means every hour in \[unknowns\]",

@@ -10,7 +10,7 @@ import pytest
 from jaxphoto import adjust, covariance, read_block, write_block
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import read_camera_file
+from jaxphoto.io.camera_files import read_camera_file
 from jaxphoto.io.toml import read_toml
 from jaxphoto.simulation import remeasure
 from tests.blocks import FIVE, measured, simulated
@@ -40,10 +40,10 @@ def results(years):
     patch = pytest.MonkeyPatch()
     with patch.context() as m:
         m.setattr("sys.argv", ["jaxphoto", "adjust", str(years / "last"), "--out", str(years / "results")])
-        from jaxphoto import cli
+        import jaxphoto_command
 
         with pytest.raises(SystemExit) as stop:
-            cli.main()
+            jaxphoto_command.main()
     assert not stop.value.code
     return years / "results"
 
@@ -102,7 +102,7 @@ def test_a_camera_file_keeps_the_covariance(years, results, monkeypatch, capsys)
         ('calibration = "../nothing"', "there is no file"),
         (
             'calibration = "../results"\nwidth_px = 3',
-            "width_px: the calibration says it; only residuals, unknowns",
+            "width_px: the calibration gives it; only residuals, unknowns",
         ),
         ('calibration = "../results"\n[cameras.one.unknowns]\nc_mm = "fixed"', "it is known beforehand by"),
     ],

@@ -35,11 +35,9 @@ from jaxphoto.camera import (
 )
 from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.errors import InputError
-from jaxphoto.io import EXPORTS, AdjustedPhotographs, export
-from jaxphoto.io.cameras import read_camera_file
-from jaxphoto.io.exports import ExportCamera
+from jaxphoto.extras.formats import EXPORTS, Project, ProjectCamera, export
+from jaxphoto.io.camera_files import read_camera_file
 from jaxphoto.writing import MARKER
-from tests.commands import run
 from tests.formulas import camera_from_object
 
 EPSG = 32633
@@ -85,8 +83,8 @@ def photographs(camera, kind="epsg"):
     frame = Frame("epsg", EPSG, None, "true", ORIGIN) if kind == "epsg" else Frame("local")
     exterior = ExteriorOrientation(positions, rotations)
     ids = tuple(re.sub(r"\.\w+$", "", name) for name in NAMES)
-    return AdjustedPhotographs(
-        "four", {"one": ExportCamera(SENSOR, interior)}, ids, NAMES, ("one",) * 4, exterior,
+    return Project(
+        "four", {"one": ProjectCamera(SENSOR, interior)}, ids, NAMES, ("one",) * 4, exterior,
         tuple(f"p{k}" for k in range(40)), xyz, image, point, SENSOR.px_from_mm(np.asarray(xy)), frame,
     )  # fmt: skip
 
@@ -348,7 +346,7 @@ def test_a_camera_that_is_fitted_misses_by_no_more_than_is_said(tmp_path):
         ExteriorOrientation(*(a[p.image] for a in (p.exterior.position, p.exterior.camera_from_object))),
         p.xyz[p.point],
     )
-    p = p._replace(cameras={"one": ExportCamera(SENSOR, brown)}, column_row=SENSOR.px_from_mm(np.asarray(xy)))
+    p = p._replace(cameras={"one": ProjectCamera(SENSOR, brown)}, column_row=SENSOR.px_from_mm(np.asarray(xy)))
     said = export(p, tmp_path / "out", "metashape").cameras["one"]
     inside = ((p.column_row > 0) & (p.column_row < [SENSOR.width_px, SENSOR.height_px])).all(axis=1)
     apart = np.linalg.norm(np.concatenate(by_metashape(tmp_path / "out", p)) - p.column_row, axis=1)[inside]
@@ -381,7 +379,7 @@ def test_every_format_holds_a_camera_says_what_it_loses_or_names_formats_that_ha
         "fisheye": InteriorOrientation(3.0, 0.031, -0.022, projection=Equisolid()),
     }
     for name, interior in lenses.items():
-        given = p._replace(cameras={"one": ExportCamera(SENSOR, interior)})
+        given = p._replace(cameras={"one": ProjectCamera(SENSOR, interior)})
         if name == "fisheye" and known.plane and not known.fisheye:
             with pytest.raises(InputError, match=r"fisheye; write one of colmap, .*metashape, .*orthority"):
                 export(given, tmp_path / name, format)
@@ -446,7 +444,7 @@ def test_the_table_of_angles_has_the_camera_as_it_was_adjusted(tmp_path):
 
 def test_several_cameras(tmp_path):
     p = photographs("opencv")
-    other = ExportCamera(Sensor(2000, 1500, 0.0048), InteriorOrientation(9.9, 0.0, 0.0, OpenCv(k1=0.1)))
+    other = ProjectCamera(Sensor(2000, 1500, 0.0048), InteriorOrientation(9.9, 0.0, 0.0, OpenCv(k1=0.1)))
     two = p._replace(cameras={**p.cameras, "two": other}, image_camera=("one", "two", "one", "two"))
     export(two, tmp_path / "nerf", "nerfstudio")
     frames = json.loads((tmp_path / "nerf" / "transforms.json").read_text())["frames"]
@@ -457,7 +455,7 @@ def test_several_cameras(tmp_path):
     export(two, tmp_path / "bex", "blocksexchange")
     groups = ElementTree.parse(tmp_path / "bex" / "blocks_exchange.xml").getroot().iter("Photogroup")
     assert [[photo.findtext("Id") for photo in g.findall("Photo")] for g in groups] == [["0", "2"], ["1", "3"]]
-    mixed = two._replace(cameras=two.cameras | {"two": ExportCamera(SENSOR, CAMERAS["fisheye"])})
+    mixed = two._replace(cameras=two.cameras | {"two": ProjectCamera(SENSOR, CAMERAS["fisheye"])})
     with pytest.raises(InputError, match="fisheyes beside others"):
         export(mixed, tmp_path / "mixed", "nerfstudio")
     assert not (tmp_path / "mixed").exists()
@@ -469,7 +467,7 @@ def test_numbers_of_numpy_are_written_as_numbers(tmp_path):
     sensor = dataclasses.replace(SENSOR, pixel_mm=np.float64(SENSOR.pixel_mm))
     p = p._replace(
         frame=dataclasses.replace(p.frame, origin=(longitude, latitude, height)),
-        cameras={"one": ExportCamera(sensor, CAMERAS["brown"])},
+        cameras={"one": ProjectCamera(sensor, CAMERAS["brown"])},
     )
     for format in ("blocksexchange", "opensfm", "metashape", "orthority", "opk", "nerfstudio", "colmap", "geojson"):
         export(p, tmp_path / format, format)
@@ -560,10 +558,6 @@ def test_features_lie_where_the_map_says(tmp_path):
         export(photographs("opencv", "local"), tmp_path / "local", "geojson")
 
 
-def test_the_page_and_the_help_name_every_format(monkeypatch, capsys):
+def test_the_page_names_every_format():
     page = (Path(__file__).parents[2] / "docs" / "exports.md").read_text()
     assert re.findall(r"^\| `([\w-]+)` \|", page.split("## Signs")[0], re.MULTILINE) == list(EXPORTS)
-    monkeypatch.setenv("COLUMNS", "250")
-    _, said, _ = run(monkeypatch, capsys, "convert", "--help")
-    words = re.sub(r"[\s│]+", " ", said)
-    assert all(f"{name}: {known.about}" in words for name, known in EXPORTS.items())

@@ -14,7 +14,7 @@ from jaxphoto.georeferencing.camera_attitude import CameraAttitude, level_from_b
 from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS, WEEK_S, Taken
 from jaxphoto.georeferencing.gps import FIX_SIGMA_M, Gps, moved
 from jaxphoto.georeferencing.map_frame import MapFrame
-from jaxphoto.io.exposures import located, read_exposures, read_marks, read_pos, read_table, with_exposures
+from jaxphoto.io.exposures import located, read_exposures, with_exposures
 from jaxphoto.io.photographs import Photograph, photographs
 from jaxphoto.io.trajectory import write_sbet
 from tests import sound_files
@@ -79,20 +79,20 @@ def same(gps, other, within_m=1e-3):
 
 
 def test_marks_are_read(tmp_path):
-    found = read_marks(written(tmp_path / "a.MRK", FLIGHT.mark(3, number=7)))
+    found = read_exposures(written(tmp_path / "a.MRK", FLIGHT.mark(3, number=7)))
     assert found.sequence.tolist() == [7] and found.time_s[0] == pytest.approx(FLIGHT.time[3], abs=1e-5)
     gps = found.gps(0)
     assert same(gps, FLIGHT.camera[3]) and gps.sigma_m == (0.024, 0.012, 0.036)
     assert (gps.fix, gps.heights) == ("fixed", "ellipsoid")
     np.testing.assert_allclose(found.camera_from_antenna_m, [ARM], atol=1e-9)
-    nothing = read_marks(written(tmp_path / "a.MRK", FLIGHT.mark(3, flag=0)))
+    nothing = read_exposures(written(tmp_path / "a.MRK", FLIGHT.mark(3, flag=0)))
     assert nothing.gps(0) is None
-    with pytest.raises(InputError, match=r"row 2: '2.* is no line of time marks"):
-        read_marks(written(tmp_path / "b.MRK", FLIGHT.mark(0) + FLIGHT.mark(1)[:60]))
+    with pytest.raises(InputError, match=r"row 2: '2.* is not a time mark"):
+        read_exposures(written(tmp_path / "b.MRK", FLIGHT.mark(0) + FLIGHT.mark(1)[:60]))
 
 
 def test_marks_by_number_with_fewer_and_more_lines_than_photographs(tmp_path):
-    file = read_marks(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k) for k in (0, 1, 3, 4, 5, 6, 7, 8, 9))))
+    file = read_exposures(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k) for k in (0, 1, 3, 4, 5, 6, 7, 8, 9))))
     taken, said = with_exposures([FLIGHT.photograph(k) for k in ALL if k not in (5, 9)], [file])
     assert [same(p.gps, FLIGHT.camera[int(p.name[4:]) - 1]) for p in taken] == [k != 2 for k in range(8)]
     assert taken[2].gps.altitude_m == 57.0
@@ -105,10 +105,10 @@ def test_marks_by_number_with_fewer_and_more_lines_than_photographs(tmp_path):
 
 @pytest.mark.parametrize(("shift_s", "words"), [(-8 * 3600.0, "+8 h (time zone)"), (-18.0, "+18 s (leap seconds")])
 def test_marks_in_a_wrong_time_zone_or_in_utc_are_found_and_said(tmp_path, shift_s, words):
-    file = read_marks(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k, k + 31, shift_s) for k in ALL)))
+    file = read_exposures(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k, k + 31, shift_s) for k in ALL)))
     taken, said = with_exposures([FLIGHT.photograph(k, told=True, name=f"IMG{k}") for k in ALL], [file])
     assert all(same(p.gps, c) for p, c in zip(taken, FLIGHT.camera, strict=True))
-    assert "by time" in said[0] and words in said[0] and "which is taken off" in said[0]
+    assert "by time" in said[0] and words in said[0] and "which is corrected" in said[0]
 
 
 @pytest.mark.parametrize("lost", [0, 2])
@@ -117,7 +117,7 @@ def test_marks_numbered_anew_after_a_loss_are_joined_by_the_positions(tmp_path, 
     steady = Flight()
     steady.time = BEGIN_S + 3.0 * np.arange(10)
     left = [k for k in ALL if k != lost]
-    file = read_marks(written(tmp_path / "a.MRK", "".join(steady.mark(k, n + 1) for n, k in enumerate(left))))
+    file = read_exposures(written(tmp_path / "a.MRK", "".join(steady.mark(k, n + 1) for n, k in enumerate(left))))
     receiver = [moved(g, np.array([0.8, -0.6, 0.0])) for g in steady.camera]
     own = [steady.photograph(k, gps=receiver[k]) for k in ALL]
     taken, said = with_exposures(own, [file])
@@ -128,9 +128,9 @@ def test_marks_numbered_anew_after_a_loss_are_joined_by_the_positions(tmp_path, 
     if lost:
         assert all(same(taken[k].gps, steady.camera[k]) for k in left)
     else:
-        assert taken == blind and "no position tells which; not used" in said[0]
+        assert taken == blind and "no position decides; not used" in said[0]
         # Numbers that begin with 2 were kept.
-        kept = read_marks(written(tmp_path / "b.MRK", "".join(steady.mark(k) for k in left)))
+        kept = read_exposures(written(tmp_path / "b.MRK", "".join(steady.mark(k) for k in left)))
         taken, said = with_exposures(blind, [kept])
         assert all(same(taken[k].gps, steady.camera[k]) for k in left) and "by number" in said[0]
 
@@ -142,28 +142,28 @@ def test_marks_of_two_flights_that_both_count_from_one(tmp_path):
     both.camera[10:] = [moved(g, np.array([15.0, 3.0, 0.0])) for g in both.camera[:10]]
     for name, first in (("a", 0), ("b", 10)):
         written(tmp_path / f"{name}.MRK", "".join(both.mark(first + k, k + 1) for k in ALL))
-    files = [read_marks(tmp_path / f"{name}.MRK") for name in "ab"]
+    files = [read_exposures(tmp_path / f"{name}.MRK") for name in "ab"]
     own = [both.photograph(k, gps=moved(both.camera[k], np.array([0.8, -0.6, 0.0]))) for k in range(20)]
     taken, said = with_exposures(own, files)
     assert all(same(p.gps, c) for p, c in zip(taken, both.camera, strict=True)), said
     blind = [p._replace(gps=None) for p in own]
     taken, said = with_exposures(blind, files)
-    assert taken == blind and all("no position tells which" in s for s in said)
+    assert taken == blind and all("no position decides" in s for s in said)
 
 
 def test_marks_of_another_day_need_positions_that_prove_the_clock(tmp_path):
-    file = read_marks(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k, shift_s=-3 * 86400) for k in ALL)))
+    file = read_exposures(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k, shift_s=-3 * 86400) for k in ALL)))
     own = [FLIGHT.photograph(k) for k in ALL]
     for unproven in ([p._replace(gps=None) for p in own], [p._replace(gps=moved(p.gps, ARM * 200)) for p in own]):
         taken, said = with_exposures(unproven, [file])
         assert taken == unproven and "its times are 3.1 days before those of the photographs" in said[0]
     taken, said = with_exposures(own, [file])
     assert all(same(p.gps, c) for p, c in zip(taken, FLIGHT.camera, strict=True))
-    assert "+3.08 days, which no time zone explains" in said[0] and "leave the file out" in said[0]
+    assert "+3.08 days, which no time zone explains" in said[0] and "omit the file" in said[0]
 
 
 def test_marks_of_another_flight_are_not_used(tmp_path):
-    file = read_marks(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k) for k in ALL)))
+    file = read_exposures(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k) for k in ALL)))
     away = [FLIGHT.photograph(k, gps=moved(FLIGHT.camera[k], np.array([900.0, 0, 0]))) for k in ALL]
     taken, said = with_exposures(away, [file])
     assert taken == away and "as of another flight; not used" in said[0]
@@ -172,10 +172,10 @@ def test_marks_of_another_flight_are_not_used(tmp_path):
 
 
 def test_events_of_the_antenna_are_brought_to_the_camera_by_the_arms_of_the_marks(tmp_path):
-    marks = read_marks(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k, sigma=1.1, flag=16) for k in ALL)))
+    marks = read_exposures(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k, sigma=1.1, flag=16) for k in ALL)))
     # One event is missing, and one is surplus.
     lines = "".join(pos_line(FLIGHT.time[k], FLIGHT.antenna(k), 2 if k == 1 else 1) for k in ALL if k != 4)
-    events = read_pos(written(tmp_path / "a_events.pos", HEAD + pos_line(BEGIN_S - 30, ORIGIN) + lines))
+    events = read_exposures(written(tmp_path / "a_events.pos", HEAD + pos_line(BEGIN_S - 30, ORIGIN) + lines))
     taken, said = with_exposures([FLIGHT.photograph(k) for k in ALL], [events, marks])
     assert all(same(p.gps, c, 2e-3) for p, c in zip(taken, FLIGHT.camera, strict=True))
     assert [p.gps.fix for p in taken] == ["fixed", "float", *["fixed"] * 2, "single", *["fixed"] * 5]
@@ -186,7 +186,7 @@ def test_events_of_the_antenna_are_brought_to_the_camera_by_the_arms_of_the_mark
 
 @pytest.mark.parametrize("clock", ["GPST", "UTC", "JST", "week"])
 def test_a_trajectory_is_interpolated_at_the_marks(tmp_path, clock):
-    marks = read_marks(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k) for k in ALL)))
+    marks = read_exposures(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k) for k in ALL)))
     at = np.arange(FLIGHT.time[0] - 2, FLIGHT.time[-2] + 0.5, 0.2)
     behind = {"UTC": LEAP_SECONDS, "JST": LEAP_SECONDS - 32400}.get(clock, 0.0)
     middle = np.array([g[:3] for g in (FLIGHT.antenna(k) for k in ALL)])
@@ -197,7 +197,7 @@ def test_a_trajectory_is_interpolated_at_the_marks(tmp_path, clock):
         lines = [f"{t // WEEK_S:.0f} {t % WEEK_S:.3f} {part}" for t, part in zip(at, rest, strict=True)]
     gap = (at > FLIGHT.time[3] - 0.5) & (at < FLIGHT.time[3] + 0.5)
     text = HEAD.replace("GPST", clock if clock != "week" else "GPST") + "".join(np.array(lines)[~gap])
-    track = read_pos(written(tmp_path / "a.pos", text))
+    track = read_exposures(written(tmp_path / "a.pos", text))
     taken, said = with_exposures([FLIGHT.photograph(k) for k in ALL], [track, marks])
     # Straight between exposures: the spline rounds the corners by centimetres.
     assert all(same(p.gps, c, 0.25) for p, c in zip(taken, FLIGHT.camera, strict=True))
@@ -207,7 +207,7 @@ def test_a_trajectory_is_interpolated_at_the_marks(tmp_path, clock):
 
 def test_a_trajectory_without_exact_times_is_not_used(tmp_path):
     lines = "".join(pos_line(BEGIN_S + 0.2 * k, ORIGIN) for k in range(100))
-    file = read_pos(written(tmp_path / "a.pos", HEAD + lines))
+    file = read_exposures(written(tmp_path / "a.pos", HEAD + lines))
     assert (
         "needs the time of every exposure to the millisecond"
         in with_exposures([FLIGHT.photograph(k) for k in ALL], [file]).sentences[0]
@@ -221,7 +221,7 @@ def test_a_lever_arm_that_is_given_turns_with_the_aircraft(tmp_path):
     yaw = 70.0
     turn = level_from_belly(yaw, 3.0, -2.0)
     lines = "".join(pos_line(FLIGHT.time[k], moved(FLIGHT.camera[k], turn @ np.array(arm))) for k in ALL)
-    events = read_pos(written(tmp_path / "a.pos", HEAD + lines))
+    events = read_exposures(written(tmp_path / "a.pos", HEAD + lines))
     flown = [FLIGHT.photograph(k, told=True, aircraft_deg=(-2.0, 3.0, yaw)) for k in ALL]
     taken, said = with_exposures(flown, [events], arm)
     assert all(same(p.gps, c) for p, c in zip(taken, FLIGHT.camera, strict=True)) and "10 is as given" in said[0]
@@ -261,13 +261,13 @@ def test_an_sbet_gives_positions_and_attitudes(tmp_path):
 
 
 def test_a_lever_arm_that_turns_nothing_is_said(tmp_path):
-    file = read_marks(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k) for k in ALL)))
+    file = read_exposures(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k) for k in ALL)))
     photographs = [FLIGHT.photograph(k) for k in ALL]
     arm = (0.0, 0.1, 0.2)
     said = with_exposures(photographs, [file], arm).sentences
     assert "the lever arm is not used: positions of time marks and tables are those of the camera" in said
     lines = "".join(pos_line(FLIGHT.time[k], FLIGHT.antenna(k)) for k in ALL)
-    events = read_pos(written(tmp_path / "e.pos", HEAD + lines))
+    events = read_exposures(written(tmp_path / "e.pos", HEAD + lines))
     said = with_exposures(photographs, [file, events], arm).sentences
     assert "lever arms of 10 are those of the time marks, not the one given" in said[1]
 
@@ -281,10 +281,10 @@ def test_a_table_by_name(tmp_path):
     file = written(
         tmp_path / "t.csv", TABLE + f"DJI_0003.JPG,{row},0,0,-40,0.02,0.03,0.05,fixed\nother,{row},,,1,,,,\n"
     )
-    with pytest.raises(InputError, match="omega_deg is empty"):
-        read_table(file)
+    with pytest.raises(InputError, match="row 3: omega is empty"):
+        read_exposures(file)
     file = written(tmp_path / "t.csv", file.read_text().replace(",,,1,,,,\n", ",,,,,,,\n"))
-    found = read_table(file, heights="geoid")
+    found = read_exposures(file, heights="geoid")
     taken, said = with_exposures([FLIGHT.photograph(k) for k in ALL], [found])
     assert taken[2].gps == gps._replace(sigma_m=(0.02, 0.03, 0.05), heights="geoid", fix="fixed")
     # kappa turns the camera to the left, yaw to the right.
@@ -303,7 +303,7 @@ def test_a_table_far_from_the_photographs_is_not_used(tmp_path, exchanged, east_
     head = "image,longitude_deg,latitude_deg,height_m,roll_deg,pitch_deg,yaw_deg\n"
     (tmp_path / "exposures.csv").write_text(head + text)
     photographs = [FLIGHT.photograph(k) for k in ALL]
-    taken, said = with_exposures(photographs, [read_table(tmp_path / "exposures.csv")])
+    taken, said = with_exposures(photographs, [read_exposures(tmp_path / "exposures.csv")])
     assert taken == photographs and words in said[0]
 
 
@@ -312,8 +312,8 @@ def test_a_table_on_the_map_counts_yaw_from_grid_north(tmp_path):
     at = MapFrame(3006, None, (16.5, 57.0, 0.0)).map(np.array([[0.0, 0.0, 80.0]]))[0]
     file = written(tmp_path / "t.csv", "image,X_m,Y_m,Z_m,roll_deg,pitch_deg,yaw_deg\na,{},{},{},0,0,10\n".format(*at))
     with pytest.raises(InputError, match="give the EPSG code"):
-        read_table(file)
-    found = read_table(file, 3006)
+        read_exposures(file)
+    found = read_exposures(file, 3006)
     np.testing.assert_allclose(found.place, place, atol=1e-7)
     # East of the central meridian (15 degrees) grid north lies east of true north by about dL sin(B).
     level = found.attitude[0].level_from_camera
@@ -380,7 +380,7 @@ OTHERS = {
 @pytest.mark.parametrize("form", OTHERS)
 def test_tables_of_other_programs(tmp_path, form):
     text, turned, stated = OTHERS[form]
-    found = read_table(written(tmp_path / "a.txt", text))
+    found = read_exposures(written(tmp_path / "a.txt", text))
     taken, said = with_exposures([FLIGHT.photograph(k) for k in ALL], [found])
     assert "positions of 6 of 10 photographs" in said[0]
     assert all(same(taken[k].gps, FLIGHT.camera[k]) for k in range(6))
@@ -400,45 +400,49 @@ def test_tables_of_other_programs(tmp_path, form):
         ("the 'x' by", "the 'y' by", "its angles turn about y first"),
         ("ID, # EVENT, TIME", "TIME, DISTANCE, TIME", "its columns are not those of photographs"),
         ("EASTING, NORTHING", "E, N", "its head names no columns"),
-        ("DJI_0002.JPG 7 1234.5", "DJI_0002.JPG 7", "row 18: 10 cells, and the header has 11"),
     ],
 )
 def test_a_text_of_pospac_that_is_not_what_it_says_is_refused(tmp_path, old, new, words):
     text = OTHERS["pospac"][0]
     assert old in text
     with pytest.raises(InputError, match=words):
-        read_table(written(tmp_path / "eo.txt", text.replace(old, new)))
+        read_exposures(written(tmp_path / "eo.txt", text.replace(old, new)))
+
+
+def test_a_row_of_pospac_that_is_too_short_is_left_out(tmp_path):
+    text = OTHERS["pospac"][0].replace("DJI_0002.JPG 7 1234.5", "DJI_0002.JPG 7")
+    assert "row 18: 10 cells, and the header has 11" in read_exposures(written(tmp_path / "eo.txt", text)).why
 
 
 def test_tables_that_nobody_can_know_are_refused(tmp_path):
     for text, words in (
         (table_of("imageName,X,Y,Z", "{0},{4},{5},{3}"), "are map coordinates; give the EPSG code"),
-        (table_of("#imagename,coordinate1,coordinate2,z", "{0},{1},{2},{3}"), "the column image is missing"),
+        (table_of("#imagename,coordinate1,coordinate2,z", "{0},{1},{2},{3}"), "add a header"),
         (table_of("imagename,latitude,longitude", "{0},{2},{1}"), "its header names no heights"),
         (table_of("label,lon,lat,z,omega [gon],phi,kappa", "{0},{1},{2},{3},0,0,0"), "its angles are in gon"),
-        (table_of("EPSG:4326", "{0},{1}", " "), r"row 2: after the name stand x, y, z"),
-        (table_of("EPSG:4326", "{0},{1},{2}", " "), "row 2: Z_m is empty"),
+        (table_of("EPSG:4326", "{0},{1}", " "), "row 2: y is empty"),
+        (table_of("EPSG:4326", "{0},{1},{2}", " "), "row 2: z is empty"),
     ):
         with pytest.raises(InputError, match=words):
-            read_table(written(tmp_path / "a.txt", text))
+            read_exposures(written(tmp_path / "a.txt", text))
 
 
 def test_rows_that_are_switched_off_are_left_out(tmp_path):
     wkt = CRS.from_epsg(ZONE).to_wkt("WKT1_GDAL").replace("\n", "")
     text = table_of(f"#CoordinateSystem: {wkt}\n#Label,Enable,X/Easting,Y/Northing,Z/Altitude", "{0},1,{4},{5},{3}")
-    found = read_table(written(tmp_path / "a.txt", text.replace("0002.JPG,1", "0002.JPG,0")))
+    found = read_exposures(written(tmp_path / "a.txt", text.replace("0002.JPG,1", "0002.JPG,0")))
     assert found.names == ("DJI_0001", "DJI_0003", "DJI_0004", "DJI_0005", "DJI_0006")
     assert same(found.gps(1), FLIGHT.camera[2])
 
 
 def test_a_table_on_a_national_datum_is_brought_to_that_of_receivers(tmp_path):
     file = written(tmp_path / "t.csv", "image,X_m,Y_m,Z_m\na,527000.25,352000.75,400.5\n")
-    found = read_table(file, 31287, "ellipsoid")
+    found = read_exposures(file, 31287, "ellipsoid")
     space = pyproj.Transformer.from_crs(pyproj.CRS(31287).to_3d(), 4979, always_xy=True)
     np.testing.assert_allclose(
         (found.place[0] - space.transform(527000.25, 352000.75, 400.5)) * [1e5, 1e5, 1], 0, atol=1e-4
     )
-    assert read_table(file, 31287).place[0, 2] == 400.5
+    assert read_exposures(file, 31287).place[0, 2] == 400.5
 
 
 def test_a_folder_of_pictures_and_all_that_lies_in_it(tmp_path):
@@ -541,7 +545,7 @@ def test_what_is_wrong_with_a_whole_table_is_not_said_of_a_row(tmp_path):
     found = read_exposures(
         written(tmp_path / "a.csv", at_row(TABLE_ROWS, 5, lambda line: line.replace("0004", "0001")))
     )
-    assert found.without == (2, 5) and "stands there twice" in found.why and len(found.rows) == 8
+    assert found.without == (2, 5) and "it is there twice" in found.why and len(found.rows) == 8
 
 
 def test_numbers_are_not_trusted_where_a_row_that_was_lost_may_have_hidden_that_they_began_anew(tmp_path):

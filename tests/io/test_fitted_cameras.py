@@ -6,8 +6,8 @@ import pytest
 
 from jaxphoto.camera import Brown, InteriorOrientation, OpenCv, Sensor, get_parameter
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import CAMERA_MODELS, read_camera_file, write_camera_file
-from jaxphoto.io.cameras.camera_writer import _FORMATS
+from jaxphoto.extras.formats import CAMERA_FORMATS, CAMERA_MODELS, write_camera_file
+from jaxphoto.io.camera_files import read_camera_file
 from tests.commands import run
 
 SENSOR = Sensor(1280, 960, 0.01)
@@ -15,7 +15,7 @@ RATIONAL = InteriorOrientation(
     11.0, 0.02, -0.03, OpenCv(k1=-0.1, k2=0.03, k3=-0.01, k4=0.2, k5=0.02, p1=1e-3, p2=-2e-3)
 )
 NAMES = {"opencv": "a.yml", "colmap": "cameras.txt", "mrcal": "a.cameramodel", "ros": "ros.yaml"}
-EVERY = [(kind, name) for kind, known in _FORMATS.items() for name in known.models]
+EVERY = [(kind, name) for kind, known in CAMERA_FORMATS.items() for name in known.models]
 
 
 def of_opencv(path):
@@ -51,7 +51,7 @@ def test_opencv_with_five_coefficients_misses_by_what_the_file_says(tmp_path):
 def test_a_model_has_no_more_terms_than_are_its_own(tmp_path, kind, model):
     path = tmp_path / NAMES[kind]
     done = write_camera_file(path, SENSOR, RATIONAL, kind, model=model, loss_px=1e3)
-    part = _FORMATS[kind].models[model]
+    part = CAMERA_FORMATS[kind].models[model]
     back = read_camera_file(path, pixel_mm=SENSOR.pixel_mm).interior
     assert type(back.distortion) is part.distortion and type(back.projection) is type(part.projection)
     assert all(float(get_parameter(back, name)) == 0 for name in part.lacks)

@@ -11,7 +11,7 @@ from pyproj import Transformer
 from jaxphoto.block import Frame
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import read_block, write_block
-from jaxphoto.io.block_folder.frame_sections import frame_section
+from jaxphoto.io.block_folder.settings import frame_section
 from jaxphoto.io.trajectory import FIELDS, Records, write_flight_csv, write_sbet
 from jaxphoto.io.trajectory.in_frame import trajectory_in, with_poses
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw, roll_pitch_yaw_from_matrix

@@ -42,7 +42,7 @@ def test_integrated_is_the_default(write_folder):
 
 
 def test_what_a_mode_cannot_be(write_folder):
-    with pytest.raises(InputError, match=r"\[georeferencing\] mode: 'pure' is no mode; write direct, integrated"):
+    with pytest.raises(InputError, match=r"\[georeferencing\] mode: 'pure' is unknown; write .direct., .integrated."):
         read_block(write_folder(mode("pure")))
 
 

@@ -13,13 +13,10 @@ from hypothesis import strategies as st
 from jaxphoto.camera import Brown, InteriorOrientation, Sensor, get_parameter, parameter_names
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
-from jaxphoto.io import FORMATS, export, read_source
+from jaxphoto.extras.formats import ProjectCamera, export, read_source, read_tables
+from jaxphoto.extras.formats.points_beside import joined, named, points_of
+from jaxphoto.extras.formats.texts import is_exterior, read_exterior
 from jaxphoto.io.block_folder.table_layout import XYZ
-from jaxphoto.io.exports.map_photographs import in_map
-from jaxphoto.io.reconstructions.exterior_text import is_exterior, read_exterior
-from jaxphoto.io.reconstructions.metashape import read_metashape
-from jaxphoto.io.reconstructions.points_beside import PhotographCamera, joined, named, points_of
-from jaxphoto.io.reconstructions.text_project import read_text_project
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
 from tests.formulas import camera_from_object
 from tests.io.oriented_files import (
@@ -78,8 +75,8 @@ def test_positions_and_rotations_of_metashape_come_back(tmp_path_factory, kind, 
     rows = "".join(f"{k} {k}.5 {k}.25\n" for k in range(3))
     (folder / "image_points.csv").unlink()
     (folder / "ties.txt").write_text("".join(f"{name} camera\n{rows}-99\n" for name in p.images))
-    table = read_metashape(folder).tables["images"]
-    wanted = in_map(p).exterior
+    table = read_tables(folder, "metashape").tables["images"]
+    wanted = p.in_map().exterior
     order = [p.images.index(name) for name in table.text("image")]
     position = np.stack([table.numbers(name) for name in XYZ], axis=1)
     # A northing of a map has nine digits before those of a nanometre.
@@ -110,7 +107,7 @@ def test_a_camera_of_metashape_itself_is_where_its_receiver_was_and_looks_down(t
     (tmp_path / "cameras.xml").write_text(twice)
     rows = "1 0.5 0.5\n2 -0.5 0.5\n3 0.5 -0.5\n-99\n"
     (tmp_path / "ties.dat").write_text(f"one c\n{rows}two c\n{rows}")
-    images = read_metashape(tmp_path).tables["images"]
+    images = read_tables(tmp_path, "metashape").tables["images"]
     at = [images.numbers(name)[0] for name in ("longitude_deg", "latitude_deg", "height_m")]
     assert np.abs((at - np.array([-120.417985477, 39.41191747, 2420.109])) / [1e-4, 1e-4, 10]).max() < 1
     # Yaw was 179.9 degrees: the camera's x axis points west.
@@ -190,7 +187,7 @@ def test_poses_come_back(tmp_path_factory, format, poses):
     rows = "".join(f"{k} {k}.5 {k}.25\n" for k in range(3))
     (folder / "image_points.csv").unlink()
     (folder / "ties.txt").write_text("".join(f"{name} camera\n{rows}-99\n" for name in p.images))
-    tables = FORMATS[format].read(folder)
+    tables = read_tables(folder, format)
     table, (camera,) = tables.tables["images"], tables.settings["cameras"].values()
     order = [p.images.index(name) for name in table.text("image")]
     position = np.stack([table.numbers(name) for name in XYZ], axis=1)
@@ -215,7 +212,7 @@ def test_positions_and_angles_come_back(tmp_path_factory, poses):
     (folder / "image_points.csv").unlink()
     rows = "".join(f"{k} {k}.5 {k}.25\n" for k in range(3))
     (folder / "ties.txt").write_text("".join(f"{name} camera\n{rows}-99\n" for name in p.images))
-    table = read_text_project(folder).tables["images"]
+    table = read_tables(folder, "texts").tables["images"]
     order = [p.images.index(name) for name in table.text("image")]
     position = np.stack([table.numbers(name) for name in XYZ], axis=1)
     np.testing.assert_allclose(position, values[order, :3], rtol=0, atol=1e-9)
@@ -228,7 +225,7 @@ def test_positions_and_angles_come_back(tmp_path_factory, poses):
 def test_markers_of_metashape_are_control_and_tie_photographs(tmp_path):
     p = inside()
     names = [p.points[k] for k in np.argsort(-np.bincount(p.point, minlength=40))[:8]]
-    at = in_map(p).xyz[[p.points.index(name) for name in names]]
+    at = p.in_map().xyz[[p.points.index(name) for name in names]]
     more = markers(p, names, at)
     write_metashape(tmp_path / "in", change=lambda text: text.replace("</chunk>", more + "</chunk>"), ties=False)
     block = read_source(tmp_path / "in")
@@ -292,7 +289,7 @@ REFUSED = {
         lambda f: _with_markers(_metashape(_without("<transform>-?[0-9].*?</transform>"))(f)), "cameras.xml: no camera",
     ),
     "no size": (_nerf(lambda t: {k: v for k, v in t.items() if k not in "wh"}), "does not say how large its"),
-    "cut": (_metashape(lambda text: text[:-30]), "cameras.xml: the XML is broken"),
+    "cut": (_metashape(lambda text: text[:-30]), "cameras.xml: damaged"),
     "no sensor": (_metashape(_without("<calibration.*</calibration>")), "'a b': its sensor is not calibrated"),
     "matrix": (_metashape(lambda text: text.replace(" 1.0</tr", " x</tr")), "'a b', transform: .* 16 fi"),
     "scale": (_metashape(lambda text: text.replace(">1.0</scale>", ">-1</scale>")), "a scale of -1 cannot be"),
@@ -304,7 +301,7 @@ REFUSED = {
     "angle": (_angles(lambda text: text + "x.jpg 1 2 3 4 5 1e99\n" * 2), "row 8: '1 2 3 4 5 1e99' is not 6 numbers"),
     "system": (_angles(lambda text: text.replace("EPSG:32633", "EPSG:99999")), "EPSG code 99999 is unknown"),
     "no camera": (lambda folder: without(write_angles(folder), "camera.toml"), "0 camera files and needs one"),
-    "no points": (lambda folder: without(write_angles(folder), "ties.dat") / "exterior.txt", "has no image points for"),
+    "no points": (lambda folder: without(write_angles(folder), "ties.dat") / "exterior.txt", "has no image points"),
     "point": (lambda folder: appended(write_angles(folder), "a b c\n7 1\n"), "row [0-9]+: '7 1' is not point"),
     "xy": (lambda folder: appended(write_angles(folder), "a b c\n7 1 x\n"), "'1 x' is not 2 numbers"),
     "matrix end": (_patb(lambda text: text.rsplit("\n", 2)[0]), "patb.ori, row 10: .* first of three rows"),
@@ -313,11 +310,11 @@ REFUSED = {
         r"itera.dat, row \d+: .* is not ORIA, name, X, Y, Z, phi, omega, kappa",
     ),
     "matrix row": (_patb(lambda text: text.rstrip() + "x\n"), "patb.ori, row 12: .* is not 4 numbers"),
-    "frames": (_nerf(lambda t: {**t, "frames": 5}), "has no list of frames; give transforms.json"),
+    "frames": (_nerf(lambda t: {**t, "frames": 5}), "transforms.json: damaged"),
     "model": (_nerf(lambda t: {**t, "camera_model": "EQUIRECTANGULAR"}), "'EQUIRECTANGULAR' is not known here"),
     "focal": (_nerf(lambda t: {**t, "fl_x": 0}), "fl_x: 0 is not positive"),
     "pose": (_nerf(lambda t: {**t, "frames": [{**f, "transform_matrix": [1]} for f in t["frames"]]}), "is not 4 x"),
-    "no table": (lambda f: without(write_nerfstudio(f), "image_points.csv"), "json has no image points, and none are"),
+    "no table": (lambda f: without(write_nerfstudio(f), "image_points.csv"), "json has no image points"),
     "pixel": (
         lambda f: appended(write_nerfstudio(f), "f,p1,x,2\n", "image_points.csv"), "points.csv, row [0-9]+: column_px",
     ),
@@ -327,7 +324,7 @@ REFUSED = {
     "interior": (
         lambda f: changed(write_orthority(f), "int_param.yaml", ": brown", ": other"), r"\[one\] type: 'other' is",
     ),
-    "yaml": (lambda f: changed(write_orthority(f), "int_param.yaml", "type: ", "type: {"), "no YAML that can be read"),
+    "yaml": (lambda f: changed(write_orthority(f), "int_param.yaml", "type: ", "type: {"), "damaged YAML"),
     "spherical": (_metashape(lambda text: text.replace('"frame"', '"spherical"')), "'spherical' is not known here"),
 }  # fmt: skip
 
@@ -384,7 +381,7 @@ def test_columns_of_orientations_are_those_that_their_header_names(tmp_path, hea
     ("head", "said"),
     [
         ("Name X Y Z Winkel Phi Kappa", "row 1: .* does not name X, Y, Z, Omega, Phi and Kappa once each; call the"),
-        ("Winkel in Grad", "degrees to some and gon to others; write degrees or gon"),
+        ("Winkel in Grad", "degrees to some and gon to others"),
     ],
 )
 def test_angles_that_may_be_others_are_refused(tmp_path, head, said):
@@ -411,7 +408,7 @@ def test_an_empty_line_ends_a_photograph_and_millimetres_are_told_by_their_signs
     text = tmp_path / "ties.txt"
     text.write_text("a.jpg\n1 -1.0 2.0\n2 3.0 1.0\n\nb.jpg\n1 4.0 2.0\n2 1.0 0.5\n\n")
     sensor = Sensor(1000, 800, 0.01)
-    camera = PhotographCamera(sensor, InteriorOrientation(20.0, 0.0, 0.0, Brown()))
+    camera = ProjectCamera(sensor, InteriorOrientation(20.0, 0.0, 0.0, Brown()))
     found = points_of(text, ["a.jpg", "b.jpg"], "ext.txt", [camera] * 2)
     np.testing.assert_allclose(found.column_row, [[400.0, 200.0], [800.0, 300.0], [900.0, 200.0], [600.0, 350.0]])
     text.write_text(text.read_text().replace("-", ""))

@@ -191,9 +191,9 @@ def test_what_is_still_to_be_turned_by_a_quarter_lies_as_the_sensor_saw_it(tmp_p
 
 def test_what_is_given_wrong(tmp_path):
     plain = photographs([write(tmp_path / "a.jpg")])
-    with pytest.raises(InputError, match="no photograph is given"):
+    with pytest.raises(InputError, match="no photographs"):
         sensor_and_interior([])
-    with pytest.raises(InputError, match=r"neither a pixel size nor EXIF that tells it .*; give pixel_mm as well"):
+    with pytest.raises(InputError, match=r"no pixel size .*; give pixel_mm as well"):
         sensor_and_interior(plain, c_mm=5.0)
     for wrong in ({"c_mm": -1.0}, {"pixel_mm": 0.0}, {"pixel_mm": float("nan")}):
         with pytest.raises(InputError, match="give a positive number of millimetres"):

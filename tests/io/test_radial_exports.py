@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxphoto.camera import BundlerRadial, Equisolid, InteriorOrientation, OpenCv
 from jaxphoto.errors import InputError
-from jaxphoto.io import FORMATS, export, read_block
-from jaxphoto.io.exports import ExportCamera
+from jaxphoto.extras.formats import ProjectCamera, export, read_tables
+from jaxphoto.io import read_block
 from tests.commands import run
 from tests.io.oriented_files import come_back, inside, posed, poses
 from tests.io.test_exports import SENSOR
@@ -94,7 +94,7 @@ def test_cameras_poses_points_and_image_points_come_back(tmp_path_factory, forma
     p = named(posed(values, InteriorOrientation(c, *at, BundlerRadial(k1, k2))))
     done = export(p, folder, format)
     assert done.cameras["one"].max_px == 0 and done.moved.max_px == 0
-    tables = FORMATS[format].read(folder)
+    tables = read_tables(folder, format)
     come_back(
         p, tables, [str(k) for k in range(4)] if format == "bal" else [name.replace(" ", "_") for name in p.images]
     )
@@ -113,7 +113,7 @@ def test_what_these_cameras_cannot_be(tmp_path):
     p = named(inside("brown", "local"))
     wide = InteriorOrientation(3.0, 0.0, 0.0, projection=Equisolid())
     with pytest.raises(InputError, match="cannot be written as bal, whose cameras are perspective, because it is a f"):
-        export(p._replace(cameras={"one": ExportCamera(SENSOR, wide)}), tmp_path / "out", "bal")
+        export(p._replace(cameras={"one": ProjectCamera(SENSOR, wide)}), tmp_path / "out", "bal")
     with pytest.raises(
         InputError, match=r"list.txt ends names at blanks, and 'a b.jpg' has one; rename the photograph"
     ):
@@ -121,7 +121,7 @@ def test_what_these_cameras_cannot_be(tmp_path):
     # Its rays turn back outside the format.
     far = p.column_row.copy()
     far[7] = (-9000.0, 0.0)
-    folds = {"one": ExportCamera(SENSOR, InteriorOrientation(8.8, 0.0, 0.0, OpenCv(-0.1, 0.0, -0.02, p1=1e-3)))}
+    folds = {"one": ProjectCamera(SENSOR, InteriorOrientation(8.8, 0.0, 0.0, OpenCv(-0.1, 0.0, -0.02, p1=1e-3)))}
     with pytest.raises(InputError, match=f"point {p.points[p.point[7]]} in image a b lies where the distortion of c"):
         export(p._replace(cameras=folds, column_row=far), tmp_path / "out", "bal")
     assert not (tmp_path / "out").exists()
@@ -131,9 +131,9 @@ def test_what_these_cameras_cannot_be(tmp_path):
 def test_the_command_writes_and_reads_again(tmp_path, monkeypatch, capsys, format):
     code, said, _ = run(monkeypatch, capsys, "convert", "examples/cross_block", tmp_path / "out", "--to", format)
     assert code == 0 and f"wrote {tmp_path / 'out'}" in said
-    assert ("image points count from the principal point\n" in said) == (format in OF)
+    assert ("image points are relative to the principal point\n" in said) == (format in OF)
     code, said, _ = run(monkeypatch, capsys, "convert", tmp_path / "out", tmp_path / "block")
-    assert code == 0 and ("a pixel is 0.001 mm, as is assumed" in said) == (format in OF)
+    assert code == 0 and ("pixel size 0.001 mm assumed" in said) == (format in OF)
     given, again = read_block("examples/cross_block"), read_block(tmp_path / "block")
     assert len(again.image_points.image) == len(given.image_points.image)
     if format == "metashape":

@@ -151,7 +151,7 @@ def test_rasters_that_are_no_surface_models(tmp_path):
             raster.read_dsm(path)
     with pytest.warns(NotGeoreferencedWarning), rasterio.open(path, "w", **kind) as file:
         file.write(np.ones((20, 30), "f4"), 1)
-    with pytest.raises(InputError, match="where its cells lie"):
+    with pytest.raises(InputError, match="no georeferencing"):
         raster.read_dsm(path)
     with pytest.raises(InputError, match="no file"):
         raster.read_dsm(tmp_path / "none.tif")
@@ -161,17 +161,6 @@ def test_rasters_that_are_no_surface_models(tmp_path):
         path.write_bytes(content)
         with pytest.raises(InputError, match=r"d\.tif cannot be read as a raster"):
             raster.read_dsm(path)
-    many = kind | {"height": 40_000, "width": 40_000, "transform": north_up(5, 5, 1, 1)}
-    with rasterio.open(tmp_path / "empty.tif", "w", **many, tiled=True, sparse_ok=True):
-        pass
-    with pytest.raises(InputError, match="40000 x 40000 pixels, which is far more than its"):
-        raster.read_dsm(tmp_path / "empty.tif")
-    # All bands of a tile are in one piece of memory.
-    bands = kind | {"count": 5_000, "transform": north_up(5, 5, 1, 1)}
-    with rasterio.open(tmp_path / "deep.tif", "w", **bands, tiled=True, interleave="pixel", sparse_ok=True):
-        pass
-    with pytest.raises(InputError, match="256 x 256 pixels in 5000 bands, which is far more than its"):
-        raster.read_dsm(tmp_path / "deep.tif")
 
 
 def test_heights_that_are_none(tmp_path):
@@ -209,7 +198,7 @@ def test_photographs_of_another_size(tmp_path):
     np.testing.assert_array_equal(
         raster.read_photograph(path, Sensor(30, 20, 0.1)), np.arange(1800, dtype="u1").reshape(3, 20, 30)
     )
-    for sensor, says in ((Sensor(20, 30, 0.1), "before it was turned"), (Sensor(40, 20, 0.1), "40 x 20")):
+    for sensor, says in ((Sensor(20, 30, 0.1), "before it was rotated"), (Sensor(40, 20, 0.1), "40 x 20")):
         with pytest.raises(InputError, match=f"30 x 20 pixels.*{says}"):
             raster.read_photograph(path, sensor)
 
@@ -284,7 +273,7 @@ def test_the_command_lays_a_photograph_over_the_ground(tmp_path, monkeypatch, ca
     ("changes", "says"),
     [
         ({"--image": "nobody"}, "no such image; it has"),
-        ({"dsm": "away"}, r"sees nothing of dsm\.tif"),
+        ({"dsm": "away"}, r"does not see dsm\.tif"),
         ({"dsm": "utm"}, "frame is local"),
         ({"photo": "dsm"}, "its camera 450 x 300"),
         ({"photo": "none"}, "no file"),
@@ -309,12 +298,12 @@ def test_what_the_command_cannot_do(tmp_path, monkeypatch, capsys, changes, says
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("--class", "two"), "give numbers of classes by commas"),
+        (("--class", "two"), "give class numbers"),
         (("--class", "9"), "no points of class 9"),
-        (("--returns", "none"), "--returns none: there are all"),
-        (("--statistic", "median"), "--statistic median: there are highest"),
-        (("--cell-m", "0"), "positive size"),
-        (("--cloud-unit", "yd"), "--cloud-unit yd: there are m"),
+        (("--returns", "none"), "'none' is not one of 'all'"),
+        (("--statistic", "median"), "'median' is not one of 'highest'"),
+        (("--cell-m", "0"), "0 is not a positive number"),
+        (("--cloud-unit", "yd"), "'yd' is not one of 'm'"),
         (("--cloud-epsg", "1"), "EPSG code 1 is unknown"),
     ],
 )
@@ -322,5 +311,5 @@ def test_what_dsm_cannot_do(tmp_path, monkeypatch, capsys, arguments, says):
     clouds.write_cloud(Cloud(np.arange(30.0).reshape(10, 3), np.ones(10, np.uint8)), tmp_path / "c.las")
     with unchecked():
         code, _, errors = run(monkeypatch, capsys, "dsm", tmp_path / "c.las", "--out", tmp_path / "d.tif", *arguments)
-    assert code == 2 and says in errors and errors.count("\n") == 1
+    assert code == 2 and says in errors and "Traceback" not in errors
     assert not (tmp_path / "d.tif").exists()

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxphoto.io.reconstructions.rays import ray_misfit
+from jaxphoto.extras.formats.texts import ray_misfit
 
 
 def test_parallel_rays_of_a_row_that_is_repeated_have_a_misfit():

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.collinearity import project
 from jaxphoto.errors import InputError
-from jaxphoto.io import convert, read_block, read_source, write_block
-from jaxphoto.io.exports import AdjustedPhotographs, ExportCamera, export
-from jaxphoto.orientation.approximate import approximate
-from jaxphoto.report.source_words import assumed_pixel_words, report_title
+from jaxphoto.extras.formats import Project, ProjectCamera, convert, export, read_source
+from jaxphoto.initial.approximate import approximate
+from jaxphoto.io import read_block, write_block
+from jaxphoto.report.results import assumed_pixel_words, report_title
 from jaxphoto.unknowns import FREE
 from tests.io.test_exports import CAMERAS, SENSOR, fisheye, photographs, plane
 
@@ -302,10 +302,10 @@ def test_what_was_exported_is_read_again(tmp_path, format, camera, frame):
     p = p._replace(image=p.image[inside], point=p.point[inside], column_row=p.column_row[inside])
     # Pixels have no size there.
     held = dataclasses.replace(SENSOR, pixel_mm=0.001, pixel_assumed=True)
-    p = p._replace(cameras={"one": ExportCamera(SENSOR, CAMERAS[camera])})
+    p = p._replace(cameras={"one": ProjectCamera(SENSOR, CAMERAS[camera])})
     export(p, tmp_path / "out", format)
     block = read_source(tmp_path / "out", format)
-    assert isinstance(p, AdjustedPhotographs) and block.sensors["one"] == held
+    assert isinstance(p, Project) and block.sensors["one"] == held
     order = [block.images.index(name) for name in sorted(block.images)]
     assert order == list(range(4))
     by_name = np.argsort(np.array(p.images, object))
@@ -392,7 +392,7 @@ def test_a_block_keeps_where_it_is_from_and_that_its_pixel_is_assumed(tmp_path):
     block = read_source(tmp_path / "again")
     assert block.converted_from == f"opensfm: {tmp_path.name}/opensfm" and block.sensors["v2 one"].pixel_assumed
     assert report_title(block) == f"opensfm, converted from opensfm: {tmp_path.name}/opensfm"
-    assert "pixel of every camera is not known: 0.001 mm is assumed. c," in assumed_pixel_words(block.sensors)
+    assert "of every camera is unknown: 0.001 mm is assumed." in assumed_pixel_words(block.sensors)
     # A pixel that is known to be of that size is not assumed.
     known = dataclasses.replace(block.sensors["v2 one"], pixel_assumed=False)
     write_block(dataclasses.replace(block, sensors={"v2 one": known}), tmp_path / "known")
@@ -476,18 +476,18 @@ REFUSED = {
     "no shots": (lambda f: write_open_sfm(f, change=lambda _: []), "no reconstruction with shots"),
     "row": (lambda f: write_open_sfm(f, version="OPENSFM_TRACKS_VERSION_v2\na\tb\n"), "tracks.csv, row 2: 2 cells"),
     "track": (lambda f: write_open_sfm(f, version="a.jpg\t10\t1\tx\t0\n"), "row 1: .* is not 2 finite numbers"),
-    "lists": (_mvg(("structure",), 5), "has not the lists views"),
+    "lists": (_mvg(("structure",), 5), "sfm_data.json: damaged"),
     "twice": (
         lambda f: write_open_mvg(f, change=lambda c: {**c, "extrinsics": c["extrinsics"] * 2}), "20 is there twice"
     ),
     "mirror": (_mvg(_TURN, np.diag([1.0, 1, -1]).tolist()), "image a.jpg is no rotation"),
     "model": (_mvg(_KIND, "spherical"), "'spherical' is not known here"),
-    "terms": (_mvg((*_DATA, "disto_k3"), [1.0]), "intrinsics 3. disto_k3: .*not a list of three"),
-    "cut": (_blocks(lambda text: text[:-30]), "the XML is broken"),
-    "unknown encoding": (_blocks(_replaced("utf-8", "utf-0")), "the XML is broken .unknown encoding: utf-0"),
-    "wide encoding": (_blocks(_replaced("utf-8", "shift_jis")), "the XML is broken .multi-byte encodings are not"),
-    "angles": (_blocks(_geographic), "longitude and latitude; export it in a map system"),
-    "axes": (_blocks(_replaced("XRightYUp", "XUpYLeft"), upwards=True), "'XUpYLeft' is not read"),
+    "terms": (_mvg((*_DATA, "disto_k3"), [1.0]), "intrinsics 3. disto_k3: .*has 1 entries; give 3"),
+    "cut": (_blocks(lambda text: text[:-30]), "block.xml: damaged"),
+    "unknown encoding": (_blocks(_replaced("utf-8", "utf-0")), "block.xml: damaged .*unknown encoding: utf-0"),
+    "wide encoding": (_blocks(_replaced("utf-8", "shift_jis")), "block.xml: damaged .*multi-byte encodings are not"),
+    "angles": (_blocks(_geographic), "is longitude and latitude"),
+    "axes": (_blocks(_replaced("XRightYUp", "XUpYLeft"), upwards=True), "one: CameraOrientation 'XUpYLeft'"),
     "fisheye": (_blocks(_replaced(">Perspective<", ">Fisheye<")), "is a 'Fisheye'"),
     "centre": (_blocks(_replaced("<x>0.5</x>", "<x>a</x>")), "photo 5, Center: .* is not 3 finite numbers"),
     "end": (_bundle(lambda lines: lines[:-1]), "number of measurements of point 6"),
@@ -496,7 +496,7 @@ REFUSED = {
         _bundle(lambda lines: [*lines[:-4], f"10{lines[-4][1:]}", *lines[-3:], "0 0 0"]),
         "number of measurements of point 6 is nan",
     ),
-    "words": (_bundle(lambda lines: [*lines, "x"]), "a word that is no number"),
+    "words": (_bundle(lambda lines: [*lines, "x"]), "bundle.out: damaged .*'x'"),
     "cameras that end": (_pix4d(lambda text: text[: text.rindex("\n", 0, -1)]), "has 29 rows"),
     "focal lengths": (_pix4d(_replaced("0 800.0 239", "0 801.0 239")), "one focal"),
     "no number": (_pix4d(_replaced("0.001 -0.002", "0.001 x")), "row 14: .* 2 numb"),

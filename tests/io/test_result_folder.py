@@ -10,8 +10,9 @@ import pytest
 
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import InputError
-from jaxphoto.io import AdjustedPhotographs, adjusted_block, read_block, read_source, write_block
-from jaxphoto.io.exports import photograph_files
+from jaxphoto.extras.formats import Project, read_source
+from jaxphoto.io import adjusted_block, read_block, write_block
+from jaxphoto.io.result_folder import photograph_files
 from jaxphoto.report import Tables, Verdict, write_results
 from tests.blocks import adjusted
 from tests.commands import run
@@ -45,8 +46,8 @@ def test_a_result_is_read_with_the_values_that_were_adjusted(folders):
     block, truth = adjusted_block(folders / "result"), adjusted("cross")
     same_unknowns(block.start.unknowns, truth.unknowns)
     assert block.start.image_known.all() and block.start.point_known.all()
-    p = AdjustedPhotographs.of(truth)
-    again = AdjustedPhotographs.of_block(block, block.start.unknowns)
+    p = Project.of(truth)
+    again = Project.of_block(block, block.start.unknowns)
     assert (again.files, again.image_camera) == (p.files, p.image_camera)
     np.testing.assert_allclose(again.column_row, p.column_row, rtol=0, atol=1e-9)
     for of, rows in (("image", p.rows_of_images), ("point", p.rows_of_points)):
@@ -110,7 +111,7 @@ def test_what_is_no_result_of_its_block_is_told_in_a_sentence(own, spoil, messag
 
 def test_a_red_verdict_is_said(own):
     path = own / "result" / "summary.json"
-    alarm = {"verdict": "red", "findings": [{"level": "alarm", "text": "the test of sigma naught fails"}]}
+    alarm = {"verdict": "red", "findings": [{"severity": "error", "text": "the test of sigma naught fails"}]}
     path.write_text(json.dumps(json.loads(path.read_text()) | alarm))
     with pytest.warns(UserWarning, match="the verdict on this adjustment is red: the test of sigma naught fails"):
         adjusted_block(own / "result")
@@ -130,7 +131,7 @@ def test_photographs_are_called_by_their_files(tmp_path):
     assert photograph_files(images, [tmp_path / "right"], tmp_path) == {"a": "a.png", "b": "b.jpg", "c": "c.png"}
     with pytest.raises(InputError, match="two images are of the photograph a"):
         block = read_source(write_text(tmp_path / "model"))
-        AdjustedPhotographs.of_block(block, block.start.unknowns, {"b": "a"})
+        Project.of_block(block, block.start.unknowns, {"b": "a"})
 
 
 def test_the_command_writes_what_was_adjusted(own, tmp_path, monkeypatch, capsys):
@@ -153,12 +154,12 @@ def test_the_command_writes_what_was_adjusted(own, tmp_path, monkeypatch, capsys
     np.testing.assert_allclose(start.exterior.position, position, rtol=0, atol=1e-9)
     assert start.interior["one"].c == adjusted("cross").unknowns.interior["one"].c
     code, said, _ = run(monkeypatch, capsys, "convert", own / "block", tmp_path / "start", "--to", "opk")
-    assert code == 0 and "start values of the block: --adjust adjusts it first" in said
+    assert code == 0 and "initial values of the block" in said
     for arguments, message in (
-        ((own / "result", tmp_path / "no", "--to", "opk", "--adjust"), "--adjust: SOURCE is a result already"),
-        ((own / "block", tmp_path / "no", "--adjust"), "--adjust: a block folder has start values"),
-        ((own / "block", tmp_path / "no", "--to", "opk", "--part", 2), "--block and --part are of results"),
-        ((own / "result", tmp_path / "no.xml", "--to", "metashape"), "is the name of a file; leave .xml out"),
+        ((own / "result", tmp_path / "no", "--to", "opk", "--adjust"), "--adjust applies to a block that is exported"),
+        ((own / "block", tmp_path / "no", "--adjust"), "--adjust applies to a block that is exported"),
+        ((own / "block", tmp_path / "no", "--to", "opk", "--part", 2), "--block and --part apply to results"),
+        ((own / "result", tmp_path / "no.xml", "--to", "metashape"), "omit .xml"),
     ):
         code, _, wrong = run(monkeypatch, capsys, "convert", *arguments)
         assert code == 2 and message in wrong and not list(tmp_path.glob("no*"))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import InputError, adjust, compare, read_block, write_block
-from jaxphoto.io.cameras import read_camera_file
+from jaxphoto.io.camera_files import read_camera_file
 from jaxphoto.io.results_judged import read_summary, reservation
 from jaxphoto.report import Tables
 from tests.blocks import adjusted, simulated
@@ -16,7 +16,7 @@ from tests.commands import run
 
 FAILED = {"passed": False, "expected_sigma0": 1.0}
 AMBER = {"converged": True, "verdict": "amber", "sigma0": 0.53, "global_test": FAILED}
-RED = {"verdict": "red", "findings": [{"level": "alarm", "text": "T1 is off"}]}
+RED = {"verdict": "red", "findings": [{"severity": "error", "text": "T1 is off"}]}
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,7 @@ RED = {"verdict": "red", "findings": [{"level": "alarm", "text": "T1 is off"}]}
         ({"converged": False, "outcome": "too few steps"}, "no results: too few steps"),
         (RED, "the verdict on .* is red: T1 is off"),
         ({"verdict": "red", "findings": "none"}, "is red: see its report"),
-        ({"verdict": "red", "findings": [{"level": "alarm", "text": "\x1b[2J"}]}, "is red: see its report"),
+        ({"verdict": "red", "findings": [{"severity": "error", "text": "\x1b[2J"}]}, "is red: see its report"),
         (AMBER, r"sigma naught of this adjustment is 0\.53, expected 1, which is no chance"),
         (AMBER | {"sigma0": "half"}, "is nan, expected 1"),
     ],
@@ -47,10 +47,10 @@ def results(tmp_path_factory):
     patch = pytest.MonkeyPatch()
     with patch.context() as m:
         m.setattr("sys.argv", ["jaxphoto", "adjust", str(folder / "block"), "--out", str(folder / "results"), "-q"])
-        from jaxphoto import cli
+        import jaxphoto_command
 
         with pytest.raises(SystemExit) as stop:
-            cli.main()
+            jaxphoto_command.main()
     assert not stop.value.code
     return folder
 
@@ -86,7 +86,7 @@ def test_sigma_naught_that_fails_its_test_is_said_and_travels_with_the_camera(re
             code, _, error = run(monkeypatch, capsys, "adjust", tmp_path / f"copy_of_{named.name}", "--out", rests)
         assert code == 0 and said in " ".join(error.split())
         findings = read_summary(rests)["findings"]
-        assert any(f["level"] == "warning" and f["text"].endswith(read.doubts[0]) for f in findings), findings
+        assert any(f["severity"] == "warning" and f["text"].endswith(read.doubts[0]) for f in findings), findings
         assert "this adjustment rests on an earlier one" in read_camera_file(rests).note
         assert said in read_camera_file(rests).note
 

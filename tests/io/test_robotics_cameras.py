@@ -6,7 +6,8 @@ import pytest
 
 from jaxphoto.camera import Equidistant, InteriorOrientation, OpenCv, OpenCvFisheye
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import read_camera_file, write_camera_file
+from jaxphoto.extras.formats import write_camera_file
+from jaxphoto.io.camera_files import read_camera_file
 from tests.io.test_cameras import POINTS, SENSOR, columns_rows, same_numbers, written
 
 RATIONAL = [-0.21, 0.11, 1.1e-3, -2.3e-3, 0.02, 0.03, -0.01, 0.004]
@@ -113,11 +114,11 @@ REFUSED = {
     "splined": ("a.cameramodel", mrcal(SPLINED, []), f"'LENSMODEL_{SPLINED}' is not known here"),
     "prism": ("a.cameramodel", mrcal("OPENCV12", [*RATIONAL, 0.1, 0.0, 0.0, 0.0]), "terms of a thin prism"),
     "few": ("a.cameramodel", mrcal("OPENCV8", RATIONAL[:7]), "12 numbers are needed"),
-    "cut": ("a.cameramodel", mrcal("OPENCV4", RATIONAL[:4])[:-40], "no camera model of mrcal that can be read"),
-    "a word": ("a.cameramodel", mrcal("OPENCV4", RATIONAL[:4]).replace("655.5", "'x'"), "intrinsics is 'x'"),
+    "cut": ("a.cameramodel", mrcal("OPENCV4", RATIONAL[:4])[:-40], "damaged or no camera file"),
+    "a word": ("a.cameramodel", mrcal("OPENCV4", RATIONAL[:4]).replace("655.5", "'x'"), "intrinsics .*'x'"),
     "omni": ("a.yaml", KALIBR.replace("camera_model: pinhole", "camera_model: omni"), "cam0 is a 'omni'"),
     "fov": ("a.yaml", KALIBR.replace("radtan", "fov"), "the distortion 'fov' of cam0"),
-    "short": ("a.yaml", KALIBR.replace("912.25, ", ""), "intrinsics of cam0 has to be a list of 4 numbers"),
+    "short": ("a.yaml", KALIBR.replace("912.25, ", ""), "intrinsics of cam0 .*4 numbers"),
 }  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from PIL import Image
 
 from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS
 from jaxphoto.io.exposures import located
-from jaxphoto.io.sound_photographs import sound_photographs
+from jaxphoto.io.photographs import valid_photographs
 from tests.io.test_exposures import ALL, FLIGHT
 
 GPS, ZONE_S = 0x8825, 7200
@@ -55,7 +55,7 @@ def clean(tmp_path_factory):
 
 def said_of(folder):
     """All sentences, each without its folder, and the photographs that are left with their positions."""
-    kept, left = sound_photographs([folder])
+    kept, left = valid_photographs([folder])
     taken, sentences = located(kept, [folder])
     said = [s.replace(f"{folder}/", "") for s in (*left.values(), *sentences)]
     return said, {p.name: p.gps for p in taken}
@@ -102,7 +102,7 @@ def test_a_wrong_time_zone_of_marks_is_one_sentence(clean, tmp_path, zone_s, wor
     marks(right)
     marks(wrong, zone_s)
     (before, sound), (said, found) = said_of(right), said_of(wrong)
-    assert [words in s and s.endswith("which is taken off") for s in said if s not in before] == [True], said
+    assert [words in s and s.endswith("which is corrected") for s in said if s not in before] == [True], said
     assert found == sound and all(g.heights == "ellipsoid" for g in found.values())
 
 

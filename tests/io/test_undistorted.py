@@ -8,8 +8,8 @@ from PIL import ExifTags, Image
 from jaxphoto.camera import Brown, Equidistant, InteriorOrientation, OpenCv, OpenCvFisheye, Sensor
 from jaxphoto.camera.undistortion import pinhole, source_pixels
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import read_camera_file, write_camera_file
-from jaxphoto.io.cameras.camera_file import CameraFile
+from jaxphoto.extras.formats import write_camera_file
+from jaxphoto.io.camera_files import CameraFile, read_camera_file
 from jaxphoto.io.photographs import photographs
 from jaxphoto.io.undistorted import write_undistorted
 from tests.commands import run
@@ -129,10 +129,10 @@ def test_the_command_leaves_out_what_is_not_of_the_camera(tmp_path, monkeypatch,
     code, said, wrong = run(monkeypatch, capsys, "undistort", tmp_path / "given", *given)
     assert code == 1 and "3 photographs of " in said
     assert "small.png: its size is 100 x 100 px" in wrong and "cut.png: " in wrong
-    assert f"left out: {tmp_path / 'given' / 'deep.png'}: its colours have 16 bits" in wrong
+    assert f"skipped: {tmp_path / 'given' / 'deep.png'}: its colours have 16 bits" in wrong
     assert {p.name for p in (tmp_path / "out").iterdir()} >= {"a.png", "b.png", "c.jpg", "camera.toml"}
     for arguments, message in (
-        ((tmp_path / "given", *given[:3], tmp_path / "no", "--keep", "most"), "--keep most: there are crop, all"),
+        ((tmp_path / "given", *given[:3], tmp_path / "no", "--keep", "most"), "'most' is not one of 'crop', 'all'"),
         (
             (tmp_path / "given" / "small.png", *given[:3], tmp_path / "no"),
             "has 100 x 100 pixels, but its camera 360 x 270",

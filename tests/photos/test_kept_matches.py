@@ -14,9 +14,9 @@ from jaxphoto.extras.photos.photograph_pairs import (
     usual_choice,
     usual_count,
 )
+from jaxphoto.initial.matches import connected_images
 from jaxphoto.io.kept_pieces import KeptPieces
 from jaxphoto.io.photographs import photographs, sensor_and_interior
-from jaxphoto.orientation.matches import connected_images
 from tests.photos.ground import C_MM, SENSOR, photograph, texture
 
 pytest.importorskip("pycolmap", reason="pycolmap, which matches photographs, is not installed (extra photos)")

@@ -12,8 +12,8 @@ from jaxphoto.extras.photos.features import FEATURES, OF_FEW
 from jaxphoto.extras.photos.matching import match_photographs, tie_features
 from jaxphoto.extras.photos.photograph_pairs import nearest_pairs, photograph_pairs
 from jaxphoto.georeferencing.gps import Gps
+from jaxphoto.initial.matches import PairMatches, connected_images, tracks
 from jaxphoto.io.photographs import photographs, sensor_and_interior
-from jaxphoto.orientation.matches import PairMatches, connected_images, tracks
 from tests.photos.ground import C_MM, SENSOR, mapped, photograph, texture
 
 pytest.importorskip("pycolmap", reason="pycolmap, which matches photographs, is not installed (extra photos)")

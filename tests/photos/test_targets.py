@@ -7,8 +7,8 @@ import pytest
 from jaxphoto import ExteriorOrientation, InputError, InteriorOrientation, Sensor, Smac
 from jaxphoto.extras.photos.targets import find_targets, read_board, rendered
 from jaxphoto.extras.photos.targets.circles import elliptic_blobs, fit_discs
+from jaxphoto.initial.rays import ideal_coordinates
 from jaxphoto.io.photographs import photographs
-from jaxphoto.orientation.rays import ideal_coordinates
 from jaxphoto.procedures.calibration.target_block import projections
 from jaxphoto.procedures.calibration.target_calibration import eccentricities
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxphoto.camera import InteriorOrientation, Sensor
-from jaxphoto.orientation.matches import PairMatches, tracks
+from jaxphoto.initial.matches import PairMatches, tracks
 from jaxphoto.procedures.orientation.colmap import Network
 from jaxphoto.procedures.orientation.known_frame import similarity_between
 from jaxphoto.procedures.orientation.orient_photographs import network_block

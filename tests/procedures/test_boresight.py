@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from jaxphoto import FIXED, FREE, BlockError, boresight, cli
+import jaxphoto_command
+from jaxphoto import FIXED, FREE, BlockError, boresight
 from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.io import write_block
 from jaxphoto.observations import Attitudes, ControlRows, StationRows
@@ -243,7 +244,7 @@ def test_what_a_step_lacks_is_said_before_the_first(spoil, words, monkeypatch):
 def run(monkeypatch, capsys, *arguments):
     monkeypatch.setattr(sys, "argv", ["jaxphoto", "boresight", *map(str, arguments)])
     with pytest.raises(SystemExit) as stop:
-        cli.main()
+        jaxphoto_command.main()
     captured = capsys.readouterr()
     return stop.value.code or 0, captured.out, captured.err
 
@@ -272,9 +273,9 @@ def test_the_command_writes_all_four_steps(monkeypatch, capsys, tmp_path):
     assert summary["passed"] is True
     assert [s["step"] for s in summary["steps"]] == [1, 2, 3, 4]
     page = (out / "report.html").read_text()
-    assert page.index("can be used") < page.index("Step 1")
+    assert page.index("is usable") < page.index("Step 1")
     # The verdict in its colour, misalignments and shifts as one picture, links to each step, and how it was made.
-    assert '<p class="verdict green">' in page and page.count("data:image/png") == 1
+    assert '<p class="verdict green">' in page and page.count("<svg") == 1
     assert all(f'href="step_{k}/report.html"' in page for k in (1, 2, 3, 4)) and "<th>command</th>" in page
     assert "misalignment of mount one" in screen
     # Earlier results are replaced whole, and exit code 1 says that a step is not passed.

@@ -170,7 +170,7 @@ def test_rounds_that_do_not_come_to_rest_are_said(monkeypatch):
     assert bool(done.adjusted.converged)
     assert not done.settled
     assert not done.converged
-    assert "did not come to rest" in findings(done)[0]
+    assert "did not converge" in findings(done)[0]
 
 
 def test_field_on_a_wall_gives_the_same_camera(simulated):

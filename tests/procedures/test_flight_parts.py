@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxphoto.camera import InteriorOrientation
-from jaxphoto.orientation.matches import PairMatches
+from jaxphoto.initial.matches import PairMatches
 from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
 from jaxphoto.procedures.matched_part import MatchedPart
 from tests.procedures.orientable import PIXEL, SENSOR, Camera, aerial, photographed

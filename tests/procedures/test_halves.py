@@ -15,10 +15,10 @@ from jaxphoto.adjustment import common_sizes
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import InputError
 from jaxphoto.io import write_block
-from jaxphoto.io.cameras import read_camera_file
+from jaxphoto.io.camera_files import read_camera_file
 from jaxphoto.procedures.halves import halved, halves
 from jaxphoto.simulation import image_coordinates, remeasure
-from jaxphoto.stability import Differences, band_of, bundle_offsets, concentration, image_grid, leading_unit, overlap
+from jaxphoto.stability import Differences, bundle_offsets, concentration, error_band, image_grid, leading_unit, overlap
 from jaxphoto.stability.band import square_radius
 from jaxphoto.statistics import common_covariance
 from jaxphoto.variants import some_images
@@ -44,7 +44,7 @@ def test_of_many_linear_calibrations_the_factor_scatters_as_stated_and_the_band_
         offsets = 2 * np.einsum("ku,uci->kci", np.where(first, 1.0, -1.0), z)
         promised = np.broadcast_to(4 * whole, (cuts, *whole.shape))
         axes = concentration(jacobian, root @ root.T)
-        band = band_of(Differences(offsets[:cuts], promised, axes, overlap(first[:cuts], size)), whole)
+        band = error_band(Differences(offsets[:cuts], promised, axes, overlap(first[:cuts], size)), whole)
         factors.append(band.factor)
         sigmas.append(band.sigma_factor / band.factor)
         error = true * units**0.5 * by_cell @ rng.normal(size=p)
@@ -70,7 +70,7 @@ def test_the_band_of_differences_holds_95_percent_where_one_unit_leads_them_all(
         effects = np.einsum("cip,up->uci", by_cell, rng.normal(size=(units, p)))
         effects[0] *= 20
         offsets = np.einsum("ku,uci->kci", np.where(first, 1.0, -1.0), effects)
-        band = band_of(Differences(offsets[:cuts], promised, axes, overlap(first[:cuts], size)), one)
+        band = error_band(Differences(offsets[:cuts], promised, axes, overlap(first[:cuts], size)), one)
         length = np.linalg.norm(offsets[cuts:], axis=2)
         fresh.append((length < band.halves).mean())
         normal.append((length < band.cell_factor * np.sqrt(square_radius(one, 1 / cuts))).mean())

@@ -187,7 +187,7 @@ def shared_of(unknowns, label: str) -> float:
 
 def test_what_cannot_have_a_bias():
     block = nominal().block
-    with pytest.raises(InputError, match=r"no strip 'A' that a bias of kind trajectory could be added to; .* 1, 2, 3"):
+    with pytest.raises(InputError, match=r"unknown strip 'A' for a bias of kind trajectory: .* 1, 2, 3"):
         bias(block, "trajectory", 0.1, "strip", of="A")
     with pytest.raises(InputError, match="per block or strip, not per image"):
         bias(block, "trajectory", 0.1, "image")

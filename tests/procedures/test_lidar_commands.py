@@ -40,7 +40,7 @@ def test_lidar_control(folder, tmp_path, monkeypatch, capsys):
     assert (block.control.axis == 2).all()
     assert (out / "lidar_heights.png").stat().st_size > 10_000
     page = (out / "report.html").read_text(encoding="utf-8")
-    assert f"{len(used)} of {len(heights)} tie points" in page and "cloud.laz" in page and "data:image/png" in page
+    assert f"{len(used)} of {len(heights)} tie points" in page and "cloud.laz" in page and "<svg" in page
     rounds = pd.read_csv(out / "lidar_rounds.csv")
     assert rounds["largest_change"].iloc[-1] < 0.1
     # Whoever adjusts it stays where it is.
@@ -55,7 +55,7 @@ def test_simultaneous(folder, tmp_path, monkeypatch, capsys):
     out, cloud = tmp_path / "both", folder / "cloud.laz"
     given = ("--trajectory", folder / "trajectory.csv", "--shift", "2", *SIGMAS)
     code, said, _ = run(monkeypatch, capsys, "simultaneous", folder, cloud, "--out", out, *given)
-    assert code == 0 and "nothing changes any more" in said
+    assert code == 0 and "converged after" in said
     names = {MARKER, "moved.csv", "rounds.csv", "surfaces.csv", "scanner_correlation.csv", "above.png", "summary.json"}
     assert names | {"cloud.laz", "trajectory.csv", "adjustment", "report.html"} == {path.name for path in out.iterdir()}
     moved = pd.read_csv(out / "moved.csv").set_index("what")
@@ -77,31 +77,31 @@ def test_simultaneous(folder, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--method", "magic"), "--method magic: there are idw, plane, tin, local, image"),
-        (("--sigma-z-m", "-1"), "--sigma-z-m -1: give a positive number"),
-        (("--class", "ground"), "--class ground: give numbers of classes"),
+        (("--method", "magic"), "'magic' is not one of 'plane'"),
+        (("--sigma-z-m", "-1"), "'--sigma-z-m': -1 is not a positive number"),
+        (("--class", "ground"), "--class ground: give class numbers"),
         (("--class", "9"), "9"),
     ],
 )
 def test_bad_options_of_lidar_control(folder, tmp_path, monkeypatch, capsys, arguments, said):
     given = ("lidar-control", folder, folder / "cloud.laz", "--out", tmp_path / "out", *arguments)
     code, _, error = run(monkeypatch, capsys, *given)
-    assert code == 2 and said in error and error.count("\n") == 1
+    assert code == 2 and said in error and "Traceback" not in error
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--shift", "much"), "--shift much: write free, fixed, or a standard deviation"),
-        (("--method", "image"), "there are idw, plane, tin, local"),
+        (("--shift", "much"), "--shift much: give free, fixed, or a standard deviation"),
+        (("--method", "image"), "'image' is not one of"),
         (("--trajectory", "nowhere.csv"), "nowhere.csv"),
     ],
 )
 def test_bad_options_of_simultaneous(folder, tmp_path, monkeypatch, capsys, arguments, said):
     given = ("simultaneous", folder, folder / "cloud.laz", "--out", tmp_path / "out", *arguments)
     code, _, error = run(monkeypatch, capsys, *given)
-    assert code == 2 and said in error and error.count("\n") == 1
+    assert code == 2 and said in error and "Traceback" not in error
 
 
 def test_a_trajectory_of_another_day(folder, tmp_path, monkeypatch, capsys):

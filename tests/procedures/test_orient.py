@@ -9,7 +9,7 @@ from jaxphoto.adjustment import solve
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names, set_parameter
 from jaxphoto.compiling import run
 from jaxphoto.errors import BlockError, GroupsError
-from jaxphoto.orientation.matches import PairMatches
+from jaxphoto.initial.matches import PairMatches
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.orientation import orient
 from jaxphoto.procedures.orientation.self_calibration import shared_covariance

@@ -8,8 +8,8 @@ import pytest
 from jaxphoto.block import Start
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
+from jaxphoto.initial.approximate import completed
 from jaxphoto.observations import ControlRows, ImageRows, StationRows
-from jaxphoto.orientation.approximate import completed
 from jaxphoto.procedures.adjust import adjust, needs_orientation, start_of
 from jaxphoto.procedures.orientation import orient_block
 from jaxphoto.procedures.orientation.self_calibration import freed

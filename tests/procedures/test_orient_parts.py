@@ -9,10 +9,10 @@ from jaxphoto.block import Start
 from jaxphoto.camera import InteriorOrientation, Smac
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
+from jaxphoto.initial.intersection import intersect_points
+from jaxphoto.initial.rays import ideal_coordinates, turn_to_object, unit_rays
 from jaxphoto.observations import Distances, StationRows
-from jaxphoto.orientation.block_intersection import intersect_points
-from jaxphoto.orientation.rays import ideal_coordinates, turn_to_object, unit_rays
-from jaxphoto.procedures.orientation.known_frame import onto_known, similarity_between
+from jaxphoto.procedures.orientation.known_frame import in_known_frame, similarity_between
 from jaxphoto.procedures.orientation.rejection import beyond_limit, unsupported
 from jaxphoto.procedures.orientation.self_calibration import corner_shift, undetermined
 from tests.formulas import camera_from_object
@@ -167,12 +167,12 @@ def known_start(block, there, images=(), points=()):
 
 def test_a_network_comes_to_known_stations_or_says_why_not(elsewhere):
     block, network, there = elsewhere
-    np.testing.assert_array_equal(onto_known(block, network, block.start).points, network.points)
-    found = onto_known(dataclasses.replace(block, stations=stations_of(there, np.arange(4))), network, block.start)
+    np.testing.assert_array_equal(in_known_frame(block, network, block.start).points, network.points)
+    found = in_known_frame(dataclasses.replace(block, stations=stations_of(there, np.arange(4))), network, block.start)
     np.testing.assert_allclose(found.points, there.points, rtol=0, atol=1e-9)
     few = dataclasses.replace(block, stations=stations_of(there, np.arange(2)))
     with pytest.raises(BlockError, match="the 2 known points and stations that they see are fewer than three"):
-        onto_known(few, network, block.start)
+        in_known_frame(few, network, block.start)
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ def test_a_network_comes_to_known_stations_or_says_why_not(elsewhere):
 def test_known_images_give_the_frame(elsewhere, images, points):
     block, network, there = elsewhere
     start = known_start(block, there, images, points)
-    found = onto_known(dataclasses.replace(block, start=start), network, start)
+    found = in_known_frame(dataclasses.replace(block, start=start), network, start)
     np.testing.assert_allclose(found.positions, there.positions, rtol=0, atol=1e-9)
     np.testing.assert_allclose(found.camera_from_object, there.matrices, rtol=0, atol=1e-9)
     np.testing.assert_allclose(found.points, there.points, rtol=0, atol=1e-9)
@@ -195,7 +195,7 @@ def test_a_scale_bar_gives_the_scale(elsewhere):
     length = np.linalg.norm(there.points[3] - there.points[17])
     block = dataclasses.replace(block, distances=Distances(bar, np.array([length]), np.array([0.01])))
     start = known_start(block, there, [2])
-    found = onto_known(dataclasses.replace(block, start=start), network, start)
+    found = in_known_frame(dataclasses.replace(block, start=start), network, start)
     np.testing.assert_allclose(found.points, there.points, rtol=0, atol=1e-9)
-    free = onto_known(block, network, block.start)
+    free = in_known_frame(block, network, block.start)
     assert np.linalg.norm(free.points[3] - free.points[17]) == pytest.approx(length, rel=1e-12)

@@ -9,7 +9,7 @@ import pytest
 
 from jaxphoto import adjust, read_block, snoop
 from jaxphoto.errors import RankError
-from jaxphoto.report.snooped import snooped_findings
+from jaxphoto.report.residual_findings import snooped_findings
 from tests.blocks import simulated
 
 
@@ -219,8 +219,8 @@ def test_what_all_rows_are_off_by_alike_goes_and_nothing_else(block):
     found = snoop(block.with_observations({"stations": dataclasses.replace(stations, value=value)}))
     assert {(s.group, s.row) for s in found.left_out} == {("stations", int(row)) for row in np.flatnonzero(heights)}
     np.testing.assert_allclose([s.error for s in found.left_out], 48.0, atol=4.0)
-    (told,) = [f.text for f in snooped_findings(found, block) if "off alike" in f.text]
-    assert f"the {heights.sum()} stations along Z" in told
+    (finding,) = [f for f in snooped_findings(found, block) if f.code == "rejected_bias"]
+    assert (finding.subject, finding.value) == ("stations along Z", heights.sum())
 
 
 def test_what_no_observations_tell_is_said_as_by_an_adjustment(block):

@@ -9,7 +9,6 @@ import pytest
 
 from jaxphoto import BlockError, InputError
 from jaxphoto.adjustment import Outcome
-from jaxphoto.cli.strip_flight import scanner_priors
 from jaxphoto.cloud import Cloud
 from jaxphoto.georeferencing import StripSpline, TrajectoryKnot
 from jaxphoto.io.recipe.truth import truth_tables
@@ -29,6 +28,7 @@ from jaxphoto.rotation import (
 )
 from jaxphoto.simulation import Simulation
 from jaxphoto.unknowns import FIXED
+from jaxphoto_command.strip_flight import scanner_priors
 from tests.lidar.clouds import SURFACES, ground
 from tests.procedures.strips import AROUND, NOISE_M, PRIORS_AROUND, SETTINGS, STRIPS, TRUTH, fitted, flown
 from tests.simulation.small import made

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from jaxphoto import adjust, read_block
 from jaxphoto.block import Frame
 from jaxphoto.camera import get_parameter
-from jaxphoto.cli.corrected_cloud import write_corrected
 from jaxphoto.cloud import Cloud
 from jaxphoto.georeferencing import Trajectory
 from jaxphoto.io import clouds
@@ -23,6 +22,7 @@ from jaxphoto.io.trajectory import FIELDS, read_sbet, sbet_records, with_records
 from jaxphoto.io.trajectory.in_frame import positions_in, records_of, with_poses
 from jaxphoto.lidar.strip_correction import correct_flight
 from jaxphoto.procedures.lidar import kept_returns
+from jaxphoto_command.strip_flight import write_corrected
 from tests.commands import run
 from tests.lidar.clouds import SURFACES, ground
 from tests.procedures.joint import BORESIGHT_DEG, flown
@@ -193,19 +193,19 @@ def test_withheld_points_that_nothing_says_anything_of_stay(cloud_file, tmp_path
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (("--adjust", "boresight,mirror"), "--adjust mirror: a scanner has boresight, lever-arm"),
-        (("--adjust", ","), "--adjust ',': a scanner has boresight"),
-        (("--most-planes", "0"), "--most-planes 0: give 1 or more"),
+        (("--adjust", "boresight,mirror"), "--adjust mirror: choose from boresight, lever-arm"),
+        (("--adjust", ","), "--adjust ',': choose from boresight"),
+        (("--most-planes", "0"), "'--most-planes'"),
         (("--pattern", "circle"), "without a trajectory strips have shifts alone"),
         (("--adjust", "boresight"), "without a trajectory strips have shifts alone"),
-        (("--pattern", "zigzag"), "--pattern zigzag: there are line, circle"),
+        (("--pattern", "zigzag"), "'zigzag' is not one of 'line', 'circle'"),
         (("--hold", "3"), "3 is no strip of the cloud, which has 1, 2"),
-        *(((option, "nan"), f"{option} nan: give a positive number") for option in POSITIVE),
-        (("--cell-m", "0"), "--cell-m 0: give a positive number"),
-        (("--sigma-heading-deg", "inf"), "--sigma-heading-deg inf: give a positive number"),
-        (("--trajectory-shift-s", "nan"), "--trajectory-shift-s nan: give a number of seconds"),
-        (("--exposure-shift-s", "inf"), "--exposure-shift-s inf: give a number of seconds"),
-        (("--breaklines", "R*"), "--breaklines names points of photographs: give their block (--block)"),
+        *(((option, "nan"), f"'{option}': nan is not a positive number") for option in POSITIVE),
+        (("--cell-m", "0"), "'--cell-m': 0 is not a positive number"),
+        (("--sigma-heading-deg", "inf"), "'--sigma-heading-deg': inf is not a positive number"),
+        (("--trajectory-shift-s", "nan"), "'--trajectory-shift-s': nan is not a finite number"),
+        (("--exposure-shift-s", "inf"), "'--exposure-shift-s': inf is not a finite number"),
+        (("--breaklines", "R*"), "--breaklines names points of photographs: add their block (--block)"),
         (("--cell-m", "0.3"), "strip 1 has fewer than 10 planes in common"),
     ],
 )
@@ -222,7 +222,7 @@ def test_photographs_are_adjusted_with_the_strips(tmp_path, monkeypatch, capsys)
     folder, out = tmp_path / "flight", tmp_path / "out"
     write_simulation(flown(), folder)
     half = functools.partial(kept_returns, most=len(flown().cloud) // 2)
-    monkeypatch.setattr("jaxphoto.cli.strip_flight.kept_returns", half)
+    monkeypatch.setattr("jaxphoto_command.strip_flight.kept_returns", half)
     drifts = ("--knots-s", "5", "--correlation-s", "60", "--sigma-position-m", "0.05", "--sigma-attitude-deg", "0.003")
     given = ("--trajectory", folder / "trajectory.csv", "--block", folder, "--adjust", "boresight,angle-scale")
     fine = (*drifts, "--sigma-heading-deg", "0.006", "--cell-m", "8")
@@ -272,10 +272,10 @@ def test_simultaneous_adjusts_what_it_is_told_to(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (("--adjust", "lens"), "--adjust lens: a flying system has scanner, trajectory and camera"),
-        (("--adjust", "scanner", "--shift", "free"), "--shift is of surfaces under tie points"),
-        (("--cell-m", "8"), "--cell-m is of planes in the overlaps of strips"),
-        (("--control", "control.csv"), "--control is of planes in the overlaps of strips"),
+        (("--adjust", "lens"), "--adjust lens: choose from scanner, trajectory, camera"),
+        (("--adjust", "scanner", "--shift", "free"), "--shift has no effect with --adjust"),
+        (("--cell-m", "8"), "--cell-m needs --adjust"),
+        (("--control", "control.csv"), "--control needs --adjust"),
     ],
 )
 def test_options_of_the_other_way_are_refused(cloud_file, tmp_path, monkeypatch, capsys, options, sentence):

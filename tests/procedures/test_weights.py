@@ -9,7 +9,6 @@ import pytest
 from jaxphoto import adjust, read_block, variance_components
 from jaxphoto.procedures.weights import made_by_blunders
 from jaxphoto.report import component_findings
-from jaxphoto.report.findings import Level
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +35,7 @@ def test_the_component_that_one_wrong_height_makes_is_an_alarm(block):
     # As in the block without the error, whose control heights are as good as stated.
     assert made.without == pytest.approx(1.0, abs=0.5)
     alarm = component_findings(components, [made])[0]
-    assert alarm.level == Level.ALARM and "T11 in Z" in alarm.text and "--snoop" in alarm.text
+    assert alarm.severity == "error" and "T11 in Z" in alarm.text and "--snoop" in alarm.text
 
 
 def test_sigmas_that_were_stated_too_small_are_not(block):

@@ -13,15 +13,18 @@ from jaxphoto.procedures.georeference_photographs import GeoreferencedPhotograph
 from jaxphoto.procedures.matched_part import MatchedPart
 from jaxphoto.procedures.orientation import Oriented
 from jaxphoto.procedures.orientation.orient_photographs import GrossErrors, OrientationReport
-from jaxphoto.report.findings import Finding, Level, Verdict
-from jaxphoto.report.flight import FlightSource, PartReport
-from jaxphoto.statistics.coverage import coverage
+from jaxphoto.report.findings import Finding, Verdict
+from jaxphoto.report.flight import FlightSource
+from jaxphoto.report.flight_plots import PartReport
+from jaxphoto.statistics.block_geometry import coverage
 from jaxphoto.writing.inputs import InputFile
 from tests.blocks import BROWN, adjusted
 
 # Recorded minus adjusted (m), X, Y, Z of the first images; the last of them is left out.
 OFFSETS_M = np.array([[0.1, -0.2, 0.3], [0.3, 0.2, 0.1], [-0.1, 0.3, 0.2], [9.0, 0.0, 0.0]])
-VERDICT = Verdict.of([Finding(Level.WARNING, "one thing to know"), Finding(Level.INFORMATION, "c of camera one")])
+VERDICT = Verdict.of(
+    [Finding("message", "warning", "one thing to know"), Finding("message", "note", "c of camera one")]
+)
 
 
 @functools.cache

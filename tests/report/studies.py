@@ -15,8 +15,8 @@ from jaxphoto.procedures.halves import Cut, Halves
 from jaxphoto.procedures.lidar import LidarControl, Round, Simultaneous
 from jaxphoto.procedures.model_choice import Judged, ModelChoice
 from jaxphoto.stability import Analysis, image_grid
-from jaxphoto.stability.analysis import analyse
 from jaxphoto.stability.band import ErrorBand
+from jaxphoto.stability.comparison import analyse
 from tests.blocks import SENSOR, adjusted
 
 GOPRO = Sensor(3000, 2250, 0.00155)

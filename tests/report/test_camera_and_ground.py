@@ -11,9 +11,8 @@ from jaxphoto.camera import Brown, InteriorOrientation, set_parameter
 from jaxphoto.camera.lens_prior import lens_prior, prior_sigmas
 from jaxphoto.observations import KnownParameters
 from jaxphoto.procedures.known_lens import KnownLens, with_known_lens
-from jaxphoto.report.alike import with_alike
-from jaxphoto.report.lens import lens_findings
-from jaxphoto.report.rolling_shutter import shutter_findings
+from jaxphoto.report.tables import with_correlated_sigma
+from jaxphoto.report.verdict import lens_findings, shutter_findings
 from tests.blocks import SENSOR, adjusted
 
 LENS = KnownLens(InteriorOrientation(35.0, 0.0, 0.0, Brown()), lens_prior("Canon", "Canon EOS 5D"), 0.01)
@@ -48,7 +47,7 @@ def test_rays_that_err_alike_widen_what_they_say_and_not_what_was_known():
     block = dataclasses.replace(found.block, priors=dataclasses.replace(found.block.priors, interior={"one": priors}))
     rows = [("one", "c_mm", 35.0, 0.012), ("one", "k1", 1e-5, 1e-6), ("one", "p1", 0.0, np.nan)]
     table = pd.DataFrame(rows, columns=["camera", "parameter", "value", "sigma"])
-    wide = with_alike(table, dataclasses.replace(found, block=block), 2.0).set_index("parameter").sigma_alike
+    wide = with_correlated_sigma(table, dataclasses.replace(found, block=block), 2.0).set_index("parameter").sigma_alike
     # 1 / 0.012^2 = 1 / 0.02^2 + 1 / 0.015^2; the rays' 0.015 become 0.030.
     assert wide["c_mm"] == pytest.approx(1 / np.sqrt(1 / 0.02**2 + 1 / 0.03**2))
     assert wide["k1"] == pytest.approx(2e-6) and np.isnan(wide["p1"])
@@ -59,20 +58,21 @@ def test_a_block_that_does_not_tell_c_is_warned_of():
     block = with_known_lens(found.block, "one", LENS)
     prior, tables = block.priors.interior["one"].c, {}
     known = float(prior.sigma)
-    for share, word in ((0.9, "does not tell c"), (0.1, "mm less than was thought, 2.5 of the former")):
+    for share, code in ((0.9, "lens_prior_only"), (0.1, "lens_prior")):
         row = {"camera": ["one"], "parameter": ["c_mm"], "value": [float(prior.value) - 2.5 * known]}
         tables["interior"] = pd.DataFrame(row | {"sigma": [share * known]})
         (finding,) = lens_findings(stub(dataclasses.replace(found, block=block), **tables))
-        assert word in finding.text
+        assert (finding.code, finding.value, finding.limit) == (code, share * known, known)
+    assert finding.numbers["ratio"] == pytest.approx(2.5) and finding.numbers["change"] == pytest.approx(-2.5 * known)
     assert list(lens_findings(stub(found, **tables))) == []
 
 
 def test_a_readout_is_told_with_its_direction():
     rows = [("shutters[one].readout_ms", -30.2, 0.5), ("shutters[two].readout_ms", 0.4, 0.3), ("mounts[m].x_m", 1, 1)]
     table = pd.DataFrame(rows, columns=["parameter", "value", "sigma"])
-    one, two = (f.text for f in shutter_findings(stub(adjusted("cross"), georeferencing=table)))
-    assert one == "camera one reads its rows in 30.2 +- 0.5 ms (last row first)"
-    assert "no rolling shutter of camera two is seen" in two
+    one, two = shutter_findings(stub(adjusted("cross"), georeferencing=table))
+    assert one.code == "rolling_shutter" and "30.2 +- 0.5 ms (last row first)" in one.text
+    assert (two.code, two.subject) == ("no_rolling_shutter", "camera two")
 
 
 def test_the_table_of_the_ground():

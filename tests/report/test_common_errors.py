@@ -20,15 +20,16 @@ def test_standard_deviations_of_few_are_judged_although_all_together_fit(block):
     vague = dataclasses.replace(control, sigma=np.full(len(control), 30.0))
     verdict = adjust(block.with_observations({"control_points": vague})).verdict()
     assert verdict.colour == "amber"
-    assert any("standard deviations of control points are" in f.text for f in verdict.findings if f.level > 0)
+    assert any(f.code == "group_sigma" and f.subject == "control points" for f in verdict.findings)
     assert adjust(block).verdict().colour == "green"
 
 
 def test_how_large_an_error_in_common_may_be_unseen_is_what_it_does(block):
     """1.5 m in the heights of all stations shows nowhere, and moves c by what the sentence says."""
     sound = adjust(block)
-    (said,) = [f.text for f in sound.verdict().findings if "stations as a whole: an error in Z" in f.text]
-    seen, moved = float(said.split(" m on")[0].split()[-1]), float(said.split(" by ")[1].split()[0])
+    (finding,) = [f for f in sound.verdict().findings if f.code == "common_bias"]
+    assert finding.subject == "stations as a whole" and finding.numbers["term"] == "Z"
+    seen, moved = finding.value, finding.numbers["moved"]
     rows, shift = block.stations, 0.2 * seen
     value = np.asarray(rows.value) + np.where(rows.axis == 2, shift, 0.0)
     off = adjust(block.with_observations({"stations": dataclasses.replace(rows, value=value)}))

@@ -8,8 +8,8 @@ import pytest
 import jaxphoto
 from jaxphoto import InputError, Outcome, Tables, report
 from jaxphoto.adjustment.told import step_lines
-from jaxphoto.report.convergence import convergence_section, convergence_words
-from jaxphoto.report.convergence_table import convergence_table
+from jaxphoto.report.results import convergence_words
+from jaxphoto.report.tables import convergence_table
 from tests.blocks import adjusted, simulated
 
 
@@ -38,6 +38,6 @@ def test_the_last_step_is_shorter_than_what_ends_an_adjustment():
 
 def test_where_nothing_was_iterated_nothing_is_told():
     without = dataclasses.replace(adjusted("cross"), course=None)
-    assert convergence_table(without).empty and not list(convergence_section(without))
+    assert convergence_table(without).empty and convergence_words(without) == ""
     with pytest.raises(InputError, match="adjust the block to draw its convergence"):
         report.plot_convergence(Tables(without))

@@ -1,7 +1,7 @@
 """Correlations as a reader has them: parameters beside one another."""
 
 from jaxphoto import Tables
-from jaxphoto.report.correlation_tables import side_by_side
+from jaxphoto.report.tables import side_by_side
 from tests.blocks import adjusted
 
 

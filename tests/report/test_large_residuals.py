@@ -6,12 +6,12 @@ import numpy as np
 
 from jaxphoto import Tables, adjust
 from jaxphoto.report import residual_findings, verdict_of
-from jaxphoto.statistics.blunder_test import Hidden
+from jaxphoto.statistics.reliability import LargestMdb
 from tests.blocks import adjusted, simulated
 
 
 def large(tables):
-    return [f.text for f in verdict_of(tables).findings if "contradicts the other observations" in f.text]
+    return [f.subject for f in verdict_of(tables).findings if f.code == "blunder"]
 
 
 def test_blunders_are_named_the_largest_first():
@@ -31,10 +31,15 @@ def test_blunders_are_named_the_largest_first():
 
 def test_what_nothing_checks_is_told_as_such(monkeypatch):
     hidden = [
-        Hidden("stations", "station A in X", np.inf, 0.1, "m"),
-        Hidden("stations", "station B in X", 2.0, 0.1, "m"),
+        LargestMdb("stations", "station A in X", np.inf, 0.1, "m"),
+        LargestMdb("stations", "station B in X", 2.0, 0.1, "m"),
     ]
-    monkeypatch.setattr(residual_findings, "worst_checked", lambda adjusted, redundancy: hidden)
-    told = [f.text for f in residual_findings.of_what_is_not_checked(Tables(adjusted("cross")))]
-    assert "station A in X: nothing checks it, and no error of it would be found, however large (its sigma" in told[-2]
-    assert "station B in X: an error of 2 m would be found with a probability of 80 % only" in told[-1]
+    monkeypatch.setattr(residual_findings, "largest_mdbs", lambda adjusted, redundancy: hidden)
+    *_, one, other = residual_findings.reliability_findings(Tables(adjusted("cross")))
+    assert (one.code, one.subject, other.code, other.subject) == (
+        "unchecked",
+        "station A in X",
+        "mdb",
+        "station B in X",
+    )
+    assert other.value == 2.0 and "MDB 2 m (sigma 0.1 m" in other.text

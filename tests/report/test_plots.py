@@ -7,7 +7,7 @@ from matplotlib.quiver import Quiver, QuiverKey
 
 from jaxphoto import Tables
 from jaxphoto.report import check_points_figure, plot_error_ellipses, plots
-from jaxphoto.report.error_ellipses import ellipse_axes
+from jaxphoto.report.plots import ellipse_axes
 from tests.blocks import adjusted
 
 
@@ -47,12 +47,12 @@ def test_points_checked_in_plan_only_have_no_height():
 
 def test_of_many_residuals_a_part_is_drawn_and_the_largest(monkeypatch):
     tables = Tables(adjusted("cross"))
-    (whole,) = plots.residuals_figure(tables, "one").axes
+    whole = plots.plot_residuals(tables, "one", Figure().add_subplot())
     n = len(tables.adjusted.block.image_points.xy)
     assert len(arrows(whole).U) == n and "1 in" not in whole.get_title(loc="left")
     monkeypatch.setattr(plots, "_ARROWS", n // 4)
     monkeypatch.setattr(plots, "_LARGEST", 3)
-    (part,) = plots.residuals_figure(tables, "one").axes
+    part = plots.plot_residuals(tables, "one", Figure().add_subplot())
     assert n // 5 <= len(arrows(part).U) <= n // 4 + 3
     assert "1 in 5" in part.get_title(loc="left") or "1 in 4" in part.get_title(loc="left")
     size = lambda axes: np.sort(np.hypot(arrows(axes).U, arrows(axes).V))  # noqa: E731

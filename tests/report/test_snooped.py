@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust, read_block, snoop
+from jaxphoto.initial.approximate import in_front, looking_away
 from jaxphoto.observations import Distances
-from jaxphoto.orientation.approximate import in_front, looking_away
 from jaxphoto.procedures import Snooped
 from jaxphoto.procedures.mistakes import coordinate_mistakes
 from jaxphoto.report import Tables, verdict_of
-from jaxphoto.report.findings import Level
-from jaxphoto.report.snooped import snooped_findings
+from jaxphoto.report.residual_findings import snooped_findings
 from jaxphoto.statistics import Suspect, covariance
-from jaxphoto.statistics.trends import inverse_of_seen
+from jaxphoto.statistics.systematic_effects import truncated_inverse
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +29,9 @@ def test_the_shift_of_a_strip_is_told_as_one(block):
     spoilt = block.with_observations({"stations": dataclasses.replace(rows, value=value)})
     first, *others = snooped_findings(snoop(spoilt), spoilt)
     n = int((in_b & (rows.axis == 2)).sum())
-    assert f"{n} of the {n} stations in strip B along Z" in first.text and "by +3" in first.text
-    assert all("left out: station of image B" in f.text for f in others[:3])
+    assert first.code == "rejected_bias" and first.subject == "stations in strip B along Z"
+    assert first.value == first.numbers["n"] == n and first.numbers["bias"] == pytest.approx(3.0, abs=0.5)
+    assert all(f.subject.startswith("station of image B") for f in others[:3])
 
 
 def test_single_errors_are_no_shift(block):
@@ -40,8 +40,8 @@ def test_single_errors_are_no_shift(block):
     value = np.array(rows.value)
     value[wrong] += [4.0, -3.0, 6.0, -5.0, 3.0]
     spoilt = block.with_observations({"stations": dataclasses.replace(rows, value=value)})
-    texts = [f.text for f in snooped_findings(snoop(spoilt), spoilt)]
-    assert len(texts) == 5 and not any("alike" in text for text in texts)
+    codes = [f.code for f in snooped_findings(snoop(spoilt), spoilt)]
+    assert codes == ["rejected_observation"] * 5
 
 
 def test_a_group_all_of_whose_rows_go_is_told(block):
@@ -62,8 +62,8 @@ def test_what_is_too_much_to_be_single_errors_is_an_alarm(block):
     xy[mine] = xy[mine][:, ::-1]
     spoilt = block.with_observations({"image_points": dataclasses.replace(rows, xy=xy)})
     first = snooped_findings(snoop(spoilt), spoilt)[0]
-    assert first.level == Level.ALARM and "most image points of image A3" in first.text
-    assert "they fit where it is mirrored" in first.text
+    assert (first.code, first.severity) == ("rejected_images", "error") and first.subject.startswith("A3")
+    assert "mirrored" in first.hint
 
 
 def test_an_image_that_is_mirrored_is_an_alarm(block):
@@ -73,7 +73,7 @@ def test_an_image_that_is_mirrored_is_an_alarm(block):
     xy = np.where(mine, np.asarray(rows.xy) * [-1.0, 1.0], np.asarray(rows.xy))
     spoilt = block.with_observations({"image_points": dataclasses.replace(rows, xy=xy)})
     found = snoop(spoilt)
-    alarms = [f.text for f in snooped_findings(found, spoilt) if f.level == Level.ALARM]
+    alarms = [f.text for f in snooped_findings(found, spoilt) if f.severity == "error"]
     verdict = verdict_of(Tables(found.adjusted))
     assert any("image D4" in text for text in (*alarms, *(verdict.texts if verdict.colour == "red" else ())))
     # Of the block as it is, no point is behind its image.
@@ -84,7 +84,7 @@ def test_an_image_that_is_mirrored_is_an_alarm(block):
 
 def test_numbers_that_overflow_are_no_pattern():
     """As where every image is mirrored and nothing fits: no direction shows, and no traceback."""
-    inverse, freedom = inverse_of_seen(np.full((3, 3), np.nan), np.eye(3), 1e-3)
+    inverse, freedom = truncated_inverse(np.full((3, 3), np.nan), np.eye(3), 1e-3)
     assert freedom == 0 and not inverse.any()
 
 
@@ -96,7 +96,7 @@ def test_the_file_whose_units_are_wrong_is_left_out_and_its_mistake_named(block)
     found = snoop(spoilt)
     assert {(s.group, int(rows.axis[s.row])) for s in found.left_out} == {(rows.group, 2)} and not found.points
     first = snooped_findings(found, spoilt)[0]
-    assert first.level == Level.ALARM and "they fit where Z is in feet, not in metres" in first.text
+    assert first.severity == "error" and "Z is in feet, not in metres" in first.hint
     # Each is predicted by what is in, and not by others that are out: as well as the others place the point.
     adjusted = found.adjusted
     height, sigma0 = np.asarray(adjusted.unknowns.points)[:, 2], float(adjusted.sigma0)

@@ -10,11 +10,19 @@ from jaxphoto import InputError, Tables
 from jaxphoto.camera import Brown, InteriorOrientation, OpenCv, parameter_unit
 from jaxphoto.io import read_result_tables
 from jaxphoto.report import to_latex, to_markdown, write_tables
-from jaxphoto.report.check_points import check_spread
-from jaxphoto.report.digits import alike, in_figures, of_sigma, with_sigma, without_powers
-from jaxphoto.report.findings import Finding, Level, Verdict
-from jaxphoto.report.table_files import head_of, readable
-from jaxphoto.report.units import column_unit, label_unit
+from jaxphoto.report.findings import Finding, Verdict
+from jaxphoto.report.formatting import (
+    column_unit,
+    head_of,
+    in_equal_figures,
+    in_figures,
+    label_unit,
+    of_sigma,
+    readable,
+    with_sigma,
+    without_powers,
+)
+from jaxphoto.report.tables import check_spread
 from tests.blocks import adjusted
 from tests.commands import run
 
@@ -44,13 +52,16 @@ def test_a_number_ends_at_the_second_digit_of_its_sigma(value, sigma, text, sigm
 def test_large_numbers_have_no_powers_of_ten():
     said = without_powers("by -1.16e+03 +- 4e+02 m, of point 7e+02b 1e-05.")
     assert said == "by -1160 +- 400 m, of point 7e+02b 1e-05."
-    assert Verdict.of([Finding(Level.ALARM, "c is off by +2e+03.")]).texts == ["c is off by +2000."]
+    assert Verdict.of([Finding("message", "error", "c is off by +2e+03.")]).texts == ["c is off by +2000."]
     assert [in_figures(1234.5, 3), of_sigma(437.0), in_figures(1e12, 2)] == ["1230", "440", "1.0e+12"]
 
 
 def test_a_column_has_as_many_figures_in_each_row():
-    assert alike([0.0035, 0.002861, -0.0129], 3) == ["0.00350", "0.00286", "-0.0129"]
-    assert alike([1e-08, 4e-10, 0.0], 4) == ["1e-08", "4e-10", "0"] and alike([20.0, 3.5], 4) == ["20", "3.5"]
+    assert in_equal_figures([0.0035, 0.002861, -0.0129], 3) == ["0.00350", "0.00286", "-0.0129"]
+    assert in_equal_figures([1e-08, 4e-10, 0.0], 4) == ["1e-08", "4e-10", "0"] and in_equal_figures([20.0, 3.5], 4) == [
+        "20",
+        "3.5",
+    ]
     shown = readable(pd.DataFrame({"rmse": [0.4, np.nan, 0.188], "X_m": [1234.5678, 0.5, 2.0]}))
     assert shown["rmse"].tolist() == ["0.400", "", "0.188"]
     assert shown["X_m"].tolist() == ["1234.5678", "0.5000", "2.0000"]
@@ -142,7 +153,7 @@ def test_the_command_writes_those_that_are_asked_for(tmp_path, monkeypatch, caps
     assert code == 0 and "2 tables" in screen
     assert {p.name for p in out.glob("*.tex")} == {"interior.tex", "exterior.tex"}
     for words, message in (
-        (("--to", "excel"), "--to excel: there are csv, parquet, markdown, latex"),
+        (("--to", "excel"), "'excel' is not one of"),
         (("--to", "latex", "--only", "inner"), "has no table inner; it has check_points, exterior, interior"),
     ):
         code, _, error = run(monkeypatch, capsys, "tables", tmp_path / "results", *words, "--out", tmp_path / "no")

@@ -38,18 +38,17 @@ def test_a_field_of_known_targets_has_cures_of_its_own(monkeypatch):
     field = dataclasses.replace(free_network.block, control=control)
     of_network, of_field = ("; ".join(verdict_of(Tables(a)).texts) for a in (free_network, adjust(field)))
     assert "with stations (GNSS), relief" in of_network and "targets alone" not in of_network
-    assert "turned by 90 degrees" in of_field and "targets alone" in of_field and "stations (GNSS)" not in of_field
+    assert "rotated by 90 degrees" in of_field and "targets alone" in of_field and "stations (GNSS)" not in of_field
 
 
 def test_a_high_correlation_that_no_image_feels_has_no_cure():
     """Stations that all shift alike: Z and c go together, and c is known well enough."""
     said = [f for f in verdict_of(tables(0.1, 1.0)).findings if "Z with c " in f.text]
-    assert [f.level for f in said] == [verdict.Level.INFORMATION]
-    assert said[0].text.endswith("what is open moves no corner of an image by 10 of its sigmas")
+    assert [(f.code, f.severity) for f in said] == [("correlation_exterior", "note")] and "10 sigma" in said[0].hint
 
 
 def weak(warnings):
-    return [w for w in warnings if "hardly determined" in w]
+    return [w for w in warnings if "poorly determined" in w]
 
 
 def test_flat_ground_without_stations_is_put_into_words():
@@ -84,7 +83,7 @@ def test_stations_that_are_too_weak_do_not_cure_it():
     """It is rho and sigma that decide, not whether stations exist; the cure is not the one for a block without any."""
     found = weak(verdict_of(tables(0.1, 50.0)).texts)
     assert found[0].startswith("c of camera one")
-    assert "stations of sigma 50 m hardly tell them apart: add better camera stations" in found[0]
+    assert "stations of sigma 50 m hardly separate them. Add better camera stations" in found[0]
 
 
 def test_a_solve_that_stopped_says_what_was_open():
@@ -94,7 +93,7 @@ def test_a_solve_that_stopped_says_what_was_open():
     first, *others = verdict_of(Tables(stopped)).findings
     assert "step limit" in first.text
     assert any("c of camera one with Z of all images: hardly determined" in f.text for f in others)
-    assert {f.level for f in (first, *others)} == {verdict.Level.ALARM}
+    assert {f.severity for f in (first, *others)} == {"error"}
 
 
 def test_a_solve_that_stopped_where_nothing_fits_says_who_finds_out():
@@ -103,7 +102,7 @@ def test_a_solve_that_stopped_where_nothing_fits_says_who_finds_out():
     far = jax.tree.map(lambda v: 100.0 * np.asarray(v), optimum.residuals)
     stopped = dataclasses.replace(optimum, converged=np.array(False), residuals=far)
     _, told = verdict_of(Tables(stopped)).findings
-    assert told.text.startswith("nothing fits where it stopped (sigma naught 1") and "--snoop" in told.text
+    assert told.code == "nothing_fits" and told.value > 90 and "--snoop" in told.hint
 
 
 def test_relief_cures_it():

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxphoto import Brown, InteriorOrientation, Sensor
-from jaxphoto.sensitivity.network.strips import StripDesign, StripPlan
+from jaxphoto.sensitivity.network.layout import StripDesign, StripPlan
 
 SENSOR = Sensor(4500, 3000, 0.008)
 INTERIOR = InteriorOrientation(34.25, 0.064, 0.273, Brown(k1=-9.12e-5, k2=1.0435e-7))

@@ -1,4 +1,4 @@
-"""What sensitivities are used for: station biases, shares of variance, external reliability; tables and command."""
+"""Station bias, variance fractions and external reliability; tables and command."""
 
 import dataclasses
 import functools
@@ -13,7 +13,6 @@ import pytest
 from typer.testing import CliRunner
 
 from jaxphoto import adjust, covariance, read_block
-from jaxphoto.cli import app
 from jaxphoto.errors import InputError
 from jaxphoto.observations import StationRows
 from jaxphoto.report.sensitivity import SensitivityTables
@@ -21,6 +20,7 @@ from jaxphoto.sensitivity.exact import sensitivity
 from jaxphoto.sensitivity.influence import Per, external_reliability, station_bias, variance_shares
 from jaxphoto.statistics import redundancy_numbers
 from jaxphoto.writing import MARKER
+from jaxphoto_command import app
 from tests.blocks import adjusted, simulated
 from tests.checked_types import unchecked
 from tests.test_examples import EXAMPLES
@@ -33,7 +33,7 @@ def derivatives(name: str, curvature: bool = True):
 
 @functools.cache
 def in_strips():
-    """The cross block, its images in two strips; no number of the adjustment depends on that."""
+    """The cross block with its images in two strips, which does not affect the adjustment."""
     a = adjusted("cross")
     strips = ("a",) * 5 + ("b",) * 5
     return dataclasses.replace(a, block=dataclasses.replace(a.block, image_strip=strips))
@@ -42,8 +42,8 @@ def in_strips():
 def test_bias_of_a_strip_is_what_full_adjustments_show() -> None:
     """10 cm in height at the stations of strip b: the largest derivatives, and the change of two adjustments."""
     a = in_strips()
-    found = station_bias(a, derivatives("cross"), "strip", 0.1)
-    assert found.units == ("a", "b")
+    result = station_bias(a, derivatives("cross"), "strip", 0.1)
+    assert result.units == ("a", "b")
     moved = (np.asarray(a.block.stations.who) >= 5) & (np.asarray(a.block.stations.axis) == 2)
 
     def principal_distance(bias: float) -> float:
@@ -52,23 +52,23 @@ def test_bias_of_a_strip_is_what_full_adjustments_show() -> None:
         return float(adjust(block, a.unknowns).unknowns.interior["one"].c)
 
     expected = (principal_distance(0.1) - principal_distance(-0.1)) / 2
-    assert found.change[derivatives("cross").of("interior[one].c_mm"), 1, 2] == pytest.approx(expected, rel=1e-3)
+    assert result.change[derivatives("cross").row("interior[one].c_mm"), 1, 2] == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("per", ["block", "image"])
 def test_station_bias_by_block_and_image(per: Per) -> None:
     a = adjusted("cross")
-    found = station_bias(a, derivatives("cross"), per, 0.1)
-    assert found.units == (("block",) if per == "block" else a.block.images)
-    total = found.change.sum(axis=1)
+    result = station_bias(a, derivatives("cross"), per, 0.1)
+    assert result.units == (("block",) if per == "block" else a.block.images)
+    total = result.change.sum(axis=1)
     whole = station_bias(a, derivatives("cross"), "block", 0.1).change[:, 0]
     np.testing.assert_allclose(total, whole, rtol=1e-9, atol=1e-12)
-    # Stations and control contradict each other: part of a bias in height ends in the principal distance.
-    assert abs(whole[derivatives("cross").of("interior[one].c_mm"), 2]) > 1e-5
+    # Stations and control contradict each other: part of a bias in height is absorbed by the principal distance.
+    assert abs(whole[derivatives("cross").row("interior[one].c_mm"), 2]) > 1e-5
 
 
 def test_variance_is_that_of_the_covariance_where_residuals_are_measurements() -> None:
-    """Up to the distortion: residuals are of ideal coordinates, which it stretches by some per cent."""
+    """Up to the distortion: residuals are of ideal coordinates, which it scales by some per cent."""
     shares = variance_shares(adjusted("cross"), derivatives("cross", False))
     cov = covariance(adjusted("cross"))
     variance = np.diagonal(cov.matrix)
@@ -80,7 +80,7 @@ def test_variance_is_that_of_the_covariance_where_residuals_are_measurements() -
 
 @pytest.mark.slow
 def test_shares_without_distortion_are_those_of_the_covariance() -> None:
-    """Where residuals are the measured coordinates themselves, A diag(sigma^2) A' is the covariance exactly."""
+    """For residuals of measured coordinates, A diag(sigma^2) A' is the covariance exactly."""
     block = simulated("fixed_interior").block
     nothing = jax.tree.map(lambda v: np.float64(0.0), block.start.unknowns.interior["one"].distortion)
     start = eqx.tree_at(lambda u: u.interior["one"].distortion, block.start.unknowns, nothing)
@@ -92,22 +92,22 @@ def test_shares_without_distortion_are_those_of_the_covariance() -> None:
 
 
 def test_external_reliability_is_an_undetected_error_adjusted_in() -> None:
-    """An error of the minimal detectable size is put into a control coordinate, and the block adjusted anew."""
+    """Readjust the block with an error of the size of the MDB in a control coordinate."""
     a = adjusted("cross")
-    found = external_reliability(a, derivatives("cross", False))
+    result = external_reliability(a, derivatives("cross", False))
     control = 4
     r = np.asarray(redundancy_numbers(a, covariance(a))["control_points"])[control]
-    error = found.detectable["control_points"][control]
+    error = result.mdb["control_points"][control]
     assert error == pytest.approx(4.13 * 0.03 / np.sqrt(r), rel=1e-9)
     value = np.array(a.block.control.value)
     value[control] += error
     again = adjust(eqx.tree_at(lambda b: b.control.value, a.block, value), a.unknowns)
-    row = derivatives("cross").of("interior[one].c_mm")
+    row = derivatives("cross").row("interior[one].c_mm")
     moved = float(again.unknowns.interior["one"].c - a.unknowns.interior["one"].c)
-    assert found.effect["control_points"][row, control] == pytest.approx(moved, rel=0.05)
-    assert all((d > 0).all() for d in found.detectable.values())
-    assert not any(np.isnan(e).any() for e in found.effect.values())
-    # The test that is meant finds it: the normalised residual moves by delta0.
+    assert result.effect["control_points"][row, control] == pytest.approx(moved, rel=0.05)
+    assert all((d > 0).all() for d in result.mdb.values())
+    assert not any(np.isnan(e).any() for e in result.effect.values())
+    # The normalised residual changes by delta0.
     change = (again.residuals["control_points"] - a.residuals["control_points"])[control] / np.sqrt(r)
     assert change == pytest.approx(4.13, rel=0.02)
 
@@ -115,10 +115,10 @@ def test_external_reliability_is_an_undetected_error_adjusted_in() -> None:
 @pytest.mark.parametrize(
     ("call", "sentence"),
     [
-        (lambda a, d: station_bias(a, d, "camera"), "per block, strip, image, not per camera"),  # type: ignore[arg-type]
+        (lambda a, d: station_bias(a, d, "camera"), "per camera is unknown: choose among block, strip, image"),  # type: ignore[arg-type]
         (lambda a, d: station_bias(a, d, "strip"), "no image with an observed station has a strip"),
-        (lambda a, d: external_reliability(a, d, 0.0), "a positive number, not 0.0"),
-        (lambda a, d: d.of("interior[one].k9"), "no estimate is called interior"),
+        (lambda a, d: external_reliability(a, d, 0.0), "must be positive, got 0.0"),
+        (lambda a, d: d.row("interior[one].k9"), "no estimate interior"),
     ],
 )
 def test_mistakes_get_a_sentence(call, sentence: str) -> None:
@@ -143,7 +143,7 @@ def test_tables_and_command(tmp_path) -> None:
     }  # fmt: skip
     page = (tmp_path / "s" / "report.html").read_text(encoding="utf-8")
     assert hashlib.sha256((EXAMPLES / "cross_block" / "image_points.csv").read_bytes()).hexdigest() in page
-    assert "<td>jaxphoto sensitivity " in page and "--bias-m 0.1 --" in page and "data:image/png" in page
+    assert "<td>jaxphoto sensitivity " in page and "--bias-m 0.1 --" in page and "<svg" in page
     assert page.count("<h2") == page.count('<a href="#') == 5
     bias = pd.read_csv(tmp_path / "s" / "sensitivity.csv")
     np.testing.assert_allclose(bias["exact"] - bias["first_order"], bias["difference"], atol=1e-15)

@@ -1,4 +1,4 @@
-"""Draws against full adjustments, against theory, and against themselves."""
+"""Monte Carlo draws compared with full adjustments, theory and each other."""
 
 import dataclasses
 
@@ -55,9 +55,9 @@ def test_a_draw_is_the_optimum_of_its_own_block(name):
     assert not draws.fallback.any()
     for k in range(3):
         block, _ = errors(jax.random.fold_in(jax.random.key(4), k), nominal.block)
-        # The same start as the nominal one's: it is what the datum of a free network refers to.
+        # The start of the nominal adjustment: the datum of a free network refers to it.
         full = adjust(block, nominal.block.start.unknowns, block.priors)
-        # Adjustments end within 1e-5 of their own.
+        # Adjustments converge to 1e-5 of a sigma.
         close(draws, k, full, nominal, 2e-5)
 
 
@@ -97,9 +97,9 @@ def test_a_lever_arm_that_is_held_can_be_drawn():
 def test_a_lever_arm_that_is_known_beforehand_can_be_drawn():
     nominal = adjusted("everything")
     (name,) = nominal.block.priors.mounts
-    known = eqx.tree_at(lambda p: p.mounts[name].lever_arm, nominal.priors, Weighted(np.zeros(3), np.full(3, 0.05)))
-    block = dataclasses.replace(nominal.block, priors=known)
-    nominal = adjust(block, nominal.unknowns, known)
+    reference = eqx.tree_at(lambda p: p.mounts[name].lever_arm, nominal.priors, Weighted(np.zeros(3), np.full(3, 0.05)))
+    block = dataclasses.replace(nominal.block, priors=reference)
+    nominal = adjust(block, nominal.unknowns, reference)
     wrong = bias(block, "lever-arm", 0.1)
     draws = monte_carlo(nominal, wrong, 1, exterior=True, points=True)
     moved = jnp.array([draws.recorded[f"{name}.lever_arm_{axis}_m"][0] for axis in ("right", "forward", "up")])
@@ -107,8 +107,8 @@ def test_a_lever_arm_that_is_known_beforehand_can_be_drawn():
     assert np.abs(moved).max() > 0.01
     close(draws, 0, adjust(block, nominal.unknowns, changed.priors), nominal, 2e-5)
     assert any(target[0] == "priors" for target in noise(block).targets)
-    scalar = eqx.tree_at(lambda p: p.mounts[name].lever_arm, known, Weighted(0.0, 0.05))
-    with pytest.raises(InputError, match="give it three"):
+    scalar = eqx.tree_at(lambda p: p.mounts[name].lever_arm, reference, Weighted(0.0, 0.05))
+    with pytest.raises(InputError, match="give three"):
         bias(dataclasses.replace(block, priors=scalar), "lever-arm", 0.1)
 
 
@@ -120,9 +120,9 @@ def test_scatter_under_noise_is_the_covariance():
     for values, sigma in zip((draws.shared, draws.exterior, draws.points), sigmas(nominal), strict=True):
         free = sigma > 0
         ratio = values.std(axis=0, ddof=1)[free] / sigma[free]
-        # The standard deviation of a sample of n is off by 1 / sqrt(2 n); five of these for the worst of hundreds.
+        # A sample standard deviation has the relative error 1 / sqrt(2 n); five times that for the worst of hundreds.
         assert np.abs(ratio - 1).max() < 5 / np.sqrt(2 * n)
-        # Noise of a measured coordinate is stretched by its distortion, which the weights do not know: two per cent.
+        # The distortion scales the noise of a measured coordinate, but not its weight: two per cent.
         assert abs(ratio.mean() - 1) < 0.03
 
 
@@ -137,14 +137,14 @@ def test_large_errors_depart_from_first_order_by_their_square():
     even = {}
     at = estimates(nominal)[0]
     for size in (0.1, 1.0):
-        to_and_fro = np.concatenate([size * shift, -size * shift])
-        run = Readjustment(nominal, change, to_and_fro)
-        (exact,) = run.batches(to_and_fro)
-        change_of_first = run.first_order(to_and_fro).shared[0] - at
+        both_signs = np.concatenate([size * shift, -size * shift])
+        run = Readjustment(nominal, change, both_signs)
+        (exact,) = run.batches(both_signs)
+        change_of_first = run.first_order(both_signs).shared[0] - at
         odd, even[size] = exact.shared[0] - exact.shared[1], exact.shared.mean(axis=0) - at
-        # First order leaves the residuals' curvature away, which is small.
+        # First order neglects the curvature of the residuals, which is small.
         assert odd / 2 == pytest.approx(change_of_first, rel=0.02, abs=0.02 * np.abs(change_of_first).min())
-    # What no first order sees grows with the square.
+    # The second-order part grows with the square.
     assert even[1.0] / even[0.1] == pytest.approx(np.full(len(at), 100.0), rel=0.1)
 
 
@@ -152,7 +152,7 @@ def test_a_draw_that_does_not_contract_is_adjusted_by_itself():
     nominal = adjusted("cross")
 
     def change(turn, block):
-        # A station field turned by a large angle about the vertical: far from where the factor was made.
+        # Stations rotated by a large angle about the vertical: far from the linearisation point of the factor.
         rows = block.stations
         xyz = jnp.asarray(rows.value).reshape(-1, 3)
         c, s = jnp.cos(turn), jnp.sin(turn)
@@ -201,21 +201,21 @@ def test_a_function_of_ones_own_records_what_it_drew():
     draws = monte_carlo(nominal, perturb, 40)
     assert set(draws.recorded) == {"rise_m"}
     c = next(k for k, label in enumerate(draws.labels) if label.endswith("c_mm"))
-    # Heights that rise together change c and nothing is as sure.
+    # A common change of the heights determines c.
     assert abs(np.corrcoef(draws.recorded["rise_m"], draws.shared[:, c])[0, 1]) > 0.999
 
 
 @pytest.mark.parametrize(
     "arguments, words",
     [
-        (("station", 0.1, "strip", ("S9",)), "no strip 'S9'"),
-        (("station", 0.1, "image", ("nowhere",)), "no image 'nowhere'"),
+        (("station", 0.1, "strip", ("S9",)), "unknown strip 'S9'"),
+        (("station", 0.1, "image", ("nowhere",)), "unknown image 'nowhere'"),
         (("station", 0.0, None, ()), "above zero"),
         (("station", -0.1, None, ()), "above zero"),
         (("station", (0.1, 0.2), None, ()), "one for each of"),
         (("station", 0.1, "point", ()), "not per point"),
-        (("stations", 0.1, None, ()), "no bias of kind"),
-        (("interior", 0.1, None, ()), "name of a parameter"),
+        (("stations", 0.1, None, ()), "unknown kind of bias"),
+        (("interior", 0.1, None, ()), "a parameter name"),
         (("lever-arm", 0.1, None, ()), "no mount"),
         (("attitude", 0.1, None, ()), "no observation"),
     ],
@@ -230,19 +230,19 @@ def test_a_bias_that_cannot_be_is_refused(arguments, words):
 def test_a_bias_of_what_is_free_is_refused():
     with pytest.raises(InputError, match="is free"):
         bias(simulated("cross").block, "interior", 0.1, parameter="c_mm")
-    with pytest.raises(InputError, match="no parameter 'k9'; it has c_mm"):
+    with pytest.raises(InputError, match="no parameter 'k9': choose among c_mm"):
         bias(simulated("cross").block, "interior", 0.1, parameter="k9")
 
 
 @pytest.mark.parametrize("draws", [0, -3])
 def test_no_draws_are_refused(draws):
     nominal = adjusted("cross")
-    with pytest.raises(InputError, match="1 at least"):
+    with pytest.raises(InputError, match="must be positive"):
         monte_carlo(nominal, bias(nominal.block, "station", 0.1), draws)
 
 
 def test_a_perturbation_that_changes_nothing_is_refused():
-    with pytest.raises(InputError, match="changes no number"):
+    with pytest.raises(InputError, match="changes no value"):
         monte_carlo(adjusted("cross"), lambda key, block: block, 3)
 
 

@@ -1,4 +1,4 @@
-"""The covariance of a planned layout: that of an adjustment of it, and its gradient that of finite differences."""
+"""Covariance of a planned layout compared with that of an adjustment, and its gradient with finite differences."""
 
 import dataclasses
 
@@ -13,9 +13,9 @@ import jaxphoto
 from jaxphoto import BlockError, DatumError, Equidistant, InputError
 from jaxphoto.camera import get_parameter
 from jaxphoto.compiling import call_compiled
-from jaxphoto.sensitivity.network import criteria
-from jaxphoto.sensitivity.network.block import check_layout, measured_block
+from jaxphoto.sensitivity.network import covariance as criteria
 from jaxphoto.sensitivity.network.covariance import design_covariance
+from jaxphoto.sensitivity.network.layout import block_from_layout, check_layout
 from jaxphoto.sensitivity.network.search import evaluate_designs
 from jaxphoto.simulation import remeasure
 from tests.blocks import observed
@@ -33,7 +33,7 @@ def layout():
 
 @pytest.fixture(scope="module")
 def measured(layout):
-    return measured_block(layout)
+    return block_from_layout(layout)
 
 
 @pytest.fixture(scope="module")
@@ -42,23 +42,23 @@ def adjusted(measured):
 
 
 def test_it_is_the_covariance_of_an_adjustment(layout, measured, adjusted):
-    planned, found = design_covariance(layout), jaxphoto.covariance(adjusted)
+    planned, result = design_covariance(layout), jaxphoto.covariance(adjusted)
     assert float(adjusted.sigma0) < 1e-9
     assert adjusted.n_observations["attitudes"] == 21
-    sigma = np.sqrt(np.diagonal(found.matrix))
-    assert [label.split(".")[-1] for label in found.labels[-len(FREE) :]] == list(FREE)
+    sigma = np.sqrt(np.diagonal(result.matrix))
+    assert [label.split(".")[-1] for label in result.labels[-len(FREE) :]] == list(FREE)
     np.testing.assert_allclose(np.asarray(planned.sigma), sigma, rtol=1e-6)
     np.testing.assert_allclose(
-        np.asarray(planned.matrix) / np.outer(sigma, sigma), found.matrix / np.outer(sigma, sigma), atol=1e-6
+        np.asarray(planned.matrix) / np.outer(sigma, sigma), result.matrix / np.outer(sigma, sigma), atol=1e-6
     )
     points = np.asarray(planned.points)[measured.point]
-    np.testing.assert_allclose(points, found.points, rtol=1e-5, atol=1e-5 * np.abs(found.points).max())
+    np.testing.assert_allclose(points, result.points, rtol=1e-5, atol=1e-5 * np.abs(result.points).max())
     rays = np.bincount(measured.block.image_points.point)
     np.testing.assert_allclose(np.asarray(planned.rays)[measured.point], rays)
 
 
 def test_noisy_measurements_scatter_by_it(layout, measured):
-    """Forty adjustments: a sigma wrong by half would not pass, a right one fails once in thousands."""
+    """Forty adjustments: a sigma wrong by half fails, a correct one fails once in thousands."""
     block, truth, _ = measured
     numbers = jax.jit(lambda key: observed(remeasure(block, truth, key)))
     errors = []
@@ -85,7 +85,7 @@ ALL = {
 
 
 def all_of(covariance):
-    """ln of every criterion, added with weights of which no sum is another."""
+    """Sum of ln of all criteria with incommensurable weights."""
     logs = jnp.log(jnp.stack([criterion(covariance) for criterion in ALL.values()]))
     return logs @ jnp.sqrt(1.0 + jnp.arange(len(ALL)))
 
@@ -109,7 +109,7 @@ def test_gradient_is_that_of_finite_differences():
 
 
 def test_points_lie_in_the_edge_of_the_usual_layout():
-    """Else the test of the gradient would not see the window."""
+    """Otherwise the test of the gradient would not cover the window."""
     rays = np.asarray(design_covariance(eqx.filter_jit(PLAN)(USUAL)).rays)
     assert (np.abs(rays - np.round(rays)) > 1e-3).sum() >= 4
 
@@ -134,13 +134,13 @@ def test_largest_is_the_limit_of_its_norm():
 
 
 def test_what_a_layout_cannot_be_is_said_in_a_sentence(layout):
-    with pytest.raises(InputError, match=r"k2, which is fixed .* \(c_mm, xp_mm, yp_mm, k1\)"):
+    with pytest.raises(InputError, match=r"k2, which is fixed: .* \(c_mm, xp_mm, yp_mm, k1\)"):
         criteria.sigma_of(design_covariance(layout), "k2")
-    with pytest.raises(InputError, match="roll of the images, which have X, Y"):
+    with pytest.raises(InputError, match=r"unknown exterior parameter roll .* X, Y"):
         criteria.mean_correlation(design_covariance(layout), ("roll",), ("k1",))
-    with pytest.raises(InputError, match="k9 is no parameter of this camera; choose among c_mm"):
+    with pytest.raises(InputError, match="unknown parameter k9 of this camera: choose among c_mm"):
         dataclasses.replace(layout, free=("k9",))
-    with pytest.raises(InputError, match="edge_mm is the positive width"):
+    with pytest.raises(InputError, match="edge_mm, the width"):
         dataclasses.replace(layout, edge_mm=0.0)
     nothing = dataclasses.replace(layout, station_weight=0.0, attitude_weight=0.0)
     with pytest.raises(DatumError, match="rotation about X"):

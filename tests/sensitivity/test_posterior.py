@@ -20,7 +20,7 @@ OF_CROSS = ("interior[one].c_mm", "interior[one].xp_mm", "exterior[i3].Z", "exte
 
 
 def standard_errors(p: Posterior) -> tuple[np.ndarray, np.ndarray]:
-    """Of means and of sigmas, over the sigmas of the Laplace approximation, as if the posterior were normal."""
+    """Standard errors of means and sigmas over the Laplace sigmas, for a normal posterior."""
     return 1 / np.sqrt(p.ess), 1 / np.sqrt(2 * p.ess)
 
 
@@ -68,7 +68,7 @@ def test_free_network_is_sampled_on_the_plane_of_its_constraints():
 
 
 class TwoHeights(NamedTuple):
-    """Two vertical images, one above the other, of one point whose X and Y are known: c and Z are unknown."""
+    """Two vertical images, one above the other, of one point with known X and Y: c and Z are unknown."""
 
     adjusted: object
     heights: np.ndarray
@@ -87,8 +87,8 @@ def two_heights() -> TwoHeights:
     camera = InteriorOrientation(35.0, 0.0, 0.0, Brown())
     block, truth = bare(scene, {"one": camera}, ("one", "one"))
     rows = dataclasses.replace(block.image_points, sigma=np.full((2, 2), SIGMA_MM))
-    known = ControlRows(np.zeros(2, int), np.arange(2), place[:2], np.zeros(2))
-    block = free(dataclasses.replace(block, image_points=rows, fixed=known), "one", ("c_mm",))
+    reference = ControlRows(np.zeros(2, int), np.arange(2), place[:2], np.zeros(2))
+    block = free(dataclasses.replace(block, image_points=rows, fixed=reference), "one", ("c_mm",))
     where = lambda b: (b.priors.exterior.position, b.priors.exterior.camera_from_object)  # noqa: E731
     block = eqx.tree_at(where, block, (FIXED, FIXED))
     simulated = measured(Simulated(block, truth), 4)
@@ -122,7 +122,7 @@ def test_curved_posterior_is_the_density_summed_over_a_grid():
     np.testing.assert_array_equal(p.samples, again.samples)
     mean, sigma, skewness = integrated(case)
     laplace = np.sqrt(np.diagonal(p.laplace))
-    # What there is to see: c above its optimum on average, and far from symmetric.
+    # The posterior is clearly non-Gaussian: the mean of c differs from its optimum, and it is skewed.
     assert (np.abs(skewness) > 0.4).all()
     assert (np.abs(mean - p.optimum) > 0.15 * laplace).all()
     assert (np.abs(p.mean - mean) / sigma < 4 / np.sqrt(p.ess)).all()
@@ -134,13 +134,16 @@ def test_curved_posterior_is_the_density_summed_over_a_grid():
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
-        ({"parameters": ["interior[one].c"]}, "no parameter interior\\[one\\].c; near are interior\\[one\\].c_mm"),
-        ({"parameters": ["interior[one].p1"]}, "interior\\[one\\].p1 is held fixed"),
-        ({"parameters": []}, "one at least, got none"),
-        ({"parameters": [OF_CROSS[0]] * 2}, "each parameter once"),
-        ({"draws": 0}, "draws is 4 at least, got 0"),
-        ({"warmup": 0}, "warmup is 1 at least, got 0"),
-        ({"chains": -1}, "chains is 1 at least, got -1"),
+        (
+            {"parameters": ["interior[one].c"]},
+            "similar names are interior\\[one\\].c_mm",
+        ),
+        ({"parameters": ["interior[one].p1"]}, "interior\\[one\\].p1 is fixed"),
+        ({"parameters": []}, "at least one parameter, each once; got none"),
+        ({"parameters": [OF_CROSS[0]] * 2}, "each once"),
+        ({"draws": 0}, "draws must be at least 4, got 0"),
+        ({"warmup": 0}, "warmup must be at least 1, got 0"),
+        ({"chains": -1}, "chains must be at least 1, got -1"),
     ],
 )
 def test_bad_questions_get_one_sentence(given, sentence):
@@ -151,14 +154,14 @@ def test_bad_questions_get_one_sentence(given, sentence):
 def test_an_adjustment_that_did_not_converge_is_not_sampled():
     block = adjusted("cross").block
     half_way = adjust(block, block.start.unknowns, max_steps=1)
-    with pytest.raises(InputError, match="no optimum to sample about"):
+    with pytest.raises(InputError, match="needs a converged adjustment"):
         posterior(half_way, OF_CROSS)
 
 
 def test_fixed_coordinates_and_images_have_no_posterior():
     a = two_heights().adjusted
     for name in ("points[p0].X", "exterior[i0].omega"):
-        with pytest.raises(InputError, match="held fixed"):
+        with pytest.raises(InputError, match="is fixed"):
             posterior(a, [name])
 
 

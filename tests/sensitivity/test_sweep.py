@@ -1,4 +1,4 @@
-"""A sweep says of every design what its adjustment alone says, recovers known laws, and tells it in a tidy table."""
+"""Sweep: same results as separate adjustments, known effects of designs, tidy table and figures."""
 
 import copy
 import dataclasses
@@ -16,7 +16,7 @@ import jaxphoto
 from jaxphoto import FREE, DatumError, InputError, RankError
 from jaxphoto.adjustment import Sizes, common_sizes
 from jaxphoto.report.sweep import plot_sweep, sweep_figure, sweep_table
-from jaxphoto.sensitivity import designs as side_by_side
+from jaxphoto.sensitivity import sweep as side_by_side
 from jaxphoto.sensitivity.sweep import Design, Sweep, sweep
 from jaxphoto.statistics import correlations
 from tests.checked_types import unchecked
@@ -55,7 +55,7 @@ STUDY = Path(__file__).resolve().parents[2] / "experiments" / "correlation_study
 def design(name: str, changes: dict[str, Any]) -> Design:
     block, truth, _ = made(copy.deepcopy(BASE) | changes)
     if name in ("unknown arm", "singular"):
-        # A known camera would hold the arm: here all images are the first one's.
+        # A known camera would determine the lever arm: here all images are of the first one.
         block = dataclasses.replace(block, image_camera=("kodak",) * len(block.images))
     if name == "blunder":
         xy = block.image_points.xy.copy()
@@ -115,7 +115,7 @@ def test_designs_of_any_size_share_one_program(designs, swept):
 
 
 def test_unknowns_of_mounts_are_correlated_over_their_images(designs, swept, sizes):
-    """Where all images share one mount, its correlations are means over the whole block."""
+    """For one mount of all images, its correlations are means over the whole block."""
     k = NAMES.index("unknown arm")
     adjusted = jaxphoto.adjust(designs[k].block, sizes=sizes)
     covariance = jaxphoto.covariance(adjusted)
@@ -131,12 +131,12 @@ def test_known_laws(swept):
     of = {name: k for k, name in enumerate(NAMES)}
     sigma, rho = swept.sigma, swept.mean_abs
     omega, phi = swept.eop_names.index("omega"), swept.eop_names.index("phi")
-    # Heights of stations hold c, as far as they and the lever arm are known.
+    # Station heights determine c if they and the lever arm are precise.
     assert sigma[of["poor stations"], c] > 1.3 * sigma[of["base"], c]
     assert sigma[of["unknown arm"], c] > 1.3 * sigma[of["base"], c]
     rho_c_up = np.abs(swept.correlation[:, c, up])
     assert rho_c_up[of["unknown arm"]] > 0.8 > 0.2 > rho_c_up[of["base"]]
-    # Strips across tell the principal point from the tilts.
+    # Cross strips separate the principal point from the tilts.
     assert rho[of["no cross strip"], omega, y_p] > 1.2 * rho[of["base"], omega, y_p]
     # A strip flown the other way determines x_p better.
     assert sigma[of["not turned"], x_p] > 1.05 * sigma[of["base"], x_p]
@@ -160,21 +160,21 @@ def test_what_says_nothing_is_kept_and_marked(designs, swept, sizes):
 
 
 def test_other_kinds_of_observations_are_another_program(monkeypatch):
-    """Findings come back in the order of the designs, with NaN where a design lacks an unknown."""
+    """Statistics come back in the order of the designs, with NaN where a design lacks an unknown."""
     without = {"mounts": {}, "sigmas.station_m": None}
     shifted = [{"strips": {strip: {"shift": {"sigma_m": 1.0}}}} for strip in "AB"]
     few = [design("", changes) for changes in ({}, without, DESIGNS["small"], *shifted)]
 
-    def found(prepared, rotations, max_steps, seconds):
+    def evaluate(prepared, rotations, max_steps, seconds):
         n, q = len(prepared), len(prepared[0].labels)
         numbers = np.array([design.redundancy for design in prepared])
         ones = np.ones((n, 6, q))
-        return side_by_side.Findings(
+        return side_by_side.DesignStatistics(
             np.ones(n, bool), np.ones(n), numbers, 4.0 * numbers, np.tile(np.eye(q), (n, 1, 1)), ones[..., 0],
             ones, ones, ones[:, :3, 0], ones[:, :3, 0],
         )  # fmt: skip
 
-    monkeypatch.setattr(importlib.import_module("jaxphoto.sensitivity.sweep"), "find", found)
+    monkeypatch.setattr(importlib.import_module("jaxphoto.sensitivity.sweep"), "evaluate", evaluate)
     swept = sweep(few)
     assert swept.programs == 3
     np.testing.assert_array_equal(swept.steps, swept.redundancy)
@@ -198,7 +198,12 @@ def test_the_study_asks_of_blocks_that_one_program_serves(monkeypatch):
         asked = study.designs()
         sizes = common_sizes(d.block for d in asked)
         assert [d.parameters["question"] for d in asked] == list(study.DRAWN)
-        assert len(side_by_side.alike([side_by_side.prepare_design(d.block, d.truth, sizes, 25) for d in asked])) == 1
+        assert (
+            len(
+                side_by_side.group_by_program([side_by_side.prepare_design(d.block, d.truth, sizes, 25) for d in asked])
+            )
+            == 1
+        )
 
 
 def test_the_table_is_tidy(swept):
@@ -254,11 +259,9 @@ def test_pictures(swept):
 
 def test_mistakes_are_told_in_one_sentence(designs, swept):
     base = designs[0]
-    with pytest.raises(InputError, match="needs one design at least"):
+    with pytest.raises(InputError, match="needs at least one design"):
         sweep([])
-    with pytest.raises(
-        InputError, match=r"design 2 \(cross True\) is told by the parameters cross, but .* name, images"
-    ):
+    with pytest.raises(InputError, match=r"design 2 \(cross True\) has the parameters cross, but .* name, images"):
         sweep([base, base._replace(parameters={"cross": True})])
     fewer = eqx.tree_at(lambda b: b.priors.interior["kodak"].distortion.k2, base.block, jaxphoto.FIXED)
     with pytest.raises(InputError, match=r"design 2 .* estimates .*k1, but the first design .*k2: give all designs"):
@@ -272,7 +275,7 @@ def test_mistakes_are_told_in_one_sentence(designs, swept):
         sweep([base._replace(block=blind)])
     with pytest.raises(InputError, match=r"design 1 .* has a truth of 3 points, but its block has \d+"):
         sweep([base._replace(truth=eqx.tree_at(lambda t: t.points, base.truth, np.zeros((3, 3))))])
-    with pytest.raises(ValueError, match="rotations is one of"), unchecked():
+    with pytest.raises(ValueError, match="rotations must be one of"), unchecked():
         sweep([base], "euler")  # type: ignore[arg-type]
     renamed = dataclasses.replace(swept, parameters=tuple({"value": k} for k in range(len(swept))))
     with pytest.raises(InputError, match="called value, like a column"):

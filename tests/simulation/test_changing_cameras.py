@@ -129,7 +129,9 @@ def test_a_photograph_without_a_time_is_named(tmp_path):
     cells = lines[3].split(",")
     cells[lines[0].split(",").index("time_s")] = ""
     table.write_text("\n".join([*lines[:3], ",".join(cells), *lines[4:]]) + "\n")
-    with pytest.raises(BlockError, match=r"row 4: image A_03 has no time_s, but its camera kodak changes"):
+    with pytest.raises(
+        BlockError, match=r"row 4: image A_03 has no time_s, but in \[unknowns.camera_rates\] its camera kodak drifts"
+    ):
         read_block(tmp_path / "block")
 
 
@@ -142,19 +144,19 @@ def test_a_photograph_without_a_time_is_named(tmp_path):
         ({"flight.turn_s": -1.0}, r"\[flight\] turn_s"),
         (
             {"thermal_rates": THERMAL["thermal_rates"]},
-            "thermal_rates: the recipe says nothing of the temp",
+            "thermal_rates: the recipe has no temperature",
         ),
-        ({"camera_walk": {"c_mm": 0.1}}, r"camera_walk: the cameras of strips walk, but there are none"),
-        (STRIPS | {"camera_walk.c_mm": 0.0}, r"\[camera_walk\]: the steps of c, x_p and y_p are all observed"),
+        ({"camera_walk": {"c_mm": 0.1}}, r"camera_walk: there are no cameras of strips"),
+        (STRIPS | {"camera_walk.c_mm": 0.0}, r"\[camera_walk\]: c, x_p and y_p all walk"),
         (
             STRIPS | {"strip_cameras.A.truth": {"c_more": "free"}},
-            r"A\.truth\] c_more: what is true is not free",
+            r"A\.truth\] c_more: a truth is not free",
         ),
         (
             SPLINE | {"camera_splines.kodak.knots": 7},
             r"kodak\.truth\]: knots = 7 is not an even number",
         ),
-        (THERMAL | {"temperature.time_constant_s": 0.0}, r"\[temperature\] time_constant_s: 0 is not positive"),
+        (THERMAL | {"temperature.time_constant_s": 0.0}, r"\[temperature\] time_constant_s: 0.0 is not positive"),
     ],
 )
 def test_what_cannot_be_is_refused(changes, words):
@@ -164,5 +166,5 @@ def test_what_cannot_be_is_refused(changes, words):
 
 def test_a_convergent_set_has_no_time():
     set_ = {"field_m": [1.0, 1.0], "stations": [{"name": "a", "distance_m": 2.0, "tilt_deg": 30.0}]}
-    with pytest.raises(InputError, match=r"camera_rates: a convergent set has no times that a camera could change in"):
+    with pytest.raises(InputError, match=r"camera_rates: a convergent set has no strips and no times"):
         recipe_from(changed(RATES | {"flight": None, "convergent": set_}))

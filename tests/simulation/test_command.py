@@ -10,7 +10,7 @@ import pytest
 import jaxphoto
 from jaxphoto.block import Block
 from jaxphoto.io import read_block, recipe_from, write_simulation
-from jaxphoto.io.block_folder.settings import toml_text
+from jaxphoto.io.toml import toml_text
 from jaxphoto.simulation import simulate
 from tests.commands import run
 from tests.simulation.small import RECIPES, changed, made
@@ -83,7 +83,7 @@ def test_mistakes_end_with_one_sentence_and_nothing_written(tmp_path, monkeypatc
     recipe.write_text((RECIPES / "000.toml").read_text().replace("= 60.0\nside", "= 160.0\nside"))
     code, said, errors = run(monkeypatch, capsys, "simulate", recipe, "--out", tmp_path / "block")
     assert (code, said) == (2, "")
-    assert errors.startswith("jaxphoto: bad.toml, [flight] forward_overlap_percent: an overlap of 160 %")
+    assert errors.startswith("jaxphoto: bad.toml, [flight] forward_overlap_percent: 160")
     assert [p.name for p in tmp_path.iterdir()] == ["bad.toml"]
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("mine")

@@ -21,7 +21,7 @@ def by_rotation():
 
 @pytest.mark.parametrize("kind", ["omega_phi_kappa", "object"])
 def test_kinds_of_rotation_are_one_covariance(by_rotation, kind):
-    """Small rotations in the camera carried over by a numerical derivative, or by the rotation itself."""
+    """Camera-frame rotations transformed by a numerical derivative, or by the rotation matrix."""
     exterior = adjusted("two_cameras").unknowns.exterior
     n = by_rotation[kind].n_images
     transport = np.eye(len(by_rotation[kind].labels))
@@ -29,19 +29,19 @@ def test_kinds_of_rotation_are_one_covariance(by_rotation, kind):
     for i in range(n):
         matrix = np.asarray(exterior.camera_from_object)[i]
         if kind == "object":
-            turn = matrix.T
+            factor = matrix.T
         else:
             step = 1e-5 * np.eye(3)
-            turn = np.asarray(angles(matrix, step) - angles(matrix, -step)).T / 2e-5
-        transport[6 * i + 3 : 6 * i + 6, 6 * i + 3 : 6 * i + 6] = turn
+            factor = np.asarray(angles(matrix, step) - angles(matrix, -step)).T / 2e-5
+        transport[6 * i + 3 : 6 * i + 6, 6 * i + 3 : 6 * i + 6] = factor
     expected = transport @ np.asarray(by_rotation["camera"].matrix) @ transport.T
     sigma = np.sqrt(np.diag(expected))
-    found = np.asarray(by_rotation[kind].matrix)
-    np.testing.assert_allclose(found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-8)
-    # Positions and interior orientation do not mind; rotations do.
+    result = np.asarray(by_rotation[kind].matrix)
+    np.testing.assert_allclose(result / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-8)
+    # Positions and interior orientation are invariant; rotations are not.
     others = np.r_[0:3, 6 * n : len(sigma)]
-    np.testing.assert_allclose(found[np.ix_(others, others)], expected[np.ix_(others, others)], rtol=1e-12)
-    assert np.abs(found / np.asarray(by_rotation["camera"].matrix) - 1).max() > 0.1
+    np.testing.assert_allclose(result[np.ix_(others, others)], expected[np.ix_(others, others)], rtol=1e-12)
+    assert np.abs(result / np.asarray(by_rotation["camera"].matrix) - 1).max() > 0.1
 
 
 def test_labels_and_a_posteriori_sigmas(by_rotation):
@@ -65,11 +65,11 @@ def test_fixed_coordinates_have_no_variance():
     """Fixed control of `everything`: X and Y of one point."""
     block, cov = adjusted("everything").block, covariance_of("everything")
     sigma = np.asarray(cov.point_sigma)
-    held = np.zeros_like(sigma, bool)
-    held[block.fixed.who, block.fixed.axis] = True
-    assert held.sum() == 2
-    assert (sigma[held] == 0).all()
-    assert (sigma[~held] > 0).all()
+    fixed = np.zeros_like(sigma, bool)
+    fixed[block.fixed.who, block.fixed.axis] = True
+    assert fixed.sum() == 2
+    assert (sigma[fixed] == 0).all()
+    assert (sigma[~fixed] > 0).all()
 
 
 def test_correlations_by_camera(by_rotation):
@@ -77,11 +77,11 @@ def test_correlations_by_camera(by_rotation):
     rho = np.asarray(cov.matrix) / np.sqrt(np.outer(np.diag(cov.matrix), np.diag(cov.matrix)))
     np.testing.assert_allclose(correlation_matrix(cov), rho, atol=1e-12)
     labels = list(cov.labels)
-    found = correlations(a, cov)
-    assert set(found) == {"one", "two"}
-    assert found["one"].parameters == ("c_mm", "xp_mm", "yp_mm", "k1", "k2")
-    assert found["two"].parameters == ("c_mm", "xp_mm", "yp_mm", "k1", "p1")
-    for name, c in found.items():
+    result = correlations(a, cov)
+    assert set(result) == {"one", "two"}
+    assert result["one"].parameters == ("c_mm", "xp_mm", "yp_mm", "k1", "k2")
+    assert result["two"].parameters == ("c_mm", "xp_mm", "yp_mm", "k1", "p1")
+    for name, c in result.items():
         assert c.images == tuple(i for i, n in zip(a.block.images, a.block.image_camera, strict=True) if n == name)
         assert len(c.images) in (4, 6)
         for j, parameter in enumerate(c.parameters):
@@ -92,8 +92,8 @@ def test_correlations_by_camera(by_rotation):
                 for e, eop in enumerate(c.eop_names):
                     assert c.exterior[i, e, j] == pytest.approx(rho[labels.index(f"exterior[{image}].{eop}"), column])
         for i, image in enumerate(c.images):
-            own = [labels.index(f"exterior[{image}].{eop}") for eop in c.eop_names]
-            np.testing.assert_allclose(c.within_image[i], rho[np.ix_(own, own)], atol=1e-12)
+            rows = [labels.index(f"exterior[{image}].{eop}") for eop in c.eop_names]
+            np.testing.assert_allclose(c.within_image[i], rho[np.ix_(rows, rows)], atol=1e-12)
         np.testing.assert_allclose(c.mean_abs, np.abs(c.exterior).sum(axis=0) / len(c.images))
         np.testing.assert_allclose(c.max_abs, np.abs(c.exterior).max(axis=0))
         assert (c.max_abs > c.mean_abs).all()

@@ -1,4 +1,4 @@
-"""Are the predicted standard deviations true? Five hundred simulated re-measurements of one block answer."""
+"""Predicted standard deviations compared with 500 simulated re-measurements of one block."""
 
 import equinox as eqx
 import jax
@@ -14,20 +14,20 @@ from jaxphoto.statistics import redundancy_numbers
 from tests.blocks import observed, simulated
 
 DRAWS = 500
-# All bounds below together fail for one in a thousand seeds if everything is right.
+# Probability that any bound below fails by chance.
 FALSE_ALARM = 1e-3
 
 _turn = jax.jit(jax.vmap(lambda estimated, true: small_angles(estimated @ true.T)))
 
 
 class Draws(eqx.Module):
-    """Errors over predicted sigmas, one row a draw and one column an unknown, and v'Pv of every draw."""
+    """Standardised errors, one row a draw and one column an unknown, and v'Pv of every draw."""
 
     standardised: np.ndarray
     square_sums: np.ndarray
     redundancy: int
     expected: np.ndarray
-    """What each observation is expected to add to v'Pv."""
+    """Expected contribution of each observation to v'Pv."""
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def draws() -> Draws:
         new = jax.tree.map(np.asarray, numbers(jax.random.key(seed)))
         return adjust(eqx.tree_at(observed, block, new), truth)
 
-    # Predicted a priori: nothing of the drawn observations enters but the place where N was formed.
+    # A priori prediction: the drawn observations enter only through the linearisation point.
     nominal = adjusted_draw(10**6)
     sigma = np.sqrt(np.diagonal(np.asarray(covariance(nominal, "camera").matrix)))
     errors, square_sums = [], []
@@ -60,12 +60,12 @@ def _expected(nominal) -> np.ndarray:
 
 
 def _errors(adjusted, truth, nominal) -> np.ndarray:
-    """Estimate minus truth of X, Y, Z, small rotations by image, then of what is free of the interior orientation."""
-    found = adjusted.unknowns
-    position = np.asarray(found.exterior.position) - np.asarray(truth.exterior.position)
-    turns = _turn(found.exterior.camera_from_object, truth.exterior.camera_from_object)
+    """Estimate minus truth of X, Y, Z, small rotations by image, then of the free interior orientation."""
+    result = adjusted.unknowns
+    position = np.asarray(result.exterior.position) - np.asarray(truth.exterior.position)
+    turns = _turn(result.exterior.camera_from_object, truth.exterior.camera_from_object)
     interior = []
-    for camera, estimated in found.interior.items():
+    for camera, estimated in result.interior.items():
         for name in parameter_names(estimated):
             if f"interior[{camera}].{name}" in nominal.structure.labels:
                 interior.append(get_parameter(estimated, name) - get_parameter(truth.interior[camera], name))
@@ -76,7 +76,7 @@ def test_scatter_of_every_unknown_is_its_predicted_sigma(draws):
     share = FALSE_ALARM / (3 * draws.standardised.shape[1])
     low, high = stats.chi2.ppf([share / 2, 1 - share / 2], DRAWS - 1) / (DRAWS - 1)
     scatter = draws.standardised.var(axis=0, ddof=1)
-    # The bound has teeth: a predicted sigma wrong by a fifth would not pass.
+    # The bound is effective: a sigma wrong by a fifth would fail.
     assert high < 1.2**2
     assert low > 0.8**2
     assert (scatter > low).all(), scatter.min()
@@ -90,10 +90,10 @@ def test_estimates_are_unbiased(draws):
 
 
 def test_square_sums_are_what_redundancy_numbers_predict(draws):
-    """v'Pv has the mean sum r d and nearly the variance 2 sum r d^2, d the stretch of the image by the distortion.
+    """v'Pv has the mean sum r d and nearly the variance 2 sum r d^2, d the scale of the image by the distortion.
 
     Residuals are of ideal coordinates and weights of measured ones (docs/conventions.md): noise of a measured
-    coordinate is stretched by the derivative of the map between them, in this block by up to a tenth in the corners.
+    coordinate is scaled by the derivative of the map between them, in this block by up to a tenth in the corners.
     """
     mean = np.sum(draws.expected)
     spread = np.sqrt(2 * mean)

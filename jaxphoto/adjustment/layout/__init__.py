@@ -1,1 +1,1 @@
-"""How a block lies in memory: rays in chunks of an image, padded sizes, several devices."""
+"""Memory layout of a block: rays in chunks, padded sizes, sharding."""

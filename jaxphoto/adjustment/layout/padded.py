@@ -1,4 +1,4 @@
-"""A block as it is computed with: its rays in chunks (`rays`), and in padded sizes (`padding`)."""
+"""Padded form of a block: rays in chunks (`rays`) and padded sizes (`padding`)."""
 
 import dataclasses
 import math
@@ -22,35 +22,36 @@ from jaxphoto.short_repr import shown
 class RayLists(eqx.Module):
     """Rays in chunks of one image, pairs of rays in chunks of two images; chunks in batches.
 
-    A batch is all that is computed with at a time, so that what it needs stays in the cache of a core. Batches are
-    dealt out to devices. Slots that are empty have rows of infinite sigma, at any image and point.
+    One batch is processed at a time, so that its intermediate arrays stay in the cache of a core. Batches are sharded
+    over devices. Empty slots are rows of infinite sigma at an arbitrary image and point.
     """
 
     chunk_image: Int[np.ndarray, "batches chunks"]
     ray_point: Int[np.ndarray, "batches chunks p"]
     pair: Int[np.ndarray, "pair_batches pair_chunks 2 q"]
-    """Numbers of two rays of a free point, the image of the first not before that of the second."""
+    """Indices of two rays of a free point; the image of the first does not precede that of the second."""
     block: Int[np.ndarray, "pair_batches pair_chunks 3"]
-    """Where the two images meet: column block of the band, row (of two column blocks) and column in it."""
+    """Position of the two images in the band: column block, row (of two column blocks) and column."""
     used: Int[np.ndarray, "devices 2"]
-    """How many of its batches, of rays and of pairs, a device needs: the first ones; the others are padding."""
+    """Number of batches, of rays and of pairs, that each device uses; the rest is padding."""
     met: Int[np.ndarray, "groups b"]
-    """Shared unknowns that rows at the points of each group touch; the number of these where it has fewer than most."""
+    """Shared unknowns touched by rows at the points of each group; padded with the number of shared unknowns."""
     free_points: bool = eqx.field(static=True)
-    """Whether any point has a free coordinate; else nothing is eliminated."""
+    """True if any point has a free coordinate; otherwise nothing is eliminated."""
     by_image: bool = eqx.field(static=True)
-    """Whether unknowns of cameras are eliminated from points as those of images are, rather than as unknowns that all
-    points may meet: where there are many more cameras than an image has."""
+    """True if camera unknowns are eliminated with the unknowns of their images rather than as border unknowns that
+    every point may touch: for many more cameras than an image has.
+    """
     columns: int = eqx.field(static=True)
-    """Column blocks of the reduced matrix, K."""
+    """Number of column blocks of the reduced matrix, K."""
     shards: int = eqx.field(static=True)
-    """Devices that the batches are dealt out to, in equal parts."""
+    """Number of devices over which batches are sharded equally."""
 
 
 def each_batch(body: Callable, carry: Any, numbers: Any, used: Array, into: Any = None) -> tuple[Any, Any]:
-    """`jax.lax.scan` over the `used` first batches; what the others give is zero. Of one batch without a loop.
+    """Scan over the first `used` batches; results of the others are zero. A single batch needs no loop.
 
-    Results are written `into` arrays that are given, and `body` gets what its own were before.
+    If `into` is given, results are written into these arrays, and `body` receives their previous content.
     """
     count = len(jax.tree.leaves(numbers)[0])
     given = lambda found: (numbers,) if into is None else (numbers, found)  # noqa: E731
@@ -74,24 +75,24 @@ def each_batch(body: Callable, carry: Any, numbers: Any, used: Array, into: Any 
 
 
 class PaddedStructure(AbstractStructure):
-    """Index arrays and sizes of a block in padded sizes; image rows are the slots of its rays."""
+    """Index arrays and sizes of a padded block; image rows are the slots of its rays."""
 
     rays: RayLists
 
     @property
     def shards(self) -> int:
-        """Devices that rays and points are dealt out to."""
+        """Number of devices over which rays and points are sharded."""
         return self.rays.shards
 
     @property
     def ray_points(self) -> Int[Array, "batches chunks p"]:
-        """The point of each ray, among those that this device has."""
+        """Point of each ray, among those of this device."""
         return self._here(self.rays.ray_point, self.n_points // self.shards)
 
     @property
     def pairs(self) -> Int[Array, "pair_batches pair_chunks 2 q"]:
-        """Numbers of rays among those that this device has."""
-        # Where batches are dealt out, a device sees its own rays alone.
+        """Indices of rays among those of this device."""
+        # A device holds only its own shard of rays.
         return self._here(self.rays.pair, math.prod(self.rays.ray_point.shape))
 
     def _here(self, index: Any, of_device: int) -> Array:
@@ -100,21 +101,21 @@ class PaddedStructure(AbstractStructure):
         return index - jax.lax.axis_index(AXIS) * of_device
 
     def each(self, body: Callable, carry: Any, numbers: Any, into: Any = None) -> tuple[Any, Any]:
-        """`each_batch` of rays: `body` of the carry and of (images, points, *numbers)."""
+        """Scan rays with `each_batch`; `body` receives the carry and (images, points, *numbers)."""
         rays = self.rays
         return each_batch(body, carry, (rays.chunk_image, self.ray_points, *numbers), rays.used[0, 0], into)
 
     def each_ray(self, function: Callable, numbers: tuple) -> Any:
-        """`function` of (images, points, *numbers) of every batch of rays."""
+        """Apply `function` to (images, points, *numbers) of every batch of rays."""
         return self.each(lambda _, own: ((), function(own)), (), numbers)[1]
 
     def by_group(self, array: Shaped[Array, "*c points"]) -> Shaped[Array, "groups *c p"]:
-        """Numbers of points, group by group."""
+        """Reshape the points axis to groups."""
         return jnp.moveaxis(array.reshape(*array.shape[:-1], -1, GROUP), -2, 0)
 
     @property
     def on_one_device(self) -> "PaddedStructure":
-        """The same for a program that no other device has a part in."""
+        """The same structure for a program on one device."""
         if self.shards == 1:
             return self
         used = np.array([[len(self.rays.chunk_image), len(self.rays.pair)]])
@@ -123,13 +124,13 @@ class PaddedStructure(AbstractStructure):
 
 @shown
 class PaddedValues(AbstractValues):
-    """The numbers of a block in padded sizes; empty slots have infinite sigmas."""
+    """Arrays of a padded block; empty slots have infinite sigmas."""
 
     xy: Float[Array, "batches 2 chunks p"]
     sigma_xy: Float[Array, "batches 2 chunks p"]
 
 
 class PaddedResiduals(NonImageResiduals):
-    """Observed minus computed over sigma, in the slots of the rays."""
+    """Residuals (observed minus computed, over sigma) in the slots of the rays."""
 
     image: Float[Numbers, "batches 2 chunks p"]

@@ -1,8 +1,7 @@
-"""Sizes come in classes: blocks as they are computed with; what is compiled serves every block of similar size.
+"""Padding of blocks to size classes, so that a compiled program serves all blocks of similar size.
 
-Before it is computed with, a block is laid out in rays (`rays`) and padded with images and points that nothing depends
-on: rows of infinite standard deviation, unknowns that are held fixed. The results are cropped again and put back in the
-block's own order. Ids stay outside: no program depends on them.
+A block is arranged in rays (`rays`) and padded with images and points without effect: rows of infinite standard
+deviation, fixed unknowns. Results are cropped and returned in the order of the block. No program depends on ids.
 """
 
 import dataclasses
@@ -27,9 +26,9 @@ from jaxphoto.static_values import Content
 @shown
 @dataclasses.dataclass(frozen=True, eq=False)
 class PaddedBlock:
-    """A block as given and in padded sizes, and the way from one to the other.
+    """A block in its own order and padded, with the conversions between both.
 
-    Compared by its content and hashed once: to `Adjustment` it is structure, not numbers.
+    Compared by content and hashed once: for JAX it is static structure of an `Adjustment`.
     """
 
     own: Structure
@@ -52,23 +51,23 @@ class PaddedBlock:
         return self is other or (isinstance(other, PaddedBlock) and self._content == other._content)
 
     def pad(self, values: Values) -> PaddedValues:
-        """Numbers of the block in padded sizes."""
+        """Pad the arrays of the block."""
         return pad_values(values, self.own, self.structure, self.places)
 
     def crop_state(self, state: UnknownArrays) -> UnknownArrays:
-        """The state in the block's own sizes and order."""
+        """Crop a state to the sizes and order of the block."""
         position, rotation, shared, points = map(still, state)
         p = self.places
         return UnknownArrays(position[..., p.image], rotation[..., p.image], shared, points[..., p.point])
 
     def crop_residuals(self, residuals: PaddedResiduals) -> Residuals:
-        """Residuals in the block's own sizes and order."""
+        """Crop residuals to the sizes and order of the block."""
         groups = zip(self.own.observed, residuals.others, strict=True)
         others = tuple(self.crop_rows(g, still(v)) for g, v in groups)
         return Residuals(others, still(residuals.datum), residuals.names, self.crop_image(residuals.image))
 
     def pad_residuals(self, own: Residuals, fill: float) -> PaddedResiduals:
-        """The reverse of `crop_residuals`: a number for each observation at its place, `fill` in all other places."""
+        """Invert `crop_residuals`: place one number per observation, `fill` elsewhere."""
         s = self.structure
 
         def rows(g: ObservedGroup) -> tuple[int, ...]:
@@ -91,46 +90,46 @@ class PaddedBlock:
         return split(laid)
 
     def crop_rows(self, group: ObservedGroup, numbers: np.ndarray) -> np.ndarray:
-        """Numbers of padded rows, (components, ...), in the block's own order: (rows) where a row is one number."""
+        """Crop padded rows (components, ...) to the order of the block; (rows) if a row is one number."""
         return crop_rows(group, numbers, self.places)
 
     def crop_image(self, image: Any) -> np.ndarray:
-        """Numbers of rays (batches, k, chunks, p) by image row of the block (k, rows)."""
+        """Return numbers of rays (batches, k, chunks, p) by image row of the block (k, rows)."""
         by_ray = np.moveaxis(still(image), 1, 0)
         return by_ray.reshape(len(by_ray), -1)[:, self.places.row]
 
     def crop_reduced(self, matrix: Any) -> np.ndarray:
-        """A matrix over the reduced unknowns (6 an image, then the shared ones) in the block's own sizes and order."""
+        """Crop a matrix over the reduced unknowns (6 per image, then shared ones) to the order of the block."""
         matrix, q = still(matrix), self.own.n_shared
         of_images = (6 * self.places.image[:, None] + np.arange(6)).ravel()
         kept = np.append(of_images, np.arange(len(matrix) - q, len(matrix)))
         return matrix[np.ix_(kept, kept)]
 
 
-# Rays, and pairs, that are computed with at a time; and the least rays of a batch, where it is the only one.
+# Number of rays and pairs per batch, and the smallest size of a single batch.
 _RAYS, _PAIRS, _FEWEST = 4096, 2048, 2048
 
 
 def pad_structure(structure: Structure, sizes: Sizes = LEAST, *, shards: int = 1, dense: bool = False) -> PaddedBlock:
-    """The block in padded sizes; the last image is the one nothing depends on.
+    """Build the padded structure of a block; its last image is padding.
 
-    `sizes` are sizes that are wanted at least, such as those of all blocks of a study; `shards` is the number of
-    devices; `dense` asks for a reduced matrix that is not a band.
+    `sizes` are minimum sizes, such as those common to all blocks of a study; `shards` is the number of devices; `dense`
+    requests a dense reduced matrix in place of a band.
     """
     s, layout = structure, RayLayout.of(structure, sizes, shards, dense)
     have = layout.sizes | sizes
     n_images, n_points = layout.columns * layout.width, shards * have.point_groups * GROUP
     chunks = min(size_class(have.chunks, _FEWEST // CHUNK), _RAYS // CHUNK)
     batches, pair_chunks = size_class(-(-have.chunks // chunks), 1), _PAIRS // PAIRS
-    # In steps of four: those that are not used take no time.
+    # In steps of four; unused batches cost no time.
     pair_batches = size_class(max(-(-have.pair_chunks // pair_chunks), 1), 4)
     image = np.full((shards, batches * chunks), n_images - 1, np.int32)
-    # A point of the same device, in slots that are empty.
+    # Empty slots refer to a point of the same device.
     first = (n_points // shards) * np.arange(shards)[:, None]
     ray_point = np.repeat(first, batches * chunks * CHUNK, axis=1).astype(np.int32)
     none = batches * chunks * CHUNK * (1 + np.arange(shards)) - 1
     pair = np.tile(none[:, None, None], (1, 2, pair_batches * pair_chunks * PAIRS)).astype(np.int32)
-    # Blocks that are none lie outside the matrix: what is written there is dropped.
+    # Empty blocks lie outside the matrix; writes to them are dropped.
     block = np.tile(np.array([layout.columns, 0, 0], np.int32), (shards, pair_batches * pair_chunks, 1))
     row, used = np.empty(len(s.image), np.int64), np.zeros((shards, 2), np.int32)
     for k, own in enumerate(layout.devices):
@@ -184,14 +183,14 @@ def pad_structure(structure: Structure, sizes: Sizes = LEAST, *, shards: int = 1
 
 
 def _eliminates_cameras(s: Structure) -> bool:
-    """See `RayLists.by_image`."""
+    """Decide `RayLists.by_image`."""
     return s.n_interior > 4 * s.n_image_colours
 
 
 def pad_values(values: Values, structure: Structure, padded: PaddedStructure, places: Places) -> PaddedValues:
-    """The numbers of a block in the sizes and the order of its padded structure.
+    """Bring the arrays of a block to the sizes and order of its padded structure.
 
-    Slots that no image row fills have infinite standard deviation: finite everywhere, and of no weight.
+    Empty slots have infinite standard deviation: finite values, no weight.
     """
     v, p, own = values, padded, structure
     n_images, n_points = p.n_images, p.n_points
@@ -221,7 +220,7 @@ def pad_values(values: Values, structure: Structure, padded: PaddedStructure, pl
         position=images(v.position, v.position[..., :1] if own.n_images else 0.0),
         rotation=images(v.rotation, v.rotation[..., :1] if own.n_images else np.eye(3)[..., None]),
         shared=v.shared,
-        # Padding looks like the first point.
+        # Padded points repeat the first point.
         points=points(v.points, v.points[..., :1] if own.n_points else 0.0),
         datum_eop=images(v.datum_eop, 0.0),
         datum_points=points(v.datum_points, 0.0),
@@ -229,7 +228,7 @@ def pad_values(values: Values, structure: Structure, padded: PaddedStructure, pl
 
 
 def _pad_group(group: CameraGroup, at: np.ndarray, n_images: int) -> CameraGroup:
-    """A group of cameras without their names; images too many have its first camera."""
+    """Pad a camera group and drop its names; padded images have its first camera."""
     return dataclasses.replace(
         group,
         names=tuple("" for _ in group.names),

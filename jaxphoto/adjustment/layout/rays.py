@@ -1,10 +1,10 @@
-"""The layout of a block: images in order, rays in chunks of one image, pairs of rays in chunks of two images.
+"""Order of images and points; rays in chunks of one image, pairs of rays in chunks of two images.
 
-A ray is an image row: one image sees one point. Rays of an image lie together, so what they add to the image is one
-product of matrices a chunk; so do pairs of rays that see a free point from the same two images, so what its elimination
-adds to the block of these two images in the reduced normal matrix is one product, too. Images are numbered so that
-those which meet lie close (reverse Cuthill-McKee), which makes that matrix a band. Where all points are fixed there are
-no pairs, and it is an arrow: images by themselves, and what they share.
+A ray is an image row: one image sees one point. Rays of an image are contiguous, so their contribution to the image is
+one matrix product per chunk. The same holds for pairs of rays that see a free point from the same two images, which
+contribute to the block of these images in the reduced normal matrix. Images are numbered by reverse Cuthill-McKee,
+which makes that matrix banded. If all points are fixed there are no pairs, and the matrix is an arrow: block-diagonal
+images with a border of shared unknowns.
 """
 
 from typing import NamedTuple
@@ -19,22 +19,22 @@ from jaxphoto.short_repr import shown
 
 @shown
 class Sizes(NamedTuple):
-    """How large each kind of list is, in a block or as it is compiled for; of one device."""
+    """Length of each list of a block, or of the sizes compiled for; per device."""
 
     images: int = 1
     bandwidth: int = 1
-    """Largest difference of places of two images that meet in a free point."""
+    """Largest difference of places of two images that share a free point."""
     point_groups: int = 1
     chunks: int = 1
-    """Of rays."""
+    """Number of chunks of rays."""
     pair_chunks: int = 0
     met: int = 0
-    """Shared unknowns that rows at the points of a group touch, in the group that has most."""
+    """Largest number of shared unknowns touched by rows at the points of a group."""
     rows: tuple[tuple[str, int], ...] = ()
-    """Of each group of observations; of rows at points, the most that a point has."""
+    """Number of rows of each observation group; for rows stored by point, the largest number at a point."""
 
     def __or__(self, other: object) -> "Sizes":
-        """What both fit into."""
+        """Return sizes that hold both."""
         if not isinstance(other, Sizes):
             return NotImplemented
         most = [dict(self.rows), dict(other.rows)]
@@ -44,57 +44,58 @@ class Sizes(NamedTuple):
 
 
 LEAST = Sizes()
-"""No more than a block needs by itself."""
+"""Minimum sizes: no more than a block needs."""
 
 
 class Places(NamedTuple):
-    """Where a block's own images, points and image rows lie in the padded arrays."""
+    """Places of the block's images, points and image rows in the padded arrays."""
 
     image: Int[np.ndarray, "images"]
     point: Int[np.ndarray, "points"]
     row: Int[np.ndarray, "rows"]
-    """Number of the ray: chunk * `CHUNK` + place in it."""
+    """Index of the ray: chunk * `CHUNK` + place in it."""
 
 
 GROUP = 32
-"""Points that share a list of the unknowns that their rows touch (`MetUnknowns`)."""
+"""Number of points that share a list of the unknowns that their rows touch (`MetUnknowns`)."""
 CHUNK, PAIRS = 64, 16
-"""Rays, and pairs of rays, of a chunk. Half or twice as many change the time of a solution by less than a tenth, in
-blocks of 31 to 200 images and points of five to twenty rays."""
-# Up to so many images, a larger reduced matrix costs less than another program; and any order of them will do.
+"""Number of rays, and of pairs of rays, per chunk. Half or twice as many change the time of a solution by less than a
+tenth, for blocks of 31 to 200 images and points of five to twenty rays.
+"""
+# Up to this number of images, a larger reduced matrix costs less than another program, and their order is irrelevant.
 _SMALL = 64
-# What a column block costs beside its operations, counted in operations (measured: about 10 microseconds).
+# Constant cost of a column block, counted in operations (measured: about 10 microseconds).
 _OVERHEAD = 2e5
 
 NO_SLOT = int(np.iinfo(np.int32).max)
-"""For what is no unknown: no group meets so many, and what is added there is dropped."""
+"""Slot without an unknown: larger than any list, so additions to it are dropped."""
 
 
 def size_class(n: int, step: int) -> int:
-    """The next multiple of `step`; of more than 16 steps the next that is 8 to 16 times a power of two of them."""
+    """Round up to a multiple of `step`; above 16 steps, to 8 to 16 times a power of two of them."""
     while n > 16 * step:
         step *= 2
     return -(-n // step) * step
 
 
 def sizes_of(structure: Structure) -> Sizes:
-    """The sizes of a block, with room for the image that nothing needs."""
+    """Return the sizes of a block, including one padding image."""
     return RayLayout.of(structure, LEAST, shards=1, dense=False).sizes
 
 
 class MetUnknowns(NamedTuple):
-    """Which shared unknowns rows at points touch, by groups of points."""
+    """Shared unknowns that rows at points touch, by group of points."""
 
     group_of: Int[np.ndarray, "points"]
     key: Int[np.ndarray, "met"]
     """Group * (number of unknowns + 1) + unknown, sorted."""
     slot: Int[np.ndarray, "met"]
-    """Which of its group's it is."""
+    """Slot of each in the list of its group."""
     n_shared: int
 
     @classmethod
     def of(cls, s: Structure, group_of: Int[np.ndarray, "points"]) -> "MetUnknowns":
-        """`group_of` is the group of each of the block's points."""
+        """Collect them; `group_of` is the group of each point of the block."""
         touched = [np.zeros(0, np.int64)]
         for g in (g for g in s.observed if g.elimination == "point"):
             touched.append(_keys(group_of[g.point[0]], g.column, s.n_shared))
@@ -104,17 +105,17 @@ class MetUnknowns(NamedTuple):
 
     @property
     def most(self) -> int:
-        """How many lie in one group, in steps of which there are few."""
+        """Largest number in a group, rounded up to few size classes."""
         return size_class(int(self.slot.max(initial=-1)) + 1, 8)
 
     def listed(self, groups: int, size: int) -> Int[np.ndarray, "groups size"]:
-        """Those of every group, and the number of unknowns in places too many."""
+        """Return the lists of all groups, padded with the number of unknowns."""
         result = np.full((groups, size), self.n_shared, np.int32)
         result[self.key // (self.n_shared + 1), self.slot] = self.key % (self.n_shared + 1)
         return result
 
     def slots(self, g: ObservedGroup) -> Int[np.ndarray, "l rows"]:
-        """Which of its group's each unknown of a row is."""
+        """Return the slot of each unknown of a row in the list of its group."""
         found = np.full(g.column.shape, NO_SLOT, np.int32)
         free = g.column < self.n_shared
         found[free] = self.slot[np.searchsorted(self.key, _keys(self.group_of[g.point[0]], g.column, self.n_shared))]
@@ -126,15 +127,15 @@ def _keys(group: np.ndarray, column: np.ndarray, n_shared: int) -> np.ndarray:
 
 
 class Chunks(NamedTuple):
-    """Numbers in order of a key, cut into chunks of one key each."""
+    """Numbers sorted by a key and cut into chunks of one key each."""
 
     key: Int[np.ndarray, "chunks"]
     slot: Int[np.ndarray, "numbers"]
-    """chunk * size + place in it, of each."""
+    """chunk * size + place in it, of each number."""
 
     @classmethod
     def of(cls, key: Int[np.ndarray, "numbers"], size: int) -> "Chunks":
-        """Of sorted keys."""
+        """Cut sorted keys into chunks."""
         which, first, count = np.unique(key, return_index=True, return_counts=True)
         n = -(-count // size)
         rank = np.arange(len(key)) - np.repeat(first, count)
@@ -142,29 +143,30 @@ class Chunks(NamedTuple):
 
 
 class DeviceLists(NamedTuple):
-    """Rays and pairs of the points that one device has."""
+    """Rays and pairs of the points of one device."""
 
     ray: Int[np.ndarray, "rays"]
-    """Rows of the block, by image and place of the point."""
+    """Image rows of the block, by image and place of the point."""
     image: Int[np.ndarray, "rays"]
     pair: Int[np.ndarray, "2 pairs"]
-    """Numbers among `ray` of two that see a free point, the image of the first not before that of the second; by
-    images."""
+    """Indices in `ray` of two rays of a free point; the image of the first does not precede that of the second. Sorted
+    by images.
+    """
     images: Int[np.ndarray, "pairs"]
     """Both images as one number: place of the first * `n_images` + place of the second."""
     chunks: Chunks
-    """Of rays, by image,"""
+    """Chunks of rays, by image."""
     pair_chunks: Chunks
-    """and of pairs, by both images."""
+    """Chunks of pairs, by both images."""
 
     @classmethod
     def of(cls, row, image, point, own, n_images: int) -> "DeviceLists":
-        """Of image rows `row`, with their places of images and points, and whether the point is free."""
+        """Build the lists from image rows `row`, places of their images and points, and flags of free points."""
         order = np.lexsort((point, image))
         row, image, point, own = row[order], image[order], point[order], own[order]
         by_point = np.argsort(np.where(own, point, np.iinfo(np.int32).max), kind="stable")[: int(own.sum())]
         at, one, other = point[by_point], [], []
-        # Of a point, images ascend.
+        # Images of a point ascend.
         for step in range(1, int(np.bincount(at).max(initial=0))):
             same = np.flatnonzero(at[step:] == at[:-step])
             one.append(by_point[same + step])
@@ -178,21 +180,21 @@ class DeviceLists(NamedTuple):
 
 
 class RayLayout(NamedTuple):
-    """Images in order, points in order, rays and pairs by device."""
+    """Order of images and points, rays and pairs by device."""
 
     image_place: Int[np.ndarray, "images"]
     point_place: Int[np.ndarray, "points"]
     columns: int
-    """Column blocks of the reduced matrix."""
+    """Number of column blocks of the reduced matrix."""
     width: int
-    """Images of each."""
+    """Images per column block."""
     devices: tuple[DeviceLists, ...]
     met: MetUnknowns
     sizes: Sizes
 
     @classmethod
     def of(cls, s: Structure, wanted: Sizes, shards: int, dense: bool) -> "RayLayout":
-        """Lay out a block with sizes of `wanted` at least; `dense` asks for a reduced matrix that is not a band."""
+        """Arrange a block with at least the sizes `wanted`; `dense` requests a dense reduced matrix, not a band."""
         own = np.any(s.point_free, axis=0)[s.point]
         place, bandwidth = order_images(*_meetings(s, own))
         images, bandwidth = max(s.n_images + 1, wanted.images), max(bandwidth, wanted.bandwidth)
@@ -201,7 +203,7 @@ class RayLayout(NamedTuple):
         groups = size_class(max(-(-s.n_points // (GROUP * shards)), wanted.point_groups), 16)
         image = place[s.image]
         point_place = np.empty(s.n_points, np.int32)
-        # Devices have as many points each, whatever the padding.
+        # All devices hold equally many points, whatever the padding.
         of_device, number = np.divmod(np.arange(s.n_points), max(-(-s.n_points // shards), 1))
         point_place[_order_points(image, s.point, s.n_points)] = of_device * groups * GROUP + number
         device = point_place[s.point] // (groups * GROUP)
@@ -214,7 +216,7 @@ class RayLayout(NamedTuple):
             images=images,
             bandwidth=bandwidth,
             point_groups=groups,
-            # One ray at least is none: what fills up chunks of pairs is made of it.
+            # At least one ray is empty: padding of pairs refers to it.
             chunks=max(len(d.chunks.key) + 1 for d in lists),
             pair_chunks=max(len(d.pair_chunks.key) for d in lists),
             met=met.most,
@@ -224,10 +226,10 @@ class RayLayout(NamedTuple):
 
 
 def order_images(image: np.ndarray, point: np.ndarray, n_images: int, n_points: int) -> tuple[np.ndarray, int]:
-    """The place of each image, and the largest difference of places of two images that see a point together."""
+    """Return the place of each image, and the largest difference of places of two images that share a point."""
     if n_images < _SMALL or not len(image):
         return np.arange(n_images, dtype=np.int32), n_images if len(image) else 1
-    # Imported here: it takes a tenth of a second, which small blocks need not wait for.
+    # Imported here: takes 0.1 s, which small blocks need not spend.
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
@@ -240,7 +242,7 @@ def order_images(image: np.ndarray, point: np.ndarray, n_images: int, n_points: 
 
 
 def _order_points(image: np.ndarray, point: np.ndarray, n_points: int) -> Int[np.ndarray, "points"]:
-    """Points by the first, last and mean image that sees them: those that lie together follow one another."""
+    """Sort points by first, last and mean image, so that neighbours are contiguous."""
     low, high, total = np.full(n_points, np.inf), np.zeros(n_points), np.zeros(n_points)
     np.minimum.at(low, point, image)
     np.maximum.at(high, point, image)
@@ -250,12 +252,13 @@ def _order_points(image: np.ndarray, point: np.ndarray, n_points: int) -> Int[np
 
 
 def column_blocks(n_images: int, bandwidth: int) -> tuple[int, int]:
-    """Number k of column blocks and images w of each, for images of which none meet further apart than `bandwidth`.
+    """Choose the number k of column blocks and the images w of each; images further apart than `bandwidth` share no
+    point.
 
-    w >= bandwidth and k w >= n_images. Costs counted are operations of the factorization: n^3 / 3 of a dense one with
-    n = 6 n_images, and m^3 / 3 for each of k column blocks with m = 6 w, 3 m^3 for each but the last (triangular
-    solution m^3, product 2 m^3) and a constant for each. The w of least cost is taken if it halves the cost at least,
-    else the block is one column.
+    w >= bandwidth and k w >= n_images. The cost is the number of operations of the factorisation: n^3 / 3 if dense,
+    with n = 6 n_images; m^3 / 3 for each of k column blocks with m = 6 w, 3 m^3 for each but the last (triangular
+    solution m^3, product 2 m^3), and a constant each. The w of least cost is used if it at least halves the cost, else
+    one column block.
     """
 
     def cost(k: int, w: int) -> float:
@@ -264,7 +267,7 @@ def column_blocks(n_images: int, bandwidth: int) -> tuple[int, int]:
 
     n = max(n_images, 1)
     narrowest = min(max(bandwidth, 1), n)
-    # For each number of column blocks the narrowest; more of them would only be padding.
+    # The narrowest for each number of column blocks; anything wider is padding.
     widths = {max(narrowest, -(-n // k)) for k in range(1, -(-n // narrowest) + 1)}
     choices = [(-(-n // w), w) for w in sorted(widths)]
     best = min(choices, key=lambda choice: cost(*choice))
@@ -272,7 +275,7 @@ def column_blocks(n_images: int, bandwidth: int) -> tuple[int, int]:
 
 
 def _meetings(s: Structure, own: Bool[np.ndarray, "rows"]) -> tuple[np.ndarray, np.ndarray, int, int]:
-    """Which images meet in which free points (`own` rows); those that an observation joins, in a point of their own."""
+    """Return image and point of the rays of free points; images joined by an observation share an artificial point."""
     image, point, n = [s.image[own]], [s.point[own]], s.n_points
     for g in s.observed:
         if g.elimination == "reduced" and len(g.image) > 1:

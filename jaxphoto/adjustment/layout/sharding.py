@@ -1,8 +1,7 @@
-"""Several devices: rays and their points are dealt out over a mesh, everything else is on every device.
+"""Sharding over devices: rays and their points are distributed over a mesh, everything else is replicated.
 
-Each device sums its own rays; the sums of the reduced normal matrix are added across devices
-(`model.structure.total`), and each factors the result for itself. So nothing but sums the size of the reduced matrix
-ever travels.
+Each device sums its own rays. The sums of the reduced normal matrix are added across devices (`model.structure.total`),
+and each device factors the result. Only sums of the size of the reduced matrix are communicated.
 """
 
 from collections.abc import Callable
@@ -17,11 +16,11 @@ from jaxphoto.devices import AXIS, mesh_of
 
 EVERYWHERE: Any = P()
 BATCHES: Any = P(AXIS)
-"""Dealt out along the first axis, that of batches."""
+"""Sharded along the first axis (batches)."""
 
 
 def along_points(ndim: int) -> Any:
-    """Dealt out along the last axis, that of points."""
+    """Sharded along the last axis (points)."""
     return P(*[None] * (ndim - 1), AXIS)
 
 
@@ -31,9 +30,9 @@ _OF_POINTS = {"points", "datum_points", "point_free", "l"}
 
 
 def sharded(function: Callable[..., Any], structure: PaddedStructure, out: Any) -> Callable[..., Any]:
-    """`function` on what each device holds; itself where there is one device.
+    """Map `function` over shards; return it unchanged for one device.
 
-    Its arguments are cut by the names of their fields; `out` says how its result is, as a prefix of that tree.
+    Arguments are sharded by field name; `out` gives the sharding of the result, as a prefix of its tree.
     """
     shards = structure.shards
     if shards == 1:
@@ -60,10 +59,10 @@ def _spec(path: tuple[Any, ...], array: Any) -> P:
         return along_points(array.ndim)
     if "listed" in names:
         return EVERYWHERE
-    # Those of rays, not those of the rows of a group.
+    # Fields of rays, not the equally named fields of observation groups.
     if name in _OF_RAYS and "observed" not in names:
         return BATCHES
-    # What rows by point touch, not what those in lists do.
+    # Rows stored by point, not those in lists.
     if name in _OF_ROWS and array.ndim == 3:
         return along_points(array.ndim)
     return along_points(array.ndim) if name in _OF_POINTS else EVERYWHERE

@@ -1,1 +1,1 @@
-"""What is adjusted: unknowns, observations by group, the residual of a row, and how they are numbered."""
+"""Model of an adjustment: unknowns, observation groups, residuals of a row, numbering."""

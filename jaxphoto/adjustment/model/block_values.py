@@ -1,4 +1,4 @@
-"""From a block, a start and priors to the batch-last numbers that the adjustment computes with, and back."""
+"""Conversion of a block, start values and priors to batch-last arrays, and back."""
 
 import dataclasses
 from typing import Any, TypeVar
@@ -23,9 +23,9 @@ SomeValues = TypeVar("SomeValues", bound=AbstractValues)
 def values_of(
     block: Block, start: Unknowns, priors: Unknowns, structure: AbstractStructure, observed: ObservedRows | None = None
 ) -> Values:
-    """Observations and start values as arrays; numbers only, so derivatives with respect to each exist.
+    """Return observations and start values as arrays. Numbers only, so all of them can be differentiated.
 
-    `observed` is `observed_in(block, priors)`, where it is known already.
+    `observed` is the result of `observed_in(block, priors)`, if already computed.
     """
     rows, s, known = block.image_points, structure, exposures(block)
     given = observed_in(block, priors) if observed is None else observed
@@ -50,23 +50,23 @@ def values_of(
 
 
 def _floats(x: Any) -> Any:
-    """A float64 array: numpy's where nothing is traced, because its operations need no compilation."""
+    """Return a float64 array; a NumPy array unless traced, because NumPy operations need no compilation."""
     return jnp.asarray(x, float) if isinstance(x, jax.core.Tracer) else np.asarray(x, float)
 
 
 def with_datum(values: SomeValues, eop: Numbers, points: Numbers) -> SomeValues:
-    """The same values with constraint rows of the datum."""
+    """Replace the constraint rows of the datum."""
     return eqx.tree_at(lambda v: (v.datum_eop, v.datum_points), values, (eop, points))
 
 
 def with_start(values: SomeValues, state: UnknownArrays) -> SomeValues:
-    """The same values with the state as the new start, so that increments are zero there."""
+    """Replace the start values by `state`, so that its increments are zero."""
     where = lambda v: (v.position, v.rotation, v.shared, v.points)  # noqa: E731
     return eqx.tree_at(where, values, tuple(state))
 
 
 def unknowns_of(state: UnknownArrays, like: Unknowns, structure: AbstractStructure) -> Unknowns:
-    """The state as the tree a user knows."""
+    """Return the state as the `Unknowns` of the public interface."""
     state = UnknownArrays(*map(_floats, state))
     interior = {}
     for group in structure.groups:
@@ -83,7 +83,7 @@ def unknowns_of(state: UnknownArrays, like: Unknowns, structure: AbstractStructu
 
 
 def _hold(points, block: Block):
-    """Fixed coordinates are what the block says, whatever the start."""
+    """Set fixed coordinates to the values of the block, whatever the start values."""
     if not len(block.fixed.who):
         return points
     held = jnp.asarray(points).at[block.fixed.axis, block.fixed.who].set(block.fixed.value)

@@ -1,4 +1,4 @@
-"""The cameras of a block by their models: one table of parameters for each, and what of it moves."""
+"""Cameras grouped by model: one parameter table per group."""
 
 import dataclasses
 
@@ -15,32 +15,34 @@ from jaxphoto.parameters import filled, size_of
 
 
 class CameraGroup(eqx.Module):
-    """Cameras of one model: their parameters are rows of one table, so one `vmap` serves them all."""
+    """Cameras of one model. Their parameters are the rows of one table, so one `vmap` serves them all."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     treedef: jax.tree_util.PyTreeDef = eqx.field(static=True)
     offset: int = eqx.field(static=True)
     camera: Int[np.ndarray, "images"]
-    """Camera (within the group) of each image; 0 where the image's camera is of another group."""
+    """Camera (within the group) of each image; 0 if the image's camera belongs to another group."""
     member: Bool[np.ndarray, "images"]
-    """Whether the image's camera is of this group."""
+    """True if the image's camera belongs to this group."""
     free_leaves: tuple[int, ...] = eqx.field(static=True)
     bent: jax.tree_util.PyTreeDef = eqx.field(static=True)
-    """Of an image, what bends its camera included: more leaves where rows move (`camera.RowMotion`)."""
+    """Tree of the interior orientation of an image, including parameters that modify it. It has more leaves where image
+    rows move during exposure (`camera.RowMotion`).
+    """
 
 
 def interior_of(group: CameraGroup, table) -> InteriorOrientation:
-    """The group's interior orientations from its table of parameters, one column a parameter, as they are or bent."""
+    """Return the interior orientations of a parameter table with one column per parameter."""
     return jax.tree.unflatten(group.treedef if len(table) == group.treedef.num_leaves else group.bent, table)
 
 
 def n_parameters(cameras: tuple[CameraGroup, ...]) -> int:
-    """Of all cameras."""
+    """Return the number of parameters of all cameras."""
     return sum(len(g.names) * g.treedef.num_leaves for g in cameras)
 
 
 def places_of_cameras(cameras: tuple[CameraGroup, ...]) -> np.ndarray | None:
-    """Places of the parameters of each image's camera (parameters, images); None where models differ."""
+    """Return the places of the parameters of each image's camera (parameters, images); None if the models differ."""
     if len(cameras) != 1:
         return None
     (g,) = cameras
@@ -49,7 +51,7 @@ def places_of_cameras(cameras: tuple[CameraGroup, ...]) -> np.ndarray | None:
 
 
 def camera_groups(block: Block, image_camera: np.ndarray) -> tuple[CameraGroup, ...]:
-    """The groups of a block; `image_camera` names the camera of each image."""
+    """Return the camera groups of a block; `image_camera` names the camera of each image."""
     by_model: dict[jax.tree_util.PyTreeDef, list[str]] = {}
     for name, interior in block.start.unknowns.interior.items():
         by_model.setdefault(jax.tree.structure(interior), []).append(name)
@@ -66,7 +68,7 @@ def camera_groups(block: Block, image_camera: np.ndarray) -> tuple[CameraGroup, 
 
 
 def with_free(group: CameraGroup, free: np.ndarray, tables: tuple[ParameterTable, ...]) -> CameraGroup:
-    """The group with its list of parameters that are free, or bent, in any of its cameras."""
+    """Set the list of parameters that are free, or modified, in any camera of the group."""
     m = group.treedef.num_leaves
     own = free[(free >= group.offset) & (free < group.offset + m * len(group.names))] - group.offset
     moved, bending = {int(k) % m for k in own}, [t for t in tables if t.bends]
@@ -78,7 +80,7 @@ def with_free(group: CameraGroup, free: np.ndarray, tables: tuple[ParameterTable
 
 
 def _bent_by(interior: InteriorOrientation, forms: list) -> InteriorOrientation:
-    """What becomes of an interior orientation that parameters of these forms bend: its tree, without numbers."""
+    """Return the tree of an interior orientation modified by parameters of these forms, without numbers."""
     still = np.zeros(3)
 
     def bent(interior: InteriorOrientation) -> InteriorOrientation:

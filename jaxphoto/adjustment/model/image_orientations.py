@@ -1,4 +1,4 @@
-"""What image rows depend on besides their points, image by image, and its derivatives by the unknowns."""
+"""Orientation and camera parameters of each image, on which image rows depend, and their derivatives."""
 
 from typing import Any, NamedTuple
 
@@ -15,33 +15,33 @@ from jaxphoto.rotation import small_rotation
 
 
 class ImageOrientations(NamedTuple):
-    """What image rows depend on besides their points, image by image."""
+    """Orientation and camera parameters by image."""
 
     centre: Float[Array, "images 3"]
     rotation: Float[Array, "images 3 3"]
     cameras: tuple[Array, ...]
-    """Of each group of cameras, its parameters: (m) where it is one camera that nothing bends, else (images, m)."""
+    """For each camera group its parameters: (m) for a single unmodified camera, else (images, m)."""
 
 
 class OrientationDerivatives(NamedTuple):
-    """Derivatives of a `ImageOrientations` with respect to scaled increments."""
+    """Derivatives of `ImageOrientations` with respect to scaled increments."""
 
     centre: Float[Array, "images 3"]
     rotation: Float[Array, "images 3 3 3"]
-    """The last axis is the increment's."""
+    """The last axis runs over the increments."""
     cameras: tuple[Array, ...]
     """(colours, free) where parameters are (m), else (images, colours, free)."""
 
 
 def orientations_of(state: UnknownArrays, values: AbstractValues, s: AbstractStructure) -> ImageOrientations:
-    """The state, image by image."""
+    """Evaluate orientations and camera parameters of all images at `state`."""
     return ImageOrientations(
         state.position.T, state.rotation.transpose(2, 0, 1), cameras_at(jnp.asarray(state.shared), values, s)
     )
 
 
 def cameras_at(shared: Array, values: AbstractValues, s: AbstractStructure) -> tuple[Array, ...]:
-    """The parameters of the cameras (see `ImageOrientations`), bent by what is declared to bend them."""
+    """Evaluate the camera parameters (see `ImageOrientations`), including declared modifications."""
     cameras = []
     for g in s.groups:
         m = g.treedef.num_leaves
@@ -67,17 +67,17 @@ def _bent(
 
 
 def by_image(g: CameraGroup, s: AbstractStructure) -> bool:
-    """Whether the parameters of a group of cameras are listed by image."""
+    """Return True if the parameters of a camera group are stored by image."""
     return s.bends or len(g.names) > 1
 
 
 def orientation_derivatives(
     y: Increments, scale: Increments, values: AbstractValues, s: AbstractStructure
 ) -> OrientationDerivatives:
-    """Derivatives of the scene at the increments `y`."""
+    """Differentiate orientations and camera parameters at the increments `y`."""
 
     turned = jax.vmap(jax.jacfwd(small_rotation), in_axes=-1, out_axes=-1)(y.eop[3:] * scale.eop[3:]) * scale.eop[3:]
-    # Term by term: a batch of products of 3 x 3 matrices takes several times as long.
+    # Term by term: a batch of 3 x 3 matrix products takes several times as long.
     rotation = added(turned[:, j, None] * values.rotation[j, :, None] for j in range(3))
     rotation = rotation.transpose(3, 0, 1, 2)
     own, n = slice(0, s.n_interior), s.n_image_colours
@@ -85,7 +85,7 @@ def orientation_derivatives(
     cameras = []
     if s.bends:
         shared = jnp.asarray(values.shared).at[s.free].add(y.shared * scale.shared, unique_indices=True)
-        # A product for each colour: an image has one owner of each kind, so nothing of another's comes in.
+        # One product per colour: an image has one owner per kind, so no other owner's parameters contribute.
         along = jax.vmap(lambda d: jax.jvp(lambda p: cameras_at(p, values, s), (shared,), (d,))[1], -1, 1)(by_colour)
         cameras = [c[..., list(g.free_leaves)] for g, c in zip(s.groups, along, strict=True)]
     else:
@@ -98,7 +98,7 @@ def orientation_derivatives(
 
 
 def of_images(tree: Any, image: Array, s: AbstractStructure) -> Any:
-    """The parts of a `ImageOrientations` or of `OrientationDerivatives` that belong to the images of chunks."""
+    """Select the entries of `ImageOrientations` or `OrientationDerivatives` that belong to the images of chunks."""
     take = lambda a: a.at[image].get(mode="promise_in_bounds")  # noqa: E731
     cameras = tuple(take(c) if by_image(g, s) else c for g, c in zip(s.groups, tree.cameras, strict=True))
     return type(tree)(take(tree.centre), take(tree.rotation), cameras)

@@ -1,8 +1,8 @@
-"""The numbers of an adjustment: observations and start, increments, the unknowns that these lead to, residuals.
+"""Arrays of an adjustment: observations, start values, increments, unknowns, residuals.
 
-Increments are scaled and small: `unknown = start (+) scale * increment`, rotations by a small rotation in the
+Increments are scaled and small: `unknown = start (+) scale * increment`; rotations change by a small rotation in the
 camera frame. Arrays are batch-last (components first, rows last), which XLA vectorises best on a CPU. Image rows are
-computed in chunks of an image's rays (`solver.ray_rows`), all others row by row (`row_functions`).
+evaluated in chunks of rays of one image (`solver.ray_rows`), all other rows by group (`row_functions`).
 """
 
 from typing import NamedTuple
@@ -19,11 +19,11 @@ from jaxphoto.rotation import small_rotation
 from jaxphoto.short_repr import shown
 
 IMAGE_POINTS = "image_points"
-"""The name of the image rows in tables and files."""
+"""Name of the image rows in tables and files."""
 
 
 class Increments(NamedTuple):
-    """Scaled changes of the unknowns since the start: what the solver iterates on."""
+    """Scaled changes of the unknowns from the start values: the iterate of the solver."""
 
     eop: Float[Array, "6 images"]
     shared: Float[Array, "shared"]
@@ -31,28 +31,28 @@ class Increments(NamedTuple):
 
 
 class NonImageResiduals(eqx.Module):
-    """Observed minus computed over sigma of all but image rows, by group; `datum` holds the constraints that
-    observations leave open.
+    """Residuals (observed minus computed, over sigma) of all groups except image rows; `datum` holds the datum
+    constraints.
 
-    While they are computed, in padded sizes, they are (components, rows), or (components, rows, points) where rows lie
-    at points. Of a result, a group whose rows are single numbers has (rows).
+    In padded sizes: (components, rows), or (components, rows, points) for rows stored by point. In a result, a group
+    with one number per row has shape (rows).
     """
 
     others: tuple[Float[Numbers, "..."], ...]
     datum: Float[Numbers, "constraints"]
     names: tuple[str, ...] = eqx.field(static=True)
-    """Of the groups of `others`."""
+    """Names of the groups in `others`."""
 
 
 @shown
 class Residuals(NonImageResiduals):
-    """Observed minus computed over sigma, by group, in the block's own order."""
+    """Residuals (observed minus computed, over sigma) by group, in the order of the block."""
 
     image: Float[Numbers, "2 rows"]
 
     @property
     def named(self) -> dict[str, Float[Numbers, "..."]]:
-        """All but the datum by the names of their groups, image points first."""
+        """Residuals by group name, image points first, without the datum."""
         return {IMAGE_POINTS: self.image, **dict(zip(self.names, self.others, strict=True))}
 
     def __getitem__(self, name: str) -> Float[Numbers, "..."]:
@@ -60,10 +60,10 @@ class Residuals(NonImageResiduals):
 
 
 class AbstractValues(eqx.Module):
-    """The numbers of an adjustment, batch-last: observations, sigmas, start, and constraint rows of the datum."""
+    """Batch-last arrays of an adjustment: observations, sigmas, start values, datum constraints."""
 
     groups: tuple[RowsInList | RowsAtPoints, ...]
-    """The numbers of the rows of `Structure.observed`; their indices are there."""
+    """Numbers of the rows of `Structure.observed`, which holds their indices."""
     time: Float[Array, "images"]
     velocity: Float[Array, "3 images"]
     rate: Float[Array, "3 images"]
@@ -80,20 +80,20 @@ class AbstractValues(eqx.Module):
 
     @property
     def exposures(self) -> tuple[Float[Array, "... images"], ...]:
-        """What an `Exposure` of each image holds."""
+        """Fields of the `Exposure` of each image."""
         return self.time, self.velocity, self.rate, self.nominal, self.flight_time, self.height, self.temperature
 
 
 @shown
 class Values(AbstractValues):
-    """Those of a block as given."""
+    """Arrays of a block in its own order."""
 
     xy: Float[Array, "2 rows"]
     sigma_xy: Float[Array, "2 rows"]
 
 
 class UnknownArrays(NamedTuple):
-    """The unknowns themselves, batch-last."""
+    """Unknowns, batch-last."""
 
     position: Float[Array, "3 images"]
     rotation: Float[Array, "3 3 images"]
@@ -102,7 +102,7 @@ class UnknownArrays(NamedTuple):
 
 
 def zero_increments(structure: AbstractStructure) -> Increments:
-    """No change from the start."""
+    """Return increments of zero."""
     s = structure
     return Increments(jnp.zeros((6, s.n_images)), jnp.zeros(s.n_shared), jnp.zeros((3, s.n_points)))
 
@@ -110,10 +110,10 @@ def zero_increments(structure: AbstractStructure) -> Increments:
 def state_at(
     increments: Increments, scale: Increments, values: AbstractValues, structure: AbstractStructure
 ) -> UnknownArrays:
-    """Start values moved by scaled increments; what is fixed does not move."""
+    """Move the start values by scaled increments; fixed unknowns do not move."""
     eop = increments.eop * scale.eop
     turn = jax.vmap(small_rotation, in_axes=-1, out_axes=-1)(eop[3:])
-    # Term by term: a batch of products of 3 x 3 matrices takes several times as long.
+    # Term by term: a batch of 3 x 3 matrix products takes several times as long.
     rotation = added(turn[:, j, None] * values.rotation[j] for j in range(3))
     return UnknownArrays(
         values.position + eop[:3],
@@ -126,7 +126,7 @@ def state_at(
 def datum_residuals(
     increments: Increments, scale: Increments, values: AbstractValues, structure: AbstractStructure
 ) -> Float[Array, "constraints"]:
-    """By how much the constraints of the datum are violated."""
+    """Evaluate the violation of the datum constraints."""
     eop = jnp.einsum("kci,ci->k", values.datum_eop * scale.eop, increments.eop)
     points = jnp.einsum("kcp,cp->k", values.datum_points * scale.points, increments.points)
     return eop + total(points, structure)

@@ -1,11 +1,11 @@
-"""Groups of observations besides image points: what each row touches, as index arrays made once on the host.
+"""Groups of observations except image points: index arrays of what each row touches, built once on the host.
 
-What the rows of a group touch decides how they are eliminated; nobody declares it:
+The unknowns that rows of a group touch determine how they enter the normal equations:
 
-    reduced     no point: rows add to the reduced normal matrix, where images and shared unknowns meet
-    point       one point and no image: they add to the point's own block before it is eliminated, and meet few of
-                the shared unknowns there (`layout.padded.RayLists.met`)
-    coupled     all else, such as two points, or a point and an image: few rows, that extra unknowns carry
+    reduced     no point: rows add to the reduced normal matrix of images and shared unknowns
+    point       one point and no image: rows add to the block of the point before it is eliminated, and touch few
+                shared unknowns (`layout.padded.RayLists.met`)
+    coupled     all others, such as two points, or a point and an image: few rows, carried by extra unknowns
                 (`solver.normal`)
 """
 
@@ -39,7 +39,7 @@ RowElimination = Literal["reduced", "point", "coupled"]
 
 
 class Argument(NamedTuple):
-    """What the residual of one row is given."""
+    """Argument of the residual function of a row."""
 
     what: str
     """"image", "point", "parameter", or a kind of declared parameters."""
@@ -54,18 +54,18 @@ class RowsInList(NamedTuple):
 
 
 class RowsAtPoints(NamedTuple):
-    """Rows by point: arrays end in (rows, points), rows being the most that a point has."""
+    """Rows stored by point: arrays end in (rows, points), where rows is the largest number of rows at a point."""
 
     at_points: AbstractObservations
 
 
 class ObservedGroup(eqx.Module):
-    """A group of observations: index arrays of its rows and of what they touch, rows last."""
+    """Group of observations: index arrays of its rows and of what they touch, rows last."""
 
     name: str = eqx.field(static=True)
     elimination: RowElimination = eqx.field(static=True)
     scalar: bool = eqx.field(static=True)
-    """Whether a row is one number; its residuals then have no axis for it in the results."""
+    """True if a row is one number; its residuals in results then have no component axis."""
     components: int = eqx.field(static=True)
     arguments: tuple[Argument, ...] = eqx.field(static=True)
     through_camera: bool = eqx.field(static=True)
@@ -73,46 +73,49 @@ class ObservedGroup(eqx.Module):
     rows: RowsInList | RowsAtPoints
     """Indices only; the numbers are in `Values.groups`."""
     image: Int[np.ndarray, "k rows"]
-    """The images that a row touches."""
+    """Images that a row touches."""
     point: Int[np.ndarray, "j rows"]
     parameter: Int[np.ndarray, "p *_"]
-    """Places of the parameters that a row touches in the vector of all shared ones; its length where there is none.
-    First those of each image, table by table, then those of the other arguments. (p, rows), or by point (p, rows,
-    points)."""
+    """Places of the parameters that a row touches in the vector of shared parameters; its length where there is none.
+    First the parameters of each image, table by table, then those of the other arguments. (p, rows), or by point (p,
+    rows, points).
+    """
     place: tuple[int, ...] = eqx.field(static=True)
-    """Which of these are unknowns in any row."""
+    """Parameters that are unknown in at least one row."""
     column: Int[np.ndarray, "l *_"]
-    """The shared unknowns that they are; the number of these where a row has none."""
+    """Shared unknown of each of these; the number of shared unknowns where a row has none."""
     slot: Int[np.ndarray, "l _ _"]
-    """Of rows by point, which of the shared unknowns of the point's group they are, see `RayLists.met`; else empty."""
+    """For rows stored by point: slot of the shared unknown in the list of the point's group, see `RayLists.met`; else
+    empty.
+    """
     loss: AbstractLoss | LinearisedLoss | None
-    """What rows cost, where it is not their square."""
+    """Loss of a row if it is not quadratic."""
     pair: Int[np.ndarray, "pairs rows 4"]
-    """Of a padded structure: where two images of a row meet in the band (`RayLists.block`), and whether transposed."""
+    """In a padded structure: place of a pair of images of a row in the band (`RayLists.block`), and 1 if transposed."""
 
     @property
     def own(self) -> AbstractObservations:
-        """The rows, wherever they lie."""
+        """Index arrays of the rows."""
         return self.rows.at_points if isinstance(self.rows, RowsAtPoints) else self.rows.listed
 
     @property
     def depth(self) -> int:
-        """Of rows at points, the most that a point has."""
+        """Largest number of rows at a point."""
         return int(np.bincount(self.point[0]).max(initial=0))
 
     @property
     def n_rows(self) -> int:
-        """Number of rows, those by point with the empty ones."""
+        """Number of rows, including empty ones where rows are stored by point."""
         return int(np.shape(jax.tree.leaves(self.own)[0])[-1])
 
 
 def observations_of(
     block: Block, priors: Unknowns, together: Sequence[JointPrior], labels: Sequence[str]
 ) -> list[tuple[str, AbstractObservations]]:
-    """All groups of a block that have rows, with their names: what it observes, then what is known beforehand.
+    """Return all non-empty groups of a block with their names: observations first, then prior information.
 
-    Scalar priors of shared parameters are not among them (`weighted_parameters`). Raises BlockError for rows that
-    refer to nothing.
+    Scalar priors of shared parameters are not included (`weighted_parameters`). Raises BlockError for rows that refer
+    to missing objects.
     """
     named = list(named_rows([*block.observations, *_priors_of_places(block, priors)]).items())
     for _, rows in named:
@@ -132,7 +135,7 @@ def observations_of(
 
 
 def weighted_parameters(priors: Sequence[object], together: Sequence[JointPrior]) -> ParameterRows:
-    """The scalar priors of shared parameters, in their order."""
+    """Return the scalar priors of shared parameters, in their order."""
     joint = {int(k) for t in together for k in t.parameters}
     own = {k: prior for k, prior in enumerate(priors) if isinstance(prior, Weighted) and k not in joint}
     value = vector_of([prior.value for prior in own.values()])
@@ -145,7 +148,7 @@ def _spread(v: Any, shape: tuple[int, ...]) -> Any:
 
 
 def _priors_of_places(block: Block, priors: Unknowns) -> list[AbstractObservations]:
-    """Weighted exterior orientations and points. Raises InputError for a prior that is none."""
+    """Return weighted exterior orientations and points. Raises InputError for an invalid prior."""
     found: list[AbstractObservations] = []
     exterior, n, m = priors.exterior, len(block.images), len(block.points)
     for label, prior, kind, count, shape in (
@@ -187,8 +190,11 @@ def group_of(
     unknown_of: Int[np.ndarray, "parameters_and_none"],
     n_shared: int,
 ) -> ObservedGroup:
-    """The index arrays of a group: `cameras` are the places of the interior orientation of each image, `unknown_of`
-    gives the shared unknown of each parameter, `n_shared` for none."""
+    """Build the index arrays of a group.
+
+    `cameras` holds the places of the interior orientation of each image, `unknown_of` the shared unknown of each
+    parameter (`n_shared` for none).
+    """
     if rows.through_camera and any(t.bends for t in tables):
         names = ", ".join(t.kind for t in tables if t.bends)
         raise BlockError(f"{rows.group} with covariances go through cameras that nothing bends: leave out {names}")
@@ -253,18 +259,18 @@ def _stack(parts: list[np.ndarray], n: int) -> np.ndarray:
 
 
 def image_tables(tables: Sequence[ParameterTable]) -> list[ParameterTable]:
-    """Those whose parameters a row gets with its images."""
+    """Return the tables whose parameters a row receives with its images."""
     return [t for t in tables if t.of_images and not t.bends]
 
 
 def indices_of(rows: AbstractObservations) -> AbstractObservations:
-    """The rows without their numbers, rows last."""
+    """Return the index arrays of rows, rows last."""
     whole = eqx.filter(with_plain_arrays(rows), lambda v: not _is_number(v))
     return jax.tree.map(lambda v: np.moveaxis(np.asarray(v), 0, -1), whole)
 
 
 def numbers_in(rows: AbstractObservations) -> AbstractObservations:
-    """The numbers of the rows without their indices, rows last; float64."""
+    """Return the numbers of rows without indices, rows last; float64."""
     whole = eqx.filter(with_plain_arrays(rows), _is_number)
 
     def last(v: Any) -> Any:

@@ -1,4 +1,4 @@
-"""The parameters that images share, those of cameras and all declared ones: their order, names and priors."""
+"""Shared parameters (of cameras and declared ones): order, names and priors."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -18,31 +18,31 @@ from jaxphoto.unknowns import Unknowns, Weighted, check_prior
 
 
 class ParameterTable(eqx.Module):
-    """Declared parameters of one kind: a row of numbers for each owner, one after the other."""
+    """Declared parameters of one kind: one row per owner."""
 
     kind: str = eqx.field(static=True)
     owners: tuple[str, ...] = eqx.field(static=True)
     form: Any = eqx.field(static=True)
-    """What `parameters.filled` makes parameters of."""
+    """Constructor argument of `parameters.filled`."""
     offset: int = eqx.field(static=True)
-    """Place of the first number in the vector of all shared parameters."""
+    """Place of the first number in the vector of shared parameters."""
     size: int = eqx.field(static=True)
     bends: bool = eqx.field(static=True)
-    """Whether it changes the interior orientation of its images."""
+    """True if it modifies the interior orientation of its images."""
     units: tuple[str, ...] = eqx.field(static=True)
-    """Of each number, what its name ends in; "" where that is no unit."""
+    """Unit suffix of each number's name; "" if it has none."""
     of_images: bool = eqx.field(static=True)
-    """Whether any image has such parameters."""
+    """True if any image has such parameters."""
     of_image: Int[np.ndarray, "images"]
-    """The owner of each image; their number where it has none."""
+    """Owner of each image; the number of owners where it has none."""
 
     def numbers_at(self, owner: np.ndarray, nowhere: int) -> Int[np.ndarray, "size n"]:
-        """Places of the numbers of owners; `nowhere` where there is none."""
+        """Return the places of the numbers of owners; `nowhere` where there is none."""
         own = self.offset + self.size * owner + np.arange(self.size)[:, None]
         return np.where(owner < len(self.owners), own, nowhere)
 
     def all_owners(self, shared: Array) -> Any:
-        """The parameters of all owners and, last, of none (zeros), along the last axis."""
+        """Return the parameters of all owners and, last, of none (zeros), along the last axis."""
         numbers = shared[self.offset : self.offset + self.size * len(self.owners)].reshape(-1, self.size)
         return filled(self.form, jnp.concatenate([numbers, jnp.zeros((1, self.size))]).T)
 
@@ -51,13 +51,13 @@ class SharedParameter(NamedTuple):
     """One shared parameter."""
 
     owner: str
-    """Whose it is, of all kinds: such as `c:kodak`, `mounts:` a mount, `strips:` a strip."""
+    """Owner, unique over all kinds: `c:kodak`, `mounts:NAME`, `strips:NAME`."""
     label: str
     prior: object
 
 
 class JointPrior(NamedTuple):
-    """Parameters known beforehand with a full covariance matrix, by their places in the vector of all parameters."""
+    """Prior with a full covariance matrix of parameters, given by their places in the vector of shared parameters."""
 
     parameters: np.ndarray
     value: Any
@@ -65,7 +65,9 @@ class JointPrior(NamedTuple):
 
 
 def tables_of(block: Block, unknowns: Unknowns, offset: int) -> tuple[ParameterTable, ...]:
-    """The declared parameters of a block in their order: what bends cameras, what points meet, then all else."""
+    """Return the declared parameters of a block in order: those that modify cameras, those that points touch, all
+    others.
+    """
     met = {kind for rows in block.observations if "image" not in dict(rows.indices()) for kind in rows.also}
     given = [(kind, owners) for kind, owners in unknowns.tables.items() if owners]
 
@@ -89,14 +91,14 @@ def tables_of(block: Block, unknowns: Unknowns, offset: int) -> tuple[ParameterT
 
 
 def shared_vector(unknowns: Unknowns, cameras: Iterable[str], tables: Sequence[ParameterTable]) -> list:
-    """All shared parameters as a list of scalars: cameras, then declared ones."""
+    """Return all shared parameters as a list of scalars: cameras first, then declared parameters."""
     of_cameras = [leaf for name in cameras for leaf in jax.tree.leaves(unknowns.interior[name])]
     known = unknowns.tables
     return of_cameras + [v for t in tables for name in t.owners for v in numbers_of(known[t.kind][name])]
 
 
 def unknowns_from(shared: Numbers, like: Unknowns, tables: Sequence[ParameterTable]) -> Unknowns:
-    """`like` with the declared parameters of the vector of all shared ones."""
+    """Replace the declared parameters of `like` by those of the vector of shared parameters."""
     found: dict[str, dict[str, Any]] = {kind: {} for kind in like.tables}
     for t in tables:
         for k, name in enumerate(t.owners):
@@ -108,9 +110,9 @@ def unknowns_from(shared: Numbers, like: Unknowns, tables: Sequence[ParameterTab
 def shared_entries(
     block: Block, priors: Unknowns, cameras: Iterable[str], tables: Sequence[ParameterTable]
 ) -> tuple[list[SharedParameter], list[JointPrior]]:
-    """All shared parameters in the order of `shared_vector`, and those that are known together.
+    """Return all shared parameters in the order of `shared_vector`, and joint priors.
 
-    Raises InputError for a prior that is none, and for a tree of priors that lacks something.
+    Raises InputError for an invalid prior and for an incomplete tree of priors.
     """
     entries: list[SharedParameter] = []
     together: list[JointPrior] = []
@@ -143,13 +145,13 @@ def shared_entries(
 
 
 def scalar_priors(priors: Any, like: Any) -> list:
-    """The prior of each number of the declared parameters `like`."""
+    """Return the prior of each number of the declared parameters `like`."""
     pairs = zip(_leaves(priors, like), leaves_in_order(like), strict=True)
     return [each for prior, value in pairs for each in _components(prior, np.size(value))]
 
 
 def _leaves(priors: Any, like: Any) -> list:
-    """The priors of parameters, one for each field (each entry of a dict) of `like`."""
+    """Return the priors of parameters, one per field (or dict entry) of `like`."""
     found = []
     for name in dynamic_fields(type(like)):
         prior, value = getattr(priors, name), getattr(like, name)
@@ -163,7 +165,7 @@ def _checked(entry: SharedParameter) -> SharedParameter:
 
 
 def _components(prior: object, n: int) -> list[object]:
-    """One prior for each of `n` numbers."""
+    """Return one prior for each of `n` numbers."""
     if not isinstance(prior, Weighted):
         return [prior] * n
     traced = is_traced((prior.value, prior.sigma))
@@ -173,7 +175,7 @@ def _components(prior: object, n: int) -> list[object]:
 
 
 def _leaf_names(interior: InteriorOrientation) -> list[str]:
-    """Parameter names in the order of the tree's leaves; a constant keeps its field's name."""
+    """Return parameter names in the order of the tree's leaves; constants keep their field's name."""
     estimable = dict(zip(("c", "x_p", "y_p"), parameter_names(interior), strict=False))
     paths = jax.tree_util.tree_flatten_with_path(interior)[0]
     return [estimable.get(path[-1].name, path[-1].name) for path, _ in paths]

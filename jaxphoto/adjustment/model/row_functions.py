@@ -1,8 +1,8 @@
-"""Rows of the groups of observations: residuals, and their derivatives by what each row touches.
+"""Residuals of observation groups and their derivatives with respect to the unknowns that each row touches.
 
-A row is a function of a few numbers: the increments z of its images (6 each), its shared unknowns and its points (3
-each). All rows of a group are computed side by side, and every derivative is one of that function, by automatic
-differentiation; no dense Jacobian is ever made. Rows are the last axis throughout; of rows by point, rows and points.
+A row is a function of few numbers: the increments z of its images (6 each), its shared unknowns and its points (3
+each). All rows of a group are evaluated together and differentiated automatically; no dense Jacobian is formed. Rows
+are the last axis; for rows stored by point, rows and points are the last two.
 """
 
 import math
@@ -25,7 +25,7 @@ from jaxphoto.rotation import small_rotation
 
 
 class Touched(NamedTuple):
-    """Increments of what one row touches, or derivatives by them."""
+    """Increments of the unknowns that one row touches, or derivatives with respect to them."""
 
     eop: Float[Array, "k 6"]
     shared: Float[Array, "l"]
@@ -33,36 +33,36 @@ class Touched(NamedTuple):
 
 
 class RowInputs(NamedTuple):
-    """Everything else that a row is computed from; of many rows with rows last."""
+    """Other inputs of a row; for many rows, rows last."""
 
     row: AbstractObservations
     scale: Touched
     position: Float[Array, "k 3"]
     rotation: Float[Array, "k 3 3"]
     exposure: tuple[Array, ...]
-    """The numbers of an `Exposure`, with a leading axis over the k images."""
+    """Fields of an `Exposure`, with a leading axis over the k images."""
     parameters: Float[Array, "p"]
     points: Float[Array, "j 3"]
 
 
-# Numbers; more of them, as of a hundred thousand rows that touch fifty unknowns each, would fill the memory.
+# Limit of numbers in memory at a time: 100,000 rows that touch fifty unknowns each would exceed the memory.
 _AT_ONCE = 1 << 24
-# From so many derivatives of each number on it is quicker to go back from the number: of one by 365 knots, forty times.
+# Number of derivatives from which reverse mode is faster (forty times for 365 knots).
 _MANY_SLOPES = 16
-# Which axis of a row by point runs over the points, and which over the rows of one.
+# Axes of points and of rows where rows are stored by point.
 _OVER_POINTS = Touched(None, -1, -1), RowInputs(-1, Touched(None, -1, -1), None, None, None, -1, -1)  # type: ignore[arg-type]
 _OVER_ROWS = Touched(None, -1, None), RowInputs(-1, Touched(None, -1, None), None, None, None, -1, None)  # type: ignore[arg-type]
 
 
 def each_row(function: Callable[[Touched, RowInputs], Any], group: ObservedGroup, z: Touched, given: RowInputs) -> Any:
-    """`function` of every row, rows last."""
+    """Map `function` over rows (last axis)."""
     if isinstance(group.rows, RowsAtPoints):
         return jax.vmap(jax.vmap(function, _OVER_ROWS, -1), _OVER_POINTS, -1)(z, given)
     return jax.vmap(function, -1, -1)(z, given)
 
 
 def rows_of(group: ObservedGroup, numbers: Any) -> AbstractObservations:
-    """The rows with their indices and numbers."""
+    """Combine indices and numbers of rows."""
     own = numbers.at_points if isinstance(numbers, RowsAtPoints) else numbers.listed
     return eqx.combine(group.own, own)
 
@@ -70,7 +70,7 @@ def rows_of(group: ObservedGroup, numbers: Any) -> AbstractObservations:
 def gathered_rows(
     group: ObservedGroup, numbers: Any, y: Increments, scale: Increments, v: AbstractValues
 ) -> tuple[Touched, RowInputs]:
-    """What every row of a group touches at the increments `y`."""
+    """Gather what every row of a group touches at the increments `y`."""
     at_points = isinstance(group.rows, RowsAtPoints)
 
     def of_images(a: Array) -> Array:
@@ -84,7 +84,7 @@ def gathered_rows(
     def of_shared(a: Array, index: Any) -> Array:
         return jnp.append(a, 0.0)[index]
 
-    # An image's exterior orientation may be held fixed, which a scale of zero says.
+    # A scale of zero marks a fixed exterior orientation.
     z = Touched(of_images(y.eop), of_shared(y.shared, group.column), of_points(y.points))
     steps = Touched(of_images(scale.eop), of_shared(scale.shared, group.column), of_points(scale.points))
     exposure = tuple(map(of_images, v.exposures))
@@ -96,14 +96,14 @@ def gathered_rows(
 
 
 def row_function(group: ObservedGroup, s: AbstractStructure) -> Callable[[Touched, RowInputs], Float[Array, "c"]]:
-    """Observed minus computed over sigma of one row."""
+    """Evaluate observed minus computed over sigma of one row."""
     tables = image_tables(s.tables)
     forms = {t.kind: (t.form, t.size) for t in s.tables}
 
     def residual(z: Touched, given: RowInputs) -> Float[Array, "c"]:
         parameters = given.parameters
         if group.place:
-            # A copy for each number would be made of an array: these are few.
+            # Indexing an array would copy it for each number; there are few here.
             parameters = parameters.at[jnp.array(group.place)].add(z.shared * given.scale.shared)
         position = given.position + z.eop[:, :3] * given.scale.eop[:, :3]
         points = given.points + z.points * given.scale.points
@@ -125,7 +125,7 @@ def row_function(group: ObservedGroup, s: AbstractStructure) -> Callable[[Touche
             exposure = Exposure(*(a[k] for a in given.exposure))
             return ImageState(position[k], turn @ given.rotation[k], exposure, own, camera)
 
-        # Images take their parameters first, in the order in which `observed_groups.group_of` lists them.
+        # Images take their parameters first, in the order of `observed_groups.group_of`.
         states = [state(k) for k in range(len(group.image))]
         for what, shape in group.arguments:
             count = math.prod(shape)
@@ -153,14 +153,14 @@ def row_function(group: ObservedGroup, s: AbstractStructure) -> Callable[[Touche
 
 
 def _stacked(parts: list[Any], shape: tuple[int, ...]) -> Any:
-    """One of `parts`, or all of them with leading axes `shape`."""
+    """Return one of `parts`, or all of them stacked with leading axes `shape`."""
     if not shape:
         return parts[0]
     return jax.tree.map(lambda *v: jnp.stack(v).reshape(*shape, *jnp.shape(v[0])), *parts)
 
 
 class RowJacobian(NamedTuple):
-    """Residuals of a group and their derivatives by scaled increments of what a row touches, rows last."""
+    """Residuals of a group and their derivatives with respect to scaled increments, rows last."""
 
     residual: Float[Array, "c *rows"]
     eop: Float[Array, "c k 6 *rows"]
@@ -171,18 +171,18 @@ class RowJacobian(NamedTuple):
 def group_residuals(
     group: ObservedGroup, numbers: Any, y: Increments, scale: Increments, v: AbstractValues, s: AbstractStructure
 ) -> Float[Array, "c *rows"]:
-    """Residuals of a group over their sigmas."""
+    """Evaluate the residuals of a group over their sigmas."""
     return each_row(row_function(group, s), group, *gathered_rows(group, numbers, y, scale, v))
 
 
 def row_jacobian(
     group: ObservedGroup, numbers: Any, y: Increments, scale: Increments, v: AbstractValues, s: AbstractStructure
 ) -> RowJacobian:
-    """Residuals of a group, and the derivatives of each row."""
+    """Evaluate the residuals of a group and the derivatives of each row."""
     function = row_function(group, s)
 
     def ahead(z: Touched, given: RowInputs) -> tuple[Float[Array, "c"], Touched]:
-        # The residuals come along.
+        # The residuals are computed along with them.
         slopes, residual = jax.jacfwd(lambda z: (function(z, given),) * 2, has_aux=True)(z)
         return residual, slopes
 
@@ -194,7 +194,7 @@ def row_jacobian(
     touched, given = gathered_rows(group, numbers, y, scale, v)
     slopes = (6 * len(group.image) + len(group.place) + 3 * len(group.point)) // group.components
     one, copies = (ahead, slopes) if slopes < _MANY_SLOPES else (back, 1)
-    # Of each row so many copies of its parameters.
+    # One copy of the parameters per row.
     size = rows_at_once(group.components * copies * len(group.parameter))
     size = group.n_rows if isinstance(group.rows, RowsAtPoints) else size
     residual, slope = over_portions(lambda *own: each_row(one, group, *own), (touched, given), group.n_rows, size)
@@ -202,12 +202,12 @@ def row_jacobian(
 
 
 def rows_at_once(numbers: int) -> int:
-    """Of how many rows, `numbers` of each, all are in memory together."""
+    """Return the number of rows of `numbers` numbers each that fit in memory."""
     return max(1, _AT_ONCE // max(numbers, 1))
 
 
 def over_portions(function: Callable[..., Any], values: tuple[Any, ...], n_rows: int, size: int) -> Any:
-    """`function` of `values`, whose rows run along their last axes, for `size` rows at a time."""
+    """Apply `function` to `values`, whose rows run along their last axes, `size` rows at a time."""
     if n_rows <= size:
         return function(*values)
     portions = jax.tree.map(lambda v: in_portions(v, size), values)
@@ -216,7 +216,7 @@ def over_portions(function: Callable[..., Any], values: tuple[Any, ...], n_rows:
 
 
 def in_portions(values: Shaped[Array, "*k rows"], size: int) -> Shaped[Array, "portions *k size"]:
-    """`size` rows each; the last row over again fills the last portion."""
+    """Split into portions of `size` rows; the last row is repeated to fill the last portion."""
     *k, n = values.shape
     filled = jnp.pad(values, [(0, 0)] * len(k) + [(0, -n % size)], "edge")
     return jnp.moveaxis(filled.reshape(*k, -(-n // size), size), -2, 0)
@@ -228,9 +228,9 @@ def _together(portions: Shaped[Array, "portions *k size"]) -> Shaped[Array, "*k 
 
 
 def reduced_places(g: ObservedGroup, n_images: int) -> Int[Array, "z rows"]:
-    """Of images and shared unknowns that the rows of a group touch, the places among the reduced unknowns.
+    """Return the places of the images' and shared unknowns of a group's rows among the reduced unknowns.
 
-    What means none lies behind the last.
+    Entries without an unknown get a place beyond the last.
     """
     images = 6 * jnp.asarray(g.image)[:, None] + jnp.arange(6)[:, None]
     return jnp.concatenate([images.reshape(-1, images.shape[-1]), 6 * n_images + jnp.asarray(g.column)])
@@ -239,7 +239,7 @@ def reduced_places(g: ObservedGroup, n_images: int) -> Int[Array, "z rows"]:
 def non_image_residuals(
     increments: Increments, scale: Increments, values: AbstractValues, structure: AbstractStructure
 ) -> NonImageResiduals:
-    """All residuals but those of the image rows."""
+    """Evaluate all residuals except those of image rows."""
     others = tuple(
         group_residuals(g, numbers, increments, scale, values, structure)
         for g, numbers in zip(structure.observed, values.groups, strict=True)

@@ -1,15 +1,15 @@
-"""The structure of a block's normal equations: who meets whom, made once on the host as index arrays.
+"""Structure of a block's normal equations as index arrays, built once on the host.
 
     unknowns    eop (6 per image: X, Y, Z, small rotation), shared (interior orientation, mounts, strips; only what
                 is not FIXED; interior orientations first), points (3 per point)
-    colours     each image touches few shared unknowns; unknowns of different cameras, mounts or strips carry the
-                same colour, so one seed differentiates all of them at once
-    groups      all observations but image rows, see `observed_groups`
-    rays        image rows, each of one image and one point: a `layout.padded.PaddedStructure` is what is computed with,
-                its images and points ordered so that those which meet lie close
+    colours     an image touches few shared unknowns; unknowns of different cameras, mounts or strips share a
+                colour, so one tangent vector differentiates all of them
+    groups      all observations except image rows, see `observed_groups`
+    rays        image rows, each of one image and one point; computations use a `layout.padded.PaddedStructure`,
+                with images and points ordered for a small bandwidth
 
-All arrays are arguments of the compiled functions, never constants in them: a new block of the same shapes
-compiles nothing.
+All arrays are arguments of the compiled functions, never constants: a new block of the same shapes needs no
+compilation.
 """
 
 import abc
@@ -54,7 +54,7 @@ from jaxphoto.unknowns import FIXED, Unknowns
 
 
 class AbstractStructure(eqx.Module):
-    """Index arrays and sizes that a block has as given and in padded sizes."""
+    """Index arrays and sizes, in the order of the block or padded."""
 
     groups: tuple[CameraGroup, ...]
     tables: tuple[ParameterTable, ...]
@@ -63,23 +63,24 @@ class AbstractStructure(eqx.Module):
     n_points: int = eqx.field(static=True)
     corrections: Corrections = eqx.field(static=True)
     n_interior: int = eqx.field(static=True)
-    """Shared unknowns that image rows touch, those of cameras and what bends them: the first ones."""
+    """Number of shared unknowns that image rows touch (cameras and what modifies them); they come first."""
     n_image_colours: int = eqx.field(static=True)
     free: Int[np.ndarray, "shared"]
-    """Index, in the vector of all shared parameters, of each shared unknown."""
+    """Index of each shared unknown in the vector of shared parameters."""
     column: Int[np.ndarray, "images colours"]
-    """Shared unknown that a colour means for an image; the number of shared unknowns where it means none. Colours of
-    image rows come first."""
+    """Shared unknown of each colour and image; the number of shared unknowns where there is none. Colours of image rows
+    come first.
+    """
     colour: Int[np.ndarray, "shared"]
     observed: tuple[ObservedGroup, ...]
-    """All observations but image rows, and what is known beforehand."""
+    """Observations except image rows, and prior information."""
     image_loss: AbstractLoss | LinearisedLoss | None
-    """What image rows cost, where it is not their square."""
+    """Loss of image rows if it is not quadratic."""
     eop_free: Float[np.ndarray, "6 images"]
     point_free: Float[np.ndarray, "3 points"]
 
     def with_losses(self, losses: Mapping[str, AbstractLoss]) -> Self:
-        """The same with losses by the names of groups."""
+        """Replace the losses by group name."""
 
         def of(name: str, numbers: int) -> AbstractLoss | None:
             return losses[name].for_rows_of(numbers) if name in losses else None
@@ -89,12 +90,12 @@ class AbstractStructure(eqx.Module):
 
     @property
     def has_losses(self) -> bool:
-        """Whether any row costs anything but its square."""
+        """True if any group has a loss that is not quadratic."""
         return self.image_loss is not None or any(g.loss is not None for g in self.observed)
 
     @property
     def with_linearised_losses(self) -> Self:
-        """The same for normal equations."""
+        """Replace losses by their linearisation, for normal equations."""
         of = lambda loss: None if loss is None else LinearisedLoss(loss)  # noqa: E731
         observed = tuple(dataclasses.replace(g, loss=of(g.loss)) for g in self.observed)
         return dataclasses.replace(self, observed=observed, image_loss=of(self.image_loss))
@@ -102,7 +103,7 @@ class AbstractStructure(eqx.Module):
     @property
     @abc.abstractmethod
     def shards(self) -> int:
-        """Devices that points are dealt out to, in equal parts."""
+        """Number of devices over which points are sharded."""
 
     @property
     def n_shared(self) -> int:
@@ -111,33 +112,33 @@ class AbstractStructure(eqx.Module):
 
     @property
     def n_cameras(self) -> int:
-        """Number of parameters of all cameras: the first ones of the vector of all shared parameters."""
+        """Number of parameters of all cameras: the first ones of the vector of shared parameters."""
         return n_parameters(self.groups)
 
     @property
     def coupled(self) -> tuple[ObservedGroup, ...]:
-        """The groups whose rows couple points."""
+        """Groups whose rows couple points."""
         return tuple(g for g in self.observed if g.elimination == "coupled")
 
     @property
     def with_shared(self) -> tuple[ObservedGroup, ...]:
-        """The groups of rows by point that touch shared unknowns, too."""
+        """Groups of rows stored by point that touch shared unknowns."""
         return tuple(g for g in self.observed if isinstance(g.rows, RowsAtPoints) and g.place)
 
     @property
     def n_coupled(self) -> int:
-        """How many numbers these observe."""
+        """Number of observations in `coupled`."""
         return sum(g.components * g.n_rows for g in self.coupled)
 
     @property
     def bends(self) -> bool:
-        """Whether the interior orientation differs between images of a camera."""
+        """True if the interior orientation differs between images of a camera."""
         return any(t.bends for t in self.tables)
 
 
 @shown
 class Structure(AbstractStructure):
-    """Of a block as given; see the module's head."""
+    """Structure in the order of the block; see the module docstring."""
 
     image: Int[np.ndarray, "rows"]
     """Image and point of each image row."""
@@ -147,25 +148,25 @@ class Structure(AbstractStructure):
 
     @property
     def shards(self) -> int:
-        """One device: nothing is dealt out yet."""
+        """Always one device."""
         return 1
 
 
 def total(x, s: AbstractStructure):
-    """The sum over all devices."""
+    """Sum over all devices."""
     return jax.lax.psum(x, AXIS) if s.shards > 1 else x
 
 
 class ObservedRows(NamedTuple):
-    """What an adjustment observes besides image points, and the order of the shared parameters."""
+    """Observations except image points, and the order of the shared parameters."""
 
     cameras: tuple[CameraGroup, ...]
     tables: tuple[ParameterTable, ...]
     entries: list[SharedParameter]
     together: list[JointPrior]
-    """What is known of several numbers of a vector together."""
+    """Joint priors of several numbers."""
     named: list[tuple[str, AbstractObservations]]
-    """Rows by the name of their group."""
+    """Rows by group name."""
 
     @property
     def camera_names(self) -> list[str]:
@@ -174,9 +175,9 @@ class ObservedRows(NamedTuple):
 
 
 def observed_in(block: Block, priors: Unknowns) -> ObservedRows:
-    """The observations of `block` and of `priors`, and the shared parameters.
+    """Return the observations of `block` and `priors`, and the shared parameters.
 
-    Raises InputError or BlockError for priors and rows that are none.
+    Raises InputError or BlockError for invalid priors and rows.
     """
     cameras = camera_groups(block, np.array(block.image_camera))
     tables = tables_of(block, block.start.unknowns, n_parameters(cameras))
@@ -187,9 +188,9 @@ def observed_in(block: Block, priors: Unknowns) -> ObservedRows:
 
 
 def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None = None) -> Structure:
-    """Everything about the adjustment of `block` that does not depend on a measured value.
+    """Build everything about the adjustment of `block` that does not depend on a measured value.
 
-    `observed` is `observed_in(block, priors)`, where it is known already.
+    `observed` is the result of `observed_in(block, priors)`, if already computed.
     """
     image, point = np.asarray(block.image_points.image), np.asarray(block.image_points.point)
     _check_rows(image, point)
@@ -234,7 +235,7 @@ def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None =
 
 
 def _check_rows(image: np.ndarray, point: np.ndarray) -> None:
-    """Raise ValueError for image rows that are not sorted by point, or hold a point twice in one image."""
+    """Raise ValueError for image rows that are not sorted by point, or repeat a point in an image."""
     if (np.diff(point) < 0).any():
         raise ValueError(
             "the rows of image_points must be sorted by point: take them in the order of np.argsort(point)"
@@ -245,7 +246,7 @@ def _check_rows(image: np.ndarray, point: np.ndarray) -> None:
 
 
 def _check_coupled(block: Block, groups: tuple[ObservedGroup, ...], point: np.ndarray, point_free: np.ndarray) -> None:
-    """Raise BlockError for a point that only rows that couple points meet: nothing of its own could eliminate it."""
+    """Raise BlockError for a point that only coupled rows observe: it cannot be eliminated."""
     own = (point_free == 0).all(axis=0)
     own[point] = True
     for g in groups:
@@ -260,9 +261,10 @@ def _check_coupled(block: Block, groups: tuple[ObservedGroup, ...], point: np.nd
 
 
 def _colours(block: Block, given: ObservedRows, free: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Colour of each shared unknown, what each means for an image, and how many of them image rows touch.
+    """Return the colour of each shared unknown, the unknown of each colour and image, and the number of image-row
+    colours.
 
-    An owner's unknowns have different colours; unknowns of two owners of a kind share theirs.
+    Unknowns of one owner have different colours; unknowns of two owners of a kind share colours.
     """
     owners = [given.entries[k].owner for k in free]
     rank, seen = np.zeros(len(free), np.int32), dict.fromkeys(owners, -1)
@@ -277,7 +279,7 @@ def _colours(block: Block, given: ObservedRows, free: np.ndarray) -> tuple[np.nd
     for kind, names in kinds.items():
         base[kind] = count
         if not any(name is not None for name in names):
-            # No image meets the scanner.
+            # No image touches the scanner.
             continue
         count += max((seen[o] + 1 for o in seen if o.split(":")[0] == kind), default=0)
         if kind == "c" or kind in bends:

@@ -1,1 +1,1 @@
-"""How it is solved: sums over rays, the reduced normal matrix and its factor, Levenberg-Marquardt, the inverse."""
+"""Solver: sums over rays, the factored reduced normal matrix, Levenberg-Marquardt, the inverse."""

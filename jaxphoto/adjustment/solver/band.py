@@ -1,21 +1,21 @@
-"""Cholesky of a block tridiagonal matrix with a dense border: the reduced normal matrix of images in order of flight.
+"""Cholesky factorisation of a block tridiagonal matrix with a dense border: the reduced normal matrix.
 
-    A = [A11 A21'             S1']     images: k column blocks of m unknowns; only adjacent ones meet,
+    A = [A11 A21'             S1']     images: k column blocks of m unknowns; only adjacent ones are coupled,
         [A21 A22 A32'         S2']     Aij = 0 for |i - j| > 1
-        [    A32 A33 ...      S3']     shared: q unknowns that meet everything (the border S, the corner C)
+        [    A32 A33 ...      S3']     shared: q unknowns coupled to everything (border S, corner C)
         [S1  S2  S3  ...      C  ]
 
-Its factor L (A = L L') has the blocks of A and no others. One column block j after the other, with P the rows of A
-below its diagonal block and W what is left of A when columns 1..j-1 are eliminated:
+Its factor L (A = L L') has the same block pattern. Column blocks j are processed in order, with P the rows of A below
+the diagonal block and W the Schur complement after elimination of columns 1..j-1:
 
     Ljj Ljj' = Wjj,   LPj = WPj Ljj'^-1,   WPP -= LPj LPj'                                   10 m^3 / 3 operations
 
-The inverse Z of A obeys Z L = L'^-1, so backwards, from the blocks ZPP of what lies below (Takahashi, Fagan and Chin):
+The inverse Z of A obeys Z L = L'^-1. Backwards, from the blocks ZPP below (Takahashi, Fagan and Chin):
 
     G = LPj Ljj^-1,   ZPj = -ZPP G,   Zjj = Ljj'^-1 Ljj^-1 + G' ZPP G
 
-needs of Z the blocks of the band and the border alone; columns of the full inverse follow by ZRj = -[ZR,j+1 ZR,q] G.
-The last column block and the shared unknowns are dense together, the end; where k = 1 they are all there is.
+requires only the blocks of Z in the band and the border; columns of the full inverse follow by ZRj = -[ZR,j+1 ZR,q] G.
+The last column block and the shared unknowns form one dense block, the end; for k = 1 there is nothing else.
 """
 
 from typing import NamedTuple
@@ -27,24 +27,23 @@ from jaxtyping import Array, Float
 
 from jaxphoto.linear_algebra import cholesky, solve_lower, solve_lower_right, solve_lower_transposed, unit_like
 
-# Inverses of triangles above this size are put together from halves: a product is five times as fast as BLAS' trsm.
+# Inverses of larger triangles are assembled from halves: a product is five times as fast as trsm of BLAS.
 _LEAF = 32
 
 
 class Band(NamedTuple):
-    """A symmetric matrix of images, ordered so that only adjacent column blocks meet, and shared unknowns."""
+    """Symmetric matrix of images, ordered so that only adjacent column blocks are coupled, and shared unknowns."""
 
     columns: Float[Array, "inner 2m m"]
-    """Column block j, of all but the last: rows 0..m-1 are A[j, j] (its lower triangle counts), rows m..2m-1 are
-    A[j+1, j]."""
+    """Column block j, of all but the last: rows 0..m-1 are A[j, j] (lower triangle), rows m..2m-1 are A[j+1, j]."""
     border: Float[Array, "q inner*m"]
     """A[shared, images of these blocks]."""
     end: Float[Array, "m+q m+q"]
-    """The last column block and the shared unknowns; its lower triangle counts."""
+    """The last column block and the shared unknowns; lower triangle."""
 
 
 class BandFactor(NamedTuple):
-    """The lower Cholesky factor of a `Band`, stored alike; zero above the diagonal."""
+    """Lower Cholesky factor of a `Band`, in the same storage; zero above the diagonal."""
 
     columns: Float[Array, "inner 2m m"]
     border: Float[Array, "q inner*m"]
@@ -52,7 +51,7 @@ class BandFactor(NamedTuple):
 
 
 class SelectedInverse(NamedTuple):
-    """Blocks of the inverse inside band and border, stored like a `Band` but with both triangles of its diagonal."""
+    """Blocks of the inverse inside band and border, stored like a `Band` but with both triangles of the diagonal."""
 
     columns: Float[Array, "inner 2m m"]
     border: Float[Array, "q inner*m"]
@@ -60,7 +59,9 @@ class SelectedInverse(NamedTuple):
 
 
 def factor_band(band: Band) -> BandFactor:
-    """L of A = L L'; NaN from the first column block on that is not positive definite (the last with the shared)."""
+    """Return L of A = L L'; NaN from the first column block that is not positive definite (the last includes the
+    shared).
+    """
     inner, _, m = band.columns.shape
     if not inner:
         return BandFactor(band.columns, band.border, cholesky(band.end))
@@ -70,7 +71,7 @@ def factor_band(band: Band) -> BandFactor:
         diagonal, shared, corner = left
         j, next_shared = at
         column = jax.lax.dynamic_index_in_dim(band.columns, j, keepdims=False)
-        # Behind the inner blocks stands the end.
+        # The end follows the inner blocks.
         following = jax.lax.dynamic_index_in_dim(band.columns, jnp.minimum(j + 1, inner - 1), keepdims=False)
         following = jnp.where(j + 1 < inner, following[:m], band.end[:m, :m])
         lower = cholesky(diagonal)
@@ -87,9 +88,9 @@ def factor_band(band: Band) -> BandFactor:
 
 
 def solve_band(factor: BandFactor, right: Float[Array, "unknowns *c"]) -> Float[Array, "unknowns *c"]:
-    """x of A x = b for one right-hand side, or for each column of several; the n + q unknowns are images, then shared.
+    """Solve A x = b for one right-hand side or for columns; the n + q unknowns are images, then shared.
 
-    L y = b downwards, L' x = y backwards.
+    L y = b forwards, L' x = y backwards.
     """
     columns, border, end = factor
     inner, _, m = columns.shape
@@ -99,7 +100,7 @@ def solve_band(factor: BandFactor, right: Float[Array, "unknowns *c"]) -> Float[
     n = (inner + 1) * m
     images, shared = b[:n].reshape(inner + 1, m, -1), b[n:]
 
-    # Columns are read in place: as what the scans run over they would be copied, which takes as long as the solution.
+    # Columns are read in place: as scanned arguments they would be copied, which takes as long as the solution.
     def down(left, at):
         j, following = at
         column = jax.lax.dynamic_index_in_dim(columns, j, keepdims=False)
@@ -122,12 +123,12 @@ def solve_band(factor: BandFactor, right: Float[Array, "unknowns *c"]) -> Float[
 
 
 def selected_inverse(factor: BandFactor) -> SelectedInverse:
-    """The blocks of A^-1 inside band and border, by Takahashi's recursion (see the module's head)."""
+    """Return the blocks of A^-1 inside band and border by Takahashi's recursion (see the module docstring)."""
     return _invert_inside(factor)[0]
 
 
 def invert_band(factor: BandFactor) -> Float[Array, "unknowns unknowns"]:
-    """All of A^-1, symmetric, images first; 2 n^2 m operations beside those of `selected_inverse`."""
+    """Return the full A^-1, symmetric, images first; 2 n^2 m operations in addition to those of `selected_inverse`."""
     inside, gains = _invert_inside(factor)
     inner, _, m = inside.columns.shape
     if not inner:
@@ -136,7 +137,7 @@ def invert_band(factor: BandFactor) -> Float[Array, "unknowns unknowns"]:
     border = jnp.concatenate([inside.border, inside.end[m:, :m]], axis=1)
     inverse = jnp.zeros((n + q, n + q)).at[n:, : n - m].set(inside.border).at[n - m :, n - m :].set(inside.end)
 
-    # Column block j is right from row block j on; what stands above is not used.
+    # Column block j is valid from row block j on; rows above are not used.
     def fill(k, inverse):
         j = inner - 1 - k
         after = jax.lax.dynamic_slice(inverse, (0, (j + 1) * m), (n, m))
@@ -148,7 +149,7 @@ def invert_band(factor: BandFactor) -> Float[Array, "unknowns unknowns"]:
 
 
 def dense(band: Band) -> Float[Array, "unknowns unknowns"]:
-    """All of A, symmetric: for small blocks and tests."""
+    """Return the full symmetric A: for small blocks and tests."""
     inner, _, m = band.columns.shape
     n, each = (inner + 1) * m, np.arange(inner)
     images = jnp.zeros((inner + 1, m, inner + 1, m)).at[each, :, each, :].set(band.columns[:, :m])
@@ -158,22 +159,22 @@ def dense(band: Band) -> Float[Array, "unknowns unknowns"]:
 
 
 def diagonal_of(stored: Band | BandFactor) -> Float[Array, " unknowns"]:
-    """The diagonal, images first."""
+    """Return the diagonal, images first."""
     m = stored.columns.shape[2]
     images = jnp.diagonal(stored.columns[:, :m], axis1=1, axis2=2).reshape(-1)
     return jnp.concatenate([images, jnp.diagonal(stored.end)])
 
 
 def pivots(diagonal: Float[Array, " unknowns"], factor: BandFactor) -> Float[Array, " unknowns"]:
-    """Squared diagonal of L over the diagonal of A (over 1 where that is not positive), images first.
+    """Return the squared diagonal of L over the diagonal of A (over 1 where that is not positive), images first.
 
-    What is left of an unknown's own information when those before it are eliminated: near zero at a rank defect.
+    The information of an unknown that remains after elimination of those before it: near zero at a rank defect.
     """
     return diagonal_of(factor) ** 2 / jnp.where(diagonal > 0, diagonal, 1.0)
 
 
 def _invert_inside(factor: BandFactor) -> tuple[SelectedInverse, Float[Array, "inner m p"]]:
-    """The selected inverse, and G' of all columns but the last."""
+    """Return the selected inverse, and G' of all columns but the last."""
     inner, _, m = factor.columns.shape
     end = _invert_dense(factor.end)
     if not inner:
@@ -181,7 +182,7 @@ def _invert_inside(factor: BandFactor) -> tuple[SelectedInverse, Float[Array, "i
     corner = end[m:, m:]
 
     def invert(after, at):
-        # Written in products A B' only: XLA takes twice as long for A' B.
+        # Only products A B': XLA takes twice as long for A' B.
         column, shared = at
         own = _invert_triangle(column[:m])
         gain = own @ jnp.concatenate([column[m:], shared]).T
@@ -196,7 +197,7 @@ def _invert_inside(factor: BandFactor) -> tuple[SelectedInverse, Float[Array, "i
 
 
 def _invert_dense(lower: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """(L L')^-1; where its halves are multiplied apart, zeros of the triangle are not."""
+    """Return (L L')^-1 from products of halves, which skip the zeros of the triangle."""
     first, across, second = _invert_halves(lower)
     corner = across @ second.T
     images = _mean(first @ first.T + across @ across.T)
@@ -210,7 +211,7 @@ def _invert_halves(lower: Float[Array, "m m"]) -> tuple[Array, Array, Array]:
 
 
 def _invert_triangle(lower: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """The transposed inverse of a lower triangle."""
+    """Return the transposed inverse of a lower triangle."""
     m = len(lower)
     if m <= _LEAF:
         return solve_lower_transposed(lower, unit_like(lower))
@@ -219,12 +220,12 @@ def _invert_triangle(lower: Float[Array, "m m"]) -> Float[Array, "m m"]:
 
 
 def _symmetric(lower: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """The symmetric matrix of a lower triangle."""
+    """Return the symmetric matrix of a lower triangle."""
     return jnp.tril(lower) + jnp.tril(lower, -1).T
 
 
 def _mean(a: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Symmetric to the last bit, which a product of floats need not be."""
+    """Symmetrise to the last bit, which a floating-point product need not be."""
     return 0.5 * (a + a.T)
 
 

@@ -1,6 +1,6 @@
-"""Solution of the normal equations: right-hand sides go down to the reduced unknowns, solutions back to the points.
+"""Solution of the normal equations: forward elimination to the reduced unknowns, back-substitution to the points.
 
-Both ways lead through F, see `normal`.
+Both use F, see `normal`.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ from jaxphoto.small_matrices import unwhiten, whiten
 
 @shown
 class FactoredNormal(eqx.Module):
-    """The normal equations at an optimum in scaled increments, undamped, factored."""
+    """Undamped factored normal equations at an optimum, in scaled increments."""
 
     reduced: Reduced
     factor: BandFactor
@@ -39,12 +39,12 @@ class FactoredNormal(eqx.Module):
 
 
 def solve_factored(reduced: Reduced, factor: BandFactor, b: Increments, at: Linearised) -> Increments:
-    """x of (N + damping diag(N)) x = b: down to the reduced unknowns, and back to the points."""
+    """Solve (N + damping diag(N)) x = b."""
     return solve_reduced(reduced, factor, *reduce_right(reduced, b, at), b.points, at)
 
 
 def reduce_right(reduced: Reduced, b: Increments, at: Linearised) -> tuple[Array, Array]:
-    """A right-hand side taken down to the reduced unknowns and to mu."""
+    """Eliminate the points from a right-hand side; returns the parts for the reduced unknowns and for mu."""
     s, k = at.structure, len(reduced.k)
     if not s.rays.free_points:
         return jnp.concatenate([b.eop.T.reshape(-1), b.shared]), jnp.zeros(k)
@@ -64,7 +64,7 @@ def reduce_right(reduced: Reduced, b: Increments, at: Linearised) -> tuple[Array
 
 
 def solve_reduced(reduced: Reduced, factor: BandFactor, right, d, b_points, at: Linearised) -> Increments:
-    """x of a right-hand side taken down already: `right` to the reduced unknowns, `d` to mu."""
+    """Solve for x, given the eliminated right-hand side: `right` for the reduced unknowns, `d` for mu."""
     r, s, n = reduced, at.structure, at.structure.n_images
     if len(d):
         right = right - r.g @ solve(r.k, d)
@@ -87,7 +87,7 @@ def solve_reduced(reduced: Reduced, factor: BandFactor, right, d, b_points, at: 
 
 
 def pull(z: PaddedResiduals, at: Linearised) -> Increments:
-    """J'z of many residuals, along a leading axis, on one device; J is computed once for all of them."""
+    """Return J'z of many residual vectors (leading axis) on one device; J is evaluated once."""
     _, scale, values, s = at
     columns_of, many = ray_columns(at), len(z.image)
 
@@ -107,7 +107,7 @@ def pull(z: PaddedResiduals, at: Linearised) -> Increments:
 
 
 def gradient(rows: LinearisedRows, at: Linearised) -> Increments:
-    """J'r of the residuals that rows were linearised with."""
+    """Return J'r of the residuals at which the rows were linearised."""
     s = at.structure
     of_points = rows.of_points.v[:, 6:].T * at.scale.points
     b = _by_unknown(total(rows.by_image[:, None, :-1, -1], s), of_points[None], s)
@@ -117,14 +117,14 @@ def gradient(rows: LinearisedRows, at: Linearised) -> Increments:
 
 
 def _by_unknown(of_images: Float[Array, "images k a"], points: Float[Array, "k 3 points"], s: PaddedStructure):
-    """Sums of images and points, many along the second axis and the first, as increments."""
+    """Return sums by image and by point as increments; vectors along the second and the first axis, respectively."""
     column = jnp.asarray(s.column)[:, : s.n_image_colours]
     shared = jnp.zeros((s.n_shared + 1, len(points))).at[column].add(of_images[:, :, 6:].swapaxes(1, 2))[:-1].T
     return Increments(of_images[:, :, :6].transpose(1, 2, 0), shared, points)
 
 
 def pull_others(z: NonImageResiduals, at: Linearised) -> Increments:
-    """J'z of all but the image rows, of many along a leading axis; J is computed once for all of them."""
+    """Return J'z of all rows except image rows for many vectors (leading axis); J is evaluated once."""
     increments, scale, values, s = at
     pairs = zip(s.observed, values.groups, strict=True)
     return _pull_others(z, tuple(row_jacobian(g, own, increments, scale, values, s) for g, own in pairs), at)
@@ -152,14 +152,14 @@ def _pull_others(z: NonImageResiduals, jacobians: tuple[RowJacobian, ...], at: L
 
 
 def _of_many(function: Callable[[Any], Any], values: Any, many: int, s: PaddedStructure) -> Any:
-    """`function` of many `values` along their leading axes, of as many side by side as memory allows.
+    """Map `function` over the leading axes of `values`, as many at a time as memory allows.
 
-    Of each of these, every row has numbers of what it touches.
+    Every row holds numbers of all unknowns it touches.
     """
     most = rows_at_once(sum(g.components * g.n_rows * len(g.parameter) for g in s.observed))
     if many <= most:
         return jax.vmap(function)(values)
-    # None is left over, which would be compiled by itself.
+    # Equal batches: a remainder would be compiled separately.
     size = next(k for k in range(most, 0, -1) if many % k == 0)
     batches = jax.tree.map(lambda v: v.reshape(many // size, size, *v.shape[1:]), values)
     found = jax.lax.map(jax.vmap(function), batches)
@@ -167,14 +167,14 @@ def _of_many(function: Callable[[Any], Any], values: Any, many: int, s: PaddedSt
 
 
 def push(x: Increments, at: Linearised) -> PaddedResiduals:
-    """J x of many increments, along a leading axis, on one device."""
+    """Return J x of many increments (leading axis) on one device."""
     image = jax.vmap(lambda own: _push_images(own, at))(x)
     both = lambda own, image: PaddedResiduals(own.others, own.datum, own.names, image)  # noqa: E731
     return jax.vmap(both)(push_others(x, at), image)
 
 
 def _push_images(x: Increments, at: Linearised) -> Float[Array, "batches 2 chunks p"]:
-    """J x of the image rows, batch by batch: what lies between stays in the processor's cache."""
+    """Return J x of the image rows by batch, so that intermediate arrays stay in the processor's cache."""
     _, scale, values, s = at
     scene, moved = jax.jvp(partial(_scene_at, at), at.increments[:2], x[:2])
     points, steps = at.state.points, x.points * scale.points
@@ -190,7 +190,7 @@ def _push_images(x: Increments, at: Linearised) -> Float[Array, "batches 2 chunk
 
 
 def push_others(x: Increments, at: Linearised) -> NonImageResiduals:
-    """J x of all but the image rows, of many along a leading axis."""
+    """Return J x of all rows except image rows for many increments (leading axis)."""
     _, scale, values, s = at
 
     def one(own: Increments) -> NonImageResiduals:

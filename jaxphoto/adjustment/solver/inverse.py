@@ -1,15 +1,15 @@
-"""The inverse of the normal matrix as far as anybody asks for it: cofactors of unknowns and of rows.
+"""Required parts of the inverse normal matrix: cofactors of unknowns and of rows.
 
-With S~ = [S g; g' -K] the reduced matrix bordered by the few rows that couple points (see `normal`), V = L L' and
-F = [W; Ws'; D_p] L^-T what a point p meets, whitened,
+With S~ = [S g; g' -K] the reduced matrix bordered by the few rows that couple points (see `normal`), V = L L' and F =
+[W; Ws'; D_p] L^-T, the whitened coupling of point p,
 
     Q~    = S~^-1                                   exterior and interior orientation, scanner, mounts, strips
-    Q_pp  = L^-T (I + F' Q~ F) L^-1                 3 x 3 a point
-    j Q j' = z'z + (j_r - F z)' Q~ (j_r - F z)      of an image row with columns j_r and j_p, z = L^-1 j_p'
+    Q_pp  = L^-T (I + F' Q~ F) L^-1                 3 x 3 per point
+    j Q j' = z'z + (j_r - F z)' Q~ (j_r - F z)      of an image row with derivatives j_r and j_p, z = L^-1 j_p'
 
-summed over rays and pairs of rays, and so of other rows by point that touch shared unknowns, too. The full matrix is
-never inverted. In a free network the part along the open motions, which the constraints of the datum hold, is
-subtracted: what remains is the covariance under inner (or minimal) constraints.
+summed over rays and pairs of rays; the same holds for rows stored by point that touch shared unknowns. The full matrix
+is never inverted. In a free network the part along the open motions, which the datum constraints fix, is subtracted:
+the covariance under inner (or minimal) constraints remains.
 """
 
 from typing import NamedTuple
@@ -50,16 +50,16 @@ class Cofactors(NamedTuple):
 
 
 class RowCofactors(NamedTuple):
-    """j Q j' of rows, in padded sizes: of the numbers of a row with one another."""
+    """Cofactors j Q j' of the numbers of a row, in padded sizes."""
 
     image: Float[Array, "batches 3 m p"]
-    """Of x, of y, and of both with one another."""
+    """Variances of x and y, and their covariance."""
     at_points: tuple[Float[Array, "c c rows points"], ...]
-    """Of the groups of `AbstractStructure.with_shared`."""
+    """For the groups of `AbstractStructure.with_shared`."""
 
 
 def cofactors_of(at: Linearised, factored: FactoredNormal, of_rows: bool) -> tuple[Cofactors, RowCofactors | None]:
-    """All cofactors of one factored block, and j Q j' of its rows if these are wanted; see the module's head."""
+    """Return all cofactors of a factored block, and j Q j' of its rows if `of_rows`; see the module docstring."""
     s = at.structure
     reduced = factored.reduced
     inverse = invert_band(factored.factor)
@@ -76,7 +76,7 @@ def cofactors_of(at: Linearised, factored: FactoredNormal, of_rows: bool) -> tup
 def _of_points(
     full: Float[Array, "n n"], reduced: Reduced, at: Linearised, of_rows: bool
 ) -> tuple[Float[Array, "points 3 3"], RowCofactors | None]:
-    """Cofactors of points, and j Q j' of rows if these are wanted."""
+    """Return cofactors of points, and j Q j' of rows if `of_rows`."""
     s = at.structure
     seen = _seen(full, reduced, s)
     half = jnp.stack(unwhiten(seen.inner, reduced.l))
@@ -89,16 +89,16 @@ def _of_points(
 
 
 class _Propagated(NamedTuple):
-    """Q~ F of each point, by what it meets; and I + F' Q~ F."""
+    """Q~ F of each point by coupled unknowns, and I + F' Q~ F."""
 
     rays: Float[Array, "batches m p d e"]
-    """By what its image is eliminated with."""
+    """For the unknowns of the ray's image."""
     border: Float[Array, "points c 3"]
     inner: Float[Array, "3 3 points"]
 
 
 def _block(full: Array, row: Array, column: Array) -> Array:
-    """Q~ of rows and columns, both along their last axes; zero for what is none."""
+    """Gather Q~ at rows and columns (last axes); zero for missing unknowns."""
     return full.at[row[..., :, None], column[..., None, :]].get(mode="fill", fill_value=0.0)
 
 
@@ -158,7 +158,7 @@ def _seen(full: Float[Array, "n n"], reduced: Reduced, s: PaddedStructure) -> _P
 
 
 def _of_images(full: Array, seen: _Propagated, reduced: Reduced, at: Linearised) -> Float[Array, "batches 3 m p"]:
-    """Of image rows."""
+    """Return j Q j' of image rows."""
     _, scale, values, s = at
     columns_of, n, q = ray_columns(at), 6 * s.n_images, s.n_image_colours
     column = jnp.asarray(s.column)[:, :q]
@@ -193,7 +193,7 @@ def _of_images(full: Array, seen: _Propagated, reduced: Reduced, at: Linearised)
 
 
 def _of_group(full: Array, rows: RowsOfPoints, seen: _Propagated, reduced: Reduced, s: PaddedStructure) -> Array:
-    """Of rows at points that touch shared unknowns."""
+    """Return j Q j' of rows stored by point that touch shared unknowns."""
     first = interior_in_border(s) + len(reduced.k) + 1
 
     def one(numbers):
@@ -214,9 +214,9 @@ def _of_group(full: Array, rows: RowsOfPoints, seen: _Propagated, reduced: Reduc
 
 
 def _without_open_motions(q: Cofactors, at: Linearised, factored: FactoredNormal) -> Cofactors:
-    """Subtract E E': what the constraints D of the datum, taken as observations, leave along the motions they hold.
+    """Subtract E E': the part of the cofactors along the motions that the datum constraints D fix.
 
-    E = (N + D'D)^-1 D' spans those motions exactly, because N does not see them; where all are open, they are known.
+    E = (N + D'D)^-1 D' spans those motions exactly, because N does not see them; if all are open, they are known.
     """
     defect = len(at.values.datum_eop)
     if not defect:
@@ -224,7 +224,7 @@ def _without_open_motions(q: Cofactors, at: Linearised, factored: FactoredNormal
     _, scale, values, s = at
     rows = at.constraints()
     if n_open_motions(values, s):
-        # The motions are known: E = M (D M)^-1.
+        # E = M (D M)^-1, with known motions M.
         m = along_motions(values, scale, s.on_one_device)
         met = jnp.einsum("kci,jci->kj", rows.eop, m.eop) + jnp.einsum("kcp,jcp->kj", rows.points, m.points)
         e = jax.tree.map(lambda v: jnp.tensordot(inverse_of(met), v, (0, 0)), m)
@@ -240,7 +240,7 @@ def _without_open_motions(q: Cofactors, at: Linearised, factored: FactoredNormal
 def row_variances(
     at: Linearised, q: Cofactors, of_rows: RowCofactors, factored: FactoredNormal
 ) -> tuple[Array, tuple[Array, ...]]:
-    """J Q J' of image rows, and of the numbers of each other row with one another (c, c, ...)."""
+    """Return J Q J' of image rows, and of the numbers of each other row (c, c, ...)."""
     at = at._replace(structure=at.structure.on_one_device)
     s = at.structure
     rest = non_image_rows(at)
@@ -259,7 +259,7 @@ def row_variances(
 def _of_reduced(g: ObservedGroup, j: RowJacobian, q: Array, s: PaddedStructure) -> Float[Array, "c c rows"]:
     def of(touched: Array, own: Array) -> Array:
         at = touched.T
-        # What means no unknown lies behind the last.
+        # A missing unknown has the place after the last.
         met = q.at[at[:, :, None], at[:, None]].get(mode="fill", fill_value=0.0)
         seen = jnp.einsum("nab,dbn->dan", met, own)
         return jnp.einsum("can,dan->cdn", own, seen)
@@ -270,7 +270,7 @@ def _of_reduced(g: ObservedGroup, j: RowJacobian, q: Array, s: PaddedStructure) 
 
 
 def _of_coupled(g: ObservedGroup, j: RowJacobian, at: Linearised, factored: FactoredNormal) -> Float[Array, "c c rows"]:
-    """By one solve for each number: they join what never met otherwise."""
+    """Return j Q j' of coupled rows by one solution per number: their unknowns are not coupled otherwise."""
     s, zero = at.structure, at.increments
 
     def whole(k, c) -> Increments:

@@ -1,17 +1,19 @@
-"""Levenberg-Marquardt for a block, as a solver of optimistix that knows the block's structure.
+"""Levenberg-Marquardt for a block, as an optimistix solver that exploits the block's structure.
 
-optimistix runs the iteration. Each iteration evaluates the residuals of one candidate. Where it is accepted, the
-normal equations are summed there, their points eliminated (`reduced`), the rest factored (`band`), and a new step is
-proposed. Once steps shrink to a hundredth, the factor is kept: such a chord step needs the gradient only.
+optimistix runs the iteration. Each iteration evaluates the residuals of one candidate. If it is accepted, the normal
+equations are summed there, points are eliminated (`reduced`), the rest is factored (`band`), and a new step is
+proposed. Once a step is shorter than a hundredth of the previous one, the factor is kept: such a chord step needs only
+the gradient.
 
-Where unknowns are weakly determined the square sum is a narrow, bent valley, and a straight step leaves it: by the
-damping that it takes to stay inside, such a block creeps. So a step v that reduces the square sum by less than the
-linear model promised is bent (geodesic acceleration, Transtrum and Sethna 2012): with r'' the second derivative of the
+With weakly determined unknowns the sum of squares is a narrow, bent valley. A straight step leaves it, and the damping
+that keeps it inside makes convergence very slow. Therefore a step v that reduces the sum of squares by less than the
+linear model predicts is bent (geodesic acceleration, Transtrum and Sethna 2012): with r'' the second derivative of the
 residuals along v,
 
     (N + D) v = -J'r,    (N + D) a = -J'r'',    x(t) = x + t v + t^2 a / 2
 
-and t is halved until the reduction is near what x(t) promises. The acceleration costs residuals and one factor more.
+and t is halved until the reduction is close to the prediction for x(t). The acceleration costs residuals and one more
+solution with the same factor.
 """
 
 from collections.abc import Callable
@@ -42,18 +44,18 @@ from jaxphoto.arrays import Numbers
 from jaxphoto.short_repr import shown
 
 Vector = Float[Array, "unknowns"]
-"""Scaled increments one below the other: one operation, where three arrays would be three to compile."""
+"""Scaled increments as one vector: one operation to compile instead of three."""
 
 
 class FactoredSystem(NamedTuple):
-    """Normal equations summed and factored."""
+    """Summed and factored normal equations."""
 
     reduced: Reduced
     factor: BandFactor
 
 
 def zero_system(y: Increments, values: PaddedValues, s: PaddedStructure) -> FactoredSystem:
-    """A system of the right shapes, to begin with."""
+    """Return a system of the right shapes as initial value."""
     n, q, k = 6 * s.n_images, s.n_shared, s.n_coupled + len(values.datum_eop)
     colours, three = image_places(s, k).shape[1], 3 if s.rays.free_points else 0
     n_points, c = y.points.shape[1], border_places(s, k).shape[1]
@@ -75,71 +77,72 @@ def zero_system(y: Increments, values: PaddedValues, s: PaddedStructure) -> Fact
 
 
 class Task(NamedTuple):
-    """What an iteration is run for: numbers, so that one program serves every task."""
+    """Purpose of an iteration, as numbers, so that one program serves all."""
 
     max_steps: Int[Numbers, ""]
     only_factor: Bool[Numbers, ""]
-    """One undamped step, for the sake of its system."""
+    """True for one undamped step, to obtain its system."""
 
 
 def to_optimum(max_steps: int) -> Task:
-    """The optimum, in so many steps at most."""
+    """Iterate to the optimum in at most `steps` steps."""
     return Task(np.array(max_steps), np.array(False))
 
 
 def to_factor() -> Task:
-    """The undamped system at the start."""
+    """Compute the undamped system at the start."""
     return Task(np.array(1), np.array(True))
 
 
 @shown
 class Course(NamedTuple):
-    """How an iteration went, a number a step: of the first `MOST_KEPT` steps, NaN beyond."""
+    """Iteration history, one number per step: the first `MOST_KEPT` steps, NaN beyond."""
 
     square_sum: Float[Numbers, "steps"]
-    """Before the step."""
+    """Sum of squares before the step."""
     length: Float[Numbers, "steps"]
-    """Of the step in the metric of the normal matrix: no unknown moves by more of its standard deviations."""
+    """Length of the step in the metric of the normal matrix: an upper bound of |change| / sigma of every unknown."""
     damping: Float[Numbers, "steps"]
-    """Added to the normal matrix, relative to its diagonal."""
+    """Damping, relative to the diagonal of the normal matrix."""
     accepted: Float[Numbers, "steps"]
-    """1 where the step was taken, 0 where more damping was tried instead."""
+    """1 if the step was accepted, 0 if it was rejected."""
     bent: Float[Numbers, "steps"]
-    """How far it went along its curve, as a fraction of the step; 0 where it was straight."""
+    """Fraction of the step at the end of its curve; 0 for a straight step."""
 
     def is_flat(self, k: int | Int[Array, ""]) -> Bool[Array, ""] | np.bool_:
-        """True if the square sum hardly fell in the steps before step k (0, 1 ...), which is as long as they were.
+        """Return True if the sum of squares hardly fell in the steps before step k (0, 1, ...), although these did not
+        shorten.
 
-        In all of them it fell by less than moving one unknown by two standard deviations changes it, so the
-        observations hardly tell these places apart.
+        In all of them it fell by less than moving one unknown by two standard deviations changes it: the observations
+        hardly distinguish these places.
         """
         first, within = jnp.maximum(k - _WINDOW, 0), (k >= _WINDOW) & (k < MOST_KEPT)
         fall = self.square_sum[first] - self.square_sum[k]
         return within & (fall < _FALL) & (self.length[k] > _SHRUNK * self.length[first])
 
 
-# Adjustments end within tens of steps; the numbers of these are all that is kept besides the unknowns.
+# Adjustments end within tens of steps; this history is all that is kept besides the unknowns.
 MOST_KEPT = 128
-# Steps that a flat square sum is told by, its fall, and the ratio of the lengths of the last and the first.
+# Number of steps that decide that the sum of squares is flat, its largest fall, and the ratio of last to first length.
 _WINDOW, _FALL, _SHRUNK = 20, 4.0, 0.5
 
 
 class Proposal(NamedTuple):
-    """A step from the iterate, and what the linear model promises of it."""
+    """Step from the iterate, and the reduction that the linear model predicts."""
 
     step: Vector
     gradient: Vector
     """J'r at the iterate."""
     half: Vector
-    """Half of the acceleration; zero before it is known."""
+    """Half of the acceleration; zero before it is computed."""
     seen: Scalar
     """v'N v of the step v."""
     damped: Scalar
     """v'D v."""
     square_sum: Scalar
-    """At the iterate."""
+    """Sum of squares at the iterate."""
     straight_sum: Scalar
-    """After the whole step, without acceleration; infinite before it is known."""
+    """Sum of squares after the whole step without acceleration; infinite before it is computed."""
 
     def part(self, t: Scalar, straight: Bool[Array, ""]) -> Vector:
         """Increment after the fraction t of the step, along the curve or `straight`."""
@@ -147,66 +150,66 @@ class Proposal(NamedTuple):
 
     @property
     def length(self) -> Scalar:
-        """In the metric of the normal matrix."""
+        """Length in the metric of the normal matrix."""
         return jnp.sqrt(jnp.maximum(self.seen, 0.0))
 
     def gain(self, t: Scalar, square_sum: Scalar) -> Scalar:
-        """The reduction of the square sum after the fraction t of the step, over that of the linear model."""
+        """Ratio of actual to predicted reduction of the sum of squares after the fraction t of the step."""
         return (self.square_sum - square_sum) / (2 * t * (self.seen + self.damped) - t**2 * self.seen)
 
 
-# What the next candidate is: the next iterate (first, after a rejected step, or where a curve led astray), the whole
+# Kind of the next candidate: the next iterate (initially, after a rejected step, or where a curve diverged), the whole
 # step, a place near the iterate for the second derivative of the residuals, or a place along the curve.
 _HERE, _STRAIGHT, _NEAR, _CURVE = range(4)
 
 
 class SolverState(NamedTuple):
-    """The solver's state between two iterations."""
+    """State of the solver between two iterations."""
 
     stage: Int[Array, ""]
     candidate: Vector
     t: Scalar
-    """The fraction of the step that leads to the candidate."""
+    """Fraction of the step that leads to the candidate."""
     shortest: Scalar
-    """The smallest such fraction that is tried."""
+    """Smallest fraction that is tried."""
     proposal: Proposal
     damping: Scalar
     growth: Scalar
-    """Of the damping when a step is rejected."""
+    """Factor of the damping after a rejected step."""
     length: Scalar
-    """Of the last accepted step."""
+    """Length of the last accepted step."""
     system: FactoredSystem
     loose: Bool[Array, ""]
-    """Whether damping takes the place of the datum's constraints."""
+    """True if damping replaces the datum constraints."""
     tightened: Bool[Array, ""]
-    """Whether it did before: it does so once."""
+    """True if it did before: it does so once."""
     done: Bool[Array, ""]
-    """Whether this is what the task asks for: the optimum, or the system."""
+    """True at the result of the task: the optimum, or the system."""
     flat: Bool[Array, ""]
-    """True if there is no use in going on: the square sum does not tell where the optimum is."""
+    """True if more steps are useless: the sum of squares does not determine the optimum."""
     steps: Int[Array, ""]
     course: Float[Array, "steps numbers"]
-    """The numbers of a `Course`, a step a row."""
+    """Numbers of a `Course`, one step per row."""
 
 
-# Damping is what is added to the normal matrix, relative to its diagonal. It begins almost as none. A rejected step v
-# takes it to v'N v / v' diag(N) v at least, the stiffness along v, which about halves the step, and to more by factors
-# of 2, 4, 8 ... (Nielsen 1999).
+# Damping is added to the normal matrix, relative to its diagonal. It starts close to zero. A rejected step v raises it
+# to at least v'N v / v' diag(N) v, the stiffness along v, which about halves the step, and then by factors of 2, 4, 8,
+# ... (Nielsen 1999).
 _FIRST_DAMPING, _GROWTH = 1e-8, 2.0
-# A step is accepted above this ratio of actual to promised reduction. Damping falls with that ratio (Nielsen's rule),
+# A step is accepted above this ratio of actual to predicted reduction. Damping falls with that ratio (Nielsen's rule),
 # at most to this fraction.
 _ACCEPT, _LEAST_FACTOR = 0.001, 0.2
-# A step below this ratio is bent, and shortened until it is above the second, or below this fraction of its length.
+# A step below the first ratio is bent, and shortened until the ratio exceeds the second or t is below this fraction.
 _GOOD, _ENOUGH, _SHORTEST = 0.75, 0.25, 0.1
-# Bending moves by this fraction of the step at most, in the metric of diag(N): 2 |a| / |v| < 1.5 (Transtrum, Sethna).
+# Largest fraction of the step by which bending moves, in the metric of diag(N): 2 |a| / |v| < 1.5 (Transtrum, Sethna).
 _BENT = 0.375
-# The fraction of a step from which its second derivative is found: the difference of residuals has digits enough.
+# Fraction of a step for its second derivative: the difference of residuals keeps enough digits.
 _DIFFERENCE = 0.01
-# Ratio of successive steps that is assumed at least when the missing part is estimated.
+# Smallest ratio of successive steps assumed when the remaining distance is estimated.
 _SLOWEST_SHOWN = 0.1
-# After a step shorter than this fraction of the one before, the next is a chord: solved for with the factor at hand. N
-# changes by about that fraction of itself, which a chord leaves of what is missing; a new factor takes several times as
-# long. At twice this, large blocks need two steps more than with new factors.
+# After a step shorter than this fraction of the previous one, the next is a chord with the existing factor. N changes
+# by about that fraction, and so does the remaining error after a chord; a new factor takes several times as long. At
+# twice this value, large blocks need two more steps than with new factors.
 _CHORD = 0.01
 
 
@@ -221,18 +224,18 @@ class Judgement(NamedTuple):
     shorten: Bool[Array, ""]
     """True if a smaller fraction of the curve is tried first."""
     astray: Bool[Array, ""]
-    """True if the straight step had a smaller square sum than the curve; it is judged instead."""
+    """True if the straight step had a smaller sum of squares than the curve; it is judged instead."""
     t: Scalar
     """Fraction of the step that is judged."""
     gain: Scalar
-    """The reduction of the square sum over the promised one."""
+    """Ratio of actual to predicted reduction of the sum of squares."""
 
 
 def _judged(state: SolverState, square_sum: Scalar, has_losses: bool) -> Judgement:
-    """Judge the candidate by the square sum there."""
+    """Judge the candidate by its sum of squares."""
     p, straight, curve = state.proposal, state.stage == _STRAIGHT, state.stage == _CURVE
     gain = p.gain(state.t, square_sum)
-    # Of a loss the linear model promises little far from the optimum, where the way is not a bent valley.
+    # Far from the optimum the linear model of a loss predicts little, although there is no bent valley.
     bend = straight & ~(gain >= _GOOD) & jnp.isfinite(square_sum) & (not has_losses)
     shorten = curve & (state.t > state.shortest) & ~(gain >= _ENOUGH)
     judged = (straight & ~bend) | (curve & ~shorten)
@@ -245,11 +248,13 @@ def _judged(state: SolverState, square_sum: Scalar, has_losses: bool) -> Judgeme
 def _next_damping(
     state: SolverState, judged: Bool[Array, ""], accept: Bool[Array, ""], t: Scalar, gain: Scalar, stiffness: Scalar
 ) -> tuple[Scalar, Scalar]:
-    """Less after an accepted step, by the ratio of actual to promised reduction; more after a rejected one."""
-    # One that had to be shortened is no reason for less.
+    """Reduce damping after an accepted step, by the ratio of actual to predicted reduction; raise it after a rejected
+    one.
+    """
+    # A shortened step does not reduce damping.
     gain = jnp.where(t < 1, jnp.minimum(gain, 0.5), gain)
     less = state.damping * jnp.maximum(_LEAST_FACTOR, 1 - (2 * gain - 1) ** 3)
-    # Nothing else keeps a loose network's matrix regular.
+    # Only damping keeps the matrix of a loose network regular.
     less = jnp.maximum(less, jnp.where(state.loose, _FIRST_DAMPING, 0.0))
     more = jnp.maximum(state.growth * state.damping, stiffness)
     damping, growth = jnp.where(accept, less, more), jnp.where(accept, _GROWTH, _GROWTH * state.growth)
@@ -257,19 +262,19 @@ def _next_damping(
 
 
 def as_vector(x: Increments) -> Vector:
-    """The increments as a vector."""
+    """Return the increments as a vector."""
     return jnp.concatenate([jnp.ravel(v) for v in x])
 
 
 class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, SolverState]):
-    """Levenberg-Marquardt, stopped by what is still missing to the optimum in standard deviations.
+    """Levenberg-Marquardt, stopped by the remaining distance to the optimum in standard deviations.
 
-    The function it minimises returns the residuals; derivatives are the solver's own business.
+    The function to minimise returns the residuals; the solver differentiates by itself.
 
-    The length of a step d in the metric of the normal matrix, sqrt(d' N d), bounds |d| / sigma of every single
-    unknown. After a step of length l that follows one of length k about l (l / k) is missing; a tenth of l is assumed
-    at least, because the first ratios flatter: they shrink quadratically until the residuals' curvature tells. Once the
-    missing part is below `tolerance`, the (practically undamped) step is taken, and is the last.
+    The length of a step d in the metric of the normal matrix, sqrt(d' N d), bounds |d| / sigma of every single unknown.
+    After a step of length l that follows one of length k, about l (l / k) remains; at least a tenth of l is assumed,
+    because the first ratios are optimistic: they decrease quadratically until the curvature of the residuals dominates.
+    Once the remaining part is below `tolerance`, the (practically undamped) step is taken as the last.
     """
 
     rtol: float
@@ -284,13 +289,13 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
     def __init__(
         self, structure: PaddedStructure, values: PaddedValues, scale: Increments, tolerance: float, task: Task
     ):
-        # optimistix' own test of convergence is not used: `step` decides.
+        # The convergence test of optimistix is not used: `step` decides.
         self.rtol, self.atol, self.norm = 0.0, 0.0, optx.max_norm
         self.structure, self.values, self.scale = structure, values, scale
         self.tolerance, self.task = tolerance, task
 
     def increments(self, y: Vector) -> Increments:
-        """The vector as increments."""
+        """Return the vector as increments."""
         n = 6 * self.structure.n_images
         eop, shared, points = jnp.split(y, [n, n + self.structure.n_shared])
         return Increments(eop.reshape(6, -1), shared, points.reshape(3, -1))
@@ -305,12 +310,12 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         s = self.structure
         if s.shards == 1:
             return jnp.vdot(a, b)
-        # Points are dealt out.
+        # Points are sharded.
         n = 6 * s.n_images + s.n_shared
         return jnp.vdot(a[:n], b[:n]) + total(jnp.vdot(a[n:], b[n:]), s)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> SolverState:
-        """Almost Gauss-Newton to begin with."""
+        """Start close to Gauss-Newton."""
         no, one, zero = jnp.array(False), jnp.ones(()), jnp.zeros(())
         none = jnp.zeros_like(y)
         return SolverState(
@@ -340,9 +345,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         chord: Bool[Array, ""],
         old: FactoredSystem,
     ) -> tuple[FactoredSystem, Vector, Vector]:
-        """The system there, x of (N + D) x = J'r - `less`, and J'r - `less`; for a `chord` the `old` system."""
+        """Return the system, x of (N + D) x = J'r - `less`, and J'r - `less`; a `chord` keeps the `old` system."""
         place = at.for_normal_equations
-        # New derivatives take the place of the old F; a chord keeps it.
+        # New derivatives overwrite the old F; a chord keeps it.
         linearised = linearise_rows(place, rows, old.reduced.f, chord)
         old = old._replace(reduced=old.reduced._replace(f=linearised.w))
 
@@ -364,7 +369,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         return system, x, as_vector(right.b)
 
     def step(self, fn, y, args, options, state: SolverState, tags):
-        """Judge the candidate; where it is accepted, propose a step from there."""
+        """Judge the candidate; if it is accepted, propose a step from there."""
         s, p, h, none = self.structure, state.proposal, _DIFFERENCE, jnp.zeros_like(y)
         near, curve = state.stage == _NEAR, state.stage == _CURVE
         here = self._at(state.candidate, state.loose)
@@ -378,15 +383,15 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         damping, growth = _next_damping(state, judged, accept, t, gain, p.seen / self._dot(p.step, weight * p.step))
         last = jnp.where(accept, p.length, state.length)
         told = Course(p.square_sum, p.length, held, accept.astype(float), jnp.where(curve & ~astray, t, 0.0))
-        # What is not judged is written over.
+        # A candidate that is not judged is overwritten.
         course = state.course.at[state.steps].set(jnp.stack(told), mode="drop")
         is_flat, steps, loose = accept & Course(*course.T).is_flat(state.steps), state.steps + judged, state.loose
         if n_open_motions(self.values, s):
-            # Held about a start that is far off, the constraints bend the path: it goes on without them, and what it
-            # ends at is brought to them as a whole.
+            # Enforced about distant start values, the constraints bend the path: the iteration continues without them,
+            # and its end is moved onto them as a whole.
             loose = loose | (judged & ~accept & ~state.tightened)
 
-        # Near the optimum N hardly changes: its factor serves on.
+        # Near the optimum N hardly changes: keep its factor.
         near_optimum = (gain >= _GOOD) & (p.length <= _CHORD * state.length) & jnp.isfinite(state.length)
         chord = accept & (state.stage == _STRAIGHT) & ~loose & near_optimum
 
@@ -394,14 +399,14 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         less = jnp.where(near, (1 - h) * p.gradient - h * held * weight * p.step, 0.0)
         system, x, b = jax.lax.cond(
             fresh | near,
-            # Of rows with losses, the normal equations have other residuals than the cost.
+            # For rows with losses, the residuals in the normal equations differ from those of the cost.
             lambda: self._solved(
                 self._at(y, loose), damping, None if s.has_losses else rows, less, chord, state.system
             ),
             lambda: (state.system, none, none),
         )
         weight, held = as_vector(system.reduced.weight), system.reduced.damping
-        # (N + D) d = -b, so d'N d = -d'b - d'D d, and the linear model promises d'N d / 2 + d'D d.
+        # (N + D) d = -b, so d'N d = -d'b - d'D d, and the linear model predicts d'N d / 2 + d'D d.
         damped = held * self._dot(x, weight * x)
         straight_sum = jnp.where(bend, square_sum, p.straight_sum)
         p = Proposal(
@@ -413,21 +418,21 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
             square_sum=jnp.where(fresh, square_sum, p.square_sum),
             straight_sum=jnp.where(fresh, jnp.inf, straight_sum),
         )
-        # An old factor leaves up to twice as much as a new one.
+        # An old factor leaves up to twice the remainder of a new one.
         left = jnp.where(chord, 2.0, 1.0) * p.length / last
         missing = p.length * jnp.clip(left, _SLOWEST_SHOWN, 1.0)
         settled = fresh & (missing <= self.tolerance) & (p.damped <= p.seen + self.tolerance**2)
         settled = settled & (steps < self.task.max_steps) & ~self.task.only_factor
         end = jnp.stack([p.square_sum, p.length, held, jnp.ones(()), jnp.zeros(())])
         course = course.at[jnp.where(settled, steps, MOST_KEPT)].set(end, mode="drop")
-        # The last step is short and was computed from an accepted iterate: it needs no proof.
+        # The last step is short and starts from an accepted iterate: it needs no evaluation.
         y, tighten = jnp.where(settled, y + p.step, y), settled & loose
         if n_open_motions(self.values, s):
             y = jax.lax.cond(tighten, lambda y: as_vector(onto_datum(self._at(y, jnp.array(False)))), lambda y: y, y)
         bent = jnp.sqrt(self._dot(p.half, weight * p.half) / self._dot(p.step, weight * p.step))
         begin = jnp.minimum(_BENT / bent, 1.0)
         stages = [tighten, fresh, bend, near, shorten]
-        # Of a rejected step nothing is left; of a curve that led astray, the straight step.
+        # Restore the iterate after a rejected step, the straight step after a curve that diverged.
         t = jnp.select(stages, [0.0, 1.0, h, begin, state.t / 2], jnp.where(accept, 1.0, 0.0))
         reached = as_vector(after(self._at(y, loose), self.increments(p.part(t, astray)), system.reduced.weight))
         progress = SolverState(
@@ -450,11 +455,11 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         return y, progress, None
 
     def terminate(self, fn, y, args, options, state: SolverState, tags):
-        """After the step that did it, the last that the task allows, or many in vain."""
+        """Stop after the final step, at the limit of the task, or after many useless steps."""
         ended = ~state.done & ((state.steps >= self.task.max_steps) | state.flat)
         results = optx.RESULTS
         return state.done | ended, results.where(ended, results.nonlinear_max_steps_reached, results.successful)
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """Nothing is left to do."""
+        """Return the iterate unchanged."""
         return y, aux, {}

@@ -1,4 +1,4 @@
-"""What all rows but image rows add to the normal equations, group by group; see `model.observed_groups`."""
+"""Contributions of all rows except image rows to the normal equations, by group; see `model.observed_groups`."""
 
 from typing import Any, NamedTuple
 
@@ -22,10 +22,10 @@ class RowsOfPoints(NamedTuple):
     shared: Float[Array, "c l rows points"]
     points: Float[Array, "c 3 rows points"]
     slot: Int[Array, "l rows points"]
-    """Which of the unknowns of the point's group these are."""
+    """Slots of these unknowns in the list of the point's group."""
 
     def of_group(self, size: int) -> Float[Array, "size rows points c"]:
-        """The derivatives by all `size` shared unknowns of a group, where points are those of the group."""
+        """Return derivatives by all `size` shared unknowns of a group of points."""
         _, rows, points = self.slot.shape
         at = self.slot, jnp.arange(rows)[:, None], jnp.arange(points)
         zero = jnp.zeros((size, rows, points, len(self.residual)))
@@ -33,32 +33,32 @@ class RowsOfPoints(NamedTuple):
 
 
 class NonImageRows(NamedTuple):
-    """Derivatives and residuals of all but the image rows."""
+    """Derivatives and residuals of all rows except image rows."""
 
     jacobians: tuple[RowJacobian, ...]
     residuals: NonImageResiduals
     v: Float[Array, "3 3 points"]
-    """Sums over the rows that lie at points: of J_p' J_p,"""
+    """Sums of J_p' J_p over the rows at each point."""
     b: Float[Array, "3 points"]
-    """and of J_p' r."""
+    """Sums of J_p' r over the rows at each point."""
     at_points: tuple["RowsOfPoints", ...]
-    """Of those that touch shared unknowns, too (`AbstractStructure.with_shared`)."""
+    """Rows that also touch shared unknowns (`AbstractStructure.with_shared`)."""
     rows_e: Float[Array, "constraints images 6"]
-    """Rows that couple points, by what they touch: observations, then the constraints of the datum."""
+    """Coupled rows: observations, then datum constraints."""
     rows_s: Float[Array, "constraints shared"]
     rows_p: Float[Array, "constraints 3 points"]
     coupled: Float[Array, "constraints"]
-    """Their residuals."""
+    """Residuals of the coupled rows."""
 
 
 class NormalSums(NamedTuple):
     """Sums of the normal equations of images and shared unknowns (see `normal`), before points are eliminated.
 
-    Shared unknowns have a column more than there are: what means none adds to it.
+    Shared unknowns have one extra column, for rows without an unknown there.
     """
 
     band: tuple[Float[Array, "inner 2w 6 w 6"], Float[Array, "w 6 w 6"]]
-    """Pairs of images, by column block; images with themselves are in `u`."""
+    """Pairs of images, by column block; images by themselves are in `u`."""
     u: Float[Array, "images 6 6"]
     us: Float[Array, "images 6 shared+1"]
     uss: Float[Array, "shared+1 shared+1"]
@@ -67,7 +67,7 @@ class NormalSums(NamedTuple):
 
 
 def non_image_rows(at: Linearised, residuals: NonImageResiduals | None = None) -> NonImageRows:
-    """Derivatives and residuals at `at`, or with `residuals` in their place, and their sums by point."""
+    """Evaluate derivatives and residuals at `at` (or use `residuals`), and their sums by point."""
     increments, scale, values, s = at
     n = increments.points.shape[1]
     jacobians = tuple(
@@ -84,7 +84,7 @@ def non_image_rows(at: Linearised, residuals: NonImageResiduals | None = None) -
     coupled = []
     for g, j in zip(s.observed, jacobians, strict=True):
         if isinstance(g.rows, RowsAtPoints):
-            # Term by term and rows with rows of a point: few, and every one of them as long as there are points.
+            # Term by term and pair by pair of rows: few, each as long as the number of points.
             flat = j.points.reshape(-1, 3, *j.points.shape[3:])
             flat = jnp.moveaxis(flat, 2, 1).reshape(-1, 3, n)
             r = j.residual.reshape(-1, n)
@@ -106,7 +106,7 @@ def non_image_rows(at: Linearised, residuals: NonImageResiduals | None = None) -
 
 
 def _coupled(g: ObservedGroup, j: RowJacobian, s: PaddedStructure, n_points: int) -> tuple[Array, Array, Array]:
-    """The rows of a group in full, by images, shared unknowns and points."""
+    """Return the rows of a group in full, by images, shared unknowns and points."""
     c, each = g.components, jnp.arange(g.n_rows)
     e = jnp.zeros((c, g.n_rows, s.n_images, 6))
     for k, image in enumerate(g.image):
@@ -122,7 +122,7 @@ def _coupled(g: ObservedGroup, j: RowJacobian, s: PaddedStructure, n_points: int
 
 
 def add_non_image_rows(sums: NormalSums, rest: NonImageRows, s: PaddedStructure) -> NormalSums:
-    """The sums with those of all rows that meet images and shared unknowns."""
+    """Add the sums of all rows that touch images and shared unknowns."""
     for g, j in zip(s.observed, rest.jacobians, strict=True):
         if g.elimination == "reduced":
             sums = _add_reduced(sums, g, j, s)
@@ -142,7 +142,7 @@ def _add_reduced(sums: NormalSums, g: ObservedGroup, j: RowJacobian, s: PaddedSt
             which, row, column, turned = jnp.asarray(g.pair[pair]).T
             pair += 1
             same = (jnp.asarray(g.image[other]) == image)[:, None, None]
-            # A row that touches an image twice: both halves of the product belong to the image itself.
+            # A row that touches an image twice: both halves of the product belong to that image.
             both = jnp.where(same, across + across.transpose(0, 2, 1), 0.0)
             u = u + sum_by(both.reshape(-1, 36), image, s.n_images).reshape(-1, 6, 6)
             across = jnp.where(turned[:, None, None] > 0, across.transpose(0, 2, 1), across)
@@ -160,7 +160,7 @@ def _add_reduced(sums: NormalSums, g: ObservedGroup, j: RowJacobian, s: PaddedSt
 def _add_products(
     uss: Float[Array, "size size"], column: Int[Array, "l rows"], shared: Float[Array, "c l rows"]
 ) -> Float[Array, "size size"]:
-    """The products of each row's derivatives with one another."""
+    """Add the products of each row's derivatives."""
     length, n = column.shape
     size = rows_at_once(length**2)
 
@@ -170,7 +170,7 @@ def _add_products(
 
     if n <= size:
         return added(uss, (column, shared))[0]
-    # What fills the last portion up has no derivatives.
+    # Padding of the last portion has no derivatives.
     shared = jnp.pad(shared, ((0, 0), (0, 0), (0, -n % size)))
     return jax.lax.scan(added, uss, (in_portions(column, size), in_portions(shared, size)))[0]
 
@@ -182,9 +182,9 @@ def _products(a: Float[Array, "c a rows"], b: Float[Array, "c b rows"]) -> Float
 def add_blocks(
     band: tuple[Array, Array], blocks: Float[Array, "blocks 6 6"], place: Array, distinct: bool = False
 ) -> tuple[Array, Array]:
-    """Pairs of images, added where they belong: in the inner column blocks, or in the last (see `RayLists.block`).
+    """Add blocks of pairs of images to the inner column blocks or to the last (see `RayLists.block`).
 
-    What lies in neither is dropped. `distinct` says that no two blocks belong in one place, which is quicker.
+    Blocks outside both are dropped. `distinct` asserts that no two blocks share a place, which is faster.
     """
     columns, last = band
     which, row, column = place.T
@@ -195,12 +195,12 @@ def add_blocks(
     return columns, last.at[row, :, column].add(blocks, mode="drop")
 
 
-# XLA compiles the loop over the rows of a scatter as one function where a row is short, and else calls several a row.
+# XLA compiles the loop over the rows of a scatter as one function if rows are short, otherwise as several calls a row.
 _PIECE = 36
 
 
 def sum_by(rows: Float[Array, "rows c"], which: Array | np.ndarray | Any, n: int) -> Float[Array, "n c"]:
-    """Sums of rows by a number from 0 to n - 1."""
+    """Sum rows by an index from 0 to n - 1."""
     pieces = -(-rows.shape[1] // _PIECE)
     size = -(-rows.shape[1] // pieces)
     split = jnp.pad(rows, ((0, 0), (0, pieces * size - rows.shape[1]))).reshape(-1, size)

@@ -1,22 +1,22 @@
-"""Normal equations with the points eliminated: symbols, residuals and their square sum, factors of the points.
+"""Normal equations with eliminated points: symbols, residuals, sum of squares, factors of the points.
 
 In scaled increments, with e the exterior orientations, s the shared unknowns and p the points,
 
         [ U    Us   W  ] [e]   [b_e]
-    N = [ Us'  Uss  Ws'] [s] = [b_s]        V block-diagonal (3 x 3 a point), W 6 x 3 a (image, point) that met
+    N = [ Us'  Uss  Ws'] [s] = [b_s]        V block-diagonal (3 x 3 per point), W 6 x 3 per ray
         [ W'   Ws   V  ] [p]   [b_p]
 
-Few rows couple points, D: distances, all that touches two points or a point and an image (`model.observed_groups`),
-and the constraints of the datum. Their part D'D of N is carried by extra unknowns mu = D x with the block -I, so V
-stays block-diagonal. With V = L L', Y = W L^-T, Ys = L^-1 Ws, Yd = L^-1 D_p', and D_r the part of D for images and
-shared unknowns:
+Few rows couple points, D: distances, all that touches two points or a point and an image (`model.observed_groups`), and
+the datum constraints. Their part D'D of N is represented by extra unknowns mu = D x with the block -I, so V stays
+block-diagonal. With V = L L', Y = W L^-T, Ys = L^-1 Ws, Yd = L^-1 D_p', and D_r the part of D for images and shared
+unknowns:
 
     S   = [U Us; Us' Uss] - [Y; Ys'] [Y; Ys']'        the reduced normal matrix
     g   = D_r' - [Y; Ys'] Yd,   K = I + Yd' Yd        the coupling of mu
-    A   = S + g K^-1 g'                               positive definite where the datum is fixed
+    A   = S + g K^-1 g'                               positive definite if the datum is fixed
 
-`reduced.reduce_normal` makes F = [Y; Ys'; Yd'], the rows of Y ray by ray and the others point by point, and sums S from
-it; `elimination` takes vectors down to the reduced unknowns, and back to the points, by products with F.
+`reduced.reduce_normal` computes F = [Y; Ys'; Yd'], the rows of Y by ray and the others by point, and sums S from it;
+`elimination` uses products with F for elimination and back-substitution of vectors.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,7 @@ from jaxphoto.arrays import added
 
 
 class Linearised(NamedTuple):
-    """Where equations are linearised: `start + scale * increments`."""
+    """Place of linearisation: `start + scale * increments`."""
 
     increments: Increments
     scale: Increments
@@ -46,28 +46,28 @@ class Linearised(NamedTuple):
 
     @property
     def state(self) -> UnknownArrays:
-        """The unknowns there."""
+        """Unknowns at that place."""
         return state_at(self.increments, self.scale, self.values, self.structure)
 
     @property
     def for_normal_equations(self) -> "Linearised":
-        """The same with residuals that belong to normal equations, where rows have losses."""
+        """Replace losses by their linearisation for normal equations."""
         return self._replace(structure=self.structure.with_linearised_losses)
 
     def constraints(self) -> Increments:
-        """Derivatives of the constraints of the datum, along a leading axis."""
+        """Return derivatives of the datum constraints, along a leading axis."""
         _, scale, values, s = self
         none = jnp.zeros((len(values.datum_eop), s.n_shared))
         return Increments(values.datum_eop * scale.eop, none, values.datum_points * scale.points)
 
     def residual_rows(self) -> "ResidualRows":
-        """All residuals over their sigmas, those of image rows batch by batch."""
+        """Evaluate all residuals over their sigmas, image rows by batch."""
         increments, scale, values, s = self
         image = s.each_ray(self._of_rays(), (values.xy, values.sigma_xy))
         return ResidualRows(image, non_image_residuals(increments, scale, values, s))
 
     def residuals(self) -> PaddedResiduals:
-        """The same of all batches at once, which can be differentiated backwards."""
+        """Evaluate all residuals over their sigmas at once, which allows reverse-mode differentiation."""
         increments, scale, values, s = self
         numbers = jnp.asarray(s.rays.chunk_image), s.ray_points, values.xy, values.sigma_xy
         image = jnp.stack(jax.vmap(self._of_rays())(numbers), axis=1)
@@ -86,7 +86,7 @@ class Linearised(NamedTuple):
         return of_batch
 
     def square_sum(self) -> Float[Array, ""]:
-        """The sum of all squared residuals."""
+        """Sum of all squared residuals."""
         return self.residual_rows().square_sum(self.structure)
 
 
@@ -94,44 +94,45 @@ class ResidualRows(NamedTuple):
     """Residuals over their sigmas."""
 
     image: Pair
-    """Of image rows, batches first."""
+    """Image rows, batches first."""
     others: NonImageResiduals
 
     def square_sum(self, s: PaddedStructure) -> Float[Array, ""]:
-        """The sum of all squares."""
+        """Sum of all squares."""
         return total(squares(self.image), s) + other_squares(self.others, s)
 
 
 class Reduced(NamedTuple):
-    """The reduced normal matrix and what takes vectors down to it and back to the points."""
+    """Reduced normal matrix and what elimination and back-substitution of vectors need."""
 
     diagonal: Float[Array, "reduced"]
-    """Of A."""
+    """Diagonal of A."""
     g: Float[Array, "reduced constraints"]
     k: Float[Array, "constraints constraints"]
     f: Float[Array, "batches chunks p d e"]
-    """F of each ray: L^-1 times what its point and its image meet, e unknowns of the image (`RayLists.by_image`)."""
+    """F of each ray: L^-1 times the coupling of its point and its image, e unknowns of the image (`RayLists.by_image`).
+    """
     border: Float[Array, "points d c"]
-    """F of each point: L^-1 times what it meets of the unknowns in `border_places`."""
+    """F of each point: L^-1 times its coupling with the unknowns in `border_places`."""
     l: Float[Array, "6 points"]  # noqa: E741
     """Cholesky factors of V: l11, l21, l22, l31, l32, l33."""
     weight: Increments
-    """The diagonal of N, without damping and D'D: what a unit of damping adds."""
+    """Diagonal of N without damping and D'D: what unit damping adds."""
     damping: Scalar
 
 
 def dot(a: Increments, b: Increments, s: PaddedStructure) -> Float[Array, ""]:
-    """a'b over all unknowns."""
+    """Return a'b over all unknowns."""
     return jnp.vdot(a.eop, b.eop) + jnp.vdot(a.shared, b.shared) + total(jnp.vdot(a.points, b.points), s)
 
 
 def squares(r: Pair) -> Float[Array, ""]:
-    """The square sum of image rows."""
+    """Return the sum of squares of image rows."""
     return added(jnp.sum(v * v) for v in r)
 
 
 def other_squares(others: NonImageResiduals, s: PaddedStructure) -> Float[Array, ""]:
-    """The square sum of all but the image rows."""
+    """Return the sum of squares of all other rows."""
     dealt_out, everywhere = jnp.zeros(()), jnp.sum(others.datum**2)
     for group, v in zip(s.observed, others.others, strict=True):
         if isinstance(group.rows, RowsAtPoints):

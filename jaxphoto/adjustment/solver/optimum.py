@@ -1,4 +1,4 @@
-"""The optimum of a block by Levenberg-Marquardt, and the scales of its unknowns."""
+"""Optimum of a block by Levenberg-Marquardt, and scales of its unknowns."""
 
 import dataclasses
 from collections.abc import Callable
@@ -29,7 +29,7 @@ TOLERANCE = 1e-5
 
 
 class Optimum(NamedTuple):
-    """Where the solver ended, after how many steps, whether it is the optimum, and how it went.
+    """End of the iteration, number of steps, convergence, iteration history.
 
     In a tangent only the increments have a derivative; the others are None.
     """
@@ -41,13 +41,13 @@ class Optimum(NamedTuple):
 
 
 def unit_scale(structure: PaddedStructure) -> Increments:
-    """Increments in metres, radians and the parameters' own units; zero for what is held fixed."""
+    """Return the scale of increments in metres, radians and the parameters' own units; zero for fixed unknowns."""
     s = structure
     return Increments(jnp.asarray(s.eop_free), jnp.ones(s.n_shared), jnp.asarray(s.point_free))
 
 
 def iterate(values: PaddedValues, structure: PaddedStructure, task: Task) -> tuple[Optimum, FactoredSystem, Increments]:
-    """The optimum, and the last system with the scale of its unknowns; or the undamped system at the start."""
+    """Return the optimum, the last system and the scale of its unknowns; or the undamped system at the start."""
     scale = typical_scale(values, structure)
     at_points = along_points(2)
     of_unknowns = Increments(EVERYWHERE, EVERYWHERE, at_points)
@@ -63,11 +63,11 @@ def iterate(values: PaddedValues, structure: PaddedStructure, task: Task) -> tup
 def _iterate(
     values: PaddedValues, scale: Increments, structure: PaddedStructure, task: Task
 ) -> tuple[Optimum, FactoredSystem]:
-    """The iteration itself, on what one device holds; increments are scaled."""
+    """Iterate on the data of one device; increments are scaled."""
     solver = LevenbergMarquardt(structure, values, scale, TOLERANCE, task)
 
     def residuals(y: Any, args: Any) -> Any:
-        # The solver differentiates for itself: optimistix is told that there is nothing to linearise.
+        # The solver differentiates by itself: optimistix has nothing to linearise.
         return jax.lax.stop_gradient(Linearised(solver.increments(y), *args).residual_rows())
 
     solution: optx.Solution = optx.least_squares(
@@ -75,7 +75,7 @@ def _iterate(
         solver,
         jnp.zeros_like(as_vector(scale)),
         args=(scale, values, structure),
-        # The task says how many.
+        # The task sets the limit.
         max_steps=None,
         throw=False,
     )
@@ -85,9 +85,9 @@ def _iterate(
 
 
 def weigh_datum(values: PaddedValues, structure: PaddedStructure) -> PaddedValues:
-    """The same constraints of the datum, each of unit length in scaled increments.
+    """Scale the datum constraints to unit length in scaled increments.
 
-    Their weight does not change the optimum (no observation speaks against them); this one keeps N well-conditioned.
+    Their weight does not change the optimum (no observation contradicts them); this one keeps N well conditioned.
     """
     if not values.datum_eop.shape[0]:
         return values
@@ -101,13 +101,13 @@ def weigh_datum(values: PaddedValues, structure: PaddedStructure) -> PaddedValue
 
 
 def typical_scale(values: PaddedValues, structure: PaddedStructure) -> Increments:
-    """What moves an image point by about its standard deviation; zero for what is held fixed.
+    """Return the change of each unknown that moves an image point by about its standard deviation; zero if fixed.
 
-    Scaling by these makes columns of the Jacobian alike within a factor of some tens, which is all that the
-    factorisation needs: unknowns run from 1e-7 (k2) to 1e3 m.
+    With these scales the columns of the Jacobian agree within a factor of some tens, which suffices for the
+    factorisation: unknowns range from 1e-7 (k2) to 1e3 m.
     """
     s, v = structure, jax.tree.map(jax.lax.stop_gradient, values)
-    # The first ray of each chunk says enough of sigmas and distances.
+    # The first ray of each chunk represents sigmas and distances.
     weight = 1 / v.sigma_xy[..., 0]
     filled = weight > 0
     sigma = jnp.sum(filled) / jnp.sum(weight)
@@ -122,7 +122,7 @@ def typical_scale(values: PaddedValues, structure: PaddedStructure) -> Increment
         vector = vector.at[group.offset : stop].set(jnp.tile(typical, len(group.names)))
     sigma, ground, angle = _typical_of_places(s, v, filled, sigma)
     eop = jnp.stack([ground, ground, ground, angle, angle, angle])
-    # By the unit that ends a declared parameter's name.
+    # By the unit at the end of a declared parameter's name.
     by_unit = {
         "m": ground,
         "rad": angle,
@@ -151,8 +151,8 @@ def _camera_of(group: CameraGroup, numbers: Array) -> InteriorOrientation:
 def _typical_of_camera(
     interior_at: Callable[[Array], InteriorOrientation], at: Float[Array, "n"], sigma: Array, corner: Float[Array, "2"]
 ) -> Float[Array, "n"]:
-    """What moves the image of a point by `sigma` (mm), of numbers that make up a camera; one where nothing moves it."""
-    # A point halfway to the corner and a ray beside it: c moves the one, coefficients the other.
+    """Return the change of each camera number that moves the image of a point by `sigma` (mm); one if none does."""
+    # A point halfway to the corner, and one beside it: c moves the first, coefficients move the second.
     aim, centre = jnp.array([0.1, 0.1, -1.0]), ExteriorOrientation(jnp.zeros(3), jnp.eye(3))
     by_number = jax.jacfwd(lambda p: image_residual(interior_at(p), centre, aim, corner))(at)
     typical = sigma / jnp.maximum(jnp.max(jnp.abs(by_number), axis=0), 1e-30)
@@ -162,7 +162,7 @@ def _typical_of_camera(
 def _typical_of_bending(
     s: PaddedStructure, v: PaddedValues, t: ParameterTable, sigma: Array, corner: Float[Array, "2"]
 ) -> Float[Array, "n"]:
-    """The same of what bends cameras, far from the middle of the flight and from the reference temperature."""
+    """Return the same for what modifies cameras, far from mid-flight and from the reference temperature."""
     farthest, of_groups = jnp.argmax(jnp.abs(v.flight_time)), []
     exposure = Exposure(*(jnp.asarray(a)[..., farthest] for a in v.exposures))
     exposure = dataclasses.replace(exposure, temperature=jnp.max(jnp.abs(v.temperature)))
@@ -173,12 +173,12 @@ def _typical_of_bending(
     return jnp.min(jnp.stack(of_groups), axis=0)
 
 
-# Of laser strips alone, which nothing saw in an image: that of a laser point, and of the attitude it is measured with.
+# Laser strips without images: typical sigma of a laser point, and of the attitude it is measured with.
 _LASER_M, _LASER_RAD = 0.01, 1e-5
 
 
 def _typical_of_places(s: PaddedStructure, v: PaddedValues, filled: Array, sigma: Array) -> tuple[Array, Array, Array]:
-    """Typical sigma of an image point (mm), and what it is on the ground (m) and as an angle (rad)."""
+    """Return the typical sigma of an image point (mm), and its size on the ground (m) and as an angle (rad)."""
     if not s.groups:
         return jnp.ones(()), jnp.array(_LASER_M), jnp.array(_LASER_RAD)
     c = v.shared[s.groups[0].offset]

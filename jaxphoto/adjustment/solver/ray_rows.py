@@ -1,7 +1,7 @@
-"""A batch of rays: residuals of its image rows, and their derivatives, in all its slots at once.
+"""Residuals of a batch of rays and their derivatives, in all slots at once.
 
-A row touches one image, one point and the parameters of one camera. Rays lie in chunks of one image, so what depends on
-the image alone is computed once a chunk, and each column of the Jacobian is one forward derivative of `image_residual`,
+A row touches one image, one point and the parameters of one camera. Rays lie in chunks of one image, so what depends
+only on the image is computed once per chunk. Each column of the Jacobian is one forward derivative of `image_residual`,
 mapped over chunks and rays. Arrays end in (m, p): chunks, rays of a chunk.
 """
 
@@ -23,21 +23,22 @@ from jaxphoto.georeferencing import apparent_point
 
 
 class RayMeasurements(NamedTuple):
-    """What was measured in a batch, with weights 1 / sigma; zero in empty slots."""
+    """Measurements of a batch, with weights 1 / sigma; zero in empty slots."""
 
     xy: Float[Array, "2 m p"]
     weight: Float[Array, "2 m p"]
     member: tuple[Bool[Array, "m"], ...]
-    """By group of cameras: whether the image's camera belongs to it."""
+    """For each camera group: true if the image's camera belongs to it."""
 
 
 Pair = tuple[Float[Array, "*batches m p"], Float[Array, "*batches m p"]]
-"""Of the rows of a batch, or of all, x and y. Joined to one array they would be computed number by number, not as
-vectors."""
+"""x and y of the rows of a batch, or of all. Joined to one array they would be computed one number at a time, not as
+vectors.
+"""
 
 
 Triple = tuple[Float[Array, "m p"], Float[Array, "m p"], Float[Array, "m p"]]
-"""The three coordinates of the points in the frames of the cameras."""
+"""Coordinates of the points in the camera frames."""
 
 
 class RayJacobian(NamedTuple):
@@ -50,30 +51,30 @@ class RayJacobian(NamedTuple):
 
 
 def points_at(numbers: Float[Array, "c points"], point: Array) -> Float[Array, "c m p"]:
-    """Numbers of the points of rays."""
+    """Gather numbers of the points of rays."""
     return jnp.moveaxis(jnp.asarray(numbers).T.at[point].get(mode="promise_in_bounds"), -1, 0)
 
 
 def seen_in(xy: Array, sigma: Array, image: Array, s: PaddedStructure) -> RayMeasurements:
-    """What rows measured."""
+    """Return the measurements of a batch."""
     return RayMeasurements(xy, 1 / sigma, tuple(jnp.asarray(g.member)[image] for g in s.groups))
 
 
 def ray_residuals(
     scene: ImageOrientations, points: Float[Array, "3 m p"], seen: RayMeasurements, s: PaddedStructure
 ) -> Pair:
-    """Weighted residuals of a batch: observed minus computed over sigma."""
+    """Evaluate the weighted residuals of a batch: observed minus computed over sigma."""
     return _residuals(
         [_leaves_of(c) for c in scene.cameras], _in_cameras(scene.centre, scene.rotation, points, seen, s), seen, s
     )
 
 
 def _in_cameras(centre: Array, rotation: Array, points: Array, seen: RayMeasurements, s: PaddedStructure) -> Triple:
-    """Points in the frames of the cameras."""
+    """Transform points to the camera frames."""
 
     def one(centre, rotation, point, weight):
         aim = apparent_point(centre, point, s.corrections)
-        # An empty slot looks straight ahead: whatever lies there, its numbers stay finite.
+        # An empty slot looks straight ahead, so that its numbers stay finite.
         aim = jnp.where(weight > 0, aim, centre - rotation[2])
         u, v, w = camera_coordinates(ExteriorOrientation(centre, rotation), aim)
         return u, v, w
@@ -88,7 +89,7 @@ def _leaves_of(camera: Array) -> list[Array]:
 
 def _residuals(cameras: list[list[Array]], in_camera: Triple, seen: RayMeasurements, s: PaddedStructure) -> Pair:
     parts = [_residuals_of(g, c, in_camera, seen) for g, c in zip(s.groups, cameras, strict=True)]
-    # Without cameras there are empty slots only.
+    # Without cameras there are only empty slots.
     x, y = parts[0] if parts else (0 * in_camera[0], 0 * in_camera[0])
     if len(parts) > 1:
         x, y = (
@@ -117,14 +118,12 @@ def ray_jacobian(
     seen: RayMeasurements,
     s: PaddedStructure,
 ) -> tuple[RayJacobian, RayJacobian]:
-    """Residuals and Jacobian of a batch, x and y, by the chain rule: through the points in the cameras' frames, three
-    numbers a slot.
-    """
+    """Evaluate residuals and Jacobian of a batch, x and y, by the chain rule through the camera frames."""
     centre, rotation, unit = scene.centre, scene.rotation, jnp.eye(3)
-    # One loop for all six: joined afterwards, they would be computed number by number.
-    still, turns = jnp.zeros((3, *rotation.shape)), jnp.moveaxis(slopes.rotation, -1, 0)
-    seeds = jnp.concatenate([unit[:, None] * slopes.centre, still[:, :, 0]]), jnp.concatenate([still, turns])
-    # jit keeps the trace: every derivative below uses it again.
+    # One loop for all six: joined afterwards, they would be computed one number at a time.
+    zero, turns = jnp.zeros((3, *rotation.shape)), jnp.moveaxis(slopes.rotation, -1, 0)
+    seeds = jnp.concatenate([unit[:, None] * slopes.centre, zero[:, :, 0]]), jnp.concatenate([zero, turns])
+    # jit keeps the trace for every derivative below.
     place = jax.jit(partial(_in_cameras, seen=seen, s=s))
     by_eop = _slope(lambda *x: place(*x, points), centre, rotation)(*seeds)
     by_point = _by_point(lambda x: place(centre, rotation, x), points, s)
@@ -140,7 +139,7 @@ def ray_jacobian(
 
 
 def _by_point(place: Callable, points: Float[Array, "3 m p"], s: PaddedStructure):
-    """Derivatives of the places in the cameras' frames by the points' coordinates; none where all are fixed."""
+    """Differentiate the coordinates in the camera frames by those of the points; empty if all points are fixed."""
     if not s.rays.free_points:
         return tuple(jnp.zeros((3, *v.shape)) for v in jax.eval_shape(place, points))
     return _slope(place, points)(jnp.broadcast_to(jnp.eye(3)[:, :, None, None], (3, *points.shape)))
@@ -149,9 +148,9 @@ def _by_point(place: Callable, points: Float[Array, "3 m p"], s: PaddedStructure
 def _camera_columns(
     cameras: tuple[Array, ...], slopes: tuple[Array, ...], in_camera: Triple, seen: RayMeasurements, s: PaddedStructure
 ):
-    """Residuals, and their derivatives by the point in the camera's frame and by the cameras' unknowns."""
+    """Evaluate residuals and their derivatives by the point in the camera frame and by the camera unknowns."""
     leaves = [_leaves_of(c) for c in cameras]
-    # Only what is free: derivatives of the rest would be computed, though they are zero.
+    # Only free parameters: derivatives of the others would be computed although they are zero.
     free = [[own[k] for k in g.free_leaves] for g, own in zip(s.groups, leaves, strict=True)]
 
     def with_free(free):
@@ -171,5 +170,5 @@ def _camera_columns(
 
 
 def _slope(function: Callable, *x: Any) -> Callable:
-    """Directions, along a leading axis, to derivatives of `function` at `x`."""
+    """Return a function from directions (leading axis) to derivatives of `function` at `x`."""
     return jax.vmap(lambda *d: jax.jvp(function, x, d)[1])

@@ -1,8 +1,8 @@
-"""The sums behind the reduced normal matrix: rays add to points, images and pairs of images, chunk by chunk.
+"""Sums of the reduced normal matrix: contributions of rays to points, images and pairs of images, by chunk.
 
-Each ray has three rows of F for the unknowns of its image, each point three for what else it meets (see `normal`). The
-products of F that meet in an image are those of a chunk of rays, those that meet in two images those of a chunk of
-pairs of rays. What is met besides images (`border_places`) is summed point by point.
+Each ray has three rows of F for the unknowns of its image; each point has three for its other coupled unknowns (see
+`normal`). Products of F for one image come from chunks of rays, those for two images from chunks of pairs of rays.
+Coupled unknowns other than images (`border_places`) are summed by point.
 """
 
 from functools import partial
@@ -35,14 +35,14 @@ from jaxphoto.compiling import once
 from jaxphoto.linear_algebra import solve
 from jaxphoto.small_matrices import cholesky_3x3, whiten
 
-# XLA compiles the loop over the rows of a scatter as one function where a row is short, and else calls several a row.
+# XLA compiles the loop over the rows of a scatter as one function if rows are short, otherwise as several calls a row.
 _PIECE = 36
-# Groups of points whose rows are computed with at a time.
+# Number of groups of points that are processed at a time.
 _GROUPS = 64
 
 
 class RightSide(NamedTuple):
-    """A right-hand side: whole (b = J'r), and taken down to the reduced unknowns and to mu."""
+    """Right-hand side b = J'r, and its parts for the reduced unknowns and for mu after elimination."""
 
     b: Increments
     reduced: Float[Array, "reduced"]
@@ -50,14 +50,15 @@ class RightSide(NamedTuple):
 
 
 def interior_in_border(s: PaddedStructure) -> int:
-    """How many interior unknowns points meet as such, not as what their images are eliminated with."""
+    """Return the number of interior unknowns that points couple with directly, not through their images."""
     return 0 if s.rays.by_image else s.n_interior
 
 
 def border_places(s: PaddedStructure, k: int) -> Int[Array, "groups border"]:
-    """What the points of each group meet besides images: interior unknowns, k constraints, the right-hand side, and
-    shared unknowns of rows at points. As places among all shared unknowns, the constraints, the right-hand side, and
-    one more for none.
+    """Return the unknowns, except images, that the points of each group couple with.
+
+    Interior unknowns, k constraints, the right-hand side, and shared unknowns of rows at points; as places among all
+    shared unknowns, the constraints, the right-hand side, and one more for none.
     """
     n, met = s.n_shared, jnp.asarray(s.rays.met)
     first = jnp.concatenate([jnp.arange(interior_in_border(s)), n + jnp.arange(k + 1)])
@@ -66,22 +67,25 @@ def border_places(s: PaddedStructure, k: int) -> Int[Array, "groups border"]:
 
 
 def image_places(s: PaddedStructure, k: int) -> Int[Array, "images colours"]:
-    """The same of each image's own unknowns of its camera, where `RayLists.by_image`."""
+    """Return the places of each image's camera unknowns if `RayLists.by_image`."""
     colours = s.n_image_colours if s.rays.by_image else 0
     column = jnp.asarray(s.column)[:, :colours]
     return jnp.where(column < s.n_shared, column, s.n_shared + k + 1)
 
 
 def reduced_columns(s: PaddedStructure, k: int) -> tuple[Int[Array, "images e"], Int[Array, "groups border"]]:
-    """Places of what images are eliminated with, and of the border of each group, among the reduced unknowns and the k
-    constraints; beyond these where it is none."""
+    """Return the places of the images' unknowns and of each group's border among the reduced unknowns and k
+    constraints.
+
+    Missing unknowns have a place beyond these.
+    """
     n = 6 * s.n_images
     eop = 6 * jnp.arange(s.n_images)[:, None] + jnp.arange(6)
     return jnp.concatenate([eop, n + image_places(s, k)], axis=1), n + border_places(s, k)
 
 
 def ray_columns(at: Linearised):
-    """A function from images, points and measurements of a batch to its residuals and Jacobian."""
+    """Return a function from images, points and measurements of a batch to its residuals and Jacobian."""
     s, points = at.structure, at.state.points
     scene = orientations_of(at.state, at.values, s)
     slopes = once(lambda: orientation_derivatives(at.increments, at.scale, at.values, s), s.eop_free)
@@ -99,17 +103,17 @@ class _AtPoints(NamedTuple):
     """Sums by point, of points in metres."""
 
     v: Float[Array, "points 9"]
-    """Of J_p' J_p (6) and J_p' r (3)."""
+    """J_p' J_p (6) and J_p' r (3)."""
     w: Float[Array, "points interior+1 3"]
-    """Of J_s' J_p; the last serves colours that mean nothing in an image."""
+    """J_s' J_p; the last serves colours without an unknown in an image."""
 
     @classmethod
     def none(cls, s: PaddedStructure, n: int) -> "_AtPoints":
-        """Before the first batch."""
+        """Return initial sums."""
         return cls(jnp.zeros((n, 9)), jnp.zeros((n, interior_in_border(s) + 1, 3)))
 
     def plus(self, j: tuple[RayJacobian, RayJacobian], image: Array, point: Array, s: PaddedStructure) -> "_AtPoints":
-        """With those of a batch."""
+        """Add the sums of a batch."""
         pairs = [(a, b) for a in range(3) for b in range(a + 1)]
         own = [added(c.point[a] * c.point[b] for c in j) for a, b in pairs]
         own += [added(c.point[a] * c.residual for c in j) for a in range(3)]
@@ -129,7 +133,7 @@ class _AtPoints(NamedTuple):
 
 
 def add_rows(sums: Float[Array, "n c"], which: Array, rows: Float[Array, "c m p"]) -> Float[Array, "n c"]:
-    """The sums with rows of rays, by a number."""
+    """Add rows of rays to the sums by index."""
     n, c = sums.shape
     pieces = next(k for k in range(1, c + 1) if c % k == 0 and c // k <= _PIECE)
     at = (which.reshape(-1)[:, None] * pieces + jnp.arange(pieces)).reshape(-1)
@@ -138,17 +142,17 @@ def add_rows(sums: Float[Array, "n c"], which: Array, rows: Float[Array, "c m p"
 
 
 class _Eliminated(NamedTuple):
-    """The points, eliminated."""
+    """Eliminated points."""
 
     l: Float[Array, "6 points"]  # noqa: E741
     border: Float[Array, "points d c"]
     b: Float[Array, "3 points"]
     diagonal: Float[Array, "3 points"]
-    """That of V, without damping."""
+    """Diagonal of V, without damping."""
 
 
 def _eliminated(sums: _AtPoints, rest: NonImageRows, met: Array, scale: Array, damping, s: PaddedStructure):
-    """L of each point, and F of what it meets besides images; `met` is W of shared unknowns that its rows touch."""
+    """Return L of each point and F of its border; `met` is W of shared unknowns that its rows touch."""
     k, n, i = len(rest.coupled), len(sums.v), interior_in_border(s)
     if not s.rays.free_points:
         unit, none = jnp.array([1.0, 0, 1, 0, 0, 1])[:, None], jnp.zeros((3, n))
@@ -157,8 +161,8 @@ def _eliminated(sums: _AtPoints, rest: NonImageRows, met: Array, scale: Array, d
     v = scale[:, None] * scale * v[np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])] + rest.v
     b = b + rest.b + jnp.einsum("kap,k->ap", rest.rows_p, rest.coupled)
     diagonal = jnp.einsum("iip->ip", v)
-    added = damping * diagonal + jnp.where(diagonal == 0, 1.0, 0.0)
-    l = once(cholesky_3x3, s.eop_free, v + added[:, None] * jnp.eye(3)[:, :, None])  # noqa: E741
+    extra = damping * diagonal + jnp.where(diagonal == 0, 1.0, 0.0)
+    l = once(cholesky_3x3, s.eop_free, v + extra[:, None] * jnp.eye(3)[:, :, None])  # noqa: E741
     interior = sums.w[:, :i].transpose(1, 2, 0) * scale
     border = jnp.concatenate([interior, rest.rows_p, b[None], met]).transpose(1, 0, 2)
     border = once(lambda w, factors: jnp.stack(whiten(w, factors)).transpose(2, 0, 1), s.eop_free, border, l)
@@ -170,18 +174,18 @@ class LinearisedRows(NamedTuple):
 
     rest: NonImageRows
     by_image: Float[Array, "images c c"]
-    """Products of derivatives by the exterior orientation and the camera's unknowns, and of the residual."""
+    """Products of derivatives by exterior orientation and camera unknowns, and of the residual."""
     of_points: _AtPoints
     w: Float[Array, "batches m p d e"]
-    """W of each ray, of points in metres: a batch's numbers lie in the order (d, e, m, p)."""
+    """W of each ray, of points in metres; in memory a batch is ordered (d, e, m, p)."""
 
 
 def linearise_rows(
     at: Linearised, rows: ResidualRows | None = None, into: Array | None = None, keep: Bool[Array, ""] | None = None
 ) -> LinearisedRows:
-    """Linearise all rows with the residuals there, or with `rows`.
+    """Linearise all rows with their residuals, or with `rows`.
 
-    W is written `into` an array of its size; where it is to `keep` what it has, that is returned in place of W.
+    W is written `into` an array of its size; if `keep` is true, the previous content is returned in its place.
     """
     s, columns_of = at.structure, ray_columns(at)
 
@@ -208,7 +212,7 @@ def linearise_rows(
 
 
 def _met_of_rays(j: tuple[RayJacobian, RayJacobian], s: PaddedStructure) -> Float[Array, "m p d e"]:
-    """W of a batch; no rows where no point is free."""
+    """Return W of a batch; without rows if no point is free."""
     eop = [jnp.concatenate([o.eop, o.shared]) if s.rays.by_image else o.eop for o in j]
     e, *shape = eop[0].shape
     if not s.rays.free_points:
@@ -218,7 +222,7 @@ def _met_of_rays(j: tuple[RayJacobian, RayJacobian], s: PaddedStructure) -> Floa
 
 
 def _whitened(w: Float[Array, "m p d e"], of_rays: Float[Array, "9 m p"], s: PaddedStructure) -> Array:
-    """F of a batch from its W, with L and the scale of its points."""
+    """Return F of a batch from W, L and the scale of its points."""
     *shape, d, e = w.shape
     if not d:
         return w
@@ -226,7 +230,7 @@ def _whitened(w: Float[Array, "m p d e"], of_rays: Float[Array, "9 m p"], s: Pad
     def by_component(w, of_rays):
         return jnp.stack(whiten([own * scale for own, scale in zip(w, of_rays[6:], strict=True)], of_rays[:6]))
 
-    # Brought to the order of rays afterwards: what is computed on the way there is computed number by number.
+    # Brought to the order of rays afterwards: anything computed in that step would be computed one number at a time.
     f = once(by_component, s.eop_free, w.reshape(3, e, *shape), of_rays)
     return f.reshape(3 * e, -1).T.reshape(*shape, 3, e)
 
@@ -234,9 +238,9 @@ def _whitened(w: Float[Array, "m p d e"], of_rays: Float[Array, "9 m p"], s: Pad
 def reduce_normal(
     at: Linearised, damping, rows: LinearisedRows | None = None, less: Increments | None = None
 ) -> tuple[Band, Reduced, RightSide]:
-    """Eliminate the points of N + damping diag(N): A, what goes with it, and the right-hand side.
+    """Eliminate the points of N + damping diag(N); returns A, what accompanies it, and the right-hand side.
 
-    That is J'r - `less` for the residuals of `rows`. Unknowns held fixed (zero columns) get a unit diagonal.
+    The right-hand side is J'r - `less` for the residuals of `rows`. Fixed unknowns (zero columns) get a unit diagonal.
     """
     s, scale = at.structure, at.scale.points
     rest, by_image, of_points, w = rows or linearise_rows(at)
@@ -258,24 +262,24 @@ def reduce_normal(
 
 
 class ProductSums(NamedTuple):
-    """F F' of what points meet: images by themselves, with the border (`border_places`), and with one another."""
+    """Products F F' of images, of images with the border (`border_places`), and of pairs of images."""
 
     own: Float[Array, "images e_e"]
     across: Float[Array, "images places e"]
     border: Float[Array, "places places"]
     band: tuple[Array, Array]
-    """Its negative, by column block, without images by themselves."""
+    """Negative products of pairs of images, by column block; without images by themselves."""
 
     @classmethod
     def of(cls, border: Float[Array, "points d c"], s: PaddedStructure, k: int) -> "ProductSums":
-        """Before the first ray, with that of the border."""
+        """Return initial sums, including those of the border."""
         places, n, e, size = border_places(s, k), s.n_images, 6 + image_places(s, k).shape[1], s.n_shared + k + 2
         width, inner = n // s.rays.columns, s.rays.columns - 1
         band = jnp.zeros((inner, 2 * width, 6, width, 6)), jnp.zeros((width, 6, width, 6))
         return cls(jnp.zeros((n, e * e)), jnp.zeros((n, size, e)), _of_border(border, places, s, size), band)
 
     def with_rays(self, image: Array, point: Array, f: Array, border: Array, s: PaddedStructure, k: int):
-        """With those of a batch."""
+        """Add the products of a batch."""
         (chunks, _, _, e), c = f.shape, interior_in_border(s) + k + 1
         places, flat = border_places(s, k), f.reshape(chunks, -1, e)
         met = border.at[point].get(mode="promise_in_bounds")
@@ -288,7 +292,7 @@ class ProductSums(NamedTuple):
         return self._replace(own=self.own + sum_by(own, image, s.n_images), across=across)
 
     def with_pairs(self, f: Float[Array, "batches m p d e"], s: PaddedStructure, k: int) -> "ProductSums":
-        """With those of pairs of rays, and of the unknowns of cameras."""
+        """Add the products of pairs of rays and of camera unknowns."""
         e, own = f.shape[-1], image_places(s, k)
 
         def to_pairs(sums, numbers):
@@ -306,7 +310,7 @@ class ProductSums(NamedTuple):
 
 
 def _of_border(border: Float[Array, "points d c"], places: Array, s: PaddedStructure, size: int):
-    """F F' of what points meet besides images."""
+    """Return F F' of the border."""
     zero = jnp.zeros((size, size))
     if not s.rays.met.shape[1]:
         flat = border.reshape(-1, border.shape[2])
@@ -316,7 +320,7 @@ def _of_border(border: Float[Array, "points d c"], places: Array, s: PaddedStruc
 
 
 def _of_cameras(sums: ProductSums, product: Array, block: Array, own: Array, s: PaddedStructure) -> ProductSums:
-    """The sums with what pairs of images add for the unknowns of their cameras."""
+    """Add the products of pairs of images for their camera unknowns."""
     one, other = pair_images(block, s)
     columns = [jnp.asarray(own).at[image].get(mode="clip") for image in (one, other)]
     across = sums.across.at[one[:, None], columns[1], :6].add(product[:, :6, 6:].swapaxes(1, 2), mode="drop")
@@ -328,7 +332,7 @@ def _of_cameras(sums: ProductSums, product: Array, block: Array, own: Array, s: 
 
 
 def pair_images(block: Array, s: PaddedStructure) -> tuple[Array, Array]:
-    """The two images of each chunk of pairs; beyond the last where there are none."""
+    """Return the two images of each chunk of pairs; a place beyond the last for empty chunks."""
     width = s.n_images // s.rays.columns
     which, row, column = jnp.asarray(block).T
     none = which == s.rays.columns
@@ -336,7 +340,7 @@ def pair_images(block: Array, s: PaddedStructure) -> tuple[Array, Array]:
 
 
 def _with_cameras(sums: ProductSums, own: Array, s: PaddedStructure) -> ProductSums:
-    """The sums with what each image adds for the unknowns of its camera."""
+    """Add the products of each image for its camera unknowns."""
     n, e = s.n_images, 6 + own.shape[1]
     square, met = sums.own.reshape(n, e, e), sums.across[:, :, 6:]
     border = sums.border.at[own].add(met.swapaxes(1, 2))
@@ -347,14 +351,14 @@ def _with_cameras(sums: ProductSums, own: Array, s: PaddedStructure) -> ProductS
 
 
 class _OfMet(NamedTuple):
-    """J_s' J_s and J_s' r of rows at points, by all shared unknowns."""
+    """J_s' J_s and J_s' r of rows at points, for all shared unknowns."""
 
     square: Float[Array, "shared shared"]
     right: Float[Array, "shared"]
 
 
 def _rows_with_shared(rest: NonImageRows, s: PaddedStructure) -> tuple[Float[Array, "b 3 points"], _OfMet]:
-    """J_s' J_p of rows at points, by what their groups of points meet, and what does not meet points."""
+    """Return J_s' J_p of rows at points for the border of their groups, and the sums without points."""
     size, n = s.rays.met.shape[1], s.n_shared
     none = jnp.zeros((size, 3, rest.b.shape[1]))
     if not rest.at_points:
@@ -385,7 +389,7 @@ def _assembled(
     points,
     f,
 ) -> tuple[Band, Reduced, RightSide]:
-    """The reduced normal matrix and right-hand side from all sums."""
+    """Assemble the reduced normal matrix and right-hand side from all sums."""
     s, coupled = at.structure, rest.coupled
     n, k, n_shared = s.n_images, len(coupled), s.n_shared
     width, inner = n // s.rays.columns, s.rays.columns - 1
@@ -395,15 +399,15 @@ def _assembled(
     (columns, last), u, us, uss, b_s, b_e = add_non_image_rows(images, rest, s)
     uss, b_s = uss + of_met.square, b_s + of_met.right
     weight = Increments(jnp.einsum("nii->in", u), jnp.diagonal(uss), points.diagonal)
-    added = damping * weight.eop.T + jnp.where(weight.eop.T == 0, 1.0, 0.0)
-    u = u - own + added[:, :, None] * jnp.eye(6)
+    extra = damping * weight.eop.T + jnp.where(weight.eop.T == 0, 1.0, 0.0)
+    u = u - own + extra[:, :, None] * jnp.eye(6)
     each, of_inner = jnp.arange(n), inner * width
     columns = columns.at[each[:of_inner] // width, each[:of_inner] % width, :, each[:of_inner] % width].add(
         u[:of_inner], unique_indices=True
     )
     last = last.at[each[:width], :, each[:width]].add(u[of_inner:], unique_indices=True)
 
-    # Of products with the border: by shared unknowns, constraints and the right-hand side.
+    # Products with the border: shared unknowns, constraints and the right-hand side.
     e_shared, e_coupled, e_right, _ = jnp.split(
         sums.across[..., :6], [n_shared, n_shared + k, n_shared + k + 1], axis=1
     )
@@ -416,11 +420,11 @@ def _assembled(
     g = jnp.concatenate([ge.reshape(6 * n, k), rest.rows_s.T - s_coupled])
     of_mu = sums.border[n_shared : n_shared + k, n_shared : n_shared + k + 1]
     kk, d = jnp.eye(k) + of_mu[:, :k], of_mu[:, k]
-    # Put together by parts that are written whole: `block` would be computed number by number.
+    # Parts are written whole: `block` would be computed one number at a time.
     end = jnp.zeros((6 * width + n_shared,) * 2).at[: 6 * width, : 6 * width].set(last.reshape(6 * width, -1))
     end = end.at[6 * width :, : 6 * width].set(us[:, 6 * of_inner :]).at[6 * width :, 6 * width :].set(uss)
     if k:
-        # A = S + g K^-1 g' joins all images: the band has one full column block.
+        # A = S + g K^-1 g' couples all images: the band has one full column block.
         end = end + g @ solve(kk, g.T)
     a = Band(columns.reshape(inner, 12 * width, 6 * width), us[:, : 6 * of_inner], end)
 
@@ -433,7 +437,7 @@ def _assembled(
 
 
 def _by_unknown(m: Float[Array, "images c c"], s: PaddedStructure):
-    """Per-image sums by colour, brought to the columns of the shared unknowns; the last column is a dummy."""
+    """Bring sums by image and colour to the columns of the shared unknowns; the last column is a dummy."""
     q, n = s.n_image_colours, s.n_shared
     each, column = jnp.arange(s.n_images), jnp.asarray(s.column)[:, : s.n_image_colours]
     us = jnp.zeros((s.n_images, 6, n + 1)).at[each[:, None], :, column].add(m[:, :6, 6 : 6 + q].transpose(0, 2, 1))

@@ -1,4 +1,4 @@
-"""Similarities: motions of images and points together that change no image coordinate."""
+"""Similarity transformations: common motions of images and points that change no image coordinate."""
 
 from typing import Any, NamedTuple
 
@@ -15,16 +15,16 @@ from jaxphoto.arrays import Numbers, joined
 from jaxphoto.linear_algebra import one_at_a_time, solve
 from jaxphoto.rotation import CROSS, small_angles, small_rotation
 
-# Newton's method on so few unknowns, begun so near, doubles the right digits with each of these.
+# Number of Newton iterations; from such close start values each doubles the correct digits.
 _NEWTON_STEPS = 5
-# Of the mean weight of the motions: holds what a single image, of which seven motions are not independent, leaves open.
+# Relative to the mean weight of the motions: regularises the seven dependent motions of a single image.
 _RIDGE = 1e-9
 
 _svd = one_at_a_time(lambda a: tuple(jnp.linalg.svd(a)))
 
 
 class DatumRows(NamedTuple):
-    """How each increment moves under the seven motions (about the centroid, shifts in units of the block's size)."""
+    """Derivatives of increments by the seven motions (about the centroid, shifts in units of the block's size)."""
 
     eop: Float[np.ndarray, "7 6 images"]
     points: Float[np.ndarray, "7 3 points"]
@@ -33,7 +33,7 @@ class DatumRows(NamedTuple):
 def similarity(
     parameters: Float[Array, "7"], position: Float[Array, "3"], rotation: Float[Array, "3 3"], centre, size
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """An image moved by a similarity about `centre`: shifts in units of `size`, rotations (rad), logarithm of scale."""
+    """Move an image by a similarity about `centre`: shifts in units of `size`, rotations (rad), logarithm of scale."""
     turn = small_rotation(parameters[3:6])
     moved = centre + size * parameters[:3] + jnp.exp(parameters[6]) * turn @ (position - centre)
     return moved, rotation @ turn.T
@@ -46,12 +46,12 @@ def motions(
     centre,
     size,
 ) -> DatumRows:
-    """Derivatives of images (position, small rotation) and points by the parameters of `similarity`, at none.
+    """Differentiate images (position, small rotation) and points by the parameters of `similarity`, at identity.
 
-    NumPy's, unless what it is given is traced.
+    In NumPy unless the arguments are traced.
 
-    Where x is away from the centre by r, a turn by theta takes it by -theta x r. On the camera's side, where increments
-    are, the same turn is R turn' R', a small rotation by -R theta.
+    For x at the distance r from the centre, a rotation theta moves it by -theta x r. In the camera frame, where
+    increments are defined, the same rotation is R turn' R', a small rotation by -R theta.
     """
 
     def of_places(x) -> Any:
@@ -66,22 +66,22 @@ def motions(
 
 
 def n_open_motions(values: AbstractValues, s: AbstractStructure) -> int:
-    """How many motions are open, where these are all seven, or all but the scale, which distances give; else 0.
+    """Return the number of open motions if these are all seven, or all but the scale that distances determine; else 0.
 
-    Those change no residual but the datum's wherever images and points are. Others (a turn about the only control
-    point, a shift that a strip's goes along with) depend on the place, or on more than images and points.
+    Such motions change no residual except the datum's, wherever images and points are. Others (a rotation about the
+    only control point, a shift compensated by a strip's) depend on the place, or on more than images and points.
     """
     k = len(values.datum_eop)
-    rigid = all(g.rigid for g in s.observed)
+    invariant = all(g.rigid for g in s.observed)
     lengths = any(g.rigid and g.elimination != "reduced" for g in s.observed)
-    return k if rigid and (k == 7 or (k == 6 and lengths)) else 0
+    return k if invariant and (k == 7 or (k == 6 and lengths)) else 0
 
 
 def onto_datum(at: Linearised) -> Increments:
-    """The increments moved by the similarity that meets the datum's constraints.
+    """Move the increments by the similarity that fulfils the datum constraints.
 
-    Newton's method finds it from the one that brings the points nearest to their start (Umeyama 1991); where it does
-    not, the increments stay as they are.
+    Newton's method starts from the similarity that brings the points closest to their start values (Umeyama 1991); if
+    it fails, the increments are returned unchanged.
     """
     y, scale, values, s = at
     k = n_open_motions(values, s)
@@ -100,18 +100,18 @@ def onto_datum(at: Linearised) -> Increments:
 
 
 def along_motions(values: PaddedValues, scale: Increments, s: PaddedStructure) -> Increments:
-    """Scaled increments along each of the `n_open_motions` (leading axis), which nothing but the datum sees."""
+    """Return scaled increments along each of the `n_open_motions` (leading axis), which only the datum sees."""
     k, shared = n_open_motions(values, s), scale.shared
     eop, points = motions(values.position, values.rotation, values.points, *_extent(values.points, s))
     return Increments(_scaled(eop[:k], scale.eop), jnp.zeros((k, *shared.shape)), _scaled(points[:k], scale.points))
 
 
 def after(at: Linearised, step: Increments, weight: Increments) -> Increments:
-    """The increments after `step`: what moves the whole block is taken as a similarity, the rest is added.
+    """Return the increments after `step`: its common motion is applied as a similarity, the rest is added.
 
-    Added up, a turn of the whole block bends it, and where few observations see where the block lies, that is all that
-    such a step would be judged by. What is a similarity is told in the metric of `weight`. Steps of a free network are
-    added up: its constraints are straight.
+    Added, a rotation of the whole block would distort it, and where few observations see the position of the block,
+    that distortion alone would decide on the step. The similarity is separated in the metric of `weight`. Steps of a
+    free network are added: its constraints are linear.
     """
     (y, scale, values, s), state = at, at.state
     if n_open_motions(values, s):
@@ -130,7 +130,7 @@ def after(at: Linearised, step: Increments, weight: Increments) -> Increments:
 
 
 def _moved(at: Linearised, parameters: Float[Array, "k"], centre, size) -> Increments:
-    """The increments there, moved by a similarity."""
+    """Return the increments moved by a similarity."""
     (y, scale, values, _), state = at, at.state
     parameters = jnp.concatenate([parameters, jnp.zeros(7 - len(parameters))])
     image = lambda x, r: similarity(parameters, x, r, centre, size)  # noqa: E731
@@ -142,19 +142,19 @@ def _moved(at: Linearised, parameters: Float[Array, "k"], centre, size) -> Incre
 
 
 def _extent(points: Float[Array, "3 points"], s: PaddedStructure) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """Centre and size (m) of the points."""
+    """Return centre and size (m) of the points."""
     mean = lambda v: total(jnp.sum(v, axis=-1), s) / s.n_points  # noqa: E731
     centre = mean(points)
     return centre, jnp.sqrt(mean(jnp.sum((points - centre[:, None]) ** 2, axis=0)))
 
 
 def _scaled(v, scale):
-    """Increments of what is free, zero for what is held."""
+    """Return increments of free unknowns, zero for fixed ones."""
     return jnp.where(scale > 0, v / jnp.where(scale > 0, scale, 1.0), 0.0)
 
 
 def _nearest(points, start, own, centre, size, s: PaddedStructure) -> Float[Array, "7"]:
-    """Parameters of the similarity that takes `points` nearest to `start`; only `own` points count."""
+    """Return the similarity that brings `points` closest to `start`; only `own` points count."""
     weight = own / total(jnp.sum(own), s)
     mean, target = total((points @ weight, start @ weight), s)
     a, b = points - mean[:, None], start - target[:, None]

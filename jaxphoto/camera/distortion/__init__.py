@@ -1,11 +1,11 @@
-"""Lens distortion: one final class per model over one abstract base, found by the name a file gives it.
+"""Lens distortion: one final class per model with a common base, found by its name in files.
 
 A new model is one file here and its line below.
 """
 
 from typing import TYPE_CHECKING
 
-# In the order of tables and messages.
+# Order of tables and messages.
 # ruff: isort: off
 from jaxphoto.camera.distortion.base import AbstractDistortion as AbstractDistortion
 from jaxphoto.camera.distortion.base import invert as invert
@@ -27,10 +27,10 @@ from jaxphoto.camera.distortion.open_cv_fisheye import OpenCvFisheye as OpenCvFi
 # ruff: isort: on
 
 DISTORTIONS = AbstractDistortion.known()
-"""The models of jaxphoto by the names that files give them; `AbstractDistortion.known()` has users' own, too."""
+"""Models of jaxphoto by name in files; `AbstractDistortion.known()` includes user-defined ones."""
 
 if not TYPE_CHECKING:
-    # Checkers of types would take a list that is computed for an empty one; the aliases above tell them the same.
+    # Type checkers would take a computed list for an empty one; the aliases above serve them.
     __all__ = sorted(
         ["DISTORTIONS", "AbstractDistortion", "invert", *(model.__name__ for model in DISTORTIONS.values())]
     )

@@ -9,13 +9,13 @@ from jaxphoto.camera.distortion.base import AbstractBrown, Affinity
 
 
 class AffineBrown(AbstractBrown):
-    """Affinity and shear first, then radial and decentring distortion of what they leave.
+    """Affinity and shear first, then radial and decentring distortion of the result.
 
         m = (x - b1 x - b2 y, y),   ideal = m - delta(m)
         delta = m (K1 r^2 + K2 r^4 + K3 r^6) + (P1 (r^2 + 2 m_x^2) + 2 P2 m_x m_y, 2 P1 m_x m_y + P2 (r^2 + 2 m_y^2))
 
-    `Brown` adds all terms in the same coordinate; the two differ by products of the affinity with the distortion, which
-    a close-range camera shows. Units as there. Source: the "backward" model 3 of DBAT (Börlin and Grussenmeyer).
+    `Brown` evaluates all terms in the same coordinate; the two differ by products of affinity and distortion, which are
+    visible for close-range cameras. Units as there. Source: the "backward" model 3 of DBAT (Börlin and Grussenmeyer).
     """
 
     name: ClassVar[str] = "affine_brown"

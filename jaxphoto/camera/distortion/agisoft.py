@@ -37,7 +37,7 @@ class Agisoft(AbstractDistortion):
     domain: ClassVar[Literal["measured", "ideal"]] = "ideal"
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
     rare: ClassVar[tuple[str, ...]] = ("k4", "p3", "p4", "b1", "b2")
-    # y runs down: what is odd in y changes its sign.
+    # y points down: odd terms in y change sign.
     terms: ClassVar[Mapping[str, Term] | None] = {
         **same_terms("k1", "k2", "k3", "k4", "p1", "p3", "p4", "b1"),
         **{"p2": Term("p2", -1.0), "b2": Term("b2", -1.0)},

@@ -1,9 +1,9 @@
-"""What every lens distortion model is: one polynomial map between measured and ideal image coordinates.
+"""Base class of lens distortions: one polynomial map between measured and ideal image coordinates.
 
-Coordinates are reduced to the principal point and in millimetres, or, for a model that is `normalised`, in units of
-the principal distance. A model writes down one direction in closed form and says which (`domain`); the other
-direction is found by `invert`. Which way a distortion runs, with which sign and in which unit, is thereby part of its
-type (docs/conventions.md); `InteriorOrientation` takes millimetres to any of them.
+Coordinates are reduced to the principal point, in millimetres or, for a `normalised` model, in units of the principal
+distance. A model implements one direction in closed form and declares which (`domain`); `invert` computes the other.
+Direction, sign and units of a distortion are thus part of its type (docs/conventions.md); `InteriorOrientation`
+converts millimetres to any of them.
 """
 
 import abc
@@ -19,14 +19,14 @@ from jaxphoto.camera.declared import Declared
 from jaxphoto.camera.sensor import Sensor
 from jaxphoto.short_repr import shown
 
-# Newton's steps at most; a model inside its monotone range needs 4 to 8.
+# Maximum number of Newton iterations; within the monotone range a model needs 4 to 8.
 _STEPS = 50
-# Places along the ray from the principal point at which the map must keep its orientation.
+# Number of places along the ray from the principal point at which the map must keep its orientation.
 _PROBES = 64
 
 
 class Term(NamedTuple):
-    """A coefficient of a model: the common term (`AbstractDistortion.terms`) is `sign * coefficient * c^power`."""
+    """Coefficient of a model as a common term (`AbstractDistortion.terms`): `sign * coefficient * c^power`."""
 
     field: str
     sign: float = 1.0
@@ -34,12 +34,12 @@ class Term(NamedTuple):
 
 
 def same_terms(*names: str) -> dict[str, Term]:
-    """Terms that are coefficients of the same name, sign and unit."""
+    """Return terms for coefficients of the same name, sign and unit."""
     return {name: Term(name) for name in names}
 
 
 def radial_powers(letter: str, n: int) -> dict[str, int]:
-    """Powers of mm of the first `n` coefficients of even powers of the radius: k1 in mm^-2, k2 in mm^-4 ..."""
+    """Return powers of mm of the first `n` coefficients of even powers of the radius: k1 in mm^-2, k2 in mm^-4 ..."""
     return {f"{letter}{i}": -2 * i for i in range(1, n + 1)}
 
 
@@ -48,21 +48,20 @@ Affinity = Literal["added", "before", "after", "around"]
 
 @shown
 class AbstractDistortion(Declared):
-    """A lens distortion; its fields are scalars, its `domain` says where the polynomial lives.
+    """Lens distortion; its fields are scalars, its `domain` declares the direction of the polynomial.
 
-    `domain == "measured"`: `closed_form` takes measured to ideal coordinates (the photogrammetric habit).
-    `domain == "ideal"`: it takes ideal to measured ones, and residuals are those of measured coordinates.
-    `normalised`: coordinates here are those in mm divided by the principal distance (tangents of the field angle), as
-    in computer vision, so that coefficients have no unit.
+    `domain == "measured"`: `closed_form` maps measured to ideal coordinates (usual in photogrammetry). `domain ==
+    "ideal"`: it maps ideal to measured ones, and residuals are those of measured coordinates. `normalised`: coordinates
+    are those in mm divided by the principal distance (tangents of the field angle), as in computer vision, so that
+    coefficients have no unit.
 
-    What a model is called and made of is declared here and nowhere else (docs/extending.md): `name`,
-    `coefficients`, `constants` and `choices` as in `Declared`; `rare` names coefficients that most cameras do without
-    (affinity, rational and highest terms); `scales` those that change the scale of the image as the principal distance
-    does: never both can be free.
+    Name and coefficients of a model are declared only here (docs/extending.md): `name`, `coefficients`, `constants` and
+    `choices` as in `Declared`; `rare` names coefficients that most cameras do not need (affinity, rational and highest
+    terms); `scales` those that change the image scale as the principal distance does: both cannot be free.
 
-    `terms` makes exact conversions possible (`camera.equivalence`): which coefficients are the terms of one of its two
-    polynomials; None where the model is neither. `affinity` says when it acts: "added" to the other terms, on the
-    coordinate that these see; or in a step of its own, "before" or "after" them, or one part "around" each side.
+    `terms` enables exact conversions (`camera.equivalence`): the coefficients as terms of one of its two polynomials;
+    None if the model is neither. `affinity` declares when it acts: "added" to the other terms, in the same coordinate;
+    or in a step of its own, "before" or "after" them, or one part "around" each side.
     """
 
     domain: eqx.AbstractClassVar[Literal["measured", "ideal"]]
@@ -74,45 +73,44 @@ class AbstractDistortion(Declared):
 
     @classmethod
     def plain(cls, sensor: Sensor) -> "AbstractDistortion":
-        """The model without distortion, for a camera with that sensor: lengths that it needs are chosen here."""
+        """Return the model without distortion for a camera with that sensor; chooses lengths that the model needs."""
         return cls()
 
     @classmethod
     def power(cls, coefficient: str) -> int | None:
-        """As of any model; 0 where coordinates are normalised."""
+        """Return the power of mm of a coefficient; 0 for normalised coordinates."""
         return 0 if cls.normalised else super().power(coefficient)
 
     @classmethod
     def usual(cls) -> tuple[str, ...]:
-        """The coefficients that most cameras need: all but `rare` and `scales`."""
+        """Return the coefficients that most cameras need: all except `rare` and `scales`."""
         return tuple(name for name in cls.coefficients if name not in (*cls.rare, *cls.scales))
 
     @abc.abstractmethod
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """The model's own direction, of one reduced coordinate in the model's unit (mm unless `normalised`)."""
+        """Map one reduced coordinate in the closed-form direction, in the model's unit (mm unless `normalised`)."""
 
     def ideal_from_measured(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Ideal (distortion-free) from measured coordinate, both reduced to the principal point, in the model's unit.
+        """Return the ideal from the measured coordinate, both reduced to the principal point, in the model's unit.
 
-        Where the model is not invertible the value is meaningless: ask `invert` whether it is.
+        Meaningless where the model is not invertible; `invert` tells.
         """
         return self.closed_form(xy) if self.domain == "measured" else invert(self, xy)[0]
 
     def measured_from_ideal(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Measured from ideal coordinate, both reduced to the principal point, in the model's unit.
+        """Return the measured from the ideal coordinate, both reduced to the principal point, in the model's unit.
 
-        Where the model is not invertible the value is meaningless: ask `invert` whether it is.
+        Meaningless where the model is not invertible; `invert` tells.
         """
         return invert(self, xy)[0] if self.domain == "measured" else self.closed_form(xy)
 
 
 def invert(distortion: AbstractDistortion, target: Float[Array, "2"]) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
-    """The coordinate that `closed_form` takes to `target`, and whether it lies in the monotone range.
+    """Return the coordinate that `closed_form` maps to `target`, and True if it lies in the monotone range.
 
-    Newton's method from the linear part of the map, differentiable to any order by the implicit function
-    theorem. The second value is False where Newton does not converge or where the map folds (its Jacobian
-    determinant changes sign) between the principal point and the coordinate found: there the model says
-    nothing, whatever the first value is.
+    Newton's method from the linear part of the map, differentiable to any order by the implicit function theorem. The
+    second value is False if Newton's method does not converge or if the Jacobian determinant of the map changes sign
+    between the principal point and the result: the model is undefined there, whatever the first value is.
     """
 
     def error(xy: Float[Array, "2"]) -> Float[Array, "2"]:
@@ -140,7 +138,7 @@ def invert(distortion: AbstractDistortion, target: Float[Array, "2"]) -> tuple[F
 
 
 def _monotone(distortion: AbstractDistortion, xy: Float[Array, "2"]) -> Bool[Array, ""]:
-    """True where the map keeps its orientation all along the ray from the principal point to `xy`."""
+    """Return True if the map keeps its orientation along the ray from the principal point to `xy`."""
 
     def determinant(fraction):
         j = jax.jacfwd(distortion.closed_form)(fraction * xy)
@@ -155,7 +153,7 @@ def _solve_2x2(a: Float[Array, "2 2"], b: Float[Array, "2"]) -> Float[Array, "2"
 
 
 def radial(r2: Float[Array, ""], *k) -> Float[Array, ""]:
-    """K1 r^2 + K2 r^4 + K3 r^6 + ..., from the square of the radius and as many coefficients as are given."""
+    """Return K1 r^2 + K2 r^4 + K3 r^6 + ..., from the squared radius and any number of coefficients."""
     if not k:
         return jnp.zeros_like(r2)
     first, *higher = k
@@ -163,14 +161,14 @@ def radial(r2: Float[Array, ""], *k) -> Float[Array, ""]:
 
 
 def decentring(p1, p2, xy: Float[Array, "2"] | tuple[Array, Array]) -> Float[Array, "2"]:
-    """Decentring distortion P1 (r^2 + 2 x^2) + 2 P2 x y, 2 P1 x y + P2 (r^2 + 2 y^2)."""
+    """Return decentring distortion P1 (r^2 + 2 x^2) + 2 P2 x y, 2 P1 x y + P2 (r^2 + 2 y^2)."""
     x, y = xy
     r2, along = x * x + y * y, 2 * (p1 * x + p2 * y)
     return jnp.stack([p1 * r2 + along * x, p2 * r2 + along * y])
 
 
 def check_positive(distortion: AbstractDistortion, field: str, meaning: str) -> None:
-    """Raise ValueError where the constant `field` of a model is not positive; under jit its value is not known yet."""
+    """Raise ValueError unless the constant `field` of a model is positive; traced values are not checked."""
     value = getattr(distortion, field)
     if not isinstance(value, jax.core.Tracer) and not value > 0:
         raise ValueError(f"{field} of {type(distortion).__name__}, {meaning}, is positive and in mm, got {value}")
@@ -179,7 +177,7 @@ def check_positive(distortion: AbstractDistortion, field: str, meaning: str) -> 
 class AbstractBrown(AbstractDistortion):
     """Radial K1-K3, decentring P1, P2, affinity b1 and shear b2, of the measured coordinate, subtracted.
 
-    Brown's models differ in when affinity and shear act.
+    Brown's models differ in the order of affinity and shear.
     """
 
     k1: Float[Array, ""] | float = 0.0
@@ -197,8 +195,8 @@ class AbstractBrown(AbstractDistortion):
     terms: ClassVar[Mapping[str, Term] | None] = same_terms(*coefficients)
 
     def undistorted(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """A coordinate (mm) without radial and decentring distortion."""
-        # `decentring` and `radial` by their common factor: this stands in every program several times over.
+        """Remove radial and decentring distortion from a coordinate (mm)."""
+        # `decentring` and `radial` by their common factor: every program contains this several times.
         x, y = xy
         r2 = x * x + y * y
         left = 1 - radial(r2, self.k1, self.k2, self.k3) - 2 * (self.p1 * x + self.p2 * y)

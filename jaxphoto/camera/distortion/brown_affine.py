@@ -9,7 +9,7 @@ from jaxphoto.camera.distortion.base import AbstractBrown, Affinity
 
 
 class BrownAffine(AbstractBrown):
-    """Radial and decentring distortion first, then affinity and shear of what they leave.
+    """Radial and decentring distortion first, then affinity and shear of the result.
 
         m = x - delta(x),   ideal = (m_x - b1 m_x - b2 m_y, m_y)
 

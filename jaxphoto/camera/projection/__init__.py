@@ -1,11 +1,11 @@
-"""Projections: one final class each over one abstract base, found by the name a file gives it.
+"""Projections: one final class each with a common base, found by its name in files.
 
 A new projection is one file here and its line below.
 """
 
 from typing import TYPE_CHECKING
 
-# In the order of tables and messages.
+# Order of tables and messages.
 # ruff: isort: off
 from jaxphoto.camera.projection.base import AbstractProjection as AbstractProjection
 from jaxphoto.camera.projection.perspective import Perspective as Perspective
@@ -16,8 +16,8 @@ from jaxphoto.camera.projection.orthographic import Orthographic as Orthographic
 # ruff: isort: on
 
 PROJECTIONS = AbstractProjection.known()
-"""The projections of jaxphoto by the names that files give them; `AbstractProjection.known()` has users' own, too."""
+"""Projections of jaxphoto by name in files; `AbstractProjection.known()` includes user-defined ones."""
 
 if not TYPE_CHECKING:
-    # Checkers of types would take a list that is computed for an empty one; the aliases above tell them the same.
+    # Type checkers would take a computed list for an empty one; the aliases above serve them.
     __all__ = sorted(["PROJECTIONS", "AbstractProjection", *(model.__name__ for model in PROJECTIONS.values())])

@@ -1,4 +1,4 @@
-"""The equidistant projection, of which most fisheye lenses are distorted forms."""
+"""Equidistant projection; most fisheye lenses are distorted forms of it."""
 
 import math
 from collections.abc import Callable
@@ -8,16 +8,16 @@ import jax.numpy as jnp
 
 from jaxphoto.camera.projection.base import AbstractProjection, Component
 
-# Below this, series in the square of an angle or its tangent: the closed forms divide zero by zero on the axis, and
-# near it their second derivatives lose half of their digits. Ten terms leave 1e-21.
+# Below this, series in the square of an angle or its tangent: the closed forms are 0 / 0 on the axis, and their second
+# derivatives lose half of their digits near it. Ten terms leave an error of 1e-21.
 _NEAR = 1e-2
 _TERMS = 10
 
 
 class Equidistant(AbstractProjection):
-    """f = theta: the distance from the principal point is the angle from the axis times c, up to 180 degrees.
+    """f = theta: the distance from the principal point is c times the angle from the axis, up to 180 degrees.
 
-    What OpenCV (cv2.fisheye) and COLMAP call fisheye is this with the distortion `OpenCvFisheye`.
+    The fisheye models of OpenCV (cv2.fisheye) and COLMAP are this projection with the distortion `OpenCvFisheye`.
     Source: Kannala and Brandt (2006), A generic camera model and calibration method for conventional, wide-angle, and
     fish-eye lenses, equation (3).
     """
@@ -29,7 +29,7 @@ class Equidistant(AbstractProjection):
         """(x, y) = c theta (u, v) / rho,  rho = |(u, v)|,  theta = atan2(rho, -w)."""
         rho2 = u * u + v * v
         near = (rho2 < _NEAR * w * w) & (w < 0)
-        # Twice `where`: derivatives of the branch that is not taken must be finite, too.
+        # Two `where`: derivatives of the branch not taken must be finite, too.
         rho = jnp.sqrt(jnp.where(near, 1.0, rho2))
         far_away = jnp.arctan2(rho, -w) / rho
         depth = jnp.where(near, -w, 1.0)
@@ -51,7 +51,7 @@ class Equidistant(AbstractProjection):
 
 
 def _series(square: Component, coefficient: Callable[[int], float]) -> Component:
-    """The power series with the coefficients 0, 1, 2, ..., by Horner."""
+    """Evaluate the power series with the coefficients 0, 1, 2, ... by Horner's scheme."""
     total = jnp.zeros_like(square)
     for k in reversed(range(_TERMS)):
         total = coefficient(k) + square * total

@@ -1,4 +1,4 @@
-"""The equisolid projection: equal parts of the sphere are equal areas of the image."""
+"""Equisolid projection: equal solid angles have equal image areas."""
 
 from typing import ClassVar
 
@@ -8,7 +8,7 @@ from jaxphoto.camera.projection.base import AbstractProjection, Component
 
 
 class Equisolid(AbstractProjection):
-    """f = 2 sin(theta / 2): a solid angle has the same area wherever it is imaged, up to 180 degrees off the axis.
+    """f = 2 sin(theta / 2): a solid angle has the same image area everywhere, up to 180 degrees off the axis.
 
     The design of many fisheye lenses. Source: Miyamoto (1964), Fish eye lens; Kannala and Brandt (2006), equation (4).
     """
@@ -17,7 +17,7 @@ class Equisolid(AbstractProjection):
     widest_deg: ClassVar[float] = 180.0
 
     def ideal_from_direction(self, c, u: Component, v: Component, w: Component) -> tuple[Component, Component]:
-        """(x, y) = c (u, v) sqrt(2 / (n (n - w))),  n = |(u, v, w)|: nothing is zero but opposite to the axis."""
+        """(x, y) = c (u, v) sqrt(2 / (n (n - w))), n = |(u, v, w)|: singular only opposite to the axis."""
         n = jnp.sqrt(u * u + v * v + w * w)
         scale = c * jnp.sqrt(2 / (n * (n - w)))
         return u * scale, v * scale

@@ -1,4 +1,4 @@
-"""The orthographic projection: the half sphere as seen from afar."""
+"""Orthographic projection: the hemisphere seen from infinity."""
 
 from typing import ClassVar
 
@@ -8,7 +8,7 @@ from jaxphoto.camera.projection.base import AbstractProjection, Component
 
 
 class Orthographic(AbstractProjection):
-    """f = sin theta: the image ends at 90 degrees, c from the principal point, where it no longer grows.
+    """f = sin theta: the image ends at 90 degrees, at the distance c from the principal point.
 
     Source: Kannala and Brandt (2006), equation (5).
     """

@@ -1,4 +1,4 @@
-"""The perspective plane: what lenses other than fisheyes approach, and what collinearity means."""
+"""Perspective projection, on which collinearity is based."""
 
 from typing import ClassVar
 
@@ -6,7 +6,7 @@ from jaxphoto.camera.projection.base import AbstractProjection, Component
 
 
 class Perspective(AbstractProjection):
-    """f = tan theta: x = -c u / w, y = -c v / w. Straight lines stay straight; 90 degrees from the axis is infinity."""
+    """f = tan theta: x = -c u / w, y = -c v / w. Straight lines stay straight; 90 degrees is infinity."""
 
     name: ClassVar[str] = "perspective"
     widest_deg: ClassVar[float] = 90.0

@@ -1,4 +1,4 @@
-"""The stereographic projection: angles in the image are those on the sphere."""
+"""Stereographic projection: conformal."""
 
 from typing import ClassVar
 

@@ -23,10 +23,10 @@ from jaxphoto.compiling.freed_memory import freed_memory_kept
 from jaxphoto.errors import InputError
 from jaxphoto.extras.photos.features import LONGEST_PX, METHOD, SiftFeatures, sift_features
 from jaxphoto.extras.photos.photograph_pairs import MostSimilar, largest_of, most_similar, usual_count
+from jaxphoto.initial.matches import PairMatches, connected_images, tracks
+from jaxphoto.initial.rays import ideal_coordinates
 from jaxphoto.io.kept_pieces import KeptPieces, name_of
 from jaxphoto.io.photographs import Photograph
-from jaxphoto.orientation.matches import PairMatches, connected_images, tracks
-from jaxphoto.orientation.rays import ideal_coordinates
 from jaxphoto.procedures.matched_part import MatchedPart
 from jaxphoto.procedures.orientation.colmap import MappedCamera, import_pycolmap, write_database
 

@@ -1,11 +1,19 @@
-"""One [cameras.X] table of block.toml: sensor, starting interior orientation and what of it is free."""
+"""The [cameras.X] tables of block.toml: sensor, interior orientation, what of it is free, and an earlier calibration.
+
+`calibration = "../last_year"` stands for format, models, interior orientation and, as prior information with its full
+covariance, the parameters that it estimated ([cameras.X.known]). What it fixed is fixed here, too, unless
+[cameras.X.unknowns] says otherwise.
+"""
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
+from pydantic import StrictBool, StrictStr, create_model
 
 from jaxphoto.arrays import on_device
 from jaxphoto.camera import (
@@ -21,24 +29,50 @@ from jaxphoto.camera import (
     sensor_keys,
     set_parameter,
 )
-from jaxphoto.camera.declared import Declared
-from jaxphoto.errors import BlockError, InputError, quoted
-from jaxphoto.io.block_folder.section import Section
-from jaxphoto.io.names import control_in
-from jaxphoto.unknowns import FIXED, FREE, Prior, Weighted
+from jaxphoto.errors import InputError, quoted
+from jaxphoto.io.toml import Count, Keys, Number, Positive, Section, status
+from jaxphoto.observations import KnownParameters
+from jaxphoto.unknowns import FIXED, FREE
 
-_KEYS = ("width_px", "height_px", "pixel_mm", "pixel_assumed", "distortion", "projection", "residuals")
 # A principal distance beyond these multiples of the format's diagonal is in another unit than millimetres.
 _LONGEST, _SHORTEST = 20.0, 0.05
 # Pixels of known sensors are 0.5 to 50 micrometres.
 PIXEL_MM = (2e-4, 0.1)
+_CALIBRATION = "calibration"
+# The keys that a table with an earlier calibration may have, too.
+_OTHER_KEYS = (_CALIBRATION, "residuals", "unknowns")
 
-Part = TypeVar("Part", bound=Declared)
+
+class SensorKeys(Keys):
+    """The format of a camera."""
+
+    width_px: Count
+    height_px: Count
+    pixel_mm: Positive
+    pixel_assumed: StrictBool = False
+
+
+class CovarianceKeys(Keys):
+    """[cameras.X.known]"""
+
+    parameters: list[StrictStr]
+    matrix: Any
+
+
+class CameraKeys(SensorKeys):
+    """[cameras.X], but for the choices of its models."""
+
+    distortion: StrictStr
+    projection: StrictStr = Perspective.name
+    residuals: Literal["model", "measured"] = "model"
+    interior: dict[str, Number] = {}  # noqa: RUF012
+    unknowns: dict[str, Any] = {}  # noqa: RUF012
+    known: CovarianceKeys | None = None
+    reservation: StrictStr = ""
 
 
 class KnownTogether(NamedTuple):
-    """Parameters of a camera that an earlier calibration knows: as they stand in its interior orientation, with this
-    covariance (in their own units)."""
+    """Parameters of a camera that an earlier calibration estimated, with their covariance (in their own units)."""
 
     parameters: tuple[str, ...]
     covariance: np.ndarray
@@ -51,51 +85,105 @@ class Camera(NamedTuple):
     interior: InteriorOrientation
     priors: InteriorOrientation
     known: KnownTogether | None = None
-    """What is known beforehand together; free in `priors`."""
+    """Joint prior information; these parameters are free in `priors`."""
     reservation: str = ""
-    """What speaks against the calibration that it is from."""
+    """A warning about the calibration that it is from."""
+
+
+@functools.cache
+def _keys(distortion: type[AbstractDistortion], projection: type[AbstractProjection]) -> type[CameraKeys]:
+    """The keys of a camera with these models: each may have choices, such as a sign."""
+    defaults = {f.name: f.default for kind in (distortion, projection) for f in dataclasses.fields(kind)}
+    choices: dict[str, Any] = {
+        key: (Literal[words], defaults[key])  # type: ignore[valid-type]
+        for key, words in {**distortion.choices, **projection.choices}.items()
+    }
+    return create_model("CameraKeys", __base__=CameraKeys, **choices)
 
 
 def read_camera(section: Section) -> Camera:
-    """The camera that a [cameras.X] table describes. Raises InputError for what cannot be one."""
-    distortion = _kind(section, "distortion", AbstractDistortion.called)
-    projection = _kind(section, "projection", AbstractProjection.called, Perspective.name)
-    section.known(*_KEYS, *distortion.choices, *projection.choices, "interior", "unknowns", "known", "reservation")
-    sensor = read_sensor(section)
+    """The camera of a [cameras.X] table."""
+    key = "distortion"
+    try:
+        distortion = AbstractDistortion.called(section.text(key))
+        key = "projection"
+        projection = AbstractProjection.called(section.text(key, Perspective.name))
+    except InputError as error:
+        message = str(error)
+        raise error if message.startswith(section.file) else section.error(key, message) from None
+    keys = section.model(_keys(distortion, projection))
+    sensor = Sensor(keys.width_px, keys.height_px, keys.pixel_mm, keys.pixel_assumed)
     if not PIXEL_MM[0] <= sensor.pixel_mm <= PIXEL_MM[1]:
-        raise section.error("pixel_mm", f"a pixel of {sensor.pixel_mm:g} mm cannot be; give its size in millimetres")
-    empty = _empty_interior(section, distortion, projection)
-    interior = _read_interior(section.section("interior"), empty, sensor)
-    status = section.section("unknowns")
-    status.known(*parameter_names(interior))
+        raise section.error("pixel_mm", f"{sensor.pixel_mm:g} mm is no size of a pixel; give it in millimetres")
+    values = section.section("interior")
+    parts = [
+        kind(
+            **{field: values.positive(name) for name, field in kind.needed().items()},
+            **{key: getattr(keys, key) for key in kind.choices},
+        )
+        for kind in (distortion, projection)
+    ]
+    empty = InteriorOrientation(0.0, 0.0, 0.0, parts[0], keys.residuals, parts[1])  # type: ignore[arg-type]
+    interior = jax.tree.map(on_device, empty)
+    names = parameter_names(interior)
+    values.known(*names, *constant_names(interior))
+    for name, value in keys.interior.items():
+        interior = set_parameter(interior, name, on_device(value))
+    _check_interior(values, sensor)
+    return Camera(sensor, interior, *_priors(section, keys, interior), keys.reservation)
+
+
+def _check_interior(values: Section, sensor: Sensor) -> None:
+    """Raise InputError for numbers in another unit than millimetres."""
+    c, diagonal = values.number("c_mm"), float(np.hypot(sensor.width_mm, sensor.height_mm))
+    if not _SHORTEST * diagonal < c < _LONGEST * diagonal:
+        raise values.error(
+            "c_mm",
+            f"{c:g} mm is no principal distance of a format of {sensor.width_mm:g} x {sensor.height_mm:g} mm; give it "
+            "positive and in millimetres, not in pixels or metres",
+        )
+    for name, side in (("xp_mm", sensor.width_mm), ("yp_mm", sensor.height_mm)):
+        if abs(values.number(name, 0.0)) > side / 2:
+            raise values.error(
+                name, "the principal point lies outside the format; give it in millimetres from the image centre"
+            )
+
+
+def _priors(section: Section, keys: CameraKeys, interior: InteriorOrientation) -> tuple[Any, KnownTogether | None]:
+    names, table = parameter_names(interior), section.section("unknowns")
+    table.known(*names)
     priors = jax.tree.map(lambda _: FIXED, interior)
-    for name in status:
-        priors = set_parameter(priors, name, status.prior(name, get_parameter(interior, name)))
-    known = _read_known(section.section("known"), parameter_names(interior))
-    for name in () if known is None else known.parameters:
-        if status.values.get(name, "free") != "free":
-            raise status.error(
-                name, f"it is known beforehand by [{section.path}.known]; remove it here, or there with its covariance"
+    for name in table:
+        priors = set_parameter(priors, name, table.prior(name, get_parameter(interior, name)))
+    if keys.known is None:
+        return priors, None
+    known, parameters = section.section("known"), tuple(keys.known.parameters)
+    for name in parameters:
+        if name not in names or parameters.count(name) > 1:
+            raise known.error("parameters", f"{quoted(name)} is unknown or given twice; use {', '.join(names)}")
+        if table.values.get(name, "free") != "free":
+            raise table.error(
+                name, f"it is known beforehand by [{known.path}]; remove it here, or there with its covariance"
             )
         priors = set_parameter(priors, name, FREE)
-    reservation = section.text("reservation", "")
-    if control_in(reservation):
-        raise section.error("reservation", "it has a control character, which a terminal would obey; remove it")
-    return Camera(sensor, interior, priors, known, reservation)
+    return priors, KnownTogether(parameters, known.covariance("matrix", keys.known.matrix, len(parameters)))
 
 
 def read_sensor(section: Section) -> Sensor:
-    """The sensor by the keys that `sensor_keys` writes. Raises InputError for what cannot be one."""
-    size = section.count("width_px"), section.count("height_px"), section.positive("pixel_mm")
-    return Sensor(*size, pixel_assumed=section.truth("pixel_assumed"))
+    """The sensor of a table that may have other keys, too."""
+    keys = section.values
+    return Sensor(
+        section.count("width_px"), section.count("height_px"), section.positive("pixel_mm"),
+        pixel_assumed=keys.get("pixel_assumed") is True,
+    )  # fmt: skip
 
 
 def known_together(interior: InteriorOrientation, covariance: np.ndarray) -> KnownTogether:
-    """What a covariance of all parameters knows: those that it does not hold at their values."""
+    """The estimated parameters in a covariance of all: those with a variance."""
     names = parameter_names(interior)
     free = np.flatnonzero(np.diagonal(covariance) > 0)
-    own = covariance[np.ix_(free, free)]
-    return KnownTogether(tuple(names[k] for k in free), (own + own.T) / 2)
+    part = covariance[np.ix_(free, free)]
+    return KnownTogether(tuple(names[k] for k in free), (part + part.T) / 2)
 
 
 def camera_section(camera: Camera) -> dict[str, Any]:
@@ -114,81 +202,53 @@ def camera_section(camera: Camera) -> dict[str, Any]:
     return written
 
 
-def status(prior: Any, start, scale: float = 1.0) -> str | dict[str, Any]:
-    """How block.toml writes a prior of an unknown whose start is `start`; `scale` is as in `Section.prior`."""
-    if isinstance(prior, Prior):
-        return prior.name.lower()
-    if not isinstance(prior, Weighted):
-        raise BlockError(f"{prior!r} is no prior; use FREE, FIXED or Weighted(value, sigma)")
-    if prior.covariance is None:
-        written: dict[str, Any] = {"sigma": (np.asarray(prior.sigma) / scale).tolist()}
-    else:
-        written = {"covariance": (np.asarray(prior.covariance) / scale**2).tolist()}
-    if not np.array_equal(np.asarray(prior.value), np.asarray(start)):
-        written["value"] = (np.asarray(prior.value) / scale).tolist()
-    return written
+def with_earlier_calibrations(settings: dict[str, Any], file: str, folder: Path) -> dict[str, Any]:
+    """The content of block.toml in `folder`, with earlier calibrations in the tables of their cameras.
 
+    Raises InputError for calibrations that cannot be read or are without covariance, and for keys that they give.
+    """
+    cameras = settings.get("cameras", {})
+    if not isinstance(cameras, dict) or not any(isinstance(t, dict) and _CALIBRATION in t for t in cameras.values()):
+        return settings
+    # A camera file may be a block.toml, which it reads by modules of this package.
+    from jaxphoto.io.camera_files import read_camera_file
 
-def _read_known(section: Section, names: tuple[str, ...]) -> KnownTogether | None:
-    if not section.values:
-        return None
-    section.known("parameters", "matrix")
-    parameters = section.texts("parameters")
-    for name in parameters:
-        if name not in names or parameters.count(name) > 1:
-            raise section.error("parameters", f"{quoted(name)} is none, or stands there twice; {', '.join(names)} are")
-    matrix = section.covariance("matrix", section.values.get("matrix"), len(parameters))
-    return KnownTogether(parameters, matrix)
-
-
-def _kind(section: Section, key: str, called: Callable[[str], type[Part]], usual: str | None = None) -> type[Part]:
-    name = section.text(key, usual)
-    try:
-        return called(name)
-    except InputError as error:
-        raise section.error(key, str(error)) from None
-
-
-def _empty_interior(
-    section: Section, distortion: type[AbstractDistortion], projection: type[AbstractProjection]
-) -> InteriorOrientation:
-    residuals = _one_of(section, "residuals", ("model", "measured"), "model")
-    parts = _empty(section, distortion), _empty(section, projection)
-    empty = InteriorOrientation(0.0, 0.0, 0.0, parts[0], residuals, parts[1])  # type: ignore[arg-type]
-    return jax.tree.map(on_device, empty)
-
-
-def _empty(section: Section, kind: type[Part]) -> Part:
-    """A model with zeros for numbers, but for the constants that it needs."""
-    values = section.section("interior")
-    usual: dict[str, Any] = {f.name: f.default for f in dataclasses.fields(kind)}
-    chosen = {key: _one_of(section, key, words, usual[key]) for key, words in kind.choices.items()}
-    return kind(**{field: values.positive(name) for name, field in kind.needed().items()}, **chosen)
-
-
-def _one_of(section: Section, key: str, words: tuple[str, ...], usual: str) -> str:
-    word = section.text(key, usual)
-    if word not in words:
-        known = " nor ".join(f'"{w}"' for w in words)
-        raise section.error(key, f"{quoted(word)} is neither {known}; choose one of them")
-    return word
-
-
-def _read_interior(section: Section, empty: InteriorOrientation, sensor: Sensor) -> InteriorOrientation:
-    section.known(*parameter_names(empty), *constant_names(empty))
-    interior = empty
-    for name in section:
-        interior = set_parameter(interior, name, on_device(section.number(name)))
-    c, diagonal = section.number("c_mm"), float(np.hypot(sensor.width_mm, sensor.height_mm))
-    if not _SHORTEST * diagonal < c < _LONGEST * diagonal:
-        raise section.error(
-            "c_mm",
-            f"a principal distance of {c:g} mm cannot be with a format of {sensor.width_mm:g} x {sensor.height_mm:g} "
-            "mm; give it positive and in millimetres, not in pixels or metres",
-        )
-    for name, half in (("xp_mm", sensor.width_mm / 2), ("yp_mm", sensor.height_mm / 2)):
-        if abs(float(get_parameter(interior, name))) > half:
+    completed: dict[str, Any] = {}
+    for name, table in cameras.items():
+        section = Section(file, f"cameras.{name}", table)
+        completed[name] = table
+        if _CALIBRATION not in section:
+            continue
+        for key in section:
+            if key not in _OTHER_KEYS:
+                only = ", ".join(_OTHER_KEYS[1:])
+                raise section.error(key, f"the calibration gives it; only {only} may be given, too: remove it")
+        given = table[_CALIBRATION] if isinstance(table[_CALIBRATION], dict) else {"file": table[_CALIBRATION]}
+        named = Section(file, f"cameras.{name}.{_CALIBRATION}", given)
+        named.known("file", "camera")
+        camera = named.text("camera") if "camera" in named else None
+        read = read_camera_file(folder / named.text("file"), camera=camera)
+        if read.covariance is None:
             raise section.error(
-                name, "the principal point lies outside the format; give it in millimetres from the image centre"
+                _CALIBRATION,
+                f"{named.text('file')} has no covariance; name results of jaxphoto adjust, or a camera file of it",
             )
-    return interior
+        known = known_together(read.interior, read.covariance)
+        fixed = jax.tree.map(lambda _: FIXED, read.interior)
+        told = camera_section(Camera(read.sensor, read.interior, fixed, known, read.note))
+        unknowns = {key: value for key, value in told["unknowns"].items() if key not in known.parameters}
+        completed[name] = told | table | {"unknowns": unknowns | table.get("unknowns", {})}
+        del completed[name][_CALIBRATION]
+    return settings | {"cameras": completed}
+
+
+def known_cameras(cameras: Mapping[str, Camera]) -> tuple[KnownParameters, ...]:
+    """The joint prior information of each camera."""
+    known = []
+    for name, camera in cameras.items():
+        if camera.known is not None:
+            parameters, covariance = camera.known
+            values = np.array([float(get_parameter(camera.interior, parameter)) for parameter in parameters])
+            labels = [f"interior[{name}].{p}" for p in parameters]
+            known.append(KnownParameters(labels, values, covariance, camera.reservation))
+    return tuple(known)

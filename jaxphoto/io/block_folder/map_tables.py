@@ -1,7 +1,7 @@
-"""The tables of a block in an EPSG system, brought to the local frame of the adjustment, and back.
+"""The tables of a block in an EPSG system, converted to the local frame of the adjustment, and back.
 
-A point or station that is not given whole (height control) is completed for the way, there and back, by what else is
-known of it: its other rows, then its approximate coordinates.
+A point or station with missing coordinates (height control) is completed for the conversion by what else is known of
+it: its other rows, then its approximate coordinates.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,8 +16,7 @@ import pandas as pd
 from jaxphoto.block import Frame
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing.map_frame import MapFrame, map_system
-from jaxphoto.io.block_folder.images import check_angles
-from jaxphoto.io.block_folder.table_layout import ANGLES, ATTITUDE, VELOCITY, XYZ, coordinate_names
+from jaxphoto.io.block_folder.table_layout import ANGLES, ATTITUDE, TOML, VELOCITY, XYZ, coordinate_names
 from jaxphoto.io.text_tables import Table
 from jaxphoto.io.trajectory import Records
 from jaxphoto.rotation import (
@@ -27,8 +26,10 @@ from jaxphoto.rotation import (
     roll_pitch_yaw_from_matrix,
 )
 
-# How far (degrees) a block may reach beyond the area that a system is meant for.
+# How far (degrees) a block may reach beyond the area of use of its system.
 _BEYOND = 3.0
+# So far (m) from the origin the vertical is tilted by 3 degrees.
+_FAR_M = 3e5
 _PLACED = ("images", "control_points", "stations", "object_points")
 
 Numbers = dict[str, pd.DataFrame]
@@ -41,20 +42,26 @@ def tables_to_local(tables: Mapping[str, Table], frame: Frame) -> dict[str, Tabl
     `frame` has its origin. Raises InputError where a row cannot be converted.
     """
     names = dict(zip(coordinate_names(frame), XYZ, strict=True))
-    for name, columns in (("images", ANGLES), ("attitudes", ATTITUDE)):
-        table = tables[name]
-        check_angles(table, np.stack([table.numbers(c, empty=True) for c in columns], axis=1), columns)
-    numbers = {name: _numbers(tables[name], names) for name in (*_PLACED, "attitudes")}
+    converted_names = (*XYZ, *ANGLES, *ATTITUDE, *VELOCITY)
+
+    def as_numbers(table: Table) -> pd.DataFrame:
+        columns = {column: table.columns[column] for column in ("image", "point", "role") if column in table}
+        for together in (tuple(names), ANGLES, ATTITUDE, VELOCITY):
+            if any(column in table for column in together):
+                columns |= {names.get(column, column): table.numbers(column, empty=True) for column in together}
+        return pd.DataFrame(columns)
 
     def refuse(name: str, line: int, message: str) -> NoReturn:
         raise tables[name].bad(line, message)
 
     converted = dict(tables)
-    for name, local in _converted(numbers, frame, False, refuse).items():
+    for name, local in _converted(
+        {n: as_numbers(tables[n]) for n in (*_PLACED, "attitudes")}, frame, False, refuse
+    ).items():
         table = tables[name]
-        kept = {column: values for column, values in table.columns.items() if column not in names}
-        turned = {c: _text(local[c].to_numpy()) for c in local if c in (*XYZ, *ANGLES, *ATTITUDE, *VELOCITY)}
-        converted[name] = Table(table.file, kept | turned, table.files, table.rows)
+        columns = {column: values for column, values in table.columns.items() if column not in names}
+        columns |= {column: local[column].to_numpy() for column in local if column in converted_names}
+        converted[name] = Table(table.file, columns, table.files, table.rows)
     return converted
 
 
@@ -69,61 +76,59 @@ def tables_to_map(tables: Numbers, frame: Frame) -> Numbers:
     return tables | {name: columns.rename(columns=names) for name, columns in converted.items()}
 
 
-def origin_of(
-    tables: Mapping[str, Table], frame: Frame, trajectory: Records | None
-) -> tuple[float, float, float] | None:
-    """A round place amid the coordinates of the tables, or of the trajectory, height zero; None where there are none.
+def with_origin(frame: Frame, tables: Mapping[str, Table], trajectory: Records | None, file: str) -> Frame:
+    """The frame with its origin: that of block.toml, else a round place amid the coordinates, at height zero.
 
-    Raises InputError where those of one file are not in the area of the system.
+    Raises InputError where the coordinates of a file are not in the area of the system, or far from the origin.
     """
     assert frame.code is not None
     # Places do not depend on the origin, which is not known yet.
     system, names = MapFrame(frame.code, frame.vertical, (0.0, 0.0, 0.0)), coordinate_names(frame)
-    placed = []
+    placed: list[np.ndarray] = []
     for table in (tables[name] for name in _PLACED if all(column in tables[name] for column in names)):
-        values = np.stack([table.numbers(column, empty=True) for column in names], axis=1)
+        values = table.matrix(names, empty=True)
         values = values[~np.isnan(values).any(axis=1)]
-        placed.append((table.file, values, system.place(values)))
+        if len(values):
+            placed.append(system.place(values))
+            _check_area(table.file, values, placed[-1], frame)
     if trajectory is not None:
         values = trajectory.coordinates
-        placed.append((trajectory.file, values, values if trajectory.geographic else system.place(values)))
-    for file, values, places in placed:
-        if len(values):
-            _check_area(file, np.median(values, axis=0), np.median(places, axis=0), frame)
-    of_tables = [places for _, _, places in (placed if trajectory is None else placed[:-1]) if len(places)]
-    places = np.concatenate(of_tables or [places for _, _, places in placed] or [np.zeros((0, 3))])
-    if not len(places):
-        return None
-    longitude, latitude, _ = np.median(places, axis=0)
-    return round(float(longitude), 4), round(float(latitude), 4), 0.0
+        places = values if trajectory.geographic else system.place(values)
+        _check_area(trajectory.file, values, places, frame)
+        placed = placed or [places]
+    if not placed:
+        if frame.origin is None:
+            raise InputError(
+                f"{file}, [frame]: no coordinate tells where the block lies; add origin = [longitude, latitude, "
+                "height] in degrees and metres"
+            )
+        return frame
+    longitude, latitude, _ = np.median(np.concatenate(placed), axis=0)
+    middle = round(float(longitude), 4), round(float(latitude), 4), 0.0
+    located = Frame(frame.kind, frame.code, frame.vertical, frame.yaw, frame.origin or middle)
+    distance = float(np.linalg.norm(located.map.local_from_place(np.array([middle]))))
+    if distance > _FAR_M:
+        raise InputError(
+            f"{file}, [frame] origin: it is {distance / 1e3:.0f} km from the block, which lies about "
+            f"({middle[0]:.4f}, {middle[1]:.4f}) degrees; correct it or remove the key"
+        )
+    return located
 
 
-def _check_area(file: str, coordinates: np.ndarray, place: np.ndarray, frame: Frame) -> None:
-    """Raise InputError where the middle of a file's `coordinates`, at `place`, is not in the area of the system."""
+def _check_area(file: str, coordinates: np.ndarray, places: np.ndarray, frame: Frame) -> None:
+    """Raise InputError where the middle of a file's `coordinates`, at `places`, is not in the area of the system."""
     assert frame.code is not None
-    area, names, (longitude, latitude, _) = map_system(frame.code).area_of_use, coordinate_names(frame), place
+    area, names = map_system(frame.code).area_of_use, coordinate_names(frame)
     if area is None:
         return
-    west, south, east, north = area.bounds
+    (longitude, latitude, _), (west, south, east, north) = np.median(places, axis=0), area.bounds
     outside = west <= east and not west - _BEYOND <= longitude <= east + _BEYOND
     if outside or not south - _BEYOND <= latitude <= north + _BEYOND or not np.isfinite(longitude):
-        about = ", ".join(f"{value:.1f}" for value in coordinates[:2])
+        about = ", ".join(f"{value:.1f}" for value in np.median(coordinates, axis=0)[:2])
         raise InputError(
             f"{file}: the coordinates, about ({about}), lie outside the area of EPSG:{frame.code} ({area.name}); "
-            f"correct the code, or the coordinates ({names[0]} is east, {names[1]} north)"
+            f"correct the code in {TOML}, or the coordinates ({names[0]} is east, {names[1]} north)"
         )
-
-
-def _numbers(table: Table, names: dict[str, str]) -> pd.DataFrame:
-    """Ids and role as text, all else that is to be converted as numbers, coordinates named `XYZ`.
-
-    What is converted together is there together: NaN where the file lacks a column.
-    """
-    columns = {column: table.columns[column] for column in ("image", "point", "role") if column in table}
-    for together in (tuple(names), ANGLES, ATTITUDE, VELOCITY):
-        if any(column in table for column in together):
-            columns |= {names.get(column, column): table.numbers(column, empty=True) for column in together}
-    return pd.DataFrame(columns)
 
 
 def _converted(tables: Numbers, frame: Frame, back: bool, refuse: Refuse) -> Numbers:
@@ -145,27 +150,25 @@ def _converted(tables: Numbers, frame: Frame, back: bool, refuse: Refuse) -> Num
         given = table[list(XYZ)].to_numpy(float)
         whole = _completed(table, given, others)
         partly = np.isnan(whole).any(axis=1)
-        if name != "images":
-            for line in np.flatnonzero(partly & ~np.isnan(given).all(axis=1)):
-                missing = XYZ[int(np.flatnonzero(np.isnan(whole[line]))[0])]
-                where = "images.csv" if name == "stations" else "object_points.csv"
-                refuse(
-                    name,
-                    int(line),
-                    f"the conversion from EPSG:{frame.code} needs {missing} too, at least approximately; add the row "
-                    f"to {where}",
-                )
         # The incomplete orientation of an image is kept for the warning that it is not used.
+        for line in np.flatnonzero(partly & ~np.isnan(given).all(axis=1)) if name != "images" else ():
+            missing = XYZ[int(np.flatnonzero(np.isnan(whole[line]))[0])]
+            where = "images.csv" if name == "stations" else "object_points.csv"
+            refuse(
+                name,
+                int(line),
+                f"the conversion from EPSG:{frame.code} needs {missing} too, at least approximately; add the row to "
+                f"{where}",
+            )
         to = given.copy()
         to[~partly] = system.map(whole[~partly]) if back else system.local(whole[~partly])
         for line in np.flatnonzero((~np.isfinite(to) & ~np.isnan(given)).any(axis=1)):
             refuse(name, int(line), f"the coordinates lie where EPSG:{frame.code} does not reach; correct them")
         local[name] = whole if back else to
         columns = table.assign(**dict(zip(XYZ, np.where(np.isnan(given), np.nan, to).T, strict=True)))
-        if name == "images" and ANGLES[0] in columns:
-            columns = _turned(columns, ANGLES, system.local_from_grid, local[name], back)
-        if name == "stations" and VELOCITY[0] in columns:
-            columns = _turned(columns, VELOCITY, system.local_from_grid, local[name], back)
+        for vectors in (ANGLES,) if name == "images" else (VELOCITY,) if name == "stations" else ():
+            if vectors[0] in columns:
+                columns = _rotated(columns, vectors, system.local_from_grid, local[name], back)
         converted[name] = columns
     attitudes = tables["attitudes"]
     if len(attitudes):
@@ -181,12 +184,12 @@ def _converted(tables: Numbers, frame: Frame, back: bool, refuse: Refuse) -> Num
                 "images.csv gives; add it",
             )
         axes = system.local_from_level if frame.yaw == "true" else system.local_from_grid
-        converted["attitudes"] = _turned(attitudes, ATTITUDE, axes, at, back)
+        converted["attitudes"] = _rotated(attitudes, ATTITUDE, axes, at, back)
     return converted
 
 
 def _completed(table: pd.DataFrame, given: np.ndarray, sources: list[pd.DataFrame]) -> np.ndarray:
-    """`given` with what is missing from the first of `sources` that has it of the same point or image."""
+    """`given`, with missing numbers from the first of `sources` that has them of the same point or image."""
     values = given.copy()
     for source in sources:
         key = "point" if "point" in source else "image"
@@ -198,45 +201,38 @@ def _completed(table: pd.DataFrame, given: np.ndarray, sources: list[pd.DataFram
     return values
 
 
-def _turned(
+def _rotated(
     table: pd.DataFrame, columns: tuple[str, ...], axes: Callable, local: np.ndarray, back: bool
 ) -> pd.DataFrame:
-    """Angles or velocities in axes of the files at `local` as they are in axes of the local frame, or back."""
+    """Angles or velocities in the axes of the files at `local`, in those of the local frame, or back."""
     values = table[list(columns)].to_numpy(float, copy=True)
     known = ~np.isnan(values).any(axis=1) & ~np.isnan(local).any(axis=1)
-    turn = axes(local[known])
+    rotation = axes(local[known])
     if back:
-        turn = np.swapaxes(turn, 1, 2)
-    values[known] = _TURNS[columns](turn, values[known])
+        rotation = np.swapaxes(rotation, 1, 2)
+    values[known] = _ROTATIONS[columns](rotation, values[known])
     return table.assign(**dict(zip(columns, values.T, strict=True)))
 
 
 @eqx.filter_jit
 @jax.vmap
-def _turned_camera(turn, degrees):
+def _rotated_camera(rotation, degrees):
     camera = matrix_from_omega_phi_kappa(jnp.deg2rad(degrees))
-    return jnp.rad2deg(omega_phi_kappa_from_matrix(camera @ turn.T))
+    return jnp.rad2deg(omega_phi_kappa_from_matrix(camera @ rotation.T))
 
 
 @eqx.filter_jit
 @jax.vmap
-def _turned_body(turn, degrees):
-    return jnp.rad2deg(roll_pitch_yaw_from_matrix(turn @ matrix_from_roll_pitch_yaw(jnp.deg2rad(degrees))))
+def _rotated_body(rotation, degrees):
+    return jnp.rad2deg(roll_pitch_yaw_from_matrix(rotation @ matrix_from_roll_pitch_yaw(jnp.deg2rad(degrees))))
 
 
-def _turned_vector(turn: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    return np.einsum("nij,nj->ni", turn, vector)
+def _rotated_vector(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    return np.einsum("nij,nj->ni", rotation, vector)
 
 
-_TURNS: dict[tuple[str, ...], Callable] = {
-    ANGLES: _turned_camera,
-    ATTITUDE: _turned_body,
-    VELOCITY: _turned_vector,
+_ROTATIONS: dict[tuple[str, ...], Callable] = {
+    ANGLES: _rotated_camera,
+    ATTITUDE: _rotated_body,
+    VELOCITY: _rotated_vector,
 }
-
-
-def _text(values: np.ndarray) -> np.ndarray:
-    """Cells that read as the same numbers, empty for NaN."""
-    cells = np.empty(len(values), object)
-    cells[:] = ["" if np.isnan(v) else repr(float(v)) for v in values]
-    return cells

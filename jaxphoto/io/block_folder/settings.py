@@ -1,116 +1,228 @@
-"""block.toml: title, frame, corrections, trajectory, cameras, default sigmas, mounts, strips, scanner and datum."""
+"""block.toml but for its cameras and unknowns: frame, corrections, trajectory, default sigmas and datum."""
 
+import dataclasses
+import warnings
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import BeforeValidator, StrictBool, StrictStr, model_validator
 
 from jaxphoto.block import Datum, Frame
-from jaxphoto.errors import quoted
+from jaxphoto.errors import InputError
+from jaxphoto.georeferencing import Corrections
+from jaxphoto.georeferencing.map_frame import check_heights, map_system
 from jaxphoto.io.block_folder.camera_section import Camera, read_camera
-from jaxphoto.io.block_folder.frame_sections import read_frame
-from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.block_folder.table_layout import LAYOUTS, PLACE, TOML
+from jaxphoto.io.toml import Count, KeyMistake, Keys, Number, Positive, Section, Vector
 from jaxphoto.variants import MODES
 
-_KEYS = (
-    "title",
-    "frame",
-    "corrections",
-    "trajectory",
-    "sigmas",
-    "cameras",
-    "mounts",
-    "strips",
-    "scanner",
-    "datum",
-    "georeferencing",
-    "observations",
-    "unknowns",
-    "partitions",
-    "breaklines",
-    "reference_temperature_c",
-    "converted_from",
-)
 _SIGMAS = (
     "image_mm", "image_px", "control_m", "control_X_m", "control_Y_m", "control_Z_m", "station_m", "attitude_deg",
 )  # fmt: skip
+_Texts = list[StrictStr]
 
 
-class Settings(NamedTuple):
-    """What block.toml says; sections are read when what they depend on is known."""
+class FrameKeys(Keys):
+    """[frame]"""
 
-    file: str
-    title: str
+    kind: Literal["local", "enu", "grid", "epsg"] = "local"
+    code: Count | None = None
+    vertical: Annotated[Count | None, BeforeValidator(lambda v: None if v == "ellipsoidal" else v)] = None
+    yaw: Literal["true", "grid"] = "true"
+    origin: Vector | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> "FrameKeys":
+        if self.kind != "epsg":
+            for key in sorted(self.model_fields_set - {"kind"}):
+                raise KeyMistake(key, 'only kind = "epsg" has this key; remove it')
+            return self
+        if self.code is None:
+            raise KeyMistake("code", "the key is missing; add it")
+        key = "code"
+        try:
+            system = map_system(self.code)
+            key = "vertical"
+            if self.vertical is not None:
+                check_heights(self.code, self.vertical)
+        except InputError as error:
+            raise KeyMistake(key, str(error)) from None
+        if self.origin is not None and (abs(self.origin[0]) > 360 or abs(self.origin[1]) > 90):
+            raise KeyMistake("origin", "this is no place; give [longitude, latitude, height] in degrees and metres")
+        if self.yaw == "grid" and system.is_geographic:
+            raise KeyMistake("yaw", f'EPSG:{self.code} has no grid; write yaw = "true"')
+        return self
+
+
+class CorrectionKeys(Keys):
+    """[corrections]"""
+
+    refraction: StrictBool = False
+    curvature: StrictBool = False
+    sea_level_m: Number | None = None
+
+
+class TrajectoryKeys(Keys):
+    """[trajectory]"""
+
+    file: StrictStr
+    shift_s: Number = 0.0
+    max_gap_s: Positive | None = None
+
+
+class DatumKeys(Keys):
+    """[datum]"""
+
+    kind: Literal["control", "minimal", "inner"] = "control"
+    over: Any = "points"
+    scale: StrictBool | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> "DatumKeys":
+        for key in sorted(self.model_fields_set - {"kind"}) if self.kind != "inner" else ():
+            raise KeyMistake(key, f'only kind = "inner" has this key; remove it or change kind from "{self.kind}"')
+        ids = isinstance(self.over, list) and self.over and all(isinstance(point, str) for point in self.over)
+        if not ids and self.over not in ("points", "images"):
+            raise KeyMistake("over", 'write "points", "images" or a list of ids as text, like ["1", "2", "3"]')
+        return self
+
+
+class GeoreferencingKeys(Keys):
+    """[georeferencing]"""
+
+    mode: Literal[tuple(MODES)] = "integrated"  # type: ignore[valid-type]
+
+
+class BlockKeys(Keys):
+    """block.toml"""
+
+    title: StrictStr = ""
+    frame: FrameKeys = FrameKeys()
+    corrections: CorrectionKeys = CorrectionKeys()
+    trajectory: TrajectoryKeys | None = None
+    sigmas: dict[str, Positive] = {}  # noqa: RUF012
+    cameras: dict[str, Any] = {}  # noqa: RUF012
+    mounts: dict[str, Any] = {}  # noqa: RUF012
+    strips: dict[str, Any] = {}  # noqa: RUF012
+    scanner: dict[str, Any] = {}  # noqa: RUF012
+    datum: DatumKeys = DatumKeys()
+    georeferencing: GeoreferencingKeys = GeoreferencingKeys()
+    observations: _Texts = []  # noqa: RUF012
+    unknowns: dict[str, Any] = {}  # noqa: RUF012
+    partitions: _Texts = []  # noqa: RUF012
+    breaklines: _Texts = []  # noqa: RUF012
+    reference_temperature_c: Number | None = None
+    converted_from: StrictStr = ""
+
+    @model_validator(mode="after")
+    def _check(self) -> "BlockKeys":
+        taken = [*(c.name for c in LAYOUTS["images"].columns), *PLACE, "mount", "block", "lidar", "knot"]
+        for name in self.partitions:
+            if name in taken or self.partitions.count(name) > 1:
+                raise KeyMistake("partitions", f"{name} has a meaning already; give the partition another name")
+        return self
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """The content of block.toml; tables of unknowns are read when their owners are known."""
+
+    top: Section
+    keys: BlockKeys
     frame: Frame
-    corrections: Section
-    trajectory: Section
-    sigmas: dict[str, float]
     cameras: dict[str, Camera]
-    mounts: Section
-    strips: Section
-    scanner: Section
     datum: Datum
-    mode: str
-    """Of georeferencing: a name of `variants.MODES`."""
-    observations: tuple[str, ...]
-    """Tables of classes that are not jaxphoto's own."""
-    unknowns: Section
-    partitions: tuple[str, ...]
-    """Columns of images.csv that say whose further unknowns are."""
-    breaklines: tuple[str, ...]
-    """Points on breaklines, by names in which * stands for any letters."""
-    reference_temperature_c: float | None
-    """At which cameras with thermal rates are what they are; None: the mean of all exposures."""
-    converted_from: str
-    """As in `Block`."""
+
+    @property
+    def file(self) -> str:
+        """The file, for messages."""
+        return self.top.file
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Default standard deviations."""
+        return self.keys.sigmas
 
 
 def read_settings(values: dict[str, Any], file: str = TOML, sigma_keys: Sequence[str] = ()) -> Settings:
-    """The settings in the content of block.toml; `file` is what messages call it, `sigma_keys` of further tables."""
+    """The settings in the content of block.toml; `sigma_keys` are those of further tables."""
     top = Section(file, "", values)
-    top.known(*_KEYS)
-    sigmas = top.section("sigmas")
-    sigmas.known(*_SIGMAS, *sigma_keys)
-    cameras = top.section("cameras")
-    if not cameras.values:
+    keys = top.model(BlockKeys)
+    top.section("sigmas").known(*_SIGMAS, *sigma_keys)
+    if not keys.cameras:
         raise top.error("", "there is no camera; add a table [cameras.NAME] with its format and interior orientation")
+    cameras = top.section("cameras")
     if "default" in cameras:
         raise cameras.error("default", "this name means every camera in [mounts]; give the camera another one")
+    over = keys.datum.over
+    datum = Datum(keys.datum.kind, tuple(over) if isinstance(over, list) else over, keys.datum.scale)
     return Settings(
-        file,
-        top.text("title", ""),
-        read_frame(top.section("frame")),
-        top.section("corrections"),
-        top.section("trajectory"),
-        {name: sigmas.positive(name) for name in sigmas},
+        top,
+        keys,
+        frame_of(keys.frame, file),
         {name: read_camera(cameras.section(name)) for name in cameras},
-        top.section("mounts"),
-        top.section("strips"),
-        top.section("scanner"),
-        _read_datum(top.section("datum")),
-        _read_mode(top.section("georeferencing")),
-        top.texts("observations"),
-        top.section("unknowns"),
-        read_partitions(top),
-        top.texts("breaklines"),
-        top.number("reference_temperature_c") if "reference_temperature_c" in top else None,
-        top.text("converted_from", ""),
+        datum,
     )
 
 
-def read_partitions(top: Section) -> tuple[str, ...]:
-    """The names of columns of images.csv. Raises InputError for those that have another meaning."""
-    names, images = top.texts("partitions"), LAYOUTS["images"]
-    taken = (*images.columns, *images.optional, *PLACE, "mount", "block", "lidar", "knot")
-    for name in names:
-        if name in taken or names.count(name) > 1:
-            raise top.error("partitions", f"{name} has a meaning already; give the partition another name")
-    return names
+def frame_of(keys: FrameKeys, file: str) -> Frame:
+    """The frame, of kind epsg without an origin where none is given."""
+    if keys.kind == "epsg" and "vertical" not in keys.model_fields_set:
+        warnings.warn(
+            f"{file}, [frame]: heights are taken as above the ellipsoid (GNSS); write "
+            'vertical = "ellipsoidal", or the EPSG code of their system (5773 for EGM96) if they are not',
+            UserWarning,
+            stacklevel=2,
+        )
+    origin = None if keys.origin is None else tuple(keys.origin)
+    return Frame(keys.kind, keys.code, keys.vertical, keys.yaw, origin)  # type: ignore[arg-type]
+
+
+def corrections_in(frame: Frame, settings: Settings) -> Corrections:
+    """The corrections that [corrections] switches on in `frame`, which has its origin."""
+    keys, section = settings.keys.corrections, settings.top.section("corrections")
+    if keys.curvature and frame.kind != "grid":
+        raise section.error(
+            "curvature",
+            f'a frame of kind "{frame.kind}" is Cartesian and needs no curvature correction; remove the key (only '
+            'kind = "grid" needs it)',
+        )
+    if frame.kind == "epsg":
+        if keys.sea_level_m is not None:
+            raise section.error("sea_level_m", "a frame of kind epsg knows its heights; remove the key")
+        return Corrections(keys.refraction, False, frame.map.sea_level() if keys.refraction else 0.0)
+    if keys.sea_level_m is not None and not keys.refraction:
+        raise section.error("sea_level_m", "only refraction = true needs it; remove the key or switch refraction on")
+    if keys.sea_level_m is None and keys.refraction and frame.kind != "grid":
+        raise section.error(
+            "sea_level_m",
+            f'refraction depends on heights above sea level, which a frame of kind "{frame.kind}" does not have; give '
+            "the Z of sea level",
+        )
+    return Corrections(keys.refraction, keys.curvature, keys.sea_level_m or 0.0)
+
+
+def frame_section(frame: Frame) -> dict[str, Any]:
+    """The [frame] table of `frame`."""
+    if frame.kind != "epsg":
+        return {"kind": frame.kind}
+    vertical = "ellipsoidal" if frame.vertical is None else frame.vertical
+    return {
+        "kind": "epsg", "code": frame.code, "vertical": vertical, "yaw": frame.yaw, "origin": list(frame.origin or ()),
+    }  # fmt: skip
+
+
+def corrections_section(corrections: Corrections, frame: Frame) -> dict[str, Any]:
+    """The [corrections] table of `corrections`; empty where nothing is on."""
+    written: dict[str, Any] = {name: True for name in ("refraction", "curvature") if getattr(corrections, name)}
+    if corrections.refraction and frame.kind != "epsg":
+        written["sea_level_m"] = corrections.sea_level_m
+    return written
 
 
 def datum_section(datum: Datum) -> dict[str, Any]:
-    """The [datum] table that `read_settings` reads as `datum`."""
+    """The [datum] table of `datum`."""
     written: dict[str, Any] = {"kind": datum.kind}
     if datum.kind == "inner":
         written["over"] = datum.over if isinstance(datum.over, str) else list(datum.over)
@@ -119,76 +231,6 @@ def datum_section(datum: Datum) -> dict[str, Any]:
     return written
 
 
-def toml_text(values: dict[str, Any]) -> str:
-    """Nested tables as TOML; numbers are written so that they come back exactly."""
-    return "\n".join(_table_lines("", values)).lstrip("\n") + "\n"
-
-
-def _read_datum(section: Section) -> Datum:
-    section.known("kind", "over", "scale")
-    kind = section.text("kind", "control")
-    if kind not in ("control", "minimal", "inner"):
-        raise section.error("kind", f'{quoted(kind)} is no datum; write "control", "minimal" or "inner"')
-    if kind != "inner":
-        for key in ("over", "scale"):
-            if key in section:
-                raise section.error(key, f'only kind = "inner" has it; remove it or change kind from "{kind}"')
-        return Datum(kind)  # type: ignore[arg-type]
-    over = section.values.get("over", "points")
-    if isinstance(over, list):
-        if not over or not all(isinstance(point, str) for point in over):
-            raise section.error(
-                "over", f'{quoted(over)} is no list of point ids; write them as text, like ["1", "2", "3"]'
-            )
-        over = tuple(over)
-    elif over not in ("points", "images"):
-        raise section.error("over", f'{quoted(over)} is unknown; write "points", "images" or a list of point ids')
-    scale = section.values.get("scale")
-    if scale is not None and not isinstance(scale, bool):
-        raise section.error("scale", f"{quoted(scale)} is neither true nor false; write one of them")
-    return Datum("inner", over, scale)
-
-
-def _read_mode(section: Section) -> str:
-    section.known("mode")
-    mode = section.text("mode", "integrated")
-    if mode not in MODES:
-        raise section.error("mode", f"{quoted(mode)} is no mode; write {', '.join(MODES)}")
-    return mode
-
-
-def _table_lines(path: str, values: dict[str, Any]) -> list[str]:
-    lines = [f"{_key(k)} = {_value(v)}" for k, v in values.items() if not _is_table(v)]
-    if path and lines:
-        lines = ["", f"[{path}]", *lines]
-    for key, value in values.items():
-        if _is_table(value):
-            lines += _table_lines(f"{path}.{_key(key)}" if path else _key(key), value)
-    return lines
-
-
-def _is_table(value: Any) -> bool:
-    # A weighted status is the one table that stands on a line of its key.
-    return isinstance(value, dict) and not {"sigma", "covariance"} & set(value)
-
-
-def _key(key: str) -> str:
-    bare = key.isascii() and key.replace("-", "").replace("_", "").isalnum()
-    return key if bare else _text(key)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_value, value)) + "]"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return _text(value)
-    return repr(float(value)) if isinstance(value, float | np.floating) else str(value)
-
-
-def _text(text: str) -> str:
-    escaped = {c: f"\\u{ord(c):04x}" for c in text if ord(c) < 32 or ord(c) == 127} | {'"': '\\"', "\\": "\\\\"}
-    return '"' + "".join(escaped.get(c, c) for c in text) + '"'
+def default_sigma(settings: Settings, *keys: str) -> float:
+    """The first of `keys` that [sigmas] has; NaN for none."""
+    return next((settings.sigmas[key] for key in keys if key in settings.sigmas), np.nan)

@@ -1,9 +1,14 @@
-"""The tables of a block folder: which files there are, which columns each has, which of them are needed."""
+"""The tables of a block folder, declared once: columns, kinds, which are required, and the checks of each."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+import pandas as pd
 
 from jaxphoto.block import Frame
 from jaxphoto.georeferencing.map_frame import map_system
+from jaxphoto.io.text_tables import Table
 
 TOML = "block.toml"
 XYZ = ("X_m", "Y_m", "Z_m")
@@ -13,40 +18,83 @@ ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
 ATTITUDE = ("roll_deg", "pitch_deg", "yaw_deg")
 SIGMA_ATTITUDE = ("sigma_roll_deg", "sigma_pitch_deg", "sigma_yaw_deg")
 VELOCITY = ("vX_m_per_s", "vY_m_per_s", "vZ_m_per_s")
+RATE = ("rate_right_deg_per_s", "rate_forward_deg_per_s", "rate_up_deg_per_s")
 FOOT = ("foot_X_m", "foot_Y_m", "foot_Z_m")
 NORMAL = ("normal_X", "normal_Y", "normal_Z")
 TURN = ("turn_right_m", "turn_forward_m", "turn_up_m")
-RATE = ("rate_right_deg_per_s", "rate_forward_deg_per_s", "rate_up_deg_per_s")
+
+
+class Column(NamedTuple):
+    """A column of `text` or numbers: a `sigma` is positive, an `angle` at most 360 degrees, a `whole` number whole."""
+
+    name: str
+    kind: Literal["text", "number", "coordinate", "sigma", "angle", "whole"] = "number"
+    required: bool = False
+    """The file must have it, without empty cells (but for coordinates, and sigmas, which [sigmas] may complete)."""
 
 
 class TableLayout(NamedTuple):
-    """One CSV of the folder."""
+    """One CSV file of the folder."""
 
-    needed: bool
-    columns: tuple[str, ...]
-    optional: tuple[str, ...] = ()
-    text: tuple[str, ...] = ()
-    """Columns of ids besides those that all tables share."""
+    columns: tuple[Column, ...]
+    required: bool = False
+    unique: tuple[str, ...] = ()
+    """No two rows have the same cells in these columns."""
+
+    def names(self, required: bool) -> tuple[str, ...]:
+        """The columns that the file must, or may, have."""
+        return tuple(c.name for c in self.columns if c.required == required)
+
+    @property
+    def text(self) -> tuple[str, ...]:
+        """The columns of text."""
+        return tuple(c.name for c in self.columns if c.kind == "text")
+
+
+def text(*names: str, required: bool = True) -> tuple[Column, ...]:
+    """Columns of text."""
+    return tuple(Column(name, "text", required) for name in names)
+
+
+def numbers(*names: str, required: bool = False) -> tuple[Column, ...]:
+    """Columns of numbers, of the kind that their names say."""
+    angles = (*ANGLES, *ATTITUDE)
+    return tuple(
+        Column(n, "sigma" if n.startswith("sigma_") else "angle" if n in angles else "number", required) for n in names
+    )
 
 
 LAYOUTS = {
-    "images": TableLayout(True, ("image", "camera"), ("strip", "time_s", "temperature_c", *XYZ, *ANGLES)),
-    "image_points": TableLayout(
-        True,
-        ("image", "point"),
-        ("x_mm", "y_mm", "column_px", "row_px", "sigma_x_mm", "sigma_y_mm", "sigma_px"),
+    "images": TableLayout(
+        (
+            *text("image", "camera"), *text("strip", required=False),
+            *numbers("time_s", "temperature_c", *XYZ, *ANGLES),
+        ), True, ("image",),
     ),
-    "control_points": TableLayout(False, ("point",), (*XYZ, *SIGMA_XYZ, "role")),
-    "stations": TableLayout(False, ("image", *XYZ), (*SIGMA_XYZ, *VELOCITY)),
-    "attitudes": TableLayout(False, ("image", *ATTITUDE), (*SIGMA_ATTITUDE, *RATE)),
-    "object_points": TableLayout(False, ("point", *XYZ)),
-    "surfaces": TableLayout(False, ("point", *FOOT, *NORMAL, *TURN, "sigma_m"), ("strip",)),
-}
-"""The tables that have readers of their own; those of other observations follow from their classes (`observed`)."""
+    "image_points": TableLayout(
+        (
+            *text("image", "point"),
+            *numbers("x_mm", "y_mm", "column_px", "row_px", "sigma_x_mm", "sigma_y_mm", "sigma_px"),
+        ), True, ("image", "point"),
+    ),
+    "control_points": TableLayout((*text("point"), *numbers(*XYZ, *SIGMA_XYZ), *text("role", required=False))),
+    "stations": TableLayout(
+        (*text("image"), *(Column(name, "coordinate", True) for name in XYZ), *numbers(*SIGMA_XYZ, *VELOCITY)),
+        unique=("image",),
+    ),
+    "attitudes": TableLayout(
+        (*text("image"), *numbers(*ATTITUDE, required=True), *numbers(*SIGMA_ATTITUDE, *RATE)), unique=("image",)
+    ),
+    "object_points": TableLayout((*text("point"), *numbers(*XYZ, required=True)), unique=("point",)),
+    "surfaces": TableLayout(
+        (*text("point"), *numbers(*FOOT, *NORMAL, *TURN, "sigma_m", required=True), *text("strip", required=False))
+    ),
+}  # fmt: skip
+"""The tables of the block itself; those of other observations follow from their classes (`declared_tables`)."""
 
 
 def coordinate_names(frame: Frame) -> tuple[str, ...]:
-    """The columns in which the files of a block in `frame` give coordinates."""
+    """The columns of coordinates in the files of a block in `frame`."""
     geographic = frame.code is not None and map_system(frame.code).is_geographic
     return PLACE if geographic else XYZ
 
@@ -54,5 +102,44 @@ def coordinate_names(frame: Frame) -> tuple[str, ...]:
 def layout_in(frame: Frame, layout: TableLayout) -> TableLayout:
     """The layout of a table of a block in `frame`."""
     names = dict(zip(XYZ, coordinate_names(frame), strict=True))
-    needed, optional = (tuple(names.get(c, c) for c in columns) for columns in (layout.columns, layout.optional))
-    return TableLayout(layout.needed, needed, optional, layout.text)
+    return layout._replace(columns=tuple(c._replace(name=names.get(c.name, c.name)) for c in layout.columns))
+
+
+def checked(table: Table, layout: TableLayout) -> Table:
+    """The table with all columns of its layout: ids as text and numbers as floats, NaN and "" where they are empty.
+
+    Raises RowError for the first cell that its column does not allow, and for rows that are given twice.
+    """
+    columns: dict[str, np.ndarray] = {}
+    for column, kind, required in layout.columns:
+        if kind == "text":
+            columns[column] = table.ids(column) if required else table.text(column)
+        elif kind == "sigma":
+            columns[column] = table.sigmas(column)
+        elif column in table or required:
+            columns[column] = table.numbers(column, empty=not required or kind == "coordinate")
+        if kind == "angle" and column in columns:
+            check_angles(table, columns[column][:, None], (column,))
+        if kind == "whole":
+            values = columns[column]
+            for line in np.flatnonzero(values != np.round(values))[:1]:
+                raise table.bad(line, f"{column} is {values[line]:g}, not a whole number like 2; correct it")
+    result = Table(table.file, columns, table.files, table.rows)
+    refuse_duplicates(result, {column: columns[column] for column in layout.unique})
+    return result
+
+
+def check_angles(table: Table, degrees: np.ndarray, columns: Sequence[str]) -> None:
+    """Raise RowError for an angle beyond one turn: it is in another unit than degrees."""
+    for line, axis in np.argwhere(np.abs(degrees) > 360)[:1]:
+        message = f"{columns[axis]} = {degrees[line, axis]:g} is more than a turn; give the angle in degrees"
+        raise table.bad(line, message)
+
+
+def refuse_duplicates(table: Table, keys: dict[str, np.ndarray], thing: str = "") -> None:
+    """Raise RowError where two rows agree in all `keys`."""
+    frame = pd.DataFrame(keys)
+    for line in np.flatnonzero(frame.duplicated())[:1] if keys else ():
+        first = int(np.flatnonzero((frame == frame.iloc[line]).all(axis=1))[0])
+        named = thing or ", ".join(f"{name} {values[line]}" for name, values in keys.items())
+        raise table.bad(line, f"{named} is given twice, first in {table.place(first)}; delete one of the rows")

@@ -1,7 +1,6 @@
-"""What a reader of one format gives: a cloud file that is open, before its coordinates are placed and filtered."""
+"""An open cloud file, before its coordinates are transformed and its points selected."""
 
 import dataclasses
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -14,54 +13,57 @@ from jaxphoto.errors import InputError
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
 
 CHUNK = 500_000
-"""Points that are read, placed and filtered together."""
-# What they may take: a point is long where a file says much of each.
-_CHUNK_BYTES = 64 << 20
+"""Number of points read, transformed and selected together."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CloudSource:
-    """A cloud file. `chunks` gives its points with the file's own coordinates, at most `CHUNK` at a time.
+    """A cloud file; `chunks` yields its points in file coordinates, at most `CHUNK` at a time.
 
-    `system` is what the file says of its coordinates. `most` is how many points there are at most, `extent` their least
-    and greatest coordinates, both None where only reading tells. A chunk's `strips` are those met up to it.
+    `count` is the number of points and `extent` their least and greatest coordinates by the header, None without one.
+    The `strips` of a chunk are those up to it.
     """
 
     name: str
     system: CoordinateSystem
-    most: int | None
+    count: int | None
     extent: Float[np.ndarray, "2 3"] | None
     chunks: Callable[[], Iterator[Cloud]]
 
 
 class StripNumbers:
-    """Numbers strips in the order in which they are met."""
+    """Indices of strips in the order of their first points."""
 
     def __init__(self) -> None:
         self._index: dict[str, int] = {}
 
     def of(self, ids: np.ndarray) -> np.ndarray:
         """The index in `names` of each of the strips `ids`."""
-        place, known = pd.factorize(ids, sort=True)
-        numbers = [self._index.setdefault(str(name), len(self._index)) for name in known]
-        return np.array(numbers, np.int32)[place]
+        codes, unique = pd.factorize(ids, sort=True)
+        return np.array([self._index.setdefault(str(name), len(self._index)) for name in unique], np.int32)[codes]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The strips met so far."""
+        """The strips up to now."""
         return tuple(self._index)
 
 
-def at_once(point_bytes: int, most: int = CHUNK) -> int:
-    """How many points of so many bytes each are read together, at most `most`."""
-    return max(1, min(most, _CHUNK_BYTES // point_bytes))
-
-
 def check_file(path: Path) -> None:
-    """Raise InputError where there is no file at `path` that can be read; a pipe or a device has no end."""
+    """Raise InputError if there is no file at `path`."""
     if path.is_dir():
         raise InputError(f"{path} is a folder; name a file")
-    if not path.exists():
+    if not path.is_file():
         raise InputError(f"there is no file {path}; correct the name")
-    if not (path.is_file() and os.access(path, os.R_OK)):
-        raise InputError(f"{path} is no file that you may read; name another, or have its rights changed")
+
+
+def no_points(name: str) -> InputError:
+    """The error about a file without points."""
+    return InputError(f"{name} has no points; name another cloud")
+
+
+def source_ids(cloud: Cloud) -> np.ndarray:
+    """Point source IDs: the names of the strips if they are 16-bit numbers, else their indices from 1."""
+    assert cloud.strip is not None
+    numbers = [int(name) if name.isdecimal() else 1 << 16 for name in cloud.strips]
+    ids = np.array(numbers) if max(numbers, default=0) < 1 << 16 else np.arange(1, len(numbers) + 1)
+    return ids[cloud.strip].astype(np.uint16)

@@ -1,24 +1,54 @@
-"""Photographs with all that their files and those beside them say of where they were taken."""
+"""Positions and attitudes of photographs from their own files and those beside them."""
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
-from jaxphoto.errors import InputError, shown
-from jaxphoto.georeferencing.gps import Heights
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.errors import InputError, few, shown
+from jaxphoto.georeferencing.camera_attitude import CameraAttitude, level_from_body
+from jaxphoto.georeferencing.exposure_times import DAY_S, WEEK_S, ZONES_S, Ambiguous, Matched
+from jaxphoto.georeferencing.gps import Heights, moved
 from jaxphoto.georeferencing.recorded_positions import one_height, plausible_positions
-from jaxphoto.io.exposures.assigned import Arm, Assigned, with_exposures
-from jaxphoto.io.exposures.marks import read_marks
+from jaxphoto.io.exposures.files import exposure_files, read_exposures
+from jaxphoto.io.exposures.matching import (
+    FINE_S,
+    Clock,
+    by_name,
+    by_number_or_time,
+    by_time,
+    clock_of,
+    count_message,
+    distance,
+    fix_counts,
+    interpolated,
+    match_message,
+    no_match_message,
+    own_files_message,
+)
 from jaxphoto.io.exposures.records import Exposures
-from jaxphoto.io.exposures.rtklib import read_pos
-from jaxphoto.io.exposures.sbet import read_sbet_exposures
-from jaxphoto.io.exposures.sound_rows import of_sound_rows
-from jaxphoto.io.exposures.table import read_table
-from jaxphoto.io.exposures.wording import said_by_own_files
 from jaxphoto.io.photographs import Photograph
 
-_SUFFIXES = (".mrk", ".pos", ".sbet")
-_TABLES = ("exposures.csv", "geo.txt")
+Arm = tuple[float, float, float]
+"""Lever arm from the camera to the antenna, right, forward, up of the aircraft (m)."""
+
+# A trajectory has more records per photograph than this; events are about as many as photographs.
+_TRACK = 3
+# Positions farther from the photographs' own are of another flight.
+_FAR_M = 200.0
+# Agreement of positions without and with corrections.
+_SAME_M = 5.0
+# Resolution of times for a trajectory: a centimetre at 10 m/s.
+_EXACT_S = 1e-3
+
+
+class Assigned(NamedTuple):
+    """Photographs with the positions and attitudes of files, and a message per file."""
+
+    photographs: list[Photograph]
+    sentences: list[str]
 
 
 def located(
@@ -30,50 +60,212 @@ def located(
     arm: Arm | None = None,
     heights: Heights | int | None = None,
 ) -> Assigned:
-    """The photographs where the files `given` and those in `folders` say they were taken, with heights above one thing.
+    """The photographs with positions of the files `given` and of those in `folders`, with heights of one kind.
 
-    `code` is the EPSG system of map coordinates in tables, `arm` the lever arm from camera to antenna (m: right,
-    forward, up of the aircraft), `heights` says above what the heights are that do not say it themselves; "take-off"
-    takes those above it, an EPSG code of heights adds its geoid. Every source has a sentence, and so has every file in
-    a folder that cannot be read. Raises InputError for such a file that is given, and for a geoid that is not at hand.
+    `code` is the EPSG system of map coordinates in tables, `arm` the lever arm, `heights` the reference of heights that
+    do not have one; "take-off" selects those above it, an EPSG code of heights adds its geoid. Invalid files in folders
+    are reported; those in `given` raise InputError, as does a geoid that is not installed.
     """
     kind: Heights = "geoid" if isinstance(heights, int) else heights or "unknown"
-    files, said = [read_exposures(path, code, kind) for path in given], []
+    files, messages = [read_exposures(path, code, kind) for path in given], []
     known = {path.resolve() for path in given}
     for path in (path for folder in folders if folder.is_dir() for path in exposure_files(folder)):
-        if path.resolve() in known:
-            continue
-        try:
-            files.append(read_exposures(path, code, kind))
-        except InputError as error:
-            said.append(f"{error}; the file is not used")
+        if path.resolve() not in known:
+            try:
+                files.append(read_exposures(path, code, kind))
+            except InputError as error:
+                messages.append(f"{error}; the file is not used")
     assigned = with_exposures(photographs, files, arm)
-    taken = assigned.photographs
-    positions, mended = plausible_positions({p.name: p.gps for p in taken})
-    positions, told = one_height(positions, {p.name: p.above_takeoff_m for p in taken}, heights)
-    sentences = [*said, *assigned.sentences, *mended, *said_by_own_files(photographs), *told]
-    return Assigned([p._replace(gps=positions[p.name]) for p in taken], list(map(shown, sentences)))
+    positions, corrections = plausible_positions({p.name: p.gps for p in assigned.photographs})
+    above = {p.name: p.above_takeoff_m for p in assigned.photographs}
+    positions, height_messages = one_height(positions, above, heights)
+    messages += [*assigned.sentences, *corrections, *own_files_message(photographs), *height_messages]
+    return Assigned([p._replace(gps=positions[p.name]) for p in assigned.photographs], list(map(shown, messages)))
 
 
-def read_exposures(path: Path, code: int | None = None, heights: Heights = "unknown") -> Exposures:
-    """The exposures or the trajectory of one file, by its ending: .MRK, .pos, .sbet or .out, else a table.
+def with_exposures(photographs: Sequence[Photograph], files: Sequence[Exposures], arm: Arm | None = None) -> Assigned:
+    """The photographs with positions, sigmas and attitudes of the files; later kinds replace earlier ones.
 
-    `code` is the EPSG system of a table's map coordinates, `heights` what its heights are above. Rows of text that are
-    wrong are left out, which `Exposures.why` says. Raises InputError, naming file and row, where half of them are.
+    Time marks are first: their times and lever arms serve positions of the antenna, at events and along trajectories.
+    Tables, by name, are last. `arm` is that of positions without a lever arm of a time mark, and, without such a file,
+    of the photographs' own positions.
     """
-    suffix = path.suffix.lower()
-    if suffix in (".sbet", ".out"):
-        return read_sbet_exposures(path)
-    if suffix == ".mrk":
-        return of_sound_rows(path, partial(read_marks, path))
-    if suffix == ".pos":
-        return of_sound_rows(path, partial(read_pos, path))
-    return of_sound_rows(path, partial(read_table, path, code, heights))
+    assignment = _Assignment(photographs, arm)
+    track = lambda f: len(f.rows) > _TRACK * len(photographs) or f.aircraft_deg is not None  # noqa: E731
+    messages = []
+    for file in sorted(files, key=lambda f: 3 if f.names else 0 if f.sequence is not None else 1 + track(f)):
+        if file.names:
+            message = assignment.by_name(file)
+        elif file.sequence is None and track(file):
+            message = assignment.along(file)
+        else:
+            message = assignment.by_time(file)
+        messages.append("; ".join(filter(None, (f"{file.file}: {message}", file.why))))
+    if arm is not None and not any(f.of_antenna for f in files):
+        if any(assignment.own):
+            messages.append(assignment.move_own(arm))
+        else:
+            messages.append("the lever arm is not used: positions of time marks and tables are those of the camera")
+    return Assigned(assignment.photographs, messages)
 
 
-def exposure_files(folder: Path) -> list[Path]:
-    """The files of a folder that say where its photographs were exposed: .MRK, .pos, .sbet, exposures.csv and
-    geo.txt."""
-    found = (f for f in folder.iterdir() if f.suffix.lower() in _SUFFIXES or f.name.lower() in _TABLES)
-    # Hidden ones are those that macOS has beside each file.
-    return sorted(f for f in found if f.is_file() and not f.name.startswith("."))
+class _Assignment:
+    """Photographs with what is known of each; every method takes one file and returns its message."""
+
+    def __init__(self, photographs: Sequence[Photograph], arm: Arm | None):
+        n = len(photographs)
+        self.photographs, self.arm = list(photographs), arm
+        # GPS times of time marks and of events.
+        self.gps_s, self.event_s = np.full(n, np.nan), np.full(n, np.nan)
+        self.camera_from_antenna_m = np.full((n, 3), np.nan)
+        # True if the position is that of the photograph's own file.
+        self.own = [True] * n
+
+    def by_name(self, file: Exposures) -> str:
+        """A table."""
+        exposure = by_name(self.photographs, file)
+        if not (exposure >= 0).any():
+            return f"none of its {len(file.names)} names is that of a photograph ({few(list(file.names))}); not used"
+        if problem := self._other_flight(file, exposure):
+            return problem
+        message = f"positions of {count_message(self.photographs, file, exposure)} by name{fix_counts(file, exposure)}"
+        for i in np.flatnonzero(exposure >= 0):
+            if (attitude := file.attitude[exposure[i]]) is not None:
+                self.photographs[i] = self.photographs[i]._replace(attitude=attitude)
+        self._set_camera(file, exposure)
+        return message
+
+    def by_time(self, file: Exposures) -> str:
+        """Time marks of DJI, by number or time, or events of the antenna, by time."""
+        clock = clock_of(self.photographs)
+        match: Matched | Ambiguous | None
+        if file.sequence is not None:
+            match, how = by_number_or_time(self.photographs, file, clock)
+        else:
+            if np.isfinite(self.gps_s).sum() >= 2:
+                clock = Clock(self.gps_s, True, FINE_S)
+            match, how = by_time(self.photographs, file, clock), "by time"
+        if not isinstance(match, Matched):
+            return no_match_message(match)
+        if problem := self._other_flight(file, match.exposure) or self._other_day(file, match):
+            return problem
+        message = match_message(self.photographs, file, match, clock, how)
+        if file.sequence is not None:
+            self._set_camera(file, match.exposure)
+            return message
+        self.event_s = np.where(match.exposure >= 0, file.time_s[match.exposure], self.event_s)
+        return f"{message}; {self._set_antenna(file, match.exposure)}"
+
+    def along(self, file: Exposures) -> str:
+        """A trajectory, at times of marks or events, or of photographs to the millisecond."""
+        times = np.where(np.isfinite(self.gps_s), self.gps_s, self.event_s)
+        if not np.isfinite(times).any():
+            clock = clock_of(self.photographs)
+            exact = [clock.gps and bool(p.taken and p.taken.resolution_s <= _EXACT_S) for p in self.photographs]
+            times = np.where(exact, clock.time_s, np.nan)
+        if not np.isfinite(times).any():
+            return (
+                "a trajectory needs the time of every exposure to the millisecond, and neither time marks nor events "
+                "nor photographs have it; not used"
+            )
+        if file.time_s.max() < 2 * WEEK_S:
+            file = file._replace(time_s=file.time_s + WEEK_S * np.floor(np.nanmin(times) / WEEK_S))
+        at = interpolated(file, times)
+        exposure = np.where(np.isfinite(at.place).all(axis=1), np.arange(len(times)), -1)
+        if not (exposure >= 0).any():
+            apart = np.nanmedian(times) - np.median(file.time_s)
+            return f"no photograph was taken while it lasts: it is {apart:+,.0f} s from them; not used"
+        if problem := self._other_flight(at, exposure):
+            return problem
+        lost = [p.name for p, k in zip(self.photographs, exposure, strict=True) if k < 0]
+        n = len(times) - len(lost)
+        without = f" ({len(lost)} before, after or in a gap of it: {few(lost)})" if lost else ""
+        message = f"positions of {n} photographs by interpolation{fix_counts(at, exposure)}{without}"
+        return f"{message}; {self._set_antenna(at, exposure)}"
+
+    def move_own(self, arm: Arm) -> str:
+        """Reduce positions of the photographs' own files by the lever arm."""
+        moved_count = left = 0
+        for i, p in enumerate(self.photographs):
+            if not self.own[i] or p.gps is None:
+                continue
+            if (rotation := _aircraft(p)) is None:
+                left += 1
+            else:
+                self.photographs[i] = p._replace(gps=moved(p.gps, -rotation @ np.array(arm)))
+                moved_count += 1
+        without = f"; {left} have no attitude that turns it, and stay" if left else ""
+        return f"the lever arm is taken off {moved_count} positions of the photographs' own files{without}"
+
+    def _set_camera(self, file: Exposures, exposure: Int[np.ndarray, "n"]) -> None:
+        """Take positions of the camera, times and lever arms."""
+        for i in np.flatnonzero(exposure >= 0):
+            k = int(exposure[i])
+            if (gps := file.gps(k)) is not None:
+                self.photographs[i], self.own[i] = self.photographs[i]._replace(gps=gps), False
+            if np.isfinite(file.time_s[k]):
+                self.gps_s[i] = file.time_s[k]
+            if file.camera_from_antenna_m is not None:
+                self.camera_from_antenna_m[i] = file.camera_from_antenna_m[k]
+
+    def _set_antenna(self, file: Exposures, exposure: Int[np.ndarray, "n"]) -> str:
+        """Take positions of the antenna, reduced to the camera; return how."""
+        marked = given = none = 0
+        for i in np.flatnonzero(exposure >= 0):
+            k = int(exposure[i])
+            gps, photograph = file.gps(k), self.photographs[i]
+            if gps is None:
+                continue
+            if file.aircraft_deg is not None and photograph.attitude is None:
+                roll, pitch, yaw = file.aircraft_deg[k].tolist()
+                fixed = CameraAttitude(level_from_body((roll, pitch, yaw)))
+                photograph = photograph._replace(attitude=fixed, aircraft_deg=(roll, pitch, yaw))
+            # Lever arms of time marks are those to the antenna; a trajectory with attitudes is that of the IMU.
+            if file.aircraft_deg is None and np.isfinite(self.camera_from_antenna_m[i]).all():
+                gps, marked = moved(gps, self.camera_from_antenna_m[i]), marked + 1
+            elif self.arm is not None and (rotation := _aircraft(photograph)) is not None:
+                gps, given = moved(gps, -rotation @ np.array(self.arm)), given + 1
+            else:
+                none += 1
+            self.photographs[i], self.own[i] = photograph._replace(gps=gps), False
+        instead = ", not the one given" if self.arm is not None else ""
+        parts = [f"lever arms of {marked} are those of the time marks{instead}"] if marked else []
+        parts += [f"the lever arm of {given} is as given"] if given else []
+        if none:
+            why = "--lever-arm gives it" if self.arm is None else "no attitude of the aircraft turns it"
+            sensor = "antenna" if file.aircraft_deg is None else "IMU"
+            parts.append(f"{none} are positions of the {sensor}, the lever arm is not known ({why})")
+        return ", ".join(parts)
+
+    def _other_flight(self, file: Exposures, exposure: Int[np.ndarray, "n"]) -> str:
+        """The reason not to use a file far from the photographs' own positions; "" if it is near."""
+        far = distance(self.photographs, file, exposure)
+        if far is None or far <= _FAR_M:
+            return ""
+        back = distance(self.photographs, file._replace(place=file.place[:, [1, 0, 2]]), exposure)
+        if back is not None and back <= _FAR_M:
+            return (
+                "its longitudes and latitudes have changed places, as the photographs' own positions show; not used: "
+                "exchange the two in the file"
+            )
+        return f"its positions are {far:,.0f} m from those of the photographs, as of another flight; not used"
+
+    def _other_day(self, file: Exposures, match: Matched) -> str:
+        """The reason not to use a file of another day; "" if its positions prove that the clock is wrong."""
+        if not abs(match.offset_s) > ZONES_S:
+            return ""
+        near = distance(self.photographs, file, match.exposure)
+        if near is not None and near <= _SAME_M:
+            return ""
+        when = "before" if match.offset_s > 0 else "after"
+        return (
+            f"its times are {abs(match.offset_s) / DAY_S:.1f} days {when} those of the photographs, as of another day, "
+            "and no positions prove that only the clock is wrong; not used"
+        )
+
+
+def _aircraft(photograph: Photograph) -> Float[np.ndarray, "3 3"] | None:
+    """Rotation from the aircraft's axes right, forward, up to the level frame, by its attitude or the camera's."""
+    if photograph.aircraft_deg is not None:
+        return level_from_body(photograph.aircraft_deg)
+    return None if photograph.attitude is None else photograph.attitude.level_from_camera

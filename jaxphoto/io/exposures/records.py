@@ -1,23 +1,25 @@
-"""Exposures as a file beside the photographs lists them, in its own order."""
+"""Exposures of a file beside the photographs, in its order."""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.errors import RowError
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.gps import Fix, Gps, Heights
 
+Lines = list[tuple[int, str]]
+"""Row numbers from 1 and lines."""
+
 
 class Exposures(NamedTuple):
-    """One entry a line of the file; NaN and None where it says nothing."""
+    """One entry per row of a file; NaN and None for unknown values."""
 
     file: str
     rows: Int[np.ndarray, "n"]
-    """Of the file, from 1."""
+    """Row numbers from 1."""
     time_s: Float[np.ndarray, "n"]
-    """Since 1980-01-06, by the clock of the file."""
+    """Seconds since 1980-01-06, by the clock of the file."""
     place: Float[np.ndarray, "n 3"]
     """Longitude, latitude (degrees) and height (m)."""
     sigma_m: Float[np.ndarray, "n 3"]
@@ -25,23 +27,23 @@ class Exposures(NamedTuple):
     fix: tuple[Fix, ...]
     heights: Heights
     names: tuple[str, ...] = ()
-    """Of the photographs, without the ending, where the file has them."""
+    """Photographs, without extension."""
     sequence: Int[np.ndarray, "n"] | None = None
-    """The number of the photograph within its flight."""
+    """Number of the photograph within its flight."""
     camera_from_antenna_m: Float[np.ndarray, "n 3"] | None = None
-    """From the antenna to the camera, east, north, up, where the file says it."""
+    """Lever arm from the antenna to the camera, east, north, up."""
     of_antenna: bool = False
-    """Whether `place` is that of the antenna (or IMU), not of the camera."""
+    """True if `place` is that of the antenna or IMU."""
     aircraft_deg: Float[np.ndarray, "n 3"] | None = None
     """Roll, pitch, yaw."""
     attitude: tuple[CameraAttitude | None, ...] = ()
     without: tuple[int, ...] = ()
-    """Rows that are wrong, and left out."""
+    """Invalid rows, which were skipped."""
     why: str = ""
-    """Which they are, and what is wrong, in words."""
+    """Message about them."""
 
     def gps(self, k: int) -> Gps | None:
-        """The position of line `k`; None where it has none."""
+        """Position of entry `k`; None if unknown."""
         longitude, latitude, height = self.place[k].tolist()
         if not np.isfinite([longitude, latitude]).all():
             return None
@@ -55,14 +57,12 @@ class Exposures(NamedTuple):
             self.fix[k],
         )
 
-
-def check_places(file: str, rows: np.ndarray, place: np.ndarray) -> None:
-    """Raise RowError for a longitude or latitude that cannot be."""
-    beyond = np.argwhere(np.abs(place[:, :2]) > [360.0, 90.0])
-    for k, axis in beyond[:1]:
-        name = ("longitude", "latitude")[axis]
-        raise RowError(
-            f"{file}, row {rows[k]}: the {name} {place[k, axis]:g} degrees cannot be; give longitude and latitude in "
-            "the columns of their names, in degrees",
-            rows[beyond[:, 0]].tolist(),
-        )
+    def take(self, chosen: np.ndarray) -> "Exposures":
+        """The entries of a mask."""
+        n, kept = len(self.rows), {}
+        for name, values in self._asdict().items():
+            if isinstance(values, np.ndarray):
+                kept[name] = values[chosen]
+            elif isinstance(values, tuple) and len(values) == n and name != "without":
+                kept[name] = tuple(v for v, c in zip(values, chosen.tolist(), strict=True) if c)
+        return self._replace(**kept)

@@ -1,67 +1,82 @@
-"""A recipe in TOML -> `Recipe`; what cannot be flown or measured is refused with one sentence.
+"""A recipe in TOML -> `Recipe`.
 
 Cameras, mounts, strips and datum are written as in block.toml. What is truly otherwise stands in a table `truth`
 below each (docs/simulation.md).
 """
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
-import numpy as np
-
-from jaxphoto.camera import InteriorOrientation, RollingShutter, constant_names, parameter_names
+from jaxphoto.camera import (
+    InteriorOrientation,
+    RollingShutter,
+    Sensor,
+    StripCamera,
+    ThermalRates,
+    constant_names,
+    parameter_names,
+)
 from jaxphoto.errors import InputError
-from jaxphoto.georeferencing import Mount, StripBias
+from jaxphoto.georeferencing import Mount, RigCamera, StripBias
 from jaxphoto.io.block_folder.camera_section import Camera, read_camera
-from jaxphoto.io.block_folder.mount_sections import read_mounts, read_strips
-from jaxphoto.io.block_folder.section import Section
+from jaxphoto.io.block_folder.parameters import (
+    by_owner,
+    keys_of,
+    read_mounts,
+    read_parameters,
+    read_strips,
+    static_fields,
+)
 from jaxphoto.io.block_folder.settings import read_settings
-from jaxphoto.io.recipe.camera_sections import (
-    CHANGES,
-    RIG,
-    WALK,
-    flown_cameras,
-    read_changes,
-    read_rig,
-    read_temperature,
-    read_walk,
-    refuse_changes,
-)
-from jaxphoto.io.recipe.convergent_section import read_convergent
-from jaxphoto.io.recipe.flight_section import Mounted, read_flight
-from jaxphoto.io.recipe.keys import sigmas, tables
-from jaxphoto.io.recipe.lidar_section import read_lidar
-from jaxphoto.io.recipe.points_section import (
-    check_points,
-    read_jitter,
-    read_points,
-    read_sigmas,
-    read_start,
-    read_targets,
-    read_terrain,
-)
-from jaxphoto.io.recipe.settlement_section import read_settlement
-from jaxphoto.io.toml import read_toml
+from jaxphoto.io.recipe.recipe_keys import CHANGES, IMAGES, PAIRS, RecipeKeys, Triple, plain
+from jaxphoto.io.toml import Keys, Positive, Section, read_toml
+from jaxphoto.parameters import AbstractParameters, dynamic_fields
 from jaxphoto.simulation import (
     Assumed,
+    CameraWalk,
     ConvergentPlan,
+    Cooling,
+    Field,
     FlightPlan,
+    Footprint,
     Recipe,
+    ScanPlan,
+    Settlement,
+    Sigmas,
     SimulatedBias,
+    SimulatedChange,
     SimulatedShutter,
+    Strip,
+    Terrain,
+    footprint,
 )
+from jaxphoto.unknowns import FREE
 
-_KEYS = (
-    "title", "cameras", "mounts", "strips", "datum", "truth", "flight", "convergent", "jitter", "terrain", "points",
-    "targets", "sigmas", "noise", "start", "lidar", "shutters", "temperature", *CHANGES, WALK, RIG,
-)  # fmt: skip
 _ZERO = (0.0, 0.0, 0.0)
+# Approximate positions at close range are off by this part of the shortest distance, unless the recipe says otherwise.
+_NEAR = 0.02
+# About the interval of nodes along a strip of the scanner.
+_NODES_S = 5.0
+
+
+class BiasTruthKeys(Keys):
+    """Standard deviations that [strips.X.truth] draws by."""
+
+    shift_sigma_m: Triple = [0.0, 0.0, 0.0]  # noqa: RUF012
+    drift_sigma_m_per_s: Triple = [0.0, 0.0, 0.0]  # noqa: RUF012
+
+
+class MotionKeys(Keys):
+    """Errors of the motion of images with a rolling shutter."""
+
+    velocity_m_per_s: Positive = 0.0
+    rate_deg_per_s: Positive = 0.0
 
 
 def read_recipe(path: str | Path) -> Recipe:
-    """The recipe in a TOML file. Raises InputError, naming file, key and mend."""
+    """The recipe in a TOML file. Raises InputError, naming file, key and cure."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"there is no file {path}; give the TOML file of a recipe")
@@ -69,159 +84,365 @@ def read_recipe(path: str | Path) -> Recipe:
 
 
 def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
-    """The recipe that the content of a TOML file describes; `file` is what messages call it.
+    """The recipe that the content of a TOML file describes; `file` is its name in messages.
 
     Experiments change `values` between reading and this: a variant is another dictionary. Raises InputError.
     """
-    top = Section(file, "", _of_measured_coordinates(values))
-    top.known(*_KEYS)
-    # What the block says, as block.toml would say it.
-    told = {key: _without_truth(top.section(key)) for key in ("cameras", "mounts", "strips")}
-    settings = read_settings(told | {key: top.values[key] for key in ("title", "datum") if key in top}, file)
-    cameras = {name: _camera(top.section("cameras").section(name), camera) for name, camera in settings.cameras.items()}
+    top = Section(file, "", dict(values))
+    keys = top.model(RecipeKeys)
+    # The tables of block.toml; residuals are those of the image that has the noise, unless a camera says otherwise.
+    stated = {name: _without_truth(getattr(keys, name)) for name in ("cameras", "mounts", "strips")}
+    stated["cameras"] = {name: {"residuals": "measured"} | camera for name, camera in stated["cameras"].items()}
+    settings = read_settings(stated | {key: top.values[key] for key in ("title", "datum") if key in top}, file)
+    cameras = {
+        name: _camera(settings.top.section("cameras").section(name), top.section("cameras").section(name), camera)
+        for name, camera in settings.cameras.items()
+    }
     sensors = {name: camera.sensor for name, camera in settings.cameras.items()}
-    mounts = _mounts(top.section("mounts"), settings.mounts, cameras)
-    image_x = {n: (mounts.get(n) or mounts.get("default") or _NO_MOUNT).truth.image_x for n in cameras}
-    flown = flown_cameras(top, tuple(cameras))
-    plan = _plan(top, {name: Mounted(sensors[name], cameras[name].truth, image_x[name]) for name in flown})
+    mounts = _mounts(settings.top.section("mounts"), top.section("mounts"), cameras)
+    rig = top.section(RigCamera.kind)
+    flown = _flown_cameras(top, rig, list(cameras))
+    image_x = {n: (mounts[m].truth.image_x if (m := _mount_of(n, mounts)) else "forward") for n in flown}
+    plan = _plan(top, keys, {name: (sensors[name], cameras[name].truth, image_x[name]) for name in flown})
     strips = [strip.name for strip in plan.strips] if isinstance(plan, FlightPlan) else []
-    points = read_points(top.section("points"), in_swaths=isinstance(plan, FlightPlan))
-    targets = tuple(map(read_targets, tables(top, "targets")))
-    check_points(top, points, targets, plan.n_images * (1 + len(top.section(RIG).values)))
-    stated, noise = read_sigmas(top, targets)
-    terrain = read_terrain(top.section("terrain"))
-    truth = top.section("truth")
-    truth.known("datum_offset_m")
+    targets = plain(keys.targets)
+    images = plan.n_images * (1 + len(rig.values))
+    ties = keys.points.ties or 0
+    points = ties + sum(t.count + len(t.at) + len(t.at_m) for t in targets)
+    if points < 3:
+        raise InputError(f"{file}, [points] ties: there are {points} points in all; ask for more than 2")
+    if images * points > PAIRS:
+        raise InputError(
+            f"{file}, [points] ties: {images} images and {points} points make more than {PAIRS} pairs; ask for fewer"
+        )
+    stated_sigmas, noise = _sigmas(top, keys, targets)
+    if rig.values and (stated_sigmas.rig_place_m is None or stated_sigmas.rig_turn_deg is None):
+        raise top.section("sigmas").error("", "the rigidity of the rig is missing; add rig_place_m and rig_turn_deg")
+    terrain = keys.terrain.terrain(top.section("terrain"))
+    near = {}
+    if isinstance(plan, ConvergentPlan) and "position_m" not in keys.start.model_fields_set:
+        near["position_m"] = _NEAR * min(station.distance_m for station in plan.stations)
     return Recipe(
-        title=settings.title,
+        title=keys.title,
         sensors=sensors,
         cameras=cameras,
         plan=plan,
-        points=points,
-        stated=stated,
+        points=keys.points.plan(ties=ties),
+        stated=stated_sigmas,
         noise=noise,
         targets=targets,
         mounts=mounts,
-        biases=_biases(top.section("strips"), settings.strips, strips),
-        shutters=_shutters(top.section("shutters"), cameras),
-        changes=read_changes(top, tuple(cameras), strips),
-        temperature=read_temperature(top),
-        walk=read_walk(top),
-        rig=read_rig(top, tuple(cameras), stated),
-        datum_offset_m=tuple(truth.vector("datum_offset_m").tolist()),
-        jitter=read_jitter(top.section("jitter")),
+        biases=_biases(settings.top.section("strips"), top.section("strips"), strips),
+        shutters={n: _shutter(table) for n, table in by_owner(top.section("shutters"), cameras).items()},
+        changes=_changes(top, keys, list(cameras), strips),
+        temperature=_temperature(keys.temperature),
+        walk=_walk(top, keys.camera_walk),
+        rig=_change(RigCamera, rig, cameras),
+        datum_offset_m=tuple(keys.truth.datum_offset_m),
+        jitter=keys.jitter.plan(),
         terrain=terrain,
-        start=read_start(top.section("start"), plan),
+        start=keys.start.plan(**near),
         datum=settings.datum,
-        settlement=read_settlement(top.section("terrain")),
-        lidar=read_lidar(top, plan, terrain, stated),
+        settlement=Settlement(plain(keys.terrain.buildings), plain(keys.terrain.trees)),
+        lidar=_lidar(top, keys, plan, terrain, stated_sigmas),
     )
 
 
-# NumPy's arrays: those of JAX would start a device and compile at import.
-_NO_MOUNT = Assumed(*[Mount(np.zeros(3), np.zeros(3))] * 3)  # type: ignore[arg-type]
+def _without_truth(tables: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    return {name: {k: v for k, v in table.items() if k != "truth"} for name, table in tables.items()}
 
 
-def _plan(top: Section, cameras: Mapping[str, Mounted]) -> FlightPlan | ConvergentPlan:
+# Parameters ------------------------------------------------------------------------------------------------------
+
+
+def _camera(stated: Section, section: Section, camera: Camera) -> Assumed[InteriorOrientation]:
+    truth = section.section("truth")
+    truth.known(*parameter_names(camera.interior), *constant_names(camera.interior))
+    values = stated.section("interior").values | {key: truth.number(key) for key in truth}
+    true = read_camera(Section(stated.file, stated.path, stated.values | {"interior": values}))
+    return Assumed(true.interior, camera.interior, camera.priors)
+
+
+def _truth(kind: type[AbstractParameters], section: Section, *others: str, drawn: bool = False) -> tuple[Any, Any]:
+    """The true parameters of a table, and the priors by which they may be `drawn`; `others` are no parameters.
+
+    Parameters that its table `truth` does not give are those of the block.
+    """
+    starts = {key.start for key in keys_of(kind)} | set(static_fields(kind))
+    truth = section.section("truth")
+    if not drawn:
+        truth.known(*sorted(starts), *others)
+    values = {key: value for key, value in section.values.items() if key in starts}
+    values |= {key: value for key, value in truth.values.items() if key not in others}
+    return read_parameters(kind, Section(truth.file, truth.path, values))
+
+
+def _mount_of(camera: str, mounts: Mapping[str, Any]) -> str:
+    return camera if camera in mounts else "default" if "default" in mounts else ""
+
+
+def _mounts(stated: Section, section: Section, cameras: Iterable[str]) -> dict[str, Assumed[Mount]]:
+    starts, priors = read_mounts(stated, cameras)
+    return {
+        name: Assumed(_truth(Mount, section.section(name))[0], start, priors[name]) for name, start in starts.items()
+    }
+
+
+def _biases(stated: Section, section: Section, strips: list[str]) -> dict[str, SimulatedBias]:
+    """A table with nothing but a `truth` leaves the bias out of the block's model."""
+    tables = by_owner(section, strips)
+    modelled = Section(stated.file, stated.path, {name: values for name, values in stated.values.items() if values})
+    starts, priors = read_strips(modelled, strips)
+    biases = {}
+    for name, table in tables.items():
+        drawn = table.section("truth")
+        sigmas = {key: drawn.values[key] for key in BiasTruthKeys.model_fields if key in drawn}
+        keys = Section(drawn.file, drawn.path, sigmas).model(BiasTruthKeys)
+        biases[name] = SimulatedBias(
+            _truth(StripBias, table, *sigmas)[0],
+            plain(keys.shift_sigma_m),
+            plain(keys.drift_sigma_m_per_s),
+            (starts[name], priors[name]) if name in starts else None,
+        )
+    return biases
+
+
+def _shutter(table: Section) -> SimulatedShutter:
+    motion = {key: table.values[key] for key in MotionKeys.model_fields if key in table}
+    keys = Section(table.file, table.path, motion).model(MotionKeys)
+    stated = {key: value for key, value in table.values.items() if key not in (*motion, "truth")}
+    model = read_parameters(RollingShutter, Section(table.file, table.path, stated))
+    knows = any(key != "truth" for key in table)
+    return SimulatedShutter(
+        _truth(RollingShutter, table)[0], keys.velocity_m_per_s, keys.rate_deg_per_s, model if knows else None
+    )
+
+
+def _change(kind: type[AbstractParameters], section: Section, owners: Iterable[str]) -> dict[str, SimulatedChange]:
+    """Changes by owner; the block's model does not know of one whose table has nothing but a `truth`."""
+    changes = {}
+    for name, table in by_owner(section, owners).items():
+        true, spread = _truth(kind, table, drawn=True)
+        for field in dynamic_fields(kind):
+            if getattr(spread, field) == FREE:
+                raise table.section("truth").error(field, "a truth is not free; give its value or a sigma")
+        stated = {key: value for key, value in table.values.items() if key != "truth"}
+        model: Any = read_parameters(kind, Section(table.file, table.path, stated)) if stated else None
+        changes[name] = SimulatedChange(true, spread, model)
+    return changes
+
+
+def _changes(top: Section, keys: Any, cameras: list[str], strips: list[str]) -> dict[str, dict[str, SimulatedChange]]:
+    owners = {"camera": cameras, "strip": strips}
+    changes = {
+        name: change
+        for name, kind in CHANGES.items()
+        if (change := _change(kind, top.section(name), owners[kind.owner]))
+    }
+    if ThermalRates.kind in changes and keys.temperature is None:
+        raise top.error(ThermalRates.kind, "the recipe has no temperature; add a table [temperature]")
+    return changes
+
+
+def _temperature(keys: Any) -> Cooling | None:
+    """The temperature of the cameras; its reference is the air unless it is given."""
+    return keys and keys.plan(reference_c=keys.air_c if keys.reference_c is None else keys.reference_c)
+
+
+def _walk(top: Section, keys: Any) -> CameraWalk | None:
+    """How cameras of strips truly walk, and what the block knows of it."""
+    if keys is None:
+        return None
+    if not top.section(StripCamera.kind).values:
+        raise top.error("camera_walk", "there are no cameras of strips that could walk; add [strip_cameras.default]")
+    stated = (keys.c_mm, keys.xp_mm, keys.yp_mm) if keys.model_fields_set - {"truth"} else None
+    if stated and not all(stated):
+        raise top.section("camera_walk").error(
+            "", "c, x_p and y_p all walk in the block; give c_mm, xp_mm and yp_mm above zero"
+        )
+    truth = keys.truth
+    return CameraWalk((truth.c_mm, truth.xp_mm, truth.yp_mm) if truth else stated or _ZERO, stated)
+
+
+def _sigmas(top: Section, keys: Any, targets: Sequence[Any]) -> tuple[Sigmas, Sigmas]:
+    """The stated sigmas, and the true ones, which are the same where [noise] does not say otherwise."""
+    section, image = top.section("sigmas"), keys.sigmas.image_mm
+    stated = keys.sigmas.plan(target_mm=keys.sigmas.target_mm or image)
+    for key in keys.noise.model_fields_set:
+        if getattr(stated, key) is None:
+            raise top.section("noise").error(key, f"this is not observed; add {key} under [sigmas] too, or remove it")
+    for key in ("relative_position_m", "relative_attitude_deg"):
+        if key in section and keys.flight is None:
+            raise section.error(key, "it is between exposures of a strip, and there is no [flight]; remove it")
+    roles = {role for group in targets for role in (group.role, *([group.choice.role] if group.choice else []))}
+    if stated.control_m is None and roles & {"control", "vertical"}:
+        raise section.error("control_m", "the key is missing, but there are control points; add it")
+    noise = vars(stated) | {name: plain(getattr(keys.noise, name)) for name in keys.noise.model_fields_set}
+    if "target_mm" not in section and "target_mm" not in keys.noise.model_fields_set:
+        # Targets are measured as well as ties, unless one of the tables gives them a standard deviation.
+        noise["target_mm"] = noise["image_mm"]
+    return stated, Sigmas(**noise)
+
+
+# Plans -----------------------------------------------------------------------------------------------------------
+
+
+def _flown_cameras(top: Section, rig: Section, cameras: list[str]) -> list[str]:
+    """All cameras, or the reference camera of the rig."""
+    rig.known(*cameras)
+    flown = [name for name in cameras if name not in rig]
+    if rig.values and len(flown) != 1:
+        raise rig.error("", "all cameras but one sit in a rig beside that one; give each of them a table")
+    if rig.values and "convergent" in top:
+        raise top.error("convergent", "a rig is flown; remove the table, or that of the rig")
+    return flown
+
+
+Flown = Mapping[str, tuple[Sensor, InteriorOrientation, Any]]
+"""Sensor, interior orientation and direction of the x axis of each camera."""
+
+
+def _plan(top: Section, keys: Any, cameras: Flown) -> FlightPlan | ConvergentPlan:
     """The flight or the convergent set; every camera takes part in it."""
     if ("flight" in top) == ("convergent" in top):
         raise top.error("", "a recipe has a table [flight] or a table [convergent]; give one of the two")
-    plan: FlightPlan | ConvergentPlan
-    if "flight" in top:
-        plan, images = read_flight(top.section("flight"), cameras), "strip is flown"
-    else:
-        if "strips" in top:
-            raise top.error("strips", "a convergent set has no strips; remove the table")
-        refuse_changes(top)
-        plan, images = read_convergent(top.section("convergent"), list(cameras)), "image is taken"
+    plan = _flight(top, keys.flight, cameras) if keys.flight else _convergent(top, keys.convergent, list(cameras))
+    if not 2 <= plan.n_images <= IMAGES:
+        table, key = ("flight", "strips") if keys.flight else ("convergent", "stations")
+        raise top.section(table).error(
+            key, f"there are {plan.n_images} images in all; give from 2, which see a point twice, to {IMAGES}"
+        )
     for name in cameras:
         if name not in plan.cameras:
-            raise top.section("cameras").error(name, f"no {images} with this camera; use it or remove it")
+            raise top.section("cameras").error(name, "no image is taken with this camera; use it or remove it")
     return plan
 
 
-def _of_measured_coordinates(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The same, residuals being those of the image that has the noise where a camera does not say which."""
-    cameras = values.get("cameras")
-    if not isinstance(cameras, Mapping):
-        return dict(values)
-    usual = {"residuals": "measured"}
-    told = {name: {**usual, **camera} if isinstance(camera, Mapping) else camera for name, camera in cameras.items()}
-    return {**values, "cameras": told}
+def _camera_of(section: Section, name: str | None, cameras: Iterable[str], number: int) -> str:
+    """The camera of a strip or station: the only one, where none is named."""
+    cameras = list(cameras)
+    if name is None and len(cameras) == 1:
+        return cameras[0]
+    place = Section(section.file, f"{section.path}, number {number}", {})
+    if name is None:
+        raise place.error("camera", "the key is missing; add it")
+    if name not in cameras:
+        raise place.error("camera", f"there is no table [cameras.{name}]; use one of {', '.join(cameras)}")
+    return name
 
 
-def _without_truth(section: Section) -> dict[str, Any]:
-    """The tables of `section`, each without its table `truth`."""
-    return {name: {k: v for k, v in section.section(name).values.items() if k != "truth"} for name in section}
+def _convergent(top: Section, keys: Any, cameras: list[str]) -> ConvergentPlan:
+    for key in ("strips", *CHANGES, "temperature", "camera_walk"):
+        if key in top:
+            raise top.error(key, "a convergent set has no strips and no times; remove the table")
+    for key in {"across", "ends"} & set(top.section("points").values):
+        raise top.section("points").error(key, "only a flight has this key; remove it")
+    section = Section(top.file, "convergent.stations", {})
+    stations = [
+        station
+        for k, table in enumerate(keys.stations, 1)
+        for station in table.stations(_camera_of(section, table.camera, cameras, k))
+    ]
+    return ConvergentPlan(tuple(stations), Field(tuple(keys.field_m)))  # type: ignore[arg-type]
 
 
-def _camera(section: Section, told: Camera) -> Assumed[InteriorOrientation]:
-    truth = section.section("truth")
-    truth.known(*parameter_names(told.interior), *constant_names(told.interior))
-    values = section.section("interior").values | {key: truth.number(key) for key in truth}
-    known = {key: value for key, value in section.values.items() if key != "truth"}
-    true = read_camera(Section(section.file, section.path, known | {"interior": values}))
-    return Assumed(true.interior, told.interior, told.priors)
+def _flight(top: Section, keys: Any, cameras: Flown) -> FlightPlan:
+    section = Section(top.file, "flight.strips", {})
+    strips: list[Strip] = []
+    for number, table in enumerate(keys.strips, 1):
+        camera = _camera_of(section, table.camera, cameras, number)
+        for strip in _strips(table, keys, camera, cameras[camera], top.section("flight")):
+            if strip.name in [other.name for other in strips]:
+                place = Section(top.file, f"flight.strips, number {number}", {})
+                raise place.error("name", f"there is another strip {strip.name}; give each its own name")
+            strips.append(strip)
+    given = {name: value for name in ("speed_m_per_s", "turn_s") if (value := getattr(keys, name)) is not None}
+    return FlightPlan(tuple(strips), **given)
 
 
-def _mounts(section: Section, told: Section, cameras: Iterable[str]) -> dict[str, Assumed[Mount]]:
-    starts, priors = read_mounts(told, cameras)
-    mounts = {}
-    for name, start in starts.items():
-        truth = section.section(name).section("truth")
-        truth.known("lever_arm_m", "boresight_deg", "time_offset_s")
-        arm = truth.vector("lever_arm_m") if "lever_arm_m" in truth else start.lever_arm
-        boresight = np.deg2rad(truth.vector("boresight_deg")) if "boresight_deg" in truth else start.boresight
-        offset = truth.number("time_offset_s", float(start.time_offset))
-        true = Mount(jnp.asarray(arm), jnp.asarray(boresight), jnp.asarray(offset), start.image_x)
-        mounts[name] = Assumed(true, start, priors[name])
-    return mounts
+def _strips(table: Any, flight: Any, camera: str, flown: tuple, section: Section) -> list[Strip]:
+    """The parallel strips of one table, flown to and fro, from left to right of the first."""
+    sensor, interior, image_x = flown
 
+    def either(thing: str) -> tuple[str, float]:
+        given = table.either(thing) or flight.either(thing)
+        if given is None:
+            raise section.error("", f"the {thing} is not given; add {' or '.join(flight.pairs[thing])}")
+        return given
 
-def _shutters(section: Section, cameras: Iterable[str]) -> dict[str, SimulatedShutter]:
-    """Of a table that holds nothing but a `truth` the block's model does not know."""
-    section.known("default", *cameras)
-    shutters = {}
-    for name in cameras:
-        key = name if name in section else "default"
-        if key not in section:
-            continue
-        own = section.section(key)
-        own.known("readout_ms", "readout", "velocity_m_per_s", "rate_deg_per_s", "truth")
-        truth = own.section("truth")
-        truth.known("readout_ms")
-        start = own.number("readout_ms", 0.0)
-        errors = {word: own.positive(word) for word in ("velocity_m_per_s", "rate_deg_per_s") if word in own}
-        prior = own.prior("readout", np.asarray(start), "_ms")
-        model = (RollingShutter(np.asarray(start)), RollingShutter(prior))  # type: ignore[arg-type]
-        knows = any(word != "truth" for word in own)
-        shutters[name] = SimulatedShutter(
-            RollingShutter(np.asarray(truth.number("readout_ms", start))),  # type: ignore[arg-type]
-            **errors,
-            model=model if knows else None,
+    def step(thing: str, footprint_m: float) -> float:
+        key, value = either(thing)
+        return value if key.endswith("_m") else (1 - value / 100) * footprint_m
+
+    c = float(interior.c)
+    key, height = either("height")
+    height *= 1.0 if key == "height_m" else c / sensor.pixel_mm
+    ground = footprint(sensor, c, height, image_x)
+    base = step("base", ground.along)
+    spacing = step("spacing", ground.across) if table.count > 1 or table.across_spacings else 0.0
+    along = table.along_m + table.along_bases * base
+    strips = []
+    for k in range(table.count):
+        # Along and across are those of the first strip's heading, and change sign for those flown the other way.
+        sign = -1 if k % 2 else 1
+        across = table.across_m + (table.across_spacings + k - (table.count - 1) / 2) * spacing
+        strips.append(
+            Strip(
+                name=f"{table.name}{k + 1}" if table.count > 1 else table.name,
+                camera=camera,
+                heading_deg=table.heading_deg + 180 * (k % 2),
+                images=table.images,
+                base_m=base,
+                height_m=height,
+                footprint=ground,
+                along_m=sign * along,
+                across_m=sign * across,
+            )
         )
-    return shutters
+    return strips
 
 
-def _biases(section: Section, told: Section, strips: list[str]) -> dict[str, SimulatedBias]:
-    """A table that holds nothing but a `truth` leaves the bias out of the block's model."""
-    section.known("default", *strips)
-    modelled = Section(told.file, told.path, {name: values for name, values in told.values.items() if values})
-    starts, priors = read_strips(modelled, strips)
-    biases = {}
-    for name in strips:
-        key = name if name in section else "default"
-        if key not in section:
-            continue
-        truth = section.section(key).section("truth")
-        truth.known("shift_m", "drift_m_per_s", "shift_sigma_m", "drift_sigma_m_per_s")
-        start = starts.get(name, StripBias(jnp.zeros(3), jnp.zeros(3)))
-        shift = truth.vector("shift_m") if "shift_m" in truth else start.shift
-        drift = truth.vector("drift_m_per_s") if "drift_m_per_s" in truth else start.drift
-        biases[name] = SimulatedBias(
-            StripBias(jnp.asarray(shift), jnp.asarray(drift)),
-            sigmas(truth, "shift_sigma_m") or _ZERO,
-            sigmas(truth, "drift_sigma_m_per_s") or _ZERO,
-            (start, priors[name]) if name in starts else None,
+def _lidar(
+    top: Section, keys: Any, plan: FlightPlan | ConvergentPlan, terrain: Terrain, stated: Sigmas
+) -> ScanPlan | None:
+    """The plan of the scanner, None without [lidar]."""
+    sigmas = top.section("sigmas")
+    if keys.lidar is None:
+        if stated.lidar_m is not None:
+            raise sigmas.error("lidar_m", "there is no table [lidar]; add it, or remove this key")
+        return None
+    if isinstance(plan, ConvergentPlan):
+        raise top.error("lidar", "a convergent set is not flown, so it has no lidar strips; remove the table")
+    if terrain.roughness_m:
+        raise top.section("terrain").error(
+            "roughness_m",
+            f"points {terrain.roughness_m:g} m above or below the ground lie on no surface that a lidar could measure; "
+            'use 0, and in place of "rolling" give its waves',
         )
-    return biases
+    if stated.lidar_m is None:
+        raise sigmas.error("lidar_m", "the key is missing, but there is a lidar; add its sigmas, like [0.5, 0.5, 0.15]")
+    strips = tuple(_lidar_strip(strip, plan.speed_m_per_s, top) for strip in keys.lidar.strips)
+    truth, names = keys.lidar.truth.plan(density_per_m2=1.0), [strip.name for strip in strips or plan.strips]
+    for key in ("shift_m", "drift_m_per_s", "attitude_deg", "attitude_drift_deg_per_s"):
+        top.section("lidar").section("truth").section(key).known("default", *names)
+    given = {name: getattr(truth, name) for name in keys.lidar.truth.model_fields_set}
+    return keys.lidar.plan(**given, strips=strips)
+
+
+def _lidar_strip(keys: Any, speed: float, top: Section) -> Strip:
+    """A strip of the scanner's own flight."""
+    nodes = 1 + max(1, math.ceil(keys.length_m / (_NODES_S * speed)))
+    if nodes > IMAGES:
+        hours = keys.length_m / speed / 3600
+        raise top.section("lidar").error("strips", f"strip {keys.name} takes {hours:.3g} hours; make length_m shorter")
+    return Strip(
+        name=keys.name,
+        camera="",
+        heading_deg=keys.heading_deg,
+        images=nodes,
+        base_m=keys.length_m / (nodes - 1),
+        height_m=keys.height_m,
+        footprint=Footprint(0.0, 0.0),
+        along_m=keys.along_m,
+        across_m=keys.across_m,
+    )

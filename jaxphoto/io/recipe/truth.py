@@ -1,21 +1,28 @@
-"""A simulation -> its block folder; beside the block's tables the truth, in the columns of the result tables."""
+"""A simulation -> its block folder with cloud and trajectory; the truth is written in the columns of result tables."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from jaxphoto.camera import constant_names, get_parameter, parameter_names
+from jaxphoto.cloud import Cloud
+from jaxphoto.georeferencing import Scanner, StripErrors, Trajectory
+from jaxphoto.io import clouds
 from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
-from jaxphoto.io.recipe.scan_files import drift_table, in_degrees, scanner_rows, write_scan
 from jaxphoto.io.result_tables import read_table
+from jaxphoto.io.trajectory import write_flight_csv
+from jaxphoto.io.trajectory.in_frame import records_of
 from jaxphoto.observations import AXES
+from jaxphoto.parameters import AbstractParameters, numbers_of
 from jaxphoto.simulation import Simulation
 from jaxphoto.simulation.flight import omega_phi_kappa
 from jaxphoto.tracing import outside_transformations
 
 FOLDER = "truth"
+CLOUD, TRAJECTORY = "cloud.laz", "trajectory.csv"
 _SCANNER = "scanner"
 _DRIFT = "trajectory_errors"
 
@@ -32,7 +39,7 @@ def write_simulation(simulation: Simulation, folder: str | Path) -> None:
         for name, table in truth_tables(simulation).items():
             table.to_csv(work / FOLDER / f"{name}.csv", index=False)
         if simulation.cloud is not None and simulation.trajectory is not None:
-            write_scan(simulation.cloud, simulation.trajectory, work)
+            _write_scan(simulation.cloud, simulation.trajectory, work)
 
 
 def truth_tables(simulation: Simulation) -> dict[str, pd.DataFrame]:
@@ -56,9 +63,9 @@ def truth_tables(simulation: Simulation) -> dict[str, pd.DataFrame]:
     }
     errors = simulation.errors
     if truth.scanner is not None and errors is not None:
-        tables[_SCANNER] = pd.DataFrame(scanner_rows(truth.scanner, errors), columns=["parameter", "value"])
+        tables[_SCANNER] = pd.DataFrame(_scanner_rows(truth.scanner, errors), columns=["parameter", "value"])
         if np.ptp(errors.position, axis=0).any() or errors.attitude.any():
-            tables[_DRIFT] = drift_table(errors, tuple(truth.scanner.shifts))
+            tables[_DRIFT] = _drift_table(errors, tuple(truth.scanner.shifts))
     return tables
 
 
@@ -87,5 +94,35 @@ def _georeferencing(simulation: Simulation) -> list[tuple[str, float]]:
         rows += [(f"strips[{name}].drift_{a}_m_per_s", v) for a, v in zip(AXES, np.asarray(bias.drift), strict=True)]
     for owners in simulation.truth.more.values():
         for name, own in owners.items():
-            rows += in_degrees(own, name)
+            rows += _in_degrees(own, name)
     return rows + [(f"datum_offset_{a}_m", v) for a, v in zip(AXES, simulation.datum_offset_m, strict=True)]
+
+
+def _write_scan(cloud: Cloud, trajectory: Trajectory, folder: Path) -> None:
+    """Write the cloud and the trajectory, both in the frame of the block."""
+    clouds.write_cloud(cloud, folder / CLOUD)
+    write_flight_csv(records_of(trajectory, TRAJECTORY), folder / TRAJECTORY)
+
+
+def _scanner_rows(scanner: Scanner, errors: StripErrors) -> list[tuple[str, float]]:
+    """parameter, value of the scanner, as the result tables name them; of its calibration what is not zero."""
+    angles = zip(("right", "forward", "up"), np.degrees(scanner.boresight), strict=True)
+    rows = [(f"scanner.boresight_{axis}_deg", float(v)) for axis, v in angles]
+    for name, shift in scanner.shifts.items():
+        rows += [(f"scanner[{name}].shift_{a}_m", float(v)) for a, v in zip(AXES, np.asarray(shift), strict=True)]
+    return rows + [(name, v) for name, v in _in_degrees(errors.calibration, "") if v]
+
+
+def _in_degrees(parameters: AbstractParameters, owner: str) -> list[tuple[str, float]]:
+    """parameter, value of declared parameters, angles in degrees."""
+    pairs = zip(parameters.labels(owner), numbers_of(parameters), strict=True)
+    return [(name.replace("_rad", "_deg"), float(np.degrees(v) if "_rad" in name else v)) for name, v in pairs]
+
+
+def _drift_table(errors: StripErrors, strips: Sequence[str]) -> pd.DataFrame:
+    """strip, time_s, X_m ... right_deg ...: what the trajectory is off by at the knots of its splines."""
+    of = np.repeat(np.array(strips, object), [s.size for s in errors.splines])
+    time = np.concatenate([s.times for s in errors.splines])
+    values = np.column_stack([errors.position, np.rad2deg(errors.attitude)])
+    names = ("X_m", "Y_m", "Z_m", "right_deg", "forward_deg", "up_deg")
+    return pd.DataFrame({"strip": of, "time_s": time} | {name: values[:, k] for k, name in enumerate(names)})

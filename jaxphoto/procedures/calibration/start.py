@@ -31,7 +31,7 @@ from jaxphoto.camera import (
 )
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
-from jaxphoto.orientation.rays import ideal_coordinates
+from jaxphoto.initial.rays import ideal_coordinates
 from jaxphoto.procedures.calibration.target_block import Board, TargetRows, projections, resected
 
 _CENTRAL = ("c_mm", "xp_mm", "yp_mm")

@@ -22,9 +22,9 @@ from jaxphoto.camera import InteriorOrientation, Sensor, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError
+from jaxphoto.initial import resect, resect_by_quaternions
+from jaxphoto.initial.rays import padded_length
 from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
-from jaxphoto.orientation import resect, resect_by_quaternions
-from jaxphoto.orientation.rays import padded_length
 from jaxphoto.unknowns import FREE, Unknowns, default_priors
 
 # Of its largest extent: what the points of a board may be off a plane and still count as flat. Surveyed targets on a

@@ -47,8 +47,8 @@ from jaxphoto.camera import InteriorOrientation, Sensor, Smac, get_parameter, pa
 from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
+from jaxphoto.initial.rays import padded_length
 from jaxphoto.linear_algebra import cholesky, inverse, solve
-from jaxphoto.orientation.rays import padded_length
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.calibration.start import distortion_model, free_parameters, nearest_distortion, rough_interior
 from jaxphoto.procedures.calibration.target_block import (

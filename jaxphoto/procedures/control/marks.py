@@ -24,9 +24,9 @@ from jaxphoto.block import Block
 from jaxphoto.block_parts import Datum, Start
 from jaxphoto.errors import counted, few
 from jaxphoto.georeferencing import FlightBias
+from jaxphoto.initial.intersection import intersect_points, intersect_with_covariance
+from jaxphoto.initial.rays import camera_rays, turn_to_object
 from jaxphoto.observations import ControlRows, ImageRows
-from jaxphoto.orientation.block_intersection import intersect_points, intersect_with_covariance
-from jaxphoto.orientation.rays import camera_rays, turn_to_object
 from jaxphoto.parameters import AbstractParameters
 from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, Marks, SurveyedPoints
 from jaxphoto.unknowns import FIXED, FREE, Unknowns

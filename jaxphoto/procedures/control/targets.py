@@ -37,8 +37,8 @@ from jaxphoto.compiling import jit_quickly
 from jaxphoto.errors import InputError, counted
 from jaxphoto.georeferencing import apparent_point
 from jaxphoto.georeferencing.ground import moved_exterior, moved_interior
-from jaxphoto.orientation.block_intersection import intersect_points
-from jaxphoto.orientation.rays import padded_length, turn_to_object
+from jaxphoto.initial.intersection import intersect_points
+from jaxphoto.initial.rays import padded_length, turn_to_object
 from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.control.control_block import CRITICAL, ControlledBlock, control_block
 from jaxphoto.procedures.control.frame import LEAST, in_frame

@@ -1,4 +1,4 @@
-"""What a photogrammetrist does with a cloud: heights or roofs as control, images and cloud, or strips, at once."""
+"""Procedures with a point cloud: heights or roofs as control, simultaneous adjustment, strip adjustment."""
 
 from jaxphoto.procedures.lidar.images_and_cloud import Simultaneous, simultaneous
 from jaxphoto.procedures.lidar.kept_returns import kept_returns

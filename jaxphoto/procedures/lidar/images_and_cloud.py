@@ -1,9 +1,10 @@
-"""Simultaneous adjustment of images and a cloud (paper 001): the cloud holds the images, the images mend the cloud.
+"""Simultaneous adjustment of images and a point cloud (paper 001): the cloud constrains the images, the images correct
+it.
 
-In one step: every tie point is observed to lie on the surface of each lidar strip that shows it, and the boresight of
-the scanner and the shifts of its strips are unknowns beside the orientations. The surface at a point follows from where
-the point is, so that step is made again until nothing changes. Then the trajectory is that of the shifted strips, and
-the cloud is computed anew from it.
+In one step: every tie point is observed to lie on the surface of each lidar strip that covers it, and the boresight of
+the scanner and the shifts of its strips are unknowns in addition to the orientations. The surface at a point depends on
+its position, so this step is iterated to convergence. Then the trajectory is corrected by the shifts of the strips, and
+the cloud is recomputed from it.
 """
 
 import dataclasses
@@ -55,42 +56,42 @@ from jaxphoto.statistics import Covariance
 from jaxphoto.unknowns import FIXED, FREE, Weighted
 
 SURFACES = get_args(Method)
-"""Names of the ways to a surface."""
+"""Names of the surface interpolation methods."""
 SHIFT_SIGMA = 0.3
-"""Standard deviation (m) of a lidar strip's shift where nothing else is said of it."""
-# So many laser points of a strip around a tie point are all that its surface can depend on; and so many times those
-# that a height is made from.
+"""Default standard deviation (m) of a lidar strip's shift."""
+# Number of laser points of a strip around a tie point that its surface can depend on; multiple of the number that a
+# height is interpolated from.
 _NEAR, _TIMES = 400, 8
 
 
 @shown
 class Simultaneous(eqx.Module):
-    """Images and cloud after their simultaneous adjustment, and before."""
+    """Images and cloud before and after simultaneous adjustment."""
 
     before: Adjustment
-    """The block alone, its interior orientation held."""
+    """Adjustment of the block alone, with fixed interior orientation."""
     adjusted: Adjustment
     cloud: Cloud
-    """Corrected."""
+    """Corrected cloud."""
     trajectory: Trajectory | None
-    """Corrected by the shifts of the strips that were flown along it."""
+    """Corrected by the shifts of the strips flown along it."""
     scanner: Scanner
     points: Int[np.ndarray, "rows"]
-    """Of the block, by observation of a surface."""
+    """Point of the block, for each observation of a surface."""
     strip: Int[np.ndarray, "rows"]
     apart_before: Float[np.ndarray, "rows"]
-    """By how much points lay above the surface of the cloud as it was, before (m); NaN where it was not to be told."""
+    """Height of points above the surface of the original cloud, before (m); NaN if undetermined."""
     apart: Float[np.ndarray, "rows"]
-    """By how much they lie above that of the corrected cloud; NaN likewise."""
+    """Height above the surface of the corrected cloud (m); NaN likewise."""
     moved_cloud: Float[np.ndarray, "3"]
-    """Root mean square move (m) of the laser points along X, Y and Z."""
+    """Root mean square motion (m) of the laser points along X, Y and Z."""
     rounds: tuple[Round, ...]
     still: bool
-    """Whether nothing changed any more at the end."""
+    """True if the iteration converged."""
 
 
 class _Strip(NamedTuple):
-    """The laser points of one strip as measured, and the path that they were measured from."""
+    """Measured laser points of one strip, and the scanner path."""
 
     cloud: Cloud
     grid: Grid
@@ -111,12 +112,12 @@ def simultaneous(
 ) -> Simultaneous:
     """Adjust `block` with its tie points on the surface of `cloud`, which is in the block's object frame.
 
-    `priors` are those of the scanner; by default its boresight is FREE where `trajectory` (of the scanner, on the
-    cloud's clock) says from where each point was measured, and FIXED where none is given; shifts are weighted at zero
-    with `SHIFT_SIGMA`. `points` are those that lie on the surface; all tie points if None.
+    `priors` are those of the scanner; by default its boresight is FREE if `trajectory` (of the scanner, on the cloud's
+    clock) gives the scanner position of each point, and FIXED without one; shifts are weighted at zero with
+    `SHIFT_SIGMA`. `points` are those on the surface; all tie points if None.
 
-    Raises BlockError where cloud and block, or cloud and trajectory, do not go together; InputError for a boresight to
-    estimate without trajectory or times; and as `jaxphoto.adjust`.
+    Raises BlockError if cloud and block, or cloud and trajectory, do not match; InputError for a boresight without
+    trajectory or times; and what `jaxphoto.adjust` raises.
     """
     settings = HeightSettings() if settings is None else settings
     names = cloud.strips or ("cloud",)
@@ -208,7 +209,7 @@ def simultaneous(
 
 
 def _strips(cloud: Cloud, names: tuple[str, ...], path: ScannerPath | None) -> list[_Strip]:
-    """The cloud strip by strip."""
+    """Split the cloud by strip."""
     strips = []
     for k, name in enumerate(names):
         own = cloud if cloud.strip is None else cloud.take(np.flatnonzero(cloud.strip == k))
@@ -227,7 +228,7 @@ def _near(
     shift: Float[Numbers, "3"],
     settings: HeightSettings,
 ) -> tuple[Cloud, ScannerPoses | None]:
-    """The laser points, corrected, that the surface at some places can depend on, and where each was measured from."""
+    """Return the corrected laser points that the surface at some places can depend on, and their scanner poses."""
 
     def corrected(index: Int[np.ndarray, "m"]) -> tuple[Cloud, ScannerPoses | None]:
         own = strip.cloud.take(index)
@@ -236,7 +237,7 @@ def _near(
         return dataclasses.replace(own, xyz=corrected_xyz(own.xyz, poses, boresight, shift)), poses
 
     order = np.asarray(strip.grid.order)
-    # Where the places were in the cloud as measured: as far off as the laser point there.
+    # Places in the measured cloud: displaced like the laser points there.
     one = order[nearest(strip.grid, xy, 1).index[:, 0]]
     off = strip.cloud.xyz[one, :2] - corrected(one)[0].xyz[:, :2]
     enough = min(max(_NEAR, _TIMES * settings.points), len(strip.cloud))
@@ -246,7 +247,7 @@ def _near(
 def _turns(
     seen: SeenByCloud, strip: Int[np.ndarray, "rows"], poses: list[ScannerPoses | None]
 ) -> Float[np.ndarray, "rows 3"]:
-    """`SurfaceRows.turn` of every row, used or not: as many in every round."""
+    """Return `SurfaceRows.turn` of every row, used or not: an equal number in every iteration."""
     turn = np.zeros_like(seen.foot)
     for k, one in enumerate(poses):
         own = strip == k
@@ -263,7 +264,7 @@ def _surface_rows(
     turn: Float[np.ndarray, "rows 3"],
     scanner: Scanner,
 ) -> SurfaceRows:
-    """The observations, of the cloud as it was measured: linear in shift and boresight about those of `scanner`."""
+    """Return observations by the measured cloud: linear in shift and boresight about those of `scanner`."""
     of, turn, foot, normal = strip[used], turn[used], seen.foot[used], seen.normal[used]
     shift = np.stack([np.asarray(v) for v in scanner.shifts.values()])[of]
     raised = turn @ np.asarray(scanner.boresight)

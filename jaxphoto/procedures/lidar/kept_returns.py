@@ -1,8 +1,8 @@
-"""Which returns of a cloud larger than memory its strip adjustment looks at: those of places that strips share.
+"""Selection of returns for a strip adjustment of a cloud larger than memory: those at places that strips share.
 
-The cloud passes twice, part by part. At first its cells are added up; then the returns of cells are taken in which two
-strips have one plane, as many as there is room for, and those about control and about tie points of photographs. What
-is then seen is what a search in all of it sees in these cells.
+The cloud is read twice, in parts. First its cells are accumulated; then the returns of cells with planes of two strips
+are kept, as many as fit, and those about control and tie points of photographs. The search then finds in them what it
+would find in the whole cloud.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,11 +21,11 @@ from jaxphoto.procedures.lidar.looks import Look, looks_of
 from jaxphoto.procedures.lidar.strip_rows import thinned
 
 KEPT = 10_000_000
-"""Returns in memory: with what their search needs about a gigabyte, and for 4,000 planes far more than enough."""
-# Of them those about tie points at most this part; each try takes so much less than the one before.
+"""Returns in memory: about a gigabyte with the search, and far more than 4,000 planes need."""
+# Maximum fraction about tie points; each attempt takes this factor less than the one before.
 _ABOUT_POINTS, _LESS = 0.5, 0.8
 _LEAST = 1e-4
-# Of a pair of strips at least so many planes are looked at.
+# Minimum number of planes per pair of strips.
 _FEWEST = 100
 
 
@@ -38,10 +38,10 @@ def kept_returns(
     surveyed: Float[np.ndarray, "k 3"] | None = None,
     most: int = KEPT,
 ) -> Cloud:
-    """The returns of a cloud that `adjust_strips` is to look at; of one of `most` returns or fewer all.
+    """Return the returns of a cloud for `adjust_strips`; all of them for at most `most` returns.
 
-    `parts` gives the cloud anew each time, in parts of bounded size whose strips are those met so far; `places` (m)
-    where tie points of photographs are, about; `surveyed` (m) where control is, all of whose returns are kept.
+    `parts` yields the cloud each time it is called, in parts of bounded size whose strips are those met so far;
+    `places` (m) are approximate tie points of photographs; `surveyed` (m) is control, all of whose returns are kept.
     """
     small: list[Cloud] = []
     passed, number = _Passed(settings, path, pattern), 0
@@ -62,7 +62,7 @@ def kept_returns(
 
 
 class _Passed:
-    """What is known of a cloud that has passed."""
+    """Accumulated data of a cloud."""
 
     def __init__(self, settings: StripSettings, path: ScannerPath | None, pattern: Pattern) -> None:
         self.settings, self.path, self.pattern = settings, path, pattern
@@ -83,13 +83,13 @@ class _Passed:
         return self._tally.strips
 
     def returns(self, part: Cloud, cells: dict[str, Int[np.ndarray, "cells"]]) -> Bool[np.ndarray, "n"]:
-        """Those of a part that lie in `cells`; and of each strip the first and the last, which its splines go from."""
+        """Return the returns of a part in `cells`; and of each strip the first and last, the ends of its splines."""
         kept = np.zeros(len(part), bool)
         for look in self._looks(part):
             own = look.returns
             kept[own] = np.isin(cells_of(part.xyz[own], self.settings), cells[look.name])
             if part.time is None:
-                # Nothing that is adjusted without times asks for more than where strips are.
+                # Without times, an adjustment needs only the extents of strips.
                 kept[own[:1]] = True
             else:
                 kept[own] |= np.isin(part.time[own], self._spans[look.strip])
@@ -107,7 +107,7 @@ def _chosen(
     places: Float[np.ndarray, "n 3"],
     always: dict[str, Int[np.ndarray, "kept"]],
 ) -> dict[str, Int[np.ndarray, "cells"]]:
-    """The cells of each look whose returns are to be kept, `most` of them together; those `always`, and others."""
+    """Return the cells of each look whose returns are kept, at most `most`; those in `always`, and others."""
     most -= _number(looks, always)
     part, room = 1.0, _ABOUT_POINTS * most
     while (kept := _number(looks, about := _about(looks, places, part, settings))) > room and part > _LEAST:
@@ -132,7 +132,7 @@ def _chosen(
 def _about(
     looks: dict[str, CellReturns], places: Float[np.ndarray, "n 3"], part: float, settings: StripSettings
 ) -> dict[str, Int[np.ndarray, "cells"]]:
-    """The cells in and beside which a part of the places lie."""
+    """Return the cells in and around which some of the places lie."""
     number = max(1, round(part * len(places)))
     some = places[np.linspace(0, len(places) - 1, number).astype(int)] if len(places) else places
     beside = [np.array([x, y, 0.0]) * settings.cell_m for x in (-1, 0, 1) for y in (-1, 0, 1)]
@@ -141,7 +141,7 @@ def _about(
 
 
 def _number(looks: dict[str, CellReturns], cells: dict[str, Int[np.ndarray, "cells"]]) -> int:
-    """Returns in cells of the looks."""
+    """Return the number of returns in cells of the looks."""
     return sum(
         int(own.returns[np.isin(own.cell, cells[name], assume_unique=True)].sum()) for name, own in looks.items()
     )

@@ -1,8 +1,7 @@
-"""Looks of a scanner: the returns of a strip that were measured ahead, and those that were measured behind.
+"""Looks of a scanner: forward and backward returns of a strip.
 
-A scanner that draws lines across the track sees a place once in a strip. One that looks all around sees it ahead and
-again, seconds later, behind: by other angles, at another time of the trajectory. What two looks of one strip say of a
-plane is then compared as that of two strips is.
+A line scanner sees a place once per strip. A circular scanner sees it ahead and, seconds later, behind: at other
+angles, at another time of the trajectory. Planes from the two looks of one strip are compared like those of two strips.
 """
 
 from typing import NamedTuple
@@ -21,11 +20,11 @@ class Look(NamedTuple):
     strip: int
     name: str
     returns: Int[np.ndarray, "n"]
-    """Which of the cloud."""
+    """Indices in the cloud."""
 
 
 def looks_of(cloud: Cloud, path: ScannerPath | None, pattern: Pattern) -> list[Look]:
-    """One of each strip; of a scanner that looks all around two, "1 ahead" and "1 behind" of strip 1."""
+    """Return one look per strip; for a circular scanner two, "1 ahead" and "1 behind" of strip 1."""
     looks = []
     for k, name in enumerate(cloud.strips):
         own = np.flatnonzero(cloud.strip == k)
@@ -39,7 +38,7 @@ def looks_of(cloud: Cloud, path: ScannerPath | None, pattern: Pattern) -> list[L
 
 
 def aside(cloud: Cloud, which: Int[np.ndarray, "n"], path: ScannerPath) -> Float[np.ndarray, "n 2"]:
-    """Tangents of the angles of returns to the right and ahead, from the body's nadir."""
+    """Return tangents of the angles of returns to the right and ahead, from the body's nadir."""
     parts = [np.zeros((0, 2))]
     for first in range(0, len(which), PORTION):
         own = which[first : first + PORTION]

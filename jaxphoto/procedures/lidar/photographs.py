@@ -1,4 +1,4 @@
-"""Photographs of the flight that strips were measured on: their exposures lie on the trajectory of the scanner."""
+"""Photographs of the same flight as laser strips: their exposures lie on the trajectory of the scanner."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -17,28 +17,28 @@ from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.observations import Attitudes, StationRows, StripPlanes, TrajectoryAttitudes, TrajectoryStations
 from jaxphoto.procedures.lidar.until_still import check_without_surfaces
 
-# Stations farther off the trajectory (m) are those of another one, or of another time.
+# Stations farther from the trajectory (m) belong to another one, or to another time.
 _FAR_M = 10.0
 
 
 class Photographs(NamedTuple):
-    """A block of images, and when each was exposed on the clock of the cloud and its trajectory."""
+    """Block of images, and the exposure times on the clock of the cloud and its trajectory."""
 
     block: Block
-    """Its stations and attitudes are what the trajectory says of the exposures."""
+    """Its stations and attitudes are those of the trajectory."""
     time: Float[np.ndarray, "images"]
     """Seconds."""
     on_breaklines: tuple[str, ...] = ()
-    """Tie points on breaklines; none: those of the block."""
+    """Tie points on breaklines; by default those of the block."""
 
     @property
     def breaklines(self) -> tuple[str, ...]:
-        """Tie points that were measured where two smooth faces meet, such as on the ridge of a roof."""
+        """Return tie points at the intersection of two smooth faces, such as the ridge of a roof."""
         return self.on_breaklines or self.block.breaklines
 
 
 def check_photographs(photographs: Photographs, trajectory: Trajectory | None) -> None:
-    """Raise InputError or BlockError for photographs that do not go with the trajectory."""
+    """Raise InputError or BlockError for photographs that do not match the trajectory."""
     block, time = photographs.block, photographs.time
     if trajectory is None:
         raise InputError(
@@ -94,7 +94,7 @@ def check_photographs(photographs: Photographs, trajectory: Trajectory | None) -
 def spans_with(
     time: Float[np.ndarray, "images"], spans: Float[np.ndarray, "strips 2"]
 ) -> Float[np.ndarray, "strips 2"]:
-    """First and last times of strips (s) and of the exposures on their trajectories."""
+    """Return first and last times of strips (s) including the exposures on their trajectories."""
     strip = _strip_of(time, spans)
     own = [np.append(time[strip == k], span) for k, span in enumerate(spans)]
     return np.array([(t.min(), t.max()) for t in own])
@@ -106,9 +106,9 @@ def on_trajectory(
     spans: Float[np.ndarray, "strips 2"],
     settings: StripSettings,
 ) -> Block:
-    """The block, its stations and attitudes those of a trajectory that is off by `splines` over `spans`.
+    """Return the block with stations and attitudes of a trajectory with errors `splines` over `spans`.
 
-    They are in place of its own: the same instruments count once.
+    They replace its own: the same instruments count once.
     """
     block, time = photographs.block, photographs.time
     strip, knots, weights = _strip_of(time, spans), np.zeros((len(time), 4), int), np.zeros((len(time), 4))
@@ -131,6 +131,6 @@ def on_trajectory(
 
 
 def _strip_of(time: Float[np.ndarray, "images"], spans: Float[np.ndarray, "strips 2"]) -> Int[np.ndarray, "images"]:
-    """The laser strip on whose trajectory each exposure lies: that nearest in time."""
+    """Return the laser strip whose trajectory holds each exposure: the nearest in time."""
     away = np.maximum(spans[:, :1] - time, time - spans[:, 1:])
     return np.argmin(np.maximum(away, 0.0), axis=0)

@@ -1,9 +1,9 @@
-"""Roofs as further control: tie points on the planes of roof faces, and measured centroids as control points.
+"""Roofs as additional control: tie points on planes of roof faces, and measured centroids as control points.
 
-A roof face is an even plane of many laser points: a tie point on it is held along the plane's normal better than by any
-single height, and normals of roofs look in many directions. The centroid of a roof holds a point in X, Y and Z, where
-somebody has measured it in the images. Both are methods that paper 004 cites. Where no roof is, heights are control as
-in `vertical_control`: they also say first where the points are, well enough to tell one roof from the next.
+A roof face is a plane of many laser points: it constrains a tie point along its normal better than any single height,
+and roof normals have many directions. The centroid of a roof constrains a point in X, Y and Z, if it was measured in
+the images. Both are methods that paper 004 cites. Elsewhere heights are control as in `vertical_control`: they also
+give the points' positions first, well enough to identify roofs.
 """
 
 import dataclasses
@@ -34,30 +34,30 @@ from jaxphoto.procedures.lidar.vertical_control import lidar_control, tie_points
 from jaxphoto.statistics import Covariance
 
 BUILDING = 6
-"""The class of roofs in LAS."""
-# Laser points so far from all points asked for (m) belong to no roof of theirs.
+"""LAS class of buildings."""
+# Laser points farther from all requested points (m) belong to none of their roofs.
 _NEAR = 40.0
-# Laser points that make a roof.
+# Minimum number of laser points of a roof.
 _LEAST = 20
-# What is farther from a plane (m) is not on it, with heights that are control already.
+# Maximum distance of a point from its plane (m), with heights as control.
 _STOREY = 2.0
 
 
 class RoofControl(eqx.Module):
-    """The adjustment with roofs for control; arrays are over the tie points that lie on a roof face."""
+    """Adjustment with roofs as control; arrays are over the tie points on roof faces."""
 
     block: Block
     """With the planes as `surfaces`, heights and centroids as control, starting from the adjusted unknowns."""
     adjusted: Adjustment
     points: Int[np.ndarray, "n"]
-    """Of the block."""
+    """Index in the block."""
     apart: Float[np.ndarray, "n"]
-    """By how much each lies above its plane (m)."""
+    """Height above the plane (m)."""
     faces: int
-    """Roof faces that hold a tie point."""
+    """Number of roof faces with a tie point."""
     rounds: tuple[Round, ...]
     still: bool
-    """Whether nothing changed any more at the end."""
+    """True if the iteration converged."""
 
 
 def roof_control(
@@ -70,15 +70,15 @@ def roof_control(
     max_rounds: int = MAX_ROUNDS,
     report: Callable[[Round], None] = lambda made: None,
 ) -> RoofControl:
-    """Adjust `block` with its tie points (or the `points` named) that lie on a roof face of `cloud` held on its plane.
+    """Adjust `block` with its tie points (or the named `points`) on roof faces of `cloud` constrained to their planes.
 
-    All others have control heights (`lidar_control`, by planes). Roofs are laser points of class 6; of a cloud without
-    classes (or with 0 and 1 only) all points are looked at, level ground among them. Points named in `centroids` were
-    measured at the middle of a roof face, and become control in X, Y and Z. The standard deviation of n points on one
+    All others have control heights (`lidar_control`, by planes). Roofs are laser points of class 6; in a cloud without
+    classes (or with 0 and 1 only) all points are searched, including level ground. Points named in `centroids` were
+    measured at the centre of a roof face, and become control in X, Y and Z. The standard deviation of n points on one
     plane is sqrt(n) times that of the plane there, which they share.
 
-    Raises BlockError where no tie point lies on a roof, or a centroid on none; InputError for names that are no points;
-    and as `jaxphoto.adjust`.
+    Raises BlockError if no tie point lies on a roof, or a centroid on none; InputError for names that are not points;
+    and what `jaxphoto.adjust` raises.
     """
     settings = HeightSettings() if settings is None else settings
     check_without_surfaces(block)
@@ -106,9 +106,9 @@ def roof_control(
         for k in np.unique(chosen[chosen >= 0]):
             own = chosen == k
             foot[own], normal[own], of_plane = plane_feet(patches[k].plane, xyz[own])
-            # What a plane is off by is common to its points.
+            # The error of a plane is common to its points.
             sigma[own] = of_plane * np.sqrt(own.sum())
-        # The yard between the wings of a house lies in the outline of its roof, too.
+        # A yard between wings of a house lies within the outline of its roof, too.
         off = np.einsum("nk,nk->n", normal, xyz - foot)
         chosen[~(np.abs(off) < _STOREY)] = -1
         return SeenByCloud(which, foot, normal, sigma, chosen >= 0)
@@ -135,7 +135,7 @@ def roof_control(
 
 
 def _patches(cloud: Cloud, places: Float[np.ndarray, "n 3"], settings: HeightSettings) -> list[Patch]:
-    """Roof faces near places; `Patch.index` counts the points of `cloud`."""
+    """Return roof faces near places; `Patch.index` refers to the points of `cloud`."""
     told = cloud.classification is not None and bool(np.any(cloud.classification > 1))
     roofs = np.flatnonzero(cloud.classification == BUILDING) if told else np.arange(len(cloud))
     if len(roofs):
@@ -151,7 +151,7 @@ def _patches(cloud: Cloud, places: Float[np.ndarray, "n 3"], settings: HeightSet
 
 
 def _faces(xy: Float[np.ndarray, "n 2"], patches: list[Patch], margin: float) -> Int[np.ndarray, "n"]:
-    """The patch that each place lies in, `margin` (m) or more from its outline; -1 where it lies in none."""
+    """Return the patch of each place, at least `margin` (m) inside its outline; -1 for none."""
     found = np.full(len(xy), -1)
     for k, patch in reversed(list(enumerate(patches))):
         corners = patch.outline[:, :2]
@@ -165,7 +165,7 @@ def _faces(xy: Float[np.ndarray, "n 2"], patches: list[Patch], margin: float) ->
 def _centroid_rows(
     block: Block, points: Int[np.ndarray, "n"], places: Float[np.ndarray, "all 3"], patches: list[Patch], cloud: Cloud
 ) -> ControlRows:
-    """Control in X, Y and Z of points at the middle of roof faces."""
+    """Return control in X, Y and Z of points at the centre of roof faces."""
     parts = [ControlRows.none()]
     for point, face in zip(points, _faces(places[points, :2], patches, 0.0), strict=True):
         if point in block.control.who:

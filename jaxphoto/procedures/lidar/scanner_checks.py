@@ -1,7 +1,7 @@
-"""Whether a cloud can have been measured from a trajectory: by where its points lie about the scanner.
+"""Consistency of a cloud and a trajectory: positions of the points relative to the scanner.
 
-Seen from the body of the aircraft, a scanner's points lie in the same place all along a flight. Those of a trajectory
-of another system, in feet, on another clock or with another yaw do not, and what is adjusted with them means nothing.
+In the body frame, a scanner's points occupy the same region along the whole flight. With a trajectory in another
+system, in feet, on another clock or with another yaw they do not, and an adjustment is meaningless.
 """
 
 import dataclasses
@@ -19,24 +19,24 @@ from jaxphoto.lidar.correction import ScannerPath, scanner_poses
 from jaxphoto.lidar.coverage import CoveredTimes, longest_interval
 from jaxphoto.procedures.lidar.looks import aside
 
-# No airborne laser scanner measures farther (m).
+# Maximum range of an airborne laser scanner (m).
 _FARTHEST_M = 10_000.0
-# So many points are looked at, second by second of those that have so many of them.
+# Number of points examined, second by second.
 _PROBED, _WINDOW_S, _FEWEST = 50_000, 1.0, 20
-# The middle of a second's points may move by so many half widths of the swath, as over water, which reflects nothing;
-# and lie at most so far aside, as a tangent.
+# Allowed motion of the mean of a second's points, in half widths of the swath, as over water without returns; and its
+# maximum across track, as a tangent.
 _WANDERS, _ASIDE = 1.5, 3.0
-# Lines spread less ahead than this part of what they do to the side, and what looks all around spreads more. Of a swath
-# narrower than this part of the height nothing is said.
+# Line patterns spread less than this fraction ahead than across; circular patterns spread more. Swaths narrower than
+# this fraction of the height are not judged.
 _ALIKE, _NARROW = 0.5, 0.02
-# Cosine of the angle between yaw and course: no crab angle leaves less.
+# Cosine of the angle between yaw and course: crab angles leave more.
 _FOLLOWS = 0.7
-# Slower (m/s), a course says nothing.
+# At lower speeds (m/s) the course is undetermined.
 _SLOW = 1.0
-# A jump is that long at least, and so many times what records usually are off.
+# Minimum size of a jump, absolute and relative to the usual scatter of records.
 _JUMP_M, _TIMES = 0.3, 20.0
-# No scanner looks as far ahead as this tangent with most of its returns; a leap that brings them under the trajectory
-# leaves this part of it. So many of them are looked at.
+# Largest mean look-ahead (tangent) of a scanner; a time shift that brings the points under the trajectory leaves at
+# most this fraction of it. Number of points examined.
 _OBLIQUE, _UNDER, _SOME = 0.8, 0.25, 1000
 
 
@@ -44,16 +44,16 @@ class _FromBody(NamedTuple):
     """Tangents of the angles of points to the right and ahead, from the body's nadir."""
 
     middle: Float[np.ndarray, "seconds 2"]
-    """Second by second."""
+    """Mean by second."""
     half_width: Float[np.ndarray, "2"]
-    """Of the points of a second, in the median."""
+    """Median half width of the points of a second."""
 
 
 def check_measured_from(cloud: Cloud, path: ScannerPath, pattern: Pattern | None = None) -> list[str]:
-    """What is odd about where the points of `cloud` lie from the scanner, in sentences.
+    """Return messages about odd positions of the points of `cloud` relative to the scanner.
 
-    Raises BlockError where they cannot have been measured from this trajectory, or lie about the scanner as those of
-    another `pattern` do, where it matters.
+    Raises BlockError if they cannot have been measured from this trajectory, or correspond to another `pattern` where
+    it matters.
     """
     some = _probed(cloud)
     away = np.linalg.norm(cloud.xyz[some] - scanner_poses(path, cloud.time[some]).position, axis=1)  # type: ignore[index]
@@ -88,7 +88,7 @@ def check_measured_from(cloud: Cloud, path: ScannerPath, pattern: Pattern | None
 
 
 def _elsewhere(cloud: Cloud, path: ScannerPath, most: float) -> list[str]:
-    """Strips whose points lie farther aside than `most` (a tangent) in the middle; none where all do."""
+    """Return strips whose mean lies farther across than `most` (a tangent); none if all do."""
     some = _probed(cloud)
     if cloud.strip is None:
         return []
@@ -99,7 +99,7 @@ def _elsewhere(cloud: Cloud, path: ScannerPath, most: float) -> list[str]:
 
 
 def _check_pattern(seen: _FromBody, pattern: Pattern) -> None:
-    """Raise BlockError where the points lie about the scanner as those of another pattern do."""
+    """Raise BlockError if the points correspond to another pattern."""
     right, ahead = seen.half_width
     spread = f"to the side by {right:.2f} of the height and ahead by {ahead:.2f}"
     if right < _ALIKE * ahead:
@@ -121,14 +121,15 @@ def _check_pattern(seen: _FromBody, pattern: Pattern) -> None:
 
 
 def _check_leap_seconds(cloud: Cloud, path: ScannerPath) -> None:
-    """Raise BlockError where the returns lie under the trajectory of some leap seconds before or after, and not under
-    it at their own times."""
+    """Raise BlockError if the returns lie under the trajectory at a shift of some leap seconds, but not at their own
+    times.
+    """
     some = cloud.take(np.linspace(0, len(cloud) - 1, _SOME).astype(int))
     own = np.asarray(some.time)
     covered = CoveredTimes(path.trajectory)
 
     def ahead(shift: float) -> float:
-        """Median tangent of the angle ahead or behind; infinite where the trajectory has few of the shifted times."""
+        """Return the median tangent of the angle ahead; infinite if the trajectory covers few of the shifted times."""
         time = own + shift
         known = np.flatnonzero(covered.covers(time))
         if len(known) < _SOME / 2:
@@ -149,7 +150,7 @@ def _check_leap_seconds(cloud: Cloud, path: ScannerPath) -> None:
 
 
 def _odd_yaw(trajectory: Trajectory) -> list[str]:
-    """Raise BlockError for angles in radians; a sentence where the body flies to another side than ahead."""
+    """Raise BlockError for angles in radians; return a message if the body does not fly ahead."""
     step = np.diff(np.asarray(trajectory.position), axis=0)[:, :2]
     time, forward = np.diff(np.asarray(trajectory.time)), _forward(np.asarray(trajectory.quaternion))[:-1]
     fast = np.linalg.norm(step, axis=1) > _SLOW * time
@@ -171,13 +172,13 @@ def _odd_yaw(trajectory: Trajectory) -> list[str]:
 
 
 def _jumps(trajectory: Trajectory) -> list[str]:
-    """A sentence where positions go on elsewhere from one record to the next, as where GNSS was initialised anew."""
+    """Return a message about jumps of the positions between records, as after a re-initialisation of GNSS."""
     time, position = np.asarray(trajectory.time), np.asarray(trajectory.position)
     between = np.diff(time)[:, None]
     speed = np.diff(position, axis=0) / between
-    # Beside what the steps before and after let expect.
+    # Relative to extrapolation from the steps before and after.
     off = np.linalg.norm((speed[1:-1] - (speed[:-2] + speed[2:]) / 2) * between[1:-1], axis=1)
-    # Over a gap, as of the turn from strip to strip, nothing is expected.
+    # Nothing is expected across a gap, as in the turn between strips.
     gap = between[:, 0] > longest_interval(trajectory)
     off[gap[1:-1] | gap[:-2] | gap[2:]] = 0.0
     k = int(np.argmax(off))
@@ -190,7 +191,7 @@ def _jumps(trajectory: Trajectory) -> list[str]:
 
 
 def _forward(quaternion: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 2"]:
-    """X and Y of the body's y axis, which points ahead."""
+    """Return X and Y of the body's y axis, which points ahead."""
     w, x, y, z = quaternion.T
     return np.column_stack([2 * (x * y - w * z), 1 - 2 * (x**2 + z**2)])
 
@@ -200,7 +201,7 @@ def _probed(cloud: Cloud) -> Int[np.ndarray, "n"]:
 
 
 def _seen(cloud: Cloud, path: ScannerPath) -> _FromBody | None:
-    """None of a swath that is too narrow to say, or of a cloud with few points."""
+    """Return the positions; None for a narrow swath, or for few points."""
     some = _probed(cloud)
     time = cloud.time[some]  # type: ignore[index]
     tangents = aside(cloud, some, path)
@@ -210,7 +211,7 @@ def _seen(cloud: Cloud, path: ScannerPath) -> _FromBody | None:
     parts = [tangents[order[k : k + n]] for k, n in zip(first, number, strict=True) if n >= _FEWEST]
     if not parts:
         return None
-    # From the first tenth to the last: a return from above the scanner is as far aside as can be.
+    # From the first decile to the last: a return above the scanner may be arbitrarily far across.
     low, middle, high = np.stack([np.quantile(part, (0.1, 0.5, 0.9), axis=0) for part in parts], axis=1)
     half_width = np.median((high - low) / 2, axis=0)
     return None if max(half_width) < _NARROW else _FromBody(middle, half_width)

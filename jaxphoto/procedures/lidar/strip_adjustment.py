@@ -1,8 +1,8 @@
-"""Strip adjustment: laser strips fitted to each other where they overlap, by their scanner and their trajectory.
+"""Strip adjustment: laser strips fitted to each other in their overlap, by scanner and trajectory corrections.
 
-Planes are sought in the cells that two strips have in common, and observed to be one (`observations.StripPlanes`);
-scanner and trajectory are corrected, the cloud is computed anew from range, angle and trajectory, and planes are sought
-in it again, until nothing changes.
+Planes common to two strips are found by cells, and observed to coincide (`observations.StripPlanes`); scanner and
+trajectory are corrected, the cloud is recomputed from range, angle and trajectory, and planes are found in it again,
+until convergence.
 """
 
 import dataclasses
@@ -48,35 +48,35 @@ from jaxphoto.unknowns import FIXED
 
 MAX_STRIP_ROUNDS = 10
 PHOTOGRAPHS = "photographs"
-"""What differences call the tie points of photographs beside strips."""
-# From this round on returns stay in their cells: strips fit to their noise by then.
+"""Name of the tie points of photographs in tables of differences."""
+# From this iteration on returns stay in their cells: strips fit to their noise by then.
 _SETTLED = 2
 # Their matrix has 29 GB.
 _MOST_KNOTS = 10_000
 
 
 class StripRound(NamedTuple):
-    """One adjustment, and what it changed."""
+    """One iteration."""
 
     number: int
     planes: int
-    """Observed; of all that fit at most `StripSettings.most`."""
+    """Number observed; at most `StripSettings.most` of those that fit."""
     points: int
-    """Tie points of photographs observed to lie on a plane; one that lies on those of two strips counts twice."""
+    """Tie points of photographs observed to lie on a plane; one on planes of two strips counts twice."""
     control: int
     """Surveyed points observed likewise."""
     left_out: int
-    """Planes and points that did not fit."""
+    """Rejected planes and points."""
     rms_m: float
-    """Of the gaps of all planes that fit, before this adjustment; no number of one strip."""
+    """Of the gaps of all fitting planes, before this adjustment; NaN for one strip."""
     largest_change: float
-    """Of an unknown of scanner, trajectory and cameras, in standard deviations."""
+    """Of the unknowns of scanner, trajectory and cameras, in standard deviations."""
 
 
 class StripDifference(NamedTuple):
-    """Two strips where they overlap, or points over the planes of a strip, before and after.
+    """Difference of two strips in their overlap, or of points and the planes of a strip, before and after.
 
-    Points are tie points of photographs, control or check points: `one` says which.
+    Points are tie points of photographs, control or check points: named in `one`.
     """
 
     one: str
@@ -84,35 +84,35 @@ class StripDifference(NamedTuple):
     planes_before: int
     planes: int
     mean_before_m: float
-    """Of the gaps along the normals of the planes that fit, by which the first lies above the other."""
+    """Mean gap along the normals of fitting planes: the first above the other."""
     rms_before_m: float
     mean_m: float
     rms_m: float
     noise_m: float
-    """What the roughness of the planes lets expect of `rms_m` where nothing else is wrong; of tie points, at most."""
+    """Expected `rms_m` from the roughness of the planes alone; for tie points an upper bound."""
 
 
 class StripAdjustment(eqx.Module):
-    """Strips after their adjustment, and before."""
+    """Strips before and after their adjustment."""
 
     before: Adjustment | None
-    """The photographs alone, their interior orientation held; None without any."""
+    """Adjustment of the photographs alone, with fixed interior orientation; None without photographs."""
     adjusted: Adjustment
     covariance: Covariance
     cloud: Cloud
-    """Corrected, with all that it had."""
+    """Corrected, with all fields."""
     trajectory: Trajectory | None
     """Corrected."""
     errors: StripErrors
-    """What was taken off."""
+    """Errors that were removed."""
     differences: tuple[StripDifference, ...]
     rounds: tuple[StripRound, ...]
     still: bool
-    """Whether nothing changed any more at the end."""
+    """True if the iteration converged."""
     odd: tuple[str, ...] = ()
-    """What is odd about cloud and trajectory, in sentences."""
+    """Messages about inconsistencies of cloud and trajectory."""
     surveyed: tuple[SurveyedGap, ...] = ()
-    """Control and check points, each over the plane of each strip that has one."""
+    """Control and check points, each above the plane of each strip that has one."""
 
 
 def adjust_strips(
@@ -129,25 +129,24 @@ def adjust_strips(
 ) -> StripAdjustment:
     """Adjust the strips of `cloud`; `trajectory` is that of its scanner, on the cloud's clock.
 
-    Standard deviations that it states are those of its errors, in place of those of `settings`; zero states none.
+    Standard deviations stated by the trajectory replace those of `settings`; zero states none.
 
-    `photographs` that were taken on it are adjusted with them: their exposures have the trajectory's errors, and their
-    tie points lie on the planes of the strips, those on breaklines on both that meet there. What of their cameras and
-    mounts is estimated their block says; its stations and attitudes are taken for the trajectory's.
+    `photographs` taken on it are adjusted as well: their exposures have the trajectory's errors, and their tie points
+    lie on the planes of the strips, those on breaklines on both faces. Their block defines the unknowns of cameras and
+    mounts; its stations and attitudes are taken to be the trajectory's.
 
-    `control` are surveyed points on smooth surfaces, in the cloud's system (m): where strips have planes about them,
-    these go through them. Its check points are compared alone. Without a trajectory it is the datum, too.
+    `control` are surveyed points on smooth surfaces, in the cloud's system (m): strips with planes about them pass
+    through them. Its check points are only compared. Without a trajectory it is the datum, too.
 
-    `priors` are those of the scanner and say its pattern; by default lines, its boresight FREE and all else FIXED. Of
-    one that looks all around, what a strip saw ahead and behind is compared, too. The trajectory of strips
-    named in `held` is right, or that of all. Without a trajectory each strip has a shift alone, and the first is held
-    where none is named, in the directions that control does not tell.
+    `priors` are those of the scanner and include its pattern; by default lines, its boresight FREE and all else FIXED.
+    For circular patterns, forward and backward looks of a strip are compared, too. The trajectory of strips named in
+    `held` is fixed, or that of all. Without a trajectory each strip has only a shift, and the first is fixed if none is
+    named, in the directions that control does not determine.
 
     Raises InputError for a cloud of one strip without control, of strips without points or without the times that a
-    trajectory needs, for a time offset of a scanner that looks all around and for control without heights or standard
-    deviations;
-    BlockError for strips that no plane joins, for control that lies elsewhere and for a trajectory that does not cover
-    the cloud or the exposures; and as `jaxphoto.adjust`.
+    trajectory needs, for a time offset of a circular scanner and for control without heights or standard deviations;
+    BlockError for strips without common planes, for control away from them and for a trajectory that does not cover the
+    cloud or the exposures; and what `jaxphoto.adjust` raises.
     """
     settings = StripSettings() if settings is None else settings
     if trajectory is None and priors is not None:
@@ -179,7 +178,7 @@ def adjust_strips(
     if control is not None:
         block, number = with_control(empty_block("strips and control") if images is None else images, control)
     if trajectory is None:
-        # With control its datum, below, is in place of a strip.
+        # With control, its datum below replaces that of a strip.
         right = held if held or control is not None else names[:1]
         block = strip_block(names, splines, right, sigmas, None, block)
     else:
@@ -206,7 +205,7 @@ def adjust_strips(
         lying = (StripPoints.joined(*points, *given),) if points or given else ()
         posed = dataclasses.replace(block, more=(*block.more, planes, *lying, *steps))
         adjusted = adjust(posed, posed.start.unknowns)
-        # With rows, as nobody knows which round is the last: its covariance serves the tables of the result, too.
+        # With rows, because any iteration may be the last: its covariance also serves the tables of the result.
         known = covariance(adjusted, rows=True)
         now = np.asarray(adjusted.values.shared)[adjusted.structure.free]
         counted = len(planes), sum(map(len, points)), sum(map(len, given))
@@ -235,7 +234,7 @@ def adjust_strips(
                 (*odd, *(() if ties is None else ties.unseen(on, adjusted.block.points))),
                 () if control is None else surveyed_gaps(control, met, errors, path, adjusted, known),
             )
-        # Of a large flight gigabytes, which the next round needs.
+        # For a large flight gigabytes, which the next iteration needs.
         del adjusted, known
 
 
@@ -269,7 +268,7 @@ def _check(
 
 
 def _spans(cloud: Cloud) -> Float[np.ndarray, "strips 2"]:
-    """First and last time of each strip (s)."""
+    """Return first and last time of each strip (s)."""
     time = times_of(cloud)
     own = [time[cloud.strip == k] for k in range(len(cloud.strips))]
     return np.array([(t.min(), t.max()) for t in own])
@@ -303,12 +302,12 @@ def _round(
 
 
 def _of(search: PointSearch, adjusted: Adjustment, known: Covariance) -> tuple[np.ndarray, np.ndarray]:
-    """Where its points are (m), as adjusted, and their covariances."""
+    """Return adjusted positions of points (m), and their covariances."""
     return np.asarray(adjusted.unknowns.points)[search.points], np.asarray(known.points)[search.points]
 
 
 def _change(moved: Float[np.ndarray, "unknowns"], known: Covariance) -> float:
-    """The largest change of an unknown, in standard deviations."""
+    """Return the largest change of an unknown, in standard deviations."""
     sigma = np.asarray(known.shared_sigma)
     return float(np.max(np.abs(moved)[sigma > 0] / sigma[sigma > 0], initial=0.0))
 
@@ -324,7 +323,7 @@ def _differences(before: Sequence[CommonPlanes], after: Sequence[CommonPlanes]) 
 def _point_differences(
     what: str, before: Sequence[PointPlanes], after: Sequence[PointPlanes]
 ) -> tuple[StripDifference, ...]:
-    """Of points over the planes of each strip."""
+    """Return the differences of points and planes, by strip."""
     rows = []
     for was, now in zip(before, after, strict=True):
         if now.fits.any():

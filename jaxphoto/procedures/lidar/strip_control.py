@@ -1,7 +1,7 @@
-"""Surveyed points on smooth surfaces, which the planes of strips meet: the datum that strips do not tell each other.
+"""Surveyed points on smooth surfaces of strips: the datum that strips cannot provide themselves.
 
-A point is one of the block, with its coordinates observed once however many strips have it: what the survey is off by
-is the same for all of them.
+A point belongs to the block, with its coordinates observed once for any number of strips: its survey error is common to
+all of them.
 """
 
 import dataclasses
@@ -23,30 +23,32 @@ from jaxphoto.procedures.lidar.tie_point_search import PointPlanes, PointSearch
 from jaxphoto.unknowns import FIXED, Weighted
 
 CONTROL, CHECK = "control", "check points"
-"""What differences call surveyed points beside strips."""
-# No strip is farther (m) from control in its system; heights of another one, or in feet, mostly are.
+"""Names of surveyed points in tables of differences."""
+# Maximum distance (m) of a strip from control in its system; usually exceeded by heights of another system, or feet.
 _FAR_M = 10.0
-# From here on distances are said in kilometres (m).
+# Distances are given in kilometres from here on (m).
 _KILOMETRES = 10_000.0
-# Of a strip that is right in some directions and free in the others (m): small and large beside what control tells.
+# Prior sigmas of a strip, fixed in some directions and free in the others (m): small and large compared with control.
 _RIGHT_M, _FREE_M = 1e-3, 100.0
-# Of the shift that most control has in common: turns of reweighting, standard deviations below which gaps weigh alike,
-# and what part of the best told direction is not told.
+# Of the common shift of most control: iterations of reweighting, standard deviations below which gaps have equal
+# weight, and fraction of the best-determined direction that is undetermined.
 _TURNS, _SMALL, _UNTOLD = 30, 0.1, 0.01
-# In standard deviations of the survey, within which two surveys of a point are one.
+# In standard deviations of the survey: two surveys within this limit belong to one point.
 _SAME = 4.0
 _NO_MARKS = Marked(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
 
 
 class OnStrips(NamedTuple):
-    """The surveyed points over planes of each look; check points all fit, because nothing follows from them."""
+    """Surveyed points above planes of each look; check points all fit, because nothing follows from them."""
 
     control: list[PointPlanes]
     check: list[PointPlanes]
 
 
 class ControlSearch:
-    """Searches about surveyed places, which stay; `number` is that of each point in the block, -1 of check points."""
+    """Searches about surveyed places, which stay; `number` is the index of each point in the block, -1 for check
+    points.
+    """
 
     def __init__(self, search: StripSearch, control: SurveyedPoints, number: Int[np.ndarray, "points"]) -> None:
         self.search, self.control = search, control
@@ -55,10 +57,10 @@ class ControlSearch:
         self._spread = variances[:, :, None] * np.eye(3)
 
     def look(self, settled: bool) -> OnStrips:
-        """The planes about the points, in the strips as the other search corrected them last."""
+        """Return the planes about the points, in the strips as last corrected by the other search."""
         seen = self._points.look(self.control.coordinates, self._spread, settled)
         control = [_of(f, ~self.control.check[f.found.point]) for f in seen]
-        # Of all strips together: a few points of one strip do not say which of them is a blunder.
+        # All strips together: a few points of one strip do not show which of them is a blunder.
         found = [(f.patches.normal[f.found.patch], f.found.gap, f.sigma) for f in control]
         normal, gap, sigma = (np.concatenate(v) for v in zip(*found, strict=True))
         fit = fitting(_without_shift(normal, gap, sigma), sigma, self.search.settings.outlier)
@@ -70,15 +72,15 @@ class ControlSearch:
         )
 
     def rows(self, seen: OnStrips, errors: StripErrors) -> tuple[StripPoints, ...]:
-        """The control that fits as observations: one group of them, where there are any."""
+        """Return the fitting control as observations: one group, if there are any."""
         return self._points.rows(seen.control, errors)
 
 
 def with_control(block: Block, control: SurveyedPoints) -> tuple[Block, Int[np.ndarray, "points"]]:
-    """`block` with the control observed, and which of its points each is; -1 of check points, which it does not need.
+    """Return `block` with the control observed, and the index of each; -1 for check points, which it does not need.
 
-    Control of the block by the same name is the same point, and its survey counts once. Raises InputError for points
-    without a height or a standard deviation, and for other points of the block by the same name.
+    Control of the block with the same name is the same point, surveyed once. Raises InputError for points without a
+    height or a standard deviation, and for other points of the block with the same name.
     """
     check_complete(control)
     again = _again(block, control)
@@ -105,7 +107,7 @@ def check_complete(control: SurveyedPoints) -> None:
 
 
 def check_seen(control: SurveyedPoints, seen: OnStrips, search: StripSearch) -> None:
-    """Raise BlockError for surveyed points that lie elsewhere than the strips, in plan or in height."""
+    """Raise BlockError for surveyed points away from the strips, in plan or in height."""
     gap = np.concatenate([f.found.gap for f in (*seen.control, *seen.check)])
     settings = search.settings
     if not len(gap):
@@ -132,16 +134,16 @@ def check_seen(control: SurveyedPoints, seen: OnStrips, search: StripSearch) -> 
 
 
 def with_datum(block: Block, strip: str, seen: OnStrips, settings: StripSettings) -> Block:
-    """`block` of shifts alone, where `strip` is right in the directions that control does not tell.
+    """Return `block` of shifts alone, with `strip` fixed in the directions that control does not determine.
 
-    These are those that it tells worse than a trajectory would: control on level ground says nothing of X and Y.
+    These are determined worse than by a trajectory: control on level ground says nothing about X and Y.
     """
     found = [(f.patches.normal[f.found.patch[f.fits]], f.sigma[f.fits]) for f in seen.control]
     normal, sigma = (np.concatenate(v) for v in zip(*found, strict=True))
     weighed = normal / sigma[:, None]
     known, axes = np.linalg.eigh(weighed.T @ weighed)
     told = known > settings.sigma_position_m**-2
-    # At least the direction that control tells best, where there is any.
+    # At least the direction that control determines best, if there is any.
     told[-1] = len(sigma) > 0
     if told.all():
         return block
@@ -161,14 +163,14 @@ def _far(metres: float) -> str:
 def _without_shift(
     normal: Float[np.ndarray, "n 3"], gap: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n"]:
-    """Gaps without the shift (of least absolute deviations) that most of them have in common.
+    """Return gaps without their most common shift (of least absolute deviations).
 
-    It is also what a blunder among few points has pulled strips by.
+    It includes the effect of a blunder among few points on the strips.
     """
     off = gap
     for k in range(_TURNS):
         weight = 1 / np.sqrt(sigma * (np.maximum(np.abs(off), _SMALL * sigma) if k else sigma))
-        # Directions that next to nothing tells stay as they are.
+        # Directions that are hardly determined stay unchanged.
         shift = np.linalg.lstsq(normal * weight[:, None], gap * weight, rcond=_UNTOLD)[0]
         off = gap - normal @ shift
     return off
@@ -180,7 +182,7 @@ def _of(seen: PointPlanes, chosen: Bool[np.ndarray, "n"]) -> PointPlanes:
 
 
 def _again(block: Block, control: SurveyedPoints) -> Bool[np.ndarray, "points"]:
-    """Which control is that of the block, too. Raises InputError for names that are those of other points there."""
+    """Return which control also belongs to the block. Raises InputError for names of other points there."""
     place, again = {name: k for k, name in enumerate(block.points)}, np.zeros(len(control.ids), bool)
     surveyed = [(rows.who, rows.axis, np.asarray(rows.value)) for rows in (block.control, block.fixed)]
     who, axis, value = (np.concatenate(v) for v in zip(*surveyed, strict=True))

@@ -1,4 +1,4 @@
-"""The observations of a strip adjustment: planes of two strips, and how a trajectory's error goes on."""
+"""Observations of a strip adjustment: planes of two strips, and steps of trajectory errors."""
 
 from typing import NamedTuple
 
@@ -16,9 +16,9 @@ from jaxphoto.observations import AttitudeSteps, PositionSteps, StripPlanes
 from jaxphoto.procedures.lidar.strip_unknowns import KnotSigmas
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 
-# Steps towards the measured point of a corrected one: each leaves a part of it as small as the corrections are.
+# Iterations from a corrected point to the measured one: each reduces the error by a factor of the corrections' size.
 _STEPS = 2
-# An odd multiplier (Knuth) that scatters neighbouring numbers over all of 64 bits.
+# Odd multiplier (Knuth) that scatters neighbouring integers over 64 bits.
 _SCATTER = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -42,14 +42,14 @@ def side_of(
     errors: StripErrors,
     path: ScannerPath | None,
 ) -> Side:
-    """The places `foot` (m, corrected by `errors`) of patches of a strip as it measured them, and from where."""
+    """Return the places `foot` (m, corrected by `errors`) of patches as measured, and the scanner poses."""
     time = patches.time[which]
     knots, weights = errors.splines[strip].weights(time)
     point = foot + patches.measured[which] - patches.mean[which]
     for _ in range(_STEPS):
         point = point - (corrected_strip(point, time, strip, errors, path) - foot)
     if path is None or not len(time):
-        # From straight above: nothing that would turn the shot is estimated.
+        # From vertically above: nothing that rotates the shot is estimated.
         none = np.zeros_like(point)
         return Side(knots, weights, point, point + np.array([0.0, 0.0, 1.0]), none, none, none)
     poses = scanner_poses(path, time)
@@ -58,16 +58,16 @@ def side_of(
 
 
 def plane_rows(pairs: PlanePairs, a: Side, b: Side) -> StripPlanes:
-    """The planes that two strips have in common, as observations."""
+    """Return planes common to two strips as observations."""
     of_a = {f"{name}_a": v for name, v in a._asdict().items()}
     of_b = {f"{name}_b": v for name, v in b._asdict().items()}
     return StripPlanes(**of_a, **of_b, normal=pairs.normal, sigma=pairs.sigma, gap=np.zeros(len(pairs.gap)))
 
 
 def thinned(normal: Float[np.ndarray, "n 3"], cell: Int[np.ndarray, "n"], most: int) -> np.ndarray:
-    """Which planes to take where there are more than `most`: half of them steep ones if there are, else by chance.
+    """Select at most `most` planes: half of them steep ones if possible, otherwise at random.
 
-    Chance is the cell's, so that the same are taken of nearly the same planes.
+    Randomness depends on the cell, so that nearly equal planes give the same selection.
     """
     tells = steep(normal)
     order = np.argsort(cell.astype(np.uint64) * _SCATTER, kind="stable")
@@ -79,14 +79,14 @@ def thinned(normal: Float[np.ndarray, "n 3"], cell: Int[np.ndarray, "n"], most: 
 def step_rows(
     splines: tuple[StripSpline, ...], sigmas: KnotSigmas, settings: StripSettings
 ) -> tuple[PositionSteps, AttitudeSteps]:
-    """From knot to knot of every strip, so that every knot has its own standard deviation beforehand."""
+    """Return steps from knot to knot of every strip, so that every knot has its a priori standard deviation."""
     start = np.concatenate([s.first + np.arange(s.size - 1) for s in splines])
     apart = np.concatenate([np.full(s.size - 1, s.interval) for s in splines])
     kept = np.exp(-apart / settings.correlation_s)
     part, none = kept[:, None] ** 2, np.zeros((len(start), 3))
 
     def new(sigma: Float[np.ndarray, "knots 3"]) -> Float[np.ndarray, "steps 3"]:
-        # Where errors become smaller faster than they are forgotten something new comes in all the same.
+        # If errors decrease faster than their correlation decays, new variance still enters.
         before, after = sigma[start] ** 2, sigma[start + 1] ** 2
         return np.sqrt(np.maximum(after - part * before, (1 - part) * np.minimum(before, after)))
 

@@ -1,4 +1,4 @@
-"""Looking for planes that two strips have in common, in the cloud as it is corrected so far."""
+"""Search for common planes of two strips, in the cloud as corrected so far."""
 
 import dataclasses
 import itertools
@@ -20,14 +20,14 @@ from jaxphoto.observations import StripPlanes
 from jaxphoto.procedures.lidar.looks import Look, looks_of
 from jaxphoto.procedures.lidar.strip_rows import plane_rows, side_of, thinned
 
-# Fewer planes of a pair of strips are chance.
+# Fewer planes of a pair of strips occur by chance.
 _FEWEST = 10
-# No trajectory makes strips lie farther from one another (m); heights of two systems, or in feet, mostly do.
+# Larger distances between strips (m) are not due to a trajectory; usually heights in two systems, or in feet.
 _APART_M = 10.0
 
 
 class CommonPlanes(NamedTuple):
-    """The planes of two strips, and which of them fit."""
+    """Planes of two strips, and which of them fit."""
 
     one: Look
     other: Look
@@ -37,10 +37,10 @@ class CommonPlanes(NamedTuple):
 
 
 class StripSearch:
-    """Searches that follow one another: returns stay in the cells in which they were when `settled`.
+    """Successive searches: once `settled`, returns stay in their cells.
 
-    With each correction some return would else leave its cell, and another come: a scatter that is part of the
-    unknowns' standard deviations, but would never come to rest.
+    Otherwise with each correction some return would leave its cell, and another enter: scatter within the unknowns'
+    standard deviations, but without convergence.
     """
 
     def __init__(
@@ -50,10 +50,10 @@ class StripSearch:
         self.looks = looks_of(cloud, path, pattern)
         self.cells: list[np.ndarray] = []
         self.corrected: list[np.ndarray] = []
-        """The returns of each look as the last search found them."""
+        """Returns of each look as corrected in the last search."""
 
     def look(self, errors: StripErrors, settled: bool) -> list[CommonPlanes]:
-        """The planes of every two strips that have some; of a strip with two looks, those of both."""
+        """Return the planes of every pair of strips; for a strip with two looks, those of both."""
         patches, cells, corrected = [], [], []
         for k, own in enumerate(self.looks):
             measured, time = self.cloud.xyz[own.returns], times_of(self.cloud)[own.returns]
@@ -67,7 +67,7 @@ class StripSearch:
 
     @property
     def corrected_cloud(self) -> Cloud:
-        """The cloud as the last search found it; all its other fields are kept."""
+        """Return the cloud as corrected in the last search; all its other fields are kept."""
         xyz = np.empty_like(self.cloud.xyz)
         for own, corrected in zip(self.looks, self.corrected, strict=True):
             xyz[own.returns] = corrected
@@ -81,7 +81,7 @@ class StripSearch:
         return CommonPlanes(self.looks[one], self.looks[other], (patches[one], patches[other]), pairs, fits)
 
     def rows(self, seen: Sequence[CommonPlanes], errors: StripErrors) -> StripPlanes:
-        """The planes that fit as observations, `most` of them shared out among the pairs of strips."""
+        """Return the fitting planes as observations, at most `most`, distributed over the pairs of strips."""
         total, parts = sum(int(f.fits.sum()) for f in seen), []
         for f in seen:
             own = np.flatnonzero(f.fits)
@@ -95,7 +95,7 @@ class StripSearch:
 
 
 def check_joined(names: Sequence[str], seen: Sequence[CommonPlanes]) -> None:
-    """Raise BlockError for a strip that no plane joins to another, or that lies in another system than another."""
+    """Raise BlockError for a strip without a common plane, or in another coordinate system."""
     apart = [found for found in seen if found.one.strip != found.other.strip]
     joined = {look.strip for found in apart for look in (found.one, found.other)}
     alone = [name for k, name in enumerate(names) if k not in joined]

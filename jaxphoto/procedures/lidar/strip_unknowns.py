@@ -1,4 +1,4 @@
-"""The unknowns of a strip adjustment: knots of every strip's trajectory, boresight and calibration of the scanner."""
+"""Unknowns of a strip adjustment: trajectory knots of every strip, boresight and calibration of the scanner."""
 
 import dataclasses
 from collections.abc import Collection, Sequence
@@ -24,11 +24,11 @@ from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
 
 _ZERO = np.zeros(3)
 NO_CALIBRATION = ScannerCalibration(_ZERO, *[np.zeros(())] * 3, np.zeros(2), np.zeros(()))  # type: ignore[arg-type, call-arg]
-"""A scanner that is right."""
+"""Scanner without errors."""
 
 
 class KnotSigmas(NamedTuple):
-    """What the trajectory may be off by at each knot of all strips."""
+    """Standard deviations of the trajectory errors at each knot of all strips."""
 
     position: Float[np.ndarray, "knots 3"]
     """Along X, Y and Z (m)."""
@@ -37,13 +37,13 @@ class KnotSigmas(NamedTuple):
 
 
 def knot_sigmas(splines: Sequence[StripSpline], trajectory: Trajectory | None, settings: StripSettings) -> KnotSigmas:
-    """Those that the trajectory states, and those of the settings where it states none (zero)."""
+    """Return those stated by the trajectory, or those of the settings where it states none (zero)."""
     times = np.concatenate([spline.times for spline in splines])
     position = np.full((len(times), 3), settings.sigma_position_m)
     attitude = np.tile(settings.sigma_attitude, (len(times), 1))
     if trajectory is None:
         return KnotSigmas(position, attitude)
-    # Of roll, pitch and yaw, which are turns about forward, right and up.
+    # Of roll, pitch and yaw, which are rotations about forward, right and up.
     stated = np.asarray(trajectory.sigma_position), np.asarray(trajectory.sigma_attitude)[:, [1, 0, 2]]
     for own, sigmas in zip((position, attitude), stated, strict=True):
         for axis, column in enumerate(sigmas.T):
@@ -53,14 +53,14 @@ def knot_sigmas(splines: Sequence[StripSpline], trajectory: Trajectory | None, s
 
 
 class ScannerPriors(NamedTuple):
-    """What is known of the scanner beforehand: FREE, FIXED or Weighted, each."""
+    """Priors of the scanner: FREE, FIXED or Weighted, each."""
 
     boresight: Any = FREE
     calibration: ScannerCalibration = ScannerCalibration(*[FIXED] * len(dynamic_fields(ScannerCalibration)))  # type: ignore[arg-type]
 
     @property
     def right(self) -> bool:
-        """Whether nothing of the scanner is estimated."""
+        """Return True if nothing of the scanner is estimated."""
         calibration = (getattr(self.calibration, name) for name in dynamic_fields(ScannerCalibration))
         return all(prior == FIXED for prior in (self.boresight, *calibration))
 
@@ -73,11 +73,11 @@ def strip_block(
     priors: ScannerPriors | None,
     photographs: Block | None = None,
 ) -> Block:
-    """A block of these unknowns, all zero, and those of `photographs`; without any, of these alone.
+    """Create a block of these unknowns, all zero, added to `photographs` if given.
 
-    The first knot of each strip is known to the trajectory's sigma.
+    The first knot of each strip has the trajectory's sigma as prior.
 
-    Without `priors` strips have a shift alone, which is free. The trajectory of strips that are `held` is right.
+    Without `priors` strips have only a shift, which is free. The trajectory of strips in `held` is fixed.
     """
     knots: dict[str, AbstractParameters] = {}
     known: dict[str, AbstractParameters] = {}
@@ -105,7 +105,7 @@ def strip_block(
 
 
 def errors_of(unknowns: Unknowns, splines: tuple[StripSpline, ...]) -> StripErrors:
-    """What the strips are off by, by the unknowns of `strip_block`."""
+    """Return the strip errors for the unknowns of `strip_block`."""
     knots = unknowns.more[TrajectoryKnot.kind].values()
     position, attitude = (np.array([getattr(k, name) for k in knots], float) for name in ("position", "attitude"))
     calibration: Any = unknowns.more.get(ScannerCalibration.kind, {"": NO_CALIBRATION})[""]

@@ -1,12 +1,12 @@
-"""By how much each surveyed point lies off each strip after the adjustment, and what is to be expected of it.
+"""Gap between each surveyed point and each strip after the adjustment, with its expected scatter.
 
-A gap g = n . (X - F') of a surveyed place X over the foot F' on the plane of a strip has the variance s^2 of plane and
-survey, and F' moves with the unknowns x, of covariance C, by a = d(n . F')/dx. What was adjusted has gone along with
-its own errors, what was not has not:
+A gap g = n . (X - F') of a surveyed place X above the foot F' on the plane of a strip has the variance s^2 of plane and
+survey, and F' depends on the unknowns x, of covariance C, by a = d(n . F')/dx. Adjusted observations have absorbed part
+of their errors, others have not:
 
-    var(g) = s^2 - a C a'    of control that was used,        s^2 + a C a'    of check points, and control left out
+    var(g) = s^2 - a C a'    for adjusted control,        s^2 + a C a'    for check points, and rejected control
 
-and g over its standard deviation is the test value w (Baarda 1968), which is Gaussian where nothing is wrong.
+and g over its standard deviation is the test value w (Baarda 1968), standard normal without errors.
 """
 
 from typing import Literal, NamedTuple
@@ -29,30 +29,30 @@ from jaxphoto.procedures.lidar.strip_rows import Side, side_of
 from jaxphoto.procedures.lidar.tie_point_search import PointPlanes
 from jaxphoto.statistics import Covariance
 
-# Parts of its noise below which an adjusted gap says nothing: nothing else tells what it does.
+# Fractions of its noise below which an adjusted gap is uninformative: nothing else checks it.
 _UNTESTED = 1e-3
 
 
 class SurveyedGap(NamedTuple):
-    """A surveyed point over the plane of a strip."""
+    """Surveyed point above the plane of a strip."""
 
     point: str
     role: Literal["control", "check"]
     strip: str
     dX_m: float
-    """Surveyed less the nearest place on the plane of the strip, corrected."""
+    """Surveyed minus the nearest place on the plane of the strip, corrected."""
     dY_m: float
     dZ_m: float
     gap_m: float
-    """Their length, positive where the point lies above."""
+    """Their length, positive if the point lies above."""
     noise_m: float
     """Of plane and survey."""
     sigma_m: float
     """Of `gap_m`, a priori."""
     w: float
-    """gap / sigma; no number where nothing checks it."""
+    """gap / sigma; NaN if nothing checks it."""
     used: bool
-    """Whether it is in the adjustment."""
+    """True if it is in the adjustment."""
 
 
 def surveyed_gaps(
@@ -63,7 +63,7 @@ def surveyed_gaps(
     adjusted: Adjustment,
     known: Covariance,
 ) -> tuple[SurveyedGap, ...]:
-    """Of each surveyed point in each strip that has a plane about it; `errors` are those that were adjusted."""
+    """Return the gaps of surveyed points for each strip with a plane about them; `errors` are the adjusted ones."""
     found: list[SurveyedGap] = []
     roles: tuple[tuple[Literal["control", "check"], list[PointPlanes]], ...]
     roles = (("control", met.control), ("check", met.check))
@@ -85,14 +85,14 @@ def surveyed_gaps(
 def _moves(
     f: PointPlanes, errors: StripErrors, path: ScannerPath | None, adjusted: Adjustment, known: Covariance
 ) -> Float[np.ndarray, "n"]:
-    """a C a', a priori."""
+    """Return a C a', a priori."""
     side = side_of(f.patches, f.found.patch, f.found.foot, f.look.strip, errors, path)
     off = np.concatenate([errors.position, errors.attitude], axis=1)[side.knots]
     off = np.einsum("nk,nkc->nc", side.weights, off)
     normal = f.patches.normal[f.found.patch]
     by_knots, *by_scanner = call_compiled(_slopes, side, normal, off, errors.boresight, errors.calibration)
     place = {label: k for k, label in enumerate(adjusted.structure.labels)}
-    # What is held has no place, and moves nothing.
+    # Fixed unknowns have no place, and contribute nothing.
     a = np.zeros((len(normal), len(place) + 1))
     knot = TrajectoryKnot(np.zeros(3), np.zeros(3))  # type: ignore[arg-type]
     owners, rows = list(adjusted.unknowns.more[TrajectoryKnot.kind]), np.arange(len(normal))
@@ -114,7 +114,7 @@ def _slopes(
     boresight: Float[Array, "3"],
     calibration: ScannerCalibration,
 ) -> tuple[Float[Array, "n 6"], Float[Array, "n 3"], Float[Array, "n calibrated"]]:
-    """By how much the foot rises along the normal with the trajectory's error, the boresight and the rest."""
+    """Differentiate the height of the foot along the normal by the trajectory's error, the boresight and the rest."""
     numbers, back = ravel_pytree(calibration)
 
     def height(off, boresight, numbers, normal, point, position, angles, velocity, rate):

@@ -1,4 +1,4 @@
-"""Looking for the planes that strips have about points, in the cloud as it is corrected so far."""
+"""Search for planes of strips about points, in the cloud as corrected so far."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -19,22 +19,21 @@ from jaxphoto.procedures.lidar.strip_search import StripSearch
 
 
 class PointPlanes(NamedTuple):
-    """The points that lie over planes of one strip, and which of them fit."""
+    """Points above planes of one strip, and which of them fit."""
 
     look: Look
     patches: StripPatches
     found: PointsOnPlanes
-    """Its points are numbers among `PointSearch.points`."""
+    """Its points are indices of `PointSearch.points`."""
     sigma: Float[np.ndarray, "n"]
-    """Of the gaps, by plane and point (m)."""
+    """Standard deviation of the gaps, from plane and point (m)."""
     fits: Bool[np.ndarray, "n"]
 
 
 class PointSearch:
-    """Searches that follow one another: returns stay about their points when `settled`, as those of `StripSearch`.
+    """Successive searches: once `settled`, returns stay with their points, as in `StripSearch`.
 
-    `points` are the numbers in the block of the points looked for: of those `on_planes`, and of each of those
-    `on_breaklines` twice, for the two faces that meet there.
+    `points` are block indices: of the points `on_planes`, and twice of those `on_breaklines`, for both faces.
     """
 
     def __init__(
@@ -51,7 +50,9 @@ class PointSearch:
     def look(
         self, place: Float[np.ndarray, "points 3"], spread: Float[np.ndarray, "points 3 3"], settled: bool
     ) -> list[PointPlanes]:
-        """The planes about points (m) with these covariances, in the strips as the other search corrected them last."""
+        """Return the planes about points (m) with these covariances, in the strips as last corrected by the other
+        search.
+        """
         search, about, seen = self.search, [], []
         for k, (own, xyz) in enumerate(zip(search.looks, search.corrected, strict=True)):
             about.append(self.about[k] if settled else self._about(xyz, place))
@@ -67,13 +68,13 @@ class PointSearch:
         return seen
 
     def _about(self, xyz: Float[np.ndarray, "n 3"], place: Float[np.ndarray, "points 3"]) -> tuple[np.ndarray, ...]:
-        """Returns about each point, or of its face, and which point each is about."""
+        """Return the returns about each point, or of its face, and the point of each."""
         index, point = returns_about(xyz, place[: self._plain], self.search.settings)
         of_faces, face = faces_about(xyz, place[self._plain :: 2], self.search.settings)
         return np.concatenate([index, of_faces]), np.concatenate([point, self._plain + face])
 
     def unseen(self, seen: Sequence[PointPlanes], names: Sequence[str]) -> list[str]:
-        """That points on breaklines have no faces in any strip, in a sentence; `names` are those of the block."""
+        """Return a message if points on breaklines have no faces in any strip; `names` are those of the block."""
         lines = self.points[self._plain :: 2]
         number = np.concatenate([f.found.point[f.found.point >= self._plain] for f in seen])
         out = np.setdiff1d(np.arange(len(lines)), (number - self._plain) // 2)
@@ -86,7 +87,7 @@ class PointSearch:
         ]
 
     def rows(self, seen: Sequence[PointPlanes], errors: StripErrors) -> tuple[StripPoints, ...]:
-        """The points that fit as observations: one group of them, where there are any."""
+        """Return the fitting points as observations: one group, if there are any."""
         of_strips = []
         for f in (f for f in seen if f.fits.any()):
             found = PointsOnPlanes(*(v[f.fits] for v in f.found))

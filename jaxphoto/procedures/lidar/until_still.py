@@ -1,4 +1,4 @@
-"""Adjusting again and again with lidar observations that follow from the result, until nothing changes."""
+"""Outer iterations: adjustments with lidar observations that depend on the result, to convergence."""
 
 import dataclasses
 import warnings
@@ -19,44 +19,44 @@ from jaxphoto.unknowns import FIXED, Unknowns
 
 MAX_ROUNDS = 20
 STILL = 0.1
-"""Nothing changes any more where no unknown moves by more than this part of its standard deviation.
+"""Converged if no unknown moves by more than this fraction of its standard deviation.
 
-Less may never come: with each move some laser point becomes a neighbour, and another ceases to be one.
+Smaller limits may never be reached: with each motion some laser point becomes a neighbour, and another ceases to be.
 """
-# A point farther from the surface, in standard deviations, is no point of it; it is tried again in the next round.
+# A point farther from the surface, in standard deviations, is rejected; it is tried again in the next iteration.
 _OUTLIER = 4.0
-# In one round only those are left out that are so near to the largest.
+# Per iteration only those are rejected that are this close to the largest.
 _LARGEST = 0.5
-# After this round, because before it the orientation may be far off; and after that one with a last word.
+# First iteration with rejection, because the orientation may be inaccurate before; last one that may reject.
 _JUDGED, _SETTLED = 2, 5
-# Observations that differ by less, in standard deviations, are the same; after so many rounds nobody looks again.
+# Observations that differ by less, in standard deviations, are equal; iterations after which they are kept.
 _SAME, _LAST_LOOK = 0.5, 8
-# Part of the height over the cloud by which points may miss it at first: what a principal distance may be off by.
+# Fraction of the height over the cloud by which points may miss it initially: error of the principal distance.
 _FAR = 0.1
-# Part of the observations that must fit at the end.
+# Fraction of the observations that must fit in the end.
 _BORNE_OUT = 0.7
-# Part by which a principal distance seldom is off that of the laboratory.
+# Fraction by which a principal distance rarely differs from its laboratory value.
 _UNUSUAL = 0.02
 
 
 class Round(NamedTuple):
-    """One adjustment, and what it changed."""
+    """One iteration."""
 
     number: int
     observed: int
-    """Observations of the lidar."""
+    """Number of lidar observations."""
     left_out: int
-    """Those that are too far off all others."""
+    """Rejected observations."""
     moved_m: float
-    """Root mean square move of the object points since the adjustment before."""
+    """Root mean square motion of the object points since the previous adjustment."""
     largest_change: float
     """Of interior and exterior orientation since then, in standard deviations."""
     rmse_m: float
-    """Of the distances between the points observed and the surface, after the adjustment."""
+    """Of the distances between the observed points and the surface, after the adjustment."""
 
 
 class SeenByCloud(NamedTuple):
-    """What a cloud says of points: one row for each that it may observe, in an order that stays from round to round."""
+    """Surface at points: one row per candidate, in an order that stays from iteration to iteration."""
 
     point: Int[np.ndarray, "rows"]
     foot: Float[np.ndarray, "rows 3"]
@@ -66,23 +66,23 @@ class SeenByCloud(NamedTuple):
     usable: Bool[np.ndarray, "rows"]
 
     def apart(self, adjusted: Adjustment) -> Float[np.ndarray, "rows"]:
-        """By how much the adjusted points lie above the surface, along its normal (m)."""
+        """Return the heights of the adjusted points above the surface, along its normal (m)."""
         points = np.asarray(adjusted.unknowns.points)[self.point]
         return np.einsum("nk,nk->n", self.normal, points - self.foot)
 
 
 class Observed(NamedTuple):
-    """The last of the rounds: its adjustment, what the cloud said, and which of it was used."""
+    """Last iteration: its adjustment, surface, and used observations."""
 
     before: SeenByCloud
-    """What the cloud said at first."""
+    """Surface at the first iteration."""
     adjusted: Adjustment
     covariance: Covariance
     seen: SeenByCloud
     used: Bool[np.ndarray, "rows"]
     rounds: tuple[Round, ...]
     still: bool
-    """Whether nothing changed any more."""
+    """True if converged."""
 
 
 Look = Callable[[Adjustment], SeenByCloud]
@@ -91,11 +91,11 @@ Build = Callable[[Adjustment, Covariance, SeenByCloud, Bool[np.ndarray, "rows"]]
 
 
 def with_interior_held(block: Block) -> Adjustment:
-    """`block` adjusted with the interior orientation held: where its points lie, as far as it knows by itself.
+    """Adjust `block` with fixed interior orientation, for the positions of its points.
 
-    Where its datum is open or nearly so, as that of a strip whose stations lie on a line, exterior orientation is held
-    as it begins, from direct georeferencing: what the cloud adds may close the datum. Raises as `adjust`, and
-    BlockError where it does not converge.
+    If its datum is open or nearly so, as that of a strip with collinear stations, exterior orientation is fixed at its
+    start values from direct georeferencing: the cloud may close the datum. Raises what `adjust` raises, and BlockError
+    if it does not converge.
     """
     held = interior_held(block).priors
     try:
@@ -112,7 +112,7 @@ def with_interior_held(block: Block) -> Adjustment:
 
 
 def interior_held(block: Block) -> Block:
-    """`block` whose interior orientation is right."""
+    """Fix the interior orientation of `block`."""
     interior = jax.tree.map(lambda _: FIXED, block.start.unknowns.interior)
     return dataclasses.replace(block, priors=dataclasses.replace(block.priors, interior=interior))
 
@@ -129,9 +129,9 @@ def check_without_surfaces(block: Block) -> None:
 def with_common_error(
     sigma: Float[np.ndarray, "rows"], usable: Bool[np.ndarray, "rows"], common_m: float
 ) -> Float[np.ndarray, "rows"]:
-    """Standard deviations whose mean over n rows keeps an error that all have in common: sigma^2 + (n - 1) common^2.
+    """Return standard deviations whose mean over n rows keeps a common error: sigma^2 + (n - 1) common^2.
 
-    `sigma` contains the common error once. An adjustment takes its observations for independent, and would average it.
+    `sigma` contains the common error once. An adjustment treats its observations as independent, and would average it.
     """
     return np.sqrt(sigma**2 + max(int(usable.sum()) - 1, 0) * common_m**2)
 
@@ -145,14 +145,14 @@ def until_still(
     group: Literal["control_points", "surfaces"],
     carry: Carry = lambda seen, before, now: seen,
 ) -> Observed:
-    """`look` at the cloud, `build` a block with what it says, adjust; from `first` on, until nothing changes.
+    """Iterate `look` at the cloud, `build` a block with the result, adjust; from `first` on, to convergence.
 
-    Each block is adjusted from the unknowns that `build` gives it. Towards the end an observation stays the one it was
-    where the cloud, looked at again, says nearly the same, and then in any case: else a laser point could become a
-    neighbour, cease to be one with the move that this makes, and so on for ever. `carry` brings an earlier observation
-    from the cloud as corrected before to that of now. The observations are the last rows of their `group`.
+    Each block is adjusted from the unknowns of `build`. In later iterations an observation stays unchanged if the new
+    one is nearly equal, and finally in any case: otherwise a laser point could alternate between being a neighbour and
+    not. `carry` transforms an earlier observation from the cloud as corrected before to the current one. The
+    observations are the last rows of their `group`.
 
-    Raises BlockError where the cloud does not lie where the points are.
+    Raises BlockError if the cloud does not lie where the points are.
     """
     adjusted, known, fits = first, covariance(first), np.array(True)
     before, at_first = first, look(first)
@@ -185,7 +185,7 @@ def until_still(
             _warn_of_scale(first, new)
             return Observed(at_first, adjusted, known, seen, used, tuple(rounds), still)
         if len(rounds) >= _JUDGED:
-            # Towards the end what was left out stays so: some observation might come and go for ever.
+            # In later iterations rejected observations stay rejected, to avoid alternation.
             fits = _fit(seen, adjusted, known, used, group) & (fits if len(rounds) >= _SETTLED else True)
         if len(rounds) < _SETTLED:
             seen = look(adjusted)
@@ -196,13 +196,13 @@ def until_still(
 
 
 def at_result(block: Block, unknowns: Unknowns) -> Block:
-    """`block` with an adjustment's unknowns for its start."""
+    """Return `block` with an adjustment's unknowns as start values."""
     known = Start(unknowns, np.ones(len(block.images), bool), np.ones(len(block.points), bool))
     return dataclasses.replace(block, start=known)
 
 
 def _check_heights(first: Adjustment, seen: SeenByCloud) -> None:
-    """Raise BlockError where the cloud is as far from the points as no principal distance explains."""
+    """Raise BlockError if the distance of the cloud from the points exceeds any error of the principal distance."""
     apart = seen.apart(first)[seen.usable]
     camera = float(np.mean(np.asarray(first.unknowns.exterior.position)[:, 2]))
     off, height = (float(np.median(v)) for v in (apart, camera - seen.foot[seen.usable, 2]))
@@ -215,7 +215,7 @@ def _check_heights(first: Adjustment, seen: SeenByCloud) -> None:
 
 
 def _check_used(seen: SeenByCloud, used: Bool[np.ndarray, "rows"]) -> None:
-    """Raise BlockError where the block contradicts what the cloud says of most points."""
+    """Raise BlockError if the block contradicts the cloud at most points."""
     n, most = int(used.sum()), int(seen.usable.sum())
     if n < max(1.0, _BORNE_OUT * most):
         raise BlockError(
@@ -225,7 +225,7 @@ def _check_used(seen: SeenByCloud, used: Bool[np.ndarray, "rows"]) -> None:
 
 
 def _warn_of_scale(first: Adjustment, found: Adjustment) -> None:
-    """A UserWarning where the heights want another principal distance than any laboratory would have missed."""
+    """Warn if the heights imply a principal distance that differs from any laboratory value."""
     for name, interior in found.unknowns.interior.items():
         before, after = float(first.unknowns.interior[name].c), float(interior.c)
         if abs(after - before) > _UNUSUAL * abs(before):
@@ -238,7 +238,7 @@ def _warn_of_scale(first: Adjustment, found: Adjustment) -> None:
 
 
 def _kept(old: SeenByCloud, new: SeenByCloud, adjusted: Adjustment) -> SeenByCloud:
-    """The old observations where the new ones hardly differ from them."""
+    """Keep old observations that hardly differ from the new ones."""
     same = np.abs(old.apart(adjusted) - new.apart(adjusted)) < _SAME * new.sigma
     chosen = (np.where(same[:, None] if v.ndim > 1 else same, u, v) for u, v in zip(old[1:], new[1:], strict=True))
     return SeenByCloud(new.point, *chosen)
@@ -247,24 +247,24 @@ def _kept(old: SeenByCloud, new: SeenByCloud, adjusted: Adjustment) -> SeenByClo
 def _fit(
     seen: SeenByCloud, adjusted: Adjustment, known: Covariance, used: Bool[np.ndarray, "rows"], group: str
 ) -> Bool[np.ndarray, "rows"]:
-    """Which observations the others bear out."""
-    # Those used, by their normalised residuals: the lidar's are the last of their group.
+    """Return which observations are consistent with the others."""
+    # Used ones, by their normalised residuals: those of the lidar are the last of their group.
     numbers, residuals = redundancy_numbers(adjusted, known), adjusted.residuals
     # A group without rows has no residuals.
     none = np.zeros(0)
     v, r = (np.asarray(of.named.get(group, none)) for of in (residuals, numbers))
     v, r = (of_group[len(of_group) - int(used.sum()) :] for of_group in (v, r))
-    # The others against where all others put their points.
+    # Others, relative to the adjusted positions.
     points = np.einsum("ni,nij,nj->n", seen.normal, np.asarray(known.points)[seen.point], seen.normal)
     w = np.where(seen.usable, np.abs(seen.apart(adjusted)) / np.sqrt(seen.sigma**2 + points), 0.0)
     w[used] = np.abs(v) / np.sqrt(np.maximum(r, LEAST_CHECKED))
-    # The largest first: they spoil the others.
+    # The largest first: they affect the others.
     limit = _OUTLIER * max(1.0, float(adjusted.sigma0))
     return w <= max(limit, _LARGEST * w.max(initial=0.0))
 
 
 def _change(old: Adjustment, new: Adjustment, known: Covariance) -> float:
-    """The largest change of a free interior or exterior orientation, in standard deviations."""
+    """Return the largest change of a free interior or exterior orientation, in standard deviations."""
     if old.structure.labels != new.structure.labels:
         return np.inf
     sigma = np.sqrt(np.maximum(np.asarray(known.matrix).diagonal(), 0.0))

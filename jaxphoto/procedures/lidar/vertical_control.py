@@ -1,8 +1,8 @@
-"""Vertical control from a cloud: the height of the laser points under each tie point.
+"""Vertical control from a cloud: the height of the laser points below each tie point.
 
-A tie point is where the images say, the cloud says how high that is, and with this height the images are adjusted
-again: in turn until nothing changes (paper 001). By `method` "image" the height is that of the pseudo control point of
-paper 001, interpolated in the image; by any other it is `lidar.heights_at`. Control is vertical only: why, says
+The images give the position of a tie point, the cloud the height there, and the images are re-adjusted with this
+height: iterated to convergence (paper 001). With `method` "image" the height is that of the pseudo control point of
+paper 001, interpolated in the image; otherwise it is `lidar.heights_at`. Control is vertical only; the reason is in
 docs/pseudo_control.md.
 """
 
@@ -34,28 +34,28 @@ from jaxphoto.statistics import Covariance
 
 Method = Literal["idw", "plane", "tin", "local", "image"]
 METHODS = get_args(Method)
-"""Names of the ways to a height."""
+"""Names of the interpolation methods."""
 
 
 class LidarControl(eqx.Module):
-    """Vertical control from a cloud, and the adjustment with it; arrays are over the `points` that it may observe."""
+    """Vertical control from a cloud, and the adjustment with it; arrays are over the candidate `points`."""
 
     block: Block
-    """With the control, and the adjusted unknowns for its start."""
+    """With the control, and the adjusted unknowns as start values."""
     adjusted: Adjustment
     points: Int[np.ndarray, "points"]
-    """Of the block."""
+    """Index in the block."""
     height: Float[np.ndarray, "points"]
-    """Z (m) of the cloud at the point; NaN where it was refused."""
+    """Z (m) of the cloud at the point; NaN if refused."""
     sigma: Float[np.ndarray, "points"]
-    """Of the height as control (m): of the cloud's, and of what the point's own place is off by on a slope."""
+    """Of the height as control (m): of the cloud's height, and of the uncertain position of the point on a slope."""
     flag: Integer[np.ndarray, "points"]
     """Sums of `lidar.HeightFlag`."""
     used: Bool[np.ndarray, "points"]
-    """Whether the height is control: neither refused nor far off all others."""
+    """True if the height is control: neither refused nor an outlier."""
     rounds: tuple[Round, ...]
     still: bool
-    """Whether nothing changed any more at the end."""
+    """True if the iteration converged."""
 
 
 def lidar_control(
@@ -68,13 +68,13 @@ def lidar_control(
     max_rounds: int = MAX_ROUNDS,
     report: Callable[[Round], None] = lambda made: None,
 ) -> LidarControl:
-    """Control heights from a cloud in the block's object frame, for the `points` named or all tie points.
+    """Adjust `block` with control heights from a cloud in its object frame, for `points` or all tie points.
 
-    A tie point is one without control, fixed or check coordinates. The block needs a datum without the cloud: camera
-    stations or control. `report` is called after each round.
+    A tie point has no control, fixed or check coordinates. The block needs a datum without the cloud: camera stations
+    or control. `report` is called after each iteration.
 
-    Raises BlockError where the cloud and the points are in different places, or no height can be told; InputError for
-    names that are no points; and as `jaxphoto.adjust`.
+    Raises BlockError if cloud and points are in different places, or no height is determined; InputError for names that
+    are not points; and what `jaxphoto.adjust` raises.
     """
     settings = HeightSettings() if settings is None else settings
     grid = cloud if isinstance(cloud, Grid) else index_cloud(cloud)
@@ -113,10 +113,10 @@ def lidar_control(
 
 
 def tie_points(block: Block, names: Collection[str] | None = None) -> Int[np.ndarray, "points"]:
-    """The points named, or all without control, fixed or check coordinates.
+    """Return the named points, or all without control, fixed or check coordinates.
 
-    Raises InputError for a name that is no point and for one whose height is control already, BlockError where there is
-    no tie point.
+    Raises InputError for a name that is not a point and for one whose height is control already, BlockError without tie
+    points.
     """
     observed = [rows.who for rows in (block.control, block.fixed, block.check)]
     if names is None:
@@ -139,7 +139,7 @@ def tie_points(block: Block, names: Collection[str] | None = None) -> Int[np.nda
 
 
 def nothing_seen(points: np.ndarray, cloud: np.ndarray, flag: np.ndarray) -> BlockError:
-    """Why no point has a height: the cloud lies elsewhere, or all heights were refused."""
+    """Return the reason why no point has a height: the cloud lies elsewhere, or all heights were refused."""
     (low, high), (least, most) = ((v[:, :2].min(axis=0), v[:, :2].max(axis=0)) for v in (points, cloud))
     if np.any(low > most) or np.any(high < least):
         block, other = (
@@ -157,15 +157,15 @@ def nothing_seen(points: np.ndarray, cloud: np.ndarray, flag: np.ndarray) -> Blo
 
 
 def flag_counts(flag: Integer[np.ndarray, "points"]) -> dict[str, int]:
-    """How many heights have each flag that any has."""
+    """Return the number of heights with each flag."""
     counts = {f.name or "": int(((flag & int(f)) != 0).sum()) for f in HeightFlag if f}
     return {name: n for name, n in counts.items() if n}
 
 
 def _heights(adjusted: Adjustment, which: np.ndarray, grid: Grid, method: Method, settings: HeightSettings):
-    """Height, its standard deviation, gradient of the surface and flag, at each of some points."""
+    """Return height, standard deviation, gradient of the surface and flag, at each of some points."""
     if method == "image":
-        # In the order of `which`, which is sorted too.
+        # In the order of `which`, which is sorted, too.
         pseudo = pseudo_control_of_block(adjusted.block, adjusted.unknowns, grid, which, settings).control
         return np.asarray(pseudo.xyz)[:, 2], *map(np.asarray, (pseudo.sigma_z, pseudo.gradient, pseudo.flag))
     found = heights_at(grid, np.asarray(adjusted.unknowns.points)[which, :2], method, settings)
@@ -173,7 +173,7 @@ def _heights(adjusted: Adjustment, which: np.ndarray, grid: Grid, method: Method
 
 
 def _sigma(known: Covariance, seen: SeenByCloud) -> Float[np.ndarray, "points"]:
-    """Of control heights: of the surface, and of the height that the uncertain place of the point means on a slope."""
+    """Return the sigma of control heights: of the surface, and of the point's uncertain position on a slope."""
     of_place = np.asarray(known.points)[seen.point][:, :2, :2]
     upright = seen.normal[:, 2]
     gradient = -seen.normal[:, :2] / upright[:, None]

@@ -12,11 +12,11 @@ import numpy as np
 from jaxphoto.block import Block, Start
 from jaxphoto.camera import InteriorOrientation, Perspective, get_parameter
 from jaxphoto.errors import BlockError
-from jaxphoto.orientation.approximate import completed
-from jaxphoto.orientation.matches import PairMatches
-from jaxphoto.orientation.rays import ideal_coordinates
+from jaxphoto.initial.approximate import completed
+from jaxphoto.initial.matches import PairMatches
+from jaxphoto.initial.rays import ideal_coordinates
 from jaxphoto.procedures.orientation.colmap import MappedCamera, map_images
-from jaxphoto.procedures.orientation.known_frame import onto_known
+from jaxphoto.procedures.orientation.known_frame import in_known_frame
 from jaxphoto.procedures.orientation.orient_photographs import Report
 from jaxphoto.unknowns import FIXED
 
@@ -58,7 +58,7 @@ def orient_block(block: Block, report: Report = lambda text: None) -> Block:
     number = np.array([point_of[i][f] for i, f in zip(network.image, network.feature, strict=True)], int)
     order = np.argsort(np.bincount(network.point)[network.point], kind="stable")
     points[number[order]] = network.points[network.point[order]]
-    network = onto_known(block, network._replace(points=points), completed(block))
+    network = in_known_frame(block, network._replace(points=points), completed(block))
 
     image_known, point_known = np.asarray(block.start.image_known), np.asarray(block.start.point_known)
     met = np.isfinite(network.points).all(axis=1) & ~point_known

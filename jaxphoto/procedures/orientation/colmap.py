@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxphoto.errors import BlockError, GroupsError
-from jaxphoto.orientation.matches import PairMatches, connected_images
+from jaxphoto.initial.matches import PairMatches, connected_images
 
 # Angles (deg) between rays below which COLMAP makes no point; the smaller one serves where images are missing.
 _ANGLES_DEG = (1.5, 0.4)

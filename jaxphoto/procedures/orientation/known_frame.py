@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from jaxphoto.block import Block, Start
 from jaxphoto.errors import BlockError
-from jaxphoto.orientation.averaging import average_rotation
+from jaxphoto.initial.averaging import average_rotation
 from jaxphoto.procedures.orientation.colmap import Network
 
 # Known places whose spread across their line is less than this part of that along it leave a turn about it open.
@@ -65,7 +65,7 @@ def similarity_between(
     return Similarity(here.mean(axis=0) - scale * turn @ there.mean(axis=0), turn, scale)
 
 
-def onto_known(block: Block, network: Network, known: Start) -> Network:
+def in_known_frame(block: Block, network: Network, known: Start) -> Network:
     """`network` in the frame of what is known of `block`: surveyed points and stations, then the images of `known`.
 
     Where surveyed places are few or nearly on a line, the images and points of `known` join them; where all are, known

@@ -17,9 +17,9 @@ from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
+from jaxphoto.initial.matches import PairMatches
+from jaxphoto.initial.rays import ideal_coordinates
 from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
-from jaxphoto.orientation.matches import PairMatches
-from jaxphoto.orientation.rays import ideal_coordinates
 from jaxphoto.procedures.orientation.colmap import MappedCamera, Network, map_images
 from jaxphoto.procedures.orientation.rejection import beyond_limit, unsupported
 from jaxphoto.procedures.orientation.self_calibration import (

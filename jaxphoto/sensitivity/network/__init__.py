@@ -1,31 +1,57 @@
-"""Network design: layouts on paper, their covariance as a differentiable function, and the search by its gradient."""
+"""Network design: planned layouts, their covariance as a differentiable function, and gradient-based search."""
 
-from jaxphoto.sensitivity.network.block import check_layout, measured_block
-from jaxphoto.sensitivity.network.covariance import NetworkCovariance, design_covariance
-from jaxphoto.sensitivity.network.criteria import (
+from jaxphoto.sensitivity.network.covariance import (
+    NetworkCovariance,
     a_criterion,
     d_criterion,
+    design_covariance,
     e_criterion,
     largest_correlation,
     mean_correlation,
     point_rmse,
     sigma_of,
 )
-from jaxphoto.sensitivity.network.layout import Layout
+from jaxphoto.sensitivity.network.layout import (
+    Layout,
+    StripDesign,
+    StripPlan,
+    block_from_layout,
+    check_layout,
+    design_from_plan,
+    strip_images,
+)
 from jaxphoto.sensitivity.network.search import (
     DesignSearch,
+    best_designs,
     evaluate_designs,
     grid_designs,
     optimise_design,
-    promising,
     random_designs,
-    stacked,
+    stack_designs,
 )
-from jaxphoto.sensitivity.network.strips import StripDesign, StripPlan, planned_design, strip_images
 
 __all__ = [
-    "DesignSearch", "Layout", "NetworkCovariance", "StripDesign", "StripPlan", "a_criterion", "check_layout",
-    "d_criterion", "design_covariance", "e_criterion", "evaluate_designs", "grid_designs", "largest_correlation",
-    "mean_correlation", "measured_block", "optimise_design", "planned_design", "point_rmse", "promising",
-    "random_designs", "sigma_of", "stacked", "strip_images",
+    "DesignSearch",
+    "Layout",
+    "NetworkCovariance",
+    "StripDesign",
+    "StripPlan",
+    "a_criterion",
+    "best_designs",
+    "block_from_layout",
+    "check_layout",
+    "d_criterion",
+    "design_covariance",
+    "design_from_plan",
+    "e_criterion",
+    "evaluate_designs",
+    "grid_designs",
+    "largest_correlation",
+    "mean_correlation",
+    "optimise_design",
+    "point_rmse",
+    "random_designs",
+    "sigma_of",
+    "stack_designs",
+    "strip_images",
 ]  # fmt: skip

@@ -1,16 +1,24 @@
-"""The covariance of a network that is only planned, differentiable in every number of its layout.
+"""Covariance of a planned network, differentiable in every number of its layout, and criteria of it to minimise.
 
 No residual is needed: the normal matrix is that of the layout itself, in the notation of adjustment/solver/normal.py,
 
     S = U - sum_p Y_p Y_p',    Y_p = W_p L_p^-T,    V_p = L_p L_p'
     Q = S^-1,    Q_pp = L_p^-T (I + Y_p' Q Y_p) L_p^-1
 
-and dense, for layouts of some tens of images and hundreds of points. Every pair of image and point takes part. Its
-weight is that of the image times a window that falls from one to zero across the edge of the format (`Layout.edge_mm`),
-so that a point which comes into an image does so without a step. Where no point lies in the edge, this is the
+and dense, for layouts of some tens of images and hundreds of points. Every pair of image and point contributes. Its
+weight is that of the image times a window that decreases from one to zero across the edge of the format
+(`Layout.edge_mm`), so a point enters an image without a discontinuity. If no point lies in the edge, this is the
 covariance of `jaxphoto.covariance` with sigma naught 1.
+
+A criterion is a plain function of it; `functools.partial(sigma_of, name="c_mm")` makes one, and so does any
+differentiable function from a `NetworkCovariance` to a number. A maximum has kinks; with `power` p it is replaced by
+the p-norm, which is smooth and larger by at most the p-th root of the number of values: use it in the search, and
+report the value without.
+
+Source of A, D and E: Pukelsheim, Optimal Design of Experiments (1993); for networks, Grafarend and Sanso (1985).
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -24,15 +32,15 @@ from jaxphoto.camera import InteriorOrientation, get_parameter, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, image_residual, project
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
-from jaxphoto.linear_algebra import cholesky, solve_lower, solve_lower_transposed
+from jaxphoto.linear_algebra import cholesky, eigh, solve_lower, solve_lower_transposed
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, rotate, small_rotation
 from jaxphoto.sensitivity.network.layout import Layout
 from jaxphoto.small_matrices import cholesky_3x3, unwhiten, whiten
 from jaxphoto.statistics import EOP_NAMES
 
-# Every point is known beforehand with this part of the best point's weight (a million times its sigma): one that fewer
-# than two images see then says nothing, and its V can be inverted. Sigmas of all others change by less than 1e-7.
-_GROUND = 1e-12
+# Prior weight of every point, relative to that of the best point (a million times its sigma): V of a point with fewer
+# than two rays is then invertible. Sigmas of all others change by less than 1e-7.
+_POINT_PRIOR = 1e-12
 EXTERIOR = EOP_NAMES["omega_phi_kappa"]
 
 
@@ -45,14 +53,14 @@ class NetworkCovariance(eqx.Module):
     matrix: Float[Array, "unknowns unknowns"]
     points: Float[Array, "points 3 3"]
     rays: Float[Array, "points"]
-    """In how many images a point is seen; one in the edge of the format counts by its weight."""
+    """Number of images of each point; an image with the point in the edge of its format counts by its weight."""
     corner: Float[Array, "free"]
-    """By how much (mm) one unit of each interior parameter moves an image point in the corner of the format."""
+    """Displacement (mm) of an image point at the corner of the format by one unit of each interior parameter."""
     free: tuple[str, ...] = eqx.field(static=True)
 
     @property
     def n_images(self) -> int:
-        """How many images the layout has."""
+        """Number of images."""
         return (len(self.matrix) - len(self.free)) // 6
 
     @property
@@ -68,33 +76,33 @@ class NetworkCovariance(eqx.Module):
 
     @property
     def interior_at_corner(self) -> Float[Array, "free free"]:
-        """The same in mm^2 at the corner of the format: one unit for all parameters, in which they can be added."""
+        """Covariance in mm^2 at the corner of the format: one unit for all parameters, as sums need."""
         return self.interior * self.corner[:, None] * self.corner[None, :]
 
     @property
     def correlation(self) -> Float[Array, "images 6 free"]:
-        """Of X, Y, Z, omega, phi, kappa of each image with the free interior parameters."""
+        """Correlations of X, Y, Z, omega, phi, kappa of each image with the free interior parameters."""
         n = 6 * self.n_images
         rho = self.matrix[:n, n:] / (self.sigma[:n, None] * self.sigma[n:])
         return rho.reshape(-1, 6, len(self.free))
 
     def column(self, name: str) -> int:
-        """Where the interior parameter `name` stands in `free`. Raises InputError where it is held fixed."""
+        """Index of the interior parameter `name` in `free`. Raises InputError if it is fixed."""
         if name not in self.free:
             free = ", ".join(self.free) or "none"
             raise InputError(
-                f"a criterion asks for {name}, which is fixed and has no covariance; name one that is free in the "
-                f"layout ({free}), or free it"
+                f"a criterion needs the covariance of {name}, which is fixed: choose a free parameter of the layout "
+                f"({free}), or free it"
             )
         return self.free.index(name)
 
 
 def design_covariance(layout: Layout) -> NetworkCovariance:
-    """The covariance of `layout`, differentiable; NaN where its observations do not determine the unknowns.
+    """Covariance of `layout`, differentiable; NaN with a rank defect.
 
-    `network.block.check_layout` says why they do not.
+    `check_layout` reports the reason of a defect.
     """
-    # A plain number would be part of the program, and each value compiled for itself.
+    # A plain number would be part of the program, and each value compiled separately.
     return call_compiled(_design_covariance, jax.tree.map(still, layout))
 
 
@@ -109,31 +117,32 @@ def _design_covariance(layout: Layout) -> NetworkCovariance:
     u = u + jax.vmap(jnp.diag)(jnp.concatenate([station, attitude], axis=1))
     us = jnp.einsum("ipca,ipcb->iab", weighted * eop, shared).reshape(6 * n, k)
     uss = jnp.einsum("ipca,ipcb->ab", weighted * shared, shared)
-    whole = jnp.block([[_block_diagonal(u), us], [us.T, uss]])
-    # (3, unknowns, points): sums of two products each, which a batch of small matrices would make slow.
-    met = lambda a: sum(  # noqa: E731
+    normal = jnp.block([[_block_diagonal(u), us], [us.T, uss]])
+    # (3, unknowns, points): sums of two products each; a batch of small matrices would be slow.
+    products = lambda a: sum(  # noqa: E731
         (weighted * a)[:, :, c, :, None] * point[:, :, c, None, :] for c in range(2)
     )
     w = jnp.concatenate(
-        [met(eop).transpose(3, 0, 2, 1).reshape(3, 6 * n, m), met(shared).sum(axis=0).transpose(2, 1, 0)], axis=1
+        [products(eop).transpose(3, 0, 2, 1).reshape(3, 6 * n, m), products(shared).sum(axis=0).transpose(2, 1, 0)],
+        axis=1,
     )
-    v = met(point).sum(axis=0).transpose(1, 2, 0)
-    floor = _GROUND * jnp.max(jnp.trace(v))
+    v = products(point).sum(axis=0).transpose(1, 2, 0)
+    floor = _POINT_PRIOR * jnp.max(jnp.trace(v))
     v = v + jax.vmap(jnp.diag, out_axes=2)(layout.by_point + floor)
     l = cholesky_3x3(v)  # noqa: E741
     y = jnp.stack(whiten(w, l), axis=1)
-    flat = y.reshape(len(whole), -1)
-    # Scaled so that the diagonal before elimination is one.
-    scale = jax.lax.stop_gradient(1 / jnp.sqrt(jnp.diagonal(whole)))
-    q = _inverse((whole - flat @ flat.T) * scale[:, None] * scale) * scale[:, None] * scale
+    flat = y.reshape(len(normal), -1)
+    # Scaled to a unit diagonal before elimination.
+    scale = jax.lax.stop_gradient(1 / jnp.sqrt(jnp.diagonal(normal)))
+    q = _inverse((normal - flat @ flat.T) * scale[:, None] * scale) * scale[:, None] * scale
     inner = jnp.eye(3)[:, :, None] + jnp.einsum("acp,adp->cdp", y, (q @ flat).reshape(y.shape))
     half = jnp.stack(unwhiten(inner, l))
     points = jnp.stack(unwhiten(half.transpose(1, 0, 2), l)).transpose(2, 0, 1)
-    turns = jax.vmap(_angles_from_turn)(layout.exterior.camera_from_object)
-    to_angles = jnp.eye(len(whole)).at[: 6 * n, : 6 * n].set(_block_diagonal(turns))
+    jacobians = jax.vmap(_angle_jacobian)(layout.exterior.camera_from_object)
+    to_angles = jnp.eye(len(normal)).at[: 6 * n, : 6 * n].set(_block_diagonal(jacobians))
     measures = image_weight > 0
-    shares = weight / jnp.where(measures, image_weight, 1.0)[:, None]
-    rays = jnp.sum(jnp.where(measures[:, None], shares, 0.0), axis=0)
+    fractions = weight / jnp.where(measures, image_weight, 1.0)[:, None]
+    rays = jnp.sum(jnp.where(measures[:, None], fractions, 0.0), axis=0)
     return NetworkCovariance(to_angles @ q @ to_angles.T, points, rays, _corner(layout), layout.free)
 
 
@@ -155,29 +164,29 @@ def _pairs(layout: Layout) -> _Pairs:
         x, y, z = camera_coordinates(image, point)
         depth = jnp.where(z < 0, -z, 1.0)
         ideal = interior.c * jnp.stack([x, y]) / depth
-        near = (z < 0) & jnp.all(jnp.abs(ideal) < reach)
-        # Double where: what is far outside is looked at as if it lay on the axis, and no derivative becomes NaN.
+        visible = (z < 0) & jnp.all(jnp.abs(ideal) < reach)
+        # `where` twice: far outside the format use a point on the axis instead, so that no derivative becomes NaN.
         axis = image.position + rotate(image.camera_from_object.T, jnp.array([0.0, 0.0, -1.0]))
-        aim = jnp.where(near, point, axis)
+        aim = jnp.where(visible, point, axis)
         xy = project(interior, image, aim)
-        window = jnp.prod(_step(0.5 + (half - jnp.abs(xy)) / layout.edge_mm))
+        window = jnp.prod(_smooth_step(0.5 + (half - jnp.abs(xy)) / layout.edge_mm))
 
         def residual(eop, shared, step):
-            turned = small_rotation(eop[3:]) @ image.camera_from_object
-            moved = ExteriorOrientation(image.position + eop[:3], turned)
-            return image_residual(_moved(interior, layout.free, shared), moved, aim + step, xy)
+            rotation = small_rotation(eop[3:]) @ image.camera_from_object
+            exterior = ExteriorOrientation(image.position + eop[:3], rotation)
+            return image_residual(_changed(interior, layout.free, shared), exterior, aim + step, xy)
 
         zero = jnp.zeros(6), jnp.zeros(len(layout.free)), jnp.zeros(3)
         by_eop, by_shared, by_point = jax.jacfwd(residual, argnums=(0, 1, 2))(*zero)
-        return _Pairs(by_eop, by_shared, by_point, jnp.where(near, weight * window, 0.0))
+        return _Pairs(by_eop, by_shared, by_point, jnp.where(visible, weight * window, 0.0))
 
-    each = jax.vmap(jax.vmap(pair, in_axes=(None, 0, None)), in_axes=(0, None, 0))
-    return each(layout.exterior, layout.points, layout.by_image[0])
+    pairs = jax.vmap(jax.vmap(pair, in_axes=(None, 0, None)), in_axes=(0, None, 0))
+    return pairs(layout.exterior, layout.points, layout.by_image[0])
 
 
-def _moved(interior: InteriorOrientation, names: tuple[str, ...], by) -> InteriorOrientation:
+def _changed(interior: InteriorOrientation, names: tuple[str, ...], change) -> InteriorOrientation:
     for k, name in enumerate(names):
-        interior = set_parameter(interior, name, get_parameter(interior, name) + by[k])
+        interior = set_parameter(interior, name, get_parameter(interior, name) + change[k])
     return interior
 
 
@@ -186,14 +195,14 @@ def _half(layout: Layout) -> Float[np.ndarray, "2"]:
 
 
 def _reach(layout: Layout) -> Float[Array, "2"]:
-    """Bounds of |ideal coordinates| on the format and its edge: outside, a pair has no weight."""
+    """Bounds of |ideal coordinates| on the format and its edge: pairs outside have no weight."""
     signs = np.array([[a, b] for a in (-1, 0, 1) for b in (-1, 0, 1)])
     ideal = jax.vmap(layout.interior.ideal_from_measured)(jnp.asarray(signs * (_half(layout) + layout.edge_mm / 2)))
     return 1.02 * jnp.max(jnp.abs(jax.lax.stop_gradient(ideal)), axis=0)
 
 
-def _step(t: Float[Array, "2"]) -> Float[Array, "2"]:
-    """0 below zero, 1 above one, between them the polynomial with two continuous derivatives."""
+def _smooth_step(t: Float[Array, "2"]) -> Float[Array, "2"]:
+    """0 below zero, 1 above one, and in between the polynomial with two continuous derivatives."""
     t = jnp.clip(t, 0.0, 1.0)
     return t**3 * (10 - 15 * t + 6 * t**2)
 
@@ -207,7 +216,7 @@ def _inverse(s: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 @_inverse.defjvp
 def _inverse_jvp(primals, tangents):
-    """-S^-1 dS S^-1: products instead of the triangular solves that JAX would differentiate, several times faster."""
+    """-S^-1 dS S^-1: matrix products, several times faster than the triangular solves that JAX would differentiate."""
     q = _inverse(*primals)
     return q, -q @ tangents[0] @ q
 
@@ -217,7 +226,7 @@ def _block_diagonal(blocks: Float[Array, "n c c"]) -> Float[Array, "nc nc"]:
     return (blocks[:, :, None, :] * jnp.eye(n)[:, None, :, None]).reshape(n * c, n * c)
 
 
-def _angles_from_turn(camera_from_object: Float[Array, "3 3"]) -> Float[Array, "6 6"]:
+def _angle_jacobian(camera_from_object: Float[Array, "3 3"]) -> Float[Array, "6 6"]:
     """Derivative of X, Y, Z, omega, phi, kappa by X, Y, Z and a small rotation about the camera's axes."""
     angles = lambda theta: omega_phi_kappa_from_matrix(small_rotation(theta) @ camera_from_object)  # noqa: E731
     return jnp.eye(6).at[3:, 3:].set(jax.jacfwd(angles)(jnp.zeros(3)))
@@ -227,5 +236,69 @@ def _corner(layout: Layout) -> Float[Array, "free"]:
     interior, half = layout.interior, jnp.asarray(_half(layout))
     aim = jnp.append(interior.ideal_from_measured(half) / interior.c, -1.0)
     centre = ExteriorOrientation(jnp.zeros(3), jnp.eye(3))
-    moved = lambda by: image_residual(_moved(interior, layout.free, by), centre, aim, half)  # noqa: E731
-    return jnp.sqrt(jnp.sum(jax.jacfwd(moved)(jnp.zeros(len(layout.free))) ** 2, axis=0))
+    residual = lambda change: image_residual(_changed(interior, layout.free, change), centre, aim, half)  # noqa: E731
+    return jnp.sqrt(jnp.sum(jax.jacfwd(residual)(jnp.zeros(len(layout.free))) ** 2, axis=0))
+
+
+def a_criterion(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
+    """A-criterion: mean variance trace(Q) / n of a covariance matrix of unknowns of one unit."""
+    return jnp.trace(matrix) / len(matrix)
+
+
+def d_criterion(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
+    """D-criterion: det(Q)^(1/n), mean size of the error ellipsoid; other units of the unknowns scale it only."""
+    scale = jnp.sqrt(jnp.diagonal(matrix))
+    log = 2 * jnp.sum(jnp.log(jnp.diagonal(cholesky(matrix / scale[:, None] / scale))))
+    return jnp.exp((log + 2 * jnp.sum(jnp.log(scale))) / len(matrix))
+
+
+def e_criterion(matrix: Float[Array, "n n"], power: float | None = None) -> Float[Array, ""]:
+    """E-criterion: largest eigenvalue, the variance of the worst determined direction, of unknowns of one unit."""
+    return _largest(eigh(matrix)[0], power)
+
+
+def sigma_of(covariance: NetworkCovariance, name: str) -> Float[Array, ""]:
+    """Standard deviation of the interior parameter `name` in its own unit. Raises InputError if it is fixed."""
+    k = covariance.column(name)
+    return jnp.sqrt(covariance.interior[k, k])
+
+
+def point_rmse(covariance: NetworkCovariance, points: Sequence[int] | slice = slice(None)) -> Float[Array, ""]:
+    """Expected RMSE (m) of a coordinate of the ground points `points`: sqrt of the mean variance over points and axes.
+
+    It predicts the RMSE at error-free check points. A point with fewer than two images makes it very large.
+    """
+    index = points if isinstance(points, slice) else np.asarray(points)
+    return jnp.sqrt(jnp.mean(jnp.diagonal(covariance.points[index], axis1=1, axis2=2)))
+
+
+def largest_correlation(
+    covariance: NetworkCovariance, exterior: Sequence[str], interior: Sequence[str], power: float | None = None
+) -> Float[Array, ""]:
+    """Maximum |rho| over all images of `exterior` (X, Y, Z, omega, phi, kappa) with `interior` (c_mm ...) parameters.
+
+    Raises InputError for a parameter that is fixed or does not exist.
+    """
+    return _largest(jnp.abs(_chosen(covariance, exterior, interior)).reshape(-1), power)
+
+
+def mean_correlation(
+    covariance: NetworkCovariance, exterior: Sequence[str], interior: Sequence[str]
+) -> Float[Array, ""]:
+    """Mean |rho| over all images of `exterior` with `interior` parameters (paper 000, Table 4)."""
+    return jnp.mean(jnp.abs(_chosen(covariance, exterior, interior)))
+
+
+def _chosen(covariance: NetworkCovariance, exterior: Sequence[str], interior: Sequence[str]) -> Array:
+    if unknown := [name for name in exterior if name not in EXTERIOR]:
+        raise InputError(f"unknown exterior parameter {unknown[0]} in a criterion: choose among {', '.join(EXTERIOR)}")
+    rows, columns = [EXTERIOR.index(name) for name in exterior], [covariance.column(name) for name in interior]
+    return covariance.correlation[:, rows][:, :, columns]
+
+
+def _largest(values: Float[Array, "n"], power: float | None) -> Float[Array, ""]:
+    largest = jnp.max(values)
+    if power is None:
+        return largest
+    # Relative to the largest, so that no power overflows.
+    return largest * jnp.sum((values / largest) ** power) ** (1 / power)

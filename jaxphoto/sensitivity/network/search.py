@@ -1,13 +1,13 @@
-"""Networks designed by gradient: the design variables between bounds that make a criterion of the covariance smallest.
+"""Gradient-based network design: minimise a criterion of the covariance over bounded design variables.
 
-A design is a tree of numbers; the user's pure function makes a `Layout` of it, and the criterion a number of the
-covariance of that. The way from one to the other is differentiated, so a search needs some tens of covariances where a
-grid needs so many to the power of the number of variables. Bounds are kept by the sine,
+A design is a tree of numbers; the user's pure function maps it to a `Layout`, and the criterion maps the covariance of
+that to a number. The composition is differentiated, so a search needs some tens of covariances, while a grid needs a
+number exponential in the number of variables. Bounds are enforced by the sine,
 
     x = (low + high) / 2 + (high - low) / 2 sin u
 
-in which u is free, and the logarithm of the criterion is what BFGS makes small: neither has a unit. Valleys are many,
-so a search goes down from several starts.
+with u free, and BFGS minimises the logarithm of the criterion: neither has a unit. The objective has many local minima,
+so a search uses several starts.
 """
 
 from collections.abc import Callable
@@ -22,40 +22,39 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError, DatumError, InputError
-from jaxphoto.sensitivity.network.block import check_layout
 from jaxphoto.sensitivity.network.covariance import NetworkCovariance, design_covariance
-from jaxphoto.sensitivity.network.layout import Layout
+from jaxphoto.sensitivity.network.layout import Layout, check_layout
 
 Design = TypeVar("Design")
 LayoutOf = Callable[[Any], Layout]
 Criterion = Callable[[NetworkCovariance], Float[Array, ""]]
 MAX_STEPS = 200
-# The search ends where a step changes ln(criterion) and the variables (in units of their range) by less.
+# Convergence: change of ln(criterion) and of the variables (in units of their range).
 _TOLERANCE = 1e-6
-# How near to a bound a start may be, in units of the half range: on it, the derivative by u is zero.
-_NEAR = 0.99
-# Designs whose covariances are computed at a time.
+# Maximum distance of a start from the centre in units of the half range: at a bound the derivative by u is zero.
+_MAX_START = 0.99
+# Designs per batch of covariances.
 _BATCH = 16
 
 
 class DesignSearch(eqx.Module, Generic[Design]):
-    """What `optimise_design` found. Designs have a leading axis over the starts; values are those of the criterion."""
+    """Result of `optimise_design`. Designs have a leading axis over the starts; values are those of the criterion."""
 
     starts: Design
     start_values: Float[np.ndarray, "starts"]
-    found: Design
+    designs: Design
     values: Float[np.ndarray, "starts"]
     steps: Int[np.ndarray, "starts"]
     converged: Bool[np.ndarray, "starts"]
 
     @property
     def best(self) -> Design:
-        """The design of the smallest criterion."""
-        return jax.tree.map(lambda v: v[np.argmin(self.values)], self.found)
+        """Design with the smallest criterion."""
+        return jax.tree.map(lambda v: v[np.argmin(self.values)], self.designs)
 
     @property
     def value(self) -> float:
-        """The criterion there."""
+        """Smallest criterion."""
         return float(np.min(self.values))
 
 
@@ -68,42 +67,40 @@ def optimise_design(
     smooth: Criterion | None = None,
     max_steps: int = MAX_STEPS,
 ) -> DesignSearch[Design]:
-    """The designs between `low` and `high` of the smallest `criterion`, one for each of `starts`.
+    """Minimise `criterion` over designs between `low` and `high`, once from each of `starts`.
 
-    `layout_of` takes one design to its `Layout` and is differentiable; `low`, `high` and each start are designs, equal
-    in shape. A variable whose bounds are equal is held. `starts` has a leading axis (`random_designs`, `stacked`).
-    `smooth` takes the place of a `criterion` with kinks inside the search; values and the best design are by
-    `criterion`, and no start comes out worse than it went in.
+    `layout_of` maps one design to its `Layout` and is differentiable; `low`, `high` and each start are designs of equal
+    structure. A variable with equal bounds is fixed. `starts` has a leading axis (`random_designs`, `stack_designs`).
+    `smooth` replaces a `criterion` with kinks in the search; values and the best design are by `criterion`, and no
+    result is worse than its start.
 
-    Raises InputError for bounds that are upside down, a start outside, or a criterion of a fixed parameter; DatumError
-    or BlockError where a start leaves the block without a datum, or images without points.
+    Raises InputError for reversed bounds, a start outside, or a criterion of a fixed parameter; DatumError or
+    BlockError for a start whose block has no datum, or images without points.
     """
     low, high = _checked(low, high)
-    starts = _inside(starts, low, high)
-    for k, start in enumerate(_each(starts)):
+    starts = _checked_starts(starts, low, high)
+    for k in range(len(jax.tree.leaves(starts)[0])):
+        start = jax.tree.map(lambda v: v[k], starts)  # noqa: B023
         _check(call_compiled(_layout, layout_of, start), f"start {k + 1} of the search")
     before = evaluate_designs(criterion, layout_of, starts)
     for number in np.flatnonzero(~np.isfinite(before)):
         raise InputError(
-            f"start {number + 1} of the search does not determine all unknowns of its block, so the criterion has no "
-            "value there; begin elsewhere, hold an interior parameter fixed, or give control and stations more weight"
+            f"start {number + 1} of the search has a rank defect, so the criterion is undefined: start elsewhere, fix "
+            "an interior parameter, or increase the weight of control and stations"
         )
     objective = criterion if smooth is None else smooth
-    found, steps, converged = call_compiled(_search, objective, layout_of, low, high, starts, max_steps)
-    found = jax.tree.map(np.asarray, found)
-    after = evaluate_designs(criterion, layout_of, found)
+    designs, steps, converged = call_compiled(_search, objective, layout_of, low, high, starts, max_steps)
+    designs = jax.tree.map(np.asarray, designs)
+    after = evaluate_designs(criterion, layout_of, designs)
     better = after < before
-    found = jax.tree.map(lambda new, old: np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old), found, starts)
-    return DesignSearch(
-        starts, before, found, np.where(better, after, before), np.asarray(steps), np.asarray(converged)
-    )
+    best = lambda new, old: np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)  # noqa: E731
+    designs = jax.tree.map(best, designs, starts)
+    values = np.where(better, after, before)
+    return DesignSearch(starts, before, designs, values, np.asarray(steps), np.asarray(converged))
 
 
 def evaluate_designs(criterion: Criterion, layout_of: LayoutOf, designs: Design) -> Float[np.ndarray, "designs"]:
-    """The criterion of every one of `designs` (a leading axis): a grid search is its smallest value.
-
-    NaN where a design does not determine the unknowns.
-    """
+    """Criterion of every one of `designs` (a leading axis), for a grid search; NaN with a rank defect."""
     arrays = jax.tree.map(lambda v: np.asarray(v, float), designs)
     return np.asarray(call_compiled(_evaluate, criterion, layout_of, arrays))
 
@@ -116,9 +113,9 @@ def random_designs(low: Design, high: Design, n: int, seed: int = 0) -> Design:
 
 
 def grid_designs(low: Design, high: Design, n: int) -> Design:
-    """Every combination of `n` values of each variable, evenly spread from `low` to `high`, with a leading axis.
+    """Every combination of `n` equidistant values of each variable from `low` to `high`, with a leading axis.
 
-    A variable whose bounds are equal has one value.
+    A variable with equal bounds has one value.
     """
     low, high = _checked(low, high)
     (lows, tree), highs = jax.tree.flatten(low), jax.tree.leaves(high)
@@ -130,23 +127,23 @@ def grid_designs(low: Design, high: Design, n: int) -> Design:
     return jax.tree.unflatten(tree, [v.reshape(-1, *x.shape) for v, x in zip(parts, lows, strict=True)])
 
 
-def promising(criterion: Criterion, layout_of: LayoutOf, designs: Design, n: int) -> Design:
-    """The `n` of `designs` (a leading axis) with the smallest criterion: where to begin a search.
+def best_designs(criterion: Criterion, layout_of: LayoutOf, designs: Design, n: int) -> Design:
+    """The `n` of `designs` (a leading axis) with the smallest criterion, as starts of a search.
 
-    From the best of a grid it finds what is better than the grid. Raises InputError where fewer have a value.
+    Raises InputError if fewer have a finite criterion.
     """
     values = evaluate_designs(criterion, layout_of, designs)
     if np.isfinite(values).sum() < n:
         raise InputError(
-            f"of {len(values)} designs {np.isfinite(values).sum()} determine their unknowns, not {n}; narrow the "
-            "bounds, or ask for fewer"
+            f"only {np.isfinite(values).sum()} of {len(values)} designs have no rank defect, {n} are required: narrow "
+            "the bounds, or request fewer"
         )
-    chosen = np.argsort(values)[:n]
-    return jax.tree.map(lambda v: np.asarray(v)[chosen], designs)
+    best = np.argsort(values)[:n]
+    return jax.tree.map(lambda v: np.asarray(v)[best], designs)
 
 
-def stacked(*designs: Design) -> Design:
-    """Single designs as one with a leading axis."""
+def stack_designs(*designs: Design) -> Design:
+    """Stack single designs along a leading axis."""
     return jax.tree.map(lambda *v: np.stack([np.asarray(x, float) for x in v]), *designs)
 
 
@@ -170,71 +167,65 @@ def _search(objective: Criterion, layout_of: LayoutOf, low, high, starts, max_st
     def logarithm(u, _):
         return jnp.log(objective(design_covariance(layout_of(design(u)))))
 
-    def down(start):
-        part = jax.tree.map(lambda v, m, h: (v - m) / jnp.where(h > 0, h, 1.0), start, middle, half)
-        u = jax.tree.map(lambda v: jnp.arcsin(jnp.clip(v, -_NEAR, _NEAR)), part)
+    def minimise(start):
+        relative = jax.tree.map(lambda v, m, h: (v - m) / jnp.where(h > 0, h, 1.0), start, middle, half)
+        u = jax.tree.map(lambda v: jnp.arcsin(jnp.clip(v, -_MAX_START, _MAX_START)), relative)
         solver: Any = optx.BestSoFarMinimiser(optx.BFGS(_TOLERANCE, _TOLERANCE))
         solution: optx.Solution = optx.minimise(logarithm, solver, u, max_steps=max_steps, throw=False)
         return design(solution.value), solution.stats["num_steps"], solution.result == optx.RESULTS.successful
 
-    # One after the other: of all at once each would wait for the slowest, and on a CPU no product gains by a batch.
-    return jax.lax.map(down, starts)
+    # Sequentially: vmapped, each would wait for the slowest, and on a CPU batches gain nothing.
+    return jax.lax.map(minimise, starts)
 
 
 def _checked(low: Design, high: Design) -> tuple[Design, Design]:
-    """Both as arrays. Raises InputError unless every low bound is at most its high one."""
+    """Bounds as arrays. Raises InputError unless every low bound is at most its high one."""
     low, high = (jax.tree.map(lambda v: np.asarray(v, float), tree) for tree in (low, high))
-    if not _alike(low, high):
-        raise InputError("the bounds are designs of different kinds; give low and high the same variables")
+    if not _same_structure(low, high):
+        raise InputError("low and high are designs of different structure: give both the same variables")
     for (path, a), b in zip(jax.tree.leaves_with_path(low), jax.tree.leaves(high), strict=True):
         name = jax.tree_util.keystr(path).lstrip(".") or "the design variable"
         if a.shape != b.shape:
-            raise InputError(f"the bounds of {name} have the shapes {a.shape} and {b.shape}; give both the same")
+            raise InputError(f"the bounds of {name} have the shapes {a.shape} and {b.shape}: give both the same")
         if not (np.isfinite(a).all() and np.isfinite(b).all()):
-            raise InputError(f"the bounds of {name} are not all finite numbers; a search needs a region")
+            raise InputError(f"the bounds of {name} are not all finite: a search needs a bounded region")
         if (a > b).any():
             k = int(np.argmax(np.ravel(a - b)))
             raise InputError(
-                f"the bounds of {name} are upside down: the low one, {np.ravel(a)[k]:g}, is above the high one, "
+                f"the bounds of {name} are reversed: the low one, {np.ravel(a)[k]:g}, exceeds the high one, "
                 f"{np.ravel(b)[k]:g}; exchange them"
             )
     return low, high
 
 
-def _alike(one: Any, other: Any) -> bool:
-    """Whether both are trees of the same variables."""
+def _same_structure(one: Any, other: Any) -> bool:
     first: Any = jax.tree.structure(one)
     return bool(first == jax.tree.structure(other))
 
 
-def _inside(starts: Design, low: Design, high: Design) -> Design:
-    """`starts` as arrays. Raises InputError where one is outside of the bounds."""
+def _checked_starts(starts: Design, low: Design, high: Design) -> Design:
+    """`starts` as arrays. Raises InputError for a start outside the bounds."""
     starts = jax.tree.map(lambda v: np.asarray(v, float), starts)
-    if not _alike(starts, low):
-        raise InputError("the starts are no designs of the kind of the bounds; give them the same variables")
+    if not _same_structure(starts, low):
+        raise InputError("the starts and the bounds are designs of different structure: give both the same variables")
     leaves = zip(jax.tree.leaves_with_path(starts), jax.tree.leaves(low), jax.tree.leaves(high), strict=True)
     for (path, v), a, b in leaves:
         name = jax.tree_util.keystr(path).lstrip(".") or "the design variable"
         if v.shape[1:] != a.shape:
             raise InputError(
-                f"the starts of {name} have the shape {v.shape}, but each is one of {a.shape}; put the starts along a "
-                "leading axis (stacked)"
+                f"the starts of {name} have the shape {v.shape}, but one has {a.shape}: stack the starts along a "
+                "leading axis (stack_designs)"
             )
         if ((v < a) | (v > b)).any():
-            raise InputError(f"a start of {name} lies outside of its bounds; widen these or begin elsewhere")
+            raise InputError(f"a start of {name} is outside its bounds: widen these or start elsewhere")
     return starts
 
 
-def _each(designs: Design) -> list[Design]:
-    n = len(jax.tree.leaves(designs)[0])
-    return [jax.tree.map(lambda v, k=k: v[k], designs) for k in range(n)]
-
-
 def _check(layout: Layout, name: str) -> None:
-    """`check_layout`, which names the design. It has to be the error that is raised, not another."""
+    """`check_layout`, with the name of the design in the error."""
     try:
         check_layout(layout)
     except DatumError as error:
-        raise DatumError(f"{name} leaves its block without a datum: {error}") from error
+        raise DatumError(f"{name} has no datum: {error}") from error
     except BlockError as error:
-        raise BlockError(f"{name} cannot be flown: {error}") from error
+        raise BlockError(f"{name} is not feasible: {error}") from error

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxphoto.compiling import call_compiled
-from jaxphoto.orientation.rays import padded_length
+from jaxphoto.initial.rays import padded_length
 
 _STEPS = 40
 # Of the diagonal: with less, a blur that residuals hide would swing to and fro.

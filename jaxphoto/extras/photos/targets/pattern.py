@@ -20,8 +20,8 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
 from jaxphoto.extras.photos.features import read_grey
 from jaxphoto.extras.photos.targets.patches import TargetPlaces
+from jaxphoto.initial.rays import camera_rays
 from jaxphoto.io.photographs import Photograph
-from jaxphoto.orientation.rays import camera_rays
 from jaxphoto.procedures.calibration import Board, Detection
 
 

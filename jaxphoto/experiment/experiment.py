@@ -1,0 +1,286 @@
+"""Experiments: variants of simulated blocks, adjusted layout by layout, and their tables compared with a paper's."""
+
+import dataclasses
+import importlib.util
+from collections.abc import Callable, Iterator, Mapping
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from jaxphoto.adjustment import Sizes, common_sizes
+from jaxphoto.block import Block
+from jaxphoto.errors import InputError, JaxphotoError
+from jaxphoto.io.recipe import recipe_from
+from jaxphoto.io.toml import read_toml
+from jaxphoto.procedures import adjust
+from jaxphoto.report import Tables
+from jaxphoto.simulation import Recipe, Simulation, simulate
+
+FILE = "experiment.py"
+Progress = Callable[[str], None]
+MEAN_DIFFERENCE = "mean_abs_difference"
+"""The column whose cell is the mean of |ours - published| over its table."""
+_KEY = ["table", "row", "column"]
+PUBLISHED = [*_KEY, "published", "unit", "tolerance", "note"]
+COLUMNS = [
+    "paper", *_KEY, "published", "ours", "unit", "tolerance", "within", "note", "spread", "n_layouts",
+]  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Results(Mapping[str, Tables]):
+    """The adjusted variants of one layout, by name; `simulations` are their blocks before `Variant.change`."""
+
+    adjusted: Mapping[str, Tables]
+    simulations: Mapping[str, Simulation]
+
+    def __getitem__(self, variant: str) -> Tables:
+        return self.adjusted[variant]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.adjusted)
+
+    def __len__(self) -> int:
+        return len(self.adjusted)
+
+
+Cells = dict[tuple[str, str], float]
+"""The cells of one table, by row and column."""
+Measure = Callable[[Results], Cells]
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """One adjustment: `change` applied to the block of the recipe, in which `recipe` replaces keys.
+
+    `recipe` is nested like the TOML file: `{"cameras": {"kodak": {"truth": {"c_mm": 35.5}}}}`.
+    """
+
+    change: Callable[[Block], Block] = lambda block: block
+    recipe: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    file: str = "recipe.toml"
+    """The recipe, beside experiment.py."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """Variants of simulated blocks and the tables printed of them.
+
+    `layouts` blocks are drawn (seeds 0, 1, ...), every variant of each is adjusted, and every table's cells are the
+    means over them. `published.csv` beside experiment.py holds what a paper prints, if there is one.
+    """
+
+    title: str
+    variants: Mapping[str, Variant]
+    tables: Mapping[str, Measure]
+    layouts: int = 10
+    paper: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """The results of an experiment: the cells of every layout, the adjustments of the first, and failures.
+
+    `cells` has the columns table, row, column, layout, value.
+    """
+
+    experiment: Experiment
+    cells: pd.DataFrame
+    first: Mapping[str, Tables]
+    failures: tuple[str, ...]
+
+
+def run_experiment(
+    experiment: Experiment, folder: Path, layouts: int | None = None, progress: Progress = lambda _: None
+) -> Run:
+    """Run `experiment`, whose recipes lie in `folder`. `progress` is called with every step.
+
+    A layout in which a variant cannot be simulated or adjusted is rejected and listed in `failures`. Raises InputError
+    where no layout is left, and for recipes that cannot be read.
+    """
+    recipes = {name: _recipe(variant, folder) for name, variant in experiment.variants.items()}
+    failures: list[str] = []
+    simulations: dict[int, dict[str, Simulation]] = {}
+    wanted, made = layouts or experiment.layouts, count(1)
+    for layout in range(wanted):
+        progress(f"simulating layout {layout + 1} of {wanted}")
+        try:
+            simulations[layout] = _simulated(experiment, recipes, layout)
+        except (JaxphotoError, ValueError) as error:
+            failures.append(f"layout {layout}: {error}")
+    sizes = _sizes([{name: s.block for name, s in variants.items()} for variants in simulations.values()])
+    rows: list[tuple] = []
+    first: dict[str, Tables] = {}
+    for layout, variants in simulations.items():
+        adjusted = {}
+        try:
+            for name, simulation in variants.items():
+                progress(f"adjusting: block {next(made)} of {len(simulations) * len(variants)}")
+                adjusted[name] = _adjusted(simulation.block, sizes[name])
+        except JaxphotoError as error:
+            failures.append(f"layout {layout}, {name}: {error}")
+            continue
+        first = first or adjusted
+        rows += [
+            (table, row, column, layout, value)
+            for table, measure in experiment.tables.items()
+            for (row, column), value in measure(Results(adjusted, variants)).items()
+        ]
+    if not first:
+        raise InputError(f"{folder}: no layout could be adjusted; the first says: {failures[0]}")
+    cells = pd.DataFrame(rows, columns=["table", "row", "column", "layout", "value"])
+    return Run(experiment, cells, first, tuple(failures))
+
+
+def simulated(experiment: Experiment, folder: Path, variant: str, layout: int = 0) -> Simulation:
+    """The block of one variant, before `Variant.change`, with its truth."""
+    return simulate(_recipe(experiment.variants[variant], folder), layout)
+
+
+def _simulated(experiment: Experiment, recipes: Mapping[str, Recipe], layout: int) -> dict[str, Simulation]:
+    """The simulation of each variant; variants of one recipe share it."""
+    made: dict[tuple[str, str], Simulation] = {}
+    variants = {}
+    for name, variant in experiment.variants.items():
+        key = (variant.file, repr(variant.recipe))
+        if key not in made:
+            made[key] = simulate(recipes[name], layout)
+        variants[name] = dataclasses.replace(made[key], block=variant.change(made[key].block))
+    return variants
+
+
+def _sizes(layouts: list[dict[str, Block]]) -> dict[str, Sizes]:
+    """Padded sizes by variant: variants and layouts with as many images share compiled programs."""
+    of_images: dict[int, list[Block]] = {}
+    for block in (b for variants in layouts for b in variants.values()):
+        of_images.setdefault(len(block.images), []).append(block)
+    sizes = {n: common_sizes(blocks) for n, blocks in of_images.items()}
+    return {name: sizes[len(block.images)] for name, block in layouts[0].items()} if layouts else {}
+
+
+def _adjusted(block: Block, sizes: Sizes) -> Tables:
+    adjusted = adjust(block, sizes=sizes)
+    if not bool(adjusted.converged):
+        raise InputError(adjusted.outcome.value)
+    return Tables(adjusted)
+
+
+def _recipe(variant: Variant, folder: Path) -> Recipe:
+    path = folder / variant.file
+    if not path.is_file():
+        raise InputError(f"there is no recipe {path}; add it, or correct the variant's file")
+    values = read_toml(path)
+    return recipe_from(_merged(values, variant.recipe), f"{folder.name}/{variant.file}")
+
+
+def _merged(values: Any, changes: Any) -> Any:
+    """Nested tables with `changes` applied."""
+    if not isinstance(values, Mapping) or not isinstance(changes, Mapping):
+        return changes
+    return {**values, **{key: _merged(values.get(key, {}), change) for key, change in changes.items()}}
+
+
+def summary(cells: pd.DataFrame) -> pd.DataFrame:
+    """Mean and standard deviation of every cell over the layouts: table, row, column, ours, spread, n_layouts."""
+    groups = cells.groupby(["table", "row", "column"], sort=False)["value"]
+    # Relative to the first layout: equal cells have exactly their value and no spread.
+    table = groups.agg(
+        ours=lambda v: v.iloc[0] + np.mean(v - v.iloc[0]),
+        spread=lambda v: np.std(v - v.iloc[0], ddof=1) if len(v) > 1 else np.nan,
+        n_layouts="size",
+    )
+    return table.reset_index()
+
+
+def read_published(folder: Path) -> pd.DataFrame:
+    """The cells that a paper prints; empty if `folder` has no published.csv. Raises InputError for a missing column."""
+    path = folder / "published.csv"
+    if not path.is_file():
+        return pd.DataFrame(columns=PUBLISHED)
+    table = pd.read_csv(path, dtype={"row": str, "column": str, "note": str}, keep_default_na=False, na_values=[""])
+    if missing := [name for name in PUBLISHED if name not in table.columns]:
+        raise InputError(f"{path}: the column {missing[0]} is missing; add it ({', '.join(PUBLISHED)} are needed)")
+    if table.duplicated(_KEY).any():
+        first = table[table.duplicated(_KEY)].iloc[0]
+        raise InputError(f"{path}: {first['table']}, {first['row']}, {first['column']} is printed twice; keep one row")
+    return table
+
+
+def compare(run: Run, folder: Path) -> pd.DataFrame:
+    """The table tables.csv: every printed or computed cell; `within` is yes or no where there is a tolerance.
+
+    `ours` is the mean over `n_layouts` layouts, `spread` its standard deviation from layout to layout.
+    """
+    published = read_published(folder)
+    table = published.merge(summary(run.cells), on=_KEY, how="left")
+    ours = summary(run.cells).merge(published[_KEY], on=_KEY, how="left", indicator=True)
+    table = pd.concat([table, ours[ours["_merge"] == "left_only"].drop(columns="_merge")], ignore_index=True)
+    table = _with_mean_differences(table)
+    judged = table["published"].notna() & table["ours"].notna() & table["tolerance"].notna()
+    inside = (table["ours"] - table["published"]).abs() <= table["tolerance"]
+    table["within"] = np.where(judged, np.where(inside, "yes", "no"), "")
+    table["paper"] = run.experiment.paper
+    table["note"] = table["note"].fillna("")
+    places = pd.factorize(table["table"])[0]
+    return table[COLUMNS].iloc[np.argsort(places, kind="stable")].reset_index(drop=True)
+
+
+def side_by_side(comparison: pd.DataFrame, table: str) -> pd.DataFrame:
+    """One table of `compare` as it is printed: rows and columns as there, `each with `published` and `ours`.
+
+    Cells that are neither are left out. Raises ValueError for an unknown table.
+    """
+    cells = comparison[comparison["table"] == table]
+    if cells.empty:
+        known = ", ".join(dict.fromkeys(comparison["table"]))
+        raise ValueError(f"{table!r} is not a table of this experiment; its tables are {known}")
+    of = cells.set_index(["row", "column"])
+    columns = pd.MultiIndex.from_product([dict.fromkeys(cells["column"]), ["published", "ours"]])
+    wide = pd.DataFrame(index=pd.Index(list(dict.fromkeys(cells["row"])), name="row"), columns=columns, dtype=float)
+    for row, column in of.index:
+        wide.loc[row, column] = of.loc[(row, column), ["published", "ours"]].to_numpy()
+    return wide.dropna(axis="columns", how="all")
+
+
+def _with_mean_differences(table: pd.DataFrame) -> pd.DataFrame:
+    """Cells of MEAN_DIFFERENCE filled in."""
+    table = table.copy()
+    for k in table.index[table["column"] == MEAN_DIFFERENCE]:
+        cells = table[(table["table"] == table.loc[k, "table"]) & (table.index != k)]
+        table.loc[k, "ours"] = (cells["ours"] - cells["published"]).abs().mean()
+    return table
+
+
+def find_experiments(directory: Path, name: str) -> list[Path]:
+    """The folder of the experiment `name`, or of `all`, in `directory`. Raises InputError if there is none."""
+    known = sorted(path.parent for path in directory.glob(f"*/{FILE}"))
+    if not known:
+        raise InputError(
+            f"{directory} holds no experiments (folders with {FILE}); go to the folder that has experiments/, name it "
+            "with --experiments, or write those of the papers there first (jaxphoto example experiments)"
+        )
+    chosen = known if name == "all" else [path for path in known if path.name == name]
+    if not chosen:
+        names = ", ".join(path.name for path in known)
+        raise InputError(f"there is no experiment {name} in {directory}; choose {names} or all")
+    return chosen
+
+
+def load_experiment(folder: Path) -> Experiment:
+    """The EXPERIMENT that experiment.py in `folder` declares. Raises InputError where it does not."""
+    path = folder / FILE
+    spec = importlib.util.spec_from_file_location(f"jaxphoto_experiment_{folder.name}", path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise InputError(f"there is no file {path}; an experiment is a folder with {FILE}")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise InputError(f"{path} cannot be run ({type(error).__name__}: {error}); correct it") from error
+    experiment = getattr(module, "EXPERIMENT", None)
+    if not isinstance(experiment, Experiment):
+        raise InputError(f"{path} declares no EXPERIMENT; end it with EXPERIMENT = Experiment(...)")
+    return experiment

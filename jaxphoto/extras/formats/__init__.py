@@ -1,0 +1,33 @@
+"""Formats of other programs: every module reads into and writes from `Project`, and declares its formats.
+
+Modules declare FORMATS (oriented projects), CAMERAS (camera files) and CONTROL (control points and marks); `convert`
+registers them and loops over them.
+"""
+
+from jaxphoto.extras.formats.camera_models import ProjectCamera
+from jaxphoto.extras.formats.convert import (
+    CAMERA_FORMATS,
+    CAMERA_MODELS,
+    CAMERAS_WRITTEN,
+    CONTROL_FORMATS,
+    EXPORTS,
+    FORMATS,
+    FORMS,
+    LOSS_PX,
+    Exported,
+    check_export_target,
+    convert,
+    export,
+    read_control,
+    read_source,
+    read_tables,
+    recognise,
+    write_camera_file,
+)
+from jaxphoto.extras.formats.project import ControlPoints, Project
+
+__all__ = [
+    "CAMERAS_WRITTEN", "CAMERA_FORMATS", "CAMERA_MODELS", "CONTROL_FORMATS", "EXPORTS", "FORMATS", "FORMS", "LOSS_PX",
+    "ControlPoints", "Exported", "Project", "ProjectCamera", "check_export_target", "convert", "export", "read_control",
+    "read_source", "read_tables", "recognise", "write_camera_file",
+]  # fmt: skip

@@ -1,0 +1,357 @@
+"""Control points and marks as tables, gcp_list.txt of OpenDroneMap, and geoin.dat of BINGO.
+
+    tables        points (point, X_m, Y_m, Z_m, sigma_X_m ..., role) or marks (image, point, x_px, y_px, sigma_px) of
+                  jaxphoto, Metashape and Pix4D, separated by commas, semicolons, tabs or blanks. A comment may name the
+                  system: "# EPSG:25832+7837", "#CoordinateSystem: ..." with WKT. Without a header, as Pix4D's: label,
+                  coordinates in the order of the system's axes, z [, horizontal and vertical accuracy], or image,
+                  label, x, y [, accuracy]. Pixels are ours.
+    gcp_list.txt  a line that names the system, then geo_x geo_y geo_z im_x im_y image_name [gcp_name] [extras]; geo_x
+    is
+                  the easting or longitude; pixels count from the centre of the upper left one. A list without marks has
+                  rows of gcp_name geo_x geo_y geo_z, or of geo_x geo_y geo_z [gcp_name].
+    geoin.dat     rows that begin with CONT are control, with CHCK check points: CONT point X Y Z ...
+
+Sources: OpenDroneMap and OpenSfM documentation, "Ground Control Points"; for BINGO, whose manual is not public, S.
+Turek's bundle block adjustment for GRASS, 2014.
+"""
+
+import re
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxphoto.errors import InputError, counted, quoted
+from jaxphoto.extras.formats.files import ControlFormat
+from jaxphoto.extras.formats.project import Project
+from jaxphoto.io.control_table import (
+    PLACE,
+    SYSTEM,
+    Cells,
+    Columns,
+    columns_of,
+    in_degrees,
+    separator_of,
+    split_row,
+    with_points,
+)
+from jaxphoto.io.names import LONGEST, harm_in
+from jaxphoto.io.text_tables import MOST_COLUMNS, is_number
+from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
+
+GCP_LIST = "gcp_list.txt"
+# Our column and row of the centre of the upper left pixel, (0, 0) in gcp_list.txt.
+_FIRST_PX = 0.5
+_POINT = {
+    "point": ("label", "point", "gcp", "gcp label", "gcp name", "point name", "marker", "name", "point id", "id"),
+    **PLACE,
+    "role": ("role", "type"),
+    "enabled": ("enable", "enabled"),
+}
+_MARK = {
+    "image": ("image", "image name", "photo", "photograph", "camera", "filename", "file name", "file"),
+    "point": _POINT["point"],
+    "x": ("x px", "x", "px", "column px", "column", "im x", "pixel x", "pixelx", "u", "image u"),
+    "y": ("y px", "y", "py", "row px", "row", "im y", "pixel y", "pixely", "v", "image v"),
+    "sigma": ("sigma px", "sigma", "accuracy px", "accuracy"),
+}
+_PICTURE = re.compile(r"\.(jpe?g|tiff?|png|dng)$", re.IGNORECASE)
+_EPSG = re.compile(r"#.*\bEPSG:\s*(\d{4,6}(?:\+\d{4,6})?)\s*$", re.IGNORECASE)
+_WKT = re.compile(r"#\s*CoordinateSystem:\s*(\S.*)$")
+_ROLES = {
+    "": False, "control": False, "gcp": False, "3d gcp": False, "2d gcp": False,
+    "check": True, "cp": True, "check point": True, "checkpoint": True,
+}  # fmt: skip
+_HEAD_LINES = 20
+_BINGO_CHECK = {"CONT": False, "CHCK": True}
+
+
+Mark = tuple[str, str, list[float], float, str]
+"""Image, point, column and row, sigma in pixels, place for messages."""
+
+
+class SurveyRows:
+    """Surveyed points in the order of the file."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+        self._rows: dict[str, tuple[list[float], list[float], bool, str]] = {}
+        self._names: dict[tuple[str, ...], str] = {}
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def named_by(self, xyz: Sequence[float]) -> str:
+        """Return the name of a point without one: P1, P2 ..., one for each position."""
+        return self._names.setdefault(tuple(map(repr, xyz)), f"P{len(self._names) + 1}")
+
+    def add(
+        self,
+        name: str,
+        xyz: list[float],
+        place: str,
+        sigma: list[float] | None = None,
+        check: bool = False,
+        once: bool = False,
+    ) -> None:
+        """Add a point; with `once`, even a repeated point with the same coordinates is an error."""
+        check_name(name, "point", place)
+        row = (xyz, sigma or [np.nan] * 3, check, place)
+        first = self._rows.setdefault(name, row)
+        same = np.array_equal(np.array(first[0]), np.array(xyz), equal_nan=True)
+        if first is not row and (once or not same):
+            other = "" if same else " with other coordinates"
+            raise InputError(f"{place}: the point {quoted(name)} stands in {first[3]}, too{other}")
+
+    def surveyed(self, system: str = "") -> SurveyedPoints:
+        """Return all points. Raise InputError if there is none."""
+        if not self._rows:
+            raise InputError(f"{self.file}: there is no point with coordinates; add some")
+        xyz, sigma, check, place = zip(*self._rows.values(), strict=True)
+        points = np.array(xyz, float).reshape(-1, 3), np.array(sigma, float).reshape(-1, 3), np.array(check, bool)
+        return SurveyedPoints(self.file, tuple(self._rows), *points, place, system)
+
+
+def read_marks(rows: Sequence[Mark]) -> Marks:
+    """Return marks of rows. Raise InputError for invalid names, and for a point marked twice in an image."""
+    seen: dict[tuple[str, str], str] = {}
+    for image, point, _, _, place in rows:
+        check_name(image, "image", place)
+        check_name(point, "point", place)
+        first = seen.setdefault((image, point), place)
+        if first is not place:
+            raise InputError(f"{place}: {quoted(point)} is marked in {quoted(image)} in {first}, too; keep one of them")
+    images, points, at, sigma, places = zip(*rows, strict=True) if rows else ((),) * 5
+    return Marks(images, points, np.array(at, float).reshape(-1, 2), np.array(sigma, float), places)
+
+
+def check_name(name: str, what: str, place: str) -> None:
+    """Raise InputError for a name that is empty, too long or harmful in results."""
+    if not name:
+        raise InputError(f"{place}: the {what} is empty; give its name or delete the row")
+    if len(name) > LONGEST or harm_in(name):
+        raise InputError(f"{place}: the {what} {quoted(name)} {harm_in(name)}")
+
+
+def numbered_lines(text: str) -> list[tuple[int, str]]:
+    """Return lines that are not empty, with their rows."""
+    return [(row, line) for row, line in enumerate(text.split("\n"), 1) if line.strip()]
+
+
+# Tables -------------------------------------------------------------------------------------------------------
+
+
+def read_table(path: Path, text: str) -> SurveyedPoints | Marks:
+    """Read the points or marks of a table."""
+    rows = numbered_lines(text)
+    comments = [line.strip() for _, line in rows[:_HEAD_LINES] if line.lstrip().startswith("#")]
+    content = [(row, line) for row, line in rows if not line.lstrip().startswith("#")]
+    systems = [match[1].strip() for line in comments for of in (_EPSG, _WKT) if (match := of.match(line))]
+    system = "".join(systems[:1])
+    separator = separator_of(content[0][1] if content else "")
+    cells = Cells(
+        path.name, [split_row(path.name, line, row, separator) for row, line in content], [r for r, _ in content]
+    )
+    if not cells.records:
+        raise cells.none("the file is empty; give it points or marks")
+    width = len(cells.records[0])
+    in_comments = [line.lstrip("#").strip().split(None if separator == " " else separator) for line in comments]
+    for k, header in enumerate([cells.records[0], *(words for words in in_comments if len(words) <= MOST_COLUMNS)]):
+        below = cells._replace(records=cells.records[k == 0 :], rows=cells.rows[k == 0 :])
+        marks, points = columns_of(header, _MARK), columns_of(header, _POINT)
+        # A comment whose columns the rows do not have is a sentence.
+        if _has(marks, ("image", "point", "x", "y"), width if k else MOST_COLUMNS):
+            return _marks(below, marks, separator)
+        if "image" not in marks and _has(points, ("point", "x", "y"), width if k else MOST_COLUMNS):
+            return read_points(below, points, separator, system, in_degrees(header, points))
+    records = with_points(cells, separator).records
+    kind, columns = _without_header(records)
+    if kind == "marks":
+        return _marks(cells, columns, separator)
+    if kind == "points":
+        return read_points(cells, columns, separator, system, False)._replace(own_axes=True)
+    usual = Counter(map(len, records)).most_common(1)[0][0]
+    odd = [k for k, r in enumerate(records) if len(r) != usual]
+    if 2 * len(odd) < len(records) and _without_header([r for r in records if len(r) == usual])[0]:
+        raise cells.bad(odd[0], f"{counted(len(records[odd[0]]), 'cell')}, where most rows have {usual}; complete it")
+    raise cells.none(
+        f"this is no file of control (it begins with {quoted(' '.join(cells.records[0]))}): give points (point, X_m, "
+        "Y_m, Z_m), marks (image, point, x_px, y_px), a gcp_list.txt, markers of Metashape, GeoJSON or a GeoPackage"
+    )
+
+
+def _has(columns: Columns, names: tuple[str, ...], width: int) -> bool:
+    return all(columns.get(name, width) < width for name in names)
+
+
+def _without_header(records: Sequence[Sequence[str]]) -> tuple[str, Columns]:
+    """Whether rows without a header are "points", "marks" or "" (neither), and their columns; most rows decide."""
+    width = {len(r) for r in records}
+    if not any(map(is_number, records[0][1:])):
+        return "", {}
+    marks = sum(bool(_PICTURE.search(r[0])) and all(map(is_number, r[2:])) for r in records)
+    if width <= {4, 5} and 2 * marks > len(records):
+        return "marks", dict(zip(("image", "point", "x", "y", "sigma"), range(max(width)), strict=False))
+    points = sum(all(map(is_number, r[1:])) for r in records)
+    if width <= {4, 6} and len(width) == 1 and 2 * points > len(records):
+        names = ("point", "x", "y", "z", "sigma_plan", "sigma_z")
+        return "points", dict(zip(names, range(max(width)), strict=False))
+    return "", {}
+
+
+def read_points(cells: Cells, columns: Columns, separator: str, system: str, degrees: bool) -> SurveyedPoints:
+    """Return rows of points with known columns; `degrees`: the header says longitude and latitude."""
+    cells, points = with_points(cells, separator, columns["point"]), SurveyRows(cells.file)
+    for k, row in enumerate(cells.records):
+        if len(row) <= max(columns["point"], columns["x"], columns["y"]):
+            raise cells.bad(k, f"{len(row)} cells are too few for the header; complete the row")
+        xyz = [cells.number(k, columns["x"], "X"), cells.number(k, columns["y"], "Y"), np.nan]
+        if "z" in columns and len(row) > columns["z"]:
+            xyz[2] = cells.height(k, columns["z"])
+        sigma = [cells.sigma(k, columns.get(f"sigma_{axis}"), f"sigma of {axis}") for axis in "xyz"]
+        plan = cells.sigma(k, columns.get("sigma_plan"), "sigma in plan")
+        sigma = [plan if np.isnan(v) and axis < 2 else v for axis, v in enumerate(sigma)]
+        if "sigma_x" in columns and "sigma_y" not in columns:
+            sigma = [sigma[0] if np.isnan(v) else v for v in sigma]
+        role, enabled = (
+            row[columns[name]].lower() if columns.get(name, len(row)) < len(row) else "" for name in ("role", "enabled")
+        )
+        if role not in _ROLES:
+            raise cells.bad(k, f"the role {quoted(role)} is unknown; write control or check")
+        check = _ROLES[role] or enabled in ("0", "false", "no")
+        points.add(row[columns["point"]], xyz, cells.place(k), sigma, check, once=True)
+    surveyed = points.surveyed(system)
+    if degrees and not (np.abs(surveyed.coordinates[:, 0]) <= 360).all():
+        raise cells.none("the header says longitude and latitude, but the numbers are no degrees; correct the header")
+    return surveyed
+
+
+def point_attributes(header: Sequence[str]) -> Columns | None:
+    """Return the columns of point features by their attributes; None for other features, such as images."""
+    columns = columns_of(header, _POINT)
+    of_images = {"image", "image name", "filename"} & {name.lower() for name in header}
+    return columns if {"point", "x", "y"} <= set(columns) and not of_images else None
+
+
+def _marks(cells: Cells, columns: Columns, separator: str) -> Marks:
+    cells = with_points(cells, separator, columns["image"], columns["point"])
+    marks: list[Mark] = []
+    for k, row in enumerate(cells.records):
+        if len(row) <= max(v for name, v in columns.items() if name != "sigma"):
+            raise cells.bad(k, f"{len(row)} cells are too few for the header; complete the row")
+        column_row = [cells.number(k, columns["x"], "x"), cells.number(k, columns["y"], "y")]
+        sigma = cells.sigma(k, columns.get("sigma"), "the sigma of the mark")
+        marks.append((row[columns["image"]], row[columns["point"]], column_row, sigma, cells.place(k)))
+    if not marks:
+        raise cells.none("there is no mark; add rows")
+    return read_marks(marks)
+
+
+# gcp_list.txt -------------------------------------------------------------------------------------------------
+
+
+def _gcp_lines(text: str) -> list[tuple[int, str]]:
+    return [(row, line) for row, line in numbered_lines(text) if not line.lstrip().startswith("#")]
+
+
+def _is_gcp_list(path: Path, text: str) -> bool:
+    lines = _gcp_lines(text)
+    if not lines or not SYSTEM.match(lines[0][1].strip()):
+        return False
+    cells = lines[1][1].split() if len(lines) > 1 else []
+    return len(lines) == 1 or (len(cells) >= 6 and all(map(is_number, cells[:5]))) or _unmarked(cells) is not None
+
+
+def _unmarked(cells: list[str]) -> tuple[str, int] | None:
+    """Name ("" for none) and first coordinate of a row without a mark; None for other rows."""
+    # A number with decimals is no name: names may stand last, and be numbers too.
+    if len(cells) == 4 and all(map(is_number, cells[1:])) and not (is_number(cells[0]) and "." in cells[0]):
+        return cells[0], 1
+    if len(cells) in (3, 4) and all(map(is_number, cells[:3])):
+        return "".join(cells[3:]), 0
+    return None
+
+
+def read_gcp_list(path: Path, text: str) -> GivenControl:
+    """Read points, all of them control, and marks."""
+    (_, system), *rows = _gcp_lines(text)
+    cells = Cells(path.name, [line.split() for _, line in rows], [row for row, _ in rows])
+    if not cells.records:
+        raise cells.none(f"there is no mark after {quoted(system.strip())}; add rows")
+    points, marks = SurveyRows(path.name), list[Mark]()
+    marked = _unmarked(cells.records[0]) is None
+    for k, row in enumerate(cells.records):
+        unmarked = None if marked else _unmarked(row)
+        if unmarked is None and len(row) < 6:
+            raise cells.bad(k, f"{len(row)} cells; write geo_x, geo_y, geo_z, im_x, im_y, image_name")
+        name, first = unmarked or (row[6] if len(row) > 6 else "", 0)
+        xyz = [cells.number(k, first, "geo_x"), cells.number(k, first + 1, "geo_y"), cells.height(k, first + 2)]
+        name = name or points.named_by(xyz)
+        points.add(name, xyz, cells.place(k))
+        if unmarked is None:
+            column_row = [cells.number(k, 3, "im_x") + _FIRST_PX, cells.number(k, 4, "im_y") + _FIRST_PX]
+            marks.append((row[5], name, column_row, np.nan, cells.place(k)))
+    return GivenControl(points.surveyed(system.strip()), read_marks(marks))
+
+
+def write_gcp_list(p: Project, folder: Path) -> None:
+    """Write gcp_list.txt if the block has control on a map; heights are ellipsoidal, check points are left out."""
+    if p.control is None or not len(p.control.point):
+        return
+    chosen = np.flatnonzero(~p.control.check & ~np.isnan(p.control.xyz[:, :2]).any(axis=1))
+    names = [*p.files, *(p.points[j] for j in p.control.point[chosen])]
+    message = ""
+    if p.frame.kind != "epsg":
+        message = "is not written, because it needs a map system and the block is in a local frame"
+    elif blank := next((name for name in names if len(name.split()) != 1), None):
+        message = f"is not written, because it ends names at blanks and {blank!r} has one; rename it"
+    elif left := len(p.control.point) - len(chosen):
+        message = f"is without {left} check points or points without X and Y, which it cannot have"
+    if message:
+        warnings.warn(f"{GCP_LIST} {message}", UserWarning, stacklevel=4)
+    if message.startswith("is not written"):
+        return
+    control, rows = p.in_map(ellipsoidal=True).control, p.rows_of_points
+    assert control is not None
+    lines = [f"EPSG:{p.frame.code}"]
+    for k in chosen.tolist():
+        point = int(control.point[k])
+        for row in rows[point].tolist():
+            values = map(repr, [*control.xyz[k].tolist(), *(p.column_row[row] - _FIRST_PX).tolist()])
+            lines.append("\t".join([*values, p.files[p.image[row]], p.points[point]]))
+    (folder / GCP_LIST).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+# geoin.dat ----------------------------------------------------------------------------------------------------
+
+
+def is_geoin(lines: list[str]) -> bool:
+    """True if all lines are records of BINGO, points among them."""
+    rows = [row for line in lines if (row := line.split(maxsplit=5)) and row[0][0] not in "*#"]
+    records = all(re.fullmatch("[A-Z]{4}|C", row[0]) for row in rows)
+    points = (row for row in rows if row[0] in _BINGO_CHECK and len(row) >= 5)
+    return records and any(all(map(is_number, row[2:5])) for row in points)
+
+
+def read_geoin(path: Path, text: str) -> SurveyedPoints:
+    """Read the points; other records are skipped."""
+    rows = [(row, line.split()) for row, line in numbered_lines(text) if line.split()[0] in _BINGO_CHECK]
+    cells, points = Cells(path.name, [line for _, line in rows], [row for row, _ in rows]), SurveyRows(path.name)
+    for k, row in enumerate(cells.records):
+        if len(row) < 5:
+            raise cells.bad(k, f"{len(row)} cells; a row has {row[0]}, the point, X, Y and Z, so complete it")
+        xyz = [cells.number(k, 2, "X"), cells.number(k, 3, "Y"), cells.height(k, 4)]
+        points.add(row[1], xyz, cells.place(k), check=_BINGO_CHECK[row[0]], once=True)
+    return points.surveyed()
+
+
+CONTROL = (
+    ControlFormat("gcp_list", "gcp_list.txt", _is_gcp_list, read_gcp_list),
+    ControlFormat(
+        "bingo", "geoin.dat of BINGO", lambda _, text: is_geoin([line for _, line in numbered_lines(text)]), read_geoin
+    ),
+)
+TABLES = ControlFormat("tables", "CSV, table of Metashape or Pix4D", lambda path, text: True, read_table)
+"""The format of every text that is no other."""

@@ -1,0 +1,94 @@
+"""Rays and ideal coordinates of many image coordinates at once."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxphoto.camera import InteriorOrientation, Perspective
+from jaxphoto.compiling import jit_quickly
+
+# Cosine of the largest angle from the axis at which a fisheye ray is projected to the perspective plane: 80 degrees,
+# where a pixel is 30 times as large as in the centre.
+_FLATTEST = 0.17
+
+
+@jit_quickly
+def directions_of(interior: InteriorOrientation, xy: Float[Array, "rows 2"]) -> Float[Array, "rows 3"]:
+    """Directions in the camera frame of image coordinates (mm); traced numbers stay traced."""
+    return jax.vmap(lambda one: jnp.stack(interior.direction_from_ideal(interior.ideal_from_measured(one))))(xy)
+
+
+def ideal_coordinates(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"]) -> Float[np.ndarray, "rows 2"]:
+    """Ideal coordinates (mm, from the principal point) on the perspective plane of the measured rows of one camera.
+
+    NaN for a ray of another projection that is farther than 80 degrees from the axis.
+    """
+    directions = _of_rows(interior, xy_mm)
+    # In this order the ideal coordinates of a perspective camera are unchanged.
+    ideal = directions[:, :2] * (-float(interior.c) / directions[:, 2:])
+    if type(interior.projection) is not Perspective:
+        ideal[~(-directions[:, 2] > _FLATTEST * np.linalg.norm(directions, axis=1))] = np.nan
+    return ideal
+
+
+def camera_rays(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"]) -> Float[np.ndarray, "rows 3"]:
+    """Unit directions in the camera frame of the measured rows of one camera of any projection."""
+    directions = _of_rows(interior, xy_mm)
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def _of_rows(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"]) -> Float[np.ndarray, "rows 3"]:
+    n = len(xy_mm)
+    xy = np.zeros((padded_length(n), 2))
+    xy[:n] = xy_mm
+    # Numbers as arrays: a float in the tree would be a constant of the program, one for every camera.
+    numbers = jax.tree.map(partial(np.asarray, dtype=float), interior)
+    return np.asarray(directions_of(numbers, xy))[:n]
+
+
+def padded_length(n: int) -> int:
+    """The next of 32, 128, 512, 2048, 4096, ...: a block of a hundred images compiles two or three times."""
+    length = 32
+    while length < n:
+        length *= 4 if length < 2048 else 2
+    return length
+
+
+def padded(values: np.ndarray, length: int) -> np.ndarray:
+    """`values` with the last row repeated to `length` rows."""
+    return values[np.minimum(np.arange(length), len(values) - 1)]
+
+
+def unit_rays(
+    c_mm: Float[np.ndarray, " rows"] | float, ideal: Float[np.ndarray, "rows 2"]
+) -> Float[np.ndarray, "rows 3"]:
+    """Unit directions (x, y, -c) in the camera frame."""
+    rays = np.column_stack([ideal, -np.broadcast_to(c_mm, len(ideal))])
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def ray_noise(rays: Float[np.ndarray, "rows 3"], sigma_rad: float) -> Float[np.ndarray, "rows 3 2"]:
+    """Errors of unit rays in the camera frame by one sigma in each of the two ideal image coordinates.
+
+        d ray = (I - ray ray') (e_x, e_y) |z| sigma_rad
+
+    `sigma_rad` is the standard deviation of an image coordinate as a fraction of c: the angle at the principal point.
+    Away from it the same error in the image is a smaller angle. Raises ValueError for a ray that does not point to
+    the front of the camera (z < 0).
+    """
+    if not np.all(rays[:, 2] < 0):
+        raise ValueError("rays in the camera frame point to the front of the camera, so their z is negative")
+    across = np.eye(3)[:, :2] - rays[:, :, None] * rays[:, None, :2]
+    return across * (sigma_rad * np.abs(rays[:, 2]))[:, None, None]
+
+
+def turn_to_object(
+    camera_from_object: Float[np.ndarray, "images 3 3"],
+    image: Int[np.ndarray, " rows"],
+    rays: Float[np.ndarray, "rows 3"],
+) -> Float[np.ndarray, "rows 3"]:
+    """Directions in the object frame of rays in the camera frames of their images."""
+    return np.einsum("nij,ni->nj", camera_from_object[image], rays)

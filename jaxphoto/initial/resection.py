@@ -1,0 +1,264 @@
+"""Resection of one image from known points, without approximate values.
+
+1. Three-point resections of some thirty triangles: the largest in the image, and random ones in case the outermost
+   points are wrong.
+2. The solutions with the smallest robust reprojection error over all points.
+3. Least squares from each of them, in ideal image coordinates over c, with Cauchy's loss. The best is the result.
+"""
+
+from itertools import combinations
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxphoto.camera import InteriorOrientation
+from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.compiling import call_compiled
+from jaxphoto.errors import BlockError
+from jaxphoto.initial.quaternions import cayley
+from jaxphoto.initial.rays import ideal_coordinates, padded, padded_length, unit_rays
+from jaxphoto.initial.three_points import three_point_resections
+from jaxphoto.least_squares import least_squares
+
+STARTS = 4
+"""Orientations to refine, at most."""
+_STARTS = 8  # that a program refines side by side
+_TRIANGLES = 16  # largest, and as many at random
+_JUDGES = 60  # points at most that choose among the solutions
+# Ideal image errors, as fractions of c: those that count as small when solutions are compared, and the typical one
+# beyond which a resection is no solution. Lenient, because the distortion may still be unknown.
+_SMALL, _HOPELESS = 2e-3, 0.2
+# A standard deviation, of the distance or in rad, that makes a resection useless; by noise of `_LEAST` of c at least.
+_OPEN, _LEAST = 0.3, 1e-6
+# Relative and absolute difference of costs that is rounding.
+_SAME_COST, _ROUNDING = 1e-10, 1e-28
+
+
+class RefinedResections(NamedTuple):
+    """Orientations refined from several starts."""
+
+    positions: Float[np.ndarray, "starts 3"]
+    matrices: Float[np.ndarray, "starts 3 3"]
+    costs: Float[np.ndarray, " starts"]
+    """Sum of robust squares of residuals over c."""
+    normals: Float[np.ndarray, "starts 6 6"]
+    """Of the shift over `distances` and the small rotation in the camera frame (rad)."""
+    distances: Float[np.ndarray, " starts"]
+    """In m, of each start from the origin."""
+    converged: Bool[np.ndarray, " starts"]
+    steps: Int[np.ndarray, " starts"]
+
+    def best(self, n_points: int) -> int:
+        """Return the index of the least cost; of costs equal but for rounding, that of a converged one."""
+        equal = self.costs <= (1 + _SAME_COST) * np.min(self.costs) + _ROUNDING * n_points
+        return int(np.lexsort((self.costs, ~self.converged, ~equal))[0])
+
+
+def resect(
+    interior: InteriorOrientation,
+    xy_mm: Float[np.ndarray, "n 2"],
+    points: Float[np.ndarray, "n 3"],
+    image: str = "(unnamed)",
+) -> ExteriorOrientation:
+    """Exterior orientation of one image from four or more known points, planar or not.
+
+    `xy_mm` are measured coordinates from the image centre, `points` (m) the known points in the same order, `image`
+    the name for the message. The interior orientation may be rough.
+
+    Raises BlockError for fewer than four distinct points (three leave up to four solutions), points on a line or in a
+    plane with the projection centre, an orientation open by more than 0.3 of the distance or 0.3 rad, a coordinate
+    that is not a number, and points that no orientation brings near their images. For the accuracy of the result see
+    `resect_by_quaternions`.
+    """
+    return resect_ideal(float(interior.c), ideal_coordinates(interior, np.asarray(xy_mm, float)), points, image)
+
+
+def resect_ideal(
+    c_mm: float, ideal: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"], image: str
+) -> ExteriorOrientation:
+    """`resect` from ideal image coordinates (mm, from the principal point)."""
+    local, origin = checked_points(ideal, points, image)
+    positions, matrices = _candidates(c_mm, ideal, local)
+    if not len(positions):
+        raise no_orientation(image)
+    errors = reprojection_errors(c_mm, ideal, local, positions, matrices)
+    # Of a few points the triangle fits three exactly, so the others are no blunders for being worse.
+    typical = np.median(errors[0]) if len(local) >= 8 else np.max(errors[0])
+    refined = refine(c_mm, ideal, local, positions, matrices, max(3 * 1.4826 * float(typical) / c_mm, 0.5 * _SMALL))
+    best = int(np.argmin(refined.costs))
+    position, matrix = refined.positions[best], refined.matrices[best]
+    error = float(np.median(reprojection_errors(c_mm, ideal, local, position[None], matrix[None])))
+    if not error < _HOPELESS * c_mm:
+        raise no_orientation(image)
+    # Six unknowns absorb part of the noise.
+    noise = error / c_mm * np.sqrt(len(local) / (len(local) - 3))
+    check_determined(refined.normals[best], max(noise, _LEAST), image, _OPEN)
+    return ExteriorOrientation(jnp.asarray(position + origin), jnp.asarray(matrix))
+
+
+def refine(
+    c_mm: float,
+    ideal: Float[np.ndarray, "n 2"],
+    points: Float[np.ndarray, "n 3"],
+    positions: Float[np.ndarray, "starts 3"],
+    matrices: Float[np.ndarray, "starts 3 3"],
+    limit: float = np.inf,
+) -> RefinedResections:
+    """Refine orientations by least squares, with Cauchy's loss of scale `limit` (residuals over c).
+
+    `points` (m) are about the origin.
+    """
+    n, starts = padded_length(len(points)), _STARTS * -(-len(positions) // _STARTS)
+    place = tuple(padded(v, starts) for v in (positions, matrices))
+    rows = *(padded(v, n) for v in (ideal / c_mm, points)), np.arange(n) < len(points)
+    # From the solution once more: normal matrices are of small rotations from there.
+    for _ in range(2):
+        results = [np.asarray(v) for v in call_compiled(_refined, *place, *rows, np.asarray(limit, float))]
+        place = results[0], results[1]
+    return RefinedResections(*(v[: len(positions)] for v in results))
+
+
+@eqx.filter_jit
+def _refined(positions, matrices, observed, points, used, limit):
+    def refined(position, matrix):
+        distance = jnp.linalg.norm(position)
+
+        def moved(step):
+            return position + distance * step[:3], cayley(step[3:]) @ matrix
+
+        def residuals(step, _):
+            """Robust residuals over c after a shift over `distance` and a small rotation in the camera frame."""
+            position, matrix = moved(step)
+            in_camera = (points - position) @ matrix.T
+            depth = -in_camera[:, 2:]
+            residual = observed - in_camera[:, :2] / jnp.where(depth == 0, 1e-100, depth)
+            # The squares of r sqrt(log(1 + q) / q) are Cauchy's loss.
+            q = jnp.sum(residual**2, axis=1, keepdims=True) / limit**2 + 1e-30
+            # A blunder may lie behind the best candidate, but no step may take more points there.
+            behind = jnp.sqrt(jnp.sum(used) * jnp.sum(used * (depth[:, 0] <= 0)))
+            return jnp.append(residual * used[:, None] * jnp.sqrt(jnp.log1p(q) / q), behind)
+
+        fit = least_squares(residuals, jnp.zeros(6), damping=1e-6)
+        return *moved(fit.unknowns), fit.cost, fit.normal, distance, fit.converged, fit.steps
+
+    return jax.vmap(refined)(positions, matrices)
+
+
+def reprojection_errors(
+    c_mm: float,
+    ideal: Float[np.ndarray, "n 2"],
+    points: Float[np.ndarray, "n 3"],
+    positions: Float[np.ndarray, "orientations 3"],
+    matrices: Float[np.ndarray, "orientations 3 3"],
+) -> Float[np.ndarray, "orientations n"]:
+    """Errors (mm) of every point in every orientation, at most c; c for a point behind the camera."""
+    camera = (matrices.reshape(-1, 3) @ points.T).reshape(-1, 3, len(points)) - matrices @ positions[:, :, None]
+    in_front = camera[:, 2] < 0
+    error = ideal.T + c_mm * camera[:, :2] / np.where(in_front, camera[:, 2], -1.0)[:, None]
+    return np.where(in_front, np.minimum(np.hypot(error[:, 0], error[:, 1]), c_mm), c_mm)
+
+
+def checked_points(
+    ideal: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"], image: str
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "3"]]:
+    """The points about their mean, and the mean (m), of an image that they can orient.
+
+    Raises BlockError for a coordinate that is not a number, fewer than four distinct points, and points on a line on
+    the ground or in the image; ValueError where there are not as many points as image coordinates.
+    """
+    points = np.asarray(points, float)
+    if points.shape != (len(ideal), 3):
+        raise ValueError(
+            f"image coordinates and points belong together, but of image {image} there are {len(ideal)} coordinates "
+            f"and points of shape {points.shape}"
+        )
+    finite = np.isfinite(points).all(axis=1) & np.isfinite(ideal).all(axis=1)
+    if not finite.all():
+        raise BlockError(
+            f"{np.sum(~finite)} of the {len(points)} known points of image {image} have a coordinate that is no "
+            "number (in the image, after the correction of its distortion, or on the ground): leave them out"
+        )
+    distinct = len(np.unique(points, axis=0))
+    cure = "or give its approximate X_m, Y_m, Z_m, omega_deg, phi_deg, kappa_deg in images.csv"
+    if distinct < 4:
+        raise BlockError(
+            f"image {image} sees {distinct} known points, and a resection needs 4: measure more known points in it "
+            + cure
+        )
+    origin = points.mean(axis=0)
+    for centred, where in (
+        (points - origin, "on a line"),
+        (ideal - ideal.mean(axis=0), "in one plane with its projection centre (a line in the image)"),
+    ):
+        across = np.linalg.svd(centred, compute_uv=False)
+        if across[1] < 1e-4 * across[0]:
+            raise BlockError(
+                f"the known points of image {image} lie {where}, which leaves its orientation open: measure a known "
+                f"point off that line {cure}"
+            )
+    return points - origin, origin
+
+
+def no_orientation(image: str) -> BlockError:
+    """Error for points that belong to other images."""
+    return BlockError(
+        f"no position and attitude of image {image} brings its known points near their images: check their ids, "
+        "the units and axes of the image coordinates, and c_mm"
+    )
+
+
+def check_determined(normal: Float[np.ndarray, "6 6"], sigma: float, image: str, limit: float) -> None:
+    """Raise BlockError if a standard deviation exceeds `limit`, as a fraction of the distance or in rad.
+
+    `sigma` is the standard deviation of image coordinates as a fraction of c.
+    """
+    values = np.linalg.eigvalsh(normal)
+    if not (values[0] > 1e-13 * values[-1] and sigma / np.sqrt(values[0]) < limit):
+        raise open_orientation(image)
+
+
+def open_orientation(image: str) -> BlockError:
+    """Error for points that do not determine the orientation."""
+    return BlockError(
+        f"the known points of image {image} leave its orientation open, as points close to a line do, few points "
+        "in a small part of the image, or points on a dangerous cylinder or curve through the projection centre: "
+        "measure known points elsewhere in it"
+    )
+
+
+def _candidates(c_mm, ideal, points):
+    """The `STARTS` solutions of the triangles with the smallest robust reprojection error, best first."""
+    triples = _triples(ideal, points)
+    positions, matrices = three_point_resections(unit_rays(c_mm, ideal)[triples], points[triples])
+    judges = np.linspace(0, len(ideal) - 1, min(len(ideal), _JUDGES)).astype(int)
+    errors = reprojection_errors(c_mm, ideal[judges], points[judges], positions, matrices)
+    order = np.argsort(np.sum(np.log1p((errors / (_SMALL * c_mm)) ** 2), axis=1))[:STARTS]
+    return positions[order], matrices[order]
+
+
+def _triples(ideal, points):
+    """Indices (triples, 3) of the largest triangles in the image and of some random ones; no lines in the object."""
+    angles = np.arange(12) * np.pi / 6
+    extreme = np.unique(np.argmax(ideal @ np.stack([np.cos(angles), np.sin(angles)]), axis=0))
+    among = np.arange(len(ideal)) if len(ideal) <= 12 else extreme
+    large = np.array(list(combinations(among, 3)), int).reshape(-1, 3)
+    random = np.random.default_rng(0).integers(len(ideal), size=(200, 3))
+    area = _area(ideal, points, large)
+    large = large[np.argsort(-area)[:_TRIANGLES]]
+    random = random[_area(ideal, points, random) > 0.1 * area.max(initial=0.0)][:_TRIANGLES]
+    triples = np.unique(np.sort(np.concatenate([large, random]), axis=1), axis=0)
+    return triples[_area(ideal, points, triples) > 0]
+
+
+def _area(ideal, points, triples):
+    """Twice the area of triangles in the image; zero where they are lines in the object."""
+    a, b, c = (ideal[triples[:, k]] for k in range(3))
+    sides = points[triples[:, [1, 2, 0]]] - points[triples]
+    longest = np.max(np.sum(sides**2, axis=2), axis=1)
+    flat = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) <= 1e-3 * longest
+    area = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    return np.where(flat, 0.0, area)

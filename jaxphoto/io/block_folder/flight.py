@@ -1,0 +1,299 @@
+"""Stations, attitudes and motion: from their tables, or interpolated in the trajectory of [trajectory]."""
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxphoto.arrays import on_device
+from jaxphoto.block import Block, Frame, Motion
+from jaxphoto.compiling import jit_quickly
+from jaxphoto.errors import BlockError, InputError
+from jaxphoto.georeferencing import Poses, RigCamera, covered, interpolate
+from jaxphoto.georeferencing.time_scales import DAY, LEAP_SECONDS, looks_like, shift_that_fits
+from jaxphoto.georeferencing.trajectory import SHORTEST
+from jaxphoto.georeferencing.yaw_units import counts_in_radians
+from jaxphoto.io.block_folder.observations import Images, read_attitudes, read_stations
+from jaxphoto.io.block_folder.settings import Settings, default_sigma
+from jaxphoto.io.block_folder.table_layout import RATE, VELOCITY
+from jaxphoto.io.text_tables import Table
+from jaxphoto.io.trajectory import Records
+from jaxphoto.io.trajectory.in_frame import positions_in, trajectory_in
+from jaxphoto.observations import Attitudes, RelativeAttitudes, RelativePositions, RigPlaces, RigTurns, StationRows
+from jaxphoto.rotation import roll_pitch_yaw_from_matrix
+from jaxphoto.unknowns import FIXED, Unknowns, late_cameras
+
+# Records before and after each exposure that the spline is fitted to: others do not affect it.
+_MARGIN = 64
+# An interval is a gap from this many times the usual interval: one record may be lost.
+_GAP = 2.5
+
+_interpolate = jit_quickly(interpolate)
+_angles = jit_quickly(jax.vmap(roll_pitch_yaw_from_matrix))
+
+
+class ObservedFlight(NamedTuple):
+    """Observed stations, attitudes and motion, and the images whose velocity and rate are known."""
+
+    stations: StationRows
+    attitudes: Attitudes
+    motion: Motion | None
+    velocity_known: np.ndarray
+    rate_known: np.ndarray
+
+    def without_heads(self, head: np.ndarray) -> "ObservedFlight":
+        """Without stations and attitudes of the images that are `head` (a mask)."""
+        stations, attitudes = self.stations, self.attitudes
+        return self._replace(
+            stations=stations.take(~head[stations.who]), attitudes=attitudes.take(~head[attitudes.image])
+        )
+
+
+def read_flight(
+    tables: Mapping[str, Table], trajectory: Records | None, images: Images, frame: Frame, settings: Settings
+) -> ObservedFlight:
+    """Stations, attitudes and motion, from the trajectory or from their tables."""
+    stations, attitudes = tables["stations"], tables["attitudes"]
+    if trajectory is not None:
+        for table in (stations, attitudes):
+            if len(table):
+                raise InputError(
+                    f"{table.file}: stations and attitudes are interpolated in {trajectory.file}; remove this file, or "
+                    f"[trajectory] from {settings.file}"
+                )
+        return _interpolated(trajectory, images, frame, settings)
+    velocity, velocity_known = _motion(stations, VELOCITY, images)
+    rate, rate_known = _motion(attitudes, RATE, images)
+    motion = None
+    if velocity_known.any() or rate_known.any():
+        motion = Motion(on_device(velocity), on_device(np.deg2rad(rate)))
+    return ObservedFlight(
+        read_stations(stations, images, settings),
+        read_attitudes(attitudes, images, settings),
+        motion,
+        velocity_known,
+        rate_known,
+    )
+
+
+def _motion(table: Table, columns: tuple[str, ...], images: Images) -> tuple[np.ndarray, np.ndarray]:
+    """Values by image, zero where unknown, and where they are known."""
+    values = np.full((len(images.ids), 3), np.nan)
+    given = table.matrix(columns, empty=True)
+    table.check(
+        np.isnan(given).any(axis=1) & ~np.isnan(given).all(axis=1),
+        lambda _: f"the motion is given in part; fill in {', '.join(columns)}, or none of them",
+    )
+    values[images.find(table)] = given
+    known = ~np.isnan(values).any(axis=1)
+    return np.nan_to_num(values), known
+
+
+def check_motion(
+    flight: ObservedFlight,
+    rows: Iterable[Any],
+    image_mount: tuple[str, ...],
+    start: Unknowns,
+    priors: Unknowns,
+    images: Images,
+    file: str,
+) -> None:
+    """Raise BlockError where a time offset of a mount, or a delay in a rig, needs motion that is not known."""
+    rows = list(rows)
+    positions, turns = (
+        [index for group in rows if isinstance(group, kind) for _, index in group.indices()]
+        for kind in (RelativePositions, RelativeAttitudes)
+    )
+    offset = {
+        name
+        for name, mount in start.mounts.items()
+        if priors.mounts[name].time_offset != FIXED or float(mount.time_offset) != 0
+    }
+    uses = np.array([mount in offset for mount in image_mount], bool)
+    for index, known, table, columns in (
+        (np.concatenate([flight.stations.who, *positions]), flight.velocity_known, "stations.csv", VELOCITY),
+        (np.concatenate([flight.attitudes.image, *turns]), flight.rate_known, "attitudes.csv", RATE),
+    ):
+        for image in index[uses[index] & ~known[index]][:1]:
+            raise images.table.misfit(
+                image,
+                f"the time_offset of [mounts.{image_mount[image]}] in {file} needs the motion of image "
+                f"{images.ids[image]}; give a [trajectory], add {', '.join(columns)} to {table}, or make time_offset "
+                '"fixed" at zero',
+            )
+    known = flight.velocity_known & flight.rate_known
+    for reference, camera in _late_pairs(rows, images.cameras, late_cameras(start, priors)):
+        if not known[reference]:
+            raise images.table.misfit(
+                reference,
+                f"the delay of [unknowns.{RigCamera.kind}.{camera}] needs the motion of image "
+                f"{images.ids[reference]}; give a [trajectory], add {', '.join(VELOCITY)} to stations.csv and "
+                f'{", ".join(RATE)} to attitudes.csv, or make delay "fixed" at zero',
+            )
+
+
+def check_motion_held(block: Block) -> None:
+    """Raise BlockError where a folder cannot hold the motion that the delay of a camera in a rig needs."""
+    late = late_cameras(block.start.unknowns, block.priors)
+    held = set(np.asarray(block.stations.who).tolist()) & set(np.asarray(block.attitudes.image).tolist())
+    for reference, camera in _late_pairs(block.more, block.image_camera, late):
+        if reference not in held:
+            raise BlockError(
+                f"the delay of {RigCamera.kind}[{camera}] needs the motion of image {block.images[reference]}, which "
+                "stations.csv and attitudes.csv hold: give it a station and an attitude, or fix the delay at zero"
+            )
+
+
+def _late_pairs(rows: Iterable[Any], cameras: Sequence[str], late: Collection[str]) -> Iterator[tuple[int, str]]:
+    """The image of the reference camera, and the camera that exposes late beside it."""
+    for group in rows:
+        if isinstance(group, RigPlaces | RigTurns):
+            for reference, image in zip(group.reference.tolist(), group.image.tolist(), strict=True):
+                if cameras[image] in late:
+                    yield reference, cameras[image]
+
+
+def check_attitude_units(table: Table, stations: StationRows, images: Images) -> None:
+    """`_check_yaw` of attitudes.csv, against the flight from image to image of a strip."""
+    yaw = np.full(len(images.ids), np.nan)
+    yaw[images.find(table)] = table.numbers("yaw_deg")
+    position = np.where(images.known[:, None], np.asarray(images.exterior.position), np.nan)
+    position[stations.who, stations.axis] = stations.value
+    strips = np.unique(np.array(images.strips, object).astype(str), return_inverse=True)[1]
+    order = np.lexsort((np.arange(len(strips)), images.times, strips))
+    same = strips[order[1:]] == strips[order[:-1]]
+    first, second = order[:-1][same], order[1:][same]
+    _check_yaw(yaw[first], position[second] - position[first], table.file)
+
+
+def _check_yaw(yaw: np.ndarray, flown: np.ndarray, file: str) -> None:
+    """Raise InputError where `yaw` follows the way `flown` when read as radians, and does not when read as degrees."""
+    course = np.arctan2(flown[:, 0], flown[:, 1])
+    known = ~np.isnan(course) & ~np.isnan(yaw)
+    if counts_in_radians(yaw[known], course[known]):
+        raise InputError(
+            f"{file}: the yaw angles lie between {yaw[known].min():.2f} and {yaw[known].max():.2f} and follow the "
+            "direction of flight as radians, not as degrees; convert roll, pitch and yaw to degrees"
+        )
+
+
+def _interpolated(records: Records, images: Images, frame: Frame, settings: Settings) -> ObservedFlight:
+    """Stations, attitudes and motion of the images at `time_s` + `shift_s`.
+
+    Raises InputError where the trajectory does not fit the frame, BlockError where it does not cover the exposures or
+    has another clock.
+    """
+    keys = settings.keys.trajectory
+    shift = keys.shift_s if keys is not None else 0.0
+    times = images.table.numbers("time_s", empty=True) + shift
+    image = np.flatnonzero(~np.isnan(times))
+    if not len(image):
+        raise images.table.misfit(0, f"no image has a time_s, but {records.file} needs it; add it")
+    times = times[image]
+    max_gap = keys.max_gap_s if keys is not None and keys.max_gap_s else _GAP * float(np.median(np.diff(records.time)))
+    near = _near(records, times)
+    sigmas = []
+    for given, key, column in ((near.sigma_m, "station_m", "X_m"), (near.sigma_deg, "attitude_deg", "roll_deg")):
+        sigmas.append(np.where(np.isnan(given), default_sigma(settings, key), given))
+        if np.isnan(sigmas[-1]).any():
+            raise InputError(
+                f"{records.file}: there is no standard deviation; add {key} under [sigmas] in {settings.file}, or the "
+                f"columns sigma_{column} and so on"
+            )
+    trajectory = trajectory_in(near, frame, sigmas[0], np.deg2rad(sigmas[1]))
+    _check_yaw(near.roll_pitch_yaw_deg[:-1, 2], np.diff(np.asarray(trajectory.position), axis=0), records.file)
+    _check_inside(times, image, records, images, shift)
+    for k in np.flatnonzero(~np.asarray(covered(trajectory, jnp.asarray(times), max_gap)))[:1]:
+        i = np.clip(np.searchsorted(records.time, times[k], side="right") - 1, 0, len(records.time) - 2)
+        raise images.table.misfit(
+            image[k],
+            f"image {images.ids[image[k]]} is exposed at {times[k]:.3f} s in a gap of {records.file}, from "
+            f"{records.time[i]:.3f} to {records.time[i + 1]:.3f} s; fill the gap, leave time_s empty, or raise "
+            "max_gap_s under [trajectory]",
+        )
+    poses = jax.tree.map(np.asarray, _interpolate(trajectory, jnp.asarray(times), max_gap))
+    _check_leap_seconds(poses, times, image, records, images, frame, shift)
+    velocity, rate = np.zeros((len(images.ids), 3)), np.zeros((len(images.ids), 3))
+    velocity[image], rate[image] = poses.velocity, poses.rate
+    who, axis = np.repeat(image, 3), np.tile(np.arange(3), len(image))
+    stations = StationRows(who, axis, jnp.asarray(poses.position.ravel()), jnp.asarray(poses.sigma_position.ravel()))
+    attitudes = Attitudes(image, _angles(poses.object_from_body), jnp.asarray(poses.sigma_attitude))
+    known = np.isin(np.arange(len(images.ids)), image)
+    return ObservedFlight(stations, attitudes, Motion(jnp.asarray(velocity), jnp.asarray(rate)), known, known)
+
+
+def _near(records: Records, times: np.ndarray) -> Records:
+    """The records about the exposures: hours of them at 200 Hz would only take time."""
+    n, at = len(records.time), np.searchsorted(records.time, times)
+    change = np.zeros(n + 1, int)
+    np.add.at(change, np.clip(at - _MARGIN, 0, n - SHORTEST), 1)
+    np.add.at(change, np.clip(at + _MARGIN, SHORTEST, n), -1)
+    return _taken(records, np.cumsum(change[:-1]) > 0)
+
+
+def _taken(records: Records, chosen: np.ndarray) -> Records:
+    return records._replace(**{n: v[chosen] for n, v in records._asdict().items() if isinstance(v, np.ndarray)})
+
+
+def _check_inside(times: np.ndarray, image: np.ndarray, records: Records, images: Images, shift: float) -> None:
+    """Raise BlockError for an exposure outside the trajectory, with the shift of the clock where one explains it."""
+    start, end = float(records.time[0]), float(records.time[-1])
+    outside = np.flatnonzero((times < start) | (times > end))
+    if not len(outside):
+        return
+    first, missing = image[outside[0]], shift_that_fits(times, start, end)
+    if missing is not None:
+        cure = f"write shift_s = {missing + shift:.15g} under [trajectory] to bring all exposures into it"
+        if missing % DAY == 0:
+            cure += f" (and {LEAP_SECONDS[0]} s more if time_s is UTC)"
+    elif times.min() < 600 and len(outside) == len(times):
+        cure = (
+            "give GPS times in images.csv, or the time of the first exposure on the clock of the trajectory as "
+            "shift_s under [trajectory]"
+        )
+    else:
+        cure = "take a trajectory that covers it, correct time_s, or leave time_s empty"
+    raise images.table.misfit(
+        first,
+        f"image {images.ids[first]} is exposed outside {records.file}: exposures at {looks_like(times)}, "
+        f"trajectory at {looks_like(records.time)}; {cure}",
+    )
+
+
+def _check_leap_seconds(
+    poses: Poses,
+    times: np.ndarray,
+    image: np.ndarray,
+    records: Records,
+    images: Images,
+    frame: Frame,
+    shift: float,
+) -> None:
+    """Raise BlockError where approximate positions fit a clock that is off by leap seconds, and not this one."""
+    known = images.known[image]
+    if not known.any():
+        return
+    expected = np.asarray(images.exterior.position)[image[known]]
+
+    def distance(leap: float) -> float:
+        """Median distance to the trajectory at shifted times; beyond its ends the ends are taken."""
+        last = np.clip(np.searchsorted(records.time, times[known] + leap), 1, len(records.time) - 1)
+        before, after = (positions_in(_taken(records, k), frame) for k in (last - 1, last))
+        span = records.time[last] - records.time[last - 1]
+        part = np.clip((times[known] + leap - records.time[last - 1]) / span, 0.0, 1.0)[:, None]
+        return float(np.median(np.linalg.norm((1 - part) * before + part * after - expected, axis=1)))
+
+    now, speed = distance(0.0), float(np.median(np.linalg.norm(poses.velocity, axis=1)))
+    # Less than half of it is no leap: then the approximations decide nothing.
+    if now <= 0.5 * min(LEAP_SECONDS) * speed:
+        return
+    distances = {sign * leap: distance(sign * leap) for leap in LEAP_SECONDS for sign in (1, -1)}
+    best = min(distances, key=lambda leap: distances[leap])
+    if distances[best] < 0.1 * now:
+        raise BlockError(
+            f"{images.table.file}: the approximate positions are {now:.0f} m from {records.file} at time_s, but "
+            f"{distances[best]:.0f} m at {best:+d} s, so one clock is UTC and the other GPS; write "
+            f"shift_s = {best + shift:.15g} under [trajectory]"
+        )

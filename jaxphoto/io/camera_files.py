@@ -1,0 +1,337 @@
+"""Camera files: cameras of results and of block.toml, and a registry for the readers of other programs' files.
+
+`jaxphoto.extras.formats` registers the formats of other programs in `CAMERA_READERS` when it is imported.
+"""
+
+import importlib
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from jaxphoto.arrays import on_device
+from jaxphoto.camera import (
+    InteriorOrientation,
+    Sensor,
+    constant_names,
+    empty_camera,
+    parameter_names,
+    set_parameter,
+)
+from jaxphoto.errors import InputError, JaxphotoError, quoted
+from jaxphoto.io.block_folder.camera_section import Camera, camera_section, known_together, read_sensor
+from jaxphoto.io.block_folder.settings import read_settings
+from jaxphoto.io.block_folder.table_layout import TOML
+from jaxphoto.io.json_file import read_json
+from jaxphoto.io.names import harm_in
+from jaxphoto.io.results_judged import SUMMARY, read_summary, reservation
+from jaxphoto.io.text_tables import LARGEST, read_csv
+from jaxphoto.io.toml import Section, read_toml, toml_text
+from jaxphoto.io.whole_text import SMALL, read_whole
+from jaxphoto.unknowns import FIXED
+
+ASSUMED_PIXEL_MM = 0.001
+"""The pixel size if neither the file nor the user gives one: c in micrometres is then the focal length in pixels."""
+INTERIOR, CAMERA = "interior.csv", "camera.toml"
+CAMERAS_READ = (
+    "OpenCV's and ROS' YAML, COLMAP's cameras.txt, Agisoft's XML, mrcal's .cameramodel, Kalibr's camera chain, a "
+    "SMAC report, interior.csv and block.toml"
+)
+"""The camera files that `read_camera_file` reads, for messages and help."""
+_IN_FOLDER = (INTERIOR, TOML, CAMERA, "cameras.txt", "cameras.bin")
+_LARGEST_SIDE_PX = 1e7
+_CORRELATION = ("parameter_a", "parameter_b", "rho")
+_ROUNDING = 1e-5
+
+
+class SeveralCamerasError(InputError):
+    """A file holds several cameras and none was chosen."""
+
+
+class CameraFile(NamedTuple):
+    """A camera as its file gives it."""
+
+    name: str
+    sensor: Sensor
+    interior: InteriorOrientation
+    covariance: Float[np.ndarray, "n n"] | None = None
+    """Covariance of `parameter_names(interior)`, zero rows for fixed parameters; None if not in the file."""
+    note: str = ""
+    """Assumptions made and further content of the file; "" if none."""
+
+
+class CameraSource(NamedTuple):
+    """A file to read, and what the user adds to it."""
+
+    path: Path
+    camera: str | None = None
+    pixel_mm: float | None = None
+    size_px: tuple[int, int] | None = None
+    block: Path | None = None
+    """The block folder or block.toml that names the model of interior.csv."""
+
+    def error(self, message: str) -> InputError:
+        """Return an error about this file."""
+        return InputError(f"{self.path}: {message}")
+
+    def text(self) -> str:
+        """Return the whole text, UTF-8 or else Windows-1252. Raise InputError for a binary file."""
+        content = read_whole(self.path, SMALL)
+        if b"\0" in content:
+            raise self.error("the file is no text; give a camera file")
+        try:
+            text = content.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = content.decode("cp1252", "replace")
+        return text.replace("\r\n", "\n").replace("\r", "\n")
+
+    def number(self, name: str, text: Any) -> float:
+        """Return a finite number of the file."""
+        try:
+            value = float(text)
+        except (TypeError, ValueError, OverflowError):
+            value = np.nan
+        if not abs(value) <= LARGEST:
+            raise self.error(f"{name} is {quoted(text)}, not a finite number; write it like 12.34")
+        return value
+
+    def chosen(self, names: list[str]) -> str:
+        """Return the requested camera of `names`, or the only one."""
+        listed = ", ".join(names)
+        if not names:
+            raise self.error("there is no camera in it; give a file with one")
+        for name in names:
+            if harm := harm_in(name):
+                raise self.error(f"the camera {quoted(name)} {harm}")
+        if self.camera is None and len(names) > 1:
+            raise SeveralCamerasError(f"{self.path}: it holds {len(names)} cameras; name one of {listed}")
+        if self.camera not in (None, *names):
+            raise self.error(f"there is no camera {quoted(self.camera)} in it; name one of {listed}")
+        return self.camera or names[0]
+
+    def sensor(self, width: float, height: float, pixel_mm: float | None = None) -> tuple[Sensor, str]:
+        """Return the sensor and a note on its assumed pixel; the user's pixel size precedes `pixel_mm`."""
+        if self.size_px is not None and self.size_px != (width, height):
+            size = "{} x {}".format(*self.size_px)
+            raise self.error(f"its images have {width:g} x {height:g} pixels, not {size}; leave the size out")
+        if not all(0 < side <= _LARGEST_SIDE_PX and side == int(side) for side in (width, height)):
+            raise self.error(f"an image of {width:g} x {height:g} pixels cannot be; give whole positive numbers")
+        pixel = self.pixel_mm if self.pixel_mm is not None else pixel_mm
+        if pixel is None:
+            note = f"the size of a pixel is not known; {ASSUMED_PIXEL_MM} mm was assumed, and c_mm scales with it"
+            return Sensor(int(width), int(height), ASSUMED_PIXEL_MM, pixel_assumed=True), note
+        if not 0 < pixel < np.inf:
+            raise self.error(f"a pixel of {pixel:g} mm cannot be; give its size in millimetres")
+        return Sensor(int(width), int(height), float(pixel)), ""
+
+
+@contextmanager
+def reading(path: Path, what: str) -> Iterator[None]:
+    """Turn any error of damaged content into one InputError about the file."""
+    try:
+        yield
+    except JaxphotoError:
+        raise
+    except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RecursionError, SyntaxError) as error:
+        raise InputError(
+            f"{path.name}: damaged or no {what} ({type(error).__name__}: {error}). Export it again"
+        ) from error
+
+
+def joined_notes(*notes: str) -> str:
+    """Join notes into one."""
+    return "; ".join(note for note in notes if note)
+
+
+class CameraReader(NamedTuple):
+    """A reader, and its test of name and content of a file."""
+
+    recognise: Callable[[Path, str], bool]
+    read: Callable[[CameraSource], CameraFile]
+
+
+def camera_readers() -> dict[str, CameraReader]:
+    """Return all readers by format, with those of other programs."""
+    importlib.import_module("jaxphoto.extras.formats")
+    return CAMERA_READERS
+
+
+def is_camera_file(path: Path) -> bool:
+    """True if the content of a file is that of a camera file other than block.toml."""
+    try:
+        text = CameraSource(path).text()
+    except InputError:
+        return False
+    return any(reader.recognise(path, text) for name, reader in camera_readers().items() if name != "block")
+
+
+def read_camera_file(
+    path: str | Path,
+    *,
+    camera: str | None = None,
+    pixel_mm: float | None = None,
+    size_px: tuple[int, int] | None = None,
+    block: str | Path | None = None,
+) -> CameraFile:
+    """Read the camera in a file of another program (docs/camera_files.md) or of jaxphoto itself.
+
+    The content tells the format. `path` may be a folder of results, of a flight, a block folder or a COLMAP model.
+    `camera` chooses one of several; `pixel_mm` and `size_px` complete what the file lacks; `block` is the block of an
+    interior.csv whose summary.json is missing.
+
+    Raises InputError for files that are missing or damaged, unknown formats and models, and missing numbers.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = results_in(path)
+        inside = [path / name for name in _IN_FOLDER if (path / name).is_file()]
+        if not inside:
+            raise InputError(f"{path} holds none of {', '.join(_IN_FOLDER)}; name the camera file")
+        path = inside[0]
+    if not path.is_file():
+        raise InputError(f"there is no file {path}; correct the name")
+    source = CameraSource(path, camera, pixel_mm, size_px, Path(block) if block is not None else None)
+    text = "" if path.name == "cameras.bin" else source.text()
+    for reader in camera_readers().values():
+        if reader.recognise(path, text):
+            with reading(path, "camera file"):
+                found = reader.read(source)
+            if pixel_mm is not None and not math.isclose(found.sensor.pixel_mm, pixel_mm, rel_tol=1e-6):
+                raise source.error(
+                    f"it says itself that a pixel is {found.sensor.pixel_mm:g} mm, not {pixel_mm:g}: leave --pixel-mm "
+                    "out, or, if that was assumed, write it in pixels first: jaxphoto camera "
+                    f"{quoted(str(path))} --out pixels.yml"
+                )
+            return found
+    if not text.strip():
+        raise source.error("the file is empty; write it again")
+    raise source.error(f"this is no camera file that is known; {CAMERAS_READ} are")
+
+
+def results_in(folder: Path) -> Path:
+    """Return the results of the largest part if `folder` is a flight, else `folder`."""
+    result = folder / "result"
+    return result if (result / INTERIOR).is_file() and not (folder / INTERIOR).is_file() else folder
+
+
+def read_block_camera(source: CameraSource) -> CameraFile:
+    """Read a camera of a block.toml, or of a file with [cameras.NAME] tables alone."""
+    cameras = read_settings(read_toml(source.path), source.path.name).cameras
+    name = source.chosen(list(cameras))
+    camera = cameras[name]
+    covariance = None
+    if camera.known is not None:
+        names = parameter_names(camera.interior)
+        which = [names.index(parameter) for parameter in camera.known.parameters]
+        covariance = np.zeros((len(names), len(names)))
+        covariance[np.ix_(which, which)] = camera.known.covariance
+    return CameraFile(name, camera.sensor, camera.interior, covariance, camera.reservation)
+
+
+def write_block_camera(
+    path: Path,
+    name: str,
+    sensor: Sensor,
+    interior: InteriorOrientation,
+    covariance: np.ndarray | None = None,
+    reservation: str = "",
+) -> None:
+    """Write the [cameras.NAME] table of a block.toml: parameters with a covariance are free, the others fixed."""
+    known = None if covariance is None else known_together(interior, covariance)
+    section = camera_section(Camera(sensor, interior, jax.tree.map(lambda _: FIXED, interior), known, reservation))
+    for parameter in () if known is None else known.parameters:
+        section["unknowns"][parameter] = "free"
+    path.write_text(toml_text({"cameras": {name: section}}), encoding="utf-8")
+
+
+def read_results(source: CameraSource) -> CameraFile:
+    """Read a camera of interior.csv with the covariance from its sigmas and correlation.csv.
+
+    Model and sensor are those of summary.json beside it, or of `source.block`.
+    """
+    summary = read_summary(source.path.parent)
+    if summary.get("converged") is False:
+        raise source.error("summary.json: the adjustment did not converge. Correct the block and adjust again")
+    table = read_csv(source.path, ("camera", "parameter", "value"), ("sigma", "significant", "unit"))
+    of = table.ids("camera")
+    name = source.chosen(list(dict.fromkeys(of.tolist())))
+    sensor, empty = _described(source, name)
+    table = table.take(of == name)
+    parameters = table.ids("parameter").tolist()
+    for row, parameter in enumerate(parameters):
+        if parameter in parameters[:row]:
+            raise table.bad(row, f"{parameter} of camera {name} stands there twice; keep one of the two rows")
+    values = dict(zip(parameters, table.numbers("value").tolist(), strict=True))
+    sigma = np.nan_to_num(table.numbers("sigma", empty=True))
+    for line in np.flatnonzero(sigma < 0):
+        raise table.bad(line, f"sigma is {sigma[line]:g}; leave it empty for a fixed parameter")
+    sigmas = dict(zip(parameters, sigma.tolist(), strict=True))
+    names, constants = parameter_names(empty), constant_names(empty)
+    if missing := [n for n in (*names, *constants) if n not in values]:
+        model = type(empty.distortion).__name__
+        raise source.error(f"camera {name} has no {', '.join(missing)}, which {model} needs; give the block it is of")
+    if not values["c_mm"] > 0:
+        raise source.error(f"c_mm of camera {name} is {values['c_mm']:g}; a principal distance is positive")
+    for constant in constants:
+        if not (values[constant] > 0 or (constant == "r0_mm" and values[constant] == 0)):
+            raise source.error(f"{constant} of camera {name} is {values[constant]:g}; give it as a positive length")
+    interior = empty
+    for parameter in (*names, *constants):
+        interior = set_parameter(interior, parameter, on_device(values[parameter]))
+    covariance = _covariance(source, name, names, np.array([sigmas[n] for n in names]))
+    return CameraFile(name, sensor, interior, covariance, reservation(summary))
+
+
+def _covariance(source: CameraSource, camera: str, names: tuple[str, ...], sigma: np.ndarray) -> np.ndarray | None:
+    """sigma_i rho_ij sigma_j, zero for fixed parameters; None without estimates or without correlation.csv."""
+    path = source.path.with_name("correlation.csv")
+    free = [n for n, s in zip(names, sigma, strict=True) if s > 0]
+    if not free or not path.is_file():
+        return None
+    try:
+        table: pd.DataFrame = pd.read_csv(path, usecols=list(_CORRELATION), dtype=str)
+    except ValueError:
+        columns = ", ".join(_CORRELATION)
+        raise source.error(f"{path.name} beside it is no table of {columns}; adjust again or remove it") from None
+    labels = {f"interior[{camera}].{n}": k for k, n in enumerate(names) if n in free}
+    rows = table[table.parameter_a.isin(labels) & table.parameter_b.isin(labels)]
+    rho = np.full((len(names), len(names)), np.nan)
+    a, b = (rows[column].map(labels).to_numpy(int) for column in _CORRELATION[:2])
+    rho[a, b] = pd.to_numeric(rows.rho, errors="coerce")
+    np.fill_diagonal(rho, 1.0)
+    part = rho[np.ix_(*2 * [[names.index(n) for n in free]])]
+    symmetric = np.isfinite(part).all() and np.abs(part - part.T).max() < _ROUNDING
+    if len(rows) != len(free) * (len(free) - 1) or not symmetric or np.linalg.eigvalsh(part).min() < -_ROUNDING:
+        raise source.error(f"{path.name} beside it is not of the same adjustment; adjust again or remove it")
+    return sigma[:, None] * np.nan_to_num(rho) * sigma
+
+
+def _described(source: CameraSource, camera: str) -> tuple[Sensor, InteriorOrientation]:
+    """Sensor and model (zeros for numbers) of a camera of the results."""
+    if source.block is not None:
+        path = source.block / TOML if source.block.is_dir() else source.block
+        cameras = read_settings(read_toml(path), path.name).cameras
+        if camera not in cameras:
+            raise source.error(f"{path} has no camera {camera!r}; give the block that was adjusted")
+        return cameras[camera].sensor, cameras[camera].interior
+    path = source.path.with_name(SUMMARY)
+    try:
+        section = Section(path.name, "", read_json(path)).section("cameras").section(camera)
+        return read_sensor(section), empty_camera(section.values)
+    except (ValueError, KeyError, TypeError):
+        raise source.error(
+            f"neither summary.json beside it nor a block says of which model camera {camera} is; give the block"
+        ) from None
+
+
+CAMERA_READERS: dict[str, CameraReader] = {
+    "interior": CameraReader(lambda path, text: text.startswith("camera,parameter,value"), read_results),
+    "block": CameraReader(lambda path, text: path.suffix == ".toml", read_block_camera),
+}
+"""Readers of camera files by format."""

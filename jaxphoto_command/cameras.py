@@ -1,0 +1,206 @@
+"""Commands that compare and combine calibrations."""
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer import Argument, Option
+
+from jaxphoto_command import options as opt
+from jaxphoto_command.application import command
+from jaxphoto_command.output import Output
+
+PANEL = "Camera comparison"
+CameraA = Annotated[Path, Argument(metavar="A", help="Results or camera file of one calibration.")]
+CameraFileB = Annotated[Path, Argument(metavar="B", help="Results or camera file of the other calibration.")]
+OptionalOut = Annotated[Path | None, Option(help="Output folder for tables, figures and report.")]
+
+
+@command("stability", PANEL, "jaxphoto stability camera_2025 camera_2026 --out stability")
+def stability(
+    output: Output,
+    first: CameraA,
+    second: CameraFileB,
+    method: opt.Alignment = "rot",
+    grid: opt.Grid = "15x11",
+    extent: opt.Extent = None,
+    noise_px: Annotated[float, Option(callback=opt.positive, help="Noise of image coordinates.")] = 1.0,
+    relief: Annotated[float, Option(help="Relief of the object points of spr, as a fraction of distance.")] = 0.0,
+    camera: opt.Camera = None,
+    camera_b: opt.CameraB = None,
+    pixel_mm: opt.PixelSize = None,
+    block: opt.ResultBlock = None,
+    out: OptionalOut = None,
+) -> None:
+    """Compare the bundles of rays of two interior orientations (Habib et al. 2006), with uncertainty."""
+    from jaxphoto.report.stability import print_stability, stability_summary, write_stability
+    from jaxphoto.stability import analyse
+    from jaxphoto.writing import check_folder
+    from jaxphoto_command.certificate import read_two
+
+    if not 0 <= relief < 1:
+        raise typer.BadParameter(f"--relief {relief:g}: give a fraction of the object distance, 0 <= relief < 1.")
+    if out is not None:
+        check_folder(out, first, second)
+    a, b = read_two((first, second), (camera, camera_b), pixel_mm, block)
+    with output.progress("comparing"):
+        points = opt.grid_points(a.sensor, grid, extent)
+        analysis = analyse(a.interior, b.interior, points, (a.covariance, b.covariance), relief)
+    noise_mm = noise_px * a.sensor.pixel_mm
+    sets = _compared(output, (first, second), (a, b))
+    print_stability(analysis, sets, a.sensor.pixel_mm, noise_mm, method, output.screen)
+    output.add(**stability_summary(analysis, sets, noise_mm, method))
+    if out is not None:
+        write_stability(analysis, sets, a.sensor, noise_mm, method, out, output.made_by(first, second))
+        output.wrote(out, f"results in {out} (open report.html)")
+
+
+@command("compare", PANEL, "jaxphoto compare results_2025 results_2026")
+def compare(
+    output: Output,
+    first: CameraA,
+    second: CameraFileB,
+    method: opt.Alignment = "rot",
+    grid: opt.Grid = "15x11",
+    extent: opt.Extent = None,
+    camera: opt.Camera = None,
+    camera_b: opt.CameraB = None,
+    pixel_mm: opt.PixelSize = None,
+    block: opt.ResultBlock = None,
+    out: OptionalOut = None,
+) -> None:
+    """Test whether a camera has changed between two calibrations, by its parameters and by its bundle of rays."""
+    from jaxphoto.report.stability import change_summary, print_change, write_change
+    from jaxphoto.stability import change
+    from jaxphoto.writing import check_folder
+    from jaxphoto_command.certificate import check_two_calibrations, read_two, share_measurements
+
+    if out is not None:
+        check_folder(out, first, second)
+    a, b = read_two((first, second), (camera, camera_b), pixel_mm, block)
+    check_two_calibrations(a, b, first, second)
+    if share_measurements(first, second):
+        output.warn("A and B share photographs or image points; the test assumes independent ones")
+    with output.progress("comparing"):
+        points = opt.grid_points(a.sensor, grid, extent)
+        result = change(a.interior, b.interior, points, (a.covariance, b.covariance), method)
+    sets = _compared(output, (first, second), (a, b))
+    print_change(result, sets, a.sensor, output.screen)
+    output.add(**change_summary(result, a.sensor))
+    if out is not None:
+        write_change(result, sets, a.sensor, out, output.made_by(first, second))
+        output.wrote(out, f"results in {out} (open report.html)")
+
+
+@command("combine", PANEL, "jaxphoto combine 2023 2024 2025 --out camera.toml")
+def combine(
+    output: Output,
+    calibrations: Annotated[list[Path], Argument(help="Results or camera files with a covariance.")],
+    out: Annotated[Path, Option(help="Camera file (.toml) to write, prior information for blocks.")],
+    camera: opt.Camera = None,
+) -> None:
+    """Combine calibrations of one camera by their full covariances.
+
+    Exit code 1: written, but they disagree.
+    """
+    import numpy as np
+
+    from jaxphoto.camera import get_parameter, parameter_names
+    from jaxphoto.errors import InputError
+    from jaxphoto.extras.formats import write_camera_file
+    from jaxphoto.io.camera_files import read_camera_file
+    from jaxphoto.stability import combine
+    from jaxphoto.stability.comparison import SIGNIFICANT_P
+    from jaxphoto.writing import check_file
+    from jaxphoto_command.certificate import check_one_sensor
+
+    if out.suffix != ".toml":
+        raise typer.BadParameter(f"--out {out}: only a .toml file can hold the covariance.")
+    check_file(out, *calibrations)
+    files = {str(path): read_camera_file(path, camera=camera) for path in calibrations}
+    first = files[str(calibrations[0])]
+    covariances = []
+    for name, file in files.items():
+        check_one_sensor(first, file, calibrations[0], Path(name))
+        if file.covariance is None:
+            raise InputError(f"{name} has no covariance; give results of jaxphoto adjust, or a camera file of them")
+        covariances.append(file.covariance)
+        if file.note:
+            output.warn(f"{name}: {file.note}")
+    result = combine([file.interior for file in files.values()], covariances, list(files))
+    notes = "; ".join(f"{name}: {file.note}" for name, file in files.items() if file.note)
+    write_camera_file(
+        out, first.sensor, result.interior, "block", name=first.name, covariance=result.covariance, reservation=notes
+    )
+    for parameter, variance in zip(parameter_names(result.interior), np.diagonal(result.covariance), strict=True):
+        if variance > 0:
+            value = float(get_parameter(result.interior, parameter))
+            output.say(f"  {parameter} = {value:.9g} +- {variance**0.5:.2g}")
+    agree = result.p_value >= SIGNIFICANT_P
+    verdict = "they agree" if agree else "they disagree: the camera has changed, or the covariances are too small"
+    output.say(
+        f"chi-square {result.chi_square:.1f}, {result.degrees_of_freedom} degrees of freedom, "
+        f"p = {result.p_value:.2g}: {verdict}"
+    )
+    p_values = dict(zip(files, result.against_others, strict=True))
+    for k, (name, p) in enumerate(p_values.items()):
+        note = ": it disagrees" if len(files) > 2 and k in result.disagreeing(SIGNIFICANT_P) else ""
+        output.say(f"  {name} and the others: p = {p:.2g}{note}")
+    output.wrote(out, f"wrote {out}")
+    output.add(
+        agree=agree,
+        chi_square=result.chi_square,
+        degrees_of_freedom=result.degrees_of_freedom,
+        p_value=result.p_value,
+        p_against_others=p_values,
+    )
+    if not agree:
+        raise typer.Exit(1)
+
+
+@command(
+    "models",
+    PANEL,
+    "jaxphoto example cross_block && jaxphoto models cross_block --models brown:k1,brown:k1+k2,opencv --out models",
+)
+def models(
+    output: Output,
+    block: opt.Block,
+    out: opt.Out,
+    models: Annotated[
+        str, Option(help="Comma-separated: brown (usual parameters), brown:all, brown:none, brown:k1+k2, smac.")
+    ] = "brown:none,brown:k1,brown:k1+k2,brown:k1+k2+k3,brown,brown:all",
+    folds: Annotated[int, Option(min=0, help="Folds of the cross-validation; 0 for none.")] = 5,
+    seed: opt.Seed = 0,
+) -> None:
+    """Compare distortion models by cross-validation, information criteria and significance."""
+    from jaxphoto.io import read_block
+    from jaxphoto.procedures.model_choice import model_choice
+    from jaxphoto.report.model_choice import print_model_choice, write_model_choice
+    from jaxphoto.writing import check_folder
+
+    check_folder(out, block)
+    start = time.perf_counter()
+    with output.progress("reading the block") as progress:
+        read, made = read_block(block), output.made_by(block)
+        seconds = {"read": time.perf_counter() - start}
+        choice = model_choice(read, opt.names(models), k=folds, seed=seed, report=progress.update)
+        seconds["adjust"] = time.perf_counter() - start - seconds["read"]
+        progress.update(f"writing {out}")
+        write_model_choice(choice, read, out, seconds, made)
+    print_model_choice(choice, output.screen)
+    output.wrote(out, f"results in {out} (open report.html)")
+    if not choice.by_bic:
+        raise typer.Exit(1)
+
+
+def _compared(output: Output, paths: tuple[Path, Path], files: tuple[Any, Any]) -> tuple[Any, Any]:
+    """Return both calibrations for a comparison, A and B, and print the notes of their files."""
+    from jaxphoto_command.certificate import compared
+
+    for letter, file in zip("AB", files, strict=True):
+        if file.note:
+            output.warn(f"{letter}: {file.note}")
+    a, b = (compared(letter, *pair) for letter, pair in zip("AB", zip(paths, files, strict=True), strict=True))
+    return a, b

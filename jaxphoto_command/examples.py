@@ -1,0 +1,134 @@
+"""Commands that write examples, simulate blocks and run experiments."""
+
+from pathlib import Path
+from typing import Annotated
+
+from typer import Argument, Option
+
+from jaxphoto_command import options as opt
+from jaxphoto_command.application import command
+from jaxphoto_command.output import Output
+
+PANEL = "Examples and simulation"
+_SIMULATED = ("lidar", "strips")
+NEXT = {
+    "cross_block": "jaxphoto adjust OUT --out results",
+    "recipe": "jaxphoto simulate OUT --out block",
+    "boresight": "jaxphoto simulate OUT --out flight",
+    "lidar": "jaxphoto simultaneous OUT OUT/cloud.laz --trajectory OUT/trajectory.csv --out both",
+    "strips": "jaxphoto strips OUT/cloud.laz --trajectory OUT/trajectory.csv --block OUT "
+    "--adjust boresight,range-offset,angle-scale --cell-m 8 --knots-s 5 --out joint",
+    "experiments": "jaxphoto experiment 000 --experiments OUT --layouts 4 --out runs",
+}
+"""The command to type after each example, which lies in OUT."""
+
+
+@command("example", PANEL, "jaxphoto example cross_block")
+def example(
+    output: Output,
+    name: Annotated[
+        str | None, Argument(metavar="NAME", help=f"Example: {', '.join(NEXT)} (default: list them).")
+    ] = None,
+    out: Annotated[Path | None, Option(help="Path to write (default: NAME or NAME.toml).")] = None,
+) -> None:
+    """Write an example block, recipe or experiment that comes with jaxphoto."""
+    import shutil
+
+    from jaxphoto.io import read_recipe, write_simulation
+    from jaxphoto.io.block_folder import check_block_target
+    from jaxphoto.io.shipped import EXAMPLES, shipped
+    from jaxphoto.simulation import simulate
+    from jaxphoto.writing import check_file, check_folder, whole_file, whole_folder
+
+    if name is None:
+        output.say(*(f"{key:12} {text}" for key, text in EXAMPLES.items()))
+        output.add(examples=dict(EXAMPLES))
+        return
+    source = shipped(name)
+    target = out if out is not None else Path(name if source.is_dir() or name in _SIMULATED else source.name)
+    if name in _SIMULATED:
+        check_block_target(target, source)
+        with output.progress("simulating"):
+            write_simulation(simulate(read_recipe(source)), target)
+    elif source.is_dir():
+        check_folder(target)
+        with whole_folder(target) as work:
+            shutil.copytree(source, work, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__"))
+    else:
+        check_file(target)
+        with whole_file(target) as work:
+            shutil.copyfile(source, work)
+    following = NEXT[name].replace("OUT", str(target))
+    output.wrote(target, f"wrote {target}; next: {following}")
+    output.add(next=following)
+
+
+@command("simulate", PANEL, "jaxphoto example recipe && jaxphoto simulate recipe.toml --out block --seed 1")
+def simulate(
+    output: Output,
+    recipe: Annotated[Path, Argument(help="Recipe in TOML (docs/simulation.md).")],
+    out: opt.BlockOut,
+    seed: opt.Seed = 0,
+) -> None:
+    """Simulate a block with known truth."""
+    from jaxphoto.io import read_recipe, write_simulation
+    from jaxphoto.io.block_folder import check_block_target
+    from jaxphoto.io.recipe.truth import CLOUD, TRAJECTORY
+    from jaxphoto.simulation import simulate
+
+    check_block_target(out, recipe)
+    with output.progress("simulating") as progress:
+        simulation = simulate(read_recipe(recipe), seed)
+        progress.update(f"writing {out}")
+        write_simulation(simulation, out)
+    block, cloud = simulation.block, simulation.cloud
+    counts = {
+        "n_images": len(block.images),
+        "n_points": len(block.points),
+        "n_image_points": len(block.image_points.image),
+        "n_laser_points": 0 if cloud is None else len(cloud),
+    }
+    scan = "" if cloud is None else f", {len(cloud)} laser points in {CLOUD}, their trajectory in {TRAJECTORY}"
+    output.wrote(
+        out,
+        f"wrote {out}: {counts['n_images']} images, {counts['n_points']} points, {counts['n_image_points']} image "
+        f"points{scan} (seed {seed}); the truth is in {out / 'truth'}",
+    )
+    output.add(**counts, seed=seed)
+
+
+@command("experiment", PANEL, "jaxphoto example experiments && jaxphoto experiment 000 --layouts 4 --out runs")
+def experiment(
+    output: Output,
+    name: Annotated[str, Argument(help="Folder of the experiment, like 000, or all.")],
+    out: Annotated[Path, Option(help="Output folder; an earlier run in it is replaced.")] = Path("results"),
+    experiments: Annotated[Path, Option(help="Folder of the experiments.")] = Path("experiments"),
+    layouts: Annotated[int | None, Option(min=1, help="Simulated layouts (default: of the experiment).")] = None,
+) -> None:
+    """Run experiments; write tables.csv and report.html with the published values."""
+    from jaxphoto.experiment import compare, find_experiments, load_experiment, run_experiment, write_runs
+    from jaxphoto.writing import check_folder
+
+    folders = find_experiments(experiments, name)
+    check_folder(out, *folders)
+    declared = {folder: load_experiment(folder) for folder in folders}
+    runs, made = {}, {folder: output.made_by(folder) for folder in folders}
+    for folder, declaration in declared.items():
+        with output.progress(folder.name) as progress:
+            runs[folder] = run_experiment(declaration, folder, layouts, progress.update)
+        # After each, to keep results if a later experiment fails.
+        write_runs(runs, out, made)
+        judged = compare(runs[folder], folder)
+        groups = list(judged.groupby("table", sort=False))
+        rows = []
+        for table, cells in groups:
+            judged_cells, outside = cells[cells["within"] != ""], cells[cells["within"] == "no"]
+            listed = "; ".join(f"{r.row} {r.column} ({r.ours:.4g}, {r.published:.4g})" for r in outside.itertuples())
+            rows.append((str(table), str((cells["within"] == "yes").sum()), str(len(judged_cells)), listed))
+        output.table(declaration.title, ("table", "within", "of", "outside (ours, published)"), iter(rows))
+        counts = {row[0]: (int(row[1]), int(row[2])) for row in rows if row[2] != "0"}
+        within, total = ({table: pair[k] for table, pair in counts.items()} for k in (0, 1))
+        output.add(**{folder.name: {"within": within, "of": total}})
+        for failure in runs[folder].failures:
+            output.warn(f"skipped: {failure}")
+    output.wrote(out, f"results in {out} (open report.html)")

@@ -1,0 +1,198 @@
+"""Commands that convert files."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from typer import Argument, Option
+
+from jaxphoto_command import options as opt
+from jaxphoto_command.application import command
+from jaxphoto_command.output import Output
+
+PANEL = "Files and formats"
+_ADJUSTED = "jaxphoto example cross_block && jaxphoto adjust cross_block --out results && "
+_Source = Literal[
+    "block", "dbat", "photomodeler", "aicon", "bal", "colmap", "opensfm", "openmvg", "blocksexchange", "metashape",
+    "pix4d", "nerfstudio", "orthority", "texts", "bundler"
+]  # fmt: skip
+_Target = Literal[
+    "block", "colmap", "colmap-binary", "metashape", "opensfm", "openmvg", "blocksexchange", "nerfstudio", "bundler",
+    "bal", "opk", "orthority", "geojson", "geopackage"
+]  # fmt: skip
+Source = Annotated[Path, Argument(help="Results, block folder, or file or folder of another program.")]
+Second = Annotated[Path | None, Argument(hidden=True, metavar="OUT")]
+
+
+def _target(out: Path | None, second: Path | None) -> Path:
+    """Return --out, or the second argument."""
+    if (out is None) == (second is None):
+        raise typer.BadParameter("Missing option: --out" if out is None else f"--out {out} and {second}: name one.")
+    return out or second  # type: ignore[return-value]
+
+
+@command("convert", PANEL, f"{_ADJUSTED}jaxphoto convert results --to colmap --out sparse")
+def convert(
+    output: Output,
+    source: Source,
+    second: Second = None,
+    out: Annotated[Path | None, Option(help="Folder to write (required).")] = None,
+    source_format: Annotated[
+        _Source | None, Option("--format", help="Format of SOURCE (docs/command_line.md; default: by its content).")
+    ] = None,
+    to: Annotated[_Target, Option(help="Format of --out (docs/exports.md).")] = "block",
+    block: Annotated[Path | None, Option(help="Block of the results in SOURCE, if it was moved.")] = None,
+    part: Annotated[int, Option(min=1, help="Part of a flight; the largest is 1.")] = 1,
+    photographs: Annotated[list[Path] | None, Option(help="Folder of the photographs, for their file names.")] = None,
+    adjust: Annotated[bool, Option("--adjust", help="Adjust the block in SOURCE first.")] = False,
+) -> None:
+    """Convert another program's files to a block folder, or a block or results to files of other programs."""
+    from jaxphoto.extras.formats import EXPORTS, Project, check_export_target, export, read_source
+    from jaxphoto.io import write_block
+    from jaxphoto.io.block_folder import check_block_target
+    from jaxphoto.io.camera_files import ASSUMED_PIXEL_MM
+    from jaxphoto.io.result_folder import adjusted_block, is_result, photograph_files
+
+    out = _target(out, second)
+    result = source_format is None and is_result(source)
+    if adjust and (result or to == "block"):
+        raise typer.BadParameter("--adjust applies to a block that is exported, not to results or --to block.")
+    if not result and (block is not None or part != 1):
+        raise typer.BadParameter(f"--block and --part apply to results, which {source} is not.")
+    if out.suffix.lower() in {suffix for known in EXPORTS.values() for suffix in known.endings}:
+        raise typer.BadParameter(f"--out {out}: {to} is a folder of files; omit {out.suffix}.")
+    (check_block_target if to == "block" else check_export_target)(out, source)
+    lacks: Any = EXPORTS[to].lacks if to in EXPORTS else ()
+    with output.progress(f"reading {source}") as progress:
+        read = adjusted_block(source, block, part) if result else read_source(source, source_format)
+        size = {
+            "n_images": len(read.images),
+            "n_points": len(read.points),
+            "n_image_points": len(read.image_points.image),
+        }
+        if to == "block":
+            progress.update(f"writing {out}")
+            write_block(read, out)
+        else:
+            progress.update("adjusting" if adjust else f"writing {out}")
+            values, text = (read.start.unknowns, "adjusted values") if result else _values(read, adjust)
+            files = photograph_files(read.images, photographs or (), source if result else None)
+            written = export(Project.of_block(read, values, files), out, to)
+            _report_export(output, written, text, "cameras" not in lacks)
+    assumed = [name for name, sensor in read.sensors.items() if sensor.pixel_assumed]
+    if to == "block" and not result and assumed:
+        cameras = f"camera {assumed[0]}" if len(assumed) == 1 else f"{len(assumed)} cameras"
+        output.say(
+            f"{cameras}: pixel size {ASSUMED_PIXEL_MM:g} mm assumed (the files have pixels only): c in um is f in px"
+        )
+    counts = {"images": len(read.images), "points": len(read.points), "image points": len(read.image_points.image)}
+    parts = ", ".join(f"{n} {name}" for name, n in counts.items() if name not in lacks)
+    output.wrote(out, f"wrote {out}: {parts}")
+    output.add(**size)
+
+
+def _values(block: Any, adjust: bool) -> tuple[Any, str]:
+    """Return initial or adjusted values of a block, and what they are."""
+    import jaxphoto
+    from jaxphoto.errors import InputError
+    from jaxphoto.procedures.adjust import start_of
+
+    if not adjust:
+        return start_of(block), "initial values of the block (to adjust it first: --adjust)"
+    adjusted = jaxphoto.adjust(block)
+    if not bool(adjusted.converged):
+        raise InputError(f"the block cannot be exported: {adjusted.outcome.value}")
+    return adjusted.unknowns, f"adjusted values, sigma naught {float(adjusted.sigma0):.3g}"
+
+
+def _report_export(output: Output, written: Any, values: str, cameras: bool) -> None:
+    """Print what was written and the loss of accuracy."""
+    output.say(values)
+    losses = {name: {"rms_px": c.rms_px, "max_px": c.max_px} for name, c in written.cameras.items()}
+    misfits = {"map_misfit": written.map_misfit, "moved": written.moved}
+    output.add(values=values, cameras=losses, **{name: m and m._asdict() for name, m in misfits.items()})
+    for name, conversion in written.cameras.items() if cameras else ():
+        output.say(f"camera {name}: {conversion.lost}")
+    if written.moved is not None:
+        moved = f"rms {written.moved.rms_px:.3g} px, maximum {written.moved.max_px:.3g} px"
+        note = f"; moved by {moved} to fit the written cameras" if written.moved.max_px else ""
+        output.say(f"image points are relative to the principal point{note}")
+    if written.map_misfit is not None:
+        misfit = f"rms {written.map_misfit.rms_px:.3g} px, maximum {written.map_misfit.max_px:.3g} px"
+        output.say(f"map coordinates are not Cartesian: image residuals {misfit}")
+
+
+@command("camera", PANEL, f"{_ADJUSTED}jaxphoto camera results --out cameras.txt")
+def camera(
+    output: Output,
+    source: Annotated[
+        Path,
+        Argument(
+            help="Results, block folder or COLMAP model; or a file: OpenCV's and ROS' YAML, COLMAP's cameras.txt, "
+            "Agisoft's XML, mrcal's .cameramodel, Kalibr's camera chain, a SMAC report, interior.csv, block.toml."
+        ),
+    ],
+    second: Second = None,
+    out: Annotated[Path | None, Option(help="Camera file to write (required).")] = None,
+    out_format: Annotated[
+        Literal["opencv", "colmap", "agisoft", "mrcal", "ros", "smac", "block"] | None,
+        Option("--format", help="Format of --out (default: by its name)."),
+    ] = None,
+    camera: opt.Camera = None,
+    pixel_mm: opt.PixelSize = None,
+    width_px: Annotated[int | None, Option(min=1, help="Image width, if SOURCE lacks it.")] = None,
+    height_px: Annotated[int | None, Option(min=1, help="Image height, if SOURCE lacks it.")] = None,
+    block: Annotated[Path | None, Option(help="Block of the results in SOURCE.")] = None,
+    distortion: Annotated[str | None, Option(help="Distortion model of a .toml (default: of SOURCE).")] = None,
+    model: Annotated[
+        str | None, Option(help="Largest model of the format to use, like OPENCV (default: as required).")
+    ] = None,
+    loss_px: Annotated[float, Option(min=0, help="Maximum misfit of a fitted model.")] = 1.0,
+) -> None:
+    """Convert a camera file: exactly where the models allow it, otherwise fitted, with the misfit in pixels."""
+    from jaxphoto.camera import AbstractDistortion, get_parameter, parameter_names
+    from jaxphoto.extras.formats import write_camera_file
+    from jaxphoto.io.camera_files import read_camera_file
+    from jaxphoto.writing import check_file
+
+    out = _target(out, second)
+    check_file(out, source)
+    if (width_px is None) != (height_px is None):
+        raise typer.BadParameter("Give both --width-px and --height-px, or neither.")
+    size = None if width_px is None or height_px is None else (width_px, height_px)
+    read = read_camera_file(source, camera=camera, pixel_mm=pixel_mm, size_px=size, block=block)
+    with output.progress("converting"):
+        written = write_camera_file(
+            out,
+            read.sensor,
+            read.interior,
+            out_format,
+            name=read.name,
+            distortion=None if distortion is None else AbstractDistortion.called(distortion),
+            covariance=read.covariance,
+            reservation=read.note,
+            model=model,
+            loss_px=loss_px,
+        )
+    models = [type(interior.distortion).__name__ for interior in (read.interior, written.interior)]
+    output.say(f"{read.name}: {models[0]} -> {models[1]}")
+    if read.note:
+        output.say(f"note: {read.note}")
+    parameters = {name: float(get_parameter(written.interior, name)) for name in parameter_names(written.interior)}
+    output.say(*(f"  {name} = {value:.9g}" for name, value in parameters.items() if value or name == "c_mm"))
+    output.say(written.lost)
+    if written.covered < 1:
+        output.say(
+            f"the distortion is not invertible in {1 - written.covered:.1%} of the image format, which was omitted"
+        )
+    output.wrote(out, f"wrote {out}")
+    output.add(
+        camera=read.name,
+        models=models,
+        lost=written.lost,
+        rms_px=written.rms_px,
+        max_px=written.max_px,
+        covered=written.covered,
+        parameters=parameters,
+        note=read.note,
+    )

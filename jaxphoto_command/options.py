@@ -1,0 +1,114 @@
+"""Options that several commands share, and checks of option values."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from typer import Argument, Option
+
+
+def positive(context: typer.Context, value: float | None) -> float | None:
+    """Check a positive, finite number."""
+    if value is not None and not 0 < value < math.inf:
+        raise typer.BadParameter(f"{value:g} is not a positive number.")
+    return value
+
+
+def finite(context: typer.Context, value: float) -> float:
+    """Check a finite number."""
+    if not math.isfinite(value):
+        raise typer.BadParameter(f"{value:g} is not a finite number.")
+    return value
+
+
+def names(text: str | None) -> list[str]:
+    """Return comma-separated names."""
+    return [name.strip() for name in (text or "").split(",") if name.strip()]
+
+
+def pair(option: str, text: str, example: str) -> tuple[float, float]:
+    """Return the two positive numbers of `15x11`."""
+    try:
+        first, second = (float(part) for part in text.lower().split("x"))
+    except ValueError:
+        first = second = math.nan
+    if not (0 < first < math.inf and 0 < second < math.inf):
+        raise typer.BadParameter(f"{option} {text}: give two positive numbers with an x between them, like {example}.")
+    return first, second
+
+
+def grid_points(sensor: Any, grid: str, extent: str | None) -> Any:
+    """Return the image points (mm) of --grid and --extent."""
+    from jaxphoto.stability import image_grid
+
+    columns, rows = pair("--grid", grid, "15x11")
+    if columns != int(columns) or rows != int(rows) or min(columns, rows) < 2:
+        raise typer.BadParameter(f"--grid {grid}: give whole numbers of 2 or more, like 15x11.")
+    return image_grid(sensor, int(columns), int(rows), pair("--extent", extent, "4.0x3.0") if extent else None)
+
+
+Block = Annotated[Path, Argument(help="Block folder (docs/block_folder.md).")]
+Out = Annotated[Path, Option(help="Output folder; earlier results in it are replaced.")]
+BlockOut = Annotated[Path, Option(help="Block folder to write; a block in it is replaced.")]
+MaxSteps = Annotated[int, Option(min=1, help="Maximum number of iterations.")]
+Seed = Annotated[int, Option(min=0, help="Seed of the random numbers.")]
+
+Alignment = Annotated[
+    Literal["zrot", "rot", "spr"], Option("--method", help="What the exterior orientation may compensate.")
+]
+Grid = Annotated[str, Option(help="Columns and rows of the grid.")]
+Extent = Annotated[
+    str | None, Option(help="Width and height of the grid in mm, like 4.0x3.0 (default: the image format).")
+]
+Camera = Annotated[str | None, Option(help="Camera, where there are several.")]
+CameraB = Annotated[str | None, Option(help="Camera of B, if its name differs.")]
+ResultBlock = Annotated[Path | None, Option(help="Block of the results, where they lack the camera model.")]
+
+Photographs = Annotated[list[Path], Argument(help="Photographs of one camera, or folders of them.")]
+Distortion = Annotated[str, Option(help="Distortion model, like brown, smac or opencv (docs/models.md).")]
+FreeParameters = Annotated[
+    str | None, Option(help="Parameters to estimate, comma-separated: c,xp,yp,k1 (default: usual ones).")
+]
+R0 = Annotated[float | None, Option(help="Balance radius R0 of SMAC (default: 0).")]
+PixelSize = Annotated[float | None, Option(help="Pixel size (default: from the file).")]
+PrincipalDistance = Annotated[float | None, Option(help="Initial principal distance (default: from EXIF).")]
+Pairs = Annotated[
+    str | None,
+    Option(
+        help="Photographs to match: exhaustive, sequence:K, position:K, similar:K (default: exhaustive up to 40, else "
+        "position:20, or similar:20 without positions). Fewer pairs take less time."
+    ),
+]
+Features = Annotated[
+    int | None, Option(min=100, help="Maximum number of features (default: 10000, above 40 photographs 5000).")
+]
+LongestSide = Annotated[int | None, Option(min=200, help="Longer side of the photograph for features (default: 2400).")]
+ControlMarks = Annotated[Path | None, Option(help="Image measurements of the points, if in another file.")]
+ControlSystem = Annotated[
+    str | None, Option(help="Coordinate system of the points, if not in the file: 25832, 25832+7837, local.")
+]
+MapSystem = Annotated[
+    str | None, Option(help="Map system of the block, like 25832 or with heights 25832+7837 (default: UTM zone).")
+]
+Targets = Annotated[
+    str | None,
+    Option(help="Targets to find at the points: circle:diameter_mm=300, aruco:dictionary=4X4_50, cross:side_mm=600."),
+]
+
+Cloud = Annotated[Path, Argument(help="Point cloud: .las, .laz, .csv or .ply (docs/clouds.md).")]
+Classes = Annotated[str | None, Option("--class", help="Classes to use, comma-separated: 2,6.")]
+Returns = Annotated[Literal["all", "first", "last", "only"], Option(help="Returns to use.")]
+CloudEpsg = Annotated[int | None, Option(help="EPSG code of the point cloud; overrides the file.")]
+CloudUnit = Annotated[
+    Literal["m", "ft", "us_ft"] | None, Option(help="Linear unit of the point cloud; overrides the file.")
+]
+
+
+def class_numbers(text: str | None) -> list[int] | None:
+    """Return the classes of --class; None for all."""
+    if text is None:
+        return None
+    if not all(part.isdigit() for part in names(text)):
+        raise typer.BadParameter(f"--class {text}: give class numbers, comma-separated, like 2,6.")
+    return [int(part) for part in names(text)]

@@ -1,0 +1,562 @@
+"""Commands that start from photographs."""
+
+import time
+from contextlib import ExitStack
+from functools import partial
+from itertools import count
+from pathlib import Path
+from threading import Thread
+from typing import Annotated, Any, Literal, get_args
+
+import typer
+from typer import Argument, Option
+
+from jaxphoto_command import options as opt
+from jaxphoto_command.application import command
+from jaxphoto_command.output import Output
+
+PANEL = "Photographs"
+_CONTROL = "gcp_list.txt, markers of Metashape, GeoJSON, GeoPackage, geoin.dat of BINGO, CSV, table of Pix4D"
+
+
+@command("fly", PANEL, "jaxphoto fly photographs --out flight")
+def fly(
+    output: Output,
+    photographs: opt.Photographs,
+    out: opt.Out,
+    pairs: opt.Pairs = None,
+    epsg: opt.MapSystem = None,
+    features: opt.Features = None,
+    longest_px: opt.LongestSide = None,
+    c_mm: opt.PrincipalDistance = None,
+    pixel_mm: opt.PixelSize = None,
+    model: opt.Distortion = "brown",
+    no_lens_prior: Annotated[
+        bool, Option("--no-lens-prior", help="Omit the prior information of such lenses (docs/lens_priors.md).")
+    ] = False,
+    rolling_shutter: Annotated[
+        bool, Option("--rolling-shutter", help="Estimate the readout time of the rows from positions and times.")
+    ] = False,
+    exposures: Annotated[
+        list[Path] | None, Option(help="Exposure files outside the folders: .MRK, .pos, SBET, a table.")
+    ] = None,
+    lever_arm: Annotated[
+        str | None, Option(help="From camera to antenna in m: right,forward,up of the aircraft.")
+    ] = None,
+    heights: Annotated[
+        str | None,
+        Option(help="Height reference, if not in the files: ellipsoid, geoid, take-off, or EPSG code (EGM96: 5773)."),
+    ] = None,
+    control: Annotated[Path | None, Option(help=f"Surveyed points: {_CONTROL}.")] = None,
+    marks: opt.ControlMarks = None,
+    control_epsg: opt.ControlSystem = None,
+    targets: opt.Targets = None,
+) -> None:
+    """Calibrate the camera of a flight from its photographs and their positions: orient, georeference, adjust, assess.
+
+    Unusable photographs are skipped and named. Exit code 1: written, but the verdict is red.
+    """
+    import datetime
+
+    from jaxphoto.camera import InteriorOrientation
+    from jaxphoto.errors import counted
+    from jaxphoto.extras.formats import read_control
+    from jaxphoto.extras.photos.control_targets import target_looker
+    from jaxphoto.extras.photos.features import LONGEST_PX
+    from jaxphoto.extras.photos.matching import match_photographs
+    from jaxphoto.extras.photos.photograph_pairs import MostSimilar, photograph_pairs, usual_choice, usual_count
+    from jaxphoto.extras.photos.targets.on_ground import read_target
+    from jaxphoto.georeferencing.map_frame import check_heights
+    from jaxphoto.georeferencing.recorded_positions import WGS84
+    from jaxphoto.io.block_folder import whole_block
+    from jaxphoto.io.exposures import exposure_files, located
+    from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
+    from jaxphoto.io.photographs import (
+        known_lens,
+        sensor_and_interior,
+        skipped_messages,
+        skipped_subfolders,
+        valid_photographs,
+    )
+    from jaxphoto.io.result_folder import write_photograph_files
+    from jaxphoto.procedures.calibration import distortion_model
+    from jaxphoto.procedures.control.of_flight import flight_control
+    from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
+    from jaxphoto.report import prepare_pictures
+    from jaxphoto.report.flight import (
+        FlightSource,
+        block_folder,
+        camera_sentences,
+        report_of,
+        write_flight,
+        write_part_orientation,
+    )
+    from jaxphoto.writing import check_folder, whole_folder
+    from jaxphoto_command.provenance import Provenance, certify
+
+    if control is None and (marks or control_epsg or targets):
+        raise typer.BadParameter("--marks, --control-epsg and --targets need --control FILE.")
+    control_files = [path for path in (control, marks) if path]
+    check_folder(out, *photographs, *control_files, *(exposures or ()))
+    surveyed, target = read_control(control, marks) if control else None, read_target(targets) if targets else None
+    check_pieces(beside(out))
+    code, vertical = map_codes(epsg)
+    reference, arm = height_reference(heights), _lever_arm(lever_arm)
+    if isinstance(reference, int):
+        check_heights(WGS84, reference)
+    Thread(target=prepare_pictures, daemon=True).start()
+    with output.progress("reading the photographs") as progress, ExitStack() as stack:
+        read, corrupt = valid_photographs(photographs)
+        for text in (*skipped_messages(corrupt), *skipped_subfolders(photographs).values()):
+            output.warn(f"skipped: {text}")
+        positions = located(read, photographs, exposures or (), code=code, arm=arm, heights=reference)
+        read = positions.photographs
+        output.say(*positions.sentences)
+        points = None
+        if surveyed:
+            finder = target_looker(target, {p.name: p.path for p in read}) if target else None
+            stations = [p.name for p in read], [p.gps for p in read]
+            points, code = flight_control(surveyed, control_epsg, *stations, finder, code)
+        camera = sensor_and_interior(read, pixel_mm, c_mm)
+        distortion = distortion_model(model, camera.sensor)
+        choice, number = pairs or usual_choice(read), features or usual_count(len(read))
+        compared = photograph_pairs(read, choice)
+        matches = "pairs by similarity" if isinstance(compared, MostSimilar) else counted(len(compared), "pair")
+        output.say(camera.origin, f"{counted(len(read), 'photograph')}, {matches} to match")
+        checkpoint = stack.enter_context(KeptPieces(beside(out)).alone())
+        matched = match_photographs(
+            read,
+            camera.sensor,
+            camera.interior,
+            compared,
+            count=number,
+            longest_px=longest_px or LONGEST_PX,
+            in_parts=True,
+            keep=checkpoint,
+            progress=progress.steps,
+        )
+        initial = camera.interior
+        taken = {p.name: (p.taken.clock_s, p.taken.resolution_s) for p in read if p.taken}
+        flight = calibrate_flight(
+            matched.named([p.name for p in read]),
+            camera.sensor,
+            InteriorOrientation(initial.c, initial.x_p, initial.y_p, distortion),
+            KnownOfFlight(
+                {p.name: p.gps for p in read},
+                {p.name: p.attitude for p in read},
+                code,
+                points,
+                None if no_lens_prior else known_lens(read, camera, distortion),
+                taken if rolling_shutter else None,
+                vertical,
+                sorted(taken, key=lambda name: taken[name][0]) if len(taken) == len(read) else (),
+            ),
+            progress.update,
+        )
+        flight = flight._replace(left_out=matched.left_out | flight.left_out)
+        progress.update("computing statistics")
+        reports = [report_of(part) for part in flight.parts]
+        in_folders = [path for folder in photographs if folder.is_dir() for path in exposure_files(folder)]
+        others = dict.fromkeys([*control_files, *(exposures or ()), *in_folders])
+        provenance = Provenance.of([p.path for p in read], list(others))
+        progress.update(f"writing {out}")
+        with whole_folder(out) as work:
+            write_photograph_files({p.name: p.path.name for p in read}, work)
+            source = FlightSource(
+                positions.sentences,
+                camera.origin,
+                initial,
+                taken,
+                provenance.conditions_for(flight.parts[0].adjusted.block.images),
+                provenance.inputs,
+                output.options(pairs=choice, features=number, longest_px=longest_px or LONGEST_PX),
+                datetime.date.today().isoformat(),
+                output.command_line(),
+            )
+
+            def write_provenance(part: Any, folder: Path) -> None:
+                provenance.write(part.adjusted.block.images, folder)
+
+            verdict = write_flight(flight, reports, corrupt, work, source, write_provenance)
+            for k, part in enumerate(flight.parts, 1):
+                with whole_block(part.adjusted.block, work / block_folder(k)) as folder:
+                    write_part_orientation(part, folder)
+                    write_provenance(part, folder)
+            no_certificate = certify(work)
+        checkpoint.remove()
+    for k, (part, page) in enumerate(zip(flight.parts, reports, strict=True), 1):
+        report = part.oriented.report
+        size = f"{len(report.order)} photographs, {report.n_image_points} image points, {report.mean_px:.2f} px"
+        placed = part.placed.sentences if part.placed else (part.why_not,)
+        controlled = part.controlled.sentences if part.controlled else ()
+        output.say(f"part {k}: {size}", *(f"  {text}" for text in (*camera_sentences(page), *placed, *controlled)))
+    output.say(*(f"{name} is not used: {reason}" for name, reason in flight.left_out.items()), verdict.headline)
+    output.say(*(f"  {finding.text}" for finding in verdict.findings if finding.severity != "note"))
+    if no_certificate:
+        output.say(f"no certificate: {no_certificate}")
+    output.wrote(out, f"results in {out} (open report.html)")
+    if verdict.severity == "error":
+        raise typer.Exit(1)
+
+
+@command("control", PANEL, "jaxphoto control flight/block gcp_list.txt --out controlled")
+def control(
+    output: Output,
+    block: Annotated[Path, Argument(help="Block folder with oriented images.")],
+    file: Annotated[Path, Argument(help=f"Surveyed points: {_CONTROL}.")],
+    out: opt.Out,
+    marks: opt.ControlMarks = None,
+    control_epsg: opt.ControlSystem = None,
+    targets: opt.Targets = None,
+    photographs: Annotated[
+        list[Path] | None, Option(help="Folder of the photographs of the block, to find targets.")
+    ] = None,
+    epsg: opt.MapSystem = None,
+) -> None:
+    """Adjust an oriented block with surveyed points and their image measurements.
+
+    A block without a datum is transformed to the control. Contradicting observations are rejected and named. Exit code
+    1: written, but the verdict is red.
+    """
+    from jaxphoto.extras.formats import read_control
+    from jaxphoto.extras.photos.control_targets import target_looker
+    from jaxphoto.extras.photos.targets.on_ground import read_target
+    from jaxphoto.io import read_block
+    from jaxphoto.io.block_folder import whole_block
+    from jaxphoto.io.photographs import skipped_messages, valid_photographs
+    from jaxphoto.procedures import adjust
+    from jaxphoto.procedures.control import at_optimum, control_block, control_block_with_targets
+    from jaxphoto.report import Tables, verdict_of
+    from jaxphoto.report.control import control_findings, control_summary, write_control
+    from jaxphoto.report.findings import Verdict
+    from jaxphoto.report.page import versions
+    from jaxphoto.report.results import write_results, write_summary
+    from jaxphoto.writing import check_folder, whole_folder
+    from jaxphoto_command.provenance import Provenance
+
+    files = [path for path in (file, marks) if path]
+    check_folder(out, block, *files)
+    if (targets is None) != (not photographs):
+        raise typer.BadParameter("Give both --targets and --photographs, or neither.")
+    target, (code, vertical) = read_target(targets) if targets else None, map_codes(epsg)
+    with output.progress("reading") as progress:
+        points, read = read_control(file, marks), read_block(block)
+        progress.update("adjusting the block")
+        oriented = at_optimum(adjust(read))
+        valid, corrupt = valid_photographs(photographs) if photographs else ([], {})
+        paths = {p.name: p.path for p in valid}
+        provenance = Provenance.of_block(block, files, list(paths.values()))
+        options: dict[str, Any] = {
+            "system": control_epsg,
+            "code": code,
+            "vertical": vertical,
+            "report": progress.update,
+        }
+        if target:
+            finder = target_looker(target, paths, progress.update)
+            result = control_block_with_targets(oriented, points, finder, **options)
+        else:
+            result = control_block(oriented, points, **options)
+        progress.update("computing statistics")
+        tables, adjusted = Tables(result.adjusted), result.adjusted
+        verdict = Verdict.of([*verdict_of(tables).findings, *control_findings(result)])
+        progress.update(f"writing {out}")
+        images = adjusted.block.images
+        times = {name: adjusted.seconds[name] for name in ("compile", "solve", "covariance")}
+        with whole_folder(out) as work:
+            with whole_folder(work / "result") as folder:
+                method = {"block": "../block", **output.options()}
+                write_results(tables, verdict, folder, times, method, output.made_by(block, file, marks))
+                provenance.write(images, folder)
+            write_control(result, work)
+            write_summary({**verdict.summary, **control_summary(result), "versions": versions()}, work)
+            with whole_block(adjusted.block, work / "block") as folder:
+                provenance.write(images, folder)
+    for text in skipped_messages(corrupt):
+        output.warn(f"skipped in the search for targets: {text}")
+    output.say(*result.sentences, verdict.headline)
+    for finding in verdict.findings:
+        if finding.severity != "note" or finding.code == "check_points":
+            output.say(f"  {finding.text}")
+    output.wrote(out, f"results in {out} (open result/report.html)")
+    if verdict.severity == "error":
+        raise typer.Exit(1)
+
+
+@command(
+    "calibrate",
+    PANEL,
+    "jaxphoto calibrate board/*.jpg --board chessboard:8x6:square_mm=30 --out camera",
+    "Boards: chessboard:8x6:square_mm=30, circles:4x11:spacing_mm=20:diameter_mm=15, "
+    "aruco:5x7:marker_mm=30:gap_mm=6:dictionary=4X4_50, "
+    "charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50, targets:FILE.csv.",
+)
+def calibrate(
+    output: Output,
+    images: Annotated[list[Path], Argument(help="Photographs of the board by one camera at one focus.")],
+    board: Annotated[str, Option(help="Board, as below.")],
+    out: opt.Out,
+    model: opt.Distortion = "smac",
+    r0_mm: opt.R0 = None,
+    free: opt.FreeParameters = None,
+    pixel_mm: opt.PixelSize = None,
+    c_mm: opt.PrincipalDistance = None,
+    board_sigma_mm: Annotated[
+        float | None,
+        Option(callback=opt.positive, help="Standard deviation of the board's coordinates (default: fixed)."),
+    ] = None,
+    max_steps: opt.MaxSteps = 100,
+) -> None:
+    """Calibrate a camera with photographs of a board.
+
+    Exit code 1: written, but not converged.
+    """
+    from jaxphoto.extras.photos.features import read_grey
+    from jaxphoto.extras.photos.targets import find_targets, read_board
+    from jaxphoto.io import write_block
+    from jaxphoto.io.photographs import photographs, sensor_and_interior
+    from jaxphoto.procedures.calibration import calibrate, distortion_model, free_parameters
+    from jaxphoto.report import prepare_pictures, print_adjustment, verdict_of
+    from jaxphoto.report.calibration import print_calibration, write_calibration
+    from jaxphoto.writing import check_folder
+
+    check_folder(out, *images)
+    pattern, taken = read_board(board), photographs(images)
+    camera = sensor_and_interior(taken, pixel_mm, c_mm)
+    wanted = None if free is None else opt.names(free)
+    free_parameters(model, distortion_model(model, camera.sensor, r0_mm or 0.0), wanted)
+    Thread(target=prepare_pictures, daemon=True).start()
+    start, number = time.perf_counter(), count(1)
+    with output.progress("detecting the board") as progress:
+        targets = find_targets(
+            taken, pattern, lambda _: progress.steps("detecting the board", next(number), len(taken))
+        )
+        seconds = {"read": time.perf_counter() - start}
+        progress.update(f"calibrating with {len(targets.detections)} photographs")
+        result = calibrate(
+            pattern.board,
+            targets.detections,
+            camera.sensor,
+            camera.interior,
+            model=model,
+            r0_mm=r0_mm or 0.0,
+            free=wanted,
+            board_sigma_m=None if board_sigma_mm is None else board_sigma_mm / 1000,
+            max_steps=max_steps,
+        )
+        result = result._replace(left_out=targets.left_out | result.left_out)
+        progress.update(f"writing {out}")
+        tables = write_calibration(
+            result,
+            out,
+            seconds,
+            {photograph.name: partial(read_grey, photograph.path) for photograph in taken},
+            lambda folder: write_block(result.adjusted.block, folder / "block"),
+            detections=targets.detections,
+            start=camera.origin,
+            made=output.made_by(*images),
+            # An assumed pixel size is the unit of every length in the report.
+            notes=() if pixel_mm is not None else (camera.origin,),
+        )
+    output.say(camera.origin)
+    print_adjustment(tables, verdict_of(tables), output.screen)
+    print_calibration(result, output.screen)
+    output.wrote(out, f"results in {out} (open report.html and photographs.html)")
+    if not result.converged:
+        raise typer.Exit(1)
+
+
+@command("orient", PANEL, "jaxphoto orient photographs/*.jpg --out BLOCK")
+def orient(
+    output: Output,
+    images: Annotated[list[Path], Argument(help="Photographs of one camera, or one block folder.")],
+    out: opt.BlockOut,
+    pairs: opt.Pairs = None,
+    features: opt.Features = None,
+    longest_px: opt.LongestSide = None,
+    c_mm: opt.PrincipalDistance = None,
+    pixel_mm: opt.PixelSize = None,
+    model: Annotated[str | None, Option(help="Distortion model, like brown or smac (default: brown).")] = None,
+    r0_mm: opt.R0 = None,
+) -> None:
+    """Orient photographs by their features, as initial values for `jaxphoto adjust`.
+
+    For a block folder, determine the approximate orientation that its images.csv lacks. Exit code 1: written, but not
+    converged.
+    """
+    from jaxphoto.camera import InteriorOrientation
+    from jaxphoto.extras.photos.features import LONGEST_PX
+    from jaxphoto.extras.photos.matching import match_photographs
+    from jaxphoto.extras.photos.photograph_pairs import photograph_pairs, usual_choice
+    from jaxphoto.io.block_folder import check_block_target, whole_block
+    from jaxphoto.io.block_folder.table_layout import TOML
+    from jaxphoto.io.json_file import read_json
+    from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
+    from jaxphoto.io.photographs import photographs, sensor_and_interior
+    from jaxphoto.procedures.calibration import distortion_model
+    from jaxphoto.procedures.orientation import orient
+    from jaxphoto.report.orientation import print_orientation, write_orientation
+
+    check_block_target(out, *images)
+    if len(images) == 1 and (images[0] / TOML).is_file():
+        values = {
+            "pairs": pairs,
+            "features": features,
+            "longest-px": longest_px,
+            "c-mm": c_mm,
+            "pixel-mm": pixel_mm,
+            "model": model,
+            "r0-mm": r0_mm,
+        }
+        if names := [f"--{name}" for name, value in values.items() if value is not None]:
+            raise typer.BadParameter(
+                f"{images[0]} is a block folder with its own image points and cameras: omit {', '.join(names)}, or "
+                "change block.toml."
+            )
+        _orient_block(output, images[0], out)
+        return
+    check_pieces(beside(out))
+    with output.progress("reading the photographs") as progress, ExitStack() as stack:
+        read = photographs(images)
+        camera = sensor_and_interior(read, pixel_mm, c_mm)
+        distortion = distortion_model(model or "brown", camera.sensor, r0_mm or 0.0)
+        compared = photograph_pairs(read, pairs or usual_choice(read))
+        output.say(camera.origin)
+        initial = camera.interior
+        checkpoint = stack.enter_context(KeptPieces(beside(out)).alone())
+        matched = match_photographs(
+            read,
+            camera.sensor,
+            initial,
+            compared,
+            count=features,
+            longest_px=longest_px or LONGEST_PX,
+            keep=checkpoint,
+            progress=progress.steps,
+        )
+        result = orient(
+            [p.name for p in read],
+            camera.sensor,
+            InteriorOrientation(initial.c, initial.x_p, initial.y_p, distortion),
+            matched.xy_mm,
+            matched.pairs,
+            matched.sigma_mm,
+            title=f"{len(read)} photographs",
+            report=progress.update,
+        )
+        # Photographs without matches are not oriented for the reason that matching states.
+        reasons = {name: matched.left_out.get(name, text) for name, text in result.report.unoriented.items()}
+        result = result._replace(report=result.report._replace(unoriented=reasons))
+        progress.update(f"writing {out}")
+        with whole_block(result.block, out) as folder:
+            write_orientation(result, folder, n_gross=matched.n_gross, sigma_factor=matched.sigma_factor)
+        checkpoint.remove()
+    output.say(
+        f"{matched.n_gross} matches rejected before (off the epipolar line, or of pairs with too few); sigma factor of "
+        f"the others {matched.sigma_factor:.2g}"
+    )
+    print_orientation(result.report, output.screen)
+    output.wrote(out, f"wrote {out}: adjust it with jaxphoto adjust {out} --out DIR")
+    output.add(**read_json(out / "orientation.json"))
+    if not result.report.converged:
+        raise typer.Exit(1)
+
+
+def _orient_block(output: Output, folder: Path, out: Path) -> None:
+    """Write the block in `folder` with initial orientations to `out`."""
+    from jaxphoto.errors import InputError
+    from jaxphoto.io import read_block, write_block
+    from jaxphoto.procedures.adjust import needs_orientation
+    from jaxphoto.procedures.orientation import orient_block
+
+    with output.progress("reading the block") as progress:
+        block = read_block(folder)
+        if not needs_orientation(block):
+            raise InputError(f"{folder} needs no orientation: resection reaches all its images; adjust it as it is")
+        oriented = orient_block(block, progress.update)
+        write_block(oriented, out)
+    n_images, n_oriented = len(block.images), int(sum(oriented.start.image_known))
+    output.wrote(out, f"{n_oriented} of {n_images} images oriented; wrote {out}")
+    output.add(n_images=n_images, n_oriented=n_oriented)
+
+
+@command("undistort", PANEL, "jaxphoto undistort photographs --camera results --out straight")
+def undistort(
+    output: Output,
+    photographs: opt.Photographs,
+    camera: Annotated[Path, Option(help="Results, block, COLMAP model or camera file.")],
+    out: Annotated[Path, Option(help="Output folder for the photographs and their camera.toml.")],
+    which: opt.Camera = None,
+    keep: Annotated[
+        Literal["crop", "all"], Option(help="crop: no black borders; all: the whole image with black borders.")
+    ] = "crop",
+) -> None:
+    """Resample photographs to a camera without distortion.
+
+    Exit code 1: written, but some were skipped.
+    """
+    from jaxphoto.io.camera_files import read_camera_file
+    from jaxphoto.io.photographs import skipped_messages, skipped_subfolders, valid_photographs
+    from jaxphoto.io.undistorted import write_undistorted
+    from jaxphoto.writing import check_folder
+
+    check_folder(out, camera, *photographs)
+    with output.progress("reading the photographs") as progress:
+        file = read_camera_file(camera, camera=which)
+        read, corrupt = valid_photographs(photographs)
+        written = write_undistorted(read, file, out, keep, progress=partial(progress.steps, "undistorting"))
+    skipped = corrupt | written.left_out
+    for text in (*skipped_messages(skipped), *skipped_subfolders(photographs).values()):
+        output.warn(f"skipped: {text}")
+    sensor, interior = written.camera
+    n, c_px = len(read) - len(written.left_out), float(interior.c) / sensor.pixel_mm
+    output.say(f"{n} photographs of {sensor.width_px} x {sensor.height_px} pixels, c = {c_px:.6g} pixels")
+    output.wrote(out, f"wrote {out}")
+    size = {"width_px": sensor.width_px, "height_px": sensor.height_px}
+    output.add(n_photographs=n, **size, c_px=c_px, left_out=list(skipped))
+    if skipped:
+        raise typer.Exit(1)
+
+
+def map_codes(text: str | None) -> tuple[int | None, int | None]:
+    """Return the EPSG codes of a map system and of its heights, of `25832+7837`."""
+    from jaxphoto.georeferencing.map_frame import check_heights, map_system
+
+    if text is None:
+        return None, None
+    plan, plus, heights = text.removeprefix("EPSG:").partition("+")
+    if not plan.isdecimal() or bool(plus) != heights.isdecimal():
+        raise typer.BadParameter(f"--epsg {text}: give the code of a map system, 25832, or with heights, 25832+7837.")
+    code, vertical = int(plan), int(heights) if heights else None
+    if (system := map_system(code)).is_geographic:
+        raise typer.BadParameter(
+            f"--epsg {code} ({system.name}) is longitude and latitude; give a map system in metres, like 25832."
+        )
+    if vertical is not None:
+        check_heights(code, vertical)
+    return code, vertical
+
+
+def height_reference(text: str | None) -> Any:
+    """Return the reference of heights, or the EPSG code of their system."""
+    from jaxphoto.georeferencing.gps import Heights
+
+    if text is None or (text in get_args(Heights) and text != "unknown"):
+        return text
+    code = text.removeprefix("EPSG:")
+    if not code.isdecimal():
+        raise typer.BadParameter(f"--heights {text}: give ellipsoid, geoid, take-off, or an EPSG code (EGM96: 5773).")
+    return int(code)
+
+
+def _lever_arm(text: str | None) -> tuple[float, float, float] | None:
+    """Return metres to the right, forward and up."""
+    if text is None:
+        return None
+    try:
+        right, forward, up = (float(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(
+            f"--lever-arm {text}: give three numbers in metres, right,forward,up, like 0,0.03,0.19."
+        ) from None
+    return right, forward, up

@@ -1,0 +1,133 @@
+"""Systematic effects in residuals: uniform p-values for complete models, and names of missing terms."""
+
+import dataclasses
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from scipy import stats
+
+from jaxphoto import FIXED, Tables, adjust, covariance, read_block
+from jaxphoto.camera import get_parameter, set_parameter
+from jaxphoto.observations.priors import KnownParameters
+from jaxphoto.report import verdict_of
+from jaxphoto.simulation import remeasure
+from jaxphoto.statistics import systematic_effect_tests, systematic_effects
+from jaxphoto.statistics.hat_matrix import HatMatrix
+from tests.blocks import Simulated, adjusted, free_network, observed, simulated
+
+KNOWN = ("interior[one].c_mm", "interior[one].k1")
+
+
+def in_strips() -> Simulated:
+    """The crossing strips with names and times; residuals of measured coordinates."""
+    block, truth = simulated("cross")
+    time = np.concatenate([np.linspace(-6, 6, 5), np.linspace(20, 34, 5)])
+    block = dataclasses.replace(block, image_strip=("a",) * 5 + ("b",) * 5, image_time=time)
+    as_measured = lambda camera: dataclasses.replace(camera, residuals="measured")  # noqa: E731
+    cameras = lambda b: (b.start.unknowns.interior["one"], b.priors.interior["one"])  # noqa: E731
+    block = eqx.tree_at(cameras, block, tuple(map(as_measured, cameras(block))))
+    return Simulated(block, dataclasses.replace(truth, interior={"one": as_measured(truth.interior["one"])}))
+
+
+def effects_in(block) -> dict:
+    a = adjust(block)
+    return {t.pattern.what: t for t in systematic_effect_tests(a, np.asarray(covariance(a).shared_sigma))}
+
+
+def test_where_nothing_is_missing_p_values_are_uniform():
+    block, truth = in_strips()
+    rng, true = np.random.default_rng(1), truth.interior["one"]
+    q = np.array([[4e-4, -3e-8], [-3e-8, 9e-12]])
+    value = np.array([float(true.c), float(get_parameter(true, "k1"))])
+    priors = (KnownParameters(KNOWN, value + np.linalg.cholesky(q) @ rng.normal(size=2), q) for _ in range(40))
+    draw = jax.jit(lambda key: observed(remeasure(block, truth, key)))
+    blocks = (
+        dataclasses.replace(eqx.tree_at(observed, block, draw(jax.random.key(seed))), more=(prior,))
+        for seed, prior in enumerate(priors)
+    )
+    p = [{what: test.p_value for what, test in effects_in(b).items()} for b in blocks]
+    assert set(p[0]) == {
+        "image points of camera one over the format", "image points of camera one over time",
+        "prior information of camera one", "stations as a whole", "stations from strip to strip",
+        "stations over time",
+    }  # fmt: skip
+    for what in p[0]:
+        assert stats.kstest([each[what] for each in p], "uniform").pvalue > 1e-3, what
+
+
+def test_a_lens_term_that_is_held_is_named():
+    term = "k2"
+    block, _ = in_strips()
+    path = lambda b: (b.start.unknowns.interior["one"], b.priors.interior["one"])  # noqa: E731
+    zero, fixed = (set_parameter(tree, term, value) for tree, value in zip(path(block), (0.0, FIXED), strict=True))
+    a = adjust(eqx.tree_at(path, block, (zero, fixed)))
+    tables = Tables(a)
+    result = tables.tested_trends[0]
+    assert result.p_value < 1e-10 and result.hints[0].term.name == term and result.hints[0].share > 0.8
+    findings = verdict_of(tables).findings
+    messages = [f.text for f in findings if f.code == "systematic" and "over the format" in f.subject]
+    assert len(messages) == 1 and f"{term}, which is fixed: free it" in messages[0]
+
+
+def test_what_stretches_the_image_may_be_a_rolling_shutter():
+    (tested,) = (t for t in Tables(adjusted("cross")).tested_trends if "over the format" in t.pattern.what)
+    cures = {term.name.split()[0]: term.cure for term in tested.pattern.terms}
+    shutter = {name for name, cure in cures.items() if "rolling shutter" in cure}
+    assert shutter == {"b1", "b2"} and cures["p1"] and not cures["c_mm"]
+
+
+def test_stations_of_a_strip_that_are_off_are_named_with_their_shift():
+    block, _ = in_strips()
+    rows = block.stations
+    error = np.where((np.asarray(rows.who) >= 5) & (rows.axis == 2), 1.5, 0.0)
+    result = effects_in(dataclasses.replace(block, stations=dataclasses.replace(rows, value=rows.value + error)))
+    test = result["stations from strip to strip"]
+    best = test.hints[0]
+    assert test.p_value < 1e-4 and best.term.name in ("Z of strip b", "Z of strip a")
+    sign = 1 if best.term.name.endswith("b") else -1
+    assert abs(best.amount - sign * 1.5) < 4 * best.sigma
+
+
+def test_stations_that_are_all_off_alike_are_named_before_any_single_one():
+    """As with another kind of height: c and the ground absorb nearly all of it, and single stations seem wrong."""
+    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    rows = block.stations
+    value = np.asarray(rows.value) + np.where(rows.axis == 2, 48.0, 0.0)
+    tables = Tables(adjust(block.with_observations({"stations": dataclasses.replace(rows, value=value)})))
+    assert tables.blunders.suspects
+    alarm = verdict_of(tables).findings[0]
+    assert alarm.severity == "error"
+    assert "stations as a whole" in alarm.text and ", Z +51" in alarm.text and "flight_bias" in alarm.text
+    (hint,) = [t.hints[0] for t in tables.tested_trends if t.pattern.what == "stations as a whole"]
+    assert abs(hint.amount - 48.0) < 3 * hint.sigma
+
+
+def test_blunders_have_no_part_in_patterns():
+    block, _ = in_strips()
+    rows = block.image_points
+    row = int(np.argmax(np.bincount(rows.point)[rows.point]))
+    xy, kept = np.array(rows.xy), np.arange(len(rows)) != row
+    xy[row] += 0.1
+    a = adjust(dataclasses.replace(block, image_points=dataclasses.replace(rows, xy=xy)))
+    tables = Tables(a)
+    assert [s.row for s in tables.blunders.suspects][:1] == [row]
+    result = {
+        t.pattern.what: t
+        for t in systematic_effect_tests(a, np.asarray(tables.covariance.shared_sigma), [("image_points", row)])
+    }
+    # As if it had not been measured.
+    without = effects_in(dataclasses.replace(block, image_points=rows.take(kept)))
+    for what, t in result.items():
+        assert t.freedom == without[what].freedom
+        assert t.p_value == pytest.approx(without[what].p_value, rel=0.05), what
+
+
+def test_where_there_is_nothing_to_look_for_nothing_is_found(monkeypatch):
+    """More cameras than are tested one by one, and no stations; and no direction to solve for."""
+    a = adjust(free_network(), simulated("cross").truth)
+    monkeypatch.setattr(systematic_effects, "MAX_GROUPS", 0)
+    assert systematic_effect_tests(a, np.asarray(covariance(a).shared_sigma)) == []
+    assert list(HatMatrix.of(a).influence_on([])) == []
