@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("--points", action="store_true", help="points are given, too, as far off")
     arguments = parser.parse_args()
     block = jaxphoto.read_block(arguments.block)
-    best = float(jaxphoto.adjust(block).square_sum)
+    best = float(jaxphoto.adjust(block).sum_of_squares)
     rng = np.random.default_rng(arguments.seed)
     count: collections.Counter[str] = collections.Counter()
     began = time.perf_counter()
@@ -75,7 +75,7 @@ def _end(block: Block, best: float) -> str:
             found = adjust_for_tables(block)
     except JaxphotoError:
         return "refused"
-    if bool(found.converged) and abs(float(found.square_sum) / best - 1) < _SAME:
+    if bool(found.converged) and abs(float(found.sum_of_squares) / best - 1) < _SAME:
         return "at the optimum"
     good = bool(found.converged) and verdict_of(Tables(found)).severity != "error"
     return "elsewhere, and said to be good" if good else "elsewhere, and red"

@@ -95,7 +95,7 @@ def _block(rng: np.random.Generator, asked: str):
     import dataclasses
 
     from jaxphoto.io import recipe_from
-    from jaxphoto.observations import ControlRows, StationRows
+    from jaxphoto.observations import CameraPositions, ControlCoordinates
     from jaxphoto.simulation import simulate
     from tests.simulation.small import changed
 
@@ -110,7 +110,7 @@ def _block(rng: np.random.Generator, asked: str):
     }
     block = simulate(recipe_from(changed(changes)), int(rng.integers(2**31))).block
     if asked == "defect":
-        return dataclasses.replace(block, control=ControlRows.none(), stations=StationRows.none())
+        return dataclasses.replace(block, control=ControlCoordinates.none(), stations=CameraPositions.none())
     if asked == "snoop":
         p = block.image_points
         xy = np.array(p.xy)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxphoto import Adjustment, Block, Unknowns, adjust, covariance
-from jaxphoto.adjustment import LEAST, Sizes
+from jaxphoto.adjustment import MINIMAL_SIZES, PaddedSizes
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.parameters import numbers_of
 
@@ -15,7 +15,7 @@ _RESOLVED, _RESOLVES = 1e-11, 6
 
 
 def optimum(block: Block, start: Unknowns | None = None, priors: Unknowns | None = None,
-            sizes: Sizes = LEAST, sigma: Values | None = None) -> Adjustment:  # fmt: skip
+            sizes: PaddedSizes = MINIMAL_SIZES, sigma: Values | None = None) -> Adjustment:  # fmt: skip
     """Return the adjustment of `block`, iterated beyond the solver's tolerance by further calls from its result."""
     found, last = adjust(block, start, priors, sizes=sizes), np.inf
     if not bool(found.converged):

@@ -21,7 +21,7 @@ from jaxphoto.adjustment import solve
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import Brown, InteriorOrientation, Sensor, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
+from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
 from jaxphoto.unknowns import default_priors
 
 NAMES = ("c_mm", "xp_mm", "yp_mm", "k1", "k2")
@@ -54,11 +54,11 @@ def block_of(problem: Problem, title: str) -> Block:
         image_mount=("",) * n_images,
         image_strip=tuple(f"S{k}" for k in p.strip),
         image_time=np.zeros(n_images),
-        image_points=ImageRows(p.obs_img, p.obs_pt, p.obs_xy, np.full(p.obs_xy.shape, p.sigma_img)),
+        image_points=ImagePoints(p.obs_img, p.obs_pt, p.obs_xy, np.full(p.obs_xy.shape, p.sigma_img)),
         control=_rows(p.gcp_pt, p.gcp_obs, p.gcp_sigma),
-        fixed=ControlRows.none(),
-        check=ControlRows.none(),
-        stations=_rows(np.arange(n_images), p.sta_obs, p.sta_sigma, StationRows),
+        fixed=ControlCoordinates.none(),
+        check=ControlCoordinates.none(),
+        stations=_rows(np.arange(n_images), p.sta_obs, p.sta_sigma, CameraPositions),
         attitudes=Attitudes.none(),
         distances=Distances.none(),
         datum=Datum(),
@@ -67,7 +67,7 @@ def block_of(problem: Problem, title: str) -> Block:
     )
 
 
-def _rows(who: np.ndarray, values: np.ndarray, sigmas: np.ndarray, kind=ControlRows):
+def _rows(who: np.ndarray, values: np.ndarray, sigmas: np.ndarray, kind=ControlCoordinates):
     n = len(who)
     return kind(np.repeat(who, 3), np.tile(np.arange(3), n), np.ravel(values), np.ravel(sigmas))
 
@@ -124,7 +124,7 @@ def _work(file: Path) -> None:
             "covariance_s": adjusted.seconds["covariance"],
             "compile_s": first.seconds["compile"],
             "steps": int(adjusted.steps),
-            "cost": float(adjusted.square_sum) / 2,
+            "cost": float(adjusted.sum_of_squares) / 2,
             "memory_mb": peak,
             "memory_with_covariance_mb": memory("VmHWM"),
         }

@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxphoto import Adjustment, Block, adjust, correlated, covariance, monte_carlo
 from jaxphoto.io import recipe_from
-from jaxphoto.observations import RelativeAttitudes, RelativePositions, StationRows, exponential_covariance
+from jaxphoto.observations import CameraPositions, RelativeAttitudes, RelativePositions, exponential_covariance
 from jaxphoto.sensitivity import noise
 from jaxphoto.simulation import Simulation, simulate
 
@@ -72,7 +72,7 @@ def drifting(block: Block) -> Block:
         own = [np.flatnonzero((strip == name) & (rows.axis == axis)) for axis in range(3)]
         matrix = exponential_covariance(times[rows.who[own[0]]], DRIFT_M, CORRELATION_S)
         sets.append(correlated(rows, np.stack(own), np.stack([matrix] * 3)))
-    return dataclasses.replace(block, stations=StationRows.none(), more=(*block.more, *sets))
+    return dataclasses.replace(block, stations=CameraPositions.none(), more=(*block.more, *sets))
 
 
 def without(block: Block, *kinds: type) -> Block:

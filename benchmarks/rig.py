@@ -26,7 +26,7 @@ import numpy as np
 
 from jaxphoto import Block, adjust, covariance
 from jaxphoto.io import recipe_from
-from jaxphoto.observations import StationRows
+from jaxphoto.observations import CameraPositions
 from jaxphoto.parameters import numbers_of
 from jaxphoto.simulation import Simulation, remeasure, simulate
 from jaxphoto.unknowns import FREE, Unknowns, Weighted
@@ -115,7 +115,7 @@ def measured(block: Block) -> Block:
 
 def unguided(block: Block) -> Block:
     """Without a trajectory."""
-    return dataclasses.replace(block, stations=StationRows.none())
+    return dataclasses.replace(block, stations=CameraPositions.none())
 
 
 CASES: dict[str, Callable[[Block], Block]] = {

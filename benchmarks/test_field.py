@@ -147,7 +147,7 @@ def _ours(block: Block) -> dict:
         # Of the whole call: making the index lists and the factor for statistics included.
         "cpu_s": time.process_time() - cpu,
         "steps": int(adjusted.steps),
-        "square_sum": float(adjusted.square_sum),
+        "square_sum": float(adjusted.sum_of_squares),
         "memory_mb": memory("VmHWM"),
     }
     between, cpu = time.perf_counter(), time.process_time()

@@ -28,7 +28,7 @@ from optimum import Values, differences, optimum, sigmas_of, unknowns_of, worst
 from yardstick_blocks import CASES, NoDataError
 
 from jaxphoto import Block, adjust, covariance
-from jaxphoto.adjustment import LEAST, TOLERANCE, Sizes, common_sizes
+from jaxphoto.adjustment import MINIMAL_SIZES, TOLERANCE, PaddedSizes, common_sizes
 from jaxphoto.sensitivity import monte_carlo, noise, response, sensitivity
 from jaxphoto.statistics import correlation_matrix, redundancy_numbers
 
@@ -63,7 +63,7 @@ def _sums(values: np.ndarray) -> np.ndarray:
     return signs @ values / np.sqrt(max(len(values), 1))
 
 
-def measure(block: Block, sizes: Sizes, whole: bool, mapped: bool) -> Values:
+def measure(block: Block, sizes: PaddedSizes, whole: bool, mapped: bool) -> Values:
     """What is stored of a block, by kind and part: draws and derivatives of the `whole`, other programs of `mapped`."""
     adjusted = optimum(block, sizes=sizes)
     block, u, priors = adjusted.block, adjusted.unknowns, adjusted.priors
@@ -171,7 +171,7 @@ def blocks_of(name: str) -> Iterator[tuple[str, Values]]:
             alike.setdefault(len(block.images), []).append(block)
         for k, (title, block) in enumerate(blocks.items()):
             same = alike[len(block.images)]
-            sizes = common_sizes(same) if len(same) > 1 else LEAST
+            sizes = common_sizes(same) if len(same) > 1 else MINIMAL_SIZES
             yield title, measure(block, sizes, k == 0, k == 0 and name in MAPPED)
 
 

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 
-Numbers = jax.Array | np.ndarray
+ArrayLike = jax.Array | np.ndarray
 """NumPy for concrete values (reading, results), JAX when traced (compiled, differentiated)."""
 
 
-def still(values) -> Any:
+def to_numpy(values) -> Any:
     """Convert to NumPy, whose operations need no compilation; leave traced values unchanged.
 
     Values sharded over several processes are gathered: each process has to call this.
@@ -49,22 +49,22 @@ def namespace(*values: Any) -> Any:
 
 def gathered(tree: Any) -> Any:
     """Gather results from several devices for the next program; values of several processes stay sharded."""
-    return tree if jax.process_count() > 1 else jax.tree.map(still, tree)
+    return tree if jax.process_count() > 1 else jax.tree.map(to_numpy, tree)
 
 
-def on_device(values) -> jax.Array:
+def as_jax_array(values) -> jax.Array:
     """Return a JAX array of concrete real numbers; `jnp.asarray` would compile a copy for each shape."""
     return jax.device_put(np.asarray(values, float))
 
 
-def added(terms: Iterable[Any]) -> Any:
+def sum_terms(terms: Iterable[Any]) -> Any:
     """Sum the terms. Python's `sum` starts with zero, one more operation of every program."""
     return functools.reduce(operator.add, terms)
 
 
-def joined(parts: Sequence) -> Numbers:
+def joined(parts: Sequence) -> ArrayLike:
     """Concatenate `parts` along their first axis, in NumPy unless traced."""
-    parts = [still(part) for part in parts]
+    parts = [to_numpy(part) for part in parts]
     return namespace(*parts).concatenate(parts)
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.arrays import Numbers, joined, still
+from jaxphoto.arrays import ArrayLike, joined, to_numpy
 from jaxphoto.block_edits import BlockEdits
 from jaxphoto.block_from_arrays import block_fields
 from jaxphoto.block_parts import Datum, Frame, Motion, Start, Temperatures
@@ -26,11 +26,11 @@ from jaxphoto.georeferencing import NOMINAL, Corrections, Exposure, Mount, Strip
 from jaxphoto.observations import (
     AbstractObservations,
     Attitudes,
-    ControlRows,
+    CameraPositions,
+    ControlCoordinates,
     Distances,
-    ImageRows,
+    ImagePoints,
     KnownParameters,
-    StationRows,
     SurfaceRows,
 )
 from jaxphoto.short_repr import block_html, block_repr, from_upstairs
@@ -55,12 +55,12 @@ class Block(BlockEdits):
     image_camera: tuple[str, ...] = eqx.field(static=True)
     image_mount: tuple[str, ...] = eqx.field(static=True)
     image_strip: tuple[str, ...] = eqx.field(static=True)
-    image_time: Float[Numbers, "images"]
-    image_points: ImageRows
-    control: ControlRows
-    fixed: ControlRows
-    check: ControlRows
-    stations: StationRows
+    image_time: Float[ArrayLike, "images"]
+    image_points: ImagePoints
+    control: ControlCoordinates
+    fixed: ControlCoordinates
+    check: ControlCoordinates
+    stations: CameraPositions
     attitudes: Attitudes
     distances: Distances
     datum: Datum = eqx.field(static=True)
@@ -72,7 +72,7 @@ class Block(BlockEdits):
     surfaces: SurfaceRows = eqx.field(default_factory=SurfaceRows.none)
     more: tuple[AbstractObservations | KnownParameters, ...] = ()
     """Observations of further kinds, and joint prior information on parameters."""
-    flight_time: Float[Numbers, "images"] | None = None
+    flight_time: Float[ArrayLike, "images"] | None = None
     """Seconds from the middle of the flight; `image_time` is from the middle of the strip. None: equal."""
     middle_s: float = eqx.field(static=True, default=0.0)
     """Middle of the flight in the time scale of the files (s)."""
@@ -89,8 +89,8 @@ class Block(BlockEdits):
 
     def __check_init__(self) -> None:
         for field, kind in (
-            ("stations", StationRows),
-            *((name, ControlRows) for name in ("control", "fixed", "check")),
+            ("stations", CameraPositions),
+            *((name, ControlCoordinates) for name in ("control", "fixed", "check")),
         ):
             given = getattr(self, field)
             if isinstance(given, AbstractObservations) and not isinstance(given, kind):
@@ -103,7 +103,7 @@ class Block(BlockEdits):
         return (self.stations, self.attitudes, self.control, self.surfaces, self.distances, *further)
 
     @property
-    def doubts(self) -> list[str]:
+    def prior_warnings(self) -> list[str]:
         """Return warnings about the prior information."""
         return [known.doubt for known in self.more if isinstance(known, KnownParameters) and known.doubt]
 
@@ -162,9 +162,9 @@ def empty_block(title: str) -> Block:
     places, known = np.zeros((0, 3)), np.zeros(0, bool)
     start = Unknowns({}, ExteriorOrientation(places, np.zeros((0, 3, 3))), places, {}, {})  # type: ignore[arg-type]
     priors = Unknowns({}, ExteriorOrientation(FREE, FREE), FREE, {}, {})  # type: ignore[arg-type]
-    none = ControlRows.none()
+    none = ControlCoordinates.none()
     return Block(
-        title, (), (), {}, (), (), (), np.zeros(0), ImageRows.none(), none, none, none, StationRows.none(),
+        title, (), (), {}, (), (), (), np.zeros(0), ImagePoints.none(), none, none, none, CameraPositions.none(),
         Attitudes.none(), Distances.none(), Datum(), Start(start, known, known), priors,
     )  # fmt: skip
 
@@ -186,10 +186,10 @@ class SensorRows(eqx.Module):
     """
 
     image: Int[np.ndarray, "n"]
-    station: Float[Numbers, "n 3"]
-    station_sigma: Float[Numbers, "n 3"]
-    roll_pitch_yaw: Float[Numbers, "n 3"]
-    attitude_sigma: Float[Numbers, "n 3"]
+    station: Float[ArrayLike, "n 3"]
+    station_sigma: Float[ArrayLike, "n 3"]
+    roll_pitch_yaw: Float[ArrayLike, "n 3"]
+    attitude_sigma: Float[ArrayLike, "n 3"]
     mount: Mount
     bias: StripBias
     exposure: Exposure
@@ -204,13 +204,13 @@ def sensor_rows(block: Block, unknowns: Unknowns) -> SensorRows:
     image = np.flatnonzero((station >= 0).all(1) & (attitude >= 0))
     rows, turn = station[image], attitude[image]
     mount, bias = mountings(block, unknowns)
-    mount, bias, exposure = jax.tree.map(lambda v: still(v)[image], (mount, bias, exposures(block)))
+    mount, bias, exposure = jax.tree.map(lambda v: to_numpy(v)[image], (mount, bias, exposures(block)))
     return SensorRows(
         image=image,
-        station=still(block.stations.value)[rows],
-        station_sigma=still(block.stations.sigma)[rows],
-        roll_pitch_yaw=still(block.attitudes.roll_pitch_yaw)[turn],
-        attitude_sigma=still(block.attitudes.sigma)[turn],
+        station=to_numpy(block.stations.value)[rows],
+        station_sigma=to_numpy(block.stations.sigma)[rows],
+        roll_pitch_yaw=to_numpy(block.attitudes.roll_pitch_yaw)[turn],
+        attitude_sigma=to_numpy(block.attitudes.sigma)[turn],
         mount=mount,
         bias=bias,
         exposure=exposure,
@@ -241,7 +241,7 @@ def _by_name(table: dict, names: tuple[str, ...], absent):
     """Stack the trees of `names` along a leading axis; `absent` replaces missing ones."""
     place = {name: k for k, name in enumerate(table)}
     index = np.array([place.get(name, len(place)) for name in names], int)
-    return jax.tree.map(lambda *v: joined([still(x)[None] for x in v])[index], *table.values(), absent)
+    return jax.tree.map(lambda *v: joined([to_numpy(x)[None] for x in v])[index], *table.values(), absent)
 
 
 def bent_cameras(block: Block, unknowns: Unknowns) -> dict[str, InteriorOrientation] | None:
@@ -252,7 +252,7 @@ def bent_cameras(block: Block, unknowns: Unknowns) -> dict[str, InteriorOrientat
     bending = []
     for owners in unknowns.tables.values():
         for first in list(owners.values())[:1]:
-            if first.bends:
+            if first.modifies_interior:
                 absent = jax.tree.map(jnp.zeros_like, first)
                 bending.append(_by_name(owners, block.owners(first.owner), absent))
     if not bending:

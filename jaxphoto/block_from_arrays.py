@@ -15,14 +15,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.arrays import on_device
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.block_parts import Datum, Start
 from jaxphoto.camera import InteriorOrientation, Sensor, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.columns import CheckedColumns, TableLike
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import Mount, StripBias
-from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
+from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
 from jaxphoto.unknowns import FREE, Unknowns, default_priors
 
 _XYZ, _SIGMA_XYZ = ("X_m", "Y_m", "Z_m"), ("sigma_X_m", "sigma_Y_m", "sigma_Z_m")
@@ -91,8 +91,8 @@ def block_fields(
     used, zero = dict(mounts or {}), jnp.zeros(3)
     unknowns = Unknowns(
         {name: interior for name, (_, interior) in cameras.items()},
-        ExteriorOrientation.from_angles(on_device(position), on_device(np.deg2rad(angles))),
-        on_device(start),
+        ExteriorOrientation.from_angles(as_jax_array(position), as_jax_array(np.deg2rad(angles))),
+        as_jax_array(start),
         used,
         {strip: StripBias(zero, zero) for strip in dict.fromkeys(strips) if strip},
     )
@@ -104,21 +104,21 @@ def block_fields(
         "image_camera": of_camera,
         "image_mount": tuple(camera if camera in used else "" for camera in of_camera),
         "image_strip": strips,
-        "image_time": on_device(listed.numbers("time_s")[:, 0] if "time_s" in listed else np.zeros(len(names))),
+        "image_time": as_jax_array(listed.numbers("time_s")[:, 0] if "time_s" in listed else np.zeros(len(names))),
         "image_points": rows,
         "control": by_role["control"],
         "fixed": by_role["fixed"],
         "check": by_role["check"],
-        "stations": _scalars(flown, of_station, kind=StationRows)[0],
+        "stations": _scalars(flown, of_station, kind=CameraPositions)[0],
         "attitudes": Attitudes(
             of_attitude,
-            on_device(np.deg2rad(turned.numbers(*_ATTITUDE))),
-            on_device(np.deg2rad(turned.sigmas(_SIGMA_ATTITUDE, "sigma_deg"))),
+            as_jax_array(np.deg2rad(turned.numbers(*_ATTITUDE))),
+            as_jax_array(np.deg2rad(turned.sigmas(_SIGMA_ATTITUDE, "sigma_deg"))),
         ),
         "distances": Distances(
             np.stack(ends, axis=1),
-            on_device(bars.numbers("distance_m")[:, 0]),
-            on_device(bars.sigmas(("sigma_m",), "sigma_m")[:, 0]),
+            as_jax_array(bars.numbers("distance_m")[:, 0]),
+            as_jax_array(bars.sigmas(("sigma_m",), "sigma_m")[:, 0]),
         ),
         "datum": datum or Datum("control" if given.n or flown.n else "minimal"),
         "start": Start(unknowns, np.full(len(names), placed), known),
@@ -138,7 +138,7 @@ def _cameras(images: CheckedColumns, cameras: tuple[str, ...]) -> tuple[str, ...
 
 def _image_rows(
     seen: CheckedColumns, images: tuple[str, ...], sigma_mm: float | None
-) -> tuple[tuple[str, ...], ImageRows]:
+) -> tuple[tuple[str, ...], ImagePoints]:
     """Return the points in order of first appearance, and their measurements sorted by point and image."""
     if not seen.n:
         raise BlockError("image_points: there are none; give what was measured in the images")
@@ -150,7 +150,7 @@ def _image_rows(
     for k in np.flatnonzero((np.diff(image[order]) == 0) & (np.diff(point[order]) == 0)):
         again = max(order[k], order[k + 1])
         raise seen.wrong(again, f"point {ids[again]} is measured twice in image {images[image[again]]}")
-    return points, ImageRows(image[order], point[order], on_device(xy[order]), on_device(sigma[order]))
+    return points, ImagePoints(image[order], point[order], as_jax_array(xy[order]), as_jax_array(sigma[order]))
 
 
 def _priors(unknowns: Unknowns, free: Sequence[str]) -> Unknowns:
@@ -166,7 +166,7 @@ def _priors(unknowns: Unknowns, free: Sequence[str]) -> Unknowns:
 
 
 def _scalars(
-    table: CheckedColumns, who: np.ndarray, observed: np.ndarray | None = None, kind: Any = ControlRows
+    table: CheckedColumns, who: np.ndarray, observed: np.ndarray | None = None, kind: Any = ControlCoordinates
 ) -> tuple[Any, np.ndarray]:
     """Return one row per coordinate, and the entry it belongs to; those not `observed` need no sigma."""
     value = table.numbers(*_XYZ, empty=True)
@@ -174,10 +174,10 @@ def _scalars(
     needed = there if observed is None else there & observed[:, None]
     sigma = table.sigmas(_SIGMA_XYZ, "sigma_m", needed=needed)
     entry, axis = np.nonzero(there)
-    return kind(who[entry], axis, on_device(value[there]), on_device(sigma[there])), entry
+    return kind(who[entry], axis, as_jax_array(value[there]), as_jax_array(sigma[there])), entry
 
 
-def _start(ids: tuple[str, ...], near: CheckedColumns, *held: ControlRows) -> tuple[np.ndarray, np.ndarray]:
+def _start(ids: tuple[str, ...], near: CheckedColumns, *held: ControlCoordinates) -> tuple[np.ndarray, np.ndarray]:
     """Return approximate coordinates of all points, control first, and which points have all three."""
     start = np.full((len(ids), 3), np.nan)
     start[near.index("point", ids, "point {name} is measured in no image")] = near.numbers(*_XYZ)

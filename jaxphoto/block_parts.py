@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.georeferencing.map_frame import MapFrame
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.static_values import StaticArray
 from jaxphoto.unknowns import Unknowns
 
 
-@shown
+@pretty_repr
 @dataclasses.dataclass(frozen=True)
 class Datum:
     """Definition of position, orientation and scale where observations leave them open.
@@ -30,32 +30,32 @@ class Datum:
     scale: bool | None = None
 
 
-@shown
+@pretty_repr
 class Motion(eqx.Module):
     """Motion of the GNSS/IMU at each exposure, for time offsets (`georeferencing.Exposure`)."""
 
-    velocity: Float[Numbers, "images 3"]
+    velocity: Float[ArrayLike, "images 3"]
     """In the object frame, m/s."""
-    rate: Float[Numbers, "images 3"]
+    rate: Float[ArrayLike, "images 3"]
     """About the body's right, forward and up axes, rad/s."""
 
 
-@shown
+@pretty_repr
 class Temperatures(eqx.Module):
     """Camera temperature at each exposure, for `camera.ThermalRates`."""
 
-    celsius: Float[Numbers, "images"]
+    celsius: Float[ArrayLike, "images"]
     """NaN if unknown: the reference temperature is assumed."""
     reference_c: float = eqx.field(static=True)
     """Temperature at which the interior orientation holds."""
 
     @property
-    def above(self) -> Float[Numbers, "images"]:
+    def above(self) -> Float[ArrayLike, "images"]:
         """Kelvins above the reference."""
         return jnp.where(jnp.isnan(self.celsius), 0.0, self.celsius - self.reference_c)
 
 
-@shown
+@pretty_repr
 @dataclasses.dataclass(frozen=True)
 class Frame:
     """Object frame of a block, and the conversion to the frame of its files.
@@ -80,7 +80,7 @@ class Frame:
         return MapFrame(self.code, self.vertical, self.origin)
 
 
-@shown
+@pretty_repr
 class Start(eqx.Module):
     """Approximate unknowns, and the images and points for which they are known.
 

@@ -7,13 +7,13 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 OF_POINTS = ("xyz", "classification", "returns", "time", "strip", "withheld")
 """Point-wise fields of a `Cloud`."""
 
 
-@shown
+@pretty_repr
 class Cloud(eqx.Module):
     """Laser points in one Cartesian frame (m): that of the block they were read for, or that of their file.
 

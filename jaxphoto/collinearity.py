@@ -18,7 +18,7 @@ from jaxphoto.arrays import from_list
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.linear_algebra import solve
 from jaxphoto.rotation import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix, rotate
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.single import single
 
 # Eager, every operation would be compiled separately; inside another program these functions are inlined.
@@ -30,7 +30,7 @@ _ROWS = 10
 _matrices = _compiled(jnp.vectorize(matrix_from_omega_phi_kappa, signature="(i)->(i,j)"))
 
 
-@shown
+@pretty_repr
 class ExteriorOrientation(eqx.Module):
     """Projection centre (m) and rotation of one image, or of many with a leading axis."""
 

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.compiling import call_compiled
 
 EFFICIENCY = 0.95
@@ -35,9 +35,9 @@ class AbstractLoss(eqx.Module):
     """Loss of the rows of a group. Numbers only: another value compiles nothing."""
 
     name: eqx.AbstractClassVar[str]
-    threshold: Float[Numbers, ""] | float | None = None
+    threshold: Float[ArrayLike, ""] | float | None = None
     """k0, in standard deviations, from which rows count less. None: by `EFFICIENCY`."""
-    scale: Float[Numbers, ""] | float = 1.0
+    scale: Float[ArrayLike, ""] | float = 1.0
     """s: standard deviation of whitened residuals. Defines what is far; changes no row's sigma."""
 
     @abc.abstractmethod

@@ -14,7 +14,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxphoto.arrays import from_list
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 UNITS = (
     "m", "rad", "mm", "s", "ms", "m_per_s", "rad_per_s", "mm_per_s", "mm_per_h", "per_h", "mm_per_K", "per_K", "ppm",
@@ -27,7 +27,7 @@ images that the block names (`Block.partitions`), such as intervals of time.
 """
 
 
-@shown
+@pretty_repr
 class AbstractParameters(eqx.Module):
     """Parameters of one owner; fields are numbers or vectors."""
 
@@ -36,7 +36,7 @@ class AbstractParameters(eqx.Module):
     owner: eqx.AbstractClassVar[str]
     names: eqx.AbstractClassVar[Mapping[str, tuple[str, ...]]]
     """Name of every number of every field, ending in its unit: _m, _rad, _s, _ms, _mm, _m_per_s, _ppm ..."""
-    bends: ClassVar[tuple[str, ...]] = ()
+    modifies_interior: ClassVar[tuple[str, ...]] = ()
     """Fields of the interior orientation that `interior` changes, such as ("c",); it is then evaluated for every image.
     """
     sized: ClassVar[str] = ""
@@ -49,7 +49,7 @@ class AbstractParameters(eqx.Module):
             object.__setattr__(self, name, from_list(value))
 
     def interior(self, interior: Any, exposure: Any) -> Any:
-        """Return the interior orientation of one image; overridden if `bends` names fields."""
+        """Return the interior orientation of one image; overridden if `modifies_interior` names fields."""
         return interior
 
     def station(self, position: Any, exposure: Any) -> Any:

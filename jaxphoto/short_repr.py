@@ -37,7 +37,7 @@ def html_of(title: str, rows: Mapping[str, object]) -> str:
     return f"<b>{escape(title)}</b><table>{cells}</table>"
 
 
-def shown(cls: T) -> T:
+def pretty_repr(cls: T) -> T:
     """The class, whose things show their fields in a few lines, and in notebooks as a small table."""
     cls.__repr__ = fields_repr  # type: ignore[assignment]
     cls._repr_html_ = fields_html  # type: ignore[attr-defined]

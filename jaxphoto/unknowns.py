@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.arrays import Numbers, from_list, still
+from jaxphoto.arrays import ArrayLike, from_list, to_numpy
 from jaxphoto.camera import (
     CameraRates,
     CameraSpline,
@@ -80,9 +80,9 @@ class Weighted(eqx.Module):
     Joint priors of several parameters: `observations.KnownParameters`.
     """
 
-    value: Float[Numbers, "..."] | float
-    sigma: Float[Numbers, "..."] | float
-    covariance: Float[Numbers, "..."] | None
+    value: Float[ArrayLike, "..."] | float
+    sigma: Float[ArrayLike, "..."] | float
+    covariance: Float[ArrayLike, "..."] | None
 
     def __init__(self, value, sigma=None, *, covariance=None):
         if (sigma is None) == (covariance is None):
@@ -106,7 +106,7 @@ class Unknowns(eqx.Module):
 
     interior: dict[str, InteriorOrientation] = eqx.field(converter=ordered)
     exterior: ExteriorOrientation
-    points: Float[Numbers, "points 3"] = eqx.field(converter=from_list)
+    points: Float[ArrayLike, "points 3"] = eqx.field(converter=from_list)
     mounts: dict[str, Mount] = eqx.field(converter=ordered)
     strips: dict[str, StripBias] = eqx.field(converter=ordered)
     scanner: Scanner | None = None
@@ -207,7 +207,7 @@ def weighted(name: str, start: Any, value: Any, sigma: Any) -> Weighted:
     """
     shape, turns = np.shape(start), np.ndim(start) > 2
     for what, given, whole in (("value", value, shape), ("sigma", sigma, shape[:-1] if turns else shape)):
-        known = still(given)
+        known = to_numpy(given)
         if isinstance(known, jax.core.Tracer):
             continue
         if known.dtype.kind not in "iuf" or not np.isfinite(known).all():

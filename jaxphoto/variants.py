@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxphoto.arrays import is_traced, still
+from jaxphoto.arrays import is_traced, to_numpy
 from jaxphoto.block import Block, Datum, direct_exterior, sensor_rows
 from jaxphoto.camera import set_parameter
 from jaxphoto.errors import BlockError, InputError, few
@@ -24,18 +24,18 @@ from jaxphoto.observations import (
     AXES,
     AbstractObservations,
     Attitudes,
-    ControlRows,
+    CameraPositions,
+    ControlCoordinates,
     Correlated,
     KnownParameters,
     RelativeAttitudes,
     RelativePositions,
-    StationRows,
 )
 from jaxphoto.parameters import AbstractParameters, dynamic_fields
 from jaxphoto.unknowns import FIXED, FREE, late_cameras
 
 # Observations of exposures by GNSS, and by an IMU.
-_POSITIONS: tuple[type, ...] = (StationRows, RelativePositions)
+_POSITIONS: tuple[type, ...] = (CameraPositions, RelativePositions)
 _TURNS: tuple[type, ...] = (Attitudes, RelativeAttitudes)
 
 
@@ -79,7 +79,7 @@ MODES: dict[str, Callable[[Block], Block]] = {"direct": direct, "integrated": in
 
 def without_stations(block: Block) -> Block:
     """Remove GNSS positions, also relative ones, and fix what only they determine: lever arms, shifts and drifts."""
-    return _hold_unseen(dataclasses.replace(block, stations=StationRows.none(), more=_without(block, _POSITIONS)))
+    return _hold_unseen(dataclasses.replace(block, stations=CameraPositions.none(), more=_without(block, _POSITIONS)))
 
 
 def without_attitudes(block: Block) -> Block:
@@ -107,7 +107,7 @@ def control_only(block: Block, points: Collection[str]) -> Block:
         block,
         control=block.control.take(stay),
         fixed=block.fixed.take(held),
-        check=ControlRows.joined(block.check, block.control.take(~stay), block.fixed.take(~held)),
+        check=ControlCoordinates.joined(block.check, block.control.take(~stay), block.fixed.take(~held)),
     )
 
 
@@ -122,8 +122,10 @@ def with_control(block: Block, points: Collection[str], sigma: float | Float[np.
         raise InputError(f"point {unknown[0]} has no surveyed coordinates; name some of {few(sorted(given))}")
     named = np.isin(np.arange(len(of)), [k for k, point in enumerate(of) if point in set(points)])
     kept, gone = ([rows.take(named[rows.who] == own) for rows in groups] for own in (True, False))
-    control = ControlRows.joined(kept[0], _as_control(kept[2], block.control, sigma))
-    return dataclasses.replace(block, control=control, fixed=kept[1], check=ControlRows.joined(gone[2], *gone[:2]))
+    control = ControlCoordinates.joined(kept[0], _as_control(kept[2], block.control, sigma))
+    return dataclasses.replace(
+        block, control=control, fixed=kept[1], check=ControlCoordinates.joined(gone[2], *gone[:2])
+    )
 
 
 def vertical_control(block: Block) -> Block:
@@ -135,9 +137,11 @@ def vertical_control(block: Block) -> Block:
     upright = check.axis == 2
     return dataclasses.replace(
         block,
-        control=ControlRows.joined(control.take(control.axis == 2), _as_control(check.take(upright), control)),
+        control=ControlCoordinates.joined(control.take(control.axis == 2), _as_control(check.take(upright), control)),
         fixed=fixed.take(fixed.axis == 2),
-        check=ControlRows.joined(check.take(~upright), control.take(control.axis != 2), fixed.take(fixed.axis != 2)),
+        check=ControlCoordinates.joined(
+            check.take(~upright), control.take(control.axis != 2), fixed.take(fixed.axis != 2)
+        ),
     )
 
 
@@ -148,7 +152,9 @@ def all_control(block: Block, sigma: float | Float[np.ndarray, "3"] | None = Non
     block has none or several.
     """
     promoted = _as_control(block.check, block.control, sigma)
-    return dataclasses.replace(block, control=ControlRows.joined(block.control, promoted), check=ControlRows.none())
+    return dataclasses.replace(
+        block, control=ControlCoordinates.joined(block.control, promoted), check=ControlCoordinates.none()
+    )
 
 
 def hold_interior(block: Block, camera: str, values: Mapping[str, float]) -> Block:
@@ -212,7 +218,7 @@ def without_observations(
     for rows in kept.named_observations.values():
         for what, index in rows.indices():
             if what == "point":
-                np.add.at(numbers, still(index).ravel(), np.repeat(len(rows.axes), np.size(index)))
+                np.add.at(numbers, to_numpy(index).ravel(), np.repeat(len(rows.axes), np.size(index)))
     np.add.at(numbers, kept.fixed.who, 1)
     point = np.flatnonzero(numbers >= 3)
     return (kept, point) if len(point) == len(numbers) else (_part(kept, np.arange(len(block.images)), point), point)
@@ -311,10 +317,10 @@ def _kind(rows: AbstractObservations | KnownParameters) -> type:
 
 
 def _as_control(
-    check: ControlRows, control: ControlRows, sigma: float | Float[np.ndarray, "3"] | None = None
-) -> ControlRows:
+    check: ControlCoordinates, control: ControlCoordinates, sigma: float | Float[np.ndarray, "3"] | None = None
+) -> ControlCoordinates:
     """Convert check coordinates to control; those without a sigma get `sigma`, or that of the control on their axis."""
-    own, taken = still(check.sigma), np.zeros(3)
+    own, taken = to_numpy(check.sigma), np.zeros(3)
     if not len(check):
         return check
     if is_traced((own, control.sigma)):
@@ -342,7 +348,7 @@ def _numbers(kept: np.ndarray, n: int) -> np.ndarray:
 
 
 def _taken(tree, index: np.ndarray):
-    return jax.tree.map(lambda v: still(v)[index], tree)
+    return jax.tree.map(lambda v: to_numpy(v)[index], tree)
 
 
 def _only(table: dict, names: Collection[str]) -> dict:

@@ -40,9 +40,9 @@ from jaxphoto.procedures.lidar import (
     adjust_strips,
     kept_returns,
 )
+from jaxphoto.procedures.lidar.iterate_to_convergence import at_result, interior_held
 from jaxphoto.procedures.lidar.looks import looks_of
 from jaxphoto.procedures.lidar.strip_control import check_complete
-from jaxphoto.procedures.lidar.until_still import at_result, interior_held
 from jaxphoto.procedures.lidar.vertical_control import tie_points
 from jaxphoto.report.strips import print_strips, strips_verdict, write_strips
 from jaxphoto.report.tables import Tables

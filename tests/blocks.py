@@ -19,7 +19,7 @@ from jaxphoto.camera import Balanced, Brown, InteriorOrientation, Sensor, Smac, 
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.compiling.quickly import jit_quickly
 from jaxphoto.georeferencing import Mount, Scanner, StripBias
-from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows, SurfaceRows
+from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints, SurfaceRows
 from jaxphoto.rotation import small_rotation
 from jaxphoto.simulation import remeasure
 from jaxphoto.unknowns import default_priors
@@ -119,11 +119,11 @@ def bare(scene: Scene, cameras: dict[str, InteriorOrientation], of_image, mounts
         image_mount=(next(iter(mounts), ""),) * n_images,
         image_strip=("a",) * half + ("b",) * (n_images - half) if strips else ("",) * n_images,
         image_time=time if strips else np.zeros(n_images),
-        image_points=ImageRows(image, point, np.zeros((n, 2)), np.full((n, 2), 0.004)),
-        control=ControlRows.none(),
-        fixed=ControlRows.none(),
-        check=ControlRows.none(),
-        stations=StationRows.none(),
+        image_points=ImagePoints(image, point, np.zeros((n, 2)), np.full((n, 2), 0.004)),
+        control=ControlCoordinates.none(),
+        fixed=ControlCoordinates.none(),
+        check=ControlCoordinates.none(),
+        stations=CameraPositions.none(),
         attitudes=Attitudes.none(),
         distances=Distances.none(),
         datum=Datum(),
@@ -133,14 +133,14 @@ def bare(scene: Scene, cameras: dict[str, InteriorOrientation], of_image, mounts
     return Simulated(block, truth)
 
 
-def rows(who, axes=(0, 1, 2), sigma=0.03, kind=ControlRows):
+def rows(who, axes=(0, 1, 2), sigma=0.03, kind=ControlCoordinates):
     """Every axis of `axes` of `who`; values are for `measured` to fill."""
     who, axis = (v.ravel() for v in np.meshgrid(np.asarray(who, int), axes, indexing="ij"))
     return kind(who, axis, np.zeros(len(who)), np.full(len(who), sigma))
 
 
-def all_stations(block: Block, sigma=0.10) -> StationRows:
-    return rows(range(len(block.images)), sigma=sigma, kind=StationRows)
+def all_stations(block: Block, sigma=0.10) -> CameraPositions:
+    return rows(range(len(block.images)), sigma=sigma, kind=CameraPositions)
 
 
 def all_attitudes(block: Block, sigma=1e-4) -> Attitudes:
@@ -271,7 +271,7 @@ def _inner_shift() -> Simulated:
     block, truth = _strips()
     priors = {name: StripBias(FREE, FIXED) for name in truth.strips}
     block = eqx.tree_at(lambda b: b.priors.strips, block, priors)
-    return Simulated(dataclasses.replace(block, control=ControlRows.none(), datum=Datum("inner")), truth)
+    return Simulated(dataclasses.replace(block, control=ControlCoordinates.none(), datum=Datum("inner")), truth)
 
 
 def _everything() -> Simulated:
@@ -291,7 +291,7 @@ def _everything() -> Simulated:
     block = dataclasses.replace(
         block,
         attitudes=all_attitudes(block).take(np.arange(1, 7)),
-        control=ControlRows.joined(rows(CONTROL), rows((5, 21, 33), (2,))),
+        control=ControlCoordinates.joined(rows(CONTROL), rows((5, 21, 33), (2,))),
         fixed=rows((17,), (0, 1), 0.0),
         distances=Distances(ends, np.zeros(3), np.array([0.02, 0.03, 0.01])),
     )
@@ -316,9 +316,10 @@ def _fixed_interior() -> Simulated:
 def _fixed_control() -> Simulated:
     """Control without error, among it a point that is fixed in height only; no stations."""
     block, truth = _cross()
-    fixed = ControlRows.joined(rows(CONTROL, sigma=0.0), rows((21,), (2,), 0.0))
+    fixed = ControlCoordinates.joined(rows(CONTROL, sigma=0.0), rows((21,), (2,), 0.0))
     return Simulated(
-        dataclasses.replace(block, control=ControlRows.none(), fixed=fixed, stations=StationRows.none()), truth
+        dataclasses.replace(block, control=ControlCoordinates.none(), fixed=fixed, stations=CameraPositions.none()),
+        truth,
     )
 
 
@@ -410,8 +411,8 @@ def _field_and_ground() -> Simulated:
     ends = np.array([[0, 3], [5, 7]])
     block = dataclasses.replace(
         block,
-        image_points=ImageRows(image[few], point[few], xy[few], sigma[few]),
-        fixed=ControlRows.joined(rows(fixed, sigma=0.0), rows((n - 1,), (2,), 0.0)),
+        image_points=ImagePoints(image[few], point[few], xy[few], sigma[few]),
+        fixed=ControlCoordinates.joined(rows(fixed, sigma=0.0), rows((n - 1,), (2,), 0.0)),
         control=rows((1, 9)),
         distances=Distances(ends, np.zeros(2), np.array([0.02, 0.03])),
     )

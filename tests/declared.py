@@ -10,12 +10,12 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto import AbstractObservations, AbstractParameters, KnownParameters, Outcome, adjust, correlated, touching
+from jaxphoto import AbstractObservations, AbstractParameters, KnownParameters, Outcome, adjust, correlated, index_of
 from jaxphoto.adjustment.adjust import _residuals
 from jaxphoto.adjustment.layout.padding import pad_structure
 from jaxphoto.adjustment.model.block_values import values_of
 from jaxphoto.adjustment.model.structure import structure_of
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.block import Block, Motion
 from jaxphoto.camera import CameraSpline, StripCamera
 from jaxphoto.compiling import run_compiled
@@ -23,6 +23,7 @@ from jaxphoto.georeferencing import Mount, RigCamera, ScannerCalibration, StripS
 from jaxphoto.observations import (
     AXES,
     AttitudeSteps,
+    CameraPositions,
     Distances,
     ImageState,
     PositionSteps,
@@ -30,7 +31,6 @@ from jaxphoto.observations import (
     RelativePositions,
     RigPlaces,
     RigTurns,
-    StationRows,
     StripCameraSteps,
     StripPlanes,
     StripPoints,
@@ -51,10 +51,10 @@ class Baselines(AbstractObservations):
     unit = "m"
     axes = AXES
 
-    start: Int[np.ndarray, "n"] = touching("image")
-    end: Int[np.ndarray, "n"] = touching("image")
-    value: Float[Numbers, "n 3"]
-    sigma: Float[Numbers, "n 3"]
+    start: Int[np.ndarray, "n"] = index_of("image")
+    end: Int[np.ndarray, "n"] = index_of("image")
+    value: Float[ArrayLike, "n 3"]
+    sigma: Float[ArrayLike, "n 3"]
 
     def residual(self, start: ImageState, end: ImageState) -> Float[Array, "3"]:
         return self.value - (end.position - start.position)
@@ -66,7 +66,7 @@ class RateOfC(AbstractParameters):
     kind = "c_rates"
     owner = "camera"
     names = {"rate": ("rate_mm_per_s",)}  # noqa: RUF012
-    bends = ("c",)
+    modifies_interior = ("c",)
 
     rate: float
 
@@ -198,8 +198,8 @@ def _further(n_images: int, angles: np.ndarray) -> tuple:
     """Observations of all further kinds; values are for `_observed` to fill."""
     rng = np.random.default_rng(4)
     factor = rng.normal(0, 0.02, (n_images, 3, 3)) + 0.05 * np.eye(3)
-    gnss = rows(range(n_images), sigma=1.0, kind=StationRows)
-    heights = rows(range(n_images), (2,), sigma=1.0, kind=StationRows)
+    gnss = rows(range(n_images), sigma=1.0, kind=CameraPositions)
+    heights = rows(range(n_images), (2,), sigma=1.0, kind=CameraPositions)
     times = np.array([np.linspace(-6, 6, 5), np.linspace(-7, 7, 5)])
     in_time = np.stack([exponential_covariance(t, 0.08, 5.0) for t in times])
     start, end = np.array([0, 3, 8, 20, 30]), np.array([7, 9, 25, 33, 5])

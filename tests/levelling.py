@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto import AbstractObservations, touching
-from jaxphoto.arrays import Numbers
+from jaxphoto import AbstractObservations, index_of
+from jaxphoto.arrays import ArrayLike
 
 
 class HeightDifferences(AbstractObservations):
@@ -13,10 +13,10 @@ class HeightDifferences(AbstractObservations):
     group = "height_differences"
     unit = "m"
 
-    start: Int[np.ndarray, "n"] = touching("point")
-    end: Int[np.ndarray, "n"] = touching("point")
-    value: Float[Numbers, "n"]
-    sigma: Float[Numbers, "n"]
+    start: Int[np.ndarray, "n"] = index_of("point")
+    end: Int[np.ndarray, "n"] = index_of("point")
+    value: Float[ArrayLike, "n"]
+    sigma: Float[ArrayLike, "n"]
 
     def residual(self, start: Float[Array, "3"], end: Float[Array, "3"]) -> Float[Array, ""]:
         return self.value - (end[2] - start[2])

@@ -16,7 +16,7 @@ from jaxphoto.adjustment import Outcome
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import Brown, InteriorOrientation, Sensor, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
+from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
 from jaxphoto.statistics import redundancy_numbers
 from jaxphoto.unknowns import default_priors
 
@@ -33,7 +33,7 @@ def baselines(data_dir):
     return folder
 
 
-def xyz_rows(who, values, sigmas, kind=ControlRows):
+def xyz_rows(who, values, sigmas, kind=ControlCoordinates):
     n = len(who)
     return kind(np.repeat(who, 3), np.tile(np.arange(3), n), np.ravel(values), np.ravel(sigmas))
 
@@ -63,13 +63,13 @@ def block_of(npz: Path) -> Block:
         image_mount=("",) * n_images,
         image_strip=("",) * n_images,
         image_time=np.zeros(n_images),
-        image_points=ImageRows(
+        image_points=ImagePoints(
             d["obs_img"][order], d["obs_pt"][order], d["obs_xy"][order], np.full(d["obs_xy"].shape, d["sigma_img"])
         ),
         control=xyz_rows(d["gcp_pt"], d["gcp_obs"], d["gcp_sigma"]),
-        fixed=ControlRows.none(),
-        check=ControlRows.none(),
-        stations=xyz_rows(np.arange(n_images), d["sta_obs"], d["sta_sigma"], StationRows),
+        fixed=ControlCoordinates.none(),
+        check=ControlCoordinates.none(),
+        stations=xyz_rows(np.arange(n_images), d["sta_obs"], d["sta_sigma"], CameraPositions),
         attitudes=Attitudes.none(),
         distances=Distances.none(),
         datum=Datum(),
@@ -118,8 +118,8 @@ def solved(request, baselines, tmp_path_factory):
 def test_cost_redundancy_and_sigma0(solved):
     adjusted, reference = solved.adjusted, solved.reference
     assert adjusted.outcome is Outcome.CONVERGED
-    assert abs(float(adjusted.square_sum) / 2 / reference["cost"] - 1) < 1e-9
-    assert abs(solved.r @ solved.r / float(adjusted.square_sum) - 1) < 1e-12
+    assert abs(float(adjusted.sum_of_squares) / 2 / reference["cost"] - 1) < 1e-9
+    assert abs(solved.r @ solved.r / float(adjusted.sum_of_squares) - 1) < 1e-12
     assert sum(adjusted.n_observations.values()) == reference["observations"]
     assert sum(adjusted.n_unknowns.values()) == reference["unknowns"]
     assert adjusted.redundancy == reference["redundancy"]
@@ -162,7 +162,7 @@ def test_by_way_of_a_block_folder(solved, tmp_path):
     block = read_block(tmp_path / "block")
     again = adjust(block)
     assert again.outcome is Outcome.CONVERGED
-    assert abs(float(again.square_sum) / 2 / solved.reference["cost"] - 1) < 1e-9
+    assert abs(float(again.sum_of_squares) / 2 / solved.reference["cost"] - 1) < 1e-9
     order = [block.points.index(name) for name in solved.block.points]
     points = np.asarray(again.unknowns.points)[order]
     unknowns = eqx.tree_at(lambda u: u.points, again.unknowns, points)

@@ -125,7 +125,7 @@ def test_files_say_what_the_adjustment_says(results, folder):
     residuals = pd.read_csv(out / "residuals.csv")
     assert residuals["redundancy_number"].sum() == pytest.approx(adjusted.redundancy, abs=1e-6)
     weighted = residuals["residual"] / residuals["sigma"]
-    assert (weighted**2).sum() == pytest.approx(float(adjusted.square_sum), rel=1e-6)
+    assert (weighted**2).sum() == pytest.approx(float(adjusted.sum_of_squares), rel=1e-6)
     assert f"{float(adjusted.sigma0):.6g}" in screen
     for axis in "XYZ":
         off = tables.check_points[f"d{axis}_m"].dropna()

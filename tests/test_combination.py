@@ -46,9 +46,12 @@ def test_it_is_the_adjustment_of_all_of_them():
         rows.append(whitener * unit)
         right.append(whitener @ own)
     a, b = np.concatenate(rows), np.concatenate(right)
-    solution, square_sum, _, _ = np.linalg.lstsq(a, b)
+    solution, sum_of_squares, _, _ = np.linalg.lstsq(a, b)
     np.testing.assert_allclose(np.asarray(parameter_vector(done.interior))[FREE], unit * solution, rtol=1e-9)
-    assert (done.chi_square, done.degrees_of_freedom) == (pytest.approx(float(square_sum[0]), rel=1e-6), 2 * len(FREE))
+    assert (done.chi_square, done.degrees_of_freedom) == (
+        pytest.approx(float(sum_of_squares[0]), rel=1e-6),
+        2 * len(FREE),
+    )
     expected = np.linalg.inv(a.T @ a) * np.outer(unit, unit)
     np.testing.assert_allclose(done.covariance[OWN], expected, rtol=1e-7)
     assert not np.delete(done.covariance, FREE, axis=0).any()

@@ -34,10 +34,10 @@ from tests.declared import OWN, adjusted, own_alone, own_priors, residuals_of, s
 
 # Every class that a file or a notebook gives rows of, by the groups of the block that show it.
 SHOWN = {
-    "ImageRows": ("image_points",),
-    "StationRows": ("stations",),
+    "ImagePoints": ("image_points",),
+    "CameraPositions": ("stations",),
     "Attitudes": ("attitudes",),
-    "ControlRows": ("control_points",),
+    "ControlCoordinates": ("control_points",),
     "SurfaceRows": ("surfaces",),
     "StripPlanes": ("strip_planes",),
     "StripPoints": ("strip_points",),

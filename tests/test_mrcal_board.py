@@ -96,7 +96,7 @@ def off(cofactors, expected):
 
 def test_square_sum_and_camera_are_mrcals(calibrated, reference):
     assert calibrated.n_observations["image_points"] == 2 * reference["n_corners"]
-    assert float(calibrated.square_sum) == pytest.approx(reference["square_sum_px2"], rel=1e-9)
+    assert float(calibrated.sum_of_squares) == pytest.approx(reference["square_sum_px2"], rel=1e-9)
     sigma = np.sqrt(np.diag(reference["intrinsics_cofactors_unit_weight"]))
     found = in_pixels(calibrated, own_parameters(calibrated))
     assert np.abs((found - reference["intrinsics"]) / sigma).max() < 1e-4

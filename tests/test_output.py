@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 from rich.progress import Progress as Bar
 
-from jaxphoto.adjustment.told import step_lines, tell_course
+from jaxphoto.adjustment.iteration_log import log_iterations, step_lines
 from jaxphoto_command import app
 from jaxphoto_command.output import Output, Progress
 from tests.blocks import adjusted
@@ -97,11 +97,11 @@ def test_verbose_logs_steps_iterations_and_compilations(capsys):
         with out.progress("reading") as progress:
             for k in range(5):
                 progress.steps("features", k, 5)
-        tell_course(result)
+        log_iterations(result)
         jax.monitoring.record_event_duration_secs(
             "/jax/core/compile/backend_compile_duration", 1.0, fun_name="jit(solve)"
         )
-    tell_course(result)
+    log_iterations(result)
     lines = [line.split(" ms  ")[1] for line in capsys.readouterr().err.splitlines()]
     course = [f"adjusted 10 images, {len(result.block.points)} points: {result.outcome.value}", *step_lines(result)]
     assert lines == ["reading", "features", *course, "compiled solve in 1.0 s"]

@@ -24,8 +24,8 @@ from jaxphoto.losses import LOSSES
 from jaxphoto.parameters import dynamic_fields
 from jaxphoto.procedures.halves import CUTS
 from jaxphoto.procedures.lidar.images_and_cloud import SHIFT_SIGMA, SURFACES
+from jaxphoto.procedures.lidar.iterate_to_convergence import MAX_ROUNDS
 from jaxphoto.procedures.lidar.strip_adjustment import MAX_STRIP_ROUNDS
-from jaxphoto.procedures.lidar.until_still import MAX_ROUNDS
 from jaxphoto.procedures.lidar.vertical_control import METHODS
 from jaxphoto.procedures.model_choice import FOLDS
 from jaxphoto.report import TABLE_FORMATS

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from jaxphoto import FIXED, FREE, BlockError, Outcome, adjust
 from jaxphoto.block import Block, Datum, Motion
 from jaxphoto.compiling.quickly import jit_quickly
-from jaxphoto.observations import ControlRows
+from jaxphoto.observations import ControlCoordinates
 from jaxphoto.simulation import remeasure
 from jaxphoto.statistics import check_discrepancies
 from jaxphoto.unknowns import is_prior
@@ -41,7 +41,7 @@ def everything() -> Block:
     return blocks.simulated("everything").block
 
 
-def named(rows: ControlRows, ids) -> dict:
+def named(rows: ControlCoordinates, ids) -> dict:
     """ControlRows by what they say, whatever the numbering; fails on a row that is there twice."""
     found = {(ids[w], int(a)): (float(v), float(s)) for w, a, v, s in zip(*vars(rows).values(), strict=True)}
     assert len(found) == len(rows.who)
@@ -50,7 +50,7 @@ def named(rows: ControlRows, ids) -> dict:
 
 def coordinates(block: Block) -> dict:
     """All surveyed coordinates, of whatever role."""
-    return named(ControlRows.joined(block.control, block.fixed, block.check), block.points)
+    return named(ControlCoordinates.joined(block.control, block.fixed, block.check), block.points)
 
 
 def measured(block: Block) -> dict:
@@ -72,7 +72,7 @@ def survey(rng: np.random.Generator, block: Block) -> Block:
     for k in range(3):
         who, axis = np.nonzero(role == k)
         sigma = np.array([0.03, 0.0, 0.0])[k] * np.ones(len(who))
-        rows.append(ControlRows(who, axis, rng.normal(size=len(who)), sigma))
+        rows.append(ControlCoordinates(who, axis, rng.normal(size=len(who)), sigma))
     return dataclasses.replace(block, control=rows[0], fixed=rows[1], check=rows[2])
 
 
@@ -106,7 +106,7 @@ def test_roles_after_each_variant(seed):
     assert len(everywhere.check.who) == 0
     # Back again: control that was demoted keeps its sigma, so promoting it changes nothing.
     demoted = dataclasses.replace(
-        without_control(dataclasses.replace(block, fixed=ControlRows.none(), check=ControlRows.none()))
+        without_control(dataclasses.replace(block, fixed=ControlCoordinates.none(), check=ControlCoordinates.none()))
     )
     assert named(all_control(demoted).control, block.points) == named(block.control, block.points)
 
@@ -132,7 +132,7 @@ def test_check_points_take_the_sigma_of_the_control_or_the_one_given():
     assert sorted(set(given.control.sigma)) == [0.02, 0.03, 0.05, 0.5]
     np.testing.assert_array_equal(vertical_control(block).control.sigma, 0.05)
     with pytest.raises(ValueError, match=r"in X have no sigma.*has none to take"):
-        all_control(dataclasses.replace(block, control=ControlRows.none()))
+        all_control(dataclasses.replace(block, control=ControlCoordinates.none()))
     mixed = dataclasses.replace(
         block, control=dataclasses.replace(block.control, sigma=0.01 + 0.01 * block.control.who)
     )

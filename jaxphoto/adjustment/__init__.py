@@ -4,40 +4,47 @@
 `NormalEquations` rather than the last two.
 """
 
-from jaxphoto.adjustment.adjust import MAX_STEPS, LaidOut, common_sizes, lay_out, linearise, solve
+from jaxphoto.adjustment.adjust import MAX_STEPS, Problem, build_problem, common_sizes, linearise, solve
 from jaxphoto.adjustment.layout.padded import PaddedResiduals, PaddedStructure, PaddedValues
 from jaxphoto.adjustment.layout.padding import PaddedBlock
-from jaxphoto.adjustment.layout.rays import LEAST, Sizes
-from jaxphoto.adjustment.normal_equations import Cofactors, Linearised, Met, NormalEquations, RowCofactors, optimise
+from jaxphoto.adjustment.layout.rays import MINIMAL_SIZES, PaddedSizes
+from jaxphoto.adjustment.normal_equations import (
+    Cofactors,
+    CoupledUnknowns,
+    Linearised,
+    NormalEquations,
+    RowCofactors,
+    optimise,
+)
 from jaxphoto.adjustment.result import Adjustment, Outcome
-from jaxphoto.adjustment.solver.levenberg_marquardt import Task, to_factor, to_optimum
+from jaxphoto.adjustment.solver.levenberg_marquardt import SolveMode, to_factor, to_optimum
 from jaxphoto.adjustment.solver.optimum import TOLERANCE
 from jaxphoto.adjustment.weak_directions import POOR, WeakDirection, weak_directions, yardsticks
-from jaxphoto.adjustment.weak_words import WeakUnknowns, weaknesses_of
+from jaxphoto.adjustment.weakness_messages import WeakUnknowns, weaknesses_of
 
 __all__ = [
-    "LEAST",
     "MAX_STEPS",
+    "MINIMAL_SIZES",
     "POOR",
     "TOLERANCE",
     "Adjustment",
     "Cofactors",
-    "LaidOut",
+    "CoupledUnknowns",
     "Linearised",
-    "Met",
     "NormalEquations",
     "Outcome",
     "PaddedBlock",
     "PaddedResiduals",
+    "PaddedSizes",
     "PaddedStructure",
     "PaddedValues",
+    "Problem",
     "RowCofactors",
-    "Sizes",
-    "Task",
+    "SolveMode",
     "WeakDirection",
     "WeakUnknowns",
+    "build_problem",
     "common_sizes",
-    "lay_out",
     "linearise",
     "optimise",
     "solve",

@@ -14,24 +14,24 @@ import numpy as np
 from jaxphoto.adjustment.arguments import check_arguments
 from jaxphoto.adjustment.datum import close_datum
 from jaxphoto.adjustment.implicit import find_optimum
+from jaxphoto.adjustment.iteration_log import log_iterations
 from jaxphoto.adjustment.layout.padded import PaddedResiduals, PaddedStructure, PaddedValues
 from jaxphoto.adjustment.layout.padding import PaddedBlock, pad_structure
-from jaxphoto.adjustment.layout.rays import LEAST, Sizes, sizes_of
-from jaxphoto.adjustment.lost_digits import warn_of_lost_digits
+from jaxphoto.adjustment.layout.rays import MINIMAL_SIZES, PaddedSizes, sizes_of
 from jaxphoto.adjustment.model.block_values import unknowns_of, values_of, with_datum, with_start
 from jaxphoto.adjustment.model.numbers import UnknownArrays, Values, state_at, zero_increments
 from jaxphoto.adjustment.model.structure import ObservedRows, Structure, observed_in, structure_of
 from jaxphoto.adjustment.normal_equations import NormalEquations, optimise
+from jaxphoto.adjustment.precision_check import warn_of_precision_loss
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.result import Adjustment
 from jaxphoto.adjustment.side_by_side import image_row_lists
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
-from jaxphoto.adjustment.solver.levenberg_marquardt import Course, to_factor, to_optimum, zero_system
+from jaxphoto.adjustment.solver.levenberg_marquardt import IterationHistory, to_factor, to_optimum, zero_system
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.similarity import n_open_motions
-from jaxphoto.adjustment.told import tell_course
-from jaxphoto.arrays import gathered, is_float, is_traced, still
+from jaxphoto.arrays import gathered, is_float, is_traced, to_numpy
 from jaxphoto.block import Block
 from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.compiling.lru_cache import LruCache
@@ -49,7 +49,7 @@ def solve(
     start: Unknowns,
     priors: Unknowns,
     max_steps: int = MAX_STEPS,
-    sizes: Sizes = LEAST,
+    sizes: PaddedSizes = MINIMAL_SIZES,
     meanwhile: Callable[[NormalEquations, dict[str, float]], None] = lambda equations, seconds: None,
     losses: Mapping[str, AbstractLoss] = MappingProxyType({}),
 ) -> Adjustment:
@@ -69,7 +69,7 @@ def solve(
     Raises DatumError if the observations leave the datum open and no constraint closes it, RankError if they do not
     determine an unknown or cannot separate unknowns.
     """
-    laid = lay_out(block, start, priors, sizes)
+    laid = build_problem(block, start, priors, sizes)
     if not laid.traced and is_traced(block.start.unknowns):
         # The result does not depend on them; a derivative would silently be zero.
         raise InputError(
@@ -79,7 +79,7 @@ def solve(
     numbers, plain = laid.padded_values, laid.padded.structure
     structure = plain.with_losses(losses)
     seconds: dict[str, float] = {}
-    course: Course | None = None
+    course: IterationHistory | None = None
     if laid.traced:
         # Stored with the layout, where it is already hashed.
         padded = dataclasses.replace(laid.padded, structure=structure) if losses else laid.padded
@@ -92,8 +92,8 @@ def solve(
             meanwhile(NormalEquations(numbers, plain, _factored_like(numbers, plain)), seconds)
         found = run_compiled(_optimise, arguments, seconds, "solve")
         # Arrays returned by several devices have another type than those passed in.
-        state = UnknownArrays(*map(still, found.state))
-        course = Course(*(still(v)[: int(found.steps)] for v in found.course))
+        state = UnknownArrays(*map(to_numpy, found.state))
+        course = IterationHistory(*(to_numpy(v)[: int(found.steps)] for v in found.course))
     steps, converged = found.steps, found.converged
     assert steps is not None and converged is not None, "only of a tangent is this unknown"
     # Its normal equations are the largest array, and are recomputed.
@@ -104,8 +104,8 @@ def solve(
         return adjusted
     # Concrete numbers, also inside a traced function.
     with jax.ensure_compile_time_eval():
-        tell_course(adjusted)
-        if adjusted.astray.any():
+        log_iterations(adjusted)
+        if adjusted.diverged_points.any():
             return dataclasses.replace(adjusted, converged=np.array(False))
         check_rank(adjusted)
     return adjusted
@@ -121,17 +121,17 @@ def _differentiable(values: PaddedValues, padded: PaddedBlock, max_steps: int) -
     return found, state_at(found.increments, unit_scale(s), values, s)
 
 
-def linearise(block: Block, unknowns: Unknowns, priors: Unknowns, sizes: Sizes = LEAST) -> Adjustment:
+def linearise(block: Block, unknowns: Unknowns, priors: Unknowns, sizes: PaddedSizes = MINIMAL_SIZES) -> Adjustment:
     """Evaluate residuals and normal equations of `block` at `unknowns`, which need not be its optimum.
 
     Used to judge all observations after an adjustment of some. Raises what `solve` raises before it computes.
     """
-    laid = lay_out(block, unknowns, priors, sizes)
+    laid = build_problem(block, unknowns, priors, sizes)
     v = laid.padded_values
     return _at(UnknownArrays(v.position, v.rotation, v.shared, v.points), laid, block, unknowns, priors, {})
 
 
-def _at(state: UnknownArrays, laid: "LaidOut", block: Block, start: Unknowns, priors: Unknowns, seconds) -> Adjustment:
+def _at(state: UnknownArrays, laid: "Problem", block: Block, start: Unknowns, priors: Unknowns, seconds) -> Adjustment:
     """Evaluate residuals and normal equations at `state`."""
     padded, numbers = laid.padded, with_start(laid.padded_values, state)
     structure, factored = padded.structure, None
@@ -157,7 +157,7 @@ def _at(state: UnknownArrays, laid: "LaidOut", block: Block, start: Unknowns, pr
     )
 
 
-class LaidOut(NamedTuple):
+class Problem(NamedTuple):
     """Problem to solve: index arrays and numbers, in block order and padded."""
 
     padded: PaddedBlock
@@ -170,14 +170,16 @@ class LaidOut(NamedTuple):
         return is_traced(self.values)
 
 
-def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAST, alone: bool = False) -> LaidOut:
+def build_problem(
+    block: Block, start: Unknowns, priors: Unknowns, sizes: PaddedSizes = MINIMAL_SIZES, alone: bool = False
+) -> Problem:
     """Close the datum of a block and pad it; for one device if `alone`.
 
     Raises what `solve` raises before it computes.
     """
     check_arguments(block, start, priors)
     check_priors(block, priors)
-    warn_of_lost_digits(block, start, priors)
+    warn_of_precision_loss(block, start, priors)
     observed = observed_in(block, priors)
     structure, padded_blocks = _layouts.get(
         _layout_key(block, priors, observed), lambda: (structure_of(block, priors, observed), {})
@@ -194,7 +196,7 @@ def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAS
     if key not in padded_blocks:
         padded_blocks[key] = pad_structure(structure, sizes, shards=shards, dense=dense)
     padded = padded_blocks[key]
-    return LaidOut(padded, values, padded.pad(values))
+    return Problem(padded, values, padded.pad(values))
 
 
 # A study may alternate between a few blocks. Index arrays of 1,000 images and a million image points take 30 MB.
@@ -228,9 +230,9 @@ def _devices_worth_using(rows: int) -> int:
     return usable(rows // _ROWS_PER_DEVICE)
 
 
-def common_sizes(blocks: Iterable[Block]) -> Sizes:
+def common_sizes(blocks: Iterable[Block]) -> PaddedSizes:
     """Return sizes that fit all `blocks`: with them, `solve` compiles once for blocks that differ only in numbers."""
-    return functools.reduce(operator.or_, (sizes_of(structure_of(b, b.priors)) for b in blocks), LEAST)
+    return functools.reduce(operator.or_, (sizes_of(structure_of(b, b.priors)) for b in blocks), MINIMAL_SIZES)
 
 
 _optimise = eqx.filter_jit(optimise)

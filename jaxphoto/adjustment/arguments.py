@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError
 from jaxphoto.unknowns import Unknowns, is_prior
@@ -93,7 +93,7 @@ def _no_numbers(block: Block, start: Unknowns, priors: Unknowns) -> Iterator[str
 
 def _bad(values: Any, may_be_infinite: bool = False) -> tuple[int, ...] | None:
     """Return the index of the first NaN or infinite number; None if all are finite or traced."""
-    array = still(values)
+    array = to_numpy(values)
     if isinstance(array, jax.core.Tracer) or array.dtype.kind != "f":
         return None
     wrong = np.isnan(array) if may_be_infinite else ~np.isfinite(array)

@@ -12,16 +12,16 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxphoto.adjustment.datum_words import datum_sentence
+from jaxphoto.adjustment.datum_messages import datum_sentence
 from jaxphoto.adjustment.model.numbers import Values
 from jaxphoto.adjustment.model.row_functions import rows_of
 from jaxphoto.adjustment.model.structure import Structure
 from jaxphoto.adjustment.solver.similarity import DatumRows, motions
-from jaxphoto.arrays import is_traced, still
+from jaxphoto.arrays import is_traced, to_numpy
 from jaxphoto.block import Block
 from jaxphoto.camera import RollingShutter
 from jaxphoto.errors import DatumError
-from jaxphoto.observations import PRIORS, ControlRows
+from jaxphoto.observations import PRIORS, ControlCoordinates
 
 if TYPE_CHECKING:
     from jaxphoto.adjustment.datum_sensitivity import SeenMotions
@@ -115,8 +115,8 @@ def _concrete(values: Values, block: Block) -> Values:
 def _as_observed(block: Block, values: Values) -> Values:
     """Move control points and images to their observed places."""
     position, points = np.array(values.position), np.array(values.points)
-    position[block.stations.axis, block.stations.who] = still(block.stations.value)
-    points[block.control.axis, block.control.who] = still(block.control.value)
+    position[block.stations.axis, block.stations.who] = to_numpy(block.stations.value)
+    points[block.control.axis, block.control.who] = to_numpy(block.control.value)
     return eqx.tree_at(lambda v: (v.position, v.points), values, (position, points))
 
 
@@ -139,7 +139,7 @@ def _plainly_closed(block: Block, values: Values, structure: Structure, vague: f
     for places, sigma in sets:
         if places.shape[1] >= 3:
             spread = np.linalg.svd(places - places.mean(1, keepdims=True), compute_uv=False)
-            known = vague == np.inf or np.max(still(sigma), initial=0.0) < vague * spread[1]
+            known = vague == np.inf or np.max(to_numpy(sigma), initial=0.0) < vague * spread[1]
             if spread[1] > 1e-6 * spread[0] and known:
                 return True
     return False
@@ -168,7 +168,7 @@ def _datum_sensitivity(
     own = [j for j, k in enumerate(s.free) if k >= s.n_cameras]
     weighted = {int(j) for g in s.observed if g.name.startswith(PRIORS) for j in g.column.ravel()}
     placed = {g.name for g in s.observed if len(g.image) or len(g.point)}
-    if placed <= {ControlRows.group}:
+    if placed <= {ControlCoordinates.group}:
         # Control alone: nothing to differentiate, its rows are the motions of its points.
         control = block.control
         rows = motions.points[:, control.axis, control.who].T / _control_sigma(values, s)[:, None]
@@ -188,7 +188,7 @@ def _control_sigma(values: Values, s: Structure) -> np.ndarray:
     """Return the standard deviations of the control (m)."""
     groups = zip(s.observed, values.groups, strict=True)
     return np.concatenate(
-        [np.zeros(0), *(np.asarray(rows_of(g, n).sigmas) for g, n in groups if g.name == ControlRows.group)]
+        [np.zeros(0), *(np.asarray(rows_of(g, n).sigmas) for g, n in groups if g.name == ControlCoordinates.group)]
     )
 
 

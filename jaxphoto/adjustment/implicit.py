@@ -19,13 +19,13 @@ from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.side_by_side import ImageRowLists, optimum_of
 from jaxphoto.adjustment.solver.band import factor_band
 from jaxphoto.adjustment.solver.elimination import solve_factored
-from jaxphoto.adjustment.solver.levenberg_marquardt import Task
+from jaxphoto.adjustment.solver.levenberg_marquardt import SolveMode
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import Optimum, typical_scale, unit_scale
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 
 
-def find_optimum(values: PaddedValues, structure: PaddedStructure, task: Task, rows: ImageRowLists) -> Optimum:
+def find_optimum(values: PaddedValues, structure: PaddedStructure, task: SolveMode, rows: ImageRowLists) -> Optimum:
     """Run Levenberg-Marquardt from the start in `values`; under `jax.vmap`, use `side_by_side`.
 
     Differentiable in every number of `values`.
@@ -49,8 +49,8 @@ def _derivative(values: PaddedValues, direction: Any, at: Increments, structure:
     # Functions called by batching rules close over no array: a rule may run in another trace.
     def gradient(increments, numbers):
         unit = unit_scale(structure)
-        residuals, pull = jax.vjp(lambda y: Linearised(y, unit, numbers, structure).residuals(), increments)
-        return pull(residuals)[0]
+        residuals, jt_product = jax.vjp(lambda y: Linearised(y, unit, numbers, structure).residuals(), increments)
+        return jt_product(residuals)[0]
 
     moved, still = eqx.partition(values, jax.tree.map(lambda t: t is not None, direction, is_leaf=lambda t: t is None))
     _, change = jax.jvp(lambda m: gradient(at, eqx.combine(m, still)), (moved,), (direction,))

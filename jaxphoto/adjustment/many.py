@@ -29,7 +29,7 @@ from jaxphoto.adjustment.model.row_functions import non_image_residuals
 from jaxphoto.adjustment.row_lists import RowList
 from jaxphoto.adjustment.solver.elimination import FactoredNormal, solve_factored
 from jaxphoto.adjustment.solver.normal import Linearised
-from jaxphoto.arrays import Numbers, added
+from jaxphoto.arrays import ArrayLike, sum_terms
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, camera_residual
 from jaxphoto.compiling import once
 from jaxphoto.georeferencing import apparent_point
@@ -47,8 +47,8 @@ class Common(eqx.Module):
     at: Linearised
     """Nominal optimum, at which all draws start."""
     factored: FactoredNormal
-    xy: Float[Numbers, "2 rows"]
-    sigma_xy: Float[Numbers, "2 rows"]
+    xy: Float[ArrayLike, "2 rows"]
+    sigma_xy: Float[ArrayLike, "2 rows"]
     lists: tuple[RowList, ...]
 
     @property
@@ -96,19 +96,19 @@ def other_gradients(y: Increments, varying: Varying, common: Common) -> Incremen
 
     def one(y: Increments, varying: Varying) -> Increments:
         values = _values_with(varying, common)
-        r, pull = jax.vjp(lambda y: non_image_residuals(y, common.scale, values, common.structure), y)
-        return pull(r)[0]
+        r, jt_product = jax.vjp(lambda y: non_image_residuals(y, common.scale, values, common.structure), y)
+        return jt_product(r)[0]
 
     return jax.vmap(one, -1, -1)(y, varying)
 
 
 def image_gradients(y: Increments, varying: Varying, common: Common) -> Increments:
     """Return the part of J'r of the image rows, draws last."""
-    state, pull = jax.vjp(lambda y: states(y, varying, common), y)
+    state, jt_product = jax.vjp(lambda y: states(y, varying, common), y)
     xy, sigma = (jnp.asarray(varying.get(name, getattr(common, name))) for name in ("xy", "sigma_xy"))
     cotangent = jax.tree.map(jnp.zeros_like, state)
     bent, pull_bent = None, None
-    if common.structure.bends:
+    if common.structure.modifies_interior:
         bent, pull_bent = jax.vjp(lambda shared: _bent_cameras(shared, varying, common), state.shared)
     of_images = []
     for k, (group, rows) in enumerate(zip(common.structure.groups, common.lists, strict=True)):
@@ -118,7 +118,7 @@ def image_gradients(y: Increments, varying: Varying, common: Common) -> Incremen
         cotangent = jax.tree.map(jnp.add, cotangent, of_group)
     if pull_bent is not None:
         cotangent = cotangent._replace(shared=cotangent.shared + pull_bent(tuple(of_images))[0])
-    return pull(cotangent)[0]
+    return jt_product(cotangent)[0]
 
 
 def _bent_cameras(shared: Float[Array, "parameters draws"], varying: Varying, common: Common) -> tuple[Array, ...]:
@@ -228,8 +228,8 @@ def _with_chunk(
         return jax.linear_transpose(turned, jnp.zeros(3))(to_u)[0]
 
     def back_to_place(image, point, to_aim):
-        _, pull = jax.vjp(lambda centre, point: apparent_point(centre, point, s.corrections), image[9:], point)
-        return pull(to_aim)
+        _, jt_product = jax.vjp(lambda centre, point: apparent_point(centre, point, s.corrections), image[9:], point)
+        return jt_product(to_aim)
 
     u = once(
         lambda i, p: _each_row(from_place, _at(i, rows.image), _at(p, rows.point)), s.eop_free, of_images, of_points
@@ -255,10 +255,10 @@ def _units(of: tuple[Array, ...]) -> list[tuple[Array, ...]]:
 
 
 def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
-    return added(x * y for x, y in zip(a, b, strict=True))
+    return sum_terms(x * y for x, y in zip(a, b, strict=True))
 
 
-def _at(array: Array, index: Numbers) -> Array:
+def _at(array: Array, index: ArrayLike) -> Array:
     return array.at[index].get(mode="promise_in_bounds")
 
 

@@ -17,16 +17,16 @@ from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals, Unk
 from jaxphoto.adjustment.solver.band import Band, dense, factor_band, invert_band, pivots, solve_band
 from jaxphoto.adjustment.solver.elimination import (
     FactoredNormal,
-    pull,
-    pull_others,
-    push,
-    push_others,
+    j_product,
+    j_product_others,
+    jt_product,
+    jt_product_others,
     reduce_right,
     solve_factored,
     solve_reduced,
 )
 from jaxphoto.adjustment.solver.inverse import Cofactors, RowCofactors, cofactors_of, row_variances
-from jaxphoto.adjustment.solver.levenberg_marquardt import Course, Task
+from jaxphoto.adjustment.solver.levenberg_marquardt import IterationHistory, SolveMode
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import iterate, typical_scale, unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.reduced import (
@@ -35,12 +35,12 @@ from jaxphoto.adjustment.solver.reduced import (
     reduce_normal,
     reduced_columns,
 )
-from jaxphoto.arrays import added, still
+from jaxphoto.arrays import sum_terms, to_numpy
 from jaxphoto.compiling import call_compiled
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 
-@shown
+@pretty_repr
 class NormalEquations(eqx.Module):
     """N x = b at the optimum, undamped and factored."""
 
@@ -73,28 +73,28 @@ class NormalEquations(eqx.Module):
     @property
     def on_one_device(self) -> "NormalEquations":
         """Convert to one device."""
-        values, factored = jax.tree.map(still, (self.values, self.factored))
+        values, factored = jax.tree.map(to_numpy, (self.values, self.factored))
         return dataclasses.replace(self, values=values, structure=self.structure.on_one_device, factored=factored)
 
     def solve(self, b: Increments) -> Increments:
         """Solve N x = b; use `jax.vmap` for many."""
         return solve_factored(self.factored.reduced, self.factored.factor, b, self.at)
 
-    def pull(self, z: PaddedResiduals) -> Increments:
+    def jt_product(self, z: PaddedResiduals) -> Increments:
         """Return J'z of many weighted residual vectors (leading axis)."""
-        return pull(z, self.at)
+        return jt_product(z, self.at)
 
-    def push(self, x: Increments) -> PaddedResiduals:
+    def j_product(self, x: Increments) -> PaddedResiduals:
         """Return J x of many increments (leading axis): changes of the adjusted observations over their sigmas."""
-        return push(x, self.at)
+        return j_product(x, self.at)
 
-    def pull_others(self, z: NonImageResiduals) -> Increments:
+    def jt_product_others(self, z: NonImageResiduals) -> Increments:
         """Return J'z of all rows except image rows (leading axis)."""
-        return pull_others(z, self.at)
+        return jt_product_others(z, self.at)
 
-    def push_others(self, x: Increments) -> NonImageResiduals:
+    def j_product_others(self, x: Increments) -> NonImageResiduals:
         """Return J x of all rows except image rows (leading axis)."""
-        return push_others(x, self.at)
+        return j_product_others(x, self.at)
 
     def cofactors(self, of_rows: bool) -> tuple[Cofactors, RowCofactors | None]:
         """Return the inverse of N for images, shared unknowns and each point, and of rows if requested."""
@@ -140,15 +140,15 @@ class NormalEquations(eqx.Module):
         """Return b = J'r at other increments, and the sum of squares r'r there."""
         at = self.at._replace(increments=increments)
         residuals = at.residuals()
-        b = pull(jax.tree.map(lambda v: v[None], residuals), at)
-        return jax.tree.map(lambda v: v[0], b), added(jnp.sum(v**2) for v in jax.tree.leaves(residuals))
+        b = jt_product(jax.tree.map(lambda v: v[None], residuals), at)
+        return jax.tree.map(lambda v: v[0], b), sum_terms(jnp.sum(v**2) for v in jax.tree.leaves(residuals))
 
     def constraints(self) -> Increments:
         """Return derivatives of the datum constraints, along a leading axis."""
         return self.at.constraints()
 
 
-class Met(NamedTuple):
+class CoupledUnknowns(NamedTuple):
     """Unknowns coupled with points, as places among the reduced unknowns and k constraints; beyond these if none."""
 
     of_images: Int[Array, "images e"]
@@ -161,7 +161,7 @@ class Met(NamedTuple):
     """Number of interior unknowns among these."""
 
     @classmethod
-    def of(cls, s: PaddedStructure, k: int) -> "Met":
+    def of(cls, s: PaddedStructure, k: int) -> "CoupledUnknowns":
         """Return those of a block."""
         of_images, of_groups = reduced_columns(s, k)
         return cls(of_images, jnp.repeat(of_groups, GROUP, axis=0), interior_in_border(s))
@@ -205,10 +205,10 @@ class Optimised(eqx.Module):
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
     factored: FactoredNormal
-    course: Course
+    course: IterationHistory
 
 
-def optimise(values: PaddedValues, structure: PaddedStructure, task: Task) -> Optimised:
+def optimise(values: PaddedValues, structure: PaddedStructure, task: SolveMode) -> Optimised:
     """Find the optimum; or factor the undamped normal equations of values at their optimum."""
     optimum, system, scale = iterate(weigh_datum(values, structure), structure, task)
     state = state_at(optimum.increments, unit_scale(structure), values, structure)

@@ -14,13 +14,13 @@ from jaxphoto.adjustment.result import Adjustment
 from jaxphoto.adjustment.solver.band import Band
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.reduced import reduce_normal
-from jaxphoto.adjustment.weak_words import weaknesses_of
-from jaxphoto.arrays import is_traced, still
+from jaxphoto.adjustment.weakness_messages import weaknesses_of
+from jaxphoto.arrays import is_traced, to_numpy
 from jaxphoto.block import Block, exposures
 from jaxphoto.camera import RATES, CameraSpline
 from jaxphoto.errors import DatumError, RankError
 from jaxphoto.georeferencing import RigCamera
-from jaxphoto.observations import AbstractObservations, Correlated, RigPlaces, RigTurns, StationRows
+from jaxphoto.observations import AbstractObservations, CameraPositions, Correlated, RigPlaces, RigTurns
 from jaxphoto.parameters import dynamic_fields
 from jaxphoto.unknowns import FREE, Unknowns, late_cameras
 
@@ -49,7 +49,7 @@ def check_priors(block: Block, priors: Unknowns) -> None:
 
 def _images_of_stations(block: Block) -> set[int]:
     """Return the images whose stations are observed, individually or in sets with a joint covariance."""
-    joint = [of.rows.who for of in block.more if isinstance(of, Correlated) and isinstance(of.rows, StationRows)]
+    joint = [of.rows.who for of in block.more if isinstance(of, Correlated) and isinstance(of.rows, CameraPositions)]
     return {int(i) for who in (block.stations.who, *joint) for i in np.ravel(np.asarray(who))}
 
 
@@ -136,7 +136,7 @@ def _check_shifts(block: Block, priors: Unknowns, with_station: set[int]) -> Non
 def _check_scanner(block: Block, priors: Unknowns) -> None:
     if priors.scanner is None:
         return
-    others = any("scanner" in rows.also for rows in block.more if isinstance(rows, AbstractObservations))
+    others = any("scanner" in rows.block_parameters for rows in block.more if isinstance(rows, AbstractObservations))
     turned = is_traced(block.surfaces.turn) or np.any(np.asarray(block.surfaces.turn))
     if priors.scanner.boresight == FREE and not others and not turned:
         raise RankError(
@@ -158,7 +158,7 @@ def _check_camera_rates(block: Block, priors: Unknowns) -> None:
             continue
         # Concrete numbers, also inside a traced function.
         with jax.ensure_compile_time_eval():
-            along = still(rates.argument(exposures(block)))
+            along = to_numpy(rates.argument(exposures(block)))
         for name, prior in owners.items():
             free = [field for field in dynamic_fields(rates) if getattr(prior, field) == FREE]
             own = sorted(_images_of(name, block.image_camera))
@@ -180,7 +180,7 @@ def _check_camera_splines(block: Block) -> None:
     splines: Any = block.start.unknowns.more.get(CameraSpline.kind, {})
     if not splines:
         return
-    in_flight = still(exposures(block).in_flight)
+    in_flight = to_numpy(exposures(block).in_flight)
     seconds = np.zeros(len(block.images)) if is_traced(in_flight) else np.abs(in_flight)
     for name, own in splines.items():
         first, spline = next(iter(splines.items()))

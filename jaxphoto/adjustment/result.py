@@ -9,13 +9,13 @@ from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment.layout.padded import PaddedValues
 from jaxphoto.adjustment.layout.padding import PaddedBlock
-from jaxphoto.adjustment.layout.rays import LEAST, Sizes
+from jaxphoto.adjustment.layout.rays import MINIMAL_SIZES, PaddedSizes
 from jaxphoto.adjustment.model.numbers import Residuals, Values
 from jaxphoto.adjustment.model.structure import Structure, observed_in
 from jaxphoto.adjustment.normal_equations import NormalEquations, factor_normal
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
-from jaxphoto.adjustment.solver.levenberg_marquardt import Course
-from jaxphoto.arrays import Numbers, still
+from jaxphoto.adjustment.solver.levenberg_marquardt import IterationHistory
+from jaxphoto.arrays import ArrayLike, to_numpy
 from jaxphoto.block import Block
 from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import PRIORS
@@ -84,15 +84,15 @@ class Adjustment(eqx.Module):
     padded_values: PaddedValues
     factored: FactoredNormal | None
     """None in an adjustment that is differentiated or mapped; see `equations`."""
-    steps: Int[Numbers, ""]
-    converged: Bool[Numbers, ""]
+    steps: Int[ArrayLike, ""]
+    converged: Bool[ArrayLike, ""]
     seconds: dict[str, float] = eqx.field(static=True, converter=lambda v: v if isinstance(v, Seconds) else Seconds(v))
     left_out: tuple[str, ...] = eqx.field(static=True, default=())
     """Tie points of the given block that are omitted: their rays do not intersect."""
-    sizes: Sizes = eqx.field(static=True, default=LEAST)
+    sizes: PaddedSizes = eqx.field(static=True, default=MINIMAL_SIZES)
     """Minimum sizes it was compiled for; with them the block is re-adjusted by the same program."""
 
-    course: Course | None = None
+    course: IterationHistory | None = None
     """Iteration history; None inside a JAX transformation and if nothing was iterated."""
 
     __repr__ = adjustment_repr
@@ -131,7 +131,7 @@ class Adjustment(eqx.Module):
         return NormalEquations(v, s, call_compiled(_factored, v, s))
 
     @property
-    def square_sum(self) -> Float[Numbers, ""] | float:
+    def sum_of_squares(self) -> Float[ArrayLike, ""] | float:
         """v'Pv: the weighted sum of squared residuals of all observations."""
         return sum(((v**2).sum() for v in self.residuals.named.values()), np.zeros(()))
 
@@ -141,22 +141,22 @@ class Adjustment(eqx.Module):
         refuse_traced("Adjustment.outcome", self.residuals)
         if bool(self.converged):
             return Outcome.CONVERGED
-        if not np.isfinite(float(self.square_sum)):
+        if not np.isfinite(float(self.sum_of_squares)):
             return Outcome.DIVERGED
-        if self.astray.any():
+        if self.diverged_points.any():
             return Outcome.ASTRAY
         kept = 0 if self.course is None else len(self.course.length)
         flat = self.course is not None and 0 < kept == int(self.steps) and bool(self.course.is_flat(kept - 1))
         return Outcome.FLAT if flat else Outcome.STEPS
 
     @property
-    def astray(self) -> Bool[np.ndarray, "points"]:
+    def diverged_points(self) -> Bool[np.ndarray, "points"]:
         """True for points so far away, compared with the others, that the directions of their rays do not differ.
 
         Their standard deviations are larger still, so that any such place is as good as the optimum.
         """
         s, u = self.structure, self.unknowns
-        x, y, z = (still(u.points)[s.point] - still(u.exterior.position)[s.image]).T
+        x, y, z = (to_numpy(u.points)[s.point] - to_numpy(u.exterior.position)[s.image]).T
         # No squares: they overflow from 1e154 m on.
         distance = np.hypot(np.hypot(x, y), z)
         far = np.zeros(len(self.block.points), bool)
@@ -197,7 +197,7 @@ class Adjustment(eqx.Module):
         return sum(self.n_observations.values()) + self.n_constraints - sum(self.n_unknowns.values())
 
     @property
-    def sigma0(self) -> Float[Numbers, ""] | float:
+    def sigma0(self) -> Float[ArrayLike, ""] | float:
         """Square root of the a posteriori variance factor; 1 without redundancy."""
         redundancy = self.redundancy
-        return (self.square_sum / redundancy) ** 0.5 if redundancy > 0 else self.square_sum * 0 + 1.0
+        return (self.sum_of_squares / redundancy) ** 0.5 if redundancy > 0 else self.sum_of_squares * 0 + 1.0

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.normal_equations import NormalEquations
-from jaxphoto.arrays import is_traced, still
+from jaxphoto.arrays import is_traced, to_numpy
 from jaxphoto.compiling import prepare, run_compiled
 
 # Number of right-hand sides solved side by side: recomputing F of a large block costs more than they do. Together they
@@ -25,7 +25,7 @@ def solve_many(equations: NormalEquations, b: Increments, seconds: dict[str, flo
     if is_traced((equations, b)):
         return _solve(equations, b)
     batches = in_batches(b, at_once(equations.scale))
-    parts = [jax.tree.map(still, run_compiled(_solve, (equations, one), seconds, "covariance")) for one in batches]
+    parts = [jax.tree.map(to_numpy, run_compiled(_solve, (equations, one), seconds, "covariance")) for one in batches]
     return joined(parts, equations.scale, len(b.shared))
 
 

@@ -21,7 +21,7 @@ from jaxphoto.adjustment.many import Common, Varying, held_in, path_name, states
 from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays
 from jaxphoto.adjustment.row_lists import RowList, batch_size, row_lists
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
-from jaxphoto.adjustment.solver.levenberg_marquardt import FactoredSystem, Task
+from jaxphoto.adjustment.solver.levenberg_marquardt import FactoredSystem, SolveMode
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import Optimum, iterate
 from jaxphoto.rotation import small_angles
@@ -47,7 +47,7 @@ def image_row_lists(padded: PaddedBlock) -> ImageRowLists:
     return ImageRowLists(row_lists(padded.own, padded.places), padded.places.row, batch_size(padded.own))
 
 
-def optimum_of(values: PaddedValues, structure: PaddedStructure, task: Task, rows: ImageRowLists) -> Optimum:
+def optimum_of(values: PaddedValues, structure: PaddedStructure, task: SolveMode, rows: ImageRowLists) -> Optimum:
     """Find the optimum from the start in `values`, without history; for many draws under `jax.vmap`."""
 
     @jax.custom_batching.custom_vmap
@@ -70,7 +70,7 @@ class _Draws(NamedTuple):
     batched: PaddedValues
     """True for each leaf with an axis of draws, its first."""
     structure: PaddedStructure
-    task: Task
+    task: SolveMode
     rows: ImageRowLists
 
     @property

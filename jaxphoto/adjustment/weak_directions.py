@@ -28,7 +28,7 @@ from jaxphoto.adjustment.right_hand_sides import at_once, solve_many
 from jaxphoto.adjustment.solver.band import factor_band
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
 from jaxphoto.adjustment.solver.reduced import reduce_normal
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.compiling import call_compiled
 
 POOR = 20.0
@@ -106,12 +106,12 @@ class WeakDirection(NamedTuple):
 def yardsticks(adjusted: Adjustment) -> Yardsticks:
     """Return the yardsticks of the unknowns of `adjusted`."""
     # A camera may be turned inside out, with negative c and yardsticks, if the optimum does not fit.
-    scale, block = jax.tree.map(lambda v: np.abs(still(v)), adjusted.equations.scale), adjusted.block
+    scale, block = jax.tree.map(lambda v: np.abs(to_numpy(v)), adjusted.equations.scale), adjusted.block
     ground = float(max(scale.eop[:3].max(initial=0.0), scale.points.max(initial=0.0)))
     angle = float(scale.eop[3:].max(initial=0.0))
-    observed = [float(np.median(still(rows.sigma))) for rows in (block.stations, block.control) if len(rows)]
+    observed = [float(np.median(to_numpy(rows.sigma))) for rows in (block.stations, block.control) if len(rows)]
     farther = max([1.0, *(sigma / ground for sigma in observed)])
-    turned = max(1.0, float(np.median(still(block.attitudes.sigma))) / angle) if len(block.attitudes) else 1.0
+    turned = max(1.0, float(np.median(to_numpy(block.attitudes.sigma))) / angle) if len(block.attitudes) else 1.0
     by_unit = {"m": farther, "s": farther, "m_per_s": farther, "rad": turned, "rad_per_s": turned}
     factors = [by_unit.get(_unit(label), 1.0) for label in adjusted.structure.labels]
     return Yardsticks(farther * ground, turned * angle, scale.shared * np.array(factors))
@@ -133,7 +133,7 @@ def weak_directions(adjusted: Adjustment, least: float = POOR) -> list[WeakDirec
     """
     equations, padded = _sound(adjusted), adjusted.padded
     yard = yardsticks(adjusted)
-    scale = jax.tree.map(still, equations.scale)
+    scale = jax.tree.map(to_numpy, equations.scale)
     sizes = np.repeat([yard.ground, yard.angle], 3)[:, None]
     units = _increments(np.where(scale.eop > 0, sizes, 0.0), yard.shared, np.where(scale.points > 0, yard.ground, 0.0))
     # Yardsticks in scaled increments, and their reciprocals; zero for fixed unknowns.
@@ -184,7 +184,7 @@ def _flat(tree: Increments) -> np.ndarray:
 
 def _columns(tree: Increments) -> np.ndarray:
     """Return increments along a leading axis as columns."""
-    return np.concatenate([still(v).reshape(len(v), math.prod(np.shape(v)[1:])) for v in tree], axis=1).T
+    return np.concatenate([to_numpy(v).reshape(len(v), math.prod(np.shape(v)[1:])) for v in tree], axis=1).T
 
 
 def _tree(columns: np.ndarray, like: Increments) -> Increments:

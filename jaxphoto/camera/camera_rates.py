@@ -33,7 +33,7 @@ class AbstractCameraRates(AbstractParameters):
     along: eqx.AbstractClassVar[str]
     """Independent variable: a word, followed by its unit."""
     owner = "camera"
-    bends = ("c", "x_p", "y_p", "k1")
+    modifies_interior = ("c", "x_p", "y_p", "k1")
 
     c_rate: Scalar
     xp_rate: Scalar

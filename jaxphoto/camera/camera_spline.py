@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.camera.camera_rates import HOUR_S
 from jaxphoto.parameters import AbstractParameters, dynamic_fields
 
@@ -42,7 +42,7 @@ class CameraSpline(AbstractParameters):
     kind = "camera_splines"
     owner = "camera"
     names = {"c_spline": ("c_mm",), "xp_spline": ("xp_mm",), "yp_spline": ("yp_mm",)}  # noqa: RUF012
-    bends = ("c", "x_p", "y_p")
+    modifies_interior = ("c", "x_p", "y_p")
     sized = "knots"
 
     c_spline: Float[Array, "knots *images"]
@@ -68,7 +68,7 @@ class CameraSpline(AbstractParameters):
         c, x_p, y_p = (jnp.sum(weights * v) for v in (self.c_spline, self.xp_spline, self.yp_spline))
         return dataclasses.replace(interior, c=interior.c + c, x_p=interior.x_p + x_p, y_p=interior.y_p + y_p)
 
-    def weights(self, time: Numbers | float) -> Float[Numbers, "knots"]:
+    def weights(self, time: ArrayLike | float) -> Float[ArrayLike, "knots"]:
         """Return the weight of each knot at a time from the middle of the flight (s)."""
         end = (self.knots - 3) / 2
         d = jnp.abs(jnp.clip(time / self.interval_s, -end, end) - self.times / self.interval_s)

@@ -24,13 +24,13 @@ from jaxphoto.camera.interior import InteriorOrientation, get_parameter, paramet
 from jaxphoto.camera.sensor import Sensor
 from jaxphoto.least_squares import least_squares
 from jaxphoto.rotation import small_rotation
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 # Image points along each side of the format, corners included, at which two cameras are compared.
 _SIDE = 25
 
 
-@shown
+@pretty_repr
 class PrincipalPoints(NamedTuple):
     """Both principal points in the image, in mm from the image centre."""
 
@@ -38,7 +38,7 @@ class PrincipalPoints(NamedTuple):
     symmetry: Float[Array, "2"]
 
 
-@shown
+@pretty_repr
 class ConversionError(NamedTuple):
     """Difference between two cameras: the largest and RMS image displacement over the format, in mm.
 

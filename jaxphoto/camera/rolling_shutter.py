@@ -55,7 +55,7 @@ class RollingShutter(AbstractParameters):
     kind = "shutters"
     owner = "camera"
     names = {"readout": ("readout_ms",)}  # noqa: RUF012
-    bends = ("time_per_mm",)
+    modifies_interior = ("time_per_mm",)
 
     readout: Scalar
 
@@ -78,7 +78,7 @@ class ImageMotion(AbstractParameters):
         "velocity": tuple(f"velocity_{axis}_m_per_s" for axis in "xyz"),
         "rate": tuple(f"rate_{axis}_rad_per_s" for axis in "xyz"),
     }
-    bends = ("velocity_x", "velocity_y", "velocity_z", "rate_x", "rate_y", "rate_z")
+    modifies_interior = ("velocity_x", "velocity_y", "velocity_z", "rate_x", "rate_y", "rate_z")
 
     velocity: Float[Array, "3 *images"]
     rate: Float[Array, "3 *images"]
@@ -86,5 +86,5 @@ class ImageMotion(AbstractParameters):
     def interior(self, interior: Any, exposure: Any) -> Any:
         """Return the interior orientation with the motion of its rows."""
         rows = interior.rows or RowMotion()
-        moving = dict(zip(self.bends, [*self.velocity, *self.rate], strict=True))
+        moving = dict(zip(self.modifies_interior, [*self.velocity, *self.rate], strict=True))
         return dataclasses.replace(interior, rows=dataclasses.replace(rows, **moving))

@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.short_repr import html_of
 
 
@@ -43,7 +43,7 @@ class Sensor(eqx.Module):
         """Format along y, in millimetres."""
         return self.height_px * self.pixel_mm
 
-    def mm_from_px(self, column_row: Float[Numbers, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    def mm_from_px(self, column_row: Float[ArrayLike, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Convert (column, row) in pixels to millimetres, origin at the image centre, x right, y up.
 
         The centre of the upper-left pixel is (0.5, 0.5) (docs/conventions.md).
@@ -51,7 +51,7 @@ class Sensor(eqx.Module):
         centre = np.array([self.width_px, self.height_px]) / 2
         return (np.asarray(column_row) - centre) * np.array([self.pixel_mm, -self.pixel_mm])
 
-    def px_from_mm(self, xy_mm: Float[Numbers, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    def px_from_mm(self, xy_mm: Float[ArrayLike, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Convert millimetres to (column, row) in pixels: the inverse of `mm_from_px`."""
         centre = np.array([self.width_px, self.height_px]) / 2
         return np.asarray(xy_mm) / np.array([self.pixel_mm, -self.pixel_mm]) + centre

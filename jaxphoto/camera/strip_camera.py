@@ -22,7 +22,7 @@ class StripCamera(AbstractParameters):
     kind = "strip_cameras"
     owner = "strip"
     names = {"c_more": ("c_more_mm",), "xp_more": ("xp_more_mm",), "yp_more": ("yp_more_mm",)}  # noqa: RUF012
-    bends = ("c", "x_p", "y_p")
+    modifies_interior = ("c", "x_p", "y_p")
 
     c_more: Scalar
     xp_more: Scalar

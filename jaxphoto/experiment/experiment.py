@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from jaxphoto.adjustment import Sizes, common_sizes
+from jaxphoto.adjustment import PaddedSizes, common_sizes
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.io.recipe import recipe_from
@@ -152,7 +152,7 @@ def _simulated(experiment: Experiment, recipes: Mapping[str, Recipe], layout: in
     return variants
 
 
-def _sizes(layouts: list[dict[str, Block]]) -> dict[str, Sizes]:
+def _sizes(layouts: list[dict[str, Block]]) -> dict[str, PaddedSizes]:
     """Padded sizes by variant: variants and layouts with as many images share compiled programs."""
     of_images: dict[int, list[Block]] = {}
     for block in (b for variants in layouts for b in variants.values()):
@@ -161,7 +161,7 @@ def _sizes(layouts: list[dict[str, Block]]) -> dict[str, Sizes]:
     return {name: sizes[len(block.images)] for name, block in layouts[0].items()} if layouts else {}
 
 
-def _adjusted(block: Block, sizes: Sizes) -> Tables:
+def _adjusted(block: Block, sizes: PaddedSizes) -> Tables:
     adjusted = adjust(block, sizes=sizes)
     if not bool(adjusted.converged):
         raise InputError(adjusted.outcome.value)

@@ -9,12 +9,12 @@ import dataclasses
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 EARTH_RADIUS_M = 6_371_000.0
 
 
-@shown
+@pretty_repr
 @dataclasses.dataclass(frozen=True)
 class Corrections:
     """Enabled corrections. `sea_level_m` is the Z of the sea: refraction needs heights above it."""

@@ -14,14 +14,14 @@ from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names,
 from jaxphoto.collinearity import ExteriorOrientation, image_ray
 from jaxphoto.georeferencing.corrections import NO_CORRECTIONS, Corrections, apparent_point
 from jaxphoto.rotation import small_rotation
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 # Refraction and curvature bend a ray by about 1e-4: each iteration gains four digits.
 _ROUNDS = 4
 _MAX_STEPS = 60
 
 
-@shown
+@pretty_repr
 class Surface(eqx.Module):
     """Ground as a height Z (m) over X and Y (m), differentiable, between the heights `low` and `high`."""
 

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.errors import InputError
 from jaxphoto.parameters import AbstractParameters
 from jaxphoto.rotation import rotate, small_angles, small_rotation
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 ImageX = Literal["forward", "left", "back", "right"]
 """Direction of the camera's x axis in the aircraft."""
@@ -74,7 +74,7 @@ class StripBias(AbstractParameters):
     drift: Float[Array, "3 *images"]
 
 
-@shown
+@pretty_repr
 class Exposure(eqx.Module):
     """Properties of an exposure that are not observed; of many with a leading (in an adjustment: last) axis.
 
@@ -100,7 +100,7 @@ class Exposure(eqx.Module):
         return self.time if self.flight_time is None else self.flight_time
 
 
-def nominal_mount(mount: Mount, exposure: Exposure) -> Float[Numbers, "3 3"]:
+def nominal_mount(mount: Mount, exposure: Exposure) -> Float[ArrayLike, "3 3"]:
     """Return `body_from_camera` without misalignment: from the exposure if given, else from the mount.
 
     Raises InputError (under `jit` an error of Equinox) if a mount that is not "forward" contradicts the exposure.
@@ -117,13 +117,13 @@ def nominal_mount(mount: Mount, exposure: Exposure) -> Float[Numbers, "3 3"]:
     return eqx.error_if(jnp.asarray(exposure.nominal), differ, message)
 
 
-def body_from_camera(boresight: Float[Array, "3"], nominal: Float[Numbers, "3 3"]) -> Float[Array, "3 3"]:
+def body_from_camera(boresight: Float[Array, "3"], nominal: Float[ArrayLike, "3 3"]) -> Float[Array, "3 3"]:
     """Return the nominal mount times the misalignment (small rotation in the camera frame, rad)."""
     return jnp.matmul(nominal, small_rotation(boresight))
 
 
 def object_from_body(
-    camera_from_object: Float[Array, "3 3"], boresight: Float[Array, "3"], nominal: Float[Numbers, "3 3"]
+    camera_from_object: Float[Array, "3 3"], boresight: Float[Array, "3"], nominal: Float[ArrayLike, "3 3"]
 ) -> Float[Array, "3 3"]:
     """Return the attitude of the body from the orientation of the camera and the boresight misalignment."""
     return camera_from_object.T @ body_from_camera(boresight, nominal).T

@@ -21,7 +21,7 @@ Frames and signs: docs/conventions.md; use of rigs: docs/rigs.md.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.georeferencing.mount import Exposure, Mount, body_from_camera, nominal_mount
 from jaxphoto.parameters import AbstractParameters
 from jaxphoto.rotation import rotate, small_angles, small_rotation
@@ -87,6 +87,6 @@ def in_rig(
 
 def turn_off(
     reference: Float[Array, "3 3"], camera_from_object: Float[Array, "3 3"], turn: Float[Array, "3"]
-) -> Float[Numbers, "3"]:
+) -> Float[ArrayLike, "3"]:
     """Return the rotation of a camera relative to its place in the rig (rad, about its own axes)."""
     return small_angles(camera_from_object @ reference.T @ small_rotation(turn).T)

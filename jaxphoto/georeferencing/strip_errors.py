@@ -6,10 +6,10 @@ from jaxtyping import Float
 
 from jaxphoto.georeferencing.scanner_calibration import ScannerCalibration
 from jaxphoto.georeferencing.trajectory_knots import SplineKnots, StripSpline
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 
-@shown
+@pretty_repr
 class StripErrors(eqx.Module):
     """Errors of a cloud: of its scanner, and of its trajectory strip by strip."""
 

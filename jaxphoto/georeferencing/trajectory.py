@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.linear_algebra import solve_tridiagonal
 from jaxphoto.rotation import matrix_from_quaternion, small_angles
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 SHORTEST = 9
 """Minimum number of records for the uncertainty of the interpolation."""
@@ -26,7 +26,7 @@ SHORTEST = 9
 _HALF_WINDOW = 8
 
 
-@shown
+@pretty_repr
 class Trajectory(eqx.Module):
     """Records of a GNSS/IMU in the object frame; at least `SHORTEST`, in order of time."""
 

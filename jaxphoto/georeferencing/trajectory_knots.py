@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.parameters import AbstractParameters
 
 # Separates strip and time in the name of a knot.
@@ -98,12 +98,12 @@ class StripSpline(NamedTuple):
 class SplineKnots(NamedTuple):
     """Spline of a strip with its coefficients, for compiled programs; more knots need no other program."""
 
-    first: Int[Numbers, ""]
+    first: Int[ArrayLike, ""]
     """Index of its first knot among those of all strips."""
-    size: Int[Numbers, ""]
-    start: Float[Numbers, ""]
-    interval: Float[Numbers, ""]
-    knots: Float[Numbers, "knots k"]
+    size: Int[ArrayLike, ""]
+    start: Float[ArrayLike, ""]
+    interval: Float[ArrayLike, ""]
+    knots: Float[ArrayLike, "knots k"]
 
     def at(self, time: Float[Array, "n"]) -> Float[Array, "n k"]:
         """Return `StripSpline.weights` and the correction at each time (s)."""
@@ -115,12 +115,12 @@ class SplineKnots(NamedTuple):
         return sum(w[:, None] * self.knots[k] for w, k in parts)  # type: ignore[return-value, misc]
 
 
-def _cubic(u: Float[Numbers, "n"]) -> list[Float[Numbers, "n"]]:
+def _cubic(u: Float[ArrayLike, "n"]) -> list[Float[ArrayLike, "n"]]:
     """Return the weights of four coefficients at the fraction `u` of an interval."""
     weights = (1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3
     return [w / 6 for w in weights]
 
 
-def weighted_knot(knots: TrajectoryKnot, weights: Float[Numbers, "knots"]) -> TrajectoryKnot:
+def weighted_knot(knots: TrajectoryKnot, weights: Float[ArrayLike, "knots"]) -> TrajectoryKnot:
     """Combine four knots (leading axis)."""
     return jax.tree.map(lambda v: sum(weights[k] * v[k] for k in range(len(weights))), knots)

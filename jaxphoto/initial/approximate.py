@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Int
 
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block, Start, direct_exterior, sensor_rows
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.errors import BlockError, InputError
@@ -101,7 +101,7 @@ def intersected(block: Block) -> Unknowns:
 def in_front(block: Block, unknowns: Unknowns) -> Bool[np.ndarray, "rows"]:
     """True for rows of `block.image_points` whose point lies, by `unknowns`, where its camera could see it."""
     u = unknowns
-    return _in_front(block, u.interior, *map(still, (u.exterior.position, u.exterior.camera_from_object, u.points)))
+    return _in_front(block, u.interior, *map(to_numpy, (u.exterior.position, u.exterior.camera_from_object, u.points)))
 
 
 def looking_away(block: Block, seen: Bool[np.ndarray, "rows"]) -> Int[np.ndarray, "some_images"]:

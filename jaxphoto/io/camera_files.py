@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from jaxphoto.arrays import on_device
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.camera import (
     InteriorOrientation,
     Sensor,
@@ -283,7 +283,7 @@ def read_results(source: CameraSource) -> CameraFile:
             raise source.error(f"{constant} of camera {name} is {values[constant]:g}; give it as a positive length")
     interior = empty
     for parameter in (*names, *constants):
-        interior = set_parameter(interior, parameter, on_device(values[parameter]))
+        interior = set_parameter(interior, parameter, as_jax_array(values[parameter]))
     covariance = _covariance(source, name, names, np.array([sigmas[n] for n in names]))
     return CameraFile(name, sensor, interior, covariance, reservation(summary))
 

@@ -15,7 +15,7 @@ import equinox as eqx
 import numpy as np
 import pandas as pd
 
-from jaxphoto.arrays import on_device
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.block import Block, Start
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation
@@ -64,7 +64,7 @@ def adjusted_block(folder: str | Path, block: str | Path | None = None, part: in
         of.start.unknowns,
         interior=of.start.unknowns.interior | interior,
         exterior=call_compiled(_from_angles, exterior[:, :3], np.deg2rad(exterior[:, 3:])),
-        points=on_device(points),
+        points=as_jax_array(points),
     )
     start = Start(unknowns, np.ones(len(of.images), bool), np.ones(len(of.points), bool))
     return dataclasses.replace(of, start=start)

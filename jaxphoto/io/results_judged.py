@@ -37,8 +37,8 @@ def reservation(summary: Mapping[str, Any]) -> str:
             f"sigma naught of this adjustment is {was:.3g}, expected {wanted:.3g}, which is no chance: its weights "
             "or its model are wrong, and its standard deviations with them"
         )
-    if isinstance(doubts := summary.get("doubts"), list) and doubts:
-        return f"this adjustment rests on an earlier one: {_told(doubts[0])}"
+    if isinstance(prior_warnings := summary.get("doubts"), list) and prior_warnings:
+        return f"this adjustment rests on an earlier one: {_told(prior_warnings[0])}"
     return ""
 
 

@@ -23,7 +23,7 @@ from pydantic import (
     model_validator,
 )
 
-from jaxphoto.arrays import on_device
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.errors import BlockError, InputError, quoted
 from jaxphoto.io.text_tables import LARGEST
 from jaxphoto.io.whole_text import SMALL, read_text
@@ -134,11 +134,11 @@ class Section:
         value = self._numbers(key, given["value"], np.shape(start)) * scale if "value" in given else np.asarray(start)
         if "covariance" in given:
             matrix = self.covariance(key, given["covariance"], len(start))
-            return Weighted(on_device(value), covariance=on_device(matrix * scale**2))
+            return Weighted(as_jax_array(value), covariance=as_jax_array(matrix * scale**2))
         sigma = self._numbers(key, given["sigma"], np.shape(start)) * scale
         if not np.all(sigma > 0):
             raise self.error(key, f'sigma = {given["sigma"]} is not positive; give the true one or "fixed"')
-        return Weighted(on_device(value), on_device(sigma))
+        return Weighted(as_jax_array(value), as_jax_array(sigma))
 
     def covariance(self, key: str, rows: Any, size: int) -> np.ndarray:
         """The covariance matrix of `size` numbers with these rows."""

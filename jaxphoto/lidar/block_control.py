@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block
 from jaxphoto.collinearity import ExteriorOrientation, image_ray
 from jaxphoto.compiling import call_compiled
@@ -18,7 +18,7 @@ from jaxphoto.errors import BlockError
 from jaxphoto.lidar.grid import Grid
 from jaxphoto.lidar.height_settings import HeightSettings
 from jaxphoto.lidar.pseudo_control import Interpolation, PseudoControl, pseudo_control_points
-from jaxphoto.observations import ControlRows
+from jaxphoto.observations import ControlCoordinates
 from jaxphoto.unknowns import Unknowns
 
 
@@ -31,11 +31,11 @@ class BlockControl(eqx.Module):
     """Image used for each."""
     control: PseudoControl
 
-    def rows(self) -> ControlRows:
+    def rows(self) -> ControlCoordinates:
         """Return vertical control: Z of the determined points, with its standard deviation."""
         good = np.flatnonzero(np.isfinite(self.control.sigma_z))
         z, sigma = self.control.xyz[good, 2], self.control.sigma_z[good]
-        return ControlRows(self.point[good], np.full(len(good), 2), z, sigma)
+        return ControlCoordinates(self.point[good], np.full(len(good), 2), z, sigma)
 
 
 def pseudo_control_of_block(
@@ -58,14 +58,14 @@ def pseudo_control_of_block(
     measured = np.flatnonzero(chosen)
     if not len(measured):
         raise BlockError("no image measured any of the points that are to take heights from the cloud; name others")
-    image, point, xy = rows.image[measured], rows.point[measured], still(rows.xy)[measured]
-    exterior = jax.tree.map(lambda v: still(v)[image], unknowns.exterior)
+    image, point, xy = rows.image[measured], rows.point[measured], to_numpy(rows.xy)[measured]
+    exterior = jax.tree.map(lambda v: to_numpy(v)[image], unknowns.exterior)
     camera = np.array(block.image_camera, object)[image]
     found: list[tuple[np.ndarray, PseudoControl, np.ndarray]] = []
     for name in dict.fromkeys(camera):
         of = np.flatnonzero(camera == name)
         one, taken = jax.tree.map(lambda v, of=of: v[of], exterior), xy[of]
-        interior = jax.tree.map(still, unknowns.interior[name])
+        interior = jax.tree.map(to_numpy, unknowns.interior[name])
         control = pseudo_control_points(
             interior, one, taken, grid, settings, interpolation=interpolation, corrections=block.corrections
         )

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.cloud import Cloud
 from jaxphoto.compiling import call_compiled
 from jaxphoto.georeferencing import Scanner, Trajectory, TrajectorySpline, corrected_point, spline_through
@@ -65,8 +65,8 @@ def scanner_motions(path: ScannerPath, time: Float[np.ndarray, "n"]) -> tuple[np
 def corrected_xyz(
     xyz: Float[np.ndarray, "n 3"],
     poses: ScannerPoses | None,
-    boresight: Float[Numbers, "3"],
-    shift: Float[Numbers, "3"],
+    boresight: Float[ArrayLike, "3"],
+    shift: Float[ArrayLike, "3"],
 ) -> Float[np.ndarray, "n 3"]:
     """Apply `georeferencing.corrected_point` to many points; without poses a boresight has no effect."""
     shift = np.asarray(shift)

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 
@@ -34,19 +34,19 @@ _REACH = 16
 class Grid(eqx.Module):
     """Points of a cloud sorted by cells. Arrays are padded, so that clouds of similar size share programs."""
 
-    xyz: Float[Numbers, "padded 3"]
+    xyz: Float[ArrayLike, "padded 3"]
     """Points in the order of the cells (m); padding repeats the last."""
-    order: Int[Numbers, "padded"]
+    order: Int[ArrayLike, "padded"]
     """Index of each in the cloud; -1 for padding."""
-    start: Int[Numbers, "offsets"]
+    start: Int[ArrayLike, "offsets"]
     """First point of each cell; the last ones are the number of points."""
-    corner: Float[Numbers, "2"]
+    corner: Float[ArrayLike, "2"]
     """X, Y (m) of the lower left corner."""
-    cell_m: Float[Numbers, ""]
+    cell_m: Float[ArrayLike, ""]
     """Side of a cell."""
-    shape: Int[Numbers, "2"]
+    shape: Int[ArrayLike, "2"]
     """Rows and columns."""
-    leafy: Bool[Numbers, "padded"]
+    leafy: Bool[ArrayLike, "padded"]
     """True for points classified as vegetation (LAS classes 3, 4, 5) or one of several returns of a pulse."""
     most: int = eqx.field(static=True)
     """Capacity for the points of any three neighbouring cells in a row."""

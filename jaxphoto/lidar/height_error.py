@@ -22,18 +22,18 @@ import jax.numpy as jnp
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.lidar.local_surface import LocalFit, Neighbours, terms
 
 
 class LidarNoise(NamedTuple):
     """Standard deviations of a laser point (m): in height and in each horizontal coordinate."""
 
-    sigma_z: Float[Numbers, ""] | float
-    sigma_xy: Float[Numbers, ""] | float
+    sigma_z: Float[ArrayLike, ""] | float
+    sigma_xy: Float[ArrayLike, ""] | float
 
 
-def noise_variance(fit: LocalFit, noise: LidarNoise) -> Float[Numbers, ""]:
+def noise_variance(fit: LocalFit, noise: LidarNoise) -> Float[ArrayLike, ""]:
     """Return the variance of a point's height over the surface (m^2): on a slope, horizontal errors contribute."""
     slope = jnp.sum(fit.coefficients[1:3] ** 2)
     on_slope = noise.sigma_z**2 + slope * noise.sigma_xy**2
@@ -42,7 +42,7 @@ def noise_variance(fit: LocalFit, noise: LidarNoise) -> Float[Numbers, ""]:
     return noise.sigma_z**2 + jnp.maximum(slope - by_chance, 0.0) * noise.sigma_xy**2
 
 
-def excess(fit: LocalFit, variance: Float[Numbers, ""], quantile: float) -> Float[Array, ""]:
+def excess(fit: LocalFit, variance: Float[ArrayLike, ""], quantile: float) -> Float[Array, ""]:
     """Return the residual variance over the expected one, relative to the normal `quantile` of chance.
 
     The quantile of chi-square over its degrees of freedom is that of Wilson and Hilferty (1931).
@@ -52,7 +52,7 @@ def excess(fit: LocalFit, variance: Float[Numbers, ""], quantile: float) -> Floa
 
 
 def height_sigma(
-    near: Neighbours, weight: Float[Numbers, "points"], fit: LocalFit, noise: LidarNoise
+    near: Neighbours, weight: Float[ArrayLike, "points"], fit: LocalFit, noise: LidarNoise
 ) -> Float[Array, ""]:
     """Return the standard deviation (m) of the height with these weights, as above."""
     expected = noise_variance(fit, noise)

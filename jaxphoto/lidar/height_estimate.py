@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.lidar.height_error import LidarNoise, excess, height_sigma, noise_variance
 from jaxphoto.lidar.inverse_distance import inverse_distance_weights
 from jaxphoto.lidar.local_surface import LocalFit, Neighbours, fit_surface
@@ -29,9 +29,9 @@ _WIDTH = 0.5
 class HeightNumbers(NamedTuple):
     """Numerical settings, for which programs are not recompiled."""
 
-    points: Int[Numbers, ""]
-    power: Float[Numbers, ""]
-    radius: Float[Numbers, ""]
+    points: Int[ArrayLike, ""]
+    power: Float[ArrayLike, ""]
+    radius: Float[ArrayLike, ""]
     """Zero: the nearest points (m)."""
     noise: LidarNoise
 
@@ -39,28 +39,28 @@ class HeightNumbers(NamedTuple):
 class HeightEstimate(NamedTuple):
     """Estimate for one place."""
 
-    height: Float[Numbers, ""]
+    height: Float[ArrayLike, ""]
     """Over the nearest point (m); NaN if undetermined."""
-    sigma: Float[Numbers, ""]
-    used: Int[Numbers, ""]
-    density: Float[Numbers, ""]
-    roughness: Float[Numbers, ""]
-    gradient: Float[Numbers, "2"]
-    leafy: Float[Numbers, ""]
+    sigma: Float[ArrayLike, ""]
+    used: Int[ArrayLike, ""]
+    density: Float[ArrayLike, ""]
+    roughness: Float[ArrayLike, ""]
+    gradient: Float[ArrayLike, "2"]
+    leafy: Float[ArrayLike, ""]
     """Fraction of vegetation among the points used."""
-    hole: Bool[Numbers, ""]
-    surrounded: Bool[Numbers, ""]
-    plane: Bool[Numbers, ""]
+    hole: Bool[ArrayLike, ""]
+    surrounded: Bool[ArrayLike, ""]
+    plane: Bool[ArrayLike, ""]
     """True if `local` used a plane."""
-    misfit: Bool[Numbers, ""]
+    misfit: Bool[ArrayLike, ""]
     """True if the points scatter about the surface more than the lidar's noise explains."""
-    rough: Bool[Numbers, ""]
+    rough: Bool[ArrayLike, ""]
     """True if they do so by far."""
-    wide: Int[Numbers, ""]
+    wide: Int[ArrayLike, ""]
     """Number of points that determined the surface."""
-    one_surface: Float[Numbers, ""]
+    one_surface: Float[ArrayLike, ""]
     """Residual variance (m^2) of one smooth surface."""
-    final: Bool[Numbers, ""]
+    final: Bool[ArrayLike, ""]
     """True if more points would not change the result."""
 
 

@@ -16,7 +16,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.cloud import Cloud
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
@@ -39,24 +39,24 @@ _MOST_WIDE = 4 * WIDE
 class Heights(eqx.Module):
     """Heights of places (m) and their properties; NaN where refused or undetermined."""
 
-    z: Float[Numbers, "places"]
-    sigma: Float[Numbers, "places"]
-    flag: Integer[Numbers, "places"]
+    z: Float[ArrayLike, "places"]
+    sigma: Float[ArrayLike, "places"]
+    flag: Integer[ArrayLike, "places"]
     """Sums of `HeightFlag`."""
-    count: Int[Numbers, "places"]
+    count: Int[ArrayLike, "places"]
     """Number of points used."""
-    density: Float[Numbers, "places"]
+    density: Float[ArrayLike, "places"]
     """Points per m^2 around the place."""
-    roughness: Float[Numbers, "places"]
+    roughness: Float[ArrayLike, "places"]
     """Standard deviation (m) of the points about the local surface."""
-    gradient: Float[Numbers, "places 2"]
+    gradient: Float[ArrayLike, "places 2"]
     """Gradient of the local surface by X and Y."""
 
     def __len__(self) -> int:
         return len(self.z)
 
     @property
-    def slope(self) -> Float[Numbers, "places"]:
+    def slope(self) -> Float[ArrayLike, "places"]:
         """Rise over run: 1 is 45 degrees."""
         return np.hypot(*np.asarray(self.gradient).T)
 
@@ -145,7 +145,7 @@ def _with_points(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSet
     return HeightEstimate(*(np.concatenate(v) for v in zip(*parts, strict=True)))
 
 
-def _neighbours(grid: Grid, xy: np.ndarray, k: int) -> tuple[Neighbours, Numbers, Numbers]:
+def _neighbours(grid: Grid, xy: np.ndarray, k: int) -> tuple[Neighbours, ArrayLike, ArrayLike]:
     """Return the nearest points of places, the height of the nearest of all, and which of them are vegetation."""
     found = nearest(grid, xy, k)
     points = grid.xyz[found.index]

@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 
 
 def inverse_distance_weights(
-    squared: Float[Numbers, "m"], used: Bool[Numbers, "m"], power: Float[Numbers, ""]
+    squared: Float[ArrayLike, "m"], used: Bool[ArrayLike, "m"], power: Float[ArrayLike, ""]
 ) -> Float[Array, "m"]:
     """Return w = d^-p over their sum, from squared distances d^2 in any unit; of the points `used`, zero for all
     others.

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 
 # Ratio of a pivot to its diagonal element: points collinear to 1e-4 of their distances.
 _SINGULAR = 1e-8
@@ -22,12 +22,12 @@ _SINGULAR = 1e-8
 class Neighbours(NamedTuple):
     """Points nearest to one place, nearest first; padded with points that are not `there`."""
 
-    xy: Float[Numbers, "points 2"]
+    xy: Float[ArrayLike, "points 2"]
     """Offsets from the place (m)."""
-    z: Float[Numbers, "points"]
+    z: Float[ArrayLike, "points"]
     """Heights over that of the nearest point (m)."""
-    distance: Float[Numbers, "points"]
-    there: Bool[Numbers, "points"]
+    distance: Float[ArrayLike, "points"]
+    there: Bool[ArrayLike, "points"]
 
 
 class LocalFit(NamedTuple):
@@ -49,13 +49,13 @@ class LocalFit(NamedTuple):
         return self.determined & (jnp.sum(self.rows[0] ** 2) <= 1)
 
 
-def terms(xy: Float[Numbers, "points 2"]) -> Float[Array, "points 6"]:
+def terms(xy: Float[ArrayLike, "points 2"]) -> Float[Array, "points 6"]:
     """Return the monomials of the coefficients."""
     x, y = xy[:, 0], xy[:, 1]
     return jnp.stack([jnp.ones_like(x), x, y, x**2 / 2, x * y, y**2 / 2], axis=1)
 
 
-def fit_surface(near: Neighbours, weight: Float[Numbers, "points"], quadratic: bool) -> LocalFit:
+def fit_surface(near: Neighbours, weight: Float[ArrayLike, "points"], quadratic: bool) -> LocalFit:
     """Fit by weighted least squares; the weights of missing points are zero.
 
     The residual variance is that of the points of positive weight, each counted once.

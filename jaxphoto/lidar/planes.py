@@ -136,5 +136,5 @@ def _principal(scaled: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return mean, *np.linalg.eigh((scaled - mean).T @ (scaled - mean))
 
 
-def _sigma0(square_sum: float, inliers: np.ndarray) -> float:
-    return float(np.sqrt(max(square_sum, 0.0) / (_CUT_VARIANCE * max(inliers.sum() - 3, 1))))
+def _sigma0(sum_of_squares: float, inliers: np.ndarray) -> float:
+    return float(np.sqrt(max(sum_of_squares, 0.0) / (_CUT_VARIANCE * max(inliers.sum() - 3, 1))))

@@ -32,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Integer
 
-from jaxphoto.arrays import Numbers, on_device, still
+from jaxphoto.arrays import ArrayLike, as_jax_array, to_numpy
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.cloud import Cloud
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, image_ray, project, project_ideal
@@ -62,15 +62,15 @@ _AT_ONCE, _FEW = 512, 64
 class PseudoControl(eqx.Module):
     """Intersections of the rays of features with a cloud, one per feature; NaN where refused or undetermined."""
 
-    xyz: Float[Numbers, "*n 3"]
+    xyz: Float[ArrayLike, "*n 3"]
     """X, Y, Z (m); X and Y are only as accurate as the orientation (docs/pseudo_control.md)."""
-    sigma_z: Float[Numbers, "*n"]
+    sigma_z: Float[ArrayLike, "*n"]
     """Standard deviation of Z (m): 95 % of the errors are within 1.96 of it."""
-    flag: Integer[Numbers, "*n"]
+    flag: Integer[ArrayLike, "*n"]
     """Sums of `HeightFlag`: HOLE also where a ray does not meet the cloud."""
-    gradient: Float[Numbers, "*n 2"]
+    gradient: Float[ArrayLike, "*n 2"]
     """Gradient of the surface by X and Y."""
-    roughness: Float[Numbers, "*n"]
+    roughness: Float[ArrayLike, "*n"]
     """Standard deviation (m) of the laser points about the plane through them."""
 
 
@@ -112,7 +112,7 @@ class _Candidates(eqx.Module):
 def pseudo_control_points(
     interior: InteriorOrientation,
     exterior: ExteriorOrientation,
-    xy: Float[Numbers, "n 2"],
+    xy: Float[ArrayLike, "n 2"],
     cloud: Cloud | Grid,
     settings: HeightSettings | None = None,
     *,
@@ -150,18 +150,18 @@ def pseudo_control_points(
     one = exterior.position.ndim == 1
     found = call_compiled(
         _pseudo_control,
-        jax.tree.map(still, interior),
-        jax.tree.map(lambda v: still(v) if one else still(v)[rows], exterior),
-        still(xy)[rows],
+        jax.tree.map(to_numpy, interior),
+        jax.tree.map(lambda v: to_numpy(v) if one else to_numpy(v)[rows], exterior),
+        to_numpy(xy)[rows],
         grid,
         skyline(grid),
-        _Numbers(*map(on_device, numbers)),
+        _Numbers(*map(as_jax_array, numbers)),
         settings.points,
         window_reach(grid, _CANDIDATES * settings.points),
         interpolation,
         corrections,
     )
-    return jax.tree.map(lambda v: still(v)[:n], found)
+    return jax.tree.map(lambda v: to_numpy(v)[:n], found)
 
 
 @eqx.filter_jit

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.lidar.grid import Grid
 
 # Gap between heights that separates two levels: in standard deviations of one point, and of the points of either level.
@@ -124,7 +124,7 @@ def levels(
     return Levels(seen, two & ~(on_upper | on_lower))
 
 
-def surrounded(q: Float[Numbers, "m 2"], which: Bool[Numbers, "m"]) -> Bool[Array, ""]:
+def surrounded(q: Float[ArrayLike, "m 2"], which: Bool[ArrayLike, "m"]) -> Bool[Array, ""]:
     """Return True if the points `which` surround q = 0: each has another less than half a turn on.
 
     A point at q = 0 is on no side.
@@ -135,7 +135,7 @@ def surrounded(q: Float[Numbers, "m 2"], which: Bool[Numbers, "m"]) -> Bool[Arra
     return jnp.all(~which | to_the_left.any(axis=1)) & jnp.any(which)
 
 
-def empty_about(distance: Float[Numbers, "m"], which: Bool[Numbers, "m"]) -> Bool[Array, ""]:
+def empty_about(distance: Float[ArrayLike, "m"], which: Bool[ArrayLike, "m"]) -> Bool[Array, ""]:
     """Return True if no point is close enough: at uniform density such an empty circle occurs once in ten thousand
     places.
 

@@ -10,14 +10,14 @@ from jaxphoto.observations.base import AXES as AXES
 from jaxphoto.observations.base import AbstractCoordinates as AbstractCoordinates
 from jaxphoto.observations.base import AbstractObservations as AbstractObservations
 from jaxphoto.observations.base import ImageState as ImageState
-from jaxphoto.observations.base import touching as touching
+from jaxphoto.observations.base import index_of as index_of
 
 # Order of tables and files.
 # ruff: isort: off
-from jaxphoto.observations.image_points import ImageRows as ImageRows
-from jaxphoto.observations.stations import StationRows as StationRows
+from jaxphoto.observations.image_points import ImagePoints as ImagePoints
+from jaxphoto.observations.stations import CameraPositions as CameraPositions
 from jaxphoto.observations.attitudes import ATTITUDE_AXES as ATTITUDE_AXES, Attitudes as Attitudes
-from jaxphoto.observations.control import ControlRows as ControlRows
+from jaxphoto.observations.control import ControlCoordinates as ControlCoordinates
 from jaxphoto.observations.surfaces import SurfaceRows as SurfaceRows
 from jaxphoto.observations.strip_planes import StripPlanes as StripPlanes
 from jaxphoto.observations.strip_points import StripPoints as StripPoints

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.georeferencing import attitude_residual, recorded_attitude
-from jaxphoto.observations.base import AbstractObservations, ImageState, touching
+from jaxphoto.observations.base import AbstractObservations, ImageState, index_of
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw
 
 ATTITUDE_AXES = ("roll", "pitch", "yaw")
@@ -24,11 +24,11 @@ class Attitudes(AbstractObservations):
         "sigma": tuple(f"sigma_{axis}_deg" for axis in ATTITUDE_AXES),
     }
 
-    image: Int[np.ndarray, "n"] = touching("image")
-    roll_pitch_yaw: Float[Numbers, "n 3"]
-    sigma: Float[Numbers, "n 3"]
+    image: Int[np.ndarray, "n"] = index_of("image")
+    roll_pitch_yaw: Float[ArrayLike, "n 3"]
+    sigma: Float[ArrayLike, "n 3"]
 
-    def residual(self, image: ImageState) -> Float[Numbers, "3"]:
+    def residual(self, image: ImageState) -> Float[ArrayLike, "3"]:
         """Return observed minus computed as a small rotation (rad); see `georeferencing.attitude_residual`."""
         computed = recorded_attitude(image.camera_from_object, image.mount, image.exposure)
         return attitude_residual(matrix_from_roll_pitch_yaw(jnp.asarray(self.roll_pitch_yaw)), computed)

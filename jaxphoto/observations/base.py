@@ -16,7 +16,7 @@ redundancy numbers, noise, sensitivities, datum, tables and files follow from it
 
 Its file is height_differences.csv with the columns start, end, value_m and sigma_m (`observations.columns`).
 
-Inside `residual` the module is *one* row: `self.value` is a number. Its arguments are what the fields marked `touching`
+Inside `residual` the module is *one* row: `self.value` is a number. Its arguments are what the fields marked `index_of`
 refer to, in order (a field of several indices per row gives a stack with a leading axis), then the kinds in `also`. A
 point is its three coordinates (m), an image an `ImageState`; any kind of declared unknowns (`jaxphoto.parameters`)
 gives parameters of that kind.
@@ -34,16 +34,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.arrays import Numbers, from_list, joined, still
+from jaxphoto.arrays import ArrayLike, from_list, joined, to_numpy
 from jaxphoto.georeferencing import Exposure, Mount, StripBias
 from jaxphoto.observations.columns import row_fields, whole_fields
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.static_values import StaticArray, map_arrays
 
 AXES = ("X", "Y", "Z")
 
 
-def touching(what: str) -> Any:
+def index_of(what: str) -> Any:
     """Declare a field of indices: of "image", "point", or a kind of declared unknowns such as "strips"."""
     return eqx.field(metadata={"touches": what})
 
@@ -58,7 +58,7 @@ class ImageState(eqx.Module):
     parameters: dict[str, Any]
     """Declared unknowns of the image, by kind; zeros if the image has none of a kind that others have."""
     interior: Any = None
-    """Interior orientation, for rows whose class sets `through_camera`."""
+    """Interior orientation, for rows whose class sets `uses_interior`."""
 
     @property
     def mount(self) -> Mount:
@@ -71,8 +71,8 @@ class ImageState(eqx.Module):
         return self.parameters.get("strips") or StripBias(jnp.zeros(3), jnp.zeros(3))
 
 
-@shown
-@dataclass_transform(field_specifiers=(touching, eqx.field))
+@pretty_repr
+@dataclass_transform(field_specifiers=(index_of, eqx.field))
 class AbstractObservations(eqx.Module):
     """Rows of one kind, along the first axis of every field; requires `sigma`, in the unit of the residual."""
 
@@ -82,17 +82,17 @@ class AbstractObservations(eqx.Module):
     """m, mm, rad, s ...; tables show rad in degrees."""
     axes: ClassVar[tuple[str, ...]] = ("",)
     """Names of the numbers of a row."""
-    also: ClassVar[tuple[str, ...]] = ()
+    block_parameters: ClassVar[tuple[str, ...]] = ()
     """Kinds of unknowns of the whole block that a row touches in addition; None if the block has none."""
     observed: ClassVar[str] = "value"
     """Observed field: noise is added to it, and derivatives are taken by it."""
-    rigid: ClassVar[bool] = False
+    rigid_invariant: ClassVar[bool] = False
     """True if the residuals are invariant under rigid-body motion."""
-    through_camera: ClassVar[bool] = False
+    uses_interior: ClassVar[bool] = False
     """True if a row touches the interior orientation of its image."""
     columns: ClassVar[Mapping[str, str | tuple[str, ...]]] = MappingProxyType({})
     """Column names in files, by field, that differ from those of `observations.columns`."""
-    once: ClassVar[bool] = False
+    unique: ClassVar[bool] = False
     """True if files may list what a row touches, in any order, only once."""
 
     def __getattribute__(self, name: str) -> Any:
@@ -109,14 +109,14 @@ class AbstractObservations(eqx.Module):
                 object.__setattr__(self, name, from_list(value))
 
     @abc.abstractmethod
-    def residual(self, *touched: Any) -> Float[Numbers, "..."]:
+    def residual(self, *touched: Any) -> Float[ArrayLike, "..."]:
         """Return observed minus computed of one row, in the unit."""
 
-    def whitened(self, residual: Float[Numbers, "..."]) -> Float[Numbers, "..."]:
+    def whitened(self, residual: Float[ArrayLike, "..."]) -> Float[ArrayLike, "..."]:
         """Return the residual of one row over its standard deviation."""
         return residual / self.sigma  # type: ignore[attr-defined]
 
-    def with_sigmas_times(self, factor: Float[Numbers, "..."]) -> Self:
+    def with_sigmas_times(self, factor: Float[ArrayLike, "..."]) -> Self:
         """Scale the standard deviations by `factor`, by number: (n,) or (n, axes)."""
         return eqx.tree_at(lambda rows: rows.sigma, self, self.sigmas * factor)
 
@@ -124,22 +124,22 @@ class AbstractObservations(eqx.Module):
         """Return rows of zero weight, used as padding."""
         return eqx.tree_at(lambda rows: rows.sigma, self, np.full(np.shape(self.sigmas), np.inf))
 
-    def indices(self) -> list[tuple[str, Int[Numbers, "..."]]]:
+    def indices(self) -> list[tuple[str, Int[ArrayLike, "..."]]]:
         """Return kinds and indices of what the rows touch: (n,), or more axes if a row touches several."""
         return [
             (f.metadata["touches"], getattr(self, f.name)) for f in dataclasses.fields(self) if "touches" in f.metadata
         ]
 
     @property
-    def observation(self) -> Numbers:
+    def observation(self) -> ArrayLike:
         """Return the observed numbers: (n,), or (n, axes)."""
         return getattr(self, self.observed)
 
-    def with_observation(self, value: Numbers) -> Self:
+    def with_observation(self, value: ArrayLike) -> Self:
         """Replace the observed numbers."""
         return eqx.tree_at(lambda rows: getattr(rows, self.observed), self, value)
 
-    def physical(self, whitened: Float[Numbers, "..."]) -> Float[np.ndarray, "..."]:
+    def physical(self, whitened: Float[ArrayLike, "..."]) -> Float[np.ndarray, "..."]:
         """Convert residuals over their standard deviations, (n,) or (axes, n), to the unit."""
         return np.asarray(whitened) * np.asarray(self.sigmas).T
 
@@ -148,7 +148,7 @@ class AbstractObservations(eqx.Module):
         """Return no rows."""
         return cls(**{f.name: np.zeros((0, *f.shape), int if f.whole else float) for f in row_fields(cls)})
 
-    def flaws(self) -> Iterator[tuple[int, str]]:
+    def validation_errors(self) -> Iterator[tuple[int, str]]:
         """Yield (row, message) for every invalid row."""
         return iter(())
 
@@ -167,7 +167,7 @@ class AbstractObservations(eqx.Module):
 
     def take(self, chosen: np.ndarray) -> Self:
         """Select rows by index or mask."""
-        return map_arrays(lambda v: still(v)[chosen], self)
+        return map_arrays(lambda v: to_numpy(v)[chosen], self)
 
     def renumbered(self, **new: np.ndarray) -> Self:
         """Keep rows whose images and points remain: `new` gives, by kind, the new index of each or -1."""
@@ -228,8 +228,8 @@ class AbstractCoordinates(AbstractObservations):
 
     who: eqx.AbstractVar[np.ndarray]
     axis: eqx.AbstractVar[np.ndarray]
-    value: eqx.AbstractVar[Numbers]
-    sigma: eqx.AbstractVar[Numbers]
+    value: eqx.AbstractVar[ArrayLike]
+    sigma: eqx.AbstractVar[ArrayLike]
 
     def axis_names(self) -> np.ndarray:
         """Return X, Y or Z of each row."""

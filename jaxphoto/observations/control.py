@@ -3,11 +3,11 @@
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.arrays import Numbers
-from jaxphoto.observations.base import AXES, AbstractCoordinates, touching
+from jaxphoto.arrays import ArrayLike
+from jaxphoto.observations.base import AXES, AbstractCoordinates, index_of
 
 
-class ControlRows(AbstractCoordinates):
+class ControlCoordinates(AbstractCoordinates):
     """Surveyed coordinates of point `who`: `axis` (0, 1, 2), `value` and `sigma` (m).
 
     Vertical control is rows with axis 2. Check coordinates, and fixed ones, use the same class.
@@ -17,12 +17,12 @@ class ControlRows(AbstractCoordinates):
     unit = "m"
     columns = {"who": "point"}  # noqa: RUF012
 
-    who: Int[np.ndarray, "n"] = touching("point")
+    who: Int[np.ndarray, "n"] = index_of("point")
     axis: Int[np.ndarray, "n"]
-    value: Float[Numbers, "n"]
-    sigma: Float[Numbers, "n"]
+    value: Float[ArrayLike, "n"]
+    sigma: Float[ArrayLike, "n"]
 
-    def residual(self, point: Float[Array, "3"]) -> Float[Numbers, ""]:
+    def residual(self, point: Float[Array, "3"]) -> Float[ArrayLike, ""]:
         """Return surveyed minus computed (m)."""
         return self.value - point[self.axis]
 

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.arrays import Numbers, still
+from jaxphoto.arrays import ArrayLike, to_numpy
 from jaxphoto.observations.base import AbstractObservations
 from jaxphoto.static_values import map_arrays
 
@@ -25,27 +25,27 @@ class Correlated(AbstractObservations):
     """
 
     rows: AbstractObservations
-    covariance: Float[Numbers, "sets n n"]
-    whitener: Float[Numbers, "sets n n"]
+    covariance: Float[ArrayLike, "sets n n"]
+    whitener: Float[ArrayLike, "sets n n"]
     """L^-1."""
     group: str = eqx.field(static=True)  # type: ignore[misc]
     unit: str = eqx.field(static=True)  # type: ignore[misc]
     axes: tuple[str, ...] = eqx.field(static=True)  # type: ignore[misc]
-    also: tuple[str, ...] = eqx.field(static=True)  # type: ignore[misc]
-    rigid: bool = eqx.field(static=True)  # type: ignore[misc]
-    through_camera: bool = eqx.field(static=True)  # type: ignore[misc]
+    block_parameters: tuple[str, ...] = eqx.field(static=True)  # type: ignore[misc]
+    rigid_invariant: bool = eqx.field(static=True)  # type: ignore[misc]
+    uses_interior: bool = eqx.field(static=True)  # type: ignore[misc]
 
-    def residual(self, *touched: Any) -> Float[Numbers, "n"]:
+    def residual(self, *touched: Any) -> Float[ArrayLike, "n"]:
         """Return the residuals of the rows of one set, concatenated."""
         n = len(self.rows.indices())
         each = jax.vmap(lambda row, *own: row.residual(*own, *touched[n:]))(self.rows, *touched[:n])
         return each.reshape(-1)
 
-    def whitened(self, residual: Float[Numbers, "n"]) -> Float[Numbers, "n"]:
+    def whitened(self, residual: Float[ArrayLike, "n"]) -> Float[ArrayLike, "n"]:
         """Return L^-1 times the residuals."""
         return self.whitener @ residual
 
-    def with_sigmas_times(self, factor: Float[Numbers, "sets n"]) -> "Correlated":
+    def with_sigmas_times(self, factor: Float[ArrayLike, "sets n"]) -> "Correlated":
         """Replace the covariance C by D C D, with D the diagonal matrix of `factor`: correlations stay."""
         where = lambda sets: (sets.covariance, sets.whitener)  # noqa: E731
         new = self.covariance * factor[:, :, None] * factor[:, None], self.whitener / factor[:, None]
@@ -55,26 +55,26 @@ class Correlated(AbstractObservations):
         """Return sets of zero weight."""
         return eqx.tree_at(lambda sets: sets.whitener, self, np.zeros(np.shape(self.whitener)))
 
-    def indices(self) -> list[tuple[str, Int[Numbers, "..."]]]:
+    def indices(self) -> list[tuple[str, Int[ArrayLike, "..."]]]:
         """Return what the rows of a set touch, along the axes after the first."""
         return self.rows.indices()
 
     @property
-    def observation(self) -> Numbers:
+    def observation(self) -> ArrayLike:
         """(sets, n)."""
         return self.rows.observation.reshape(len(self), -1)
 
-    def with_observation(self, value: Numbers) -> "Correlated":
+    def with_observation(self, value: ArrayLike) -> "Correlated":
         """Replace the observed numbers."""
         inner = self.rows.with_observation(value.reshape(self.rows.observation.shape))
         return eqx.tree_at(lambda sets: sets.rows, self, inner)
 
     @property
-    def sigmas(self) -> Numbers:
+    def sigmas(self) -> ArrayLike:
         """(sets, n)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
-    def physical(self, whitened: Float[Numbers, "n sets"]) -> Float[np.ndarray, "n sets"]:
+    def physical(self, whitened: Float[ArrayLike, "n sets"]) -> Float[np.ndarray, "n sets"]:
         """Return L times the whitened residuals."""
         return np.linalg.solve(np.asarray(self.whitener), np.asarray(whitened).T[..., None])[..., 0].T
 
@@ -124,15 +124,15 @@ def correlated(
     except np.linalg.LinAlgError:
         raise ValueError("a covariance matrix is not positive definite: a combination has no uncertainty") from None
     return Correlated(
-        rows=map_arrays(lambda v: still(v)[index], rows),
+        rows=map_arrays(lambda v: to_numpy(v)[index], rows),
         covariance=covariance,
         whitener=whitener,
         group=f"correlated_{rows.group}",
         unit=rows.unit,
         axes=rows.axes * index.shape[1],
-        also=rows.also,
-        rigid=rows.rigid,
-        through_camera=rows.through_camera,
+        block_parameters=rows.block_parameters,
+        rigid_invariant=rows.rigid_invariant,
+        uses_interior=rows.uses_interior,
     )
 
 

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.arrays import Numbers
-from jaxphoto.observations.base import AbstractObservations, touching
+from jaxphoto.arrays import ArrayLike
+from jaxphoto.observations.base import AbstractObservations, index_of
 
 
 class Distances(AbstractObservations):
@@ -15,15 +15,15 @@ class Distances(AbstractObservations):
 
     group = "distances"
     unit = "m"
-    rigid = True
+    rigid_invariant = True
     columns = {"points": ("point_a", "point_b"), "value": "distance_m"}  # noqa: RUF012
-    once = True
+    unique = True
 
-    points: Int[np.ndarray, "n 2"] = touching("point")
-    value: Float[Numbers, "n"]
-    sigma: Float[Numbers, "n"]
+    points: Int[np.ndarray, "n 2"] = index_of("point")
+    value: Float[ArrayLike, "n"]
+    sigma: Float[ArrayLike, "n"]
 
-    def residual(self, ends: Float[Array, "2 3"]) -> Float[Numbers, ""]:
+    def residual(self, ends: Float[Array, "2 3"]) -> Float[ArrayLike, ""]:
         """Return observed minus computed (m)."""
         return self.value - jnp.sqrt(jnp.sum((ends[0] - ends[1]) ** 2))
 
@@ -31,7 +31,7 @@ class Distances(AbstractObservations):
         """Labels such as "distance A to B"."""
         return np.array([f"distance {points[a]} to {points[b]}" for a, b in self.points], object)
 
-    def flaws(self) -> Iterator[tuple[int, str]]:
+    def validation_errors(self) -> Iterator[tuple[int, str]]:
         """Yield distances from a point to itself, and those not positive."""
         for row in np.flatnonzero(self.points[:, 0] == self.points[:, 1]):
             yield int(row), "the distance runs from a point to itself; correct point_a or point_b"

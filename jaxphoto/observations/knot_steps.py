@@ -15,9 +15,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.georeferencing import TrajectoryKnot
-from jaxphoto.observations.base import AXES, AbstractObservations, touching
+from jaxphoto.observations.base import AXES, AbstractObservations, index_of
 
 
 class AbstractKnotSteps(AbstractObservations):
@@ -27,13 +27,13 @@ class AbstractKnotSteps(AbstractObservations):
     observed = "step"
     columns = {"step": (), "kept": "kept"}  # noqa: RUF012
 
-    start: Int[np.ndarray, "n"] = touching("trajectory_knots")
-    end: Int[np.ndarray, "n"] = touching("trajectory_knots")
-    kept: Float[Numbers, "n"]
-    sigma: Float[Numbers, "n 3"]
-    step: Float[Numbers, "n 3"]
+    start: Int[np.ndarray, "n"] = index_of("trajectory_knots")
+    end: Int[np.ndarray, "n"] = index_of("trajectory_knots")
+    kept: Float[ArrayLike, "n"]
+    sigma: Float[ArrayLike, "n 3"]
+    step: Float[ArrayLike, "n 3"]
 
-    def flaws(self) -> Iterator[tuple[int, str]]:
+    def validation_errors(self) -> Iterator[tuple[int, str]]:
         """Yield fractions that no process has."""
         kept = np.asarray(self.kept)
         for row in np.flatnonzero((kept < 0) | (kept > 1)):
@@ -58,7 +58,7 @@ class PositionSteps(AbstractKnotSteps):
     axes = AXES
     _words = ("step", "in")
 
-    def residual(self, start: TrajectoryKnot, end: TrajectoryKnot) -> Float[Numbers, "3"]:
+    def residual(self, start: TrajectoryKnot, end: TrajectoryKnot) -> Float[ArrayLike, "3"]:
         """Return observed minus computed step (m)."""
         return self.step - (end.position - self.kept * start.position)
 
@@ -71,6 +71,6 @@ class AttitudeSteps(AbstractKnotSteps):
     axes = ("right", "forward", "up")
     _words = ("turn", "about")
 
-    def residual(self, start: TrajectoryKnot, end: TrajectoryKnot) -> Float[Numbers, "3"]:
+    def residual(self, start: TrajectoryKnot, end: TrajectoryKnot) -> Float[ArrayLike, "3"]:
         """Return observed minus computed step (rad)."""
         return self.step - (end.attitude - self.kept * start.attitude)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 
 # Tolerance of the sum of weights about 1, and of the length of a normal: rounding of a few written digits.
 _OFF = 1e-3
@@ -29,14 +29,14 @@ def pose_columns(place: str, side: str = "") -> dict[str, tuple[str, ...]]:
 NORMAL = {"normal": ("normal_X", "normal_Y", "normal_Z")}
 
 
-def weight_flaws(weights: Float[Numbers, "n 4"]) -> Iterator[tuple[int, str]]:
+def weight_flaws(weights: Float[ArrayLike, "n 4"]) -> Iterator[tuple[int, str]]:
     """Yield rows whose weights do not add up to one correction."""
     total = np.asarray(weights).sum(axis=1)
     for row in np.flatnonzero(np.abs(total - 1) > _OFF):
         yield int(row), f"the weights of its knots add up to {total[row]:.4f}; give weights that add up to 1"
 
 
-def normal_flaws(normal: Float[Numbers, "n 3"]) -> Iterator[tuple[int, str]]:
+def normal_flaws(normal: Float[ArrayLike, "n 3"]) -> Iterator[tuple[int, str]]:
     """Yield rows whose normal is not a unit vector."""
     length = np.linalg.norm(np.asarray(normal), axis=1)
     for row in np.flatnonzero(np.abs(length - 1) > _OFF):

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.errors import camera_words, few
-from jaxphoto.observations.base import AXES, AbstractObservations, ImageState, touching
+from jaxphoto.observations.base import AXES, AbstractObservations, ImageState, index_of
 from jaxphoto.rotation import small_angles
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 PRIORS = "priors"
 
@@ -22,11 +22,11 @@ class ParameterRows(AbstractObservations):
     group = PRIORS
     unit = ""
 
-    parameter: Int[np.ndarray, "n"] = touching("parameter")
-    value: Float[Numbers, "n"]
-    sigma: Float[Numbers, "n"]
+    parameter: Int[np.ndarray, "n"] = index_of("parameter")
+    value: Float[ArrayLike, "n"]
+    sigma: Float[ArrayLike, "n"]
 
-    def residual(self, parameter: Float[Array, ""]) -> Float[Numbers, ""]:
+    def residual(self, parameter: Float[Array, ""]) -> Float[ArrayLike, ""]:
         """Return prior minus estimated value."""
         return self.value - parameter
 
@@ -38,11 +38,11 @@ class PositionRows(AbstractObservations):
     unit = "m"
     axes = AXES
 
-    image: Int[np.ndarray, "n"] = touching("image")
-    value: Float[Numbers, "n 3"]
-    sigma: Float[Numbers, "n 3"]
+    image: Int[np.ndarray, "n"] = index_of("image")
+    value: Float[ArrayLike, "n 3"]
+    sigma: Float[ArrayLike, "n 3"]
 
-    def residual(self, image: ImageState) -> Float[Numbers, "3"]:
+    def residual(self, image: ImageState) -> Float[ArrayLike, "3"]:
         """Return prior minus estimated value (m)."""
         return self.value - image.position
 
@@ -56,13 +56,13 @@ class RotationRows(AbstractObservations):
     observed = "turn"
     columns = {"value": tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "turn": ()}  # noqa: RUF012
 
-    image: Int[np.ndarray, "n"] = touching("image")
-    value: Float[Numbers, "n 3 3"]
-    sigma: Float[Numbers, "n 3"]
-    turn: Float[Numbers, "n 3"]
+    image: Int[np.ndarray, "n"] = index_of("image")
+    value: Float[ArrayLike, "n 3 3"]
+    sigma: Float[ArrayLike, "n 3"]
+    turn: Float[ArrayLike, "n 3"]
     """Observed rotation in addition to `value`: zero, unless an error is simulated."""
 
-    def residual(self, image: ImageState) -> Float[Numbers, "3"]:
+    def residual(self, image: ImageState) -> Float[ArrayLike, "3"]:
         """Return prior minus estimated rotation, a small rotation in the camera frame (rad)."""
         return self.turn + small_angles(jnp.asarray(self.value) @ image.camera_from_object.T)
 
@@ -74,16 +74,16 @@ class PointRows(AbstractObservations):
     unit = "m"
     axes = AXES
 
-    point: Int[np.ndarray, "n"] = touching("point")
-    value: Float[Numbers, "n 3"]
-    sigma: Float[Numbers, "n 3"]
+    point: Int[np.ndarray, "n"] = index_of("point")
+    value: Float[ArrayLike, "n 3"]
+    sigma: Float[ArrayLike, "n 3"]
 
-    def residual(self, point: Float[Array, "3"]) -> Float[Numbers, "3"]:
+    def residual(self, point: Float[Array, "3"]) -> Float[ArrayLike, "3"]:
         """Return prior minus estimated value (m)."""
         return self.value - point
 
 
-@shown
+@pretty_repr
 class KnownParameters(eqx.Module):
     """Joint prior of parameters: an earlier calibration, with its correlations.
 
@@ -92,16 +92,16 @@ class KnownParameters(eqx.Module):
     """
 
     labels: tuple[str, ...] = eqx.field(static=True)
-    value: Float[Numbers, "n"]
-    covariance: Float[Numbers, "n n"]
+    value: Float[ArrayLike, "n"]
+    covariance: Float[ArrayLike, "n n"]
     reservation: str = eqx.field(static=True)
     """Reservation about their source, such as a calibration with a red verdict; "" for none."""
 
     def __init__(
         self,
         labels: Sequence[str],
-        value: Float[Numbers, "n"],
-        covariance: Float[Numbers, "n n"],
+        value: Float[ArrayLike, "n"],
+        covariance: Float[ArrayLike, "n n"],
         reservation: str = "",
     ):
         self.labels, self.value, self.covariance, self.reservation = tuple(labels), value, covariance, reservation

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.georeferencing import StripBias, attitude_residual, recorded_attitude, sensor_position
 from jaxphoto.observations.attitudes import ATTITUDE_AXES
-from jaxphoto.observations.base import AXES, AbstractObservations, ImageState, touching
+from jaxphoto.observations.base import AXES, AbstractObservations, ImageState, index_of
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw
 
 _NO_BIAS = StripBias(np.zeros(3), np.zeros(3))  # type: ignore[arg-type]
@@ -30,12 +30,12 @@ _NO_BIAS = StripBias(np.zeros(3), np.zeros(3))  # type: ignore[arg-type]
 class AbstractRelativeRows(AbstractObservations):
     """Pose of the GNSS/IMU at `image_2` relative to that at `image_1`."""
 
-    once = True
+    unique = True
 
-    image_1: Int[np.ndarray, "n"] = touching("image")
-    image_2: Int[np.ndarray, "n"] = touching("image")
+    image_1: Int[np.ndarray, "n"] = index_of("image")
+    image_2: Int[np.ndarray, "n"] = index_of("image")
 
-    def flaws(self) -> Iterator[tuple[int, str]]:
+    def validation_errors(self) -> Iterator[tuple[int, str]]:
         """Yield images paired with themselves."""
         for row in np.flatnonzero(self.image_1 == self.image_2):
             yield int(row), "image_1 and image_2 are the same; name two exposures"
@@ -55,10 +55,10 @@ class RelativePositions(AbstractRelativeRows):
     axes = AXES
     columns = {"value": tuple(f"d{axis}_m" for axis in AXES)}  # noqa: RUF012
 
-    value: Float[Numbers, "n 3"]
-    sigma: Float[Numbers, "n 3"]
+    value: Float[ArrayLike, "n 3"]
+    sigma: Float[ArrayLike, "n 3"]
 
-    def residual(self, image_1: ImageState, image_2: ImageState) -> Float[Numbers, "3"]:
+    def residual(self, image_1: ImageState, image_2: ImageState) -> Float[ArrayLike, "3"]:
         """Return observed minus computed (m)."""
         return self.value - (_antenna(image_2) - _antenna(image_1))
 
@@ -74,11 +74,11 @@ class RelativeAttitudes(AbstractRelativeRows):
     unit = "rad"
     axes = ATTITUDE_AXES
     observed = "roll_pitch_yaw"
-    rigid = True
+    rigid_invariant = True
     columns = {"roll_pitch_yaw": tuple(f"{axis}_deg" for axis in ATTITUDE_AXES)}  # noqa: RUF012
 
-    roll_pitch_yaw: Float[Numbers, "n 3"]
-    sigma: Float[Numbers, "n 3"]
+    roll_pitch_yaw: Float[ArrayLike, "n 3"]
+    sigma: Float[ArrayLike, "n 3"]
 
     def residual(self, image_1: ImageState, image_2: ImageState) -> Float[Array, "3"]:
         """Return observed minus computed as a small rotation (rad); see `georeferencing.attitude_residual`."""

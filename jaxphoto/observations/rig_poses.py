@@ -10,10 +10,10 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import RigCamera, reference_later, rig_place, turn_off
-from jaxphoto.observations.base import AXES, AbstractObservations, ImageState, touching
+from jaxphoto.observations.base import AXES, AbstractObservations, ImageState, index_of
 
 
 class AbstractRigRows(AbstractObservations):
@@ -22,12 +22,12 @@ class AbstractRigRows(AbstractObservations):
     observed = "off"
     columns = {"off": ()}  # noqa: RUF012
 
-    reference: Int[np.ndarray, "n"] = touching("image")
-    image: Int[np.ndarray, "n"] = touching("image")
-    off: Float[Numbers, "n 3"]
-    sigma: Float[Numbers, "n 3"]
+    reference: Int[np.ndarray, "n"] = index_of("image")
+    image: Int[np.ndarray, "n"] = index_of("image")
+    off: Float[ArrayLike, "n 3"]
+    sigma: Float[ArrayLike, "n 3"]
 
-    def flaws(self) -> Iterator[tuple[int, str]]:
+    def validation_errors(self) -> Iterator[tuple[int, str]]:
         """Yield photographs paired with themselves."""
         for row in np.flatnonzero(self.reference == self.image):
             yield int(row), "the image is its own reference; name that of the reference camera of the same event"
@@ -40,7 +40,7 @@ class RigPlaces(AbstractRigRows):
     unit = "m"
     axes = tuple(axis.lower() for axis in AXES)
 
-    def residual(self, reference: ImageState, image: ImageState) -> Float[Numbers, "3"]:
+    def residual(self, reference: ImageState, image: ImageState) -> Float[ArrayLike, "3"]:
         """Return observed minus computed (m)."""
         own = _camera_of(image)
         return self.off - (rig_place(*_reference_for(reference, own), image.position) - own.place)
@@ -51,10 +51,10 @@ class RigTurns(AbstractRigRows):
 
     group = "rig_turns"
     unit = "rad"
-    rigid = True
+    rigid_invariant = True
     axes = ("rx", "ry", "rz")
 
-    def residual(self, reference: ImageState, image: ImageState) -> Float[Numbers, "3"]:
+    def residual(self, reference: ImageState, image: ImageState) -> Float[ArrayLike, "3"]:
         """Return observed minus computed (rad)."""
         own = _camera_of(image)
         _, turned = _reference_for(reference, own)

@@ -3,9 +3,9 @@
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.georeferencing import sensor_position
-from jaxphoto.observations.base import AXES, AbstractCoordinates, ImageState, touching
+from jaxphoto.observations.base import AXES, AbstractCoordinates, ImageState, index_of
 
 
 def station_of(image: ImageState) -> Float[Array, "3"]:
@@ -19,19 +19,19 @@ def station_of(image: ImageState) -> Float[Array, "3"]:
     return at
 
 
-class StationRows(AbstractCoordinates):
+class CameraPositions(AbstractCoordinates):
     """Coordinates of the GNSS/IMU at the exposure of image `who`: `axis` (0, 1, 2), `value` and `sigma` (m)."""
 
     group = "stations"
     unit = "m"
     columns = {"who": "image"}  # noqa: RUF012
 
-    who: Int[np.ndarray, "n"] = touching("image")
+    who: Int[np.ndarray, "n"] = index_of("image")
     axis: Int[np.ndarray, "n"]
-    value: Float[Numbers, "n"]
-    sigma: Float[Numbers, "n"]
+    value: Float[ArrayLike, "n"]
+    sigma: Float[ArrayLike, "n"]
 
-    def residual(self, image: ImageState) -> Float[Numbers, ""]:
+    def residual(self, image: ImageState) -> Float[ArrayLike, ""]:
         """Return observed minus computed (m)."""
         return self.value - station_of(image)[self.axis]
 

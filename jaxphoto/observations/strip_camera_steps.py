@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.camera import StripCamera
-from jaxphoto.observations.base import AbstractObservations, touching
+from jaxphoto.observations.base import AbstractObservations, index_of
 
 
 class StripCameraSteps(AbstractObservations):
@@ -20,12 +20,12 @@ class StripCameraSteps(AbstractObservations):
     unit = "mm"
     axes = ("c", "xp", "yp")
 
-    start: Int[np.ndarray, "n"] = touching(StripCamera.kind)
-    end: Int[np.ndarray, "n"] = touching(StripCamera.kind)
-    value: Float[Numbers, "n 3"]
-    sigma: Float[Numbers, "n 3"]
+    start: Int[np.ndarray, "n"] = index_of(StripCamera.kind)
+    end: Int[np.ndarray, "n"] = index_of(StripCamera.kind)
+    value: Float[ArrayLike, "n 3"]
+    sigma: Float[ArrayLike, "n 3"]
 
-    def residual(self, start: StripCamera, end: StripCamera) -> Float[Numbers, "3"]:
+    def residual(self, start: StripCamera, end: StripCamera) -> Float[ArrayLike, "3"]:
         """Return observed minus computed step (mm)."""
         steps = (end.c_more - start.c_more, end.xp_more - start.xp_more, end.yp_more - start.yp_more)
         return self.value - jnp.stack([jnp.asarray(step) for step in steps])

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.georeferencing import Scanner, ScannerCalibration, TrajectoryKnot, corrected_return, weighted_knot
-from jaxphoto.observations.base import AbstractObservations, touching
+from jaxphoto.observations.base import AbstractObservations, index_of
 from jaxphoto.observations.on_trajectory import NORMAL, knot_columns, normal_flaws, pose_columns, weight_flaws
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw
 
@@ -46,7 +46,7 @@ class StripPlanes(AbstractObservations):
     group = "strip_planes"
     unit = "m"
     axes = ("normal",)
-    also = ("scanner", "scanner_calibration")
+    block_parameters = ("scanner", "scanner_calibration")
     observed = "gap"
     columns = {  # noqa: RUF012
         **knot_columns("_a"),
@@ -57,23 +57,23 @@ class StripPlanes(AbstractObservations):
         "gap": (),
     }
 
-    knots_a: Int[np.ndarray, "n 4"] = touching("trajectory_knots")
-    knots_b: Int[np.ndarray, "n 4"] = touching("trajectory_knots")
-    weights_a: Float[Numbers, "n 4"]
-    weights_b: Float[Numbers, "n 4"]
-    point_a: Float[Numbers, "n 3"]
-    point_b: Float[Numbers, "n 3"]
-    scanner_a: Float[Numbers, "n 3"]
-    scanner_b: Float[Numbers, "n 3"]
-    roll_pitch_yaw_a: Float[Numbers, "n 3"]
-    roll_pitch_yaw_b: Float[Numbers, "n 3"]
-    velocity_a: Float[Numbers, "n 3"]
-    velocity_b: Float[Numbers, "n 3"]
-    rate_a: Float[Numbers, "n 3"]
-    rate_b: Float[Numbers, "n 3"]
-    normal: Float[Numbers, "n 3"]
-    sigma: Float[Numbers, "n"]
-    gap: Float[Numbers, "n"]
+    knots_a: Int[np.ndarray, "n 4"] = index_of("trajectory_knots")
+    knots_b: Int[np.ndarray, "n 4"] = index_of("trajectory_knots")
+    weights_a: Float[ArrayLike, "n 4"]
+    weights_b: Float[ArrayLike, "n 4"]
+    point_a: Float[ArrayLike, "n 3"]
+    point_b: Float[ArrayLike, "n 3"]
+    scanner_a: Float[ArrayLike, "n 3"]
+    scanner_b: Float[ArrayLike, "n 3"]
+    roll_pitch_yaw_a: Float[ArrayLike, "n 3"]
+    roll_pitch_yaw_b: Float[ArrayLike, "n 3"]
+    velocity_a: Float[ArrayLike, "n 3"]
+    velocity_b: Float[ArrayLike, "n 3"]
+    rate_a: Float[ArrayLike, "n 3"]
+    rate_b: Float[ArrayLike, "n 3"]
+    normal: Float[ArrayLike, "n 3"]
+    sigma: Float[ArrayLike, "n"]
+    gap: Float[ArrayLike, "n"]
 
     def residual(
         self,
@@ -81,7 +81,7 @@ class StripPlanes(AbstractObservations):
         knots_b: TrajectoryKnot,
         scanner: Scanner | None,
         calibration: ScannerCalibration | None,
-    ) -> Float[Numbers, ""]:
+    ) -> Float[ArrayLike, ""]:
         """Return the height of b's plane above a's (m), along the normal."""
         known = scanner, calibration
         off_a, off_b = weighted_knot(knots_a, self.weights_a), weighted_knot(knots_b, self.weights_b)
@@ -90,7 +90,7 @@ class StripPlanes(AbstractObservations):
         b = return_at(self.point_b, self.scanner_b, self.roll_pitch_yaw_b, *motion_b, off_b, *known)
         return self.gap - jnp.sum(self.normal * (a - b))
 
-    def flaws(self) -> Iterator[tuple[int, str]]:
+    def validation_errors(self) -> Iterator[tuple[int, str]]:
         """Yield invalid weights and normals."""
         yield from weight_flaws(self.weights_a)
         yield from weight_flaws(self.weights_b)

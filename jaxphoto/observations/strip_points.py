@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.georeferencing import Scanner, ScannerCalibration, TrajectoryKnot, weighted_knot
-from jaxphoto.observations.base import AbstractObservations, touching
+from jaxphoto.observations.base import AbstractObservations, index_of
 from jaxphoto.observations.on_trajectory import NORMAL, knot_columns, normal_flaws, pose_columns, weight_flaws
 from jaxphoto.observations.strip_planes import return_at
 
@@ -28,21 +28,21 @@ class StripPoints(AbstractObservations):
     group = "strip_points"
     unit = "m"
     axes = ("normal",)
-    also = ("scanner", "scanner_calibration")
+    block_parameters = ("scanner", "scanner_calibration")
     observed = "rise"
     columns = knot_columns() | pose_columns("foot") | NORMAL | {"rise": ()}
 
-    point: Int[np.ndarray, "n"] = touching("point")
-    knots: Int[np.ndarray, "n 4"] = touching("trajectory_knots")
-    weights: Float[Numbers, "n 4"]
-    foot: Float[Numbers, "n 3"]
-    scanner: Float[Numbers, "n 3"]
-    roll_pitch_yaw: Float[Numbers, "n 3"]
-    velocity: Float[Numbers, "n 3"]
-    rate: Float[Numbers, "n 3"]
-    normal: Float[Numbers, "n 3"]
-    sigma: Float[Numbers, "n"]
-    rise: Float[Numbers, "n"]
+    point: Int[np.ndarray, "n"] = index_of("point")
+    knots: Int[np.ndarray, "n 4"] = index_of("trajectory_knots")
+    weights: Float[ArrayLike, "n 4"]
+    foot: Float[ArrayLike, "n 3"]
+    scanner: Float[ArrayLike, "n 3"]
+    roll_pitch_yaw: Float[ArrayLike, "n 3"]
+    velocity: Float[ArrayLike, "n 3"]
+    rate: Float[ArrayLike, "n 3"]
+    normal: Float[ArrayLike, "n 3"]
+    sigma: Float[ArrayLike, "n"]
+    rise: Float[ArrayLike, "n"]
 
     def residual(
         self,
@@ -50,14 +50,14 @@ class StripPoints(AbstractObservations):
         knots: TrajectoryKnot,
         scanner: Scanner | None,
         calibration: ScannerCalibration | None,
-    ) -> Float[Numbers, ""]:
+    ) -> Float[ArrayLike, ""]:
         """Return the height of the plane above the point (m), along its normal."""
         off = weighted_knot(knots, self.weights)
         pose = self.scanner, self.roll_pitch_yaw, self.velocity, self.rate
         foot = return_at(self.foot, *pose, off, scanner, calibration)
         return self.rise - jnp.sum(self.normal * (point - foot))
 
-    def flaws(self) -> Iterator[tuple[int, str]]:
+    def validation_errors(self) -> Iterator[tuple[int, str]]:
         """Yield invalid weights and normals."""
         yield from weight_flaws(self.weights)
         yield from normal_flaws(self.normal)

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.georeferencing import Scanner
-from jaxphoto.observations.base import AbstractObservations, touching
+from jaxphoto.observations.base import AbstractObservations, index_of
 
 
 class SurfaceRows(AbstractObservations):
@@ -22,7 +22,7 @@ class SurfaceRows(AbstractObservations):
     group = "surfaces"
     unit = "m"
     axes = ("normal",)
-    also = ("scanner",)
+    block_parameters = ("scanner",)
     observed = "rise"
     columns = {  # noqa: RUF012
         "foot": ("foot_X_m", "foot_Y_m", "foot_Z_m"),
@@ -31,21 +31,21 @@ class SurfaceRows(AbstractObservations):
         "rise": (),
     }
 
-    point: Int[np.ndarray, "n"] = touching("point")
+    point: Int[np.ndarray, "n"] = index_of("point")
     strip: Int[np.ndarray, "n"]
     """Index in `Unknowns.scanner.shifts`; 0 in a block without a scanner."""
-    foot: Float[Numbers, "n 3"]
-    normal: Float[Numbers, "n 3"]
-    turn: Float[Numbers, "n 3"]
-    sigma: Float[Numbers, "n"]
-    rise: Float[Numbers, "n"]
+    foot: Float[ArrayLike, "n 3"]
+    normal: Float[ArrayLike, "n 3"]
+    turn: Float[ArrayLike, "n 3"]
+    sigma: Float[ArrayLike, "n"]
+    rise: Float[ArrayLike, "n"]
 
     def __init__(self, point, strip, foot, normal, turn, sigma, rise=None):
         self.point, self.strip = np.asarray(point), strip
         self.foot, self.normal, self.turn, self.sigma = foot, normal, turn, sigma
         self.rise = np.zeros(np.shape(sigma)) if rise is None else rise
 
-    def residual(self, point: Float[Array, "3"], scanner: Scanner | None) -> Float[Numbers, ""]:
+    def residual(self, point: Float[Array, "3"], scanner: Scanner | None) -> Float[ArrayLike, ""]:
         """Return the height of the surface above the point (m), along its normal."""
         apart, rise = point - self.foot, jnp.zeros(())
         if scanner is not None:

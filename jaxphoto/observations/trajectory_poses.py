@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.georeferencing import TrajectoryKnot, attitude_residual, recorded_attitude, weighted_knot
 from jaxphoto.observations.attitudes import ATTITUDE_AXES
-from jaxphoto.observations.base import AXES, AbstractCoordinates, AbstractObservations, ImageState, touching
+from jaxphoto.observations.base import AXES, AbstractCoordinates, AbstractObservations, ImageState, index_of
 from jaxphoto.observations.on_trajectory import knot_columns, weight_flaws
 from jaxphoto.observations.stations import station_of
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw, small_rotation
@@ -37,19 +37,19 @@ class TrajectoryStations(AbstractCoordinates):
     unit = "m"
     columns = knot_columns() | {"who": "image"}
 
-    who: Int[np.ndarray, "n"] = touching("image")
-    knots: Int[np.ndarray, "n 4"] = touching("trajectory_knots")
-    weights: Float[Numbers, "n 4"]
+    who: Int[np.ndarray, "n"] = index_of("image")
+    knots: Int[np.ndarray, "n 4"] = index_of("trajectory_knots")
+    weights: Float[ArrayLike, "n 4"]
     axis: Int[np.ndarray, "n"]
-    value: Float[Numbers, "n"]
-    sigma: Float[Numbers, "n"]
+    value: Float[ArrayLike, "n"]
+    sigma: Float[ArrayLike, "n"]
 
-    def residual(self, image: ImageState, knots: TrajectoryKnot) -> Float[Numbers, ""]:
+    def residual(self, image: ImageState, knots: TrajectoryKnot) -> Float[ArrayLike, ""]:
         """Return observed minus computed (m)."""
         off = weighted_knot(knots, self.weights)
         return self.value - (station_of(image) + off.position)[self.axis]
 
-    def flaws(self) -> Iterator[tuple[int, str]]:
+    def validation_errors(self) -> Iterator[tuple[int, str]]:
         """Yield invalid weights and axes."""
         yield from weight_flaws(self.weights)
         for row in np.flatnonzero(~np.isin(self.axis, (0, 1, 2))):
@@ -70,11 +70,11 @@ class TrajectoryAttitudes(AbstractObservations):
     observed = "roll_pitch_yaw"
     columns = knot_columns() | {"roll_pitch_yaw": tuple(f"{axis}_deg" for axis in ATTITUDE_AXES)}
 
-    image: Int[np.ndarray, "n"] = touching("image")
-    knots: Int[np.ndarray, "n 4"] = touching("trajectory_knots")
-    weights: Float[Numbers, "n 4"]
-    roll_pitch_yaw: Float[Numbers, "n 3"]
-    sigma: Float[Numbers, "n 3"]
+    image: Int[np.ndarray, "n"] = index_of("image")
+    knots: Int[np.ndarray, "n 4"] = index_of("trajectory_knots")
+    weights: Float[ArrayLike, "n 4"]
+    roll_pitch_yaw: Float[ArrayLike, "n 3"]
+    sigma: Float[ArrayLike, "n 3"]
 
     def residual(self, image: ImageState, knots: TrajectoryKnot) -> Float[Array, "3"]:
         """Return observed minus computed as a small rotation (rad); see `georeferencing.attitude_residual`."""
@@ -83,7 +83,7 @@ class TrajectoryAttitudes(AbstractObservations):
         computed = recorded_attitude(image.camera_from_object, image.mount, image.exposure)
         return attitude_residual(jnp.matmul(observed, small_rotation(off.attitude)), computed)
 
-    def flaws(self) -> Iterator[tuple[int, str]]:
+    def validation_errors(self) -> Iterator[tuple[int, str]]:
         """Yield invalid weights."""
         return weight_flaws(self.weights)
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.adjustment import LEAST, MAX_STEPS, Adjustment, Outcome, Sizes, solve
+from jaxphoto.adjustment import MAX_STEPS, MINIMAL_SIZES, Adjustment, Outcome, PaddedSizes, solve
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.arrays import is_traced
 from jaxphoto.block import Block, sensor_rows
@@ -45,7 +45,7 @@ def adjust(
     *,
     more: Sequence[AbstractObservations | KnownParameters] = (),
     max_steps: int = MAX_STEPS,
-    sizes: Sizes = LEAST,
+    sizes: PaddedSizes = MINIMAL_SIZES,
 ) -> Adjustment:
     """Self-calibrating bundle adjustment of `block`.
 
@@ -86,7 +86,7 @@ def adjust_for_tables(
     block: Block,
     max_steps: int = MAX_STEPS,
     report: Callable[[str], object] = lambda text: None,
-    sizes: Sizes = LEAST,
+    sizes: PaddedSizes = MINIMAL_SIZES,
 ) -> Adjustment:
     """`adjust`, with what tables and report will want compiled meanwhile; `report` is told what is being done.
 
@@ -166,7 +166,7 @@ def _without_points_gone(adjusted: Adjustment, from_start: _FromStart) -> Adjust
         return adjusted
     block, found, names = adjusted.block, adjusted, list[str]()
     most = _GONE * len(block.points)
-    while (gone := found.astray).any() and len(names) + gone.sum() <= most:
+    while (gone := found.diverged_points).any() and len(names) + gone.sum() <= most:
         rows = gone[found.block.image_points.point]
         part, kept = without_observations(found.block, {IMAGE_POINTS: rows})
         if len(kept) == len(gone):
@@ -213,8 +213,8 @@ def _better(one: Adjustment, other: Adjustment | None) -> bool:
     """Whether an adjustment from elsewhere is an optimum, and fits; or fits incomparably better than another."""
     if not bool(one.converged):
         return False
-    least = np.inf if other is None else float(np.nan_to_num(other.square_sum, nan=np.inf))
-    return float(one.square_sum) < (1.0 if float(one.sigma0) < ABSURD else _FAR_BETTER) * least
+    least = np.inf if other is None else float(np.nan_to_num(other.sum_of_squares, nan=np.inf))
+    return float(one.sum_of_squares) < (1.0 if float(one.sigma0) < ABSURD else _FAR_BETTER) * least
 
 
 def _somewhere(adjusted: Adjustment, max_steps: int) -> bool:

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.arrays import on_device
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.block import Block
 from jaxphoto.compiling import jit_quickly
 from jaxphoto.georeferencing import Mount
@@ -160,13 +160,13 @@ def with_attitudes(block: Block, recorded: RecordedTurn) -> Block:
     """`block` with the attitudes observed, of a camera that looks down with the top of its pictures forward."""
     angles = _roll_pitch_yaw(recorded.local_from_camera)
     zero = np.zeros(3)
-    mount = Mount(on_device(zero), on_device(zero), on_device(0.0), "right")  # type: ignore[arg-type]
+    mount = Mount(as_jax_array(zero), as_jax_array(zero), as_jax_array(0.0), "right")  # type: ignore[arg-type]
     boresight = Weighted(zero, np.deg2rad(BORESIGHT_DEG))
     prior = Mount(FIXED, boresight, FIXED, "right")  # type: ignore[arg-type]
     unknowns = dataclasses.replace(block.start.unknowns, mounts={_MOUNT: mount})
     return dataclasses.replace(
         block,
-        attitudes=Attitudes(recorded.image, on_device(np.asarray(angles)), on_device(recorded.sigma_rad)),
+        attitudes=Attitudes(recorded.image, as_jax_array(np.asarray(angles)), as_jax_array(recorded.sigma_rad)),
         image_mount=(_MOUNT,) * len(block.images),
         start=dataclasses.replace(block.start, unknowns=unknowns),
         priors=dataclasses.replace(block.priors, mounts={_MOUNT: prior}),

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment import Adjustment, Sizes, linearise
+from jaxphoto.adjustment import Adjustment, PaddedSizes, linearise
 from jaxphoto.block import Block
 from jaxphoto.losses import AbstractLoss, Tukey
 from jaxphoto.observations import AbstractCoordinates, AbstractObservations
@@ -58,14 +58,14 @@ def beginnings(
     start: Unknowns | None,
     loss: AbstractLoss | None,
     max_steps: int,
-    sizes: Sizes,
+    sizes: PaddedSizes,
     report: Callable[[str], object],
 ) -> Iterator[Callable[[], Begun]]:
     """Yield initial solutions, to be tried until one fits; with a `loss` only that one. Raises what `adjust` raises."""
 
     def robustly(loss: AbstractLoss) -> Begun:
         begun = robust(block, loss, from_all(), max_steps=max_steps, sizes=sizes, report=report)
-        return Begun(begun.at, checked_parts(begun.at), begun.astray)
+        return Begun(begun.at, checked_parts(begun.at), begun.diverged_points)
 
     @cache
     def from_all() -> Unknowns:
@@ -88,7 +88,7 @@ def without_what_is_alike(
     start: Unknowns | None,
     found: Adjustment,
     max_steps: int,
-    sizes: Sizes,
+    sizes: PaddedSizes,
     report: Callable[[str], object],
 ) -> Iterator[tuple[Masks, Callable[[], Begun]]]:
     """Return an initial solution without rows that share an error along an axis of their group.
@@ -107,7 +107,7 @@ def _without(
     block: Block,
     start: Unknowns | None,
     max_steps: int,
-    sizes: Sizes,
+    sizes: PaddedSizes,
     report: Callable[[str], object],
     out: Masks,
 ) -> Begun:
@@ -123,7 +123,7 @@ def _reweighted(
     block: Block,
     start: Unknowns,
     max_steps: int,
-    sizes: Sizes,
+    sizes: PaddedSizes,
     report: Callable[[str], object],
     least: Mapping[str, float | np.ndarray],
 ) -> Begun:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.observations import AXES
 from jaxphoto.procedures.fit import fit
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics import (
     LEVEL,
     Covariance,
@@ -41,7 +41,7 @@ _ANGLES = {"x": "d-omega", "y": "d-phi", "z": "d-kappa"}
 _UNITS = {"_m_per_s": "m/s", "_mm": "mm", "_deg": "deg", "_m": "m", "_s": "s"}
 
 
-@shown
+@pretty_repr
 class BoresightEstimate(NamedTuple):
     """Estimate of a step, in `unit` (angles in degrees); sigma is a posteriori."""
 
@@ -51,7 +51,7 @@ class BoresightEstimate(NamedTuple):
     unit: str
 
 
-@shown
+@pretty_repr
 class Step(eqx.Module):
     """Step of a boresight calibration: its adjustment and conclusions.
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxphoto.arrays import on_device
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.block import Block
 from jaxphoto.camera import AbstractDistortion, InteriorOrientation, Sensor, exact, get_parameter, set_parameter
 from jaxphoto.camera.conversion import fitted
@@ -78,7 +78,7 @@ def _start(given: InteriorOrientation, candidate: Candidate, sensor: Sensor) -> 
     interior = dataclasses.replace(interior, residuals="measured")
     for name in held:
         interior = set_parameter(interior, name, 0.0)
-    return jax.tree.map(on_device, interior)
+    return jax.tree.map(as_jax_array, interior)
 
 
 def _priors(given: InteriorOrientation, priors, interior: InteriorOrientation, free: tuple[str, ...]):

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.block_edits import one_camera
 from jaxphoto.camera import parameter_names
 from jaxphoto.errors import InputError
@@ -20,7 +20,7 @@ def compare(
     camera: str | None = None,
     camera_b: str | None = None,
     *,
-    points: Float[Numbers, "points 2"] | None = None,
+    points: Float[ArrayLike, "points 2"] | None = None,
     method: Method = "rot",
 ) -> Change:
     """Compare a camera in two adjustments of different photographs: by parameters, and by its bundle of rays.

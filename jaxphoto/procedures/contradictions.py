@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment import Adjustment, Sizes, linearise
+from jaxphoto.adjustment import Adjustment, PaddedSizes, linearise
 from jaxphoto.procedures.beginnings import weighed
 from jaxphoto.procedures.robust import Blocks, Masks, checked_parts
 from jaxphoto.statistics import LEAST_CHECKED, LEVEL, UNCHECKED, chi_square_limit
@@ -33,7 +33,7 @@ def row_sizes(at: Adjustment, r: Blocks, predicted: bool = False) -> dict[str, F
     return found
 
 
-def predicted_parts(at: Adjustment, left: Masks, sizes: Sizes) -> Blocks:
+def predicted_parts(at: Adjustment, left: Masks, sizes: PaddedSizes) -> Blocks:
     """Return `checked_parts`, of rejected rows as if each was added to the others, which then predict it."""
     rows = at.block.named_observations
     weak = {name: weighed(own, np.where(left[name], _WEAK**-2, 1.0)) for name, own in rows.items()}

@@ -11,14 +11,14 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxphoto.adjustment import Sizes, common_sizes
-from jaxphoto.arrays import still
+from jaxphoto.adjustment import PaddedSizes, common_sizes
+from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block, bent_cameras
 from jaxphoto.collinearity import ExteriorOrientation, image_residual
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import apparent_point
-from jaxphoto.observations import ImageRows
+from jaxphoto.observations import ImagePoints
 from jaxphoto.unknowns import Unknowns
 
 _LEAST_RAYS = 2
@@ -52,11 +52,11 @@ def folds(block: Block, k: int, seed: int = 0) -> Int[np.ndarray, "rows"]:
 def without_rows(block: Block, left_out: Bool[np.ndarray, "rows"]) -> Block:
     """Remove some image points of the block."""
     kept, p = ~left_out, block.image_points
-    rows = ImageRows(p.image[kept], p.point[kept], still(p.xy)[kept], still(p.sigma)[kept])
+    rows = ImagePoints(p.image[kept], p.point[kept], to_numpy(p.xy)[kept], to_numpy(p.sigma)[kept])
     return dataclasses.replace(block, image_points=rows)
 
 
-def fold_blocks(block: Block, fold: Int[np.ndarray, "rows"]) -> tuple[list[Block], Sizes]:
+def fold_blocks(block: Block, fold: Int[np.ndarray, "rows"]) -> tuple[list[Block], PaddedSizes]:
     """Return the block without each of the folds, and sizes that fit these and the block itself."""
     parts = [without_rows(block, fold == k) for k in range(fold.max() + 1)]
     return parts, common_sizes([block, *parts])
@@ -70,16 +70,16 @@ def measured_discrepancies(block: Block, unknowns: Unknowns) -> Float[np.ndarray
     p = block.image_points
     found = np.zeros((len(p.image), 2))
     camera = np.array(block.image_camera, object)[p.image]
-    positions, matrices = (still(v) for v in (unknowns.exterior.position, unknowns.exterior.camera_from_object))
+    positions, matrices = (to_numpy(v) for v in (unknowns.exterior.position, unknowns.exterior.camera_from_object))
     bent = bent_cameras(block, unknowns)
     for name, interior in unknowns.interior.items():
         own = np.flatnonzero(camera == name)
         if len(own):
             image, point = p.image[own], p.point[own]
             exterior = ExteriorOrientation(positions[image], matrices[image])
-            taken = interior if bent is None else jax.tree.map(lambda v: still(v)[image], bent[name])  # noqa: B023
+            taken = interior if bent is None else jax.tree.map(lambda v: to_numpy(v)[image], bent[name])  # noqa: B023
             numbers = jax.tree.map(lambda v: np.asarray(v, float), dataclasses.replace(taken, residuals="measured"))
-            rows = (exterior, still(unknowns.points)[point], still(p.xy)[own])
+            rows = (exterior, to_numpy(unknowns.points)[point], to_numpy(p.xy)[own])
             found[own] = call_compiled(_discrepancies, numbers, *rows, block.corrections, bent is not None)
     return found
 

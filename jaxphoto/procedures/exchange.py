@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block
 from jaxphoto.initial.rays import camera_rays, turn_to_object
 from jaxphoto.procedures.robust import Masks
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 
-@shown
+@pretty_repr
 class Exchange(NamedTuple):
     """Rows of a group that exchange observed values and standard deviations."""
 
@@ -41,7 +41,7 @@ def exchanged(block: Block, left: Masks, exchange: Exchange) -> tuple[Block, Mas
     order = np.arange(len(rows))
     for own in exchange.rows:
         order[list(own)] = np.roll(own, -1)
-    new, sigma = rows.with_observation(still(rows.observation)[order]), still(rows.sigmas)
+    new, sigma = rows.with_observation(to_numpy(rows.observation)[order]), to_numpy(rows.sigmas)
     new = new.with_sigmas_times(sigma[order] / sigma)
     left = left | {group: _marked(left[group], back, False) for group, back in exchange.back.items()}
     left = left | {exchange.group: _marked(left[exchange.group], exchange.out, True)} if exchange.out else left
@@ -62,7 +62,7 @@ def with_what_rests_on_them(done: Sequence[Exchange], wrong: Sequence[bool]) -> 
 
 def with_places(at: Adjustment, places: Mapping[int, Float[np.ndarray, "3"]]) -> Adjustment:
     """Return `at` with points at these places (m)."""
-    points = np.array(still(at.unknowns.points))
+    points = np.array(to_numpy(at.unknowns.points))
     for point, place in places.items():
         points[point] = place
     return eqx.tree_at(lambda a: a.unknowns.points, at, points)
@@ -75,13 +75,13 @@ def rays_of(
     camera.
     """
     block, exterior = at.block, at.unknowns.exterior
-    p, measured = block.image_points, still(block.image_points.xy)
+    p, measured = block.image_points, to_numpy(block.image_points.xy)
     camera, rays, c = np.array(block.image_camera, object)[p.image], np.zeros((len(p), 3)), np.ones(len(p))
     for name, interior in at.unknowns.interior.items():
         own = camera == name
         if own.any():
             rays[own], c[own] = camera_rays(interior, measured[own]), float(interior.c)
-    return still(exterior.position)[p.image], turn_to_object(still(exterior.camera_from_object), p.image, rays), c
+    return to_numpy(exterior.position)[p.image], turn_to_object(to_numpy(exterior.camera_from_object), p.image, rays), c
 
 
 def _marked(left: np.ndarray, rows: tuple[int, ...], out: bool) -> np.ndarray:

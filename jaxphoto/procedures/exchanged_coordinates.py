@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxphoto.adjustment import Adjustment, Sizes, linearise
-from jaxphoto.arrays import still
+from jaxphoto.adjustment import Adjustment, PaddedSizes, linearise
+from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError, few
@@ -35,7 +35,7 @@ _DOUBTED = 0.25
 
 
 def coordinate_exchanges(
-    at: Adjustment, left: Masks, gone: Int[np.ndarray, "points"], sizes: Sizes
+    at: Adjustment, left: Masks, gone: Int[np.ndarray, "points"], sizes: PaddedSizes
 ) -> tuple[list[Exchange], Adjustment]:
     """Return exchanges that resolve rejected rows `left` and points that are `gone`; `at` is the linearised block.
 
@@ -45,7 +45,7 @@ def coordinate_exchanges(
     for group, rows in at.block.named_observations.items():
         if not isinstance(rows, AbstractCoordinates) or len(rows.indices()) != 1:
             continue
-        ((what, who),) = ((what, still(index)) for what, index in rows.indices())
+        ((what, who),) = ((what, to_numpy(index)) for what, index in rows.indices())
         doubted = _doubted(at.block, left, group, what, who, gone)
         if len(doubted) < 2:
             continue
@@ -56,7 +56,7 @@ def coordinate_exchanges(
         else:
             by_images, placed = _placed_images(at, doubted, gone)
         there = linearise(at.block, by_images.unknowns, at.block.priors, sizes)
-        off = np.where(np.isin(who, placed), rows.physical(still(there.residuals[group])), np.nan)
+        off = np.where(np.isin(who, placed), rows.physical(to_numpy(there.residuals[group])), np.nan)
         near = _NEARER if left[group].all() else _NEAR
         if new := [_exchange(at.block, rows, what, *own) for own in _rounds(rows, who, doubted, off, near)]:
             found, at = found + new, by_images
@@ -74,7 +74,7 @@ def as_one(block: Block, done: Sequence[Exchange], left: Masks) -> list[Exchange
         if not isinstance(rows, AbstractCoordinates) or not own:
             found += own
             continue
-        ((what, who),) = ((what, still(index)) for what, index in rows.indices())
+        ((what, who),) = ((what, to_numpy(index)) for what, index in rows.indices())
         order, out = np.arange(len(rows)), left[group]
         for one in (one for e in own for one in e.rows):
             order[list(one)] = order[np.roll(one, -1)]
@@ -153,8 +153,8 @@ def _placed_images(
     Points are intersected from other images, if these suffice: an image with a wrong station has distorted them.
     """
     block, exterior = at.block, at.unknowns.exterior
-    p, points = block.image_points, still(at.unknowns.points)
-    positions, matrices = (np.array(still(v)) for v in (exterior.position, exterior.camera_from_object))
+    p, points = block.image_points, to_numpy(at.unknowns.points)
+    positions, matrices = (np.array(to_numpy(v)) for v in (exterior.position, exterior.camera_from_object))
     placed = []
     for image in images.tolist():
         own = np.flatnonzero((p.image == image) & ~np.isin(p.point, gone))
@@ -164,10 +164,10 @@ def _placed_images(
         chosen = np.isfinite(places[which]).all(axis=1)
         interior = at.unknowns.interior[block.image_camera[image]]
         try:
-            seen = resect(interior, still(p.xy)[own[chosen]], places[which[chosen]], block.images[image])
+            seen = resect(interior, to_numpy(p.xy)[own[chosen]], places[which[chosen]], block.images[image])
         except BlockError:
             continue
-        positions[image], matrices[image] = still(seen.position), still(seen.camera_from_object)
+        positions[image], matrices[image] = to_numpy(seen.position), to_numpy(seen.camera_from_object)
         placed.append(image)
     new = ExteriorOrientation(jnp.asarray(positions), jnp.asarray(matrices))
     at = eqx.tree_at(lambda a: a.unknowns.exterior, at, new)

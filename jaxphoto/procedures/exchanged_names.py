@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block
 from jaxphoto.initial.intersection import intersect_points
 from jaxphoto.procedures.cross_validation import measured_discrepancies
@@ -99,10 +99,10 @@ def put_back(block: Block, left: Masks, points: Iterable[int]) -> Masks:
 def _seen(at: Adjustment, left: Masks, gone: Int[np.ndarray, "points"], sigma0: float) -> _Seen:
     block, unknowns = at.block, at.unknowns
     p = block.image_points
-    measured = still(p.xy)
+    measured = to_numpy(p.xy)
     origins, directions, c = rays_of(at)
     is_gone = np.isin(np.arange(len(block.points)), gone)
-    far = np.linalg.norm(still(unknowns.points)[p.point] - origins, axis=1)
+    far = np.linalg.norm(to_numpy(unknowns.points)[p.point] - origins, axis=1)
     depths = np.tile([np.inf, 0.0], (len(block.images), 1))
     sound = ~is_gone[p.point] & ~left[p.group]
     np.minimum.at(depths[:, 0], p.image[sound], far[sound])
@@ -115,7 +115,7 @@ def _seen(at: Adjustment, left: Masks, gone: Int[np.ndarray, "points"], sigma0: 
         left[p.group],
         origins,
         directions,
-        still(p.sigma).mean(axis=1) / c,
+        to_numpy(p.sigma).mean(axis=1) / c,
         depths * [1 / _DEPTH, _DEPTH],
         sigma0**2 * float(chi_square_limit(np.array(1), LEVEL / len(p))),
     )
@@ -195,7 +195,7 @@ def _predicted(at: Adjustment, seen: _Seen, pair: tuple[int, int], r: Blocks, si
         return True
     # Far from the prediction a difference is not a measure: repeat with exchanged names.
     block, _ = exchanged(at.block, {}, Exchange(p.group, (pair,), "", {}))
-    off = (measured_discrepancies(block, at.unknowns) / still(p.sigma))[staying]
+    off = (measured_discrepancies(block, at.unknowns) / to_numpy(p.sigma))[staying]
     # Both coordinates of a point are tested; like all others, against all others.
     limit = sigma0**2 * float(chi_square_limit(np.array(2), LEVEL / len(p)))
     return bool(np.all(np.einsum("ni,nij,nj->n", off, r[p.group][staying], off) < limit))

@@ -18,7 +18,7 @@ _SHOWN = 4
 def fit(adjusted: Adjustment, cov: Covariance) -> tuple[list[str], bool]:
     """Return messages about sigma0, blunders and residuals of control; and True if all is consistent."""
     sigma0, redundancy = float(adjusted.sigma0), adjusted.redundancy
-    p = chi_square_p(float(adjusted.square_sum), redundancy)
+    p = chi_square_p(float(adjusted.sum_of_squares), redundancy)
     found = f"sigma0 {sigma0:.3f} with redundancy {redundancy}"
     test = f"(chi-square test, p = {p:.2g})"
     large = p < LEVEL and sigma0 > LARGE_SIGMA0

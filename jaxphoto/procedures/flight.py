@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from jaxphoto.adjustment import LEAST, Adjustment
+from jaxphoto.adjustment import MINIMAL_SIZES, Adjustment
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import BlockError, DatumError, GroupsError, InputError, RankError
@@ -146,7 +146,7 @@ def _calibrated(
         controlled, no_control = controlled_or_why(block, known.control, known.code, known.vertical, report)
     try:
         # Without positions it is the network that the orientation ended with, which needs no other program.
-        sizes = LEAST if placed else oriented.sizes
+        sizes = MINIMAL_SIZES if placed else oriented.sizes
         adjusted = controlled.adjusted if controlled else adjust_for_tables(block, sizes=sizes)
     except (InputError, BlockError, DatumError, RankError) as error:
         if placed is None:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.adjustment.model.parameter_tables import scalar_priors
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.block import Block, SensorRows, direct_exterior, sensor_rows
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names
 from jaxphoto.collinearity import ExteriorOrientation
@@ -34,8 +34,8 @@ from jaxphoto.georeferencing.intersection_covariance import (
 )
 from jaxphoto.initial import intersect_points
 from jaxphoto.initial.rays import camera_rays, padded_length, turn_to_object
-from jaxphoto.observations import ControlRows
-from jaxphoto.short_repr import shown
+from jaxphoto.observations import ControlCoordinates
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.tracing import outside_transformations
 from jaxphoto.unknowns import Weighted
 
@@ -43,7 +43,7 @@ from jaxphoto.unknowns import Weighted
 _STEPS = 4
 
 
-@shown
+@pretty_repr
 class Georeferenced(eqx.Module):
     """What GNSS, IMU, mount and camera give without an adjustment. All covariances are a priori."""
 
@@ -52,13 +52,13 @@ class Georeferenced(eqx.Module):
     points: tuple[str, ...] = eqx.field(static=True)
     """The points that at least two of them show from two sides."""
     exterior: ExteriorOrientation
-    exterior_covariance: Float[Numbers, "images 6 6"]
+    exterior_covariance: Float[ArrayLike, "images 6 6"]
     """Of X, Y, Z (m) and a small rotation in the camera frame (rad)."""
     positions: Float[np.ndarray, "points 3"]
     """Of `points`, m."""
     covariance: Float[np.ndarray, "points 3 3"]
     """Of `positions` (m^2), errors that images share by a mount or a camera included."""
-    discrepancies: ControlRows
+    discrepancies: ControlCoordinates
     """Surveyed minus computed (m) at control, fixed and check points, with the survey's sigmas; `who`: of `points`."""
 
     @property
@@ -108,7 +108,7 @@ def georeference(block: Block) -> Georeferenced:
         sigma = _sigmas([get_parameter(interior, parameter) for parameter in parameter_names(interior)])
         covariance += _shared_covariance(rays.gain[rows], by_interior, np.diag(sigma**2), point[rows], n)
 
-    surveyed = ControlRows.joined(block.control, block.fixed, block.check)
+    surveyed = ControlCoordinates.joined(block.control, block.fixed, block.check)
     place = np.full(len(block.points), -1)
     place[shown] = np.arange(n)
     known = surveyed.take(place[surveyed.who] >= 0)
@@ -120,7 +120,9 @@ def georeference(block: Block) -> Georeferenced:
         exterior_covariance=own + _propagated(by.mount, of_image),
         positions=positions,
         covariance=np.asarray(covariance),
-        discrepancies=ControlRows(who, known.axis, np.asarray(known.value) - positions[who, known.axis], known.sigma),
+        discrepancies=ControlCoordinates(
+            who, known.axis, np.asarray(known.value) - positions[who, known.axis], known.sigma
+        ),
     )
 
 
@@ -180,7 +182,7 @@ def _intersected(
     return _Rays(image, point, gain, sigma, by_exterior, by_interior), points, shown
 
 
-def _propagated(by: Float[np.ndarray, "n 6 m"], sigma: Float[Numbers, "n m"]) -> Float[np.ndarray, "n 6 6"]:
+def _propagated(by: Float[np.ndarray, "n 6 m"], sigma: Float[ArrayLike, "n m"]) -> Float[np.ndarray, "n 6 6"]:
     return np.einsum("nij,nj,nkj->nik", by, np.asarray(sigma) ** 2, by)
 
 

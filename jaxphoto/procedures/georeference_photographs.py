@@ -25,7 +25,7 @@ from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.map_frame import MapFrame, map_name
 from jaxphoto.initial.rays import padded, padded_length
 from jaxphoto.least_squares import least_squares
-from jaxphoto.observations import StationRows
+from jaxphoto.observations import CameraPositions
 from jaxphoto.procedures.attitudes_of_photographs import RecordedTurn, recorded_turn, with_attitudes
 from jaxphoto.procedures.georeferencing_words import LEVEL_WORDS, attitude_words, position_words
 from jaxphoto.procedures.level_strip import is_line, level_turn
@@ -128,7 +128,7 @@ def georeference_photographs(
         similarity = _nearest(similarity, there[used], here[used], sigma[used], helping)
     _check_upright(block, similarity)
     rows, axis = np.flatnonzero(used).repeat(3), np.tile(np.arange(3), used.sum())
-    stations = StationRows(image[rows], axis, raw[rows, axis], sigma[rows, axis])
+    stations = CameraPositions(image[rows], axis, raw[rows, axis], sigma[rows, axis])
     placed = dataclasses.replace(
         with_part_shifts(similarity.of_block(block), parts, image),
         stations=stations,

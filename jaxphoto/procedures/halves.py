@@ -17,12 +17,12 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float
 
-from jaxphoto.adjustment import Adjustment, Sizes, common_sizes
+from jaxphoto.adjustment import Adjustment, PaddedSizes, common_sizes
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, parameter_names
 from jaxphoto.errors import BlockError, DatumError, InputError, RankError
 from jaxphoto.procedures.adjust import adjust
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.stability import (
     Differences,
     ErrorBand,
@@ -60,7 +60,7 @@ class Cut(NamedTuple):
     jacobian_px: Float[np.ndarray, "coordinates parameters"] = np.zeros((0, 0))
 
 
-@shown
+@pretty_repr
 class Halves(NamedTuple):
     """A calibration by a whole block, its halves, and how far its standard deviations can be believed."""
 
@@ -225,7 +225,7 @@ def _balanced(units: int, rng: np.random.Generator) -> Bool[np.ndarray, "cuts un
 
 
 def halved(
-    adjusted: Adjustment, first: np.ndarray, camera: str, cells_mm: np.ndarray, method: Method, sizes: Sizes
+    adjusted: Adjustment, first: np.ndarray, camera: str, cells_mm: np.ndarray, method: Method, sizes: PaddedSizes
 ) -> Cut:
     """The images `first` of an adjusted block and the others, adjusted for themselves and compared at `cells_mm`."""
     block = adjusted.block

@@ -9,7 +9,7 @@ from itertools import permutations
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError
 from jaxphoto.initial import resect
@@ -50,10 +50,10 @@ def coordinate_mistakes(snooped: Snooped, block: Block) -> dict[str, str]:
 def is_mirrored(snooped: Snooped, block: Block, image: int) -> bool:
     """Whether an image of `block` that does not fit does so once it is turned over, seen from where the others are."""
     adjusted, p = snooped.adjusted, block.image_points
-    place = dict(zip(adjusted.block.points, still(adjusted.unknowns.points), strict=True))
+    place = dict(zip(adjusted.block.points, to_numpy(adjusted.unknowns.points), strict=True))
     own = np.flatnonzero((p.image == image) & np.isin(np.array(block.points, object)[p.point], list(place)))
     points = np.array([place[block.points[k]] for k in p.point[own]]).reshape(-1, 3)
-    interior, xy = adjusted.unknowns.interior[block.image_camera[image]], still(p.xy)[own]
+    interior, xy = adjusted.unknowns.interior[block.image_camera[image]], to_numpy(p.xy)[own]
     mirrored = xy * [-1.0, 1.0]
     try:
         seen = resect(interior, mirrored, points, block.images[image])
@@ -63,14 +63,14 @@ def is_mirrored(snooped: Snooped, block: Block, image: int) -> bool:
         float(interior.c),
         ideal_coordinates(interior, mirrored),
         points,
-        still(seen.position)[None],
-        still(seen.camera_from_object)[None],
+        to_numpy(seen.position)[None],
+        to_numpy(seen.camera_from_object)[None],
     )
-    others = still(adjusted.unknowns.exterior.position).mean(axis=0)
+    others = to_numpy(adjusted.unknowns.exterior.position).mean(axis=0)
     # Flat ground that is turned over is as well seen from beneath.
-    if (others - points.mean(axis=0)) @ (still(seen.position) - points.mean(axis=0)) <= 0:
+    if (others - points.mean(axis=0)) @ (to_numpy(seen.position) - points.mean(axis=0)) <= 0:
         return False
-    return bool(np.median(off) < _FIT * np.median(still(p.sigma)[own]))
+    return bool(np.median(off) < _FIT * np.median(to_numpy(p.sigma)[own]))
 
 
 def _said_and_seen(
@@ -78,7 +78,7 @@ def _said_and_seen(
 ) -> tuple[Float[np.ndarray, "who 3"], Float[np.ndarray, "who 3"]]:
     """What was given of each point or image, and where the others put it (m); no number where there is none."""
     said = np.full((int(rows.who.max()) + 1, 3), np.nan)
-    said[rows.who, rows.axis] = still(rows.value)
+    said[rows.who, rows.axis] = to_numpy(rows.value)
     seen = said.copy()
     for s in snooped.left_out:
         if s.group == name:

@@ -22,7 +22,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-from jaxphoto.adjustment import Adjustment, Sizes
+from jaxphoto.adjustment import Adjustment, PaddedSizes
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError, DatumError, InputError, RankError
 from jaxphoto.procedures.adjust import adjust
@@ -48,7 +48,7 @@ class Judged(NamedTuple):
     n_parameters: int = 0
     n_effective: int = 0
     redundancy: int = 0
-    square_sum: float = _NAN
+    sum_of_squares: float = _NAN
     rms_px: float = _NAN
     cv_rms_px: float = _NAN
     cv_excess: float = _NAN
@@ -64,7 +64,7 @@ class Judged(NamedTuple):
     @property
     def sigma0(self) -> float:
         """Of residuals of measured coordinates."""
-        return float(np.sqrt(self.square_sum / self.redundancy)) if self.redundancy > 0 else _NAN
+        return float(np.sqrt(self.sum_of_squares / self.redundancy)) if self.redundancy > 0 else _NAN
 
     @property
     def weakest(self) -> Significance | None:
@@ -135,7 +135,7 @@ def _judge(candidate: Candidate, adjusted: Adjustment) -> Judged:
     if not bool(adjusted.converged):
         return Judged(candidate, adjusted.outcome.value)
     block = adjusted.block
-    apart, s = measured_discrepancies(block, adjusted.unknowns), float(adjusted.square_sum)
+    apart, s = measured_discrepancies(block, adjusted.unknowns), float(adjusted.sum_of_squares)
     p, r = adjusted.n_unknowns["interior"], adjusted.redundancy
     n = r + p
     fit = n * np.log(s / n) if r > 0 else _NAN
@@ -145,7 +145,7 @@ def _judge(candidate: Candidate, adjusted: Adjustment) -> Judged:
         n_parameters=p,
         n_effective=n,
         redundancy=r,
-        square_sum=s,
+        sum_of_squares=s,
         rms_px=float(np.sqrt(np.mean(_squares_px(block, apart)))),
         aic=aic,
         aicc=aic + 2 * (p + 1) * (p + 2) / (n - p - 2) if n > p + 2 else _NAN,
@@ -161,7 +161,7 @@ def _squares_px(block: Block, apart_mm: Float[np.ndarray, "rows 2"]) -> Float[np
 
 
 def _predicted(
-    block: Block, adjusted: Adjustment, fold: np.ndarray, sizes: Sizes, counted: Callable[[int], object]
+    block: Block, adjusted: Adjustment, fold: np.ndarray, sizes: PaddedSizes, counted: Callable[[int], object]
 ) -> Float[np.ndarray, "left_out"] | None:
     """Squared prediction errors (px) of all rows that are ever left out; None where a fold does not converge."""
     if not bool(adjusted.converged):
@@ -207,5 +207,5 @@ def _f_test(smaller: Judged, larger: Judged) -> tuple[float, float]:
     more = larger.n_parameters - smaller.n_parameters
     if larger.redundancy <= 0 or more <= 0:
         return _NAN, _NAN
-    f = (smaller.square_sum - larger.square_sum) / more / (larger.square_sum / larger.redundancy)
+    f = (smaller.sum_of_squares - larger.sum_of_squares) / more / (larger.sum_of_squares / larger.redundancy)
     return f, float(scipy.special.fdtrc(more, larger.redundancy, max(f, 0.0)))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.arrays import on_device, still
+from jaxphoto.arrays import as_jax_array, to_numpy
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import RigCamera, rig_turn
@@ -59,7 +59,7 @@ def with_rig(block: Block, reference: str, place_m: float, turn_rad: float) -> B
                 f"no images of cameras {camera} and {reference} in one event have approximate orientations, so nothing "
                 f"says where {camera} is in the rig; orient the block first"
             )
-        start[camera] = RigCamera(*map(on_device, _middle(block, at[mine], image[mine])))
+        start[camera] = RigCamera(*map(as_jax_array, _middle(block, at[mine], image[mine])))
     free: Any = {camera: RigCamera(FREE, FREE, FIXED) for camera in start}  # type: ignore[arg-type]
     unknowns = dataclasses.replace(block.start.unknowns, more=block.start.unknowns.more | {RigCamera.kind: start})
     return dataclasses.replace(
@@ -90,7 +90,7 @@ def _middle(
     Turns are median matrices made orthogonal again: rotation vectors of half a turn may have either sign.
     """
     exterior = block.start.unknowns.exterior
-    position, rotation = still(exterior.position), still(exterior.camera_from_object)
+    position, rotation = to_numpy(exterior.position), to_numpy(exterior.camera_from_object)
     place = np.einsum("nij,nj->ni", rotation[reference], position[image] - position[reference])
     u, _, v = np.linalg.svd(np.median(rotation[image] @ rotation[reference].transpose(0, 2, 1), axis=0))
     turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v

@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxphoto.adjustment import LEAST, MAX_STEPS, Adjustment, Outcome, Sizes, linearise, solve
-from jaxphoto.arrays import still
+from jaxphoto.adjustment import MAX_STEPS, MINIMAL_SIZES, Adjustment, Outcome, PaddedSizes, linearise, solve
+from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError, RankError
 from jaxphoto.losses import AbstractLoss, Huber, StudentT
 from jaxphoto.procedures.adjust import start_of
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics import LEAST_CHECKED, LEAST_SIGMA0, covariance, redundancy_numbers
 from jaxphoto.statistics.quantiles import student_freedom
 from jaxphoto.tracing import outside_transformations
@@ -38,7 +38,7 @@ _WIDE, _FALL, _STILL = 1e3, 0.1, 0.02
 _ROUNDS = 20
 
 
-@shown
+@pretty_repr
 class Robust(NamedTuple):
     """A robust adjustment: where its losses together are least."""
 
@@ -50,7 +50,7 @@ class Robust(NamedTuple):
     """By group of observations, of each row: 1 counts whole, 0 not at all."""
     at: Adjustment
     """The block linearised there; its residuals and normal equations are those of least squares."""
-    astray: Masks
+    diverged_points: Masks
     """Image points of points that these rows do not place: they had no part in it."""
 
 
@@ -61,7 +61,7 @@ def robust(
     start: Unknowns | None = None,
     *,
     max_steps: int = MAX_STEPS,
-    sizes: Sizes = LEAST,
+    sizes: PaddedSizes = MINIMAL_SIZES,
     report: Callable[[str], object] = lambda text: None,
 ) -> Robust:
     """Adjust `block` with `loss` (Huber's if None) for all groups of observations, or with one for each that is named.
@@ -104,7 +104,7 @@ def solve_placed(
     left: Masks,
     unknowns: Unknowns,
     max_steps: int,
-    sizes: Sizes,
+    sizes: PaddedSizes,
     losses: Mapping[str, AbstractLoss] | None = None,
 ) -> tuple[Adjustment, Int[np.ndarray, "points"], Masks]:
     """`block` adjusted from `unknowns` without what is `left` out, and without points that the rest does not place.
@@ -125,7 +125,7 @@ def solve_placed(
         else:
             if solved.outcome is Outcome.DIVERGED:
                 raise BlockError(solved.outcome.value)
-            lost = np.flatnonzero(solved.astray)
+            lost = np.flatnonzero(solved.diverged_points)
         if not len(lost):
             return solved, point, left
         # From where it began: what is lost has pulled at the others.
@@ -171,11 +171,11 @@ def checked_parts(adjusted: Adjustment) -> Blocks:
 
 def some_points(unknowns: Unknowns, point: np.ndarray) -> Unknowns:
     """The unknowns of a block that has some of the points only."""
-    return dataclasses.replace(unknowns, points=still(unknowns.points)[point])
+    return dataclasses.replace(unknowns, points=to_numpy(unknowns.points)[point])
 
 
 def all_points(unknowns: Unknowns, before: Unknowns, point: np.ndarray) -> Unknowns:
     """The unknowns with all points: those that are gone, where they were."""
     points = np.array(before.points)
-    points[point] = still(unknowns.points)
+    points[point] = to_numpy(unknowns.points)
     return dataclasses.replace(unknowns, points=points)

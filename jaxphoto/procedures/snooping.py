@@ -19,7 +19,7 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 
-from jaxphoto.adjustment import MAX_STEPS, Adjustment, Sizes, common_sizes, linearise, solve
+from jaxphoto.adjustment import MAX_STEPS, Adjustment, PaddedSizes, common_sizes, linearise, solve
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError, DatumError, JaxphotoError, RankError, counted
@@ -33,7 +33,7 @@ from jaxphoto.procedures.exchange import Exchange, exchanged, with_places, with_
 from jaxphoto.procedures.exchanged_coordinates import as_one, coordinate_exchanges
 from jaxphoto.procedures.exchanged_names import name_exchanges, points_that_meet, put_back
 from jaxphoto.procedures.robust import Blocks, Masks, all_points, checked_parts, residual_scales, solve_placed
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics import (
     LEAST_SIGMA0,
     LEVEL,
@@ -56,7 +56,7 @@ _SINGLE = 1 / 3
 _BESIDE_THE_WORST = 0.5
 
 
-@shown
+@pretty_repr
 class Snooped(NamedTuple):
     """A block without its blunders, adjusted; what was left out, the worst first; what was put right.
 
@@ -162,7 +162,9 @@ def _better(one: Snooped, other: Snooped) -> bool:
     return bool(one.adjusted.sigma0 < other.adjusted.sigma0)
 
 
-def _snooped(block: Block, begun: Begun, max_steps: int, sizes: Sizes, report: Callable[[str], object]) -> Snooped:
+def _snooped(
+    block: Block, begun: Begun, max_steps: int, sizes: PaddedSizes, report: Callable[[str], object]
+) -> Snooped:
     """From where a robust adjustment has led."""
     at, r, flown = begun
     scale = residual_scales(at, r)
@@ -222,7 +224,7 @@ def _snooped(block: Block, begun: Begun, max_steps: int, sizes: Sizes, report: C
 
 
 def _exchanges(
-    at: Adjustment, left: Masks, lost: np.ndarray, sigma0: float, r: Blocks, sizes: Sizes, known: set
+    at: Adjustment, left: Masks, lost: np.ndarray, sigma0: float, r: Blocks, sizes: PaddedSizes, known: set
 ) -> tuple[list[Exchange], Adjustment]:
     """Exchanges that are not `known`, and are from now on; and `at` with what they are of where it is seen.
 

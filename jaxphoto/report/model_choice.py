@@ -54,7 +54,7 @@ def choice_table(choice: ModelChoice) -> pd.DataFrame:
         rows.append({
             "model": j.candidate.name, "distortion": j.candidate.distortion.__name__,
             "coefficients": " ".join(j.candidate.free), "parameters": j.n_parameters, "observations": j.n_effective,
-            "redundancy": j.redundancy, "square_sum": j.square_sum, "sigma0": j.sigma0, "rms_px": j.rms_px,
+            "redundancy": j.redundancy, "square_sum": j.sum_of_squares, "sigma0": j.sigma0, "rms_px": j.rms_px,
             "cv_rms_px": j.cv_rms_px, "cv_excess_se": j.cv_excess, "aic": j.aic, "aicc": j.aicc, "bic": j.bic,
             "smaller": j.smaller, "f": j.f, "f_p": j.f_p, "weakest": weakest.parameter if weakest else "",
             "weakest_ratio": weakest.ratio if weakest else np.nan,

@@ -133,7 +133,7 @@ def summary_of(tables: Tables, verdict: Verdict, seconds: dict[str, float]) -> d
         "n_images": len(adjusted.block.images),
         "sigma0": float(adjusted.sigma0),
         **({"global_test": test} if test else {}),
-        **({"doubts": doubts} if (doubts := adjusted.block.doubts) else {}),
+        **({"doubts": prior_warnings} if (prior_warnings := adjusted.block.prior_warnings) else {}),
         "redundancy": adjusted.redundancy,
         "n_observations": {"total": sum(observations.values()), **observations},
         "n_constraints": adjusted.n_constraints,

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import Residuals
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.camera import RATES, constant_names, get_parameter, parameter_names, parameter_unit
 from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import AXES, AbstractObservations
@@ -101,7 +101,7 @@ class Tables:
         prepare_statistics(self.adjusted.equations, self.adjusted.seconds)
         return covariance(self.adjusted, rows=True) if self._known is None else self._known
 
-    def _if_converged(self, sigma: Numbers) -> np.ndarray:
+    def _if_converged(self, sigma: ArrayLike) -> np.ndarray:
         """Standard deviations; NaN where the adjustment did not converge."""
         return np.where(bool(self.adjusted.converged), np.asarray(sigma), np.nan)
 
@@ -284,10 +284,10 @@ class Tables:
         def names(of: Callable[[str, AbstractObservations], Any]) -> pd.Categorical:
             return pd.Categorical(column(lambda g, rows: np.asarray(of(g, rows), object)))
 
-        def numbers(values: Mapping[str, Numbers]) -> np.ndarray:
+        def numbers(values: Mapping[str, ArrayLike]) -> np.ndarray:
             return column(lambda g, rows: values[g])
 
-        def in_units(values: Mapping[str, Numbers]) -> np.ndarray:
+        def in_units(values: Mapping[str, ArrayLike]) -> np.ndarray:
             return column(lambda g, rows: in_file_unit(rows.unit)[0] * np.asarray(values[g]))
 
         def axis(group: str, rows: AbstractObservations) -> np.ndarray:
@@ -440,7 +440,7 @@ def convergence_table(adjusted: Adjustment) -> pd.DataFrame:
     n = len(course.length)
     # A very long iteration keeps its first steps; the end is known in any case.
     end = n == int(adjusted.steps)
-    sums = np.append(course.square_sum, float(adjusted.square_sum)) if end else course.square_sum
+    sums = np.append(course.sum_of_squares, float(adjusted.sum_of_squares)) if end else course.sum_of_squares
     columns = {
         "step": pd.Series([*map(str, range(1, n + 1)), *(["end"] if end else [])]),
         "sigma0": pd.Series(np.sqrt(sums / redundancy)),

@@ -73,7 +73,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
         # Statistics hold at an optimum only.
         return
     prepare_hat_matrix(adjusted.equations, adjusted.seconds)
-    yield from (Finding("prior_information", "warning", doubt) for doubt in adjusted.block.doubts)
+    yield from (Finding("prior_information", "warning", doubt) for doubt in adjusted.block.prior_warnings)
     if adjusted.left_out:
         yield Finding("rejected", "warning", left_out_words(adjusted))
     yield from behind_findings(adjusted)
@@ -101,7 +101,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
 
 def _not_converged(adjusted: Adjustment) -> Iterator[Finding]:
     yield Finding("not_converged", "error", adjusted.outcome.value)
-    if names := [adjusted.block.points[p] for p in np.flatnonzero(adjusted.astray)]:
+    if names := [adjusted.block.points[p] for p in np.flatnonzero(adjusted.diverged_points)]:
         yield Finding("diverged_points", "error", few(names), len(names), hint="Check their image measurements")
     sigma0 = float(adjusted.sigma0)
     # Where the observations fit at the stop, it is no bad start but a direction the block does not determine.

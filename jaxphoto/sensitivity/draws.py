@@ -22,14 +22,14 @@ from jaxphoto.adjustment.many import Common, Varying, held_in, path_name
 from jaxphoto.adjustment.model.block_values import values_of, with_datum
 from jaxphoto.adjustment.model.numbers import UnknownArrays
 from jaxphoto.adjustment.row_lists import batch_size, row_lists
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block, Start
 from jaxphoto.compiling import call_compiled
 from jaxphoto.devices import usable
 from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.sensitivity.perturbation import Perturbation, Recorded, in_order_of
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.tracing import outside_transformations
 
 # Number of draws from which optimised compilation pays off.
@@ -38,7 +38,7 @@ _MANY = 500
 _MAX_DEVICES = 1024
 
 
-@shown
+@pretty_repr
 class Draws(eqx.Module):
     """Re-adjustments of a block, one a draw along the first axis.
 
@@ -152,7 +152,7 @@ class Readjustment:
     def warm_up(self, entries: Any) -> None:
         """Compile the programs of `batches`."""
         began = time.perf_counter()
-        first = jax.tree.map(lambda v: still(v)[:1], entries)
+        first = jax.tree.map(lambda v: to_numpy(v)[:1], entries)
         self._fetch(*self._start(first, first_only=False), 1)
         self.seconds["compile"] = time.perf_counter() - began
 
@@ -174,7 +174,7 @@ class Readjustment:
 
     def _split(self, entries: Any) -> Iterator[Any]:
         for first in range(0, _count(entries), self.batch_size):
-            yield jax.tree.map(lambda v, k=first: still(v)[k : k + self.batch_size], entries)
+            yield jax.tree.map(lambda v, k=first: to_numpy(v)[k : k + self.batch_size], entries)
 
     def _start(self, entries: Any, first_only: bool) -> tuple[Found, Recorded]:
         """Start a batch asynchronously, padded by its last entry."""
@@ -193,7 +193,7 @@ class Readjustment:
 
     def _estimates(self, state: UnknownArrays) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
         """`shared`, `exterior` and `points` of `Draws`."""
-        shared = still(state.shared)[:, self.adjusted.structure.free]
+        shared = to_numpy(state.shared)[:, self.adjusted.structure.free]
         points = _by_object(state.points) if self.points else None
         return shared, self._exterior(state) if self.exterior else None, points
 
@@ -212,7 +212,7 @@ class Readjustment:
             v, converged, steps = adjusted.values, bool(adjusted.converged), int(adjusted.steps)
         except JaxphotoError:
             v, converged, steps = jax.tree.map(lambda x: np.full_like(x, np.nan), self.adjusted.values), False, 0
-        state = UnknownArrays(*(still(x)[None] for x in (v.position, v.rotation, v.shared, v.points)))
+        state = UnknownArrays(*(to_numpy(x)[None] for x in (v.position, v.rotation, v.shared, v.points)))
         return Draws({}, *self._estimates(state), np.array([converged]), np.array([steps]), np.array([True]), ())
 
     def _exterior(self, state: UnknownArrays) -> Float[np.ndarray, "draws images 6"]:
@@ -281,7 +281,7 @@ def _draws_first(values: Array) -> Any:
 
 def _by_object(values: Any) -> np.ndarray:
     """Draws first, then images or points, then components."""
-    return np.moveaxis(still(values), -1, 1)
+    return np.moveaxis(to_numpy(values), -1, 1)
 
 
 def _count(entries: Any) -> int:

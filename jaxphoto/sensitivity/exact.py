@@ -37,7 +37,7 @@ from jaxphoto.adjustment.model.block_values import unknowns_of, values_of, with_
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS, UnknownArrays, state_at
 from jaxphoto.adjustment.model.row_functions import reduced_places
 from jaxphoto.adjustment.model.structure import Structure
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block
 from jaxphoto.compiling import run_compiled
 from jaxphoto.errors import InputError
@@ -52,7 +52,7 @@ from jaxphoto.sensitivity.hessian import (
     solve_hessian,
 )
 from jaxphoto.sensitivity.image_rows import ListedRows, image_rows
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.small_matrices import unwhiten
 from jaxphoto.statistics import EOP_NAMES
 from jaxphoto.statistics.covariance import rotation_jacobians
@@ -143,7 +143,7 @@ def _inverses(l: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "n 3 3"]:  # noq
 _MAX_ELEMENTS = 2e8
 
 
-@shown
+@pretty_repr
 class Sensitivity(eqx.Module):
     """Derivatives of the estimates named by `labels`, one row each, by observations in the block's order.
 
@@ -204,11 +204,11 @@ def sensitivity(adjusted: Adjustment, *, curvature: bool = True, points: Sequenc
     structure, estimates = adjusted.structure, 6 * len(places.image) + s.n_shared + 3 * len(points)
     _check_size(structure, estimates)
     arguments = equations, image_rows(adjusted), np.array(float(curvature))
-    parts = jax.tree.map(still, run_compiled(_derivatives, arguments, adjusted.seconds, "sensitivity"))
+    parts = jax.tree.map(to_numpy, run_compiled(_derivatives, arguments, adjusted.seconds, "sensitivity"))
     requested = places.point[[adjusted.block.points.index(name) for name in points]] if points else np.zeros(0, int)
     unknowns = np.append(6 * places.image[:, None] + np.arange(6), 6 * s.n_images + np.arange(s.n_shared))
     step = np.append(scale.eop.T, scale.shared)[unknowns]
-    estimated = Estimates(unknowns, step, parts.rotations[places.image], requested, still(scale.points).T[requested])
+    estimated = Estimates(unknowns, step, parts.rotations[places.image], requested, to_numpy(scale.points).T[requested])
     adjoint = adjoint_vectors(parts.h, estimated)
 
     rows = _observations(parts, padded, len(unknowns) + len(parts.h.c))
@@ -307,7 +307,7 @@ def _by_fixed(
     shared = np.setdiff1d(np.arange(len(values.shared)), s.free)
     indices = _Fixed(*(np.asarray(v, np.int32) for v in (shared, places.point[fixed.who], fixed.axis)))
     arguments = equations, np.array(float(curvature)), indices
-    b = still(run_compiled(_fixed_rows, arguments, adjusted.seconds, "sensitivity"))
+    b = to_numpy(run_compiled(_fixed_rows, arguments, adjusted.seconds, "sensitivity"))
     n = 6 * s.n_images + s.n_shared
     products = b[:, unknowns] @ adjoint[: len(unknowns)] + b[:, n:] @ adjoint[len(adjoint) - 3 * s.n_points :]
 
@@ -337,7 +337,7 @@ def _fixed_rows(equations: NormalEquations, curved: Array, fixed: _Fixed) -> Flo
     return jnp.concatenate([by_shared, by_coordinate])
 
 
-@shown
+@pretty_repr
 class Response(eqx.Module):
     """Change of every unknown in its own unit; images, points and parameters in the block's order."""
 
@@ -389,7 +389,7 @@ def response(
     )
     state, angles = run_compiled(_response, arguments, adjusted.seconds, "sensitivity")
     change = unknowns_of(adjusted.padded.crop_state(state), adjusted.unknowns, s)
-    return Response(change, still(angles)[adjusted.padded.places.image])
+    return Response(change, to_numpy(angles)[adjusted.padded.places.image])
 
 
 def _difference(changed: np.ndarray, values: np.ndarray) -> np.ndarray:

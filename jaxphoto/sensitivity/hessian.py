@@ -28,18 +28,18 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.adjustment import Adjustment, Linearised, Met, PaddedStructure, PaddedValues
+from jaxphoto.adjustment import Adjustment, CoupledUnknowns, Linearised, PaddedStructure, PaddedValues
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
 from jaxphoto.adjustment.model.row_functions import (
     RowInputs,
-    Touched,
+    RowVariables,
     each_row,
     gathered_rows,
     reduced_places,
     row_function,
 )
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.errors import InputError
 from jaxphoto.linear_algebra import solve
 from jaxphoto.sensitivity.image_rows import ListedRows, RowProducts, row_products
@@ -57,7 +57,7 @@ class RowSecond(NamedTuple):
     """By z and by the observations."""
 
 
-def mixed_second(at: Linearised, direction: PaddedValues, curved: Float[Numbers, ""]) -> Increments:
+def mixed_second(at: Linearised, direction: PaddedValues, curved: Float[ArrayLike, ""]) -> Increments:
     """B dv over all rows, for a direction dv of the values; leaves that are None do not change."""
 
     def gradient(changed):
@@ -70,11 +70,11 @@ def mixed_second(at: Linearised, direction: PaddedValues, curved: Float[Numbers,
     return jax.jvp(gradient, (eqx.filter(at.values, varying),), (direction,))[1]
 
 
-def row_second(group: ObservedGroup, numbers: Any, at: Linearised, curved: Float[Numbers, ""]) -> RowSecond:
+def row_second(group: ObservedGroup, numbers: Any, at: Linearised, curved: Float[ArrayLike, ""]) -> RowSecond:
     """H and B of every row of a group."""
     function = row_function(group, at.structure)
 
-    def second(z: Touched, inputs: RowInputs) -> RowSecond:
+    def second(z: RowVariables, inputs: RowInputs) -> RowSecond:
         flat, unravel = ravel_pytree(z)
         observed = inputs.row.observation
 
@@ -91,7 +91,7 @@ def row_second(group: ObservedGroup, numbers: Any, at: Linearised, curved: Float
     return each_row(second, group, *inputs)
 
 
-def rows_second(at: Linearised, curved: Float[Numbers, ""]) -> tuple[RowSecond, ...]:
+def rows_second(at: Linearised, curved: Float[ArrayLike, ""]) -> tuple[RowSecond, ...]:
     """`row_second` of all groups."""
     s = at.structure
     return tuple(row_second(g, numbers, at, curved) for g, numbers in zip(s.observed, at.values.groups, strict=True))
@@ -212,7 +212,7 @@ def check_optimum(adjusted: Adjustment) -> None:
         )
 
 
-def reduce_hessian(at: Linearised, rows: ListedRows, curved: Float[Numbers, ""]) -> ReducedHessian:
+def reduce_hessian(at: Linearised, rows: ListedRows, curved: Float[ArrayLike, ""]) -> ReducedHessian:
     """Eliminate the points from H (`curved` 1) or N (0), in scaled increments; fixed unknowns get a unit diagonal."""
     values, scale, s = at.values, at.scale, at.structure
     second = rows_second(at, curved)
@@ -221,7 +221,7 @@ def reduce_hessian(at: Linearised, rows: ListedRows, curved: Float[Numbers, ""])
     at_points = points_second(second, at)
     h = row_products(values, scale, rows, curved, s)
     column = image_columns(s)[:, 6:][jnp.asarray(rows.image)] - 6 * s.n_images
-    places = Met.of(s, k)
+    places = CoupledUnknowns.of(s, k)
     v, interior = _by_point(h.by_point[6:], rows.point, column, places.interior, s)
     v = v + at_points.v
     unit = jnp.where(jnp.einsum("iip->ip", v) == 0, 1.0, 0.0)
@@ -235,7 +235,7 @@ def reduce_hessian(at: Linearised, rows: ListedRows, curved: Float[Numbers, ""])
     ray_factors = jnp.stack(whiten(w.swapaxes(0, 1), l[:, point][:, None])).transpose(2, 0, 1)
     f = ray_factors[jnp.asarray(rows.of_slot)]
     m = jnp.zeros((n + k, n + k)).at[:n, :n].set(other_second(second, s) + _by_unknown(h, s))
-    m = m.at[n:, :n].set(d_e).at[:n, n:].set(d_e.T) - Met.products(f, border, s, k)
+    m = m.at[n:, :n].set(d_e).at[:n, n:].set(d_e.T) - CoupledUnknowns.products(f, border, s, k)
     fixed = jnp.where(jnp.diagonal(m) == 0, 1.0, 0.0)
     m = m.at[n:].set(c @ m[n:]) + jnp.diag(jnp.where(jnp.arange(n + k) < n, fixed, -1.0))
     return ReducedHessian(
@@ -244,7 +244,11 @@ def reduce_hessian(at: Linearised, rows: ListedRows, curved: Float[Numbers, ""])
 
 
 def _by_point(
-    met: Float[Array, "touched 3 rows"], point: Numbers, column: Int[Array, "rows colours"], i: int, s: PaddedStructure
+    met: Float[Array, "touched 3 rows"],
+    point: ArrayLike,
+    column: Int[Array, "rows colours"],
+    i: int,
+    s: PaddedStructure,
 ) -> tuple[Float[Array, "3 3 points"], Float[Array, "interior 3 points"]]:
     """Sums over the rows of each point: by the point, and by the point and interior unknowns."""
     n = s.n_points

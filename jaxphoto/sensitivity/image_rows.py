@@ -28,7 +28,7 @@ from jaxphoto.adjustment import Adjustment, PaddedStructure, PaddedValues
 from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.image_orientations import by_image, orientation_derivatives, orientations_of
 from jaxphoto.adjustment.model.numbers import Increments, state_at
-from jaxphoto.arrays import Numbers, added, still
+from jaxphoto.arrays import ArrayLike, sum_terms, to_numpy
 from jaxphoto.collinearity import camera_residual
 from jaxphoto.compiling import once
 from jaxphoto.georeferencing import Corrections, apparent_point
@@ -44,10 +44,10 @@ _BATCH = 8192
 class ListedRows(NamedTuple):
     """Image rows in the block's order, then at least one row of zero weight; indices of a padded structure."""
 
-    image: Int[Numbers, "rows"]
-    point: Int[Numbers, "rows"]
-    xy: Float[Numbers, "2 rows"]
-    weight: Float[Numbers, "2 rows"]
+    image: Int[ArrayLike, "rows"]
+    point: Int[ArrayLike, "rows"]
+    xy: Float[ArrayLike, "2 rows"]
+    weight: Float[ArrayLike, "2 rows"]
     """1 / sigma (1/mm)."""
     of_slot: Int[np.ndarray, "batches chunks p"]
     """Row of each ray; the last row for padding."""
@@ -75,12 +75,12 @@ def image_rows(adjusted: Adjustment) -> ListedRows:
         # Rows of zero weight repeat the first, so all their values are finite.
         return np.concatenate([values, np.repeat(values[..., :1], size - n, axis=-1)], axis=-1)
 
-    weight = pad(1 / still(adjusted.values.sigma_xy))
+    weight = pad(1 / to_numpy(adjusted.values.sigma_xy))
     weight[:, n:] = 0.0
     of_slot = np.full(rays.ray_point.shape, size - 1, np.int32)
     of_slot.reshape(-1)[places.row] = np.arange(n)
     image, point = places.image[s.image].astype(np.int32), places.point[s.point].astype(np.int32)
-    return ListedRows(pad(image), pad(point), pad(still(adjusted.values.xy)), weight, of_slot)
+    return ListedRows(pad(image), pad(point), pad(to_numpy(adjusted.values.xy)), weight, of_slot)
 
 
 def _size(rows: int) -> int:
@@ -90,7 +90,7 @@ def _size(rows: int) -> int:
 
 
 def row_products(
-    values: PaddedValues, scale: Increments, rows: ListedRows, curved: Float[Numbers, ""], s: PaddedStructure
+    values: PaddedValues, scale: Increments, rows: ListedRows, curved: Float[ArrayLike, ""], s: PaddedStructure
 ) -> RowProducts:
     """H and B of all rows at the values, in scaled increments; without the terms in r if `curved` is 0."""
     count = -(-len(rows.image) // _BATCH)
@@ -115,7 +115,7 @@ def row_products(
 
 
 def _batch_products(
-    values: PaddedValues, scale: Increments, rows: ListedRows, curved: Float[Numbers, ""], s: PaddedStructure
+    values: PaddedValues, scale: Increments, rows: ListedRows, curved: Float[ArrayLike, ""], s: PaddedStructure
 ) -> RowProducts:
     image, point = rows.image, rows.point
     q, zero = s.n_image_colours, jax.tree.map(jnp.zeros_like, scale)
@@ -137,8 +137,8 @@ def _batch_products(
 
     cross = once(lambda g, du: sum(g[k, :, None] * d for k, d in enumerate(du)), s.eop_free, g, du)
     rotated = curved * image_step[3:, None] * jnp.stack(_cross(g_u, du))
-    eop = added(d[:6, None] * cross[k, None, :6] for k, d in enumerate(du))
-    by_point = added(d[:, None] * cross[k, None, 6:] for k, d in enumerate(du))
+    eop = sum_terms(d[:6, None] * cross[k, None, :6] for k, d in enumerate(du))
+    by_point = sum_terms(d[:, None] * cross[k, None, 6:] for k, d in enumerate(du))
     # Twice the lower triangle: symmetrised with the transpose later.
     eop = eop.at[3:].add(rotated[:, :6]).at[3:, :3].add(rotated[:, :3])
     by_point = by_point.at[3:6].add(rotated[:, 6:])
@@ -156,12 +156,12 @@ def _batch_products(
     )
 
 
-def _at(array: Array, index: Numbers) -> Array:
+def _at(array: Array, index: ArrayLike) -> Array:
     return jnp.asarray(array).at[..., index].get(mode="promise_in_bounds")
 
 
 def _dot(a: Iterable[Array], b: Iterable[Array]) -> Array:
-    return added(x * y for x, y in zip(a, b, strict=True))
+    return sum_terms(x * y for x, y in zip(a, b, strict=True))
 
 
 def _cross(a: Sequence[Array] | Array, b: Sequence[Array] | Array) -> Scalars:
@@ -217,7 +217,7 @@ def _camera_second(
     u: Scalars,
     xy: Scalars,
     weight: Scalars,
-    curved: Float[Numbers, ""],
+    curved: Float[ArrayLike, ""],
 ) -> tuple[Float[Array, "u_and_colours directions rows"], Scalars]:
     """G of every row, (u, t) by (u, t, m), and J_u' r."""
     q = len(slope)

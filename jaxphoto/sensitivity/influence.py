@@ -15,13 +15,13 @@ from jaxphoto.errors import InputError
 from jaxphoto.observations import AbstractObservations, Correlated
 from jaxphoto.sensitivity.exact import Sensitivity
 from jaxphoto.sensitivity.perturbation import OBSERVED
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics import DELTA0, covariance, minimal_detectable_biases, observation_groups, redundancy_numbers
 
 Per = Literal["block", "strip", "image"]
 
 
-@shown
+@pretty_repr
 class StationBias(eqx.Module):
     """Change of every estimate (`Sensitivity.labels`) for a bias of all stations of a unit along one axis."""
 
@@ -30,7 +30,7 @@ class StationBias(eqx.Module):
     bias_m: float = eqx.field(static=True)
 
 
-@shown
+@pretty_repr
 class VarianceShares(eqx.Module):
     """Fraction of each estimate's variance due to each observation; over all groups a row sums to 1.
 
@@ -47,7 +47,7 @@ class VarianceShares(eqx.Module):
         return {name: fraction.sum(axis=1) for name, fraction in self.groups.items()}
 
 
-@shown
+@pretty_repr
 class ExternalReliability(eqx.Module):
     """Minimal detectable biases (MDB), and the effect of each on every estimate if it is not detected.
 

@@ -37,20 +37,20 @@ from jaxphoto.observations import (
     AXES,
     Attitudes,
     AttitudeSteps,
+    CameraPositions,
     Correlated,
     KnownParameters,
     PositionSteps,
-    StationRows,
     TrajectoryAttitudes,
     TrajectoryStations,
 )
 from jaxphoto.rotation import small_rotation
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.unknowns import FIXED, FREE, Weighted, is_prior
 
 Steps = type[PositionSteps] | type[AttitudeSteps]
 OBSERVED = {
-    "station": (StationRows, TrajectoryStations),
+    "station": (CameraPositions, TrajectoryStations),
     "attitude": (Attitudes, TrajectoryAttitudes),
 }
 """Kinds of bias of GNSS and IMU, and the observations they apply to."""
@@ -170,7 +170,7 @@ PER = {
 _AXES = {"lever-arm": ("right_m", "forward_m", "up_m"), "boresight": ("x_rad", "y_rad", "z_rad")}
 
 
-@shown
+@pretty_repr
 class Bias(eqx.Module):
     """Errors added to values of a block: `sigma` times independent variates of `distribution`.
 

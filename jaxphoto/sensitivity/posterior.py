@@ -31,7 +31,7 @@ from jaxtyping import Array, Float, Int, Scalar
 
 from jaxphoto.adjustment import Adjustment, Linearised, NormalEquations
 from jaxphoto.adjustment.model.numbers import Increments, state_at
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
 from jaxphoto.linear_algebra import solve
@@ -146,11 +146,11 @@ def posterior(
     equations = adjusted.equations.on_one_device
     index = _indices(adjusted, parameters)
     free = np.flatnonzero(_flat(jax.tree.map(np.asarray, equations.scale), np))
-    optimum, laplace = map(still, call_compiled(_laplace, equations, index))
+    optimum, laplace = map(to_numpy, call_compiled(_laplace, equations, index))
     samples, divergences, gradients = map(
-        still, call_compiled(_sample, equations, index, free, np.array(seed), chains, draws, warmup)
+        to_numpy, call_compiled(_sample, equations, index, free, np.array(seed), chains, draws, warmup)
     )
-    rhat, ess = map(still, call_compiled(_diagnostics, samples))
+    rhat, ess = map(to_numpy, call_compiled(_diagnostics, samples))
     return Posterior(
         parameters=tuple(parameters),
         samples=samples,

@@ -20,12 +20,12 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxphoto.adjustment import (
     MAX_STEPS,
     NormalEquations,
+    PaddedSizes,
     PaddedStructure,
     PaddedValues,
-    Sizes,
-    Task,
+    SolveMode,
+    build_problem,
     common_sizes,
-    lay_out,
     optimise,
     to_factor,
     to_optimum,
@@ -33,7 +33,7 @@ from jaxphoto.adjustment import (
 from jaxphoto.adjustment.model.block_values import with_start
 from jaxphoto.adjustment.model.numbers import UnknownArrays
 from jaxphoto.adjustment.rank import DEFECT
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.block import Block
 from jaxphoto.compiling import run_compiled
 from jaxphoto.devices import AXIS, mesh_of, usable
@@ -52,9 +52,9 @@ class CheckPoints(NamedTuple):
     `weight` is 1, and 0 for padding.
     """
 
-    point: Int[Numbers, "check"]
-    weight: Float[Numbers, "check"]
-    truth: Float[Numbers, "check 3"]
+    point: Int[ArrayLike, "check"]
+    weight: Float[ArrayLike, "check"]
+    truth: Float[ArrayLike, "check 3"]
 
 
 class PreparedDesign(NamedTuple):
@@ -71,31 +71,31 @@ class PreparedDesign(NamedTuple):
 class DesignStatistics(NamedTuple):
     """Statistics of one design; in metres, radians and the unknowns' own units, a priori."""
 
-    converged: Bool[Numbers, ""]
-    least_pivot: Float[Numbers, ""]
+    converged: Bool[ArrayLike, ""]
+    least_pivot: Float[ArrayLike, ""]
     """Smallest pivot relative to its diagonal element: 1 for independent unknowns, 0 for a rank defect."""
-    steps: Int[Numbers, ""]
-    square_sum: Float[Numbers, ""]
+    steps: Int[ArrayLike, ""]
+    sum_of_squares: Float[ArrayLike, ""]
     """v'Pv."""
-    covariance: Float[Numbers, "shared shared"]
-    exterior_variance: Float[Numbers, "6"]
+    covariance: Float[ArrayLike, "shared shared"]
+    exterior_variance: Float[ArrayLike, "6"]
     """X, Y, Z and three rotations, mean over the images."""
-    mean_abs: Float[Numbers, "6 shared"]
+    mean_abs: Float[ArrayLike, "6 shared"]
     """|rho| of X, Y, Z and three rotations with each shared unknown, mean over its images."""
-    max_abs: Float[Numbers, "6 shared"]
-    check_variance: Float[Numbers, "3"]
+    max_abs: Float[ArrayLike, "6 shared"]
+    check_variance: Float[ArrayLike, "3"]
     """Mean over the check points of the variance of computed coordinates."""
-    check_square: Float[Numbers, "3"]
+    check_square: Float[ArrayLike, "3"]
     """Mean over the check points of (true - computed) squared."""
 
 
-def prepare_design(block: Block, truth: Unknowns | None, sizes: Sizes, n_check: int) -> PreparedDesign:
+def prepare_design(block: Block, truth: Unknowns | None, sizes: PaddedSizes, n_check: int) -> PreparedDesign:
     """Add approximate values, datum and padding to `block`, as `jaxphoto.adjust` does.
 
     `sizes` and `n_check`, the length of the list of check points, are common to all designs. Raises the errors of
     `jaxphoto.adjust`: BlockError, DatumError, RankError.
     """
-    problem = lay_out(block, approximate(block), block.priors, sizes, alone=True)
+    problem = build_problem(block, approximate(block), block.priors, sizes, alone=True)
     s, constraints = problem.padded.own, len(problem.values.datum_eop)
     points = np.unique(block.check.who)
     check = CheckPoints(np.zeros(n_check, np.int32), np.zeros(n_check), np.full((n_check, 3), np.nan))
@@ -173,7 +173,7 @@ def _statistics(
 ) -> DesignStatistics:
     """Adjust, factorise at the optimum, and compute covariance and statistics."""
 
-    def solve(start: UnknownArrays, task: Task):
+    def solve(start: UnknownArrays, task: SolveMode):
         optimum = optimise(with_start(values, start), s, task)
         return optimum.state, optimum
 
@@ -199,7 +199,7 @@ def _statistics(
         converged=optima.converged[0],
         least_pivot=equations.least_pivot(),
         steps=optima.steps[0],
-        square_sum=equations.at.square_sum(),
+        sum_of_squares=equations.at.sum_of_squares(),
         covariance=covariance[n:, n:],
         exterior_variance=free @ variance[:n].reshape(-1, 6) / jnp.sum(free),
         mean_abs=jnp.sum(rho, axis=0) / jnp.sum(touches, axis=0),
@@ -372,7 +372,7 @@ def _sweep(
         determined=determined,
         steps=np.asarray(statistics.steps),
         redundancy=redundancy,
-        sigma0=masked(np.where(redundancy > 0, np.sqrt(statistics.square_sum / np.maximum(redundancy, 1)), 1.0)),
+        sigma0=masked(np.where(redundancy > 0, np.sqrt(statistics.sum_of_squares / np.maximum(redundancy, 1)), 1.0)),
         sigma=sigma,
         correlation=statistics.covariance / (sigma[:, :, None] * sigma[:, None, :]),
         exterior_sigma=masked(np.sqrt(statistics.exterior_variance)),

@@ -20,7 +20,7 @@ def observed_anew(rows: Rows, block: Block, truth: Unknowns, key: PRNGKeyArray) 
 
     Rows with joint covariances, and those that touch parameters `truth` does not have, are not changed.
     """
-    if isinstance(rows, Correlated | KnownParameters) or rows.also or rows.through_camera or not len(rows):
+    if isinstance(rows, Correlated | KnownParameters) or rows.block_parameters or rows.uses_interior or not len(rows):
         return rows
     missing = {what for what, _ in rows.indices()} - {"image", "point", *truth.tables}
     if missing:

@@ -13,7 +13,7 @@ from jaxphoto.block import Datum
 from jaxphoto.camera import InteriorOrientation, RollingShutter, Sensor
 from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.parameters import AbstractParameters
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.simulation.convergent_plan import ConvergentPlan, Field
 from jaxphoto.simulation.flight_plan import FlightPlan, Swaths
 from jaxphoto.simulation.scan_plan import ScanPlan, Triple
@@ -199,7 +199,7 @@ class Approximation:
     points_m: float | None = None
 
 
-@shown
+@pretty_repr
 @dataclasses.dataclass(frozen=True)
 class Recipe:
     """Recipe of a simulation, without its seed.

@@ -15,7 +15,7 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Mount, RigCamera, StripBias, StripErrors, Trajectory
-from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
+from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
 from jaxphoto.short_repr import simulation_html, simulation_repr
 from jaxphoto.simulation.changing_cameras import (
     Circumstances,
@@ -134,7 +134,7 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
         image_time=flight.time,
         image_points=_image_points(recipe, scene, seed),
         control=control,
-        fixed=ControlRows.none(),
+        fixed=ControlCoordinates.none(),
         check=check,
         stations=stations,
         attitudes=attitudes,
@@ -181,24 +181,24 @@ def _seen(recipe: Recipe, flight: Flight, scene: TruePoints, seed: int) -> TrueP
     return scene._replace(rays=rays)
 
 
-def _image_points(recipe: Recipe, scene: TruePoints, seed: int) -> ImageRows:
+def _image_points(recipe: Recipe, scene: TruePoints, seed: int) -> ImagePoints:
     image, point, xy = scene.rays
     target = scene.is_target[point][:, None]
     noise = np.where(target, recipe.noise.target_mm, recipe.noise.image_mm)
     stated = np.where(target, recipe.stated.target_mm, recipe.stated.image_mm)
     xy = xy + noise * _draw(seed, "noise of image points", xy.shape)
-    return ImageRows(image, point, xy, np.broadcast_to(stated, xy.shape).copy())
+    return ImagePoints(image, point, xy, np.broadcast_to(stated, xy.shape).copy())
 
 
-def _control(recipe: Recipe, scene: TruePoints, seed: int) -> tuple[ControlRows, ControlRows]:
+def _control(recipe: Recipe, scene: TruePoints, seed: int) -> tuple[ControlCoordinates, ControlCoordinates]:
     """Surveyed coordinates of control and of check points; every point draws, so roles do not move the noise."""
     surveyed = scene.xyz + _sigma(recipe.noise.control_m) * _draw(seed, "noise of control", scene.xyz.shape)
     sigma = _sigma(recipe.stated.control_m)
 
-    def rows(*roles: str) -> ControlRows:
+    def rows(*roles: str) -> ControlCoordinates:
         pairs = [(k, axis) for k, role in enumerate(scene.roles) if role in roles for axis in _AXES[role]]
         who, axis = np.array(pairs, int).reshape(-1, 2).T
-        return ControlRows(who, axis, surveyed[who, axis], sigma[axis])
+        return ControlCoordinates(who, axis, surveyed[who, axis], sigma[axis])
 
     return rows("control", "vertical"), rows("check")
 
@@ -209,14 +209,14 @@ def _georeferencing(
     attitude: Float[np.ndarray, "images 3"],
     of: Int[np.ndarray, "n"],
     seed: int,
-) -> tuple[StationRows, Attitudes]:
+) -> tuple[CameraPositions, Attitudes]:
     """Return GNSS and IMU observations `of` some images, at `position` (m) and roll, pitch, yaw (rad)."""
     n = len(of)
-    stations, attitudes = StationRows.none(), Attitudes.none()
+    stations, attitudes = CameraPositions.none(), Attitudes.none()
     if recipe.stated.station_m is not None:
         position = position[of] + _sigma(recipe.noise.station_m) * _draw(seed, "noise of stations", (n, 3))
         who, axis = np.indices((n, 3)).reshape(2, -1)
-        stations = StationRows(of[who], axis, position.ravel(), _sigma(recipe.stated.station_m)[axis])
+        stations = CameraPositions(of[who], axis, position.ravel(), _sigma(recipe.stated.station_m)[axis])
     if recipe.stated.attitude_deg is not None:
         noise = np.deg2rad(_sigma(recipe.noise.attitude_deg)) * _draw(seed, "noise of attitudes", (n, 3))
         sigma = np.deg2rad(_sigma(recipe.stated.attitude_deg))
@@ -241,7 +241,7 @@ def _true_biases(recipe: Recipe, flight: Flight, seed: int) -> dict[str, StripBi
 
 
 def _start(
-    recipe: Recipe, flight: Flight, scene: TruePoints, control: ControlRows, seed: int
+    recipe: Recipe, flight: Flight, scene: TruePoints, control: ControlCoordinates, seed: int
 ) -> tuple[Start, Unknowns]:
     """Where the adjustment starts, and its priors; control stands in for approximate coordinates where it is given."""
     n, near = len(flight.images), recipe.start

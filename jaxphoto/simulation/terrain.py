@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.simulation.buildings import Building, roof_height, wall_distance
 from jaxphoto.simulation.trees import Tree, under_crown
 
@@ -42,7 +42,7 @@ class RandomWaves:
         return tuple(Wave(amplitude, *row) for row in np.stack([length, heading, phase], axis=1).tolist())
 
 
-@shown
+@pretty_repr
 @dataclasses.dataclass(frozen=True)
 class Terrain:
     """Z = height + slope . (X, Y) + waves, with an independent uniform roughness of +- `roughness_m` at every point.

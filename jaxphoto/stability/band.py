@@ -32,8 +32,8 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float
 
-from jaxphoto.arrays import Numbers
-from jaxphoto.short_repr import shown
+from jaxphoto.arrays import ArrayLike
+from jaxphoto.short_repr import pretty_repr
 
 LEVEL = 0.95
 """Confidence level of error bands and limits."""
@@ -41,7 +41,7 @@ LEVEL = 0.95
 _MIN_SPLITS = round(1 / (1 - LEVEL))
 
 
-@shown
+@pretty_repr
 class Differences(NamedTuple):
     """Differences of the halves of all splits, and their predicted covariances; pixels of the measured image."""
 
@@ -53,7 +53,7 @@ class Differences(NamedTuple):
     """r_kl^2."""
 
 
-@shown
+@pretty_repr
 class ErrorBand(NamedTuple):
     """Scale factor of the standard deviations, and radii that contain 95 % of the errors; in pixels."""
 
@@ -128,7 +128,7 @@ def leading_unit(
     return int(fraction.argmax()), float(fraction.max())
 
 
-def overlap(first: Bool[np.ndarray, "cuts units"], size: Numbers) -> Float[np.ndarray, "cuts cuts"]:
+def overlap(first: Bool[np.ndarray, "cuts units"], size: ArrayLike) -> Float[np.ndarray, "cuts cuts"]:
     """r_kl^2 of splits with the units `first` in their first half; `size` is the weight of each unit."""
     side = np.where(first, 1.0, -1.0)
     return ((side * size) @ side.T / size.sum()) ** 2

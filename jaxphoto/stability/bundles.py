@@ -21,13 +21,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxphoto.arrays import Numbers, still
+from jaxphoto.arrays import ArrayLike, to_numpy
 from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, invert, parameter_names, set_parameter
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
 from jaxphoto.linear_algebra import solve
 from jaxphoto.rotation import small_rotation
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 
 def image_grid(
@@ -47,7 +47,7 @@ def image_grid(
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
-def image_rays(interior: InteriorOrientation, points: Float[Numbers, "points 2"]) -> Float[Array, "points 3"]:
+def image_rays(interior: InteriorOrientation, points: Float[ArrayLike, "points 2"]) -> Float[Array, "points 3"]:
     """Bundle of rays (x', y', -c) in mm, in the camera frame, of measured image points (mm from the centre).
 
     x' is the distortion-free coordinate from the principal point, on the virtual image plane at distance c, for any
@@ -151,7 +151,7 @@ def align(
     return optimum, jnp.all(jnp.abs(gradient(optimum)) <= columns * size)
 
 
-@shown
+@pretty_repr
 class BundleOffsets(eqx.Module):
     """Offsets of two bundles after alignment, on the first one's virtual image plane, in mm.
 
@@ -195,9 +195,9 @@ class BundleOffsets(eqx.Module):
 def rmse_offset(
     first: InteriorOrientation,
     second: InteriorOrientation,
-    points: Float[Numbers, "points 2"],
+    points: Float[ArrayLike, "points 2"],
     method: Method = "rot",
-    depth: Float[Numbers, "points"] | None = None,
+    depth: Float[ArrayLike, "points"] | None = None,
 ) -> Float[Array, ""]:
     """RMSE_offset (mm) of two interior orientations over image points (mm, from the centre; see `image_grid`).
 
@@ -213,9 +213,9 @@ def rmse_offset(
 def bundle_offsets(
     first: InteriorOrientation,
     second: InteriorOrientation,
-    points: Float[Numbers, "points 2"],
+    points: Float[ArrayLike, "points 2"],
     method: Method = "rot",
-    depth: Float[Numbers, "points"] | None = None,
+    depth: Float[ArrayLike, "points"] | None = None,
 ) -> BundleOffsets:
     """Compute the offsets of two bundles after alignment, with derivatives; arguments as in `rmse_offset`.
 
@@ -227,7 +227,7 @@ def bundle_offsets(
     return call_compiled(_bundle_offsets, as_arrays(first), as_arrays(second), points, method, _depths(points, depth))
 
 
-def check_rays(interior: InteriorOrientation, points: Float[Numbers, "points 2"], name: str) -> None:
+def check_rays(interior: InteriorOrientation, points: Float[ArrayLike, "points 2"], name: str) -> None:
     """Raise InputError if the distortion of `interior` is not invertible or has no ray ahead at some of `points`."""
     regular = regular_rays(interior, points)
     if not regular.all():
@@ -238,9 +238,9 @@ def check_rays(interior: InteriorOrientation, points: Float[Numbers, "points 2"]
         )
 
 
-def regular_rays(interior: InteriorOrientation, points: Float[Numbers, "points 2"]) -> Bool[Numbers, "points"]:
+def regular_rays(interior: InteriorOrientation, points: Float[ArrayLike, "points 2"]) -> Bool[ArrayLike, "points"]:
     """True for image points (mm) with an invertible distortion and a ray ahead."""
-    return still(call_compiled(_regular, as_arrays(interior), jnp.asarray(points, float)))
+    return to_numpy(call_compiled(_regular, as_arrays(interior), jnp.asarray(points, float)))
 
 
 @eqx.filter_jit

@@ -21,7 +21,7 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.camera import (
     InteriorOrientation,
     constant_names,
@@ -31,7 +31,7 @@ from jaxphoto.camera import (
     parameter_unit,
 )
 from jaxphoto.errors import InputError
-from jaxphoto.short_repr import change_html, change_repr, shown
+from jaxphoto.short_repr import change_html, change_repr, pretty_repr
 from jaxphoto.stability.band import LEVEL, square_radius
 from jaxphoto.stability.bundles import (
     METHODS,
@@ -45,7 +45,7 @@ from jaxphoto.stability.bundles import (
 from jaxphoto.stability.quadratic_form import QuadraticForm
 
 
-@shown
+@pretty_repr
 class OffsetUncertainty(NamedTuple):
     """Distribution of RMSE_offset by the covariances of both sets; in mm, except the probability."""
 
@@ -67,8 +67,8 @@ class OffsetUncertainty(NamedTuple):
 
 def offset_uncertainty(
     offsets: BundleOffsets,
-    first: Float[Numbers, "p p"] | None = None,
-    second: Float[Numbers, "p p"] | None = None,
+    first: Float[ArrayLike, "p p"] | None = None,
+    second: Float[ArrayLike, "p p"] | None = None,
 ) -> OffsetUncertainty | None:
     """Compute the uncertainty of RMSE_offset from the covariances of the parameter sets; None if both are None.
 
@@ -92,19 +92,19 @@ def offset_uncertainty(
     estimated = QuadraticForm.of_normal(v, jacobian, covariance)
     one_camera = QuadraticForm.of_normal(np.zeros_like(v), jacobian, covariance)
 
-    def root(square_sum: float) -> float:
-        return float(np.sqrt(square_sum / f))
+    def root(sum_of_squares: float) -> float:
+        return float(np.sqrt(sum_of_squares / f))
 
     tail = (1 - LEVEL) / 2
-    square_sum = float(v @ v)
+    sum_of_squares = float(v @ v)
     return OffsetUncertainty(
         sigma_mm=estimated.sigma_of_root / f**0.5,
         low_mm=root(estimated.quantile(tail)),
         high_mm=root(estimated.quantile(1 - tail)),
         expected_of_one_mm=one_camera.mean_of_root / f**0.5,
         limit_of_one_mm=root(one_camera.quantile(LEVEL)),
-        p_value=one_camera.tail_probability(square_sum),
-        unexplained_mm=root(max(square_sum - one_camera.mean, 0.0)),
+        p_value=one_camera.tail_probability(sum_of_squares),
+        unexplained_mm=root(max(sum_of_squares - one_camera.mean, 0.0)),
     )
 
 
@@ -114,7 +114,7 @@ SIGNIFICANT_P = 0.05
 _MIN_P = 1e-300
 
 
-@shown
+@pretty_repr
 class Analysis(NamedTuple):
     """Two parameter sets compared by one method; `uncertainty` is None without covariances."""
 
@@ -150,8 +150,8 @@ def change_meaning(p_value: float) -> str:
 def analyse(
     first: InteriorOrientation,
     second: InteriorOrientation,
-    points: Float[Numbers, "points 2"],
-    covariances: tuple[Float[Numbers, "p p"] | None, Float[Numbers, "q q"] | None] = (None, None),
+    points: Float[ArrayLike, "points 2"],
+    covariances: tuple[Float[ArrayLike, "p p"] | None, Float[ArrayLike, "q q"] | None] = (None, None),
     relief: float = 0.0,
 ) -> dict[Method, Analysis]:
     """Compare two parameter sets by zrot, rot and spr over image points (mm from the centre; see `image_grid`).
@@ -178,7 +178,7 @@ def analyse(
 _ROUNDING = 1e-12
 
 
-@shown
+@pretty_repr
 class ParameterChange(NamedTuple):
     """One parameter in two calibrations, in its own unit: second minus first, with its significance."""
 
@@ -304,7 +304,7 @@ def _parameters(
     return tuple(changes)
 
 
-@shown
+@pretty_repr
 class Combination(NamedTuple):
     """Weighted mean of several calibrations."""
 

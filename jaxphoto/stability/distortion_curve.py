@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.compiling import call_compiled
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.stability.bundles import as_arrays, parameter_vector, with_parameters
 
 _DIRECTIONS = 36
@@ -28,7 +28,7 @@ NORMAL_95 = 1.959963984540054
 """Two-sided 95 % quantile of the standard normal distribution."""
 
 
-@shown
+@pretty_repr
 class DistortionCurve(NamedTuple):
     """Distortion by distance from the principal point; mm."""
 

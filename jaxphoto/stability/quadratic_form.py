@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 # Variances below this fraction of the largest contribute their mean only.
 _NEGLIGIBLE = 1e-14
@@ -27,7 +27,7 @@ _NODES = 800
 _NEGLIGIBLE_EXPONENT = 40.0
 
 
-@shown
+@pretty_repr
 class QuadraticForm(eqx.Module):
     """S = constant + sum (sqrt(shift_i) + sqrt(weight_i) z_i)^2, z_i independent standard normal.
 

@@ -24,8 +24,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.arrays import still
-from jaxphoto.short_repr import shown
+from jaxphoto.arrays import to_numpy
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics.discrepancy import observation_groups
 from jaxphoto.statistics.hat_matrix import HatMatrix
 from jaxphoto.statistics.quantiles import student_limit
@@ -44,7 +44,7 @@ LEAST_SIGMA0 = 1e-3
 """Sigma naught below which residuals are the rounding of exact values; no blunder test is made."""
 
 
-@shown
+@pretty_repr
 class Suspect(eqx.Module):
     """An observation whose normalised residual exceeds the critical value, and its error if it is the only outlier."""
 
@@ -62,7 +62,7 @@ class Suspect(eqx.Module):
     unit: str
 
 
-@shown
+@pretty_repr
 class BlunderTest(eqx.Module):
     """`suspects`: rows with a component beyond `limit`, largest first; `n` normalised residuals were tested."""
 
@@ -79,7 +79,7 @@ def blunder_test(adjusted: Adjustment, redundancy: Redundancy, level: float = LE
     w, precision = normalised_residuals(adjusted, redundancy), error_precision(adjusted, redundancy)
     sigma0 = float(adjusted.sigma0)
     groups = {name: rows for name, rows in observation_groups(adjusted).items() if rows.unit}
-    absolute = {name: np.where(still(redundancy[name]) > LEAST_CHECKED, np.abs(w[name]), 0.0) for name in groups}
+    absolute = {name: np.where(to_numpy(redundancy[name]) > LEAST_CHECKED, np.abs(w[name]), 0.0) for name in groups}
     n = sum(int((v > 0).sum()) for v in absolute.values())
     limit, block, suspects = critical_w(n, adjusted.redundancy, level), adjusted.block, []
     if sigma0 < LEAST_SIGMA0:
@@ -145,7 +145,7 @@ def multiple_outlier_test(
     )
     c = unadjusted - hat_matrix.products(column, n + len(at))[0]
     v = hat_matrix.residuals
-    square_sum, unknowns = float(v @ v), [n + np.flatnonzero(np.isin(at, row_index)) for row_index in rows]
+    sum_of_squares, unknowns = float(v @ v), [n + np.flatnonzero(np.isin(at, row_index)) for row_index in rows]
     u = np.concatenate([effect_columns @ v, v[at]])
     min_fraction = min([MIN_FRACTION, *(pattern.min_fraction for pattern, _ in effects)])
     chosen: list[int] = [] if n else [0]
@@ -153,7 +153,7 @@ def multiple_outlier_test(
         s = np.concatenate([np.arange(n), *(unknowns[i] for i in chosen)])
         inverse, freedom = truncated_inverse(c[np.ix_(s, s)], unadjusted[np.ix_(s, s)], min_fraction)
         errors, redundancy = inverse @ u[s], adjusted.redundancy - freedom
-        remaining = square_sum - float(u[s] @ errors)
+        remaining = sum_of_squares - float(u[s] @ errors)
         if redundancy < 1 or remaining <= LEAST_SIGMA0**2 * redundancy:
             break
         w = np.zeros(len(tested))

@@ -31,13 +31,13 @@ from jaxtyping import Float
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.right_hand_sides import solve_many
-from jaxphoto.arrays import Numbers, is_traced, namespace, still
-from jaxphoto.short_repr import shown
+from jaxphoto.arrays import ArrayLike, is_traced, namespace, to_numpy
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics.covariance import EOP_NAMES, Covariance
 from jaxphoto.statistics.hat_matrix import inner_products
 
 
-@shown
+@pretty_repr
 class Correlations(eqx.Module):
     """Correlation coefficients of one camera, as arrays with the names of their axes."""
 
@@ -64,7 +64,7 @@ class Correlations(eqx.Module):
 
 def correlation_matrix(covariance: Covariance) -> Float[Any, "reduced reduced"]:
     """Correlation matrix of `covariance.labels`; zero for fixed unknowns."""
-    matrix = still(covariance.matrix)
+    matrix = to_numpy(covariance.matrix)
     xp, variance = namespace(matrix), matrix.diagonal()
     inverse = xp.where(variance > 0, 1 / xp.sqrt(xp.where(variance > 0, variance, 1.0)), 0.0)
     return matrix * inverse[:, None] * inverse[None, :]
@@ -100,7 +100,7 @@ def high_pairs(names: Sequence[str], rho: Float[np.ndarray, "n n"], above: float
     return sorted(pairs, key=lambda pair: -abs(pair[2]))
 
 
-@shown
+@pretty_repr
 class LinearForms(NamedTuple):
     """Covariances of linear functions of unknowns, with one another and with the shared unknowns."""
 
@@ -112,9 +112,9 @@ def linear_forms(
     adjusted: Adjustment,
     n_forms: int,
     *,
-    points: Float[Numbers, "forms points 3"] | None = None,
-    exterior: Float[Numbers, "forms images 6"] | None = None,
-    shared: Float[Numbers, "forms shared"] | None = None,
+    points: Float[ArrayLike, "forms points 3"] | None = None,
+    exterior: Float[ArrayLike, "forms images 6"] | None = None,
+    shared: Float[ArrayLike, "forms shared"] | None = None,
 ) -> LinearForms:
     """A posteriori covariances of `n_forms` linear functions f = g' x of the unknowns; omitted weights g are zero.
 
@@ -123,7 +123,7 @@ def linear_forms(
     `Structure.labels`, in their own units.
     """
     equations, places = adjusted.equations.on_one_device.weighed, adjusted.padded.places
-    scale = jax.tree.map(still, equations.scale)
+    scale = jax.tree.map(to_numpy, equations.scale)
 
     def weights(g: Any, index: Any, scale: Any) -> Any:
         if g is None:
@@ -153,7 +153,7 @@ _MIN_COSINE = 0.7
 _ROUNDING = 1e-9
 
 
-@shown
+@pretty_repr
 class GroundCorrelations(eqx.Module):
     """Correlations of the `FORMS` of the ground with the interior orientation of a camera."""
 

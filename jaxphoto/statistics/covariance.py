@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxphoto.adjustment import Adjustment, Cofactors, NormalEquations, PaddedResiduals, RowCofactors
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.structure import observed_in
-from jaxphoto.arrays import Numbers, gathered, still
+from jaxphoto.arrays import ArrayLike, gathered, to_numpy
 from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.errors import counted
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, small_rotation
@@ -40,9 +40,9 @@ class Covariance(eqx.Module):
     for a posteriori values.
     """
 
-    matrix: Float[Numbers, "reduced reduced"]
-    points: Float[Numbers, "points 3 3"]
-    variance_factor: Float[Numbers, ""] | float
+    matrix: Float[ArrayLike, "reduced reduced"]
+    points: Float[ArrayLike, "points 3 3"]
+    variance_factor: Float[ArrayLike, ""] | float
     cofactors: Cofactors
     """In padded sizes; see `Adjustment.padded`."""
     rows: RowCofactors | None
@@ -50,7 +50,7 @@ class Covariance(eqx.Module):
     labels: tuple[str, ...] = eqx.field(static=True)
     n_images: int = eqx.field(static=True)
     rotations: Rotations = eqx.field(static=True)
-    converged: Bool[Numbers, ""]
+    converged: Bool[ArrayLike, ""]
     """False: the covariance is evaluated where the adjustment stopped and is no measure of accuracy."""
 
     def __repr__(self) -> str:
@@ -65,7 +65,7 @@ class Covariance(eqx.Module):
     _repr_html_ = fields_html
 
     @property
-    def exterior_sigma(self) -> Float[Numbers, "images 6"]:
+    def exterior_sigma(self) -> Float[ArrayLike, "images 6"]:
         """A posteriori standard deviations of X, Y, Z (m) and the rotations (rad), by image."""
         return self._sigma(self.matrix.diagonal())[: 6 * self.n_images].reshape(-1, 6)
 
@@ -77,12 +77,12 @@ class Covariance(eqx.Module):
         return matrix[np.arange(n), :3, np.arange(n), :3]
 
     @property
-    def shared_sigma(self) -> Float[Numbers, "shared"]:
+    def shared_sigma(self) -> Float[ArrayLike, "shared"]:
         """A posteriori standard deviations of the shared unknowns, in the order of the last `labels`."""
         return self._sigma(self.matrix.diagonal())[6 * self.n_images :]
 
     @property
-    def point_sigma(self) -> Float[Numbers, "points 3"]:
+    def point_sigma(self) -> Float[ArrayLike, "points 3"]:
         """A posteriori standard deviations of the object points (m)."""
         return self._sigma(self.points.diagonal(axis1=1, axis2=2))
 
@@ -100,7 +100,7 @@ class Covariance(eqx.Module):
         covariance[np.ix_(free, free)] = np.asarray(self.matrix)[np.ix_(columns, columns)] * float(self.variance_factor)
         return covariance
 
-    def _sigma(self, variance: Numbers) -> Any:
+    def _sigma(self, variance: ArrayLike) -> Any:
         xp = jnp if isinstance(variance * self.variance_factor, jax.Array) else np
         # The variance of a fixed unknown is zero or, by rounding, slightly negative. NaN stays NaN.
         # `where` twice: the square root has no derivative at zero.
@@ -121,14 +121,14 @@ def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa", *
     labels = [f"exterior[{i}].{n}" for i in adjusted.block.images for n in EOP_NAMES[rotations]]
     return Covariance(
         matrix=adjusted.padded.crop_reduced(matrix),
-        points=still(points)[adjusted.padded.places.point],
+        points=to_numpy(points)[adjusted.padded.places.point],
         variance_factor=adjusted.sigma0**2,
         cofactors=cofactors,
         rows=rows_cofactors,
         labels=(*labels, *adjusted.structure.labels),
         n_images=adjusted.structure.n_images,
         rotations=rotations,
-        converged=still(adjusted.converged),
+        converged=to_numpy(adjusted.converged),
     )
 
 

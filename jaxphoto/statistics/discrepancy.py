@@ -24,13 +24,13 @@ from jaxtyping import Float
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.adjustment.model.row_functions import rows_of
-from jaxphoto.observations import AXES, AbstractObservations, ControlRows
+from jaxphoto.observations import AXES, AbstractObservations, ControlCoordinates
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics.quantiles import student_limit
 
 
-@shown
+@pretty_repr
 class Spread(eqx.Module):
     """Number, mean, root mean square and maximum absolute value of one group along one axis."""
 
@@ -76,11 +76,13 @@ def residual_spread(adjusted: Adjustment) -> list[Spread]:
     return spreads
 
 
-def check_discrepancies(adjusted: Adjustment) -> ControlRows:
+def check_discrepancies(adjusted: Adjustment) -> ControlCoordinates:
     """Surveyed minus computed coordinates (m) of the check points, with the survey's sigmas (paper 000, Table 5)."""
     check = adjusted.block.check
     points = np.asarray(adjusted.unknowns.points)
-    return ControlRows(check.who, check.axis, np.asarray(check.value) - points[check.who, check.axis], check.sigma)
+    return ControlCoordinates(
+        check.who, check.axis, np.asarray(check.value) - points[check.who, check.axis], check.sigma
+    )
 
 
 def point_differences(first: Adjustment, second: Adjustment) -> tuple[tuple[str, ...], Float[np.ndarray, "n 3"]]:
@@ -119,7 +121,7 @@ _LEVEL = 0.05
 _DIGITS = 2
 
 
-@shown
+@pretty_repr
 class ComponentAccuracy(NamedTuple):
     """Tested accuracy of one component; metres."""
 
@@ -154,7 +156,7 @@ class ComponentAccuracy(NamedTuple):
         return self.n >= LEAST_CHECK_POINTS and not math.isnan(self.survey_m)
 
 
-@shown
+@pretty_repr
 class AxisErrors(NamedTuple):
     """Surveyed minus computed along one axis: number of check points, mean and root mean square (m)."""
 
@@ -172,7 +174,7 @@ class AxisErrors(NamedTuple):
         return abs(self.mean_m) > student_limit(self.n - 1, _LEVEL) * scatter
 
 
-@shown
+@pretty_repr
 class PositionalAccuracy(NamedTuple):
     """Accuracy of an adjusted block at its check points."""
 
@@ -181,7 +183,7 @@ class PositionalAccuracy(NamedTuple):
     axes: tuple[AxisErrors, ...]
 
 
-def positional_accuracy(discrepancies: ControlRows) -> PositionalAccuracy:
+def positional_accuracy(discrepancies: ControlCoordinates) -> PositionalAccuracy:
     """Positional accuracy from `discrepancies`, surveyed minus computed with the survey's sigmas.
 
     See `check_discrepancies`. A sigma of zero is unknown.

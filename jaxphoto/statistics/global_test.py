@@ -14,13 +14,13 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.compiling import call_compiled
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics.discrepancy import observation_groups
 from jaxphoto.statistics.quantiles import chi_square_tails
 from jaxphoto.statistics.reliability import Redundancy
 
 
-@shown
+@pretty_repr
 class VarianceFactor(eqx.Module):
     """v'Pv over the redundancy of a group of observations, with its two-sided p-value."""
 
@@ -41,12 +41,12 @@ class VarianceFactor(eqx.Module):
 def global_test(adjusted: Adjustment, redundancy: Redundancy | None = None) -> VarianceFactor:
     """Test sigma naught of all observations against 1; with redundancy numbers, against its expectation for residuals
     of distorted coordinates (`expected_residual_scale`)."""
-    n, square_sum = sum(adjusted.n_observations.values()), float(adjusted.square_sum)
+    n, sum_of_squares = sum(adjusted.n_observations.values()), float(adjusted.sum_of_squares)
     expected = 1.0
     if redundancy is not None and adjusted.redundancy > 0:
         image_numbers = np.asarray(redundancy.image).sum(axis=0)
         expected += float(image_numbers @ (_expected(adjusted) - 1)) / adjusted.redundancy
-    return _tested("", n, square_sum, adjusted.redundancy, expected)
+    return _tested("", n, sum_of_squares, adjusted.redundancy, expected)
 
 
 def group_factors(adjusted: Adjustment, redundancy: Redundancy) -> list[VarianceFactor]:
@@ -96,8 +96,8 @@ def _slopes(interior: InteriorOrientation, xy: Float[Array, "rows 2"]) -> Float[
     return jax.vmap(jax.jacfwd(interior.closed_form))(xy)
 
 
-def _tested(group: str, n: int, square_sum: float, redundancy: float, expected: float) -> VarianceFactor:
+def _tested(group: str, n: int, sum_of_squares: float, redundancy: float, expected: float) -> VarianceFactor:
     if redundancy <= 0:
         return VarianceFactor(group, n, redundancy, 1.0, 1.0)
-    p = 2 * min(chi_square_tails(square_sum / expected, redundancy))
-    return VarianceFactor(group, n, redundancy, square_sum / redundancy, min(p, 1.0), expected)
+    p = 2 * min(chi_square_tails(sum_of_squares / expected, redundancy))
+    return VarianceFactor(group, n, redundancy, sum_of_squares / redundancy, min(p, 1.0), expected)

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int, Int32
 from jaxphoto.adjustment import Adjustment, NormalEquations
 from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals
 from jaxphoto.adjustment.right_hand_sides import at_once, blank, in_batches, joined, prepare_solving, solve_many
-from jaxphoto.arrays import Numbers, still
+from jaxphoto.arrays import ArrayLike, to_numpy
 from jaxphoto.compiling import prepare, run_compiled
 
 # Maximum number of directions per batch, and of array elements in a batch: several arrays of this size coexist.
@@ -97,10 +97,10 @@ class HatMatrix(eqx.Module):
 
     @property
     def _scale(self) -> Float[np.ndarray, "shared"]:
-        return still(self.equations.scale.shared)
+        return to_numpy(self.equations.scale.shared)
 
     def _shared_changes(self, x: Increments) -> Float[np.ndarray, "m shared"]:
-        return -still(x.shared) * self._scale
+        return -to_numpy(x.shared) * self._scale
 
     def _jt_products(self, column: Column, directions: range) -> Increments:
         """J' z of each direction."""
@@ -114,7 +114,7 @@ class HatMatrix(eqx.Module):
                 yield z
 
         program = _pull if self.image_rows else _pull_others
-        parts = [jax.tree.map(still, self._run(program, z)) for z in batches()]
+        parts = [jax.tree.map(to_numpy, self._run(program, z)) for z in batches()]
         # There may be no direction: all parameters fixed, or no candidate effects.
         return joined(parts, self.equations.scale, len(directions))
 
@@ -126,7 +126,7 @@ class HatMatrix(eqx.Module):
         """J x of each direction, in the order of `places`."""
         valid, count, program = self.laid < self.count, len(x.shared), _push if self.image_rows else _push_others
         for first, batch in zip(range(0, count, size := _batch(len(self.laid))), in_batches(x, size), strict=True):
-            for row in still(self._run(program, batch))[: count - first]:
+            for row in to_numpy(self._run(program, batch))[: count - first]:
                 product = np.zeros(self.count)
                 product[self.laid[valid]] = row[valid]
                 yield product
@@ -135,14 +135,14 @@ class HatMatrix(eqx.Module):
         return run_compiled(program, (self.equations, argument), self.adjusted.seconds, "covariance")
 
 
-def inner_products(a: Increments, b: Increments) -> Float[Numbers, "m n"]:
+def inner_products(a: Increments, b: Increments) -> Float[ArrayLike, "m n"]:
     """a' b of each of `a` with each of `b`, along leading axes.
 
     Summed kind by kind: in a large block a copy of all increments takes 100 MB.
     """
     products: Any = np.zeros((len(a.shared), len(b.shared)))
     for pair in zip(a, b, strict=True):
-        v, w = (part.reshape(len(part), math.prod(part.shape[1:])) for part in map(still, pair))
+        v, w = (part.reshape(len(part), math.prod(part.shape[1:])) for part in map(to_numpy, pair))
         products = products + v @ w.T
     return products
 
@@ -169,24 +169,24 @@ def _batch(n_elements: int) -> int:
 @eqx.filter_jit
 def _pull(equations: NormalEquations, z: Float[Array, "k places"]) -> Increments:
     zero = jax.tree.map(lambda v: jnp.zeros(v.shape), jax.eval_shape(equations.at.residuals))
-    return equations.pull(jax.vmap(ravel_pytree(zero)[1])(z))
+    return equations.jt_product(jax.vmap(ravel_pytree(zero)[1])(z))
 
 
 @eqx.filter_jit
 def _pull_others(equations: NormalEquations, z: Float[Array, "k places"]) -> Increments:
-    one = jax.eval_shape(equations.push_others, blank(equations.scale, 1))
+    one = jax.eval_shape(equations.j_product_others, blank(equations.scale, 1))
     zero = jax.tree.map(lambda v: jnp.zeros(v.shape[1:]), one)
-    return equations.pull_others(jax.vmap(ravel_pytree(zero)[1])(z))
+    return equations.jt_product_others(jax.vmap(ravel_pytree(zero)[1])(z))
 
 
 @eqx.filter_jit
 def _push_others(equations: NormalEquations, x: Increments) -> Float[Array, "k places"]:
-    return _rows(equations.push_others(x))
+    return _rows(equations.j_product_others(x))
 
 
 @eqx.filter_jit
 def _push(equations: NormalEquations, x: Increments) -> Float[Array, "k places"]:
-    return _rows(equations.push(x))
+    return _rows(equations.j_product(x))
 
 
 def _rows(residuals: NonImageResiduals) -> Float[Array, "k places"]:

@@ -6,10 +6,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 
-def chi_square_tails(square_sum: float, freedom: float) -> tuple[float, float]:
+def chi_square_tails(sum_of_squares: float, freedom: float) -> tuple[float, float]:
     """Lower and upper tail probabilities of a square sum."""
     special = _special()
-    return float(special.gammainc(freedom / 2, square_sum / 2)), float(special.gammaincc(freedom / 2, square_sum / 2))
+    return float(special.gammainc(freedom / 2, sum_of_squares / 2)), float(
+        special.gammaincc(freedom / 2, sum_of_squares / 2)
+    )
 
 
 def chi_square_limit(freedom: Int[np.ndarray, "*n"], level: float) -> Float[np.ndarray, "*n"]:

@@ -23,10 +23,10 @@ from jaxtyping import Array, Float
 
 from jaxphoto.adjustment import Adjustment, NormalEquations
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS, Residuals
-from jaxphoto.arrays import Numbers, still
+from jaxphoto.arrays import ArrayLike, to_numpy
 from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.observations import AbstractObservations, Correlated
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics.covariance import Cofactors, Covariance, RowCofactors, prepare_covariance, row_cofactors
 from jaxphoto.statistics.discrepancy import observation_groups
 from jaxphoto.statistics.hat_matrix import HatMatrix
@@ -58,7 +58,7 @@ def prepare_statistics(equations: NormalEquations, seconds: dict[str, float]) ->
     prepare(_row_variances, (equations, Cofactors._make(cofactors), rows), seconds)
 
 
-@shown
+@pretty_repr
 class Redundancy(eqx.Module):
     """Redundancy numbers, shaped like `Adjustment.residuals`; they sum to the redundancy."""
 
@@ -67,16 +67,16 @@ class Redundancy(eqx.Module):
     """I - J Q J' (rows, c, c) of the whitened numbers of each row, by group."""
 
     @property
-    def image(self) -> Float[Numbers, "2 rows"]:
+    def image(self) -> Float[ArrayLike, "2 rows"]:
         """Redundancy numbers of the image rows."""
         return self.numbers.image
 
     @property
-    def named(self) -> dict[str, Float[Numbers, "..."]]:
+    def named(self) -> dict[str, Float[ArrayLike, "..."]]:
         """Redundancy numbers by group name."""
         return self.numbers.named
 
-    def __getitem__(self, name: str) -> Float[Numbers, "..."]:
+    def __getitem__(self, name: str) -> Float[ArrayLike, "..."]:
         return self.numbers[name]
 
 
@@ -92,7 +92,7 @@ def redundancy_numbers(adjusted: Adjustment, covariance: Covariance) -> Redundan
     blocks: dict[str, np.ndarray] = {}
     for g, v in zip(adjusted.structure.observed, others, strict=True):
         c, rows = g.components, groups[g.name]
-        flat = still(v).reshape(c * c, *np.shape(v)[2:])
+        flat = to_numpy(v).reshape(c * c, *np.shape(v)[2:])
         hat = adjusted.padded.crop_rows(dataclasses.replace(g, scalar=False), flat)
         block = np.eye(c) - hat.reshape(c, c, -1).transpose(2, 0, 1)
         numbers = np.diagonal(block, axis1=1, axis2=2).T
@@ -156,12 +156,12 @@ def minimal_detectable_biases(
     """
     mdbs = {}
     for name, p in error_precision(adjusted, redundancy).items():
-        checked = still(redundancy[name]) > UNCHECKED
+        checked = to_numpy(redundancy[name]) > UNCHECKED
         mdbs[name] = np.where(checked, delta0 / np.sqrt(np.where(checked, p, 1.0)), np.inf)
     return mdbs
 
 
-@shown
+@pretty_repr
 class LargestMdb(NamedTuple):
     """The observation of a group with the largest MDB in standard deviations."""
 
@@ -180,7 +180,7 @@ def largest_mdbs(adjusted: Adjustment, redundancy: Redundancy) -> list[LargestMd
     mdbs = minimal_detectable_biases(adjusted, redundancy)
     for name, rows in observation_groups(adjusted).items():
         if rows.unit and len(rows):
-            mdb, sigma = np.atleast_2d(mdbs[name]), np.atleast_2d(still(rows.sigmas).T)
+            mdb, sigma = np.atleast_2d(mdbs[name]), np.atleast_2d(to_numpy(rows.sigmas).T)
             k = np.unravel_index(np.argmax(mdb / sigma), mdb.shape)
             component, row = np.reshape(k, (2, 1))
             (words,) = rows.words_of(component, row, block.images, block.points)
@@ -188,7 +188,7 @@ def largest_mdbs(adjusted: Adjustment, redundancy: Redundancy) -> list[LargestMd
     return largest
 
 
-@shown
+@pretty_repr
 class MdbEffects(eqx.Module):
     """External reliability: effect of the MDB of every observation, in standard deviations of the affected quantity.
 
@@ -201,7 +201,7 @@ class MdbEffects(eqx.Module):
     """Upper bound for any function of the unknowns."""
 
 
-@shown
+@pretty_repr
 class LargestEffect(NamedTuple):
     """The observation whose MDB has the largest effect on an interior parameter."""
 

@@ -25,14 +25,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.arrays import Numbers, is_traced, namespace, still
+from jaxphoto.arrays import ArrayLike, is_traced, namespace, to_numpy
 from jaxphoto.block_edits import one_camera
 from jaxphoto.camera import InteriorOrientation, Sensor, parameter_names
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
 from jaxphoto.linear_algebra import solve
 from jaxphoto.rotation import small_rotation
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.stability import as_arrays, image_grid, parameter_vector, regular_rays, with_parameters
 from jaxphoto.statistics.correlation import linear_forms
 
@@ -40,14 +40,14 @@ from jaxphoto.statistics.correlation import linear_forms
 _LONG, _SHORT = 60, 40
 
 
-@shown
+@pretty_repr
 class SigmaMap(eqx.Module):
     """A posteriori covariances of projected points over the format of a camera."""
 
     camera: str = eqx.field(static=True)
     distance_m: float
     """Distance of the point from the projection centre; infinite for a direction."""
-    points: Float[Numbers, "cells 2"]
+    points: Float[ArrayLike, "cells 2"]
     """Measured image coordinates (mm from the centre of the image)."""
     covariance: Float[Any, "cells 2 2"]
     """Of x and y (mm^2); NaN where the distortion is not invertible or the ray points backwards."""
@@ -66,7 +66,7 @@ def sigma_map(
     camera: str | None = None,
     *,
     distance_m: float = float("inf"),
-    points: Float[Numbers, "cells 2"] | None = None,
+    points: Float[ArrayLike, "cells 2"] | None = None,
 ) -> SigmaMap:
     """Covariance of the image of a point at `distance_m` due to errors of interior and exterior orientation.
 
@@ -84,14 +84,14 @@ def _sigma_map(
     adjusted: Adjustment,
     name: str,
     distance_m: float,
-    points: Float[Numbers, "cells 2"] | None,
+    points: Float[ArrayLike, "cells 2"] | None,
     joint: tuple[list[str], Float[Any, "n n"]],
 ) -> SigmaMap:
     """The map of a camera with the `_joint_covariance` `joint`."""
     interior, sensor = adjusted.unknowns.interior[name], adjusted.block.sensors[name]
     xy = _cells(sensor) if points is None else np.asarray(points, float)
     parameters, covariance = joint
-    jacobian = still(call_compiled(_derivatives, as_arrays(interior), jnp.asarray(xy), jnp.asarray(1 / distance_m)))
+    jacobian = to_numpy(call_compiled(_derivatives, as_arrays(interior), jnp.asarray(xy), jnp.asarray(1 / distance_m)))
     index = [
         *(parameter_names(interior).index(p) for p in parameters),
         *range(jacobian.shape[2] - 6, jacobian.shape[2]),
@@ -124,7 +124,7 @@ def sigma_maps(adjusted: Adjustment) -> dict[str, tuple[SigmaMap, SigmaMap]]:
     return maps
 
 
-def _cells(sensor: Sensor) -> Float[Numbers, "cells 2"]:
+def _cells(sensor: Sensor) -> Float[ArrayLike, "cells 2"]:
     across = sensor.width_px >= sensor.height_px
     return image_grid(sensor, *((_LONG, _SHORT) if across else (_SHORT, _LONG)))
 
@@ -139,7 +139,7 @@ def _joint_covariance(adjusted: Adjustment, camera: str) -> tuple[list[str], Flo
     images = np.flatnonzero(np.array(adjusted.block.image_camera) == camera)
     exterior: Any = np.zeros((n, len(adjusted.block.images), 6))
     exterior[-6:-3, images, 3:] = np.eye(3)[:, None, :] / len(images)
-    minus_rotations = -still(adjusted.unknowns.exterior.camera_from_object)[images].swapaxes(0, 1) / len(images)
+    minus_rotations = -to_numpy(adjusted.unknowns.exterior.camera_from_object)[images].swapaxes(0, 1) / len(images)
     if is_traced(minus_rotations):
         exterior = jnp.asarray(exterior).at[-3:, images, :3].set(minus_rotations)
     else:

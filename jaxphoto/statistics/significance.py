@@ -38,7 +38,7 @@ from jaxphoto.camera import (
     set_parameter,
 )
 from jaxphoto.compiling import call_compiled
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics.covariance import Covariance
 from jaxphoto.statistics.quantiles import beta_tail, chi_square_shift
 from jaxphoto.tracing import outside_transformations
@@ -48,7 +48,7 @@ SIGNIFICANCE_LEVEL = 0.05
 """Error probability of the tests of zero parameters."""
 
 
-@shown
+@pretty_repr
 class Significance(eqx.Module):
     """One estimated interior parameter: value, a posteriori sigma, |value| / sigma, and two-sided p of value = 0.
 
@@ -90,7 +90,7 @@ def significance(adjusted: Adjustment, covariance: Covariance) -> list[Significa
     return result
 
 
-@shown
+@pretty_repr
 class FixedAtZero(NamedTuple):
     """First-order change of a camera if one interior parameter is fixed at zero."""
 
@@ -135,9 +135,9 @@ def student_p(t: float, degrees_of_freedom: int) -> float:
     return float(call_compiled(_beta, np.array(a), np.array(x)))
 
 
-def chi_square_p(square_sum: float, redundancy: int) -> float:
+def chi_square_p(sum_of_squares: float, redundancy: int) -> float:
     """Probability of a larger v'Pv if the a priori sigmas are true; 1 without redundancy."""
-    return float(gammaincc(redundancy / 2, square_sum / 2)) if redundancy > 0 else 1.0
+    return float(gammaincc(redundancy / 2, sum_of_squares / 2)) if redundancy > 0 else 1.0
 
 
 @eqx.filter_jit
@@ -152,7 +152,7 @@ POWER = 0.80
 _MIN_INFORMATION = 1e-6
 
 
-@shown
+@pretty_repr
 class ZeroTest(NamedTuple):
     """Test of zero parameters, one entry a parameter.
 
@@ -231,14 +231,14 @@ def _solved(
     return float(np.sum((right @ half) ** 2)), int(determined.sum()), half @ half.T
 
 
-def _tail(square_sum: float, freedom: int, redundancy: int) -> float:
+def _tail(sum_of_squares: float, freedom: int, redundancy: int) -> float:
     """Probability of a larger square sum over the a posteriori variance factor; 1 without redundancy."""
     if freedom == 0 or redundancy <= 0:
         return 1.0
-    return beta_tail(square_sum / (square_sum + redundancy), freedom / 2, redundancy / 2)
+    return beta_tail(sum_of_squares / (sum_of_squares + redundancy), freedom / 2, redundancy / 2)
 
 
-@shown
+@pretty_repr
 class CameraDrift(NamedTuple):
     """Change of one camera from its first exposure to its last, or from the lowest to the highest temperature.
 
@@ -254,7 +254,7 @@ class CameraDrift(NamedTuple):
     change: ZeroTest
 
 
-@shown
+@pretty_repr
 class CameraDifferences(NamedTuple):
     """Differences from the camera of the block (mm), by strip or by knot; one entry an estimated parameter."""
 

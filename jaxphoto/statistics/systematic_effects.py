@@ -37,7 +37,7 @@ from jaxphoto.camera import (
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words
 from jaxphoto.observations import PRIORS, AbstractObservations, Correlated
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics.discrepancy import observation_groups
 from jaxphoto.statistics.hat_matrix import HatMatrix
 from jaxphoto.statistics.quantiles import beta_tail
@@ -64,7 +64,7 @@ _CURE_OF_SHIFT = {
 _CURE_OF_STRIP = "on the average: let that strip shift, or check its recording and its camera"
 
 
-@shown
+@pretty_repr
 class EffectTerm(NamedTuple):
     """A named combination of the columns of a systematic effect."""
 
@@ -87,7 +87,7 @@ class Part(NamedTuple):
     """One over their standard deviations."""
 
 
-@shown
+@pretty_repr
 class SystematicEffect(NamedTuple):
     """Candidate columns that residuals may follow, in parts."""
 
@@ -368,7 +368,7 @@ _MAX_BLUNDERS = 16
 _MATCH = 0.5
 
 
-@shown
+@pretty_repr
 class TermEstimate(NamedTuple):
     """One term of a systematic effect, estimated alone."""
 
@@ -382,7 +382,7 @@ class TermEstimate(NamedTuple):
     """Change of the interior parameters with it, in their standard deviations, by path."""
 
 
-@shown
+@pretty_repr
 class EffectTest(NamedTuple):
     """Test of one systematic effect."""
 
@@ -498,15 +498,15 @@ def _tested(
     c = unadjusted - adjusted_products[first:last, first:last] - cross @ blunders.inverse @ cross.T
     changes = changes[first:last] - cross @ blunders.inverse @ blunders.changes
     inverse, freedom = truncated_inverse(c, unadjusted, pattern.min_fraction)
-    square_sum, redundancy = float(v @ v) - blunders.explained, adjusted.redundancy - blunders.freedom
-    if freedom == 0 or redundancy <= freedom or square_sum <= 0:
+    sum_of_squares, redundancy = float(v @ v) - blunders.explained, adjusted.redundancy - blunders.freedom
+    if freedom == 0 or redundancy <= freedom or sum_of_squares <= 0:
         return None
-    explained, b, sigma0 = float(u @ inverse @ u), inverse @ u, (square_sum / redundancy) ** 0.5
+    explained, b, sigma0 = float(u @ inverse @ u), inverse @ u, (sum_of_squares / redundancy) ** 0.5
     column_products = pattern.products(whitened=False)
     size2 = (b @ column_products @ b - sigma0**2 * np.sum(column_products * inverse)) / pattern.rows
     hints = _hints(adjusted, pattern, u, c, unadjusted, changes, sigma0)
     hints = [hint._replace(share=hint.share / explained) for hint in hints]
-    p = beta_tail(explained / square_sum, freedom / 2, (redundancy - freedom) / 2)
+    p = beta_tail(explained / sum_of_squares, freedom / 2, (redundancy - freedom) / 2)
     hints.sort(key=lambda h: -h.share)
     matching = 0
     if hints and m:

@@ -46,8 +46,8 @@ from jaxphoto.adjustment import MAX_STEPS, Adjustment, solve
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError, counted
-from jaxphoto.observations import AXES, AbstractObservations, Correlated, ImageRows
-from jaxphoto.short_repr import shown
+from jaxphoto.observations import AXES, AbstractObservations, Correlated, ImagePoints
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics.covariance import covariance
 from jaxphoto.statistics.discrepancy import observation_groups
 from jaxphoto.statistics.hat_matrix import HatMatrix
@@ -55,7 +55,7 @@ from jaxphoto.statistics.reliability import redundancy_numbers
 from jaxphoto.tracing import outside_transformations
 
 
-@shown
+@pretty_repr
 class Selection(NamedTuple):
     """Observations of one group: all of them, or those of some axes, cameras, images or points."""
 
@@ -70,7 +70,7 @@ Partition = Sequence[str] | Mapping[str, Selection | Sequence[Selection]]
 """Splits of `SPLITS` (none: one part a group), or the selections of each label."""
 
 
-@shown
+@pretty_repr
 class Parts(NamedTuple):
     """A partition of the observations of one adjustment."""
 
@@ -202,7 +202,7 @@ PROBES = 64
 depend on them: their error is below one per cent for parts with a redundancy of some tens."""
 
 
-@shown
+@pretty_repr
 class PartialRedundancy(eqx.Module):
     """Redundancy by parts of a partition; the last entry is all observations in none."""
 
@@ -250,7 +250,7 @@ def _products(adjusted: Adjustment, parts: Parts, probes: int) -> tuple[np.ndarr
     n = len(parts.labels) + 1
     largest = int(np.argmax(sum(np.bincount(np.ravel(index), minlength=n) for index in parts.part_of.values())))
     # The largest part gets no vectors. If it holds all image points, their share is the rest of z'Hz = |Hz|^2.
-    skip_images = all((index == largest).all() for name, index in parts.part_of.items() if name == ImageRows.group)
+    skip_images = all((index == largest).all() for name, index in parts.part_of.items() if name == ImagePoints.group)
     hat_matrix = HatMatrix.of(adjusted, image_rows=not skip_images)
     # Datum constraints count as one more part.
     part = np.full(hat_matrix.count, n)
@@ -294,7 +294,7 @@ _UNCHECKED = 1e-6
 _SINGULAR = 1e-10
 
 
-@shown
+@pretty_repr
 class VarianceComponents(eqx.Module):
     """Variance components of the parts of a partition, and the adjustment with them.
 

@@ -17,7 +17,7 @@ from jaxphoto.adjustment.model.block_values import values_of, with_datum
 from jaxphoto.adjustment.model.numbers import Increments, zero_increments
 from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.adjustment.solver.band import factor_band
-from jaxphoto.adjustment.solver.elimination import pull, reduce_right, solve_factored
+from jaxphoto.adjustment.solver.elimination import jt_product, reduce_right, solve_factored
 from jaxphoto.adjustment.solver.non_image_rows import NonImageRows, non_image_rows
 from jaxphoto.adjustment.solver.optimum import typical_scale, weigh_datum
 from jaxphoto.adjustment.solver.ray_rows import RayJacobian
@@ -203,7 +203,7 @@ def _dense(values, structure) -> Dense:
     solutions, *undamped = jax.lax.map(solved, jnp.array(DAMPINGS))
     reduced, right = jax.tree.map(lambda v: v[DAMPINGS.index(0.0)], undamped)
     own = at.residuals()
-    b = jax.tree.map(lambda v: v[0], pull(jax.tree.map(lambda v: v[None], own), at))
+    b = jax.tree.map(lambda v: v[0], jt_product(jax.tree.map(lambda v: v[None], own), at))
     down, d = reduce_right(reduced, b, at)
     return Dense(
         jacobian=jacobian,
@@ -213,7 +213,7 @@ def _dense(values, structure) -> Dense:
         vector=vector,
         gradient=ravel_pytree(b)[0],
         sums=ravel_pytree(right.b)[0],
-        square_sums=jnp.stack([at.square_sum(), sum(jnp.sum(v**2) for v in jax.tree.leaves(own))]),
+        square_sums=jnp.stack([at.sum_of_squares(), sum(jnp.sum(v**2) for v in jax.tree.leaves(own))]),
         taken_down=jnp.stack([jnp.concatenate([down, d]), jnp.concatenate([right.reduced, right.d])]),
         couples=jnp.zeros(0, bool),
         solutions=solutions,

@@ -12,7 +12,7 @@ from jaxphoto.adjustment.arguments import check_arguments
 from jaxphoto.block import Datum, Motion
 from jaxphoto.compiling.lru_cache import LruCache
 from jaxphoto.georeferencing import Mount, StripBias
-from jaxphoto.observations import Attitudes, ControlRows, StationRows
+from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates
 from tests.blocks import simulated
 from tests.checked_types import unchecked
 
@@ -34,7 +34,7 @@ def without_attitudes(block):
 
 
 def without_stations(block):
-    return dataclasses.replace(block, stations=StationRows.none())
+    return dataclasses.replace(block, stations=CameraPositions.none())
 
 
 def at_one_time(block):
@@ -67,7 +67,7 @@ def without_second_strip(block):
 
 
 BOTH_SHIFTS = {name: StripBias(FREE, FIXED) for name in "ab"}
-NO_CONTROL = {"control": ControlRows.none(), "fixed": ControlRows.none()}
+NO_CONTROL = {"control": ControlCoordinates.none(), "fixed": ControlCoordinates.none()}
 
 
 @pytest.mark.parametrize(
@@ -236,6 +236,6 @@ def test_trees_of_another_kind_are_named():
 
 def test_lists_are_arrays():
     with unchecked():
-        rows = ControlRows([0, 1], [2, 2], [1.0, 2.0], [0.1, 0.1])
+        rows = ControlCoordinates([0, 1], [2, 2], [1.0, 2.0], [0.1, 0.1])
         assert rows.value.dtype == float and rows.who.dtype.kind == "i"
         assert Mount([0.1, 0.2, 0.3], [0.0, 0.0, 0.0]).lever_arm.shape == (3,)

@@ -11,12 +11,12 @@ from scipy.optimize import minimize_scalar
 
 from jaxphoto import Outcome, adjust
 from jaxphoto.adjustment import common_sizes, weaknesses_of
-from jaxphoto.adjustment.adjust import lay_out
+from jaxphoto.adjustment.adjust import build_problem
+from jaxphoto.adjustment.iteration_log import step_lines
 from jaxphoto.adjustment.model.numbers import state_at
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import typical_scale
 from jaxphoto.adjustment.solver.reduced import linearise_rows, reduce_normal
-from jaxphoto.adjustment.told import step_lines
 from jaxphoto.report.results import convergence_words
 from jaxphoto.report.tables import convergence_table
 from tests.adjustment.dense import in_one_list
@@ -57,7 +57,7 @@ def test_flat_blocks_converge_within_forty_steps(seed):
     found = optimum(seed)
     assert found.outcome is Outcome.CONVERGED and int(found.steps) <= 40
     # What is refused is not taken, and no step makes the square sum larger.
-    sums = np.append(found.course.square_sum, float(found.square_sum))
+    sums = np.append(found.course.sum_of_squares, float(found.sum_of_squares))
     assert (np.diff(sums) <= 1e-6 * sums[:-1]).all()
     assert (np.diff(sums)[found.course.accepted == 0] == 0).all()
 
@@ -89,7 +89,7 @@ def test_what_is_not_determined_is_told_early_and_named():
 def test_the_optimum_is_that_of_a_search_over_the_principal_distance(seed):
     """Dense Gauss-Newton for each c, from the truth, and the c of the least square sum: no valley is followed."""
     block, truth = flat(seed).block, flat(seed).truth
-    laid = lay_out(block, truth, block.priors, alone=True)
+    laid = build_problem(block, truth, block.priors, alone=True)
     values, structure = laid.padded_values, laid.padded.structure
     scale = typical_scale(values, structure)
     flat_scale, back = ravel_pytree(scale)
@@ -145,7 +145,7 @@ def test_a_well_determined_block_takes_straight_steps():
 def test_the_right_hand_side_of_other_residuals(name):
     """J'r with r elsewhere, less what is subtracted: what the acceleration is solved from."""
     block = simulated(name).block
-    laid = lay_out(block, block.start.unknowns, block.priors, alone=True)
+    laid = build_problem(block, block.start.unknowns, block.priors, alone=True)
     values, structure = laid.padded_values, laid.padded.structure
     scale = typical_scale(values, structure)
     free, back = ravel_pytree(jax.tree.map(lambda v: v > 0, scale))
@@ -161,8 +161,13 @@ def test_the_right_hand_side_of_other_residuals(name):
         r = residuals(moved)
         (pulled,) = jax.vjp(residuals, zero)[1](r)
         expected = jax.tree.map(jnp.subtract, pulled, moved)
-        return ravel_pytree(right.b)[0], ravel_pytree(expected)[0], there.residual_rows().square_sum(structure), r @ r
+        return (
+            ravel_pytree(right.b)[0],
+            ravel_pytree(expected)[0],
+            there.residual_rows().sum_of_squares(structure),
+            r @ r,
+        )
 
-    found, expected, square_sum, expected_sum = both()
+    found, expected, sum_of_squares, expected_sum = both()
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * float(jnp.max(jnp.abs(expected))))
-    assert float(square_sum) == pytest.approx(float(expected_sum))
+    assert float(sum_of_squares) == pytest.approx(float(expected_sum))

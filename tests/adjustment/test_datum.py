@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from jaxphoto import FIXED, FREE, DatumError, adjust
-from jaxphoto.adjustment.datum_words import MOTIONS
+from jaxphoto.adjustment.datum_messages import MOTIONS
 from jaxphoto.block import Datum
 from jaxphoto.georeferencing import StripBias
-from jaxphoto.observations import ControlRows, Distances, StationRows
+from jaxphoto.observations import CameraPositions, ControlCoordinates, Distances
 from tests.adjustment.dense import with_constraints
 from tests.blocks import (
     BROWN,
@@ -32,7 +32,7 @@ BARE = bare(aerial(), {"one": BROWN}, ("one",) * 10)
 
 def block_with(**observations):
     """The aerial block with only these observations beside image points, at its true values."""
-    observations.setdefault("stations", StationRows.none())
+    observations.setdefault("stations", CameraPositions.none())
     return measured(BARE._replace(block=dataclasses.replace(BARE.block, **observations))).block
 
 
@@ -95,7 +95,7 @@ def test_control_in_height_only():
 
 
 def stations_at(places):
-    stations = rows(range(len(places)), sigma=0.1, kind=StationRows)
+    stations = rows(range(len(places)), sigma=0.1, kind=CameraPositions)
     block = block_with(stations=stations)
     return eqx.tree_at(lambda b: b.stations.value, block, places[stations.who, stations.axis])
 
@@ -131,9 +131,9 @@ def test_free_shifts_leave_the_position():
     "observations",
     [
         {"control": rows((3, 4, 37))},
-        {"control": ControlRows.joined(rows((3, 4), (0, 1)), rows((3, 20, 36), (2,)))},
+        {"control": ControlCoordinates.joined(rows((3, 4), (0, 1)), rows((3, 20, 36), (2,)))},
         {"fixed": rows((3, 4, 37), sigma=0.0)},
-        {"stations": rows(range(10), sigma=0.1, kind=StationRows)},
+        {"stations": rows(range(10), sigma=0.1, kind=CameraPositions)},
         {"attitudes": all_attitudes(BARE.block), "control": rows((20,)), "distances": BAR},
     ],
     ids=["full", "plan-and-height", "fixed", "stations", "attitudes-and-bar"],

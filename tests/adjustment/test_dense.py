@@ -97,15 +97,15 @@ def _solved(values, s, damping):
     rows = linearise_rows(at)
     a, reduced, right = reduce_normal(at, damping, rows)
     factor = factor_band(a)
-    _, push = jax.linearize(lambda y: at._replace(increments=y).residuals(), at.increments)
-    pull = jax.linear_transpose(push, at.increments)
+    _, j_product = jax.linearize(lambda y: at._replace(increments=y).residuals(), at.increments)
+    jt_product = jax.linear_transpose(j_product, at.increments)
 
     def multiplied(x):
-        return jax.tree.map(lambda nx, w, x: nx + damping * w * x, pull(push(x))[0], reduced.weight, x)
+        return jax.tree.map(lambda nx, w, x: nx + damping * w * x, jt_product(j_product(x))[0], reduced.weight, x)
 
     at_once = solve_factored(reduced, factor, right.b, at)
     before = solve_reduced(reduced, factor, right.reduced, right.d, right.b.points, at)
-    return right.b, gradient(rows, at), pull(at.residuals())[0], multiplied(at_once), multiplied(before)
+    return right.b, gradient(rows, at), jt_product(at.residuals())[0], multiplied(at_once), multiplied(before)
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -226,7 +226,7 @@ def test_scipy_finds_the_same_optimum(name):
         gtol=1e-15,
     )
     a = adjusted(name)
-    assert abs(2 * found.cost / float(a.square_sum) - 1) < 1e-9
+    assert abs(2 * found.cost / float(a.sum_of_squares) - 1) < 1e-9
     increments = jax.tree.map(lambda y, k: y * k, back(spread(found.x)), scale)
     state = padded.crop_state(jax.jit(lambda x: state_at(x, unit_scale(s), values, s))(increments))
     cov = covariance_of(name)

@@ -50,7 +50,7 @@ def assert_same(one, other):
     error = (unknowns.exterior.position - others.exterior.position) / exterior[:, :3]
     assert np.abs(error).max() < 1e-5
     assert (np.abs(unknowns.points - others.points) < 1e-5 * cov.point_sigma + 1e-12).all()
-    assert float(b.square_sum) == pytest.approx(float(a.square_sum), rel=1e-11)
+    assert float(b.sum_of_squares) == pytest.approx(float(a.sum_of_squares), rel=1e-11)
     unit = np.outer(sigma, sigma)
     np.testing.assert_allclose(cov2.matrix / unit, cov.matrix / unit, atol=1e-8)
     np.testing.assert_allclose(cov2.points, cov.points, rtol=1e-6, atol=1e-12)

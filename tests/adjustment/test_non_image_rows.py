@@ -73,16 +73,16 @@ def test_many_directions_in_portions_are_those_one_by_one(name, portion, monkeyp
     rng = np.random.default_rng(2)
     x = jax.tree.map(lambda v: rng.normal(size=(12, *v.shape)), equations.scale)
     at = equations.at
-    _, push = jax.linearize(lambda y: at._replace(increments=y).residuals(), at.increments)
-    pull = jax.linear_transpose(push, at.increments)
+    _, j_product = jax.linearize(lambda y: at._replace(increments=y).residuals(), at.increments)
+    jt_product = jax.linear_transpose(j_product, at.increments)
     numbers = sum(g.components * g.n_rows * len(g.parameter) for g in equations.structure.observed)
     monkeypatch.setattr(row_functions, "_AT_ONCE", portion * max(numbers, 1))
     assert row_functions.rows_at_once(numbers) == portion
-    pushed = eqx.filter_jit(lambda equations, x: equations.push(x))(equations, x)
-    pulled = eqx.filter_jit(lambda equations, z: equations.pull(z))(equations, pushed)
+    pushed = eqx.filter_jit(lambda equations, x: equations.j_product(x))(equations, x)
+    pulled = eqx.filter_jit(lambda equations, z: equations.jt_product(z))(equations, pushed)
     for k in range(12):
-        own = push(jax.tree.map(lambda v, k=k: v[k], x))
+        own = j_product(jax.tree.map(lambda v, k=k: v[k], x))
         for one, other in zip(jax.tree.leaves(pushed), jax.tree.leaves(own), strict=True):
             np.testing.assert_allclose(one[k], other, atol=1e-9 * max(1.0, np.abs(other).max(initial=0.0)))
-        for one, other in zip(jax.tree.leaves(pulled), jax.tree.leaves(pull(own)[0]), strict=True):
+        for one, other in zip(jax.tree.leaves(pulled), jax.tree.leaves(jt_product(own)[0]), strict=True):
             np.testing.assert_allclose(one[k], other, atol=1e-9 * max(1.0, np.abs(other).max(initial=0.0)))

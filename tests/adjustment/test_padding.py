@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from jaxphoto import FIXED, ExteriorOrientation, adjust, covariance
 from jaxphoto.adjustment import common_sizes
-from jaxphoto.adjustment.adjust import lay_out
+from jaxphoto.adjustment.adjust import build_problem
 from jaxphoto.adjustment.layout.padding import pad_structure
-from jaxphoto.adjustment.layout.rays import Sizes, size_class, sizes_of
+from jaxphoto.adjustment.layout.rays import PaddedSizes, size_class, sizes_of
 from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.block import Block
 from jaxphoto.compiling import run
@@ -54,22 +54,22 @@ def test_a_layout_is_kept_for_blocks_that_differ_in_numbers_only():
     block = simulated("cross").block
     start = block.start.unknowns
     first, again = (
-        lay_out(block, start, block.priors),
-        lay_out(block.shift_stations([1.0, 0.0, 0.0]), start, block.priors),
+        build_problem(block, start, block.priors),
+        build_problem(block.shift_stations([1.0, 0.0, 0.0]), start, block.priors),
     )
     assert again.padded is first.padded
     numbers = [jax.tree.leaves(laid.padded_values.groups) for laid in (first, again)]
     assert any(not np.array_equal(one, other) for one, other in zip(*numbers, strict=True))
     # FIXED is structure, and is no number.
     held = dataclasses.replace(block.priors, exterior=ExteriorOrientation(FIXED, FIXED))
-    assert not lay_out(block, start, held).padded.structure.eop_free.any()
+    assert not build_problem(block, start, held).padded.structure.eop_free.any()
     # The same shapes with other indices, and unknowns in another order.
     stations = dataclasses.replace(block.stations, who=block.stations.who[::-1])
     turned = dataclasses.replace(block, stations=stations)
-    one, other = (laid.padded.own.observed[0] for laid in (first, lay_out(turned, start, block.priors)))
+    one, other = (laid.padded.own.observed[0] for laid in (first, build_problem(turned, start, block.priors)))
     assert one.name == other.name == "stations"
     np.testing.assert_array_equal(other.image, one.image[:, ::-1])
-    assert lay_out(block, start, block.priors, Sizes(images=64)).padded.structure.n_images == 64
+    assert build_problem(block, start, block.priors, PaddedSizes(images=64)).padded.structure.n_images == 64
 
 
 def test_a_layout_follows_the_order_of_a_scanners_strips():
@@ -81,7 +81,7 @@ def test_a_layout_follows_the_order_of_a_scanners_strips():
 
     start, priors = reordered(block.start.unknowns), reordered(block.priors)
     turned = dataclasses.replace(block, start=dataclasses.replace(block.start, unknowns=start), priors=priors)
-    one, other = (lay_out(b, b.start.unknowns, b.priors).padded.own.labels for b in (block, turned))
+    one, other = (build_problem(b, b.start.unknowns, b.priors).padded.own.labels for b in (block, turned))
     assert sorted(one) == sorted(other)
     assert one != other
 

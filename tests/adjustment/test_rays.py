@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxphoto.adjustment import LEAST
+from jaxphoto.adjustment import MINIMAL_SIZES
 from jaxphoto.adjustment.layout import padding
 from jaxphoto.adjustment.layout.padding import pad_structure
 from jaxphoto.adjustment.layout.rays import Chunks, DeviceLists, order_images, sizes_of
@@ -110,7 +110,7 @@ def test_rows_lie_where_they_are_computed_with(name, shards, at_once, monkeypatc
 def test_images_that_meet_in_fixed_points_only_do_not_meet():
     structure, _, s, places, _ = laid_out("field")
     assert not s.rays.free_points and not s.rays.used[:, 1].any()
-    assert sizes_of(structure).bandwidth == LEAST.bandwidth
+    assert sizes_of(structure).bandwidth == MINIMAL_SIZES.bandwidth
     assert sorted(places.image.tolist()) == list(range(structure.n_images))
 
 

@@ -59,7 +59,7 @@ def numbers_of(result: Adjustment) -> dict[str, np.ndarray]:
         "points": unknowns.points,
         "interior": np.array(jax.tree.leaves(unknowns.interior)),
         "mounts": np.concatenate([np.zeros(0), *map(np.ravel, jax.tree.leaves(unknowns.mounts))]),
-        "square_sum": result.square_sum,
+        "square_sum": result.sum_of_squares,
         "steps": result.steps,
         "matrix": cofactors.matrix,
         "point_covariances": cofactors.points,

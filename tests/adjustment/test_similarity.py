@@ -14,7 +14,7 @@ from jaxphoto.adjustment.model.numbers import Increments, zero_increments
 from jaxphoto.adjustment.solver.optimum import unit_scale
 from jaxphoto.adjustment.solver.similarity import after, motions, n_open_motions, onto_datum, similarity
 from jaxphoto.block import Datum
-from jaxphoto.observations import Distances, StationRows
+from jaxphoto.observations import CameraPositions, Distances
 from jaxphoto.rotation import small_angles, small_rotation
 from tests.adjustment.dense import prepared
 from tests.blocks import free_network, from_afar, simulated
@@ -120,13 +120,13 @@ def test_a_block_that_hardly_knows_how_it_lies_is_turned_as_a_whole(sigma_m, deg
     start = block.start.unknowns
     stations = np.asarray(start.exterior.position) + rng.normal(0, sigma_m, (len(block.images), 3))
     index = np.indices(stations.shape).reshape(2, -1)
-    rows = StationRows(*index, stations.ravel(), np.full(stations.size, sigma_m))
+    rows = CameraPositions(*index, stations.ravel(), np.full(stations.size, sigma_m))
     block = dataclasses.replace(block, datum=Datum("control"), stations=rows)
     near, far = adjust(block, start), adjust(block, turned(start, degrees))
     assert bool(far.converged)
     # 28 and more than 100 steps where increments are added up.
     assert int(far.steps) < 12
-    assert float(far.square_sum) == pytest.approx(float(near.square_sum), rel=1e-9)
+    assert float(far.sum_of_squares) == pytest.approx(float(near.sum_of_squares), rel=1e-9)
 
 
 def test_motions_are_the_derivatives_of_a_similarity():
@@ -180,7 +180,7 @@ def test_a_free_network_is_found_from_afar():
     assert bool(far.converged)
     # 20 with the constraints held all along, 12 as it is.
     assert int(far.steps) < 16
-    assert float(far.square_sum) == pytest.approx(float(near.square_sum), rel=1e-9)
+    assert float(far.sum_of_squares) == pytest.approx(float(near.sum_of_squares), rel=1e-9)
     np.testing.assert_allclose(shape_of(far), shape_of(near), rtol=1e-6)
     # The inner constraints over the points, about the start: no shift, no turn, no change of scale.
     moved, arm = far.unknowns.points - points, points - points.mean(axis=0)

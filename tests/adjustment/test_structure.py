@@ -11,7 +11,7 @@ from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.block import Start
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
-from jaxphoto.observations import ControlRows, Distances, ImageRows
+from jaxphoto.observations import ControlCoordinates, Distances, ImagePoints
 from tests.blocks import VARIANTS, adjusted, covariance_of, simulated
 
 
@@ -65,7 +65,7 @@ def permuted(block, images, points, seed):
     order = order[np.argsort(new_point[rows.point[order]], kind="stable")]
     who = lambda r, place: type(r)(place[r.who], r.axis, r.value, r.sigma)  # noqa: E731
     shuffled = rng.permutation(len(block.control.who))
-    control = ControlRows(
+    control = ControlCoordinates(
         *(
             np.asarray(v)[shuffled]
             for v in (block.control.who, block.control.axis, block.control.value, block.control.sigma)
@@ -83,7 +83,7 @@ def permuted(block, images, points, seed):
         image_mount=pick(block.image_mount),
         image_strip=pick(block.image_strip),
         image_time=np.asarray(block.image_time)[images],
-        image_points=ImageRows(
+        image_points=ImagePoints(
             new_image[rows.image][order], new_point[rows.point][order], rows.xy[order], rows.sigma[order]
         ),
         control=who(control, new_point),
@@ -103,7 +103,7 @@ def test_no_order_matters(seed):
     block = permuted(one.block, images, points, seed)
     assert block.images != one.block.images
     other = adjust(block, block.start.unknowns)
-    assert float(other.square_sum) == pytest.approx(float(one.square_sum), rel=1e-9)
+    assert float(other.sum_of_squares) == pytest.approx(float(one.sum_of_squares), rel=1e-9)
     assert other.redundancy == one.redundancy
     sigma = covariance_of("cross")
     error = np.asarray(other.unknowns.points) - np.asarray(one.unknowns.points)[points]
@@ -125,7 +125,7 @@ def test_names_of_cameras_do_not_matter():
         (rename(block.start.unknowns.interior), rename(block.priors.interior)),
     )
     one, other = adjusted("two_cameras"), adjust(swapped, swapped.start.unknowns)
-    assert float(other.square_sum) == pytest.approx(float(one.square_sum), rel=1e-9)
+    assert float(other.sum_of_squares) == pytest.approx(float(one.sum_of_squares), rel=1e-9)
     for name in swap:
         assert float(other.unknowns.interior[swap[name]].c) == pytest.approx(
             float(one.unknowns.interior[name].c), abs=1e-6

@@ -14,7 +14,7 @@ from jaxphoto.camera import ImageMotion, RollingShutter, RowMotion
 from jaxphoto.collinearity import image_residual
 from jaxphoto.errors import BlockError, DatumError
 from jaxphoto.io import read_block, write_block
-from jaxphoto.observations import ControlRows, StationRows
+from jaxphoto.observations import CameraPositions, ControlCoordinates
 from jaxphoto.rotation import small_rotation
 from tests.blocks import BROWN, SENSOR, simulated
 from tests.derivatives import check_derivatives, compiled
@@ -146,8 +146,8 @@ def test_motions_are_unknowns_by_image_where_they_are_weighted(rolling):
 
 
 def test_what_it_cannot_do_is_refused(rolling):
-    block, none = with_shutter(*rolling), ControlRows.none()
-    loose = dataclasses.replace(block, control=none, stations=StationRows.none(), datum=Datum("inner", "points"))
+    block, none = with_shutter(*rolling), ControlCoordinates.none()
+    loose = dataclasses.replace(block, control=none, stations=CameraPositions.none(), datum=Datum("inner", "points"))
     with pytest.raises(DatumError, match="nothing in the block gives it a scale: add stations"):
         adjust(loose)
     rows = block.image_points.take(np.arange(4))

@@ -9,7 +9,7 @@ from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import Brown, InteriorOrientation, Sensor
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.georeferencing import Mount, StripBias
-from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
+from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
 from jaxphoto.unknowns import FIXED, Unknowns, uniform_priors
 from tests.formulas import camera_from_object
 
@@ -81,11 +81,11 @@ def block_of(image, point, xy, n_images, n_points):
         image_mount=("default",) * n_images,
         image_strip=("default",) * n_images,
         image_time=np.zeros(n_images),
-        image_points=ImageRows(image, point, xy, np.full_like(xy, 0.004)),
-        control=ControlRows.none(),
-        fixed=ControlRows.none(),
-        check=ControlRows.none(),
-        stations=StationRows.none(),
+        image_points=ImagePoints(image, point, xy, np.full_like(xy, 0.004)),
+        control=ControlCoordinates.none(),
+        fixed=ControlCoordinates.none(),
+        check=ControlCoordinates.none(),
+        stations=CameraPositions.none(),
         attitudes=Attitudes.none(),
         distances=Distances.none(),
         datum=Datum(),
@@ -111,4 +111,4 @@ def with_known(block, truth, images=(), points=()):
 def coordinate_rows(values, who, axes=(0, 1, 2)):
     """ControlRows of every axis of `axes` of `who`, with the values of the table `values`."""
     who, axis = (grid.ravel() for grid in np.meshgrid(np.asarray(who, int), axes, indexing="ij"))
-    return ControlRows(who, axis, values[who, axis], np.full(len(who), 0.03))
+    return ControlCoordinates(who, axis, values[who, axis], np.full(len(who), 0.03))

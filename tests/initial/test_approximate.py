@@ -10,7 +10,7 @@ from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Exposure, Mount, StripBias, recorded_attitude, sensor_position
 from jaxphoto.initial import approximate
 from jaxphoto.initial.resection import resect_ideal
-from jaxphoto.observations import Attitudes, ImageRows
+from jaxphoto.observations import Attitudes, ImagePoints
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 from tests.derivatives import compiled
 from tests.initial.scene import Truth, block_of, coordinate_rows, strip, with_known
@@ -32,7 +32,7 @@ def points_of_image(block, image):
 
 def without_rows(block, drop):
     rows = block.image_points
-    kept = ImageRows(rows.image[~drop], rows.point[~drop], rows.xy[~drop], rows.sigma[~drop])
+    kept = ImagePoints(rows.image[~drop], rows.point[~drop], rows.xy[~drop], rows.sigma[~drop])
     return eqx.tree_at(lambda b: b.image_points, block, kept)
 
 
@@ -184,7 +184,7 @@ def test_nearly_parallel_rays_are_named():
     block, truth = strip(n_images=2)
     rows = block.image_points
     once = rows.image == 0
-    double = ImageRows(
+    double = ImagePoints(
         np.concatenate([rows.image[once], rows.image[once] + 1]), np.tile(rows.point[once], 2),
         np.tile(rows.xy[once], (2, 1)), np.tile(rows.sigma[once], (2, 1)),
     )  # fmt: skip

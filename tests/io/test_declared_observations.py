@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.block import Block
 from jaxphoto.camera import StripCamera
 from jaxphoto.errors import BlockError, InputError
@@ -19,6 +19,7 @@ from jaxphoto.io import read_block, write_block
 from jaxphoto.observations import (
     OBSERVATIONS,
     AbstractObservations,
+    CameraPositions,
     Correlated,
     Distances,
     KnownParameters,
@@ -26,9 +27,8 @@ from jaxphoto.observations import (
     RelativePositions,
     RigPlaces,
     RigTurns,
-    StationRows,
     correlated,
-    touching,
+    index_of,
 )
 from jaxphoto.observations.columns import columns_of, row_fields
 from jaxphoto.rotation import small_rotation
@@ -45,13 +45,13 @@ class Everything(AbstractObservations):
     axes = ("u", "v")
     columns = {"weather": "weather_code", "base": ("east_m", "up_m", "north_m"), "offset": ()}  # noqa: RUF012
 
-    pair: Int[np.ndarray, "n 2"] = touching("image")
-    who: Int[np.ndarray, "n"] = touching("strips")
+    pair: Int[np.ndarray, "n 2"] = index_of("image")
+    who: Int[np.ndarray, "n"] = index_of("strips")
     weather: Int[np.ndarray, "n"]
-    value: Float[Numbers, "n 2"]
-    base: Float[Numbers, "n 3"]
-    sigma: Float[Numbers, "n 2"]
-    offset: Float[Numbers, "n"]
+    value: Float[ArrayLike, "n 2"]
+    base: Float[ArrayLike, "n 3"]
+    sigma: Float[ArrayLike, "n 2"]
+    offset: Float[ArrayLike, "n"]
 
     def residual(self, pair, who) -> Float[Array, "2"]:
         """Nothing that means anything."""
@@ -281,7 +281,7 @@ def test_rows_that_nobody_can_read_are_not_lost_in_silence(block, tmp_path):
 
 
 def test_what_files_cannot_say_is_refused(block, tmp_path):
-    second = rows_of(StationRows, 2)
+    second = rows_of(CameraPositions, 2)
     with pytest.raises(
         BlockError, match=r"Block\.more has stations, but stations\.csv is for those of Block\.stations"
     ):
@@ -331,7 +331,7 @@ def test_mistakes_in_covariances_are_named(block, tmp_path, change, words):
 def test_annotations_and_columns_that_say_too_little():
     class Open(HeightDifferences):
         group = "open"
-        extra: Float[Numbers, "n k"]
+        extra: Float[ArrayLike, "n k"]
 
     class Short(HeightDifferences):
         group = "short"

@@ -12,7 +12,7 @@ from jaxphoto.block import Frame
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import Corrections
 from jaxphoto.io import read_block, write_block
-from jaxphoto.observations import PointRows, StationRows, correlated
+from jaxphoto.observations import CameraPositions, PointRows, correlated
 from jaxphoto.report import Tables, Verdict, write_results
 from jaxphoto.rotation import matrix_from_omega_phi_kappa, matrix_from_roll_pitch_yaw
 from tests.blocks import adjusted, simulated
@@ -289,7 +289,7 @@ def test_an_adjustment_does_not_depend_on_the_system_of_the_files(tmp_path):
 def test_what_is_no_coordinate_is_not_converted(write_folder, tmp_path):
     block = read_block(to_utm(write_folder()))
     near = PointRows(np.array([1]), np.array([[1.0, 2.0, 3.0]]), np.full((1, 3), 0.1))
-    axes = StationRows(np.array([0, 0, 0]), np.arange(3), np.array([4.0, 5.0, 6.0]), np.ones(3))
+    axes = CameraPositions(np.array([0, 0, 0]), np.arange(3), np.array([4.0, 5.0, 6.0]), np.ones(3))
     block = dataclasses.replace(block, more=(near, correlated(axes, [[0, 1, 2]], 0.5 * np.eye(3)[None])))
     write_block(block, tmp_path / "copy")
     again = read_block(tmp_path / "copy")

@@ -87,7 +87,7 @@ def shortened(folder):
     changed(folder / "result" / "object_points.csv", lambda t: t[1:])
 
 
-def astray(folder):
+def diverged_points(folder):
     path = folder / "result" / "summary.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"converged": False}))
 

@@ -86,7 +86,9 @@ def test_sigma_naught_that_fails_its_test_is_said_and_travels_with_the_camera(re
             code, _, error = run(monkeypatch, capsys, "adjust", tmp_path / f"copy_of_{named.name}", "--out", rests)
         assert code == 0 and said in " ".join(error.split())
         findings = read_summary(rests)["findings"]
-        assert any(f["severity"] == "warning" and f["text"].endswith(read.doubts[0]) for f in findings), findings
+        assert any(f["severity"] == "warning" and f["text"].endswith(read.prior_warnings[0]) for f in findings), (
+            findings
+        )
         assert "this adjustment rests on an earlier one" in read_camera_file(rests).note
         assert said in read_camera_file(rests).note
 

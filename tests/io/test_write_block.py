@@ -16,7 +16,7 @@ from jaxphoto.camera import Smac
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import read_block, write_block
 from jaxphoto.io.names import harm_in
-from jaxphoto.observations import ControlRows
+from jaxphoto.observations import ControlCoordinates
 from jaxphoto.unknowns import FIXED, FREE, Weighted
 
 SMAC = ("block.toml", 'distortion = "brown"', 'distortion = "smac"\nsign = "add"')
@@ -100,7 +100,7 @@ def test_numbers_and_ids_come_back_exactly(write_folder, tmp_path_factory, value
         write_folder().rename(source)
     block = read_block(source)
     points = tuple(name if point == "p3" else point for point in block.points)
-    fixed = ControlRows(block.fixed.who, block.fixed.axis, jnp.asarray(values), block.fixed.sigma)
+    fixed = ControlCoordinates(block.fixed.who, block.fixed.axis, jnp.asarray(values), block.fixed.sigma)
     control = dataclasses.replace(block.control, sigma=jnp.full(4, sigma))
     block = dataclasses.replace(
         block, points=points, fixed=fixed, control=control, datum=dataclasses.replace(block.datum, over=(name,))

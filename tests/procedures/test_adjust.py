@@ -43,10 +43,10 @@ def test_points_that_fly_away_from_a_start_that_is_far_off_come_back():
     for _ in range(6):
         spoilt = far_off(block, rng)
     alone = solve(spoilt, start_of(spoilt), spoilt.priors)
-    assert alone.astray.any() and not bool(alone.converged)
+    assert alone.diverged_points.any() and not bool(alone.converged)
     found = adjust(spoilt)
     assert bool(found.converged) and not found.left_out
-    np.testing.assert_allclose(float(found.square_sum), float(best.square_sum), rtol=1e-6)
+    np.testing.assert_allclose(float(found.sum_of_squares), float(best.sum_of_squares), rtol=1e-6)
 
 
 def test_images_that_are_given_upside_down_are_oriented_by_their_points():
@@ -62,7 +62,7 @@ def test_images_that_are_given_upside_down_are_oriented_by_their_points():
     spoilt = dataclasses.replace(block, start=dataclasses.replace(start, unknowns=unknowns, image_known=known))
     with pytest.warns(UserWarning, match="lead nowhere"):
         found = adjust(spoilt)
-    np.testing.assert_allclose(float(found.square_sum), float(best.square_sum), rtol=1e-6)
+    np.testing.assert_allclose(float(found.sum_of_squares), float(best.sum_of_squares), rtol=1e-6)
 
 
 def test_a_tie_point_whose_rays_meet_nowhere_is_left_out_and_said():
@@ -80,7 +80,7 @@ def test_a_tie_point_whose_rays_meet_nowhere_is_left_out_and_said():
     assert found.left_out == (block.points[point],) and block.points[point] not in found.block.points
     gone = {"image_points": rows.point == point}
     without = adjust(without_observations(block, gone)[0])
-    np.testing.assert_allclose(float(found.square_sum), float(without.square_sum), rtol=1e-9)
+    np.testing.assert_allclose(float(found.sum_of_squares), float(without.sum_of_squares), rtol=1e-9)
     verdict = verdict_of(Tables(adjust_for_tables(spoilt)))
     assert verdict.colour == "amber" and "left out" in verdict.texts[0]
 

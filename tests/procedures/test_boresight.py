@@ -14,7 +14,7 @@ import jaxphoto_command
 from jaxphoto import FIXED, FREE, BlockError, boresight
 from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.io import write_block
-from jaxphoto.observations import Attitudes, ControlRows, StationRows
+from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates
 from jaxphoto.procedures import step_block
 from jaxphoto.writing import MARKER
 from tests.blocks import BORESIGHT, BROWN, CONTROL, Simulated, aerial, all_attitudes, all_stations, bare, measured, rows
@@ -224,8 +224,8 @@ def lone_control():
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (lambda: dataclasses.replace(block(), control=ControlRows.none()), ["step 1", "control_points.csv"]),
-        (lambda: dataclasses.replace(block(), stations=StationRows.none()), ["step 2", "stations.csv"]),
+        (lambda: dataclasses.replace(block(), control=ControlCoordinates.none()), ["step 1", "control_points.csv"]),
+        (lambda: dataclasses.replace(block(), stations=CameraPositions.none()), ["step 2", "stations.csv"]),
         (lambda: dataclasses.replace(block(), attitudes=Attitudes.none()), ["step 3", "attitudes.csv"]),
         (lambda: dataclasses.replace(block(), image_strip=("",) * 10), ["step 2", "column strip", "images.csv"]),
         (lambda: dataclasses.replace(block(), image_strip=("a",) * 10), ["strip a", "opposite direction"]),

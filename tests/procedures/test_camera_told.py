@@ -8,7 +8,7 @@ from scipy import stats
 
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.io import read_block
-from jaxphoto.observations import ImageRows
+from jaxphoto.observations import ImagePoints
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.orientation import orient
 from jaxphoto.procedures.orientation.self_calibration import correlation_factor
@@ -36,7 +36,7 @@ def block():
     assert len(block.images) >= N_IMAGES
     image = np.repeat(np.arange(N_IMAGES), PER_IMAGE)
     xy = rng.uniform([-4, -3], [4, 3], (len(image), 2))
-    rows = ImageRows(image, np.zeros(len(image), int), xy, np.ones((len(image), 2)))
+    rows = ImagePoints(image, np.zeros(len(image), int), xy, np.ones((len(image), 2)))
     camera = block.image_camera[0]
     return dataclasses.replace(block, image_points=rows, sensors={camera: Sensor(1600, 1200, 0.005)})
 

@@ -8,7 +8,7 @@ import pytest
 from jaxphoto import adjust
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import MapFrame
-from jaxphoto.observations import StationRows
+from jaxphoto.observations import CameraPositions
 from jaxphoto.procedures.control import GivenControl, Marks, at_optimum, control_block
 from jaxphoto.procedures.control.frame import onto_control
 from jaxphoto.procedures.control.marks import without_names
@@ -96,7 +96,7 @@ def test_control_on_a_line_needs_positions_of_the_photographs(marked):
     there = at_optimum(found_in(marked, marked.control).adjusted)
     position = np.asarray(there.start.unknowns.exterior.position)
     image, axis = np.indices(position.shape).reshape(2, -1)
-    stations = StationRows(image, axis, position.ravel(), np.full(image.size, 0.1))
+    stations = CameraPositions(image, axis, position.ravel(), np.full(image.size, 0.1))
     placed = dataclasses.replace(without_names(there, points.ids), stations=stations)
     again = marks.take(np.array(marks.point) == points.ids[1])
     again = again._replace(point=("again",) * len(again.point))

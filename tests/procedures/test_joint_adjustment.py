@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from jaxphoto import BlockError, InputError
 from jaxphoto.adjustment import Outcome
 from jaxphoto.camera import get_parameter
-from jaxphoto.observations import Attitudes, StationRows
+from jaxphoto.observations import Attitudes, CameraPositions
 from jaxphoto.procedures.lidar import adjust_strips
 from jaxphoto.procedures.lidar.photographs import check_photographs
 from jaxphoto.report import plot_scanner_correlation, plot_trajectory_errors
@@ -227,7 +227,7 @@ def test_the_result_is_that_of_dense_least_squares_by_other_formulas():
     adjusted = fitted().adjusted
     twin, x = Twin(adjusted), vector_of(adjusted)
     r = twin(x)
-    assert r @ r == pytest.approx(float(adjusted.square_sum), rel=1e-9)
+    assert r @ r == pytest.approx(float(adjusted.sum_of_squares), rel=1e-9)
     n = 6 * twin.n + len(twin.labels)
     # Steps of a hundredth of a standard deviation or so: differences are right to five digits.
     step = np.full(len(x), 1e-4)
@@ -273,7 +273,7 @@ def test_what_cannot_be_adjusted_together():
     cut = dataclasses.replace(flight.trajectory, **{f: v[kept] for f, v in vars(flight.trajectory).items()})
     with pytest.raises(BlockError, match=r"image A_01 was exposed at .* in a gap of the trajectory from"):
         check_photographs(taken, cut)
-    bare = dataclasses.replace(taken.block, stations=StationRows.none(), attitudes=Attitudes.none())
+    bare = dataclasses.replace(taken.block, stations=CameraPositions.none(), attitudes=Attitudes.none())
     refused(InputError, "the block has no stations", taken._replace(block=bare))
     late = taken.time + np.where(taken.time > 0, -1.0, 1.0)
     refused(BlockError, "stations of the block lie .* m from where the trajectory is", taken._replace(time=late))

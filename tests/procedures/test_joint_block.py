@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import JaxphotoError, adjust, bias, covariance, read_block, write_block
-from jaxphoto.procedures.lidar.until_still import at_result
+from jaxphoto.procedures.lidar.iterate_to_convergence import at_result
 from tests.commands import run
 from tests.procedures.joint import fitted
 

@@ -10,7 +10,7 @@ from jaxphoto import FIXED, FREE, Weighted, adjust
 from jaxphoto.camera import Brown, OpenCv, Smac, exact, get_parameter, rebalance, set_parameter
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import write_block
-from jaxphoto.observations import ImageRows
+from jaxphoto.observations import ImagePoints
 from jaxphoto.procedures.camera_candidates import candidate_of, with_candidate
 from jaxphoto.procedures.cross_validation import folds, measured_discrepancies, without_rows
 from jaxphoto.procedures.model_choice import model_choice
@@ -99,14 +99,14 @@ def test_the_criteria_are_their_formulas(choice):
     for j in choice.judged:
         n, p = j.n_effective, j.n_parameters + 1
         assert n == j.redundancy + j.n_parameters
-        fit = n * np.log(j.square_sum / n)
+        fit = n * np.log(j.sum_of_squares / n)
         np.testing.assert_allclose([j.aic, j.bic], [fit + 2 * p, fit + p * np.log(n)], rtol=1e-12)
         np.testing.assert_allclose(j.aicc - j.aic, 2 * p * (p + 1) / (n - p - 1), rtol=1e-9)
-        np.testing.assert_allclose(j.sigma0, np.sqrt(j.square_sum / j.redundancy), rtol=1e-12)
+        np.testing.assert_allclose(j.sigma0, np.sqrt(j.sum_of_squares / j.redundancy), rtol=1e-12)
     # What is counted does not depend on the model.
     assert len({j.n_effective for j in choice.judged}) == 1
     true, large = choice.judged[1:]
-    f = (true.square_sum - large.square_sum) / 5 / (large.square_sum / large.redundancy)
+    f = (true.sum_of_squares - large.sum_of_squares) / 5 / (large.sum_of_squares / large.redundancy)
     np.testing.assert_allclose(large.f, f, rtol=1e-12)
     # Noise of the standard deviations stated: sigma naught is 1 within five of its own.
     assert abs(true.sigma0 - 1) < 5 / np.sqrt(2 * true.redundancy)
@@ -159,7 +159,7 @@ def test_nothing_to_leave_out_is_said(block):
     p, (_, first) = block.image_points, np.unique(block.image_points.point, return_index=True)
     two = np.concatenate([first, first + 1])
     few = eqx.tree_at(
-        lambda b: b.image_points, block, ImageRows(p.image[two], p.point[two], np.asarray(p.xy)[two], p.sigma[two])
+        lambda b: b.image_points, block, ImagePoints(p.image[two], p.point[two], np.asarray(p.xy)[two], p.sigma[two])
     )
     with pytest.raises(BlockError, match="no point was measured in three images"):
         folds(few, 5)

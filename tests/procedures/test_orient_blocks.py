@@ -9,7 +9,7 @@ from jaxphoto.block import Start
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.initial.approximate import completed
-from jaxphoto.observations import ControlRows, ImageRows, StationRows
+from jaxphoto.observations import CameraPositions, ControlCoordinates, ImagePoints
 from jaxphoto.procedures.adjust import adjust, needs_orientation, start_of
 from jaxphoto.procedures.orientation import orient_block
 from jaxphoto.procedures.orientation.self_calibration import freed
@@ -45,7 +45,7 @@ def with_control(block, true, scene, which):
     known = np.zeros(len(points), bool)
     known[which] = True
     unknowns = dataclasses.replace(block.start.unknowns, points=points)
-    rows = ControlRows(
+    rows = ControlCoordinates(
         np.repeat(which, 3), np.tile(np.arange(3), len(which)), points[which].ravel(), np.full(3 * len(which), 0.01)
     )
     return dataclasses.replace(block, control=rows, start=Start(unknowns, block.start.image_known, known))
@@ -123,7 +123,7 @@ def with_stations(block, scene, which):
     """Stations observed by GNSS to 5 cm, no angles."""
     noise = 0.05 * np.random.default_rng(1).normal(size=(len(which), 3))
     n = len(which)
-    rows = StationRows(
+    rows = CameraPositions(
         np.repeat(which, 3),
         np.tile(np.arange(3), n),
         (scene.positions[which] + noise).ravel(),
@@ -195,7 +195,7 @@ def test_images_beyond_reach_are_named(flown):
     second = np.isin(np.arange(len(block.points)), rows.point[rows.image >= 5])
     block = with_known_images(block, scene, [0, 1])
     kept = ~(first & second)[rows.point]
-    cut = ImageRows(*(np.asarray(v)[kept] for v in (rows.image, rows.point, rows.xy, rows.sigma)))
+    cut = ImagePoints(*(np.asarray(v)[kept] for v in (rows.image, rows.point, rows.xy, rows.sigma)))
     with pytest.raises(BlockError, match=r"5 of 10 images have .* \(p05, p06, p07, p08, p09\).* nor .*2 groups"):
         start_of(dataclasses.replace(block, image_points=cut))
 

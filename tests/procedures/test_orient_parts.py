@@ -11,7 +11,7 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.initial.intersection import intersect_points
 from jaxphoto.initial.rays import ideal_coordinates, turn_to_object, unit_rays
-from jaxphoto.observations import Distances, StationRows
+from jaxphoto.observations import CameraPositions, Distances
 from jaxphoto.procedures.orientation.known_frame import in_known_frame, similarity_between
 from jaxphoto.procedures.orientation.rejection import beyond_limit, unsupported
 from jaxphoto.procedures.orientation.self_calibration import corner_shift, undetermined
@@ -146,7 +146,7 @@ def elsewhere():
 def stations_of(there, images):
     """Stations of `images` as rows of a block."""
     n = len(images)
-    return StationRows(
+    return CameraPositions(
         np.repeat(images, 3), np.tile(np.arange(3), n), there.positions[images].ravel(), np.full(3 * n, 0.1)
     )
 

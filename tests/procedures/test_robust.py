@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import BlockError, adjust, robust, snoop
-from jaxphoto.adjustment import LEAST, MAX_STEPS, solve
+from jaxphoto.adjustment import MAX_STEPS, MINIMAL_SIZES, solve
 from jaxphoto.losses import Huber, StudentT
 from jaxphoto.procedures.robust import solve_placed
 from tests.blocks import simulated
@@ -93,4 +93,4 @@ def test_an_adjustment_that_diverges_ends_the_search():
     left = {name: np.zeros(len(rows), bool) for name, rows in block.named_observations.items()}
     unknowns = dataclasses.replace(start, interior=type(start.interior)({name: camera}))
     with pytest.raises(BlockError, match="became infinite"):
-        solve_placed(block, left, unknowns, MAX_STEPS, LEAST)
+        solve_placed(block, left, unknowns, MAX_STEPS, MINIMAL_SIZES)

@@ -9,7 +9,7 @@ import pytest
 from jaxphoto import BlockError, DatumError, InputError, covariance
 from jaxphoto.cloud import Cloud
 from jaxphoto.lidar import HeightFlag, HeightSettings
-from jaxphoto.observations import ControlRows, StationRows
+from jaxphoto.observations import CameraPositions, ControlCoordinates
 from jaxphoto.procedures.lidar import LidarControl, lidar_control
 from tests.marks import slow_but
 from tests.procedures.lidar import scanned, triplet
@@ -107,7 +107,7 @@ def test_a_triplet_is_calibrated_by_pseudo_control():
         (lambda b: b, ("nobody",), InputError, "nobody is no point of the block"),
         (lambda b: _with_height(b, 0), (0,), InputError, "is control already"),
         (lambda b: _all_checked(b), None, BlockError, "no tie point"),
-        (lambda b: dataclasses.replace(b, stations=StationRows.none()), None, DatumError, "camera stations"),
+        (lambda b: dataclasses.replace(b, stations=CameraPositions.none()), None, DatumError, "camera stations"),
     ],
 )
 def test_what_has_no_answer_is_refused(change, points, error, said):
@@ -124,9 +124,11 @@ def test_a_cloud_elsewhere_is_refused_with_both_extents():
 
 
 def _with_height(block, point):
-    return dataclasses.replace(block, control=ControlRows(np.array([point]), np.array([2]), np.zeros(1), np.ones(1)))
+    return dataclasses.replace(
+        block, control=ControlCoordinates(np.array([point]), np.array([2]), np.zeros(1), np.ones(1))
+    )
 
 
 def _all_checked(block):
     n = len(block.points)
-    return dataclasses.replace(block, check=ControlRows(np.arange(n), np.full(n, 2), np.zeros(n), np.zeros(n)))
+    return dataclasses.replace(block, check=ControlCoordinates(np.arange(n), np.full(n, 2), np.zeros(n), np.zeros(n)))

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto import Tables
-from jaxphoto.adjustment import LEAST
+from jaxphoto.adjustment import MINIMAL_SIZES
 from jaxphoto.camera.conditions import Conditions
 from jaxphoto.procedures.flight import FlightPart
 from jaxphoto.procedures.georeference_photographs import GeoreferencedPhotographs
@@ -41,7 +41,7 @@ def part_report() -> PartReport:
         list(block.images), [np.zeros((k + 5, 2)) for k in range(n)], [], [], np.zeros((0, 3), int), 1.0
     )
     residuals = np.asarray(found.residuals.image).T * np.asarray(block.image_points.sigma)
-    part = FlightPart(Oriented(block, residuals, report, LEAST), matched, placed, "", None, found)
+    part = FlightPart(Oriented(block, residuals, report, MINIMAL_SIZES), matched, placed, "", None, found)
     d = np.full((n, 3), np.nan)
     d[:4] = OFFSETS_M
     images = pd.DataFrame({"image": block.images, "n_image_points": np.bincount(found.structure.image, minlength=n)})

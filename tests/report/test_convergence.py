@@ -7,7 +7,7 @@ import pytest
 
 import jaxphoto
 from jaxphoto import InputError, Outcome, Tables, report
-from jaxphoto.adjustment.told import step_lines
+from jaxphoto.adjustment.iteration_log import step_lines
 from jaxphoto.report.results import convergence_words
 from jaxphoto.report.tables import convergence_table
 from tests.blocks import adjusted, simulated
@@ -24,8 +24,8 @@ def test_sigma_naught_falls_from_that_of_the_start_to_that_of_the_optimum():
     assert lines[-1] == f"end: sigma naught {float(result.sigma0):.6g}"
     # One step from the start leads to where the second begins.
     one = jaxphoto.adjust(simulated("cross").block, max_steps=1)
-    assert one.course.square_sum[0] == pytest.approx(result.course.square_sum[0])
-    assert float(one.square_sum) == pytest.approx(result.course.square_sum[1], rel=1e-6)
+    assert one.course.sum_of_squares[0] == pytest.approx(result.course.sum_of_squares[0])
+    assert float(one.sum_of_squares) == pytest.approx(result.course.sum_of_squares[1], rel=1e-6)
     assert "1 step, which is the limit (--max-steps)" in convergence_words(one) and one.outcome is Outcome.STEPS
 
 

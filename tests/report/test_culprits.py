@@ -132,7 +132,7 @@ def test_a_camera_that_has_changed_since_its_calibration_is_told_first():
     alone = adjust(larger)
     by_it = calibration_by(alone)
     d, both = by_it.value - known.value, known.covariance + by_it.covariance / float(alone.sigma0) ** 2
-    share = float(d @ np.linalg.solve(both, d)) / float(tables.adjusted.square_sum)
+    share = float(d @ np.linalg.solve(both, d)) / float(tables.adjusted.sum_of_squares)
     assert found.freedom == 5
     assert found.p_value == pytest.approx(beta_tail(share, 2.5, (tables.adjusted.redundancy - 5) / 2), rel=0.5)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import Tables, adjust
-from jaxphoto.observations import StationRows
+from jaxphoto.observations import CameraPositions
 from jaxphoto.report import verdict, verdict_of
 from tests.blocks import BROWN, CONTROL, Scene, Simulated, adjusted, aerial, all_stations, bare, free, measured, rows
 
@@ -22,7 +22,7 @@ def tables(relief: float, stations: bool | float, names=("c_mm", "xp_mm", "yp_mm
     scene = aerial()
     positions = scene.positions * [1, 1, 0] + [0, 0, 1000.0]
     built, truth = bare(Scene(positions, scene.angles, scene.points * [1, 1, relief]), {"one": BROWN}, ("one",) * 10)
-    observed = all_stations(built, 0.10 if stations is True else stations) if stations else StationRows.none()
+    observed = all_stations(built, 0.10 if stations is True else stations) if stations else CameraPositions.none()
     built = dataclasses.replace(built, control=rows(CONTROL), stations=observed)
     return Tables(adjust(measured(Simulated(free(built, "one", names), truth)).block))
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from jaxphoto import adjust, covariance, read_block
 from jaxphoto.errors import InputError
-from jaxphoto.observations import StationRows
+from jaxphoto.observations import CameraPositions
 from jaxphoto.report.sensitivity import SensitivityTables
 from jaxphoto.sensitivity.exact import sensitivity
 from jaxphoto.sensitivity.influence import Per, external_reliability, station_bias, variance_shares
@@ -128,7 +128,7 @@ def test_mistakes_get_a_sentence(call, sentence: str) -> None:
 
 def test_bias_of_a_block_without_stations() -> None:
     a = adjusted("cross")
-    a = dataclasses.replace(a, block=dataclasses.replace(a.block, stations=StationRows.none()))
+    a = dataclasses.replace(a, block=dataclasses.replace(a.block, stations=CameraPositions.none()))
     with pytest.raises(InputError, match="no observed stations"):
         station_bias(a, derivatives("cross"))
 

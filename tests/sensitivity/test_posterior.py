@@ -11,7 +11,7 @@ import pytest
 
 from jaxphoto import FIXED, InputError, adjust, covariance
 from jaxphoto.camera import Brown, InteriorOrientation
-from jaxphoto.observations import ControlRows
+from jaxphoto.observations import ControlCoordinates
 from jaxphoto.report.posterior import posterior_figure, posterior_table
 from jaxphoto.sensitivity.posterior import Posterior, posterior
 from tests.blocks import Scene, Simulated, adjusted, bare, free, measured
@@ -87,7 +87,7 @@ def two_heights() -> TwoHeights:
     camera = InteriorOrientation(35.0, 0.0, 0.0, Brown())
     block, truth = bare(scene, {"one": camera}, ("one", "one"))
     rows = dataclasses.replace(block.image_points, sigma=np.full((2, 2), SIGMA_MM))
-    reference = ControlRows(np.zeros(2, int), np.arange(2), place[:2], np.zeros(2))
+    reference = ControlCoordinates(np.zeros(2, int), np.arange(2), place[:2], np.zeros(2))
     block = free(dataclasses.replace(block, image_points=rows, fixed=reference), "one", ("c_mm",))
     where = lambda b: (b.priors.exterior.position, b.priors.exterior.camera_from_object)  # noqa: E731
     block = eqx.tree_at(where, block, (FIXED, FIXED))

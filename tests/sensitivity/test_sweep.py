@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 import jaxphoto
 from jaxphoto import FREE, DatumError, InputError, RankError
-from jaxphoto.adjustment import Sizes, common_sizes
+from jaxphoto.adjustment import PaddedSizes, common_sizes
 from jaxphoto.report.sweep import plot_sweep, sweep_figure, sweep_table
 from jaxphoto.sensitivity import sweep as side_by_side
 from jaxphoto.sensitivity.sweep import Design, Sweep, sweep
@@ -75,7 +75,7 @@ def swept(designs: list[Design]) -> Sweep:
 
 
 @pytest.fixture(scope="module")
-def sizes(designs: list[Design]) -> Sizes:
+def sizes(designs: list[Design]) -> PaddedSizes:
     return common_sizes(d.block for d in designs)
 
 

@@ -11,7 +11,13 @@ from jaxphoto import Outcome, adjust, covariance, monte_carlo
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import NOMINAL
 from jaxphoto.io import read_block, recipe_from, write_block
-from jaxphoto.observations import RelativeAttitudes, RelativePositions, StationRows, correlated, exponential_covariance
+from jaxphoto.observations import (
+    CameraPositions,
+    RelativeAttitudes,
+    RelativePositions,
+    correlated,
+    exponential_covariance,
+)
 from jaxphoto.sensitivity import noise
 from jaxphoto.variants import indirect, without_attitudes, without_stations
 from tests.simulation.small import SMALL, changed, made
@@ -81,7 +87,7 @@ def test_it_goes_through_files(tmp_path):
     ],
 )
 def test_mistakes_are_named(tmp_path, table, old, new, words):
-    block = dataclasses.replace(flown().block, stations=StationRows.none())
+    block = dataclasses.replace(flown().block, stations=CameraPositions.none())
     write_block(block, tmp_path / "copy")
     path = tmp_path / "copy" / table
     text = path.read_text()
@@ -111,7 +117,7 @@ def drifting(block):
         sets = [np.flatnonzero((strips[rows.who] == strip) & (rows.axis == axis)) for axis in range(3)]
         in_time = exponential_covariance(np.asarray(block.image_time)[rows.who[sets[0]]], 0.1, 60.0)
         more.append(correlated(rows, np.stack(sets), np.stack([in_time] * 3)))
-    return dataclasses.replace(block, stations=StationRows.none(), more=(*block.more, *more))
+    return dataclasses.replace(block, stations=CameraPositions.none(), more=(*block.more, *more))
 
 
 N_DRAWS = 60

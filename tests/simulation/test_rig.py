@@ -39,8 +39,8 @@ RIG = {
 
 
 @functools.cache
-def flown(bends: bool = True):
-    still = {} if bends else {"noise.rig_place_m": 0.0, "noise.rig_turn_deg": 0.0}
+def flown(modifies_interior: bool = True):
+    still = {} if modifies_interior else {"noise.rig_place_m": 0.0, "noise.rig_turn_deg": 0.0}
     return simulate(recipe_from(changed(RIG | still)), 1)
 
 
@@ -52,7 +52,7 @@ def poses(simulation):
 
 
 def test_cameras_sit_beside_the_one_that_is_flown():
-    place, turn = poses(flown(bends=False))
+    place, turn = poses(flown(modifies_interior=False))
     np.testing.assert_allclose(place, np.tile(TRUE_PLACE, (14, 1)), atol=1e-9)
     np.testing.assert_allclose(turn, np.tile(TRUE_TURN, (14, 1)), atol=1e-9)
 
@@ -153,14 +153,14 @@ LATE = {
 
 
 @functools.cache
-def late(bends: bool = True):
-    still = {} if bends else {"noise.rig_place_m": 0.0, "noise.rig_turn_deg": 0.0}
+def late(modifies_interior: bool = True):
+    still = {} if modifies_interior else {"noise.rig_place_m": 0.0, "noise.rig_turn_deg": 0.0}
     return simulate(recipe_from(changed(RIG | LATE | still)), 1)
 
 
 def test_a_late_camera_is_where_the_rig_has_come_to():
     """Beside the reference as it was at its own exposure: the way flown in the meantime, and the turn."""
-    simulation = late(bends=False)
+    simulation = late(modifies_interior=False)
     position, rotation = (np.asarray(v) for v in vars(simulation.truth.exterior).values())
     motion = simulation.block.motion
     for k in range(0, 28, 2):
@@ -226,10 +226,10 @@ def test_a_rig_flies_beside_a_scanner_on_one_trajectory():
     """As one camera would: the scanner sees the same, and stations are those of the reference, on its clock."""
     with_rig_on = {name: RIG[name] for name in ("cameras.oblique", "rig_cameras", "points")}
     drift = {"drift_sigma_m": [0.2] * 3, "correlation_s": 60.0}
-    bends = {"sigmas.rig_place_m": 0.001, "sigmas.rig_turn_deg": 0.001}
+    modifies_interior = {"sigmas.rig_place_m": 0.001, "sigmas.rig_turn_deg": 0.001}
     scanned = {"terrain": {"kind": "waves"}, "lidar": {"density_per_m2": 0.01, "same_trajectory": True, "truth": drift},
                "sigmas.lidar_m": 0.03, "noise.station_m": 0.0}  # fmt: skip
-    one, rigged = (simulate(recipe_from(changed(own | scanned)), 1) for own in ({}, with_rig_on | bends))
+    one, rigged = (simulate(recipe_from(changed(own | scanned)), 1) for own in ({}, with_rig_on | modifies_interior))
     np.testing.assert_array_equal(rigged.cloud.xyz, one.cloud.xyz)
     time = np.asarray(rigged.block.flight_time)
     np.testing.assert_array_equal(time[::2], one.block.flight_time)

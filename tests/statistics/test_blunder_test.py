@@ -92,7 +92,7 @@ def test_the_blocks_of_a_row_hold_its_redundancy_numbers():
 def test_sigma_naught_is_tested_on_both_sides():
     a = adjusted("cross")
     test = global_test(a)
-    q, f = float(a.square_sum), a.redundancy
+    q, f = float(a.sum_of_squares), a.redundancy
     assert test.p_value == pytest.approx(2 * min(stats.chi2.cdf(q, f), stats.chi2.sf(q, f)), rel=1e-9)
     numbers = redundancy_numbers(a, covariance_of("cross"))
     groups = {g.group: g for g in group_factors(a, numbers)}

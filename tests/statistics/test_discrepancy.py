@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import Tables, angle_differences, covariance, point_differences
-from jaxphoto.observations import ControlRows
+from jaxphoto.observations import ControlCoordinates
 from jaxphoto.report.results import accuracy_sentences
 from jaxphoto.report.tables import accuracy_table
 from jaxphoto.statistics import (
@@ -83,7 +83,7 @@ def test_truth_is_recovered_within_its_sigmas():
 def check_rows(error, sigma):
     """Rows of discrepancies (n, 3) with sigmas of the same shape; NaN for an axis without survey."""
     who, axis = np.nonzero(np.isfinite(error))
-    return ControlRows(who, axis, error[who, axis], np.broadcast_to(sigma, error.shape)[who, axis])
+    return ControlCoordinates(who, axis, error[who, axis], np.broadcast_to(sigma, error.shape)[who, axis])
 
 
 def thirty(z=0.03):
@@ -161,5 +161,5 @@ def test_a_shift_and_a_poor_survey_are_named():
 
 
 def test_no_check_points_say_nothing():
-    result = positional_accuracy(ControlRows.none())
+    result = positional_accuracy(ControlCoordinates.none())
     assert result.tested == () and accuracy_sentences(result) == [] and len(accuracy_table(result)) == 0

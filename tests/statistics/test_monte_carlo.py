@@ -47,7 +47,7 @@ def draws() -> Draws:
         adjusted = adjusted_draw(seed)
         assert bool(adjusted.converged)
         errors.append(_errors(adjusted, truth, nominal))
-        square_sums.append(float(adjusted.square_sum))
+        square_sums.append(float(adjusted.sum_of_squares))
     return Draws(np.array(errors) / sigma, np.array(square_sums), nominal.redundancy, _expected(nominal))
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from jaxphoto import adjust, angle_differences, correlated, covariance, point_differences
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.observations import Correlated, StationRows, exponential_covariance
+from jaxphoto.observations import CameraPositions, Correlated, exponential_covariance
 from jaxphoto.simulation import image_coordinates
 from jaxphoto.statistics import (
     a_priori_sigmas,
@@ -84,7 +84,7 @@ def joined():
         correlated(gnss, np.arange(3 * n).reshape(n, 3), factor @ factor.transpose(0, 2, 1)),
         correlated(gnss.take(gnss.axis == 2), np.arange(n).reshape(2, -1), along),
     )
-    return dataclasses.replace(block, stations=StationRows.none(), more=more)
+    return dataclasses.replace(block, stations=CameraPositions.none(), more=more)
 
 
 def test_of_rows_that_a_covariance_joins_it_holds_too():
@@ -123,7 +123,7 @@ def test_physical_residuals_are_observed_minus_computed():
     assert np.corrcoef(np.ravel(v["image_points"]), np.ravel(measured))[0, 1] > 0.999
     sigmas = a_priori_sigmas(a)
     square = sum(float(np.sum((v[group] / sigmas[group]) ** 2)) for group in v)
-    assert square == pytest.approx(float(a.square_sum), rel=1e-12)
+    assert square == pytest.approx(float(a.sum_of_squares), rel=1e-12)
     assert float(a.sigma0) == pytest.approx(np.sqrt(square / a.redundancy), rel=1e-12)
 
 
@@ -165,7 +165,7 @@ def test_check_points_do_not_take_part():
     wrong = eqx.tree_at(lambda b: b.check.value, block, np.asarray(block.check.value) + 1.0)
     a = adjust(wrong, wrong.start.unknowns)
     one = adjusted("cross")
-    assert float(a.square_sum) == float(one.square_sum)
+    assert float(a.sum_of_squares) == float(one.sum_of_squares)
     np.testing.assert_allclose(
         check_discrepancies(a).value, np.asarray(check_discrepancies(one).value) + 1.0, atol=1e-12
     )

@@ -14,9 +14,11 @@ from jaxphoto.statistics import CameraDrift, ZeroTest, camera_drifts, chi_square
 from tests.camera.test_camera_rates import TRUE, changing_block, with_rates
 
 
-@pytest.mark.parametrize(("square_sum", "redundancy"), [(3.0, 3), (16.3, 3), (300.0, 248), (102_000.0, 100_000)])
-def test_chi_square(square_sum, redundancy):
-    assert chi_square_p(square_sum, redundancy) == pytest.approx(stats.chi2.sf(square_sum, redundancy), rel=1e-6)
+@pytest.mark.parametrize(("sum_of_squares", "redundancy"), [(3.0, 3), (16.3, 3), (300.0, 248), (102_000.0, 100_000)])
+def test_chi_square(sum_of_squares, redundancy):
+    assert chi_square_p(sum_of_squares, redundancy) == pytest.approx(
+        stats.chi2.sf(sum_of_squares, redundancy), rel=1e-6
+    )
 
 
 def test_nothing_is_tested_without_redundancy():

@@ -9,8 +9,8 @@ import pytest
 
 from benchmarks.variance_components import TRUE, estimates, flight
 from jaxphoto import InputError, Selection, correlated, variance_components
-from jaxphoto.adjustment import LEAST
-from jaxphoto.observations import StationRows
+from jaxphoto.adjustment import MINIMAL_SIZES
+from jaxphoto.observations import CameraPositions
 from jaxphoto.report import component_findings, component_tables
 from jaxphoto.statistics import partial_redundancy, partition_observations
 from tests.adjustment.dense import at_optimum
@@ -40,7 +40,7 @@ def test_traces_are_those_of_dense_matrices(split):
     np.testing.assert_allclose(result.matrix, expected, atol=1e-9)
     np.testing.assert_allclose(result.redundancy, expected.sum(axis=1), atol=1e-9)
     assert result.redundancy.sum() == pytest.approx(adjusted(BLOCK).redundancy)
-    assert result.square_sums.sum() == pytest.approx(float(adjusted(BLOCK).square_sum))
+    assert result.square_sums.sum() == pytest.approx(float(adjusted(BLOCK).sum_of_squares))
     assert (result.uncertainty == 0).all()
 
 
@@ -99,7 +99,7 @@ def test_the_estimate_is_the_fixed_point(components):
 
 
 def test_it_is_adjusted_again_by_the_program_that_adjusted_it(monkeypatch):
-    sizes = LEAST._replace(chunks=50)
+    sizes = MINIMAL_SIZES._replace(chunks=50)
 
     def solved(block, start, priors, max_steps, given_sizes):
         raise InputError(f"{given_sizes == sizes}")
@@ -167,7 +167,7 @@ def test_components_are_those_of_an_optimum():
 def test_sets_of_a_covariance_are_scaled_as_a_whole():
     """D C D, whose whitener is that of C over D; correlations stay."""
     factor = np.random.default_rng(3).normal(0, 0.02, (2, 3, 3)) + 0.05 * np.eye(3)
-    sets = correlated(rows(range(2), sigma=1.0, kind=StationRows), np.arange(6).reshape(2, 3), factor @ factor.mT)
+    sets = correlated(rows(range(2), sigma=1.0, kind=CameraPositions), np.arange(6).reshape(2, 3), factor @ factor.mT)
     d = np.array([[2.0, 2, 2], [0.5, 1, 3]])
     scaled = sets.with_sigmas_times(d)
     np.testing.assert_allclose(scaled.sigmas, sets.sigmas * d)

@@ -14,9 +14,9 @@ from jaxtyping import Array, Float, Int, Shaped
 from jaxphoto.adjustment.layout.rays import GROUP
 from jaxphoto.adjustment.model.numbers import AbstractValues, NonImageResiduals
 from jaxphoto.adjustment.model.structure import AbstractStructure
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.devices import AXIS
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 
 class RayLists(eqx.Module):
@@ -122,7 +122,7 @@ class PaddedStructure(AbstractStructure):
         return dataclasses.replace(self, rays=dataclasses.replace(self.rays, shards=1, used=used))
 
 
-@shown
+@pretty_repr
 class PaddedValues(AbstractValues):
     """Arrays of a padded block; empty slots have infinite sigmas."""
 
@@ -133,4 +133,4 @@ class PaddedValues(AbstractValues):
 class PaddedResiduals(NonImageResiduals):
     """Residuals (observed minus computed, over sigma) in the slots of the rays."""
 
-    image: Float[Numbers, "batches 2 chunks p"]
+    image: Float[ArrayLike, "batches 2 chunks p"]

@@ -18,7 +18,7 @@ from jaxphoto.adjustment.model.numbers import Values
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints, RowsInList
 from jaxphoto.adjustment.model.row_functions import rows_of
 from jaxphoto.adjustment.model.structure import Structure
-from jaxphoto.arrays import namespace, still
+from jaxphoto.arrays import namespace, to_numpy
 
 
 def pad_groups(
@@ -125,7 +125,7 @@ def _pad_numbers(g: ObservedGroup, wide: ObservedGroup, numbers: Any, places: Pl
     size = int(np.prod(shape))
 
     def spread(x: Any, fill: Any) -> Any:
-        return scatter(x, at, size, still(fill)[..., None]).reshape(*x.shape[:-1], *shape)
+        return scatter(x, at, size, to_numpy(fill)[..., None]).reshape(*x.shape[:-1], *shape)
 
     fills = jax.tree.map(lambda x, y: None if x is None else y, own, idle, is_leaf=lambda x: x is None)
     laid = jax.tree.map(spread, own, fills)

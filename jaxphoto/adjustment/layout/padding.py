@@ -13,17 +13,26 @@ import numpy as np
 
 from jaxphoto.adjustment.layout.padded import PaddedResiduals, PaddedStructure, PaddedValues, RayLists
 from jaxphoto.adjustment.layout.padded_groups import crop_rows, pad_groups, pad_rows, put, scatter
-from jaxphoto.adjustment.layout.rays import CHUNK, GROUP, LEAST, PAIRS, Places, RayLayout, Sizes, size_class
+from jaxphoto.adjustment.layout.rays import (
+    CHUNK,
+    GROUP,
+    MINIMAL_SIZES,
+    PAIRS,
+    PaddedSizes,
+    Places,
+    RayLayout,
+    size_class,
+)
 from jaxphoto.adjustment.model.camera_groups import CameraGroup
 from jaxphoto.adjustment.model.numbers import Residuals, UnknownArrays, Values
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
 from jaxphoto.adjustment.model.structure import Structure
-from jaxphoto.arrays import namespace, still
-from jaxphoto.short_repr import shown
+from jaxphoto.arrays import namespace, to_numpy
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.static_values import Content
 
 
-@shown
+@pretty_repr
 @dataclasses.dataclass(frozen=True, eq=False)
 class PaddedBlock:
     """A block in its own order and padded, with the conversions between both.
@@ -56,15 +65,15 @@ class PaddedBlock:
 
     def crop_state(self, state: UnknownArrays) -> UnknownArrays:
         """Crop a state to the sizes and order of the block."""
-        position, rotation, shared, points = map(still, state)
+        position, rotation, shared, points = map(to_numpy, state)
         p = self.places
         return UnknownArrays(position[..., p.image], rotation[..., p.image], shared, points[..., p.point])
 
     def crop_residuals(self, residuals: PaddedResiduals) -> Residuals:
         """Crop residuals to the sizes and order of the block."""
         groups = zip(self.own.observed, residuals.others, strict=True)
-        others = tuple(self.crop_rows(g, still(v)) for g, v in groups)
-        return Residuals(others, still(residuals.datum), residuals.names, self.crop_image(residuals.image))
+        others = tuple(self.crop_rows(g, to_numpy(v)) for g, v in groups)
+        return Residuals(others, to_numpy(residuals.datum), residuals.names, self.crop_image(residuals.image))
 
     def pad_residuals(self, own: Residuals, fill: float) -> PaddedResiduals:
         """Invert `crop_residuals`: place one number per observation, `fill` elsewhere."""
@@ -95,12 +104,12 @@ class PaddedBlock:
 
     def crop_image(self, image: Any) -> np.ndarray:
         """Return numbers of rays (batches, k, chunks, p) by image row of the block (k, rows)."""
-        by_ray = np.moveaxis(still(image), 1, 0)
+        by_ray = np.moveaxis(to_numpy(image), 1, 0)
         return by_ray.reshape(len(by_ray), -1)[:, self.places.row]
 
     def crop_reduced(self, matrix: Any) -> np.ndarray:
         """Crop a matrix over the reduced unknowns (6 per image, then shared ones) to the order of the block."""
-        matrix, q = still(matrix), self.own.n_shared
+        matrix, q = to_numpy(matrix), self.own.n_shared
         of_images = (6 * self.places.image[:, None] + np.arange(6)).ravel()
         kept = np.append(of_images, np.arange(len(matrix) - q, len(matrix)))
         return matrix[np.ix_(kept, kept)]
@@ -110,7 +119,9 @@ class PaddedBlock:
 _RAYS, _PAIRS, _FEWEST = 4096, 2048, 2048
 
 
-def pad_structure(structure: Structure, sizes: Sizes = LEAST, *, shards: int = 1, dense: bool = False) -> PaddedBlock:
+def pad_structure(
+    structure: Structure, sizes: PaddedSizes = MINIMAL_SIZES, *, shards: int = 1, dense: bool = False
+) -> PaddedBlock:
     """Build the padded structure of a block; its last image is padding.
 
     `sizes` are minimum sizes, such as those common to all blocks of a study; `shards` is the number of devices; `dense`

@@ -14,11 +14,11 @@ from jaxtyping import Bool, Int
 
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup
 from jaxphoto.adjustment.model.structure import Structure
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 
-@shown
-class Sizes(NamedTuple):
+@pretty_repr
+class PaddedSizes(NamedTuple):
     """Length of each list of a block, or of the sizes compiled for; per device."""
 
     images: int = 1
@@ -33,17 +33,17 @@ class Sizes(NamedTuple):
     rows: tuple[tuple[str, int], ...] = ()
     """Number of rows of each observation group; for rows stored by point, the largest number at a point."""
 
-    def __or__(self, other: object) -> "Sizes":
+    def __or__(self, other: object) -> "PaddedSizes":
         """Return sizes that hold both."""
-        if not isinstance(other, Sizes):
+        if not isinstance(other, PaddedSizes):
             return NotImplemented
         most = [dict(self.rows), dict(other.rows)]
         rows = tuple((name, max(of.get(name, 0) for of in most)) for name in most[0] | most[1])
         images, bandwidth, groups, chunks, pairs, met = map(max, self[:-1], other[:-1])
-        return Sizes(images, bandwidth, groups, chunks, pairs, met, rows)
+        return PaddedSizes(images, bandwidth, groups, chunks, pairs, met, rows)
 
 
-LEAST = Sizes()
+MINIMAL_SIZES = PaddedSizes()
 """Minimum sizes: no more than a block needs."""
 
 
@@ -78,9 +78,9 @@ def size_class(n: int, step: int) -> int:
     return -(-n // step) * step
 
 
-def sizes_of(structure: Structure) -> Sizes:
+def sizes_of(structure: Structure) -> PaddedSizes:
     """Return the sizes of a block, including one padding image."""
-    return RayLayout.of(structure, LEAST, shards=1, dense=False).sizes
+    return RayLayout.of(structure, MINIMAL_SIZES, shards=1, dense=False).sizes
 
 
 class MetUnknowns(NamedTuple):
@@ -190,10 +190,10 @@ class RayLayout(NamedTuple):
     """Images per column block."""
     devices: tuple[DeviceLists, ...]
     met: MetUnknowns
-    sizes: Sizes
+    sizes: PaddedSizes
 
     @classmethod
-    def of(cls, s: Structure, wanted: Sizes, shards: int, dense: bool) -> "RayLayout":
+    def of(cls, s: Structure, wanted: PaddedSizes, shards: int, dense: bool) -> "RayLayout":
         """Arrange a block with at least the sizes `wanted`; `dense` requests a dense reduced matrix, not a band."""
         own = np.any(s.point_free, axis=0)[s.point]
         place, bandwidth = order_images(*_meetings(s, own))
@@ -212,7 +212,7 @@ class RayLayout(NamedTuple):
             DeviceLists.of(row, image[row], point_place[s.point[row]], own[row], columns * width) for row in rows
         )
         met = MetUnknowns.of(s, point_place // GROUP)
-        sizes = Sizes(
+        sizes = PaddedSizes(
             images=images,
             bandwidth=bandwidth,
             point_groups=groups,

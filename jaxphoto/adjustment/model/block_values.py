@@ -12,7 +12,7 @@ from jaxphoto.adjustment.model.numbers import AbstractValues, UnknownArrays, Val
 from jaxphoto.adjustment.model.observed_groups import RowsInList, numbers_in
 from jaxphoto.adjustment.model.parameter_tables import shared_vector, unknowns_from
 from jaxphoto.adjustment.model.structure import AbstractStructure, ObservedRows, observed_in
-from jaxphoto.arrays import Numbers, vector_of
+from jaxphoto.arrays import ArrayLike, vector_of
 from jaxphoto.block import Block, exposures
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.unknowns import Unknowns
@@ -54,7 +54,7 @@ def _floats(x: Any) -> Any:
     return jnp.asarray(x, float) if isinstance(x, jax.core.Tracer) else np.asarray(x, float)
 
 
-def with_datum(values: SomeValues, eop: Numbers, points: Numbers) -> SomeValues:
+def with_datum(values: SomeValues, eop: ArrayLike, points: ArrayLike) -> SomeValues:
     """Replace the constraint rows of the datum."""
     return eqx.tree_at(lambda v: (v.datum_eop, v.datum_points), values, (eop, points))
 

@@ -71,11 +71,11 @@ def with_free(group: CameraGroup, free: np.ndarray, tables: tuple[ParameterTable
     """Set the list of parameters that are free, or modified, in any camera of the group."""
     m = group.treedef.num_leaves
     own = free[(free >= group.offset) & (free < group.offset + m * len(group.names))] - group.offset
-    moved, bending = {int(k) % m for k in own}, [t for t in tables if t.bends]
+    moved, bending = {int(k) % m for k in own}, [t for t in tables if t.modifies_interior]
     bent = _bent_by(jax.tree.unflatten(group.treedef, [0.0] * m), [t.form for t in bending])
     fields = [path[-1].name for path, _ in jax.tree_util.tree_flatten_with_path(bent)[0]]
     for t in bending:
-        moved |= {fields.index(name) for name in t.form[0].bends if name in fields}
+        moved |= {fields.index(name) for name in t.form[0].modifies_interior if name in fields}
     return dataclasses.replace(group, free_leaves=tuple(sorted(moved)), bent=jax.tree.structure(bent))
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.numbers import AbstractValues, Increments, UnknownArrays
 from jaxphoto.adjustment.model.structure import AbstractStructure
-from jaxphoto.arrays import added
+from jaxphoto.arrays import sum_terms
 from jaxphoto.georeferencing import Exposure
 from jaxphoto.rotation import small_rotation
 
@@ -53,9 +53,11 @@ def cameras_at(shared: Array, values: AbstractValues, s: AbstractStructure) -> t
 def _bent(
     g: CameraGroup, cameras: Float[Array, "images m"], shared: Array, v: AbstractValues, s: AbstractStructure
 ) -> Array:
-    if not s.bends:
+    if not s.modifies_interior:
         return cameras
-    bending = [(jax.tree.map(lambda p, t=t: p[..., t.of_image], t.all_owners(shared))) for t in s.tables if t.bends]
+    bending = [
+        (jax.tree.map(lambda p, t=t: p[..., t.of_image], t.all_owners(shared))) for t in s.tables if t.modifies_interior
+    ]
 
     def one(camera: Array, parameters: list, *exposure: Array) -> Array:
         interior = interior_of(g, list(camera))
@@ -68,7 +70,7 @@ def _bent(
 
 def by_image(g: CameraGroup, s: AbstractStructure) -> bool:
     """Return True if the parameters of a camera group are stored by image."""
-    return s.bends or len(g.names) > 1
+    return s.modifies_interior or len(g.names) > 1
 
 
 def orientation_derivatives(
@@ -78,12 +80,12 @@ def orientation_derivatives(
 
     turned = jax.vmap(jax.jacfwd(small_rotation), in_axes=-1, out_axes=-1)(y.eop[3:] * scale.eop[3:]) * scale.eop[3:]
     # Term by term: a batch of 3 x 3 matrix products takes several times as long.
-    rotation = added(turned[:, j, None] * values.rotation[j, :, None] for j in range(3))
+    rotation = sum_terms(turned[:, j, None] * values.rotation[j, :, None] for j in range(3))
     rotation = rotation.transpose(3, 0, 1, 2)
     own, n = slice(0, s.n_interior), s.n_image_colours
     by_colour = jnp.zeros((len(values.shared), n)).at[s.free[own], s.colour[own]].set(scale.shared[own])
     cameras = []
-    if s.bends:
+    if s.modifies_interior:
         shared = jnp.asarray(values.shared).at[s.free].add(y.shared * scale.shared, unique_indices=True)
         # One product per colour: an image has one owner per kind, so no other owner's parameters contribute.
         along = jax.vmap(lambda d: jax.jvp(lambda p: cameras_at(p, values, s), (shared,), (d,))[1], -1, 1)(by_colour)

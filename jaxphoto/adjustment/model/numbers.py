@@ -14,9 +14,9 @@ from jaxtyping import Array, Float
 
 from jaxphoto.adjustment.model.observed_groups import RowsAtPoints, RowsInList
 from jaxphoto.adjustment.model.structure import AbstractStructure, total
-from jaxphoto.arrays import Numbers, added
+from jaxphoto.arrays import ArrayLike, sum_terms
 from jaxphoto.rotation import small_rotation
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 IMAGE_POINTS = "image_points"
 """Name of the image rows in tables and files."""
@@ -38,24 +38,24 @@ class NonImageResiduals(eqx.Module):
     with one number per row has shape (rows).
     """
 
-    others: tuple[Float[Numbers, "..."], ...]
-    datum: Float[Numbers, "constraints"]
+    others: tuple[Float[ArrayLike, "..."], ...]
+    datum: Float[ArrayLike, "constraints"]
     names: tuple[str, ...] = eqx.field(static=True)
     """Names of the groups in `others`."""
 
 
-@shown
+@pretty_repr
 class Residuals(NonImageResiduals):
     """Residuals (observed minus computed, over sigma) by group, in the order of the block."""
 
-    image: Float[Numbers, "2 rows"]
+    image: Float[ArrayLike, "2 rows"]
 
     @property
-    def named(self) -> dict[str, Float[Numbers, "..."]]:
+    def named(self) -> dict[str, Float[ArrayLike, "..."]]:
         """Residuals by group name, image points first, without the datum."""
         return {IMAGE_POINTS: self.image, **dict(zip(self.names, self.others, strict=True))}
 
-    def __getitem__(self, name: str) -> Float[Numbers, "..."]:
+    def __getitem__(self, name: str) -> Float[ArrayLike, "..."]:
         return self.named[name]
 
 
@@ -84,7 +84,7 @@ class AbstractValues(eqx.Module):
         return self.time, self.velocity, self.rate, self.nominal, self.flight_time, self.height, self.temperature
 
 
-@shown
+@pretty_repr
 class Values(AbstractValues):
     """Arrays of a block in its own order."""
 
@@ -114,7 +114,7 @@ def state_at(
     eop = increments.eop * scale.eop
     turn = jax.vmap(small_rotation, in_axes=-1, out_axes=-1)(eop[3:])
     # Term by term: a batch of 3 x 3 matrix products takes several times as long.
-    rotation = added(turn[:, j, None] * values.rotation[j] for j in range(3))
+    rotation = sum_terms(turn[:, j, None] * values.rotation[j] for j in range(3))
     return UnknownArrays(
         values.position + eop[:3],
         rotation,

@@ -68,8 +68,8 @@ class ObservedGroup(eqx.Module):
     """True if a row is one number; its residuals in results then have no component axis."""
     components: int = eqx.field(static=True)
     arguments: tuple[Argument, ...] = eqx.field(static=True)
-    through_camera: bool = eqx.field(static=True)
-    rigid: bool = eqx.field(static=True)
+    uses_interior: bool = eqx.field(static=True)
+    rigid_invariant: bool = eqx.field(static=True)
     rows: RowsInList | RowsAtPoints
     """Indices only; the numbers are in `Values.groups`."""
     image: Int[np.ndarray, "k rows"]
@@ -195,8 +195,8 @@ def group_of(
     `cameras` holds the places of the interior orientation of each image, `unknown_of` the shared unknown of each
     parameter (`n_shared` for none).
     """
-    if rows.through_camera and any(t.bends for t in tables):
-        names = ", ".join(t.kind for t in tables if t.bends)
+    if rows.uses_interior and any(t.modifies_interior for t in tables):
+        names = ", ".join(t.kind for t in tables if t.modifies_interior)
         raise BlockError(f"{rows.group} with covariances go through cameras that nothing bends: leave out {names}")
     n, nowhere = len(rows), len(unknown_of) - 1
     by_kind = {t.kind: t for t in tables}
@@ -209,7 +209,7 @@ def group_of(
             if what == "image":
                 images.append(one)
                 of_images += [t.numbers_at(t.of_image[one], nowhere) for t in own]
-                if rows.through_camera:
+                if rows.uses_interior:
                     of_images.append(_cameras(rows, cameras)[:, one])
             elif what == "point":
                 points.append(one)
@@ -219,7 +219,7 @@ def group_of(
                 of_others.append(by_kind[what].numbers_at(one, nowhere))
             else:
                 raise BlockError(f"{rows.group}: the rows touch {what}, of which the block has none")
-    for kind in rows.also:
+    for kind in rows.block_parameters:
         arguments.append(Argument(kind, ()))
         if kind in by_kind:
             of_others.append(np.repeat(by_kind[kind].numbers_at(np.zeros(1, int), nowhere), n, axis=1))
@@ -234,8 +234,8 @@ def group_of(
         scalar=len(rows.axes) == 1,
         components=len(rows.axes),
         arguments=tuple(arguments),
-        through_camera=rows.through_camera,
-        rigid=rows.rigid or not (images or points),
+        uses_interior=rows.uses_interior,
+        rigid_invariant=rows.rigid_invariant or not (images or points),
         rows=RowsInList(indices_of(rows)),
         image=_stack(images, n),
         point=_stack(points, n),
@@ -260,7 +260,7 @@ def _stack(parts: list[np.ndarray], n: int) -> np.ndarray:
 
 def image_tables(tables: Sequence[ParameterTable]) -> list[ParameterTable]:
     """Return the tables whose parameters a row receives with its images."""
-    return [t for t in tables if t.of_images and not t.bends]
+    return [t for t in tables if t.of_images and not t.modifies_interior]
 
 
 def indices_of(rows: AbstractObservations) -> AbstractObservations:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from jaxphoto.arrays import Numbers, is_traced
+from jaxphoto.arrays import ArrayLike, is_traced
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, parameter_names
 from jaxphoto.errors import InputError
@@ -27,7 +27,7 @@ class ParameterTable(eqx.Module):
     offset: int = eqx.field(static=True)
     """Place of the first number in the vector of shared parameters."""
     size: int = eqx.field(static=True)
-    bends: bool = eqx.field(static=True)
+    modifies_interior: bool = eqx.field(static=True)
     """True if it modifies the interior orientation of its images."""
     units: tuple[str, ...] = eqx.field(static=True)
     """Unit suffix of each number's name; "" if it has none."""
@@ -68,12 +68,12 @@ def tables_of(block: Block, unknowns: Unknowns, offset: int) -> tuple[ParameterT
     """Return the declared parameters of a block in order: those that modify cameras, those that points touch, all
     others.
     """
-    met = {kind for rows in block.observations if "image" not in dict(rows.indices()) for kind in rows.also}
+    met = {kind for rows in block.observations if "image" not in dict(rows.indices()) for kind in rows.block_parameters}
     given = [(kind, owners) for kind, owners in unknowns.tables.items() if owners]
 
     def rank(item: tuple[str, dict]) -> int:
         kind, owners = item
-        return 0 if next(iter(owners.values())).bends else 1 if kind in met or kind == "scanner" else 2
+        return 0 if next(iter(owners.values())).modifies_interior else 1 if kind in met or kind == "scanner" else 2
 
     tables = []
     for kind, owners in sorted(given, key=rank):
@@ -84,7 +84,9 @@ def tables_of(block: Block, unknowns: Unknowns, offset: int) -> tuple[ParameterT
         units = tuple(unit_of(label) for label in first.labels(""))
         some = bool((of_image < len(place)).any())
         tables.append(
-            ParameterTable(kind, tuple(owners), form, offset, size_of(form), bool(first.bends), units, some, of_image)
+            ParameterTable(
+                kind, tuple(owners), form, offset, size_of(form), bool(first.modifies_interior), units, some, of_image
+            )
         )
         offset += tables[-1].size * len(owners)
     return tuple(tables)
@@ -97,7 +99,7 @@ def shared_vector(unknowns: Unknowns, cameras: Iterable[str], tables: Sequence[P
     return of_cameras + [v for t in tables for name in t.owners for v in numbers_of(known[t.kind][name])]
 
 
-def unknowns_from(shared: Numbers, like: Unknowns, tables: Sequence[ParameterTable]) -> Unknowns:
+def unknowns_from(shared: ArrayLike, like: Unknowns, tables: Sequence[ParameterTable]) -> Unknowns:
     """Replace the declared parameters of `like` by those of the vector of shared parameters."""
     found: dict[str, dict[str, Any]] = {kind: {} for kind in like.tables}
     for t in tables:

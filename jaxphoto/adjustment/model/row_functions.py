@@ -24,7 +24,7 @@ from jaxphoto.parameters import filled
 from jaxphoto.rotation import small_rotation
 
 
-class Touched(NamedTuple):
+class RowVariables(NamedTuple):
     """Increments of the unknowns that one row touches, or derivatives with respect to them."""
 
     eop: Float[Array, "k 6"]
@@ -36,7 +36,7 @@ class RowInputs(NamedTuple):
     """Other inputs of a row; for many rows, rows last."""
 
     row: AbstractObservations
-    scale: Touched
+    scale: RowVariables
     position: Float[Array, "k 3"]
     rotation: Float[Array, "k 3 3"]
     exposure: tuple[Array, ...]
@@ -50,11 +50,13 @@ _AT_ONCE = 1 << 24
 # Number of derivatives from which reverse mode is faster (forty times for 365 knots).
 _MANY_SLOPES = 16
 # Axes of points and of rows where rows are stored by point.
-_OVER_POINTS = Touched(None, -1, -1), RowInputs(-1, Touched(None, -1, -1), None, None, None, -1, -1)  # type: ignore[arg-type]
-_OVER_ROWS = Touched(None, -1, None), RowInputs(-1, Touched(None, -1, None), None, None, None, -1, None)  # type: ignore[arg-type]
+_OVER_POINTS = RowVariables(None, -1, -1), RowInputs(-1, RowVariables(None, -1, -1), None, None, None, -1, -1)  # type: ignore[arg-type]
+_OVER_ROWS = RowVariables(None, -1, None), RowInputs(-1, RowVariables(None, -1, None), None, None, None, -1, None)  # type: ignore[arg-type]
 
 
-def each_row(function: Callable[[Touched, RowInputs], Any], group: ObservedGroup, z: Touched, given: RowInputs) -> Any:
+def each_row(
+    function: Callable[[RowVariables, RowInputs], Any], group: ObservedGroup, z: RowVariables, given: RowInputs
+) -> Any:
     """Map `function` over rows (last axis)."""
     if isinstance(group.rows, RowsAtPoints):
         return jax.vmap(jax.vmap(function, _OVER_ROWS, -1), _OVER_POINTS, -1)(z, given)
@@ -69,7 +71,7 @@ def rows_of(group: ObservedGroup, numbers: Any) -> AbstractObservations:
 
 def gathered_rows(
     group: ObservedGroup, numbers: Any, y: Increments, scale: Increments, v: AbstractValues
-) -> tuple[Touched, RowInputs]:
+) -> tuple[RowVariables, RowInputs]:
     """Gather what every row of a group touches at the increments `y`."""
     at_points = isinstance(group.rows, RowsAtPoints)
 
@@ -85,8 +87,8 @@ def gathered_rows(
         return jnp.append(a, 0.0)[index]
 
     # A scale of zero marks a fixed exterior orientation.
-    z = Touched(of_images(y.eop), of_shared(y.shared, group.column), of_points(y.points))
-    steps = Touched(of_images(scale.eop), of_shared(scale.shared, group.column), of_points(scale.points))
+    z = RowVariables(of_images(y.eop), of_shared(y.shared, group.column), of_points(y.points))
+    steps = RowVariables(of_images(scale.eop), of_shared(scale.shared, group.column), of_points(scale.points))
     exposure = tuple(map(of_images, v.exposures))
     parameters = of_shared(v.shared, group.parameter)
     row = rows_of(group, numbers)
@@ -95,12 +97,12 @@ def gathered_rows(
     )
 
 
-def row_function(group: ObservedGroup, s: AbstractStructure) -> Callable[[Touched, RowInputs], Float[Array, "c"]]:
+def row_function(group: ObservedGroup, s: AbstractStructure) -> Callable[[RowVariables, RowInputs], Float[Array, "c"]]:
     """Evaluate observed minus computed over sigma of one row."""
     tables = image_tables(s.tables)
     forms = {t.kind: (t.form, t.size) for t in s.tables}
 
-    def residual(z: Touched, given: RowInputs) -> Float[Array, "c"]:
+    def residual(z: RowVariables, given: RowInputs) -> Float[Array, "c"]:
         parameters = given.parameters
         if group.place:
             # Indexing an array would copy it for each number; there are few here.
@@ -119,7 +121,7 @@ def row_function(group: ObservedGroup, s: AbstractStructure) -> Callable[[Touche
             turn = small_rotation(z.eop[k, 3:] * given.scale.eop[k, 3:])
             own = {t.kind: filled(t.form, take(t.size)) for t in tables}
             camera = None
-            if group.through_camera:
+            if group.uses_interior:
                 (only,) = s.groups
                 camera = interior_of(only, list(take(only.treedef.num_leaves)))
             exposure = Exposure(*(a[k] for a in given.exposure))
@@ -181,14 +183,14 @@ def row_jacobian(
     """Evaluate the residuals of a group and the derivatives of each row."""
     function = row_function(group, s)
 
-    def ahead(z: Touched, given: RowInputs) -> tuple[Float[Array, "c"], Touched]:
+    def ahead(z: RowVariables, given: RowInputs) -> tuple[Float[Array, "c"], RowVariables]:
         # The residuals are computed along with them.
         slopes, residual = jax.jacfwd(lambda z: (function(z, given),) * 2, has_aux=True)(z)
         return residual, slopes
 
-    def back(z: Touched, given: RowInputs) -> tuple[Float[Array, "c"], Touched]:
-        residual, pull = jax.vjp(lambda z: function(z, given), z)
-        (slopes,) = jax.vmap(pull)(jnp.eye(len(residual)))
+    def back(z: RowVariables, given: RowInputs) -> tuple[Float[Array, "c"], RowVariables]:
+        residual, jt_product = jax.vjp(lambda z: function(z, given), z)
+        (slopes,) = jax.vmap(jt_product)(jnp.eye(len(residual)))
         return residual, slopes
 
     touched, given = gathered_rows(group, numbers, y, scale, v)

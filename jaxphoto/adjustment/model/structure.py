@@ -48,8 +48,8 @@ from jaxphoto.devices import AXIS
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Corrections
 from jaxphoto.losses import AbstractLoss, LinearisedLoss
-from jaxphoto.observations import PRIORS, AbstractObservations, ImageRows
-from jaxphoto.short_repr import shown
+from jaxphoto.observations import PRIORS, AbstractObservations, ImagePoints
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.unknowns import FIXED, Unknowns
 
 
@@ -86,7 +86,7 @@ class AbstractStructure(eqx.Module):
             return losses[name].for_rows_of(numbers) if name in losses else None
 
         observed = tuple(dataclasses.replace(g, loss=of(g.name, g.components)) for g in self.observed)
-        return dataclasses.replace(self, observed=observed, image_loss=of(ImageRows.group, len(ImageRows.axes)))
+        return dataclasses.replace(self, observed=observed, image_loss=of(ImagePoints.group, len(ImagePoints.axes)))
 
     @property
     def has_losses(self) -> bool:
@@ -131,12 +131,12 @@ class AbstractStructure(eqx.Module):
         return sum(g.components * g.n_rows for g in self.coupled)
 
     @property
-    def bends(self) -> bool:
+    def modifies_interior(self) -> bool:
         """True if the interior orientation differs between images of a camera."""
-        return any(t.bends for t in self.tables)
+        return any(t.modifies_interior for t in self.tables)
 
 
-@shown
+@pretty_repr
 class Structure(AbstractStructure):
     """Structure in the order of the block; see the module docstring."""
 
@@ -202,7 +202,7 @@ def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None =
     unknown_of = np.full(len(entries) + 1, len(free), np.int32)
     unknown_of[free] = np.arange(len(free))
     colour, column, n_image_colours = _colours(block, given, free)
-    bent = sum(t.size * len(t.owners) for t in tables if t.bends)
+    bent = sum(t.size * len(t.owners) for t in tables if t.modifies_interior)
     n_interior = int((free < n_parameters(given.cameras) + bent).sum())
     cameras = places_of_cameras(given.cameras)
     groups = tuple(group_of(name, rows, tables, cameras, unknown_of, len(free)) for name, rows in given.named)
@@ -275,14 +275,14 @@ def _colours(block: Block, given: ObservedRows, free: np.ndarray) -> tuple[np.nd
     }
     base, count = {}, 0
     n_image_colours = 0
-    bends = {t.kind for t in given.tables if t.bends}
+    modifies_interior = {t.kind for t in given.tables if t.modifies_interior}
     for kind, names in kinds.items():
         base[kind] = count
         if not any(name is not None for name in names):
             # No image touches the scanner.
             continue
         count += max((seen[o] + 1 for o in seen if o.split(":")[0] == kind), default=0)
-        if kind == "c" or kind in bends:
+        if kind == "c" or kind in modifies_interior:
             n_image_colours = count
     colour = np.array([base[o.split(":")[0]] + r for o, r in zip(owners, rank, strict=True)], np.int32)
     column = np.full((len(block.images), count), len(free), np.int32)

@@ -23,13 +23,13 @@ from jaxphoto.adjustment.solver.band import BandFactor, solve_band
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced
 from jaxphoto.adjustment.solver.ray_rows import points_at, ray_residuals, seen_in
 from jaxphoto.adjustment.solver.reduced import LinearisedRows, add_rows, border_places, image_places, ray_columns
-from jaxphoto.arrays import added
+from jaxphoto.arrays import sum_terms
 from jaxphoto.linear_algebra import solve
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.small_matrices import unwhiten, whiten
 
 
-@shown
+@pretty_repr
 class FactoredNormal(eqx.Module):
     """Undamped factored normal equations at an optimum, in scaled increments."""
 
@@ -86,7 +86,7 @@ def solve_reduced(reduced: Reduced, factor: BandFactor, right, d, b_points, at: 
     return Increments(eop.T, shared, jnp.stack(unwhiten(jnp.stack(whiten(b_points, r.l)) - z.T, r.l)))
 
 
-def pull(z: PaddedResiduals, at: Linearised) -> Increments:
+def jt_product(z: PaddedResiduals, at: Linearised) -> Increments:
     """Return J'z of many residual vectors (leading axis) on one device; J is evaluated once."""
     _, scale, values, s = at
     columns_of, many = ray_columns(at), len(z.image)
@@ -95,15 +95,15 @@ def pull(z: PaddedResiduals, at: Linearised) -> Increments:
         *measured, z = numbers
         (of_images, of_points), j = sums, columns_of(measured)
         both = list(zip((jnp.concatenate([c.eop, c.shared]) for c in j), jnp.moveaxis(z, 1, 0), strict=True))
-        of_image = added(jnp.einsum("anp,knp->nka", c, v) for c, v in both)
-        of_point = added(c.point * v[:, None] for c, v in zip(j, jnp.moveaxis(z, 1, 0), strict=True))
+        of_image = sum_terms(jnp.einsum("anp,knp->nka", c, v) for c, v in both)
+        of_point = sum_terms(c.point * v[:, None] for c, v in zip(j, jnp.moveaxis(z, 1, 0), strict=True))
         of_point = of_point.reshape(3 * many, *measured[1].shape)
         return (of_images.at[measured[0]].add(of_image), add_rows(of_points, measured[1], of_point)), ()
 
     none = jnp.zeros((s.n_images, many, 6 + s.n_image_colours)), jnp.zeros((s.n_points, 3 * many))
     (of_images, of_points), _ = s.each(batch, none, (values.xy, values.sigma_xy, jnp.moveaxis(z.image, 0, 1)))
     of_points = of_points.T.reshape(many, 3, -1) * scale.points
-    return jax.tree.map(jnp.add, _by_unknown(of_images, of_points, s), pull_others(z, at))
+    return jax.tree.map(jnp.add, _by_unknown(of_images, of_points, s), jt_product_others(z, at))
 
 
 def gradient(rows: LinearisedRows, at: Linearised) -> Increments:
@@ -123,7 +123,7 @@ def _by_unknown(of_images: Float[Array, "images k a"], points: Float[Array, "k 3
     return Increments(of_images[:, :, :6].transpose(1, 2, 0), shared, points)
 
 
-def pull_others(z: NonImageResiduals, at: Linearised) -> Increments:
+def jt_product_others(z: NonImageResiduals, at: Linearised) -> Increments:
     """Return J'z of all rows except image rows for many vectors (leading axis); J is evaluated once."""
     increments, scale, values, s = at
     pairs = zip(s.observed, values.groups, strict=True)
@@ -166,11 +166,11 @@ def _of_many(function: Callable[[Any], Any], values: Any, many: int, s: PaddedSt
     return jax.tree.map(lambda v: v.reshape(many, *v.shape[2:]), found)
 
 
-def push(x: Increments, at: Linearised) -> PaddedResiduals:
+def j_product(x: Increments, at: Linearised) -> PaddedResiduals:
     """Return J x of many increments (leading axis) on one device."""
     image = jax.vmap(lambda own: _push_images(own, at))(x)
     both = lambda own, image: PaddedResiduals(own.others, own.datum, own.names, image)  # noqa: E731
-    return jax.vmap(both)(push_others(x, at), image)
+    return jax.vmap(both)(j_product_others(x, at), image)
 
 
 def _push_images(x: Increments, at: Linearised) -> Float[Array, "batches 2 chunks p"]:
@@ -189,7 +189,7 @@ def _push_images(x: Increments, at: Linearised) -> Float[Array, "batches 2 chunk
     return s.each_ray(batch, (values.xy, values.sigma_xy))
 
 
-def push_others(x: Increments, at: Linearised) -> NonImageResiduals:
+def j_product_others(x: Increments, at: Linearised) -> NonImageResiduals:
     """Return J x of all rows except image rows for many increments (leading axis)."""
     _, scale, values, s = at
 

@@ -40,8 +40,8 @@ from jaxphoto.adjustment.solver.reduced import (
     reduce_normal,
 )
 from jaxphoto.adjustment.solver.similarity import after, n_open_motions, onto_datum
-from jaxphoto.arrays import Numbers
-from jaxphoto.short_repr import shown
+from jaxphoto.arrays import ArrayLike
+from jaxphoto.short_repr import pretty_repr
 
 Vector = Float[Array, "unknowns"]
 """Scaled increments as one vector: one operation to compile instead of three."""
@@ -76,37 +76,37 @@ def zero_system(y: Increments, values: PaddedValues, s: PaddedStructure) -> Fact
     return FactoredSystem(reduced, factor)
 
 
-class Task(NamedTuple):
+class SolveMode(NamedTuple):
     """Purpose of an iteration, as numbers, so that one program serves all."""
 
-    max_steps: Int[Numbers, ""]
-    only_factor: Bool[Numbers, ""]
+    max_steps: Int[ArrayLike, ""]
+    only_factor: Bool[ArrayLike, ""]
     """True for one undamped step, to obtain its system."""
 
 
-def to_optimum(max_steps: int) -> Task:
+def to_optimum(max_steps: int) -> SolveMode:
     """Iterate to the optimum in at most `steps` steps."""
-    return Task(np.array(max_steps), np.array(False))
+    return SolveMode(np.array(max_steps), np.array(False))
 
 
-def to_factor() -> Task:
+def to_factor() -> SolveMode:
     """Compute the undamped system at the start."""
-    return Task(np.array(1), np.array(True))
+    return SolveMode(np.array(1), np.array(True))
 
 
-@shown
-class Course(NamedTuple):
+@pretty_repr
+class IterationHistory(NamedTuple):
     """Iteration history, one number per step: the first `MOST_KEPT` steps, NaN beyond."""
 
-    square_sum: Float[Numbers, "steps"]
+    sum_of_squares: Float[ArrayLike, "steps"]
     """Sum of squares before the step."""
-    length: Float[Numbers, "steps"]
+    length: Float[ArrayLike, "steps"]
     """Length of the step in the metric of the normal matrix: an upper bound of |change| / sigma of every unknown."""
-    damping: Float[Numbers, "steps"]
+    damping: Float[ArrayLike, "steps"]
     """Damping, relative to the diagonal of the normal matrix."""
-    accepted: Float[Numbers, "steps"]
+    accepted: Float[ArrayLike, "steps"]
     """1 if the step was accepted, 0 if it was rejected."""
-    bent: Float[Numbers, "steps"]
+    bent: Float[ArrayLike, "steps"]
     """Fraction of the step at the end of its curve; 0 for a straight step."""
 
     def is_flat(self, k: int | Int[Array, ""]) -> Bool[Array, ""] | np.bool_:
@@ -117,7 +117,7 @@ class Course(NamedTuple):
         hardly distinguish these places.
         """
         first, within = jnp.maximum(k - _WINDOW, 0), (k >= _WINDOW) & (k < MOST_KEPT)
-        fall = self.square_sum[first] - self.square_sum[k]
+        fall = self.sum_of_squares[first] - self.sum_of_squares[k]
         return within & (fall < _FALL) & (self.length[k] > _SHRUNK * self.length[first])
 
 
@@ -139,7 +139,7 @@ class Proposal(NamedTuple):
     """v'N v of the step v."""
     damped: Scalar
     """v'D v."""
-    square_sum: Scalar
+    sum_of_squares: Scalar
     """Sum of squares at the iterate."""
     straight_sum: Scalar
     """Sum of squares after the whole step without acceleration; infinite before it is computed."""
@@ -153,9 +153,9 @@ class Proposal(NamedTuple):
         """Length in the metric of the normal matrix."""
         return jnp.sqrt(jnp.maximum(self.seen, 0.0))
 
-    def gain(self, t: Scalar, square_sum: Scalar) -> Scalar:
+    def gain(self, t: Scalar, sum_of_squares: Scalar) -> Scalar:
         """Ratio of actual to predicted reduction of the sum of squares after the fraction t of the step."""
-        return (self.square_sum - square_sum) / (2 * t * (self.seen + self.damped) - t**2 * self.seen)
+        return (self.sum_of_squares - sum_of_squares) / (2 * t * (self.seen + self.damped) - t**2 * self.seen)
 
 
 # Kind of the next candidate: the next iterate (initially, after a rejected step, or where a curve diverged), the whole
@@ -189,7 +189,7 @@ class SolverState(NamedTuple):
     """True if more steps are useless: the sum of squares does not determine the optimum."""
     steps: Int[Array, ""]
     course: Float[Array, "steps numbers"]
-    """Numbers of a `Course`, one step per row."""
+    """Numbers of a `IterationHistory`, one step per row."""
 
 
 # Damping is added to the normal matrix, relative to its diagonal. It starts close to zero. A rejected step v raises it
@@ -223,7 +223,7 @@ class Judgement(NamedTuple):
     """True if the acceleration is needed first."""
     shorten: Bool[Array, ""]
     """True if a smaller fraction of the curve is tried first."""
-    astray: Bool[Array, ""]
+    diverged_points: Bool[Array, ""]
     """True if the straight step had a smaller sum of squares than the curve; it is judged instead."""
     t: Scalar
     """Fraction of the step that is judged."""
@@ -231,15 +231,15 @@ class Judgement(NamedTuple):
     """Ratio of actual to predicted reduction of the sum of squares."""
 
 
-def _judged(state: SolverState, square_sum: Scalar, has_losses: bool) -> Judgement:
+def _judged(state: SolverState, sum_of_squares: Scalar, has_losses: bool) -> Judgement:
     """Judge the candidate by its sum of squares."""
     p, straight, curve = state.proposal, state.stage == _STRAIGHT, state.stage == _CURVE
-    gain = p.gain(state.t, square_sum)
+    gain = p.gain(state.t, sum_of_squares)
     # Far from the optimum the linear model of a loss predicts little, although there is no bent valley.
-    bend = straight & ~(gain >= _GOOD) & jnp.isfinite(square_sum) & (not has_losses)
+    bend = straight & ~(gain >= _GOOD) & jnp.isfinite(sum_of_squares) & (not has_losses)
     shorten = curve & (state.t > state.shortest) & ~(gain >= _ENOUGH)
     judged = (straight & ~bend) | (curve & ~shorten)
-    astray = curve & judged & ~(square_sum < p.straight_sum)
+    astray = curve & judged & ~(sum_of_squares < p.straight_sum)
     t = jnp.where(astray, 1.0, state.t)
     gain = jnp.where(astray, p.gain(t, p.straight_sum), gain)
     return Judgement(judged, judged & (gain >= _ACCEPT), bend, shorten, astray, t, gain)
@@ -284,10 +284,10 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
     values: PaddedValues
     scale: Increments
     tolerance: float
-    task: Task
+    task: SolveMode
 
     def __init__(
-        self, structure: PaddedStructure, values: PaddedValues, scale: Increments, tolerance: float, task: Task
+        self, structure: PaddedStructure, values: PaddedValues, scale: Increments, tolerance: float, task: SolveMode
     ):
         # The convergence test of optimistix is not used: `step` decides.
         self.rtol, self.atol, self.norm = 0.0, 0.0, optx.max_norm
@@ -333,7 +333,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
             done=no,
             flat=no,
             steps=jnp.array(0),
-            course=jnp.full((MOST_KEPT, len(Course._fields)), jnp.nan),
+            course=jnp.full((MOST_KEPT, len(IterationHistory._fields)), jnp.nan),
         )
 
     def _solved(
@@ -374,18 +374,24 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         near, curve = state.stage == _NEAR, state.stage == _CURVE
         here = self._at(state.candidate, state.loose)
         rows, _ = fn(state.candidate, here[1:])
-        square_sum = rows.square_sum(s)
-        judged, accept, bend, shorten, astray, t, gain = _judged(state, square_sum, s.has_losses)
+        sum_of_squares = rows.sum_of_squares(s)
+        judged, accept, bend, shorten, astray, t, gain = _judged(state, sum_of_squares, s.has_losses)
         fresh = (state.stage == _HERE) | (accept & ~astray)
         y = jnp.where(fresh, state.candidate, y)
         reduced = state.system.reduced
         weight, held = as_vector(reduced.weight), reduced.damping
         damping, growth = _next_damping(state, judged, accept, t, gain, p.seen / self._dot(p.step, weight * p.step))
         last = jnp.where(accept, p.length, state.length)
-        told = Course(p.square_sum, p.length, held, accept.astype(float), jnp.where(curve & ~astray, t, 0.0))
+        told = IterationHistory(
+            p.sum_of_squares, p.length, held, accept.astype(float), jnp.where(curve & ~astray, t, 0.0)
+        )
         # A candidate that is not judged is overwritten.
         course = state.course.at[state.steps].set(jnp.stack(told), mode="drop")
-        is_flat, steps, loose = accept & Course(*course.T).is_flat(state.steps), state.steps + judged, state.loose
+        is_flat, steps, loose = (
+            accept & IterationHistory(*course.T).is_flat(state.steps),
+            state.steps + judged,
+            state.loose,
+        )
         if n_open_motions(self.values, s):
             # Enforced about distant start values, the constraints bend the path: the iteration continues without them,
             # and its end is moved onto them as a whole.
@@ -408,14 +414,14 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         weight, held = as_vector(system.reduced.weight), system.reduced.damping
         # (N + D) d = -b, so d'N d = -d'b - d'D d, and the linear model predicts d'N d / 2 + d'D d.
         damped = held * self._dot(x, weight * x)
-        straight_sum = jnp.where(bend, square_sum, p.straight_sum)
+        straight_sum = jnp.where(bend, sum_of_squares, p.straight_sum)
         p = Proposal(
             step=jnp.where(fresh, -x, p.step),
             gradient=jnp.where(fresh, b, p.gradient),
             half=jnp.where(fresh, 0.0, jnp.where(near, -x / h**2, p.half)),
             seen=jnp.where(fresh, self._dot(x, b) - damped, p.seen),
             damped=jnp.where(fresh, damped, p.damped),
-            square_sum=jnp.where(fresh, square_sum, p.square_sum),
+            sum_of_squares=jnp.where(fresh, sum_of_squares, p.sum_of_squares),
             straight_sum=jnp.where(fresh, jnp.inf, straight_sum),
         )
         # An old factor leaves up to twice the remainder of a new one.
@@ -423,7 +429,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         missing = p.length * jnp.clip(left, _SLOWEST_SHOWN, 1.0)
         settled = fresh & (missing <= self.tolerance) & (p.damped <= p.seen + self.tolerance**2)
         settled = settled & (steps < self.task.max_steps) & ~self.task.only_factor
-        end = jnp.stack([p.square_sum, p.length, held, jnp.ones(()), jnp.zeros(())])
+        end = jnp.stack([p.sum_of_squares, p.length, held, jnp.ones(()), jnp.zeros(())])
         course = course.at[jnp.where(settled, steps, MOST_KEPT)].set(end, mode="drop")
         # The last step is short and starts from an accepted iterate: it needs no evaluation.
         y, tighten = jnp.where(settled, y + p.step, y), settled & loose

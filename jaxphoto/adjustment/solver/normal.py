@@ -33,7 +33,7 @@ from jaxphoto.adjustment.model.observed_groups import RowsAtPoints
 from jaxphoto.adjustment.model.row_functions import non_image_residuals
 from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.ray_rows import Pair, points_at, ray_residuals, seen_in
-from jaxphoto.arrays import added
+from jaxphoto.arrays import sum_terms
 
 
 class Linearised(NamedTuple):
@@ -85,9 +85,9 @@ class Linearised(NamedTuple):
 
         return of_batch
 
-    def square_sum(self) -> Float[Array, ""]:
+    def sum_of_squares(self) -> Float[Array, ""]:
         """Sum of all squared residuals."""
-        return self.residual_rows().square_sum(self.structure)
+        return self.residual_rows().sum_of_squares(self.structure)
 
 
 class ResidualRows(NamedTuple):
@@ -97,7 +97,7 @@ class ResidualRows(NamedTuple):
     """Image rows, batches first."""
     others: NonImageResiduals
 
-    def square_sum(self, s: PaddedStructure) -> Float[Array, ""]:
+    def sum_of_squares(self, s: PaddedStructure) -> Float[Array, ""]:
         """Sum of all squares."""
         return total(squares(self.image), s) + other_squares(self.others, s)
 
@@ -128,7 +128,7 @@ def dot(a: Increments, b: Increments, s: PaddedStructure) -> Float[Array, ""]:
 
 def squares(r: Pair) -> Float[Array, ""]:
     """Return the sum of squares of image rows."""
-    return added(jnp.sum(v * v) for v in r)
+    return sum_terms(jnp.sum(v * v) for v in r)
 
 
 def other_squares(others: NonImageResiduals, s: PaddedStructure) -> Float[Array, ""]:

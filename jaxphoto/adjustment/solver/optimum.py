@@ -16,7 +16,13 @@ from jaxphoto.adjustment.layout.sharding import BATCHES, EVERYWHERE, along_point
 from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.parameter_tables import ParameterTable
-from jaxphoto.adjustment.solver.levenberg_marquardt import Course, FactoredSystem, LevenbergMarquardt, Task, as_vector
+from jaxphoto.adjustment.solver.levenberg_marquardt import (
+    FactoredSystem,
+    IterationHistory,
+    LevenbergMarquardt,
+    SolveMode,
+    as_vector,
+)
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.camera.camera_rates import HOUR_S
@@ -37,7 +43,7 @@ class Optimum(NamedTuple):
     increments: Increments
     steps: Int[Array, ""] | None
     converged: Bool[Array, ""] | None
-    course: Course | None
+    course: IterationHistory | None
 
 
 def unit_scale(structure: PaddedStructure) -> Increments:
@@ -46,7 +52,9 @@ def unit_scale(structure: PaddedStructure) -> Increments:
     return Increments(jnp.asarray(s.eop_free), jnp.ones(s.n_shared), jnp.asarray(s.point_free))
 
 
-def iterate(values: PaddedValues, structure: PaddedStructure, task: Task) -> tuple[Optimum, FactoredSystem, Increments]:
+def iterate(
+    values: PaddedValues, structure: PaddedStructure, task: SolveMode
+) -> tuple[Optimum, FactoredSystem, Increments]:
     """Return the optimum, the last system and the scale of its unknowns; or the undamped system at the start."""
     scale = typical_scale(values, structure)
     at_points = along_points(2)
@@ -61,7 +69,7 @@ def iterate(values: PaddedValues, structure: PaddedStructure, task: Task) -> tup
 
 
 def _iterate(
-    values: PaddedValues, scale: Increments, structure: PaddedStructure, task: Task
+    values: PaddedValues, scale: Increments, structure: PaddedStructure, task: SolveMode
 ) -> tuple[Optimum, FactoredSystem]:
     """Iterate on the data of one device; increments are scaled."""
     solver = LevenbergMarquardt(structure, values, scale, TOLERANCE, task)
@@ -81,7 +89,7 @@ def _iterate(
     )
     increments, state = solver.increments(solution.value), solution.state
     converged = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(increments.eop))
-    return Optimum(increments, state.steps, converged, Course(*state.course.T)), state.system
+    return Optimum(increments, state.steps, converged, IterationHistory(*state.course.T)), state.system
 
 
 def weigh_datum(values: PaddedValues, structure: PaddedStructure) -> PaddedValues:
@@ -137,7 +145,7 @@ def typical_scale(values: PaddedValues, structure: PaddedStructure) -> Increment
     if s.tables:
         declared: list[Array] = []
         for t in s.tables:
-            felt = t.bends and not set(t.units) <= set(by_unit)
+            felt = t.modifies_interior and not set(t.units) <= set(by_unit)
             other = _typical_of_bending(s, v, t, sigma, corner) if felt else jnp.ones(t.size)
             declared += [by_unit.get(unit, other[k]) for k, unit in enumerate(t.units)] * len(t.owners)
         vector = vector.at[s.n_cameras :].set(jnp.stack(declared))

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from jaxphoto.adjustment.layout.padded import PaddedStructure
 from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.image_orientations import ImageOrientations, OrientationDerivatives
-from jaxphoto.arrays import added
+from jaxphoto.arrays import sum_terms
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, camera_residual
 from jaxphoto.compiling import once
 from jaxphoto.georeferencing import apparent_point
@@ -93,7 +93,7 @@ def _residuals(cameras: list[list[Array]], in_camera: Triple, seen: RayMeasureme
     x, y = parts[0] if parts else (0 * in_camera[0], 0 * in_camera[0])
     if len(parts) > 1:
         x, y = (
-            added(jnp.where(own[:, None], v, 0.0) for own, v in zip(seen.member, of_groups, strict=True))
+            sum_terms(jnp.where(own[:, None], v, 0.0) for own, v in zip(seen.member, of_groups, strict=True))
             for of_groups in zip(*parts, strict=True)
         )
     if s.image_loss is not None:
@@ -132,7 +132,7 @@ def ray_jacobian(
     )
 
     def of_one(k: int) -> RayJacobian:
-        eop, point = (added(b[k] * v for b, v in zip(by_place, moved, strict=True)) for moved in (by_eop, by_point))
+        eop, point = (sum_terms(b[k] * v for b, v in zip(by_place, moved, strict=True)) for moved in (by_eop, by_point))
         return RayJacobian(residual[k], eop, by_camera[k], point)
 
     return of_one(0), of_one(1)

@@ -30,7 +30,7 @@ from jaxphoto.adjustment.solver.non_image_rows import (
 )
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced, ResidualRows
 from jaxphoto.adjustment.solver.ray_rows import RayJacobian, points_at, ray_jacobian, seen_in
-from jaxphoto.arrays import added
+from jaxphoto.arrays import sum_terms
 from jaxphoto.compiling import once
 from jaxphoto.linear_algebra import solve
 from jaxphoto.small_matrices import cholesky_3x3, whiten
@@ -115,12 +115,12 @@ class _AtPoints(NamedTuple):
     def plus(self, j: tuple[RayJacobian, RayJacobian], image: Array, point: Array, s: PaddedStructure) -> "_AtPoints":
         """Add the sums of a batch."""
         pairs = [(a, b) for a in range(3) for b in range(a + 1)]
-        own = [added(c.point[a] * c.point[b] for c in j) for a, b in pairs]
-        own += [added(c.point[a] * c.residual for c in j) for a in range(3)]
+        own = [sum_terms(c.point[a] * c.point[b] for c in j) for a, b in pairs]
+        own += [sum_terms(c.point[a] * c.residual for c in j) for a in range(3)]
         v, w = add_rows(self.v, point, jnp.stack(own)), self.w
         i, q = w.shape[1] - 1, s.n_image_colours
         if i:
-            met = added(c.shared[:, None] * c.point for c in j)
+            met = sum_terms(c.shared[:, None] * c.point for c in j)
             if i == q:
                 # One camera: its colours are its unknowns.
                 met = jnp.concatenate([met, jnp.zeros_like(met[:1])]).reshape(-1, *point.shape)
@@ -217,7 +217,7 @@ def _met_of_rays(j: tuple[RayJacobian, RayJacobian], s: PaddedStructure) -> Floa
     e, *shape = eop[0].shape
     if not s.rays.free_points:
         return jnp.zeros((*shape, 0, e))
-    w = [added(c * o.point[a] for c, o in zip(eop, j, strict=True)) for a in range(3)]
+    w = [sum_terms(c * o.point[a] for c, o in zip(eop, j, strict=True)) for a in range(3)]
     return jnp.concatenate(w).reshape(*shape, 3, e)
 
 
@@ -366,9 +366,9 @@ def _rows_with_shared(rest: NonImageRows, s: PaddedStructure) -> tuple[Float[Arr
 
     def of_group(groups: tuple[RowsOfPoints, ...]) -> tuple[Array, Array, Array]:
         each = [(rows.of_group(size), rows) for rows in groups]
-        met = added(jnp.einsum("brpc,ckrp->bkp", of, rows.points) for of, rows in each)
-        square = added(jnp.einsum("arpc,brpc->ab", of, of) for of, _ in each)
-        return met, square, added(jnp.einsum("brpc,crp->b", of, rows.residual) for of, rows in each)
+        met = sum_terms(jnp.einsum("brpc,ckrp->bkp", of, rows.points) for of, rows in each)
+        square = sum_terms(jnp.einsum("arpc,brpc->ab", of, of) for of, _ in each)
+        return met, square, sum_terms(jnp.einsum("brpc,crp->b", of, rows.residual) for of, rows in each)
 
     groups = jax.tree.map(s.by_group, rest.at_points)
     met, square, right = jax.lax.map(of_group, groups, batch_size=_GROUPS)

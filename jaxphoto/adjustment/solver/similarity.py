@@ -11,7 +11,7 @@ from jaxphoto.adjustment.layout.padded import PaddedStructure, PaddedValues
 from jaxphoto.adjustment.model.numbers import AbstractValues, Increments, datum_residuals
 from jaxphoto.adjustment.model.structure import AbstractStructure, total
 from jaxphoto.adjustment.solver.normal import Linearised, dot
-from jaxphoto.arrays import Numbers, joined
+from jaxphoto.arrays import ArrayLike, joined
 from jaxphoto.linear_algebra import one_at_a_time, solve
 from jaxphoto.rotation import CROSS, small_angles, small_rotation
 
@@ -40,9 +40,9 @@ def similarity(
 
 
 def motions(
-    position: Float[Numbers, "3 images"],
-    rotation: Float[Numbers, "3 3 images"],
-    points: Float[Numbers, "3 points"],
+    position: Float[ArrayLike, "3 images"],
+    rotation: Float[ArrayLike, "3 3 images"],
+    points: Float[ArrayLike, "3 points"],
     centre,
     size,
 ) -> DatumRows:
@@ -72,8 +72,8 @@ def n_open_motions(values: AbstractValues, s: AbstractStructure) -> int:
     only control point, a shift compensated by a strip's) depend on the place, or on more than images and points.
     """
     k = len(values.datum_eop)
-    invariant = all(g.rigid for g in s.observed)
-    lengths = any(g.rigid and g.elimination != "reduced" for g in s.observed)
+    invariant = all(g.rigid_invariant for g in s.observed)
+    lengths = any(g.rigid_invariant and g.elimination != "reduced" for g in s.observed)
     return k if invariant and (k == 7 or (k == 6 and lengths)) else 0
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxphoto.camera.declared import Declared
 from jaxphoto.camera.sensor import Sensor
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 # Maximum number of Newton iterations; within the monotone range a model needs 4 to 8.
 _STEPS = 50
@@ -46,7 +46,7 @@ def radial_powers(letter: str, n: int) -> dict[str, int]:
 Affinity = Literal["added", "before", "after", "around"]
 
 
-@shown
+@pretty_repr
 class AbstractDistortion(Declared):
     """Lens distortion; its fields are scalars, its `domain` declares the direction of the polynomial.
 

@@ -16,13 +16,13 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from jaxphoto.camera.declared import Declared
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 
 Component = Any
 """Component of a direction or an image coordinate: a number, or a NumPy or JAX array of many."""
 
 
-@shown
+@pretty_repr
 class AbstractProjection(Declared):
     """Projection; its name and parameters are declared as in `Declared`. Most have no parameters.
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxphoto.arrays import on_device
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.camera import (
     AbstractDistortion,
     AbstractProjection,
@@ -81,7 +81,7 @@ def in_pixels(
     x_p, y_p = sensor.mm_from_px(np.array([centre], float))[0]
     distortion = model.distortion(**terms)
     interior = InteriorOrientation(fy * sensor.pixel_mm, x_p, y_p, distortion, projection=model.projection)
-    return jax.tree.map(on_device, interior)
+    return jax.tree.map(as_jax_array, interior)
 
 
 def pixels_of(interior: InteriorOrientation, sensor: Sensor) -> tuple[float, float, float, float]:

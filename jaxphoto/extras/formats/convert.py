@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block
 from jaxphoto.camera import AbstractDistortion, InteriorOrientation, Perspective, Sensor
 from jaxphoto.camera.conversion import Conversion, converted
@@ -223,8 +223,8 @@ def _ideal_px(p: Project) -> Float[np.ndarray, "n 2"]:
     of_row, ideal = np.array(p.image_camera, object)[p.image], np.zeros((len(ray), 2))
     for name, (sensor, interior, _) in p.cameras.items():
         rows = of_row == name
-        xy = interior.projection.ideal_from_direction(still(interior.c), *in_camera[rows].T)
-        ideal[rows] = np.stack([still(v) for v in xy], axis=1) / sensor.pixel_mm
+        xy = interior.projection.ideal_from_direction(to_numpy(interior.c), *in_camera[rows].T)
+        ideal[rows] = np.stack([to_numpy(v) for v in xy], axis=1) / sensor.pixel_mm
     return ideal
 
 

@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation, image_ray
 from jaxphoto.compiling import call_compiled
@@ -111,8 +111,8 @@ def footprints(p: Project) -> list[Float[np.ndarray, "n 3"] | None]:
         sides = [np.stack(side, axis=1) for side in ((t, -half), (half, t), (-t, half), (-half, -t))]
         border = np.concatenate(sides) * [sensor.width_mm, sensor.height_mm]
         exterior = ExteriorOrientation(p.exterior.position[i], p.exterior.camera_from_object[i])
-        directions = still(call_compiled(_directions, interior, exterior, border))
-        rings.append(_on_ground(still(exterior.position), directions, ground))
+        directions = to_numpy(call_compiled(_directions, interior, exterior, border))
+        rings.append(_on_ground(to_numpy(exterior.position), directions, ground))
     return rings
 
 

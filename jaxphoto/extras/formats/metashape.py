@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Float
 from pyproj import CRS
 
-from jaxphoto.arrays import on_device
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.block import Frame
 from jaxphoto.camera import Agisoft, InteriorOrientation, Sensor
 from jaxphoto.errors import InputError, quoted
@@ -113,7 +113,7 @@ def _camera(source: CameraSource, name: str, calibration: ElementTree.Element, p
     distortion = Agisoft(**{k: v / f if k in _SCALED else v for k, v in values.items()})
     projection = _MODELS[kind].projection
     interior = InteriorOrientation(f * sensor.pixel_mm, x_p, y_p, distortion, projection=projection)
-    return CameraFile(name, sensor, jax.tree.map(on_device, interior), None, joined_notes(note, assumed))
+    return CameraFile(name, sensor, jax.tree.map(as_jax_array, interior), None, joined_notes(note, assumed))
 
 
 def _values(source: CameraSource, calibration: ElementTree.Element, sensor: Sensor) -> tuple[dict[str, float], str]:

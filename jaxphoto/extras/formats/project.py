@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block, Frame
 from jaxphoto.camera import set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
@@ -23,7 +23,7 @@ from jaxphoto.io.block_folder.camera_section import Camera, camera_section
 from jaxphoto.io.block_folder.settings import frame_section
 from jaxphoto.io.block_folder.table_layout import ANGLES, SIGMA_XYZ, coordinate_names
 from jaxphoto.io.text_tables import Table
-from jaxphoto.observations import ControlRows
+from jaxphoto.observations import ControlCoordinates
 from jaxphoto.procedures.control.surveyed import SIGMA_M, system_of
 from jaxphoto.procedures.georeference_photographs import utm_of
 from jaxphoto.unknowns import FIXED, FREE, Unknowns
@@ -68,7 +68,7 @@ class ControlPoints(NamedTuple):
         return ControlPoints(point, xyz, sigma, np.arange(len(point)) >= len(control.point))
 
 
-def _points(kinds: list[tuple[ControlRows, float]], n_points: int) -> ControlPoints:
+def _points(kinds: list[tuple[ControlCoordinates, float]], n_points: int) -> ControlPoints:
     """Rows by point, each kind with the standard deviation that stands for none."""
     xyz, sigma = np.full((n_points, 3), np.nan), np.full((n_points, 3), np.nan)
     for rows, none in kinds:
@@ -121,8 +121,8 @@ class Project(NamedTuple):
             twice = next(name for name in names if names.count(name) > 1)
             raise InputError(f"two images are of the photograph {twice}; give each photograph one name")
         rows = block.image_points
-        xy, image = still(rows.xy), np.asarray(rows.image)
-        column_row, sigma_px = np.zeros((len(image), 2)), still(rows.sigma).copy()
+        xy, image = to_numpy(rows.xy), np.asarray(rows.image)
+        column_row, sigma_px = np.zeros((len(image), 2)), to_numpy(rows.sigma).copy()
         camera = np.array(block.image_camera, object)[image]
         used = dict.fromkeys(block.image_camera)
         for name in used:
@@ -131,12 +131,14 @@ class Project(NamedTuple):
         exterior = unknowns.exterior
         labels = {"refraction": "refraction", "curvature": "earth curvature"}
         corrections = [label for name, label in labels.items() if getattr(block.corrections, name)]
-        bent = [kind for kind, owners in unknowns.tables.items() if any(type(p).bends for p in owners.values())]
+        bent = [
+            kind for kind, owners in unknowns.tables.items() if any(type(p).modifies_interior for p in owners.values())
+        ]
         return Project(
             block.title, {name: ProjectCamera(block.sensors[name], unknowns.interior[name]) for name in used},
             block.images, names, block.image_camera,
-            ExteriorOrientation(still(exterior.position), still(exterior.camera_from_object)), block.points,
-            still(unknowns.points), image, np.asarray(rows.point), column_row, block.frame, (*corrections, *bent),
+            ExteriorOrientation(to_numpy(exterior.position), to_numpy(exterior.camera_from_object)), block.points,
+            to_numpy(unknowns.points), image, np.asarray(rows.point), column_row, block.frame, (*corrections, *bent),
             sigma_px, ControlPoints.of(block),
         )  # fmt: skip
 
@@ -204,7 +206,7 @@ class Project(NamedTuple):
             on_map = system.map(np.where(missing, points, control.xyz))
             control = control._replace(xyz=np.where(missing, np.nan, on_map))
         return self._replace(
-            exterior=ExteriorOrientation(still(system.map(position)), still(rotations)),
+            exterior=ExteriorOrientation(to_numpy(system.map(position)), to_numpy(rotations)),
             xyz=None if self.xyz is None else system.map(self.xyz),
             control=control,
             on_map=True,

@@ -26,7 +26,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-from jaxphoto.arrays import on_device
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.camera import BundlerRadial, InteriorOrientation, Perspective, Sensor
 from jaxphoto.camera.conversion import Conversion
 from jaxphoto.collinearity import ExteriorOrientation
@@ -65,7 +65,7 @@ def _project(path: Path, title: str, s: _Scene) -> Project:
     for k, ((width, height), (f, k1, k2)) in enumerate(zip(size.tolist(), s.values.tolist(), strict=True)):
         interior = InteriorOrientation(f * ASSUMED_PIXEL_MM, 0.0, 0.0, BundlerRadial(k1, k2))
         sensor = Sensor(width, height, ASSUMED_PIXEL_MM, pixel_assumed=True)
-        cameras[str(k)] = ProjectCamera(sensor, jax.tree.map(on_device, interior), ("c_mm", "k1", "k2"))
+        cameras[str(k)] = ProjectCamera(sensor, jax.tree.map(as_jax_array, interior), ("c_mm", "k1", "k2"))
     return Project(
         title,
         cameras,

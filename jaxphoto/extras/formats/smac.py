@@ -11,7 +11,7 @@ from pathlib import Path
 
 import jax
 
-from jaxphoto.arrays import on_device
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.camera import InteriorOrientation, Perspective, Sensor, Smac, rebalance, with_sign
 from jaxphoto.extras.formats.camera_models import CameraModel
 from jaxphoto.extras.formats.files import CameraFormat
@@ -57,7 +57,7 @@ def read_smac_report(source: CameraSource) -> CameraFile:
     sensor, assumed = _sensor(source, text)
     coefficients = {name.lower(): value for name, value in values.items() if name[0] in "KP"}
     interior = InteriorOrientation(c, values["xp"], values["yp"], Smac(**coefficients, sign="add"))  # type: ignore[arg-type]
-    return CameraFile(source.path.stem, sensor, jax.tree.map(on_device, interior), None, assumed)
+    return CameraFile(source.path.stem, sensor, jax.tree.map(as_jax_array, interior), None, assumed)
 
 
 def write_smac_report(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:

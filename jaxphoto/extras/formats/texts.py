@@ -29,7 +29,7 @@ import pandas as pd
 import scipy
 from jaxtyping import Float, Int
 
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError, few, quoted
 from jaxphoto.extras.formats.camera_models import ProjectCamera
@@ -312,7 +312,7 @@ def _of_angles(path: Path, rows: list[_Row], places: dict[str, int], degrees: fl
         names.append(" ".join(cells[:-most]))
     numbers = np.array(values).reshape(-1, len(_COLUMNS))
     exterior = ExteriorOrientation.from_angles(numbers[:, :3], np.deg2rad(numbers[:, 3:] * degrees))  # type: ignore[arg-type]
-    return ExteriorText(names, numbers[:, :3], still(exterior.camera_from_object))
+    return ExteriorText(names, numbers[:, :3], to_numpy(exterior.camera_from_object))
 
 
 def _of_matrices(path: Path, rows: list[_Row]) -> ExteriorText:
@@ -362,7 +362,7 @@ def _of_bingo(path: Path, numbered: list[tuple[int, str]]) -> ExteriorText:
 
 def angles_deg(exterior: ExteriorOrientation) -> Float[np.ndarray, "images 3"]:
     """Return omega, phi, kappa in degrees."""
-    return np.rad2deg(still(exterior.omega_phi_kappa))
+    return np.rad2deg(to_numpy(exterior.omega_phi_kappa))
 
 
 def write(p: Project, folder: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.arrays import on_device
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.block import Block, Start, sensor_rows
 from jaxphoto.camera import ThermalRates
 from jaxphoto.errors import InputError, few
@@ -170,7 +170,7 @@ def assemble(source: BlockTables) -> Block:
     start = Unknowns(
         {name: camera.interior for name, camera in cameras.items()},
         images.exterior,
-        on_device(control.start),
+        as_jax_array(control.start),
         {name: mounts[name] for name in used},
         strips,
         scanner,
@@ -190,8 +190,8 @@ def assemble(source: BlockTables) -> Block:
         image_camera=images.cameras,
         image_mount=image_mount,
         image_strip=images.strips,
-        image_time=on_device(images.times),
-        flight_time=None if images.strips_are_the_flight else on_device(images.flight_times),
+        image_time=as_jax_array(images.times),
+        flight_time=None if images.strips_are_the_flight else as_jax_array(images.flight_times),
         middle_s=images.middle_s,
         temperatures=temperatures_of(images, settings),
         image_points=points.rows,
@@ -226,7 +226,7 @@ def assemble(source: BlockTables) -> Block:
         distances=distances,
         more=(*further, *known_cameras(cameras)),
     )
-    for doubt in block.doubts:
+    for doubt in block.prior_warnings:
         warnings.warn(doubt, stacklevel=3)
     posed = MODES[keys.georeferencing.mode](block)
     if keys.georeferencing.mode == "direct":

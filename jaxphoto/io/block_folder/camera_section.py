@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from pydantic import StrictBool, StrictStr, create_model
 
-from jaxphoto.arrays import on_device
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.camera import (
     AbstractDistortion,
     AbstractProjection,
@@ -124,11 +124,11 @@ def read_camera(section: Section) -> Camera:
         for kind in (distortion, projection)
     ]
     empty = InteriorOrientation(0.0, 0.0, 0.0, parts[0], keys.residuals, parts[1])  # type: ignore[arg-type]
-    interior = jax.tree.map(on_device, empty)
+    interior = jax.tree.map(as_jax_array, empty)
     names = parameter_names(interior)
     values.known(*names, *constant_names(interior))
     for name, value in keys.interior.items():
-        interior = set_parameter(interior, name, on_device(value))
+        interior = set_parameter(interior, name, as_jax_array(value))
     _check_interior(values, sensor)
     return Camera(sensor, interior, *_priors(section, keys, interior), keys.reservation)
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from jaxphoto.arrays import on_device
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError, InputError, few
 from jaxphoto.io.block_folder.observations import Images, ObservedPoints, sigmas_of
@@ -122,7 +122,7 @@ def _rows(kind: Kind, table: Table, ids: Ids, settings: Settings) -> AbstractObs
     for column in (c for c in columns_of(kind) if c.field == "sigma"):
         sigma[column.of_rows] = sigmas_of(table, column.name, settings, sigma_key(kind)) * column.scale
     rows = _instance(kind, table, fields | {"sigma": sigma})
-    if kind.once:
+    if kind.unique:
         touched = np.sort([fields[c.field][c.of_rows] for c in columns_of(kind) if c.touches], axis=0)
         thing = f"this {kind.group.replace('_', ' ').removesuffix('s')}"
         refuse_duplicates(table, {str(k): index for k, index in enumerate(touched)}, thing)
@@ -141,8 +141,8 @@ def _fields(kind: Kind, table: Table, ids: Ids) -> dict[str, np.ndarray]:
 
 
 def _instance(kind: Kind, table: Table, fields: Mapping[str, np.ndarray]) -> AbstractObservations:
-    rows = kind(**{name: v if v.dtype.kind == "i" else on_device(v) for name, v in fields.items()})
-    for line, message in rows.flaws():
+    rows = kind(**{name: v if v.dtype.kind == "i" else as_jax_array(v) for name, v in fields.items()})
+    for line, message in rows.validation_errors():
         raise table.bad(line, message)
     return rows
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.arrays import on_device
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.block import Block, Frame, Motion
 from jaxphoto.compiling import jit_quickly
 from jaxphoto.errors import BlockError, InputError
@@ -21,7 +21,7 @@ from jaxphoto.io.block_folder.table_layout import RATE, VELOCITY
 from jaxphoto.io.text_tables import Table
 from jaxphoto.io.trajectory import Records
 from jaxphoto.io.trajectory.in_frame import positions_in, trajectory_in
-from jaxphoto.observations import Attitudes, RelativeAttitudes, RelativePositions, RigPlaces, RigTurns, StationRows
+from jaxphoto.observations import Attitudes, CameraPositions, RelativeAttitudes, RelativePositions, RigPlaces, RigTurns
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 from jaxphoto.unknowns import FIXED, Unknowns, late_cameras
 
@@ -37,7 +37,7 @@ _angles = jit_quickly(jax.vmap(roll_pitch_yaw_from_matrix))
 class ObservedFlight(NamedTuple):
     """Observed stations, attitudes and motion, and the images whose velocity and rate are known."""
 
-    stations: StationRows
+    stations: CameraPositions
     attitudes: Attitudes
     motion: Motion | None
     velocity_known: np.ndarray
@@ -68,7 +68,7 @@ def read_flight(
     rate, rate_known = _motion(attitudes, RATE, images)
     motion = None
     if velocity_known.any() or rate_known.any():
-        motion = Motion(on_device(velocity), on_device(np.deg2rad(rate)))
+        motion = Motion(as_jax_array(velocity), as_jax_array(np.deg2rad(rate)))
     return ObservedFlight(
         read_stations(stations, images, settings),
         read_attitudes(attitudes, images, settings),
@@ -155,7 +155,7 @@ def _late_pairs(rows: Iterable[Any], cameras: Sequence[str], late: Collection[st
                     yield reference, cameras[image]
 
 
-def check_attitude_units(table: Table, stations: StationRows, images: Images) -> None:
+def check_attitude_units(table: Table, stations: CameraPositions, images: Images) -> None:
     """`_check_yaw` of attitudes.csv, against the flight from image to image of a strip."""
     yaw = np.full(len(images.ids), np.nan)
     yaw[images.find(table)] = table.numbers("yaw_deg")
@@ -218,7 +218,9 @@ def _interpolated(records: Records, images: Images, frame: Frame, settings: Sett
     velocity, rate = np.zeros((len(images.ids), 3)), np.zeros((len(images.ids), 3))
     velocity[image], rate[image] = poses.velocity, poses.rate
     who, axis = np.repeat(image, 3), np.tile(np.arange(3), len(image))
-    stations = StationRows(who, axis, jnp.asarray(poses.position.ravel()), jnp.asarray(poses.sigma_position.ravel()))
+    stations = CameraPositions(
+        who, axis, jnp.asarray(poses.position.ravel()), jnp.asarray(poses.sigma_position.ravel())
+    )
     attitudes = Attitudes(image, _angles(poses.object_from_body), jnp.asarray(poses.sigma_attitude))
     known = np.isin(np.arange(len(images.ids)), image)
     return ObservedFlight(stations, attitudes, Motion(jnp.asarray(velocity), jnp.asarray(rate)), known, known)

@@ -32,7 +32,7 @@ _BEYOND = 3.0
 _FAR_M = 3e5
 _PLACED = ("images", "control_points", "stations", "object_points")
 
-Numbers = dict[str, pd.DataFrame]
+ArrayLike = dict[str, pd.DataFrame]
 Refuse = Callable[[str, int, str], NoReturn]
 
 
@@ -65,7 +65,7 @@ def tables_to_local(tables: Mapping[str, Table], frame: Frame) -> dict[str, Tabl
     return converted
 
 
-def tables_to_map(tables: Numbers, frame: Frame) -> Numbers:
+def tables_to_map(tables: ArrayLike, frame: Frame) -> ArrayLike:
     """The tables of `write_block` in the system of `frame`: the inverse of `tables_to_local`."""
 
     def refuse(name: str, line: int, message: str) -> NoReturn:
@@ -131,7 +131,7 @@ def _check_area(file: str, coordinates: np.ndarray, places: np.ndarray, frame: F
         )
 
 
-def _converted(tables: Numbers, frame: Frame, back: bool, refuse: Refuse) -> Numbers:
+def _converted(tables: ArrayLike, frame: Frame, back: bool, refuse: Refuse) -> ArrayLike:
     """All tables to the local frame, or back. Completed coordinates serve the conversion and are not kept."""
     system, converted = frame.map, dict(tables)
     control, images = tables["control_points"], tables["images"]

@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 import pandas as pd
 
-from jaxphoto.arrays import on_device
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.block import Temperatures
 from jaxphoto.camera import RATES
 from jaxphoto.collinearity import ExteriorOrientation
@@ -32,7 +32,7 @@ from jaxphoto.io.block_folder.table_layout import (
 )
 from jaxphoto.io.conditions import CONDITIONS, read_conditions
 from jaxphoto.io.text_tables import Table
-from jaxphoto.observations import AXES, Attitudes, ControlRows, ImageRows, StationRows, SurfaceRows
+from jaxphoto.observations import AXES, Attitudes, CameraPositions, ControlCoordinates, ImagePoints, SurfaceRows
 from jaxphoto.unknowns import FIXED, Unknowns
 
 ROLES = ("control", "fixed", "check")
@@ -159,7 +159,7 @@ def temperatures_of(images: Images, settings: Settings) -> Temperatures | None:
     known, reference = ~np.isnan(celsius), settings.keys.reference_temperature_c
     if not known.any():
         return None
-    return Temperatures(on_device(celsius), float(celsius[known].mean()) if reference is None else reference)
+    return Temperatures(as_jax_array(celsius), float(celsius[known].mean()) if reference is None else reference)
 
 
 def check_times(images: Images, starts: Unknowns, priors: Unknowns) -> None:
@@ -194,7 +194,7 @@ class ObservedPoints(NamedTuple):
 
     table: Table
     ids: tuple[str, ...]
-    rows: ImageRows
+    rows: ImagePoints
     lines: np.ndarray
 
     def find(self, ids: np.ndarray) -> np.ndarray:
@@ -214,7 +214,7 @@ def read_image_points(table: Table, images: Images, settings: Settings) -> Obser
     sigma = _image_sigmas(table, pixel, settings)
     point, ids = pd.factorize(table.text("point"))
     order = np.lexsort((image, point))
-    rows = ImageRows(image[order], point[order], on_device(xy[order]), on_device(sigma[order]))
+    rows = ImagePoints(image[order], point[order], as_jax_array(xy[order]), as_jax_array(sigma[order]))
     return ObservedPoints(table, tuple(ids), rows, order)
 
 
@@ -282,9 +282,9 @@ def check_rays(points: ObservedPoints, images: Images, controlled: np.ndarray) -
 class Control(NamedTuple):
     """Object coordinates by role, starting coordinates (points, 3) and for which points all three are known."""
 
-    control: ControlRows
-    fixed: ControlRows
-    check: ControlRows
+    control: ControlCoordinates
+    fixed: ControlCoordinates
+    check: ControlCoordinates
     start: np.ndarray
     known: np.ndarray
     controlled: np.ndarray
@@ -333,7 +333,7 @@ def read_control(table: Table, approximations: Table, points: ObservedPoints, se
     sigma[role == "fixed"] = 0.0
     # A check coordinate needs no sigma: it never enters an adjustment.
     sigma = np.nan_to_num(sigma)
-    rows = ControlRows(index[lines], axes, on_device(value[lines, axes]), on_device(sigma[lines, axes]))
+    rows = ControlCoordinates(index[lines], axes, as_jax_array(value[lines, axes]), as_jax_array(sigma[lines, axes]))
     by_role = {name: rows.take((role[lines] == name) & (index[lines] >= 0)) for name in ROLES}
     controlled = np.zeros(len(points.ids), bool)
     for given in (by_role["control"], by_role["fixed"]):
@@ -373,20 +373,20 @@ def check_datum_points(over: object, points: ObservedPoints, file: str) -> None:
                 raise InputError(f"{file}, [datum] over: point {name} is measured in no image; remove it from the list")
 
 
-def read_stations(table: Table, images: Images, settings: Settings) -> StationRows:
+def read_stations(table: Table, images: Images, settings: Settings) -> CameraPositions:
     """Observed positions, one row per coordinate."""
     image, (value, lines, axes) = images.find(table), _given_coordinates(table)
     needed = ~np.isnan(value)
     columns = enumerate(SIGMA_XYZ)
     sigma = np.stack([sigmas_of(table, c, settings, "station_m", needed=needed[:, a]) for a, c in columns], axis=1)
-    return StationRows(image[lines], axes, on_device(value[lines, axes]), on_device(sigma[lines, axes]))
+    return CameraPositions(image[lines], axes, as_jax_array(value[lines, axes]), as_jax_array(sigma[lines, axes]))
 
 
 def read_attitudes(table: Table, images: Images, settings: Settings) -> Attitudes:
     """Observed attitudes, in radians."""
     sigma = np.stack([sigmas_of(table, c, settings, "attitude_deg") for c in SIGMA_ATTITUDE], axis=1)
     degrees = table.matrix(ATTITUDE)
-    return Attitudes(images.find(table), on_device(np.deg2rad(degrees)), on_device(np.deg2rad(sigma)))
+    return Attitudes(images.find(table), as_jax_array(np.deg2rad(degrees)), as_jax_array(np.deg2rad(sigma)))
 
 
 def read_surfaces(table: Table, strips: tuple[str, ...], points: ObservedPoints, settings: Settings) -> SurfaceRows:
@@ -405,4 +405,4 @@ def read_surfaces(table: Table, strips: tuple[str, ...], points: ObservedPoints,
         number = table.find(
             "strip", strips, lambda name: f"strip {quoted(name)} has no table; add [scanner.shifts.{name}] {cure}"
         )
-    return SurfaceRows(point, number, *map(on_device, (foot, normal, turn, sigma)))
+    return SurfaceRows(point, number, *map(as_jax_array, (foot, normal, turn, sigma)))

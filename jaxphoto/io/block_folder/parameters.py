@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxphoto.arrays import annotated, on_device
+from jaxphoto.arrays import annotated, as_jax_array
 from jaxphoto.block import Block
 from jaxphoto.camera import ImageMotion, RollingShutter
 from jaxphoto.errors import BlockError, counted, few, quoted
@@ -94,14 +94,14 @@ def read_parameters(kind: Kind, table: Section) -> tuple[Any, Any]:
     for key in keys:
         shape = (getattr(empty, kind.sized),) if kind.sized else key.shape
         value = table.vector(key.start, *shape) if shape else np.asarray(table.number(key.start, 0.0))
-        starts[key.field] = on_device(value * key.scale)
+        starts[key.field] = as_jax_array(value * key.scale)
         given, walk = table.values.get(key.field), f"walk{key.unit}"
         if empty is not None and isinstance(given, dict) and walk in given:
             # How far the camera drifts in an hour.
             drift = table.section(key.field)
             drift.known(walk)
-            covariance = on_device(empty.walk * drift.positive(walk) ** 2)
-            priors[key.field] = Weighted(on_device(np.zeros(len(empty.walk))), covariance=covariance)
+            covariance = as_jax_array(empty.walk * drift.positive(walk) ** 2)
+            priors[key.field] = Weighted(as_jax_array(np.zeros(len(empty.walk))), covariance=covariance)
         else:
             priors[key.field] = table.prior(key.field, value * key.scale, key.unit, key.scale)
     return _instance(kind, starts, table), _instance(kind, priors, table)
@@ -174,10 +174,10 @@ def read_scanner(section: Section) -> tuple[Scanner | None, Scanner | None]:
         table = tables.section(name)
         table.known("shift_m", "shift")
         shift = table.vector("shift_m")
-        shifts[name], priors[name] = on_device(shift), table.prior("shift", shift, "_m")
+        shifts[name], priors[name] = as_jax_array(shift), table.prior("shift", shift, "_m")
     boresight = section.vector("boresight_deg") * _DEG
     prior = section.prior("boresight", boresight, "_deg", _DEG)
-    return Scanner(on_device(boresight), shifts), Scanner(prior, priors)  # type: ignore[arg-type]
+    return Scanner(as_jax_array(boresight), shifts), Scanner(prior, priors)  # type: ignore[arg-type]
 
 
 def scanner_section(scanner: Scanner | None, priors: Scanner | None) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError
 from jaxphoto.initial import resect, resect_by_quaternions
 from jaxphoto.initial.rays import padded_length
-from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
+from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
 from jaxphoto.unknowns import FREE, Unknowns, default_priors
 
 # Of its largest extent: what the points of a board may be off a plane and still count as flat. Surveyed targets on a
@@ -121,7 +121,7 @@ def calibration_block(
     seen, point = np.unique(rows.point, return_inverse=True)
     xyz = board.xyz_m[seen]
     who, axis = np.repeat(np.arange(len(seen)), 3), np.tile(np.arange(3), len(seen))
-    known = ControlRows(who, axis, xyz.ravel(), np.full(len(who), board_sigma_m or 0.0))
+    known = ControlCoordinates(who, axis, xyz.ravel(), np.full(len(who), board_sigma_m or 0.0))
     interior = jax.tree.map(lambda v: np.asarray(v, float), interior)
     unknowns = Unknowns({CAMERA: interior}, exterior, xyz, {}, {})
     priors = default_priors(unknowns)
@@ -137,11 +137,11 @@ def calibration_block(
         image_mount=none,
         image_strip=none,
         image_time=np.zeros(n),
-        image_points=ImageRows(rows.image, point, rows.xy_mm, rows.sigma_mm),
-        control=ControlRows.none() if board_sigma_m is None else known,
-        fixed=known if board_sigma_m is None else ControlRows.none(),
-        check=ControlRows.none(),
-        stations=StationRows.none(),
+        image_points=ImagePoints(rows.image, point, rows.xy_mm, rows.sigma_mm),
+        control=ControlCoordinates.none() if board_sigma_m is None else known,
+        fixed=known if board_sigma_m is None else ControlCoordinates.none(),
+        check=ControlCoordinates.none(),
+        stations=CameraPositions.none(),
         attitudes=Attitudes.none(),
         distances=Distances.none(),
         datum=Datum(),

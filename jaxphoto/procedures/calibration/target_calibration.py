@@ -61,7 +61,7 @@ from jaxphoto.procedures.calibration.target_block import (
     resected,
     rms_px,
 )
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics import covariance
 from jaxphoto.unknowns import FIXED
 
@@ -203,7 +203,7 @@ _FIRST_SIGMA_PX = 1.0
 _FIRST = ("c_mm", "k1", "k2", "a1", "a2", "a14")
 
 
-@shown
+@pretty_repr
 class Calibration(NamedTuple):
     """A calibrated camera, and what became of the photographs."""
 

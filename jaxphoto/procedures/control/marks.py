@@ -19,14 +19,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxphoto.arrays import on_device
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.block import Block
 from jaxphoto.block_parts import Datum, Start
 from jaxphoto.errors import counted, few
 from jaxphoto.georeferencing import FlightBias
 from jaxphoto.initial.intersection import intersect_points, intersect_with_covariance
 from jaxphoto.initial.rays import camera_rays, turn_to_object
-from jaxphoto.observations import ControlRows, ImageRows
+from jaxphoto.observations import ControlCoordinates, ImagePoints
 from jaxphoto.parameters import AbstractParameters
 from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, Marks, SurveyedPoints
 from jaxphoto.unknowns import FIXED, FREE, Unknowns
@@ -213,8 +213,8 @@ def into_block(
     begin, in the frame of the block.
     """
     n = len(block.points)
-    new = ImageRows(
-        rows.image, rows.point + n, on_device(rows.xy_mm), on_device(np.repeat(rows.sigma_mm[:, None], 2, 1))
+    new = ImagePoints(
+        rows.image, rows.point + n, as_jax_array(rows.xy_mm), as_jax_array(np.repeat(rows.sigma_mm[:, None], 2, 1))
     )
     unknowns = block.start.unknowns
     unknowns = dataclasses.replace(unknowns, points=np.concatenate([np.asarray(unknowns.points, float), start]))
@@ -222,17 +222,17 @@ def into_block(
     return dataclasses.replace(
         block,
         points=(*block.points, *ids),
-        image_points=ImageRows.joined(block.image_points, new),
-        control=ControlRows.joined(block.control, _coordinates(xyz, sigma, control, n)),
-        check=ControlRows.joined(block.check, _coordinates(xyz, sigma, check, n)),
+        image_points=ImagePoints.joined(block.image_points, new),
+        control=ControlCoordinates.joined(block.control, _coordinates(xyz, sigma, control, n)),
+        check=ControlCoordinates.joined(block.check, _coordinates(xyz, sigma, check, n)),
         datum=Datum(),
         start=Start(unknowns, block.start.image_known, known),
     )
 
 
-def _coordinates(xyz, sigma, chosen, first: int) -> ControlRows:
+def _coordinates(xyz, sigma, chosen, first: int) -> ControlCoordinates:
     point, axis = np.nonzero(np.isfinite(xyz) & chosen[:, None])
-    return ControlRows(first + point, axis, on_device(xyz[point, axis]), on_device(sigma[point, axis]))
+    return ControlCoordinates(first + point, axis, as_jax_array(xyz[point, axis]), as_jax_array(sigma[point, axis]))
 
 
 def without_names(block: Block, ids: tuple[str, ...]) -> Block:

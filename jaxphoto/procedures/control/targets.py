@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block
 from jaxphoto.camera import parameter_names
 from jaxphoto.collinearity import ExteriorOrientation, in_field, project
@@ -41,7 +41,7 @@ from jaxphoto.initial.intersection import intersect_points
 from jaxphoto.initial.rays import padded_length, turn_to_object
 from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.control.control_block import CRITICAL, ControlledBlock, control_block
-from jaxphoto.procedures.control.frame import LEAST, in_frame
+from jaxphoto.procedures.control.frame import MINIMAL_SIZES, in_frame
 from jaxphoto.procedures.control.marks import Marked, marked, misses, rays_of
 from jaxphoto.procedures.control.surveyed import SIGMA_M, GivenControl, Marks
 from jaxphoto.statistics import covariance
@@ -72,7 +72,7 @@ def predicted(
     joint = covariance(adjusted)
     n, factor = len(block.images), float(joint.variance_factor)
     matrix, labels = np.asarray(joint.matrix) * factor, list(joint.labels)
-    position, turn = still(unknowns.exterior.position), still(unknowns.exterior.camera_from_object)
+    position, turn = to_numpy(unknowns.exterior.position), to_numpy(unknowns.exterior.camera_from_object)
     to_angles = np.asarray(turns_of(jnp.asarray(np.moveaxis(turn, 0, -1)), joint.rotations))
     found: list[Predicted] = []
     image = np.arange(n).repeat(len(xyz))
@@ -388,12 +388,12 @@ def control_block_with_targets(
     texts += [
         f"the target of {ids[p]} was found anew, {off:.2g} m from what was first taken for it"
         for p, off in anew.items()
-        if p not in still
+        if p not in to_numpy
     ]
     texts += [
         f"what was found for check point {ids[p]} lies {off:.2g} m from its place: see whether it is its target, or "
         "mark it by hand"
-        for p, off in still.items()
+        for p, off in to_numpy.items()
         if points.check[p]
     ]
     return now._replace(sentences=(*texts, *now.sentences))
@@ -405,7 +405,7 @@ def _far(now: ControlledBlock, by_hand: Marked) -> dict[int, float]:
     They stay unless another target is found: a block may be bent there, which check points are to tell.
     """
     state, off = np.array(now.state, object), np.linalg.norm(np.nan_to_num(now.off_m), axis=1)
-    if (state == "control").sum() < LEAST:
+    if (state == "control").sum() < MINIMAL_SIZES:
         return {}
     usual = np.median(off[np.isin(state, ["control", "check"])])
     far = np.isin(state, ["check", "left out"]) & (np.nan_to_num(now.w).max(axis=1) > CRITICAL) & (off > _FAR * usual)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import ArrayLike
 from jaxphoto.block import Block
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
@@ -39,19 +39,19 @@ from jaxphoto.lidar.coverage import check_covered
 from jaxphoto.lidar.heights import Method
 from jaxphoto.lidar.tangent_planes import TangentPlanes, tangent_planes
 from jaxphoto.observations import SurfaceRows
-from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
-from jaxphoto.procedures.lidar.until_still import (
+from jaxphoto.procedures.lidar.iterate_to_convergence import (
     MAX_ROUNDS,
     Round,
     SeenByCloud,
     at_result,
     check_without_surfaces,
-    until_still,
+    iterate_to_convergence,
     with_common_error,
     with_interior_held,
 )
+from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
 from jaxphoto.procedures.lidar.vertical_control import nothing_seen, tie_points
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics import Covariance
 from jaxphoto.unknowns import FIXED, FREE, Weighted
 
@@ -64,7 +64,7 @@ SHIFT_SIGMA = 0.3
 _NEAR, _TIMES = 400, 8
 
 
-@shown
+@pretty_repr
 class Simultaneous(eqx.Module):
     """Images and cloud before and after simultaneous adjustment."""
 
@@ -155,8 +155,8 @@ def simultaneous(
         found = []
         for of, shift in zip(strips, scanner.shifts.values(), strict=True):
             near, poses = _near(of, xy, scanner.boresight, shift, settings)
-            touching = tangent_planes(index_cloud(near), xy, method, settings)
-            found.append((touching, None if poses is None else jax.tree.map(lambda v, k=touching.nearest: v[k], poses)))
+            index_of = tangent_planes(index_cloud(near), xy, method, settings)
+            found.append((index_of, None if poses is None else jax.tree.map(lambda v, k=index_of.nearest: v[k], poses)))
         return found
 
     last: dict[str, Any] = {}
@@ -187,7 +187,7 @@ def simultaneous(
         raised = last["turn"] @ (np.asarray(new.boresight) - np.asarray(old.boresight))
         return seen._replace(foot=seen.foot - shift - raised[:, None] * seen.normal)
 
-    found = until_still(first, look, build, max_rounds, report, "surfaces", carry)
+    found = iterate_to_convergence(first, look, build, max_rounds, report, "surfaces", carry)
     scanner = found.adjusted.unknowns.scanner
     assert scanner is not None
     corrected, used = correct_cloud(cloud, scanner, path), found.used
@@ -224,8 +224,8 @@ def _strips(cloud: Cloud, names: tuple[str, ...], path: ScannerPath | None) -> l
 def _near(
     strip: _Strip,
     xy: Float[np.ndarray, "n 2"],
-    boresight: Float[Numbers, "3"],
-    shift: Float[Numbers, "3"],
+    boresight: Float[ArrayLike, "3"],
+    shift: Float[ArrayLike, "3"],
     settings: HeightSettings,
 ) -> tuple[Cloud, ScannerPoses | None]:
     """Return the corrected laser points that the surface at some places can depend on, and their scanner poses."""

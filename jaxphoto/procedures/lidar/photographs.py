@@ -14,8 +14,8 @@ from jaxphoto.georeferencing.time_scales import looks_like, shift_that_fits
 from jaxphoto.lidar.correction import scanner_path, scanner_poses
 from jaxphoto.lidar.coverage import CoveredTimes
 from jaxphoto.lidar.strip_settings import StripSettings
-from jaxphoto.observations import Attitudes, StationRows, StripPlanes, TrajectoryAttitudes, TrajectoryStations
-from jaxphoto.procedures.lidar.until_still import check_without_surfaces
+from jaxphoto.observations import Attitudes, CameraPositions, StripPlanes, TrajectoryAttitudes, TrajectoryStations
+from jaxphoto.procedures.lidar.iterate_to_convergence import check_without_surfaces
 
 # Stations farther from the trajectory (m) belong to another one, or to another time.
 _FAR_M = 10.0
@@ -123,7 +123,7 @@ def on_trajectory(
     more = (*block.more, position, *([attitude] if len(attitude) else []))
     return dataclasses.replace(
         block,
-        stations=StationRows.none(),
+        stations=CameraPositions.none(),
         attitudes=Attitudes.none(),
         breaklines=photographs.breaklines,
         more=more,

@@ -21,14 +21,14 @@ from jaxphoto.errors import BlockError, InputError
 from jaxphoto.lidar import HeightSettings
 from jaxphoto.lidar.planes import plane_feet
 from jaxphoto.lidar.roofs import Patch, planar_patches, roof_centroid
-from jaxphoto.observations import ControlRows, SurfaceRows
-from jaxphoto.procedures.lidar.until_still import (
+from jaxphoto.observations import ControlCoordinates, SurfaceRows
+from jaxphoto.procedures.lidar.iterate_to_convergence import (
     MAX_ROUNDS,
     Round,
     SeenByCloud,
     at_result,
     check_without_surfaces,
-    until_still,
+    iterate_to_convergence,
 )
 from jaxphoto.procedures.lidar.vertical_control import lidar_control, tie_points
 from jaxphoto.statistics import Covariance
@@ -116,13 +116,13 @@ def roof_control(
     def build(adjusted: Adjustment, known: Covariance, seen: SeenByCloud, used: Bool[np.ndarray, "rows"]) -> Block:
         n, own = int(used.sum()), np.concatenate([which[used], middles])
         others = of_heights.take(~np.isin(of_heights.who, own))
-        held = dataclasses.replace(block, control=ControlRows.joined(block.control, centres, others))
+        held = dataclasses.replace(block, control=ControlCoordinates.joined(block.control, centres, others))
         rows = SurfaceRows(
             which[used], np.zeros(n, int), seen.foot[used], seen.normal[used], np.zeros((n, 3)), seen.sigma[used]
         )
         return at_result(dataclasses.replace(held, surfaces=rows), adjusted.unknowns)
 
-    found = until_still(first, look, build, max_rounds, report, "surfaces")
+    found = iterate_to_convergence(first, look, build, max_rounds, report, "surfaces")
     return RoofControl(
         at_result(found.adjusted.block, found.adjusted.unknowns),
         found.adjusted,
@@ -164,9 +164,9 @@ def _faces(xy: Float[np.ndarray, "n 2"], patches: list[Patch], margin: float) ->
 
 def _centroid_rows(
     block: Block, points: Int[np.ndarray, "n"], places: Float[np.ndarray, "all 3"], patches: list[Patch], cloud: Cloud
-) -> ControlRows:
+) -> ControlCoordinates:
     """Return control in X, Y and Z of points at the centre of roof faces."""
-    parts = [ControlRows.none()]
+    parts = [ControlCoordinates.none()]
     for point, face in zip(points, _faces(places[points, :2], patches, 0.0), strict=True):
         if point in block.control.who:
             raise InputError(f"point {block.points[point]} is control already: leave it out of the centroids")
@@ -176,5 +176,5 @@ def _centroid_rows(
                 f"{places[point, 0]:.1f} m, Y {places[point, 1]:.1f} m: leave it out"
             )
         centre, covariance = roof_centroid(cloud.xyz[patches[face].index])
-        parts.append(ControlRows(np.full(3, point), np.arange(3), centre, np.sqrt(np.diagonal(covariance))))
-    return ControlRows.joined(*parts)
+        parts.append(ControlCoordinates(np.full(3, point), np.arange(3), centre, np.sqrt(np.diagonal(covariance))))
+    return ControlCoordinates.joined(*parts)

@@ -25,6 +25,7 @@ from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.observations import StripPoints
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
+from jaxphoto.procedures.lidar.iterate_to_convergence import STILL, at_result, with_interior_held
 from jaxphoto.procedures.lidar.photographs import Photographs, check_photographs, on_trajectory, spans_with
 from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
 from jaxphoto.procedures.lidar.strip_control import (
@@ -41,7 +42,6 @@ from jaxphoto.procedures.lidar.strip_search import CommonPlanes, StripSearch, ch
 from jaxphoto.procedures.lidar.strip_unknowns import ScannerPriors, errors_of, knot_sigmas, strip_block
 from jaxphoto.procedures.lidar.surveyed_gaps import SurveyedGap, surveyed_gaps
 from jaxphoto.procedures.lidar.tie_point_search import PointPlanes, PointSearch
-from jaxphoto.procedures.lidar.until_still import STILL, at_result, with_interior_held
 from jaxphoto.procedures.lidar.vertical_control import tie_points
 from jaxphoto.statistics import Covariance, covariance
 from jaxphoto.unknowns import FIXED

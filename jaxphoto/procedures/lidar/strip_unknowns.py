@@ -19,7 +19,7 @@ from jaxphoto.georeferencing import (
 )
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.parameters import AbstractParameters, dynamic_fields
-from jaxphoto.procedures.lidar.until_still import at_result
+from jaxphoto.procedures.lidar.iterate_to_convergence import at_result
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
 
 _ZERO = np.zeros(3)

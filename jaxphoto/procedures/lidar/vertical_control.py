@@ -20,13 +20,13 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.lidar import Grid, HeightFlag, HeightSettings, heights_at, index_cloud
 from jaxphoto.lidar.block_control import pseudo_control_of_block
-from jaxphoto.observations import ControlRows
-from jaxphoto.procedures.lidar.until_still import (
+from jaxphoto.observations import ControlCoordinates
+from jaxphoto.procedures.lidar.iterate_to_convergence import (
     MAX_ROUNDS,
     Round,
     SeenByCloud,
     at_result,
-    until_still,
+    iterate_to_convergence,
     with_common_error,
     with_interior_held,
 )
@@ -95,10 +95,12 @@ def lidar_control(
 
     def build(adjusted: Adjustment, known: Covariance, seen: SeenByCloud, used: np.ndarray) -> Block:
         heights["sigma"] = _sigma(known, seen)
-        rows = ControlRows(which[used], np.full(used.sum(), 2), seen.foot[used, 2], heights["sigma"][used])
-        return dataclasses.replace(at_result(block, adjusted.unknowns), control=ControlRows.joined(block.control, rows))
+        rows = ControlCoordinates(which[used], np.full(used.sum(), 2), seen.foot[used, 2], heights["sigma"][used])
+        return dataclasses.replace(
+            at_result(block, adjusted.unknowns), control=ControlCoordinates.joined(block.control, rows)
+        )
 
-    found = until_still(with_interior_held(block), look, build, max_rounds, report, "control_points")
+    found = iterate_to_convergence(with_interior_held(block), look, build, max_rounds, report, "control_points")
     return LidarControl(
         at_result(found.adjusted.block, found.adjusted.unknowns),
         found.adjusted,

@@ -12,14 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment import Adjustment, Sizes, solve
+from jaxphoto.adjustment import Adjustment, PaddedSizes, solve
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.initial.matches import PairMatches
 from jaxphoto.initial.rays import ideal_coordinates
-from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
+from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
 from jaxphoto.procedures.orientation.colmap import MappedCamera, Network, map_images
 from jaxphoto.procedures.orientation.rejection import beyond_limit, unsupported
 from jaxphoto.procedures.orientation.self_calibration import (
@@ -28,7 +28,7 @@ from jaxphoto.procedures.orientation.self_calibration import (
     freed,
     self_calibration,
 )
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.unknowns import Unknowns, default_priors
 from jaxphoto.variants import some_images, without_observations
 
@@ -99,7 +99,7 @@ class OrientationReport(NamedTuple):
     """Factor of the standard deviations of the camera for the correlation of neighbouring residuals."""
 
 
-@shown
+@pretty_repr
 class Oriented(NamedTuple):
     """A block of photographs, oriented as a free network of arbitrary scale, and how it came about."""
 
@@ -108,7 +108,7 @@ class Oriented(NamedTuple):
     residuals_mm: Float[np.ndarray, "rows 2"]
     """Of its image points, observed minus computed."""
     report: OrientationReport
-    sizes: Sizes
+    sizes: PaddedSizes
     """That its adjustments were compiled for; with them that of `block` runs the same program."""
 
 
@@ -202,7 +202,7 @@ def _iterated(block: Block, calibration: SelfCalibration, free: tuple[str, ...],
         report(f"adjusting {len(block.images)} images, iteration {iteration}")
         part = calibration.with_priors(block, free)
         adjusted = solve(part, part.start.unknowns, part.priors, _MAX_STEPS, calibration.sizes)
-        if np.isfinite(float(adjusted.square_sum)):
+        if np.isfinite(float(adjusted.sum_of_squares)):
             block = _started(block, adjusted.unknowns)
         far, limit = beyond_limit(block, np.asarray(adjusted.residuals.image))
         alone = unsupported(block) & ~far
@@ -270,7 +270,7 @@ def network_block(title, names, sensor, interior, features, sigmas_mm, network: 
         sensor,
         (interior, priors),
         (exterior, network.points),
-        ImageRows(network.image, network.point, np.concatenate(features)[begin], np.stack([sigma, sigma], axis=1)),
+        ImagePoints(network.image, network.point, np.concatenate(features)[begin], np.stack([sigma, sigma], axis=1)),
     )
     return block if network.oriented.all() else some_images(block, network.oriented)
 
@@ -282,7 +282,7 @@ def photographs_block(
     sensor: Sensor,
     camera: tuple[InteriorOrientation, InteriorOrientation],
     start: tuple[ExteriorOrientation, Float[np.ndarray, "points 3"]],
-    rows: ImageRows,
+    rows: ImagePoints,
 ) -> Block:
     """Photographs of one `camera`, its interior orientation and the priors of that, as a free network from `start`."""
     interior, priors = (dataclasses.replace(part, residuals="measured") for part in camera)
@@ -298,10 +298,10 @@ def photographs_block(
         image_strip=("",) * n,
         image_time=np.zeros(n),
         image_points=rows,
-        control=ControlRows.none(),
-        fixed=ControlRows.none(),
-        check=ControlRows.none(),
-        stations=StationRows.none(),
+        control=ControlCoordinates.none(),
+        fixed=ControlCoordinates.none(),
+        check=ControlCoordinates.none(),
+        stations=CameraPositions.none(),
         attitudes=Attitudes.none(),
         distances=Distances.none(),
         datum=Datum("inner", "points"),

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment import Adjustment, NormalEquations, Sizes, common_sizes
+from jaxphoto.adjustment import Adjustment, NormalEquations, PaddedSizes, common_sizes
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names, set_parameter
 from jaxphoto.compiling import call_compiled
@@ -46,7 +46,7 @@ class SelfCalibration(NamedTuple):
     unit: dict[str, float]
     """By parameter: the change that moves the corner of the format by its whole radius."""
     start: dict[str, float]
-    sizes: Sizes
+    sizes: PaddedSizes
     """Of the whole block, which parts of it are padded to: they run one compiled program."""
 
     def observation(self, name: str) -> Weighted:
@@ -92,7 +92,7 @@ def self_calibration(block: Block, camera: str) -> SelfCalibration:
     corner = np.array([sensor.width_mm, sensor.height_mm]) / 2
     unit = {n: float(np.linalg.norm(corner)) / corner_shift(interior, n, corner) for n in names}
     start = {n: float(np.asarray(get_parameter(interior, n))) for n in names}
-    made = SelfCalibration(camera, names, unit, start, Sizes())
+    made = SelfCalibration(camera, names, unit, start, PaddedSizes())
     return made._replace(sizes=common_sizes([made.with_priors(block, names)]))
 
 

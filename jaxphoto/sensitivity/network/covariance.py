@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.camera import InteriorOrientation, get_parameter, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, image_residual, project
 from jaxphoto.compiling import call_compiled
@@ -103,7 +103,7 @@ def design_covariance(layout: Layout) -> NetworkCovariance:
     `check_layout` reports the reason of a defect.
     """
     # A plain number would be part of the program, and each value compiled separately.
-    return call_compiled(_design_covariance, jax.tree.map(still, layout))
+    return call_compiled(_design_covariance, jax.tree.map(to_numpy, layout))
 
 
 @eqx.filter_jit

@@ -20,14 +20,14 @@ from jaxtyping import Array, Float
 from jaxphoto.adjustment.datum import close_datum
 from jaxphoto.adjustment.model.block_values import values_of
 from jaxphoto.adjustment.model.structure import structure_of
-from jaxphoto.arrays import Numbers, still
+from jaxphoto.arrays import ArrayLike, to_numpy
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import InteriorOrientation, Perspective, Sensor, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import NOMINAL, Mount, body_from_camera
-from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
+from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw, roll_pitch_yaw_from_matrix
 from jaxphoto.simulation import FlightPlan, photograph
 from jaxphoto.unknowns import FREE, Unknowns, default_priors
@@ -45,13 +45,13 @@ class Layout(eqx.Module):
     exterior: ExteriorOrientation
     points: Float[Array, "points 3"]
     """Ground points (m), including control points."""
-    image_weight: Float[Numbers, "..."] | float
+    image_weight: Float[ArrayLike, "..."] | float
     """Weight of both image coordinates, by image; 1 / mm^2."""
-    control_weight: Float[Numbers, "..."] | float = 0.0
+    control_weight: Float[ArrayLike, "..."] | float = 0.0
     """Weight of X, Y, Z by point; 1 / m^2."""
-    station_weight: Float[Numbers, "..."] | float = 0.0
+    station_weight: Float[ArrayLike, "..."] | float = 0.0
     """Weight of X, Y, Z of the projection centre by image; 1 / m^2."""
-    attitude_weight: Float[Numbers, "..."] | float = 0.0
+    attitude_weight: Float[ArrayLike, "..."] | float = 0.0
     """Weight of roll, pitch, yaw by image, the camera's x axis pointing forward; 1 / rad^2."""
     sensor: Sensor = eqx.field(static=True, kw_only=True)
     free: tuple[str, ...] = eqx.field(static=True, default=("c_mm", "xp_mm", "yp_mm"))
@@ -88,13 +88,13 @@ class StripDesign(eqx.Module):
     control point.
     """
 
-    heading: Float[Numbers, "strips"]
-    height: Float[Numbers, "strips"]
-    across: Float[Numbers, "strips"]
-    along: Float[Numbers, "strips"]
-    roll: Float[Numbers, "strips"]
-    pitch: Float[Numbers, "strips"]
-    control: Float[Numbers, "control 2"]
+    heading: Float[ArrayLike, "strips"]
+    height: Float[ArrayLike, "strips"]
+    across: Float[ArrayLike, "strips"]
+    along: Float[ArrayLike, "strips"]
+    roll: Float[ArrayLike, "strips"]
+    pitch: Float[ArrayLike, "strips"]
+    control: Float[ArrayLike, "control 2"]
 
 
 class StripPlan(eqx.Module):
@@ -107,9 +107,9 @@ class StripPlan(eqx.Module):
     """
 
     interior: InteriorOrientation
-    points: Float[Numbers, "points 3"]
-    turn: Float[Numbers, "images 3"]
-    shift: Float[Numbers, "images 3"]
+    points: Float[ArrayLike, "points 3"]
+    turn: Float[ArrayLike, "images 3"]
+    shift: Float[ArrayLike, "images 3"]
     base: float
     reach: float
     image_sigma: float
@@ -140,7 +140,7 @@ class StripPlan(eqx.Module):
         )
 
 
-def design_from_plan(plan: FlightPlan, control: Float[Numbers, "control 2"]) -> StripDesign:
+def design_from_plan(plan: FlightPlan, control: Float[ArrayLike, "control 2"]) -> StripDesign:
     """Strips of a flight plan over ground of mean height zero, without tilts, and control points at X, Y (m)."""
     numbers = [(np.deg2rad(s.heading_deg), s.height_m, s.across_m, s.along_m, 0.0, 0.0) for s in plan.strips]
     heading, height, across, along, roll, pitch = np.array(numbers).T
@@ -149,15 +149,15 @@ def design_from_plan(plan: FlightPlan, control: Float[Numbers, "control 2"]) -> 
 
 def strip_images(
     images: Sequence[int],
-    base: Float[Numbers, "strips"] | float,
-    heading: Float[Numbers, "strips"],
-    height: Float[Numbers, "strips"] | float,
-    along: Float[Numbers, "strips"] | float = 0.0,
-    across: Float[Numbers, "strips"] | float = 0.0,
-    roll: Float[Numbers, "strips"] | float = 0.0,
-    pitch: Float[Numbers, "strips"] | float = 0.0,
-    turn: Float[Numbers, "images 3"] | float = 0.0,
-    shift: Float[Numbers, "images 3"] | float = 0.0,
+    base: Float[ArrayLike, "strips"] | float,
+    heading: Float[ArrayLike, "strips"],
+    height: Float[ArrayLike, "strips"] | float,
+    along: Float[ArrayLike, "strips"] | float = 0.0,
+    across: Float[ArrayLike, "strips"] | float = 0.0,
+    roll: Float[ArrayLike, "strips"] | float = 0.0,
+    pitch: Float[ArrayLike, "strips"] | float = 0.0,
+    turn: Float[ArrayLike, "images 3"] | float = 0.0,
+    shift: Float[ArrayLike, "images 3"] | float = 0.0,
 ) -> ExteriorOrientation:
     """Exterior orientations of straight strips with `images` images each, the camera's x axis forward.
 
@@ -207,7 +207,7 @@ def block_from_layout(layout: Layout) -> LayoutBlock:
     Weights become standard deviations; zero weights are not observed. Raises BlockError for an image with fewer than
     three points.
     """
-    layout = jax.tree.map(still, layout)
+    layout = jax.tree.map(to_numpy, layout)
     n = len(layout.exterior.position)
     rays = photograph(
         {CAMERA: layout.interior}, {CAMERA: layout.sensor}, (CAMERA,) * n, layout.exterior, np.asarray(layout.points)
@@ -243,11 +243,11 @@ def block_from_layout(layout: Layout) -> LayoutBlock:
         image_mount=(MOUNT,) * n,
         image_strip=("",) * n,
         image_time=np.zeros(n),
-        image_points=ImageRows(rays.image, number[rays.point], rays.xy, sigma),
-        control=ControlRows(*_rows(control[point], np.asarray(truth.points))),
-        fixed=ControlRows.none(),
-        check=ControlRows.none(),
-        stations=StationRows(*_rows(station, np.asarray(layout.exterior.position))),
+        image_points=ImagePoints(rays.image, number[rays.point], rays.xy, sigma),
+        control=ControlCoordinates(*_rows(control[point], np.asarray(truth.points))),
+        fixed=ControlCoordinates.none(),
+        check=ControlCoordinates.none(),
+        stations=CameraPositions(*_rows(station, np.asarray(layout.exterior.position))),
         attitudes=Attitudes(with_attitude, angles[with_attitude], 1 / np.sqrt(attitude[with_attitude])),
         distances=Distances.none(),
         datum=Datum(),

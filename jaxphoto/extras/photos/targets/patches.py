@@ -86,19 +86,19 @@ def fit_patches(
         which = np.flatnonzero(~still)
         if not len(which):
             break
-        square_sum, normal, right = (part[which] for part in state)
+        sum_of_squares, normal, right = (part[which] for part in state)
         diagonal = np.einsum("pkk->pk", normal)
         damped = normal + (damping[which, None] * diagonal + 1e-12)[:, :, None] * np.eye(unknowns)
         step = np.linalg.solve(damped, right[:, :, None])[:, :, 0]
         trial = system(parameters[which] + step, which)
-        better = trial[0] <= square_sum
+        better = trial[0] <= sum_of_squares
         parameters[which[better]] += step[better]
         for part, new in zip(state, trial, strict=True):
             part[which[better]] = new[better]
         damping[which] = np.clip(damping[which] * np.where(better, 0.3, 10.0), _LEAST_DAMPING, 1e9)
         still[which] = np.max(np.abs(step[:, :2]), axis=1) < _STILL
-    square_sum, normal, _ = state
-    noise = np.sqrt(square_sum / np.maximum(used.sum(axis=1) - unknowns, 1))
+    sum_of_squares, normal, _ = state
+    noise = np.sqrt(sum_of_squares / np.maximum(used.sum(axis=1) - unknowns, 1))
     # What the picture no longer sees at all, such as a blur far below a pixel's own, stays where it is.
     scale = np.sqrt(np.einsum("pkk->pk", normal))
     unseen = scale <= 1e-5 * scale.max(axis=1, keepdims=True)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust
-from jaxphoto.adjustment.lost_digits import warn_of_lost_digits
+from jaxphoto.adjustment.precision_check import warn_of_precision_loss
 from tests.blocks import adjusted, simulated
 
 
@@ -27,7 +27,7 @@ def test_large_coordinates_lose_decimetres():
     block, start = simulated("cross").block, adjusted("cross").unknowns
     far = eqx.tree_at(lambda u: u.points, start, np.asarray(start.points + 5_400_000, np.float32))
     with pytest.warns(UserWarning, match=r"start\.points is float32 and knows 54\d+ to 0\.5 only"):
-        warn_of_lost_digits(block, far, block.priors)
+        warn_of_precision_loss(block, far, block.priors)
 
 
 def test_32_bit_computation_is_warned_of():
@@ -35,7 +35,7 @@ def test_32_bit_computation_is_warned_of():
     jax.config.update("jax_enable_x64", False)
     try:
         with pytest.warns(UserWarning, match="computes with 32 bits"):
-            warn_of_lost_digits(block, start, block.priors)
+            warn_of_precision_loss(block, start, block.priors)
     finally:
         jax.config.update("jax_enable_x64", True)
 
@@ -43,4 +43,4 @@ def test_32_bit_computation_is_warned_of():
 def test_float64_is_silent():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_of_lost_digits(simulated("cross").block, adjusted("cross").unknowns, simulated("cross").block.priors)
+        warn_of_precision_loss(simulated("cross").block, adjusted("cross").unknowns, simulated("cross").block.priors)

@@ -8,7 +8,7 @@ from jaxphoto.adjustment.result import Adjustment
 LOGGER = logging.getLogger("jaxphoto.adjustment")
 
 
-def tell_course(adjusted: Adjustment) -> None:
+def log_iterations(adjusted: Adjustment) -> None:
     """Log the sizes of the adjustment, and one line per step."""
     if LOGGER.isEnabledFor(logging.INFO):
         images, points = len(adjusted.block.images), len(adjusted.block.points)
@@ -28,4 +28,4 @@ def step_lines(adjusted: Adjustment) -> Iterator[str]:
         moved = f"moves {length:.2g} sigmas, damping {damping:.1g}{along}{refused}"
         yield f"step {k}: sigma naught {(before / redundancy) ** 0.5:.6g}, {moved}"
     if len(course.length) == int(adjusted.steps):
-        yield f"end: sigma naught {(float(adjusted.square_sum) / redundancy) ** 0.5:.6g}"
+        yield f"end: sigma naught {(float(adjusted.sum_of_squares) / redundancy) ** 0.5:.6g}"

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.block import Block
-from jaxphoto.observations import ControlRows
+from jaxphoto.observations import ControlCoordinates
 
 MOTIONS = (
     "shift in X",
@@ -33,8 +33,8 @@ def datum_sentence(null_motions: np.ndarray, block: Block, named: list[str], sig
     """Return what is open, the observations present, and the cure; `sigma` if closed by noise (rad, or relative)."""
     names = motion_names(null_motions)
     counts = {rows.group: int(np.size(rows.observation)) for rows in block.observations if len(rows)}
-    if n := counts.pop(ControlRows.group, 0) + len(block.fixed.who):
-        counts[ControlRows.group] = n
+    if n := counts.pop(ControlCoordinates.group, 0) + len(block.fixed.who):
+        counts[ControlCoordinates.group] = n
     what = {"control_points": "control coordinates", "stations": "station coordinates", "attitudes": "attitude angles"}
     what |= {"surfaces": "points on surfaces"}
     order = ["control_points", *(name for name in counts if name != "control_points")]

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment.datum_words import MOTIONS, motion_names
+from jaxphoto.adjustment.datum_messages import MOTIONS, motion_names
 from jaxphoto.adjustment.result import Adjustment
 from jaxphoto.adjustment.solver.similarity import motions
 from jaxphoto.adjustment.weak_directions import OPEN, POOR, WeakDirection, weak_directions, yardsticks
-from jaxphoto.arrays import still
+from jaxphoto.arrays import to_numpy
 from jaxphoto.errors import counted, few
 
 # Fraction of the squared motion that a similarity must explain.
@@ -59,9 +59,9 @@ class _Words:
     def __init__(self, adjusted: Adjustment) -> None:
         self.block, self.structure = adjusted.block, adjusted.structure
         self.values, self.yard = adjusted.values, yardsticks(adjusted)
-        self.position = still(adjusted.unknowns.exterior.position)
-        self.rotation = still(adjusted.unknowns.exterior.camera_from_object)
-        self.xyz = still(adjusted.unknowns.points)
+        self.position = to_numpy(adjusted.unknowns.exterior.position)
+        self.rotation = to_numpy(adjusted.unknowns.exterior.camera_from_object)
+        self.xyz = to_numpy(adjusted.unknowns.points)
         self.cameras = adjusted.unknowns.interior
 
     def kind(self, d: WeakDirection) -> tuple[str, ...]:
@@ -135,7 +135,7 @@ class _Words:
     def _image(self, d: WeakDirection) -> str:
         (image,) = d.images
         mine = self.structure.image == image
-        xy = still(self.block.image_points.xy)[mine]
+        xy = to_numpy(self.block.image_points.xy)[mine]
         extent = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False) if len(xy) > 2 else np.array([1.0, 1.0])
         on_line = ", nearly on a line" if extent[1] < _LINE * extent[0] else ""
         return (
@@ -215,7 +215,7 @@ class _Words:
         places = self.xyz[points] if len(points) else self.position[images]
         centre = places.mean(axis=0)
         size = float(np.sqrt(((places - centre) ** 2).sum(1).mean())) or 1.0
-        position, rotation, places = map(still, (self.values.position, self.values.rotation, self.values.points))
+        position, rotation, places = map(to_numpy, (self.values.position, self.values.rotation, self.values.points))
         eop, xyz = motions(position, rotation, places, centre, size)
         yard = np.repeat([self.yard.ground, self.yard.angle], 3)
         columns = np.concatenate(

@@ -136,7 +136,7 @@ def with_common_error(
     return np.sqrt(sigma**2 + max(int(usable.sum()) - 1, 0) * common_m**2)
 
 
-def until_still(
+def iterate_to_convergence(
     first: Adjustment,
     look: Look,
     build: Build,

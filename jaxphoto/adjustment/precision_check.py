@@ -9,7 +9,7 @@ from jaxphoto.block import Block
 from jaxphoto.unknowns import Unknowns
 
 
-def warn_of_lost_digits(block: Block, start: Unknowns, priors: Unknowns) -> None:
+def warn_of_precision_loss(block: Block, start: Unknowns, priors: Unknowns) -> None:
     """Warn if JAX computes in 32 bits, and about numbers given with fewer than 64."""
     if not jax.config.values["jax_enable_x64"]:
         warnings.warn(
