@@ -93,17 +93,17 @@ __version__ = "0.1.0"
 __all__ = [
     *(model.__name__ for model in (*DISTORTIONS.values(), *PROJECTIONS.values())),
     "FIXED", "FREE", "MAX_STEPS", "AbstractDistortion", "AbstractObservations", "AbstractParameters",
-    "AbstractProjection", "Adjustment", "Attitudes", "Block", "BlockError", "ControlCoordinates", "Corrections", "Datum",
-    "DatumError", "Distances", "Exposure", "ExteriorOrientation", "Frame", "ImagePoints", "InputError",
-    "InteriorOrientation", "JaxphotoError", "KnownParameters", "Mount", "Outcome", "RankError", "Selection", "Sensor",
-    "Start", "CameraPositions", "StripBias", "Surface", "SurfaceRows", "Tables", "Unknowns", "Weighted", "adjust",
-    "angle_differences", "bias", "boresight", "calibrate", "common_sizes", "compare", "conversion_error", "convert",
-    "correlated", "covariance", "decentring_from_symmetry", "default_priors", "direct_orientation", "georeference",
-    "ground_point", "halves", "image_ray", "intersect", "monte_carlo", "orient", "point_differences",
-    "principal_points", "project", "read_block", "read_recipe", "read_source", "readjust", "rebalance",
-    "rebalance_covariance", "robust", "sigma_map", "significance", "simulate", "simultaneous", "snoop",
-    "symmetry_from_decentring", "index_of",
-    "variance_components", "write_block", "write_simulation",
+    "AbstractProjection", "Adjustment", "Attitudes", "Block", "BlockError", "CameraPositions",
+    "ControlCoordinates", "Corrections", "Datum", "DatumError", "Distances", "Exposure", "ExteriorOrientation",
+    "Frame", "ImagePoints", "InputError", "InteriorOrientation", "JaxphotoError", "KnownParameters", "Mount",
+    "Outcome", "RankError", "Selection", "Sensor", "Start", "StripBias", "Surface", "SurfaceRows", "Tables",
+    "Unknowns", "Weighted", "adjust", "angle_differences", "bias", "boresight", "calibrate", "common_sizes",
+    "compare", "conversion_error", "convert", "correlated", "covariance", "decentring_from_symmetry",
+    "default_priors", "direct_orientation", "georeference", "ground_point", "halves", "image_ray", "index_of",
+    "intersect", "monte_carlo", "orient", "point_differences", "principal_points", "project", "read_block",
+    "read_recipe", "read_source", "readjust", "rebalance", "rebalance_covariance", "robust", "sigma_map",
+    "significance", "simulate", "simultaneous", "snoop", "symmetry_from_decentring", "variance_components",
+    "write_block", "write_simulation",
 ]  # fmt: skip
 
 # Files and tables bring pandas and more, a third of a second, and studies are not for every day: they are imported when

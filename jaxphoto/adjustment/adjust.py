@@ -79,7 +79,7 @@ def solve(
     numbers, plain = laid.padded_values, laid.padded.structure
     structure = plain.with_losses(losses)
     seconds: dict[str, float] = {}
-    course: IterationHistory | None = None
+    history: IterationHistory | None = None
     if laid.traced:
         # Stored with the layout, where it is already hashed.
         padded = dataclasses.replace(laid.padded, structure=structure) if losses else laid.padded
@@ -93,13 +93,13 @@ def solve(
         found = run_compiled(_optimise, arguments, seconds, "solve")
         # Arrays returned by several devices have another type than those passed in.
         state = UnknownArrays(*map(to_numpy, found.state))
-        course = IterationHistory(*(to_numpy(v)[: int(found.steps)] for v in found.course))
+        history = IterationHistory(*(to_numpy(v)[: int(found.steps)] for v in found.history))
     steps, converged = found.steps, found.converged
     assert steps is not None and converged is not None, "only of a tangent is this unknown"
     # Its normal equations are the largest array, and are recomputed.
     del found
     adjusted = _at(state, laid, block, start, priors, seconds)
-    adjusted = dataclasses.replace(adjusted, steps=steps, converged=converged, course=course, sizes=sizes)
+    adjusted = dataclasses.replace(adjusted, steps=steps, converged=converged, history=history, sizes=sizes)
     if laid.traced:
         return adjusted
     # Concrete numbers, also inside a traced function.

@@ -19,13 +19,13 @@ def log_iterations(adjusted: Adjustment) -> None:
 
 def step_lines(adjusted: Adjustment) -> Iterator[str]:
     """Return one line per step: sigma0 before it and its length in standard deviations; the last one is the outcome."""
-    course, redundancy = adjusted.course, max(adjusted.redundancy, 1)
-    if course is None:
+    history, redundancy = adjusted.history, max(adjusted.redundancy, 1)
+    if history is None:
         return
-    for k, (before, length, damping, accepted, bent) in enumerate(zip(*course, strict=True), 1):
+    for k, (before, length, damping, accepted, bent) in enumerate(zip(*history, strict=True), 1):
         along = f", {bent:.2g} of it along a curve" if bent > 0 else ""
         refused = "" if accepted > 0 else ", refused"
         moved = f"moves {length:.2g} sigmas, damping {damping:.1g}{along}{refused}"
         yield f"step {k}: sigma naught {(before / redundancy) ** 0.5:.6g}, {moved}"
-    if len(course.length) == int(adjusted.steps):
+    if len(history.length) == int(adjusted.steps):
         yield f"end: sigma naught {(float(adjusted.sum_of_squares) / redundancy) ** 0.5:.6g}"

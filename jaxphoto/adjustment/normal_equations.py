@@ -205,7 +205,7 @@ class Optimised(eqx.Module):
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
     factored: FactoredNormal
-    course: IterationHistory
+    history: IterationHistory
 
 
 def optimise(values: PaddedValues, structure: PaddedStructure, task: SolveMode) -> Optimised:
@@ -214,5 +214,5 @@ def optimise(values: PaddedValues, structure: PaddedStructure, task: SolveMode) 
     state = state_at(optimum.increments, unit_scale(structure), values, structure)
     factored = FactoredNormal(system.reduced, system.factor, scale)
     assert optimum.steps is not None and optimum.converged is not None, "only of a tangent is this unknown"
-    assert optimum.course is not None
-    return Optimised(state, optimum.steps, optimum.converged, factored, optimum.course)
+    assert optimum.history is not None
+    return Optimised(state, optimum.steps, optimum.converged, factored, optimum.history)

@@ -92,7 +92,7 @@ class Adjustment(eqx.Module):
     sizes: PaddedSizes = eqx.field(static=True, default=MINIMAL_SIZES)
     """Minimum sizes it was compiled for; with them the block is re-adjusted by the same program."""
 
-    course: IterationHistory | None = None
+    history: IterationHistory | None = None
     """Iteration history; None inside a JAX transformation and if nothing was iterated."""
 
     __repr__ = adjustment_repr
@@ -145,8 +145,8 @@ class Adjustment(eqx.Module):
             return Outcome.DIVERGED
         if self.diverged_points.any():
             return Outcome.ASTRAY
-        kept = 0 if self.course is None else len(self.course.length)
-        flat = self.course is not None and 0 < kept == int(self.steps) and bool(self.course.is_flat(kept - 1))
+        kept = 0 if self.history is None else len(self.history.length)
+        flat = self.history is not None and 0 < kept == int(self.steps) and bool(self.history.is_flat(kept - 1))
         return Outcome.FLAT if flat else Outcome.STEPS
 
     @property

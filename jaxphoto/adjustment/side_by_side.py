@@ -53,7 +53,7 @@ def optimum_of(values: PaddedValues, structure: PaddedStructure, task: SolveMode
     @jax.custom_batching.custom_vmap
     def one(values: PaddedValues) -> Optimum:
         # The history has no derivative, and is not needed where something is differentiated.
-        return iterate(values, structure, task)[0]._replace(course=None)
+        return iterate(values, structure, task)[0]._replace(history=None)
 
     @one.def_vmap
     def rule(draws: int, batched: list[Any], values: PaddedValues) -> tuple[Optimum, Optimum]:
@@ -142,7 +142,7 @@ def _found(draws: _Draws, values: PaddedValues) -> Optimum:
         own = draws._replace(structure=eqx.tree_at(lambda s: s.eop_free, draws.structure, free))
         nominal = draws.one(values, k)
         optimum, system, scale = iterate(nominal, own.structure, draws.task)
-        optimum = optimum._replace(course=None)
+        optimum = optimum._replace(history=None)
         optima = jax.tree.map(lambda all, one: all.at[k].set(one), found.optima, optimum)
         found = _Found(optima, found.done.at[k].set(True), found.factors + 1)
         if not together:

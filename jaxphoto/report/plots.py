@@ -584,7 +584,7 @@ def plot_link_strength(tables: Tables, ax: Axes | None = None) -> Axes:
 
 def plot_convergence(tables: Tables, ax: Axes | None = None, *, steps: bool = False) -> Axes:
     """Sigma naught by iteration, or the length of each of the `steps` in sigmas. Raises InputError if unknown."""
-    if tables.adjusted.course is None:
+    if tables.adjusted.history is None:
         raise InputError("of this adjustment no iteration is known: adjust the block to draw its convergence")
     ax, table = axes_or_new(ax), tables.convergence
     ax.locator_params(axis="x", integer=True)

@@ -481,14 +481,14 @@ def _correlations(tables: Tables) -> Iterator[Part]:
 
 def convergence_words(adjusted: Adjustment) -> str:
     """Number of steps and the reason of the end."""
-    course, n = adjusted.course, int(adjusted.steps)
-    if course is None or not n:
+    history, n = adjusted.history, int(adjusted.steps)
+    if history is None or not n:
         return ""
-    refused = int((course.accepted == 0).sum())
-    bent = int(((course.bent > 0) & (course.accepted > 0)).sum())
+    refused = int((history.accepted == 0).sum())
+    bent = int(((history.bent > 0) & (history.accepted > 0)).sum())
     words = counted(n, "step") + (f", {bent} of them along a curve (weakly determined unknowns)" if bent else "")
     words += f", {refused} of them rejected and repeated with more damping" if refused else ""
-    last = course.length[-1] if len(course.length) == n else np.nan
+    last = history.length[-1] if len(history.length) == n else np.nan
     if adjusted.outcome is Outcome.CONVERGED:
         return f"{words}. Converged: the last moved no unknown by more than {last:.1e} of its standard deviation."
     if adjusted.outcome is Outcome.STEPS:

@@ -434,20 +434,20 @@ def convergence_table(adjusted: Adjustment) -> pd.DataFrame:
     `length` bounds the move of every unknown in its standard deviations. `bent` is the fraction of the step that was
     tried along its curve (geodesic acceleration), NaN for a straight step. The last row is the end.
     """
-    course, redundancy = adjusted.course, max(adjusted.redundancy, 1)
-    if course is None:
+    history, redundancy = adjusted.history, max(adjusted.redundancy, 1)
+    if history is None:
         return pd.DataFrame(columns=["step", "sigma0", "length", "damping", "bent", "taken"])
-    n = len(course.length)
+    n = len(history.length)
     # A very long iteration keeps its first steps; the end is known in any case.
     end = n == int(adjusted.steps)
-    sums = np.append(course.sum_of_squares, float(adjusted.sum_of_squares)) if end else course.sum_of_squares
+    sums = np.append(history.sum_of_squares, float(adjusted.sum_of_squares)) if end else history.sum_of_squares
     columns = {
         "step": pd.Series([*map(str, range(1, n + 1)), *(["end"] if end else [])]),
         "sigma0": pd.Series(np.sqrt(sums / redundancy)),
-        "length": pd.Series(course.length),
-        "damping": pd.Series(course.damping),
-        "bent": pd.Series(np.where(course.bent > 0, course.bent, np.nan)),
-        "taken": pd.Series(np.where(course.accepted > 0, "yes", "no")),
+        "length": pd.Series(history.length),
+        "damping": pd.Series(history.damping),
+        "bent": pd.Series(np.where(history.bent > 0, history.bent, np.nan)),
+        "taken": pd.Series(np.where(history.accepted > 0, "yes", "no")),
     }
     return pd.DataFrame(columns).fillna({"taken": ""})
 

@@ -57,14 +57,14 @@ def test_flat_blocks_converge_within_forty_steps(seed):
     found = optimum(seed)
     assert found.outcome is Outcome.CONVERGED and int(found.steps) <= 40
     # What is refused is not taken, and no step makes the square sum larger.
-    sums = np.append(found.course.sum_of_squares, float(found.sum_of_squares))
+    sums = np.append(found.history.sum_of_squares, float(found.sum_of_squares))
     assert (np.diff(sums) <= 1e-6 * sums[:-1]).all()
-    assert (np.diff(sums)[found.course.accepted == 0] == 0).all()
+    assert (np.diff(sums)[found.history.accepted == 0] == 0).all()
 
 
 def test_some_steps_follow_a_curve_and_the_course_tells():
-    found = next(optimum(seed) for seed in SEEDS if (optimum(seed).course.bent > 0).any())
-    table, bent = convergence_table(found), found.course.bent
+    found = next(optimum(seed) for seed in SEEDS if (optimum(seed).history.bent > 0).any())
+    table, bent = convergence_table(found), found.history.bent
     assert (table["bent"].notna().to_numpy()[: len(bent)] == (bent > 0)).all()
     assert ((bent >= 0) & (bent <= 1)).all()
     assert sum("along a curve" in line for line in step_lines(found)) == (bent > 0).sum()
@@ -137,7 +137,7 @@ def test_the_optimum_is_that_of_a_search_over_the_principal_distance(seed):
 
 def test_a_well_determined_block_takes_straight_steps():
     found = adjusted("cross")
-    assert not (found.course.bent > 0).any() and (found.course.accepted > 0).all()
+    assert not (found.history.bent > 0).any() and (found.history.accepted > 0).all()
     assert int(found.steps) <= 4
 
 

@@ -87,7 +87,7 @@ def shortened(folder):
     changed(folder / "result" / "object_points.csv", lambda t: t[1:])
 
 
-def diverged_points(folder):
+def diverged(folder):
     path = folder / "result" / "summary.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"converged": False}))
 
@@ -97,7 +97,7 @@ def diverged_points(folder):
     [
         (renamed, r"exterior\.csv is not of the block .*: image i0; name the block that was adjusted by --block"),
         (shortened, r"object_points\.csv is not of the block .*: point p0"),
-        (astray, "the adjustment did not converge"),
+        (diverged, "the adjustment did not converge"),
         (lambda f: shutil.rmtree(f / "block"), r"should be .*block, where there is no block\.toml"),
         (lambda f: (f / "result" / "exterior.csv").unlink(), r"exterior\.csv is missing, which results have"),
         (lambda f: (f / "result" / "interior.csv").unlink(), r"has no interior\.csv; give a folder that"),

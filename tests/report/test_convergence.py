@@ -24,20 +24,20 @@ def test_sigma_naught_falls_from_that_of_the_start_to_that_of_the_optimum():
     assert lines[-1] == f"end: sigma naught {float(result.sigma0):.6g}"
     # One step from the start leads to where the second begins.
     one = jaxphoto.adjust(simulated("cross").block, max_steps=1)
-    assert one.course.sum_of_squares[0] == pytest.approx(result.course.sum_of_squares[0])
-    assert float(one.sum_of_squares) == pytest.approx(result.course.sum_of_squares[1], rel=1e-6)
+    assert one.history.sum_of_squares[0] == pytest.approx(result.history.sum_of_squares[0])
+    assert float(one.sum_of_squares) == pytest.approx(result.history.sum_of_squares[1], rel=1e-6)
     assert "1 step, which is the limit (--max-steps)" in convergence_words(one) and one.outcome is Outcome.STEPS
 
 
 def test_the_last_step_is_shorter_than_what_ends_an_adjustment():
     result = adjusted("cross")
-    last = result.course.length[-1]
-    assert 0 <= last < 1e-4 and (result.course.length[:-1] > last).all()
+    last = result.history.length[-1]
+    assert 0 <= last < 1e-4 and (result.history.length[:-1] > last).all()
     assert f"by more than {last:.1e} of its standard deviation" in convergence_words(result)
 
 
 def test_where_nothing_was_iterated_nothing_is_told():
-    without = dataclasses.replace(adjusted("cross"), course=None)
+    without = dataclasses.replace(adjusted("cross"), history=None)
     assert convergence_table(without).empty and convergence_words(without) == ""
     with pytest.raises(InputError, match="adjust the block to draw its convergence"):
         report.plot_convergence(Tables(without))

@@ -188,7 +188,7 @@ class SolverState(NamedTuple):
     flat: Bool[Array, ""]
     """True if more steps are useless: the sum of squares does not determine the optimum."""
     steps: Int[Array, ""]
-    course: Float[Array, "steps numbers"]
+    history: Float[Array, "steps numbers"]
     """Numbers of a `IterationHistory`, one step per row."""
 
 
@@ -239,10 +239,10 @@ def _judged(state: SolverState, sum_of_squares: Scalar, has_losses: bool) -> Jud
     bend = straight & ~(gain >= _GOOD) & jnp.isfinite(sum_of_squares) & (not has_losses)
     shorten = curve & (state.t > state.shortest) & ~(gain >= _ENOUGH)
     judged = (straight & ~bend) | (curve & ~shorten)
-    astray = curve & judged & ~(sum_of_squares < p.straight_sum)
-    t = jnp.where(astray, 1.0, state.t)
-    gain = jnp.where(astray, p.gain(t, p.straight_sum), gain)
-    return Judgement(judged, judged & (gain >= _ACCEPT), bend, shorten, astray, t, gain)
+    diverged = curve & judged & ~(sum_of_squares < p.straight_sum)
+    t = jnp.where(diverged, 1.0, state.t)
+    gain = jnp.where(diverged, p.gain(t, p.straight_sum), gain)
+    return Judgement(judged, judged & (gain >= _ACCEPT), bend, shorten, diverged, t, gain)
 
 
 def _next_damping(
@@ -333,7 +333,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
             done=no,
             flat=no,
             steps=jnp.array(0),
-            course=jnp.full((MOST_KEPT, len(IterationHistory._fields)), jnp.nan),
+            history=jnp.full((MOST_KEPT, len(IterationHistory._fields)), jnp.nan),
         )
 
     def _solved(
@@ -375,20 +375,20 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         here = self._at(state.candidate, state.loose)
         rows, _ = fn(state.candidate, here[1:])
         sum_of_squares = rows.sum_of_squares(s)
-        judged, accept, bend, shorten, astray, t, gain = _judged(state, sum_of_squares, s.has_losses)
-        fresh = (state.stage == _HERE) | (accept & ~astray)
+        judged, accept, bend, shorten, diverged, t, gain = _judged(state, sum_of_squares, s.has_losses)
+        fresh = (state.stage == _HERE) | (accept & ~diverged)
         y = jnp.where(fresh, state.candidate, y)
         reduced = state.system.reduced
         weight, held = as_vector(reduced.weight), reduced.damping
         damping, growth = _next_damping(state, judged, accept, t, gain, p.seen / self._dot(p.step, weight * p.step))
         last = jnp.where(accept, p.length, state.length)
-        told = IterationHistory(
-            p.sum_of_squares, p.length, held, accept.astype(float), jnp.where(curve & ~astray, t, 0.0)
+        record = IterationHistory(
+            p.sum_of_squares, p.length, held, accept.astype(float), jnp.where(curve & ~diverged, t, 0.0)
         )
         # A candidate that is not judged is overwritten.
-        course = state.course.at[state.steps].set(jnp.stack(told), mode="drop")
+        history = state.history.at[state.steps].set(jnp.stack(record), mode="drop")
         is_flat, steps, loose = (
-            accept & IterationHistory(*course.T).is_flat(state.steps),
+            accept & IterationHistory(*history.T).is_flat(state.steps),
             state.steps + judged,
             state.loose,
         )
@@ -430,7 +430,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         settled = fresh & (missing <= self.tolerance) & (p.damped <= p.seen + self.tolerance**2)
         settled = settled & (steps < self.task.max_steps) & ~self.task.only_factor
         end = jnp.stack([p.sum_of_squares, p.length, held, jnp.ones(()), jnp.zeros(())])
-        course = course.at[jnp.where(settled, steps, MOST_KEPT)].set(end, mode="drop")
+        history = history.at[jnp.where(settled, steps, MOST_KEPT)].set(end, mode="drop")
         # The last step is short and starts from an accepted iterate: it needs no evaluation.
         y, tighten = jnp.where(settled, y + p.step, y), settled & loose
         if n_open_motions(self.values, s):
@@ -440,7 +440,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         stages = [tighten, fresh, bend, near, shorten]
         # Restore the iterate after a rejected step, the straight step after a curve that diverged.
         t = jnp.select(stages, [0.0, 1.0, h, begin, state.t / 2], jnp.where(accept, 1.0, 0.0))
-        reached = as_vector(after(self._at(y, loose), self.increments(p.part(t, astray)), system.reduced.weight))
+        reached = as_vector(after(self._at(y, loose), self.increments(p.part(t, diverged)), system.reduced.weight))
         progress = SolverState(
             stage=jnp.select(stages, [_HERE, _STRAIGHT, _NEAR, _CURVE, _CURVE], _HERE),
             candidate=jnp.where(t > 0, reached, y),
@@ -456,7 +456,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
             done=(settled & ~tighten) | self.task.only_factor,
             flat=is_flat,
             steps=steps + settled,
-            course=course,
+            history=history,
         )
         return y, progress, None
 

@@ -43,7 +43,7 @@ class Optimum(NamedTuple):
     increments: Increments
     steps: Int[Array, ""] | None
     converged: Bool[Array, ""] | None
-    course: IterationHistory | None
+    history: IterationHistory | None
 
 
 def unit_scale(structure: PaddedStructure) -> Increments:
@@ -89,7 +89,7 @@ def _iterate(
     )
     increments, state = solver.increments(solution.value), solution.state
     converged = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(increments.eop))
-    return Optimum(increments, state.steps, converged, IterationHistory(*state.course.T)), state.system
+    return Optimum(increments, state.steps, converged, IterationHistory(*state.history.T)), state.system
 
 
 def weigh_datum(values: PaddedValues, structure: PaddedStructure) -> PaddedValues:

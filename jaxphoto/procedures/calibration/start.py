@@ -136,11 +136,11 @@ def flat_start(
     # The mean of logarithms: a view of something else adds a constant and no more.
     bend = lambda k: float(np.mean(np.log(_bends(views, k, half))))  # noqa: E731
     lens = scipy.optimize.minimize(bend, np.zeros(2), method="Nelder-Mead", options={"maxiter": 120}).x
-    modifies_interior = _bends(views, lens, half)
+    distortion_misfit = _bends(views, lens, half)
     straight = [
         view
-        for view, error in zip(views, modifies_interior, strict=True)
-        if error <= _MISFIT * np.median(modifies_interior)
+        for view, error in zip(views, distortion_misfit, strict=True)
+        if error <= _MISFIT * np.median(distortion_misfit)
     ]
     homographies = [_homography(board, _straight(xy, lens, half)) for board, xy in straight]
     rows, right = [], []

@@ -22,7 +22,7 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Block, Start
 from jaxphoto.errors import DatumError, InputError, counted, few
 from jaxphoto.procedures.adjust import adjust_for_tables
-from jaxphoto.procedures.control.frame import MINIMAL_SIZES, InFrame, in_frame, on_a_line, onto_control
+from jaxphoto.procedures.control.frame import MIN_POINTS, InFrame, in_frame, on_a_line, onto_control
 from jaxphoto.procedures.control.marks import Marked, intersected, into_block, marked, with_gnss_bias, without_names
 from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, SIGMA_M, GivenControl, SurveyedPoints
 from jaxphoto.statistics import LEAST_CHECKED, covariance, normalised_residuals, redundancy_numbers
@@ -264,8 +264,8 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
     known = np.flatnonzero(np.isfinite(met).all(axis=1) & ~points.check & whole)
     agree = np.ones(len(met), bool)
     by_positions = len(block.stations) > 0 and not len(block.control)
-    line = len(known) >= MINIMAL_SIZES and on_a_line(met[known], frame.xyz[known])
-    if frame.at_place and (line or len(known) < MINIMAL_SIZES):
+    line = len(known) >= MIN_POINTS and on_a_line(met[known], frame.xyz[known])
+    if frame.at_place and (line or len(known) < MIN_POINTS):
         how = " lie on a line, which leaves a turn about it open" if line else ""
         stays = f"the block stays {'at its positions' if by_positions else 'where it lies'}"
         said = [f"{counted(len(known), 'control point')} in two photographs or more{how}: {stays}"]
@@ -308,7 +308,7 @@ def _assumed(control: GivenControl, sigma: Float[np.ndarray, "points 3"]) -> lis
 
 def _one_height(points: SurveyedPoints) -> list[str]:
     height = points.coordinates[:, 2]
-    if len(height) < MINIMAL_SIZES or np.ptp(height) != 0:
+    if len(height) < MIN_POINTS or np.ptp(height) != 0:
         return []
     return [
         f"all {len(height)} surveyed heights are {height[0]:g} m; where nobody surveyed them, leave them empty and "

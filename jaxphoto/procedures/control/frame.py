@@ -38,7 +38,7 @@ from jaxphoto.procedures.orientation.known_frame import Similarity, similarity_b
 _SAMPLES = 300
 # Standard deviations, and part of the size of the control, within which a point fits.
 _BEYOND, _BENT = 5.0, 0.01
-MINIMAL_SIZES = 3
+MIN_POINTS = 3
 # Fewer than this part of the points that fit, of so many at least, may be poor ones.
 _MOST, _ENOUGH = 2 / 3, 6
 # Of a median of lengths of normal errors in space to one coordinate, and what a similarity takes up.
@@ -71,7 +71,7 @@ def onto_control(
     Raises InputError for fewer than three, for such as lie on a line, and where no three and a fourth agree; it says
     where exchanged coordinates would.
     """
-    if len(here) < MINIMAL_SIZES:
+    if len(here) < MIN_POINTS:
         raise InputError(
             f"{file}: {counted(len(here), 'control point')} in two photographs or more, where three tell place, scale "
             "and attitude of a block; mark more"
@@ -84,12 +84,12 @@ def onto_control(
         )
     if best.agree.mean() < _MOST and assumed.any() and (poor := _poor(there, here, sigma_m, assumed)) is not None:
         return poor
-    if len(here) > MINIMAL_SIZES and best.agree.sum() > MINIMAL_SIZES:
+    if len(here) > MIN_POINTS and best.agree.sum() > MIN_POINTS:
         return best
-    if best.agree.all() and len(here) == MINIMAL_SIZES:
+    if best.agree.all() and len(here) == MIN_POINTS:
         return best
     exchanged = _best(there, here[:, [1, 0, 2]], sigma_m)
-    if exchanged is not None and exchanged.agree.sum() > max(MINIMAL_SIZES, best.agree.sum()):
+    if exchanged is not None and exchanged.agree.sum() > max(MIN_POINTS, best.agree.sum()):
         raise InputError(
             f"{file}: the control points fit the photographs with X and Y exchanged; exchange the two columns"
         )
@@ -112,11 +112,11 @@ def _poor(there, here, sigma_m, assumed) -> OntoControl | None:
         return None
     similarity = min(_of_threes(there, here), key=lambda s: np.median(_off(s, there, here)))
     # Rousseeuw's factor for few points.
-    scatter = (1 + 5 / (n - MINIMAL_SIZES)) * float(np.median(_off(similarity, there, here))) / _MEDIAN
+    scatter = (1 + 5 / (n - MIN_POINTS)) * float(np.median(_off(similarity, there, here))) / _MEDIAN
     for _ in range(5):
         near = _off(similarity, there, here) < _WITHIN * scatter
         found = similarity_between(there[near], here[near])
-        if found is None or near.sum() <= MINIMAL_SIZES:
+        if found is None or near.sum() <= MIN_POINTS:
             return None
         similarity = found
         squares = np.sum(_off(similarity, there, here)[near] ** 2)
@@ -139,10 +139,10 @@ def _tolerance(here, sigma_m) -> Float[np.ndarray, "points"]:
 
 
 def _of_threes(there, here) -> Iterator[Similarity]:
-    samples = list(combinations(range(len(here)), MINIMAL_SIZES))
+    samples = list(combinations(range(len(here)), MIN_POINTS))
     if len(samples) > _SAMPLES:
         rng = np.random.default_rng(0)
-        samples = [tuple(rng.choice(len(here), MINIMAL_SIZES, replace=False)) for _ in range(_SAMPLES)]
+        samples = [tuple(rng.choice(len(here), MIN_POINTS, replace=False)) for _ in range(_SAMPLES)]
     for pick in samples:
         similarity = similarity_between(there[list(pick)], here[list(pick)], 0.02)
         if similarity is not None:

@@ -41,7 +41,7 @@ from jaxphoto.initial.intersection import intersect_points
 from jaxphoto.initial.rays import padded_length, turn_to_object
 from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.control.control_block import CRITICAL, ControlledBlock, control_block
-from jaxphoto.procedures.control.frame import MINIMAL_SIZES, in_frame
+from jaxphoto.procedures.control.frame import MIN_POINTS, in_frame
 from jaxphoto.procedures.control.marks import Marked, marked, misses, rays_of
 from jaxphoto.procedures.control.surveyed import SIGMA_M, GivenControl, Marks
 from jaxphoto.statistics import covariance
@@ -384,16 +384,16 @@ def control_block_with_targets(
     texts = _told(ids, seen, looked, why_not)
     if now is None:
         raise InputError(f"{points.file}: no target was found; {'; '.join(texts)}")
-    still = _far(now, by_hand)
+    distant = _far(now, by_hand)
     texts += [
         f"the target of {ids[p]} was found anew, {off:.2g} m from what was first taken for it"
         for p, off in anew.items()
-        if p not in to_numpy
+        if p not in distant
     ]
     texts += [
         f"what was found for check point {ids[p]} lies {off:.2g} m from its place: see whether it is its target, or "
         "mark it by hand"
-        for p, off in to_numpy.items()
+        for p, off in distant.items()
         if points.check[p]
     ]
     return now._replace(sentences=(*texts, *now.sentences))
@@ -405,7 +405,7 @@ def _far(now: ControlledBlock, by_hand: Marked) -> dict[int, float]:
     They stay unless another target is found: a block may be bent there, which check points are to tell.
     """
     state, off = np.array(now.state, object), np.linalg.norm(np.nan_to_num(now.off_m), axis=1)
-    if (state == "control").sum() < MINIMAL_SIZES:
+    if (state == "control").sum() < MIN_POINTS:
         return {}
     usual = np.median(off[np.isin(state, ["control", "check"])])
     far = np.isin(state, ["check", "left out"]) & (np.nan_to_num(now.w).max(axis=1) > CRITICAL) & (off > _FAR * usual)
