@@ -45,7 +45,7 @@ from jaxphoto.procedures.control.frame import MIN_POINTS, in_frame
 from jaxphoto.procedures.control.marks import Marked, marked, misses, rays_of
 from jaxphoto.procedures.control.surveyed import SIGMA_M, GivenControl, Marks
 from jaxphoto.statistics import covariance
-from jaxphoto.statistics.covariance import turns_of
+from jaxphoto.statistics.covariance import rotation_jacobians
 
 
 class Predicted(NamedTuple):
@@ -73,7 +73,7 @@ def predicted(
     n, factor = len(block.images), float(joint.variance_factor)
     matrix, labels = np.asarray(joint.matrix) * factor, list(joint.labels)
     position, turn = to_numpy(unknowns.exterior.position), to_numpy(unknowns.exterior.camera_from_object)
-    to_angles = np.asarray(turns_of(jnp.asarray(np.moveaxis(turn, 0, -1)), joint.rotations))
+    to_angles = np.asarray(rotation_jacobians(jnp.asarray(np.moveaxis(turn, 0, -1)), joint.rotations))
     found: list[Predicted] = []
     image = np.arange(n).repeat(len(xyz))
     point = np.tile(np.arange(len(xyz)), n)
