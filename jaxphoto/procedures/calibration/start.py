@@ -14,7 +14,6 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import Array, Float
@@ -32,6 +31,7 @@ from jaxphoto.camera import (
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
 from jaxphoto.initial.rays import ideal_coordinates
+from jaxphoto.least_squares import least_squares
 from jaxphoto.procedures.calibration.target_block import Board, TargetRows, projections, resected
 
 _CENTRAL = ("c_mm", "xp_mm", "yp_mm")
@@ -72,8 +72,8 @@ def free_parameters(name: str, distortion: AbstractDistortion, wanted: Sequence[
     return tuple(n for n in names if n in asked)
 
 
-# Points along each side of the format at which two distortions are compared, and Gauss-Newton steps.
-_SIDE, _STEPS = 15, 8
+# Points along each side of the format at which two distortions are compared.
+_SIDE = 15
 # Principal distances, over the diagonal of the format, that a photograph of a board can have.
 _SHORTEST, _LONGEST = 0.15, 15.0
 # Of the typical mean square error of a homography: beyond, a view is no plane seen by this camera.
@@ -174,28 +174,25 @@ def nearest_distortion(
         given, wanted = wanted, given
     interior = jax.tree.map(lambda v: np.asarray(v, float), InteriorOrientation(known.c, known.x_p, known.y_p, model))
     names = tuple(name for name in free if name in model.coefficients)
-    for _ in range(_STEPS if names else 0):
-        value, slope = call_compiled(_closed_form, interior, given, names)
-        slope = np.asarray(slope).reshape(-1, len(names))
-        length = np.maximum(np.linalg.norm(slope, axis=0), 1e-300)
-        step = np.linalg.lstsq(slope / length, (wanted - np.asarray(value)).ravel(), rcond=1e-10)[0] / length
-        for name, change in zip(names, step, strict=True):
-            interior = set_parameter(interior, name, np.asarray(get_parameter(interior, name) + change))
+    if names:
+        begin = np.array([float(get_parameter(interior, name)) for name in names])
+        values = np.asarray(call_compiled(_nearest, begin, interior, given, wanted, names))
+        interior = _with(interior, names, values)
     return interior
 
 
 @eqx.filter_jit
-def _closed_form(interior: InteriorOrientation, xy: Float[Array, "n 2"], names: tuple[str, ...]):
-    """What the distortion makes of `xy`, (n, 2), and the derivatives by the coefficients `names`, (n, 2, names)."""
+def _nearest(start: Float[Array, "u"], interior: InteriorOrientation, given, wanted, names: tuple[str, ...]):
+    def residuals(values, _):
+        return (jax.vmap(_with(interior, names, values).closed_form)(given) - wanted).ravel()
 
-    def value(parameters):
-        tree = interior
-        for name, parameter in zip(names, parameters, strict=True):
-            tree = set_parameter(tree, name, parameter)
-        return jax.vmap(tree.closed_form)(jnp.asarray(xy))
+    return least_squares(residuals, start).unknowns
 
-    start = jnp.stack([get_parameter(interior, name) for name in names])
-    return value(start), jax.jacfwd(value)(start)
+
+def _with(interior: InteriorOrientation, names: tuple[str, ...], values) -> InteriorOrientation:
+    for name, value in zip(names, values, strict=True):
+        interior = set_parameter(interior, name, value)
+    return interior
 
 
 def _straight(xy, lens, half):

@@ -59,15 +59,14 @@ class Network(NamedTuple):
 
 
 def import_pycolmap() -> Any:
-    """The module pycolmap, silenced. Raises BlockError where it is not installed."""
+    """Return the module pycolmap, silenced. Raises BlockError if it is not installed."""
     try:
         # Loaded after pycolmap 4.2.1, OpenCV 5.0 ends the process where it writes a PNG.
         import cv2  # noqa: F401
         import pycolmap
     except ImportError:
         raise BlockError(
-            "images are oriented from their common points by COLMAP, which is not installed: "
-            "pip install 'jaxphoto[photos]'"
+            "images are oriented by COLMAP, which is not installed: pip install 'jaxphoto[photos]'"
         ) from None
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     return pycolmap

@@ -31,7 +31,7 @@ import scipy
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.errors import InputError
-from jaxphoto.extras.photos.targets.patches import Patches, TargetPlaces, fit_patches, linearised
+from jaxphoto.extras.photos.targets.patches import Patches, TargetPlaces, fit_patches, fits
 from jaxphoto.extras.photos.targets.pattern import FoundBoard, Pattern
 from jaxphoto.io.text_tables import read_csv
 from jaxphoto.procedures.calibration import Board
@@ -192,8 +192,8 @@ def _disc(parameters, pixel):
 
 
 @eqx.filter_jit
-def _discs(parameters: Float[Array, "n 10"], pixels: Float[Array, "n m 2"]):
-    return linearised(_disc)(parameters, pixels)
+def _discs(start: Float[Array, "n 10"], pixels: Float[Array, "n m 2"], grey, used):
+    return fits(_disc, start, pixels, grey, used)
 
 
 # How far apart neighbouring spots are drawn, and the longest side of the drawing.

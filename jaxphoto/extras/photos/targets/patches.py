@@ -1,22 +1,21 @@
-"""Least-squares matching of many small patches of a picture with a model of what they show.
+"""Least-squares fits of models to many small patches of a picture, side by side, and corners of squares.
 
     grey(pixel) = model(parameters, pixel) + noise,   v'v -> min,   C = s0^2 (J'J)^-1,   s0^2 = v'v / (n - u)
 
-All patches of a picture are fitted at once, each by its own damped Gauss-Newton steps. The noise is that which the fit
-leaves, so that a model that does not fit (halos of sharpening, compression, shadows) makes larger standard deviations.
+The noise is that of the residuals: a model that does not fit (halos of sharpening, compression, shadows) gives larger
+standard deviations.
 
-Corners of squares to a part of a pixel: where four squares meet as on a chessboard, or the corner of one.
-
-Both are two straight edges, blurred with one width s (and by the pixels), over a brightness that changes linearly,
-with d = pixel - corner:
+Corners where four squares meet, as on a chessboard, and corners of single squares are two straight edges, blurred with
+one width s (and by the pixels), over a brightness that changes linearly, with d = pixel - corner:
 
     four squares   grey = m + g . d + a erf(e1 / s) erf(e2 / s)
     one square     grey = m + g . d + a (1 + erf(e1 / s)) (1 + erf(e2 / s)) / 4,    ek = d . (cos tk, sin tk)
 
-The nine unknowns (corner, t1, t2, ln s, a, m, g) are fitted to a round window by least squares (`patches`).
+The nine unknowns (corner, t1, t2, ln s, a, m, g) are fitted to a round window.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,91 +24,66 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxphoto.compiling import call_compiled
-from jaxphoto.initial.rays import padded_length
+from jaxphoto.initial.rays import padded, padded_length
+from jaxphoto.least_squares import Fit, least_squares
 
-_STEPS = 40
-# Of the diagonal: with less, a blur that residuals hide would swing to and fro.
-_LEAST_DAMPING = 1e-3
-# In pixels: by what a last step may still move a target.
-_STILL = 1e-3
+# Iterations, and the last change of the grey values over the residuals (about 1e-3 of a sigma), or in grey values.
+_STEPS, _RTOL, _ATOL = 40, 1e-4, 1e-3
+# Patches are padded to a multiple of these pixels.
 _PIXELS = 64
 
 
 class PatchFit(NamedTuple):
-    """Fitted parameters of each patch; the first two are column and row from where the patch was looked for."""
+    """Fitted parameters of each patch; the first two are column and row from the origin of the patch."""
 
     parameters: Float[np.ndarray, "patches parameters"]
     covariance: Float[np.ndarray, "patches parameters parameters"]
     noise: Float[np.ndarray, "patches"]
     """Standard deviation of a grey value, s0."""
     fitted: Bool[np.ndarray, "patches"]
-    """False where the steps did not come to rest or the parameters cannot be told apart."""
+    """False if the fit did not converge or the parameters are not determined."""
 
 
 class Patches(NamedTuple):
     """Pixels of patches of a picture."""
 
     pixels: Float[np.ndarray, "patches pixels 2"]
-    """Column and row from the patch's own origin."""
+    """Column and row from the origin of the patch."""
     grey: Float[np.ndarray, "patches pixels"]
     used: Bool[np.ndarray, "patches pixels"]
-    """False for what is there to fill the array, such as pixels beyond the border of the picture."""
+    """False for padding and pixels beyond the border of the picture."""
 
 
-def fit_patches(
-    linearised: Any,
-    start: Float[np.ndarray, "patches parameters"],
-    patches: Patches,
-) -> PatchFit:
-    """Fit a model to patches, from starting parameters.
-
-    `linearised` (made by `eqx.filter_jit`) gives values (patches, pixels) and derivatives (patches, pixels, parameters)
-    of the model for parameters (patches, parameters) and pixels (patches, pixels, 2).
-    """
-    (n, unknowns), (pixels, grey, used) = start.shape, patches
-    width = -(-pixels.shape[1] // _PIXELS) * _PIXELS
-
-    def system(parameters, which):
-        padded, place = np.ones((padded_length(len(which)), unknowns)), np.zeros((padded_length(len(which)), width, 2))
-        padded[: len(which)], place[: len(which), : pixels.shape[1]] = parameters, pixels[which]
-        values = call_compiled(linearised, padded, place)
-        value, slope = (np.asarray(v)[: len(which), : pixels.shape[1]] for v in values)
-        residual = np.where(used[which], grey[which] - value, 0.0)
-        slope = np.where(used[which, :, None], slope, 0.0)
-        across = slope.transpose(0, 2, 1)
-        return np.sum(residual**2, axis=1), across @ slope, (across @ residual[:, :, None])[:, :, 0]
-
-    parameters, damping = start.astype(float), np.full(n, 1e-3)
-    state = system(parameters, np.arange(n))
-    still = np.zeros(n, bool)
-    for _ in range(_STEPS):
-        which = np.flatnonzero(~still)
-        if not len(which):
-            break
-        sum_of_squares, normal, right = (part[which] for part in state)
-        diagonal = np.einsum("pkk->pk", normal)
-        damped = normal + (damping[which, None] * diagonal + 1e-12)[:, :, None] * np.eye(unknowns)
-        step = np.linalg.solve(damped, right[:, :, None])[:, :, 0]
-        trial = system(parameters[which] + step, which)
-        better = trial[0] <= sum_of_squares
-        parameters[which[better]] += step[better]
-        for part, new in zip(state, trial, strict=True):
-            part[which[better]] = new[better]
-        damping[which] = np.clip(damping[which] * np.where(better, 0.3, 10.0), _LEAST_DAMPING, 1e9)
-        still[which] = np.max(np.abs(step[:, :2]), axis=1) < _STILL
-    sum_of_squares, normal, _ = state
-    noise = np.sqrt(sum_of_squares / np.maximum(used.sum(axis=1) - unknowns, 1))
-    # What the picture no longer sees at all, such as a blur far below a pixel's own, stays where it is.
+def fit_patches(program: Callable, start: Float[np.ndarray, "patches parameters"], patches: Patches) -> PatchFit:
+    """Fit a model to patches from initial parameters; `program` is `eqx.filter_jit` of `fits` of that model."""
+    (n, unknowns), used = start.shape, patches.used
+    wide = -used.shape[1] % _PIXELS
+    arrays = (np.pad(v, ((0, 0), (0, wide), *((0, 0),) * (v.ndim - 2))) for v in patches)
+    fit: Fit = call_compiled(program, *(padded(v, padded_length(n)) for v in (start.astype(float), *arrays)))
+    parameters, normal, cost, converged = (np.array(v)[:n] for v in fit[:4])
+    noise = np.sqrt(cost / np.maximum(used.sum(axis=1) - unknowns, 1))
+    # A parameter that the picture does not determine at all, such as a blur far below a pixel, stays where it is.
     scale = np.sqrt(np.einsum("pkk->pk", normal))
     unseen = scale <= 1e-5 * scale.max(axis=1, keepdims=True)
     scale = np.where(unseen, np.inf, scale)
     correlation = normal / scale[:, :, None] / scale[:, None, :] + unseen[:, :, None] * np.eye(unknowns)
-    known = np.isfinite(correlation).all(axis=(1, 2))
-    correlation[~known] = np.eye(unknowns)
-    known &= np.linalg.eigvalsh(correlation)[:, 0] > 1e-10
-    correlation[~known] = np.eye(unknowns)
+    regular = np.isfinite(correlation).all(axis=(1, 2))
+    correlation[~regular] = np.eye(unknowns)
+    regular &= np.linalg.eigvalsh(correlation)[:, 0] > 1e-10
+    correlation[~regular] = np.eye(unknowns)
     covariance = np.linalg.inv(correlation) / scale[:, :, None] / scale[:, None, :] * (noise**2)[:, None, None]
-    return PatchFit(parameters, covariance, noise, still & known & (used.sum(axis=1) > unknowns))
+    return PatchFit(parameters, covariance, noise, converged & regular & (used.sum(axis=1) > unknowns))
+
+
+def fits(model: Callable, start, pixels, grey, used) -> Fit:
+    """Least-squares fits of `model(parameters, pixel)` to patches, side by side."""
+
+    def fit(start, pixels, grey, used):
+        grey_of = jax.vmap(model, in_axes=(None, 0))
+        residuals = lambda parameters, _: jnp.where(used, grey_of(parameters, pixels) - grey, 0.0)  # noqa: E731
+        return least_squares(residuals, start, rtol=_RTOL, atol=_ATOL, max_steps=_STEPS)
+
+    return jax.vmap(fit)(start, pixels, grey, used)
 
 
 def windows(
@@ -162,14 +136,14 @@ def fit_square_corners(
     reach_px: Float[np.ndarray, "n"],
 ) -> TargetPlaces:
     """Corners of single squares; `edges` as in `fit_crossings`, from the corner along the square's own sides."""
-    return _fit(_single, lambda one, other: (1 + one) * (1 + other) / 4, picture, near, edges, reach_px)
+    return _fit(_square_corners, lambda one, other: (1 + one) * (1 + other) / 4, picture, near, edges, reach_px)
 
 
-def _fit(linearised, shape, picture, near, edges, reach_px) -> TargetPlaces:
+def _fit(program, shape, picture, near, edges, reach_px) -> TargetPlaces:
     radius = np.clip(reach_px, _SMALLEST_PX, _LARGEST_PX)
     for _ in range(2):  # once more about the corner that was found
         patches = windows(picture, near, radius)
-        fit = fit_patches(linearised, _start(shape, patches, edges), patches)
+        fit = fit_patches(program, _start(shape, patches, edges), patches)
         moved = fit.parameters[:, :2]
         stayed = fit.fitted & (np.linalg.norm(moved, axis=1) < _FAR)
         near = near + np.where(stayed[:, None], moved, 0.0)
@@ -217,25 +191,11 @@ def _square_corner(parameters, pixel):
     return mean + contrast * (1 + first) * (1 + second) / 4
 
 
-def linearised(model):
-    """Values and derivatives of `model` for the pixels of many patches, as `fit_patches` wants it."""
-
-    def one(parameters, pixel):
-        value = model(parameters, pixel)
-        return value, value
-
-    def both(parameters, pixel):
-        slope, value = jax.jacfwd(one, has_aux=True)(parameters, pixel)
-        return value, slope
-
-    return jax.vmap(jax.vmap(both, in_axes=(None, 0)))
+@eqx.filter_jit
+def _crossings(start: Float[Array, "n 9"], pixels: Float[Array, "n m 2"], grey, used):
+    return fits(_crossing, start, pixels, grey, used)
 
 
 @eqx.filter_jit
-def _crossings(parameters: Float[Array, "n 9"], pixels: Float[Array, "n m 2"]):
-    return linearised(_crossing)(parameters, pixels)
-
-
-@eqx.filter_jit
-def _single(parameters: Float[Array, "n 9"], pixels: Float[Array, "n m 2"]):
-    return linearised(_square_corner)(parameters, pixels)
+def _square_corners(start: Float[Array, "n 9"], pixels: Float[Array, "n m 2"], grey, used):
+    return fits(_square_corner, start, pixels, grey, used)
