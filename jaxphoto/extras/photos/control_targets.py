@@ -1,4 +1,4 @@
-"""Targets of surveyed points in photographs, near where they are predicted, to a part of a pixel."""
+"""Search for targets of surveyed points in photographs, near their predicted image coordinates."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,7 +10,7 @@ from jaxphoto.extras.photos.features import read_grey
 from jaxphoto.extras.photos.targets.on_ground import GroundTarget
 from jaxphoto.procedures.control.targets import Candidates, Looker, Predicted
 
-# What blur, compression and shadows add to the standard deviation of a fit.
+# Standard deviation (px) of blur, compression and shadows, added to that of a fit.
 _LEAST_SIGMA_PX = 0.1
 _HALF = 0.5
 
@@ -18,7 +18,7 @@ _HALF = 0.5
 def target_looker(
     target: GroundTarget, paths: Mapping[str, Path], progress: Callable[[str], object] = lambda image: None
 ) -> Looker:
-    """What looks for `target` in the photographs at `paths`, by the names of images; others are not looked at."""
+    """Return the search for `target` in the photographs at `paths`, by image names; other images are skipped."""
 
     def look(
         at: Predicted, radius: Float[np.ndarray, "n"], images: tuple[str, ...], ids: tuple[str, ...]

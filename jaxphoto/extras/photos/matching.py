@@ -1,8 +1,8 @@
-"""Matches of photographs: which features of two show the same place, by their descriptors and by the epipolar lines.
+"""Matches of photographs by descriptors and epipolar geometry.
 
-Descriptors are matched and pairs are verified by COLMAP: nearest neighbours both ways with Lowe's ratio test, then the
-inliers of one fundamental matrix or homography. Both need no principal distance: that of EXIF may be a third off, and
-would refuse true matches with an essential matrix.
+COLMAP matches descriptors (mutual nearest neighbours with Lowe's ratio test) and verifies pairs: inliers of a
+fundamental matrix or homography. Neither needs a principal distance: that of EXIF may be wrong by a third, and an
+essential matrix would reject correct matches.
 """
 
 import contextlib
@@ -31,57 +31,57 @@ from jaxphoto.procedures.matched_part import MatchedPart
 from jaxphoto.procedures.orientation.colmap import MappedCamera, import_pycolmap, write_database
 
 MIN_MATCHES = 15
-"""Of two photographs: fewer may agree with some fundamental matrix by chance, and so may less than this ratio."""
+"""Minimum number of matches of a pair, and of their inlier ratio: fewer agree by chance."""
 _MIN_RATIO = 0.3
-# Distance from the epipolar line at most, over the diagonal: 4 pixels of 1,300. Unknown distortion grows with it.
+# Maximum distance from the epipolar line over the diagonal (4 of 1,300 pixels): unknown distortion increases it.
 _OFF_LINE = 0.003
-# Scatter is measured where nine tenths lie, 1.645 standard deviations of a normal distribution: the median would be
-# blind to the long tails that features have, the square sum to nothing but the false matches left.
+# Scatter is that of the 90 % quantile, 1.645 standard deviations: the median ignores the long tails of features, and
+# the sum of squares is sensitive to the remaining false matches.
 _MOST, _MOST_SIGMA = 0.9, 1.6449
 _BLANK = "it shows no features: it is blank or out of focus"
 _ALONE = f"it has {MIN_MATCHES} points in common with no other photograph it was compared with"
-# Pairs that are matched at a time, and kept in one piece.
+# Pairs that are matched, and stored, at a time.
 _CHUNK = 200
 Progress = Callable[[str, int, int], None]
-"""Called with the current step, the number of items done, and of how many."""
+"""Called with the step, the number of items done, and their total number."""
 
 
 class MatchedPhotographs(NamedTuple):
     """Features of photographs and their matches."""
 
     xy_mm: list[Float[np.ndarray, "n 2"]]
-    """For each photograph, as `SiftFeatures`."""
+    """Image coordinates of each photograph, as in `SiftFeatures`."""
     sigma_mm: list[Float[np.ndarray, "n"]]
-    """Those of `SiftFeatures` times `sigma_factor`."""
+    """Standard deviations of `SiftFeatures` times `sigma_factor`."""
     sigma_factor: float
-    """How far the matches scatter about the epipolar lines, over what `SiftFeatures` expects."""
+    """Scatter of the matches about the epipolar lines over that of `SiftFeatures`."""
     pairs: list[PairMatches]
-    """Of those that have enough in common."""
+    """Pairs with enough matches."""
     counts: Int[np.ndarray, "compared 4"]
-    """For all pairs compared: first, second, matches by looks, those of them kept (0 where they are too few)."""
+    """For all compared pairs: first, second, matches by descriptors, verified matches (0 if too few)."""
     left_out: dict[str, str]
-    """Photographs by name that match no other one, and why."""
+    """Photographs by name without any match, and why."""
 
     @property
     def gross(self) -> Int[np.ndarray, "compared 3"]:
-        """For all pairs compared: first, second, matches by looks that are not on the epipolar lines, or too few."""
+        """For all compared pairs: first, second, number of rejected matches."""
         return np.column_stack([self.counts[:, :2], self.counts[:, 2] - self.counts[:, 3]])
 
     @property
     def n_gross(self) -> int:
-        """How many those are in all."""
+        """Total number of rejected matches."""
         return int(self.gross[:, 2].sum())
 
     def named(self, names: list[str]) -> MatchedPart:
-        """The same of photographs that are called so, as `calibrate_flight` takes it."""
+        """Return the matches of photographs with these names, as `calibrate_flight` takes them."""
         return MatchedPart(names, self.xy_mm, self.sigma_mm, self.pairs, self.gross, self.sigma_factor)
 
 
 class TieFeatures(NamedTuple):
-    """Points seen in several photographs, one row for each measurement, sorted by point."""
+    """Points in several photographs, one row per measurement, sorted by point."""
 
     photograph: Int[np.ndarray, "rows"]
-    """Index of the photograph, in the order given."""
+    """Index of the photograph."""
     point: Int[np.ndarray, "rows"]
     xy_mm: Float[np.ndarray, "rows 2"]
 
@@ -98,16 +98,16 @@ def match_photographs(
     keep: KeptPieces | None = None,
     progress: Progress = lambda step, done, of: None,
 ) -> MatchedPhotographs:
-    """SIFT features of photographs of one camera, and their matches in the `pairs` of indices.
+    """Match SIFT features of photographs of one camera in the `pairs` of indices.
 
-    Of each there are `count` features at most, by default 5,000, or 10,000 of up to 40 photographs; it is reduced to
-    `longest_px` before. `interior` is the known camera; only its distortion and principal point count. Results are
-    written to `keep`, and read from there where they exist: an interrupted run continues, to the same result.
+    Each has up to `count` features, by default 5,000, or 10,000 of up to 40 photographs, and is reduced to
+    `longest_px`. `interior` is the known camera; only its distortion and principal point are used. Results are stored
+    in the checkpoint `keep`, from which an interrupted run continues.
 
-    A photograph that shows no features, or matches no other one, is `left_out` by name.
+    Photographs without features or matches are in `left_out`.
 
-    Raises InputError as `sift_features`, where no two photographs match, and where they fall into groups that nothing
-    joins, but not `in_parts`; BlockError where pycolmap is not installed.
+    Raises InputError as `sift_features`, if no two photographs match, and, except `in_parts`, for unconnected groups;
+    BlockError if pycolmap is not installed.
     """
     if len(photographs) < 2:
         raise InputError("an orientation needs two photographs that overlap, or more; give them all")
@@ -121,10 +121,10 @@ def match_photographs(
 def tie_features(
     paths: list[Path], sensor: Sensor, count: int | None = None, least_photographs: int = 2
 ) -> TieFeatures:
-    """Points that overlapping photographs of one camera show in common: pairs, triplets and more.
+    """Return the points that overlapping photographs of one camera have in common.
 
-    All pairs are matched as by `match_photographs` and joined as by `tracks`; points in fewer than `least_photographs`
-    are left out. Raises InputError as `sift_features`, and where no two photographs have enough in common.
+    All pairs are matched by `match_photographs` and joined by `tracks`; points in fewer than `least_photographs` are
+    omitted. Raises InputError as `sift_features`, and if no two photographs have enough in common.
     """
     each = itertools.combinations(range(len(paths)), 2)
     matched = _matched(paths, sensor, InteriorOrientation(1.0), each, count, LONGEST_PX, None, lambda *step: None)
@@ -139,13 +139,13 @@ def tie_features(
 
 
 class _PairResult(NamedTuple):
-    """Results of several pairs, concatenated."""
+    """Concatenated results of several pairs."""
 
     counts: Int[np.ndarray, "pairs 2"]
-    """Matches by descriptors, and verified ones."""
+    """Matches by descriptors, and verified matches."""
     verified: Int[np.ndarray, "verified 2"]
     off_line: Float[np.ndarray, "verified"]
-    """Distances from the epipolar lines over their sigmas."""
+    """Distances from the epipolar lines over their standard deviations."""
 
 
 def _matched(
@@ -215,7 +215,7 @@ def _matched(
 
 
 def _database(pycolmap: Any, folder: Path, sensor: Sensor, features: list[SiftFeatures], ideal_px: list) -> Path:
-    """A COLMAP database of descriptors; a place with several of them is there several times."""
+    """Write a COLMAP database of descriptors; a feature with several of them has several keypoints."""
     camera = MappedCamera(sensor.width_px, sensor.height_px, float(sensor.width_px), False)
     keypoints = [xy[f.feature] for xy, f in zip(ideal_px, features, strict=True)]
     write_database(folder / "photographs.db", [camera], [0] * len(features), keypoints, (), prior_c=False)
@@ -258,7 +258,7 @@ def _match_pairs(
 
 
 def _places(matches: Int[np.ndarray, "n 2"], one: np.ndarray, other: np.ndarray) -> Int[np.ndarray, "places 2"]:
-    """Matches of descriptors as matches of places, each place once at most."""
+    """Matches of descriptors as one-to-one matches of features."""
     pairs = np.unique(np.column_stack([one[matches[:, 0]], other[matches[:, 1]]]), axis=0)
     once = np.ones(len(pairs), bool)
     for side in pairs.T:
@@ -269,7 +269,7 @@ def _places(matches: Int[np.ndarray, "n 2"], one: np.ndarray, other: np.ndarray)
 
 def _over_sigma(off_line_px: float, one: np.ndarray, other: np.ndarray, *sigmas: np.ndarray) -> np.ndarray:
     """Misclosures other' F one of verified matches over their standard deviations; `sigmas` in the same unit."""
-    # Of the sampling with the weights of MAGSAC++ (Barath and others, 2020), from a fixed seed.
+    # Sampling with the weights of MAGSAC++ (Barath and others, 2020), from a fixed seed.
     matrix, _ = cv2.findFundamentalMat(one, other, cv2.USAC_MAGSAC, off_line_px, 0.9999, 10_000)
     if matrix is None:
         return np.zeros(0)
@@ -281,7 +281,7 @@ def _over_sigma(off_line_px: float, one: np.ndarray, other: np.ndarray, *sigmas:
 
 
 def _alone(names: list[str], blank: list[bool], pairs: list[PairMatches], in_parts: bool) -> list[int]:
-    """Photographs that match no other one; InputError unless all others hang together, or may be `in_parts`."""
+    """Indices of photographs without matches. Raises InputError for unconnected groups, except `in_parts`."""
     groups = connected_images(len(names), pairs)
     joined = [group for group in groups if len(group) > 1]
     if not joined:

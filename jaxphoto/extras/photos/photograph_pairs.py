@@ -1,7 +1,7 @@
 """Pairs of photographs to match: all, neighbours in sequence or position, or the most similar ones.
 
-Similar photographs are those whose few largest features match, at a thousandth of the cost of matching all. Large
-features are few and seen from everywhere (Wu 2013, Towards linear-time incremental structure from motion).
+Similarity is the number of matches of the few widest features, at a thousandth of the cost of matching all; wide
+features are visible from everywhere (Wu 2013, Towards linear-time incremental structure from motion).
 """
 
 import itertools
@@ -17,50 +17,49 @@ from jaxphoto.extras.photos.features import FEATURES, OF_FEW, SiftFeatures
 from jaxphoto.io.photographs import Photograph
 
 _EARTH_M = 6_371_000.0
-# So many of each are compared where photographs are many: as far as those of four fifths overlap still show the same,
-# in all directions.
+# Default number of neighbours: all that overlap, at an overlap of 80 % both ways.
 _NEAREST = 20
 FEW = 2 * _NEAREST
-"""Photographs of which each is compared with each, and many features of each are found."""
+"""Up to this number of photographs, all pairs are matched, with more features."""
 
 LARGEST = 300
-"""Features of a photograph that are compared, those of the largest width."""
+"""Number of the widest features that are compared."""
 # Lowe's ratio test.
 _RATIO = 0.8
 # Photographs whose products with one are in memory at a time.
 _AT_ONCE = 32
-# Fewer matches among the largest come by chance.
+# Fewer matches of the widest features occur by chance.
 _LEAST = 2
 
 
 class MostSimilar(NamedTuple):
-    """Each photograph with the `number` that look most like it, which their features tell."""
+    """Pairs of each photograph with the `number` most similar ones."""
 
     number: int
 
 
 def usual_choice(photographs: Sequence[Photograph]) -> str:
-    """The choice of pairs where nobody makes one: all of few, else neighbours, else those that look alike."""
+    """Default choice of pairs: all of few, else neighbours by position, else the most similar ones."""
     if len(photographs) <= FEW:
         return "exhaustive"
     return f"{'position' if all(p.gps for p in photographs) else 'similar'}:{_NEAREST}"
 
 
 def usual_count(photographs: int) -> int:
-    """Features of each of so many photographs, at most, where nobody says how many."""
+    """Default number of features of each of N photographs."""
     return OF_FEW if photographs <= FEW else FEATURES
 
 
 def photograph_pairs(
     photographs: Sequence[Photograph], choice: str = "exhaustive"
 ) -> list[tuple[int, int]] | MostSimilar:
-    """The pairs (first < second) of indices of photographs that `choice` names.
+    """Return the pairs (first < second) of indices of photographs that `choice` names.
 
-    `exhaustive`: all; for many photographs they are too many. `sequence:K`: each with the K that follow it in the order
-    given. `position:K`: each with the K nearest by the GPS positions of EXIF, heights left out.
-    `similar:K`: each with the K that look most like it, for `match_photographs` to find.
+    `exhaustive`: all. `sequence:K`: each with the next K in the given order. `position:K`: each with the K nearest by
+    the GPS positions of EXIF, in plan. `similar:K`: each with the K most similar ones (`match_photographs` selects
+    them).
 
-    Raises InputError for another choice, and for `position` where a photograph has no position.
+    Raises InputError for another choice, and for `position` if a photograph has no position.
     """
     name, _, number = choice.partition(":")
     if name == "exhaustive" and not number:
@@ -88,14 +87,14 @@ def photograph_pairs(
 
 
 def nearest_pairs(positions_m: Float[np.ndarray, "n axes"], count: int) -> list[tuple[int, int]]:
-    """The pairs (first < second) in which one is among the `count` nearest of the other."""
+    """Return the pairs (first < second) of which one is among the `count` nearest of the other."""
     n = len(positions_m)
     _, near = scipy.spatial.cKDTree(positions_m).query(positions_m, k=range(1, min(count + 1, n) + 1))
     return sorted({(min(k, j), max(k, j)) for k in range(n) for j in near[k].tolist() if j != k})
 
 
 def largest_of(features: SiftFeatures) -> UInt8[np.ndarray, "_ 128"]:
-    """The descriptors of the `LARGEST` widest features."""
+    """Descriptors of the `LARGEST` widest features."""
     width = features.sigma_mm[features.feature]
     return features.descriptors[np.sort(np.argsort(-width, kind="stable")[:LARGEST])]
 
@@ -103,9 +102,9 @@ def largest_of(features: SiftFeatures) -> UInt8[np.ndarray, "_ 128"]:
 def most_similar(
     largest: Sequence[UInt8[np.ndarray, "_ 128"]], count: int, progress: Callable[[int, int], None]
 ) -> list[tuple[int, int]]:
-    """The pairs (first < second) in which one is among the `count` photographs that the other matches most.
+    """Return the pairs (first < second) of which one is among the `count` photographs most similar to the other.
 
-    `largest` are descriptors of each photograph, `LARGEST` or fewer of its widest features.
+    `largest` are the descriptors of up to `LARGEST` of the widest features of each photograph.
     """
     n = len(largest)
     votes = np.zeros((n, n), int)
@@ -120,10 +119,10 @@ def most_similar(
 
 
 def _votes(one: UInt8[np.ndarray, "_ 128"], others: Sequence[UInt8[np.ndarray, "_ 128"]]) -> Int[np.ndarray, "others"]:
-    """How many of `one` have in each of `others` a nearest descriptor that is clearly nearer than the second."""
+    """Number of descriptors of `one` that pass the ratio test in each of `others`."""
     if len(one) == 0:
         return np.zeros(len(others), int)
-    # What is missing to LARGEST is as far as can be.
+    # Padding up to LARGEST is infinitely far.
     b = np.zeros((len(others), LARGEST, 128), np.float32)
     square = np.full((len(others), LARGEST), np.inf, np.float32)
     for k, other in enumerate(others):

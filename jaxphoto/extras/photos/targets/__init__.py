@@ -1,4 +1,4 @@
-"""Targets of calibration boards in photographs: found by OpenCV, placed by least squares, with standard deviations."""
+"""Targets of calibration boards in photographs: detected by OpenCV, measured by least squares."""
 
 from jaxphoto.extras.photos.targets.board_description import SYNTAX, read_board
 from jaxphoto.extras.photos.targets.chessboard import Chessboard

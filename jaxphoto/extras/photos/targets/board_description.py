@@ -24,7 +24,7 @@ SYNTAX = {
     "charuco": "charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50",
     "targets": "targets:FILE.csv",
 }
-"""Each kind of board as one writes it."""
+"""Syntax of each kind of board."""
 
 _MADE: dict[str, tuple[Callable[..., Pattern], tuple[str, ...], int]] = {
     "chessboard": (Chessboard, ("square_mm",), 3),
@@ -35,10 +35,7 @@ _MADE: dict[str, tuple[Callable[..., Pattern], tuple[str, ...], int]] = {
 
 
 def read_board(description: str) -> Pattern:
-    """The board that a line describes; lengths in millimetres, inside in metres.
-
-    Raises InputError, with the syntax, for what describes none.
-    """
+    """Create the board of a one-line description (mm). Raises InputError, with the syntax, for an invalid one."""
     kind, _, rest = description.partition(":")
     if kind not in SYNTAX:
         raise InputError(

@@ -1,22 +1,17 @@
-"""Centres of circles to a part of a pixel: an ellipse fitted to the grey values about its edge by least squares.
+"""Circular targets: centres by least squares, asymmetric grids, and fields of coded arrangement.
 
     grey = m + g . d + a (1 - erf(e / s)) / 2,   rho = |L' d|,   e = rho (rho - 1) / |L L' d|,   d = pixel - centre
 
-e is the distance from the ellipse rho = 1 to first order. The ten unknowns (centre, the three of L, ln s, a, m, g) are
-fitted by `patches`. The centre is that of the ellipse, which is not the image of the circle's centre: see
+e is the distance from the ellipse rho = 1 to first order. The ten unknowns (centre, three of L, ln s, a, m, g) are
+fitted by `patches`. The centre of the ellipse is not the image of the circle's centre: see `eccentricity` in
 `jaxphoto.procedures.calibration.target_calibration`.
 
-Asymmetric grids of circles: every second row is shifted by half the distance of the circles in it.
-
-Single circular targets with known coordinates on a plane, told apart by their arrangement and size.
-
-A circle of known size and its image give the affine map between board and picture there, but for a rotation; the
-direction to one neighbour gives that, and the other neighbours say whether it is right. The guesses that most agree
-with become homographies over all targets. Of those with most targets the one that fits best wins, unless another
-labelling does as well: then the arrangement is the same when it is turned, and no picture can tell how it is seen.
-
-Which side of its plane a field is seen from its coordinates do not say (a floor, a ceiling, a wall), so that both are
-tried; of an arrangement that is its own mirror image the side is that of Z, unless the plane stands upright.
+Single targets with known coordinates on a plane are identified by arrangement and size. A circle of known size and its
+image give the affine map between board and picture up to a rotation; the direction to one neighbour gives the rotation,
+and the other neighbours test it. The best hypotheses are extended to homographies over all targets. The best fit among
+those of most targets is the result, unless another labelling fits as well: the arrangement is then symmetric. The side
+from which a field is seen is unknown (floor, ceiling, wall): both are tried; for a mirror-symmetric arrangement it is
+that of Z, except for vertical planes.
 """
 
 from pathlib import Path
@@ -36,35 +31,34 @@ from jaxphoto.extras.photos.targets.pattern import FoundBoard, Pattern
 from jaxphoto.io.text_tables import read_csv
 from jaxphoto.procedures.calibration import Board
 
-# Pixels on both sides of the edge that are looked at, and how many of one target at most.
+# Half width (px) of the ring about the edge, and the maximum number of pixels of one target.
 _RING, _MOST = 4.0, 1024
 _BLUR = 1.0
-# Area of an ellipse over that of the ellipse with its moments: by how much a blob may differ, its smallest size in
-# pixels and how long it may be.
+# Tolerance of the area of a blob relative to the ellipse of its moments, its minimum area (px) and maximum elongation.
 _SHAPE, _LEAST_AREA, _ELONGATION = 0.06, 20, 6.0
-# Of its own smaller half axis: how far a fitted centre may be from that of the blob.
+# Maximum shift of a fitted centre over the smaller half axis.
 _MOVED = 0.5
 
 
 class Blobs(NamedTuple):
-    """Dark or bright spots that have the shape of an ellipse, as OpenCV counts pixels."""
+    """Elliptic spots of a picture, dark or bright; the origin is the centre of the upper-left pixel."""
 
     column_row: Float[np.ndarray, "n 2"]
     shape: Float[np.ndarray, "n 2 2"]
     """Q of the ellipse d' Q d = 1."""
     dark: Bool[np.ndarray, "n"]
-    """Whether it is darker than what is around it."""
+    """True if the spot is darker than its surroundings."""
 
     def take(self, chosen: np.ndarray) -> "Blobs":
-        """The spots that `chosen` (an index or a mask) names."""
+        """Select spots by index or mask."""
         return Blobs(self.column_row[chosen], self.shape[chosen], self.dark[chosen])
 
 
 def elliptic_blobs(picture: np.ndarray, half_axes: tuple[np.ndarray, float] | None = None) -> Blobs:
-    """All elliptic spots of a picture, by adaptive thresholds of several widths; none touches the border.
+    """Detect all elliptic spots of a picture, by adaptive thresholds of several widths; none touches the border.
 
-    Of several about one place the one that is most like an ellipse; of those alone whose `half_axes` (the greater
-    first, px) are these up to a factor, where they are given: a bright disc on a dark one is not lost beside it.
+    Of several at one place the most elliptic one is kept. With `half_axes` (larger first, px, and a factor), only spots
+    of that size within the factor compete: a bright disc on a dark one is then found.
     """
     smooth = cv2.GaussianBlur(picture, (3, 3), 0)
     height, width = picture.shape
@@ -91,7 +85,7 @@ def _of_size(shape: np.ndarray, half_axes: np.ndarray, factor: float) -> bool:
 
 
 def _is_dark(picture: np.ndarray, centre: np.ndarray, shape: np.ndarray) -> bool:
-    """Whether a spot is darker at half its radius than at one and a half."""
+    """True if a spot is darker at half its radius than at one and a half."""
     angle = np.arange(16) * np.pi / 8
     to_edge = np.linalg.inv(np.linalg.cholesky(shape)).T @ np.stack([np.cos(angle), np.sin(angle)])
     high, wide = picture.shape
@@ -103,7 +97,7 @@ def _is_dark(picture: np.ndarray, centre: np.ndarray, shape: np.ndarray) -> bool
 
 
 def _components(mask: np.ndarray):
-    """Centre, Q and misfit of each connected spot of a mask that is an ellipse."""
+    """Centre, Q and misfit of each elliptic connected component of a mask."""
     height, width = mask.shape
     contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     for contour in contours:
@@ -129,7 +123,7 @@ def _components(mask: np.ndarray):
 
 
 def fit_discs(picture: np.ndarray, blobs: Blobs) -> TargetPlaces:
-    """Centres of ellipses with their standard deviations, from where and what `blobs` says they are about."""
+    """Measure the centres of ellipses, with standard deviations, from `blobs`."""
     n = len(blobs.column_row)
     if not n:
         return TargetPlaces(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool))
@@ -151,12 +145,12 @@ def fit_discs(picture: np.ndarray, blobs: Blobs) -> TargetPlaces:
 
 
 def _spread(grey, used) -> Float[np.ndarray, "n"]:
-    """How much brighter the bright pixels are than the dark ones."""
+    """Range of the grey values of each patch (10 % to 90 % quantile)."""
     return np.array([np.subtract(*np.percentile(g[u], [90, 10])) for g, u in zip(grey, used, strict=True)])
 
 
 def _rings(picture: np.ndarray, blobs: Blobs) -> Patches:
-    """Pixels near the edge of each ellipse, as `windows` gives them: all of them, or every so many of large ones."""
+    """Pixels near the edge of each ellipse, thinned for large ones."""
     height, width = picture.shape
     places, greys = [], []
     for centre, shape in zip(blobs.column_row, blobs.shape, strict=True):
@@ -183,7 +177,7 @@ def _disc(parameters, pixel):
     column, row, l1, l2, l3, blur, contrast, mean, in_column, in_row = parameters
     x, y = pixel[0] - column, pixel[1] - row
     u, v = l1 * x + l2 * y, l3 * y
-    # Q d = L (L' d); the root's derivative at the very centre is not wanted there, where e is far from zero anyway.
+    # Q d = L (L' d); 1e-12 keeps the derivative finite at the centre, where e is far from zero.
     rho = jnp.sqrt(u * u + v * v + 1e-12)
     slope = jnp.sqrt((l1 * u) ** 2 + (l2 * u + l3 * v) ** 2 + 1e-12)
     distance = rho * (rho - 1) / slope
@@ -196,18 +190,18 @@ def _discs(start: Float[Array, "n 10"], pixels: Float[Array, "n m 2"], grey, use
     return fits(_disc, start, pixels, grey, used)
 
 
-# How far apart neighbouring spots are drawn, and the longest side of the drawing.
+# Distance (px) of neighbouring spots in the drawing, and its longest side.
 _APART_PX, _LONGEST_PX = 60, 6000
-# Bits of a part of a pixel: on whole pixels some grids are no longer seen as one.
+# Fractional bits of drawn coordinates: on whole pixels some grids are not detected.
 _SHIFT = 4
-# Of the distance to a neighbour in a slanting line: by how much it may differ, and how many spots are looked at for it.
+# Relative tolerance of the distance of diagonal neighbours, and the number of spots that are tested for each.
 _OFF_SPACING, _NEAREST = 0.35, 24
 
 
 class CircleGrid(Pattern):
-    """`columns` circles in each of `rows` rows that are `spacing_m` apart; in a row they are twice as far apart.
+    """Asymmetric grid of `columns` circles in each of `rows` rows, `spacing_m` apart; twice that apart in a row.
 
-    Rows and columns are counted as OpenCV's asymmetric grid counts them (4x11 is the usual one).
+    Rows and columns are counted as in OpenCV's asymmetric grid (4x11 is the usual one).
     """
 
     def __init__(self, columns: int, rows: int, spacing_m: float, diameter_m: float) -> None:
@@ -222,7 +216,7 @@ class CircleGrid(Pattern):
         self.board = Board("asymmetric circles", ids, xyz, np.full(len(ids), diameter_m))
 
     def find(self, picture: np.ndarray) -> FoundBoard | None:
-        """The circles of the grid, in rows; None where it is not found, and without those that have no clear edge."""
+        """The circles of the grid by rows; None if it is not found; without circles that have no clear edge."""
         blobs = elliptic_blobs(picture)
         for dark in (True, False):
             own = self._like_the_grid(blobs.take(blobs.dark == dark))
@@ -242,10 +236,9 @@ class CircleGrid(Pattern):
         return disc_reflectance(self.board, xy_m)
 
     def _like_the_grid(self, blobs: Blobs) -> Blobs:
-        """The largest web of spots each as far from the next, in radii of both, as neighbours in a slanting line.
+        """Largest connected set of spots whose distances, in radii, are those of diagonal neighbours of the grid.
 
-        Measured along the axes of the ellipses that does not depend on how the grid is seen. Letters, leaves and other
-        round things go; among many of them the search for the grid would find none.
+        In units of the ellipses distances do not depend on the view. OpenCV fails if many other round things are left.
         """
         n = len(blobs.column_row)
         if n < 2:
@@ -266,19 +259,19 @@ class CircleGrid(Pattern):
         along, down = centres[self.columns - 1] - centres[0], centres[2 * self.columns] - centres[0]
         if along[0] * down[1] - along[1] * down[0] < 0:
             if self.rows % 2 == 0:
-                return None  # seen as in a mirror, which such a grid cannot be
+                return None  # a mirror image is impossible
             centres = centres.reshape(self.rows, self.columns, 2)[::-1].reshape(-1, 2)
         which = scipy.spatial.cKDTree(blobs.column_row).query(centres)[1]
         d = centres - blobs.column_row[which]
-        # What OpenCV counts as a circle may be no ellipse here: cut off, or in half a shadow.
+        # A circle of OpenCV may be no ellipse here: occluded, or half in shadow.
         same = np.einsum("ni,nij,nj->n", d, blobs.shape[which], d) < 1
         return FoundBoard(np.flatnonzero(same), fit_discs(picture, blobs.take(which[same])))
 
 
 def _drawing(places: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, float, Float[np.ndarray, "2"]]:
-    """A clean picture of spots at `places`, its scale and the place of its corner: `drawn = (place - corner) * scale`.
+    """Clean picture of spots at `places`, its scale and corner: `drawn = (place - corner) * scale`.
 
-    OpenCV's search for spots wants them evenly lit, of some size and apart.
+    OpenCV's search needs evenly lit, separated spots of sufficient size.
     """
     distance = scipy.spatial.cKDTree(places).query(places, k=2)[0][:, 1]
     scale = _APART_PX / float(np.median(distance))
@@ -293,7 +286,7 @@ def _drawing(places: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, float, Float
 
 
 def disc_reflectance(board: Board, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-    """Black where a place lies in one of the board's circles, white elsewhere."""
+    """Black inside the circles of the board, white elsewhere."""
     black = np.zeros(len(xy_m), bool)
     for centre, diameter in zip(board.xyz_m[:, :2], board.diameter_m, strict=True):
         black |= np.sum((xy_m - centre) ** 2, axis=1) < (diameter / 2) ** 2
@@ -302,19 +295,20 @@ def disc_reflectance(board: Board, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.n
 
 _LEAST = 6
 _NEIGHBOURS = 8
-# Of the distance between neighbours: what a guess, and what a homography of a distorted picture, may be off.
+# Tolerances over the distance of neighbours: of a hypothesis, and of a homography of a distorted picture.
 _OFF, _NEAR = 0.25, 0.3
 _GUESSES = 40
-# Another labelling is as good from this part of the number of targets on, and up to this multiple of the misfit.
+# A labelling competes with at least this fraction of the largest number of targets, and up to this multiple of the
+# misfit.
 _AS_GOOD, _AS_NEAR = 0.8, 2.0
-# Z of the normal of a plane that stands upright.
+# Z of the normal of a vertical plane.
 _UPRIGHT = 0.1
 
 
 class CircularTargets(Pattern):
     """Dark or bright circles on a plane, from a CSV file: point, X_mm, Y_mm, Z_mm, diameter_mm.
 
-    Raises InputError for a file that cannot be read as that, for fewer than six targets, and where no plane holds them.
+    Raises InputError for an invalid file, fewer than six targets, and targets that are not coplanar.
     """
 
     def __init__(self, path: Path) -> None:
@@ -340,7 +334,7 @@ class CircularTargets(Pattern):
         self._upright = bool(abs(axes[2, 2]) < _UPRIGHT)
 
     def find(self, picture: np.ndarray) -> FoundBoard | None:
-        """The targets that are seen; None where their arrangement is not found, or found in several ways."""
+        """The visible targets; None if their arrangement is not found, or ambiguous."""
         blobs = elliptic_blobs(picture)
         for dark in (True, False):
             own = blobs.take(blobs.dark == dark)
@@ -355,14 +349,14 @@ class CircularTargets(Pattern):
 
 
 class _Labelling(NamedTuple):
-    """(target, blob) pairs, the RMS (px) by which a homography misses them, and the side of the plane, 1 or -1."""
+    """Pairs (target, blob), the RMS misfit (px) of their homography, and the side of the plane, 1 or -1."""
 
     pairs: Int[np.ndarray, "pairs 2"]
     misfit: float
     side: int
 
     def agrees(self, other: "_Labelling") -> bool:
-        """Whether most of these pairs are the other's, too."""
+        """True if most of these pairs are in `other`, too."""
         label = dict(other.pairs[:, ::-1].tolist())
         same = sum(label.get(blob) == target for target, blob in self.pairs.tolist())
         return self.side == other.side and same >= 0.5 * len(self.pairs)
@@ -371,9 +365,9 @@ class _Labelling(NamedTuple):
 def identified(
     flat: Float[np.ndarray, "targets 2"], radius: Float[np.ndarray, "targets"], blobs: Blobs, upright: bool = False
 ) -> Int[np.ndarray, "pairs 2"] | None:
-    """(target, blob) of those that are each other's, from places in the plane of the field; None if not told.
+    """Identify targets in the plane of the field: pairs (target, blob), or None if ambiguous.
 
-    Y is up where the field is seen from its front. Of an `upright` field nobody knows which side that is.
+    Y is up if the field is seen from its front; the front of an `upright` field is unknown.
     """
     if len(blobs.column_row) < _LEAST:
         return None
@@ -389,7 +383,7 @@ def identified(
 
 
 def _best(found: list[_Labelling]) -> _Labelling | None:
-    """The labelling that fits best among those of most targets; None where another one is as good."""
+    """The best fit among the labellings of most targets; None if another one is as good."""
     most = max((len(one.pairs) for one in found), default=0)
     able = [one for one in found if len(one.pairs) >= _AS_GOOD * most]
     best = min(able, key=lambda one: one.misfit, default=None)
@@ -404,9 +398,9 @@ def _nearest(places: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n k"]:
 
 
 def _guesses(down, radius, blobs) -> list[np.ndarray]:
-    """Lists of pairs (target, blob): a target with those of its neighbours that agree; most first."""
+    """Hypotheses, as lists of pairs (target, blob): a target and its consistent neighbours; longest first."""
     near_target, near_blob = _nearest(down), _nearest(blobs.column_row)
-    # Neighbours as seen from a target, in radii and with circles made round: what is left is a rotation.
+    # Neighbours relative to a target, in radii, with ellipses transformed to circles: a rotation remains.
     w = (down[near_target] - down[:, None]) / radius[:, None, None]
     lower = np.linalg.cholesky(blobs.shape)
     u = np.einsum("bji,bkj->bki", lower, blobs.column_row[near_blob] - blobs.column_row[:, None])
@@ -430,7 +424,7 @@ def _guesses(down, radius, blobs) -> list[np.ndarray]:
 
 
 def _grown(flat, pairs, blobs) -> tuple[np.ndarray, float] | None:
-    """All pairs that a homography from a few leads to, and by how much it misses them; None where it leads nowhere."""
+    """Extend a hypothesis by homographies to all pairs, with their misfit; None if that fails."""
     spacing = np.linalg.norm(flat[_nearest(flat)[:, 0]] - flat, axis=1)
     for _ in range(4):
         if len(np.unique(pairs[:, 1])) < len(pairs) or len(pairs) < 4:
@@ -447,7 +441,7 @@ def _grown(flat, pairs, blobs) -> tuple[np.ndarray, float] | None:
         pairs = np.column_stack([np.flatnonzero(good), blob[good]])
     if len(pairs) < _LEAST:
         return None
-    # Of a homography of these pairs, not of those that led to them.
+    # Homography of the final pairs.
     h, _ = cv2.findHomography(flat[pairs[:, 0]], blobs.column_row[pairs[:, 1]])
     if h is None:
         return None

@@ -1,4 +1,4 @@
-"""Boards of ArUco markers, and ChArUco boards: chessboards with a marker in each white square. Any part may be seen."""
+"""Boards of ArUco markers, and ChArUco boards: chessboards with a marker in each white square. Any part may be visible."""
 
 from typing import NamedTuple
 
@@ -14,13 +14,13 @@ from jaxphoto.procedures.calibration import Board
 DICTIONARIES: tuple[str, ...] = tuple(
     sorted(name.removeprefix("DICT_") for name in dir(cv2.aruco) if name.startswith("DICT_") and name.isupper())
 )
-"""OpenCV's dictionaries of markers, without DICT_."""
-# Of the width of what is beside a corner: how far a window reaches.
+"""Names of OpenCV's marker dictionaries, without DICT_."""
+# Radius of a window over the width of the cells beside a corner.
 _PART = 0.8
 
 
 class ArucoGrid(Pattern):
-    """`columns` x `rows` markers of `marker_m`, `gap_m` apart, numbered in rows from 0; each has four targets."""
+    """`columns` x `rows` markers of `marker_m`, `gap_m` apart, numbered by rows from 0; targets are their corners."""
 
     def __init__(self, columns: int, rows: int, marker_m: float, gap_m: float, dictionary: str) -> None:
         self._dictionary = _dictionary(dictionary, columns * rows)
@@ -33,7 +33,7 @@ class ArucoGrid(Pattern):
         self.board = Board("ArUco markers", ids, np.column_stack([xy, np.zeros(len(xy))]), np.zeros(len(xy)))
 
     def find(self, picture: np.ndarray) -> FoundBoard | None:
-        """The corners of all markers of the board that are seen; None where there is none."""
+        """The corners of all visible markers of the board; None if there is none."""
         found = found_markers(picture, self._dictionary, self.gap_m / self.marker_m)
         own = (found.number < self.columns * self.rows) & (np.bincount(found.number)[found.number] == 1)
         if not own.any():
@@ -56,11 +56,11 @@ class FoundMarkers(NamedTuple):
 
     number: Int[np.ndarray, "n"]
     corners: TargetPlaces
-    """Four of each, one marker after the other."""
+    """Four of each marker."""
 
 
 def found_markers(picture: np.ndarray, dictionary, margin: float) -> FoundMarkers:
-    """All markers of a dictionary that a picture shows, with a bright `margin` (in sides of a marker) around each."""
+    """Detect all markers of a dictionary, with a bright `margin` (in sides of a marker) around each."""
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)
     if ids is None:
         return FoundMarkers(np.zeros(0, int), TargetPlaces(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool)))
@@ -87,14 +87,14 @@ class CharucoBoard(Pattern):
         self.board = Board("ChArUco", ids, xyz + np.array([square_m, -square_m, 0.0]), np.zeros(len(ids)))
 
     def find(self, picture: np.ndarray) -> FoundBoard | None:
-        """The inner corners between markers that are seen; None where there are no four, or all lie in one row."""
+        """The visible inner corners between markers; None for fewer than four, or for one row."""
         corners, ids, *_ = cv2.aruco.CharucoDetector(self._drawn).detectBoard(picture)
         if ids is None or len(ids) < 4:
             return None
         near, point = np.asarray(corners, float).reshape(-1, 2), np.asarray(ids).ravel()
         plane = self.board.xyz_m[point, :2]
         if np.ptp(plane, axis=0).min() == 0:
-            return None  # which way the other edges run, and where the camera is, a row does not tell
+            return None  # collinear corners determine no homography
         homography, _ = cv2.findHomography(plane, near)
         if homography is None:
             return None
@@ -102,7 +102,7 @@ class CharucoBoard(Pattern):
         seen = cv2.perspectiveTransform(ends.reshape(1, -1, 2), homography).reshape(-1, 3, 2)
         sides = seen[:, 1:] - seen[:, :1]
         length = np.linalg.norm(sides, axis=2, keepdims=True)
-        # The nearest marker begins where its margin ends, both ways: farther by the diagonal.
+        # The nearest marker begins behind its margin, in both directions: on the diagonal.
         margin = (1 - self.marker_m / self.square_m) / 2 * np.sqrt(2)
         reach = _PART * margin * length.min(axis=(1, 2))
         return FoundBoard(point, fit_crossings(picture, near, sides / length, reach))
@@ -130,7 +130,7 @@ def _dictionary(name: str, needed: int):
 
 
 def _marker_reflectance(dictionary, number, u, v, inside) -> Float[np.ndarray, "n"]:
-    """Of marker `number` at (u, v) from its upper left corner, in sides; white outside of it."""
+    """Reflectance of marker `number` at (u, v) from its upper-left corner, in sides; white outside."""
     cells = dictionary.markerSize + 2
     drawn = np.stack([cv2.aruco.generateImageMarker(dictionary, k, cells) > 0 for k in range(number.max() + 1)])
     inside = inside & (u >= 0) & (u < 1) & (v >= 0) & (v < 1)

@@ -1,10 +1,10 @@
-"""Single targets on the ground in a window of a photograph: circles, markers with numbers, and crosses of four squares.
+"""Targets on the ground in a window of a photograph: circles, numbered markers, and crosses of four squares.
 
-    circle:diameter_mm=300              bright or dark, told by size and shape
+    circle:diameter_mm=300              bright or dark, identified by size and shape
     aruco:dictionary=4X4_50             the number is the last one in the name of the point: GCP7 is marker 7
-    cross:side_mm=600                   two black and two white squares that meet, together so wide
+    cross:side_mm=600                   two black and two white squares that meet, of this width together
 
-How large a target is in the picture follows from the derivative of the projection there, if it lies flat.
+The size in the picture follows from the derivative of the projection, for a horizontal target.
 """
 
 import abc
@@ -25,33 +25,33 @@ SYNTAX = {
     "aruco": "aruco:dictionary=4X4_50",
     "cross": "cross:side_mm=600",
 }
-# Of the size that a target should have: the factor by which what is seen may differ.
+# Tolerance (factor) of the size.
 _LIKE = 1.5
-# The smallest target in pixels that can be told from noise.
+# Diameter or side (px) of the smallest target that is distinguished from noise.
 _SMALLEST_PX = 5.0
-# A cross: angles around its middle, how far out (of its side), how alike opposite and how unlike neighbouring squares.
+# Cross: samples of a circle, its radius over the side, minimum correlation of opposite and maximum of adjacent squares.
 _ANGLES, _OUT, _OPPOSITE, _BESIDE = 72, 0.3, 0.7, -0.5
 _MOST = 6
 
 
 class GroundTarget(abc.ABC):
-    """A kind of target, one at each point."""
+    """Kind of target."""
 
     named = False
-    """Whether it tells which point it is."""
+    """True if a target identifies its point."""
     side_m = 0.0
 
     @abc.abstractmethod
     def find(self, window: np.ndarray, point: str, px_per_m: Float[np.ndarray, "2 2"]) -> TargetPlaces:
-        """What may be the target of `point` in a window, as OpenCV counts its pixels."""
+        """Candidates for the target of `point` in a window; the origin is the centre of the upper-left pixel."""
 
     def reach_px(self, px_per_m: Float[np.ndarray, "2 2"]) -> float:
-        """How far about a target the window has to go."""
+        """Half the width (px) of a window about the target."""
         return 8.0 * self.side_m * float(np.linalg.norm(px_per_m, 2)) + 8.0
 
 
 class Circle(GroundTarget):
-    """A circle of `diameter_m`."""
+    """Circle of `diameter_m`."""
 
     def __init__(self, diameter_m: float) -> None:
         self.side_m = diameter_m
@@ -65,7 +65,7 @@ class Circle(GroundTarget):
 
 
 class Marker(GroundTarget):
-    """A marker of one of OpenCV's dictionaries."""
+    """Marker of one of OpenCV's dictionaries."""
 
     named = True
 
@@ -73,7 +73,7 @@ class Marker(GroundTarget):
         self.dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))
 
     def find(self, window: np.ndarray, point: str, px_per_m: Float[np.ndarray, "2 2"]) -> TargetPlaces:
-        """The middle of the marker of the point's number, where its diagonals meet."""
+        """The intersection of the diagonals of the marker with the number of the point."""
         digits = re.findall(r"\d+", point)
         found = found_markers(window, self.dictionary, 1.0)
         own = np.flatnonzero(found.number == int(digits[-1][:9])) if digits else np.zeros(0, int)
@@ -88,7 +88,7 @@ class Marker(GroundTarget):
         return TargetPlaces(np.array(middle).reshape(-1, 2), np.array(sigma).reshape(-1, 2), np.ones(len(middle), bool))
 
     def reach_px(self, px_per_m: Float[np.ndarray, "2 2"]) -> float:
-        """Its size is not told; that of a large one."""
+        """Half the width for a large marker: the size is unknown."""
         return 2.0 * float(np.linalg.norm(px_per_m, 2)) + 20.0
 
 
@@ -99,7 +99,7 @@ class Cross(GroundTarget):
         self.side_m = side_m
 
     def find(self, window: np.ndarray, point: str, px_per_m: Float[np.ndarray, "2 2"]) -> TargetPlaces:
-        """Places around which grey values change sides four times, as they should."""
+        """Saddle points with four edges around them."""
         side = float(np.sqrt(abs(np.linalg.det(px_per_m)))) * self.side_m
         if side < _SMALLEST_PX:
             return _nothing()
@@ -124,7 +124,7 @@ class Cross(GroundTarget):
 
 
 def read_target(description: str) -> GroundTarget:
-    """The target that a line describes. Raises InputError, with the syntax, for what describes none."""
+    """Create the target of a one-line description. Raises InputError, with the syntax, for an invalid one."""
     kind, _, rest = description.partition(":")
     name, _, value = rest.partition("=")
     if kind not in SYNTAX:
@@ -142,7 +142,7 @@ def read_target(description: str) -> GroundTarget:
 
 
 def _edges(grey: np.ndarray, place: np.ndarray, radius: float) -> Float[np.ndarray, "2 2"] | None:
-    """Unit directions of the two edges of a crossing at a place; None where there is none."""
+    """Unit directions of the two edges of a crossing at a place; None if there is none."""
     angle = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
     around = (place + radius * np.column_stack([np.cos(angle), np.sin(angle)])).astype(np.float32)
     high, wide = grey.shape
@@ -160,7 +160,7 @@ def _edges(grey: np.ndarray, place: np.ndarray, radius: float) -> Float[np.ndarr
         return None
     part = value[change] / (value[change] - after[change])
     at = angle[change] + part * 2 * np.pi / _ANGLES
-    # Those opposite are one edge.
+    # Opposite changes are one edge.
     middle = (at[:2] + at[2:] - np.pi) / 2
     return np.column_stack([np.cos(middle), np.sin(middle)])
 

@@ -102,19 +102,19 @@ def windows(
     return Patches(pixels, picture[row, column].astype(float), used)
 
 
-# Of pixels: the blur to start from, and how far a corner may be from where it was looked for.
+# Initial blur (px), and maximum distance of a corner from its initial place.
 _BLUR, _FAR = 1.0, 2.0
-# A window reaches no farther than this, or edges that a lens bends count as straight.
+# Bounds of the radius of a window: a lens bends longer edges.
 _LARGEST_PX, _SMALLEST_PX = 7.0, 2.9
 
 
 class TargetPlaces(NamedTuple):
-    """Targets in a picture as OpenCV counts (the centre of the upper-left pixel is (0, 0)), standard deviations."""
+    """Targets in a picture and standard deviations; the origin is the centre of the upper-left pixel (OpenCV)."""
 
     column_row: Float[np.ndarray, "n 2"]
     sigma_px: Float[np.ndarray, "n 2"]
     found: Bool[np.ndarray, "n"]
-    """False where nothing like the target is in the picture there."""
+    """False if the picture shows no such target there."""
 
 
 def fit_crossings(
@@ -123,8 +123,8 @@ def fit_crossings(
     edges: Float[np.ndarray, "n 2 2"],
     reach_px: Float[np.ndarray, "n"],
 ) -> TargetPlaces:
-    """Corners where four squares meet. `edges` are unit directions along the two edges at each; `reach_px` says how far
-    from the corner nothing else is in the picture.
+    """Measure corners where four squares meet; `edges` are unit directions along the two edges of each, `reach_px` is
+    the distance within which the picture shows nothing else.
     """
     return _fit(_crossings, np.multiply, picture, near, edges, reach_px)
 
@@ -135,13 +135,13 @@ def fit_square_corners(
     edges: Float[np.ndarray, "n 2 2"],
     reach_px: Float[np.ndarray, "n"],
 ) -> TargetPlaces:
-    """Corners of single squares; `edges` as in `fit_crossings`, from the corner along the square's own sides."""
+    """Measure corners of single squares; `edges` as in `fit_crossings`, from the corner along the sides of the square."""
     return _fit(_square_corners, lambda one, other: (1 + one) * (1 + other) / 4, picture, near, edges, reach_px)
 
 
 def _fit(program, shape, picture, near, edges, reach_px) -> TargetPlaces:
     radius = np.clip(reach_px, _SMALLEST_PX, _LARGEST_PX)
-    for _ in range(2):  # once more about the corner that was found
+    for _ in range(2):  # repeated about the measured corner
         patches = windows(picture, near, radius)
         fit = fit_patches(program, _start(shape, patches, edges), patches)
         moved = fit.parameters[:, :2]
@@ -154,10 +154,10 @@ def _fit(program, shape, picture, near, edges, reach_px) -> TargetPlaces:
 
 
 def _start(shape, patches, edges):
-    """Corner in the middle, edges as given; contrast, brightness and its change by linear least squares."""
+    """Initial parameters: corner in the middle, edges as given, brightness by linear least squares."""
     pixels, grey, used = patches
     across = np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
-    # The normal of each edge points to the other edge, so that a single square lies on the positive side of both.
+    # The normal of each edge points to the other edge: a single square is on the positive side of both.
     side = np.sign(np.sum(across * edges[:, ::-1], axis=2))
     across = across * np.where(side == 0, 1.0, side)[:, :, None]
     angle = np.arctan2(across[..., 1], across[..., 0])
@@ -172,7 +172,7 @@ def _start(shape, patches, edges):
 
 def _edges(parameters, pixel):
     x, y = pixel[0] - parameters[0], pixel[1] - parameters[1]
-    # A pixel sums over its own square, whose variance is a twelfth: no edge is sharper, and none can be missed.
+    # A pixel integrates over its square (variance 1/12), which bounds the sharpness of an edge.
     width = jnp.sqrt(2 / 12 + jnp.exp(2 * parameters[4]))
     first, second = (
         jax.scipy.special.erf((x * jnp.cos(t) + y * jnp.sin(t)) / width) for t in (parameters[2], parameters[3])

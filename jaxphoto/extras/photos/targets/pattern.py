@@ -1,9 +1,4 @@
-"""What every kind of calibration board is: targets with known coordinates, and a way to find them in a picture.
-
-The targets of a board in many photographs.
-
-Photographs of a flat board as a known camera would take them: for tests, examples and planning.
-"""
+"""Calibration boards: targets with known coordinates, their detection in photographs, and rendered photographs."""
 
 import abc
 import math
@@ -26,49 +21,49 @@ from jaxphoto.procedures.calibration import Board, Detection
 
 
 class FoundBoard(NamedTuple):
-    """What a picture shows of a board."""
+    """Targets of a board in a picture."""
 
     point: Int[np.ndarray, "n"]
-    """Index into the board's points."""
+    """Index of the points of the board."""
     places: TargetPlaces
 
 
 class Pattern(abc.ABC):
-    """A kind of calibration board; `board` has the coordinates of its targets."""
+    """Kind of calibration board; `board` has the coordinates of its targets."""
 
     board: Board
 
     @abc.abstractmethod
     def find(self, picture: np.ndarray) -> FoundBoard | None:
-        """The board's targets in grey values (rows, columns) of 0 to 255; None where the board is not found."""
+        """Detect the targets in grey values (rows, columns) of 0 to 255; None if the board is not found."""
 
     @abc.abstractmethod
     def reflectance(self, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """What is printed at places of the board (m, in the frame of `board`): 0 black, 1 white."""
+        """Reflectance at places of the board (m, in the frame of `board`): 0 black, 1 white."""
 
     def hint(self, pictures: Sequence[np.ndarray]) -> str | None:
-        """What other board pictures without this one seem to show, where that can be said."""
+        """Describe what pictures without this board show instead, if anything."""
         return None
 
 
-# Photographs without the board that are asked for another one.
+# Maximum number of photographs that are searched for another board.
 _LOOKED_AT = 5
 
 
 class Targets(NamedTuple):
-    """What photographs show of a board."""
+    """Targets of a board in photographs."""
 
     detections: list[Detection]
     left_out: dict[str, str]
-    """Photographs in which the board was not found, by the name of the image, each with what was seen instead."""
+    """Photographs without the board, by image name, and why."""
 
 
 def find_targets(
     photographs: Sequence[Photograph], pattern: Pattern, progress: Callable[[str], None] = lambda image: None
 ) -> Targets:
-    """Look for the board in every photograph, in the order given; `progress` is told the image that is looked at.
+    """Detect the board in all photographs; `progress` is called with each image name.
 
-    Raises InputError for a file that OpenCV cannot read, and where no photograph shows the board.
+    Raises InputError for a file that OpenCV cannot read, and if no photograph shows the board.
     """
     detections: list[Detection] = []
     left_out: dict[str, str] = {}
@@ -80,7 +75,7 @@ def find_targets(
             left_out[photograph.name] = "the board was not found"
             continue
         good, places = found.places.found, found.places
-        # OpenCV counts from the centre of the upper-left pixel, which is (0.5, 0.5) here.
+        # OpenCV's origin is the centre of the upper-left pixel, which is (0.5, 0.5) here.
         column_row = places.column_row[good] + 0.5
         detections.append(Detection(photograph.name, found.point[good], column_row, places.sigma_px[good]))
     if not detections:
@@ -108,11 +103,11 @@ def rendered(
     margin_m: float = 0.03,
     seed: int = 0,
 ) -> np.ndarray:
-    """Grey values (rows, columns) of 0 to 255 of the board, in the plane Z = 0 of its frame.
+    """Render a photograph of the board, in the plane Z = 0 of its frame: grey values (rows, columns) of 0 to 255.
 
-    Each pixel is the mean over `rays`, each traced through lens and plane; the lens blurs by a Gaussian of `blur_px`;
-    `noise` is the standard deviation of a grey value. The board ends `margin_m` beyond its outermost target; beyond is
-    grey.
+    Each pixel is the mean of `rays`, traced through lens and plane; the lens blurs by a Gaussian of `blur_px`; `noise`
+    is the standard deviation of a grey value. The board ends `margin_m` beyond its outermost target, and is surrounded
+    by grey.
     """
     column, row = np.meshgrid(np.arange(sensor.width_px), np.arange(sensor.height_px))
     corner = np.stack([column.ravel(), row.ravel()], axis=1)
@@ -130,7 +125,7 @@ def rendered(
         on = (along > 0) & np.all((place > low - margin_m) & (place < high + margin_m), axis=1)
         total += _BACKGROUND * ~on
         total[on] += pattern.reflectance(place[on])
-    # Neither black nor white is the end of the scale, so that noise is not cut off.
+    # Grey values from 30 to 225: noise is not clipped.
     grey = 30 + 195 * total.reshape(sensor.height_px, sensor.width_px) / rays
     grey = cv2.GaussianBlur(grey, (0, 0), blur_px) + noise * np.random.default_rng(seed).standard_normal(grey.shape)
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
