@@ -1,13 +1,14 @@
-"""Which model of the lens a calibration estimates, and which of its parameters.
+"""Distortion model, free parameters and initial values of a calibration: distortion from straightness, c from
+perspective.
 
-Where a calibration starts when nothing is known of the camera: distortion from straightness, c from perspective.
+1. Radial distortion, `ideal = measured (1 - k1 r^2 - k2 r^4)` about the image centre, for which the photographs of a
+flat board are best approximated by homographies (straight lines stay straight). Errors are measured in the plane of the
+board, so that a smaller image does not have smaller errors.
 
-1. Radial distortion, `ideal = measured (1 - k1 r^2 - k2 r^4)` about the image centre: that with which the photographs
-   of a flat board are best what a pinhole makes of a plane, a homography each (lines are straight). The errors are
-   those in the plane of the board, so that a smaller image is no better one.
-2. The principal distance from the homographies (Zhang, 2000): the images of the board's axes are at right angles and of
-   one length, `h1' W h2 = 0`, `h1' W h1 = h2' W h2` with W = diag(1, 1, c^2), by least squares over all photographs.
-3. The coefficients of any distortion model that come nearest to this radial distortion over the format.
+2. The principal distance from the homographies (Zhang, 2000): the images of the axes of the board are orthogonal and of
+equal length, `h1' W h2 = 0`, `h1' W h1 = h2' W h2` with W = diag(1, 1, c^2), by least squares over all photographs.
+
+3. The coefficients of any distortion model nearest to this radial distortion over the format.
 """
 
 from collections.abc import Sequence
@@ -38,9 +39,10 @@ _CENTRAL = ("c_mm", "xp_mm", "yp_mm")
 
 
 def distortion_model(name: str, sensor: Sensor, r0_mm: float = 0.0) -> AbstractDistortion:
-    """The model called `name` in block.toml, without distortion, with constants that fit the sensor (`plain`).
+    """Return the distortion model `name` of block.toml without distortion, with constants that fit the sensor
+    (`plain`).
 
-    Raises InputError for an unknown name, and for an R0 of another model than SMAC or one beyond the format.
+    Raises InputError for an unknown name, for R0 of another model than SMAC, and for R0 beyond the format.
     """
     kind, longer = AbstractDistortion.called(name), max(sensor.width_mm, sensor.height_mm)
     if kind is Smac:
@@ -53,11 +55,11 @@ def distortion_model(name: str, sensor: Sensor, r0_mm: float = 0.0) -> AbstractD
 
 
 def free_parameters(name: str, distortion: AbstractDistortion, wanted: Sequence[str] | None = None) -> tuple[str, ...]:
-    """The parameters to estimate, in the order of the model: `wanted` (c, xp, yp stand for c_mm, ...), or the usual.
+    """Return the parameters to estimate, in the order of the model: `wanted` (c, xp, yp stand for c_mm, ...), or the
+    default.
 
-    The usual are c, the principal point, and the coefficients that a board tells (`AbstractDistortion.usual`): for SMAC
-    and Brown K1-K3, P1, P2; affinity, rational and highest terms only where they are wanted. Raises
-    InputError for names that the model has not, and for a scale coefficient beside c.
+    The default is c, the principal point, and the coefficients that a board determines (`AbstractDistortion.usual`):
+    for SMAC and Brown K1-K3, P1, P2. Raises InputError for unknown names, and for a scale coefficient together with c.
     """
     names = parameter_names(InteriorOrientation(1.0, distortion=distortion))
     if wanted is None:
@@ -74,25 +76,25 @@ def free_parameters(name: str, distortion: AbstractDistortion, wanted: Sequence[
 
 # Points along each side of the format at which two distortions are compared.
 _SIDE = 15
-# Principal distances, over the diagonal of the format, that a photograph of a board can have.
+# Bounds of the principal distance over the diagonal of the format.
 _SHORTEST, _LONGEST = 0.15, 15.0
-# Of the typical mean square error of a homography: beyond, a view is no plane seen by this camera.
+# Limit of the mean square error of a homography over the median: beyond, a view is not a plane seen by this camera.
 _MISFIT = 25.0
-# Mean square errors of homographies, over the size of the board: of none that fits, and of measurements without noise.
+# Mean square errors of homographies over the size of the board: for an invalid lens, and the minimum.
 _FOLDED, _EXACT = 1e6, 1e-16
-# Of h1 and h2, what a view must be tilted by to tell c: below, all views are taken as square on.
+# Minimum tilt of a view (from h1 and h2) that determines c.
 _TILT = 1e-3
-# Of the largest singular value: below, points determine no homography, as those of one row and a single one beside it.
+# Minimum ratio of singular values for which points determine a homography.
 _DETERMINED = 1e-3
 
 
 def rough_interior(
     board: Board, rows: TargetRows, sensor: Sensor, known: InteriorOrientation | None = None
 ) -> InteriorOrientation:
-    """Where the calibration starts: from a flat board, else from what is `known`, else from resections with several c.
+    """Initial interior orientation: from a flat board, else `known`, else from resections with several c.
 
-    Of a board that is not flat, and of views square on, nothing is told by homographies: then c is that of `known`, or
-    the one of a few between half and three times the longer side with which resections leave least.
+    Homographies determine nothing for a board that is not flat, and no c for views without tilt: c is then that of
+    `known`, or that of seven between half and three times the longer side with the smallest resection errors.
     """
     plane = board.plane
     if plane is not None:
@@ -111,7 +113,7 @@ def rough_interior(
 
 
 def _resection_error(board: Board, rows: TargetRows, interior: InteriorOrientation) -> float:
-    """Median error (mm) of the resections of all photographs with an interior orientation."""
+    """Median error (mm) of the resections of all photographs."""
     exterior, why = resected(board, rows, interior)
     rows = rows.take(np.array([rows.images[k] not in why for k in rows.image], bool))
     if not len(rows.image):
@@ -124,16 +126,16 @@ def _resection_error(board: Board, rows: TargetRows, interior: InteriorOrientati
 def flat_start(
     views: Sequence[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]], sensor: Sensor
 ) -> tuple[InteriorOrientation, bool]:
-    """c, K1 and K2 (`Brown`) from views of flat boards: coordinates in the board (m) and measured ones (mm).
+    """Estimate c, K1 and K2 (`Brown`) from views of flat boards: board coordinates (m) and image coordinates (mm).
 
-    Views whose points lie on a line, or all but one of them, say nothing and are not looked at. The second value is
-    False where no view is tilted enough to tell c, which is then 1.2 times the longer side.
+    Views with collinear points, except for one, are skipped. The second value is False if no view has enough tilt to
+    determine c, which is then 1.2 times the longer side.
     """
     half = np.hypot(sensor.width_mm, sensor.height_mm) / 2
     views = [view for view in views if _determines(view[0])]
     if not views:
         return InteriorOrientation(1.2 * max(sensor.width_mm, sensor.height_mm)), False
-    # The mean of logarithms: a view of something else adds a constant and no more.
+    # The mean of logarithms is robust: a view of something else adds a constant.
     bend = lambda k: float(np.mean(np.log(_bends(views, k, half))))  # noqa: E731
     lens = scipy.optimize.minimize(bend, np.zeros(2), method="Nelder-Mead", options={"maxiter": 120}).x
     distortion_misfit = _bends(views, lens, half)
@@ -162,9 +164,9 @@ def flat_start(
 def nearest_distortion(
     known: InteriorOrientation, model: AbstractDistortion, free: Sequence[str], sensor: Sensor
 ) -> InteriorOrientation:
-    """`known` with the distortion `model`, whose coefficients among `free` come nearest to that of `known`.
+    """Return `known` with the distortion `model`, its coefficients `free` fitted to that of `known`.
 
-    Over 15 x 15 points of the format, by least squares of the residuals that an adjustment would have.
+    The fit is to 15 x 15 points of the format, by least squares of the residuals of an adjustment.
     """
     x, y = (np.linspace(-0.48, 0.48, _SIDE) * side for side in (sensor.width_mm, sensor.height_mm))
     measured = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
@@ -206,7 +208,7 @@ def _bends(views, lens, half) -> Float[np.ndarray, "views"]:
     """Mean square error of the best homography of each view, in the board and over its size."""
     r = np.linspace(0, 1, 20)
     if np.any(1 - 3 * lens[0] * r**2 - 5 * lens[1] * r**4 <= 0.05):
-        return np.full(len(views), _FOLDED)  # the lens would fold the image inside the format
+        return np.full(len(views), _FOLDED)  # the lens is not invertible inside the format
     errors = []
     for board, xy in views:
         image = _straight(xy, lens, half)
@@ -218,28 +220,28 @@ def _bends(views, lens, half) -> Float[np.ndarray, "views"]:
 
 
 def _homography(board, image) -> Float[np.ndarray, "3 3"]:
-    """image ~ H board, by least squares in coordinates of one size (the direct linear transformation)."""
+    """Homography image ~ H board by the direct linear transformation, in conditioned coordinates."""
     (a, to_a), (b, to_b) = _conditioned(board), _conditioned(image)
     h = np.linalg.svd(_linear(a, b))[2][-1].reshape(3, 3)
     return np.linalg.solve(to_b, h @ to_a)
 
 
 def _determines(board) -> bool:
-    """Whether points of a plane determine a homography: then only one takes them to themselves."""
+    """True if points of a plane determine a homography: the map to themselves is unique."""
     same, _ = _conditioned(board)
     size = np.linalg.svd(_linear(same, same), compute_uv=False)
     return bool(len(size) > 7 and size[7] > _DETERMINED * size[0])
 
 
 def _linear(board, image) -> Float[np.ndarray, "rows 9"]:
-    """The equations of the direct linear transformation: these times the nine elements of H are zero."""
+    """Equations of the direct linear transformation: their product with the nine elements of H is zero."""
     one, zero = np.ones((len(board), 1)), np.zeros((len(board), 3))
     point = np.hstack([board, one])
     return np.vstack([np.hstack([point, zero, -image[:, :1] * point]), np.hstack([zero, point, -image[:, 1:] * point])])
 
 
 def _conditioned(xy):
-    """The same points about their middle and of size 1, and the matrix that makes them so."""
+    """Conditioned points, about their mean and of size 1, and the matrix of the conditioning."""
     middle = xy.mean(axis=0)
     size = max(float(np.sqrt(np.mean(np.sum((xy - middle) ** 2, axis=1)))), 1e-300)
     matrix = np.array([[1 / size, 0, -middle[0] / size], [0, 1 / size, -middle[1] / size], [0, 0, 1]])

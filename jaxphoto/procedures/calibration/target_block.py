@@ -1,10 +1,6 @@
-"""A calibration board, and its targets as measured in photographs.
+"""Calibration boards, their targets as measured in photographs, and the block of a calibration.
 
-The block of a calibration: the photographs of a board, its points known, the interior orientation free.
-
-Residuals in the measured image, in pixels, and their RMS as OpenCV defines it.
-
-Where each photograph of a board was taken from, before the adjustment.
+Residuals are in the measured image, in pixels; their RMS is that of OpenCV.
 """
 
 from collections.abc import Sequence
@@ -27,26 +23,25 @@ from jaxphoto.initial.rays import padded_length
 from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
 from jaxphoto.unknowns import FREE, Unknowns, default_priors
 
-# Of its largest extent: what the points of a board may be off a plane and still count as flat. Surveyed targets on a
-# wall are never exact; beyond a hundredth, views are no homographies and circles face elsewhere.
+# Maximum distance from a plane over the largest extent of a flat board; beyond, views are no homographies.
 _FLAT = 1e-2
 
 
 class Board(NamedTuple):
-    """Targets with known coordinates, in a frame of their own: for a flat board Z points to who looks at it."""
+    """Targets with known coordinates in a frame of their own; for a flat board Z points to the observer."""
 
     name: str
     points: tuple[str, ...]
     """Ids of the targets."""
     xyz_m: Float[np.ndarray, "points 3"]
     diameter_m: Float[np.ndarray, "points"]
-    """Of circles; 0 for the corners of squares."""
+    """Of circles; 0 for corners of squares."""
 
     @property
     def plane(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]] | None:
-        """The middle of a flat board and axes (columns; right-handed, the third is the normal), or None.
+        """Centre of a flat board and its axes (columns; right-handed, the third is the normal), or None.
 
-        The normal is either of the two; of a board that does not stand upright that with Z > 0.
+        The normal is arbitrary for a vertical board, otherwise that with Z > 0.
         """
         middle = self.xyz_m.mean(axis=0)
         _, size, axes = np.linalg.svd(self.xyz_m - middle, full_matrices=False)
@@ -58,18 +53,18 @@ class Board(NamedTuple):
 
 
 class Detection(NamedTuple):
-    """The targets of a board that were found in one photograph."""
+    """Targets of a board in one photograph."""
 
     image: str
     point: Int[np.ndarray, "n"]
-    """Index into the board's points."""
+    """Index of the points of the board."""
     column_row: Float[np.ndarray, "n 2"]
-    """In pixels; the centre of the upper-left pixel is (0.5, 0.5) (docs/conventions.md)."""
+    """In pixels; the centre of the upper-left pixel is (0.5, 0.5)."""
     sigma_px: Float[np.ndarray, "n 2"]
     """Standard deviations of column and row."""
 
     def take(self, chosen: np.ndarray) -> "Detection":
-        """The targets that `chosen` (an index or a mask) names."""
+        """Select targets by index or mask."""
         return Detection(self.image, self.point[chosen], self.column_row[chosen], self.sigma_px[chosen])
 
 
@@ -77,19 +72,19 @@ CAMERA = "camera"
 
 
 class TargetRows(NamedTuple):
-    """Image points of targets, one a row, sorted by target and image as in a block."""
+    """Image points of targets, one per row, sorted by target and image as in a block."""
 
     images: tuple[str, ...]
     image: Int[np.ndarray, "rows"]
-    """Index into `images`."""
+    """Index of `images`."""
     point: Int[np.ndarray, "rows"]
-    """Index into the board's points."""
+    """Index of the points of the board."""
     xy_mm: Float[np.ndarray, "rows 2"]
     sigma_mm: Float[np.ndarray, "rows 2"]
 
     @staticmethod
     def of(detections: Sequence[Detection], sensor: Sensor) -> "TargetRows":
-        """The image points of all `detections`, in millimetres."""
+        """Image points of all `detections`, in millimetres."""
         image = np.repeat(np.arange(len(detections)), [len(d.point) for d in detections])
         point = np.concatenate([d.point for d in detections])
         order = np.lexsort((image, point))
@@ -98,7 +93,7 @@ class TargetRows(NamedTuple):
         return TargetRows(tuple(d.image for d in detections), image[order], point[order], xy_mm[order], sigma_mm[order])
 
     def take(self, chosen: np.ndarray) -> "TargetRows":
-        """The rows that a mask names, and the images that keep one."""
+        """Select rows by a mask, and the images that keep one."""
         kept, image = np.unique(self.image[chosen], return_inverse=True)
         images = tuple(self.images[k] for k in kept)
         return TargetRows(images, image, self.point[chosen], self.xy_mm[chosen], self.sigma_mm[chosen])
@@ -113,10 +108,10 @@ def calibration_block(
     free: Sequence[str],
     board_sigma_m: float | None = None,
 ) -> Block:
-    """The block in which every image point of `rows` is observed, with what starts where.
+    """Build the block of a calibration from the image points `rows` and initial values.
 
-    The points of the board are fixed, or control with the standard deviation `board_sigma_m` on each axis. Those seen
-    in no photograph are left out. `free` names the parameters of the interior orientation that are (c_mm, k1, ...).
+    The points of the board are fixed, or control with the standard deviation `board_sigma_m` on each axis; points
+    without rows are omitted. `free` names the free parameters of the interior orientation (c_mm, k1, ...).
     """
     seen, point = np.unique(rows.point, return_inverse=True)
     xyz = board.xyz_m[seen]
@@ -151,10 +146,10 @@ def calibration_block(
 
 
 def reprojection_residuals(adjusted: Adjustment) -> Float[np.ndarray, "rows 2"]:
-    """Measured minus projected, (column, row) in pixels, in the order of the block's image points.
+    """Measured minus projected (column, row) in pixels, in the order of the image points of the block.
 
-    In the measured image whatever the model's own direction: what a distortion in the measured coordinate leaves in the
-    ideal image is stretched where the lens compresses.
+    They are those of the measured image, also for distortions of measured coordinates, whose residuals of the ideal
+    image are stretched where the lens compresses.
     """
     block, unknowns = adjusted.block, adjusted.unknowns
     rows = block.image_points
@@ -174,7 +169,7 @@ def projections(
     camera_from_object: Float[np.ndarray, "rows 3 3"],
     point: Float[np.ndarray, "rows 3"],
 ) -> Float[np.ndarray, "rows 2"]:
-    """Measured image coordinates (mm) of one point (m) in one image a row, distortion included."""
+    """Projected image coordinates (mm) of one point (m) in one image per row, with distortion."""
     n = len(point)
     some = np.arange(padded_length(n)) % n
     numbers = jax.tree.map(lambda v: np.asarray(v, float), interior)
@@ -182,7 +177,7 @@ def projections(
 
 
 def rms_px(residuals: Float[np.ndarray, "rows 2"]) -> float:
-    """Root mean square over image points, both axes together: sqrt(sum(dx^2 + dy^2) / n), as OpenCV's calibration."""
+    """Root mean square over image points, both axes together: sqrt(sum(dx^2 + dy^2) / n), as in OpenCV."""
     return float(np.sqrt(np.mean(np.sum(np.asarray(residuals) ** 2, axis=1)))) if len(residuals) else 0.0
 
 
@@ -195,7 +190,7 @@ def _projected(interior, position, camera_from_object, point):
 def resected(
     board: Board, rows: TargetRows, interior: InteriorOrientation
 ) -> tuple[ExteriorOrientation, dict[str, str]]:
-    """Exterior orientation of the images that have one, in their order; why the others have none, by their names."""
+    """Exterior orientations of the images that can be resected, in their order; reasons for the others, by image name."""
     positions, matrices, why = [], [], {}
     for k, name in enumerate(rows.images):
         own = rows.image == k
@@ -215,7 +210,9 @@ def resected(
 
 
 def _exterior(interior: InteriorOrientation, xy_mm, points, sigma_mm: float, image: str) -> ExteriorOrientation:
-    """By quaternions (paper 002); from three points with robust weights where these leave it open or do not fit."""
+    """Resection by quaternions (paper 002); from three points with robust weights if that is undetermined or does not
+    fit.
+    """
     try:
         found = resect_by_quaternions(interior, xy_mm, points, sigma_mm, image)
     except BlockError:

@@ -1,33 +1,29 @@
-"""The image of a circle's centre is not the centre of the circle's image.
+"""Calibration of a camera from the targets of a board in photographs.
 
-A circle is seen as an ellipse (bent by the lens), and what is measured is the centre of the ellipse that is nearest to
-its edge (`jaxphoto.extras.photos.targets`). Both centres are computed from the adjusted orientation, the plane and
-the radius of the circle. With the boundary b(t), 0 <= t < 2 pi, projected through the whole camera, Green's theorem
-gives area, centroid and second moments of the image,
+1. Initial values: distortion and principal distance from homographies of a flat board (`start`), resection.
 
-    A = 1/2 int (b x b') dt,   m = 1/(3 A) int b (b x b') dt,   M = 1/(4 A) int (b - m) (b - m)' ((b - m) x b') dt,
-
-and from the ellipse with these, Q = (4 M)^-1 = L L', Gauss-Newton steps lead to the nearest one,
-
-    int e^2 |b'| dt -> min,   e = rho (rho - 1) / |L L' d|,   rho = |L' d|,   d = b - centre.
-
-On a smooth closed curve the trapezoidal rule converges exponentially: 32 points give every digit. Without distortion
-the three centres, of area, of the nearest ellipse and of the conic, are one; with it the first two are up to some
-hundredths of a pixel apart, for circles of a hundred pixels seen at a steep angle in the corner.
-
-What of the residuals of a calibration is gross error, and how large the rest is beside the measurement's noise.
-
-Calibration of a camera from the targets of a board found in photographs, in rounds of adjusting and looking.
-
-1. Start: lens and principal distance from the homographies of a flat board (`start`), orientation by resection.
 2. Self-calibrating adjustment; the points of the board are fixed, or weighted.
-3. Photographs that do not fit and blunders among the image points go; image points get the standard deviation of their
-   measurement and what board and model add to it (`outliers.added_sigma`); centres of circles are corrected for their
-   eccentricity; and back to 2, until nothing changes (`Calibration.settled`), twenty times at most.
+
+3. Photographs that do not fit and blunders among the image points are rejected; image points get the standard deviation
+of their measurement and that of board and model (`added_sigma`); centres of circles are corrected for their
+eccentricity. Steps 2 and 3 repeat until nothing changes (`Calibration.settled`), at most twenty times.
 
 Residuals are those of the measured image, whatever the direction of the distortion.
 
-The covariance of a calibrated interior orientation, as the stability analysis wants it.
+Eccentricity: a circle is seen as an ellipse (bent by the lens); measured is the centre of the ellipse nearest to its
+edge, which is not the image of its centre. Both follow from the adjusted orientation, the plane and the radius of the
+circle. With the boundary b(t), 0 <= t < 2 pi, projected through the camera, Green's theorem gives area, centroid and
+second moments of the image,
+
+    A = 1/2 int (b x b') dt,   m = 1/(3 A) int b (b x b') dt,   M = 1/(4 A) int (b - m) (b - m)' ((b - m) x b') dt,
+
+and from the ellipse of these, Q = (4 M)^-1 = L L', Gauss-Newton steps lead to the nearest one,
+
+    int e^2 |b'| dt -> min,   e = rho (rho - 1) / |L L' d|,   rho = |L' d|,   d = b - centre.
+
+The trapezoidal rule converges exponentially on a smooth closed curve: 32 points give every digit. Without distortion
+the centres of area, of the nearest ellipse and of the conic coincide; with it the first two differ by up to some
+hundredths of a pixel, for circles of a hundred pixels at a steep angle in the corner.
 """
 
 import dataclasses
@@ -66,7 +62,7 @@ from jaxphoto.statistics import covariance
 from jaxphoto.unknowns import FIXED
 
 _POINTS = 32
-# From the ellipse of the moments, which is the nearest but for the lens.
+# From the ellipse of the moments, which differs by the distortion only.
 _STEPS = 3
 
 
@@ -77,10 +73,9 @@ def eccentricity(
     axes: Float[Array, "3 2"],
     radius_m: Float[Array, ""],
 ) -> Float[Array, "2"]:
-    """Centre of the ellipse nearest to a circle's image minus the image of the circle's centre, in mm as measured.
+    """Centre of the ellipse nearest to a circle's image minus the image of its centre (mm, measured image).
 
-    `centre` (m) and two orthogonal unit vectors in its plane, `axes`, in the object frame. Source: the centre of the
-    ellipse is in any book of projective geometry; through a distorting lens it is that of the formulas above.
+    `centre` (m) and `axes`, two orthogonal unit vectors in its plane, are in the object frame.
     """
 
     def boundary(t):
@@ -90,7 +85,8 @@ def eccentricity(
     about = project(interior, exterior, centre)
     t = jnp.arange(_POINTS) * (2 * jnp.pi / _POINTS)
     b, slope = jax.vmap(lambda t: jax.jvp(boundary, (t,), (1.0,)))(t)
-    # About the centre's image, so that the small difference keeps its digits, and in units of the circle's size.
+    # Relative to the image of the centre, to preserve digits of the small difference, and in units of the circle's
+    # size.
     b = b - about
     cross = b[:, 0] * slope[:, 1] - b[:, 1] * slope[:, 0]
     size = jnp.sqrt(jnp.abs(jnp.sum(cross)))
@@ -109,7 +105,7 @@ def eccentricity(
 
 
 def _distances(ellipse: Float[Array, "5"], b: Float[Array, "points 2"]) -> Float[Array, "points"]:
-    """Distances of points from an ellipse (column, row and the three of L) to first order."""
+    """Distances of points from an ellipse (column, row and three elements of L) to first order."""
     x, y = b[:, 0] - ellipse[0], b[:, 1] - ellipse[1]
     u, v = ellipse[2] * x + ellipse[3] * y, ellipse[4] * y
     # XLA without optimisation differentiates jnp.hypot wrongly (jax 0.10.2).
@@ -125,10 +121,10 @@ def eccentricities(
     axes: Float[np.ndarray, "3 2"],
     radius_m: Float[np.ndarray, "rows"],
 ) -> Float[np.ndarray, "rows 2"]:
-    """`eccentricity` (mm) of one circle in one image a row, all in planes parallel to `axes`; 0 where the radius is."""
+    """`eccentricity` (mm) of one circle in one image per row, all in planes parallel to `axes`; 0 for a radius of 0."""
     n = len(centre)
     some = np.arange(padded_length(n)) % n
-    # A point has no area: any radius does, and the result is not used.
+    # A point has no area: the result for this radius is discarded.
     radius = np.where(radius_m > 0, radius_m, max(float(np.max(radius_m)), 1e-12))
     numbers = jax.tree.map(lambda v: np.asarray(v, float), interior)
     arguments = (numbers, position[some], camera_from_object[some], centre[some], axes, radius[some])
@@ -142,22 +138,22 @@ def _eccentricities(interior, position, camera_from_object, centre, axes, radius
     return jax.vmap(one)(position, camera_from_object, centre, radius)
 
 
-# Of the typical standard deviation: beyond, an image point is a blunder (one good point in 270,000 is).
+# Limit of a normalised residual: one valid image point of 270,000 exceeds it.
 _LIMIT = 5.0
-# Of an image's largest blunder: others so large go with it.
+# Blunders of at least this fraction of the largest one of an image are rejected together.
 _NEARLY = 0.5
-# Of the typical image's RMS, and in pixels: beyond both, a photograph does not fit.
+# Limits of the median residual of a photograph: over that of the typical one, and in pixels.
 _IMAGE_LIMIT, _IMAGE_PX = 5.0, 2.0
-# The median of the length of a vector with two normal components of sigma 1.
+# Median length of a vector with two normal components of sigma 1.
 _MEDIAN = float(np.sqrt(2 * np.log(2)))
 
 
 def blunders(
     residuals: Float[np.ndarray, "n 2"], sigma: Float[np.ndarray, "n 2"], image: Int[np.ndarray, "n"], n_images: int
 ) -> Bool[np.ndarray, "n"]:
-    """Image points whose residual is over five times what their sigma and the median of all let expect.
+    """Image points with residuals of more than five times their sigma, scaled by the median of all.
 
-    Of each image only those at least half as large as its largest: a blunder turns its image, and good points with it.
+    Of each image only those of at least half its largest one: a blunder distorts the orientation, and valid residuals.
     """
     size = np.linalg.norm(residuals / sigma, axis=1)
     largest = np.zeros(n_images)
@@ -168,18 +164,17 @@ def blunders(
 def misfits(
     residuals: Float[np.ndarray, "n 2"], image: Int[np.ndarray, "n"], n_images: int
 ) -> Bool[np.ndarray, "images"]:
-    """Images in which more than half of the points are off by five times what is usual in the others, and by pixels."""
+    """Images whose median residual exceeds that of the others five times, and two pixels."""
     size = np.linalg.norm(residuals, axis=1)
     typical = np.array([np.median(size[image == k]) for k in range(n_images)])
     return (typical > _IMAGE_LIMIT * np.median(typical)) & (typical > _IMAGE_PX)
 
 
 def added_sigma(residuals: Float[np.ndarray, "n 2"], sigma: Float[np.ndarray, "n 2"], redundancy: int) -> float:
-    """The standard deviation a that explains the residuals beside the measurement's: sum v^2 / (sigma^2 + a^2) = r.
+    """Standard deviation a (px) that explains the residuals together with `sigma`: sum v^2 / (sigma^2 + a^2) = r.
 
-    Zero where sigma alone explains them. In pixels, as `residuals` and `sigma`. It is what an uneven board, a shutter
-    that takes one row after the other, or a lens model with too few coefficients add; without it the points that happen
-    to be measured best would bend the camera to their own systematic errors.
+    Zero if `sigma` alone explains them. It accounts for an uneven board, a rolling shutter, or a distortion model with
+    too few coefficients; without it the most accurate points would have too much weight.
     """
     square, variance = residuals**2, sigma**2
 
@@ -195,53 +190,53 @@ def added_sigma(residuals: Float[np.ndarray, "n 2"], sigma: Float[np.ndarray, "n
 LEAST_IMAGES = 3
 _LEAST_POINTS = 6
 _ROUNDS = 20
-# Pixels by which the added standard deviation and the centres of circles may still change in a last round.
+# Final change (px) of the added standard deviation and of the centres of circles.
 _STILL_PX = 1e-4
-# What all image points weigh alike in the first round, in pixels.
+# Common standard deviation (px) of image points in the first iteration.
 _FIRST_SIGMA_PX = 1.0
-# What a lens is to first order: estimated alone where all at once does not converge.
+# First-order parameters of a lens: estimated first if the adjustment of all does not converge.
 _FIRST = ("c_mm", "k1", "k2", "a1", "a2", "a14")
 
 
 @pretty_repr
 class Calibration(NamedTuple):
-    """A calibrated camera, and what became of the photographs."""
+    """Calibrated camera, and what was rejected."""
 
     adjusted: Adjustment
     board: Board
     measured: TargetRows
-    """The image points that were used, as measured, with the standard deviations of the measurement."""
+    """Accepted image points, as measured, with the standard deviations of the measurement."""
     residuals_px: Float[np.ndarray, "rows 2"]
     """Measured minus projected (column, row), in the order of `measured` and of the block's image points."""
     eccentricity_px: Float[np.ndarray, "rows 2"]
-    """(column, row) that the measured centres of circles were corrected by, in the same order."""
+    """Correction (column, row) of the measured centres of circles, in the same order."""
     added_sigma_px: float
-    """What board, shutter and model add to the standard deviations of the measurement."""
+    """Standard deviation of board, shutter and model, added to that of the measurement."""
     left_out: dict[str, str]
-    """Photographs that were not used, each with the reason."""
+    """Rejected photographs, with the reason."""
     removed: tuple[tuple[str, str], ...]
-    """(image, point) of image points that were blunders."""
+    """(image, point) of rejected image points."""
     settled: bool
-    """False where the last round still changed something: image points that were used, sigmas, centres of circles."""
+    """False if the last iteration still changed image points, sigmas or centres of circles."""
 
     @property
     def converged(self) -> bool:
-        """Whether the last adjustment converged and the rounds came to rest."""
+        """True if the last adjustment converged and the iteration settled."""
         return bool(self.adjusted.converged) and self.settled
 
     @property
     def sensor(self) -> Sensor:
-        """The format."""
+        """Image format."""
         return self.adjusted.block.sensors[CAMERA]
 
     @property
     def interior(self) -> InteriorOrientation:
-        """The interior orientation."""
+        """Interior orientation."""
         return self.adjusted.unknowns.interior[CAMERA]
 
     @property
     def rms_px(self) -> float:
-        """Per image point, both axes together, in the measured image: sqrt(sum(dx^2 + dy^2) / n), as OpenCV's."""
+        """RMS of the residuals, both axes together, in the measured image: sqrt(sum(dx^2 + dy^2) / n), as in OpenCV."""
         return rms_px(self.residuals_px)
 
 
@@ -257,14 +252,14 @@ def calibrate(
     board_sigma_m: float | None = None,
     max_steps: int = MAX_STEPS,
 ) -> Calibration:
-    """The camera that took photographs of a board.
+    """Calibrate the camera that took photographs of a board.
 
-    `start` is what is known of it, such as c from EXIF; a flat board seen at a tilt needs none. `model` is the name of
-    a distortion in block.toml, `r0_mm` the balance radius of SMAC, `free` the parameters to estimate
-    (`free_parameters`). The board's points are fixed, or known with `board_sigma_m` (m) on each axis.
+    `start` is the initial camera, such as c from EXIF; a tilted flat board needs none. `model` is the name of a
+    distortion in block.toml, `r0_mm` the balance radius of SMAC, `free` the parameters to estimate (`free_parameters`).
+    The points of the board are fixed, or have the standard deviation `board_sigma_m` (m) on each axis.
 
-    Raises InputError for a model or parameters that are none and where fewer than three photographs can be used, and
-    what `adjust` raises.
+    Raises InputError for an unknown model or parameter, for fewer than three usable photographs, and what `adjust`
+    raises.
     """
     distortion = distortion_model(model, sensor, r0_mm)
     names = free_parameters(model, distortion, free)
@@ -274,7 +269,7 @@ def calibrate(
     rows = TargetRows.of(used, sensor)
     rough = rough_interior(board, rows, sensor, start)
     if start is not None:
-        # What is not estimated stays what was given.
+        # Parameters that are not estimated keep their given values.
         for name in {"c_mm", "xp_mm", "yp_mm"}.difference(names):
             rough = set_parameter(rough, name, float(get_parameter(start, name)))
     exterior, why = resected(board, rows, rough)
@@ -299,7 +294,7 @@ def calibrate(
         turned = float(np.max(np.linalg.norm(correction - before, axis=1), initial=0.0)) / sensor.pixel_mm
         misfit = misfits(residuals, rows.image, len(rows.images))
         large = blunders(residuals, sigma / sensor.pixel_mm, rows.image, len(rows.images))
-        # What the correction of circles has still to change is no blunder.
+        # A residual within the last change of the eccentricity is no blunder.
         good = ~misfit[rows.image] & ~(large & (np.linalg.norm(residuals, axis=1) > turned))
         redundancy = adjusted.redundancy - 2 * int((~good).sum())
         last, added = added, added_sigma(residuals[good], rows.sigma_mm[good] / sensor.pixel_mm, redundancy)
@@ -338,7 +333,7 @@ def _check_enough(images: int, given: int) -> None:
 
 
 def _adjusted(block: Block, max_steps: int) -> Adjustment:
-    """The adjustment; where it does not converge at once, c and the first radial coefficients come first."""
+    """Adjust; if that does not converge, first with c and the first radial coefficients only."""
     adjusted = adjust(block, max_steps=max_steps)
     if bool(adjusted.converged):
         return adjusted
@@ -356,7 +351,7 @@ def _still(exterior: ExteriorOrientation) -> ExteriorOrientation:
 
 
 def _image_eccentricities(board, rows, interior, exterior) -> Float[np.ndarray, "rows 2"]:
-    """In mm of the image; zero for corners and where the board has no plane."""
+    """In mm of the image; zero for corners and for a board that is not flat."""
     if not board.diameter_m.any() or board.plane is None:
         return np.zeros_like(rows.xy_mm)
     return eccentricities(
@@ -372,7 +367,6 @@ def _image_eccentricities(board, rows, interior, exterior) -> Float[np.ndarray, 
 def interior_covariance(adjusted: Adjustment) -> Float[np.ndarray, "parameters parameters"]:
     """A posteriori covariance of the camera of a calibration, in the order and units of `parameter_names`.
 
-    Rows and columns of what was held are zero. It takes the image points as independent of each other: what a board
-    that is not flat does to many of them alike is not in it.
+    Rows and columns of fixed parameters are zero. Image points are assumed to be independent.
     """
     return covariance(adjusted).of_interior(CAMERA, parameter_names(adjusted.unknowns.interior[CAMERA]))

@@ -1,4 +1,4 @@
-"""Control of a block from files: surveyed points and marks, placed, adjusted with, tested."""
+"""Control of a block: surveyed points and their marks, transformation to their frame, adjustment and tests."""
 
 from jaxphoto.procedures.control.control_block import ControlledBlock, at_optimum, control_block, rejudged
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints

@@ -1,14 +1,14 @@
-"""Surveyed points and their marks after an adjustment: how far they are off, and what contradicts the rest.
+"""Adjust an oriented block with control, and reject control that contradicts the rest.
 
-Of what was adjusted with, the normalised residual tells (Baarda's test), of check points and points that were left out
-the difference over its standard deviation: that of the survey and that of the adjustment together.
+1. Rays of marks are intersected; a mark that contradicts the others of its point is rejected.
 
-An oriented block adjusted with control: placed, tested, and what contradicts the rest left out and named.
+2. Three or more consistent control points transform the block to their frame. With fewer it stays where it is.
 
-1. Rays of the marks meet in points; a mark that contradicts the others of its point goes.
-2. Three control points or more that agree bring the block to their frame. With fewer it stays where it is.
-3. It is adjusted with them. Then, in turns, the one observation of control that contradicts the rest most is left out,
-   and points that were left out come back where they agree. Check points never enter.
+3. The block is adjusted with them. Iteratively, the observation of control with the largest normalised residual is
+rejected, and rejected points that agree return. Check points never enter.
+
+Normalised residuals test observations (Baarda); check points and rejected points are tested by their difference over
+its standard deviation, of survey and adjustment together.
 """
 
 import dataclasses
@@ -28,14 +28,14 @@ from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, SIGMA_M, GivenCo
 from jaxphoto.statistics import LEAST_CHECKED, covariance, normalised_residuals, redundancy_numbers
 
 CRITICAL = 4.0
-"""Normalised residuals beyond this are errors: one in 16,000 is not."""
+"""Limit of normalised residuals: one valid observation of 16,000 exceeds it."""
 
-# Residuals whose scatter is told, and the median of the larger of two normal errors.
+# Minimum number of residuals of a scatter estimate, and the median of the larger of two normal errors.
 _ENOUGH, _LARGER = 8, 1.05
-# Surveyed points whose scatter is told, the median of a normal error, and by how much they scatter more than a guess
-# before it is given up: the median of twelve is beyond 1.9 times what it should be in one block of a hundred.
+# Minimum number of surveyed points of a scatter estimate, the median of a normal error, and the ratio of scatters that
+# rejects a default: the median of twelve exceeds 1.9 in one valid block of a hundred.
 _POINTS, _MEDIAN, _MORE = 6, 0.6745, 2.0
-# Change (of the logarithm) that another adjustment is not worth.
+# Change (of the logarithm) that is not worth another adjustment.
 _STILL = 0.15
 
 
@@ -44,21 +44,21 @@ class JudgedControl(NamedTuple):
 
     adjusted_m: Float[np.ndarray, "points 3"]
     off_m: Float[np.ndarray, "points 3"]
-    """Surveyed minus adjusted; NaN where nothing was surveyed."""
+    """Surveyed minus adjusted; NaN without survey."""
     sigma_m: Float[np.ndarray, "points 3"]
     """Of the adjusted coordinates, a posteriori."""
     w: Float[np.ndarray, "points 3"]
-    """Over its standard deviation; NaN where nothing tells."""
+    """Normalised residuals; NaN if not tested."""
     marks_px: Float[np.ndarray, "rows 2"]
     """Measured minus computed, column and row, of the marks in the order of the block."""
     marks_w: Float[np.ndarray, "rows"]
-    """The larger of both axes; NaN where nothing tells."""
+    """Normalised residuals, the larger of both axes; NaN if not tested."""
 
 
 def judged(
     adjusted: Adjustment, n: int, xyz: Float[np.ndarray, "points 3"], sigma: Float[np.ndarray, "points 3"]
 ) -> JudgedControl:
-    """The last `n` points, surveyed at `xyz` with `sigma` (m); whatever their role."""
+    """Test the last `n` points, surveyed at `xyz` with `sigma` (m), in any role."""
     block = adjusted.block
     first = len(block.points) - n
     cov = covariance(adjusted, rows=True)
@@ -85,15 +85,15 @@ def judged(
 
 
 def _largest(w: Float[np.ndarray, "2 rows"]) -> Float[np.ndarray, "rows"]:
-    """Over the first axis; NaN where all are."""
+    """Largest over the first axis; NaN if all are."""
     found = np.max(np.nan_to_num(w, nan=-1.0), axis=0, initial=-1.0)
     return np.where(found < 0, np.nan, found)
 
 
 def scatter(marks_w: Float[np.ndarray, "rows"]) -> float:
-    """How much more the normalised residuals of marks scatter than they should; 1 at least, and where they are few.
+    """Robust scatter of the normalised residuals of marks; at least 1, and 1 for few marks.
 
-    What people mark seldom is as good as they say, which makes no blunders of it.
+    Manual marks are often less accurate than stated, which makes no blunders of them.
     """
     known = marks_w[np.isfinite(marks_w)]
     return max(1.0, float(np.median(known)) / _LARGER) if len(known) >= _ENOUGH else 1.0
@@ -105,11 +105,11 @@ def poorer_survey(
     assumed: Bool[np.ndarray, "points 3"],
     guess_m: tuple[float, float, float],
 ) -> Float[np.ndarray, "3"] | None:
-    """Standard deviations (m) of the coordinates `assumed` by which most of them fit; None where `sigma_m` will do.
+    """Standard deviations (m) of the coordinates `assumed` that explain most of them; None if `sigma_m` does.
 
-    The median of the normalised residuals tells, of plan and height each; up to half of the points may spoil it.
-    A block gives way to what is held too firmly, so that more than one adjustment is needed to tell: once they are not
-    `guess_m` any more, standard deviations become smaller, too. Heights are at first taken to be as poor as the plan.
+    They follow from the medians of the normalised residuals of plan and height; up to half of the points may be
+    blunders. A block is deformed by control with too much weight, so that several adjustments are needed: after the
+    default `guess_m` is rejected, standard deviations may decrease, too. Heights are at first as poor as the plan.
     """
     now, given_up = np.array(guess_m), bool((sigma_m[assumed] > max(guess_m)).any())
     factor = np.ones(3)
@@ -128,19 +128,19 @@ def poorer_survey(
 
 
 def beyond(w: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
-    """Which points are off by more than chance."""
+    """True for points with a significant normalised residual."""
     return np.nan_to_num(w).max(axis=1, initial=0.0) > CRITICAL
 
 
 _ROUNDS = 8
-# Sentences about marks in an error, which is one line.
+# Maximum number of sentences about marks in an error message.
 _SAID = 2
-# Of the worst normalised residual: what is less is not left out beside it.
+# Fraction of the largest normalised residual below which no other observation is rejected with it.
 _BESIDE_THE_WORST = 0.7
 
 
 class ControlledBlock(NamedTuple):
-    """A block adjusted with control, and what became of each surveyed point. Arrays are over the surveyed points."""
+    """A block adjusted with control, and the result of each surveyed point. Arrays are over the surveyed points."""
 
     adjusted: Adjustment
     ids: tuple[str, ...]
@@ -149,17 +149,17 @@ class ControlledBlock(NamedTuple):
     """control, check, left out (it contradicts the rest), not marked (in too few photographs)."""
     n_marks: tuple[int, ...]
     xyz_m: Float[np.ndarray, "points 3"]
-    """Surveyed, in the local frame of the block; NaN for what is not known."""
+    """Surveyed, in the local frame of the block; NaN if unknown."""
     off_m: Float[np.ndarray, "points 3"]
-    """Surveyed minus adjusted, in the local frame of the block; NaN where there is none."""
+    """Surveyed minus adjusted, in the local frame of the block; NaN if undefined."""
     survey_sigma_m: Float[np.ndarray, "points 3"]
     sigma_m: Float[np.ndarray, "points 3"]
     """Of the adjusted coordinates, a posteriori."""
     w: Float[np.ndarray, "points 3"]
     marks: Marked
-    """Those that were adjusted with; `point` counts the surveyed points."""
+    """Accepted marks; `point` is the index of the surveyed points."""
     marks_px: Float[np.ndarray, "rows 2"]
-    """Their residuals, column and row."""
+    """Residuals of the marks, column and row."""
     sentences: tuple[str, ...]
 
 
@@ -174,12 +174,11 @@ def control_block(
     adjust: Callable[[Block], Adjustment] = adjust_for_tables,
     report: Callable[[str], object] = lambda text: None,
 ) -> ControlledBlock:
-    """`block`, whose images and points have a start, adjusted with `control`.
+    """Adjust `block`, whose images and points have initial values, with `control`.
 
-    `system` names that of the points where their file does not, `code` the EPSG code of a block that has none yet,
-    `vertical` that of the heights that it has in files. `elsewhere` are photographs that are known but not of this
-    block. Raises InputError for control that cannot be used as it stands: see `in_frame` and `onto_control`; and where
-    no mark is in a photograph of the block.
+    `system` names that of the points if their file does not, `code` the EPSG code of a block that has none yet,
+    `vertical` that of the heights of files. `elsewhere` are photographs of other blocks. Raises InputError for unusable
+    control (`in_frame`, `onto_control`), and if no mark is in a photograph of the block.
     """
     points, ids = control.points, control.points.ids
     frame = in_frame(block, points, system, code, vertical)
@@ -193,12 +192,12 @@ def control_block(
     try:
         block, start, agree, sigma, told = _placed(block, frame, met.points, met.covariance, sigma, points)
     except InputError as error:
-        # What marks say of one another is why there is too little, where there is.
+        # Contradicting marks explain why too few points are left.
         raise InputError("; ".join([str(error), *_one_height(points), *met.sentences[:_SAID]])) from error
     said += told
     count = np.bincount(rows.point, minlength=len(ids))
     known = np.where(np.isnan(points.coordinates), np.nan, frame.xyz)
-    # One ray and a known place are an observation, one ray alone is none.
+    # One ray and a known point are an observation, one ray alone is not.
     seen = (count > 1) & np.isfinite(start).all(axis=1) | (count == 1) & ~points.check & np.isfinite(known).all(axis=1)
     start = np.where(np.isfinite(start), start, frame.xyz)
     base = without_names(block, ids)
@@ -214,21 +213,21 @@ def control_block(
         place = np.cumsum(seen) - 1
         own = now._replace(point=place[now.point])
         names = tuple(ids[k] for k in which)
-        # What is taken for the survey of check points is no ground to claim an accuracy on.
+        # A default standard deviation of check points must not enter the stated accuracy.
         told = np.where(points.check[:, None] & np.isnan(points.sigma_m), 0.0, sigma)[which]
         roles = used[which], points.check[which]
         made = into_block(base, names, known[which], told, start[which], own, *roles)
         try:
             adjusted = adjust(made)
         except DatumError as error:
-            # What is taken of the control beforehand may be why it does not tell enough.
+            # The default standard deviations may be why control does not determine the datum.
             raise DatumError("; ".join([str(error), *_assumed(control, sigma)])) from error
         if not bool(adjusted.converged):
             said.append("the adjustment with control did not converge; it is not tested")
         found = _spread(judged(adjusted, len(which), known[which], sigma[which]), seen)
         poorer = poorer_survey(found.w[used], sigma[used], np.isnan(points.sigma_m[used]), SIGMA_M)
         if poorer is not None and number + 1 < _ROUNDS and bool(adjusted.converged):
-            # Before any is judged by a guess that most contradict.
+            # Before any point is tested with a default that most contradict.
             sigma = np.where(np.isnan(points.sigma_m), poorer, sigma)
             continue
         new, gone, text = _tested(found, now, used, seen & ~points.check, ids, block.images)
@@ -258,8 +257,10 @@ def control_block(
 
 
 def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: SurveyedPoints):
-    """The block in the frame of control, where its points begin, which agree with it, how well they were surveyed, and
-    what is to be said."""
+    """Transform the block to the frame of control.
+
+    Return block, initial points, consistent points, standard deviations of the survey, and messages.
+    """
     whole = np.isfinite(points.coordinates).all(axis=1)
     known = np.flatnonzero(np.isfinite(met).all(axis=1) & ~points.check & whole)
     agree = np.ones(len(met), bool)
@@ -273,7 +274,7 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
     spread = np.sqrt(np.trace(covariance[known], axis1=1, axis2=2))
     assumed, surveyed = np.isnan(points.sigma_m[known]).any(axis=1), np.linalg.norm(sigma[known], axis=1)
     if not frame.at_place:
-        # In the unit of the block's own frame, which a similarity is to tell.
+        # In the unit of the block, until a similarity determines the scale.
         first = onto_control(met[known], frame.xyz[known], surveyed, points.file, assumed)
         spread = spread * first.similarity.scale
     onto = onto_control(met[known], frame.xyz[known], np.hypot(surveyed, spread), points.file, assumed)
@@ -317,7 +318,7 @@ def _one_height(points: SurveyedPoints) -> list[str]:
 
 
 def _tested(found: JudgedControl, now: Marked, used, able, ids, images):
-    """Control points in use after the test, marks that go, and a sentence for each; nothing where all agree."""
+    """Accepted control points after the test, marks to reject, and a sentence for each; no sentence if all agree."""
     new, gone, said = used.copy(), np.zeros(len(now.image), bool), []
     of_points, of_marks = np.where(used, np.nan_to_num(found.w).max(axis=1), 0.0), np.nan_to_num(found.marks_w)
     wide = scatter(found.marks_w)
@@ -325,7 +326,7 @@ def _tested(found: JudgedControl, now: Marked, used, able, ids, images):
     if not worst > CRITICAL:
         back = able & ~used & ~beyond(found.w) & np.isfinite(found.w).any(axis=1)
         return new | back, gone, [""] * bool(back.any())
-    # What a blunder does to the residuals about it is no second one.
+    # Smaller residuals near a blunder are often caused by it.
     limit = max(CRITICAL, _BESIDE_THE_WORST * worst)
     for p in np.unique(now.point).tolist():
         row = max(np.flatnonzero(now.point == p), key=lambda k: of_marks[k])
@@ -353,7 +354,7 @@ def _left_out(ids, left, found: JudgedControl, frame: InFrame):
 
 
 def _spread(own: JudgedControl, seen) -> JudgedControl:
-    """Over all surveyed points, NaN for those that are not in the block."""
+    """Expand to all surveyed points, with NaN for those that are not in the block."""
     wide = lambda v: np.where(seen[:, None], v[np.cumsum(seen) - 1], np.nan)  # noqa: E731
     return own._replace(
         adjusted_m=wide(own.adjusted_m), off_m=wide(own.off_m), sigma_m=wide(own.sigma_m), w=wide(own.w)
@@ -361,20 +362,20 @@ def _spread(own: JudgedControl, seen) -> JudgedControl:
 
 
 def rejudged(found: ControlledBlock, adjusted: Adjustment) -> ControlledBlock:
-    """The same by another adjustment of its block, as with other weights."""
+    """Test again after another adjustment of the block, such as with other weights."""
     seen = np.array(found.state, object) != "not marked"
     own = _spread(judged(adjusted, int(seen.sum()), found.xyz_m[seen], found.survey_sigma_m[seen]), seen)
     return found._replace(adjusted=adjusted, off_m=own.off_m, sigma_m=own.sigma_m, w=own.w, marks_px=own.marks_px)
 
 
 def at_optimum(adjusted: Adjustment) -> Block:
-    """The block of an adjustment, all of whose images and points start where that has led."""
+    """The adjusted block, with initial values at the optimum."""
     block = adjusted.block
     known = (np.ones(len(names), bool) for names in (block.images, block.points))
     return dataclasses.replace(block, start=Start(adjusted.unknowns, *known))
 
 
 def _from(base: Block, adjusted: Adjustment) -> Block:
-    """`base` that starts at the optimum of the same with control."""
+    """`base` with initial values at the optimum of the same block with control."""
     unknowns = dataclasses.replace(adjusted.unknowns, points=np.asarray(adjusted.unknowns.points)[: len(base.points)])
     return dataclasses.replace(base, start=dataclasses.replace(base.start, unknowns=unknowns))

@@ -1,15 +1,12 @@
-"""The similarity that brings a block onto control points: of those that agree with one another.
+"""The frame of control: coordinate systems, and the robust similarity that transforms a block to control points.
 
-Every three points (or 300 samples of three) give a similarity; that counts which most others fit, then least squares of
-these. How well points have to fit leaves room for what an adjustment will take out: a block that is bent by a lens or
-stands on weak positions misses by a part of its size. What does not fit is not judged here: it is left out of the first
-adjustment, which judges it.
+Every three points (or 300 samples of three) give a similarity; the one with the most consistent points is refined by
+least squares of these. The tolerance leaves room for deformations that the adjustment removes: distortion, or weak
+positions. Inconsistent points are omitted from the first adjustment, which tests them.
 
-Where no file says how well points were surveyed and most do not fit, they may be worse than is usual: a hand-held
-receiver is off by metres. The similarity of the least median difference tells by how much (P. J. Rousseeuw, Least
-median of squares regression, JASA 79, 1984), as long as more than half of the points are not gross errors.
-
-A block and control in one frame: the block in that of the control, or the control in that of the block.
+If standard deviations are defaults and most points are inconsistent, the survey may be less accurate (a hand-held
+receiver: metres). The similarity of the least median of squares (P. J. Rousseeuw, JASA 79, 1984) estimates the
+accuracy, as long as more than half of the points are valid.
 """
 
 import dataclasses
@@ -36,25 +33,25 @@ from jaxphoto.procedures.georeference_photographs import utm_of
 from jaxphoto.procedures.orientation.known_frame import Similarity, similarity_between
 
 _SAMPLES = 300
-# Standard deviations, and part of the size of the control, within which a point fits.
+# Tolerance of a point: standard deviations, and fraction of the size of the control.
 _BEYOND, _BENT = 5.0, 0.01
 MIN_POINTS = 3
-# Fewer than this part of the points that fit, of so many at least, may be poor ones.
+# Below this fraction of consistent points, of at least so many, the survey may be less accurate than assumed.
 _MOST, _ENOUGH = 2 / 3, 6
-# Of a median of lengths of normal errors in space to one coordinate, and what a similarity takes up.
+# Ratio of the median length of normal errors in space to their sigma, and parameters of a similarity.
 _MEDIAN, _PARAMETERS = 1.54, 7
-# Standard deviations beyond which a difference does not count for those of the others; part of the size of the control
-# that standard deviations are at most: beyond, coordinates are of other points, or of another order.
+# Limit (standard deviations) of the refined estimate; maximum standard deviation over the size of the control: beyond,
+# points or the order of coordinates are wrong.
 _WITHIN, _POOREST = 3.5, 0.05
 
 
 class OntoControl(NamedTuple):
-    """A similarity and which points made it."""
+    """Similarity, and the points that agree with it."""
 
     similarity: Similarity
     agree: Bool[np.ndarray, "points"]
     scatter_m: float | None = None
-    """Standard deviation of a coordinate of the points that no file says one of, where they are worse than usual."""
+    """Estimated standard deviation of a coordinate without a stated one, if larger than the default."""
 
 
 def onto_control(
@@ -64,12 +61,13 @@ def onto_control(
     file: str,
     assumed: Bool[np.ndarray, "points"],
 ) -> OntoControl:
-    """From places `there` in a frame of a block to the same as surveyed, `here`; `sigma_m` of the differences.
+    """Estimate the similarity from `there`, in the frame of a block, to surveyed points `here`.
 
-    Those of the `assumed` are a guess, which most of the points may correct.
+    `sigma_m` are those of the differences; those of `assumed` points are defaults, which most of the points may
+    correct.
 
-    Raises InputError for fewer than three, for such as lie on a line, and where no three and a fourth agree; it says
-    where exchanged coordinates would.
+    Raises InputError for fewer than three points, for collinear points, and if no three and a fourth are consistent,
+    with the cure if exchanged coordinates would be.
     """
     if len(here) < MIN_POINTS:
         raise InputError(
@@ -101,17 +99,17 @@ def onto_control(
 
 
 def on_a_line(there: Float[np.ndarray, "points 3"], here: Float[np.ndarray, "points 3"]) -> bool:
-    """Whether no three of the points lie beside one another, so that they leave a turn about their line open."""
+    """True if all points are collinear, which leaves a rotation about their line undetermined."""
     return next(_of_threes(there, here), None) is None
 
 
 def _poor(there, here, sigma_m, assumed) -> OntoControl | None:
-    """Where most points agree if those `assumed` were surveyed poorly; None where they do not then either."""
+    """Estimate with poor accuracy of the `assumed` points; None if most points are not consistent then either."""
     n = len(here)
     if n < _ENOUGH:
         return None
     similarity = min(_of_threes(there, here), key=lambda s: np.median(_off(s, there, here)))
-    # Rousseeuw's factor for few points.
+    # Rousseeuw's factor for small samples.
     scatter = (1 + 5 / (n - MIN_POINTS)) * float(np.median(_off(similarity, there, here))) / _MEDIAN
     for _ in range(5):
         near = _off(similarity, there, here) < _WITHIN * scatter
@@ -174,19 +172,19 @@ class InFrame(NamedTuple):
 
     frame: Frame
     xyz: Float[np.ndarray, "points 3"]
-    """m; heights that are not known are those of the others."""
+    """m; unknown heights are the median of the others."""
     at_place: bool
-    """Whether the block was there before, so that it tells where the points should be."""
+    """True if the block has that frame already."""
 
 
 def in_frame(
     block: Block, points: SurveyedPoints, words: str | None, code: int | None, vertical: int | None = None
 ) -> InFrame:
-    """The points in the frame of `block`, or where it has none in one of theirs.
+    """Transform the points to the frame of `block`, or to a new frame.
 
-    `words` name their system where the file does not. `code` is the EPSG code that a new frame has; without one it is
-    that of the points, or UTM. `vertical` is that of its heights; without one it is theirs. Raises InputError for a
-    system that is not told, told twice, or cannot be, and for points that lie far from the block, with what would fit.
+    `words` name their system if the file does not. `code` is the EPSG code of a new frame, by default that of the
+    points or UTM, `vertical` that of its heights, by default that of the points. Raises InputError for a missing,
+    contradictory or unusable system, and for points far from the block, with a system that would fit.
     """
     at = block.frame.origin
     system = told_system(points, words, lambda: fitting(points, None, *at[:2]) if at is not None else "")
@@ -203,7 +201,7 @@ def in_frame(
         there = places(points, system, block.frame.code)
         heights = block.frame.vertical if vertical is None else vertical
         if heights is None and block.frame.code == system.code:
-            # Brought onto the points, the block has heights of theirs.
+            # The transformed block has heights of the points.
             heights = system.vertical
         return InFrame(
             dataclasses.replace(block.frame, vertical=heights), block.frame.map.local_from_place(there), True
@@ -224,7 +222,7 @@ def in_frame(
 
 
 def told_system(points: SurveyedPoints, words: str | None, guess: Callable[[], str]) -> ControlSystem:
-    """The system that the file of `points` says, or `words`. Raises InputError for none, with a `guess`, or two."""
+    """The system in the file of `points`, or `words`. Raises InputError for none, with a `guess`, or two."""
     own = system_of(points.system, points.file) if points.system else None
     given = system_of(words, "the EPSG code of the control") if words else None
     if own and given and own.crs != given.crs:
@@ -240,7 +238,7 @@ def told_system(points: SurveyedPoints, words: str | None, guess: Callable[[], s
 
 
 def new_code(points: SurveyedPoints, system: ControlSystem) -> int:
-    """The EPSG code for a block that has none: that of a map in which the points are, or the zone of UTM."""
+    """EPSG code for a block that has none: that of the map system of the points, or the UTM zone."""
     if system.code is not None and system.crs is not None and system.crs.is_projected:
         return system.code
     longitude, latitude, _ = np.median(places(points, system, 4326), axis=0)

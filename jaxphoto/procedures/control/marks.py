@@ -1,12 +1,7 @@
-"""Marks of surveyed points in the images of a block: which image, which point, where; and which cannot be used.
+"""Marks of surveyed points in the images of a block: usable marks, their intersection, and their rows of a block.
 
-Surveyed points where the rays of their marks meet; a mark that contradicts the others of its point is found so.
-
-Each two rays of a point give a place; that which most rays pass within the limit counts, then least squares of these.
-A mark at the wrong target is off by far more than the limit, whose second part leaves room for an orientation that is
-not adjusted yet.
-
-Surveyed points as points of a block: their image points, their coordinates in their roles, and the bias of GNSS.
+Each two rays of a point give a position; the one that most rays pass within the limit is refined by least squares. A
+mark at the wrong target misses by far more than the limit, which leaves room for an orientation before adjustment.
 """
 
 import dataclasses
@@ -35,27 +30,27 @@ _ENDING = re.compile(r"\.[A-Za-z]{2,4}$")
 
 
 class Marked(NamedTuple):
-    """Rows of marks that can be used, sorted by point and image."""
+    """Usable marks, sorted by point and image."""
 
     image: Int[np.ndarray, "rows"]
-    """Index into the block's images."""
+    """Index of the images of the block."""
     point: Int[np.ndarray, "rows"]
-    """Index into the surveyed points."""
+    """Index of the surveyed points."""
     xy_mm: Float[np.ndarray, "rows 2"]
     sigma_mm: Float[np.ndarray, "rows"]
 
     def take(self, chosen: np.ndarray) -> "Marked":
-        """Those that a mask or indices choose."""
+        """Select rows by mask or index."""
         return Marked(*(v[chosen] for v in self))
 
 
 def marked(
     block: Block, points: SurveyedPoints, marks: Marks, elsewhere: Collection[str] = ()
 ) -> tuple[Marked, list[str]]:
-    """The marks of `points` in the images of `block`, and a sentence for those that cannot be used.
+    """Return the marks of `points` in the images of `block`, and a sentence for those that are unusable.
 
-    An image is found by the name of its file, whatever folder, ending and case. `elsewhere` are images that are known,
-    but in no block or another: no word is lost on marks in these.
+    Images are found by file name, whatever folder, extension and case. Marks in `elsewhere`, images of other blocks,
+    are ignored.
     """
     image = images_of(marks.image, block.images)
     other = images_of(marks.image, tuple(elsewhere)) >= 0
@@ -83,7 +78,7 @@ def marked(
 
 
 def images_of(names: Sequence[str], images: Sequence[str]) -> Int[np.ndarray, "names"]:
-    """The image that each name means; -1 for none, or for more than one."""
+    """Index of the image that each name means; -1 for none, or for more than one."""
     exact = {name: k for k, name in enumerate(images)}
     loose: dict[str, int] = {}
     for k, name in enumerate(images):
@@ -98,7 +93,7 @@ def images_of(names: Sequence[str], images: Sequence[str]) -> Int[np.ndarray, "n
 
 
 def _say(said: list[str], marks: Marks, wrong: np.ndarray, names: Sequence[str], what: str) -> None:
-    """A sentence on the marks that are `wrong`, with the first of them."""
+    """Add a sentence on the marks that are `wrong`, with the first of them."""
     which = np.flatnonzero(wrong)
     if len(which):
         listed = few(list(dict.fromkeys(names[int(k)] for k in which)))
@@ -106,25 +101,25 @@ def _say(said: list[str], marks: Marks, wrong: np.ndarray, names: Sequence[str],
 
 
 _BEYOND, _ROOM_PX = 4.0, 3.0
-# Pairs of rays of one point: more marks tell no more.
+# Maximum number of pairs of rays of one point.
 _PAIRS = 300
-# Rays within this angle (rad) of one another meet nowhere.
+# Minimum angle (rad) of two rays.
 _PARALLEL = np.deg2rad(0.5)
 
 
 class Intersected(NamedTuple):
-    """Where rays of marks meet, in the frame of the block."""
+    """Intersections of the rays of marks, in the frame of the block."""
 
     points: Float[np.ndarray, "points 3"]
-    """NaN where fewer than two rays meet."""
+    """NaN for fewer than two rays."""
     covariance: Float[np.ndarray, "points 3 3"]
     good: Bool[np.ndarray, "rows"]
-    """Marks whose rays pass their point; marks that are alone are good, as far as anybody can tell."""
+    """True for marks whose rays pass their point, and for single marks."""
     sentences: tuple[str, ...]
 
 
 def rays_of(block: Block, unknowns: Unknowns, rows: Marked) -> Float[np.ndarray, "rows 3"]:
-    """Unit directions in the camera frames of the marks."""
+    """Unit directions of the marks in the camera frames."""
     rays = np.zeros((len(rows.image), 3))
     camera = np.array(block.image_camera, object)[rows.image]
     for name in set(camera.tolist()):
@@ -134,7 +129,7 @@ def rays_of(block: Block, unknowns: Unknowns, rows: Marked) -> Float[np.ndarray,
 
 
 def intersected(block: Block, unknowns: Unknowns, rows: Marked, ids: tuple[str, ...]) -> Intersected:
-    """The points of `rows` by the orientation `unknowns`; `ids` name them."""
+    """Intersect the points of `rows` with the orientation `unknowns`; `ids` name them."""
     n, good = len(ids), np.ones(len(rows.image), bool)
     positions = np.asarray(unknowns.exterior.position, float)
     matrices = np.asarray(unknowns.exterior.camera_from_object, float)
@@ -171,7 +166,7 @@ def intersected(block: Block, unknowns: Unknowns, rows: Marked, ids: tuple[str, 
 
 
 def _passing(origins, directions, limit) -> Bool[np.ndarray, "rays"]:
-    """Which of the rays of one point pass the place that most of them pass; none where no two rays meet."""
+    """True for the rays of one point that pass the position of most of them; all False if no two rays meet."""
     n = len(origins)
     pairs = list(combinations(range(n), 2))
     pairs = [pairs[k] for k in np.linspace(0, len(pairs) - 1, min(len(pairs), _PAIRS)).astype(int)]
@@ -189,7 +184,7 @@ def _passing(origins, directions, limit) -> Bool[np.ndarray, "rays"]:
 
 
 def misses(places, origins, directions) -> Float[np.ndarray, "places rays"]:
-    """Angles (rad) by which rays miss places; infinite behind."""
+    """Angles (rad) by which rays miss positions; infinite behind the camera."""
     towards = places[:, None] - origins
     along = np.sum(towards * directions, axis=2)
     across = np.linalg.norm(np.cross(directions[None], towards), axis=2)
@@ -206,11 +201,10 @@ def into_block(
     control: Bool[np.ndarray, "points"],
     check: Bool[np.ndarray, "points"],
 ) -> Block:
-    """`block` with the points `ids` at its end, which may have none of these names yet; `rows` are their marks.
+    """Append the points `ids`, whose names are new, to `block`; `rows` are their marks.
 
-    `xyz` (m, NaN for what is not known) are observed with `sigma` of those that are `control`, and check coordinates of
-    those that are `check`, with 0 for a sigma that nobody gave; of the others they tell nothing. `start` is where all
-    begin, in the frame of the block.
+    `xyz` (m, NaN if unknown) are observed with `sigma` for `control` points, and are check coordinates for `check`
+    points, with a sigma of 0 if not stated. `start` are initial values in the frame of the block.
     """
     n = len(block.points)
     new = ImagePoints(
@@ -236,10 +230,9 @@ def _coordinates(xyz, sigma, chosen, first: int) -> ControlCoordinates:
 
 
 def without_names(block: Block, ids: tuple[str, ...]) -> Block:
-    """`block` whose points have none of the names `ids`.
+    """Remove the names `ids` from the points of `block`.
 
-    Surveyed points of these names are replaced, so they go with their image points. Others are tie points, whose names
-    mean nothing: they get another one.
+    Surveyed points of these names are removed with their image points; tie points are renamed.
     """
     surveyed = {int(p) for rows in (block.control, block.fixed, block.check) for p in np.asarray(rows.who)}
     taken = set(ids)
@@ -270,9 +263,9 @@ def without_names(block: Block, ids: tuple[str, ...]) -> Block:
 
 
 def with_gnss_bias(block: Block) -> Block:
-    """`block` whose stations have a common shift, which control tells: another zero of heights, another datum."""
+    """Add a common shift of the stations of `block`, which control determines: height reference or datum."""
     unknowns, zero = block.start.unknowns, np.zeros(3)
-    # Beside a part of the flight that has none, the shifts of others count from it.
+    # Parts of a flight without a shift are the reference of the others.
     if "flight_bias" in unknowns.more or (unknowns.strips and unknowns.strips.keys() >= set(block.image_strip)):
         return block
     bias: dict[str, AbstractParameters] = {"": FlightBias(zero, zero)}  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Control of a flight: looked at before hours of matching, then tried on every part; a part can do without it."""
+"""Control of a flight: checked before matching, then used for every part; a part may be adjusted without it."""
 
 from collections.abc import Callable, Collection, Iterable
 from functools import partial
@@ -20,16 +20,16 @@ from jaxphoto.statistics import Selection
 
 
 class FlightControl(NamedTuple):
-    """Control as files have it, and the system of its points where they do not say it."""
+    """Control, and the system of its points if the file does not state it."""
 
     control: GivenControl
     system: str | None
     images: tuple[str, ...]
-    """All photographs of the flight that can be read."""
+    """All valid photographs of the flight."""
     looker: Looker | None
-    """What finds targets in them."""
+    """Search for targets in the photographs."""
     local: bool
-    """Whether the points are in Cartesian metres of no map, where positions of photographs tell nothing."""
+    """True for points in local Cartesian metres, to which positions of photographs have no relation."""
 
 
 def flight_control(
@@ -40,10 +40,10 @@ def flight_control(
     looker: Looker | None = None,
     code: int | None = None,
 ) -> tuple[FlightControl, int | None]:
-    """Control that may fit photographs, and the EPSG code of the flight: `code`, else that of the points' map system.
+    """Check control against photographs, and return the EPSG code of the flight: `code`, else that of the points.
 
-    Raises InputError where no mark names one of the `images`, where the system is not told or cannot be, where it is a
-    local one though a `code` is given, and where the points lie far from the `positions`, with what would fit.
+    Raises InputError if no mark is in one of the `images`, for a missing or invalid system, for a local one together
+    with `code`, and for points far from the `positions`, with a system that would fit.
     """
     known = [gps for gps in positions if gps is not None]
     place = np.median([(g.longitude_deg, g.latitude_deg) for g in known], axis=0) if known else None
@@ -71,7 +71,7 @@ def flight_control(
 def controlled_or_why(
     block: Block, given: FlightControl, code: int | None, vertical: int | None, report: Report
 ) -> tuple[ControlledBlock | None, str]:
-    """`block` with the control of the flight, or why it has to do without."""
+    """Adjust `block` with the control of the flight, or return why that is impossible."""
     of: Callable[..., ControlledBlock] = control_block
     if given.looker is not None:
         of = partial(control_block_with_targets, looker=given.looker)
@@ -84,7 +84,7 @@ def controlled_or_why(
 
 
 def parts_with_marks(adjusted: Adjustment, marked: Collection[str]) -> dict[str, Selection]:
-    """What has a variance component of its own: features, marks set by hand or found, stations in plan and height."""
+    """Groups of observations with a variance component each: features, marks, stations in plan and height."""
     own = set(marked)
     parts = {"image points": Selection("image_points")}
     if own:

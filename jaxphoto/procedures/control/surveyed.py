@@ -1,9 +1,7 @@
-"""What is known of control before photographs are looked at: surveyed points, and where photographs show them.
+"""Surveyed points, their marks in photographs, and their coordinate system.
 
-The coordinate system of control: from the words of a file to places on the ellipsoid of a block.
-
-Words are an EPSG code, with one of heights (25832+7837) or without, "WGS84 UTM 32N" and strings of PROJ as OpenDroneMap
-writes them, WKT as Metashape does, or "local" for Cartesian metres of no map.
+A system is an EPSG code, with one of heights (25832+7837) or without, "WGS84 UTM 32N" and PROJ strings as in
+OpenDroneMap, WKT as in Metashape, or "local" for Cartesian metres without a map.
 """
 
 import functools
@@ -23,39 +21,39 @@ from jaxphoto.errors import InputError, quoted
 from jaxphoto.georeferencing.map_frame import MapFrame, map_name, map_system
 
 SIGMA_M = (0.02, 0.02, 0.03)
-"""Of a surveyed point, east, north and up, where its file says none: a receiver with corrections, one occupation."""
+"""Default standard deviations of a surveyed point, east, north and up: RTK, one occupation."""
 MARK_SIGMA_PX = 1.0
-"""Of a mark set by hand where its file says none."""
+"""Default standard deviation of a manual mark."""
 
 
 class SurveyedPoints(NamedTuple):
-    """Points with coordinates, as a file has them."""
+    """Points with coordinates as in a file."""
 
     file: str
     ids: tuple[str, ...]
     coordinates: Float[np.ndarray, "points 3"]
-    """Easting, northing, height (m), or longitude, latitude (degrees), height; NaN for a height that is not known."""
+    """Easting, northing, height (m), or longitude, latitude (degrees), height; NaN for an unknown height."""
     sigma_m: Float[np.ndarray, "points 3"]
-    """East, north, up; NaN where the file says none."""
+    """East, north, up; NaN if not stated."""
     check: Bool[np.ndarray, "points"]
-    """Whether it only checks the block, and never enters the adjustment."""
+    """True for check points, which never enter the adjustment."""
     places: tuple[str, ...]
     """File and row of each."""
     system: str = ""
-    """What the file says of the coordinate system: an EPSG code, a string of PROJ, WKT, "local"; "" for nothing."""
+    """Coordinate system in the file: EPSG code, PROJ string, WKT, "local"; "" if not stated."""
     own_axes: bool = False
-    """Whether the first two coordinates are in the order of the system's own axes (EPSG:4326 has latitude first)."""
+    """True if the first two coordinates are in the axis order of the system (EPSG:4326: latitude first)."""
 
 
 class Marks(NamedTuple):
-    """Where photographs show points, in pixels: the centre of the upper-left pixel is (0.5, 0.5)."""
+    """Image coordinates of points in photographs (px); the centre of the upper-left pixel is (0.5, 0.5)."""
 
     image: tuple[str, ...]
-    """The name of the file or of the image."""
+    """Name of the file or of the image."""
     point: tuple[str, ...]
     column_row: Float[np.ndarray, "marks 2"]
     sigma_px: Float[np.ndarray, "marks"]
-    """NaN where the file says none."""
+    """NaN if not stated."""
     places: tuple[str, ...]
 
     @staticmethod
@@ -64,7 +62,7 @@ class Marks(NamedTuple):
         return Marks((), (), np.zeros((0, 2)), np.zeros(0), ())
 
     def take(self, chosen: np.ndarray) -> "Marks":
-        """Those that a mask or indices choose."""
+        """Select marks by mask or index."""
         which = np.arange(len(self.image))[chosen]
         names = (tuple(names[k] for k in which) for names in (self.image, self.point, self.places))
         image, point, places = names
@@ -72,7 +70,7 @@ class Marks(NamedTuple):
 
     @staticmethod
     def joined(one: "Marks", other: "Marks") -> "Marks":
-        """Both, one after the other."""
+        """Concatenate marks."""
         column_row = np.concatenate([one.column_row, other.column_row])
         sigma = np.concatenate([one.sigma_px, other.sigma_px])
         places = one.places + other.places
@@ -80,7 +78,7 @@ class Marks(NamedTuple):
 
 
 class GivenControl(NamedTuple):
-    """Surveyed points and marks of them; there may be none of these, where targets are to be found."""
+    """Surveyed points and their marks, which may be empty if targets are to be found."""
 
     points: SurveyedPoints
     marks: Marks
@@ -90,29 +88,29 @@ LOCAL = "local"
 _CODES = re.compile(r"(?:EPSG::?)?\s*(\d{1,6})(?:\s*\+\s*(?:EPSG::?)?(\d{1,6}))?\s*(?:[<#].*)?", re.IGNORECASE)
 _UTM = re.compile(r"WGS\s?84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
 _WKT = re.compile(r"\s*(GEOGCS|PROJCS|COMPD_CS|GEOGCRS|GEODCRS|PROJCRS|COMPOUNDCRS|GEOCCS)\[")
-# Those that read no files.
+# PROJ parameters that read no files.
 _KEYS = {
     "proj", "zone", "south", "ellps", "datum", "units", "no_defs", "type", "lat_0", "lon_0", "lat_1", "lat_2", "lat_ts",
     "k", "k_0", "x_0", "y_0", "towgs84", "a", "b", "rf", "alpha", "gamma", "lonc", "lat_b", "pm", "vunits", "wktext",
     "over",
 }  # fmt: skip
 _LONGEST = 20_000
-# Control of a flight lies no farther from it.
+# Maximum distance of control from a flight.
 NEAR_M = 20_000.0
 
 
 class ControlSystem(NamedTuple):
-    """A system of surveyed coordinates; `crs` None is local and Cartesian."""
+    """Coordinate system of surveyed points; `crs` None is local and Cartesian."""
 
     crs: CRS | None
     code: int | None
-    """EPSG code of the horizontal system; None where it has none."""
+    """EPSG code of the horizontal system, if any."""
     vertical: int | None
-    """That of the heights; None where they are above the ellipsoid, or nobody says above what."""
+    """EPSG code of the heights; None for ellipsoidal heights, or if unknown."""
 
     @property
     def name(self) -> str:
-        """As sentences name it."""
+        """Name in messages."""
         if self.crs is None:
             return "a local system"
         code = map_name(self.code, self.vertical) if self.code else ""
@@ -121,7 +119,7 @@ class ControlSystem(NamedTuple):
 
 @functools.lru_cache(maxsize=64)
 def system_of(words: str, place: str) -> ControlSystem:
-    """The system that `words`, read at `place`, name. Raises InputError where they name none."""
+    """Parse the system `words`, read at `place`. Raises InputError if they name none."""
     words = words.strip()
     if words.lower() == LOCAL or words.startswith("LOCAL_CS["):
         return ControlSystem(None, None, None)
@@ -155,8 +153,8 @@ def system_of(words: str, place: str) -> ControlSystem:
 def places(points: SurveyedPoints, system: ControlSystem, code: int) -> Float[np.ndarray, "points 3"]:
     """Longitude, latitude (degrees) and height (m) of the points, on the ellipsoid of the EPSG system `code`.
 
-    Unknown heights are taken as the median of the others. Raises InputError for coordinates that the system has not,
-    for heights whose geoid is not at hand, and where no point has a height.
+    Unknown heights are the median of the others. Raises InputError for coordinates outside the system, for a missing
+    geoid model, and if no point has a height.
     """
     crs = system.crs
     assert crs is not None
@@ -186,7 +184,7 @@ def places(points: SurveyedPoints, system: ControlSystem, code: int) -> Float[np
 
 
 def filled(points: SurveyedPoints) -> Float[np.ndarray, "points 3"]:
-    """Coordinates with the median height where there is none. Raises InputError where no point has one."""
+    """Coordinates with the median height for unknown ones. Raises InputError if no point has one."""
     xyz = points.coordinates.copy()
     if np.isnan(xyz[:, 2]).all():
         raise InputError(f"{points.file}: no point has a height; add them")
@@ -195,7 +193,7 @@ def filled(points: SurveyedPoints) -> Float[np.ndarray, "points 3"]:
 
 
 def check_near(points: SurveyedPoints, system: ControlSystem, longitude: float, latitude: float) -> None:
-    """Raise InputError where the points lie far from where the photographs were taken, with what would fit."""
+    """Raise InputError for points far from the photographs, with a system that would fit."""
     code = system.code or 4326
     try:
         off = distance_m(places(points, system, code), longitude, latitude)
@@ -211,7 +209,7 @@ def check_near(points: SurveyedPoints, system: ControlSystem, longitude: float, 
 
 
 def fitting(points: SurveyedPoints, system: ControlSystem | None, longitude: float, latitude: float) -> str:
-    """Under which reading the points lie where the photographs were taken; "" where there is none."""
+    """Describe the system in which the points are near the photographs; "" if there is none."""
     exchanged = points._replace(coordinates=points.coordinates[:, [1, 0, 2]])
     if system is not None and system.crs is not None and _near(exchanged, system, longitude, latitude):
         return f"with the first two coordinates exchanged, in {system.name}"
@@ -246,7 +244,7 @@ def _systems_at(longitude: float, latitude: float) -> list[int]:
 
 
 def distance_m(places: Float[np.ndarray, "n 3"], longitude: float, latitude: float) -> float:
-    """Of the middle of `places` (degrees) from a place, on a sphere."""
+    """Distance of the median of `places` (degrees) from a place, on a sphere."""
     there = np.deg2rad(np.median(places[:, :2], axis=0))
     here = np.deg2rad([longitude, latitude])
     half = np.sin((there - here) / 2) ** 2

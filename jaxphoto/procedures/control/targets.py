@@ -1,22 +1,16 @@
-"""Where photographs should show surveyed points, with the covariance that says how far to look.
+"""Targets of surveyed points: predicted in photographs, searched for, verified, and adjusted with, iteratively.
 
     C = J_i C_i J_i' + J_X C_X J_X'
 
-J_i is by the exterior orientation of the image and the interior one of its camera, with their joint covariance from the
-adjustment; J_X by the point, with the covariance of the survey and of what survey and block may differ by in common.
+is the covariance of a predicted image point: J_i are the derivatives by exterior and interior orientation with their
+joint covariance from the adjustment, J_X those by the point with the covariance of the survey and of its offset.
 
-Targets of surveyed points looked for where photographs should show them, and believed where their rays meet.
+A search returns candidates. Those of a point in several photographs belong to one target if their rays meet, near
+enough to the point. Of positions with similar numbers of photographs, the one with the sharpest edges is the target; if
+that is ambiguous none is accepted, nor candidates far less sharp than the targets of other points (stones).
 
-What looks into pictures gives candidates; those of a point in different photographs are of one target where their rays
-meet at one place, near enough to where the point should be. Of places that about as many photographs tell the one
-with the sharper edges is it, which targets are made to have; where that does not decide none is believed, nor what is
-far less sharp than the targets of the other points, as a round stone is.
-
-Control whose targets are found in the photographs: predicted, looked for, adjusted with, and once more from there.
-
-The first round looks as far as what is known of the block leaves open, the next ones only as far as the block with the
-targets that were found does, which decides between targets that look alike. What was found far from where the others
-have the block is looked for anew from there, and gives way to what is found: it was another thing.
+The first search covers the uncertainty of the given block, the next ones that of the block with the accepted targets,
+which resolves similar targets. Targets far from the position that the other points predict are searched for again.
 """
 
 from collections.abc import Callable, Collection
@@ -49,25 +43,25 @@ from jaxphoto.statistics.covariance import rotation_jacobians
 
 
 class Predicted(NamedTuple):
-    """Surveyed points in images; pixels from the upper-left corner, whose pixel has its centre at (0.5, 0.5)."""
+    """Surveyed points in images; px from the upper-left corner, whose pixel has its centre at (0.5, 0.5)."""
 
     image: Int[np.ndarray, "n"]
     point: Int[np.ndarray, "n"]
     column_row: Float[np.ndarray, "n 2"]
     covariance: Float[np.ndarray, "n 2 2"]
-    """In px^2."""
+    """px^2."""
     px_per_m: Float[np.ndarray, "n 2 3"]
-    """How the place in the picture moves with X, Y, Z of the point."""
+    """Derivative of the image coordinates by X, Y, Z of the point."""
 
     def take(self, chosen: np.ndarray) -> "Predicted":
-        """Those that a mask or indices choose."""
+        """Select rows by mask or index."""
         return Predicted(*(v[chosen] for v in self))
 
 
 def predicted(
     adjusted: Adjustment, xyz: Float[np.ndarray, "points 3"], of_points: Float[np.ndarray, "points 3 3"]
 ) -> Predicted:
-    """All places where `xyz` (m, in the frame of the block, of covariance `of_points`) are in a picture."""
+    """Predict `xyz` (m, in the frame of the block, with covariance `of_points`) in all photographs that show them."""
     block, unknowns = adjusted.block, adjusted.unknowns
     joint = covariance(adjusted)
     n, factor = len(block.images), float(joint.variance_factor)
@@ -129,51 +123,52 @@ def _projected(interior, exterior, points, corrections):
     return jax.vmap(one)(exterior, points)
 
 
-# Standard deviations within which a target is looked for, and pixels at least.
+# Search radius: standard deviations, and minimum in pixels.
 _WITHIN, _LEAST_PX = 3.5, 5.0
-# Of a block that no control has placed yet, m in plan: what receivers without corrections have in common.
+# Standard deviation (m, plan) of the common offset of a block without control: receivers without corrections.
 COMMON_M = 3.0
-# Ties about a point whose height is that of the ground there.
+# Number of tie points that give the height of the ground at a point.
 _NEAR_TIES = 8
-# By how many pixels a candidate may miss the place where the rays of its point meet.
+# Maximum distance (px) of a candidate from the intersection of the rays of its point.
 _MISS_PX = 2.0
 _LEAST_IMAGES, _LEAST_UNNAMED = 2, 3
-# Of the photographs that show a target, how many show another place for that to be as good.
+# Fraction of the photographs of a target above which another position competes.
 _ALIKE = 0.6
 _PARALLEL = np.deg2rad(0.5)
-# By which factor the fits of a target are better than those of another place that looks like it; and by which one they
-# may be worse than those of the other targets.
+# Ratio of fits above which a target is sharper than another candidate, and above which it is duller than other targets.
 _SHARPER, _DULL = 1.5, 3.0
 _MOST_PAIRS = 2000
 
 
 class Candidates(NamedTuple):
-    """What might be a target, by row of what was predicted."""
+    """Candidates for targets, by row of the predictions."""
 
     row: Int[np.ndarray, "n"]
     column_row: Float[np.ndarray, "n 2"]
     sigma_px: Float[np.ndarray, "n"]
     fit_px: Float[np.ndarray, "n"]
-    """Of the fit to its grey values alone: small where its edge is sharp and strong, as a target's is."""
+    """Standard deviation of the fit to the grey values alone: small for sharp edges."""
 
 
 class Looker(NamedTuple):
-    """What finds targets in the pictures."""
+    """Search for targets in photographs."""
 
     look: Callable[[Predicted, Float[np.ndarray, "n"], tuple[str, ...], tuple[str, ...]], Candidates]
-    """Candidates within the radius (px) of each place; with the names of all images and points."""
+    """Return candidates within the radius (px) of each prediction; arguments include the names of all images and
+    points.
+    """
     named: bool
-    """Whether a target tells which point it is."""
+    """True if a target identifies its point."""
 
 
 class FoundTargets(NamedTuple):
-    """Marks of targets that were found, and what became of every point that was looked for, by its name."""
+    """Marks of accepted targets, and the result of every point by name."""
 
     marks: Marks
     looked: dict[str, tuple[str, ...]]
-    """In which photographs it was looked for."""
+    """Photographs that were searched."""
     why_not: dict[str, str]
-    """Of those that were not found."""
+    """Reasons of points without a target."""
 
 
 def found_marks(
@@ -185,9 +180,11 @@ def found_marks(
     looker: Looker,
     placed: bool,
 ) -> FoundTargets:
-    """Targets of the points `ids` at `xyz` (m, +- `sigma`) in the images of `adjusted`, but for (image, point) `known`.
+    """Find targets of the points `ids` at `xyz` (m, +- `sigma`) in the images of `adjusted`, except (image, point)
+    `known`.
 
-    `placed`: control has placed the block; else its plan is that of receivers, and heights are those of its own ground.
+    `placed`: control determines the frame of the block; otherwise its plan is that of receivers, its heights those of
+    the ground.
     """
     of_points = np.einsum("ni,ij->nij", sigma**2, np.eye(3))
     if not placed:
@@ -203,7 +200,7 @@ def found_marks(
 
 
 def _on_own_ground(adjusted: Adjustment, xyz) -> tuple[Float[np.ndarray, "points 3"], float]:
-    """`xyz` with heights shifted in common onto the ground that the block has there, and how far single ones are."""
+    """Shift the heights of `xyz` to the ground of the block, and estimate the scatter of single ones."""
     ties = np.asarray(adjusted.unknowns.points, float)
     above = []
     for point in xyz:
@@ -264,14 +261,14 @@ def _believed(adjusted, ids, xyz, of_points, at: Predicted, seen: Candidates, na
 
 
 def _fit_of_others(taken: dict[int, list[int]], fit_px: Float[np.ndarray, "n"]) -> dict[int, float]:
-    """For each point what fits of the other points' targets usually are; without bound where there are too few."""
+    """Median fit of the targets of the other points; infinite for too few."""
     own = {p: float(np.median(fit_px[rows])) for p, rows in taken.items()}
     others = {p: [fit for q, fit in own.items() if q != p] for p in own}
     return {p: float(np.median(fits)) if len(fits) >= _LEAST_IMAGES else np.inf for p, fits in others.items()}
 
 
 def _meeting(origins, directions, image, limit, fit, near, of_point) -> tuple[np.ndarray, str]:
-    """The candidates, one of an image, whose rays meet at one place near a point; or why there are none."""
+    """The candidates, one per image, whose rays meet near a point; or why there are none."""
     one, other = np.triu_indices(len(image), 1)
     apart = image[one] != image[other]
     one, other = one[apart], other[apart]
@@ -286,7 +283,7 @@ def _meeting(origins, directions, image, limit, fit, near, of_point) -> tuple[np
         origins[ray], directions[ray], np.arange(len(one)).repeat(2), len(one), min_angle=_PARALLEL
     )
     off = met - near
-    # Two rays may be off by more than the survey: what they are good for is in the limit.
+    # Two rays may differ by more than the survey: their own accuracy is in the limit.
     room = np.linalg.norm(near - origins[one], axis=1) * limit[one] * 5
     distance = np.sqrt(np.einsum("ni,ij,nj->n", off, np.linalg.inv(of_point + 1e-12 * np.eye(3)), off))
     sure &= (distance < _WITHIN * 1.5) | (np.linalg.norm(off, axis=1) < room)
@@ -297,7 +294,7 @@ def _meeting(origins, directions, image, limit, fit, near, of_point) -> tuple[np
     score = np.stack([(inside & (image == i)).any(axis=1) for i in images]).sum(axis=0)
     likely = np.flatnonzero(score >= min(score.max(), max(_LEAST_UNNAMED, _ALIKE * score.max())))
     sharp = np.array([np.median(fit[inside[k]]) for k in likely])
-    # Of the places that are as sharp as the sharpest, which are often one, that which most photographs show.
+    # Of the positions about as sharp as the sharpest, that of most photographs.
     miss = misses(met[sure], origins, directions).min(axis=1)
     alike = likely[sharp <= _SHARPER * sharp.min()]
     best = int(alike[np.argmax(score[alike] - 1e-3 * miss[alike])])
@@ -314,7 +311,7 @@ def _meeting(origins, directions, image, limit, fit, near, of_point) -> tuple[np
 
 
 _ROUNDS = 3
-# Of what the other surveyed points are off (median): what was found so far away may be another thing.
+# Distance over the median of the other points beyond which a target may be something else.
 _FAR = 10.0
 
 
@@ -330,10 +327,9 @@ def control_block_with_targets(
     adjust: Callable[[Block], Adjustment] = adjust_for_tables,
     report: Callable[[str], object] = lambda text: None,
 ) -> ControlledBlock:
-    """`control_block` with the marks of `control` and those that `looker` finds.
+    """Adjust with the marks of `control` and those that `looker` finds; see `control_block`.
 
-    Raises InputError as it does, and for a block in a frame of its own without marks of three control points: nobody
-    knows where to look there.
+    Raises InputError as it does, and for a block in an arbitrary frame without marks of three control points.
     """
     points, ids = control.points, control.points.ids
     sigma = np.where(np.isnan(points.sigma_m), SIGMA_M, points.sigma_m)
@@ -357,9 +353,9 @@ def control_block_with_targets(
     for _ in range(_ROUNDS):
         report("looking for targets")
         frame = in_frame(adjusted.block, points, system, code, vertical)
-        # By marks, by targets of an earlier round, or by control that the block came with.
+        # By marks, by targets of an earlier iteration, or by control of the block.
         placed = len(adjusted.block.control) > 0
-        # Each but once: what is found again is no other.
+        # Each only once.
         far = {p: off for p, off in _far(now, by_hand).items() if p not in anew} if now else {}
         rows = (by_hand, now.marks.take(~np.isin(now.marks.point, list(far)))) if now else (by_hand,)
         known = {pair for of in rows for pair in zip(of.image.tolist(), of.point.tolist(), strict=True)}
@@ -374,7 +370,7 @@ def control_block_with_targets(
         why_not |= found.why_not
         if not len(found.marks.image):
             break
-        # Where one of an earlier round was left out, another may be found in its place; what is far goes as a whole.
+        # After a rejection another target may be found; distant ones are replaced as a whole.
         again = set(zip(found.marks.image, found.marks.point, strict=True))
         names = {ids[p] for p in gone}
         kept = [(i, p) not in again and p not in names for i, p in zip(every.image, every.point, strict=True)]
@@ -400,9 +396,9 @@ def control_block_with_targets(
 
 
 def _far(now: ControlledBlock, by_hand: Marked) -> dict[int, float]:
-    """Of points that were found far from their place, not by hand, and that nothing is adjusted with: how far (m).
+    """Distance (m) of found targets, not marked by hand nor adjusted with, that are far from their points.
 
-    They stay unless another target is found: a block may be bent there, which check points are to tell.
+    They remain unless another target is found: the block may be deformed there, which check points show.
     """
     state, off = np.array(now.state, object), np.linalg.norm(np.nan_to_num(now.off_m), axis=1)
     if (state == "control").sum() < MIN_POINTS:
@@ -415,7 +411,7 @@ def _far(now: ControlledBlock, by_hand: Marked) -> dict[int, float]:
 def _told(
     ids: tuple[str, ...], seen: dict[str, set[str]], looked: dict[str, set[str]], why_not: dict[str, str]
 ) -> list[str]:
-    """One sentence on what was found in all rounds, and one for each point that was found in none."""
+    """One sentence on the targets of all iterations, and one for each point without any."""
     found = [f"{name} in {len(seen[name])} of {len(looked[name])}" for name in ids if seen[name]]
     count = f"{counted(len(found), 'target')} found in the photographs that should show them"
     return [f"{count}: {', '.join(found)}"] * bool(found) + [why_not[p] for p in ids if p in why_not and not seen[p]]

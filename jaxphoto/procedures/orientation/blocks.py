@@ -1,6 +1,6 @@
-"""A block of which too little is known but its image points: its images oriented by COLMAP, as photographs are.
+"""Orient a block without initial values by COLMAP; its points give the matches.
 
-Its points give the matches. Gross errors stay in the block; COLMAP keeps them from corrupting its start.
+Gross errors stay in the block; COLMAP prevents their influence on initial values.
 """
 
 import dataclasses
@@ -20,19 +20,19 @@ from jaxphoto.procedures.orientation.known_frame import in_known_frame
 from jaxphoto.procedures.orientation.orient_photographs import Report
 from jaxphoto.unknowns import FIXED
 
-# Points measured by hand are few, and mostly right.
+# Manual image points are few, and mostly correct.
 _MIN_MATCHES, _MIN_POINTS = 8, 6
 
 
 def orient_block(block: Block, report: Report = lambda text: None) -> Block:
-    """Return `block` with a start for its images and points, from its image points alone.
+    """Add initial values for images and points of `block`, from its image points alone.
 
-    The frame is that of its known points and camera stations, where three or more not on a line are seen, else that of
-    its known images; where nothing is known, it is arbitrary. A principal distance that is not fixed starts where
-    COLMAP estimates it. What was known stays as it is; images and points that cannot be oriented stay unknown.
+    The frame is that of three or more known points and camera stations that are not collinear, else that of known
+    images, else arbitrary. A principal distance that is not fixed starts at COLMAP's estimate. Known values are
+    unchanged; images and points that cannot be oriented stay unknown.
 
-    Raises BlockError for cameras that are not perspective, where no two images begin a network, for groups of images
-    that nothing connects, and where known points and stations are too few for the frame.
+    Raises BlockError for cameras that are not perspective, if no two images can be oriented, for unconnected groups of
+    images, and for too few known points and stations.
     """
     _check_perspective(block)
     start, measured = block.start.unknowns, block.image_points
@@ -53,7 +53,7 @@ def orient_block(block: Block, report: Report = lambda text: None) -> Block:
         _MIN_MATCHES,
         _MIN_POINTS,
     )
-    # Of several points that COLMAP made of one, that of most rays counts.
+    # Of several points that COLMAP made of one, that with most rays.
     points = np.full((len(block.points), 3), np.nan)
     number = np.array([point_of[i][f] for i, f in zip(network.image, network.feature, strict=True)], int)
     order = np.argsort(np.bincount(network.point)[network.point], kind="stable")
@@ -101,7 +101,7 @@ def _check_perspective(block: Block) -> None:
 
 
 def _common_points(points: list[np.ndarray]) -> Iterator[PairMatches]:
-    """The points that each two images have in common, as indices of their rows."""
+    """Common points of each two images, as indices of their rows."""
     for i in range(len(points)):
         for j in range(i + 1, len(points)):
             _, one, other = np.intersect1d(points[i], points[j], return_indices=True)

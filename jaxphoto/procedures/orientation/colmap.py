@@ -1,9 +1,9 @@
 """Incremental mapping by COLMAP: features and their matches -> exterior orientation, object points and tracks.
 
 COLMAP (Schönberger and Frahm 2016, "Structure-from-Motion Revisited") verifies every pair by its essential or
-fundamental matrix or its homography, and adds one image after the other by resection, triangulation and local bundle
-adjustment. Here it sees ideal image coordinates of the camera as it is known, and may estimate the principal distance
-and one radial term. Its result is a set of approximate values: `jaxphoto.procedures.orientation.orient` adjusts them.
+fundamental matrix or homography, and adds images by resection, triangulation and local bundle adjustment. Here its
+input is ideal image coordinates of the initial camera, and it may estimate the principal distance and one radial term.
+Its result are initial values: `jaxphoto.procedures.orientation.orient` adjusts them.
 """
 
 import tempfile
@@ -17,11 +17,11 @@ from jaxtyping import Bool, Float, Int
 from jaxphoto.errors import BlockError, GroupsError
 from jaxphoto.initial.matches import PairMatches, connected_images
 
-# Angles (deg) between rays below which COLMAP makes no point; the smaller one serves where images are missing.
+# Minimum angles (deg) between rays of a point; the smaller one is tried if images are missing.
 _ANGLES_DEG = (1.5, 0.4)
-# A principal distance that comes out by this factor away from its start is not determined by the images.
+# Maximum factor of the estimated principal distance over its initial value.
 _PLAUSIBLE = 1.5
-# Part of the matches of a pair that its relative orientation must agree with: fewer agree by chance.
+# Minimum inlier ratio of a pair: fewer matches agree by chance.
 _MIN_INLIER_RATIO = 0.25
 
 
@@ -31,7 +31,7 @@ _ONE_PLACE = "they were taken from one place, or see too few points at a wide en
 
 
 class MappedCamera(NamedTuple):
-    """A camera without distortion, in pixels."""
+    """Camera without distortion, in pixels."""
 
     width_px: int
     height_px: int
@@ -41,13 +41,13 @@ class MappedCamera(NamedTuple):
 
 
 class Network(NamedTuple):
-    """Images oriented in a frame of arbitrary position, rotation and scale, and the points they see."""
+    """Images oriented in an arbitrary frame, and their points."""
 
     positions: Float[np.ndarray, "images 3"]
     camera_from_object: Float[np.ndarray, "images 3 3"]
     oriented: Bool[np.ndarray, " images"]
     order: tuple[int, ...]
-    """The oriented images as COLMAP lists them."""
+    """Oriented images in COLMAP's order."""
     points: Float[np.ndarray, "points 3"]
     image: Int[np.ndarray, " rows"]
     feature: Int[np.ndarray, " rows"]
@@ -55,7 +55,7 @@ class Network(NamedTuple):
     c_px: tuple[float, ...]
     """By camera."""
     verified: tuple[PairMatches, ...]
-    """Matches that agree with the relative orientation of their pair."""
+    """Inlier matches of each pair."""
 
 
 def import_pycolmap() -> Any:
@@ -84,9 +84,9 @@ def map_images(
     """Orient the images `names` from `matches` of their features, gross errors among them.
 
     `features_px` are ideal coordinates in pixels (column, row), `image_camera` the camera of each image. A pair needs
-    `min_matches` that agree, an image `min_points`.
+    `min_matches` inliers, an image `min_points`.
 
-    Raises BlockError where no two images begin a network, and GroupsError for groups that nothing connects.
+    Raises BlockError if no two images can be oriented, and GroupsError for unconnected groups.
     """
     pycolmap = import_pycolmap()
     if not (enough := [m for m in matches if len(m.features) >= min_matches]):
@@ -130,7 +130,7 @@ def map_images(
 
 
 def _verified_matches(pycolmap: Any, database: str) -> tuple[PairMatches, ...]:
-    """The inlier matches of all pairs in a COLMAP `database`."""
+    """Inlier matches of all pairs in a COLMAP `database`."""
     verified = []
     with pycolmap.Database.open(database) as stored:
         for pair, geometry in zip(*stored.read_two_view_geometries(), strict=True):
@@ -149,7 +149,7 @@ def _rays(camera: MappedCamera, xy_px: Float[np.ndarray, "n 2"]) -> Float[np.nda
 
 
 def _only_rotated(rays: list[np.ndarray], match: PairMatches, c_px: float) -> bool:
-    """True if a rotation takes the rays of one image to those of the other: both were taken from one place."""
+    """True if a rotation maps the rays of one image to those of the other: both have the same projection centre."""
     one, other = rays[match.first][match.features[:, 0]], rays[match.second][match.features[:, 1]]
     u, _, vt = np.linalg.svd(one.T @ other)
     turned = one @ (u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
@@ -207,7 +207,7 @@ def write_database(
 
 
 def _options(pycolmap: Any, cameras, angle: float, free: bool, min_matches: int, min_points: int) -> Any:
-    """Options of the mapping. COLMAP's own find no beginning where all images look along their path."""
+    """Mapping options. COLMAP's defaults find no initial pair if all images look along their path."""
     options = pycolmap.IncrementalPipelineOptions(random_seed=0)
     options.extract_colors, options.min_model_size, options.max_num_models = False, 2, 4
     options.min_num_matches = min_matches
@@ -222,7 +222,7 @@ def _options(pycolmap: Any, cameras, angle: float, free: bool, min_matches: int,
 
 
 def _score(model: Any, cameras: Sequence[MappedCamera]) -> tuple[bool, int, int]:
-    """True if all principal distances are plausible; images; image points."""
+    """True if all principal distances are plausible; number of images; number of image points."""
     ratios = [c.focal_length / cameras[k - 1].c_px for k, c in model.cameras.items()]
     plausible = all(1 / _PLAUSIBLE < ratio < _PLAUSIBLE for ratio in ratios)
     return plausible, model.num_reg_images(), model.compute_num_observations()
@@ -238,7 +238,7 @@ def _network(model: Any, n_images: int, n_cameras: int, verified: tuple[PairMatc
         matrices[k] = np.diag([1.0, -1, -1]) @ image.cam_from_world().rotation.matrix()
     tracks = [point.track.elements for point in model.points3D.values()]
     rows = np.array([(e.image_id - 1, e.point2D_idx, p) for p, track in enumerate(tracks) for e in track], int)
-    # COLMAP may join two features of an image to one point: the first stands.
+    # COLMAP may join two features of an image to one point: the first is kept.
     rows = rows.reshape(-1, 3)[np.unique(rows.reshape(-1, 3)[:, [2, 0]], axis=0, return_index=True)[1]]
     return Network(
         positions,

@@ -1,4 +1,4 @@
-"""The similarity that brings a network in a frame of its own to points, stations and images that are known."""
+"""Similarity from an arbitrary frame of a network to known points, stations and images."""
 
 import dataclasses
 from typing import NamedTuple
@@ -11,29 +11,29 @@ from jaxphoto.errors import BlockError
 from jaxphoto.initial.averaging import average_rotation
 from jaxphoto.procedures.orientation.colmap import Network
 
-# Known places whose spread across their line is less than this part of that along it leave a turn about it open.
+# Minimum spread of known points across their line over that along it: otherwise a rotation is undetermined.
 _LINE = 1e-3
-# The same where known images can give the turn: approximate positions of a strip scatter by more than `_LINE`.
+# The same if known images can give the rotation: approximate positions of a strip scatter by more than `_LINE`.
 _NEARLY_A_LINE = 0.05
 
 
 class Similarity(NamedTuple):
-    """X in one frame is `shift + scale * turn @ x` of x in another."""
+    """Similarity: X in one frame is `shift + scale * turn @ x` of x in another."""
 
     shift: Float[np.ndarray, "3"]
     turn: Float[np.ndarray, "3 3"]
     scale: float
 
     def of(self, x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Places in the other frame."""
+        """Transform points to the other frame."""
         return self.shift + self.scale * x @ self.turn.T
 
     def turned(self, camera_from_object: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
-        """Rotations from the other frame."""
+        """Transform rotations to the other frame."""
         return camera_from_object @ self.turn.T
 
     def of_block(self, block: Block) -> Block:
-        """`block` whose start is in the other frame; what was observed stays where it is."""
+        """Transform the initial values of `block` to the other frame; observations are unchanged."""
         unknowns = block.start.unknowns
         exterior = dataclasses.replace(
             unknowns.exterior,
@@ -47,10 +47,10 @@ class Similarity(NamedTuple):
 def similarity_between(
     there: Float[np.ndarray, "n 3"], here: Float[np.ndarray, "n 3"], line: float = _LINE
 ) -> Similarity | None:
-    """The similarity that takes `there` nearest to `here` (least squares); None where they leave one open.
+    """Estimate the similarity from `there` to `here` by least squares; None if it is undetermined.
 
-    Umeyama (1991), "Least-squares estimation of transformation parameters between two point patterns". Three places
-    that do not lie on a line are needed: that spread across it by more than the part `line` of their spread along it.
+    Umeyama (1991), "Least-squares estimation of transformation parameters between two point patterns". Three points are
+    needed whose spread across their line exceeds the fraction `line` of that along it.
     """
     if len(here) < 3:
         return None
@@ -66,13 +66,13 @@ def similarity_between(
 
 
 def in_known_frame(block: Block, network: Network, known: Start) -> Network:
-    """`network` in the frame of what is known of `block`: surveyed points and stations, then the images of `known`.
+    """Transform `network` to the frame of known points and stations of `block`, then of the images of `known`.
 
-    Where surveyed places are few or nearly on a line, the images and points of `known` join them; where all are, known
-    images give the turn, and where there is one place, scale bars the scale. A scale that nothing tells stays that of
-    the network, and so does its frame where nothing is known.
+    If known points are few or nearly collinear, images and points of `known` join them; if these are, too, known images
+    give the rotation, and for a single point, scale bars give the scale. Without information, frame and scale of the
+    network remain.
 
-    Raises BlockError where there are some surveyed places, but fewer than three, or on a line, and no known image.
+    Raises BlockError for one or two known points, or collinear ones, without a known image.
     """
     there, here = _surveyed(block, network)
     images = np.flatnonzero(np.asarray(known.image_known) & network.oriented)
@@ -95,7 +95,7 @@ def in_known_frame(block: Block, network: Network, known: Start) -> Network:
 
 
 def _surveyed(block: Block, network: Network) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Known points that are met and stations of oriented images: in the network, and as surveyed."""
+    """Known points and stations of oriented images: in the network, and as surveyed."""
     points = np.flatnonzero(np.asarray(block.start.point_known) & _met(network))
     station = np.full((len(block.images), 3), np.nan)
     station[np.asarray(block.stations.who), np.asarray(block.stations.axis)] = np.asarray(block.stations.value, float)
@@ -105,7 +105,7 @@ def _surveyed(block: Block, network: Network) -> tuple[Float[np.ndarray, "n 3"],
 
 
 def _by_images(block: Block, network: Network, known: Start, images, there, here) -> Similarity:
-    """By `images` and points of `known` and surveyed places, and by the rotations where all lie nearly on a line."""
+    """From `images` and points of `known` and surveyed points, and from rotations if all are nearly collinear."""
     exterior = known.unknowns.exterior
     points = np.flatnonzero(np.asarray(known.point_known) & ~np.asarray(block.start.point_known) & _met(network))
     there = np.concatenate([there, network.points[points], network.positions[images]])
@@ -125,7 +125,7 @@ def _by_images(block: Block, network: Network, known: Start, images, there, here
 
 
 def _scale_of_bars(block: Block, network: Network) -> float:
-    """By the median of the scale bars whose ends are met; 1 where there is none."""
+    """Median scale of the scale bars with both ends; 1 if there is none."""
     ends = np.asarray(block.distances.points)
     met = _met(network)[ends].all(axis=1)
     if not met.any():

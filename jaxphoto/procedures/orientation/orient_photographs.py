@@ -35,15 +35,15 @@ from jaxphoto.variants import some_images, without_observations
 CAMERA = "camera"
 """Name of the camera of photographs in the block."""
 SIGMA_PX = 0.5
-"""Standard deviation of a feature, in pixels, where none is given."""
+"""Default standard deviation of a feature, in pixels."""
 MIN_MATCHES = 15
-"""Of a pair of photographs: fewer false ones agree with some orientation by chance."""
+"""Minimum number of matches of a pair: fewer false ones agree by chance."""
 MIN_POINTS = 10
-"""Number of points that an oriented photograph sees."""
+"""Minimum number of points of an oriented photograph."""
 ITERATIONS = 20
-# The iteration ends where at most this part of the image points, or so many of them, are rejected.
+# The iteration ends if at most this fraction of the image points, or so many of them, are rejected.
 _CONVERGED, _FEW = 1e-3, 2
-# Over flat ground a principal distance that is hardly determined moves slowly.
+# Over flat ground a weakly determined principal distance converges slowly.
 _MAX_STEPS = 200
 
 Report = Callable[[str], object]
@@ -57,17 +57,17 @@ class GrossErrors(NamedTuple):
     off_epipolar: int
     """Matches that do not agree with a relative orientation of their pair."""
     untriangulated: int
-    """Other matches whose features are of no common point."""
+    """Other matches whose features are not of one point."""
     beyond: int
     """Image points whose residual exceeds the limit."""
     too_few: int
     """Image points of points and images that are left with too few of them."""
     unsupported: int
-    """Image points of two rays that meet where nothing near them in the images is."""
+    """Image points of two rays at a depth that neighbouring points contradict."""
 
 
 class OrientationReport(NamedTuple):
-    """How an orientation came about."""
+    """Summary of an orientation."""
 
     n_images: int
     n_matches: int
@@ -94,22 +94,22 @@ class OrientationReport(NamedTuple):
     estimated: tuple[str, ...]
     """Parameters of the interior orientation that are free in the block."""
     observed: tuple[str, ...]
-    """Why others are observed where they start, a sentence each."""
+    """Why others stay observed at their initial values, a sentence each."""
     alike: float
     """Factor of the standard deviations of the camera for the correlation of neighbouring residuals."""
 
 
 @pretty_repr
 class Oriented(NamedTuple):
-    """A block of photographs, oriented as a free network of arbitrary scale, and how it came about."""
+    """Block of photographs, oriented as a free network of arbitrary scale, and the report."""
 
     block: Block
-    """It starts where the orientation ended; `jaxphoto.adjust` gives its statistics."""
+    """Initial values are those of the last adjustment; `jaxphoto.adjust` gives statistics."""
     residuals_mm: Float[np.ndarray, "rows 2"]
-    """Of its image points, observed minus computed."""
+    """Residuals of its image points, observed minus computed."""
     report: OrientationReport
     sizes: PaddedSizes
-    """That its adjustments were compiled for; with them that of `block` runs the same program."""
+    """Sizes of the compiled adjustments: with them that of `block` runs the same program."""
 
 
 def orient(
@@ -125,10 +125,10 @@ def orient(
     """Orient the images `names` of one camera from matches of their features, gross errors among them.
 
     `features` are measured image coordinates (mm, from the image centre) by image, `sigmas_mm` their standard
-    deviations (half a pixel by default), `matches` index them. `interior` is where its parameters start; those that
-    the images determine are free in the block. `report` is called with the current step.
+    deviations (half a pixel by default), `matches` index them. `interior` is the initial camera; parameters that the
+    images determine are free in the block. `report` is called with the current step.
 
-    Raises BlockError where no two images begin a network, and for groups of images that nothing connects (all named).
+    Raises BlockError if no two images can be oriented, and for unconnected groups of images (all named).
     """
     features = [np.asarray(xy, float).reshape(-1, 2) for xy in features]
     if sigmas_mm is None:
@@ -182,21 +182,21 @@ def orient(
 
 
 class _Iterated(NamedTuple):
-    """A network without gross errors, adjusted."""
+    """Adjusted network without gross errors."""
 
     block: Block
     adjusted: Adjustment
     limit: float
-    """Of residuals over a priori standard deviations."""
+    """Limit of residuals over a priori standard deviations."""
     iterations: int
     settled: bool
     rejected: dict[str, int]
     lost: dict[str, str]
-    """Images that see too few points without gross errors."""
+    """Images with too few points without gross errors."""
 
 
 def _iterated(block: Block, calibration: SelfCalibration, free: tuple[str, ...], report: Report) -> _Iterated:
-    """`block` adjusted with the parameters `free`, the others observed, until hardly any image point is rejected."""
+    """Adjust `block` with the parameters `free`, the others observed, until hardly any image point is rejected."""
     rejected, lost = {"beyond": 0, "too_few": 0, "unsupported": 0}, dict[str, str]()
     for iteration in range(1, ITERATIONS + 1):
         report(f"adjusting {len(block.images)} images, iteration {iteration}")
@@ -232,7 +232,7 @@ def _started(block: Block, unknowns: Unknowns) -> Block:
 
 
 def _match_errors(matches: Sequence[PairMatches], network: Network) -> tuple[int, int, int]:
-    """Matches of images that are not oriented, off the epipolar line, and of features without a common point."""
+    """Number of matches of unoriented images, off the epipolar line, and of features without a common point."""
     point = {(i, f): p for i, f, p in zip(network.image, network.feature, network.point, strict=True)}
     of_pair = {(m.first, m.second): m.features for m in network.verified}
     unoriented = off = untriangulated = 0
@@ -248,7 +248,7 @@ def _match_errors(matches: Sequence[PairMatches], network: Network) -> tuple[int
 
 
 def _unoriented(names, network: Network, block: Block, lost: dict[str, str]) -> dict[str, str]:
-    """Why images are not oriented."""
+    """Reasons of unoriented images."""
     paired = {names[k] for m in network.verified for k in (m.first, m.second)}
     few = f"it shares too few points with the others that fit one orientation; {MIN_POINTS} are needed"
     alone = "no other image has a relative orientation to it"
@@ -256,7 +256,7 @@ def _unoriented(names, network: Network, block: Block, lost: dict[str, str]) -> 
 
 
 def network_block(title, names, sensor, interior, features, sigmas_mm, network: Network) -> Block:
-    """The oriented images and the points of `network`, their interior orientation free in its usual parameters."""
+    """Block of the oriented images and points of `network`; the usual parameters of the camera are free."""
     for name in parameter_names(interior):
         interior = set_parameter(interior, name, np.asarray(get_parameter(interior, name), float))
     priors = freed(interior, ("c_mm", "xp_mm", "yp_mm", *interior.distortion.usual()))
@@ -284,7 +284,9 @@ def photographs_block(
     start: tuple[ExteriorOrientation, Float[np.ndarray, "points 3"]],
     rows: ImagePoints,
 ) -> Block:
-    """Photographs of one `camera`, its interior orientation and the priors of that, as a free network from `start`."""
+    """Block of photographs of one `camera` (interior orientation and its priors), a free network with initial values
+    `start`.
+    """
     interior, priors = (dataclasses.replace(part, residuals="measured") for part in camera)
     unknowns = Unknowns({CAMERA: interior}, *start, {}, {})
     n, n_points = len(names), len(points)

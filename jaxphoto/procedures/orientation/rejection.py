@@ -1,10 +1,9 @@
 """Gross errors of an oriented network: image points by their residuals, and points of two rays by their depth.
 
-A false match along an epipolar line makes a point of two rays that fit as well as those of a true one, at any depth.
-Its neighbours in the image contradict it: over the places (x, y) of an image the inverse depth of a surface varies
-little, and that of a plane is linear. A point of two rays is rejected whose inverse depth is far from the median of its
-neighbours in both of its images, by their robust spread and its own standard deviation. At an edge, or where things
-stand before one another, neighbours spread as widely as the scene is deep, and everything stays.
+A false match along an epipolar line gives a point of two rays at a wrong depth without residuals. Its neighbours in the
+image contradict it: over an image the inverse depth of a surface varies little, and that of a plane is linear. A point
+of two rays is rejected if its inverse depth is far from the median of its neighbours in both images, by their robust
+spread and its own standard deviation. At depth discontinuities neighbours spread widely, and nothing is rejected.
 """
 
 import numpy as np
@@ -12,21 +11,21 @@ from jaxtyping import Bool, Float, Int
 
 from jaxphoto.block import Block
 
-# Gross errors are beyond so many robust standard deviations, and never within the second, in a priori ones.
+# Limit in robust standard deviations, and its minimum in a priori ones.
 _LIMIT, _MIN_LIMIT = 4.0, 1.0
-# Nearest points in the image, and by how many of their spreads a point may differ from their median.
+# Number of nearest points in the image, and the limit of a depth in their robust spreads.
 _NEIGHBOURS, _DEPTH_LIMIT = 12, 8.0
-# Distances that are computed at a time.
+# Number of distances that are computed at a time.
 _CHUNK = 4_000_000
-# The standard deviation of a normal distribution over its median absolute deviation, and over the median of the length
-# of errors in two axes (Rayleigh).
+# Ratios of the standard deviation of a normal distribution to its median absolute deviation, and of errors in two axes
+# to the median of their length (Rayleigh).
 _MAD, _RAYLEIGH = 1.4826, 1 / 1.1774
 
 
 def beyond_limit(block: Block, residuals: Float[np.ndarray, "2 rows"]) -> tuple[Bool[np.ndarray, " rows"], float]:
-    """Image rows whose `residuals`, over their sigmas, exceed the limit, one of each point at most; and the limit.
+    """Image rows whose `residuals`, over their sigmas, exceed the limit, at most one per point; and the limit.
 
-    Residuals are divided by the root of the part of an error that n rays of a point show, (2 n - 3) / (2 n).
+    Residuals are divided by the square root of the redundancy of a ray of n, (2 n - 3) / (2 n).
     """
     point = np.asarray(block.image_points.point)
     rays = np.bincount(point, minlength=len(block.points))[point]
@@ -38,7 +37,7 @@ def beyond_limit(block: Block, residuals: Float[np.ndarray, "2 rows"]) -> tuple[
 
 
 def unsupported(block: Block) -> Bool[np.ndarray, " rows"]:
-    """Image rows of the points of two rays whose depths their neighbours in both images contradict."""
+    """Image rows of points of two rays whose depths their neighbours in both images contradict."""
     rows, start = block.image_points, block.start.unknowns
     image, point = np.asarray(rows.image), np.asarray(rows.point)
     ray = np.asarray(start.points)[point] - np.asarray(start.exterior.position)[image]
@@ -55,7 +54,7 @@ def unsupported(block: Block) -> Bool[np.ndarray, " rows"]:
 
 
 def _far(xy, inverse, sigma, tested: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " tested"]:
-    """True for `tested` points of one image, at `xy` with `inverse` depths, that their neighbours contradict."""
+    """True for the `tested` points of one image, at `xy` with `inverse` depths, that their neighbours contradict."""
     near = np.concatenate(
         [_nearest(xy, some) for some in np.array_split(xy[tested], 1 + tested.sum() * len(xy) // _CHUNK)]
     )
@@ -66,7 +65,7 @@ def _far(xy, inverse, sigma, tested: Bool[np.ndarray, " n"]) -> Bool[np.ndarray,
 
 
 def _nearest(xy: Float[np.ndarray, "n 2"], to: Float[np.ndarray, "m 2"]) -> Int[np.ndarray, "m neighbours"]:
-    """The nearest of `xy` without the point itself, for each of `to`, which are among them."""
+    """Nearest neighbours among `xy` of each of `to`, a subset, without the point itself."""
     apart = np.sum(xy**2, axis=1) - 2 * to @ xy.T
     order = np.argpartition(apart, _NEIGHBOURS, axis=1)[:, : _NEIGHBOURS + 1]
     itself = np.argmin(np.take_along_axis(apart, order, axis=1), axis=1)
@@ -75,9 +74,9 @@ def _nearest(xy: Float[np.ndarray, "n 2"], to: Float[np.ndarray, "m 2"]) -> Int[
 
 
 def _relative_depth_sigma(ray, point, sigma_rad) -> Float[np.ndarray, " rows"]:
-    """Relative standard deviation of the depths of points of two rays: the errors of both over their angle."""
+    """Relative standard deviation of the depths of points of two rays: errors of both over their angle."""
     direction = ray / np.linalg.norm(ray, axis=1, keepdims=True)
     total = np.stack([np.bincount(point, v) for v in direction.T], axis=1)
-    # Two unit vectors at an angle g add to one of length 2 cos(g / 2).
+    # The sum of two unit vectors at an angle g has the length 2 cos(g / 2).
     half = np.arccos(np.clip(np.linalg.norm(total, axis=1) / 2, 0, 1))[point]
     return np.sqrt(2) * sigma_rad / np.sin(np.maximum(2 * half, 1e-9))

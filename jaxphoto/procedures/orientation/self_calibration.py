@@ -1,12 +1,12 @@
-"""What is estimated of a camera by images that orient themselves, and which of its parameters they determine.
+"""Self-calibration of a network without control: parameters of the camera that the images determine.
 
-While a network is adjusted, every parameter is observed at its start with a standard deviation of three parts in a
-hundred of the image radius in the corner of the format, the principal distance of a tenth of itself: real lenses are
-within a few of these. Which parameters the images determine follows from the covariance of that adjustment with these
-observations subtracted. The others, the weakest first, stay observed in the block.
+During the iteration every parameter is observed at its initial value with a standard deviation of 3 % of the image
+radius in the corner of the format, the principal distance with 10 %: real lenses are within a few of these. The
+parameters that the images determine follow from the covariance of the adjustment without these observations. The
+others, the weakest first, stay observed in the block.
 
-Residuals of neighbouring rays are correlated where the lens, a rolling shutter or the features do what no model
-describes. Standard deviations that take rays for independent are too small by the root of the design effect (Kish),
+Residuals of neighbouring rays are correlated if lens, rolling shutter or features have errors that no model describes.
+Standard deviations of independent rays are then too small by the square root of the design effect (Kish),
 
     d = sum over cells (sum over the rays of a cell v)^2 / sum over all rays v^2,
 
@@ -29,10 +29,10 @@ from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words
 from jaxphoto.unknowns import FIXED, FREE, Weighted
 
-# Prior standard deviation of a distortion parameter or of the principal point, by the image shift in the corner of the
-# format over its radius; of c over c; and of a parameter that is free.
+# Prior standard deviations: of distortion parameters and principal point, by the image shift in the corner of the
+# format over its radius; of c over c; and of a free parameter.
 _LENS, _C, _FREE = 0.03, 0.1, 0.3
-# Images determine a parameter whose standard deviation is at most this part of the prior one.
+# Maximum standard deviation of a determined parameter over its prior one.
 _DETERMINED = 0.5
 # Cells along the longer side of an image.
 _CELLS = 8
@@ -44,10 +44,10 @@ class SelfCalibration(NamedTuple):
     camera: str
     names: tuple[str, ...]
     unit: dict[str, float]
-    """By parameter: the change that moves the corner of the format by its whole radius."""
+    """Change of each parameter that shifts the corner of the format by its radius."""
     start: dict[str, float]
     sizes: PaddedSizes
-    """Of the whole block, which parts of it are padded to: they run one compiled program."""
+    """Padded sizes of the whole block: parts of it run the same compiled program."""
 
     def observation(self, name: str) -> Weighted:
         """Prior information of a parameter: its start."""
@@ -55,7 +55,7 @@ class SelfCalibration(NamedTuple):
         return Weighted(np.asarray(self.start[name]), np.asarray(sigma))
 
     def with_priors(self, block: Block, free: tuple[str, ...]) -> Block:
-        """`block` with the parameters `free` observed too loosely to count, where they are now, the others at start."""
+        """`block` with the parameters `free` observed loosely at their current values, the others at initial values."""
         interior, priors = block.start.unknowns.interior[self.camera], block.priors.interior[self.camera]
         for name in self.names:
             prior = self.observation(name)
@@ -66,7 +66,7 @@ class SelfCalibration(NamedTuple):
         return _with_camera_priors(block, self.camera, priors)
 
     def final_priors(self, block: Block, free: tuple[str, ...]) -> Block:
-        """`block` with the parameters `free` free, the others observed at their start."""
+        """`block` with the parameters `free` free, the others observed at initial values."""
         priors = freed(block.priors.interior[self.camera], free)
         for name in self.names:
             if name not in free:
@@ -75,17 +75,17 @@ class SelfCalibration(NamedTuple):
 
 
 class Determined(NamedTuple):
-    """The parameters of a camera that images determine."""
+    """Parameters of a camera that images determine."""
 
     names: tuple[str, ...]
     observed: list[str]
-    """Why others are observed, a sentence each."""
+    """Why others stay observed, a sentence each."""
     correlation_factor: float
     """Factor of their standard deviations for the correlation of neighbouring residuals."""
 
 
 def self_calibration(block: Block, camera: str) -> SelfCalibration:
-    """What a free network of the images of `block` estimates of `camera`: all that its priors do not fix."""
+    """Parameters of `camera` that a free network of the images of `block` estimates: all that are not fixed."""
     priors, sensor = block.priors.interior[camera], block.sensors[camera]
     interior = block.start.unknowns.interior[camera]
     names = tuple(n for n in parameter_names(priors) if get_parameter(priors, n) != FIXED)
@@ -97,9 +97,9 @@ def self_calibration(block: Block, camera: str) -> SelfCalibration:
 
 
 def corner_shift(interior: InteriorOrientation, name: str, corner: np.ndarray) -> float:
-    """Image shift (mm) in the corner of the format, or nearer where it is larger, per unit of a parameter.
+    """Image shift (mm) in the corner of the format, or its maximum along the radius, per unit of a parameter.
 
-    A balance radius may lie at the corner, where radial terms then vanish.
+    Radial terms vanish in the corner if that is their balance radius.
     """
     if name == "c_mm":
         return float(np.linalg.norm(corner) / np.asarray(interior.c))
@@ -112,7 +112,7 @@ def corner_shift(interior: InteriorOrientation, name: str, corner: np.ndarray) -
 
 
 def determined(adjusted: Adjustment, calibration: SelfCalibration) -> Determined:
-    """The parameters of `calibration` that images determine; in `adjusted` all of them were observed."""
+    """Select the parameters of `calibration` that images determine; in `adjusted` all of them are observed."""
     factor = correlation_factor(adjusted.block, np.asarray(adjusted.residuals.image))
     matrix, labels = shared_covariance(adjusted), adjusted.structure.labels
     camera, names = calibration.camera, calibration.names
@@ -120,7 +120,7 @@ def determined(adjusted: Adjustment, calibration: SelfCalibration) -> Determined
     known = [calibration.observation(name) for name in names]
     sigma = np.array([float(prior.sigma) for prior in known])
     loose = np.array([_FREE * calibration.unit[name] for name in names])
-    # The normal equations of the image points alone.
+    # Normal equations of the image points alone.
     images = np.linalg.inv(matrix[np.ix_(place, place)]) - np.diag(sigma**-2.0)
     weak = undetermined(names, images / (float(adjusted.sigma0) * factor) ** 2, sigma, loose)
     return Determined(
@@ -137,7 +137,7 @@ def determined(adjusted: Adjustment, calibration: SelfCalibration) -> Determined
 
 
 def correlation_factor(block: Block, residuals: Float[np.ndarray, "2 rows"]) -> float:
-    """The root of the design effect of the `residuals` of the image rows of `block`, both axes together; 1 or more."""
+    """Square root of the design effect of the `residuals` of the image rows of `block`, both axes together; at least 1."""
     rows, sensors = block.image_points, [block.sensors[camera] for camera in block.image_camera]
     half = np.array([(s.width_mm, s.height_mm) for s in sensors])[rows.image] / 2
     side = 2 * half.max(axis=1, keepdims=True) / _CELLS
@@ -148,7 +148,7 @@ def correlation_factor(block: Block, residuals: Float[np.ndarray, "2 rows"]) -> 
 
 
 def shared_covariance(adjusted: Adjustment) -> np.ndarray:
-    """A priori covariance of the unknowns that images share, which no datum changes."""
+    """A priori covariance of the unknowns that images share, independent of the datum."""
     equations, n = adjusted.equations, adjusted.structure.n_shared
     scale = np.asarray(equations.scale.shared)
     inverse = np.asarray(call_compiled(_inverse, equations))[-n:, -n:]
@@ -157,17 +157,17 @@ def shared_covariance(adjusted: Adjustment) -> np.ndarray:
 
 @eqx.filter_jit
 def _inverse(equations: NormalEquations) -> Float[Array, "reduced reduced"]:
-    # All of statistics.covariance, points and all, would take several times longer to compile.
+    # statistics.covariance, with all points, would compile several times longer.
     return equations.inverse_of_reduced()
 
 
 def undetermined(
     names: tuple[str, ...], normal: np.ndarray, observed: np.ndarray, loose: np.ndarray
 ) -> dict[str, float]:
-    """Parameters that the images do not determine, and their standard deviations by the images.
+    """Parameters that the images do not determine, and their standard deviations from the images.
 
-    `normal` are the normal equations of the images. What they do not determine is added to them, the weakest parameter
-    first, with the standard deviations `observed`; the others with `loose`, which keep them regular.
+    `normal` are the normal equations of the images. Undetermined parameters are added as observations, the weakest
+    first, with the standard deviations `observed`; the others with `loose`, which keep the equations regular.
     """
     weak = np.zeros(len(names), bool)
     sigmas: dict[str, float] = {}
@@ -182,7 +182,7 @@ def undetermined(
 
 
 def freed(priors: InteriorOrientation, names: tuple[str, ...]) -> InteriorOrientation:
-    """Priors of a camera of which `names` are FREE and everything else is FIXED."""
+    """Priors of a camera with the parameters `names` FREE and all others FIXED."""
     for name in parameter_names(priors):
         priors = set_parameter(priors, name, FREE if name in names else FIXED)
     return priors

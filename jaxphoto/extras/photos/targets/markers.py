@@ -1,4 +1,4 @@
-"""Boards of ArUco markers, and ChArUco boards: chessboards with a marker in each white square. Any part may be visible."""
+"""ArUco boards, and ChArUco boards: chessboards with a marker in each white square. Any part may be visible."""
 
 from typing import NamedTuple
 

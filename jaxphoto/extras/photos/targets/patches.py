@@ -135,7 +135,7 @@ def fit_square_corners(
     edges: Float[np.ndarray, "n 2 2"],
     reach_px: Float[np.ndarray, "n"],
 ) -> TargetPlaces:
-    """Measure corners of single squares; `edges` as in `fit_crossings`, from the corner along the sides of the square."""
+    """Measure corners of single squares; `edges` as in `fit_crossings`, along the sides of the square."""
     return _fit(_square_corners, lambda one, other: (1 + one) * (1 + other) / 4, picture, near, edges, reach_px)
 
 
