@@ -190,7 +190,7 @@ def _projected(interior, position, camera_from_object, point):
 def resected(
     board: Board, rows: TargetRows, interior: InteriorOrientation
 ) -> tuple[ExteriorOrientation, dict[str, str]]:
-    """Exterior orientations of the images that can be resected, in their order; reasons for the others, by image name."""
+    """Exterior orientations of the images that can be resected, in their order; reasons for the others by name."""
     positions, matrices, why = [], [], {}
     for k, name in enumerate(rows.images):
         own = rows.image == k

@@ -137,7 +137,7 @@ def determined(adjusted: Adjustment, calibration: SelfCalibration) -> Determined
 
 
 def correlation_factor(block: Block, residuals: Float[np.ndarray, "2 rows"]) -> float:
-    """Square root of the design effect of the `residuals` of the image rows of `block`, both axes together; at least 1."""
+    """Square root of the design effect of the `residuals` of image rows, both axes together; at least 1."""
     rows, sensors = block.image_points, [block.sensors[camera] for camera in block.image_camera]
     half = np.array([(s.width_mm, s.height_mm) for s in sensors])[rows.image] / 2
     side = 2 * half.max(axis=1, keepdims=True) / _CELLS
