@@ -61,7 +61,7 @@ def fly(
     from jaxphoto.camera import InteriorOrientation
     from jaxphoto.errors import counted
     from jaxphoto.extras.formats import read_control
-    from jaxphoto.extras.photos.control_targets import target_looker
+    from jaxphoto.extras.photos.control_targets import make_target_search
     from jaxphoto.extras.photos.features import LONGEST_PX
     from jaxphoto.extras.photos.matching import match_photographs
     from jaxphoto.extras.photos.photograph_pairs import MostSimilar, photograph_pairs, usual_choice, usual_count
@@ -114,7 +114,7 @@ def fly(
         output.say(*positions.sentences)
         points = None
         if surveyed:
-            finder = target_looker(target, {p.name: p.path for p in read}) if target else None
+            finder = make_target_search(target, {p.name: p.path for p in read}) if target else None
             stations = [p.name for p in read], [p.gps for p in read]
             points, code = flight_control(surveyed, control_epsg, *stations, finder, code)
         camera = sensor_and_interior(read, pixel_mm, c_mm)
@@ -219,7 +219,7 @@ def control(
     1: written, but the verdict is red.
     """
     from jaxphoto.extras.formats import read_control
-    from jaxphoto.extras.photos.control_targets import target_looker
+    from jaxphoto.extras.photos.control_targets import make_target_search
     from jaxphoto.extras.photos.targets.on_ground import read_target
     from jaxphoto.io import read_block
     from jaxphoto.io.block_folder import whole_block
@@ -253,7 +253,7 @@ def control(
             "report": progress.update,
         }
         if target:
-            finder = target_looker(target, paths, progress.update)
+            finder = make_target_search(target, paths, progress.update)
             result = control_block_with_targets(oriented, points, finder, **options)
         else:
             result = control_block(oriented, points, **options)

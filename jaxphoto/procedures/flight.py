@@ -11,8 +11,8 @@ from jaxphoto.errors import BlockError, DatumError, GroupsError, InputError, Ran
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.procedures.adjust import adjust_for_tables
-from jaxphoto.procedures.control import ControlledBlock, rejudged
-from jaxphoto.procedures.control.of_flight import FlightControl, controlled_or_why, parts_with_marks
+from jaxphoto.procedures.control import ControlledBlock, retest
+from jaxphoto.procedures.control.of_flight import FlightControl, adjust_with_control, parts_with_marks
 from jaxphoto.procedures.georeference_photographs import (
     GeoreferencedPhotographs,
     as_they_scatter,
@@ -143,7 +143,7 @@ def _calibrated(
             why_not = str(error)
     block = placed.block if placed else oriented.block
     if known.control is not None:
-        controlled, no_control = controlled_or_why(block, known.control, known.code, known.vertical, report)
+        controlled, no_control = adjust_with_control(block, known.control, known.code, known.vertical, report)
     try:
         # Without positions it is the network that the orientation ended with, which needs no other program.
         sizes = MINIMAL_SIZES if placed else oriented.sizes
@@ -169,7 +169,7 @@ def _calibrated(
         why_not,
         components,
         adjusted,
-        rejudged(controlled, adjusted) if controlled else None,
+        retest(controlled, adjusted) if controlled else None,
         no_control,
         lens.sentences(oriented.block, CAMERA) if lens else (),
         why_still,

@@ -8,16 +8,16 @@ from jaxtyping import Float
 
 from jaxphoto.extras.photos.features import read_grey
 from jaxphoto.extras.photos.targets.on_ground import GroundTarget
-from jaxphoto.procedures.control.targets import Candidates, Looker, Predicted
+from jaxphoto.procedures.control.targets import Candidates, Predicted, TargetSearch
 
 # Standard deviation (px) of blur, compression and shadows, added to that of a fit.
 _LEAST_SIGMA_PX = 0.1
 _HALF = 0.5
 
 
-def target_looker(
+def make_target_search(
     target: GroundTarget, paths: Mapping[str, Path], progress: Callable[[str], object] = lambda image: None
-) -> Looker:
+) -> TargetSearch:
     """Return the search for `target` in the photographs at `paths`, by image names; other images are skipped."""
 
     def look(
@@ -48,4 +48,4 @@ def target_looker(
         sigma = np.hypot(np.array(fit, float), _LEAST_SIGMA_PX)
         return Candidates(np.array(row, int), np.array(place, float).reshape(-1, 2), sigma, np.array(fit, float))
 
-    return Looker(look, target.named)
+    return TargetSearch(look, target.named)

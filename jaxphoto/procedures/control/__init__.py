@@ -1,6 +1,6 @@
 """Control of a block: surveyed points and their marks, transformation to their frame, adjustment and tests."""
 
-from jaxphoto.procedures.control.control_block import ControlledBlock, at_optimum, control_block, rejudged
+from jaxphoto.procedures.control.control_block import ControlledBlock, at_optimum, control_block, retest
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 from jaxphoto.procedures.control.targets import control_block_with_targets
 
@@ -12,5 +12,5 @@ __all__ = [
     "at_optimum",
     "control_block",
     "control_block_with_targets",
-    "rejudged",
+    "retest",
 ]

@@ -39,7 +39,7 @@ _POINTS, _MEDIAN, _MORE = 6, 0.6745, 2.0
 _STILL = 0.15
 
 
-class JudgedControl(NamedTuple):
+class TestedControl(NamedTuple):
     """The last `points` of a block and the marks of them."""
 
     adjusted_m: Float[np.ndarray, "points 3"]
@@ -55,9 +55,9 @@ class JudgedControl(NamedTuple):
     """Normalised residuals, the larger of both axes; NaN if not tested."""
 
 
-def judged(
+def test_control(
     adjusted: Adjustment, n: int, xyz: Float[np.ndarray, "points 3"], sigma: Float[np.ndarray, "points 3"]
-) -> JudgedControl:
+) -> TestedControl:
     """Test the last `n` points, surveyed at `xyz` with `sigma` (m), in any role."""
     block = adjusted.block
     first = len(block.points) - n
@@ -81,7 +81,7 @@ def judged(
         np.asarray(redundancy.image)[:, rows] > LEAST_CHECKED, np.abs(np.asarray(tested.image)[:, rows]), np.nan
     )
     marks_px = residual.T / pixel[:, None] * (1, -1)
-    return JudgedControl(place, off, own, w, marks_px, _largest(of_marks))
+    return TestedControl(place, off, own, w, marks_px, _largest(of_marks))
 
 
 def _largest(w: Float[np.ndarray, "2 rows"]) -> Float[np.ndarray, "rows"]:
@@ -224,7 +224,7 @@ def control_block(
             raise DatumError("; ".join([str(error), *_assumed(control, sigma)])) from error
         if not bool(adjusted.converged):
             said.append("the adjustment with control did not converge; it is not tested")
-        found = _spread(judged(adjusted, len(which), known[which], sigma[which]), seen)
+        found = _spread(test_control(adjusted, len(which), known[which], sigma[which]), seen)
         poorer = poorer_survey(found.w[used], sigma[used], np.isnan(points.sigma_m[used]), SIGMA_M)
         if poorer is not None and number + 1 < _ROUNDS and bool(adjusted.converged):
             # Before any point is tested with a default that most contradict.
@@ -317,7 +317,7 @@ def _one_height(points: SurveyedPoints) -> list[str]:
     ]
 
 
-def _tested(found: JudgedControl, now: Marked, used, able, ids, images):
+def _tested(found: TestedControl, now: Marked, used, able, ids, images):
     """Accepted control points after the test, marks to reject, and a sentence for each; no sentence if all agree."""
     new, gone, said = used.copy(), np.zeros(len(now.image), bool), []
     of_points, of_marks = np.where(used, np.nan_to_num(found.w).max(axis=1), 0.0), np.nan_to_num(found.marks_w)
@@ -342,7 +342,7 @@ def _tested(found: JudgedControl, now: Marked, used, able, ids, images):
     return new, gone, said
 
 
-def _left_out(ids, left, found: JudgedControl, frame: InFrame):
+def _left_out(ids, left, found: TestedControl, frame: InFrame):
     for k in np.flatnonzero(left):
         told = ", ".join(f"{v:.3g}" for v in found.off_m[k])
         text = f"control point {ids[k]} contradicts the rest by {told} m (east, north, up) and is left out"
@@ -353,7 +353,7 @@ def _left_out(ids, left, found: JudgedControl, frame: InFrame):
         yield text
 
 
-def _spread(own: JudgedControl, seen) -> JudgedControl:
+def _spread(own: TestedControl, seen) -> TestedControl:
     """Expand to all surveyed points, with NaN for those that are not in the block."""
     wide = lambda v: np.where(seen[:, None], v[np.cumsum(seen) - 1], np.nan)  # noqa: E731
     return own._replace(
@@ -361,10 +361,10 @@ def _spread(own: JudgedControl, seen) -> JudgedControl:
     )
 
 
-def rejudged(found: ControlledBlock, adjusted: Adjustment) -> ControlledBlock:
+def retest(found: ControlledBlock, adjusted: Adjustment) -> ControlledBlock:
     """Test again after another adjustment of the block, such as with other weights."""
     seen = np.array(found.state, object) != "not marked"
-    own = _spread(judged(adjusted, int(seen.sum()), found.xyz_m[seen], found.survey_sigma_m[seen]), seen)
+    own = _spread(test_control(adjusted, int(seen.sum()), found.xyz_m[seen], found.survey_sigma_m[seen]), seen)
     return found._replace(adjusted=adjusted, off_m=own.off_m, sigma_m=own.sigma_m, w=own.w, marks_px=own.marks_px)
 
 

@@ -187,7 +187,7 @@ def in_frame(
     contradictory or unusable system, and for points far from the block, with a system that would fit.
     """
     at = block.frame.origin
-    system = told_system(points, words, lambda: fitting(points, None, *at[:2]) if at is not None else "")
+    system = stated_system(points, words, lambda: fitting(points, None, *at[:2]) if at is not None else "")
     if block.frame.kind == "epsg":
         assert block.frame.code is not None and block.frame.origin is not None
         if code is not None and code != block.frame.code:
@@ -221,7 +221,7 @@ def in_frame(
     )
 
 
-def told_system(points: SurveyedPoints, words: str | None, guess: Callable[[], str]) -> ControlSystem:
+def stated_system(points: SurveyedPoints, words: str | None, guess: Callable[[], str]) -> ControlSystem:
     """The system in the file of `points`, or `words`. Raises InputError for none, with a `guess`, or two."""
     own = system_of(points.system, points.file) if points.system else None
     given = system_of(words, "the EPSG code of the control") if words else None

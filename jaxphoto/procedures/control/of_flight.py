@@ -11,10 +11,10 @@ from jaxphoto.block import Block
 from jaxphoto.errors import InputError, JaxphotoError, few
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.procedures.control.control_block import ControlledBlock, control_block
-from jaxphoto.procedures.control.frame import new_code, told_system
+from jaxphoto.procedures.control.frame import new_code, stated_system
 from jaxphoto.procedures.control.marks import images_of
 from jaxphoto.procedures.control.surveyed import GivenControl, check_near, fitting
-from jaxphoto.procedures.control.targets import Looker, control_block_with_targets
+from jaxphoto.procedures.control.targets import TargetSearch, control_block_with_targets
 from jaxphoto.procedures.orientation.orient_photographs import Report
 from jaxphoto.statistics import Selection
 
@@ -26,7 +26,7 @@ class FlightControl(NamedTuple):
     system: str | None
     images: tuple[str, ...]
     """All valid photographs of the flight."""
-    looker: Looker | None
+    target_search: TargetSearch | None
     """Search for targets in the photographs."""
     local: bool
     """True for points in local Cartesian metres, to which positions of photographs have no relation."""
@@ -37,7 +37,7 @@ def flight_control(
     system: str | None,
     images: Iterable[str],
     positions: Iterable[Gps | None],
-    looker: Looker | None = None,
+    target_search: TargetSearch | None = None,
     code: int | None = None,
 ) -> tuple[FlightControl, int | None]:
     """Check control against photographs, and return the EPSG code of the flight: `code`, else that of the points.
@@ -48,7 +48,7 @@ def flight_control(
     known = [gps for gps in positions if gps is not None]
     place = np.median([(g.longitude_deg, g.latitude_deg) for g in known], axis=0) if known else None
     guess = (lambda: fitting(control.points, None, *place)) if place is not None else (lambda: "")
-    told = told_system(control.points, system, guess)
+    told = stated_system(control.points, system, guess)
     if place is not None and told.crs is not None:
         check_near(control.points, told, *place)
     names = tuple(images)
@@ -63,18 +63,18 @@ def flight_control(
                 f"{control.points.file} is in a local system, and EPSG:{code} is given for the block; leave out the "
                 "code, or give the control in a map system"
             )
-        return FlightControl(control, system, names, looker, local=True), None
+        return FlightControl(control, system, names, target_search, local=True), None
     own = new_code(control.points, told) if code is None else code
-    return FlightControl(control, system, names, looker, local=False), own
+    return FlightControl(control, system, names, target_search, local=False), own
 
 
-def controlled_or_why(
+def adjust_with_control(
     block: Block, given: FlightControl, code: int | None, vertical: int | None, report: Report
 ) -> tuple[ControlledBlock | None, str]:
     """Adjust `block` with the control of the flight, or return why that is impossible."""
     of: Callable[..., ControlledBlock] = control_block
-    if given.looker is not None:
-        of = partial(control_block_with_targets, looker=given.looker)
+    if given.target_search is not None:
+        of = partial(control_block_with_targets, target_search=given.target_search)
     try:
         how: dict[str, Any] = {"system": given.system, "code": code, "vertical": vertical, "elsewhere": given.images}
         found = of(block, given.control, **how, report=report)

@@ -150,7 +150,7 @@ class Candidates(NamedTuple):
     """Standard deviation of the fit to the grey values alone: small for sharp edges."""
 
 
-class Looker(NamedTuple):
+class TargetSearch(NamedTuple):
     """Search for targets in photographs."""
 
     look: Callable[[Predicted, Float[np.ndarray, "n"], tuple[str, ...], tuple[str, ...]], Candidates]
@@ -177,7 +177,7 @@ def found_marks(
     xyz: Float[np.ndarray, "points 3"],
     sigma: Float[np.ndarray, "points 3"],
     known: Collection[tuple[int, int]],
-    looker: Looker,
+    target_search: TargetSearch,
     placed: bool,
 ) -> FoundTargets:
     """Find targets of the points `ids` at `xyz` (m, +- `sigma`) in the images of `adjusted`, except (image, point)
@@ -195,8 +195,8 @@ def found_marks(
     at = at.take(np.array([pair not in known for pair in pairs], bool))
     spread = np.sqrt(np.linalg.eigvalsh(at.covariance)[:, 1]) if len(at.image) else np.zeros(0)
     radius = np.maximum(_WITHIN * spread, _LEAST_PX)
-    seen = looker.look(at, radius, adjusted.block.images, ids)
-    return _believed(adjusted, ids, xyz, of_points, at, seen, looker.named, radius)
+    seen = target_search.look(at, radius, adjusted.block.images, ids)
+    return _believed(adjusted, ids, xyz, of_points, at, seen, target_search.named, radius)
 
 
 def _on_own_ground(adjusted: Adjustment, xyz) -> tuple[Float[np.ndarray, "points 3"], float]:
@@ -318,7 +318,7 @@ _FAR = 10.0
 def control_block_with_targets(
     block: Block,
     control: GivenControl,
-    looker: Looker,
+    target_search: TargetSearch,
     *,
     system: str | None = None,
     code: int | None = None,
@@ -327,7 +327,7 @@ def control_block_with_targets(
     adjust: Callable[[Block], Adjustment] = adjust_for_tables,
     report: Callable[[str], object] = lambda text: None,
 ) -> ControlledBlock:
-    """Adjust with the marks of `control` and those that `looker` finds; see `control_block`.
+    """Adjust with the marks of `control` and those that `target_search` finds; see `control_block`.
 
     Raises InputError as it does, and for a block in an arbitrary frame without marks of three control points.
     """
@@ -359,7 +359,7 @@ def control_block_with_targets(
         far = {p: off for p, off in _far(now, by_hand).items() if p not in anew} if now else {}
         rows = (by_hand, now.marks.take(~np.isin(now.marks.point, list(far)))) if now else (by_hand,)
         known = {pair for of in rows for pair in zip(of.image.tolist(), of.point.tolist(), strict=True)}
-        found = found_marks(adjusted, ids, frame.xyz, sigma, known, looker, placed)
+        found = found_marks(adjusted, ids, frame.xyz, sigma, known, target_search, placed)
         for name, images in found.looked.items():
             looked[name] |= set(images)
         gone = {p: off for p, off in far.items() if ids[p] in found.marks.point}
