@@ -39,12 +39,12 @@ def make_target_search(
                 window = np.ascontiguousarray(picture[low[1] : high[1], low[0] : high[0]])
                 if min(window.shape) < 2 * _HALF + 8:
                     continue
-                found = target.find(window, ids[at.point[k]], across)
-                there = found.column_row + low + _HALF
+                targets = target.find(window, ids[at.point[k]], across)
+                there = targets.column_row + low + _HALF
                 near = np.linalg.norm(there - at.column_row[k], axis=1) < radius[k]
                 row += [k] * int(near.sum())
                 place += list(there[near])
-                fit += np.sqrt(np.mean(found.sigma_px[near] ** 2, axis=1)).tolist()
+                fit += np.sqrt(np.mean(targets.sigma_px[near] ** 2, axis=1)).tolist()
         sigma = np.hypot(np.array(fit, float), _LEAST_SIGMA_PX)
         return Candidates(np.array(row, int), np.array(place, float).reshape(-1, 2), sigma, np.array(fit, float))
 

@@ -93,10 +93,10 @@ def interest_points(photograph: Path, sensor: Sensor, count: int) -> Features:
     quality = cv2.cornerMinEigenVal(picture, 3)
     apart = max(3, int(0.5 * np.sqrt(sensor.width_px * sensor.height_px / max(count, 1))))
     # Ten times as many candidates, at half the distance of an even spread.
-    found = cv2.goodFeaturesToTrack(picture, 10 * count, _WEAKEST, min(apart, 20))
-    if found is None:
+    candidates = cv2.goodFeaturesToTrack(picture, 10 * count, _WEAKEST, min(apart, 20))
+    if candidates is None:
         raise InputError(f"{photograph}: no interest point was found; the picture is blank or out of focus")
-    corners = found.reshape(-1, 2)
+    corners = candidates.reshape(-1, 2)
     border = np.minimum(corners, [sensor.width_px - 1, sensor.height_px - 1] - corners).min(axis=1)
     corners = corners[border >= _BORDER_PX]
     strength = quality[corners[:, 1].astype(int), corners[:, 0].astype(int)]
@@ -150,8 +150,8 @@ def sift_features(
     chosen, described = sift.compute(picture, chosen)
     if described is None:
         return SiftFeatures(np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros((0, 128), np.uint8))
-    found = np.array([(*key.pt, key.size) for key in chosen])
-    places, feature = np.unique(found, axis=0, return_inverse=True)
+    circles = np.array([(*key.pt, key.size) for key in chosen])
+    places, feature = np.unique(circles, axis=0, return_inverse=True)
     # OpenCV's size is the diameter, twice the width.
     sigma_px = np.hypot(_SIGMA_PX, _SIGMA_OF_WIDTH * places[:, 2] / 2) * scale.mean()
     roots = np.sqrt(described / np.maximum(described.sum(axis=1, keepdims=True), 1e-9))

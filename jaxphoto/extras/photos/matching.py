@@ -208,7 +208,7 @@ def _matched(
         [f.xy_mm for f in features],
         [factor * f.sigma_mm for f in features],
         factor,
-        [PairMatches(*pair, found) for pair, found in zip(compared, by_pair, strict=True) if len(found)],
+        [PairMatches(*pair, matches) for pair, matches in zip(compared, by_pair, strict=True) if len(matches)],
         np.column_stack([np.array(compared, int).reshape(-1, 2), numbers]),
         {},
     )
@@ -242,8 +242,8 @@ def _match_pairs(
     counts, verified, off_line = [], [np.zeros((0, 2), int)], [np.zeros(0)]
     with pycolmap.Database.open(database) as stored:
         for a, b in pairs:
-            found = stored.read_two_view_geometry(a + 1, b + 1).inlier_matches
-            inliers = np.asarray(found, int).reshape(-1, 2)
+            geometry = stored.read_two_view_geometry(a + 1, b + 1).inlier_matches
+            inliers = np.asarray(geometry, int).reshape(-1, 2)
             rows = _places(inliers, features[a].feature, features[b].feature)
             if len(rows) < MIN_MATCHES:
                 rows = rows[:0]

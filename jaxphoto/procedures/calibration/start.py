@@ -100,9 +100,9 @@ def rough_interior(
     if plane is not None:
         middle, axes = plane
         flat = (board.xyz_m - middle) @ axes[:, :2]
-        own = [rows.image == k for k in range(len(rows.images))]
-        rough, told = flat_start([(flat[rows.point[k]], rows.xy_mm[k]) for k in own], sensor)
-        if told or known is None:
+        of_image = [rows.image == k for k in range(len(rows.images))]
+        rough, determined = flat_start([(flat[rows.point[k]], rows.xy_mm[k]) for k in of_image], sensor)
+        if determined or known is None:
             return rough
         return eqx.tree_at(lambda i: i.c, rough, float(known.c))
     if known is not None:
@@ -154,11 +154,11 @@ def flat_start(
     slope, wanted = np.array(rows), np.array(right)
     square = slope @ wanted / max(slope @ slope, 1e-300)
     c = np.sqrt(square) * half if square > 0 else np.nan
-    told = bool(np.max(np.abs(slope)) > _TILT and 2 * _SHORTEST * half < c < 2 * _LONGEST * half)
-    if not told:
+    determined = bool(np.max(np.abs(slope)) > _TILT and 2 * _SHORTEST * half < c < 2 * _LONGEST * half)
+    if not determined:
         c = 1.2 * max(sensor.width_mm, sensor.height_mm)
     k1, k2 = lens / half ** np.array([2, 4])
-    return InteriorOrientation(c, distortion=Brown(k1=k1, k2=k2)), told
+    return InteriorOrientation(c, distortion=Brown(k1=k1, k2=k2)), determined
 
 
 def nearest_distortion(
@@ -171,22 +171,22 @@ def nearest_distortion(
     x, y = (np.linspace(-0.48, 0.48, _SIDE) * side for side in (sensor.width_mm, sensor.height_mm))
     measured = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     ideal = ideal_coordinates(known, measured)
-    given, wanted = (measured - np.asarray(known.principal_point), ideal)
+    source, wanted = (measured - np.asarray(known.principal_point), ideal)
     if model.domain == "ideal":
-        given, wanted = wanted, given
+        source, wanted = wanted, source
     interior = jax.tree.map(lambda v: np.asarray(v, float), InteriorOrientation(known.c, known.x_p, known.y_p, model))
     names = tuple(name for name in free if name in model.coefficients)
     if names:
         begin = np.array([float(get_parameter(interior, name)) for name in names])
-        values = np.asarray(call_compiled(_nearest, begin, interior, given, wanted, names))
+        values = np.asarray(call_compiled(_nearest, begin, interior, source, wanted, names))
         interior = _with(interior, names, values)
     return interior
 
 
 @eqx.filter_jit
-def _nearest(start: Float[Array, "u"], interior: InteriorOrientation, given, wanted, names: tuple[str, ...]):
+def _nearest(start: Float[Array, "u"], interior: InteriorOrientation, source, wanted, names: tuple[str, ...]):
     def residuals(values, _):
-        return (jax.vmap(_with(interior, names, values).closed_form)(given) - wanted).ravel()
+        return (jax.vmap(_with(interior, names, values).closed_form)(source) - wanted).ravel()
 
     return least_squares(residuals, start).unknowns
 

@@ -116,7 +116,7 @@ def calibration_block(
     seen, point = np.unique(rows.point, return_inverse=True)
     xyz = board.xyz_m[seen]
     who, axis = np.repeat(np.arange(len(seen)), 3), np.tile(np.arange(3), len(seen))
-    known = ControlCoordinates(who, axis, xyz.ravel(), np.full(len(who), board_sigma_m or 0.0))
+    coordinates = ControlCoordinates(who, axis, xyz.ravel(), np.full(len(who), board_sigma_m or 0.0))
     interior = jax.tree.map(lambda v: np.asarray(v, float), interior)
     unknowns = Unknowns({CAMERA: interior}, exterior, xyz, {}, {})
     priors = default_priors(unknowns)
@@ -133,8 +133,8 @@ def calibration_block(
         image_strip=none,
         image_time=np.zeros(n),
         image_points=ImagePoints(rows.image, point, rows.xy_mm, rows.sigma_mm),
-        control=ControlCoordinates.none() if board_sigma_m is None else known,
-        fixed=known if board_sigma_m is None else ControlCoordinates.none(),
+        control=ControlCoordinates.none() if board_sigma_m is None else coordinates,
+        fixed=coordinates if board_sigma_m is None else ControlCoordinates.none(),
         check=ControlCoordinates.none(),
         stations=CameraPositions.none(),
         attitudes=Attitudes.none(),
@@ -193,10 +193,10 @@ def resected(
     """Exterior orientations of the images that can be resected, in their order; reasons for the others by name."""
     positions, matrices, why = [], [], {}
     for k, name in enumerate(rows.images):
-        own = rows.image == k
+        of_image = rows.image == k
         try:
-            sigma_mm = float(np.median(rows.sigma_mm[own]))
-            exterior = _exterior(interior, rows.xy_mm[own], board.xyz_m[rows.point[own]], sigma_mm, name)
+            sigma_mm = float(np.median(rows.sigma_mm[of_image]))
+            exterior = _exterior(interior, rows.xy_mm[of_image], board.xyz_m[rows.point[of_image]], sigma_mm, name)
         except BlockError as error:
             why[name] = f"no resection: {error}"
             continue
@@ -214,7 +214,7 @@ def _exterior(interior: InteriorOrientation, xy_mm, points, sigma_mm: float, ima
     fit.
     """
     try:
-        found = resect_by_quaternions(interior, xy_mm, points, sigma_mm, image)
+        resection = resect_by_quaternions(interior, xy_mm, points, sigma_mm, image)
     except BlockError:
         return resect(interior, xy_mm, points, image)
-    return ExteriorOrientation(jnp.asarray(found.position), jnp.asarray(found.camera_from_object))
+    return ExteriorOrientation(jnp.asarray(resection.position), jnp.asarray(resection.camera_from_object))

@@ -128,8 +128,8 @@ def eccentricities(
     radius = np.where(radius_m > 0, radius_m, max(float(np.max(radius_m)), 1e-12))
     numbers = jax.tree.map(lambda v: np.asarray(v, float), interior)
     arguments = (numbers, position[some], camera_from_object[some], centre[some], axes, radius[some])
-    found = np.asarray(call_compiled(_eccentricities, *arguments))[:n]
-    return np.where(radius_m[:, None] > 0, found, 0.0)
+    offsets = np.asarray(call_compiled(_eccentricities, *arguments))[:n]
+    return np.where(radius_m[:, None] > 0, offsets, 0.0)
 
 
 @eqx.filter_jit
@@ -324,10 +324,10 @@ def calibrate(
     )
 
 
-def _check_enough(images: int, given: int) -> None:
+def _check_enough(images: int, total: int) -> None:
     if images < LEAST_IMAGES:
         raise InputError(
-            f"{images} of {given} photographs show enough of the board, and a calibration needs "
+            f"{images} of {total} photographs show enough of the board, and a calibration needs "
             f"{LEAST_IMAGES}: take more of them, with the board tilted and turned"
         )
 

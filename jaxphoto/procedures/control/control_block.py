@@ -65,15 +65,15 @@ def test_control(
     redundancy = redundancy_numbers(adjusted, cov)
     tested = normalised_residuals(adjusted, redundancy)
     place = np.asarray(adjusted.unknowns.points, float)[first:]
-    own = np.asarray(cov.point_sigma)[first:]
+    point_sigma = np.asarray(cov.point_sigma)[first:]
     off = xyz - place
-    w = np.abs(off) / np.hypot(own, np.where(np.isfinite(sigma), sigma, 0.0))
+    w = np.abs(off) / np.hypot(point_sigma, np.where(np.isfinite(sigma), sigma, 0.0))
     control = block.control
     if len(control):
-        r, told = np.asarray(redundancy["control_points"]), np.asarray(tested["control_points"])
+        r, normalised = np.asarray(redundancy["control_points"]), np.asarray(tested["control_points"])
         mine = np.asarray(control.who) >= first
         who, axis = np.asarray(control.who)[mine] - first, np.asarray(control.axis)[mine]
-        w[who, axis] = np.where(r[mine] > LEAST_CHECKED, np.abs(told[mine]), np.nan)
+        w[who, axis] = np.where(r[mine] > LEAST_CHECKED, np.abs(normalised[mine]), np.nan)
     rows = np.asarray(block.image_points.point) >= first
     pixel = np.array([block.sensors[c].pixel_mm for c in block.image_camera])[block.image_points.image[rows]]
     residual = np.asarray(adjusted.residuals.image)[:, rows] * np.asarray(block.image_points.sigma).T[:, rows]
@@ -81,13 +81,13 @@ def test_control(
         np.asarray(redundancy.image)[:, rows] > LEAST_CHECKED, np.abs(np.asarray(tested.image)[:, rows]), np.nan
     )
     marks_px = residual.T / pixel[:, None] * (1, -1)
-    return TestedControl(place, off, own, w, marks_px, _largest(of_marks))
+    return TestedControl(place, off, point_sigma, w, marks_px, _largest(of_marks))
 
 
 def _largest(w: Float[np.ndarray, "2 rows"]) -> Float[np.ndarray, "rows"]:
     """Largest over the first axis; NaN if all are."""
-    found = np.max(np.nan_to_num(w, nan=-1.0), axis=0, initial=-1.0)
-    return np.where(found < 0, np.nan, found)
+    largest = np.max(np.nan_to_num(w, nan=-1.0), axis=0, initial=-1.0)
+    return np.where(largest < 0, np.nan, largest)
 
 
 def scatter(marks_w: Float[np.ndarray, "rows"]) -> float:
@@ -95,8 +95,8 @@ def scatter(marks_w: Float[np.ndarray, "rows"]) -> float:
 
     Manual marks are often less accurate than stated, which makes no blunders of them.
     """
-    known = marks_w[np.isfinite(marks_w)]
-    return max(1.0, float(np.median(known)) / _LARGER) if len(known) >= _ENOUGH else 1.0
+    finite = marks_w[np.isfinite(marks_w)]
+    return max(1.0, float(np.median(finite)) / _LARGER) if len(finite) >= _ENOUGH else 1.0
 
 
 def poorer_survey(
@@ -116,9 +116,9 @@ def poorer_survey(
     for axes in ([0, 1], [2]):
         if assumed[:, axes].any():
             now[axes] = np.median(sigma_m[:, axes][assumed[:, axes]])
-        told = assumed[:, axes] & np.isfinite(w[:, axes])
-        if told.any(axis=1).sum() >= _POINTS:
-            factor[axes] = np.median(w[:, axes][told]) / _MEDIAN
+        tested = assumed[:, axes] & np.isfinite(w[:, axes])
+        if tested.any(axis=1).sum() >= _POINTS:
+            factor[axes] = np.median(w[:, axes][tested]) / _MEDIAN
     if given_up:
         return None if np.abs(np.log(factor)).max() < _STILL else np.maximum(factor * now, guess_m)
     if factor.max() < _MORE:
@@ -182,19 +182,19 @@ def control_block(
     """
     points, ids = control.points, control.points.ids
     frame = in_frame(block, points, system, code, vertical)
-    rows, said = marked(block, points, control.marks, elsewhere)
+    rows, messages = marked(block, points, control.marks, elsewhere)
     if not len(rows.image):
         first = f" ({few(list(dict.fromkeys(control.marks.image)))})" if control.marks.image else ""
         raise InputError(f"{points.file}: no mark{first} is in a photograph of the block ({few(block.images)})")
     met = intersected(block, block.start.unknowns, rows, ids)
-    rows, said = rows.take(met.good), [*said, *met.sentences]
+    rows, messages = rows.take(met.good), [*messages, *met.sentences]
     sigma = np.where(np.isnan(points.sigma_m), SIGMA_M, points.sigma_m)
     try:
-        block, start, agree, sigma, told = _placed(block, frame, met.points, met.covariance, sigma, points)
+        block, start, agree, sigma, seen_sigma = _placed(block, frame, met.points, met.covariance, sigma, points)
     except InputError as error:
         # Contradicting marks explain why too few points are left.
         raise InputError("; ".join([str(error), *_one_height(points), *met.sentences[:_SAID]])) from error
-    said += told
+    messages += seen_sigma
     count = np.bincount(rows.point, minlength=len(ids))
     known = np.where(np.isnan(points.coordinates), np.nan, frame.xyz)
     # One ray and a known point are an observation, one ray alone is not.
@@ -204,55 +204,55 @@ def control_block(
     used = seen & ~points.check & agree
     if len(base.stations) and all(np.isfinite(known[used, axis]).any() for axis in range(3)):
         base = with_gnss_bias(base)
-        said.append("positions of the receiver have a shift of their own, which control tells")
+        messages.append("positions of the receiver have a shift of their own, which control tells")
     now = rows.take(seen[rows.point])
     tried: list[tuple] = []
     for number in range(_ROUNDS):
         report(f"adjusting with {int(used.sum())} control points")
         which = np.flatnonzero(seen)
         place = np.cumsum(seen) - 1
-        own = now._replace(point=place[now.point])
+        of_seen = now._replace(point=place[now.point])
         names = tuple(ids[k] for k in which)
         # A default standard deviation of check points must not enter the stated accuracy.
-        told = np.where(points.check[:, None] & np.isnan(points.sigma_m), 0.0, sigma)[which]
+        seen_sigma = np.where(points.check[:, None] & np.isnan(points.sigma_m), 0.0, sigma)[which]
         roles = used[which], points.check[which]
-        made = into_block(base, names, known[which], told, start[which], own, *roles)
+        controlled = into_block(base, names, known[which], seen_sigma, start[which], of_seen, *roles)
         try:
-            adjusted = adjust(made)
+            adjusted = adjust(controlled)
         except DatumError as error:
             # The default standard deviations may be why control does not determine the datum.
             raise DatumError("; ".join([str(error), *_assumed(control, sigma)])) from error
         if not bool(adjusted.converged):
-            said.append("the adjustment with control did not converge; it is not tested")
-        found = _spread(test_control(adjusted, len(which), known[which], sigma[which]), seen)
-        poorer = poorer_survey(found.w[used], sigma[used], np.isnan(points.sigma_m[used]), SIGMA_M)
+            messages.append("the adjustment with control did not converge; it is not tested")
+        tested = _spread(test_control(adjusted, len(which), known[which], sigma[which]), seen)
+        poorer = poorer_survey(tested.w[used], sigma[used], np.isnan(points.sigma_m[used]), SIGMA_M)
         if poorer is not None and number + 1 < _ROUNDS and bool(adjusted.converged):
             # Before any point is tested with a default that most contradict.
             sigma = np.where(np.isnan(points.sigma_m), poorer, sigma)
             continue
-        new, gone, text = _tested(found, now, used, seen & ~points.check, ids, block.images)
+        new, rejected, text = _tested(tested, now, used, seen & ~points.check, ids, block.images)
         key = (used.tobytes(), len(now.image))
         if number + 1 == _ROUNDS or not text or key in tried or not bool(adjusted.converged):
             break
         tried.append(key)
-        said += text
-        used, now = new, now.take(~gone)
+        messages += text
+        used, now = new, now.take(~rejected)
         count = np.bincount(now.point, minlength=len(ids))
         seen &= count > 0
         used &= seen
         base = _from(base, adjusted)
         start[which] = np.asarray(adjusted.unknowns.points)[len(base.points) :]
     left = seen & ~points.check & ~used
-    said = [*_assumed(control, sigma), *said]
-    said += _left_out(ids, left, found, frame)
+    messages = [*_assumed(control, sigma), *messages]
+    messages += _left_out(ids, left, tested, frame)
     state = np.where(points.check, "check", np.where(used, "control", "left out"))
     state = np.where(seen, state, "not marked")
     if not_marked := [ids[k] for k in np.flatnonzero(~seen)]:
-        said.append(f"{len(not_marked)} surveyed points are marked in too few photographs: {few(not_marked)}")
+        messages.append(f"{len(not_marked)} surveyed points are marked in too few photographs: {few(not_marked)}")
     n_marks = tuple(int(v) for v in np.bincount(now.point, minlength=len(ids)))
     return ControlledBlock(
-        adjusted, ids, points.check, tuple(state.tolist()), n_marks, known, found.off_m, sigma, found.sigma_m,
-        found.w, now, found.marks_px, tuple(dict.fromkeys(filter(None, said))),
+        adjusted, ids, points.check, tuple(state.tolist()), n_marks, known, tested.off_m, sigma, tested.sigma_m,
+        tested.w, now, tested.marks_px, tuple(dict.fromkeys(filter(None, messages))),
     )  # fmt: skip
 
 
@@ -269,8 +269,8 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
     if frame.at_place and (line or len(known) < MIN_POINTS):
         how = " lie on a line, which leaves a turn about it open" if line else ""
         stays = f"the block stays {'at its positions' if by_positions else 'where it lies'}"
-        said = [f"{counted(len(known), 'control point')} in two photographs or more{how}: {stays}"]
-        return block, met, agree, sigma, said
+        messages = [f"{counted(len(known), 'control point')} in two photographs or more{how}: {stays}"]
+        return block, met, agree, sigma, messages
     spread = np.sqrt(np.trace(covariance[known], axis1=1, axis2=2))
     assumed, surveyed = np.isnan(points.sigma_m[known]).any(axis=1), np.linalg.norm(sigma[known], axis=1)
     if not frame.at_place:
@@ -281,30 +281,30 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
     if onto.scatter_m is not None:
         sigma = np.where(np.isnan(points.sigma_m), onto.scatter_m, sigma)
     agree[known] = onto.agree
-    said = [f"{int(onto.agree.sum())} of {counted(len(known), 'control point')} bring the block to their frame"]
+    messages = [f"{int(onto.agree.sum())} of {counted(len(known), 'control point')} bring the block to their frame"]
     if frame.at_place:
         off = np.median((frame.xyz - met)[known[onto.agree]], axis=0)
-        told = ", ".join(f"{v:.2f}" for v in np.round(off, 2) + 0.0)
+        offset = ", ".join(f"{v:.2f}" for v in np.round(off, 2) + 0.0)
         there = "the positions of the photographs have" if by_positions else "the block has"
-        said.append(f"control lies {told} m (east, north, up) from where {there} it")
+        messages.append(f"control lies {offset} m (east, north, up) from where {there} it")
     block = dataclasses.replace(onto.similarity.of_block(block), frame=frame.frame)
-    return block, onto.similarity.of(met), agree, sigma, said
+    return block, onto.similarity.of(met), agree, sigma, messages
 
 
 def _assumed(control: GivenControl, sigma: Float[np.ndarray, "points 3"]) -> list[str]:
-    said, none = [], np.isnan(control.points.sigma_m)
+    messages, none = [], np.isnan(control.points.sigma_m)
     if n := int(none.any(axis=1).sum()):
         taken = np.where(none, sigma, 0.0).max(axis=0)
         why = "they scatter about the photographs: " if (taken > SIGMA_M).any() else ""
         east, north, up = np.where(none.any(axis=0), np.maximum(taken, SIGMA_M), SIGMA_M)
-        said.append(
+        messages.append(
             f"{n} surveyed points have no standard deviations: {why}{max(east, north):.2g} m east and north, "
             f"{up:.2g} m up are taken"
         )
-    said += _one_height(control.points)
+    messages += _one_height(control.points)
     if n := int(np.isnan(control.marks.sigma_px).sum()):
-        said.append(f"{n} marks have no standard deviations: {MARK_SIGMA_PX:g} px is taken")
-    return said
+        messages.append(f"{n} marks have no standard deviations: {MARK_SIGMA_PX:g} px is taken")
+    return messages
 
 
 def _one_height(points: SurveyedPoints) -> list[str]:
@@ -317,15 +317,15 @@ def _one_height(points: SurveyedPoints) -> list[str]:
     ]
 
 
-def _tested(found: TestedControl, now: Marked, used, able, ids, images):
+def _tested(tested: TestedControl, now: Marked, used, able, ids, images):
     """Accepted control points after the test, marks to reject, and a sentence for each; no sentence if all agree."""
-    new, gone, said = used.copy(), np.zeros(len(now.image), bool), []
-    of_points, of_marks = np.where(used, np.nan_to_num(found.w).max(axis=1), 0.0), np.nan_to_num(found.marks_w)
-    wide = scatter(found.marks_w)
+    new, rejected, messages = used.copy(), np.zeros(len(now.image), bool), []
+    of_points, of_marks = np.where(used, np.nan_to_num(tested.w).max(axis=1), 0.0), np.nan_to_num(tested.marks_w)
+    wide = scatter(tested.marks_w)
     worst = max(of_points.max(initial=0.0), of_marks.max(initial=0.0) / wide)
     if not worst > CRITICAL:
-        back = able & ~used & ~beyond(found.w) & np.isfinite(found.w).any(axis=1)
-        return new | back, gone, [""] * bool(back.any())
+        back = able & ~used & ~beyond(tested.w) & np.isfinite(tested.w).any(axis=1)
+        return new | back, rejected, [""] * bool(back.any())
     # Smaller residuals near a blunder are often caused by it.
     limit = max(CRITICAL, _BESIDE_THE_WORST * worst)
     for p in np.unique(now.point).tolist():
@@ -334,38 +334,41 @@ def _tested(found: TestedControl, now: Marked, used, able, ids, images):
             continue
         if of_marks[row] < of_points[p]:
             new[p] = False
-            said.append("")
+            messages.append("")
             continue
-        gone[row] = True
-        off, image = np.linalg.norm(found.marks_px[row]), images[now.image[row]]
-        said.append(f"the mark of {ids[p]} in {image} is {off:.3g} px off (w = {found.marks_w[row]:.3g}) and left out")
-    return new, gone, said
+        rejected[row] = True
+        off, image = np.linalg.norm(tested.marks_px[row]), images[now.image[row]]
+        messages.append(
+            f"the mark of {ids[p]} in {image} is {off:.3g} px off (w = {tested.marks_w[row]:.3g}) and left out"
+        )
+    return new, rejected, messages
 
 
-def _left_out(ids, left, found: TestedControl, frame: InFrame):
+def _left_out(ids, left, tested: TestedControl, frame: InFrame):
     for k in np.flatnonzero(left):
-        told = ", ".join(f"{v:.3g}" for v in found.off_m[k])
-        text = f"control point {ids[k]} contradicts the rest by {told} m (east, north, up) and is left out"
-        near = np.linalg.norm(frame.xyz - found.adjusted_m[k], axis=1)
+        offset = ", ".join(f"{v:.3g}" for v in tested.off_m[k])
+        text = f"control point {ids[k]} contradicts the rest by {offset} m (east, north, up) and is left out"
+        near = np.linalg.norm(frame.xyz - tested.adjusted_m[k], axis=1)
         other = int(np.argmin(np.where(np.arange(len(ids)) == k, np.inf, near)))
-        if near[other] < 0.1 * np.linalg.norm(found.off_m[k]):
+        if near[other] < 0.1 * np.linalg.norm(tested.off_m[k]):
             text += f": its marks show {ids[other]}, so look at the names"
         yield text
 
 
-def _spread(own: TestedControl, seen) -> TestedControl:
+def _spread(tested: TestedControl, seen) -> TestedControl:
     """Expand to all surveyed points, with NaN for those that are not in the block."""
     wide = lambda v: np.where(seen[:, None], v[np.cumsum(seen) - 1], np.nan)  # noqa: E731
-    return own._replace(
-        adjusted_m=wide(own.adjusted_m), off_m=wide(own.off_m), sigma_m=wide(own.sigma_m), w=wide(own.w)
+    return tested._replace(
+        adjusted_m=wide(tested.adjusted_m), off_m=wide(tested.off_m), sigma_m=wide(tested.sigma_m), w=wide(tested.w)
     )
 
 
-def retest(found: ControlledBlock, adjusted: Adjustment) -> ControlledBlock:
+def retest(controlled: ControlledBlock, adjusted: Adjustment) -> ControlledBlock:
     """Test again after another adjustment of the block, such as with other weights."""
-    seen = np.array(found.state, object) != "not marked"
-    own = _spread(test_control(adjusted, int(seen.sum()), found.xyz_m[seen], found.survey_sigma_m[seen]), seen)
-    return found._replace(adjusted=adjusted, off_m=own.off_m, sigma_m=own.sigma_m, w=own.w, marks_px=own.marks_px)
+    seen = np.array(controlled.state, object) != "not marked"
+    xyz, sigma = controlled.xyz_m[seen], controlled.survey_sigma_m[seen]
+    new = _spread(test_control(adjusted, int(seen.sum()), xyz, sigma), seen)
+    return controlled._replace(adjusted=adjusted, off_m=new.off_m, sigma_m=new.sigma_m, w=new.w, marks_px=new.marks_px)
 
 
 def at_optimum(adjusted: Adjustment) -> Block:

@@ -113,10 +113,10 @@ def _poor(there, here, sigma_m, assumed) -> OntoControl | None:
     scatter = (1 + 5 / (n - MIN_POINTS)) * float(np.median(_off(similarity, there, here))) / _MEDIAN
     for _ in range(5):
         near = _off(similarity, there, here) < _WITHIN * scatter
-        found = similarity_between(there[near], here[near])
-        if found is None or near.sum() <= MIN_POINTS:
+        refined = similarity_between(there[near], here[near])
+        if refined is None or near.sum() <= MIN_POINTS:
             return None
-        similarity = found
+        similarity = refined
         squares = np.sum(_off(similarity, there, here)[near] ** 2)
         scatter = float(np.sqrt(squares / (3 * near.sum() - _PARAMETERS)))
     agree = _off(similarity, there, here) < np.where(assumed, _BEYOND * scatter, _tolerance(here, sigma_m))
@@ -160,10 +160,10 @@ def _best(there, here, sigma_m) -> OntoControl | None:
     similarity = best[1]
     for _ in range(5):
         agree = _off(similarity, there, here) < tolerance
-        found = similarity_between(there[agree], here[agree])
-        if found is None:
+        refined = similarity_between(there[agree], here[agree])
+        if refined is None:
             break
-        similarity = found
+        similarity = refined
     return OntoControl(similarity, _off(similarity, there, here) < tolerance)
 
 
@@ -223,18 +223,20 @@ def in_frame(
 
 def stated_system(points: SurveyedPoints, words: str | None, guess: Callable[[], str]) -> ControlSystem:
     """The system in the file of `points`, or `words`. Raises InputError for none, with a `guess`, or two."""
-    own = system_of(points.system, points.file) if points.system else None
+    stated = system_of(points.system, points.file) if points.system else None
     given = system_of(words, "the EPSG code of the control") if words else None
-    if own and given and own.crs != given.crs:
-        raise InputError(f"{points.file} says {own.name}, but {given.name} is given; leave out the one that is wrong")
-    found = own or given
-    if found is None:
+    if stated and given and stated.crs != given.crs:
+        raise InputError(
+            f"{points.file} says {stated.name}, but {given.name} is given; leave out the one that is wrong"
+        )
+    system = stated or given
+    if system is None:
         would = guess()
         raise InputError(
             f"{points.file} does not say the coordinate system of its points; give its EPSG code (or local, for "
             "Cartesian metres of no map)" + (f": they would fit {would}" if would else "")
         )
-    return found
+    return system
 
 
 def new_code(points: SurveyedPoints, system: ControlSystem) -> int:

@@ -56,17 +56,17 @@ def marked(
     other = images_of(marks.image, tuple(elsewhere)) >= 0
     place = {name: k for k, name in enumerate(points.ids)}
     point = np.array([place.get(name, -1) for name in marks.point], int)
-    said: list[str] = []
-    _say(said, marks, (image < 0) & ~other, marks.image, "of no photograph that is used")
-    _say(said, marks, (point < 0), marks.point, f"of points without coordinates in {points.file}")
+    messages: list[str] = []
+    _say(messages, marks, (image < 0) & ~other, marks.image, "of no photograph that is used")
+    _say(messages, marks, (point < 0), marks.point, f"of points without coordinates in {points.file}")
     size = np.array([(s.width_px, s.height_px) for s in (block.sensors[c] for c in block.image_camera)], float)
     outside = ((marks.column_row < 0) | (marks.column_row > size[image])).any(axis=1) & (image >= 0) & (point >= 0)
-    _say(said, marks, outside, marks.image, "outside of the picture")
+    _say(messages, marks, outside, marks.image, "outside of the picture")
     kept = np.flatnonzero((image >= 0) & (point >= 0) & ~outside)
     kept = kept[np.lexsort((image[kept], point[kept]))]
     # The same photograph under two names.
     twice = np.r_[False, (np.diff(image[kept]) == 0) & (np.diff(point[kept]) == 0)] if len(kept) else np.zeros(0, bool)
-    _say(said, marks, np.isin(np.arange(len(image)), kept[twice]), marks.point, "there twice for one photograph")
+    _say(messages, marks, np.isin(np.arange(len(image)), kept[twice]), marks.point, "there twice for one photograph")
     kept = kept[~twice]
     sigma = np.where(np.isnan(marks.sigma_px), MARK_SIGMA_PX, marks.sigma_px)[kept]
     xy = np.zeros((len(kept), 2))
@@ -74,7 +74,7 @@ def marked(
     for k, row in enumerate(kept.tolist()):
         sensor = block.sensors[block.image_camera[image[row]]]
         xy[k], pixel[k] = sensor.mm_from_px(marks.column_row[row][None])[0], sensor.pixel_mm
-    return Marked(image[kept], point[kept], xy, sigma * pixel), said
+    return Marked(image[kept], point[kept], xy, sigma * pixel), messages
 
 
 def images_of(names: Sequence[str], images: Sequence[str]) -> Int[np.ndarray, "names"]:
@@ -83,21 +83,21 @@ def images_of(names: Sequence[str], images: Sequence[str]) -> Int[np.ndarray, "n
     loose: dict[str, int] = {}
     for k, name in enumerate(images):
         loose[name.lower()] = k if name.lower() not in loose else -1
-    found = []
+    indices = []
     for name in names:
         file = ntpath.basename(name)
         stem = _ENDING.sub("", file)
         hits = [exact[word] for word in (name, file, stem) if word in exact]
-        found.append(hits[0] if hits else loose.get(stem.lower(), loose.get(file.lower(), -1)))
-    return np.array(found, int)
+        indices.append(hits[0] if hits else loose.get(stem.lower(), loose.get(file.lower(), -1)))
+    return np.array(indices, int)
 
 
-def _say(said: list[str], marks: Marks, wrong: np.ndarray, names: Sequence[str], what: str) -> None:
+def _say(messages: list[str], marks: Marks, wrong: np.ndarray, names: Sequence[str], what: str) -> None:
     """Add a sentence on the marks that are `wrong`, with the first of them."""
     which = np.flatnonzero(wrong)
     if len(which):
         listed = few(list(dict.fromkeys(names[int(k)] for k in which)))
-        said.append(f"left out: {counted(len(which), 'mark')} {what}: {listed} ({marks.places[which[0]]})")
+        messages.append(f"left out: {counted(len(which), 'mark')} {what}: {listed} ({marks.places[which[0]]})")
 
 
 _BEYOND, _ROOM_PX = 4.0, 3.0
@@ -123,8 +123,8 @@ def rays_of(block: Block, unknowns: Unknowns, rows: Marked) -> Float[np.ndarray,
     rays = np.zeros((len(rows.image), 3))
     camera = np.array(block.image_camera, object)[rows.image]
     for name in set(camera.tolist()):
-        own = camera == name
-        rays[own] = camera_rays(unknowns.interior[name], rows.xy_mm[own])
+        of_camera = camera == name
+        rays[of_camera] = camera_rays(unknowns.interior[name], rows.xy_mm[of_camera])
     return rays
 
 
@@ -138,21 +138,23 @@ def intersected(block: Block, unknowns: Unknowns, rows: Marked, ids: tuple[str, 
     c = np.array([float(unknowns.interior[name].c) for name in block.image_camera])[rows.image]
     pixel = np.array([block.sensors[name].pixel_mm for name in block.image_camera])[rows.image]
     limit = np.hypot(_BEYOND * rows.sigma_mm, _ROOM_PX * pixel) / c
-    said: list[str] = []
+    messages: list[str] = []
     for p in np.unique(rows.point).tolist():
-        own = np.flatnonzero(rows.point == p)
-        if len(own) < 2:
+        of_point = np.flatnonzero(rows.point == p)
+        if len(of_point) < 2:
             continue
-        passing = _passing(origins[own], directions[own], limit[own])
-        images = [block.images[i] for i in rows.image[own[~passing]]]
+        passing = _passing(origins[of_point], directions[of_point], limit[of_point])
+        images = [block.images[i] for i in rows.image[of_point[~passing]]]
         if passing.sum() < 2:
-            good[own] = False
-            said.append(f"the marks of {ids[p]} in {few(images)} contradict one another, and none is used")
+            good[of_point] = False
+            messages.append(f"the marks of {ids[p]} in {few(images)} contradict one another, and none is used")
         elif len(images):
-            good[own[~passing]] = False
-            said.append(f"the mark of {ids[p]} in {few(images)} contradicts those in {passing.sum()} others: left out")
+            good[of_point[~passing]] = False
+            messages.append(
+                f"the mark of {ids[p]} in {few(images)} contradicts those in {passing.sum()} others: left out"
+            )
     used = np.flatnonzero(good)
-    found = intersect_with_covariance(
+    intersection = intersect_with_covariance(
         positions,
         matrices,
         rows.image[used],
@@ -162,7 +164,7 @@ def intersected(block: Block, unknowns: Unknowns, rows: Marked, ids: tuple[str, 
         float(np.median((rows.sigma_mm / c)[used])) if len(used) else 1.0,
         _PARALLEL,
     )
-    return Intersected(found.points, found.covariance, good, tuple(said))
+    return Intersected(intersection.points, intersection.covariance, good, tuple(messages))
 
 
 def _passing(origins, directions, limit) -> Bool[np.ndarray, "rays"]:
@@ -236,9 +238,9 @@ def without_names(block: Block, ids: tuple[str, ...]) -> Block:
     """
     surveyed = {int(p) for rows in (block.control, block.fixed, block.check) for p in np.asarray(rows.who)}
     taken = set(ids)
-    gone = np.array([name in taken and k in surveyed for k, name in enumerate(block.points)], bool)
-    new = np.where(gone, -1, np.cumsum(~gone) - 1)
-    kept = [name for name, out in zip(block.points, gone, strict=True) if not out]
+    replaced = np.array([name in taken and k in surveyed for k, name in enumerate(block.points)], bool)
+    new = np.where(replaced, -1, np.cumsum(~replaced) - 1)
+    kept = [name for name, out in zip(block.points, replaced, strict=True) if not out]
     names = set(kept) | taken
     for k, name in enumerate(kept):
         if name in taken:
@@ -248,7 +250,7 @@ def without_names(block: Block, ids: tuple[str, ...]) -> Block:
             kept[k] = name
     renumbered = lambda rows: rows.renumbered(point=new)  # noqa: E731
     start = block.start
-    unknowns = dataclasses.replace(start.unknowns, points=np.asarray(start.unknowns.points, float)[~gone])
+    unknowns = dataclasses.replace(start.unknowns, points=np.asarray(start.unknowns.points, float)[~replaced])
     changed = {
         name: renumbered(getattr(block, name))
         for name in ("image_points", "control", "fixed", "check", "surfaces", "distances")
@@ -258,7 +260,7 @@ def without_names(block: Block, ids: tuple[str, ...]) -> Block:
         points=tuple(kept),
         **changed,
         more=tuple(renumbered(m) if hasattr(m, "renumbered") else m for m in block.more),
-        start=Start(unknowns, start.image_known, np.asarray(start.point_known)[~gone]),
+        start=Start(unknowns, start.image_known, np.asarray(start.point_known)[~replaced]),
     )
 
 
@@ -269,8 +271,8 @@ def with_gnss_bias(block: Block) -> Block:
     if "flight_bias" in unknowns.more or (unknowns.strips and unknowns.strips.keys() >= set(block.image_strip)):
         return block
     bias: dict[str, AbstractParameters] = {"": FlightBias(zero, zero)}  # type: ignore[arg-type]
-    known: dict[str, AbstractParameters] = {"": FlightBias(FREE, FIXED)}  # type: ignore[arg-type]
-    more, priors = unknowns.more | {"flight_bias": bias}, block.priors.more | {"flight_bias": known}
+    freed: dict[str, AbstractParameters] = {"": FlightBias(FREE, FIXED)}  # type: ignore[arg-type]
+    more, priors = unknowns.more | {"flight_bias": bias}, block.priors.more | {"flight_bias": freed}
     return dataclasses.replace(
         block,
         start=dataclasses.replace(block.start, unknowns=dataclasses.replace(unknowns, more=more)),

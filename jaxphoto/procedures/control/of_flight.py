@@ -45,51 +45,50 @@ def flight_control(
     Raises InputError if no mark is in one of the `images`, for a missing or invalid system, for a local one together
     with `code`, and for points far from the `positions`, with a system that would fit.
     """
-    known = [gps for gps in positions if gps is not None]
-    place = np.median([(g.longitude_deg, g.latitude_deg) for g in known], axis=0) if known else None
+    recorded = [gps for gps in positions if gps is not None]
+    place = np.median([(g.longitude_deg, g.latitude_deg) for g in recorded], axis=0) if recorded else None
     guess = (lambda: fitting(control.points, None, *place)) if place is not None else (lambda: "")
-    told = stated_system(control.points, system, guess)
-    if place is not None and told.crs is not None:
-        check_near(control.points, told, *place)
+    stated = stated_system(control.points, system, guess)
+    if place is not None and stated.crs is not None:
+        check_near(control.points, stated, *place)
     names = tuple(images)
     if len(control.marks.image) and (images_of(control.marks.image, names) < 0).all():
         raise InputError(
             f"{control.marks.places[0]}: no mark is in one of the {len(names)} photographs ({few(names)}), but in "
             f"{few(list(dict.fromkeys(control.marks.image)))}; use the names of their files"
         )
-    if told.crs is None:
+    if stated.crs is None:
         if code is not None:
             raise InputError(
                 f"{control.points.file} is in a local system, and EPSG:{code} is given for the block; leave out the "
                 "code, or give the control in a map system"
             )
         return FlightControl(control, system, names, target_search, local=True), None
-    own = new_code(control.points, told) if code is None else code
-    return FlightControl(control, system, names, target_search, local=False), own
+    flight_code = new_code(control.points, stated) if code is None else code
+    return FlightControl(control, system, names, target_search, local=False), flight_code
 
 
 def adjust_with_control(
-    block: Block, given: FlightControl, code: int | None, vertical: int | None, report: Report
+    block: Block, control: FlightControl, code: int | None, vertical: int | None, report: Report
 ) -> tuple[ControlledBlock | None, str]:
     """Adjust `block` with the control of the flight, or return why that is impossible."""
+    how: dict[str, Any] = {"system": control.system, "code": code, "vertical": vertical, "report": report}
     of: Callable[..., ControlledBlock] = control_block
-    if given.target_search is not None:
-        of = partial(control_block_with_targets, target_search=given.target_search)
+    if control.target_search is not None:
+        of = partial(control_block_with_targets, target_search=control.target_search)
     try:
-        how: dict[str, Any] = {"system": given.system, "code": code, "vertical": vertical, "elsewhere": given.images}
-        found = of(block, given.control, **how, report=report)
+        return of(block, control.control, elsewhere=control.images, **how), ""
     except JaxphotoError as error:
         return None, str(error)
-    return found, ""
 
 
 def parts_with_marks(adjusted: Adjustment, marked: Collection[str]) -> dict[str, Selection]:
     """Groups of observations with a variance component each: features, marks, stations in plan and height."""
-    own = set(marked)
     parts = {"image points": Selection("image_points")}
-    if own:
-        ties = [name for name in adjusted.block.points if name not in own]
-        parts = {"image points": Selection("image_points", points=ties), "marks": Selection("image_points", points=own)}
+    if marked:
+        ties = [name for name in adjusted.block.points if name not in marked]
+        parts["image points"] = Selection("image_points", points=ties)
+        parts["marks"] = Selection("image_points", points=set(marked))
     if len(adjusted.block.stations):
         parts |= {"stations X-Y": Selection("stations", axes=("X", "Y")), "stations Z": Selection("stations", axes="Z")}
     return parts

@@ -132,8 +132,8 @@ def system_of(words: str, place: str) -> ControlSystem:
         f"{place}: {quoted(words)} names no coordinate system; write EPSG:25832, EPSG:25832+7837 with heights, or local"
     )
     keys = {part.lstrip("+").split("=")[0] for part in words.split()}
-    known = bool(_WKT.match(words)) and "EXTENSION" not in words and "GRID" not in words.upper()
-    if len(words) > _LONGEST or not (known or (words.startswith("+proj=") and keys <= _KEYS)):
+    is_wkt = bool(_WKT.match(words)) and "EXTENSION" not in words and "GRID" not in words.upper()
+    if len(words) > _LONGEST or not (is_wkt or (words.startswith("+proj=") and keys <= _KEYS)):
         raise wrong
     try:
         with warnings.catch_warnings():
@@ -165,22 +165,22 @@ def places(points: SurveyedPoints, system: ControlSystem, code: int) -> Float[np
     assert ellipsoid is not None
     if system.vertical is not None and system.code is not None:
         xyz = MapFrame(system.code, system.vertical, (0.0, 0.0, 0.0)).place(xyz)
-        own = map_system(system.code).geodetic_crs
-        assert own is not None
-        crs = own
+        geodetic = map_system(system.code).geodetic_crs
+        assert geodetic is not None
+        crs = geodetic
     try:
         change = Transformer.from_crs(crs if crs.is_geocentric else crs.to_3d(), ellipsoid.to_3d(), always_xy=True)
     except ProjError:
         raise InputError(
             f"{points.file}: PROJ knows no way from {system.name} to the ellipsoid of EPSG:{code}"
         ) from None
-    found = np.stack(change.transform(*xyz.T), axis=1)
-    for k in np.flatnonzero(~np.isfinite(found).all(axis=1)):
-        told = ", ".join(f"{v:.10g}" for v in xyz[k])
+    there = np.stack(change.transform(*xyz.T), axis=1)
+    for k in np.flatnonzero(~np.isfinite(there).all(axis=1)):
+        text = ", ".join(f"{v:.10g}" for v in xyz[k])
         raise InputError(
-            f"{points.places[k]}: {told} is no place of {system.name}; correct coordinates, their order or the system"
+            f"{points.places[k]}: {text} is no place of {system.name}; correct coordinates, their order or the system"
         )
-    return found
+    return there
 
 
 def filled(points: SurveyedPoints) -> Float[np.ndarray, "points 3"]:
@@ -233,14 +233,14 @@ def _systems_at(longitude: float, latitude: float) -> list[int]:
     area = AreaOfInterest(longitude, latitude, longitude, latitude)
     listed = query_crs_info("EPSG", [PJType.PROJECTED_CRS], area, contains=True)
     codes = sorted(listed, key=lambda info: (not info.name.startswith("WGS 84 / UTM"), int(info.code)))
-    found = []
+    usable = []
     for info in codes:
         try:
             map_system(int(info.code))
         except InputError:
             continue
-        found.append(int(info.code))
-    return found
+        usable.append(int(info.code))
+    return usable
 
 
 def distance_m(places: Float[np.ndarray, "n 3"], longitude: float, latitude: float) -> float:

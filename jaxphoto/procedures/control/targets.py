@@ -68,20 +68,20 @@ def predicted(
     matrix, labels = np.asarray(joint.matrix) * factor, list(joint.labels)
     position, turn = to_numpy(unknowns.exterior.position), to_numpy(unknowns.exterior.camera_from_object)
     to_angles = np.asarray(rotation_jacobians(jnp.asarray(np.moveaxis(turn, 0, -1)), joint.rotations))
-    found: list[Predicted] = []
+    rows: list[Predicted] = []
     image = np.arange(n).repeat(len(xyz))
     point = np.tile(np.arange(len(xyz)), n)
     camera = np.array(block.image_camera, object)[image]
     for name, interior in unknowns.interior.items():
-        own = np.flatnonzero(camera == name)
-        if not len(own):
+        of_camera = np.flatnonzero(camera == name)
+        if not len(of_camera):
             continue
-        i, p = image[own], point[own]
-        pad = np.resize(np.arange(len(own)), padded_length(len(own)))
+        i, p = image[of_camera], point[of_camera]
+        pad = np.resize(np.arange(len(of_camera)), padded_length(len(of_camera)))
         numbers = jax.tree.map(partial(np.asarray, dtype=float), interior)
         exterior = ExteriorOrientation(position[i[pad]], turn[i[pad]])  # type: ignore[arg-type]
-        told = _projected(numbers, exterior, xyz[p[pad]], block.corrections)
-        xy, seen, by_point, by_exterior, by_interior = (np.asarray(v)[: len(own)] for v in told)
+        projections = _projected(numbers, exterior, xyz[p[pad]], block.corrections)
+        xy, seen, by_point, by_exterior, by_interior = (np.asarray(v)[: len(of_camera)] for v in projections)
         free = [k for k, q in enumerate(parameter_names(interior)) if f"interior[{name}].{q}" in labels]
         place = [labels.index(f"interior[{name}].{parameter_names(interior)[k]}") for k in free]
         sensor = block.sensors[name]
@@ -92,7 +92,7 @@ def predicted(
             by = np.column_stack([by_exterior[k, :, :3], by_angles, by_interior[k][:, free]])
             pixel = np.array([1, -1]) / sensor.pixel_mm
             c = by @ matrix[np.ix_(where, where)] @ by.T + by_point[k] @ of_points[p[k]] @ by_point[k].T
-            found.append(
+            rows.append(
                 Predicted(
                     i[k : k + 1],
                     p[k : k + 1],
@@ -104,7 +104,7 @@ def predicted(
     none = Predicted(
         *(np.zeros((0, *s), t) for s, t in (((), int), ((), int), ((2,), float), ((2, 2), float), ((2, 3), float)))
     )
-    return Predicted(*(np.concatenate(parts) for parts in zip(none, *found, strict=True)))
+    return Predicted(*(np.concatenate(parts) for parts in zip(none, *rows, strict=True)))
 
 
 @partial(jit_quickly, static_argnum=3)
@@ -195,8 +195,8 @@ def found_marks(
     at = at.take(np.array([pair not in known for pair in pairs], bool))
     spread = np.sqrt(np.linalg.eigvalsh(at.covariance)[:, 1]) if len(at.image) else np.zeros(0)
     radius = np.maximum(_WITHIN * spread, _LEAST_PX)
-    seen = target_search.look(at, radius, adjusted.block.images, ids)
-    return _believed(adjusted, ids, xyz, of_points, at, seen, target_search.named, radius)
+    candidates = target_search.look(at, radius, adjusted.block.images, ids)
+    return _believed(adjusted, ids, xyz, of_points, at, candidates, target_search.named, radius)
 
 
 def _on_own_ground(adjusted: Adjustment, xyz) -> tuple[Float[np.ndarray, "points 3"], float]:
@@ -228,19 +228,26 @@ def _believed(adjusted, ids, xyz, of_points, at: Predicted, seen: Candidates, na
     looked: dict[str, tuple[str, ...]] = {}
     why_not: dict[str, str] = {}
     for p in np.unique(at.point).tolist():
-        own = np.flatnonzero(point == p)
+        group = np.flatnonzero(point == p)
         looked[ids[p]] = tuple(block.images[i] for i in at.image[at.point == p])
         near = xyz[p], of_points[p]
-        chosen, why = _meeting(positions[image[own]], directions[own], image[own], limit[own], seen.fit_px[own], *near)
+        chosen, why = _meeting(
+            positions[image[group]],
+            directions[group],
+            image[group],
+            limit[group],
+            seen.fit_px[group],
+            *near,
+        )
         sure = named or radius[at.point == p].max() < 3 * _LEAST_PX
         least = _LEAST_IMAGES if sure else _LEAST_UNNAMED
         if not why and len(chosen) < least:
-            why = f"it was seen in {len(chosen)}, and {least} are needed" if len(own) else "it was not seen"
+            why = f"it was seen in {len(chosen)}, and {least} are needed" if len(group) else "it was not seen"
         if why:
             where = counted(len(looked[ids[p]]), "photograph")
             why_not[ids[p]] = f"the target of {ids[p]} was looked for in {where}: {why}"
             continue
-        taken[p] = own[chosen].tolist()
+        taken[p] = group[chosen].tolist()
     usual = _fit_of_others(taken, seen.fit_px)
     for p, rows_of in list(taken.items()):
         if not named and np.median(seen.fit_px[rows_of]) > _DULL * usual[p]:
@@ -262,8 +269,8 @@ def _believed(adjusted, ids, xyz, of_points, at: Predicted, seen: Candidates, na
 
 def _fit_of_others(taken: dict[int, list[int]], fit_px: Float[np.ndarray, "n"]) -> dict[int, float]:
     """Median fit of the targets of the other points; infinite for too few."""
-    own = {p: float(np.median(fit_px[rows])) for p, rows in taken.items()}
-    others = {p: [fit for q, fit in own.items() if q != p] for p in own}
+    fits_of = {p: float(np.median(fit_px[rows])) for p, rows in taken.items()}
+    others = {p: [fit for q, fit in fits_of.items() if q != p] for p in fits_of}
     return {p: float(np.median(fits)) if len(fits) >= _LEAST_IMAGES else np.inf for p, fits in others.items()}
 
 
@@ -348,7 +355,7 @@ def control_block_with_targets(
     looked: dict[str, set[str]] = {name: set() for name in ids}
     seen: dict[str, set[str]] = {name: set() for name in ids}
     why_not: dict[str, str] = {}
-    anew: dict[int, float] = {}
+    replaced: dict[int, float] = {}
     every = control.marks
     for _ in range(_ROUNDS):
         report("looking for targets")
@@ -356,15 +363,15 @@ def control_block_with_targets(
         # By marks, by targets of an earlier iteration, or by control of the block.
         placed = len(adjusted.block.control) > 0
         # Each only once.
-        far = {p: off for p, off in _far(now, by_hand).items() if p not in anew} if now else {}
+        far = {p: off for p, off in _far(now, by_hand).items() if p not in replaced} if now else {}
         rows = (by_hand, now.marks.take(~np.isin(now.marks.point, list(far)))) if now else (by_hand,)
         known = {pair for of in rows for pair in zip(of.image.tolist(), of.point.tolist(), strict=True)}
         found = found_marks(adjusted, ids, frame.xyz, sigma, known, target_search, placed)
         for name, images in found.looked.items():
             looked[name] |= set(images)
-        gone = {p: off for p, off in far.items() if ids[p] in found.marks.point}
-        anew |= gone
-        seen |= {ids[p]: set() for p in gone}
+        distant_points = {p: off for p, off in far.items() if ids[p] in found.marks.point}
+        replaced |= distant_points
+        seen |= {ids[p]: set() for p in distant_points}
         for name, image in zip(found.marks.point, found.marks.image, strict=True):
             seen[name].add(image)
         why_not |= found.why_not
@@ -372,7 +379,7 @@ def control_block_with_targets(
             break
         # After a rejection another target may be found; distant ones are replaced as a whole.
         again = set(zip(found.marks.image, found.marks.point, strict=True))
-        names = {ids[p] for p in gone}
+        names = {ids[p] for p in distant_points}
         kept = [(i, p) not in again and p not in names for i, p in zip(every.image, every.point, strict=True)]
         every = Marks.joined(every.take(np.array(kept, bool)), found.marks)
         now = control_block(block, control._replace(marks=every), **how)
@@ -383,7 +390,7 @@ def control_block_with_targets(
     distant = _far(now, by_hand)
     texts += [
         f"the target of {ids[p]} was found anew, {off:.2g} m from what was first taken for it"
-        for p, off in anew.items()
+        for p, off in replaced.items()
         if p not in distant
     ]
     texts += [
@@ -412,6 +419,6 @@ def _told(
     ids: tuple[str, ...], seen: dict[str, set[str]], looked: dict[str, set[str]], why_not: dict[str, str]
 ) -> list[str]:
     """One sentence on the targets of all iterations, and one for each point without any."""
-    found = [f"{name} in {len(seen[name])} of {len(looked[name])}" for name in ids if seen[name]]
-    count = f"{counted(len(found), 'target')} found in the photographs that should show them"
-    return [f"{count}: {', '.join(found)}"] * bool(found) + [why_not[p] for p in ids if p in why_not and not seen[p]]
+    counts = [f"{name} in {len(seen[name])} of {len(looked[name])}" for name in ids if seen[name]]
+    count = f"{counted(len(counts), 'target')} found in the photographs that should show them"
+    return [f"{count}: {', '.join(counts)}"] * bool(counts) + [why_not[p] for p in ids if p in why_not and not seen[p]]

@@ -38,10 +38,10 @@ def orient_block(block: Block, report: Report = lambda text: None) -> Block:
     start, measured = block.start.unknowns, block.image_points
     cameras = sorted(set(block.image_camera))
     rows = [np.flatnonzero(np.asarray(measured.image) == i) for i in range(len(block.images))]
-    point_of = [np.asarray(measured.point)[own] for own in rows]
+    point_of = [np.asarray(measured.point)[row] for row in rows]
     features = [
-        block.sensors[name].px_from_mm(ideal_coordinates(start.interior[name], np.asarray(measured.xy, float)[own]))
-        for name, own in zip(block.image_camera, rows, strict=True)
+        block.sensors[name].px_from_mm(ideal_coordinates(start.interior[name], np.asarray(measured.xy, float)[row]))
+        for name, row in zip(block.image_camera, rows, strict=True)
     ]
     report(f"orienting {len(block.images)} images (COLMAP)")
     network = map_images(
@@ -63,11 +63,11 @@ def orient_block(block: Block, report: Report = lambda text: None) -> Block:
     image_known, point_known = np.asarray(block.start.image_known), np.asarray(block.start.point_known)
     met = np.isfinite(network.points).all(axis=1) & ~point_known
     oriented = network.oriented & ~image_known
-    known = (start.exterior.position, start.exterior.camera_from_object, start.points)
+    old = (start.exterior.position, start.exterior.camera_from_object, start.points)
     new = (network.positions, network.camera_from_object, network.points)
     is_new = (oriented[:, None], oriented[:, None, None], met[:, None])
     places = lambda u: (u.exterior.position, u.exterior.camera_from_object, u.points)  # noqa: E731
-    unknowns = eqx.tree_at(places, start, tuple(np.where(*v) for v in zip(is_new, new, known, strict=True)))
+    unknowns = eqx.tree_at(places, start, tuple(np.where(*v) for v in zip(is_new, new, old, strict=True)))
     interior = {
         name: _with_c(start.interior[name], c_px * block.sensors[name].pixel_mm)
         for name, c_px in zip(cameras, network.c_px, strict=True)

@@ -119,9 +119,9 @@ def map_images(
             options = _options(pycolmap, cameras, angle, free, min_matches, min_points)
             models = pycolmap.incremental_mapping(database, folder, folder, options).values()
             for model in models:
-                found = _score(model, cameras)
-                if found > score:
-                    best, score = model, found
+                quality = _score(model, cameras)
+                if quality > score:
+                    best, score = model, quality
             if score[:2] == (True, wanted):
                 break
         if best is None:
@@ -188,12 +188,12 @@ def write_database(
     pycolmap = import_pycolmap()
     with pycolmap.Database.open(database) as stored, pycolmap.DatabaseTransaction(stored):
         for camera in cameras:
-            made = pycolmap.Camera.create_from_model_name(
+            initial = pycolmap.Camera.create_from_model_name(
                 0, "SIMPLE_RADIAL", camera.c_px, camera.width_px, camera.height_px
             )
-            made.has_prior_focal_length = prior_c
+            initial.has_prior_focal_length = prior_c
             rig = pycolmap.Rig()
-            rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, stored.write_camera(made)))
+            rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, stored.write_camera(initial)))
             stored.write_rig(rig)
         for k, (of_camera, features) in enumerate(zip(image_camera, features_px, strict=True)):
             image = stored.write_image(pycolmap.Image(name=str(k), camera_id=of_camera + 1))

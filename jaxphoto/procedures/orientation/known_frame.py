@@ -76,21 +76,21 @@ def in_known_frame(block: Block, network: Network, known: Start) -> Network:
     """
     there, here = _surveyed(block, network)
     images = np.flatnonzero(np.asarray(known.image_known) & network.oriented)
-    found = similarity_between(there, here, _NEARLY_A_LINE if len(images) else _LINE)
-    if found is None and len(images):
-        found = _by_images(block, network, known, images, there, here)
-    elif found is None and len(here):
+    similarity = similarity_between(there, here, _NEARLY_A_LINE if len(images) else _LINE)
+    if similarity is None and len(images):
+        similarity = _by_images(block, network, known, images, there, here)
+    elif similarity is None and len(here):
         raise BlockError(
             f"the images are oriented to one another, but the {len(here)} known points and stations that they see are "
             "fewer than three or lie on a line, which leaves the frame open: measure more known points, or give "
             "approximate X_m, Y_m, Z_m, omega_deg, phi_deg, kappa_deg in images.csv"
         )
-    elif found is None:
-        found = Similarity(np.zeros(3), np.eye(3), _scale_of_bars(block, network))
+    elif similarity is None:
+        similarity = Similarity(np.zeros(3), np.eye(3), _scale_of_bars(block, network))
     return network._replace(
-        positions=found.of(network.positions),
-        camera_from_object=found.turned(network.camera_from_object),
-        points=found.of(network.points),
+        positions=similarity.of(network.positions),
+        camera_from_object=similarity.turned(network.camera_from_object),
+        points=similarity.of(network.points),
     )
 
 
@@ -111,9 +111,9 @@ def _by_images(block: Block, network: Network, known: Start, images, there, here
     there = np.concatenate([there, network.points[points], network.positions[images]])
     positions = np.asarray(exterior.position, float)[images]
     here = np.concatenate([here, np.asarray(known.unknowns.points, float)[points], positions])
-    found = similarity_between(there, here, _NEARLY_A_LINE)
-    if found is not None:
-        return found
+    similarity = similarity_between(there, here, _NEARLY_A_LINE)
+    if similarity is not None:
+        return similarity
     matrices = np.asarray(exterior.camera_from_object, float)[images]
     turn, _ = average_rotation(np.einsum("nji,njk->nik", matrices, network.camera_from_object[images]))
     a, b = there - there.mean(axis=0), here - here.mean(axis=0)

@@ -152,21 +152,21 @@ def orient(
     first = _iterated(block, calibration, (), report)
     camera = determined(first.adjusted, calibration)
     last = _iterated(first.block, calibration, camera.names, report)
-    made = calibration.final_priors(last.block, camera.names)
+    final = calibration.final_priors(last.block, camera.names)
     rejected = {reason: first.rejected[reason] + last.rejected[reason] for reason in first.rejected}
-    residual = np.asarray(last.adjusted.residuals.image).T * np.asarray(made.image_points.sigma)
+    residual = np.asarray(last.adjusted.residuals.image).T * np.asarray(final.image_points.sigma)
     return Oriented(
-        made,
+        final,
         residual,
         OrientationReport(
             n_images=len(names),
             n_matches=sum(len(m.features) for m in matches),
             n_pairs=len(network.verified),
-            order=tuple(names[i] for i in network.order if names[i] in made.images),
-            unoriented=_unoriented(names, network, made, first.lost | last.lost),
+            order=tuple(names[i] for i in network.order if names[i] in final.images),
+            unoriented=_unoriented(names, network, final, first.lost | last.lost),
             gross_errors=GrossErrors(*_match_errors(matches, network), **rejected),
-            n_points=len(made.points),
-            n_image_points=len(made.image_points.image),
+            n_points=len(final.points),
+            n_image_points=len(final.image_points.image),
             rounds=first.iterations + last.iterations,
             settled=last.settled,
             converged=last.settled and bool(last.adjusted.converged),

@@ -47,9 +47,10 @@ def unsupported(block: Block) -> Bool[np.ndarray, " rows"]:
     two = np.bincount(point)[point] == 2
     contradicted = np.zeros(len(point), bool)
     for number in np.unique(image):
-        seen = np.flatnonzero(image == number)
-        if len(seen) > _NEIGHBOURS and two[seen].any():
-            contradicted[seen[two[seen]]] = _far(np.asarray(rows.xy)[seen], inverse[seen], sigma[seen], two[seen])
+        rows_of = np.flatnonzero(image == number)
+        xy, tested = np.asarray(rows.xy)[rows_of], two[rows_of]
+        if len(rows_of) > _NEIGHBOURS and tested.any():
+            contradicted[rows_of[tested]] = _far(xy, inverse[rows_of], sigma[rows_of], tested)
     return (np.bincount(point[contradicted], minlength=len(block.points)) == 2)[point]
 
 

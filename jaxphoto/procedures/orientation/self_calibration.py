@@ -92,8 +92,8 @@ def self_calibration(block: Block, camera: str) -> SelfCalibration:
     corner = np.array([sensor.width_mm, sensor.height_mm]) / 2
     unit = {n: float(np.linalg.norm(corner)) / corner_shift(interior, n, corner) for n in names}
     start = {n: float(np.asarray(get_parameter(interior, n))) for n in names}
-    made = SelfCalibration(camera, names, unit, start, PaddedSizes())
-    return made._replace(sizes=common_sizes([made.with_priors(block, names)]))
+    calibration = SelfCalibration(camera, names, unit, start, PaddedSizes())
+    return calibration._replace(sizes=common_sizes([calibration.with_priors(block, names)]))
 
 
 def corner_shift(interior: InteriorOrientation, name: str, corner: np.ndarray) -> float:
@@ -117,8 +117,8 @@ def determined(adjusted: Adjustment, calibration: SelfCalibration) -> Determined
     matrix, labels = shared_covariance(adjusted), adjusted.structure.labels
     camera, names = calibration.camera, calibration.names
     place = [labels.index(f"interior[{camera}].{name}") for name in names]
-    known = [calibration.observation(name) for name in names]
-    sigma = np.array([float(prior.sigma) for prior in known])
+    priors = [calibration.observation(name) for name in names]
+    sigma = np.array([float(prior.sigma) for prior in priors])
     loose = np.array([_FREE * calibration.unit[name] for name in names])
     # Normal equations of the image points alone.
     images = np.linalg.inv(matrix[np.ix_(place, place)]) - np.diag(sigma**-2.0)
@@ -129,7 +129,7 @@ def determined(adjusted: Adjustment, calibration: SelfCalibration) -> Determined
             f"{name} of {camera_words(camera)} is observed where it starts, {float(prior.value):.6g} +- "
             f"{float(prior.sigma):.2g}: the images leave the corner of the format open by "
             f"{weak[name] / calibration.unit[name]:.1%} of its radius"
-            for name, prior in zip(names, known, strict=True)
+            for name, prior in zip(names, priors, strict=True)
             if name in weak
         ],
         factor,

@@ -50,15 +50,15 @@ def read_board(description: str) -> Pattern:
     counts = size.lower().split("x")
     if len(counts) != 2 or not all(n.isdecimal() and least <= int(n) <= 500 for n in counts):
         raise _bad(description, kind, f"{size!r} is no count of columns x rows, {least} to 500 each")
-    given: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for setting in settings:
         name, sign, value = setting.partition("=")
-        if not sign or name not in names or name in given:
+        if not sign or name not in names or name in texts:
             raise _bad(description, kind, f"{setting!r} is not one of {', '.join(f'{n}=...' for n in names)}")
-        given[name] = value
-    if missing := [name for name in names if name not in given]:
+        texts[name] = value
+    if missing := [name for name in names if name not in texts]:
         raise _bad(description, kind, f"{missing[0]} is missing")
-    values = {name.removesuffix("_mm"): _value(description, kind, name, text) for name, text in given.items()}
+    values = {name.removesuffix("_mm"): _value(description, kind, name, text) for name, text in texts.items()}
     try:
         return make(*map(int, counts), **{f"{k}_m" if k != "dictionary" else k: v for k, v in values.items()})
     except ValueError as error:

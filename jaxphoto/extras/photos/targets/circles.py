@@ -219,16 +219,16 @@ class CircleGrid(Pattern):
         """The circles of the grid by rows; None if it is not found; without circles that have no clear edge."""
         blobs = elliptic_blobs(picture)
         for dark in (True, False):
-            own = self._like_the_grid(blobs.take(blobs.dark == dark))
-            if len(own.column_row) < len(self.board.points):
+            candidates = self._like_the_grid(blobs.take(blobs.dark == dark))
+            if len(candidates.column_row) < len(self.board.points):
                 continue
-            drawn, scale, corner = _drawing(own.column_row)
+            drawn, scale, corner = _drawing(candidates.column_row)
             for sheet, times, shift in ((drawn, scale, corner), (picture, 1.0, np.zeros(2))):
                 for how in (cv2.CALIB_CB_ASYMMETRIC_GRID, cv2.CALIB_CB_ASYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING):
                     seen, centres = cv2.findCirclesGrid(sheet, (self.columns, self.rows), flags=how)  # type: ignore[call-overload]
-                    found = self._placed(picture, own, centres.reshape(-1, 2) / times + shift) if seen else None
-                    if found is not None:
-                        return found
+                    grid = self._placed(picture, candidates, centres.reshape(-1, 2) / times + shift) if seen else None
+                    if grid is not None:
+                        return grid
         return None
 
     def reflectance(self, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
@@ -337,10 +337,10 @@ class CircularTargets(Pattern):
         """The visible targets; None if their arrangement is not found, or ambiguous."""
         blobs = elliptic_blobs(picture)
         for dark in (True, False):
-            own = blobs.take(blobs.dark == dark)
-            pairs = identified(self._flat, self.board.diameter_m / 2, own, self._upright)
+            candidates = blobs.take(blobs.dark == dark)
+            pairs = identified(self._flat, self.board.diameter_m / 2, candidates, self._upright)
             if pairs is not None:
-                return FoundBoard(pairs[:, 0], fit_discs(picture, own.take(pairs[:, 1])))
+                return FoundBoard(pairs[:, 0], fit_discs(picture, candidates.take(pairs[:, 1])))
         return None
 
     def reflectance(self, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
@@ -371,21 +371,21 @@ def identified(
     """
     if len(blobs.column_row) < _LEAST:
         return None
-    found: list[_Labelling] = []
+    labellings: list[_Labelling] = []
     for side in (1, -1):
-        seen = flat * (side, 1)
-        grown = (_grown(seen, guess, blobs) for guess in _guesses(seen * (1, -1), radius, blobs))
-        found += [_Labelling(*g, side) for g in grown if g is not None]
-    best = _best(found)
+        front = flat * (side, 1)
+        grown = (_grown(front, guess, blobs) for guess in _guesses(front * (1, -1), radius, blobs))
+        labellings += [_Labelling(*g, side) for g in grown if g is not None]
+    best = _best(labellings)
     if best is None and not upright:
-        best = _best([one for one in found if one.side == 1])
+        best = _best([one for one in labellings if one.side == 1])
     return None if best is None else best.pairs
 
 
-def _best(found: list[_Labelling]) -> _Labelling | None:
+def _best(labellings: list[_Labelling]) -> _Labelling | None:
     """The best fit among the labellings of most targets; None if another one is as good."""
-    most = max((len(one.pairs) for one in found), default=0)
-    able = [one for one in found if len(one.pairs) >= _AS_GOOD * most]
+    most = max((len(one.pairs) for one in labellings), default=0)
+    able = [one for one in labellings if len(one.pairs) >= _AS_GOOD * most]
     best = min(able, key=lambda one: one.misfit, default=None)
     if best is None or any(one.misfit < _AS_NEAR * best.misfit and not one.agrees(best) for one in able):
         return None
@@ -433,10 +433,10 @@ def _grown(flat, pairs, blobs) -> tuple[np.ndarray, float] | None:
         if h is None:
             return None
         beside = flat + np.stack([spacing, np.zeros_like(spacing)], axis=1)
-        seen, other = (cv2.perspectiveTransform(p[None], h)[0] for p in (flat, beside))
-        distance = np.linalg.norm(seen[:, None] - blobs.column_row, axis=2)
+        places, other = (cv2.perspectiveTransform(p[None], h)[0] for p in (flat, beside))
+        distance = np.linalg.norm(places[:, None] - blobs.column_row, axis=2)
         blob = distance.argmin(axis=1)
-        good = distance.min(axis=1) < _NEAR * np.linalg.norm(other - seen, axis=1)
+        good = distance.min(axis=1) < _NEAR * np.linalg.norm(other - places, axis=1)
         good &= distance.argmin(axis=0)[blob] == np.arange(len(flat))
         pairs = np.column_stack([np.flatnonzero(good), blob[good]])
     if len(pairs) < _LEAST:

@@ -34,12 +34,12 @@ class ArucoGrid(Pattern):
 
     def find(self, picture: np.ndarray) -> FoundBoard | None:
         """The corners of all visible markers of the board; None if there is none."""
-        found = found_markers(picture, self._dictionary, self.gap_m / self.marker_m)
-        own = (found.number < self.columns * self.rows) & (np.bincount(found.number)[found.number] == 1)
-        if not own.any():
+        markers = found_markers(picture, self._dictionary, self.gap_m / self.marker_m)
+        valid = (markers.number < self.columns * self.rows) & (np.bincount(markers.number)[markers.number] == 1)
+        if not valid.any():
             return None
-        point = (4 * found.number[own][:, None] + np.arange(4)).ravel()
-        return FoundBoard(point, TargetPlaces(*(v[np.repeat(own, 4)] for v in found.corners)))
+        point = (4 * markers.number[valid][:, None] + np.arange(4)).ravel()
+        return FoundBoard(point, TargetPlaces(*(v[np.repeat(valid, 4)] for v in markers.corners)))
 
     def reflectance(self, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
         """Black-framed markers on white."""
@@ -99,8 +99,8 @@ class CharucoBoard(Pattern):
         if homography is None:
             return None
         ends = plane[:, None] + np.array([[0, 0], [1, 0], [0, -1]]) * self.square_m
-        seen = cv2.perspectiveTransform(ends.reshape(1, -1, 2), homography).reshape(-1, 3, 2)
-        sides = seen[:, 1:] - seen[:, :1]
+        projected = cv2.perspectiveTransform(ends.reshape(1, -1, 2), homography).reshape(-1, 3, 2)
+        sides = projected[:, 1:] - projected[:, :1]
         length = np.linalg.norm(sides, axis=2, keepdims=True)
         # The nearest marker begins behind its margin, in both directions: on the diagonal.
         margin = (1 - self.marker_m / self.square_m) / 2 * np.sqrt(2)

@@ -75,11 +75,11 @@ class Marker(GroundTarget):
     def find(self, window: np.ndarray, point: str, px_per_m: Float[np.ndarray, "2 2"]) -> TargetPlaces:
         """The intersection of the diagonals of the marker with the number of the point."""
         digits = re.findall(r"\d+", point)
-        found = found_markers(window, self.dictionary, 1.0)
-        own = np.flatnonzero(found.number == int(digits[-1][:9])) if digits else np.zeros(0, int)
+        markers = found_markers(window, self.dictionary, 1.0)
+        matching = np.flatnonzero(markers.number == int(digits[-1][:9])) if digits else np.zeros(0, int)
         middle, sigma = [], []
-        for k in own:
-            corners, each, good = (v[4 * k : 4 * k + 4] for v in found.corners)
+        for k in matching:
+            corners, each, good = (v[4 * k : 4 * k + 4] for v in markers.corners)
             a, c, b, d = corners[[0, 2, 1, 3]]
             across = np.column_stack([c - a, b - d])
             if good.all() and abs(np.linalg.det(across)) > 1:
@@ -113,9 +113,9 @@ class Cross(GroundTarget):
         near, edges = [], []
         for k in order:
             place = np.array([column[k], row[k]], float)
-            if (told := _edges(grey, place, max(_OUT * side, 2.5))) is not None:
+            if (directions := _edges(grey, place, max(_OUT * side, 2.5))) is not None:
                 near.append(place)
-                edges.append(told)
+                edges.append(directions)
         if not near:
             return _nothing()
         near, edges = near[:_MOST], edges[:_MOST]

@@ -70,14 +70,14 @@ def find_targets(
     for photograph in photographs:
         progress(photograph.name)
         picture = read_grey(photograph.path)
-        found = pattern.find(picture)
-        if found is None:
+        seen = pattern.find(picture)
+        if seen is None:
             left_out[photograph.name] = "the board was not found"
             continue
-        good, places = found.places.found, found.places
+        good, places = seen.places.found, seen.places
         # OpenCV's origin is the centre of the upper-left pixel, which is (0.5, 0.5) here.
         column_row = places.column_row[good] + 0.5
-        detections.append(Detection(photograph.name, found.point[good], column_row, places.sigma_px[good]))
+        detections.append(Detection(photograph.name, seen.point[good], column_row, places.sigma_px[good]))
     if not detections:
         hint = pattern.hint([read_grey(photograph.path) for photograph in photographs[:_LOOKED_AT]])
         raise InputError(
