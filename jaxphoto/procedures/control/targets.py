@@ -68,7 +68,7 @@ def predicted(
     matrix, labels = np.asarray(joint.matrix) * factor, list(joint.labels)
     position, turn = to_numpy(unknowns.exterior.position), to_numpy(unknowns.exterior.camera_from_object)
     to_angles = np.asarray(rotation_jacobians(jnp.asarray(np.moveaxis(turn, 0, -1)), joint.rotations))
-    rows: list[Predicted] = []
+    rows: list[tuple] = []
     image = np.arange(n).repeat(len(xyz))
     point = np.tile(np.arange(len(xyz)), n)
     camera = np.array(block.image_camera, object)[image]
@@ -85,26 +85,17 @@ def predicted(
         free = [k for k, q in enumerate(parameter_names(interior)) if f"interior[{name}].{q}" in labels]
         place = [labels.index(f"interior[{name}].{parameter_names(interior)[k]}") for k in free]
         sensor = block.sensors[name]
-        half = np.array([sensor.width_mm, sensor.height_mm]) / 2
+        half, pixel = np.array([sensor.width_mm, sensor.height_mm]) / 2, np.array([1, -1]) / sensor.pixel_mm
+        column_row = sensor.px_from_mm(xy)
         for k in np.flatnonzero(seen & (np.abs(xy) < half).all(axis=1)):
             where = [*range(6 * i[k], 6 * i[k] + 6), *place]
             by_angles = by_exterior[k, :, 3:] @ np.linalg.inv(to_angles[i[k]])
             by = np.column_stack([by_exterior[k, :, :3], by_angles, by_interior[k][:, free]])
-            pixel = np.array([1, -1]) / sensor.pixel_mm
             c = by @ matrix[np.ix_(where, where)] @ by.T + by_point[k] @ of_points[p[k]] @ by_point[k].T
-            rows.append(
-                Predicted(
-                    i[k : k + 1],
-                    p[k : k + 1],
-                    sensor.px_from_mm(xy[k : k + 1]),
-                    (c * np.outer(pixel, pixel))[None],
-                    (by_point[k] * pixel[:, None])[None],
-                )
-            )
-    none = Predicted(
-        *(np.zeros((0, *s), t) for s, t in (((), int), ((), int), ((2,), float), ((2, 2), float), ((2, 3), float)))
-    )
-    return Predicted(*(np.concatenate(parts) for parts in zip(none, *rows, strict=True)))
+            rows.append((i[k], p[k], column_row[k], c * np.outer(pixel, pixel), by_point[k] * pixel[:, None]))
+    columns = zip(*rows, strict=True) if rows else [[]] * 5
+    shapes = (), (), (2,), (2, 2), (2, 3)
+    return Predicted(*(np.array(v, float if s else int).reshape(-1, *s) for v, s in zip(columns, shapes, strict=True)))
 
 
 @partial(jit_quickly, static_argnum=3)

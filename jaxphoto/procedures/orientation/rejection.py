@@ -7,7 +7,8 @@ spread and its own standard deviation. At depth discontinuities neighbours sprea
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+import scipy
+from jaxtyping import Bool, Float
 
 from jaxphoto.block import Block
 
@@ -15,8 +16,6 @@ from jaxphoto.block import Block
 _LIMIT, _MIN_LIMIT = 4.0, 1.0
 # Number of nearest points in the image, and the limit of a depth in their robust spreads.
 _NEIGHBOURS, _DEPTH_LIMIT = 12, 8.0
-# Number of distances that are computed at a time.
-_CHUNK = 4_000_000
 # Ratios of the standard deviation of a normal distribution to its median absolute deviation, and of errors in two axes
 # to the median of their length (Rayleigh).
 _MAD, _RAYLEIGH = 1.4826, 1 / 1.1774
@@ -56,22 +55,11 @@ def unsupported(block: Block) -> Bool[np.ndarray, " rows"]:
 
 def _far(xy, inverse, sigma, tested: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " tested"]:
     """True for the `tested` points of one image, at `xy` with `inverse` depths, that their neighbours contradict."""
-    near = np.concatenate(
-        [_nearest(xy, some) for some in np.array_split(xy[tested], 1 + tested.sum() * len(xy) // _CHUNK)]
-    )
-    around = inverse[near]
+    # The nearest point is the point itself.
+    around = inverse[scipy.spatial.cKDTree(xy).query(xy[tested], _NEIGHBOURS + 1)[1][:, 1:]]
     median = np.median(around, axis=1)
     spread = _MAD * np.median(np.abs(around - median[:, None]), axis=1)
     return np.abs(inverse[tested] - median) > _DEPTH_LIMIT * np.hypot(spread, sigma[tested])
-
-
-def _nearest(xy: Float[np.ndarray, "n 2"], to: Float[np.ndarray, "m 2"]) -> Int[np.ndarray, "m neighbours"]:
-    """Nearest neighbours among `xy` of each of `to`, a subset, without the point itself."""
-    apart = np.sum(xy**2, axis=1) - 2 * to @ xy.T
-    order = np.argpartition(apart, _NEIGHBOURS, axis=1)[:, : _NEIGHBOURS + 1]
-    itself = np.argmin(np.take_along_axis(apart, order, axis=1), axis=1)
-    others = np.arange(_NEIGHBOURS + 1) != itself[:, None]
-    return order[others].reshape(len(to), _NEIGHBOURS)
 
 
 def _relative_depth_sigma(ray, point, sigma_rad) -> Float[np.ndarray, " rows"]:
