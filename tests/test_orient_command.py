@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from jaxphoto.camera import InteriorOrientation
+from jaxphoto.extras.photos import matching
 from jaxphoto.extras.photos.matching import MatchedPhotographs
 from jaxphoto.io import read_block
 from jaxphoto.io.photographs import CameraStart
