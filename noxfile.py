@@ -53,7 +53,7 @@ def checks(session: nox.Session) -> None:
 
 @nox.session(python=FIRST)
 def wheel(session: nox.Session) -> None:
-    """The wheel alone, as a user without a checkout has it."""
+    """Test the wheel alone, as for a user without a checkout."""
     session.install("hatchling", "mypy", "pip")
     session.run(".ci/stranger", session.virtualenv.location, external=True)
 
@@ -68,7 +68,7 @@ def suite(session: nox.Session) -> None:
 
 @nox.session(python=FIRST)
 def slow(session: nox.Session) -> None:
-    """A sixteenth of the slow tests, in turn from commit to commit: all of them take too long."""
+    """Run a sixteenth of the slow tests, by turns from commit to commit."""
     session.install(".[dev]")
     count = subprocess.run(["git", "rev-list", "--count", "HEAD"], capture_output=True, text=True).stdout.strip()
     session.run(*_readme_command("pytest"), "-m", "slow", "--part", f"{int(count or 0) % 16 + 1}/16")

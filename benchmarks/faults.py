@@ -172,11 +172,11 @@ class Tried:
 
     def judged(self, place: Path, when: str, *, must_be: bool, finished: bool = False) -> Iterator[str]:
         """What is wrong below `place` after a fault; results `must_be` there, of a run that has `finished`."""
-        from jaxphoto.writing import clear_leftovers
+        from jaxphoto.writing import is_place
 
-        clear_leftovers(place)
         out = place / self.case.out
-        if others := _names(place) - {self.case.out} - ({self.kept} if not finished else set()):
+        others = {name for name in _names(place) if not is_place(name)} - {self.case.out}
+        if others := others - ({self.kept} if not finished else set()):
             yield f"{when}: {sorted(others)} left"
         if not out.exists():
             if must_be and self.name not in _GOES_ON:

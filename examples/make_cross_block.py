@@ -178,7 +178,7 @@ def photograph(exterior: ExteriorOrientation, places: np.ndarray) -> tuple[np.nd
 
 
 def write(table: pd.DataFrame, path: Path, digits: int) -> None:
-    """A CSV with so many decimals."""
+    """Write a CSV with this number of decimals."""
     table.to_csv(path, index=False, float_format=f"%.{digits}f")
 
 

@@ -17,10 +17,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import jax
 
 jax.config.update("jax_enable_x64", True)
-# One device of JAX a core: large blocks are dealt out to them (docs/scaling.md).
+# One JAX device per core: large blocks are sharded over them (docs/scaling.md).
 _chosen = "host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
 if jax.config.values["jax_num_cpu_devices"] <= 0 and not _chosen:
-    # Too late where JAX has begun to compute: then its devices stay what they are.
+    # Too late if JAX has already computed: its devices then stay as they are.
     with contextlib.suppress(RuntimeError):
         # Those that this process may use, where the system says it (macOS and Windows do not).
         _cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -106,8 +106,8 @@ __all__ = [
     "write_block", "write_simulation",
 ]  # fmt: skip
 
-# Files and tables bring pandas and more, a third of a second, and studies are not for every day: they are imported when
-# first asked for, as is every room. The names of each room, as imported above for whoever reads types.
+# Imported at first use: files and tables need pandas, a third of a second. Names by package, as imported above for
+# type checkers.
 _LATER = {
     "extras.formats": ("convert", "read_source"),
     "io": ("read_block", "read_recipe", "write_block", "write_simulation"),

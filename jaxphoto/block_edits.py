@@ -45,7 +45,7 @@ class BlockEdits(eqx.Module):
         InputError for a sigma that is not positive, and for values that are not numbers or have another shape.
         """
         if value is None and name in ("position", "rotation", "points"):
-            raise InputError(f"weigh({name!r}) needs a value beside its sigma: where it starts, nobody observed it")
+            raise InputError(f"weigh({name!r}) needs a value with its sigma: its start value is not an observation")
         return self._with_priors(
             (name,), lambda start: weighted(name, start, start if value is None else value, sigma), of
         )
@@ -113,7 +113,7 @@ class BlockEdits(eqx.Module):
         for name in names or ("",):
             if not isinstance(name, str) or not name:
                 asked = f"{name!r} is no parameter" if names else "no parameter is named"
-                raise InputError(f"{asked}: give names with commas between, such as c_mm, k1, lever_arm, position")
+                raise InputError(f"{asked}: give names separated by commas, such as c_mm, k1, lever_arm, position")
         for name in names:
             priors = with_prior(priors, name, prior_of, block.start.unknowns, of)
         return dataclasses.replace(block, priors=priors)

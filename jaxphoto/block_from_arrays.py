@@ -141,7 +141,7 @@ def _image_rows(
 ) -> tuple[tuple[str, ...], ImagePoints]:
     """Return the points in order of first appearance, and their measurements sorted by point and image."""
     if not seen.n:
-        raise BlockError("image_points: there are none; give what was measured in the images")
+        raise BlockError("image_points: empty; give the measured image coordinates")
     image, ids = seen.index("image", images, "image {name} is not listed under images"), seen.ids("point")
     points = tuple(dict.fromkeys(ids))
     point = seen.index("point", points, "")

@@ -29,7 +29,7 @@ class CheckedColumns:
         lengths = {key: len(np.atleast_1d(column)) for key, column in self.columns.items()}
         if len(set(lengths.values())) > 1:
             listed = ", ".join(f"{key} {n}" for key, n in lengths.items())
-            raise InputError(f"{name}: the columns differ in length ({listed}); give each entry a value in all")
+            raise InputError(f"{name}: the columns differ in length ({listed}); give every column one value per entry")
         self.n = next(iter(lengths.values()), 0)
 
     def __contains__(self, column: str) -> bool:
@@ -48,7 +48,7 @@ class CheckedColumns:
         try:
             values = np.stack([np.asarray(self._column(c), float).reshape(self.n) for c in columns], axis=1)
         except (TypeError, ValueError) as error:
-            raise InputError(f"{self.name}: {', '.join(columns)} must be one number an entry ({error})") from None
+            raise InputError(f"{self.name}: {', '.join(columns)} must have one number per entry ({error})") from None
         for entry, k in np.argwhere(~np.isfinite(values)):
             if not (empty and np.isnan(values[entry, k])):
                 raise self.wrong(entry, f"{columns[k]} is {values[entry, k]}; give a number")
@@ -68,7 +68,7 @@ class CheckedColumns:
             one = self.numbers(of_all, empty=True) if of_all in self else np.full((self.n, 1), float(default or 0))
             values = np.repeat(one, len(columns), axis=1)
         elif needed.any():
-            raise InputError(f"{self.name}: there is no standard deviation; give {' and '.join(columns)}, or {of_all}")
+            raise InputError(f"{self.name}: no standard deviation; give {' and '.join(columns)}, or {of_all}")
         else:
             values = np.zeros(needed.shape)
         for entry, k in np.argwhere(needed & ~(values > 0)):

@@ -1,7 +1,7 @@
-"""What the console and notebooks show of things, in lines instead of pages: counts, numbers, outcome, sigma naught.
+"""Short `repr` and HTML of objects: counts, numbers, outcome, sigma naught.
 
-Tables and pictures are made upstairs (`jaxphoto.report`), which nothing down here may import. What an object offers of
-them for notebooks is asked for by name, when it is wanted: `from_upstairs`.
+Tables and plots are made by `jaxphoto.report`, which this module must not import; objects get its functions by name
+when they are called (`from_upstairs`).
 """
 
 import dataclasses
@@ -15,21 +15,20 @@ from typing import Any, TypeVar
 import numpy as np
 
 T = TypeVar("T", bound=type)
-# Of a thing by its fields: how long a word for one of them is at most, how many numbers and names are told, and how
-# many rows and fields.
+# Of an object by its fields: longest text of a field, most numbers and names shown, most rows and fields.
 _LONGEST, _FEW, _ROWS, _FIELDS = 72, 4, 20, 24
 
-# Standard deviations that a normal number exceeds once in a thousand times, to either side.
+# Two-sided 0.1 % quantile of the normal distribution.
 _ONE_IN_A_THOUSAND = 3.29
 
 
 def from_upstairs(name: str, room: str = "report") -> Any:
-    """A function of a package above, which is imported now."""
+    """Return a function of a package above, imported now."""
     return getattr(importlib.import_module(f"jaxphoto.{room}"), name)
 
 
 def html_of(title: str, rows: Mapping[str, object]) -> str:
-    """A small table under a title, as notebooks show it."""
+    """Return a small HTML table under a title."""
     cells = "".join(
         f'<tr><th style="text-align:left">{escape(name)}</th><td style="text-align:left">{escape(str(value))}</td></tr>'
         for name, value in rows.items()
@@ -38,14 +37,14 @@ def html_of(title: str, rows: Mapping[str, object]) -> str:
 
 
 def pretty_repr(cls: T) -> T:
-    """The class, whose things show their fields in a few lines, and in notebooks as a small table."""
+    """Add a short `repr` and an HTML table of the fields to a class."""
     cls.__repr__ = fields_repr  # type: ignore[assignment]
     cls._repr_html_ = fields_html  # type: ignore[attr-defined]
     return cls
 
 
 def fields_repr(thing: Any) -> str:
-    """`Name(field word, field word, ...)`, in as many lines as it takes."""
+    """Return `Name(field text, field text, ...)`, wrapped."""
     told = [f"{name} {field_word(value)}".strip() for name, value in _fields(thing)]
     if len(told) > _FIELDS:
         told[_FIELDS:] = [f"{len(told) - _FIELDS} more"]
@@ -53,7 +52,7 @@ def fields_repr(thing: Any) -> str:
 
 
 def fields_html(thing: Any) -> str:
-    """The same as a table; below it what has rows of its own."""
+    """Return the fields as an HTML table, followed by fields that are tables themselves."""
     fields = dict(_fields(thing))
     tables = {name: rows for name, rows in fields.items() if _is_rows(rows)}
     words = {name: field_word(value) for name, value in fields.items() if name not in tables}
@@ -61,7 +60,7 @@ def fields_html(thing: Any) -> str:
 
 
 def _fields(thing: Any) -> Iterator[tuple[str, Any]]:
-    """Those that there are: what JAX takes apart may lack some for a while."""
+    """Yield the fields that exist: a tree that JAX rebuilds may lack some."""
     names = getattr(thing, "_fields", None) or [field.name for field in dataclasses.fields(thing)]
     given = ((name, getattr(thing, name, None)) for name in names if not name.startswith("_"))
     return ((name, value) for name, value in given if value is not None and not _is_empty(value))
@@ -72,7 +71,7 @@ def _is_empty(value: Any) -> bool:
 
 
 def _is_rows(value: Any) -> bool:
-    """Whether it is several of one kind of record, of words and numbers alone."""
+    """Return True for a list of records of one kind that contain only text and numbers."""
     if not isinstance(value, tuple | list) or not value or not hasattr(value[0], "_fields"):
         return False
     plain = str | int | float | np.generic | None
@@ -89,7 +88,7 @@ def _rows_html(name: str, rows: Any) -> str:
 
 
 def field_word(value: Any) -> str:
-    """What a field holds, in a word or two."""
+    """Describe the value of a field in a few words."""
     if isinstance(value, str):
         return textwrap.shorten(value, _LONGEST, placeholder=" ...")
     if isinstance(value, bool | np.bool_):
@@ -109,7 +108,7 @@ def field_word(value: Any) -> str:
 
 
 def _several_word(value: Any) -> str:
-    """Of names and numbers the first; of things how many."""
+    """Describe a list: the first names and numbers, or the number of objects."""
     if isinstance(value, Mapping) and all(isinstance(v, int | float) for v in value.values()) and len(value) <= _FEW:
         return numbers_words(value)
     items = [str(key) for key in value] if isinstance(value, Mapping) else list(value)
@@ -121,11 +120,11 @@ def _several_word(value: Any) -> str:
 
 
 def number_word(value: Any) -> str:
-    """A number in six digits, as are a few of them; a prior or a larger array in a word."""
+    """Format a number or a few in six digits; describe a larger array by its shape."""
     if np.ndim(value) == 0 and isinstance(value, int | float | np.generic | np.ndarray):
         return f"{float(value):.6g}"
     if hasattr(value, "shape") and not np.ndim(value):
-        # JAX's: a traced one has no value.
+        # A traced JAX number has no value.
         return f"{float(value):.6g}" if getattr(value, "is_fully_addressable", False) else type(value).__name__
     # As above.
     known = isinstance(value, np.ndarray) or getattr(value, "is_fully_addressable", False)
@@ -135,12 +134,12 @@ def number_word(value: Any) -> str:
 
 
 def numbers_words(numbers: Mapping[str, Any]) -> str:
-    """`c_mm 34.25, k1 -9.12e-05`."""
+    """Format `c_mm 34.25, k1 -9.12e-05`."""
     return ", ".join(f"{name} {number_word(value)}" for name, value in numbers.items())
 
 
 def _observed(block: Any) -> dict[str, int]:
-    """How much of each kind is observed besides image points."""
+    """Count the observations of each kind other than image points."""
     rows = {
         "control coordinate": block.control.who,
         "fixed coordinate": block.fixed.who,
@@ -154,7 +153,7 @@ def _observed(block: Any) -> dict[str, int]:
 
 
 def block_html(block: Any, unknowns: Mapping[str, object], title: str = "Block") -> str:
-    """Counts of a block, and what is known of its `unknowns`, in words by owner."""
+    """Return the counts of a block and its `unknowns` (texts by owner) as an HTML table."""
     counts: dict[str, object] = {
         "images": f"{len(block.images)} of {_counted(len(block.sensors), 'camera')}",
         "points": f"{len(block.points)} in {_counted(_length(block.image_points.image), 'image point')}",
@@ -165,7 +164,7 @@ def block_html(block: Any, unknowns: Mapping[str, object], title: str = "Block")
 
 
 def adjustment_html(adjusted: Any, unknowns: Mapping[str, object]) -> str:
-    """Outcome and quality of an adjustment, and its shared unknowns in words by owner."""
+    """Return outcome and quality of an adjustment and its shared unknowns (texts by owner) as an HTML table."""
     if adjusted.factored is None or np.ndim(adjusted.converged) != 0:
         return escape(adjustment_repr(adjusted))
     rows: dict[str, object] = {
@@ -180,7 +179,7 @@ def adjustment_html(adjusted: Any, unknowns: Mapping[str, object]) -> str:
 
 
 def block_repr(block: Any) -> str:
-    """`Block 'title': 31 images of 1 camera, 352 points in 2415 image points; ...` with what else is observed."""
+    """Return `Block 'title': 31 images of 1 camera, 352 points in 2415 image points; ...` and other observations."""
     more = ", ".join(_counted(n, name) for name, n in _observed(block).items())
     return (
         f"Block {block.title!r}: {_counted(len(block.images), 'image')} of {_counted(len(block.sensors), 'camera')}, "
@@ -190,9 +189,9 @@ def block_repr(block: Any) -> str:
 
 
 def adjustment_repr(adjusted: Any) -> str:
-    """`Adjustment of 'title': converged ...`, then steps, sigma naught and redundancy, in two lines."""
+    """Return `Adjustment of 'title': converged ...`, steps, sigma naught and redundancy, in two lines."""
     of = f"Adjustment of {adjusted.block.title!r}"
-    # A traced number has no value, and several have no common one; `factored` is None inside a transformation of JAX.
+    # A traced number has no value, and several have no common one; `factored` is None in a JAX transformation.
     if adjusted.factored is None or np.ndim(adjusted.converged) != 0:
         return f"{of} inside a transformation of JAX or of several blocks at once: its numbers are arrays"
     observations, unknowns = (sum(n.values()) for n in (adjusted.n_observations, adjusted.n_unknowns))
@@ -204,24 +203,24 @@ def adjustment_repr(adjusted: Any) -> str:
 
 
 def _sigma0_words(adjusted: Any) -> str:
-    """`1.043`; where chance does not explain it, with what does to one in a thousand, and who knows why."""
+    """Format `1.043`; outside the 99.9 % interval also the expected interval."""
     sigma0, redundancy = float(adjusted.sigma0), adjusted.redundancy
     if redundancy <= 0:
         return f"{sigma0:.4g}"
-    # Of many squares, sigma naught is normal about 1 with the variance 1 / (2 redundancy).
+    # With many degrees of freedom, sigma naught is normal about 1 with the variance 1 / (2 redundancy).
     expected = _ONE_IN_A_THOUSAND / (2 * redundancy) ** 0.5
     asks = f" (expected 1 +- {expected:.2g}: see .verdict())" if abs(sigma0 - 1) > expected else ""
     return f"{sigma0:.4g}{asks}"
 
 
 def simulation_repr(simulated: Any) -> str:
-    """`Simulation with its truth, of Block ...`, and of a lidar how much it has."""
+    """Return `Simulation with its truth, of Block ...` and the size of its lidar data."""
     more = ", ".join(_scanned(simulated).values())
     return f"Simulation with its truth, of {block_repr(simulated.block)}" + (f";\n  {more}" if more else "")
 
 
 def simulation_html(simulated: Any) -> str:
-    """Counts of its block, of a lidar's cloud and trajectory, and what is true of what all images share."""
+    """Return the counts of its block, cloud and trajectory and the true shared parameters as an HTML table."""
     truth = {f"true {name}": words for name, words in simulated.truth.words.items()}
     return block_html(simulated.block, _scanned(simulated) | truth, "Simulation of block")
 
@@ -237,13 +236,13 @@ def _scanned(simulated: Any) -> dict[str, str]:
 
 
 def change_repr(found: Any) -> str:
-    """`Change: nothing says that the camera has changed`, and below it what each test says."""
+    """Return `Change: ...` and one line per test."""
     told = "; ".join(f"{name}: {words}" for name, words in _tests(found).items())
     return f"Change: {_change_words(found)};\n  {told}"
 
 
 def change_html(found: Any) -> str:
-    """The verdict and the tests, and below them the parameters that either calibration has."""
+    """Return the verdict, the tests and the parameters of both calibrations as an HTML table."""
     used = [one for one in found.parameters if one.sigma > 0 or one.first or one.second]
     rows = {"verdict": _change_words(found), **_tests(found)}
     return html_of("Change", rows) + (_rows_html("parameters", used) if used else "")
@@ -254,7 +253,7 @@ def _change_words(found: Any) -> str:
 
 
 def _tests(found: Any) -> dict[str, str]:
-    """Words and numbers of each test that there is."""
+    """Describe each test that was made."""
     of_all = f"at {int(found.beyond.sum())} of {len(found.limit_mm)} points of the format"
     tests = {"beyond the 95 % limit": of_all}
     if np.isfinite(found.p_field):
@@ -271,5 +270,5 @@ def _counted(n: int, name: str) -> str:
 
 
 def _length(rows: Any) -> int:
-    """0 for what is no array: a tree may hold anything while JAX maps over it."""
+    """Return 0 for anything but an array: a tree may hold anything while JAX maps over it."""
     return next(iter(getattr(rows, "shape", ())), 0)

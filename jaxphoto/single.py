@@ -27,7 +27,7 @@ def single(name: str, values: Any, *shape: int | None) -> Float[Array, "..."]:
         return values
     many = values.ndim == len(shape) + 1 and all(n in (None, m) for n, m in zip(shape, values.shape[1:], strict=True))
     mend = "map the function over many with jax.vmap" if many else "give an array of that shape"
-    raise InputError(f"{name} has shape {_written(values.shape)} where {_written(shape)} is one: {mend}")
+    raise InputError(f"{name} has shape {_written(values.shape)} where {_written(shape)} is required: {mend}")
 
 
 def _written(shape: tuple[int | None, ...]) -> str:

@@ -14,7 +14,7 @@ def refuse_traced(what: str, tree: Any) -> None:
     """Raise InputError if a JAX transformation traces any number of `tree`."""
     if is_traced(tree):
         raise InputError(
-            f"{what} needs known numbers, which jit, grad and vmap do not have: return the adjustment or the block "
+            f"{what} needs concrete numbers, which jit, grad and vmap do not have: return the adjustment or the block "
             f"from the transformed function, and call {what} outside"
         )
 

@@ -169,7 +169,7 @@ def check_prior(label: str, prior: Any) -> None:
     if not is_prior(prior):
         given = " ".join(repr(prior).split())
         raise InputError(
-            f"{label}: {given:.80} is no prior; use FREE, FIXED (at the start value) or Weighted(value, sigma)"
+            f"{label}: {given:.80} is not a prior; use FREE, FIXED (at the start value) or Weighted(value, sigma)"
         )
 
 
@@ -189,7 +189,7 @@ def late_cameras(start: Unknowns, priors: Unknowns) -> list[str]:
 
 
 def uniform_priors(unknowns: Unknowns, prior: Prior) -> Unknowns:
-    """A tree of priors shaped like `unknowns`, `prior` everywhere."""
+    """Return a tree of priors shaped like `unknowns`, `prior` everywhere."""
     return jax.tree.map(lambda _: prior, unknowns)
 
 
@@ -201,7 +201,7 @@ def default_priors(unknowns: Unknowns) -> Unknowns:
 
 
 def weighted(name: str, start: Any, value: Any, sigma: Any) -> Weighted:
-    """The prior of a parameter that was observed as `value` with `sigma`; arrays have the shape of its `start`.
+    """Return the prior of a parameter that was observed as `value` with `sigma`; arrays have the shape of its `start`.
 
     Raises InputError, which names the parameter, for what no observation can be.
     """
@@ -214,7 +214,7 @@ def weighted(name: str, start: Any, value: Any, sigma: Any) -> Weighted:
             raise InputError(f"{name}: its {what} is {' '.join(str(given).split()):.60}: give a finite number")
         if what == "sigma" and (bad := known[known <= 0]).size:
             raise InputError(
-                f"{name}: its sigma is {bad[0]:g}: give one above zero, or hold the parameter with fix({name!r})"
+                f"{name}: its sigma is {bad[0]:g}: give a positive one, or fix the parameter with fix({name!r})"
             )
         if known.shape != whole[len(whole) - known.ndim :]:
             more = f", or an array of the shape {whole}" if whole else ""

@@ -63,8 +63,8 @@ def direct(block: Block) -> Block:
         left = np.flatnonzero(~known)
         so = "1 image is so" if len(left) == 1 else f"{len(left)} images are so"
         raise BlockError(
-            f"image {block.images[left[0]]} has neither station and attitude nor an exterior orientation ({so}), which "
-            "direct georeferencing needs: give them, or take another mode"
+            f"image {block.images[left[0]]} has neither station and attitude nor an exterior orientation ({so}), "
+            "which direct georeferencing needs: give them, or choose another mode"
         )
     found = direct_exterior(rows)
     exterior = jax.tree.map(lambda old, new: jnp.asarray(old).at[rows.image].set(new), _exterior(block), found)
@@ -325,7 +325,7 @@ def _as_control(
         return check
     if is_traced((own, control.sigma)):
         if sigma is None:
-            raise InputError("inside a JAX transformation, say which sigma check coordinates get as control")
+            raise InputError("inside a JAX transformation, give the sigma of check coordinates used as control")
         filled = jnp.where(own == 0, jnp.broadcast_to(jnp.asarray(sigma), 3)[check.axis], own)
         return dataclasses.replace(check, sigma=filled)
     for axis in np.unique(check.axis[own == 0]):

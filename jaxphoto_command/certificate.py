@@ -23,8 +23,7 @@ from jaxphoto.report.certificate import (
 )
 from jaxphoto.report.page import write_pdf
 from jaxphoto.report.stability import Compared
-from jaxphoto.writing import whole_file
-from jaxphoto.writing.inputs import InputFile, input_file
+from jaxphoto.writing import InputFile, input_file, whole_file
 
 _MIN_CELLS = 4
 # Files that identify the last calibration.
@@ -158,7 +157,7 @@ def check_two_calibrations(a: CameraFile, b: CameraFile, first: Path, second: Pa
 
 
 def share_measurements(first: Path, second: Path) -> bool:
-    """True if two folders of results are based on the same photograph or file of image points."""
+    """Return True if two folders of results are based on the same photograph or file of image points."""
     return not _measurements(first).isdisjoint(_measurements(second))
 
 

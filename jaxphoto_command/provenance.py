@@ -9,7 +9,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.conditions import CONDITIONS, conditions_of, marked, read_conditions, write_conditions
 from jaxphoto.io.input_hashes import block_inputs, write_inputs
-from jaxphoto.writing.inputs import InputFile, input_file
+from jaxphoto.writing import InputFile, input_file
 from jaxphoto_command.certificate import certificate_document, write_certificate
 
 # Files read of a folder of results or of an experiment.

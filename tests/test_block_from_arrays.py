@@ -142,7 +142,7 @@ def test_a_network_without_control_has_a_minimal_datum():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"sigma_mm": None}, r"image_points: there is no standard deviation; give sigma_x_mm and sigma_y_mm, or sigma"),
+        ({"sigma_mm": None}, r"image_points: no standard deviation; give sigma_x_mm and sigma_y_mm, or sigma"),
         ({"sigma_mm": -1.0}, r"image_points, entry 0: the standard deviation sigma_x_mm is -1.0; it must be positive"),
         ({"cameras": {}}, r"cameras: there is none"),
         ({"cameras": KODAK | {"d": KODAK["kodak"]}}, r"images: add the column camera, as there are 2 \(kodak, d\)"),
@@ -160,7 +160,7 @@ def test_a_network_without_control_has_a_minimal_datum():
         ({"image_points": POINTS | {"x_mm": [1, 2, np.nan, 3]}}, r"image_points, entry 2: x_mm is nan; give a number"),
         (
             {"image_points": POINTS | {"x_mm": [1, "2,5", 1, 3]}},
-            r"image_points: x_mm, y_mm must be one number an entry",
+            r"image_points: x_mm, y_mm must have one number per entry",
         ),
         (
             {"image_points": POINTS | {"image": ["a"] * 4}},
@@ -173,7 +173,7 @@ def test_a_network_without_control_has_a_minimal_datum():
         ),
         (
             {"control": {"point": ["1"], **columns(XYZ, [[1.0, 2.0, 3.0]])}},
-            r"control: there is no standard deviation; give",
+            r"control: no standard deviation; give",
         ),
         (
             {"control": {"point": ["1"], **columns(XYZ, [[1.0, 2.0, 3.0]]), "role": ["chek"]}},

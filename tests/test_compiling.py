@@ -166,17 +166,17 @@ def test_nothing_that_is_read_runs_by_itself():
 
 def test_a_tree_is_told_and_comes_back():
     tree = {"a": [None, True, 2, 0.1, float("inf"), "x"], "b": (Slot(), jax.tree.map(lambda _: Slot(), Brown()))}
-    again = plain_tree.tree_of(json.loads(json.dumps(plain_tree.told(tree))))
+    again = plain_tree.from_json(json.loads(json.dumps(plain_tree.to_json(tree))))
     assert [*map(type, again["b"])] == [Slot, Brown]
     assert again["a"] == tree["a"]
     assert isinstance(again["b"][1].k1, Slot)
     assert jax.tree.structure(again) == jax.tree.structure(tree)
     for unknown in (Own(), object(), {1: 2}, lambda x: x, np.zeros(2), Brown):
         with pytest.raises(TypeError):
-            plain_tree.told(unknown)
+            plain_tree.to_json(unknown)
     for name in ("os:system", "jaxphoto:read_block", "jaxphoto.io:read_block", "builtins:list"):
         with pytest.raises(TypeError):
-            plain_tree.tree_of({name: []})
+            plain_tree.from_json({name: []})
 
 
 @pytest.mark.parametrize("error", [jax.errors.JaxRuntimeError, TypeError])

@@ -88,7 +88,7 @@ def test_options_that_cannot_be(flown, tmp_path, monkeypatch, capsys):
         (["--epsg", 99], "EPSG code 99 is unknown"),
         (["--epsg", "25832+"], "--epsg 25832+: give the code"),
         (["--epsg", "4326"], "(WGS 84) is longitude and latitude; give a map system in metres"),
-        (["--epsg", "25832+4326"], "EPSG:4326 (WGS 84) is no system of heights"),
+        (["--epsg", "25832+4326"], "EPSG:4326 (WGS 84) is not a vertical CRS"),
         (["--model", "pinhole"], "pinhole"),
         (["--pairs", "position:3"], "have no GPS position"),
         (["--lever-arm", "0,1"], "--lever-arm 0,1: give three numbers in metres"),

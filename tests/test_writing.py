@@ -4,8 +4,6 @@ import contextlib
 import errno
 import os
 import resource
-import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +16,7 @@ from jaxphoto.extras.formats import write_camera_file
 from jaxphoto.io.clouds import write_cloud
 from jaxphoto.io.raster import write_dsm, write_hillshade
 from jaxphoto.lidar.raster import Raster
-from jaxphoto.writing import MARKER, check_file, check_folder, locked, place, whole, whole_file, whole_folder
+from jaxphoto.writing import MARKER, check_file, check_folder, whole_file, whole_folder
 from tests.commands import run
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -86,7 +84,7 @@ def test_what_is_written_before_goes_and_what_is_the_users_stays(tmp_path):
     assert not (out / "b").exists()
     assert (out / "notes" / "today.txt").read_text() == "mine"
     assert os.readlink(out / "link") == "nowhere"
-    with pytest.raises(InputError, match="link is not jaxphoto's, and something of that name"):
+    with pytest.raises(InputError, match="link was not written by jaxphoto"):
         write(out, link="3")
     assert (out / "a").read_text() == "2"
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
@@ -101,7 +99,7 @@ def test_a_folder_that_jaxphoto_did_not_write_is_refused(tmp_path, marker):
         write(tmp_path, a="1")
     assert (tmp_path / "thesis").read_text() == "years"
     if marker != '{"files": {}}':
-        with pytest.raises(InputError, match="nothing in it says that jaxphoto wrote it"):
+        with pytest.raises(InputError, match="was not written by jaxphoto"):
             check_folder(tmp_path)
 
 
@@ -118,7 +116,7 @@ def test_what_cannot_be_written_is_said_before_anything_is_computed(tmp_path, mo
     def fails(*_, **__):
         raise OSError(errno.EROFS, "Read-only file system")
 
-    monkeypatch.setattr("jaxphoto.writing.place.tempfile.mkdtemp", fails)
+    monkeypatch.setattr("jaxphoto.writing.tempfile.mkdtemp", fails)
     for check in (check_folder, check_file):
         with pytest.raises(InputError, match=r"deeper cannot be written \(Read-only file system\)"):
             check(tmp_path / "deep" / "deeper")
@@ -140,7 +138,7 @@ def test_what_can_be_no_folder_is_said_before_that_its_place_cannot_be_written(t
     def fails(*_, **__):
         raise OSError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr("jaxphoto.writing.place.tempfile.mkdtemp", fails)
+    monkeypatch.setattr("jaxphoto.writing.tempfile.mkdtemp", fails)
     (tmp_path / "file").write_text("1")
     with pytest.raises(InputError, match="file is a file: name a folder"):
         check_folder(tmp_path / "file")
@@ -148,114 +146,20 @@ def test_what_can_be_no_folder_is_said_before_that_its_place_cannot_be_written(t
         check_folder(tmp_path / "folder")
 
 
-def test_a_folder_that_is_just_put_in_its_place_is_looked_at_when_it_is_there(tmp_path, monkeypatch):
-    """Moved aside by a run that writes: who asks for its rights waits until it is back."""
-    out, aside = tmp_path / "out", tmp_path / "aside"
-    write(out, a="1")
-    moved, asked = threading.Event(), threading.Event()
-
-    def replaced():
-        with locked(tmp_path, wait=True):
-            out.rename(aside)
-            moved.set()
-            asked.wait(1.0)
-            time.sleep(0.1)
-            aside.rename(out)
-
-    writer = threading.Thread(target=replaced)
-    room = whole.check_room
-
-    def there_is_room(target):
-        # All that is asked before is asked of a folder that is there.
-        writer.start()
-        moved.wait(5.0)
-        room(target)
-        asked.set()
-
-    monkeypatch.setattr(whole, "check_room", there_is_room)
-    rights = []
-    monkeypatch.setattr(whole.os, "access", lambda path, mode: rights.append(Path(path).exists()) or True)
-    check_folder(out)
-    writer.join()
-    assert rights == [True] and said(out) == {"a": "1"}
-
-
-@pytest.mark.parametrize("system", ["in one step", "in two"])
-def test_there_is_always_a_whole_folder(tmp_path, monkeypatch, system):
-    """Two who write and one who looks; where names can be exchanged it never is absent."""
-    if system == "in two":
-        monkeypatch.setattr(place, "exchange", lambda *_: False)
-    out, texts = tmp_path / "out", ("1" * 1000, "2" * 1000)
-    write(out, a=texts[0], b=texts[0])
-    stop = threading.Event()
-
-    def again(text):
-        while not stop.is_set():
-            write(out, a=text, b=text)
-
-    writers = [threading.Thread(target=again, args=(text,)) for text in texts]
-    for writer in writers:
-        writer.start()
-    try:
-        seen, until = set(), time.monotonic() + 0.5
-        while time.monotonic() < until:
-            try:
-                folder = os.open(out, os.O_RDONLY)
-            except FileNotFoundError:
-                assert system == "in two"
-                continue
-            try:
-                files = [os.open(name, os.O_RDONLY, dir_fd=folder) for name in ("a", "b")]
-            except FileNotFoundError:
-                continue  # It was exchanged and removed while we looked.
-            finally:
-                os.close(folder)
-            read = [os.read(file, 2000).decode() for file in files]
-            for file in files:
-                os.close(file)
-            assert read[0] == read[1] in texts
-            seen.add(read[0])
-    finally:
-        stop.set()
-        for writer in writers:
-            writer.join()
-    assert said(out)["a"] in texts
-    assert [p.name for p in tmp_path.iterdir()] == ["out"]
-
-
-def test_what_a_killed_run_left_is_cleared_and_nothing_lost(tmp_path):
-    """Killed while writing; between two renames; and one that is not dead."""
-    (tmp_path / ".jaxphoto-dead" / "new" / "out").mkdir(parents=True)
-    for folder, text in (("old", "1"), ("new", "2")):
-        made = tmp_path / ".jaxphoto-between" / folder / "moved"
-        made.mkdir(parents=True)
-        (made / "a").write_text(text)
-    alive = tmp_path / ".jaxphoto-alive"
-    alive.mkdir()
-    with locked(alive) as own:
-        assert own
-        check_folder(tmp_path / "out")
-        assert {p.name for p in tmp_path.iterdir()} == {"moved", ".jaxphoto-alive"}
-    assert said(tmp_path / "moved") == {"a": "2"}
-    check_file(tmp_path / "file")
-    assert [p.name for p in tmp_path.iterdir()] == ["moved"]
-
-
 def test_an_error_between_two_renames_loses_nothing(tmp_path, monkeypatch):
     out = tmp_path / "out"
     write(out, a="1")
-    monkeypatch.setattr(place, "exchange", lambda *_: False)
     rename = os.rename
 
     def interrupted(one, other):
-        rename(one, other)
-        if Path(one) == out:
+        if Path(other) == out and Path(one).name == "out":
             raise KeyboardInterrupt
+        rename(one, other)
 
     monkeypatch.setattr(os, "rename", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write(out, a="2")
-    assert said(out) == {"a": "2"}
+    assert said(out) == {"a": "1"}
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
@@ -274,7 +178,7 @@ def test_links_stay_and_what_they_lead_to_is_written(tmp_path):
 def test_only_files_are_replaced_by_files(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (Path("/dev/null"), tmp_path, tmp_path / "pipe"):
-        with pytest.raises(InputError, match="no file"), whole_file(path) as work:
+        with pytest.raises(InputError, match=r"not a regular file|cannot be written"), whole_file(path) as work:
             work.write_text("")
         with pytest.raises(InputError, match="exists already"):
             check_file(path)

@@ -112,7 +112,7 @@ def body_angles() -> plt.Figure:
 
 
 def headings() -> plt.Figure:
-    """The same aircraft from above on four headings: what roll and pitch are of omega and phi."""
+    """Draw an aircraft from above on four headings: roll and pitch as parts of omega and phi."""
     figure, panels = plt.subplots(1, 4, figsize=(6.9, 2.7))
     # Nose, wing and tailplane to the right, tail.
     half = [(0, 1), (0.1, 0.75), (0.1, 0.3), (0.9, 0), (0.9, -0.15), (0.1, -0.05), (0.06, -0.6), (0.35, -0.8)]
@@ -199,7 +199,7 @@ def image_coordinates() -> plt.Figure:
 
 
 def boresight() -> plt.Figure:
-    """The three angles of the boresight, each positive; the camera's x axis forward, level flight to the north."""
+    """Draw the three boresight angles, each positive; the camera's x axis forward, level flight to the north."""
     views = (
         ("b_x > 0\nseen from ahead, the end of x", 0, 1, 2),
         ("b_y > 0\nseen from the right", 1, 0, 2),
@@ -211,7 +211,7 @@ def boresight() -> plt.Figure:
 
 
 def _panels(views, rows_of, names, fixed) -> plt.Figure:
-    """A panel for each angle, alone and positive: its title, its number, and which axes lie to the right and up."""
+    """Yield a panel per angle, alone and positive: title, number, and the axes to the right and up."""
     figure, panels = plt.subplots(1, 3, figsize=(6.7, 2.6))
     for panel, (title, angle, right, up) in zip(panels, views, strict=True):
         panel.set_label(title.split()[0])

@@ -57,7 +57,7 @@ def run(path: Path, executed: Path) -> None:
 
 
 def entry(path: Path) -> str:
-    """The notebook's part of the page."""
+    """Write the notebook's part of the page."""
     notebook = with_outputs(path)
     title, _, text = notebook.cells[0].source.partition("\n")
     about = _on_page(" ".join(text.strip().split("\n\n")[0].split()))
@@ -71,7 +71,7 @@ def entry(path: Path) -> str:
 
 
 def picture(notebook: nbformat.NotebookNode) -> str:
-    """The file of that of the cell with the tag, or of the last."""
+    """Return the picture of the tagged cell, or of the last."""
     tagged = [cell for cell in notebook.cells if "gallery" in cell.metadata.get("tags", ())]
     found = [
         shown[1]
@@ -83,7 +83,7 @@ def picture(notebook: nbformat.NotebookNode) -> str:
 
 
 def conclusion(notebook: nbformat.NotebookNode) -> str:
-    """The last words that a cell worked out, or that stand in the last cell of text."""
+    """Return the last text that a cell computed, or the last text cell."""
     for cell in reversed(notebook.cells):
         for output in cell.get("outputs", ()):
             if "text/markdown" in output.get("data", {}):

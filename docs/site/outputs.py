@@ -23,7 +23,7 @@ _KINDS = ("text/html", "image/png", "text/markdown", "text/latex", "text/plain")
 
 
 def code_of(notebook: nbformat.NotebookNode) -> str:
-    """A hash of the code, which outputs are of."""
+    """Hash the code of a notebook."""
     code = "\0".join(cell.source for cell in notebook.cells if cell.cell_type == "code")
     return hashlib.sha256(code.encode()).hexdigest()
 
@@ -40,7 +40,7 @@ def keep(path: Path, executed: nbformat.NotebookNode, made: str) -> None:
 
 
 def _small(stem: str, cell: str, output: nbformat.NotebookNode) -> dict:
-    """A stream as it is; of anything else its best form, a picture as a file."""
+    """Return a stream unchanged, other outputs in their richest form, pictures as files."""
     if output.output_type == "stream":
         return {"output_type": "stream", "name": output.name, "text": output.text}
     kind = next(kind for kind in _KINDS if kind in output.data)
@@ -56,14 +56,14 @@ def _small(stem: str, cell: str, output: nbformat.NotebookNode) -> dict:
 
 
 def kept(path: Path) -> dict | None:
-    """What was kept of a run of this very code."""
+    """Return the stored outputs of this code."""
     file = OUTPUTS / f"{path.stem}.json"
     found = json.loads(file.read_text("utf-8")) if file.is_file() else None
     return found if found and found["code"] == code_of(nbformat.read(path, as_version=4)) else None
 
 
 def with_outputs(path: Path) -> nbformat.NotebookNode:
-    """The notebook with what was kept of a run of it."""
+    """Return the notebook with its stored outputs."""
     notebook, shown = nbformat.read(path, as_version=4), kept(path)
     for cell in notebook.cells:
         if shown and cell.cell_type == "code":

@@ -79,7 +79,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """A notebook says when its outputs were made."""
+    """Add the date of the outputs to a notebook."""
     notebook = ROOT / "notebooks" / Path(page.file.src_uri).name
     if not page.file.src_uri.endswith(".ipynb"):
         return html
@@ -90,13 +90,13 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
-    """The one script that the theme would fetch from elsewhere is the site's own; the style is ours."""
+    """Replace the script that the theme would fetch by a local one; add the style."""
     output = output.replace("</head>", f"<style>{_STYLE}</style></head>", 1)
     return output.replace("https://unpkg.com/iframe-worker/shim", "../" * page.url.count("/") + _WORKER)
 
 
 def on_post_build(config: MkDocsConfig) -> None:
-    """The notebooks with their outputs are pages now."""
+    """Add the notebooks with their outputs as pages."""
     shutil.rmtree(_WITH_OUTPUTS)
 
 
@@ -145,7 +145,7 @@ def _as_on_site(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
 
 
 def _from_notebook(match: re.Match[str]) -> str:
-    """A link out of notebooks/: to a page of docs/ under its title, of another file of the repository its place."""
+    """Rewrite a link out of notebooks/: to a page of docs/, or to a file of the repository."""
     text, target, place = match.group(1), match.group(2), match.group(3) or ""
     if not target.startswith("docs/"):
         return f"`{target}`" if text == target else f"{text} (`{target}`)"
@@ -178,7 +178,7 @@ def _notebook_title(path: Path) -> str:
 
 
 def _public() -> dict[str, list[str]]:
-    """The names of `import jaxphoto`, all pictures, and what the pages of the papers name, by room."""
+    """List the public names, the plots, and the names on the pages of the papers, by package."""
     found: dict[str, set[str]] = {}
     for identifier in _identifiers().values():
         found.setdefault(identifier.split(".")[1], set()).add(identifier)

@@ -33,7 +33,7 @@ def main() -> None:
 
 
 def with_tables(text: str, paper: str) -> str:
-    """The page of a paper with its tables as they are kept."""
+    """Return the page with the stored tables."""
     cells = pd.read_csv(KEPT, dtype={"paper": str, "row": str, "unit": str, "note": str}, keep_default_na=False)
     for column in ("published", "ours", "tolerance", "spread", "n_layouts"):
         cells[column] = pd.to_numeric(cells[column])

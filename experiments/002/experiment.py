@@ -33,7 +33,7 @@ GRID = image_grid(SENSOR, 15, 11)
 
 
 def printed(dataset: str, r0_mm: int) -> InteriorOrientation:
-    """The set of IOP that the paper prints."""
+    """Return the printed IOP."""
     cells = PUBLISHED[PUBLISHED["table"] == TABLES[dataset]].set_index(["row", "column"])["published"]
     values = {name: float(cells[f"R0 = {r0_mm}", column]) for name, column in IOPS.items()}
     c, x_p, y_p = (values.pop(name) for name in ("c_mm", "xp_mm", "yp_mm"))
@@ -41,7 +41,7 @@ def printed(dataset: str, r0_mm: int) -> InteriorOrientation:
 
 
 def covariance(tables: Tables, r0_mm: int) -> np.ndarray:
-    """A posteriori covariance of the twin's IOP in the order of their names, written with another R0."""
+    """Return the a posteriori covariance of the twin's IOP, ordered by name, with another R0."""
     ((camera, interior),) = tables.adjusted.unknowns.interior.items()
     full = tables.covariance.of_interior(camera, parameter_names(interior))
     return np.asarray(rebalance_covariance(interior, float(r0_mm), full))
@@ -95,7 +95,7 @@ def rmse_offset(results: Results) -> Cells:
 
 
 def twin(dataset: str) -> Variant:
-    """The simulated twin whose truth is the printed set with R0 = 0 and whose noise is the printed sigma0."""
+    """Simulate a twin with the printed IOP (R0 = 0) as truth and the printed sigma0 as noise."""
     interior = printed(dataset, 0)
     truth = {name: float(get_parameter(interior, name)) for name in IOPS}
     cells = PUBLISHED[PUBLISHED["table"] == "table2_sigma0"].set_index(["row", "column"])["published"]

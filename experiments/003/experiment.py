@@ -26,7 +26,7 @@ variants = {f"{c}/{n}": Variant(partial(step, config=c, number=n)) for c in "AB"
 
 
 def rows(number: int) -> dict[str, str]:
-    """Configuration -> its variant of one step."""
+    """Return the variant of one step by configuration."""
     return {c: f"{c}/{number}" for c in "AB"}
 
 

@@ -18,7 +18,7 @@ SIGMA_IMAGE_MM = 0.00395
 
 
 def block_of(row: str, free: bool) -> Variant:
-    """The block of one row, self-calibrating or with the IOP of the test field held."""
+    """Build the block of one row, self-calibrating or with the test-field IOP fixed."""
     n, variance_factor, truth = ROWS[row]
 
     def change(block: Block) -> Block:

@@ -64,7 +64,7 @@ CORNERS = ((-1, -1), (1, 1), (-1, 1), (1, -1))
 
 
 def recipe_of(p: Parameters) -> Mapping[str, Any]:
-    """What the recipe says of a design."""
+    """Apply a design to the recipe."""
     across = 0.0 if p["second_pair"] == "across" else 90.0
     strips = []
     for pair, heading, height in (("E", 90.0, 1000.0), ("N", across, 1000.0 * (1 + p["rise_percent"] / 100))):
@@ -127,7 +127,7 @@ DRAWN = {
 
 
 def printed(table: pd.DataFrame, question: str) -> pd.DataFrame:
-    """The designs of a question, one a row, with what is `SHOWN` of each."""
+    """Tabulate the designs of a question, one per row, with the columns `SHOWN`."""
     rows = table[table["question"] == question].merge(pd.DataFrame(SHOWN, columns=["quantity", "of"]))
     return rows.pivot_table(index=list(QUESTIONS[question]), columns=["quantity", "of"], values="value", sort=False)
 

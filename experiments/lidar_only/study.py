@@ -37,7 +37,7 @@ EXPERIMENTS = {"third": lambda block: block, "fourth": conventional}
 
 
 def truth_of(simulation: Simulation) -> dict[str, float]:
-    """The interior orientation that was flown."""
+    """Return the true interior orientation."""
     camera = simulation.truth.interior["kodak"]
     values = (camera.c, camera.x_p, camera.y_p, camera.distortion.k1, camera.distortion.k2)
     return dict(zip(IOPS, map(float, values), strict=True))

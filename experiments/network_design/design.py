@@ -43,7 +43,7 @@ OMEGA_ONLY = eqx.Partial(largest_correlation, exterior=("omega",), interior=("yp
 
 
 def plan(seed: int) -> StripPlan:
-    """The mission of paper 000 over a disc of ground, with the jitter and the ground points that `seed` draws."""
+    """Plan the mission of paper 000 over a disc, with jitter and ground points drawn by `seed`."""
     rng, jitter = np.random.default_rng(seed), RECIPE.jitter
     places = rng.uniform(-RADIUS_M, RADIUS_M, (4 * POINTS, 2))
     ground = RECIPE.terrain.place(places[np.hypot(*places.T) < RADIUS_M][:POINTS], rng)
@@ -127,7 +127,7 @@ def each(designs: StripDesign) -> list[StripDesign]:
 
 
 def judged(of: StripPlan, designs: dict[str, StripDesign], draws: int) -> pd.DataFrame:
-    """What the search says of each layout; adjustments of it, with and without noise; and other flights of it.
+    """Evaluate each layout: search, adjustments with and without noise, repeated flights.
 
     `other_flights` is the mean over ten more draws of jitter and ground points, of which the search knew nothing.
     """
@@ -157,7 +157,7 @@ def judged(of: StripPlan, designs: dict[str, StripDesign], draws: int) -> pd.Dat
 
 
 def noisy(block: Block, truth: Unknowns) -> Callable[[int], Block]:
-    """The block measured once more, with the noise that a seed draws."""
+    """Return the block with new noise drawn by a seed."""
     numbers = lambda b: (b.image_points.xy, b.stations.value, b.control.value)  # noqa: E731
     draw = jax.jit(lambda key: numbers(remeasure(block, truth, key)))
     return lambda seed: eqx.tree_at(numbers, block, jax.tree.map(np.asarray, draw(jax.random.key(seed))))
@@ -175,7 +175,7 @@ def table_of(designs: dict[str, StripDesign]) -> pd.DataFrame:
 
 
 def designs_of(table: pd.DataFrame, usual: StripDesign) -> dict[str, StripDesign]:
-    """What `table_of` wrote down."""
+    """Read what `table_of` wrote."""
     where = lambda d: (d.heading, d.height, d.across, d.control)  # noqa: E731
     return {
         str(name): eqx.tree_at(
@@ -193,7 +193,7 @@ def designs_of(table: pd.DataFrame, usual: StripDesign) -> dict[str, StripDesign
 
 
 def picture(of: StripPlan, designs: dict[str, StripDesign], values: pd.Series, path: Path) -> None:
-    """The layouts side by side."""
+    """Compare the layouts."""
     figure, panels = plt.subplots(1, len(designs), figsize=(3.4 * len(designs), 3.8), layout="constrained", sharey=True)
     ends = np.cumsum((0, *of.images))
     for axes, (name, design) in zip(panels, designs.items(), strict=True):

@@ -11,13 +11,13 @@ Recipe = Mapping[str, Any]
 
 
 def mount(key: str, truth: Any, parameter: str) -> tuple[Recipe, Recipe]:
-    """An error of the mount that the adjustment does not know of, and with its parameter free."""
+    """Return an unmodelled error of the mount, and the variant with its parameter free."""
     ignored = {"truth": {key: truth}}
     return {"mounts": {"default": ignored}}, {"mounts": {"default": ignored | {parameter: "free"}}}
 
 
 def strips(key: str, truths: Mapping[str, list[float]], parameter: str) -> tuple[Recipe, Recipe]:
-    """An error of each strip that the adjustment does not know of, and with its parameter free."""
+    """Return an unmodelled error per strip, and the variant with its parameter free."""
     ignored = {strip: {"truth": {key: truth}} for strip, truth in truths.items()}
     return {"strips": ignored}, {"strips": {strip: table | {parameter: "free"} for strip, table in ignored.items()}}
 

@@ -73,8 +73,7 @@ def solve(
     if not laid.traced and is_traced(block.start.unknowns):
         # The result does not depend on them; a derivative would silently be zero.
         raise InputError(
-            "a JAX transformation traces block.start, but the argument start was given and counts in its place: "
-            "change start, or leave it out"
+            "a JAX transformation traces block.start, but the argument start replaces it: change start, or omit it"
         )
     numbers, plain = laid.padded_values, laid.padded.structure
     structure = plain.with_losses(losses)

@@ -27,7 +27,7 @@ def check_arguments(block: Any, start: Any, priors: Any) -> None:
     _check_models(start, priors)
     _check_shapes(block, start)
     for place in _no_numbers(block, start, priors):
-        raise InputError(f"{place} is NaN or infinite: give a number, or leave it out")
+        raise InputError(f"{place} is NaN or infinite: give a number, or omit it")
 
 
 def _check_owners(name: str, tree: Unknowns, known: Unknowns) -> None:

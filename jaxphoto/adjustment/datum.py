@@ -50,8 +50,8 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
     scale_open = bool(len(null_motions)) and bool(np.abs(null_motions[:, 6]).max() > 1e-6)
     if scale_open and any(t.kind == RollingShutter.kind for t in structure.tables):
         raise DatumError(
-            "a rolling shutter sees by how many metres cameras move, but nothing in the block gives it a scale: add "
-            "stations, control or a distance, or leave the shutter out"
+            "a rolling shutter needs the scale of the block, which is open: add stations, control or a distance, or "
+            "remove the shutter"
         )
     kind, over = block.datum.kind, block.datum.over
     if kind == "control":
@@ -71,8 +71,8 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
         return null
     if without_place:
         raise DatumError(
-            "a JAX transformation traces the start values, but the constraints of a free network are built from known "
-            "ones: take the block from outside the transformed function, and pass only what changes"
+            "a JAX transformation traces the start values, but the constraints of a free network need concrete "
+            "ones: define the block outside the transformed function, and pass only what changes"
         )
     constraints = _minimal(null, structure) if kind == "minimal" else _inner(null, block, over)
     product = np.einsum("kci,jci->kj", constraints.eop, null.eop) + np.einsum(

@@ -14,7 +14,7 @@ def warn_of_precision_loss(block: Block, start: Unknowns, priors: Unknowns) -> N
     if not jax.config.values["jax_enable_x64"]:
         warnings.warn(
             "JAX computes with 32 bits (jax_enable_x64 was switched off after jaxphoto was imported): an adjustment "
-            "may not converge, and its standard deviations mean little; switch it on for adjusting",
+            "may not converge and its standard deviations are unreliable; enable it before adjusting",
             stacklevel=4,
         )
     groups = {"image_points": block.image_points, **{rows.group: rows for rows in block.observations}, "start": start}

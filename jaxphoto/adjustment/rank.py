@@ -69,8 +69,8 @@ def _check_scales(priors: Unknowns) -> None:
         for name in interior.distortion.scales:
             if interior.c == FREE and getattr(interior.distortion, name) == FREE:
                 raise RankError(
-                    f"interior[{camera}].c_mm and interior[{camera}].{name} are one scale and cannot both "
-                    f"be estimated: hold {name} fixed"
+                    f"interior[{camera}].c_mm and interior[{camera}].{name} both scale the image and cannot both be "
+                    f"estimated: fix {name}"
                 )
 
 
@@ -81,22 +81,22 @@ def _check_mounts(block: Block, priors: Unknowns, with_station: set[int], with_a
         if prior.boresight == FREE and not attitudes:
             raise RankError(
                 f"mounts[{name}].boresight is free, but none of its images has an observed attitude: add attitudes, "
-                "or hold the boresight fixed"
+                "or fix the boresight"
             )
         if prior.lever_arm == FREE and not stations:
             raise RankError(
                 f"mounts[{name}].lever_arm is free, but none of its images has an observed station: add stations, "
-                "or hold the lever arm fixed"
+                "or fix the lever arm"
             )
         if prior.time_offset == FREE and not (stations or attitudes):
             raise RankError(
                 f"mounts[{name}].time_offset is free, but none of its images has an observed station or attitude: "
-                "add them, or hold the time offset fixed"
+                "add them, or fix the time offset"
             )
         if prior.time_offset == FREE and block.motion is None:
             raise RankError(
-                f"mounts[{name}].time_offset is free, but nothing says how the sensor moved at the exposures: give "
-                "its velocity and rates of turn (Block.motion), or hold the time offset fixed"
+                f"mounts[{name}].time_offset is free, but the motion of the sensor at the exposures is unknown: "
+                "give its velocity and angular rates (Block.motion), or fix the time offset"
             )
 
 
@@ -109,13 +109,13 @@ def _check_strips(block: Block, priors: Unknowns, with_station: set[int]) -> Non
             if getattr(prior, what) == FREE and n < least:
                 found = "one image with an observed station" if n else "no image with an observed station"
                 raise RankError(
-                    f"strips[{name}].{what} is free, but the strip has {found}: hold the {what} of strip {name} fixed, "
+                    f"strips[{name}].{what} is free, but the strip has {found}: fix the {what} of strip {name}, "
                     f"or add stations of {least} of its images or more"
                 )
         if prior.drift == FREE and not is_traced(times) and np.ptp(times[images]) == 0:
             raise RankError(
                 f"strips[{name}].drift is free, but all images of the strip with an observed station have one time: "
-                f"give the times of their exposures, or hold the drift of strip {name} fixed"
+                f"give the times of their exposures, or fix the drift of strip {name}"
             )
 
 
@@ -129,7 +129,7 @@ def _check_shifts(block: Block, priors: Unknowns, with_station: set[int]) -> Non
     if {block.image_strip[i] for i in with_station} <= set(shifted):
         raise DatumError(
             f"the shift of every strip is free (strips {', '.join(shifted)}) and the block has no control, so its "
-            f"position is open: add control points, or hold the shift of one strip fixed, such as that of {shifted[0]}"
+            f"position is undetermined: add control points, or fix the shift of one strip, such as {shifted[0]}"
         )
 
 
@@ -141,13 +141,13 @@ def _check_scanner(block: Block, priors: Unknowns) -> None:
     if priors.scanner.boresight == FREE and not others and not turned:
         raise RankError(
             "scanner.boresight is free, but no point lies on a laser scanner's surface that the boresight moves: add "
-            "such points, measured from known positions of the scanner, or hold the boresight fixed"
+            "such points, measured from known positions of the scanner, or fix the boresight"
         )
     for k, (name, prior) in enumerate(priors.scanner.shifts.items()):
         if prior == FREE and not np.any(block.surfaces.strip == k):
             raise RankError(
-                f"scanner[{name}].shift is free, but no point lies on a surface of that lidar strip: hold the shift "
-                "fixed, or leave the strip out"
+                f"scanner[{name}].shift is free, but no point lies on a surface of that lidar strip: fix the shift, "
+                "or remove the strip"
             )
 
 
@@ -165,13 +165,13 @@ def _check_camera_rates(block: Block, priors: Unknowns) -> None:
             if free and not is_traced(along) and np.ptp(along[own]) == 0:
                 raise RankError(
                     f"{rates.kind}[{name}].{free[0]} is free, but all images of the camera have one {what}: give the "
-                    f"{what}s of their exposures, or hold the rate fixed"
+                    f"{what}s of their exposures, or fix the rate"
                 )
             distortion = priors.interior[name].distortion
             if "k1_rate" in free and "k1" not in distortion.coefficients:
                 raise RankError(
-                    f"{rates.kind}[{name}].k1_rate is free, but the distortion {distortion.name} has no k1: hold the "
-                    "rate fixed"
+                    f"{rates.kind}[{name}].k1_rate is free, but the distortion {distortion.name} has no k1: fix the "
+                    "rate"
                 )
 
 
@@ -202,16 +202,16 @@ def _check_rigs(block: Block, priors: Unknowns) -> None:
     late = late_cameras(block.start.unknowns, priors)
     if late and block.motion is None:
         raise RankError(
-            f"{RigCamera.kind}[{late[0]}].delay acts with the motion of the rig, of which nothing is said: give its "
-            "velocity and rates of turn (Block.motion; a [trajectory], or their columns in stations.csv and "
-            "attitudes.csv), or hold the delay fixed at zero"
+            f"{RigCamera.kind}[{late[0]}].delay needs the motion of the rig: give its velocity and angular rates "
+            "(Block.motion; a [trajectory], or their columns in stations.csv and "
+            "attitudes.csv), or fix the delay at zero"
         )
     for rows in (of for of in block.more if isinstance(of, RigPlaces | RigTurns)):
         for i in rows.image:
             if (camera := block.image_camera[i]) not in known:
                 raise RankError(
                     f"{rows.group} has image {block.images[i]}, but its camera {camera} is not in the rig: add "
-                    f"[unknowns.{RigCamera.kind}.{camera}], or leave the image out"
+                    f"[unknowns.{RigCamera.kind}.{camera}], or remove the image"
                 )
 
 
@@ -229,7 +229,7 @@ def check_rank(adjusted: Adjustment) -> None:
     if found := weaknesses_of(adjusted):
         sentences = "; ".join(weakness.sentence for weakness in found)
         points = {p for weakness in found for p in weakness.points} if all(w.points for w in found) else set()
-        raise RankError(f"the observations cannot tell these unknowns apart: {sentences}", sorted(points))
+        raise RankError(f"rank defect, these unknowns are not separable: {sentences}", sorted(points))
 
 
 @eqx.filter_jit

@@ -39,7 +39,7 @@ class Outcome(enum.Enum):
     )
     FLAT = (
         "not converged: steps as long as before hardly reduce the residuals any more, so the observations do not "
-        "determine some unknowns; hold them fixed, give them weights, or add observations that do"
+        "determine some unknowns; fix them, give them weights, or add observations that do"
     )
     ASTRAY = (
         "not converged: object points went so far away that their rays are parallel; look for blunders in what was "
@@ -126,7 +126,7 @@ class Adjustment(eqx.Module):
             return NormalEquations(v, s, self.factored)
         if v.xy.ndim != _DIMENSIONS:
             raise ValueError(
-                "statistics of many adjustments at once: ask for them inside the function that jax.vmap maps"
+                "statistics of a batch of adjustments: compute them inside the function that jax.vmap maps"
             )
         return NormalEquations(v, s, call_compiled(_factored, v, s))
 

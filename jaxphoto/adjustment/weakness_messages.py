@@ -202,8 +202,8 @@ class _Words:
         enough = {label for label, left in zip(self.structure.labels, self._left(d), strict=True) if left < POOR}
         will_do = [label for label in labels if label in enough]
         if will_do:
-            return f"hold {few(will_do, ' or ')} fixed at a value that is known, or give it a weight"
-        return f"hold {few(labels, ' and ')} fixed at values that are known, or give them weights"
+            return f"fix {few(will_do, ' or ')} at a known value, or give it a weight"
+        return f"fix {few(labels, ' and ')} at known values, or give them weights"
 
     def _left(self, d: WeakDirection) -> np.ndarray:
         """Return the remaining fraction of the direction's sigma for each shared unknown fixed."""

@@ -23,7 +23,7 @@ def rebalance(interior: InteriorOrientation, r0_mm: Float[Array, ""] | float) ->
     """
     d = interior.distortion
     if not isinstance(d, Smac):
-        raise ValueError(f"only SMAC has a balance radius to change, this camera has {type(d).__name__}")
+        raise ValueError(f"only SMAC has a balance radius to change; this camera has {type(d).__name__}")
     k = jnp.stack([jnp.asarray(v, float) for v in (d.k1, d.k2, d.k3, d.k4)])
     old, new = (jnp.asarray(r, float) ** (2 * jnp.arange(1, 5)) for r in (d.r0, r0_mm))
     to_zero = 1 + d.signum * (d.k0 - k @ old)

@@ -1,4 +1,4 @@
-"""A camera that wanders during a flight: principal distance and principal point as cubic B-splines of time.
+"""Camera that drifts during a flight: principal distance and principal point as cubic B-splines of time.
 
 With n knots h apart, the middle of them in the middle of the flight, an exposure at time t from there sees through
 
@@ -55,7 +55,9 @@ class CameraSpline(AbstractParameters):
         if type(self.knots) is not int or self.knots % 2 or not 4 <= self.knots <= MOST:
             raise ValueError(f"knots = {self.knots!r} is not an even number from 4 to {MOST}")
         if type(self.interval_s) not in (int, float) or not 0 < self.interval_s <= _LONGEST_S:
-            raise ValueError(f"interval_s = {self.interval_s!r} is no positive number of seconds up to {_LONGEST_S:g}")
+            raise ValueError(
+                f"interval_s = {self.interval_s!r} is not a positive number of seconds up to {_LONGEST_S:g}"
+            )
 
     def labels(self, owner: str) -> tuple[str, ...]:
         """Labels such as `camera_splines[kodak].c_3_mm`."""

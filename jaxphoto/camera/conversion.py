@@ -99,8 +99,8 @@ def fitted(
         found = fuller if not found.rms_px <= fuller.rms_px else found
     if not np.isfinite(found.max_px):
         raise ValueError(
-            f"{target.__name__} cannot follow this camera to the edge of its format: the fitted model folds there; "
-            "choose a model with more terms"
+            f"{target.__name__} cannot represent this camera up to the edge of its format: the fitted model is not "
+            "invertible there; choose a model with more terms"
         )
     return found._replace(covered=covered)
 
@@ -112,8 +112,8 @@ def _sampled(interior: InteriorOrientation, sensor: Sensor) -> tuple[np.ndarray,
     rays, good = (np.asarray(v) for v in call_compiled(_rays, _arrays(interior), points))
     if good.mean() < 0.5:
         raise ValueError(
-            f"the distortion of this camera folds within {1 - good.mean():.0%} of its format: check its coefficients, "
-            "their unit and the size of the image"
+            f"the distortion of this camera is not invertible over {1 - good.mean():.0%} of its format: check its "
+            "coefficients, their unit and the size of the image"
         )
     return points[good], rays[good], float(good.mean())
 

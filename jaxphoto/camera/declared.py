@@ -84,19 +84,19 @@ def _check(cls: type[Declared]) -> None:
     listed = (*cls.coefficients, *cls.constants.values(), *cls.choices)
     if wrong := [name for name in listed if name not in fields]:
         raise InputError(
-            f"{cls.__qualname__}: {', '.join(wrong)} in what it declares is no field of it; its fields are "
+            f"{cls.__qualname__}: {', '.join(wrong)} declared, but no such field exists; its fields are "
             f"{_listed(sorted(fields))}"
         )
     if silent := [name for name in _annotated(cls) if name not in listed]:
         raise InputError(
-            f"{cls.__qualname__}: the field {', '.join(silent)} is declared nowhere; name it in coefficients, in "
-            "constants or in choices"
+            f"{cls.__qualname__}: the field {', '.join(silent)} is not declared; name it in coefficients, constants "
+            "or choices"
         )
     if strange := [name for name in cls.powers if name not in cls.coefficients]:
-        raise InputError(f"{cls.__qualname__}: {', '.join(strange)} in powers is no coefficient of it; correct it")
+        raise InputError(f"{cls.__qualname__}: {', '.join(strange)} in powers is not a coefficient; correct it")
     if len(set(listed)) < len(listed):
         raise InputError(
-            f"{cls.__qualname__}: a field is declared twice; name it in coefficients, in constants or in choices"
+            f"{cls.__qualname__}: a field is declared twice; name it once in coefficients, constants or choices"
         )
 
 

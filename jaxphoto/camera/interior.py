@@ -43,7 +43,7 @@ class InteriorOrientation(eqx.Module):
     def __check_init__(self) -> None:
         if both := set(self.projection.coefficients) & set(self.distortion.coefficients):
             raise InputError(
-                f"{', '.join(sorted(both))} would be a coefficient of the projection {self.projection.name} and of the "
+                f"{', '.join(sorted(both))} is a coefficient of both the projection {self.projection.name} and the "
                 f"distortion {self.distortion.name}: rename it in one of them"
             )
 

@@ -57,7 +57,7 @@ def lens_prior(make: str | None, model: str | None) -> LensPrior:
     for models, makes, prior in lens_priors():
         if model in models or any(name.startswith(own.lower()) for own in makes for name in told):
             return prior
-    raise AssertionError("the last entry of the table fits all")
+    raise AssertionError("the last entry of the table matches every camera")
 
 
 def prior_sigmas(

@@ -107,8 +107,8 @@ def _border(sensor: Sensor, interior: InteriorOrientation, less_px: float) -> tu
     xy, good = (np.asarray(v) for v in call_compiled(_plane, interior, (sides * size).reshape(-1, 2)))
     if not good.all():
         raise ValueError(
-            "at the border of its format this camera looks at 90 degrees from its axis or more, or its distortion "
-            "folds: there is no pinhole camera in its place"
+            "at the border of its format this camera sees directions 90 degrees or more from its axis, or its "
+            "distortion is not invertible: no pinhole camera can replace it"
         )
     return xy[:, 0].reshape(4, -1), xy[:, 1].reshape(4, -1)
 

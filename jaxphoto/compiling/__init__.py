@@ -1,4 +1,4 @@
-"""Compiling: how much of it is worth its time, running what is compiled, and keeping it on disk."""
+"""Compile, run and store the programs of JAX."""
 
 from jaxphoto.compiling.once import once
 from jaxphoto.compiling.quickly import jit_quickly

@@ -1,8 +1,8 @@
-"""A text that says what a program is compiled for, the same in every process; or the refusal to give one.
+"""Text that identifies what a program is compiled for, equal in every process.
 
-It must never be the same for two programs that differ. So only what is known to be told by it whole is described:
-plain values, arrays by their type, containers, dataclasses, and functions and classes of packages whose content the
-key of `store` holds otherwise, by their names.
+Two different programs must never have the same text. Only values that the text identifies completely are described:
+plain values, arrays by their type, containers, dataclasses, and functions and classes of packages whose sources or
+versions are in the key of `store`, by name.
 """
 
 import dataclasses
@@ -16,26 +16,26 @@ import numpy as np
 
 from jaxphoto.static_values import StaticArray
 
-# Packages whose sources or versions are part of the key: a name in them says what it means.
+# Packages whose sources or versions are part of the key, so that a name in them identifies its content.
 _KNOWN = frozenset({"jaxphoto", "jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy", "builtins"})
 _PLAIN = (type(None), bool, int, float, complex, str, bytes)
 
 
 class Indescribable(Exception):
-    """Something whose meaning a text cannot be trusted to tell; what depends on it stays in its process."""
+    """Raised for a value that a text cannot identify; programs that depend on it are not stored."""
 
 
 class _Leaf:
-    """Stands for a leaf of a tree of which only the structure is known."""
+    """Placeholder for a leaf of a tree of which only the structure is known."""
 
 
 def is_known(module: str) -> bool:
-    """Whether the key says what a name in `module` means."""
+    """Return True if the key identifies a name in `module`."""
     return module.split(".")[0] in _KNOWN
 
 
 def describe(value: Any) -> str:
-    """The text for arguments, static and not: of arrays their types only. Raises Indescribable."""
+    """Describe arguments, static or not; arrays by their type only. Raises Indescribable."""
     if type(value) in _PLAIN:
         return repr(value)
     if isinstance(value, _Leaf):
@@ -56,7 +56,7 @@ def describe(value: Any) -> str:
 
 
 def _content(value: Any) -> list:
-    """What a container or dataclass consists of, in order."""
+    """Return the parts of a container or dataclass, in order."""
     if isinstance(value, tuple) and (type(value) is tuple or hasattr(value, "_fields")):
         return list(value)
     if type(value) is list:
@@ -65,17 +65,17 @@ def _content(value: Any) -> list:
         return [part for item in value.items() for part in item]
     if dataclasses.is_dataclass(value):
         return [getattr(value, field.name) for field in dataclasses.fields(value)]
-    raise Indescribable(f"{type(value)} is not known to be told by its parts")
+    raise Indescribable(f"{type(value)} is not known to be identified by its parts")
 
 
 def _array(value: Any) -> str:
-    """The type of an array: what a compiled program asks of its argument."""
-    told = f"array {np.dtype(value.dtype).name} {value.shape}"
+    """Return the type of an array: all that a compiled program requires of an argument."""
+    text = f"array {np.dtype(value.dtype).name} {value.shape}"
     if not isinstance(value, jax.Array):
-        return told
+        return text
     devices: Any = value.sharding.device_set
     place = f" {value.sharding} {sorted(device.id for device in devices)}" if value.committed else ""
-    return told + " weak" * value.weak_type + place
+    return text + " weak" * value.weak_type + place
 
 
 def _name(value: type | types.FunctionType) -> str:

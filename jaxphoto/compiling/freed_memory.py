@@ -1,31 +1,31 @@
-"""Memory that was freed: whether the C library keeps it or gives it back to the system."""
+"""Freed memory: kept by the C library, or returned to the system."""
 
 import contextlib
 import ctypes
 import sys
 from collections.abc import Callable, Iterator
 
-# Of <malloc.h>.
+# From <malloc.h>.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _MMAP_MAX = -1, -3, -4
 _USUAL_MMAPS = 65_536
 _ALL = 2**31 - 1
-# Pieces up to this size come from memory that was freed, and so much is kept: what glibc comes to by itself once it has
-# freed such a piece. Until then it may map what a program works with anew at each call: of P31, 3.3 MB and a third of
-# the time of a solution.
+# Blocks up to this size come from freed memory, of which glibc keeps this much: the values it adapts to by itself once
+# it has freed such a block. Until then it may map work space anew at each call: 3.3 MB and a third of the solution time
+# of P31.
 _LARGEST, _KEPT = 32 * 2**20, 64 * 2**20
 
 
 def keep_freed_memory() -> None:
-    """Have glibc use what a program worked with again at its next call."""
+    """Make glibc reuse freed work space at the next call."""
     if option := _of_glibc("mallopt"):
         option(_MMAP_THRESHOLD, _LARGEST)
         option(_TRIM_THRESHOLD, _KEPT)
 
 
 def return_freed_memory() -> None:
-    """Have glibc give back what is free: of the many small pieces of XLA's compiler it would keep 50 MB a program.
+    """Make glibc return freed memory; of the small blocks of XLA's compiler it would keep 50 MB per program.
 
-    Other C libraries do so themselves, or have no such call.
+    Other C libraries do so by themselves or have no such call.
     """
     if trim := _of_glibc("malloc_trim"):
         trim(0)
@@ -33,11 +33,11 @@ def return_freed_memory() -> None:
 
 @contextlib.contextmanager
 def freed_memory_kept() -> Iterator[None]:
-    """Have glibc keep what is freed meanwhile, for what allocates and frees the same gigabyte again and again.
+    """Make glibc keep freed memory, for code that repeatedly allocates and frees the same gigabyte.
 
-    Asked of the system anew each time, every page of it is cleared and mapped again, which takes a third of the time
-    of finding features. It goes back at the end. Threads have a part of it only where all share one pool, as in the
-    command `jaxphoto`. Other C libraries go on as they do.
+    Otherwise every page is cleared and mapped anew each time, a third of the time of feature extraction. At the end it
+    is returned. Threads benefit only where all share one arena, as in the command `jaxphoto`. Other C libraries are
+    unaffected.
     """
     option = _of_glibc("mallopt")
     if option is None:

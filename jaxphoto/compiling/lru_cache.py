@@ -16,7 +16,7 @@ class LruCache(Generic[_Value]):
         self._lock = Lock()
 
     def get(self, key: Hashable, make: Callable[[], _Value]) -> _Value:
-        """Return the value of `key`; `make` it where it is not kept."""
+        """Return the value of `key`; `make` it if it is not cached."""
         with self._lock:
             if key in self._values:
                 self._values[key] = self._values.pop(key)
@@ -29,6 +29,6 @@ class LruCache(Generic[_Value]):
         return value
 
     def clear(self) -> None:
-        """Forget all values."""
+        """Remove all values."""
         with self._lock:
             self._values.clear()

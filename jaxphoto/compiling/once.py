@@ -1,4 +1,4 @@
-"""Computing something once, whatever XLA thinks."""
+"""Evaluate an expression once where XLA would duplicate it."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,12 +8,12 @@ import jax.numpy as jnp
 
 
 def once(function: Callable, witness: Any, *given: Any) -> Any:
-    """`function(*given)`, computed once: XLA on a CPU fuses what is cheap into all that uses it, barriers or not.
+    """Evaluate `function(*given)` once: XLA on a CPU fuses cheap operations into each of their users, despite barriers.
 
-    It leaves a branch alone that may not be taken; that this one always is, XLA cannot know: it hangs on `witness`, an
-    argument of the program whose numbers are never negative.
+    XLA does not fuse a branch that may not be taken. That this one always is, XLA cannot know: the condition depends on
+    `witness`, an argument of the program whose values are never negative.
     """
-    # jit keeps the trace that the shape takes.
+    # jit keeps the trace of eval_shape.
     function = jax.jit(function)
     shape = jax.eval_shape(function, *given)
     nothing = lambda *_: jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shape)  # noqa: E731

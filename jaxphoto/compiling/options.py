@@ -1,6 +1,6 @@
 """Compiler options of XLA on a CPU: compile time against run time.
 
-None is needed for a right result. Options come and go with versions of jaxlib, so this one is asked for each.
+No option is needed for a correct result. Options change between versions of jaxlib, so each is tested for support.
 """
 
 import functools
@@ -9,15 +9,15 @@ import os
 import jax
 
 Options = dict[str, bool | int | str]
-# XLA splits a program into 32 parts that many cores compile at once, each at a cost of its own: with two parts
-# compiling a flight of eleven photographs takes a quarter less CPU time, and no longer on two cores.
+# XLA splits a program into 32 parts that many cores compile in parallel, each with overhead: with two parts, compiling
+# a flight of eleven photographs takes a quarter less CPU time, and no longer on two cores.
 _PARTS = 2
 
 
 def _options(level: int, fusion_emitters: bool) -> Options:
     return {
         "xla_backend_optimization_level": level,
-        # Until jaxlib 0.11; the older code generator compiles faster.
+        # Up to jaxlib 0.11; the older code generator compiles faster.
         "xla_cpu_use_fusion_emitters": fusion_emitters,
         "xla_cpu_parallel_codegen_split_count": _PARTS,
     }
@@ -25,17 +25,17 @@ def _options(level: int, fusion_emitters: bool) -> Options:
 
 # For the adjustment (docs/solver.md).
 _ADJUSTMENT = _options(1, fusion_emitters=False)
-# For what runs thousands of times: four times the time to compile, and a quarter less to run (docs/monte_carlo.md).
+# For programs that run thousands of times: four times the compile time, a quarter less run time (docs/monte_carlo.md).
 _THOROUGH = _options(3, fusion_emitters=True)
 
 
 def quick_to_compile() -> Options:
-    """Options for programs that run once per block, where compile time is all that counts."""
+    """Return options for programs that run once per block, where only compile time matters."""
     return _known(_options(0, fusion_emitters=False))
 
 
 def options_here(thorough: bool = False) -> Options | None:
-    """Options for the programs of an adjustment; None on other devices, or where the user chose a level."""
+    """Return options for the programs of an adjustment; None on other devices, or if the user chose a level."""
     chosen = "xla_backend_optimization_level" in os.environ.get("XLA_FLAGS", "")
     if jax.default_backend() != "cpu" or chosen or jax.config.values.get("jax_disable_most_optimizations"):
         return None
@@ -48,7 +48,7 @@ def _known(options: Options) -> Options:
 
 @functools.cache
 def _is_known(name: str, value: bool | int | str) -> bool:
-    """True if this jaxlib takes the option, found by compiling a program that does nothing."""
+    """Return True if this jaxlib accepts the option, tested with an empty program."""
     try:
         jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
     except jax.errors.JaxRuntimeError:

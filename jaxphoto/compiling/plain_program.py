@@ -1,7 +1,7 @@
-"""A compiled program of a CPU as plain JSON beside the bytes that XLA writes, and back.
+"""Compiled CPU program as plain JSON and the bytes that XLA serialises, and back.
 
-JAX's own way (`jax.experimental.serialize_executable`) is pickle, which runs what it reads. Here only XLA reads what
-is not JSON. The types are JAX's inner ones: where another version has others, nothing is kept, and all is compiled.
+`jax.experimental.serialize_executable` uses pickle, which executes what it reads. Here XLA reads all that is not JSON.
+The types are internal to JAX: in a version where they differ, nothing is stored and everything is compiled.
 """
 
 import base64
@@ -22,18 +22,18 @@ _NOTHING: dict[str, Any] = {
     "unordered_effects": [], "ordered_effects": [], "keepalive": [], "host_callbacks": [], "mut": None,
     "pgle_profiler": None,
 }  # fmt: skip
-"""What a program that is a function of its arguments has none of."""
+"""Attributes that are empty for a program that is a function of its arguments."""
 
 
 class PlainProgram(NamedTuple):
-    """What is kept of a program: `text` in what JSON has, and what XLA writes of it."""
+    """Stored form of a program: JSON `text` and the bytes that XLA serialises."""
 
     text: dict[str, Any]
     executable: bytes
 
 
 def as_plain(program: jax.stages.Compiled) -> PlainProgram:
-    """What `program_of` needs. Raises TypeError for a program that cannot be kept, and what JAX and XLA raise."""
+    """Serialise a program. Raises TypeError if it cannot be stored, and what JAX and XLA raise."""
     executable: Any = program._executable
     inner = executable._unloaded_executable
     if any(getattr(inner, name) for name in _NOTHING) or program._params.const_args:
@@ -59,7 +59,7 @@ def as_plain(program: jax.stages.Compiled) -> PlainProgram:
 
 
 def program_of(plain: PlainProgram) -> jax.stages.Compiled:
-    """The program, from and to lists of arrays. Raises whatever there is to raise where `plain` is not what it was."""
+    """Deserialise a program from and to lists of arrays. Raises various errors if `plain` is invalid."""
     devices_here: list[Any] = jax.devices()
     text, by_id = plain.text, {device.id: device for device in devices_here}
     devices = xla_client.DeviceList(tuple(by_id[number] for number in text["devices"]))
@@ -101,7 +101,7 @@ def _aval(text: list) -> Any:
 
 
 def _sharding(sharding: Any) -> dict[str, Any]:
-    """Where an array lies, in what JSON has."""
+    """Describe the placement of an array in JSON."""
     if sharding.memory_kind != "device":
         raise TypeError(f"memory of kind {sharding.memory_kind} cannot be kept")
     if isinstance(sharding, SingleDeviceSharding):

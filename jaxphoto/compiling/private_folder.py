@@ -1,8 +1,8 @@
-"""A folder of files that this user wrote, as this process or another one of theirs wrote them, under these names.
+"""Directory of files that only this user can have written, each bound to its name.
 
-What is read from it is run, so nobody else may have put it there: the folder and its files belong to the user, nobody
-else may write to them, and every file begins with a keyed hash (HMAC-SHA256) of its name and content, by a secret that
-only the user can read. A file of another machine, one put under another name, or damaged, is as good as none.
+Its content is executed. So the directory and its files belong to the user, nobody else may write to them, and each file
+begins with an HMAC-SHA256 of its name and content, with a secret that only the user can read. A file of another
+machine, one under another name, or a damaged one is ignored.
 """
 
 import contextlib
@@ -18,12 +18,12 @@ from pathlib import Path
 
 _SECRET = "secret"
 _DIGEST = hashlib.sha256().digest_size
-# Names are hashes; anything else was left by a process that was killed while it wrote (seconds).
+# Names are hashes; other files were left by a process killed while writing (seconds).
 _NAME, _LEFT = re.compile("[0-9a-f]{64}"), 3600.0
 
 
 def read(folder: Path, name: str) -> bytes | None:
-    """The content of a file; None where there is none that can be trusted, whole, of that name. Marks it as used."""
+    """Return the content of a file, or None if it is missing, invalid or not trusted. Updates its time of use."""
     try:
         _make_private(folder)
         content = _own_content(folder / name)
@@ -37,7 +37,7 @@ def read(folder: Path, name: str) -> bytes | None:
 
 
 def write(folder: Path, name: str, content: bytes) -> None:
-    """Write a file whole, or not at all where it cannot be written, and nobody notices."""
+    """Write a file completely, or not at all where it cannot be written."""
     with contextlib.suppress(OSError):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         _make_private(folder)
@@ -45,7 +45,7 @@ def write(folder: Path, name: str, content: bytes) -> None:
 
 
 def limit(folder: Path, most: float) -> None:
-    """Delete what was not used for longest until the rest is below `most` bytes, and what was never finished."""
+    """Delete the least recently used files until the rest is below `most` bytes, and incomplete files."""
     with contextlib.suppress(OSError):
         files = sorted(
             ((path, path.stat()) for path in folder.iterdir() if path.name != _SECRET), key=lambda f: f[1].st_mtime
@@ -59,12 +59,12 @@ def limit(folder: Path, most: float) -> None:
 
 
 def _secret(folder: Path) -> bytes:
-    """The secret of this folder, made where there is none."""
+    """Return the secret of this directory; create it if there is none."""
     path = folder / _SECRET
     with contextlib.suppress(OSError):
         if len(known := _own_content(path)) == _DIGEST:
             return known
-    # Of two who make one at once, the later wins; what the other has hashed is written anew.
+    # If two processes create one at once, the later wins; files hashed with the other are rewritten.
     _write(path, secrets.token_bytes(_DIGEST))
     return _own_content(path)
 
@@ -74,7 +74,7 @@ def _hash(secret: bytes, name: str, content: bytes) -> bytes:
 
 
 def _make_private(folder: Path) -> None:
-    """Raise PermissionError where the folder is another user's; keep others out where it is this one's."""
+    """Raise PermissionError for another user's directory; restrict the permissions of this user's."""
     found = folder.stat()
     if hasattr(os, "getuid") and found.st_uid != os.getuid():
         raise PermissionError(folder)
@@ -83,7 +83,7 @@ def _make_private(folder: Path) -> None:
 
 
 def _own_content(path: Path) -> bytes:
-    """Raises OSError where there is no such file, or somebody else can write to it."""
+    """Read a file. Raises OSError if it is missing or others can write to it."""
     with open(path, "rb", opener=_opened_itself) as file:
         found = os.fstat(file.fileno())
         if not stat.S_ISREG(found.st_mode):
@@ -94,12 +94,12 @@ def _own_content(path: Path) -> bytes:
 
 
 def _opened_itself(path: str, flags: int) -> int:
-    """Not what a link leads to; and without waiting for the other end of a pipe."""
+    """Open without following a link or waiting for the other end of a pipe."""
     return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
 
 
 def _write(path: Path, content: bytes) -> None:
-    # Written whole, then named: another process sees all of it or nothing. It is for this user only.
+    # Written completely, then renamed; readable by this user only.
     opened, beside = tempfile.mkstemp(dir=path.parent)
     try:
         with open(opened, "wb") as file:

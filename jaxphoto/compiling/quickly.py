@@ -1,4 +1,4 @@
-"""Quick compilation of what runs once per block."""
+"""Fast compilation of functions that run once per block."""
 
 import functools
 from collections.abc import Callable
@@ -15,9 +15,9 @@ _SHAPES = 16
 
 
 def jit_quickly(function: Callable[..., _Result], static_argnum: int | None = None) -> Callable[..., _Result]:
-    """Return `jax.jit` of a function that runs once per block: hardly optimised, and keeping few shapes.
+    """Return `jax.jit` of a function that runs once per block: hardly optimised, few shapes cached.
 
-    Under a transformation of JAX it is the plain function, because compiler options belong to a whole program.
+    Under a transformation of JAX it is the plain function, because compiler options apply to a whole program.
     """
     programs: dict[tuple, jax.stages.Compiled] = {}
 

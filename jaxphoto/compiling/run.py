@@ -1,7 +1,7 @@
-"""Calling what is compiled so that compiling and running are told apart, compiled at most once a process.
+"""Run compiled functions: compile and run times apart, compiled at most once per process.
 
-Tracing and lowering are Python and take turns; compiling is not, so what is known to be needed soon (`prepare`) is
-compiled on another core meanwhile.
+Tracing and lowering are Python and hold its lock; compiling does not, so programs needed soon (`prepare`) are compiled
+on another core meanwhile.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from jaxphoto.compiling.plain_tree import Slot
 
 
 class _Program(NamedTuple):
-    """A compiled function of arrays, and the tree that its results fill: leaves that are `Slot` are arrays."""
+    """Compiled function of arrays, and the tree that its results fill: leaves that are `Slot` are arrays."""
 
     compiled: jax.stages.Compiled
     leaves: list
@@ -30,28 +30,28 @@ class _Program(NamedTuple):
     loaded: bool
 
     def __call__(self, arrays: list) -> Any:
-        """The result, ready."""
+        """Run it and wait for the result."""
         found = iter(jax.block_until_ready(self.compiled(*arrays)))
         leaves = [next(found) if isinstance(leaf, Slot) else leaf for leaf in self.leaves]
         return jax.tree.unflatten(self.structure, leaves)
 
 
-# What a process keeps: beyond, what was not used for longest goes. A large program takes three hundred mappings of
-# memory, and Linux gives a process 65,530; the one that finds none left crashes.
+# Programs kept by a process; beyond, the least recently used is dropped. A large program takes 300 memory mappings of
+# 65,530 that Linux gives a process; running out of them crashes it.
 MOST = 100
 _programs: dict[object, _Program] = {}
 _gone = 0
-"""Programs that went since JAX forgot what it traced."""
+"""Programs dropped since the last `jax.clear_caches`."""
 _prepared: dict[object, Future[_Program]] = {}
 _workers = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="jaxphoto-compile")
 keep_freed_memory()
 
 
 def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], name: str, thorough: bool = False) -> Any:
-    """Call `function` (made by `eqx.filter_jit`), compiling it first and apart, or loading it from disk (`store`).
+    """Call `function` (of `eqx.filter_jit`), first compiling it or loading it from disk (`store`).
 
-    Adds to `seconds["compile"]` what compiling or loading took, and to `seconds[name]` what the call took. What runs
-    thousands of times is worth `thorough` compiling. Under a transformation of JAX it is a plain call.
+    Adds to `seconds["compile"]` the time of compiling or loading, and to `seconds[name]` that of the call. `thorough`
+    compilation pays for programs that run thousands of times. Under a transformation of JAX it is a plain call.
     """
     began = time.perf_counter()
     found = _key_and_arrays(function, arguments, thorough)
@@ -68,7 +68,7 @@ def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], nam
     try:
         result = program(arrays)
     except Exception:
-        # Read whole, but not fit to run after all: that shows in the call only, and in many ways.
+        # A file may be valid and yet not run on this machine: this shows only in the call, as various errors.
         if not program.loaded:
             raise
         program = _program_of(function.__wrapped__, arguments, thorough, anew=True)()
@@ -81,14 +81,14 @@ def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], nam
 
 
 def call_compiled(function: Any, *arguments: Any, thorough: bool = False) -> Any:
-    """`run_compiled` where nobody asks for times: what a start needs, and would otherwise trace each time."""
+    """Call `run_compiled` without timing, for functions that would otherwise be traced in each process."""
     return run_compiled(function, arguments, {}, "", thorough)
 
 
 def prepare(function: Any, arguments: tuple, seconds: dict[str, float]) -> bool:
-    """Have `function` compiled in the background for a later `run_compiled` with arguments of these types.
+    """Compile `function` in the background for a later `run_compiled` with arguments of these types.
 
-    Adds to `seconds["compile"]` what this caller waits for. Returns whether anything is left to compile.
+    Adds to `seconds["compile"]` the time that the caller waits. Returns True if anything is left to compile.
     """
     began = time.perf_counter()
     found = _key_and_arrays(function, arguments, thorough=False)
@@ -103,10 +103,10 @@ def prepare(function: Any, arguments: tuple, seconds: dict[str, float]) -> bool:
 
 
 def _keep(key: object, program: _Program) -> None:
-    """Keep `program` as the one used last; the one that was not used for longest goes where there are too many.
+    """Cache `program` as the most recently used; drop the least recently used beyond `MOST`.
 
-    JAX keeps what it traced of each, some MB; it forgets that when as many have gone as are kept, and with it whatever
-    the calling process has compiled itself, which is compiled anew when it is called.
+    JAX keeps its own traces of each, some MB. They are cleared when `MOST` programs have been dropped, together with
+    whatever the calling process has compiled itself, which is then compiled again when called.
     """
     global _gone
     _programs.pop(key, None)
@@ -120,9 +120,9 @@ def _keep(key: object, program: _Program) -> None:
 
 
 def _key_and_arrays(function: Any, arguments: tuple, thorough: bool) -> tuple[object, list] | None:
-    """What tells programs apart within a process, and the arrays that one is called with; None where any is traced.
+    """Return the key of a program within this process, and its array arguments; None if any is traced.
 
-    Taking arguments apart costs more than all else that is done here, so it is done once.
+    Flattening the arguments costs more than the rest, so it is done once.
     """
     leaves, structure = jax.tree.flatten(arguments)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
@@ -139,7 +139,7 @@ def _type(array: Any) -> tuple:
 
 
 def _program_of(function: Any, arguments: tuple, thorough: bool, anew: bool = False) -> Callable[[], _Program]:
-    """What gives the program: from disk; compiled, and kept for the next process, where it is not or wanted `anew`.
+    """Return a function that gives the program: from disk, or compiled and stored (always with `anew`).
 
     All that depends on the thread, such as `with jax.enable_x64(False)`, is done before this returns.
     """
@@ -164,7 +164,7 @@ def _program_of(function: Any, arguments: tuple, thorough: bool, anew: bool = Fa
 
 
 def _lowered(function: Any, arguments: tuple) -> tuple[jax.stages.Lowered, Any]:
-    """`function` as one from list to list of arrays, which JAX can keep on disk; and the tree that these fill."""
+    """Lower `function` as one from list to list of arrays, which JAX can serialise; return also its result tree."""
     dynamic, static = eqx.partition(arguments, eqx.is_array)
     arrays, structure = jax.tree.flatten(dynamic)
     skeleton: Any = None
@@ -175,7 +175,7 @@ def _lowered(function: Any, arguments: tuple) -> tuple[jax.stages.Lowered, Any]:
         skeleton = jax.tree.map(lambda leaf: Slot() if eqx.is_array(leaf) else leaf, result)
         return [leaf for leaf in jax.tree.leaves(result) if eqx.is_array(leaf)]
 
-    # A name of its own: what JAX's cache holds of `function` itself must not be taken for it (`_not_in_cache`).
+    # A name of its own: JAX's cache must not substitute its entry of `function` (`_not_in_cache`).
     flat.__name__ = f"{function.__name__}_of_arrays"
     return jax.jit(flat).lower(*arrays), skeleton
 
@@ -183,12 +183,12 @@ def _lowered(function: Any, arguments: tuple) -> tuple[jax.stages.Lowered, Any]:
 _THRESHOLD = "jax_persistent_cache_min_compile_time_secs"
 _lock = threading.Lock()
 _kept_out: list[float] = []
-"""The threshold that the user has, once for each compilation under way in `_not_in_cache`."""
+"""The user's threshold, once per compilation in progress in `_not_in_cache`."""
 
 
 @contextlib.contextmanager
 def _not_in_cache() -> Iterator[None]:
-    """Keep what is compiled out of JAX's cache: XLA cannot write a program of a CPU once more that comes from there."""
+    """Exclude a compilation from JAX's cache: XLA cannot serialise a CPU program loaded from there."""
     with _lock:
         _kept_out.append(_kept_out[0] if _kept_out else jax.config.values[_THRESHOLD])
         jax.config.update(_THRESHOLD, float("inf"))

@@ -55,8 +55,8 @@ class DatumChange(NamedTuple):
         known = self.accuracy_m
         if known is None:
             return (
-                f"PROJ knows no way from WGS 84 to the datum {self.datum}: positions are taken as they are, which can "
-                "be wrong by hundreds of metres; take a map system of another datum",
+                f"PROJ has no transformation from WGS 84 to the datum {self.datum}: positions are not transformed, "
+                "which can be wrong by hundreds of metres; choose a CRS of another datum",
             )
         moved = self.places(wgs84, with_height) - wgs84
         north, east = np.deg2rad(moved[:, 1]) * 6.371e6, np.deg2rad(moved[:, 0] + self.meridian_deg) * 6.371e6
@@ -93,8 +93,8 @@ def datum_change(code: int, longitude_deg: float, latitude_deg: float) -> DatumC
     group = ways(CRS.from_epsg(_WGS84_3D), geodetic.to_3d(), longitude_deg, latitude_deg)
     if not group.transformers:
         raise InputError(
-            f"PROJ knows no way from WGS 84 to the datum of EPSG:{code} ({system.name}) at {longitude_deg:.3f}, "
-            f"{latitude_deg:.3f} degrees; give a map system of the place"
+            f"PROJ has no transformation from WGS 84 to the datum of EPSG:{code} ({system.name}) at "
+            f"{longitude_deg:.3f}, {latitude_deg:.3f} degrees; give a CRS of the place"
         )
     best = group.transformers[0]
     accuracy = None if "Ballpark" in best.description or best.accuracy < 0 else float(best.accuracy)

@@ -116,7 +116,7 @@ def _offsets(times: np.ndarray, events: np.ndarray, tolerance_s: float, most: in
 
 
 def _joined(times: np.ndarray, events: np.ndarray, offset: float, tolerance_s: float) -> tuple[np.ndarray, float]:
-    """The exposure of each time, each used once and in order, and the refined constant."""
+    """Return the exposure of each time, each used once and in order, and the refined constant."""
     best, left = _in_order(times, events, offset, tolerance_s)
     # Refine the window: its middle is the mean of fine times, and the midrange of truncated seconds.
     for _ in range(2):

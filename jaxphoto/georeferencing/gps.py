@@ -48,7 +48,7 @@ class Gps(NamedTuple):
 
 
 def moved(gps: Gps, east_north_up_m: Float[np.ndarray, "3"]) -> Gps:
-    """The position shifted by a lever arm (m, on WGS 84)."""
+    """Return the position shifted by a lever arm (m, on WGS 84)."""
     east, north, up = np.asarray(east_north_up_m, float).tolist()
     s = np.sin(np.deg2rad(gps.latitude_deg))
     w = 1 - _E2 * s * s

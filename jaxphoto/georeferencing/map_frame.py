@@ -107,18 +107,17 @@ def map_system(code: int) -> CRS:
         raise InputError(f"the EPSG code {code} is unknown; correct it (epsg.io lists them)") from None
     if not (system.is_projected or system.is_geographic) or system.is_compound:
         raise InputError(
-            f"EPSG:{code} ({system.name}) is no map or geographic system; give the code of one, and the system of the "
-            "heights as vertical"
+            f"EPSG:{code} ({system.name}) is neither a projected nor a geographic CRS; give the code of one, and "
+            "the height system as vertical"
         )
     plane = system.axis_info[:2]
     if system.is_projected and any(axis.unit_conversion_factor != 1 for axis in plane):
         raise InputError(
-            f"EPSG:{code} ({system.name}) counts in {plane[0].unit_name}, not in metres; convert the coordinates to a "
-            "system in metres"
+            f"EPSG:{code} ({system.name}) has the unit {plane[0].unit_name}; convert the coordinates to a CRS in metres"
         )
     if system.is_projected and {axis.direction for axis in plane} & {"south", "west"}:
         raise InputError(
-            f"EPSG:{code} ({system.name}) counts southwards or westwards; convert the coordinates to a system of "
+            f"EPSG:{code} ({system.name}) has axes to the south or west; convert the coordinates to a CRS of "
             "eastings and northings"
         )
     return system
@@ -145,13 +144,11 @@ def _to_place(code: int, vertical: int | None) -> Transformer:
     try:
         heights = CRS.from_epsg(vertical)
     except CRSError:
-        raise InputError(
-            f"the EPSG code {vertical} is unknown; correct it, or give heights above the ellipsoid"
-        ) from None
+        raise InputError(f"the EPSG code {vertical} is unknown; correct it, or give ellipsoidal heights") from None
     if not heights.is_vertical:
         raise InputError(
-            f"EPSG:{vertical} ({heights.name}) is no system of heights; give the code of one (5773 is EGM96), or "
-            "heights above the ellipsoid"
+            f"EPSG:{vertical} ({heights.name}) is not a vertical CRS; give the code of one (5773 is EGM96), or "
+            "ellipsoidal heights"
         )
     # pyproj warns where an error is raised below.
     with warnings.catch_warnings():
@@ -161,13 +158,13 @@ def _to_place(code: int, vertical: int | None) -> Transformer:
         grids = [grid for operation in group.unavailable_operations for grid in operation.grids if not grid.available]
         if not grids:
             raise InputError(
-                f"PROJ knows no way from the heights of EPSG:{vertical} ({heights.name}) to the ellipsoid of "
+                f"PROJ has no transformation from the heights of EPSG:{vertical} ({heights.name}) to the ellipsoid of "
                 f"EPSG:{code}; give them above the ellipsoid ({_ON_ELLIPSOID})"
             )
         name = grids[0].short_name
         raise InputError(
             f"the heights of EPSG:{vertical} ({heights.name}) need the geoid {name}, which is not on this computer; "
-            f'get it by "pyproj sync --file {name}", or give them above the ellipsoid ({_ON_ELLIPSOID})'
+            f'get it by "pyproj sync --file {name}", or give ellipsoidal heights ({_ON_ELLIPSOID})'
         )
     return group.transformers[0]
 

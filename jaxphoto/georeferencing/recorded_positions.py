@@ -25,7 +25,7 @@ _SAME_M, _APART_M = 0.5, 5.0
 
 
 def plausible_positions(positions: Mapping[str, Gps | None]) -> tuple[Positions, list[str]]:
-    """The plausible positions, exchanged latitudes and longitudes corrected, and a message for each kind of change."""
+    """Return plausible positions (exchanged latitudes and longitudes corrected) and a message per kind of change."""
     result: Positions = dict(positions)
     absent = [name for name, gps in result.items() if gps is None]
     nowhere = [n for n, g in result.items() if g and max(abs(g.latitude_deg), abs(g.longitude_deg)) < _NOWHERE_DEG]
@@ -63,7 +63,7 @@ def one_height(
     above_takeoff_m: Mapping[str, float | None],
     wanted: Heights | int | None = None,
 ) -> tuple[Positions, list[str]]:
-    """The positions with heights of one reference, and messages about it.
+    """Return the positions with heights of one reference, and messages about it.
 
     `wanted` "take-off" selects the heights above take-off; others are the reference of heights without one, an EPSG
     code that of a geoid, which is added. If None, heights of two references are joined by those above take-off.
@@ -151,8 +151,8 @@ def _above_ellipsoid(positions: Positions, vertical: int) -> tuple[Positions, li
     for name, place, height in zip(places, given, heights, strict=True):
         if not np.isfinite(height):
             raise InputError(
-                f"the geoid of the heights EPSG:{vertical} does not reach the photograph {quoted(name)} at "
-                f"{place[0]:.4f}, {place[1]:.4f} degrees; give the system of heights of that place"
+                f"the geoid of the heights EPSG:{vertical} does not cover the photograph {quoted(name)} at "
+                f"{place[0]:.4f}, {place[1]:.4f} degrees; give the vertical CRS of that place"
             )
     result = dict(positions)
     for name, height in zip(places, heights.tolist(), strict=True):

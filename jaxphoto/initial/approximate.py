@@ -99,7 +99,7 @@ def intersected(block: Block) -> Unknowns:
 
 
 def in_front(block: Block, unknowns: Unknowns) -> Bool[np.ndarray, "rows"]:
-    """True for rows of `block.image_points` whose point lies, by `unknowns`, where its camera could see it."""
+    """Return True for rows of `block.image_points` whose point lies, by `unknowns`, where its camera could see it."""
     u = unknowns
     return _in_front(block, u.interior, *map(to_numpy, (u.exterior.position, u.exterior.camera_from_object, u.points)))
 

@@ -34,7 +34,7 @@ class DirectedPoint(NamedTuple):
 def average_rotation(
     rotations: Float[np.ndarray, "n 3 3"], weights: Float[np.ndarray, " n"] | None = None
 ) -> tuple[Float[np.ndarray, "3 3"], float]:
-    """The average of rotations, and the weighted root mean square (rad) of the angles to it.
+    """Return the average of rotations, and the weighted root mean square (rad) of the angles to it.
 
     The eigenvector of the largest eigenvalue of sum w q q', with the unit quaternions q: their signs do not count.
     """
@@ -79,7 +79,7 @@ def intersect_directions(
 
 
 def best_triplet(pairs: Sequence[Any]) -> tuple[int, int, int] | None:
-    """The three images to begin with; None where no three form three pairs that close.
+    """Return the three images to begin with; None where no three form three pairs that close.
 
     A pair has the indices `first` and `second` of its images, the rotation `second_from_first` between the camera
     frames, the `base` (unit vector to the second centre in the first camera's frame), the number `n` of points that
@@ -115,13 +115,13 @@ def _of(pair):
 
 
 def _closes(ij, jk, ik) -> bool:
-    """True if the three rotations are those of three images."""
+    """Return True if the three rotations are those of three images."""
     chord = np.linalg.norm(_of(jk)[0] @ _of(ij)[0] - _of(ik)[0])
     return bool(2 * np.arcsin(min(chord / np.sqrt(8), 1.0)) < _CLOSED)
 
 
 def _spans(ij, jk, ik) -> bool:
-    """True if the three bases, in the frame of image i, lie in a plane and span it."""
+    """Return True if the three bases, in the frame of image i, lie in a plane and span it."""
     turn, first = _of(ij)
     second, third = turn.T @ _of(jk)[1], _of(ik)[1]
     products = [np.cross(first, second), np.cross(second, third), np.cross(first, third)]

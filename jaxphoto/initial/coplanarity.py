@@ -50,7 +50,7 @@ class RayPairs(NamedTuple):
         return RayPairs(rays_1, rays_2, *noise, 0.5 * _EPIPOLE * square_1 * square_2)
 
     def take(self, which) -> "RayPairs":
-        """Some of the rows."""
+        """Select rows."""
         return RayPairs(*(part[which] for part in self))
 
 
@@ -85,12 +85,12 @@ def moved(
 
 
 def essential(rotation: Float[np.ndarray, "*n 3 3"], base: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
-    """The essential matrix `E = R [B]x`, of which `x_2' E x_1 = 0`."""
+    """Return the essential matrix `E = R [B]x`, of which `x_2' E x_1 = 0`."""
     return rotation @ cross_matrices(base)
 
 
 def misclosures(essentials: Float[np.ndarray, "m 3 3"], pairs: RayPairs) -> Float[np.ndarray, "m n"]:
-    """The misclosures of the coplanarity condition over their standard deviations, of many essential matrices."""
+    """Return the coplanarity misclosures over their standard deviations, of many essential matrices."""
     by_1 = np.swapaxes(essentials, 1, 2) @ pairs.rays_2.T  # (m, 3, n)
     by_2 = essentials @ pairs.rays_1.T
     variance = np.broadcast_to(pairs.floor, (len(essentials), len(pairs.floor))).copy()
@@ -103,7 +103,7 @@ def misclosures(essentials: Float[np.ndarray, "m 3 3"], pairs: RayPairs) -> Floa
 def behind(
     rotations: Float[np.ndarray, "m 3 3"], bases: Float[np.ndarray, "m 3"], pairs: RayPairs, sigmas: float
 ) -> Bool[np.ndarray, "m n"]:
-    """True for points behind a camera by more than `sigmas` standard deviations of their parallax."""
+    """Return True for points behind a camera by more than `sigmas` standard deviations of their parallax."""
     # The distances along the rays have the signs of (x_1 x x_2)'(B x x_2) and (x_1 x x_2)'(B x x_1).
     along_1, along_2 = bases @ pairs.rays_1.T, (rotations @ bases[:, :, None])[:, :, 0] @ pairs.rays_2.T
     cosine = np.sum((pairs.rays_2 @ rotations) * pairs.rays_1, axis=2)
@@ -176,7 +176,7 @@ def _linearised(rotations, bases, tangents, pairs):
 def error_directions(
     rotation: Float[np.ndarray, "3 3"], base: Float[np.ndarray, "3"], pairs: RayPairs
 ) -> Float[np.ndarray, "n 4"]:
-    """Derivatives of the misclosures over their standard deviations by the four image coordinates, in their sigmas.
+    """Return the derivatives of the standardised misclosures by the four image coordinates, in their sigmas.
 
     The product of two such rows is the correlation of the misclosures of one point in two orientations.
     """

@@ -84,7 +84,7 @@ def _cubics(basis: Float[np.ndarray, "fives 4 3 3"]) -> Float[np.ndarray, "fives
 def orientations(
     essentials: Float[np.ndarray, "m 3 3"],
 ) -> tuple[Float[np.ndarray, "m 4 3 3"], Float[np.ndarray, "m 4 3"]]:
-    """The four orientations of each essential matrix: `camera_2_from_camera_1` and the base in camera 1's frame.
+    """Return the four orientations of each essential matrix: `camera_2_from_camera_1` and the base in camera 1's frame.
 
     Both rotations U W V', U W' V' with both directions of the base, the vector that E maps to zero. Points lie in
     front of both cameras in one of the four only.

@@ -22,7 +22,7 @@ _SAME = 1e-12
 
 
 def homographies(rays_1: Float[np.ndarray, "sets n 3"], rays_2: Float[np.ndarray, "sets n 3"]):
-    """The homography H of the middle singular value 1, `x_2 ~ H x_1`, of every set of four or more pairs of rays.
+    """Estimate the homography H, `x_2 ~ H x_1`, middle singular value 1, of each set of four or more pairs of rays.
 
     Of three points on a line, or of fewer than four different ones, it is one of many.
     """

@@ -35,7 +35,7 @@ def intersect_points(
     coordinates: tuple[Int[np.ndarray, " known"], Int[np.ndarray, " known"], Float[np.ndarray, " known"]] | None = None,
     min_angle: float = np.deg2rad(0.02),
 ) -> tuple[Float[np.ndarray, "points 3"], Bool[np.ndarray, " points"]]:
-    """The point (m) nearest to its rays, for every point, and True if its rays determine it.
+    """Return the point (m) nearest to its rays, for every point, and True if its rays determine it.
 
         sum over rays (I - d d') (X - origin) = 0
 
@@ -79,7 +79,7 @@ def intersect_with_covariance(
     sigma_rad: float,
     min_angle: float = np.deg2rad(0.02),
 ) -> IntersectedPoints:
-    """The points with the least squared errors of image coordinates, and their covariances.
+    """Return the points with the least squared errors of image coordinates, and their covariances.
 
         sum J' (u - u(X)) = 0,   u = (x, y) / -z,   Q = sigma_rad^2 (sum J' J)^-1,   J = du / dX
 

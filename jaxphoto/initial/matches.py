@@ -84,7 +84,7 @@ def tracks(n_features: list[int], pairs: list[PairMatches]) -> Tracks:
 
 
 def connected_images(n_images: int, pairs: list[PairMatches]) -> list[Int[np.ndarray, "images"]]:
-    """Groups of images connected by matches, the largest first; an image without matches is a group."""
+    """Return the groups of images connected by matches, the largest first; an image without matches is a group."""
     parent = list(range(n_images))
     for pair in pairs:
         if len(pair.features):
@@ -94,7 +94,7 @@ def connected_images(n_images: int, pairs: list[PairMatches]) -> list[Int[np.nda
 
 
 def _edges(first: np.ndarray, pairs: list[PairMatches]) -> Int[np.ndarray, "edges 2"]:
-    """Matches of all pairs, with features numbered across photographs."""
+    """Return the matches of all pairs, with features numbered across photographs."""
     edges = [np.zeros((0, 2), int)]
     for one, other, features in pairs:
         if not 0 <= one < other < len(first) - 1:
@@ -107,7 +107,7 @@ def _edges(first: np.ndarray, pairs: list[PairMatches]) -> Int[np.ndarray, "edge
 
 
 def _support(edges: np.ndarray, n: int) -> Int[np.ndarray, "edges"]:
-    """Number of third features matched to both ends of each match: the triangles of the graph over it."""
+    """Return the number of third features matched to both ends of each match: the triangles of the graph over it."""
     # SciPy takes a quarter of a second to import, and few orient photographs.
     from scipy.sparse import csr_matrix
 
@@ -123,13 +123,13 @@ def _support(edges: np.ndarray, n: int) -> Int[np.ndarray, "edges"]:
 
 
 def _portions(edges: np.ndarray) -> Iterator[np.ndarray]:
-    """Some at a time, to limit memory."""
+    """Yield some at a time, to limit memory."""
     for begin in range(0, len(edges), _AT_ONCE):
         yield edges[begin : begin + _AT_ONCE]
 
 
 def _root(parent: list[int], k: int) -> int:
-    """Representative of the component of `k`, with path halving."""
+    """Return the representative of the component of `k`, with path halving."""
     while parent[k] != k:
         parent[k] = parent[parent[k]]
         k = parent[k]

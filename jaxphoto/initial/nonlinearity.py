@@ -22,6 +22,6 @@ def typical_errors(normal: Float[np.ndarray, "u u"], sigma: float) -> Float[np.n
 
 
 def is_nonlinear(growth: Float[np.ndarray, " steps"], unknowns: int, sigma: float) -> bool:
-    """True if the growth of the squared residuals at `typical_errors` is not that of linear equations."""
+    """Return True if the growth of the squared residuals at `typical_errors` is not that of linear equations."""
     least, most = np.quantile(growth / (unknowns * sigma**2), _QUANTILES)
     return not (least > 1 / _FACTOR and most < _FACTOR)

@@ -35,7 +35,7 @@ def cayley(theta):
 
 
 def best_rotations(products: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3 3"]:
-    """The rotation R with the largest sum of b' R a, where `products` is the sum of b a'.
+    """Return the rotation R with the largest sum of b' R a, where `products` is the sum of b a'.
 
     R belongs to the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix, linear in the products
     (Horn 1987, "Closed-form solution of absolute orientation using unit quaternions", J. Opt. Soc. Am. A 4(4)). Of

@@ -35,7 +35,7 @@ def ideal_coordinates(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "r
 
 
 def camera_rays(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"]) -> Float[np.ndarray, "rows 3"]:
-    """Unit directions in the camera frame of the measured rows of one camera of any projection."""
+    """Return unit directions in the camera frame of the measured rows of one camera of any projection."""
     directions = _of_rows(interior, xy_mm)
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
@@ -50,7 +50,7 @@ def _of_rows(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"]) 
 
 
 def padded_length(n: int) -> int:
-    """The next of 32, 128, 512, 2048, 4096, ...: a block of a hundred images compiles two or three times."""
+    """Return the next of 32, 128, 512, 2048, 4096, ...: a block of a hundred images compiles two or three times."""
     length = 32
     while length < n:
         length *= 4 if length < 2048 else 2
@@ -65,7 +65,7 @@ def padded(values: np.ndarray, length: int) -> np.ndarray:
 def unit_rays(
     c_mm: Float[np.ndarray, " rows"] | float, ideal: Float[np.ndarray, "rows 2"]
 ) -> Float[np.ndarray, "rows 3"]:
-    """Unit directions (x, y, -c) in the camera frame."""
+    """Return unit directions (x, y, -c) in the camera frame."""
     rays = np.column_stack([ideal, -np.broadcast_to(c_mm, len(ideal))])
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 

@@ -109,7 +109,7 @@ def relative_orientations(
     robust: bool = True,
     images: str = "the two images",
 ) -> list[RelativeOrientation]:
-    """The relative orientation, best first, and those that fit as well as the best.
+    """Return the relative orientation, best first, and those that fit as well as the best.
 
     One that is not `described` is a start of an adjustment, but its covariance says little. Arguments and other errors
     are those of `relative_orientation`.
@@ -154,7 +154,7 @@ def relative_orientations(
 
 
 def _adjusted(rotations, bases, pairs: RayPairs, robust: bool) -> list[RelativeOrientation]:
-    """The orientations that the starts lead to, best first, without those that fit significantly worse.
+    """Return the orientations that the starts lead to, best first, without those that fit significantly worse.
 
     With `robust`, gross errors take no part. Starts with fewer than five points that agree lead to none.
     """
@@ -183,7 +183,7 @@ def _adjusted(rotations, bases, pairs: RayPairs, robust: bool) -> list[RelativeO
 
 
 def _retested(fits: RelativeFits, pairs: RayPairs, agrees) -> Bool[np.ndarray, "m n"]:
-    """The points that agree, by each misclosure over its own standard deviation after the adjustment (Baarda).
+    """Return the points that agree, by each misclosure over its own standard deviation after the adjustment (Baarda).
 
     That of a point that took part is sqrt(1 - h) with its leverage h, so that one that drew the orientation to itself
     is detected. A point that all others together cannot check, the usual end of a false match with an odd parallax,
@@ -204,7 +204,7 @@ def _retested(fits: RelativeFits, pairs: RayPairs, agrees) -> Bool[np.ndarray, "
 
 
 def _worthwhile(fits: RelativeFits, agrees, pairs: RayPairs) -> list[int]:
-    """The starts that may still become as good as the best, one of each group on its way to the same orientation."""
+    """Select starts that may still become as good as the best, one of each group converging to one orientation."""
     squares = fits.values**2
     costs = np.where(agrees, squares, BLUNDER**2).sum(axis=1)
     best = int(np.argmin(costs))
@@ -242,7 +242,7 @@ def _distinct(fits: RelativeFits, pairs: RayPairs, agrees, robust: bool) -> list
 
 
 def _same(one: RelativeOrientation, other: RelativeOrientation) -> bool:
-    """True if two orientations differ by no more than a few standard deviations, or than rounding."""
+    """Return True if two orientations differ by no more than a few standard deviations, or than rounding."""
     rotation = one.camera_2_from_camera_1 @ other.camera_2_from_camera_1.T
     theta = np.array(
         [rotation[1, 2] - rotation[2, 1], rotation[2, 0] - rotation[0, 2], rotation[0, 1] - rotation[1, 0]]
@@ -254,7 +254,7 @@ def _same(one: RelativeOrientation, other: RelativeOrientation) -> bool:
 
 
 def _as_good(ends: list[tuple[float, RelativeOrientation]], pairs: RayPairs) -> list[RelativeOrientation]:
-    """The best, and those whose squared misclosures are no larger than noise may make them.
+    """Return the best, and those whose squared misclosures are no larger than noise may make them.
 
     Where the best has few points, an orientation that fits five of them and calls the others gross errors is none.
     """
@@ -294,7 +294,7 @@ def _inverses(normals: Float[np.ndarray, "m 5 5"]) -> Float[np.ndarray, "m 5 5"]
 
 
 def _is_described(one: RelativeOrientation, pairs: RayPairs) -> bool:
-    """True if errors are as the covariance says (see `nonlinearity`), by the points of `pairs` that agree."""
+    """Return True if errors are as the covariance says (see `nonlinearity`), by the points of `pairs` that agree."""
     pairs = pairs.take(one.agrees)
     noise = max(1.0, np.nan_to_num(one.sigma0))
     steps = typical_errors(np.linalg.inv(one.covariance), noise)
@@ -310,7 +310,7 @@ def check_described(one: RelativeOrientation, images: str) -> None:
 
 
 def _sigma(one: RelativeOrientation) -> float:
-    """Standard deviation (rad) of the weakest direction."""
+    """Return the standard deviation (rad) of the weakest direction."""
     return float(np.sqrt(np.linalg.eigvalsh(one.covariance)[-1])) if np.isfinite(one.covariance).all() else np.inf
 
 

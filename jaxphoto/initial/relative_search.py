@@ -71,7 +71,7 @@ def candidates(pairs: RayPairs) -> tuple[Float[np.ndarray, "starts 3 3"], Float[
 
 
 def _of_plane(plane, pairs: RayPairs):
-    """The orientations of the homography of the points that agree with it; none where these are few."""
+    """Return the orientations of the homography of the points that agree with it; none where these are few."""
     for _ in range(3):
         agrees = transfer_errors(plane, pairs)[0] < _OFF_PLANE
         if agrees.sum() < max(_LEAST_PLANE, _PLANE * len(agrees)):
@@ -81,7 +81,7 @@ def _of_plane(plane, pairs: RayPairs):
 
 
 def _fives(rng: np.random.Generator, n: int):
-    """Indices (fives, 5) of different points: all, of a few points."""
+    """Return indices (fives, 5) of different points: all, of a few points."""
     if n <= _FEW:
         return np.array(list(combinations(range(n), 5)))
     if n < 50:

@@ -165,7 +165,7 @@ def reprojection_errors(
 def checked_points(
     ideal: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"], image: str
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "3"]]:
-    """The points about their mean, and the mean (m), of an image that they can orient.
+    """Return the points about their mean, and the mean (m), of an image that they can orient.
 
     Raises BlockError for a coordinate that is not a number, fewer than four distinct points, and points on a line on
     the ground or in the image; ValueError where there are not as many points as image coordinates.
@@ -197,8 +197,8 @@ def checked_points(
         across = np.linalg.svd(centred, compute_uv=False)
         if across[1] < 1e-4 * across[0]:
             raise BlockError(
-                f"the known points of image {image} lie {where}, which leaves its orientation open: measure a known "
-                f"point off that line {cure}"
+                f"the known points of image {image} lie {where}, which leaves its orientation undetermined: measure "
+                f"a known point off that line {cure}"
             )
     return points - origin, origin
 
@@ -224,14 +224,14 @@ def check_determined(normal: Float[np.ndarray, "6 6"], sigma: float, image: str,
 def open_orientation(image: str) -> BlockError:
     """Error for points that do not determine the orientation."""
     return BlockError(
-        f"the known points of image {image} leave its orientation open, as points close to a line do, few points "
-        "in a small part of the image, or points on a dangerous cylinder or curve through the projection centre: "
-        "measure known points elsewhere in it"
+        f"the known points of image {image} leave its orientation undetermined, as points close to a line do, few "
+        "points in a small part of the image, or points on a dangerous cylinder or curve through the projection "
+        "centre: measure known points elsewhere in it"
     )
 
 
 def _candidates(c_mm, ideal, points):
-    """The `STARTS` solutions of the triangles with the smallest robust reprojection error, best first."""
+    """Return the `STARTS` solutions of the triangles with the smallest robust reprojection error, best first."""
     triples = _triples(ideal, points)
     positions, matrices = three_point_resections(unit_rays(c_mm, ideal)[triples], points[triples])
     judges = np.linspace(0, len(ideal) - 1, min(len(ideal), _JUDGES)).astype(int)
@@ -241,7 +241,7 @@ def _candidates(c_mm, ideal, points):
 
 
 def _triples(ideal, points):
-    """Indices (triples, 3) of the largest triangles in the image and of some random ones; no lines in the object."""
+    """Choose indices (triples, 3) of the largest image triangles and of random ones; none collinear in the object."""
     angles = np.arange(12) * np.pi / 6
     extreme = np.unique(np.argmax(ideal @ np.stack([np.cos(angles), np.sin(angles)]), axis=0))
     among = np.arange(len(ideal)) if len(ideal) <= 12 else extreme

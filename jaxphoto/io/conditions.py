@@ -15,7 +15,7 @@ from jaxphoto.camera.conditions import NUMBERS, TEXTS, Conditions
 from jaxphoto.errors import InputError
 from jaxphoto.io.names import LONGEST, harm_in
 from jaxphoto.io.photograph_metadata import TAG, Exif, number, open_picture, read_exif, text
-from jaxphoto.writing.inputs import input_file
+from jaxphoto.writing import input_file
 
 CONDITIONS = "conditions.csv"
 # Tags of EXIF 2.31 that Pillow does not name.

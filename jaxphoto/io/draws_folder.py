@@ -145,7 +145,6 @@ def check_place(directory: Path) -> None:
     for path in (directory, *directory.parents):
         if path.is_file():
             raise InputError(f"{path} is a file: name a folder for the draws")
-    clear_leftovers(directory)
     known = not directory.is_dir() or (directory / _RUN).is_file()
     if not known and any(not is_place(path.name) for path in directory.iterdir()):
         raise InputError(f"{directory} is not empty and holds no Monte Carlo run: name a new folder")

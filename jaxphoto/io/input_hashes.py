@@ -11,7 +11,7 @@ import pandas as pd
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.text_tables import read_csv
 from jaxphoto.io.toml import read_toml
-from jaxphoto.writing.inputs import InputFile, input_file
+from jaxphoto.writing import InputFile, input_file
 
 INPUTS = "inputs.csv"
 # Of a folder that block.toml names, such as an earlier calibration.

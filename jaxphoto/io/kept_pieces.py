@@ -33,7 +33,6 @@ class KeptPieces:
         self.folder = folder
         check_pieces(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        clear_leftovers(folder)
         if not (folder / _MARKER).is_file():
             with whole_file(folder / _MARKER) as work:
                 work.write_text(_SAYS, encoding="utf-8")

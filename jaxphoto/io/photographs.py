@@ -29,8 +29,7 @@ from jaxphoto.io.photograph_metadata import (
     time_of_exposure,
 )
 from jaxphoto.procedures.known_lens import KnownLens
-from jaxphoto.writing import MARKER
-from jaxphoto.writing.inputs import input_file
+from jaxphoto.writing import MARKER, input_file
 
 _DIAGONAL_35_MM = math.hypot(36, 24)
 # Some cameras write 1 or 65535 if the focal length on film is unknown.

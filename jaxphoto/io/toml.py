@@ -243,7 +243,7 @@ def status(prior: Any, start: Any, scale: float = 1.0) -> str | dict[str, Any]:
     if isinstance(prior, Prior):
         return prior.name.lower()
     if not isinstance(prior, Weighted):
-        raise BlockError(f"{prior!r} is no prior; use FREE, FIXED or Weighted(value, sigma)")
+        raise BlockError(f"{prior!r} is not a prior; use FREE, FIXED or Weighted(value, sigma)")
     if prior.covariance is None:
         written: dict[str, Any] = {"sigma": (np.asarray(prior.sigma) / scale).tolist()}
     else:

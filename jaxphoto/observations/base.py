@@ -125,7 +125,7 @@ class AbstractObservations(eqx.Module):
         return eqx.tree_at(lambda rows: rows.sigma, self, np.full(np.shape(self.sigmas), np.inf))
 
     def indices(self) -> list[tuple[str, Int[ArrayLike, "..."]]]:
-        """Return kinds and indices of what the rows touch: (n,), or more axes if a row touches several."""
+        """Return kinds and indices of what the rows refer to: (n,), or more axes if a row touches several."""
         return [
             (f.metadata["touches"], getattr(self, f.name)) for f in dataclasses.fields(self) if "touches" in f.metadata
         ]

@@ -122,7 +122,7 @@ def correlated(
     try:
         whitener = np.linalg.inv(np.linalg.cholesky(covariance))
     except np.linalg.LinAlgError:
-        raise ValueError("a covariance matrix is not positive definite: a combination has no uncertainty") from None
+        raise ValueError("a covariance matrix is not positive definite") from None
     return Correlated(
         rows=map_arrays(lambda v: to_numpy(v)[index], rows),
         covariance=covariance,

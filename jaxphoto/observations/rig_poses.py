@@ -70,7 +70,8 @@ def _reference_for(reference: ImageState, own: RigCamera) -> tuple[Float[Array, 
 def _camera_of(image: ImageState) -> RigCamera:
     if RigCamera.kind not in image.parameters:
         raise BlockError(
-            f"there are rows of a rig, but the block knows of no camera in one: give [unknowns.{RigCamera.kind}.CAMERA]"
+            "there are rows of a rig, but no camera of the block belongs to one: give "
+            f"[unknowns.{RigCamera.kind}.CAMERA]"
         )
     found: RigCamera = image.parameters[RigCamera.kind]
     return found

@@ -26,7 +26,7 @@ from jaxphoto.report.verdict import readout_of
 from jaxphoto.stability import LEVEL, NORMAL_95, Method, change, distortion_curve, frame_sigma, image_grid
 from jaxphoto.statistics import AxisErrors
 from jaxphoto.statistics.correlation import high_pairs
-from jaxphoto.writing.inputs import InputFile, digest_of_all
+from jaxphoto.writing import InputFile, digest_of_all
 
 _GRID = (15, 11)
 # Every third row of the distortion curve is tabulated.

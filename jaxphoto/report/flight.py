@@ -56,8 +56,7 @@ from jaxphoto.report.results import (
 from jaxphoto.report.tables import Tables, with_correlated_sigma
 from jaxphoto.report.verdict import lens_findings, shutter_findings, verdict_of
 from jaxphoto.statistics.block_geometry import Coverage, coverage, image_links, weak_links
-from jaxphoto.writing import whole_folder
-from jaxphoto.writing.inputs import InputFile, digest_of_all
+from jaxphoto.writing import InputFile, digest_of_all, whole_folder
 
 # Images of the table on the page; of more, those with the largest residuals.
 _MOST, _WORST = 150, 50

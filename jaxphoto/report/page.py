@@ -26,7 +26,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.report.findings import Verdict, as_sentence
 from jaxphoto.report.formatting import head_of, numeric_columns, readable
 from jaxphoto.report.plots import new_figure
-from jaxphoto.writing.inputs import InputFile
+from jaxphoto.writing import InputFile
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

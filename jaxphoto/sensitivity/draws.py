@@ -185,7 +185,7 @@ class Readjustment:
         return call_compiled(find_optima, *arguments, thorough=self.many and not first_only), recorded
 
     def _fetch(self, optima: Found, recorded: Recorded, n: int) -> Draws:
-        """The first `n` draws of a batch."""
+        """Return the first `n` draws of a batch."""
         state = self.adjusted.padded.crop_state(UnknownArrays(*(_draws_first(v)[:n] for v in optima.state)))
         labels, scalars = self.adjusted.structure.labels, {name: np.asarray(v)[:n] for name, v in recorded.items()}
         steps, converged = np.asarray(optima.steps)[:n], np.asarray(optima.settled)[:n]
@@ -223,7 +223,7 @@ class Readjustment:
         return np.concatenate([_by_object(state.position), angles], axis=2)
 
     def _varying_values(self, entry: Any) -> tuple[Varying, Recorded]:
-        """The values of one draw that differ from the nominal ones."""
+        """Return the values of one draw that differ from the nominal ones."""
         values, recorded = self._all_values(entry)
         return {name: jnp.asarray(values[name], float) for name in self.names}, recorded
 
@@ -264,7 +264,7 @@ class Readjustment:
 
 
 def common_of(adjusted: Adjustment, batch: int | None = None) -> Common:
-    """The nominal adjustment, from whose optimum all draws start, with image rows in batches of `batch`."""
+    """Return the nominal adjustment, from whose optimum all draws start, with image rows in batches of `batch`."""
     equations, values = adjusted.equations.weighed, adjusted.values
     lists = row_lists(adjusted.structure, adjusted.padded.places, batch)
     return Common(equations.at, equations.factored, np.asarray(values.xy), np.asarray(values.sigma_xy), lists)
@@ -300,7 +300,7 @@ def _check_same(block: Any, nominal: Block) -> None:
 
 
 def _is_number_or_same(new: Any, old: Any) -> bool:
-    """True if a leaf is unchanged, or floating-point values of the same shape."""
+    """Return True if a leaf is unchanged, or floating-point values of the same shape."""
     if np.asarray(old).dtype.kind not in "f":
         return new is old or (not isinstance(new, jax.core.Tracer) and np.array_equal(new, old))
     return np.shape(new) == np.shape(old)

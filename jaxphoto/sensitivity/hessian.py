@@ -250,7 +250,7 @@ def _by_point(
     i: int,
     s: PaddedStructure,
 ) -> tuple[Float[Array, "3 3 points"], Float[Array, "interior 3 points"]]:
-    """Sums over the rows of each point: by the point, and by the point and interior unknowns."""
+    """Return the sums over the rows of each point: by the point, and by the point and interior unknowns."""
     n = s.n_points
     v = jax.ops.segment_sum(met[:3].reshape(9, -1).T, jnp.asarray(point), n).T.reshape(3, 3, n)
     at = jnp.asarray(point)[:, None], jnp.minimum(column, i)
@@ -259,7 +259,7 @@ def _by_point(
 
 
 def _by_unknown(h: RowProducts, s: PaddedStructure) -> Float[Array, "n n"]:
-    """Sums by image, at the unknowns of the image and of its colours."""
+    """Return the sums by image, at the unknowns of the image and of its colours."""
     n_eop, columns = 6 * s.n_images, image_columns(s)
     images, n = jnp.arange(s.n_images), n_eop + s.n_shared
     eop = 0.5 * (h.eop + h.eop.transpose(0, 2, 1))

@@ -84,7 +84,7 @@ def image_rows(adjusted: Adjustment) -> ListedRows:
 
 
 def _size(rows: int) -> int:
-    """Padded number of rows: classes at most an eighth apart, then multiples of the batch."""
+    """Return the padded number of rows: classes at most an eighth apart, then multiples of the batch."""
     step = min(1 << max((rows - 1).bit_length() - 4, 0), _BATCH) if rows <= _BATCH else _BATCH
     return -(-rows // step) * step
 

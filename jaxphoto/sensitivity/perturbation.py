@@ -213,7 +213,7 @@ class Bias(eqx.Module):
 
 
 def in_order_of(block: Block, changed: Block) -> Block:
-    """`changed` with its unknowns in the order of `block`."""
+    """Return `changed` with its unknowns in the order of `block`."""
     start = dataclasses.replace(changed.start, unknowns=changed.start.unknowns.in_order_of(block.start.unknowns))
     return dataclasses.replace(changed, start=start, priors=changed.priors.in_order_of(block.priors))
 
@@ -385,7 +385,7 @@ def _follow(tree: Any, path: tuple[Any, ...]) -> Any:
 
 
 def _leaf(tree: Any, name: str) -> Any:
-    """A field, or a parameter of a camera by its name."""
+    """Return a field, or a parameter of a camera by its name."""
     named = isinstance(tree, InteriorOrientation) and not hasattr(tree, name)
     return get_parameter(tree, name) if named else getattr(tree, name)
 

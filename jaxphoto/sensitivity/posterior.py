@@ -164,7 +164,7 @@ def posterior(
 
 
 def _indices(adjusted: Adjustment, parameters: Sequence[str]) -> Int[np.ndarray, " parameters"]:
-    """Indices of `parameters` in the vector of `_physical`."""
+    """Return indices of `parameters` in the vector of `_physical`."""
     block, s, padded = adjusted.block, adjusted.structure, adjusted.padded
     n, q, image, point = padded.structure.n_images, s.n_shared, padded.places.image, padded.places.point
     names = EOP_NAMES["omega_phi_kappa"]
@@ -231,7 +231,7 @@ class _White(NamedTuple):
         return z - self.datum.T @ (self.datum @ z)
 
     def whitened(self, row: Increments) -> Float[Array, "free"]:
-        """Derivative by z of a function with the derivative `row` by x."""
+        """Return the derivative by z of a function with the derivative `row` by x."""
         right, d = self.equations.reduce(row)
         reduced = self.equations.factored.reduced
         if len(d):
@@ -291,7 +291,7 @@ def _sample(
     equations: NormalEquations, index: Int[Array, " parameters"], free: Int[Array, " free"], seed: Int[Array, ""],
     chains: int, draws: int, warmup: int,
 ) -> tuple[Float[Array, "chains draws parameters"], Int[Array, " chains"], Int[Array, " chains"]]:  # fmt: skip
-    """Samples of the parameters; divergent transitions and gradients of each chain."""
+    """Return samples of the parameters; divergent transitions and gradients of each chain."""
     white, at = _White.at_optimum(equations, free), equations.at
     metric, transition = jnp.ones(len(free)), blackjax.nuts.build_kernel()
     begin, update, final = blackjax.adaptation.step_size.dual_averaging_adaptation(_ACCEPTANCE)

@@ -108,7 +108,7 @@ def prepare_design(block: Block, truth: Unknowns | None, sizes: PaddedSizes, n_c
 
 
 def group_by_program(designs: Sequence[PreparedDesign]) -> list[list[int]]:
-    """Indices of the designs that share one compiled program, by program."""
+    """Return indices of the designs that share one compiled program, by program."""
     groups: dict[object, list[int]] = {}
     for k, design in enumerate(designs):
         arrays, rest = eqx.partition((design.values, design.structure), eqx.is_array)

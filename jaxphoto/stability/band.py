@@ -118,7 +118,7 @@ def concentration(
 def leading_unit(
     first: Bool[np.ndarray, "cuts units"], offsets: Float[np.ndarray, "cuts cells 2"]
 ) -> tuple[int, float]:
-    """The unit whose half alone explains most of the squares of all differences, and the fraction it explains.
+    """Return the unit whose half alone explains most of the squares of all differences, and the fraction it explains.
 
     d_k = s_ku z_u + the rest: each of many equal units explains about its share, and 1 / cuts by chance.
     """

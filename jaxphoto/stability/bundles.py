@@ -239,7 +239,7 @@ def check_rays(interior: InteriorOrientation, points: Float[ArrayLike, "points 2
 
 
 def regular_rays(interior: InteriorOrientation, points: Float[ArrayLike, "points 2"]) -> Bool[ArrayLike, "points"]:
-    """True for image points (mm) with an invertible distortion and a ray ahead."""
+    """Return True for image points (mm) with an invertible distortion and a ray ahead."""
     return to_numpy(call_compiled(_regular, as_arrays(interior), jnp.asarray(points, float)))
 
 
@@ -258,7 +258,7 @@ def _bundle_offsets(first, second, points, method, depth) -> BundleOffsets:
 
 @eqx.filter_jit
 def _regular(interior, points):
-    """True where the map from measured to ideal coordinates keeps its orientation and the ray points ahead."""
+    """Return True where the map from measured to ideal coordinates keeps its orientation and the ray points ahead."""
 
     def regular(xy):
         _, _, w = interior.direction_from_ideal(interior.ideal_from_measured(xy))

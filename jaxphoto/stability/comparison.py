@@ -123,11 +123,11 @@ class Analysis(NamedTuple):
     uncertainty: OffsetUncertainty | None
 
     def similar(self, noise_mm: float) -> bool:
-        """True if RMSE_offset is within the noise of image coordinates (paper 002: about one pixel)."""
+        """Return True if RMSE_offset is within the noise of image coordinates (paper 002: about one pixel)."""
         return bool(self.offsets.rmse_mm <= noise_mm)
 
     def verdict(self, noise_mm: float) -> str:
-        """Result of the comparison in one or two sentences."""
+        """Return the result of the comparison in one or two sentences."""
         rmse, uncertainty = float(self.offsets.rmse_mm), self.uncertainty
         result, side = ("similar", "within") if self.similar(noise_mm) else ("not similar", "beyond")
         text = f"{result}: RMSE_offset of {1e3 * rmse:.3g} um is {side} the noise of {1e3 * noise_mm:.3g} um"
@@ -286,7 +286,7 @@ def mahalanobis(difference: Float[np.ndarray, "n"], covariance: Float[np.ndarray
 
 
 def same_model(first: InteriorOrientation, second: InteriorOrientation) -> bool:
-    """True if the parameters of both have the same meaning."""
+    """Return True if the parameters of both have the same meaning."""
     constants = [{n: float(get_parameter(i, n)) for n in constant_names(i)} for i in (first, second)]
     return model_keys(first) == model_keys(second) and constants[0] == constants[1]
 
@@ -319,7 +319,7 @@ class Combination(NamedTuple):
     """p-value of the difference of each calibration from the combination of all others."""
 
     def disagreeing(self, level: float) -> list[int]:
-        """Indices of calibrations that differ from the others, with the overall error probability `level`."""
+        """Return indices of calibrations that differ from the others, with the overall error probability `level`."""
         n = len(self.against_others)
         return [k for k, p in enumerate(self.against_others) if p < level / n]
 

@@ -42,7 +42,7 @@ class QuadraticForm(eqx.Module):
     def of_normal(
         mean: Float[np.ndarray, "n"], jacobian: Float[np.ndarray, "n parameters"], covariance: Float[np.ndarray, "p p"]
     ) -> "QuadraticForm":
-        """The form v'v of a normal v with this mean and the covariance J Q J'; Q may be singular."""
+        """Return the form v'v of a normal v with this mean and the covariance J Q J'; Q may be singular."""
         root = covariance_root(covariance)
         axes, spread, _ = np.linalg.svd(np.asarray(jacobian) @ root, full_matrices=False)
         weights = spread**2
@@ -119,7 +119,7 @@ class QuadraticForm(eqx.Module):
         return (self.shifts * t / denominator - np.log1p(-2 * self.weights * t) / 2).sum(-1)
 
     def _slope(self, t: float, x: float) -> float:
-        """Derivative of K(t) - t x - log|t| at a real t."""
+        """Return the derivative of K(t) - t x - log|t| at a real t."""
         denominator = 1 - 2 * self.weights * t
         return float((self.shifts / denominator**2 + self.weights / denominator).sum() - x - 1 / t)
 

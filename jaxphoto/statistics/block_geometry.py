@@ -114,7 +114,7 @@ def _tangents(interior: InteriorOrientation, xy: Float[Array, "n 2"]) -> Float[A
 
 
 def _inside(at: Float[np.ndarray, "rows columns 2"], polygon: Float[np.ndarray, "corners 2"]) -> np.ndarray:
-    """True for points inside a polygon (even-odd rule)."""
+    """Return True for points inside a polygon (even-odd rule)."""
     x, y = at[..., 0], at[..., 1]
     odd = np.zeros(x.shape, bool)
     for (x1, y1), (x2, y2) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
@@ -183,7 +183,7 @@ def image_links(adjusted: Adjustment) -> ImageLinks:
 
 
 def weak_links(adjusted: Adjustment, links: ImageLinks, most: int) -> list[WeakLink]:
-    """The `most` weakest edges of the maximum spanning tree, weakest first."""
+    """Return the `most` weakest edges of the maximum spanning tree, weakest first."""
     n, measured = len(adjusted.block.images), _measured(adjusted)
     # The maximum spanning tree of strengths is the minimum spanning tree of their inverses.
     ends = links.first.astype(np.int32), links.second.astype(np.int32)

@@ -116,7 +116,7 @@ def linear_forms(
     exterior: Float[ArrayLike, "forms images 6"] | None = None,
     shared: Float[ArrayLike, "forms shared"] | None = None,
 ) -> LinearForms:
-    """A posteriori covariances of `n_forms` linear functions f = g' x of the unknowns; omitted weights g are zero.
+    """Return the a posteriori covariances of `n_forms` functions f = g' x of the unknowns; omitted weights are zero.
 
     cov(f, h) = sigma0^2 g' N^-1 h with the normal matrix N. Unknowns are the coordinates of points (m), of each image
     its position (m) and small rotations about the axes of its camera (rad), and the shared unknowns in the order of

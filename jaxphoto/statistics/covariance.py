@@ -87,7 +87,7 @@ class Covariance(eqx.Module):
         return self._sigma(self.points.diagonal(axis1=1, axis2=2))
 
     def of_interior(self, camera: str, parameters: Sequence[str]) -> Float[np.ndarray, "parameters parameters"]:
-        """A posteriori covariance of a camera's interior orientation in the order of `parameters`; zero where fixed."""
+        """Return the a posteriori covariance of a camera's interior orientation by `parameters`; zero if fixed."""
         first, prefix = 6 * self.n_images, f"interior[{camera}]."
         index = {
             label.removeprefix(prefix): first + k
@@ -174,7 +174,7 @@ def physical_covariance(q: Cofactors, scale: Increments, rotation: Float[Array, 
 
 
 def rotation_jacobians(rotation: Float[Array, "3 3 images"], rotations: Rotations) -> Float[Array, "images 3 3"]:
-    """Derivatives of the three `rotations` (rad) of each image by its small rotation in the camera frame (rad)."""
+    """Return the derivatives of the `rotations` (rad) of each image by its small rotation in the camera frame (rad)."""
 
     def jacobian(camera_from_object):
         if rotations == "camera":
@@ -194,7 +194,7 @@ Weights = dict[tuple[str, str, int], Float[np.ndarray, "parameters"]]
 def common_covariance(
     first: Adjustment, second: Adjustment, camera: str, parameters: Sequence[str]
 ) -> Float[np.ndarray, "parameters parameters"]:
-    """A priori covariance of the interior orientations of `camera` in two adjustments without a common image.
+    """Return the a priori covariance of the interior orientations of `camera` in adjustments without common images.
 
     Rows are `parameters` of the first, columns those of the second, in their own units; zero for fixed parameters and
     for adjustments that share no observation.

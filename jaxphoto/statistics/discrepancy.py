@@ -59,7 +59,7 @@ def physical_residuals(adjusted: Adjustment) -> dict[str, Float[np.ndarray, "...
 
 
 def a_priori_sigmas(adjusted: Adjustment) -> dict[str, Float[np.ndarray, "..."]]:
-    """A priori standard deviations of the observations by group, in the units of `physical_residuals`."""
+    """Return the a priori standard deviations of the observations by group, in the units of `physical_residuals`."""
     return {name: np.asarray(rows.sigmas).T for name, rows in observation_groups(adjusted).items()}
 
 
@@ -100,7 +100,7 @@ def angle_differences(first: Adjustment, second: Adjustment) -> tuple[tuple[str,
 
 
 def spread_of(group: str, axis: str, values: np.ndarray, unit: str) -> Spread:
-    """Number, mean, RMSE (over n) and maximum of values that are not empty."""
+    """Return the number, mean, RMSE (over n) and maximum of values that are not empty."""
     rmse, max_abs = float(np.sqrt((values**2).mean())), float(np.abs(values).max())
     return Spread(group, axis, len(values), float(values.mean()), rmse, max_abs, unit)
 

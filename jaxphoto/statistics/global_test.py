@@ -61,7 +61,7 @@ def group_factors(adjusted: Adjustment, redundancy: Redundancy) -> list[Variance
 
 
 def expected_residual_scale(adjusted: Adjustment) -> dict[str, float]:
-    """Expected root mean square of the image residuals over their standard deviations, by camera.
+    """Return the expected root mean square of the image residuals over their standard deviations, by camera.
 
     1 for residuals of measured coordinates. For residuals of corrected coordinates (docs/adjustment.md, residuals of
     wide-angle cameras), the distortion scales the noise with the image.
@@ -75,7 +75,7 @@ _GRID = 33
 
 
 def _expected(adjusted: Adjustment) -> Float[np.ndarray, "rows"]:
-    """Expected v'v / 2 of each image row's whitened residuals before adjustment, with the a priori noise."""
+    """Return the expected v'v / 2 of each image row's whitened residuals before adjustment, with the a priori noise."""
     rows = adjusted.structure.image
     cameras, expected = np.array(adjusted.block.image_camera)[rows], np.ones(len(rows))
     for name, interior in adjusted.unknowns.interior.items():

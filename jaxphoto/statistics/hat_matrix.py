@@ -45,7 +45,7 @@ class HatMatrix(eqx.Module):
 
     @classmethod
     def of(cls, adjusted: Adjustment, *, image_rows: bool = True) -> "HatMatrix":
-        """Number the observations of an adjustment and prepare its normal equations."""
+        """Index the observations of an adjustment and prepare its normal equations."""
         leaves, structure = jax.tree.flatten(adjusted.residuals)
         ends = np.cumsum([np.size(v) for v in leaves])
         numbers = [np.arange(e - np.size(v), e, dtype=float) for v, e in zip(leaves, ends, strict=True)]
@@ -136,7 +136,7 @@ class HatMatrix(eqx.Module):
 
 
 def inner_products(a: Increments, b: Increments) -> Float[ArrayLike, "m n"]:
-    """a' b of each of `a` with each of `b`, along leading axes.
+    """Return a' b of each of `a` with each of `b`, along leading axes.
 
     Summed kind by kind: in a large block a copy of all increments takes 100 MB.
     """

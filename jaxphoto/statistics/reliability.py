@@ -175,7 +175,7 @@ class LargestMdb(NamedTuple):
 
 
 def largest_mdbs(adjusted: Adjustment, redundancy: Redundancy) -> list[LargestMdb]:
-    """The largest MDB in standard deviations of each group of observations."""
+    """Return the largest MDB in standard deviations of each group of observations."""
     largest, block = [], adjusted.block
     mdbs = minimal_detectable_biases(adjusted, redundancy)
     for name, rows in observation_groups(adjusted).items():
@@ -249,7 +249,7 @@ def mdb_effects(adjusted: Adjustment, covariance: Covariance, redundancy: Redund
 
 
 def largest_interior_effects(adjusted: Adjustment, external: MdbEffects) -> list[LargestEffect]:
-    """The largest effect on each of `REPORTED_PARAMETERS` that some camera estimates."""
+    """Return the largest effect on each of `REPORTED_PARAMETERS` that some camera estimates."""
     effects, block = [], adjusted.block
     for parameter, moved in external.interior.items():
         largest: LargestEffect | None = None

@@ -87,7 +87,7 @@ def _sigma_map(
     points: Float[ArrayLike, "cells 2"] | None,
     joint: tuple[list[str], Float[Any, "n n"]],
 ) -> SigmaMap:
-    """The map of a camera with the `_joint_covariance` `joint`."""
+    """Return the map of a camera with the `_joint_covariance` `joint`."""
     interior, sensor = adjusted.unknowns.interior[name], adjusted.block.sensors[name]
     xy = _cells(sensor) if points is None else np.asarray(points, float)
     parameters, covariance = joint

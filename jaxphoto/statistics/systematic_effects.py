@@ -254,7 +254,7 @@ def _parts_of_image(
 def _by_strip(
     adjusted: Adjustment, name: str, rows: AbstractObservations, places: Places
 ) -> Iterator[SystematicEffect]:
-    """Common mean, mean per strip and linear drift of each axis of rows that each belong to one image."""
+    """Return the common mean, mean per strip and linear drift of each axis of rows that each belong to one image."""
     block, at = adjusted.block, np.atleast_2d(places[name])
     image_number = rows.names_of("image", [str(k) for k in range(len(block.images))])
     if not len(image_number) or not all(n.isdigit() for n in image_number):
@@ -333,7 +333,7 @@ def _fields(
 
 @eqx.filter_jit
 def _slopes(interior: InteriorOrientation, names: tuple[str, ...], values: Array, xy: Array) -> Array:
-    """Derivatives of the measured or the ideal coordinate (whichever has a closed form) by each parameter."""
+    """Return the derivatives of the measured or ideal coordinate (whichever has a closed form) by each parameter."""
 
     def coordinate(v: Array, point: Array) -> Array:
         camera = interior
@@ -345,7 +345,7 @@ def _slopes(interior: InteriorOrientation, names: tuple[str, ...], values: Array
 
 
 def _is_affine(field: Float[np.ndarray, "2 n"], centred: Float[np.ndarray, "2 n"]) -> bool:
-    """True if the field stretches or shears the image, as the sequential exposure of rows does."""
+    """Return True if the field stretches or shears the image, as the sequential exposure of rows does."""
     matrix = field @ np.linalg.pinv(centred)
     stretched = np.abs(matrix - np.eye(2) * np.trace(matrix) / 2).max() > _MAX_MISFIT * np.abs(matrix).max()
     return bool(stretched and np.abs(matrix @ centred - field).max() < _MAX_MISFIT * np.abs(field).max())

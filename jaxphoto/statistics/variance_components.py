@@ -114,13 +114,13 @@ SPLITS: dict[str, _Split] = {"xy-z": _plan_and_height, "axis": _by_axis, "camera
 
 
 def observed_rows(adjusted: Adjustment) -> dict[str, AbstractObservations]:
-    """Groups of observations that may have variance components: all but prior information."""
+    """Return the groups of observations that may have variance components: all but prior information."""
     groups = observation_groups(adjusted)
     return {name: groups[name] for name in adjusted.block.named_observations}
 
 
 def partition_observations(adjusted: Adjustment, partition: Partition) -> Parts:
-    """The parts of an adjustment's observations, in the order of the partition.
+    """Return the parts of an adjustment's observations, in the order of the partition.
 
     Raises InputError for an unknown split, group or name, a label without observations, observations with two labels,
     and correlated rows in different parts.
@@ -425,7 +425,7 @@ def _unsupported(
     step: _Step,
     converged: bool,
 ) -> tuple[int, str] | None:
-    """The part with the weakest unsupported component, if any, and the warning.
+    """Return the part with the weakest unsupported component, if any, and the warning.
 
     One at a time: without it, others may become separable. Before convergence the standard deviation is no criterion:
     a part with far too small a priori sigmas has little redundancy at first.
@@ -459,7 +459,7 @@ def _positive(change: np.ndarray, current: PartialRedundancy, free: np.ndarray) 
 
 
 def _reweighted(block: Block, parts: Parts, factor: np.ndarray) -> Block:
-    """The block with its variances times `factor`."""
+    """Return the block with its variances times `factor`."""
     scale = np.sqrt(np.append(factor, 1.0))
 
     def scaled(name: str, rows: AbstractObservations) -> AbstractObservations:

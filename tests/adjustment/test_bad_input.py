@@ -88,17 +88,17 @@ NO_CONTROL = {"control": ControlCoordinates.none(), "fixed": ControlCoordinates.
         (
             lambda: without_attitudes(with_mount(boresight=FREE)),
             RankError,
-            ["mounts[imu].boresight", "attitude", "hold the boresight fixed"],
+            ["mounts[imu].boresight", "attitude", "fix the boresight"],
         ),
         (
             lambda: without_stations(with_mount(lever_arm=FREE)),
             RankError,
-            ["mounts[imu].lever_arm", "station", "hold the lever arm fixed"],
+            ["mounts[imu].lever_arm", "station", "fix the lever arm"],
         ),
         (
             lambda: with_mount(time_offset=FREE),
             RankError,
-            ["mounts[imu].time_offset", "motion", "hold the time offset fixed"],
+            ["mounts[imu].time_offset", "motion", "fix the time offset"],
         ),
         (
             lambda: without_stations(without_attitudes(moving(with_mount(time_offset=FREE)))),
@@ -113,12 +113,12 @@ NO_CONTROL = {"control": ControlCoordinates.none(), "fixed": ControlCoordinates.
         (
             lambda: without_turns(simulated("surfaces").block),
             RankError,
-            ["scanner.boresight", "known positions of the scanner", "hold the boresight fixed"],
+            ["scanner.boresight", "known positions of the scanner", "fix the boresight"],
         ),
         (
             lambda: without_second_strip(simulated("surfaces").block),
             RankError,
-            ["scanner[l2].shift", "no point lies on a surface", "hold the shift fixed"],
+            ["scanner[l2].shift", "no point lies on a surface", "fix the shift"],
         ),
     ],
     ids=[

@@ -30,7 +30,7 @@ def test_a_similarity_meets_the_constraints_and_changes_nothing_else(kind, dista
     rng = np.random.default_rng(3)
     eop, shared, points = zero_increments(s)
     draw = lambda v, size: jnp.asarray(rng.normal(0, size, v.shape))  # noqa: E731
-    # With a turn and a shear of all, so that no constraint is met by chance.
+    # With a turn and a shear of all, so that no constraint is determined by chance.
     moved = draw(points, 40.0) + 0.1 * jnp.roll(values.points, 1, axis=0)
     y = eop.at[:3].set(draw(eop[:3], 80.0)).at[3:].set(draw(eop[3:], 0.2)), shared, moved
     at = Linearised(type(zero_increments(s))(*y), unit_scale(s), values, s)

@@ -72,7 +72,7 @@ def test_there_and_back_again():
 
 
 def test_only_smac_has_a_balance_radius():
-    with pytest.raises(ValueError, match="only SMAC has a balance radius to change, this camera has Brown"):
+    with pytest.raises(ValueError, match="only SMAC has a balance radius to change; this camera has Brown"):
         rebalance(InteriorOrientation(35.0, distortion=Brown()), 3.0)
 
 

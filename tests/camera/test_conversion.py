@@ -206,5 +206,5 @@ def test_corners_of_which_a_camera_says_nothing_are_left_out():
     x, y = np.meshgrid(np.linspace(-18, 18, 25), np.linspace(-12, 12, 25))
     assert found.covered == pytest.approx(np.mean(np.hypot(x, y) < 45 * 2 / 3 / np.sqrt(2.7)))
     assert 0.8 < found.covered < 1
-    with pytest.raises(ValueError, match=r"the distortion of this camera folds within 9\d% of its format"):
+    with pytest.raises(ValueError, match=r"the distortion of this camera is not invertible over 9\d% of its format"):
         fitted(InteriorOrientation(10.0, 0.0, 0.0, BundlerRadial(k1=-0.9)), Brown, SENSOR)

@@ -157,7 +157,7 @@ def test_the_grid_of_orthogonal_polynomials_is_chosen_in_one_place():
 
 
 def test_a_misspelt_coefficient_is_refused_when_the_class_is_defined():
-    with pytest.raises(InputError, match=r"Misspelt: k_1 in what it declares is no field of it; its fields are k1$"):
+    with pytest.raises(InputError, match=r"Misspelt: k_1 declared, but no such field exists; its fields are k1$"):
 
         class Misspelt(AbstractDistortion):
             k1: float = 0.0
@@ -169,7 +169,7 @@ def test_a_misspelt_coefficient_is_refused_when_the_class_is_defined():
 
 
 def test_a_field_that_is_declared_nowhere_is_refused():
-    with pytest.raises(InputError, match="Silent: the field k2 is declared nowhere; name it in"):
+    with pytest.raises(InputError, match="Silent: the field k2 is not declared; name it in"):
 
         class Silent(AbstractDistortion):
             k1: float = 0.0

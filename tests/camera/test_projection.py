@@ -257,7 +257,5 @@ def test_a_coefficient_of_projection_and_distortion_is_refused():
         name = "bent"
         coefficients = ("k1",)
 
-    with pytest.raises(
-        InputError, match="k1 would be a coefficient of the projection bent and of the distortion brown"
-    ):
+    with pytest.raises(InputError, match="k1 is a coefficient of both the projection bent and the distortion brown"):
         InteriorOrientation(C, projection=Bent())

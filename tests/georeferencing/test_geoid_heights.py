@@ -86,13 +86,13 @@ def test_a_block_that_control_places_has_the_heights_that_are_asked_for(geoid):
 
 
 def test_a_place_that_the_geoid_does_not_reach_is_named(geoid):
-    with pytest.raises(InputError, match=r"EPSG:5773 does not reach the photograph 'far' at 13.3000, 20.0000 degrees"):
+    with pytest.raises(InputError, match=r"EPSG:5773 does not cover the photograph 'far' at 13.3000, 20.0000 degrees"):
         one_height({"a": HERE, "far": HERE._replace(latitude_deg=20.0)}, {}, EGM96)
 
 
 @pytest.mark.skipif(any(GRID in os.listdir(folder) for folder in FOLDERS), reason="PROJ has the grid here")
 def test_a_geoid_that_is_not_here_is_refused_with_how_to_get_it():
-    with pytest.raises(InputError, match=rf'geoid {GRID}, which is not on this computer; get it by "pyproj sync'):
+    with pytest.raises(InputError, match=rf'geoid {GRID}, which is not installed; get it by "pyproj sync'):
         one_height({"a": HERE}, {}, EGM96)
 
 
@@ -107,7 +107,7 @@ def test_a_code_that_is_none_is_refused():
 
 
 def test_a_code_of_no_heights_is_refused():
-    with pytest.raises(InputError, match=r"EPSG:25832 .* is no system of heights"):
+    with pytest.raises(InputError, match=r"EPSG:25832 .* is not a vertical CRS"):
         one_height({"a": HERE._replace(heights="ellipsoid")}, {}, 25832)
 
 

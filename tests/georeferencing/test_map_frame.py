@@ -91,7 +91,7 @@ REFUSED = {
     (2227, None): ["EPSG:2227", "US survey foot", "convert"],
     (2053, None): ["EPSG:2053", "southwards", "convert"],
     (32722, 99999): ["EPSG code 99999 is unknown", "above the ellipsoid"],
-    (32722, 4326): ["EPSG:4326", "no system of heights", "5773"],
+    (32722, 4326): ["EPSG:4326", "not a vertical CRS", "5773"],
     (32722, 5773): ["EGM96 height", "us_nga_egm96_15.tif", "not on this computer", "pyproj sync", "ellipsoidal"],
 }
 

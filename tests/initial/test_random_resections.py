@@ -77,7 +77,7 @@ def test_errors_of_every_kind(errors, kind):
 
 def test_few_are_refused_and_each_for_a_reason(errors):
     assert len(errors.refused) <= 0.02 * N
-    assert all("equally well" in reason or "leave its orientation open" in reason for reason in errors.refused)
+    assert all("equally well" in reason or "leave its orientation undetermined" in reason for reason in errors.refused)
 
 
 def test_robust_weights_cost_little(errors):

@@ -17,7 +17,7 @@ from jaxphoto.report.findings import Finding, Verdict
 from jaxphoto.report.flight import FlightSource
 from jaxphoto.report.flight_plots import PartReport
 from jaxphoto.statistics.block_geometry import coverage
-from jaxphoto.writing.inputs import InputFile
+from jaxphoto.writing import InputFile
 from tests.blocks import BROWN, adjusted
 
 # Recorded minus adjusted (m), X, Y, Z of the first images; the last of them is left out.

@@ -115,7 +115,7 @@ class PaddedStructure(AbstractStructure):
 
     @property
     def on_one_device(self) -> "PaddedStructure":
-        """The same structure for a program on one device."""
+        """Return this structure for a program on one device."""
         if self.shards == 1:
             return self
         used = np.array([[len(self.rays.chunk_image), len(self.rays.pair)]])

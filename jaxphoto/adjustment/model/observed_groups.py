@@ -174,7 +174,7 @@ def _check(rows: AbstractObservations, block: Block) -> None:
         size = {"image": len(block.images), "point": len(block.points)}.get(what)
         index = np.asarray(index)
         if index.dtype.kind not in "iu":
-            raise BlockError(f"{rows.group}: what a row touches is given by numbers of {what}s, not by {index.dtype}")
+            raise BlockError(f"{rows.group}: a row refers to indices of {what}s, not by {index.dtype}")
         if size is None:
             continue
         bad = np.flatnonzero(((index < 0) | (index >= size)).reshape(len(index), -1).any(axis=1))
@@ -197,7 +197,9 @@ def group_of(
     """
     if rows.uses_interior and any(t.modifies_interior for t in tables):
         names = ", ".join(t.kind for t in tables if t.modifies_interior)
-        raise BlockError(f"{rows.group} with covariances go through cameras that nothing bends: leave out {names}")
+        raise BlockError(
+            f"{rows.group} with covariances need cameras without time-dependent interior orientation: remove {names}"
+        )
     n, nowhere = len(rows), len(unknown_of) - 1
     by_kind = {t.kind: t for t in tables}
     images, points, of_images, of_others, arguments = [], [], [], [], []
@@ -218,7 +220,7 @@ def group_of(
             elif what in by_kind:
                 of_others.append(by_kind[what].numbers_at(one, nowhere))
             else:
-                raise BlockError(f"{rows.group}: the rows touch {what}, of which the block has none")
+                raise BlockError(f"{rows.group}: the rows refer to {what}, but the block has none")
     for kind in rows.block_parameters:
         arguments.append(Argument(kind, ()))
         if kind in by_kind:
@@ -250,7 +252,7 @@ def group_of(
 
 def _cameras(rows: AbstractObservations, cameras: np.ndarray | None) -> np.ndarray:
     if cameras is None:
-        raise BlockError(f"{rows.group} go through the camera: that works where all cameras have one distortion model")
+        raise BlockError(f"{rows.group} use the interior orientation: give all cameras one distortion model")
     return cameras
 
 

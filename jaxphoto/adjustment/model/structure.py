@@ -195,7 +195,7 @@ def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None =
     image, point = np.asarray(block.image_points.image), np.asarray(block.image_points.point)
     _check_rows(image, point)
     if len(np.unique(np.asarray(block.control.who) * 3 + np.asarray(block.control.axis))) < len(block.control.who):
-        raise ValueError("control holds a coordinate of a point twice: keep one row of each")
+        raise ValueError("control has duplicate coordinates of a point: keep one row of each")
     given = observed_in(block, priors) if observed is None else observed
     tables, entries = given.tables, given.entries
     free = np.array([k for k, e in enumerate(entries) if e.prior != FIXED], dtype=np.int32)
@@ -237,12 +237,10 @@ def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None =
 def _check_rows(image: np.ndarray, point: np.ndarray) -> None:
     """Raise ValueError for image rows that are not sorted by point, or repeat a point in an image."""
     if (np.diff(point) < 0).any():
-        raise ValueError(
-            "the rows of image_points must be sorted by point: take them in the order of np.argsort(point)"
-        )
+        raise ValueError("the rows of image_points must be sorted by point: reorder them by np.argsort(point)")
     key = point.astype(np.int64) * (int(image.max(initial=0)) + 1) + image
     if len(np.unique(key)) < len(key):
-        raise ValueError("image_points holds a point twice in one image: keep one row of each")
+        raise ValueError("image_points has a point twice in one image: keep one row of each")
 
 
 def _check_coupled(block: Block, groups: tuple[ObservedGroup, ...], point: np.ndarray, point_free: np.ndarray) -> None:
@@ -256,7 +254,7 @@ def _check_coupled(block: Block, groups: tuple[ObservedGroup, ...], point: np.nd
         if g.elimination == "coupled" and not own[g.point].all():
             name = block.points[int(g.point[~own[g.point]][0])]
             raise BlockError(
-                f"point {name} is met by {g.name} alone: measure it in an image, or give it control, or leave it out"
+                f"point {name} is determined by {g.name} only: measure it in an image, add control, or remove it"
             )
 
 

@@ -172,7 +172,7 @@ def places(points: SurveyedPoints, system: ControlSystem, code: int) -> Float[np
         change = Transformer.from_crs(crs if crs.is_geocentric else crs.to_3d(), ellipsoid.to_3d(), always_xy=True)
     except ProjError:
         raise InputError(
-            f"{points.file}: PROJ knows no way from {system.name} to the ellipsoid of EPSG:{code}"
+            f"{points.file}: PROJ has no transformation from {system.name} to the ellipsoid of EPSG:{code}"
         ) from None
     there = np.stack(change.transform(*xyz.T), axis=1)
     for k in np.flatnonzero(~np.isfinite(there).all(axis=1)):

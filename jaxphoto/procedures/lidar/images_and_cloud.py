@@ -135,7 +135,7 @@ def simultaneous(
     if priors.boresight != FIXED and not timed:
         raise InputError(
             "the boresight of the scanner needs its trajectory and the time of each laser point, which say from where "
-            "a point was measured: give them, or hold the boresight fixed"
+            "a point was measured: give them, or fix the boresight"
         )
     check_without_surfaces(block)
     if timed:

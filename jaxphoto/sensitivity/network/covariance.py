@@ -227,7 +227,7 @@ def _block_diagonal(blocks: Float[Array, "n c c"]) -> Float[Array, "nc nc"]:
 
 
 def _angle_jacobian(camera_from_object: Float[Array, "3 3"]) -> Float[Array, "6 6"]:
-    """Derivative of X, Y, Z, omega, phi, kappa by X, Y, Z and a small rotation about the camera's axes."""
+    """Return the derivative of X, Y, Z, omega, phi, kappa by X, Y, Z and a small rotation about the camera's axes."""
     angles = lambda theta: omega_phi_kappa_from_matrix(small_rotation(theta) @ camera_from_object)  # noqa: E731
     return jnp.eye(6).at[3:, 3:].set(jax.jacfwd(angles)(jnp.zeros(3)))
 
@@ -258,13 +258,13 @@ def e_criterion(matrix: Float[Array, "n n"], power: float | None = None) -> Floa
 
 
 def sigma_of(covariance: NetworkCovariance, name: str) -> Float[Array, ""]:
-    """Standard deviation of the interior parameter `name` in its own unit. Raises InputError if it is fixed."""
+    """Return the standard deviation of the interior parameter `name` in its own unit. Raises InputError if fixed."""
     k = covariance.column(name)
     return jnp.sqrt(covariance.interior[k, k])
 
 
 def point_rmse(covariance: NetworkCovariance, points: Sequence[int] | slice = slice(None)) -> Float[Array, ""]:
-    """Expected RMSE (m) of a coordinate of the ground points `points`: sqrt of the mean variance over points and axes.
+    """Return the expected RMSE (m) of a coordinate of `points`: sqrt of the mean variance over points and axes.
 
     It predicts the RMSE at error-free check points. A point with fewer than two images makes it very large.
     """

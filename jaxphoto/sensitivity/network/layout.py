@@ -141,7 +141,7 @@ class StripPlan(eqx.Module):
 
 
 def design_from_plan(plan: FlightPlan, control: Float[ArrayLike, "control 2"]) -> StripDesign:
-    """Strips of a flight plan over ground of mean height zero, without tilts, and control points at X, Y (m)."""
+    """Return strips of a flight plan over ground of mean height zero, without tilts, and control points at X, Y (m)."""
     numbers = [(np.deg2rad(s.heading_deg), s.height_m, s.across_m, s.along_m, 0.0, 0.0) for s in plan.strips]
     heading, height, across, along, roll, pitch = np.array(numbers).T
     return StripDesign(heading, height, across, along, roll, pitch, np.asarray(control, float))

@@ -128,7 +128,7 @@ def grid_designs(low: Design, high: Design, n: int) -> Design:
 
 
 def best_designs(criterion: Criterion, layout_of: LayoutOf, designs: Design, n: int) -> Design:
-    """The `n` of `designs` (a leading axis) with the smallest criterion, as starts of a search.
+    """Return the `n` of `designs` (a leading axis) with the smallest criterion, as starts of a search.
 
     Raises InputError if fewer have a finite criterion.
     """
@@ -204,7 +204,7 @@ def _same_structure(one: Any, other: Any) -> bool:
 
 
 def _checked_starts(starts: Design, low: Design, high: Design) -> Design:
-    """`starts` as arrays. Raises InputError for a start outside the bounds."""
+    """Return `starts` as arrays. Raises InputError for a start outside the bounds."""
     starts = jax.tree.map(lambda v: np.asarray(v, float), starts)
     if not _same_structure(starts, low):
         raise InputError("the starts and the bounds are designs of different structure: give both the same variables")
