@@ -258,7 +258,7 @@ def _match_pairs(
 
 
 def _places(matches: Int[np.ndarray, "n 2"], one: np.ndarray, other: np.ndarray) -> Int[np.ndarray, "places 2"]:
-    """Matches of descriptors as one-to-one matches of features."""
+    """Return matches of descriptors as one-to-one matches of features."""
     pairs = np.unique(np.column_stack([one[matches[:, 0]], other[matches[:, 1]]]), axis=0)
     once = np.ones(len(pairs), bool)
     for side in pairs.T:
@@ -281,7 +281,7 @@ def _over_sigma(off_line_px: float, one: np.ndarray, other: np.ndarray, *sigmas:
 
 
 def _alone(names: list[str], blank: list[bool], pairs: list[PairMatches], in_parts: bool) -> list[int]:
-    """Indices of photographs without matches. Raises InputError for unconnected groups, except `in_parts`."""
+    """Return the photographs without matches. Raises InputError for unconnected groups, except `in_parts`."""
     groups = connected_images(len(names), pairs)
     joined = [group for group in groups if len(group) > 1]
     if not joined:

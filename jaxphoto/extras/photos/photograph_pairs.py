@@ -119,7 +119,7 @@ def most_similar(
 
 
 def _votes(one: UInt8[np.ndarray, "_ 128"], others: Sequence[UInt8[np.ndarray, "_ 128"]]) -> Int[np.ndarray, "others"]:
-    """Number of descriptors of `one` that pass the ratio test in each of `others`."""
+    """Count the descriptors of `one` that pass the ratio test in each of `others`."""
     if len(one) == 0:
         return np.zeros(len(others), int)
     # Padding up to LARGEST is infinitely far.

@@ -91,7 +91,7 @@ _DETERMINED = 1e-3
 def rough_interior(
     board: Board, rows: TargetRows, sensor: Sensor, known: InteriorOrientation | None = None
 ) -> InteriorOrientation:
-    """Initial interior orientation: from a flat board, else `known`, else from resections with several c.
+    """Estimate the initial camera from a flat board, else `known`, else from resections with several c.
 
     Homographies determine nothing for a board that is not flat, and no c for views without tilt: c is then that of
     `known`, or that of seven between half and three times the longer side with the smallest resection errors.
@@ -227,7 +227,7 @@ def _homography(board, image) -> Float[np.ndarray, "3 3"]:
 
 
 def _determines(board) -> bool:
-    """True if points of a plane determine a homography: the map to themselves is unique."""
+    """Return True if points of a plane determine a homography: the map to themselves is unique."""
     same, _ = _conditioned(board)
     size = np.linalg.svd(_linear(same, same), compute_uv=False)
     return bool(len(size) > 7 and size[7] > _DETERMINED * size[0])

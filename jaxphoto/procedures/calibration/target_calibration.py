@@ -171,7 +171,7 @@ def misfits(
 
 
 def added_sigma(residuals: Float[np.ndarray, "n 2"], sigma: Float[np.ndarray, "n 2"], redundancy: int) -> float:
-    """Standard deviation a (px) that explains the residuals together with `sigma`: sum v^2 / (sigma^2 + a^2) = r.
+    """Estimate the sigma a (px) that explains the residuals together with `sigma`: sum v^2 / (sigma^2 + a^2) = r.
 
     Zero if `sigma` alone explains them. It accounts for an uneven board, a rolling shutter, or a distortion model with
     too few coefficients; without it the most accurate points would have too much weight.
@@ -365,7 +365,7 @@ def _image_eccentricities(board, rows, interior, exterior) -> Float[np.ndarray, 
 
 
 def interior_covariance(adjusted: Adjustment) -> Float[np.ndarray, "parameters parameters"]:
-    """A posteriori covariance of the camera of a calibration, in the order and units of `parameter_names`.
+    """Return the a posteriori covariance of the camera of a calibration, in the order and units of `parameter_names`.
 
     Rows and columns of fixed parameters are zero. Image points are assumed to be independent.
     """

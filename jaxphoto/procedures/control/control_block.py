@@ -105,7 +105,7 @@ def poorer_survey(
     assumed: Bool[np.ndarray, "points 3"],
     guess_m: tuple[float, float, float],
 ) -> Float[np.ndarray, "3"] | None:
-    """Standard deviations (m) of the coordinates `assumed` that explain most of them; None if `sigma_m` does.
+    """Estimate sigmas (m) of the coordinates `assumed` that explain most of them; None if `sigma_m` does.
 
     They follow from the medians of the normalised residuals of plan and height; up to half of the points may be
     blunders. A block is deformed by control with too much weight, so that several adjustments are needed: after the
@@ -128,7 +128,7 @@ def poorer_survey(
 
 
 def beyond(w: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
-    """True for points with a significant normalised residual."""
+    """Return True for points with a significant normalised residual."""
     return np.nan_to_num(w).max(axis=1, initial=0.0) > CRITICAL
 
 
@@ -318,7 +318,7 @@ def _one_height(points: SurveyedPoints) -> list[str]:
 
 
 def _tested(tested: TestedControl, now: Marked, used, able, ids, images):
-    """Accepted control points after the test, marks to reject, and a sentence for each; no sentence if all agree."""
+    """Return accepted control points, marks to reject, and a sentence for each; no sentence if all agree."""
     new, rejected, messages = used.copy(), np.zeros(len(now.image), bool), []
     of_points, of_marks = np.where(used, np.nan_to_num(tested.w).max(axis=1), 0.0), np.nan_to_num(tested.marks_w)
     wide = scatter(tested.marks_w)
@@ -372,13 +372,13 @@ def retest(controlled: ControlledBlock, adjusted: Adjustment) -> ControlledBlock
 
 
 def at_optimum(adjusted: Adjustment) -> Block:
-    """The adjusted block, with initial values at the optimum."""
+    """Return the adjusted block, with initial values at the optimum."""
     block = adjusted.block
     known = (np.ones(len(names), bool) for names in (block.images, block.points))
     return dataclasses.replace(block, start=Start(adjusted.unknowns, *known))
 
 
 def _from(base: Block, adjusted: Adjustment) -> Block:
-    """`base` with initial values at the optimum of the same block with control."""
+    """Return `base` with initial values at the optimum of the same block with control."""
     unknowns = dataclasses.replace(adjusted.unknowns, points=np.asarray(adjusted.unknowns.points)[: len(base.points)])
     return dataclasses.replace(base, start=dataclasses.replace(base.start, unknowns=unknowns))

@@ -99,7 +99,7 @@ def onto_control(
 
 
 def on_a_line(there: Float[np.ndarray, "points 3"], here: Float[np.ndarray, "points 3"]) -> bool:
-    """True if all points are collinear, which leaves a rotation about their line undetermined."""
+    """Return True if all points are collinear, which leaves a rotation about their line undetermined."""
     return next(_of_threes(there, here), None) is None
 
 
@@ -222,7 +222,7 @@ def in_frame(
 
 
 def stated_system(points: SurveyedPoints, words: str | None, guess: Callable[[], str]) -> ControlSystem:
-    """The system in the file of `points`, or `words`. Raises InputError for none, with a `guess`, or two."""
+    """Return the system in the file of `points`, or `words`. Raises InputError for none, with a `guess`, or two."""
     stated = system_of(points.system, points.file) if points.system else None
     given = system_of(words, "the EPSG code of the control") if words else None
     if stated and given and stated.crs != given.crs:

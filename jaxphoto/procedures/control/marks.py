@@ -119,7 +119,7 @@ class Intersected(NamedTuple):
 
 
 def rays_of(block: Block, unknowns: Unknowns, rows: Marked) -> Float[np.ndarray, "rows 3"]:
-    """Unit directions of the marks in the camera frames."""
+    """Return unit directions of the marks in the camera frames."""
     rays = np.zeros((len(rows.image), 3))
     camera = np.array(block.image_camera, object)[rows.image]
     for name in set(camera.tolist()):
@@ -168,7 +168,7 @@ def intersected(block: Block, unknowns: Unknowns, rows: Marked, ids: tuple[str, 
 
 
 def _passing(origins, directions, limit) -> Bool[np.ndarray, "rays"]:
-    """True for the rays of one point that pass the position of most of them; all False if no two rays meet."""
+    """Return True for the rays of one point that pass the position of most of them; all False if no two rays meet."""
     n = len(origins)
     pairs = list(combinations(range(n), 2))
     pairs = [pairs[k] for k in np.linspace(0, len(pairs) - 1, min(len(pairs), _PAIRS)).astype(int)]

@@ -83,7 +83,7 @@ def adjust_with_control(
 
 
 def parts_with_marks(adjusted: Adjustment, marked: Collection[str]) -> dict[str, Selection]:
-    """Groups of observations with a variance component each: features, marks, stations in plan and height."""
+    """Return groups of observations with a variance component each: features, marks, stations in plan and height."""
     parts = {"image points": Selection("image_points")}
     if marked:
         ties = [name for name in adjusted.block.points if name not in marked]

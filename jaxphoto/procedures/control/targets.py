@@ -266,7 +266,7 @@ def _fit_of_others(taken: dict[int, list[int]], fit_px: Float[np.ndarray, "n"]) 
 
 
 def _meeting(origins, directions, image, limit, fit, near, of_point) -> tuple[np.ndarray, str]:
-    """The candidates, one per image, whose rays meet near a point; or why there are none."""
+    """Return the candidates, one per image, whose rays meet near a point; or why there are none."""
     one, other = np.triu_indices(len(image), 1)
     apart = image[one] != image[other]
     one, other = one[apart], other[apart]

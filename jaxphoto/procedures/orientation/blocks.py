@@ -101,7 +101,7 @@ def _check_perspective(block: Block) -> None:
 
 
 def _common_points(points: list[np.ndarray]) -> Iterator[PairMatches]:
-    """Common points of each two images, as indices of their rows."""
+    """Yield the common points of each two images, as indices of their rows."""
     for i in range(len(points)):
         for j in range(i + 1, len(points)):
             _, one, other = np.intersect1d(points[i], points[j], return_indices=True)

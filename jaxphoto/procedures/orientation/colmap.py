@@ -142,14 +142,14 @@ def _verified_matches(pycolmap: Any, database: str) -> tuple[PairMatches, ...]:
 
 
 def _rays(camera: MappedCamera, xy_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """Unit directions of ideal coordinates, in COLMAP's camera frame."""
+    """Return unit directions of ideal coordinates, in COLMAP's camera frame."""
     xy = (xy_px - np.array([camera.width_px, camera.height_px]) / 2) / camera.c_px
     rays = np.column_stack([xy, np.ones(len(xy))])
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
 def _only_rotated(rays: list[np.ndarray], match: PairMatches, c_px: float) -> bool:
-    """True if a rotation maps the rays of one image to those of the other: both have the same projection centre."""
+    """Return True if a rotation maps the rays of one image to those of the other: both have one projection centre."""
     one, other = rays[match.first][match.features[:, 0]], rays[match.second][match.features[:, 1]]
     u, _, vt = np.linalg.svd(one.T @ other)
     turned = one @ (u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
@@ -207,7 +207,7 @@ def write_database(
 
 
 def _options(pycolmap: Any, cameras, angle: float, free: bool, min_matches: int, min_points: int) -> Any:
-    """Mapping options. COLMAP's defaults find no initial pair if all images look along their path."""
+    """Return mapping options. COLMAP's defaults find no initial pair if all images look along their path."""
     options = pycolmap.IncrementalPipelineOptions(random_seed=0)
     options.extract_colors, options.min_model_size, options.max_num_models = False, 2, 4
     options.min_num_matches = min_matches
@@ -222,7 +222,7 @@ def _options(pycolmap: Any, cameras, angle: float, free: bool, min_matches: int,
 
 
 def _score(model: Any, cameras: Sequence[MappedCamera]) -> tuple[bool, int, int]:
-    """True if all principal distances are plausible; number of images; number of image points."""
+    """Return True if all principal distances are plausible; number of images; number of image points."""
     ratios = [c.focal_length / cameras[k - 1].c_px for k, c in model.cameras.items()]
     plausible = all(1 / _PLAUSIBLE < ratio < _PLAUSIBLE for ratio in ratios)
     return plausible, model.num_reg_images(), model.compute_num_observations()

@@ -232,7 +232,7 @@ def _started(block: Block, unknowns: Unknowns) -> Block:
 
 
 def _match_errors(matches: Sequence[PairMatches], network: Network) -> tuple[int, int, int]:
-    """Number of matches of unoriented images, off the epipolar line, and of features without a common point."""
+    """Count matches of unoriented images, off the epipolar line, and of features without a common point."""
     point = {(i, f): p for i, f, p in zip(network.image, network.feature, network.point, strict=True)}
     of_pair = {(m.first, m.second): m.features for m in network.verified}
     unoriented = off = untriangulated = 0

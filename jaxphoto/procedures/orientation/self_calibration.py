@@ -148,7 +148,7 @@ def correlation_factor(block: Block, residuals: Float[np.ndarray, "2 rows"]) -> 
 
 
 def shared_covariance(adjusted: Adjustment) -> np.ndarray:
-    """A priori covariance of the unknowns that images share, independent of the datum."""
+    """Return the a priori covariance of the unknowns that images share, independent of the datum."""
     equations, n = adjusted.equations, adjusted.structure.n_shared
     scale = np.asarray(equations.scale.shared)
     inverse = np.asarray(call_compiled(_inverse, equations))[-n:, -n:]

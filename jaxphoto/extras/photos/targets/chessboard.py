@@ -41,7 +41,7 @@ class Chessboard(Pattern):
         return np.where(inside, (column + row) % 2, 1.0)
 
     def hint(self, pictures: Sequence[np.ndarray]) -> str | None:
-        """The largest grid of corners in the pictures."""
+        """Describe the largest grid of corners in the pictures."""
         counts = []
         for picture in pictures:
             flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
@@ -64,7 +64,7 @@ def grid_points(columns: int, rows: int, apart_m: float) -> tuple[tuple[str, ...
 
 
 def facing(grid: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows columns 2"]:
-    """The grid with rows ordered as seen from the front."""
+    """Return the grid with rows ordered as seen from the front."""
     along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     return grid if along[0] * down[1] - along[1] * down[0] > 0 else grid[::-1]
 

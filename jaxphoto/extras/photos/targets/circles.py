@@ -85,7 +85,7 @@ def _of_size(shape: np.ndarray, half_axes: np.ndarray, factor: float) -> bool:
 
 
 def _is_dark(picture: np.ndarray, centre: np.ndarray, shape: np.ndarray) -> bool:
-    """True if a spot is darker at half its radius than at one and a half."""
+    """Return True if a spot is darker at half its radius than at one and a half."""
     angle = np.arange(16) * np.pi / 8
     to_edge = np.linalg.inv(np.linalg.cholesky(shape)).T @ np.stack([np.cos(angle), np.sin(angle)])
     high, wide = picture.shape
@@ -216,7 +216,7 @@ class CircleGrid(Pattern):
         self.board = Board("asymmetric circles", ids, xyz, np.full(len(ids), diameter_m))
 
     def find(self, picture: np.ndarray) -> FoundBoard | None:
-        """The circles of the grid by rows; None if it is not found; without circles that have no clear edge."""
+        """Find the circles of the grid by rows; None if it is not found; without circles that have no clear edge."""
         blobs = elliptic_blobs(picture)
         for dark in (True, False):
             candidates = self._like_the_grid(blobs.take(blobs.dark == dark))
@@ -334,7 +334,7 @@ class CircularTargets(Pattern):
         self._upright = bool(abs(axes[2, 2]) < _UPRIGHT)
 
     def find(self, picture: np.ndarray) -> FoundBoard | None:
-        """The visible targets; None if their arrangement is not found, or ambiguous."""
+        """Find the visible targets; None if their arrangement is not found, or ambiguous."""
         blobs = elliptic_blobs(picture)
         for dark in (True, False):
             candidates = blobs.take(blobs.dark == dark)
@@ -356,7 +356,7 @@ class _Labelling(NamedTuple):
     side: int
 
     def agrees(self, other: "_Labelling") -> bool:
-        """True if most of these pairs are in `other`, too."""
+        """Return True if most of these pairs are in `other`, too."""
         label = dict(other.pairs[:, ::-1].tolist())
         same = sum(label.get(blob) == target for target, blob in self.pairs.tolist())
         return self.side == other.side and same >= 0.5 * len(self.pairs)
@@ -383,7 +383,7 @@ def identified(
 
 
 def _best(labellings: list[_Labelling]) -> _Labelling | None:
-    """The best fit among the labellings of most targets; None if another one is as good."""
+    """Select the best fit among the labellings of most targets; None if another one is as good."""
     most = max((len(one.pairs) for one in labellings), default=0)
     able = [one for one in labellings if len(one.pairs) >= _AS_GOOD * most]
     best = min(able, key=lambda one: one.misfit, default=None)

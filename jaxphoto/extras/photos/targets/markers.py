@@ -33,7 +33,7 @@ class ArucoGrid(Pattern):
         self.board = Board("ArUco markers", ids, np.column_stack([xy, np.zeros(len(xy))]), np.zeros(len(xy)))
 
     def find(self, picture: np.ndarray) -> FoundBoard | None:
-        """The corners of all visible markers of the board; None if there is none."""
+        """Find the corners of all visible markers of the board; None if there is none."""
         markers = found_markers(picture, self._dictionary, self.gap_m / self.marker_m)
         valid = (markers.number < self.columns * self.rows) & (np.bincount(markers.number)[markers.number] == 1)
         if not valid.any():
@@ -87,7 +87,7 @@ class CharucoBoard(Pattern):
         self.board = Board("ChArUco", ids, xyz + np.array([square_m, -square_m, 0.0]), np.zeros(len(ids)))
 
     def find(self, picture: np.ndarray) -> FoundBoard | None:
-        """The visible inner corners between markers; None for fewer than four, or for one row."""
+        """Find the visible inner corners between markers; None for fewer than four, or for one row."""
         corners, ids, *_ = cv2.aruco.CharucoDetector(self._drawn).detectBoard(picture)
         if ids is None or len(ids) < 4:
             return None

@@ -73,7 +73,7 @@ class Marker(GroundTarget):
         self.dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))
 
     def find(self, window: np.ndarray, point: str, px_per_m: Float[np.ndarray, "2 2"]) -> TargetPlaces:
-        """The intersection of the diagonals of the marker with the number of the point."""
+        """Find the intersection of the diagonals of the marker with the number of the point."""
         digits = re.findall(r"\d+", point)
         markers = found_markers(window, self.dictionary, 1.0)
         matching = np.flatnonzero(markers.number == int(digits[-1][:9])) if digits else np.zeros(0, int)
@@ -142,7 +142,7 @@ def read_target(description: str) -> GroundTarget:
 
 
 def _edges(grey: np.ndarray, place: np.ndarray, radius: float) -> Float[np.ndarray, "2 2"] | None:
-    """Unit directions of the two edges of a crossing at a place; None if there is none."""
+    """Find the unit directions of the two edges of a crossing at a place; None if there is none."""
     angle = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
     around = (place + radius * np.column_stack([np.cos(angle), np.sin(angle)])).astype(np.float32)
     high, wide = grey.shape

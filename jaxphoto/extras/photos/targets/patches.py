@@ -154,7 +154,7 @@ def _fit(program, shape, picture, near, edges, reach_px) -> TargetPlaces:
 
 
 def _start(shape, patches, edges):
-    """Initial parameters: corner in the middle, edges as given, brightness by linear least squares."""
+    """Return initial parameters: corner in the middle, edges as given, brightness by linear least squares."""
     pixels, grey, used = patches
     across = np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
     # The normal of each edge points to the other edge: a single square is on the positive side of both.
