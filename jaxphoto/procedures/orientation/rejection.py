@@ -54,7 +54,7 @@ def unsupported(block: Block) -> Bool[np.ndarray, " rows"]:
 
 
 def _far(xy, inverse, sigma, tested: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " tested"]:
-    """Return True for the `tested` points of an image, at `xy` with `inverse` depths, that their neighbours contradict."""
+    """Return True for the `tested` points of an image whose `inverse` depths their neighbours contradict."""
     # The nearest point is the point itself.
     around = inverse[scipy.spatial.cKDTree(xy).query(xy[tested], _NEIGHBOURS + 1)[1][:, 1:]]
     median = np.median(around, axis=1)
