@@ -11,7 +11,7 @@ from jaxphoto.extras.photos.targets.on_ground import GroundTarget
 from jaxphoto.procedures.control.targets import Candidates, Predicted, TargetSearch
 
 # Standard deviation (px) of blur, compression and shadows, added to that of a fit.
-_LEAST_SIGMA_PX = 0.1
+_MIN_SIGMA_PX = 0.1
 _HALF = 0.5
 
 
@@ -45,7 +45,7 @@ def make_target_search(
                 row += [k] * int(near.sum())
                 place += list(there[near])
                 fit += np.sqrt(np.mean(targets.sigma_px[near] ** 2, axis=1)).tolist()
-        sigma = np.hypot(np.array(fit, float), _LEAST_SIGMA_PX)
+        sigma = np.hypot(np.array(fit, float), _MIN_SIGMA_PX)
         return Candidates(np.array(row, int), np.array(place, float).reshape(-1, 2), sigma, np.array(fit, float))
 
     return TargetSearch(look, target.named)

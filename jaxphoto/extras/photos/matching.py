@@ -37,7 +37,7 @@ _MIN_RATIO = 0.3
 _OFF_LINE = 0.003
 # Scatter is that of the 90 % quantile, 1.645 standard deviations: the median ignores the long tails of features, and
 # the sum of squares is sensitive to the remaining false matches.
-_MOST, _MOST_SIGMA = 0.9, 1.6449
+_QUANTILE, _QUANTILE_SIGMA = 0.9, 1.6449
 _BLANK = "it shows no features: it is blank or out of focus"
 _ALONE = f"it has {MIN_MATCHES} points in common with no other photograph it was compared with"
 # Pairs that are matched, and stored, at a time.
@@ -203,7 +203,7 @@ def _matched(
     verified = np.concatenate([np.zeros((0, 2), int), *(r.verified for r in results)])
     off_line = np.concatenate([np.zeros(0), *(r.off_line for r in results)])
     by_pair = np.split(verified, np.cumsum(numbers[:, 1]))[:-1]
-    factor = float(np.quantile(np.abs(off_line), _MOST)) / _MOST_SIGMA if len(off_line) else 1.0
+    factor = float(np.quantile(np.abs(off_line), _QUANTILE)) / _QUANTILE_SIGMA if len(off_line) else 1.0
     return MatchedPhotographs(
         [f.xy_mm for f in features],
         [factor * f.sigma_mm for f in features],

@@ -29,7 +29,7 @@ _RATIO = 0.8
 # Photographs whose products with one are in memory at a time.
 _AT_ONCE = 32
 # Fewer matches of the widest features occur by chance.
-_LEAST = 2
+_MIN_VOTES = 2
 
 
 class MostSimilar(NamedTuple):
@@ -115,7 +115,7 @@ def most_similar(
         progress(a + 1, n)
     votes += votes.T
     order = np.argsort(-votes, axis=1, kind="stable")[:, :count]
-    return sorted({(min(a, b), max(a, b)) for a in range(n) for b in order[a].tolist() if votes[a, b] >= _LEAST})
+    return sorted({(min(a, b), max(a, b)) for a in range(n) for b in order[a].tolist() if votes[a, b] >= _MIN_VOTES})
 
 
 def _votes(one: UInt8[np.ndarray, "_ 128"], others: Sequence[UInt8[np.ndarray, "_ 128"]]) -> Int[np.ndarray, "others"]:

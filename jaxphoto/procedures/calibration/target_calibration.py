@@ -187,8 +187,8 @@ def added_sigma(residuals: Float[np.ndarray, "n 2"], sigma: Float[np.ndarray, "n
     return float(scipy.optimize.brentq(excess, 0.0, largest, xtol=1e-9 * largest))
 
 
-LEAST_IMAGES = 3
-_LEAST_POINTS = 6
+MIN_IMAGES = 3
+_MIN_POINTS = 6
 _ROUNDS = 20
 # Final change (px) of the added standard deviation and of the centres of circles.
 _STILL_PX = 1e-4
@@ -263,7 +263,7 @@ def calibrate(
     """
     distortion = distortion_model(model, sensor, r0_mm)
     names = free_parameters(model, distortion, free)
-    left_out = {d.image: f"{len(d.point)} targets found" for d in detections if len(d.point) < _LEAST_POINTS}
+    left_out = {d.image: f"{len(d.point)} targets found" for d in detections if len(d.point) < _MIN_POINTS}
     used = [d for d in detections if d.image not in left_out]
     _check_enough(len(used), len(detections))
     rows = TargetRows.of(used, sensor)
@@ -302,7 +302,7 @@ def calibrate(
         if settled or round_ == _ROUNDS - 1:
             break
         left_out |= {rows.images[k]: "it does not fit the others" for k in np.flatnonzero(misfit)}
-        few = np.bincount(rows.image[good], minlength=len(rows.images)) < _LEAST_POINTS
+        few = np.bincount(rows.image[good], minlength=len(rows.images)) < _MIN_POINTS
         left_out |= {rows.images[k]: "too few targets without blunders" for k in np.flatnonzero(few & ~misfit)}
         out = ~good & ~misfit[rows.image] & ~few[rows.image]
         removed += [(rows.images[i], board.points[p]) for i, p in zip(rows.image[out], rows.point[out], strict=True)]
@@ -325,10 +325,10 @@ def calibrate(
 
 
 def _check_enough(images: int, total: int) -> None:
-    if images < LEAST_IMAGES:
+    if images < MIN_IMAGES:
         raise InputError(
             f"{images} of {total} photographs show enough of the board, and a calibration needs "
-            f"{LEAST_IMAGES}: take more of them, with the board tilted and turned"
+            f"{MIN_IMAGES}: take more of them, with the board tilted and turned"
         )
 
 

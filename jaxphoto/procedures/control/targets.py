@@ -115,20 +115,20 @@ def _projected(interior, exterior, points, corrections):
 
 
 # Search radius: standard deviations, and minimum in pixels.
-_WITHIN, _LEAST_PX = 3.5, 5.0
+_WITHIN, _MIN_PX = 3.5, 5.0
 # Standard deviation (m, plan) of the common offset of a block without control: receivers without corrections.
 COMMON_M = 3.0
 # Number of tie points that give the height of the ground at a point.
 _NEAR_TIES = 8
 # Maximum distance (px) of a candidate from the intersection of the rays of its point.
 _MISS_PX = 2.0
-_LEAST_IMAGES, _LEAST_UNNAMED = 2, 3
+_MIN_IMAGES, _MIN_UNNAMED = 2, 3
 # Fraction of the photographs of a target above which another position competes.
 _ALIKE = 0.6
 _PARALLEL = np.deg2rad(0.5)
 # Ratio of fits above which a target is sharper than another candidate, and above which it is duller than other targets.
 _SHARPER, _DULL = 1.5, 3.0
-_MOST_PAIRS = 2000
+_MAX_PAIRS = 2000
 
 
 class Candidates(NamedTuple):
@@ -185,7 +185,7 @@ def found_marks(
     pairs = zip(at.image.tolist(), at.point.tolist(), strict=True)
     at = at.take(np.array([pair not in known for pair in pairs], bool))
     spread = np.sqrt(np.linalg.eigvalsh(at.covariance)[:, 1]) if len(at.image) else np.zeros(0)
-    radius = np.maximum(_WITHIN * spread, _LEAST_PX)
+    radius = np.maximum(_WITHIN * spread, _MIN_PX)
     candidates = target_search.look(at, radius, adjusted.block.images, ids)
     return _believed(adjusted, ids, xyz, of_points, at, candidates, target_search.named, radius)
 
@@ -230,8 +230,8 @@ def _believed(adjusted, ids, xyz, of_points, at: Predicted, seen: Candidates, na
             seen.fit_px[group],
             *near,
         )
-        sure = named or radius[at.point == p].max() < 3 * _LEAST_PX
-        least = _LEAST_IMAGES if sure else _LEAST_UNNAMED
+        sure = named or radius[at.point == p].max() < 3 * _MIN_PX
+        least = _MIN_IMAGES if sure else _MIN_UNNAMED
         if not why and len(chosen) < least:
             why = f"it was seen in {len(chosen)}, and {least} are needed" if len(group) else "it was not seen"
         if why:
@@ -262,7 +262,7 @@ def _fit_of_others(taken: dict[int, list[int]], fit_px: Float[np.ndarray, "n"]) 
     """Median fit of the targets of the other points; infinite for too few."""
     fits_of = {p: float(np.median(fit_px[rows])) for p, rows in taken.items()}
     others = {p: [fit for q, fit in fits_of.items() if q != p] for p in fits_of}
-    return {p: float(np.median(fits)) if len(fits) >= _LEAST_IMAGES else np.inf for p, fits in others.items()}
+    return {p: float(np.median(fits)) if len(fits) >= _MIN_IMAGES else np.inf for p, fits in others.items()}
 
 
 def _meeting(origins, directions, image, limit, fit, near, of_point) -> tuple[np.ndarray, str]:
@@ -270,8 +270,8 @@ def _meeting(origins, directions, image, limit, fit, near, of_point) -> tuple[np
     one, other = np.triu_indices(len(image), 1)
     apart = image[one] != image[other]
     one, other = one[apart], other[apart]
-    if len(one) > _MOST_PAIRS:
-        pick = np.linspace(0, len(one) - 1, _MOST_PAIRS).astype(int)
+    if len(one) > _MAX_PAIRS:
+        pick = np.linspace(0, len(one) - 1, _MAX_PAIRS).astype(int)
         one, other = one[pick], other[pick]
     none = np.zeros(0, int)
     if not len(one):
@@ -290,7 +290,7 @@ def _meeting(origins, directions, image, limit, fit, near, of_point) -> tuple[np
     inside = misses(met[sure], origins, directions) < limit
     images = np.unique(image)
     score = np.stack([(inside & (image == i)).any(axis=1) for i in images]).sum(axis=0)
-    likely = np.flatnonzero(score >= min(score.max(), max(_LEAST_UNNAMED, _ALIKE * score.max())))
+    likely = np.flatnonzero(score >= min(score.max(), max(_MIN_UNNAMED, _ALIKE * score.max())))
     sharp = np.array([np.median(fit[inside[k]]) for k in likely])
     # Of the positions about as sharp as the sharpest, that of most photographs.
     miss = misses(met[sure], origins, directions).min(axis=1)

@@ -35,7 +35,7 @@ from jaxphoto.procedures.calibration import Board
 _RING, _MOST = 4.0, 1024
 _BLUR = 1.0
 # Tolerance of the area of a blob relative to the ellipse of its moments, its minimum area (px) and maximum elongation.
-_SHAPE, _LEAST_AREA, _ELONGATION = 0.06, 20, 6.0
+_SHAPE, _MIN_AREA, _ELONGATION = 0.06, 20, 6.0
 # Maximum shift of a fitted centre over the smaller half axis.
 _MOVED = 0.5
 
@@ -104,10 +104,10 @@ def _components(mask: np.ndarray):
         if len(contour) < 12:
             continue
         left, top, wide, high = cv2.boundingRect(contour)
-        if left <= 1 or top <= 1 or left + wide >= width - 1 or top + high >= height - 1 or wide * high < _LEAST_AREA:
+        if left <= 1 or top <= 1 or left + wide >= width - 1 or top + high >= height - 1 or wide * high < _MIN_AREA:
             continue
         m = cv2.moments(contour)
-        if m["m00"] < _LEAST_AREA:
+        if m["m00"] < _MIN_AREA:
             continue
         centre = np.array([m["m10"], m["m01"]]) / m["m00"]
         covariance = np.array([[m["mu20"], m["mu11"]], [m["mu11"], m["mu02"]]]) / m["m00"]
@@ -293,7 +293,7 @@ def disc_reflectance(board: Board, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.n
     return np.where(black, 0.0, 1.0)
 
 
-_LEAST = 6
+_MIN_TARGETS = 6
 _NEIGHBOURS = 8
 # Tolerances over the distance of neighbours: of a hypothesis, and of a homography of a distorted picture.
 _OFF, _NEAR = 0.25, 0.3
@@ -320,8 +320,8 @@ class CircularTargets(Pattern):
         ids = tuple(table.ids("point").tolist())
         if len(set(ids)) < len(ids):
             raise InputError(f"{path.name}: a point stands there twice; give each target an id of its own")
-        if len(ids) < _LEAST:
-            raise InputError(f"{path.name}: {len(ids)} targets are too few; a photograph needs {_LEAST} of them")
+        if len(ids) < _MIN_TARGETS:
+            raise InputError(f"{path.name}: {len(ids)} targets are too few; a photograph needs {_MIN_TARGETS} of them")
         self.board = Board(path.stem, ids, xyz, diameter / 1000)
         plane = self.board.plane
         if plane is None:
@@ -369,7 +369,7 @@ def identified(
 
     Y is up if the field is seen from its front; the front of an `upright` field is unknown.
     """
-    if len(blobs.column_row) < _LEAST:
+    if len(blobs.column_row) < _MIN_TARGETS:
         return None
     labellings: list[_Labelling] = []
     for side in (1, -1):
@@ -439,7 +439,7 @@ def _grown(flat, pairs, blobs) -> tuple[np.ndarray, float] | None:
         good = distance.min(axis=1) < _NEAR * np.linalg.norm(other - places, axis=1)
         good &= distance.argmin(axis=0)[blob] == np.arange(len(flat))
         pairs = np.column_stack([np.flatnonzero(good), blob[good]])
-    if len(pairs) < _LEAST:
+    if len(pairs) < _MIN_TARGETS:
         return None
     # Homography of the final pairs.
     h, _ = cv2.findHomography(flat[pairs[:, 0]], blobs.column_row[pairs[:, 1]])
