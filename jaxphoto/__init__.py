@@ -1,6 +1,6 @@
 """jaxphoto: differentiable photogrammetry on JAX.
 
-Importing it switches JAX to float64 (docs/precision.md) and, unless you chose otherwise, keeps compiled code in a
+Importing it switches JAX to float64 (docs/statistics.md) and, unless you chose otherwise, keeps compiled code in a
 cache on disk.
 """
 
@@ -17,7 +17,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import jax
 
 jax.config.update("jax_enable_x64", True)
-# One JAX device per core: large blocks are sharded over them (docs/scaling.md).
+# One JAX device per core: large blocks are sharded over them (docs/solver.md).
 _chosen = "host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
 if jax.config.values["jax_num_cpu_devices"] <= 0 and not _chosen:
     # Too late if JAX has already computed: its devices then stay as they are.

@@ -22,7 +22,7 @@ SigmaXY = Annotated[float, Option(help="Standard deviation of a laser point in e
 Systematic = Annotated[float, Option(help="Standard deviation of a common error of all heights.")]
 MaxRounds = Annotated[int, Option(min=1, help="Maximum number of outer iterations (surface lookup, adjustment).")]
 Trajectory = Annotated[
-    Path | None, Option(help="Trajectory of the scanner (docs/trajectory.md), on the clock of the cloud.")
+    Path | None, Option(help="Trajectory of the scanner (docs/georeferencing.md), on the clock of the cloud.")
 ]
 TrajectoryShift = Annotated[float, Option(callback=opt.finite, help="Trajectory time minus point cloud time.")]
 ExposureShift = Annotated[float, Option(callback=opt.finite, help="Point cloud time minus time_s of images.csv.")]
@@ -159,7 +159,7 @@ def simultaneous(
     max_rounds: MaxRounds = 20,
     adjust: Annotated[
         str | None,
-        Option(help="Estimate of the whole system, comma-separated: scanner,trajectory,camera (docs/joint.md)."),
+        Option(help="Estimate of the whole system, comma-separated: scanner,trajectory,camera (docs/boresight.md)."),
     ] = None,
     exposure_shift_s: ExposureShift = 0.0,
     control: Control = None,

@@ -32,7 +32,7 @@ def fly(
     pixel_mm: opt.PixelSize = None,
     model: opt.Distortion = "brown",
     no_lens_prior: Annotated[
-        bool, Option("--no-lens-prior", help="Omit the prior information of such lenses (docs/lens_priors.md).")
+        bool, Option("--no-lens-prior", help="Omit the prior information of such lenses (docs/target_calibration.md).")
     ] = False,
     rolling_shutter: Annotated[
         bool, Option("--rolling-shutter", help="Estimate the readout time of the rows from positions and times.")

@@ -12,7 +12,7 @@ import pytest
 from typer.main import get_command
 
 from jaxphoto.camera.undistortion import Keep
-from jaxphoto.extras.formats import CAMERAS_WRITTEN, EXPORTS, FORMATS, LOSS_PX
+from jaxphoto.extras.formats import CAMERAS_WRITTEN, LOSS_PX
 from jaxphoto.extras.photos.features import LONGEST_PX
 from jaxphoto.georeferencing import PATTERN_OF, ScannerCalibration
 from jaxphoto.io.clouds.cloud_reader import Returns
@@ -46,8 +46,6 @@ CHOICES = [
     (blocks.monte_carlo, "kind", [*PER, "noise"]),
     (blocks.sensitivity, "per", get_args(Per)),
     (blocks.halves, "method", ALIGNMENTS),
-    (files.convert, "source_format", FORMATS),
-    (files.convert, "to", ["block", *EXPORTS]),
     (files.camera, "out_format", CAMERAS_WRITTEN),
     (photographs.undistort, "keep", get_args(Keep)),
     (lidar.lidar_control, "method", METHODS),

@@ -86,7 +86,7 @@ def relative_orientation(
     `relative_orientations`). ValueError where `sigma_rad` is not positive or there are not as many rays of the one as
     of the other.
 
-    Sources: docs/orientation.md; Mikhail, Bethel and McGlone (2001), "Introduction to Modern Photogrammetry".
+    Sources: docs/photographs.md; Mikhail, Bethel and McGlone (2001), "Introduction to Modern Photogrammetry".
     """
     all_that_fit = relative_orientations(rays_1, rays_2, sigma_rad, robust, images)
     for one in all_that_fit:

@@ -1,4 +1,4 @@
-"""Rasters by rasterio: surface models, hillshades, photographs and orthophotos (docs/surface_model.md)."""
+"""Rasters by rasterio: surface models, hillshades, photographs and orthophotos (docs/clouds.md)."""
 
 import warnings
 from collections.abc import Iterator

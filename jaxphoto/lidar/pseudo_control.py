@@ -1,6 +1,6 @@
 """Pseudo control points: image features with heights from surrounding laser points.
 
-For a feature at (x, y) in an image of known orientation (paper 001, equations (1)-(3); docs/pseudo_control.md):
+For a feature at (x, y) in an image of known orientation (paper 001, equations (1)-(3); docs/lidar_heights.md):
 
 1. down the ray, cell by cell, to the first with a laser point as high as the ray: the visible surface (`sight`); 2.
 project the laser points around that place into the image; if they lie on two levels, as at a building, those of the
@@ -63,7 +63,7 @@ class PseudoControl(eqx.Module):
     """Intersections of the rays of features with a cloud, one per feature; NaN where refused or undetermined."""
 
     xyz: Float[ArrayLike, "*n 3"]
-    """X, Y, Z (m); X and Y are only as accurate as the orientation (docs/pseudo_control.md)."""
+    """X, Y, Z (m); X and Y are only as accurate as the orientation (docs/lidar_heights.md)."""
     sigma_z: Float[ArrayLike, "*n"]
     """Standard deviation of Z (m): 95 % of the errors are within 1.96 of it."""
     flag: Integer[ArrayLike, "*n"]

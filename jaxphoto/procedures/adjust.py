@@ -51,7 +51,7 @@ def adjust(
 
     `start` gives every unknown an approximate value; where it is None, those of the block are completed by resection
     and intersection, and where these do not reach all images, or lead nowhere, found from image points alone and
-    brought to the frame of what is known (docs/orient.md). `priors` says what is FREE, FIXED or Weighted; where it is
+    brought to the known frame (docs/photographs.md). `priors` says what is FREE, FIXED or Weighted; where it is
     None, what the block says. `more` are observations of any kind, those of your own among them (docs/extending.md),
     and parameters known beforehand together: they are added to `block.more`, so that the block of the result has them.
 

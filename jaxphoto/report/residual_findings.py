@@ -230,7 +230,7 @@ def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
                 matters, spoilt = True, moved > _SPOILT_BY_EFFECT
                 detail += f"; {path} would move by {moved:.1f} sigma"
         elif t.pattern.camera:
-            detail += ": no single usual term is most of it; try a distortion of more terms (docs/model_choice.md)"
+            detail += ": no single usual term is most of it; try a distortion of more terms (docs/stability.md)"
         elif several := [h for h in t.hints if abs(h.amount) > SIGNIFICANT_RATIO * h.sigma][:_SHOWN]:
             detail += f", each alone {_terms(t.pattern, several)}"
         # Suspects that the term explains are no blunders.

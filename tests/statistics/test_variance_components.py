@@ -192,7 +192,7 @@ def test_scatter_is_sigma_and_the_truth_lies_within_three():
     assert result["converged"].all()
     for k, true_factor in enumerate(TRUE.values()):
         supported = result["supported"][:, k]
-        # Of stations in plan 71 of 75 other flights supported one (docs/weights.md); the limit is three sigma below.
+        # Of stations in plan 71 of 75 other flights supported one (docs/statistics.md); the limit is three sigma below.
         assert supported.mean() >= 0.75
         factor, sigma = result["factor"][supported, k], result["sigma"][supported, k]
         assert (np.abs(factor - true_factor**2) > 3 * sigma).sum() <= 1

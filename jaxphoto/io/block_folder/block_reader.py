@@ -79,7 +79,7 @@ class BlockTables:
 def read_block(folder: str | Path, more: Iterable[type] = ()) -> Block:
     """The block that a folder describes (docs/block_folder.md).
 
-    `more` are classes of observations and of unknowns of your own (docs/extending_files.md).
+    `more` are classes of observations and of unknowns of your own (docs/extending.md).
 
     Raises InputError for a file, row or number that cannot be read and BlockError for observations that do not fit
     together. Warns (UserWarning) of columns, points and cameras that are not used.

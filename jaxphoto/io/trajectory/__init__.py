@@ -1,4 +1,4 @@
-"""GNSS/IMU trajectories from CSV and Applanix SBET, and back (docs/trajectory.md)."""
+"""GNSS/IMU trajectories from CSV and Applanix SBET, and back (docs/georeferencing.md)."""
 
 from pathlib import Path
 

@@ -3,7 +3,7 @@
 The images give the position of a tie point, the cloud the height there, and the images are re-adjusted with this
 height: iterated to convergence (paper 001). With `method` "image" the height is that of the pseudo control point of
 paper 001, interpolated in the image; otherwise it is `lidar.heights_at`. Control is vertical only; the reason is in
-docs/pseudo_control.md.
+docs/lidar_heights.md.
 """
 
 import dataclasses
