@@ -179,7 +179,7 @@ def read_camera_file(
     size_px: tuple[int, int] | None = None,
     block: str | Path | None = None,
 ) -> CameraFile:
-    """Read the camera in a file of another program (docs/camera_files.md) or of jaxphoto itself.
+    """Read the camera in a file of another program (docs/formats.md) or of jaxphoto itself.
 
     The content tells the format. `path` may be a folder of results, of a flight, a block folder or a COLMAP model.
     `camera` chooses one of several; `pixel_mm` and `size_px` complete what the file lacks; `block` is the block of an

@@ -41,30 +41,11 @@ GIVEN = {
             "--out DRAWS": "--draws 20 --out DRAWS",
         },
     ),
-    "docs/camera_files.md": Given(
-        "jaxphoto example cross_block --out block\njaxphoto adjust block --out results\n"
-        "jaxphoto camera block/block.toml --out calib.yml\n"
-        "jaxphoto camera block/block.toml --distortion smac --out report.txt\n"
-    ),
-    "docs/certificate.md": Given(_RESULTS),
     "docs/clouds.md": Given("made_photographs blank PHOTO\n"),
     "docs/command_line.md": Given(_BLOCK),
     "docs/control.md": Given(_FLIGHT + "jaxphoto orient PHOTOGRAPHS/*.jpg --out BLOCK\n"),
-    "docs/exports.md": Given(
-        _BLOCK + _RESULTS + _FLIGHT,
-        {
-            "CAMERA_OR_RESULTS": "PHOTOGRAPHS.toml",
-            "RESULTS OUT --to FORMAT": "RESULTS A --to colmap",
-            "FORMAT": "opensfm",
-        },
-    ),
-    "docs/orientations.md": Given(
-        "jaxphoto example cross_block\njaxphoto convert cross_block FOLDER --to metashape --adjust\n"
-    ),
+    "docs/formats.md": Given(_FLIGHT, {"CAMERA_OR_RESULTS": "PHOTOGRAPHS.toml"}),
     "docs/photographs.md": Given(_FLIGHT),
-    "docs/reconstructions.md": Given(
-        "jaxphoto example cross_block\njaxphoto convert cross_block FILE_OR_FOLDER --to openmvg --adjust\n"
-    ),
     "docs/solver.md": Given(_BLOCK + "cp -r BLOCK block\necho 'import jaxphoto' > my_script.py\n"),
     "docs/statistics.md": Given(_BLOCK),
     "docs/stability.md": Given(
@@ -96,6 +77,15 @@ NOT_RUN = {
         "checks that .ci/run makes",
         ".venv/bin/pytest -m quick\n.venv/bin/pytest -n 2 tests/camera\n": "runs these tests",
     },
+    "docs/formats.md": {
+        **{
+            f"jaxphoto convert cross_block {name} --to {format} --adjust\n\njaxphoto convert {name} from_{name}\n"
+            f"jaxphoto adjust from_{name} --out results_{name}\n": "runs in test_other_programs.py"
+            for name, format in (("metashape", "metashape"), ("colmap", "colmap"), ("pix4d", "opk"))
+        },
+        'jaxphoto convert "$JAXPHOTO_DATA/sxb" strasbourg\njaxphoto adjust strasbourg --out results_dbat\n': "runs in "
+        "test_other_programs.py",
+    },
     "docs/half_an_hour.md": {"python3 -m venv venv && . venv/bin/activate && pip install jaxphoto": _INSTALLS},
     "docs/install.md": {
         "pip install 'jaxphoto'\n": _INSTALLS,
@@ -110,7 +100,6 @@ NOT_RUN = {
 PYTHON_NOT_RUN = ("docs/solver.md",)
 # Pages whose blocks run in a test of their own, which looks at what comes out.
 ELSEWHERE = {
-    "docs/from_other_programs.md": "test_from_other_programs.py",
     "docs/half_an_hour.md": "test_half_an_hour.py",
     "docs/papers.md": "test_commands_on_pages.py",
 }

@@ -559,5 +559,5 @@ def test_features_lie_where_the_map_says(tmp_path):
 
 
 def test_the_page_names_every_format():
-    page = (Path(__file__).parents[2] / "docs" / "exports.md").read_text()
-    assert re.findall(r"^\| `([\w-]+)` \|", page.split("## Signs")[0], re.MULTILINE) == list(EXPORTS)
+    page = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| `([\w-]+)` \|", page.split("## Export")[1], re.MULTILINE) == list(EXPORTS)

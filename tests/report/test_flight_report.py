@@ -50,8 +50,10 @@ def test_the_verdict_is_first_then_linked_contents_of_all_sections(page):
 
 def test_the_documentation_lists_the_sections_of_the_page(page):
     told = re.findall(r'<h2 id="[^"]+">([^<]+)</h2>', page)
-    document = (Path(__file__).parents[2] / "docs" / "flight_report.md").read_text(encoding="utf-8")
-    listed = re.findall(r"^\| ([^|]+) \|", document.split("## ")[0], re.MULTILINE)[2:]
+    document = (
+        (Path(__file__).parents[2] / "docs" / "report.md").read_text(encoding="utf-8").split("## Report of a flight")[1]
+    )
+    listed = re.findall(r"^\| ([^|]+) \|", document.split("\n\nThe rms")[0], re.MULTILINE)[2:]
     assert [t for t in told if t not in ("Part 2", "Files")] == [t for t in listed if t in told]
     # Sections of blocks with control, check points, more than one mount, or variance components.
     optional = {"Mounts and strips", "Control points", "Check points: surveyed minus computed", "Variance components"}

@@ -137,7 +137,7 @@ def _cameras(path: Path, names: list[str]) -> tuple[dict[str, ProjectCamera], li
     near = (p for p in sorted(path.parent.iterdir()) if p.is_file() and not p.name.startswith("."))
     files = [p for p in near if p.suffix.lower() in _CAMERAS]
     if len(files) != 1:
-        raise InputError(f"{path.parent} holds {len(files)} camera files and needs one (docs/camera_files.md)")
+        raise InputError(f"{path.parent} holds {len(files)} camera files and needs one (docs/formats.md)")
     file, beside = files[0], path.with_name(IMAGES)
     if not beside.is_file():
         try:

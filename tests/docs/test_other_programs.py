@@ -1,4 +1,4 @@
-"""Half an hour from other programs: the commands of docs/from_other_programs.md, and the camera that each comes to."""
+"""Projects of other programs: the commands of docs/formats.md, and the camera that each results in."""
 
 import re
 from pathlib import Path
@@ -8,15 +8,15 @@ import pytest
 
 from tests.commands import run_script
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "from_other_programs.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "formats.md"
 
 
 def scripts():
-    """The shell lines of each section, those before the first under ''."""
-    parts = re.split(r"^## (.+)$", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    """Return the shell lines of each section, after those that write the example."""
+    parts = re.split(r"^#{2,3} (.+)$", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE)
     return {
-        name: "\n".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL))
-        for name, text in zip(["", *parts[1::2]], parts[::2], strict=True)
+        name: "\n".join(["jaxphoto example cross_block", *re.findall(r"```sh\n(.*?)```", text, re.DOTALL)])
+        for name, text in zip(parts[1::2], parts[2::2], strict=True)
     }
 
 
@@ -26,11 +26,11 @@ def estimated(results):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("program", "px_mm"), [("Metashape", 0.008), ("COLMAP", 0.001), ("Pix4D", 0.008)])
-def test_what_the_example_plays_comes_to_its_camera(program, px_mm, tmp_path):
-    run_script(scripts()[""] + scripts()[program], tmp_path)
+def test_the_exported_example_results_in_its_camera(program, px_mm, tmp_path):
+    run_script(scripts()[program], tmp_path)
     found = estimated(tmp_path / f"results_{program.lower()}")
     c, sigma = found.loc["c_mm"] * 0.008 / px_mm
-    # The truth, and that photographs alone know it to some 1.2 %.
+    # The true value; a free network determines c to some 1.2 %.
     assert abs(c - 34.25) < 4 * sigma and 0.2 < sigma < 0.8
     assert (tmp_path / f"results_{program.lower()}" / "report.html").stat().st_size > 10_000
 
