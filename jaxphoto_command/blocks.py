@@ -66,7 +66,7 @@ def adjust(
     from jaxphoto.procedures.weights import made_by_blunders
     from jaxphoto.statistics import SPLITS
     from jaxphoto.writing import check_folder, whole_folder
-    from jaxphoto_command.provenance import Provenance
+    from jaxphoto_command.certificate import Provenance
 
     splits = tuple(dict.fromkeys(opt.names(weights)))
     if unknown := [name for name in splits if name not in (*SPLITS, "group")]:
@@ -166,7 +166,7 @@ def certificate(
     camera: opt.Camera = None,
 ) -> None:
     """Write the certificate of a calibration: parameters, precision, stability, inputs."""
-    from jaxphoto.io.results_judged import read_summary, reservation
+    from jaxphoto.io.result_tables import read_summary, reservation
     from jaxphoto.writing import check_room
     from jaxphoto_command.certificate import certificate_document, write_certificate
 
@@ -190,7 +190,7 @@ def tables(
 ) -> None:
     """Write tables of results as CSV, Parquet, Markdown or LaTeX, rounded to their standard deviations."""
     from jaxphoto.io import read_result_tables
-    from jaxphoto.io.results_judged import read_summary, reservation
+    from jaxphoto.io.result_tables import read_summary, reservation
     from jaxphoto.report import write_table
     from jaxphoto.writing import check_folder, whole_folder
 

@@ -181,8 +181,7 @@ def simultaneous(
 
     from jaxphoto.georeferencing import Scanner
     from jaxphoto.io import clouds, read_block
-    from jaxphoto.io.trajectory import write_moved
-    from jaxphoto.io.trajectory.in_frame import trajectory_in, with_positions
+    from jaxphoto.io.trajectory import trajectory_in, with_positions, write_moved
     from jaxphoto.lidar import HeightSettings
     from jaxphoto.lidar.correction import correct_cloud, scanner_path
     from jaxphoto.lidar.coverage import check_covered

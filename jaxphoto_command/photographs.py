@@ -92,7 +92,7 @@ def fly(
         write_part_orientation,
     )
     from jaxphoto.writing import check_folder, whole_folder
-    from jaxphoto_command.provenance import Provenance, certify
+    from jaxphoto_command.certificate import Provenance, certify
 
     if control is None and (marks or control_epsg or targets):
         raise typer.BadParameter("--marks, --control-epsg and --targets need --control FILE.")
@@ -232,7 +232,7 @@ def control(
     from jaxphoto.report.page import versions
     from jaxphoto.report.results import write_results, write_summary
     from jaxphoto.writing import check_folder, whole_folder
-    from jaxphoto_command.provenance import Provenance
+    from jaxphoto_command.certificate import Provenance
 
     files = [path for path in (file, marks) if path]
     check_folder(out, block, *files)
@@ -390,9 +390,9 @@ def orient(
     from jaxphoto.extras.photos.photograph_pairs import photograph_pairs, usual_choice
     from jaxphoto.io.block_folder import check_block_target, whole_block
     from jaxphoto.io.block_folder.table_layout import TOML
-    from jaxphoto.io.json_file import read_json
     from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
     from jaxphoto.io.photographs import photographs, sensor_and_interior
+    from jaxphoto.io.text_files import read_json
     from jaxphoto.procedures.calibration import distortion_model
     from jaxphoto.procedures.orientation import orient
     from jaxphoto.report.orientation import print_orientation, write_orientation

@@ -19,10 +19,9 @@ from jaxphoto.initial import approximate
 from jaxphoto.io import clouds, read_block, write_block
 from jaxphoto.io.block_folder import exposure_times
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, Placement
-from jaxphoto.io.names import points_called
 from jaxphoto.io.raster import write_dsm
-from jaxphoto.io.trajectory import Records, read_records, write_moved
-from jaxphoto.io.trajectory.in_frame import trajectory_in, with_poses
+from jaxphoto.io.text_tables import points_matching
+from jaxphoto.io.trajectory import Records, read_records, trajectory_in, with_poses, write_moved
 from jaxphoto.lidar.cell_returns import CellTally
 from jaxphoto.lidar.correction import scanner_path
 from jaxphoto.lidar.coverage import CoveredTimes
@@ -194,7 +193,7 @@ def cloud_records(trajectory: Path, shift_s: float) -> Records:
 
 def _photographs(block: Path, flight: StripFiles, fixed_camera: bool) -> Photographs:
     read, times = read_block(block), exposure_times(block) + flight.exposure_shift_s
-    breaklines = points_called(read.points, names(flight.breaklines), "--breaklines")
+    breaklines = points_matching(read.points, names(flight.breaklines), "--breaklines")
     return Photographs(interior_held(read) if fixed_camera else read, times, breaklines)
 
 

@@ -27,11 +27,14 @@ LONG = (
     "boresight",
     "control",
     "extending",
+    "georeferencing",
     "monte_carlo",
     "network_design",
+    "notebook",
     "papers",
     "sensitivity",
     "statistics",
+    "time_dependent_cameras",
     "trust",
 )
 

@@ -14,7 +14,7 @@ import pandas as pd
 
 from jaxphoto.block import Block
 from jaxphoto.io.draws_folder import DrawsFolder, digest_of
-from jaxphoto.io.json_file import read_json
+from jaxphoto.io.text_files import read_json
 from jaxphoto.report.draws import (
     LONG,
     Moments,

@@ -15,10 +15,10 @@ from tests.io import (
     control_files,
     oriented_files,
     test_bal,
+    test_camera_formats,
     test_cameras,
     test_colmap,
     test_reconstructions,
-    test_robotics_cameras,
 )
 from tests.io.conftest import FILES
 
@@ -113,7 +113,7 @@ PROJECTS = {
     "blocksexchange": [test_reconstructions.write_blocks_exchange, _exported("blocksexchange")],
     "bundler": [test_reconstructions.write_bundler, _exported("bundler")],
     "pix4d": [test_reconstructions.write_pix4d],
-    "metashape": [oriented_files.write_metashape, oriented_files.write_metashape_beside],
+    "metashape": [oriented_files.write_metashape, _exported("metashape")],
     "texts": [oriented_files.write_angles, oriented_files.write_patb, oriented_files.write_bingo, _exported("opk")],
     "nerfstudio": [oriented_files.write_nerfstudio],
     "orthority": [oriented_files.write_orthority, _exported("orthority")],
@@ -122,8 +122,8 @@ CAMERAS = {
     "interior": ("interior.csv", test_cameras.INTERIOR), "block": ("a.toml", test_cameras.TOML),
     "agisoft": ("a.xml", test_cameras.AGISOFT), "smac": ("a.txt", test_cameras.SMAC),
     "colmap": ("cameras.txt", test_cameras.COLMAP), "opencv": ("a.yml", test_cameras.OPENCV),
-    "mrcal": ("a", test_robotics_cameras.mrcal("OPENCV8", test_robotics_cameras.RATIONAL)),
-    "kalibr": ("a.yaml", test_robotics_cameras.KALIBR),
+    "mrcal": ("a", test_camera_formats.mrcal("OPENCV8", test_camera_formats.RATIONAL)),
+    "kalibr": ("a.yaml", test_camera_formats.KALIBR),
 }  # fmt: skip
 CONTROL = {
     "gcp_list": control_files.GCP_LIST, "metashape": control_files.MARKERS, "geo_json": control_files.GEO_JSON,

@@ -198,6 +198,7 @@ def test_a_block_that_estimates_no_camera(tmp_path):
     assert not (tmp_path / "run" / "interior.png").exists()
 
 
+@pytest.mark.slow
 def test_a_block_that_estimates_a_scanner(tmp_path):
     nominal = adjusted("surfaces")
     wrong = bias(nominal.block, "station", 0.1, "block")

@@ -18,8 +18,16 @@ from jaxphoto.io import clouds
 from jaxphoto.io.clouds.cloud_reader import EVERY_CLASS
 from jaxphoto.io.raster import read_dsm
 from jaxphoto.io.recipe.truth import write_simulation
-from jaxphoto.io.trajectory import FIELDS, read_sbet, sbet_records, with_records, write_sbet
-from jaxphoto.io.trajectory.in_frame import positions_in, records_of, with_poses
+from jaxphoto.io.trajectory import (
+    FIELDS,
+    positions_in,
+    read_sbet,
+    records_of,
+    sbet_records,
+    with_poses,
+    with_records,
+    write_sbet,
+)
 from jaxphoto.lidar.strip_correction import correct_flight
 from jaxphoto.procedures.lidar import kept_returns
 from jaxphoto_command.strip_flight import write_corrected

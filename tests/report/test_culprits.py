@@ -26,6 +26,7 @@ def without_k2():
     return verdict_of(Tables(adjust(block.fix("k2"))))
 
 
+@pytest.mark.slow
 def test_a_term_that_is_held_is_told_before_the_observations_that_it_accuses(without_k2):
     assert without_k2.colour == "red"
     first = next(k for k, text in enumerate(without_k2.texts) if "k2, which is fixed: free it" in text)
@@ -33,6 +34,7 @@ def test_a_term_that_is_held_is_told_before_the_observations_that_it_accuses(wit
     assert accused and first < min(accused)
 
 
+@pytest.mark.slow
 def test_parameters_are_called_as_people_call_them(without_k2):
     told = " ".join(without_k2.texts)
     assert "k1 of camera one would move by" in told or "c of camera one would move by" in told

@@ -15,6 +15,7 @@ from jaxphoto.report import Tables, verdict_of
 from jaxphoto.report.residual_findings import snooped_findings
 from jaxphoto.statistics import Suspect, covariance
 from jaxphoto.statistics.systematic_effects import truncated_inverse
+from tests.blocks import adjusted, simulated
 
 
 @pytest.fixture(scope="module")
@@ -44,10 +45,11 @@ def test_single_errors_are_no_shift(block):
     assert codes == ["rejected_observation"] * 5
 
 
-def test_a_group_all_of_whose_rows_go_is_told(block):
+def test_a_group_all_of_whose_rows_go_is_told():
     """A single scale bar, which nothing is left of."""
+    block = simulated("cross").block
     control = block.control
-    ends = np.array([block.points.index(name) for name in ("T1", "T3")])
+    ends = np.array([block.points.index(name) for name in ("p3", "p37")])
     one, other = (np.asarray(control.value)[control.who == p] for p in ends)
     bar = Distances(ends[None], np.array([np.linalg.norm(one - other) + 5.0]), np.array([0.02]))
     found = snoop(dataclasses.replace(block, distances=bar))
@@ -55,17 +57,33 @@ def test_a_group_all_of_whose_rows_go_is_told(block):
     assert left.group == "distances" and abs(left.error - 5.0) < 1.0
 
 
-def test_what_is_too_much_to_be_single_errors_is_an_alarm(block):
-    """x and y of an image exchanged."""
+def exchanged(block, name):
+    """The block with x and y of an image exchanged."""
     rows = block.image_points
-    xy, mine = np.array(rows.xy), rows.image == block.images.index("A3")
+    xy, mine = np.array(rows.xy), rows.image == block.images.index(name)
     xy[mine] = xy[mine][:, ::-1]
-    spoilt = block.with_observations({"image_points": dataclasses.replace(rows, xy=xy)})
-    first = snooped_findings(snoop(spoilt), spoilt)[0]
-    assert (first.code, first.severity) == ("rejected_images", "error") and first.subject.startswith("A3")
+    return block.with_observations({"image_points": dataclasses.replace(rows, xy=xy)}), np.flatnonzero(mine)
+
+
+def assert_alarm(snooped, block, name):
+    first = snooped_findings(snooped, block)[0]
+    assert (first.code, first.severity) == ("rejected_images", "error") and first.subject.startswith(name)
     assert "mirrored" in first.hint
 
 
+def test_an_image_of_which_most_is_rejected_is_an_alarm():
+    block, mine = exchanged(adjusted("cross").block, "i3")
+    left = tuple(Suspect("image_points", int(k), 0, "", 99.0, 1.0, 0.01, "mm") for k in mine)
+    assert_alarm(Snooped(adjusted("cross"), left, (), ()), block, "i3")
+
+
+@pytest.mark.slow
+def test_what_is_too_much_to_be_single_errors_is_an_alarm(block):
+    spoilt, _ = exchanged(block, "A3")
+    assert_alarm(snoop(spoilt), spoilt, "A3")
+
+
+@pytest.mark.slow
 def test_an_image_that_is_mirrored_is_an_alarm(block):
     """Collinearity holds behind a camera, too: from below nothing but one station would contradict it."""
     rows = block.image_points
@@ -88,6 +106,7 @@ def test_numbers_that_overflow_are_no_pattern():
     assert freedom == 0 and not inverse.any()
 
 
+@pytest.mark.slow
 def test_the_file_whose_units_are_wrong_is_left_out_and_its_mistake_named(block):
     """Heights of control in feet: the stations are right, and the search begins without control."""
     rows = block.control
@@ -98,9 +117,9 @@ def test_the_file_whose_units_are_wrong_is_left_out_and_its_mistake_named(block)
     first = snooped_findings(found, spoilt)[0]
     assert first.severity == "error" and "Z is in feet, not in metres" in first.hint
     # Each is predicted by what is in, and not by others that are out: as well as the others place the point.
-    adjusted = found.adjusted
-    height, sigma0 = np.asarray(adjusted.unknowns.points)[:, 2], float(adjusted.sigma0)
-    variance = np.asarray(covariance(adjusted).points)[:, 2, 2]
+    unknowns, sigma0 = found.adjusted.unknowns, float(found.adjusted.sigma0)
+    height = np.asarray(unknowns.points)[:, 2]
+    variance = np.asarray(covariance(found.adjusted).points)[:, 2, 2]
     for s in found.left_out:
         who = rows.who[s.row]
         assert s.error == pytest.approx(value[s.row] - height[who], abs=1e-4)

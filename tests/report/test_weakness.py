@@ -27,6 +27,7 @@ def tables(relief: float, stations: bool | float, names=("c_mm", "xp_mm", "yp_mm
     return Tables(adjust(measured(Simulated(free(built, "one", names), truth)).block))
 
 
+@pytest.mark.slow
 def test_a_field_of_known_targets_has_cures_of_its_own(monkeypatch):
     monkeypatch.setattr(verdict, "HIGH_CORRELATION", 0.5)
     monkeypatch.setattr(verdict, "HIGH_OWN_CORRELATION", 0.5)
@@ -41,6 +42,7 @@ def test_a_field_of_known_targets_has_cures_of_its_own(monkeypatch):
     assert "rotated by 90 degrees" in of_field and "targets alone" in of_field and "stations (GNSS)" not in of_field
 
 
+@pytest.mark.slow
 def test_a_high_correlation_that_no_image_feels_has_no_cure():
     """Stations that all shift alike: Z and c go together, and c is known well enough."""
     said = [f for f in verdict_of(tables(0.1, 1.0)).findings if "Z with c " in f.text]

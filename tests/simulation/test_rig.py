@@ -175,6 +175,7 @@ def test_a_late_camera_is_where_the_rig_has_come_to():
         np.testing.assert_allclose(rotation[k + 1], own, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_delay_of_a_camera_is_found():
     adjusted = adjust(late().block)
     assert adjusted.outcome is Outcome.CONVERGED

@@ -17,6 +17,7 @@ from tests.adjustment.dense import at_optimum
 from tests.blocks import adjusted, rows
 from tests.checked_types import unchecked
 from tests.commands import run
+from tests.marks import slow_but
 
 BLOCK = "everything"
 # Seven parts each; image points are one of them, or three.
@@ -32,7 +33,7 @@ def dense_traces(parts, name=BLOCK) -> np.ndarray:
     return membership.T @ r[: len(part), : len(part)] ** 2 @ membership
 
 
-@pytest.mark.parametrize("split", SPLITS)
+@pytest.mark.parametrize("split", slow_but([SPLITS[0]], SPLITS))
 def test_traces_are_those_of_dense_matrices(split):
     parts = partition_observations(adjusted(BLOCK), split)
     assert len(parts.labels) == 7

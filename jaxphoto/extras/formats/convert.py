@@ -15,12 +15,13 @@ from jaxphoto.camera import AbstractDistortion, InteriorOrientation, Perspective
 from jaxphoto.camera.conversion import Conversion, converted
 from jaxphoto.errors import InputError, few
 from jaxphoto.extras.formats.camera_models import CameraModel
-from jaxphoto.extras.formats.files import CameraFormat, Format, by_content, read_text
+from jaxphoto.extras.formats.files import CameraFormat, Format, by_content
 from jaxphoto.extras.formats.project import Project
 from jaxphoto.io.block_folder import BlockTables, assemble, write_block
 from jaxphoto.io.block_folder.block_reader import read_folder
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.camera_files import CAMERA_READERS, is_camera_file, joined_notes, reading, write_block_camera
+from jaxphoto.io.text_files import read_legacy_text
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 from jaxphoto.writing import check_folder, whole_file, whole_folder
 
@@ -330,8 +331,8 @@ def _target(
 
 
 def is_control_file(path: Path) -> bool:
-    """True if the content of a file is that of a control file other than a plain table."""
-    text = "" if gis.is_geopackage(path) else read_text(path)
+    """Return True if the content of a file is that of a control file other than a plain table."""
+    text = "" if gis.is_geopackage(path) else read_legacy_text(path)
     return any(format.recognise(path, text) for format in CONTROL_FORMATS.values())
 
 
@@ -340,10 +341,10 @@ def read_control(control: str | Path, marks: str | Path | None = None) -> GivenC
 
     The content tells the format of `FORMS`. Raises InputError if either is none.
     """
-    own = _read_control(Path(control))
-    if isinstance(own, Marks):
+    content = _read_control(Path(control))
+    if isinstance(content, Marks):
         raise InputError(f"{Path(control).name} has marks but no coordinates; give it as the marks")
-    points, seen = (own.points, own.marks) if isinstance(own, GivenControl) else (own, Marks.none())
+    points, seen = content if isinstance(content, GivenControl) else (content, Marks.none())
     if marks is not None:
         other = _read_control(Path(marks))
         if isinstance(other, SurveyedPoints):
@@ -362,7 +363,7 @@ def read_control(control: str | Path, marks: str | Path | None = None) -> GivenC
 
 
 def _read_control(path: Path) -> GivenControl | SurveyedPoints | Marks:
-    text = "" if gis.is_geopackage(path) else read_text(path)
+    text = "" if gis.is_geopackage(path) else read_legacy_text(path)
     chosen = next((f for f in CONTROL_FORMATS.values() if f.recognise(path, text)), control.TABLES)
     with reading(path, chosen.about):
         return chosen.read(path, text)
