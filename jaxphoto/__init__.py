@@ -80,8 +80,7 @@ if TYPE_CHECKING:
     from jaxphoto.extras.formats import convert, read_source
     from jaxphoto.io import read_block, read_recipe, write_block, write_simulation
     from jaxphoto.procedures.calibration import calibrate
-    from jaxphoto.procedures.compare import compare
-    from jaxphoto.procedures.halves import halves
+    from jaxphoto.procedures.compare import compare, halves
     from jaxphoto.procedures.lidar import simultaneous
     from jaxphoto.procedures.orientation import orient
     from jaxphoto.report import Tables
@@ -112,8 +111,7 @@ _LATER = {
     "extras.formats": ("convert", "read_source"),
     "io": ("read_block", "read_recipe", "write_block", "write_simulation"),
     "procedures.calibration": ("calibrate",),
-    "procedures.compare": ("compare",),
-    "procedures.halves": ("halves",),
+    "procedures.compare": ("compare", "halves"),
     "procedures.lidar": ("simultaneous",),
     "procedures.orientation": ("orient",),
     "report": ("Tables",),

@@ -266,7 +266,7 @@ def control(
         with whole_folder(out) as work:
             with whole_folder(work / "result") as folder:
                 method = {"block": "../block", **output.options()}
-                write_results(tables, verdict, folder, times, method, output.made_by(block, file, marks))
+                write_results(tables, verdict, folder, times, method, output.command_record(block, file, marks))
                 provenance.write(images, folder)
             write_control(result, work)
             write_summary({**verdict.summary, **control_summary(result), "versions": versions()}, work)
@@ -354,7 +354,7 @@ def calibrate(
             lambda folder: write_block(result.adjusted.block, folder / "block"),
             detections=targets.detections,
             start=camera.origin,
-            made=output.made_by(*images),
+            record=output.command_record(*images),
             # An assumed pixel size is the unit of every length in the report.
             notes=() if pixel_mm is not None else (camera.origin,),
         )

@@ -22,13 +22,10 @@ from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, Placement
 from jaxphoto.io.raster import write_dsm
 from jaxphoto.io.text_tables import points_matching
 from jaxphoto.io.trajectory import Records, read_records, trajectory_in, with_poses, write_moved
-from jaxphoto.lidar.cell_returns import CellTally
-from jaxphoto.lidar.correction import scanner_path
+from jaxphoto.lidar.correction import correct_strips, scanner_path
 from jaxphoto.lidar.coverage import CoveredTimes
-from jaxphoto.lidar.raster import Raster
-from jaxphoto.lidar.strip_correction import correct_strips
-from jaxphoto.lidar.strip_differences import strip_differences
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.raster import Raster, strip_differences
+from jaxphoto.lidar.strip_planes import CellTally, StripSettings
 from jaxphoto.procedures.control import SurveyedPoints
 from jaxphoto.procedures.control.surveyed import system_of
 from jaxphoto.procedures.lidar import (
@@ -39,9 +36,9 @@ from jaxphoto.procedures.lidar import (
     adjust_strips,
     kept_returns,
 )
-from jaxphoto.procedures.lidar.iterate_to_convergence import at_result, interior_held
-from jaxphoto.procedures.lidar.looks import looks_of
+from jaxphoto.procedures.lidar.iterate_to_convergence import at_result, fix_interior
 from jaxphoto.procedures.lidar.strip_control import check_complete
+from jaxphoto.procedures.lidar.strip_model import looks_of
 from jaxphoto.procedures.lidar.vertical_control import tie_points
 from jaxphoto.report.strips import print_strips, strips_verdict, write_strips
 from jaxphoto.report.tables import Tables
@@ -148,7 +145,7 @@ def adjust_flight(output: Output, flight: StripFiles, choices: StripChoices, out
             priors,
             photographs=photographs,
             control=control,
-            held=choices.fixed_strips,
+            fixed=choices.fixed_strips,
             max_rounds=choices.max_rounds,
             report=report,
         )
@@ -176,8 +173,8 @@ def adjust_flight(output: Output, flight: StripFiles, choices: StripChoices, out
                 write_dsm(folder / f"differences_{name}.tif", raster, differences.system)
             return maps
 
-        made = output.made_by(cloud, trajectory, block, flight.control)
-        write_strips(result, tables, verdict, out, write_files, made)
+        record = output.command_record(cloud, trajectory, block, flight.control)
+        write_strips(result, tables, verdict, out, write_files, record)
     print_verdict(verdict, output.screen)
     print_strips(result, output.screen)
     output.wrote(out, f"results in {out} (open report.html)")
@@ -194,7 +191,7 @@ def cloud_records(trajectory: Path, shift_s: float) -> Records:
 def _photographs(block: Path, flight: StripFiles, fixed_camera: bool) -> Photographs:
     read, times = read_block(block), exposure_times(block) + flight.exposure_shift_s
     breaklines = points_matching(read.points, names(flight.breaklines), "--breaklines")
-    return Photographs(interior_held(read) if fixed_camera else read, times, breaklines)
+    return Photographs(fix_interior(read) if fixed_camera else read, times, breaklines)
 
 
 def _stated_sigmas(records: Records, stated: set[str]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:

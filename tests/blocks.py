@@ -6,13 +6,14 @@ aerial variants have the same points in the same images and share compiled progr
 
 import dataclasses
 import functools
+from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from jaxphoto import FIXED, FREE, Outcome, Unknowns, Weighted, adjust, covariance
+from jaxphoto import FIXED, FREE, Outcome, Unknowns, Weighted, adjust, covariance, read_block
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import Balanced, Brown, InteriorOrientation, Sensor, Smac, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
@@ -441,3 +442,15 @@ def adjusted(name: str):
 def covariance_of(name: str):
     """Covariance of `adjusted(name)`, rotations about the camera axes."""
     return covariance(adjusted(name), "camera")
+
+
+@functools.cache
+def example() -> Block:
+    """The block of examples/cross_block."""
+    return read_block(Path(__file__).parents[1] / "examples" / "cross_block")
+
+
+@functools.cache
+def adjusted_example():
+    """`example`, adjusted."""
+    return adjust(example())

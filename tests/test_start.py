@@ -19,10 +19,10 @@ from jaxphoto.io.clouds.cloud_reader import Returns
 from jaxphoto.io.clouds.coordinate_system import UNITS
 from jaxphoto.io.shipped import EXAMPLES
 from jaxphoto.lidar.raster import Statistic
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.losses import LOSSES
 from jaxphoto.parameters import dynamic_fields
-from jaxphoto.procedures.halves import CUTS
+from jaxphoto.procedures.compare import CUTS
 from jaxphoto.procedures.lidar.images_and_cloud import SHIFT_SIGMA, SURFACES
 from jaxphoto.procedures.lidar.iterate_to_convergence import MAX_ROUNDS
 from jaxphoto.procedures.lidar.strip_adjustment import MAX_STRIP_ROUNDS

@@ -1,4 +1,4 @@
-"""The experiment of docs/papers.md can be read and simulated, and its measures exist."""
+"""The example of docs/papers.md is read and simulated, and its measures exist."""
 
 import re
 from pathlib import Path

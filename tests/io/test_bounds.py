@@ -10,8 +10,8 @@ from jaxphoto.errors import BlockError, InputError, quoted, shown
 from jaxphoto.io import read_block, recipe_from
 from jaxphoto.io.draws_folder import DrawsFolder
 from jaxphoto.io.text_files import read_bytes, read_json, read_text
-from jaxphoto.simulation import visibility
-from jaxphoto.simulation.flight_plan import Footprint, Strip, Swaths
+from jaxphoto.simulation import points
+from jaxphoto.simulation.plans import Footprint, Strip, Swaths
 from tests.io.test_map_block import to_utm
 from tests.simulation.small import RECIPES, changed, made
 
@@ -84,7 +84,7 @@ def test_distant_strips_are_refused():
 
 def test_visibility_computed_in_parts_is_the_same(monkeypatch):
     whole = made().block.image_points
-    monkeypatch.setattr(visibility, "_PAIRS", 100)
+    monkeypatch.setattr(points, "_PAIRS", 100)
     parts = made().block.image_points
     for name in ("image", "point", "xy"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name))

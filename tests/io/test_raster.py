@@ -15,8 +15,7 @@ from jaxphoto import InputError, Sensor
 from jaxphoto.block import Frame
 from jaxphoto.cloud import Cloud
 from jaxphoto.io import clouds, raster, write_block
-from jaxphoto.lidar.orthophoto import Picture
-from jaxphoto.lidar.raster import Raster, filled, hillshade, surface_model
+from jaxphoto.lidar.raster import Picture, Raster, filled, hillshade, surface_model
 from tests.checked_types import unchecked
 from tests.commands import run
 from tests.lidar.photographs import rendered

@@ -33,8 +33,8 @@ from jaxphoto.simulation import (
     Terrain,
     Trees,
     Wave,
-    scan_plan,
-    settlement,
+    plans,
+    scene,
 )
 
 _KINDS: tuple[type[AbstractParameters], ...] = (*RATES, CameraSpline, StripCamera)
@@ -108,9 +108,9 @@ class PlanKeys(Keys):
 # Types of keys by types of fields.
 _TYPES: dict[Any, Any] = {
     float: Number, int: Whole, bool: StrictBool, str: StrictStr,
-    scan_plan.Triple: Triple, settlement.Range: PositiveRange,
+    plans.Triple: Triple, scene.Range: PositiveRange,
     tuple[tuple[float, float], ...]: list[Pair], tuple[tuple[float, ...], ...]: list[Place],
-    dict[str, scan_plan.Triple]: dict[str, Vector],
+    dict[str, plans.Triple]: dict[str, Vector],
 }  # fmt: skip
 
 
