@@ -71,7 +71,7 @@ class StripFiles(NamedTuple):
 
 
 class StripChoices(NamedTuple):
-    """What is adjusted, and how."""
+    """Parameters to adjust and their options."""
 
     settings: StripSettings
     stated: set[str]

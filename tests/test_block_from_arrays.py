@@ -166,7 +166,7 @@ def test_a_network_without_control_has_a_minimal_datum():
             {"image_points": POINTS | {"image": ["a"] * 4}},
             r"image_points, entry 1: point 1 is measured twice in image a",
         ),
-        ({"image_points": {k: [] for k in POINTS}}, r"image_points: there are none"),
+        ({"image_points": {k: [] for k in POINTS}}, r"image_points: empty"),
         (
             {"control": {"point": ["9"], **columns(XYZ, [[1.0, 2.0, 3.0]])}},
             r"control, entry 0: point 9 is measured in no image",

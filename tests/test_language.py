@@ -22,7 +22,7 @@ TERMS = {
     r"flaws?": "validation error",
     r"spoil(s|t|ed)?": "corrupt, invalid",
     r"upstairs|downstairs": "a layer above, below",
-    r"wander(s|ed|ing)?": "drift",
+    r"wander(s|ed|ing)": "drift",
     r"whoever|somebody": "a subject with a name",
     r"(is|are|was|were|be) told": "reported, given",
 }

@@ -120,7 +120,7 @@ class Adjustment(eqx.Module):
 
     @property
     def equations(self) -> NormalEquations:
-        """Normal equations for statistics; factored anew each time inside a JAX transformation."""
+        """Normal equations for statistics; refactored at each use inside a JAX transformation."""
         s, v = self.padded.structure, self.padded_values
         if self.factored is not None:
             return NormalEquations(v, s, self.factored)

@@ -10,7 +10,7 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD, _MMAP_MAX = -1, -3, -4
 _USUAL_MMAPS = 65_536
 _ALL = 2**31 - 1
 # Blocks up to this size come from freed memory, of which glibc keeps this much: the values it adapts to by itself once
-# it has freed such a block. Until then it may map work space anew at each call: 3.3 MB and a third of the solution time
+# it has freed such a block. Until then it may map new work space at each call: 3.3 MB and a third of the solution time
 # of P31.
 _LARGEST, _KEPT = 32 * 2**20, 64 * 2**20
 
@@ -35,7 +35,7 @@ def return_freed_memory() -> None:
 def freed_memory_kept() -> Iterator[None]:
     """Make glibc keep freed memory, for code that repeatedly allocates and frees the same gigabyte.
 
-    Otherwise every page is cleared and mapped anew each time, a third of the time of feature extraction. At the end it
+    Otherwise every page is cleared and mapped again each time, a third of the time of feature extraction. At the end it
     is returned. Threads benefit only where all share one arena, as in the command `jaxphoto`. Other C libraries are
     unaffected.
     """

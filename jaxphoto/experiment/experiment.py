@@ -136,12 +136,12 @@ def run_experiment(
 
 
 def simulated(experiment: Experiment, folder: Path, variant: str, layout: int = 0) -> Simulation:
-    """The block of one variant, before `Variant.change`, with its truth."""
+    """Return the block of one variant, before `Variant.change`, with its truth."""
     return simulate(_recipe(experiment.variants[variant], folder), layout)
 
 
 def _simulated(experiment: Experiment, recipes: Mapping[str, Recipe], layout: int) -> dict[str, Simulation]:
-    """The simulation of each variant; variants of one recipe share it."""
+    """Return the simulation of each variant; variants of one recipe share it."""
     simulations: dict[tuple[str, str], Simulation] = {}
     variants = {}
     for name, variant in experiment.variants.items():
@@ -153,7 +153,7 @@ def _simulated(experiment: Experiment, recipes: Mapping[str, Recipe], layout: in
 
 
 def _sizes(layouts: list[dict[str, Block]]) -> dict[str, PaddedSizes]:
-    """Padded sizes by variant: variants and layouts with as many images share compiled programs."""
+    """Return the padded sizes by variant: variants and layouts with as many images share compiled programs."""
     of_images: dict[int, list[Block]] = {}
     for block in (b for variants in layouts for b in variants.values()):
         of_images.setdefault(len(block.images), []).append(block)
@@ -196,7 +196,7 @@ def summary(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def read_published(folder: Path) -> pd.DataFrame:
-    """The cells that a paper prints; empty if `folder` has no published.csv. Raises InputError for a missing column."""
+    """Read the cells that a paper prints; empty without published.csv. Raises InputError for a missing column."""
     path = folder / "published.csv"
     if not path.is_file():
         return pd.DataFrame(columns=PUBLISHED)
@@ -210,7 +210,7 @@ def read_published(folder: Path) -> pd.DataFrame:
 
 
 def compare(run: Run, folder: Path) -> pd.DataFrame:
-    """The table tables.csv: every printed or computed cell; `within` is yes or no where there is a tolerance.
+    """Return the table tables.csv: every printed or computed cell; `within` is yes or no where there is a tolerance.
 
     `ours` is the mean over `n_layouts` layouts, `spread` its standard deviation from layout to layout.
     """
@@ -255,7 +255,7 @@ def _with_mean_differences(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def find_experiments(directory: Path, name: str) -> list[Path]:
-    """The folder of the experiment `name`, or of `all`, in `directory`. Raises InputError if there is none."""
+    """Return the folder of the experiment `name`, or of `all`, in `directory`. Raises InputError if there is none."""
     known = sorted(path.parent for path in directory.glob(f"*/{FILE}"))
     if not known:
         raise InputError(
@@ -270,7 +270,7 @@ def find_experiments(directory: Path, name: str) -> list[Path]:
 
 
 def load_experiment(folder: Path) -> Experiment:
-    """The EXPERIMENT that experiment.py in `folder` declares. Raises InputError where it does not."""
+    """Return the EXPERIMENT that experiment.py in `folder` declares. Raises InputError where it does not."""
     path = folder / FILE
     spec = importlib.util.spec_from_file_location(f"jaxphoto_experiment_{folder.name}", path)
     if spec is None or spec.loader is None or not path.is_file():

@@ -29,14 +29,14 @@ def named(variants: Iterable[str]) -> dict[str, str]:
 
 
 def _by_row(rows: Rows, columns: Callable[[Tables], Mapping[str, float]]) -> Measure:
-    """The measure whose rows are the `columns` of one variant each."""
+    """Return the measure whose rows are the `columns` of one variant each."""
     return lambda results: {
         (row, column): value for row, variant in rows.items() for column, value in columns(results[variant]).items()
     }
 
 
 def _by_pair(pairs: Iterable[tuple[str, str]], columns: Callable[[Tables, Tables], Mapping[str, float]]) -> Measure:
-    """The measure whose rows `first-second` are the `columns` of two variants each."""
+    """Return the measure whose rows `first-second` are the `columns` of two variants each."""
     pairs = list(pairs)
     return lambda results: {
         (f"{first}-{second}", column): value

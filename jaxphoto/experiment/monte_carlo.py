@@ -118,7 +118,7 @@ class MonteCarlo:
         return self._sum_up([c for c in self.folder.columns() if c not in _OF_DRAWS])
 
     def _written(self) -> tuple[dict, pd.DataFrame] | None:
-        """The summary and table of all draws on disk; None if they are incomplete."""
+        """Return the summary and table of all draws on disk; None if they are incomplete."""
         directory = self.folder.directory
         try:
             summary, table = read_json(directory / "summary.json"), pd.read_csv(directory / "summary.csv")
@@ -174,7 +174,7 @@ class MonteCarlo:
         return summary, table
 
     def _sigmas(self) -> dict[str, float]:
-        """By name of the error, angles in degrees."""
+        """Return the standard deviations by name of the error, angles in degrees."""
         pairs = zip(self.drawn.names, self.drawn.sigma, strict=True)
         return {name: float(np.degrees(v) if name.endswith("_rad") else v) for name, v in pairs}
 
@@ -208,7 +208,7 @@ class MonteCarlo:
 
 
 def _errors_line(drawn: Bias) -> str:
-    """The errors in a line: their number, the quantities, and a digest of the assignment."""
+    """Return the errors in a line: their number, the quantities, and a digest of the assignment."""
     where = sorted({path[0] if path[0] != "start" else path[2] for path in drawn.targets})
     paths = (".".join(map(str, path)).encode() for path in drawn.targets)
     digest = _digest(*drawn.index, *(np.frombuffer(path, np.uint8) for path in paths))

@@ -51,7 +51,7 @@ _TABLE = Environment(loader=PackageLoader("jaxphoto.experiment"), autoescape=Tru
 
 
 def index_page(experiments: Mapping[str, tuple[str, pd.DataFrame]]) -> str:
-    """A page with links to those of several experiments: name -> title and comparison."""
+    """Return a page with links to those of several experiments: name -> title and comparison."""
     parts: list[Part] = []
     for name, (title, t) in experiments.items():
         good, judged = int((t["within"] == "yes").sum()), int((t["within"] != "").sum())
@@ -60,7 +60,7 @@ def index_page(experiments: Mapping[str, tuple[str, pd.DataFrame]]) -> str:
 
 
 def experiment_page(run: Run, comparison: pd.DataFrame, record: CommandRecord | None = None) -> str:
-    """The page as HTML: agreement, the block of the first layout, each table as printed, check points."""
+    """Return the page as HTML: agreement, the block of the first layout, each table as printed, check points."""
     tables = [table_texts(str(name), cells) for name, cells in comparison.groupby("table", sort=False)]
     judged, good = (sum(table[name] for table in tables) for name in ("judged", "good"))
     verdict = f"{good} of {judged} printed values with a tolerance are within it"
@@ -96,7 +96,7 @@ def _parts(run: Run, comparison: pd.DataFrame, tables: list[dict]) -> Iterator[P
 
 
 def table_texts(name: str, cells: pd.DataFrame) -> dict:
-    """The texts of a printed table: title, columns, rows, notes, and the number of cells within their tolerance."""
+    """Format a printed table: title, columns, rows, notes, and the number of cells within their tolerance."""
     overall = cells["column"] == MEAN_DIFFERENCE
     shown = cells[~overall]
     # A note of a whole column is put at its heading, others at their cells; they are numbered in order.
@@ -195,7 +195,7 @@ def table_title(name: str) -> str:
 
 
 def heading(column: str, unit: str, power: int) -> str:
-    """The label of a column, with the unit of its name, else `unit`; its numbers are times 10**`power`."""
+    """Return the label of a column, with the unit of its name, else `unit`; its numbers are times 10**`power`."""
     stem, _, last = column.rpartition("_")
     named = last in _UNITS and bool(stem)
     of = (last if named else unit).replace("um", "µm")
@@ -206,7 +206,7 @@ def heading(column: str, unit: str, power: int) -> str:
 
 
 def power_of(values: Iterable[float]) -> int:
-    """The power of ten of a column of small numbers, 0 for others."""
+    """Return the power of ten of a column of small numbers, 0 for others."""
     largest = max((abs(v) for v in values), default=0.0)
     return math.floor(math.log10(largest)) if 0 < largest < _SMALL else 0
 
@@ -285,7 +285,7 @@ def comparison_figure(comparison: pd.DataFrame, table: str) -> Figure:
 
 
 def _both(comparison: pd.DataFrame, table: str) -> pd.DataFrame:
-    """The cells of a table that are both printed and ours."""
+    """Return the cells of a table that are both printed and ours."""
     cells = comparison[(comparison["table"] == table) & (comparison["column"] != MEAN_DIFFERENCE)]
     cells = cells[cells["published"].notna() & cells["ours"].notna()]
     if cells.empty:

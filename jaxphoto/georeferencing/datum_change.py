@@ -72,7 +72,7 @@ class DatumChange(NamedTuple):
             said = f"positions are brought from WGS 84 to the datum {self.datum} {by}: {plan:.2f} m in plan, {heights}"
         if self.better:
             grid, accuracy = self.better
-            said += f'; {grid}, which is not on this computer, gives {accuracy:g} m ("pyproj sync --file {grid}")'
+            said += f'; {grid}, which is not installed, gives {accuracy:g} m ("pyproj sync --file {grid}")'
         return (said,)
 
     def _changed(self, values: np.ndarray, with_height: bool | np.ndarray, direction: str) -> np.ndarray:

@@ -159,11 +159,11 @@ def _to_place(code: int, vertical: int | None) -> Transformer:
         if not grids:
             raise InputError(
                 f"PROJ has no transformation from the heights of EPSG:{vertical} ({heights.name}) to the ellipsoid of "
-                f"EPSG:{code}; give them above the ellipsoid ({_ON_ELLIPSOID})"
+                f"EPSG:{code}; give ellipsoidal heights ({_ON_ELLIPSOID})"
             )
         name = grids[0].short_name
         raise InputError(
-            f"the heights of EPSG:{vertical} ({heights.name}) need the geoid {name}, which is not on this computer; "
+            f"the heights of EPSG:{vertical} ({heights.name}) need the geoid {name}, which is not installed; "
             f'get it by "pyproj sync --file {name}", or give ellipsoidal heights ({_ON_ELLIPSOID})'
         )
     return group.transformers[0]

@@ -5,7 +5,7 @@
 3. Unknown images that see at least four known points are resected, those with the most known points first, and back to
    2. First only points whose rays meet at 1 degree or more serve; where nothing is left to orient, narrower ones do.
 
-Where everything is known beforehand, only the check that every point lies in front of its cameras runs.
+If all approximate values are given, only the check that every point lies in front of its cameras runs.
 """
 
 import dataclasses

@@ -2,7 +2,7 @@
 
 1. Essential matrices of random fives of points and both orientations of the best homography (`relative_search`).
 2. Least squares with the coplanarity condition from all of them, side by side. After each the gross errors are tested
-   for anew, until none changes. Every start has its own set of points; starts that come to the same are dropped.
+   for again, until none changes. Every start has its own set of points; starts that come to the same are dropped.
 3. The best is the result, with all that fit as well.
 4. Tests of what the rays do not determine: too few points, points on a line or on a critical surface, errors that no
    covariance describes (`nonlinearity`), images from one place, agreement no better than chance.
@@ -276,7 +276,7 @@ def _as_good(ends: list[tuple[float, RelativeOrientation]], pairs: RayPairs) -> 
 
 
 def _allowance(best: RelativeOrientation, other: RelativeOrientation, pairs: RayPairs) -> float:
-    """By how much the squared misclosures of an orientation as true as the best may be larger.
+    """Return the tolerance by which squared misclosures of an orientation as likely as the best may be larger.
 
     Of two orientations that both fit but for noise, such as of a flat scene, each point's squared misclosures differ
     with the variance 4 (1 - r^2), where r is their correlation.

@@ -71,7 +71,7 @@ def _time(shot: Any) -> str:
 
 
 def marked(conditions: Sequence[Conditions], used: Collection[str]) -> list[Conditions]:
-    """The conditions, with `used` set for the images `used` of a block."""
+    """Return the conditions, with `used` set for the images `used` of a block."""
     return [one._replace(used=one.image in used) for one in conditions]
 
 

@@ -157,4 +157,4 @@ def _reading(file: Path) -> Iterator[None]:
         yield
     # pyarrow raises KeyError or UnicodeDecodeError for damaged column names.
     except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError):
-        raise InputError(f"{file} is damaged: delete it, and its draws are made anew") from None
+        raise InputError(f"{file} is damaged: delete it, then its draws are repeated") from None

@@ -80,7 +80,7 @@ def read_exif(picture: Image.Image) -> Exif:
 
 
 def number(value: Any, positive: bool = False) -> float | None:
-    """A finite number of EXIF or XMP (Parrot writes fractions); None for anything else."""
+    """Return a finite number of EXIF or XMP (Parrot writes fractions); None for anything else."""
     try:
         result = float(Fraction(value)) if isinstance(value, str) and "/" in value else float(value)
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
@@ -89,12 +89,12 @@ def number(value: Any, positive: bool = False) -> float | None:
 
 
 def text(value: Any) -> str:
-    """A text of EXIF without padding, "" for anything else."""
+    """Return a text of EXIF without padding, "" for anything else."""
     return " ".join(value.replace("\0", " ").split()) if isinstance(value, str) else ""
 
 
 def xmp_fields(packet: Any) -> dict[str, str]:
-    """The attributes of drones in an XMP packet by `namespace:name`."""
+    """Return the attributes of drones in an XMP packet by `namespace:name`."""
     if isinstance(packet, bytes):
         packet = packet.decode("utf-8", "replace")
     if not isinstance(packet, str):
@@ -199,7 +199,7 @@ def _attitude(value: Callable[[str], float | None], space: str) -> CameraAttitud
 
 
 def _three(values: Sequence[float | None], above: float = -math.inf) -> tuple[float, float, float] | None:
-    """The three numbers if all exist and exceed `above`."""
+    """Return the three numbers if all exist and exceed `above`."""
     a, b, c = values
     return None if a is None or b is None or c is None or min(a, b, c) <= above else (a, b, c)
 

@@ -151,7 +151,7 @@ def _sensor_width(shot: Mapping, width_px: int, height_px: int) -> float | None:
 def sensor_and_interior(
     photographs: Sequence[Photograph], pixel_mm: float | None = None, c_mm: float | None = None
 ) -> CameraStart:
-    """The camera of `photographs`, all of one: from the arguments, else from EXIF.
+    """Return the camera of `photographs`, all of one: from the arguments, else from EXIF.
 
     The pixel size is that of the focal plane resolution, or follows from the focal length f and that of the same field
     on film, f35: the diagonal of the sensor is 43.27 mm f / f35. The principal distance is f; with a given pixel size
@@ -237,7 +237,7 @@ ONE_CAMERA: list[tuple[str, Callable[[Photograph], Hashable], str]] = [
 
 
 def valid_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], dict[str, str]]:
-    """The photographs of one camera in files and folders `paths`, and the reason for each skipped file.
+    """Return the photographs of one camera in files and folders `paths`, and the reason for each skipped file.
 
     Skipped are files that are not pictures or cut off, second files of one name, identical and edited copies, and those
     that differ from most in a property of `ONE_CAMERA`. Raises InputError for a path that does not exist, and if no
@@ -287,7 +287,7 @@ def valid_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
 
 
 def skipped_messages(skipped: Mapping[str, str]) -> list[str]:
-    """The reasons for skipped files, one message for more than three files with the same reason."""
+    """Return the reasons for skipped files, one message for more than three files with the same reason."""
     files: dict[str, list[str]] = {}
     for path, reason in skipped.items():
         files.setdefault(reason.removeprefix(f"{path}: "), []).append(path)
@@ -301,7 +301,7 @@ def skipped_messages(skipped: Mapping[str, str]) -> list[str]:
 
 
 def picture_files(paths: Sequence[str | Path]) -> list[Path]:
-    """The files among `paths`, and all pictures of the folders among them, by name; hidden files are skipped."""
+    """Return the files among `paths`, and all pictures of the folders among them, by name; hidden files are skipped."""
     files = []
     for path in map(Path, paths):
         inner = sorted(f for f in path.iterdir() if not f.name.startswith(".")) if path.is_dir() else []
@@ -343,7 +343,7 @@ def _hints(paths: Sequence[str | Path]) -> list[str]:
 
 
 def _series(name: str) -> str:
-    """A name without its numbers."""
+    """Return a name without its numbers."""
     return re.sub(r"\d+", "#", name)
 
 

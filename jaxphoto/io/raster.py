@@ -110,7 +110,7 @@ def write_orthophoto(
 
 
 def _geotiff(raster: Raster, system: CoordinateSystem) -> dict[str, Any]:
-    """The rasterio profile of a GeoTIFF on the cells of `raster`."""
+    """Return the rasterio profile of a GeoTIFF on the cells of `raster`."""
     rows, columns = raster.heights.shape
     return {
         "driver": "GTiff",
@@ -140,7 +140,7 @@ def _opened(path: Path) -> Iterator[rasterio.DatasetReader]:
 
 @contextmanager
 def _whole_raster(path: str | Path, **profile: Any) -> Iterator[DatasetWriter]:
-    """A raster to write into, which becomes the file `path`; in memory, because GDAL does not report a full disk."""
+    """Yield a raster to write, which becomes the file `path`; in memory, as GDAL does not report a full disk."""
     with _without_georeferencing(), MemoryFile() as memory:
         with memory.open(**profile) as file:
             yield file

@@ -101,13 +101,13 @@ def _listed(flight: Path) -> dict[str, str]:
 
 
 def _parts(folder: Path) -> list[Any] | None:
-    """The list of parts of a flight; None for other folders."""
+    """Return the list of parts of a flight; None for other folders."""
     parts = read_json(folder / SUMMARY).get("parts") if (folder / SUMMARY).is_file() else None
     return parts if isinstance(parts, list) else None
 
 
 def _sources(folder: Path, block: Path | None, part: int) -> tuple[Path, Path]:
-    """The folders of the results and of the block."""
+    """Return the folders of the results and of the block."""
     result = folder
     parts = None if (folder / INTERIOR).is_file() else _parts(folder)
     if parts is not None:
@@ -129,7 +129,7 @@ def _sources(folder: Path, block: Path | None, part: int) -> tuple[Path, Path]:
 
 
 def _block_of(folder: Path) -> Path:
-    """The block of results that their summary names, or the flight around them."""
+    """Return the block of results that their summary names, or the flight around them."""
     name = read_json(folder / SUMMARY).get("block") if (folder / SUMMARY).is_file() else None
     if isinstance(name, str) and name:
         return folder / name
@@ -142,7 +142,7 @@ def _block_of(folder: Path) -> Path:
 
 
 def _below(folder: Path, name: Any) -> Path | None:
-    """A folder in `folder`; None for any other name."""
+    """Return a folder in `folder`; None for any other name."""
     return folder / name if isinstance(name, str) and name != ".." and Path(name).name == name != "" else None
 
 
@@ -158,7 +158,7 @@ def _camera(result: Path, name: str, block: Block, source: Path) -> InteriorOrie
 def _values(
     result: Path, block: Path, file: str, column: str, ids: Sequence[str], numbers: tuple[str, ...]
 ) -> np.ndarray:
-    """The numbers of a table of results in the order of the block. Raise InputError for other ids."""
+    """Return the numbers of a table of results in the order of the block. Raise InputError for other ids."""
     path = result / file
     if not path.is_file():
         raise InputError(f"{path} is missing, which results have; adjust again")

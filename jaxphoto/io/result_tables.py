@@ -57,7 +57,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
 
 
 def reservation(summary: Mapping[str, Any]) -> str:
-    """The most severe warning about an adjustment (convergence, verdict, global test, prior); "" if none."""
+    """Return the most severe warning about an adjustment (convergence, verdict, global test, prior); "" if none."""
     if summary.get("converged") is False:
         return f"this adjustment did not converge, so its numbers are no results: {summary.get('outcome')}"
     if summary.get("verdict") == "red":
@@ -70,7 +70,7 @@ def reservation(summary: Mapping[str, Any]) -> str:
             f"sigma naught of this adjustment is {sigma0:.3g}, expected {expected:.3g}, a significant difference: its "
             "weights or its model are wrong, and its standard deviations with them"
         )
-    if prior_warnings := summary.get("doubts"):
+    if prior_warnings := summary.get("prior_warnings"):
         return f"this adjustment rests on an earlier one: {prior_warnings[0]}"
     return ""
 

@@ -41,7 +41,7 @@ class Table:
 
     @staticmethod
     def of(file: str, columns: dict[str, Any], rows: np.ndarray | None = None) -> "Table":
-        """A table of one file; without `rows`, lines are counted from 1."""
+        """Return a table of one file; without `rows`, lines are counted from 1."""
         n = len(next(iter(columns.values()))) if columns else 0
         return Table(file, columns, np.full(n, file, object), np.arange(1, n + 1) if rows is None else rows)
 
@@ -75,12 +75,12 @@ class Table:
             raise RowError(f"{self.place(lines[0])}: {message(lines[0])}", self.rows[lines].tolist())
 
     def text(self, column: str) -> np.ndarray:
-        """A column of text; empty strings if the file lacks it."""
+        """Return a column of text; empty strings if the file lacks it."""
         cells = self.columns.get(column)
         return np.full(len(self), "", object) if cells is None else np.asarray(cells, object)
 
     def ids(self, column: str) -> np.ndarray:
-        """A column of ids. Raises RowError for an empty one."""
+        """Return a column of ids. Raises RowError for an empty one."""
         values = self.text(column)
         self.check(values == "", lambda line: f"the {column} is empty; give its id or delete the row")
         return values
@@ -94,7 +94,7 @@ class Table:
         return index
 
     def numbers(self, column: str, *, empty: bool = False) -> np.ndarray:
-        """A column of finite numbers; `empty` permits NaN for empty cells and missing columns."""
+        """Return a column of finite numbers; `empty` permits NaN for empty cells and missing columns."""
         cells = self.columns.get(column)
         if cells is None:
             return np.full(len(self), np.nan)
@@ -112,7 +112,7 @@ class Table:
         return np.stack([self.numbers(column, empty=empty) for column in columns], axis=1)
 
     def sigmas(self, column: str) -> np.ndarray:
-        """A column of positive standard deviations; NaN for empty cells."""
+        """Return a column of positive standard deviations; NaN for empty cells."""
         values = self.numbers(column, empty=True)
         self.check(
             values <= 0,
@@ -208,7 +208,7 @@ def _cells(path: Path, lines: list[str], rows: list[int], separator: str) -> pd.
 
 
 def points_matching(points: Sequence[str], patterns: Iterable[str], where: str) -> tuple[str, ...]:
-    """The points that match `patterns` (* for any characters). Raises InputError for a pattern without a match."""
+    """Return the points that match `patterns` (* for any characters). Raises InputError for one without a match."""
     matching: dict[str, None] = {}
     for pattern in patterns:
         names = [point for point in points if fnmatch.fnmatchcase(point, pattern)]

@@ -80,7 +80,7 @@ class Section:
         return iter(self.values)
 
     def error(self, key: str, message: str) -> InputError:
-        """An error about one key, or with key "" about the whole table."""
+        """Return an error about one key, or with key "" about the whole table."""
         table = f"[{self.path}] " if self.path else ""
         return InputError(f"{self.file}, {table}{key}".rstrip(" ,") + f": {message}")
 
@@ -91,27 +91,27 @@ class Section:
                 raise self.error(key, f"no such key is known; use {', '.join(keys)} or remove it")
 
     def section(self, key: str) -> "Section":
-        """The table under `key`; empty if missing."""
+        """Return the table under `key`; empty if missing."""
         return Section(self.file, f"{self.path}.{key}" if self.path else key, self.values.get(key, {}))
 
     def model(self, kind: type[M]) -> M:
-        """The table as a model."""
+        """Return the table as a model."""
         return self._validated(kind.model_validate, self.values)
 
     def number(self, key: str, default: float | None = None) -> float:
-        """A finite number."""
+        """Return a finite number."""
         return self._value(_NUMBER, key, default)
 
     def positive(self, key: str) -> float:
-        """A finite number above zero."""
+        """Return a finite number above zero."""
         return self._value(_POSITIVE, key)
 
     def count(self, key: str) -> int:
-        """A whole number above zero."""
+        """Return a whole number above zero."""
         return self._value(_COUNT, key)
 
     def text(self, key: str, default: str | None = None) -> str:
-        """A piece of text."""
+        """Return a piece of text."""
         return self._value(_TEXT, key, default)
 
     def vector(self, key: str, size: int = 3) -> np.ndarray:
@@ -142,7 +142,7 @@ class Section:
         return Weighted(as_jax_array(value), as_jax_array(sigma))
 
     def covariance(self, key: str, rows: Any, size: int) -> np.ndarray:
-        """The covariance matrix of `size` numbers with these rows."""
+        """Return the covariance matrix of `size` numbers with these rows."""
         if not isinstance(rows, list) or [len(r) if isinstance(r, list) else 0 for r in rows] != [size] * size:
             raise self.error(
                 key, f"the covariance is no matrix of {size} x {size}; write {size} lists of {size} numbers"
@@ -172,7 +172,7 @@ class Section:
             raise self._sentence(errors, key) from None
 
     def _sentence(self, errors: ValidationError, key: tuple[str, ...]) -> InputError:
-        """The first error of pydantic with its place and cure."""
+        """Return the first error of pydantic with its place and cure."""
         error = errors.errors()[0]
         mistake = error.get("ctx", {}).get("error")
         place: list[Any] = [*key, *error["loc"], *([mistake.key] if isinstance(mistake, KeyMistake) else [])]
@@ -240,7 +240,7 @@ def toml_text(values: dict[str, Any]) -> str:
 
 
 def status(prior: Any, start: Any, scale: float = 1.0) -> str | dict[str, Any]:
-    """The status that `Section.prior` reads as `prior` of an unknown that starts at `start`."""
+    """Return the status that `Section.prior` reads as `prior` of an unknown that starts at `start`."""
     if isinstance(prior, Prior):
         return prior.name.lower()
     if not isinstance(prior, Weighted):

@@ -185,7 +185,7 @@ def inflated_components(
 def _rejected_in_part(
     adjusted: Adjustment, snooped: Snooped, partition: Partition, part: int
 ) -> tuple[int, tuple[str, ...]]:
-    """Number of rejected or exchanged components in a part, and their labels."""
+    """Return the number of rejected or exchanged components in a part, and their labels."""
     parts = partition_observations(adjusted, partition).part_of
     in_part = {name: np.atleast_2d(part_of) == part for name, part_of in parts.items()}
     out = [(s.words, in_part[s.group][:, s.row]) for s in snooped.left_out]

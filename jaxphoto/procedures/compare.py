@@ -220,7 +220,7 @@ def _units(block: Block, by: str) -> tuple[list[str], np.ndarray]:
 
 
 def _cuts(block: Block, by: str, camera: str, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Number of image points of each unit, and the units in the first half of each division (cuts, units).
+    """Return the number of image points of each unit, and the units in the first half of each division (cuts, units).
 
     The camera is in both halves of each.
     """
@@ -302,7 +302,7 @@ def _oriented(block: Block, chosen: Bool[np.ndarray, "images"]) -> Block:
 
 
 def _joint_covariance(adjusted: Adjustment, both: list[Adjustment], camera: str, names: tuple[str, ...]) -> np.ndarray:
-    """A posteriori covariance of the camera in both halves; common observations have the block's variance factor."""
+    """Return the covariance of the camera in both halves; common observations have the block's variance factor."""
     p = len(names)
     joint = np.zeros((2 * p, 2 * p))
     joint[:p, :p], joint[p:, p:] = (covariance(half).of_interior(camera, names) for half in both)

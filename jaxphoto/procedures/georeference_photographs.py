@@ -233,8 +233,9 @@ def _check_upright(block: Block, similarity: Similarity) -> None:
 
 
 def _rotation_sigma(here: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, "n 3"]) -> float:
-    """Standard deviation of the rotation about the longest direction of the positions (rad), from their extent across
-    it.
+    """Return the standard deviation (rad) of the rotation about the longest direction of the positions.
+
+    It follows from their extent across that direction.
     """
     across = np.linalg.svd(here - np.median(here, axis=0), compute_uv=False)
     # The extent includes the scatter of the positions.

@@ -27,7 +27,7 @@ class MatchedPart(NamedTuple):
         return int(self.gross[:, 2].sum())
 
     def groups(self, least: int = 2) -> list["MatchedPart"]:
-        """Connected groups, the largest first, of `least` photographs or more."""
+        """Return the connected groups, the largest first, of `least` photographs or more."""
         together = connected_images(len(self.names), self.pairs)
         return [self._of(group) for group in together if len(group) >= least]
 

@@ -56,7 +56,7 @@ class BlockPlaces(NamedTuple):
         return float(np.ptp(known, axis=0).max()) or 1.0 if len(known) else 1.0
 
     def ties(self, most: int) -> Int[np.ndarray, drawn]:
-        """Indices of known points; of more than `most` every n-th."""
+        """Return indices of known points; of more than `most` every n-th."""
         known = np.flatnonzero(self.point_known)
         return known[:: max(1, -(-len(known) // most))]
 
@@ -89,7 +89,7 @@ def _completed(places: np.ndarray, given: Any, groups: tuple[Any, ...]) -> np.nd
 
 
 def pyramids(source: Block | Adjustment, places: BlockPlaces, most: int) -> Float[np.ndarray, "images corners 3"]:
-    """A line along the edges of each image's pyramid; of more than `most` images for every n-th."""
+    """Return a line along the edges of each image's pyramid; of more than `most` images for every n-th."""
     block, start = (source, source.start.unknowns) if isinstance(source, Block) else (source.block, source.unknowns)
     images = np.flatnonzero(places.image_known & (np.asarray(block.start.image_known, bool) | (source is not block)))
     images = images[:: max(1, -(-len(images) // most))]
@@ -139,7 +139,7 @@ def plot_block(source: Block | Adjustment, ax: Axes | None = None, *, in_3d: boo
 
 
 def block_words(block: Block) -> str:
-    """Description of a plot of a block."""
+    """Return the description of a plot of a block."""
     control, check = (len(np.unique(rows.who)) for rows in (block.control, block.check))
     return (
         f"The block: {counted(len(block.images), 'camera station')}, {counted(len(block.points), 'object point')}, "
@@ -151,7 +151,7 @@ def block_words(block: Block) -> str:
 
 
 def block_view(adjusted: Adjustment, covariance: Covariance | None) -> Markup | None:
-    """The 3-D view as part of a page, with plotly.js inside; None if plotly is not installed (extra `report`)."""
+    """Return the 3-D view as part of a page, with plotly.js; None without plotly (extra `report`)."""
     try:
         figure = block_in_space(adjusted, covariance)
     except ImportError:
@@ -195,7 +195,7 @@ def block_in_space(source: Block | Adjustment, covariance: Covariance | None = N
 
 
 def _origin(places: BlockPlaces) -> Float[np.ndarray, 3]:
-    """A round origin of the drawn coordinates (m); zero where coordinates are small."""
+    """Return a round origin of the drawn coordinates (m); zero where coordinates are small."""
     known = places.points[places.point_known] if places.point_known.any() else places.stations[places.image_known]
     known = known[np.isfinite(known).all(axis=1)]
     middle = np.median(known, axis=0) if len(known) else np.zeros(3)

@@ -34,7 +34,7 @@ _SHIFTS = re.compile(r"strips\[.*\]\.shift_._m")
 
 
 def boresight_verdict(steps: Sequence[Step]) -> str:
-    """The result of the steps in one sentence."""
+    """Return the result of the steps in one sentence."""
     failed = [step.number for step in steps if not step.go_on]
     last = steps[-1].number
     if not failed:
@@ -109,7 +109,7 @@ def _short(path: str) -> str:
 
 
 def boresight_parts(steps: Sequence[Step]) -> list[Part]:
-    """The page: misalignments, then findings and estimates of each step."""
+    """Return the page: misalignments, then findings and estimates of each step."""
     parts: list[Part] = []
     if figure := boresight_figure(steps):
         parts.append(Heading("Misalignment and shifts"))

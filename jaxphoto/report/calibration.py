@@ -44,7 +44,7 @@ def photographs_table(calibration: Calibration) -> pd.DataFrame:
 
 
 def targets_figure(calibration: Calibration, image: str, picture: np.ndarray | None = None) -> Figure:
-    """The targets of one image, over its grey values if given, with enlarged residual vectors."""
+    """Return the targets of one image, over its grey values if given, with enlarged residual vectors."""
     rows, sensor = calibration.measured, calibration.sensor
     of_image = rows.image == rows.images.index(image)
     place, v = sensor.px_from_mm(rows.xy_mm[of_image]), calibration.residuals_px[of_image]
@@ -59,7 +59,7 @@ def targets_figure(calibration: Calibration, image: str, picture: np.ndarray | N
 def left_out_figure(
     calibration: Calibration, image: str, picture: np.ndarray | None = None, found: Detection | None = None
 ) -> Figure:
-    """A skipped image with the reason and the targets that were detected in it."""
+    """Return a skipped image with the reason and the targets that were detected in it."""
     place = np.zeros((0, 2)) if found is None else found.column_row
     figure = _image_figure(calibration.sensor, picture, f"{image}: not used, {calibration.left_out[image]}")
     figure.axes[0].plot(*place.T, "x", ms=5, color="tab:orange")
@@ -67,7 +67,7 @@ def left_out_figure(
 
 
 def _image_figure(sensor: Sensor, picture: np.ndarray | None, title: str) -> Figure:
-    """The image format in pixels, with grey values if given."""
+    """Return the image format in pixels, with grey values if given."""
     figure = new_figure(_WIDTH_INCHES, _WIDTH_INCHES * sensor.height_px / sensor.width_px + 0.6)
     axes = figure.subplots()
     if picture is not None:
@@ -165,7 +165,7 @@ def _images_page(calibration: Calibration, photographs: pd.DataFrame, shown: Seq
 
 
 def calibration_summary(calibration: Calibration) -> dict:
-    """The additional content of summary.json."""
+    """Return the additional content of summary.json."""
     return {
         "rms_px": calibration.rms_px,
         "n_images_used": len(calibration.measured.images),

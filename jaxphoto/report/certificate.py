@@ -122,7 +122,7 @@ class Certified(NamedTuple):
 
 
 def certificate_page(certified: Certified) -> str:
-    """The certificate as HTML. Raises InputError for a non-invertible distortion, and what `change` raises."""
+    """Return the certificate as HTML. Raises InputError for a non-invertible distortion, and what `change` raises."""
     model = next((f"{c.camera} {c.serial}".strip() for c in certified.conditions if c.camera), "")
     foot = f"inputs SHA-256 {digest_of_all(certified.files)[:16]}" if certified.all_inputs else "inputs unknown"
     parts = [part for section in _SECTIONS for part in section(certified)]
@@ -131,7 +131,7 @@ def certificate_page(certified: Certified) -> str:
 
 
 def _statement(certified: Certified) -> tuple[str, str]:
-    """The first sentence and its colour."""
+    """Return the first sentence and its colour."""
     colour, severities = certified.summary.get("verdict"), [severity for severity, _ in certified.findings]
     if certified.covariance is None:
         return "Not to be signed: nothing of this camera was estimated, or no correlations are kept.", "red"

@@ -67,7 +67,7 @@ def control_findings(control: ControlledBlock) -> list[Finding]:
 
 
 def control_summary(control: ControlledBlock) -> dict:
-    """The same for summary.json."""
+    """Return states and residuals of the control points for summary.json."""
     rejected = [name for name, state in zip(control.ids, control.state, strict=True) if state == "left out"]
     states = {
         state: {

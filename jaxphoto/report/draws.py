@@ -77,7 +77,7 @@ def draws_table(draws: Draws, adjusted: Adjustment, first: int = 0) -> pd.DataFr
 
 
 def in_degrees(name: str) -> str:
-    """The name of a column whose angles are in degrees."""
+    """Return the name of a column whose angles are in degrees."""
     return name.removesuffix("_rad") + "_deg" if name.endswith("_rad") else name
 
 
@@ -232,8 +232,10 @@ def write_draws_page(
 
 
 def correlation_cube(correlations: Correlations) -> xr.Dataset:
-    """The correlations of a camera: `interior` (parameter, with_parameter), `exterior` (image, element, parameter) and
-    `within_image` (image, element, with_element).
+    """Return the correlations of a camera.
+
+    `interior` (parameter, with_parameter), `exterior` (image, element, parameter) and `within_image` (image, element,
+    with_element).
     """
     # Imported here because it takes a third of a second.
     import xarray as xr
@@ -269,8 +271,10 @@ def covariance_array(known: Covariance) -> xr.DataArray:
 
 
 def draws_cube(draws: Draws, adjusted: Adjustment) -> xr.Dataset:
-    """A Monte Carlo: `shared` (draw, parameter), `error` (draw, of_error), `converged`, `iterations` and `fallback`
-    (draw); if kept, `exterior` (draw, image, element) and `points` (draw, point, axis).
+    """Return a Monte Carlo as a cube.
+
+    `shared` (draw, parameter), `error` (draw, of_error), `converged`, `iterations` and `fallback` (draw); if kept,
+    `exterior` (draw, image, element) and `points` (draw, point, axis).
     """
     import xarray as xr
 
@@ -321,7 +325,7 @@ def posterior_table(posterior: Posterior) -> pd.DataFrame:
 
 
 def posterior_figure(posterior: Posterior) -> Figure:
-    """The sample of each parameter with its Gaussian, and the pair that deviates most from its 95 % ellipse."""
+    """Return the sample of each parameter with its Gaussian, and the pair that deviates most from its 95 % ellipse."""
     names, factor = _names_and_factors(posterior)
     k = len(names)
     panels = k + (k > 1)

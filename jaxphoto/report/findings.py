@@ -110,14 +110,14 @@ class Verdict:
 
 
 def as_sentence(text: str) -> str:
-    """A text with a capital (except for symbols such as c and k2) and a full stop."""
+    """Return a text with a capital (except for symbols such as c and k2) and a full stop."""
     first = text.split(maxsplit=1)[0] if text.strip() else ""
     start = text if len(first) == 1 or re.search(r"[_\d]", first) else f"{text[:1].upper()}{text[1:]}"
     return start if start.endswith((".", "!", "?")) else f"{start}."
 
 
 def symbol(parameter: str) -> str:
-    """The symbol of a parameter: c of c_mm."""
+    """Return the symbol of a parameter: c of c_mm."""
     return _SYMBOLS.get(parameter, parameter)
 
 
@@ -131,6 +131,6 @@ def in_symbols(text: str) -> str:
 
 
 def p_words(p_value: float, digits: int = 1) -> str:
-    """A p-value in a sentence."""
+    """Return a p-value in a sentence."""
     text = of_p(p_value, digits)
     return f"p {text}" if text.startswith("<") else f"p = {text}"

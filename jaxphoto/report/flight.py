@@ -142,7 +142,7 @@ def _images(part: FlightPart) -> pd.DataFrame:
 
 
 def flight_verdict(flight: CalibratedFlight, reports: Sequence[PartReport], spoilt: Mapping[str, str]) -> Verdict:
-    """The verdict of the largest part, unconnected parts and unused images."""
+    """Return the verdict of the largest part, unconnected parts and unused images."""
     unused, found = len(flight.left_out) + len(spoilt), list(reports[0].verdict.findings)
     sizes = [len(r.part.oriented.block.images) for r in reports]
     if len(reports) > 1:
@@ -174,7 +174,7 @@ def flight_page(
     source: FlightSource,
     folders: Sequence[str],
 ) -> str:
-    """The page as HTML; `folders` have the results of the parts. The largest part is reported in full."""
+    """Return the page as HTML; `folders` have the results of the parts. The largest part is reported in full."""
     n_images = sum(len(r.images) for r in reports) + len(left_out) + len(spoilt)
     parts: list[Part] = [flight_summary(reports, n_images), *verdict_parts(verdict)]
     parts += _unused(left_out, spoilt)
@@ -199,7 +199,7 @@ def flight_page(
 
 
 def flight_summary(reports: Sequence[PartReport], n_images: int) -> pd.DataFrame:
-    """The summary of each part of the images that were `given`."""
+    """Return the summary of each part of the images that were `given`."""
     columns = {}
     for number, r in enumerate(reports, 1):
         adjusted, used = r.part.adjusted, r.images[r.images["position"] == "used"]
@@ -253,7 +253,7 @@ def coverage_section(report: PartReport) -> Iterator[Part]:
 
 
 def positions_section(report: PartReport, source: FlightSource) -> Iterator[Part]:
-    """Recorded minus adjusted positions: statistics, plots, and residuals compared with their sigmas."""
+    """Return the recorded minus adjusted positions: statistics, plots, and residuals compared with their sigmas."""
     part, table = report.part, report.images
     yield Heading("Recorded positions")
     yield from (Paragraph(as_sentence(s)) for s in source.positions_from)
@@ -326,7 +326,7 @@ def surveyed_section(report: PartReport) -> Iterator[Part]:
 
 
 def surveyed_parts(control: ControlledBlock) -> Iterator[Part]:
-    """The same without a heading."""
+    """Return the recorded positions without a heading."""
     state, rows = np.array(control.state, object), []
     for what in ("control", "check"):
         discrepancy = control.off_m[state == what]
@@ -357,7 +357,7 @@ def axis_cell(off_m: np.ndarray, rms_m: float) -> str:
 
 
 def links_section(report: PartReport) -> Iterator[Part]:
-    """The network of images by common points, and its weakest links."""
+    """Return the network of images by common points, and its weakest links."""
     adjusted, images = report.part.adjusted, report.part.adjusted.block.images
     links = image_links(adjusted)
     of_image = np.bincount(np.concatenate([links.first, links.second]), minlength=len(images))
@@ -440,7 +440,7 @@ def _orientation(report: PartReport) -> Iterator[Part]:
 
 
 def _smaller_part(report: PartReport, number: int, source: FlightSource) -> Iterator[Part]:
-    """Findings, camera, offsets, surveyed points, and orientation."""
+    """Return the findings, camera, offsets, surveyed points, and orientation."""
     yield Heading(f"Part {number}")
     yield Paragraph(as_sentence(report.verdict.headline), f"verdict {report.verdict.colour}")
     yield from verdict_parts(report.verdict)
@@ -502,12 +502,12 @@ def provenance_section(source: FlightSource) -> Iterator[Part]:
 
 
 def part_folder(number: int) -> str:
-    """The result folder of a part; the largest is number 1."""
+    """Return the result folder of a part; the largest is number 1."""
     return "result" if number == 1 else f"result_{number}"
 
 
 def block_folder(number: int) -> str:
-    """The block folder of a part."""
+    """Return the block folder of a part."""
     return "block" if number == 1 else f"block_{number}"
 
 

@@ -63,7 +63,7 @@ def offsets_less_mean(report: PartReport) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def plot_position_offsets(report: PartReport, ax: Axes | None = None, *, upright: bool = False) -> Axes:
-    """Recorded (GNSS) minus adjusted positions without their mean: arrows in plan, or bars in height if `upright`.
+    """Draw recorded minus adjusted positions without their mean: arrows in plan, or bars in height if `upright`.
 
     Raises InputError if the part has no recorded positions.
     """
@@ -144,7 +144,7 @@ class TimeLine(NamedTuple):
 
 
 def time_line(report: PartReport, taken: Mapping[str, Moment]) -> TimeLine:
-    """The images of a part in the order in which they were `taken`."""
+    """Return the images of a part in the order in which they were `taken`."""
     images, position = report.part.adjusted.block.images, np.asarray(report.part.adjusted.unknowns.exterior.position)
     moments = np.array([taken.get(name, (np.nan, 1.0)) for name in images]).reshape(-1, 2)
     timed_images, n = np.isfinite(moments[:, 0]), len(images)

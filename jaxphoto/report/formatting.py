@@ -95,13 +95,13 @@ def without_unit(name: str) -> tuple[str, str]:
 
 
 def head_of(name: str) -> str:
-    """A column's name with its unit in brackets: "sigma X [m]" of sigma_X_m."""
+    """Return a column's name with its unit in brackets: "sigma X [m]" of sigma_X_m."""
     words, unit = without_unit(name)
     return words.replace("_", " ") + (f" [{unit}]" if unit else "")
 
 
 def label_unit(label: str, cameras: Mapping[str, InteriorOrientation]) -> str:
-    """The unit of a parameter path such as `interior[kodak].k1`; "" if unknown."""
+    """Return the unit of a parameter path such as `interior[kodak].k1`; "" if unknown."""
     owner, _, parameter = label.rpartition("].")
     kind, _, name = owner.partition("[")
     if kind == "points" and not without_unit(parameter)[1]:
@@ -110,7 +110,7 @@ def label_unit(label: str, cameras: Mapping[str, InteriorOrientation]) -> str:
 
 
 def column_unit(column: str, cameras: Mapping[str, InteriorOrientation]) -> str:
-    """The unit of a column of Monte Carlo draws: `kodak.k1`, `bias.kodak.k1`, `strips.E1.shift_X_m`."""
+    """Return the unit of a column of Monte Carlo draws: `kodak.k1`, `bias.kodak.k1`, `strips.E1.shift_X_m`."""
     camera, _, parameter = column.removeprefix("bias.").rpartition(".")
     return _unit_of(camera, parameter, cameras)
 
@@ -187,7 +187,7 @@ def _texts(table: pd.DataFrame, name: str) -> list[str]:
 
 
 def _sigmas_of(table: pd.DataFrame, name: str) -> pd.Series | None:
-    """Standard deviations of a column, where the table has them; NaN or zero for fixed parameters."""
+    """Return the standard deviations of a column, where the table has them; NaN or zero for fixed parameters."""
     if name == "mean" and {"rmse", "n"} <= set(table.columns):
         return table["rmse"] / np.sqrt(table["n"])
     if others := [other for other in _BY_OTHERS.get(name, ()) if other in table]:
@@ -206,12 +206,12 @@ def without_empty(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def numeric_columns(table: pd.DataFrame) -> list[bool]:
-    """True for each column of numbers, which is aligned right."""
+    """Return True for each column of numbers, which is aligned right."""
     return [bool(pd.api.types.is_numeric_dtype(table[c]) and table[c].dtype != bool) for c in table.columns]
 
 
 def to_rich(table: pd.DataFrame, title: str = "") -> Table:
-    """A table for the terminal, numbers aligned right."""
+    """Return a table for the terminal, numbers aligned right."""
     shown = Table(title=title or None)
     for name, number in zip(table.columns, numeric_columns(table), strict=True):
         shown.add_column(head_of(str(name)), justify="right" if number else "left")
@@ -221,7 +221,7 @@ def to_rich(table: pd.DataFrame, title: str = "") -> Table:
 
 
 def to_markdown(table: pd.DataFrame, name: str = "") -> str:
-    """A Markdown table, numbers aligned right."""
+    """Return a Markdown table, numbers aligned right."""
     shown = readable(table)
     cells = [[head_of(str(c)) for c in shown.columns], *shown.to_numpy(object).tolist()]
     lines = ["| " + " | ".join(str(cell).replace("|", r"\|") for cell in row) + " |" for row in cells]
@@ -243,7 +243,7 @@ _PAGE = 45
 
 
 def to_latex(table: pd.DataFrame, name: str = "") -> str:
-    """A LaTeX table with booktabs rules (\\usepackage{booktabs}, and longtable for long ones)."""
+    """Return a LaTeX table with booktabs rules (\\usepackage{booktabs}, and longtable for long ones)."""
     shown = readable(table)
     shown = pd.DataFrame({_latex_head(str(c)): [_latex(v) for v in shown[c]] for c in shown.columns})
     return shown.to_latex(
@@ -269,7 +269,7 @@ def _latex(text: str) -> str:
 
 
 def _latex_head(name: str) -> str:
-    """A head with Greek letters: `$\\sigma_{\\omega}$ [deg]` of sigma_omega_deg."""
+    """Return a head with Greek letters: `$\\sigma_{\\omega}$ [deg]` of sigma_omega_deg."""
     head, _, unit = head_of(name).partition(" [")
     words = [rf"\{word}" if word in _GREEK else word for word in head.split()]
     if words[:1] == [r"\sigma"] and len(words) == 2:

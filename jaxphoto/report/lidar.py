@@ -62,7 +62,7 @@ def surfaces_table(result: Simultaneous) -> pd.DataFrame:
 
 
 def moved_table(result: Simultaneous) -> pd.DataFrame:
-    """what, before, after, moved, sigma, unit: every estimated parameter of cameras, scanner, mounts and strips.
+    """Tabulate what, before, after, moved, sigma, unit of the parameters of cameras, scanner, mounts and strips.
 
     Then the RMS moves of camera stations, rotations, object points and laser points, and the RMS height of points above
     the surface. Sigmas are a posteriori.
@@ -222,7 +222,7 @@ def write_simultaneous(
 
 
 def _strongest(correlations: pd.DataFrame) -> pd.DataFrame:
-    """The strongest correlations, each pair once."""
+    """Return the strongest correlations, each pair once."""
     names = ["parameter_a", "parameter_b"]
     repeated = pd.DataFrame(np.sort(correlations[names].to_numpy(str), axis=1), correlations.index).duplicated()
     strongest = correlations[~repeated].sort_values("rho", key=np.abs, ascending=False, kind="stable")[:_ROWS]
@@ -230,7 +230,7 @@ def _strongest(correlations: pd.DataFrame) -> pd.DataFrame:
 
 
 def rounds_words(rounds: Sequence[Round], converged: bool) -> tuple[str, str]:
-    """The outer iterations in two sentences."""
+    """Return the outer iterations in two sentences."""
     last = rounds[-1]
     end = f"converged after {len(rounds)} iterations" if converged else f"not converged after {len(rounds)} iterations"
     return (
@@ -246,7 +246,7 @@ def print_rounds(rounds: Sequence[Round], converged: bool, console: Console) -> 
 
 
 def heights_page(control: LidarControl, figure: Figure, record: CommandRecord) -> str:
-    """The page of heights of a cloud as control: iterations, flags, plot, and the largest differences."""
+    """Return the page of heights of a cloud as control: iterations, flags, plot, and the largest differences."""
     heights = heights_table(control)
     heights.insert(5, "difference_m", heights["height_m"] - heights["Z_m"])
     largest = heights.sort_values("difference_m", key=np.abs, ascending=False, kind="stable")[:_ROWS]

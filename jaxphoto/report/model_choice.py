@@ -78,7 +78,7 @@ def parameter_table(choice: ModelChoice) -> pd.DataFrame:
 
 
 def choice_verdict(choice: ModelChoice) -> list[str]:
-    """The choice in sentences."""
+    """Return the choice in sentences."""
     if not choice.by_bic:
         return ["no model could be adjusted; see the column problem"]
     best = min(j.bic for j in choice.judged if math.isfinite(j.bic))
@@ -177,6 +177,6 @@ def print_model_choice(choice: ModelChoice, console: Console) -> None:
 
 
 def _shown(table: pd.DataFrame) -> pd.DataFrame:
-    """The columns for reading, as text."""
+    """Return the columns for reading, as text."""
     columns = {name: ["" if pd.isna(v) else form(v) for v in table[name]] for name, form in _SHOWN.items()}
     return without_empty(pd.DataFrame(columns))

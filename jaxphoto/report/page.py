@@ -93,7 +93,7 @@ class CommandRecord(NamedTuple):
 def page(
     title: str, parts: Iterable[Part], verdict: tuple[str, str] = ("", ""), style: str = "", foot: str = ""
 ) -> str:
-    """The page as HTML; `verdict` is its first sentence and its colour (green, amber, red or none).
+    """Return the page as HTML; `verdict` is its first sentence and its colour (green, amber, red or none).
 
     Paragraphs before the first heading stand above the contents. `style` are additional rules.
     """
@@ -146,7 +146,7 @@ def _mostly_numbers(column: pd.Series) -> bool:
 
 
 def _svg(plot: Plot) -> Markup:
-    """A figure as inline SVG that scales to the width of the page."""
+    """Return a figure as inline SVG that scales to the width of the page."""
     from matplotlib import rc_context
 
     figure = plot.figure
@@ -164,12 +164,12 @@ def _svg(plot: Plot) -> Markup:
 
 
 def anchor(heading: str) -> str:
-    """The link target of a section."""
+    """Return the link target of a section."""
     return re.sub(r"\W+", "-", heading.lower()).strip("-")
 
 
 def verdict_parts(verdict: Verdict) -> list[Part]:
-    """The findings, each with its severity."""
+    """Return the findings, each with its severity."""
     return [Paragraph(as_sentence(f.text), f.severity) for f in verdict.findings]
 
 

@@ -37,7 +37,7 @@ _BARS = 2.0
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of a size in inches."""
+    """Return an empty figure of a size in inches."""
     # Imported here because matplotlib takes a third of a second.
     from matplotlib.figure import Figure
 
@@ -60,7 +60,7 @@ def axes_or_new(axes: Axes | None, *, in_3d: bool = False) -> Axes:
 
 
 def label(name: str) -> str:
-    """A name as matplotlib text: a dollar would begin a formula."""
+    """Return a name as matplotlib text: a dollar would begin a formula."""
     return printable(name).replace("$", r"\$")
 
 
@@ -83,7 +83,7 @@ def log_ticks(axes: Axes) -> None:
 
 
 def draw_format(axes: Axes, sensor: Sensor) -> None:
-    """The outline of the image format on axes of millimetres from its centre."""
+    """Return the outline of the image format on axes of millimetres from its centre."""
     w, h = sensor.width_mm / 2, sensor.height_mm / 2
     axes.plot([-w, w, w, -w, -w], [-h, -h, h, h, -h], color="0.4", lw=0.8)
     axes.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
@@ -92,7 +92,7 @@ def draw_format(axes: Axes, sensor: Sensor) -> None:
 def draw_format_map(
     axes: Axes, sensor: Sensor, cells_mm: Float[np.ndarray, "cells 2"], name: str, values: Float[np.ndarray, cells]
 ) -> None:
-    """A colour map over the image format; `name` is its title."""
+    """Return a colour map over the image format; `name` is its title."""
     if np.ptp(values) > 1e-9 * max(np.abs(values).max(), 1e-300):
         filled = axes.tricontourf(cells_mm[:, 0], cells_mm[:, 1], values, levels=12, cmap="cividis")
         axes.figure.colorbar(filled, ax=axes, shrink=0.85)
@@ -124,7 +124,7 @@ def draw_arrows(axes: Axes, at: np.ndarray, v: np.ndarray, key: float, length: f
 
 
 def round_key(v: np.ndarray) -> float:
-    """A round number near three times the RMS of `v`."""
+    """Return a round number near three times the RMS of `v`."""
     rms = float(np.sqrt(np.nanmean(v**2))) if np.isfinite(v).any() else 1.0
     return float(f"{3 * max(rms, 1e-12):.0e}")
 
@@ -182,7 +182,7 @@ def _over_format(ax: Axes, tables: Tables, camera: str, xy: np.ndarray, v: np.nd
 
 
 def plot_density(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
-    """Number of image points in each cell of the format."""
+    """Return the number of image points in each cell of the format."""
     ax, camera = axes_or_new(ax), one_camera(tables.adjusted.block, camera)
     sensor = tables.adjusted.block.sensors[camera]
     cell, centres = _cells(sensor, residuals_of(tables, camera)[0])
@@ -438,7 +438,7 @@ def ellipse_axes(
 
 
 def plot_error_ellipses(tables: Tables, ax: Axes | None = None, *, unit: str = "m") -> Axes:
-    """Standard error ellipses of the projection centres in plan (39 % lie within), enlarged; colour: sigma of Z."""
+    """Draw standard ellipses of the projection centres in plan (39 % lie within), enlarged; colour: sigma of Z."""
     from matplotlib.collections import EllipseCollection
 
     ax, covariance = axes_or_new(ax), tables.covariance.positions * float(tables.covariance.variance_factor)
@@ -493,7 +493,7 @@ def plot_point_sigmas(tables: Tables, ax: Axes | None = None, *, unit: str = "m"
 
 
 def plot_rays(tables: Tables, ax: Axes | None = None) -> Axes:
-    """Number of object points by number of rays."""
+    """Return the number of object points by number of rays."""
     ax, most = axes_or_new(ax), 15
     rays = np.minimum(np.bincount(tables.adjusted.structure.point), most)
     ax.bar(np.arange(2, most + 1), np.bincount(rays, minlength=most + 1)[2:], color="tab:blue")
@@ -503,14 +503,14 @@ def plot_rays(tables: Tables, ax: Axes | None = None) -> Axes:
 
 
 def plot_overlap(tables: Tables, ax: Axes | None = None) -> Axes:
-    """Number of images that cover each cell of the ground; coordinates are metres."""
+    """Return the number of images that cover each cell of the ground; coordinates are metres."""
     ax = axes_or_new(ax)
     draw_overlap(ax, coverage(tables.adjusted), tables.adjusted)
     return ax
 
 
 def draw_overlap(ax: Axes, cover: Coverage, adjusted: Adjustment) -> None:
-    """Number of images per cell, and the stations."""
+    """Return the number of images per cell, and the stations."""
     counts = np.ma.masked_less(cover.seen_by, 1)
     x, y = (np.append(v - cover.step_m / 2, v[-1] + cover.step_m / 2) for v in (cover.x, cover.y))
     shown = ax.pcolormesh(x, y, counts, cmap="viridis", rasterized=True)
@@ -528,7 +528,7 @@ _INK, _ACROSS, _THINNEST = 0.5, 200.0, 0.05
 
 
 def plot_links(tables: Tables, ax: Axes | None = None, *, unit: str = "m") -> Axes:
-    """The network of images in plan by common points, dark lines for strong links; the weakest in red.
+    """Return the network of images in plan by common points, dark lines for strong links; the weakest in red.
 
     Of a class of many links an even sample is drawn, as title and legend say.
     """

@@ -63,7 +63,7 @@ _HIDDEN = 10.0
 
 
 def residual_findings(tables: Tables) -> Iterator[Finding]:
-    """Tests of sigma naught, of single residuals and of systematic effects."""
+    """Return the tests of sigma naught, of single residuals and of systematic effects."""
     yield from _global_test(tables)
     fits = global_test(tables.adjusted, tables.redundancy).sigma <= ABSURD
     effects, suspects = list(_systematic(tables, fits)), tables.blunders.suspects
@@ -83,13 +83,13 @@ def residual_findings(tables: Tables) -> Iterator[Finding]:
 
 
 def contradictions(tables: Tables) -> Iterator[Finding]:
-    """Tests of sigma naught and of single residuals."""
+    """Return the tests of sigma naught and of single residuals."""
     yield from _global_test(tables)
     yield from _blunders(tables, tables.culprits)
 
 
 def _priors_of_lens_type(block: Block) -> bool:
-    """True if the priors are the spread of a lens type, which has zero distortion as its mean."""
+    """Return True if the priors are the spread of a lens type, which has zero distortion as its mean."""
     values = [
         float(prior.value)
         for priors in block.priors.interior.values()
@@ -149,7 +149,7 @@ def stretch_findings(adjusted: Adjustment) -> Iterator[Finding]:
 
 
 def _blunders(tables: Tables, suspects: Sequence[Suspect]) -> Iterator[Finding]:
-    """The most likely blunders.
+    """Return the most likely blunders.
 
     An error if far beyond the critical value or if it moves the interior orientation, otherwise a warning: of many
     thousand real observations a few are slightly beyond.
@@ -175,7 +175,7 @@ def _blunders(tables: Tables, suspects: Sequence[Suspect]) -> Iterator[Finding]:
 
 
 def _effect(tables: Tables, suspect: Suspect) -> tuple[str, float]:
-    """The interior parameter that the error of a suspect moves most, in a posteriori sigmas."""
+    """Return the interior parameter that the error of a suspect moves most, in a posteriori sigmas."""
     moved = {
         parameter: float(np.atleast_2d(of[suspect.group])[suspect.number, suspect.row]) * abs(suspect.w) / DELTA0
         for parameter, of in tables.undetected.interior.items()
@@ -243,7 +243,7 @@ def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
 
 
 def _terms(pattern: SystematicEffect, likely: list[TermEstimate]) -> str:
-    """The likely terms with their amounts, and the cure."""
+    """Return the likely terms with their amounts, and the cure."""
     factor, unit = in_file_unit(pattern.unit)
     amounts = (f" {factor * h.amount:+.3g} +- {factor * h.sigma:.2g} {unit}".rstrip() for h in likely)
     names = ", ".join(h.term.name + (a if h.term.report_amount else "") for h, a in zip(likely, amounts, strict=True))
@@ -315,7 +315,7 @@ def left_out_table(snooped: Snooped, block: Block) -> pd.DataFrame:
 
 
 def snooped_findings(snooped: Snooped, block: Block) -> list[Finding]:
-    """What was corrected and rejected, systematic errors first."""
+    """Yield findings on corrected and rejected observations, systematic errors first."""
     found = [*_too_many(snooped, block)]
     found += [Finding("exchanged", "warning", exchange.words) for exchange in snooped.exchanged]
     found += _common(snooped, block)
@@ -382,7 +382,7 @@ def _too_many(snooped: Snooped, block: Block) -> Iterator[Finding]:
 
 
 def component_tables(components: VarianceComponents) -> dict[str, pd.DataFrame]:
-    """By file name: variance_components, and variance_component_correlation.
+    """Tables by file name: variance_components, and variance_component_correlation.
 
     Columns are group, observations, redundancy, factor, sigma_factor, degrees_of_freedom, supported; and group_a,
     group_b, rho. A group that supports no component has the factor 1 and no sigma.

@@ -100,7 +100,7 @@ def write_results(
 
 
 def table_names(tables: Tables) -> tuple[str, ...]:
-    """The tables in the result folder of an adjustment."""
+    """Return the tables in the result folder of an adjustment."""
     in_map = tables.adjusted.block.frame.kind == "epsg"
     drifting = any(rates.kind in tables.adjusted.unknowns.more for rates in RATES)
     return (
@@ -131,7 +131,7 @@ def write_summary(summary: dict, directory: Path) -> None:
 
 
 def summary_of(tables: Tables, verdict: Verdict, seconds: dict[str, float]) -> dict:
-    """The content of summary.json."""
+    """Return the content of summary.json."""
     adjusted = tables.adjusted
     observations, unknowns = adjusted.n_observations, adjusted.n_unknowns
     test = _global_test(tables)
@@ -143,7 +143,7 @@ def summary_of(tables: Tables, verdict: Verdict, seconds: dict[str, float]) -> d
         "n_images": len(adjusted.block.images),
         "sigma0": float(adjusted.sigma0),
         **({"global_test": test} if test else {}),
-        **({"doubts": prior_warnings} if (prior_warnings := adjusted.block.prior_warnings) else {}),
+        **({"prior_warnings": prior_warnings} if (prior_warnings := adjusted.block.prior_warnings) else {}),
         "redundancy": adjusted.redundancy,
         "n_observations": {"total": sum(observations.values()), **observations},
         "n_constraints": adjusted.n_constraints,
@@ -186,12 +186,12 @@ def write_study(
 
 
 def rounded(seconds: Mapping[str, float]) -> dict[str, float]:
-    """Times to the microsecond."""
+    """Return the times to the microsecond."""
     return {name: round(value, 6) for name, value in seconds.items()}
 
 
 def _global_test(tables: Tables) -> dict[str, Any]:
-    """The test of sigma naught, if the adjustment converged and has redundancy."""
+    """Return the test of sigma naught, if the adjustment converged and has redundancy."""
     if not bool(tables.adjusted.converged) or tables.adjusted.redundancy <= 0:
         return {}
     test = global_test(tables.adjusted, tables.redundancy)
@@ -202,7 +202,7 @@ def _global_test(tables: Tables) -> dict[str, Any]:
 
 
 def report_page(tables: Tables, verdict: Verdict, record: CommandRecord | None = None) -> str:
-    """The report as HTML: verdict, summary, at most three findings, then all sections."""
+    """Return the report as HTML: verdict, summary, at most three findings, then all sections."""
     block = tables.adjusted.block
     parts: list[Part] = [summary_table(tables), *verdict_parts(verdict)[:_TOP]]
     if len(verdict.findings) > _TOP:
@@ -328,7 +328,7 @@ def adjustment_sections(
 
 
 def plotted_cameras(tables: Tables) -> list[str]:
-    """The cameras that are plotted: of many those with the most image points."""
+    """Return the cameras that are plotted: of many those with the most image points."""
     block, structure = tables.adjusted.block, tables.adjusted.structure
     cameras, of_image = list(tables.adjusted.unknowns.interior), np.array(block.image_camera)
     n_points = np.bincount(structure.image, minlength=len(of_image))
@@ -492,7 +492,7 @@ def _correlations(tables: Tables) -> Iterator[Part]:
 
 
 def convergence_words(adjusted: Adjustment) -> str:
-    """Number of steps and the reason of the end."""
+    """Return the number of steps and the reason of the end."""
     history, n = adjusted.history, int(adjusted.steps)
     if history is None or not n:
         return ""
@@ -510,18 +510,18 @@ def convergence_words(adjusted: Adjustment) -> str:
 
 
 def report_title(block: Block) -> str:
-    """The title of a block and its source."""
+    """Return the title of a block and its source."""
     name = block.title or "jaxphoto adjustment"
     return f"{name}, converted from {block.converted_from}" if block.converted_from else name
 
 
 def assumed_pixels(sensors: Mapping[str, Sensor]) -> list[Part]:
-    """A paragraph on cameras whose pixel size is assumed, if there are any."""
+    """Return a paragraph on cameras whose pixel size is assumed, if there are any."""
     return [Paragraph(words)] if (words := assumed_pixel_words(sensors)) else []
 
 
 def assumed_pixel_words(sensors: Mapping[str, Sensor]) -> str:
-    """A sentence on cameras whose pixel size is assumed; "" if there are none."""
+    """Return a sentence on cameras whose pixel size is assumed; "" if there are none."""
     cameras = [name for name, sensor in sensors.items() if sensor.pixel_assumed]
     if not cameras:
         return ""
@@ -536,7 +536,7 @@ def assumed_pixel_words(sensors: Mapping[str, Sensor]) -> str:
 
 
 def accuracy_sentences(accuracy: PositionalAccuracy) -> list[str]:
-    """The tested accuracy class of each component, and why it cannot be claimed; empty without check points."""
+    """Return the tested accuracy class of each component, and why it cannot be claimed; empty without check points."""
     if not accuracy.tested:
         return []
     sentences = [f"Positional accuracy by the {_STANDARD}; survey errors of the check points are included where known."]
@@ -561,7 +561,7 @@ def accuracy_sentences(accuracy: PositionalAccuracy) -> list[str]:
 
 
 def class_sentences(accuracy: PositionalAccuracy) -> list[str]:
-    """The accuracy class of each component, horizontal first."""
+    """Return the accuracy class of each component, horizontal first."""
     return [_class_sentence(t) for t in accuracy.tested]
 
 

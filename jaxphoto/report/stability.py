@@ -84,7 +84,7 @@ def stability_table(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_
 
 
 def by_method(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_mm: float) -> pd.DataFrame:
-    """The same for reading, in micrometres, with a column per method."""
+    """Return the stability table in micrometres, with a column per method."""
     table = stability_table(analyses, pixel_mm, noise_mm).set_index("method")
     um = {"RMSE_offset": "rmse_offset_mm", "as measured": "rmse_measured_mm", "largest": "largest_mm"}
     with_sigma = "sigma_mm" in table
@@ -168,7 +168,7 @@ def write_stability(
 def stability_summary(
     analyses: Mapping[Method, Analysis], sets: tuple[Compared, Compared], noise_mm: float, method: Method
 ) -> dict[str, Any]:
-    """The comparison in summary.json."""
+    """Return the comparison in summary.json."""
     chosen = analyses[method]
     return {
         "verdict": f"{method}: {chosen.verdict(noise_mm)}", "method": method, "similar": chosen.similar(noise_mm),
@@ -202,7 +202,7 @@ def change_cells(change: Change, sensor: Sensor) -> pd.DataFrame:
 
 
 def change_verdict(change: Change, sensor: Sensor) -> list[str]:
-    """The tests in sentences."""
+    """Return the tests in sentences."""
     sentences = []
     if change.degrees_of_freedom:
         sentences.append(
@@ -232,7 +232,7 @@ def change_verdict(change: Change, sensor: Sensor) -> list[str]:
 
 
 def change_headline(change: Change) -> str:
-    """The result of both tests: the camera has changed if one of them says so."""
+    """Return the result of both tests: the camera has changed if one of them says so."""
     return change_meaning(float(np.nanmin([change.p_parameters, change.p_field])))
 
 
@@ -254,7 +254,7 @@ def change_figure(change: Change, sensor: Sensor) -> Figure:
 
 
 def change_table(change: Change) -> pd.DataFrame:
-    """The changed parameters for reading; fixed ones without p."""
+    """Return the changed parameters for reading; fixed ones without p."""
     table = parameter_changes(change).drop(columns="ratio")
     return table[(table["sigma"] > 0) | (table["first"] != 0) | (table["second"] != 0)]
 
@@ -295,7 +295,7 @@ def write_change(
 
 
 def change_summary(change: Change, sensor: Sensor) -> dict[str, Any]:
-    """The comparison in summary.json."""
+    """Return the comparison in summary.json."""
     field = change.field.uncertainty
     return {
         "verdict": change_verdict(change, sensor),
@@ -349,7 +349,7 @@ def cut_table(halves: Halves) -> pd.DataFrame:
 
 
 def halves_verdict(halves: Halves) -> list[str]:
-    """The result in sentences."""
+    """Return the result in sentences."""
     band, n, camera = halves.band, len(halves.cuts), camera_words(halves.camera)
     deviation, factor = (band.factor - 1) / band.sigma_factor, f"{band.factor:.2f} +- {band.sigma_factor:.2f}"
     size = "too small" if deviation > _SURE else "too large" if deviation < -_SURE else "consistent with the halves"
@@ -381,7 +381,7 @@ def halves_verdict(halves: Halves) -> list[str]:
 
 
 def plot_halves(halves: Halves, ax: Axes | None = None, *, band: bool = False) -> Axes:
-    """The factor of the standard deviations over the format, or the radius of the `band` that holds 95 % (px)."""
+    """Return the factor of the standard deviations over the format, or the radius of the 95 % `band` (px)."""
     ax = axes_or_new(ax)
     name = "95 % of the errors are smaller [px]" if band else "factor of the standard deviations"
     values = halves.band.calibration if band else halves.band.cell_factor

@@ -125,7 +125,7 @@ def errors_along(
 
 
 def _knot_labels(result: StripAdjustment) -> list[list[str]]:
-    """The paths of the six numbers of every knot of all strips."""
+    """Return the paths of the six numbers of every knot of all strips."""
     zero = np.zeros(3)
     knot = TrajectoryKnot(zero, zero)  # type: ignore[arg-type]
     return [list(knot.labels(owner)) for owner in result.adjusted.unknowns.more[TrajectoryKnot.kind]]

@@ -94,7 +94,7 @@ def _shared_names(labels: Sequence[str]) -> tuple[list[str], list[float]]:
 
 
 def _unit(name: str) -> str:
-    """The unit at the end of a name; none of a coefficient (docs/models.md)."""
+    """Return the unit at the end of a name; none of a coefficient (docs/models.md)."""
     return without_unit(name)[1]
 
 
@@ -131,7 +131,7 @@ def plot_sweep(
 
 
 def _chosen(table: pd.DataFrame, x: str, quantity: str, of: str, by: Sequence[str]) -> pd.DataFrame:
-    """The rows to be drawn."""
+    """Return the rows to be drawn."""
     for column in (x, *by):
         if column not in table:
             raise InputError(f"the table has no column {column}: choose among {', '.join(map(str, table.columns))}")

@@ -89,7 +89,7 @@ class Tables:
         return f"Tables of {self.adjusted!r};\n  {', '.join(names)}"
 
     def _repr_html_(self) -> str:
-        """The interior orientation and the spread of residuals."""
+        """Return the interior orientation and the spread of residuals."""
         shown = (t.to_html(index=False, border=0, na_rep="") for t in (self.interior, self.residual_spread))
         return f"{self.adjusted._repr_html_()}{''.join(shown)}"
 
@@ -102,7 +102,7 @@ class Tables:
         return covariance(self.adjusted, rows=True) if self._known is None else self._known
 
     def _if_converged(self, sigma: ArrayLike) -> np.ndarray:
-        """Standard deviations; NaN where the adjustment did not converge."""
+        """Return the standard deviations; NaN where the adjustment did not converge."""
         return np.where(bool(self.adjusted.converged), np.asarray(sigma), np.nan)
 
     @cached_property
@@ -476,7 +476,7 @@ def side_by_side(table: pd.DataFrame, rows: list[str], column: str, value: str) 
 
 
 def with_correlated_sigma(interior: pd.DataFrame, adjusted: Adjustment, factor: float) -> pd.DataFrame:
-    """The interior orientations with the column `sigma_correlated`: `sigma` for spatially correlated residuals.
+    """Return the interior orientations with the column `sigma_correlated`: `sigma` for spatially correlated residuals.
 
     The information of the rays is divided by `factor`^2, that of priors is not: with sigma s and prior p, the rays
     alone give 1 / d^2 = 1 / s^2 - 1 / p^2, and `sigma_correlated` combines p and `factor` d, parameter by parameter.

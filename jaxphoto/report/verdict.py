@@ -148,7 +148,7 @@ def duplicate_images(block: Block) -> list[tuple[str, str, int]]:
 
 
 def duplicate_findings(block: Block) -> Iterator[Finding]:
-    """The first pair of duplicate images, and the number of further ones."""
+    """Return the first pair of duplicate images, and the number of further ones."""
     if pairs := duplicate_images(block):
         one, other, n = pairs[0]
         others = f"; {len(pairs) - 1} further pairs" if len(pairs) > 1 else ""
@@ -276,7 +276,7 @@ def _weak(tables: Tables, reported: frozenset[str]) -> Iterator[Finding]:
 
 
 def _not_significant(tables: Tables, s: Significance) -> Finding:
-    """The effect of holding an insignificant parameter at zero."""
+    """Return the effect of holding an insignificant parameter at zero."""
     change, sensor = fix_at_zero(tables.adjusted, tables.covariance, s), tables.adjusted.block.sensors[s.camera]
     others = {name: abs(v) for name, v in change.in_sigmas.items() if name != s.parameter}
     most = max(others, key=lambda name: others[name], default="")
@@ -287,7 +287,7 @@ def _not_significant(tables: Tables, s: Significance) -> Finding:
 
 
 def _all_known(block: Block) -> bool:
-    """True if all points are known in advance: a field of targets."""
+    """Return True if all points are known in advance: a field of targets."""
     return len(np.union1d(block.control.who, block.fixed.who)) == len(block.points)
 
 
@@ -365,7 +365,7 @@ def ground_findings(tables: Tables) -> Iterator[Finding]:
 
 
 def _invertible(adjusted: Adjustment, name: str, sensor: Sensor) -> bool:
-    """True if the corner of the format lies within the monotonic range of the distortion."""
+    """Return True if the corner of the format lies within the monotonic range of the distortion."""
     corner = np.array([sensor.width_mm, sensor.height_mm]) / 2
     r = np.linspace(0.0, 1.0, 65)[:, None] * corner
     out = np.asarray(call_compiled(_closed_form, adjusted.unknowns.interior[name], r))
@@ -381,7 +381,7 @@ def _closed_form(interior, xy):
 
 
 def lens_findings(tables: Tables) -> Iterator[Finding]:
-    """Adjusted c compared with its prior; a warning if the block hardly adds to the prior."""
+    """Return the adjusted c compared with its prior; a warning if the block hardly adds to the prior."""
     adjusted, little = tables.adjusted, 0.7
     if not bool(adjusted.converged):
         return
@@ -402,12 +402,12 @@ def lens_findings(tables: Tables) -> Iterator[Finding]:
 
 
 def readout_of(camera: str) -> str:
-    """The parameter name of a camera's rolling-shutter readout."""
+    """Return the parameter name of a camera's rolling-shutter readout."""
     return f"{RollingShutter.kind}[{camera}].readout_ms"
 
 
 def shutter_findings(tables: Tables) -> Iterator[Finding]:
-    """The estimated readout of every rolling shutter, and whether it is significant."""
+    """Return the estimated readout of every rolling shutter, and whether it is significant."""
     table = tables.georeferencing
     for label, value, sigma in table[table["parameter"].str.startswith(f"{RollingShutter.kind}[")].to_numpy():
         words = camera_words(label.split("[", 1)[1].rsplit("]", 1)[0])
@@ -419,7 +419,7 @@ def shutter_findings(tables: Tables) -> Iterator[Finding]:
 
 
 def drift_findings(tables: Tables) -> Iterator[Finding]:
-    """Changes of cameras with estimated rates or splines, and differences between strips."""
+    """Return the changes of cameras with estimated rates or splines, and differences between strips."""
     yield from map(drift_finding, tables.tested_drifts)
     yield from map(differences_finding, camera_spline_differences(tables.adjusted, tables.covariance))
     if (strips := strip_differences(tables.adjusted, tables.covariance)) is not None:

@@ -240,7 +240,7 @@ def _check_size(structure: Structure, estimates: int) -> None:
 
 
 class _Derivatives(NamedTuple):
-    """Of a padded block: the reduced Hessian, and B of all but the image rows (z, observed, ...)."""
+    """Reduced Hessian of a padded block, and B of all but the image rows (z, observed, ...)."""
 
     h: ReducedHessian
     rotations: Float[Array, "images 3 3"]

@@ -71,7 +71,7 @@ def correlation_matrix(covariance: Covariance) -> Float[Any, "reduced reduced"]:
 
 
 def correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, Correlations]:
-    """By camera: IOP x IOP, and EOP x IOP of each of its images."""
+    """Correlations by camera: IOP x IOP, and EOP x IOP of each of its images."""
     rho, n = correlation_matrix(covariance), 6 * covariance.n_images
     names = EOP_NAMES[covariance.rotations]
     result = {}

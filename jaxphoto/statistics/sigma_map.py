@@ -112,7 +112,7 @@ def seen_distance_m(adjusted: Adjustment, camera: str | None = None) -> float:
 
 
 def sigma_maps(adjusted: Adjustment) -> dict[str, tuple[SigmaMap, SigmaMap]]:
-    """By camera with estimated parameters: at infinity, and at the median distance of its points."""
+    """Return the maps by camera with estimated parameters: at infinity, and at the median distance of its points."""
     s = adjusted.structure
     used = {adjusted.block.image_camera[i] for i in np.unique(s.image)}
     maps: dict[str, tuple[SigmaMap, SigmaMap]] = {}

@@ -140,7 +140,7 @@ def test_k0_and_c_are_one_scale():
     block = free(smac(0.0), "one", ("k0",))
     with pytest.raises(RankError) as caught:
         adjust(block, block.start.unknowns)
-    for word in ("interior[one].c_mm", "interior[one].k0", "hold"):
+    for word in ("interior[one].c_mm", "interior[one].k0", "fix"):
         assert word in str(caught.value)
 
 

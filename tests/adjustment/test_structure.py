@@ -150,5 +150,5 @@ def test_a_point_that_only_a_distance_meets_is_refused():
         points=(*block.points, "far"),
         distances=Distances(np.array([[0, len(block.points)]]), np.ones(1), np.ones(1)),
     )
-    with pytest.raises(BlockError, match="point far is determined by distances alone"):
+    with pytest.raises(BlockError, match="point far is determined by distances only"):
         structure_of(lonely, block.priors)

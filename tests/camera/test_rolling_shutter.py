@@ -148,7 +148,7 @@ def test_motions_are_unknowns_by_image_where_they_are_weighted(rolling):
 def test_what_it_cannot_do_is_refused(rolling):
     block, none = with_shutter(*rolling), ControlCoordinates.none()
     loose = dataclasses.replace(block, control=none, stations=CameraPositions.none(), datum=Datum("inner", "points"))
-    with pytest.raises(DatumError, match="nothing in the block gives it a scale: add stations"):
+    with pytest.raises(DatumError, match="needs the scale of the block"):
         adjust(loose)
     rows = block.image_points.take(np.arange(4))
     joined = correlated(rows, [range(4)], np.eye(8)[None] * 0.004**2)

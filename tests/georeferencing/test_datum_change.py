@@ -46,7 +46,7 @@ def test_what_a_change_does_and_how_sure_it_is_is_said():
     assert nad83.startswith("positions of WGS 84 are taken as of the datum NAD83(2011), by") and "known to 2 m" in nad83
     (britain,) = said(27700, -1.5, 52.0)
     # Where the grid is there, it is the way.
-    assert "uk_os_OSTN15_NTv2_OSGBtoETRS.tif, which is not on this computer, gives 1 m" in britain or "(9)" in britain
+    assert "uk_os_OSTN15_NTv2_OSGBtoETRS.tif, which is not installed, gives 1 m" in britain or "(9)" in britain
     # A system of elsewhere.
     assert "can be wrong by hundreds of metres" in said(31287, -60.0, -30.0)[0]
 

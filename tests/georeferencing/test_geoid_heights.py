@@ -102,7 +102,7 @@ def test_without_any_height_none_is_said_to_be_right(geoid):
 
 
 def test_a_code_that_is_none_is_refused():
-    with pytest.raises(InputError, match="EPSG code 99999 is unknown; correct it, or give heights above"):
+    with pytest.raises(InputError, match="EPSG code 99999 is unknown; correct it, or give ellipsoidal heights"):
         one_height({"a": HERE}, {}, 99999)
 
 

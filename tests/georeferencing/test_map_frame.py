@@ -86,13 +86,13 @@ def test_sea_level_at_the_origin():
 
 REFUSED = {
     (99999, None): ["EPSG code 99999 is unknown", "correct"],
-    (4978, None): ["EPSG:4978", "no map or geographic system", "give"],
-    (5773, None): ["EPSG:5773", "no map or geographic system", "vertical"],
+    (4978, None): ["EPSG:4978", "neither a projected nor a geographic CRS", "give"],
+    (5773, None): ["EPSG:5773", "neither a projected nor a geographic CRS", "vertical"],
     (2227, None): ["EPSG:2227", "US survey foot", "convert"],
-    (2053, None): ["EPSG:2053", "southwards", "convert"],
-    (32722, 99999): ["EPSG code 99999 is unknown", "above the ellipsoid"],
+    (2053, None): ["EPSG:2053", "south or west", "convert"],
+    (32722, 99999): ["EPSG code 99999 is unknown", "ellipsoidal heights"],
     (32722, 4326): ["EPSG:4326", "not a vertical CRS", "5773"],
-    (32722, 5773): ["EGM96 height", "us_nga_egm96_15.tif", "not on this computer", "pyproj sync", "ellipsoidal"],
+    (32722, 5773): ["EGM96 height", "us_nga_egm96_15.tif", "not installed", "pyproj sync", "ellipsoidal"],
 }
 
 

@@ -95,7 +95,7 @@ def test_a_camera_file_keeps_the_covariance(years, results, monkeypatch, capsys)
         ('calibration = "../this"', "has no covariance; name results of jaxphoto adjust, or a camera file of it"),
         ('calibration = "../nothing"', "there is no file"),
         ('calibration = "../results"\nwidth_px = 3', "width_px: the calibration gives it; only residuals, unknowns"),
-        ('calibration = "../results"\n[cameras.one.unknowns]\nc_mm = "fixed"', "it is known beforehand by"),
+        ('calibration = "../results"\n[cameras.one.unknowns]\nc_mm = "fixed"', "it has prior information in"),
     ],
 )
 def test_invalid_calibrations_are_refused(years, results, table, sentence):

@@ -63,7 +63,7 @@ def mistaken(text, rng):
 
 @pytest.mark.parametrize("count", [8, pytest.param(200, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("reader", READERS)
-def test_mistakes_are_read_or_refused(tmp_path, reader):
+def test_mistakes_are_read_or_refused(tmp_path, reader, count):
     write, read = READERS[reader]
     write(tmp_path)
     paths = sorted(path for path in tmp_path.rglob("*") if path.is_file() and path.suffix != ".bin")
@@ -71,7 +71,7 @@ def test_mistakes_are_read_or_refused(tmp_path, reader):
         pytest.skip("binary")
     texts = [path.read_text(encoding="utf-8") for path in paths]
     rng = np.random.default_rng(zlib.crc32(reader.encode()))
-    for _ in range(8):
+    for _ in range(count):
         k = int(rng.integers(len(paths)))
         paths[k].write_text(mistaken(texts[k], rng), encoding="utf-8")
         with warnings.catch_warnings():

@@ -6,7 +6,6 @@ import functools
 import jax
 import numpy as np
 import pytest
-from jaxphoto.io.names import points_called
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
@@ -14,6 +13,7 @@ from jaxphoto import BlockError, InputError, JaxphotoError, adjust, bias, covari
 from jaxphoto.adjustment import Outcome
 from jaxphoto.camera import get_parameter
 from jaxphoto.georeferencing import StripSpline
+from jaxphoto.io.text_tables import points_matching
 from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.observations import Attitudes, CameraPositions, StripPlanes
 from jaxphoto.procedures.lidar import Photographs, adjust_strips
@@ -367,9 +367,9 @@ def test_of_each_point_on_a_breakline_both_faces_are_sought_in_every_strip():
 
 
 def test_points_on_breaklines_are_named_by_patterns():
-    assert points_called(("A1", "R1", "R2", "B"), ["R*", "A1", "R1"], "") == ("R1", "R2", "A1")
-    with pytest.raises(InputError, match=r"--breaklines X\*: no point of the block is called so"):
-        points_called(("A1",), ["X*"], "--breaklines")
+    assert points_matching(("A1", "R1", "R2", "B"), ["R*", "A1", "R1"], "") == ("R1", "R2", "A1")
+    with pytest.raises(InputError, match=r"--breaklines X\*: no point of the block has this name"):
+        points_matching(("A1",), ["X*"], "--breaklines")
 
 
 def test_points_on_breaklines_come_back_with_their_block(tmp_path):
@@ -386,7 +386,7 @@ def test_points_on_breaklines_come_back_with_their_block(tmp_path):
     assert read_block(tmp_path / "block").breaklines == names
     settings = tmp_path / "block" / "block.toml"
     settings.write_text(settings.read_text().replace(f'"{names[0]}"', '"R*"', 1))
-    with pytest.raises(InputError, match=r"block\.toml, breaklines: R\*: no point of the block is called so"):
+    with pytest.raises(InputError, match=r"block\.toml, breaklines: R\*: no point of the block has this name"):
         read_block(tmp_path / "block")
 
 

@@ -77,7 +77,7 @@ def read(path: Path) -> BlockTables:
 
 
 def _camera(path: Path) -> tuple[str, dict[str, Any]]:
-    """The camera's id and its [cameras.X] table, from the five lines of one camera."""
+    """Return the camera's id and its [cameras.X] table, from the five lines of one camera."""
     rows = [(row, line.split()) for row, line in content_rows(path)]
     if [len(cells) for _, cells in rows] != [8, 1, 2, 2, 4]:
         raise InputError(f"{path.name}: the five lines of one camera (8, 1, 2, 2, 4 numbers) are expected")

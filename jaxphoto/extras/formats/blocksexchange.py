@@ -95,7 +95,7 @@ def read(path: Path) -> Project:
 
 
 def _parsed(path: Path) -> tuple[ElementTree.Element, _Ties, int]:
-    """The tree without tie points (gigabytes in it), the tie points, and the number of control points."""
+    """Return the tree without tie points (gigabytes in it), the tie points, and the number of control points."""
     ties, n_control = _Ties([], [], [], []), 0
     events = ElementTree.iterparse(io.BytesIO(read_bytes(path)), ("start", "end"))
     _, root = next(events)
@@ -114,7 +114,7 @@ def _parsed(path: Path) -> tuple[ElementTree.Element, _Ties, int]:
 
 
 def _system(path: Path, root: ElementTree.Element, block: ElementTree.Element) -> str:
-    """The words that name the system of the block, "" for a local one. Raise InputError for a geographic one."""
+    """Return the words that name the system of the block, "" for a local one. Raise InputError for a geographic one."""
     number = (block.findtext("SRSId") or "").strip()
     for system in root.iterfind("SpatialReferenceSystems/SRS"):
         words = (system.findtext("Definition") or "").strip()

@@ -109,7 +109,7 @@ class _Binary:
         return values
 
     def count(self, size: int) -> int:
-        """Number of the records that follow, of at least `size` bytes."""
+        """Return the number of the records that follow, of at least `size` bytes."""
         (count,) = self.take("Q")
         if count * size > len(self.data) - self.at:
             raise InputError(f"{self.path}: the file ends early. Copy it again")

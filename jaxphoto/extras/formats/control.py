@@ -183,7 +183,7 @@ def _has(columns: Columns, names: tuple[str, ...], width: int) -> bool:
 
 
 def _without_header(records: Sequence[Sequence[str]]) -> tuple[str, Columns]:
-    """Whether rows without a header are "points", "marks" or "" (neither), and their columns; most rows decide."""
+    """Classify rows without a header as "points", "marks" or "" (neither), with columns; most rows decide."""
     width = {len(r) for r in records}
     if not any(map(is_number, records[0][1:])):
         return "", {}

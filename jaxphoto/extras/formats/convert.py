@@ -198,7 +198,7 @@ def check_export_target(folder: Path, *inputs: Path) -> None:
 
 
 def _converted(project: Project, name: str, format: Format) -> Conversion:
-    """A camera as one that the format has."""
+    """Return a camera as one that the format has."""
     sensor, interior, _ = project.cameras[name]
     model = format.plane if type(interior.projection) is Perspective else format.fisheye
     if format.plane is None:
@@ -309,7 +309,7 @@ def _target(
     model: str | None,
     distortion: type[AbstractDistortion] | None,
 ) -> CameraModel:
-    """The model in which a camera is written."""
+    """Return the model in which a camera is written."""
     if format.plane is not None and format.fisheye is None and type(interior.projection) is not Perspective:
         others = ", ".join(n for n in CAMERAS_WRITTEN if CAMERA_FORMATS[n].fisheye or not CAMERA_FORMATS[n].plane)
         raise InputError(f"{path}: cameras of {format.name} are perspective, this is a fisheye; write one of {others}")

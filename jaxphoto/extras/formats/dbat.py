@@ -52,7 +52,7 @@ class _Script(NamedTuple):
         return (self.root.findtext(place) or default).strip()
 
     def numbers(self, place: str, default: str, n: int | None = None) -> list[float]:
-        """The comma-separated numbers of an element, `n` of them if given."""
+        """Return the comma-separated numbers of an element, `n` of them if given."""
         text = self.text(place, default)
         values = [finite(part) for part in text.split(",")]
         numbers = [value for value in values if value is not None]
@@ -62,7 +62,7 @@ class _Script(NamedTuple):
         return numbers
 
     def file(self, element: ElementTree.Element) -> Path:
-        """The file that an element names, by the base folder of <input>."""
+        """Return the file that an element names, by the base folder of <input>."""
         base = self.find("input").get("base_dir", "$HERE").replace("$HERE", str(self.path.parent))
         base = base.replace("$HOME", str(Path.home()))
         name = (element.text or "").strip()
@@ -71,7 +71,7 @@ class _Script(NamedTuple):
         return Path(base) / name
 
     def tables(self, tag: str, *columns: str) -> list[tuple[Table, ElementTree.Element]]:
-        """The files of <input><tag>, columns named by the attribute `format`; `columns` are needed."""
+        """Return the files of <input><tag>, columns named by the attribute `format`; `columns` are needed."""
         elements = self.find(f"input/{tag}").findall("file")
         if not elements:
             raise self.error(f"<{tag}> names 0 files; add <file format='{','.join(columns)}'>")
@@ -86,7 +86,7 @@ class _Script(NamedTuple):
         return tables
 
     def setting(self, operation: str, key: str) -> str:
-        """The text of an operation's element, or of its <all>."""
+        """Return the text of an operation's element, or of its <all>."""
         element = self.root.find(f"operations/operation/{operation}/{key}")
         return "default" if element is None else (element.findtext("all") or element.text or "").strip()
 
@@ -184,7 +184,7 @@ def _prior_orientations(script: _Script, file: str, name_of: dict[str, str]) -> 
 
 
 def _oriented(images: Table, prior: Table) -> Table:
-    """The images with orientations where all six values are given."""
+    """Return the images with orientations where all six values are given."""
     columns = (*XYZ, *(f"{name}_deg" for name in _ANGLES))
     if not all(name in prior for name in columns):
         return images
@@ -265,7 +265,7 @@ def _first(table: Table, *names: str) -> str | None:
 
 
 def _camera(script: _Script) -> dict[str, Any]:
-    """The [cameras.X] table of the one camera."""
+    """Return the [cameras.X] table of the one camera."""
     c = _CAMERA_PLACE
     if len(script.find("input/cameras").findall("camera")) != 1:
         raise script.error("there is not exactly one <camera>; this reader takes one, so convert the project by hand")
@@ -321,7 +321,7 @@ def _coefficients(script: _Script, tag: str, most: int) -> dict[str, float]:
 
 
 def _free(script: _Script) -> dict[str, str]:
-    """The interior parameters that the script estimates."""
+    """Return the interior parameters that the script estimates."""
     n_k, n_p = (int(script.numbers(f"{_CAMERA_PLACE}/{name}", n)[0]) for name, n in (("nK", "3"), ("nP", "2")))
     if n_k > 3 or n_p > 2:
         raise script.error(f"nK = {n_k}, nP = {n_p} are more coefficients than Brown's model has; use at most 3 and 2")

@@ -211,7 +211,7 @@ def _blob(shape: np.ndarray, kind: str, srs: int) -> bytes:
 
 
 def _surveyed(file: str, features: Sequence[tuple[Sequence[float], dict[str, Any]]], system: str) -> SurveyedPoints:
-    """The points of features, each coordinates and attributes; a height is that of the geometry, else an attribute."""
+    """Return the points of features with attributes; the height is of the geometry, else an attribute."""
     keys = list(dict.fromkeys(key for _, attributes in features for key in attributes))
     solid = any(len(coordinates) > 2 for coordinates, _ in features)
     header = [*("xyz" if solid else "xy"), *keys]

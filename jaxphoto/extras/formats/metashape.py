@@ -87,7 +87,7 @@ def _sensors(root: ElementTree.Element) -> dict[str, tuple[ElementTree.Element, 
 
 
 def _calibration(sensor: ElementTree.Element) -> tuple[ElementTree.Element | None, str | None]:
-    """The adjusted calibration of a sensor, else the initial one, and its pixel size."""
+    """Return the adjusted calibration of a sensor, else the initial one, and its pixel size."""
     calibrations = {c.get("class", "adjusted"): c for c in sensor.findall("calibration")}
     sizes = {p.get("name"): p.get("value") for p in sensor.iter("property")}
     return calibrations.get("adjusted", calibrations.get("initial")), sizes.get("pixel_width")
@@ -228,7 +228,7 @@ def _control(rows: SurveyRows, points: list[str]) -> ControlPoints:
 
 
 def _photos(path: Path, chunk: ElementTree.Element) -> tuple[list[_Aligned], str]:
-    """The aligned cameras of the largest component, and that component."""
+    """Return the aligned cameras of the largest component, and that component."""
     photos, unaligned = [], 0
     for camera in chunk.iterfind("cameras//camera"):
         transform, label = camera.findtext("transform"), (camera.get("label") or "").strip()
@@ -290,13 +290,13 @@ def _transform(path: Path, chunk: ElementTree.Element, component: str) -> tuple[
 
 
 def _system(path: Path, chunk: ElementTree.Element, centres: Float[np.ndarray, "images 3"]) -> ControlSystem:
-    """The system of the file; WGS 84 if it names none and positions are geocentric."""
+    """Return the system of the file; WGS 84 if it names none and positions are geocentric."""
     words = _system_words(chunk) or (f"EPSG:{WGS84}" if is_geocentric(centres) else "local")
     return system_of(words, path.name)
 
 
 def _datum_code(path: Path, system: ControlSystem) -> int:
-    """The EPSG code of the system, else that of its geographic system."""
+    """Return the EPSG code of the system, else that of its geographic system."""
     if system.code is not None:
         return system.code
     geodetic = None if system.crs is None else system.crs.geodetic_crs
@@ -331,7 +331,7 @@ def _system_words(chunk: ElementTree.Element) -> str:
 
 
 def _markers(path: Path, chunk: ElementTree.Element) -> tuple[SurveyRows, list[Mark]]:
-    """Those of the file, else those of markers.xml beside it."""
+    """Read the markers of the file, else of markers.xml in its folder."""
     beside = path.with_name(MARKERS_FILE)
     if chunk.find("markers//marker") is not None or not beside.is_file() or beside == path:
         return _markers_of(path.name, chunk)
@@ -381,7 +381,7 @@ def _number(element: ElementTree.Element, key: str, place: str) -> float:
 
 
 def _sigma(reference: ElementTree.Element, key: str, place: str) -> float:
-    """Standard deviation of an axis, or of all three; Metashape writes 0 for none."""
+    """Return the standard deviation of an axis, or of all three; Metashape writes 0 for none."""
     key = key if reference.get(key) is not None else "sxyz"
     value = _number(reference, key, place) if reference.get(key) is not None else np.nan
     if value < 0:
@@ -472,7 +472,7 @@ def _add_sensor(sensors: ElementTree.Element, number: int, name: str, camera: Pr
 
 
 def _reference(frame: Frame) -> str:
-    """The coordinate system as WKT."""
+    """Return the coordinate system as WKT."""
     if frame.kind != "epsg" or frame.code is None:
         return _LOCAL
     compound = frame.vertical is not None

@@ -135,7 +135,7 @@ def _matrix(source: CameraSource, storage: Any, key: str) -> np.ndarray:
 
 
 def _parts(sensor: Sensor, interior: InteriorOrientation) -> tuple[bool, list[float], list[float]]:
-    """Whether it is a fisheye, the camera matrix row by row, and as many coefficients as OpenCV needs."""
+    """Return True for a fisheye, the camera matrix by rows, and as many coefficients as OpenCV needs."""
     fx, fy, column, row = pixels_of(interior, sensor)
     fisheye = isinstance(interior.distortion, OpenCvFisheye)
     values = [float(getattr(interior.distortion, k)) for k in (FISHEYE_TERMS if fisheye else OPENCV_ORDER)]

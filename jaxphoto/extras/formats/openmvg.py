@@ -118,7 +118,7 @@ def _by_key(path: Path, content: dict[str, Any], name: str) -> dict[str, dict[st
 
 
 def _data(value: dict[str, Any]) -> dict[str, Any]:
-    """The values of an object and of its base class."""
+    """Return the values of an object and of its base class."""
     data = value["ptr_wrapper"]["data"]
     return {**data.get("value0", {}), **data}
 
@@ -179,7 +179,7 @@ def write(p: Project, folder: Path) -> None:
 
 
 def _written(camera: ProjectCamera) -> tuple[str, dict[str, Any]]:
-    """The first kind that holds a camera, and its values."""
+    """Return the first kind that holds a camera, and its values."""
     sensor, interior, _ = camera
     d = interior.distortion
     needed = {name for name in d.coefficients if float(getattr(d, name)) != 0}
@@ -198,7 +198,7 @@ def _item(key: int, value: dict[str, Any]) -> dict[str, Any]:
 
 
 def _wrapped(number: int, data: dict[str, Any]) -> dict[str, Any]:
-    """The object `number` of the file behind a pointer."""
+    """Return the object `number` of the file behind a pointer."""
     return {"ptr_wrapper": {"id": _NEW | (number + 1), "data": data}}
 
 

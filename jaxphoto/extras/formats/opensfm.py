@@ -86,7 +86,7 @@ def read(path: Path) -> Project:
 
 
 def _reference(folder: Path, content: Section) -> Place | None:
-    """The origin of the world on WGS 84; None if unknown (0, 0 in a reconstruction without GPS)."""
+    """Return the origin of the world on WGS 84; None if unknown (0, 0 in a reconstruction without GPS)."""
     path = folder / REFERENCE
     if "reference_lla" in content:
         reference = content.section("reference_lla")

@@ -178,7 +178,7 @@ def _written(name: str, camera: ProjectCamera) -> str:
 
 
 def _number(value: float) -> str:
-    """A number of YAML 1.1, which has a point before the exponent."""
+    """Return a number of YAML 1.1, which has a point before the exponent."""
     digits, e, exponent = repr(float(value)).partition("e")
     return digits + ("" if "." in digits else ".0") + e + exponent
 

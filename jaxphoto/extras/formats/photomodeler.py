@@ -101,7 +101,7 @@ def read(path: Path) -> BlockTables:
 
 
 def _camera(path: Path, lines: list[str]) -> dict[str, Any]:
-    """The [cameras.X] table."""
+    """Return the [cameras.X] table."""
     if len(lines[1].split()) == 2:
         raise InputError(f"{path.name}, row 2: it has no size of the photographs; write width, height at its end")
     _, _, width, height = row_numbers(path, 2, lines[1].split(), 4)

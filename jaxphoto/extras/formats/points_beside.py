@@ -224,7 +224,7 @@ def _read_table(text: Path, files: Sequence[str], of: str) -> Shown:
 
 
 def _photograph(head: str, places: dict[str, int]) -> tuple[int, list[str]]:
-    """The photograph that a head names, -1 for none, and the words after its name."""
+    """Return the photograph that a head names, -1 for none, and the words after its name."""
     words = head.split()
     for n in range(len(words), 0, -1):
         name = head if n == len(words) else " ".join(words[:n])

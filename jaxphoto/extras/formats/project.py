@@ -353,7 +353,7 @@ def _cells(values: Float[np.ndarray, "n"]) -> np.ndarray:
 
 
 def _section(camera: ProjectCamera) -> dict[str, Any]:
-    """The table [cameras.X]."""
+    """Return the table [cameras.X]."""
     priors = jax.tree.map(lambda _: FIXED, camera.interior)
     for name in camera.free:
         priors = set_parameter(priors, name, FREE)
@@ -438,7 +438,7 @@ def with_system(p: Project, words: str) -> Project:
 
 
 def _frame_amid(code: int, vertical: int | None, places: Float[np.ndarray, "n 3"]) -> Frame:
-    """A frame with a rounded place amid `places` as its origin."""
+    """Return a frame with a rounded place amid `places` as its origin."""
     longitude, latitude, _ = np.median(places, axis=0)
     return Frame("epsg", code, vertical, "true", (round(float(longitude), 4), round(float(latitude), 4), 0.0))
 

@@ -134,7 +134,7 @@ def oriented_project(
 
 
 def _cameras(path: Path, names: list[str]) -> tuple[dict[str, ProjectCamera], list[str]]:
-    """The cameras of the folder, and the camera of each photograph."""
+    """Return the cameras of the folder, and the camera of each photograph."""
     near = (p for p in sorted(path.parent.iterdir()) if p.is_file() and not p.name.startswith("."))
     files = [p for p in near if p.suffix.lower() in _CAMERAS]
     if len(files) != 1:
@@ -243,7 +243,7 @@ def read_exterior(path: Path) -> ExteriorText:
 
 
 def _system(path: Path, head: str) -> str:
-    """An EPSG code in the head, else the content of a .prj of the same name or of the only one in the folder."""
+    """Return an EPSG code in the head, else the content of a .prj of the same name or of the only one in the folder."""
     if named := _SYSTEM.search(head):
         return named[1]
     same = path.with_suffix(".prj")
@@ -252,7 +252,7 @@ def _system(path: Path, head: str) -> str:
 
 
 def _cells(line: str) -> list[str]:
-    """The cells between the first separator that is frequent enough, else between blanks."""
+    """Return the cells between the first separator that is frequent enough, else between blanks."""
     for separator in ("\t", ";", ","):
         if line.count(separator) >= 3:
             return [cell.strip() for cell in line.strip().split(separator)]

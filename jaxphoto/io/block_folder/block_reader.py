@@ -76,7 +76,7 @@ class BlockTables:
 
 
 def read_block(folder: str | Path, more: Iterable[type] = ()) -> Block:
-    """The block that a folder describes (docs/block_folder.md).
+    """Return the block that a folder describes (docs/block_folder.md).
 
     `more` are classes of observations and of unknowns of your own (docs/extending.md).
 
@@ -87,12 +87,12 @@ def read_block(folder: str | Path, more: Iterable[type] = ()) -> Block:
 
 
 def exposure_times(folder: str | Path) -> Float[np.ndarray, "images"]:
-    """`time_s` of images.csv, in the order of the block; NaN where it is empty."""
+    """Return `time_s` of images.csv, in the order of the block; NaN where it is empty."""
     return read_folder(Path(folder)).tables["images"].numbers("time_s", empty=True)
 
 
 def read_folder(folder: Path, more: Iterable[type] = ()) -> BlockTables:
-    """The files of a block folder. Raises InputError for those that are missing or cannot be read."""
+    """Return the files of a block folder. Raises InputError for those that are missing or cannot be read."""
     if not folder.is_dir():
         raise InputError(f"there is no folder {folder}; give the folder that holds {TOML}")
     required = (TOML, *(f"{name}.csv" for name, layout in LAYOUTS.items() if layout.required))
@@ -118,7 +118,7 @@ def read_folder(folder: Path, more: Iterable[type] = ()) -> BlockTables:
 
 
 def assemble(source: BlockTables) -> Block:
-    """The block that settings and tables describe; all checks that need more than one line are made here."""
+    """Return the block that settings and tables describe; all checks that need more than one line are made here."""
     kinds = source.kinds
     settings = read_settings(dict(source.settings), source.file, [sigma_key(kind) for kind in own_tables(kinds)])
     keys, top, frame = settings.keys, settings.top, settings.frame

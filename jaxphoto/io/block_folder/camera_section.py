@@ -92,7 +92,7 @@ class Camera(NamedTuple):
 
 @functools.cache
 def _keys(distortion: type[AbstractDistortion], projection: type[AbstractProjection]) -> type[CameraKeys]:
-    """The keys of a camera with these models: each may have choices, such as a sign."""
+    """Return the keys of a camera with these models: each may have choices, such as a sign."""
     defaults = {f.name: f.default for kind in (distortion, projection) for f in dataclasses.fields(kind)}
     choices: dict[str, Any] = {
         key: (Literal[words], defaults[key])  # type: ignore[valid-type]
@@ -102,7 +102,7 @@ def _keys(distortion: type[AbstractDistortion], projection: type[AbstractProject
 
 
 def read_camera(section: Section) -> Camera:
-    """The camera of a [cameras.X] table."""
+    """Return the camera of a [cameras.X] table."""
     key = "distortion"
     try:
         distortion = AbstractDistortion.called(section.text(key))
@@ -163,14 +163,14 @@ def _priors(section: Section, keys: CameraKeys, interior: InteriorOrientation) -
             raise known.error("parameters", f"{quoted(name)} is unknown or given twice; use {', '.join(names)}")
         if table.values.get(name, "free") != "free":
             raise table.error(
-                name, f"it is known beforehand by [{known.path}]; remove it here, or there with its covariance"
+                name, f"it has prior information in [{known.path}]; remove it here, or there with its covariance"
             )
         priors = set_parameter(priors, name, FREE)
     return priors, KnownTogether(parameters, known.covariance("matrix", keys.known.matrix, len(parameters)))
 
 
 def read_sensor(section: Section) -> Sensor:
-    """The sensor of a table that may have other keys, too."""
+    """Return the sensor of a table that may have other keys, too."""
     keys = section.values
     return Sensor(
         section.count("width_px"), section.count("height_px"), section.positive("pixel_mm"),
@@ -179,7 +179,7 @@ def read_sensor(section: Section) -> Sensor:
 
 
 def known_together(interior: InteriorOrientation, covariance: np.ndarray) -> KnownTogether:
-    """The estimated parameters in a covariance of all: those with a variance."""
+    """Return the estimated parameters in a covariance of all: those with a variance."""
     names = parameter_names(interior)
     free = np.flatnonzero(np.diagonal(covariance) > 0)
     part = covariance[np.ix_(free, free)]
@@ -187,7 +187,7 @@ def known_together(interior: InteriorOrientation, covariance: np.ndarray) -> Kno
 
 
 def camera_section(camera: Camera) -> dict[str, Any]:
-    """The [cameras.X] table that `read_camera` reads as `camera`."""
+    """Return the [cameras.X] table that `read_camera` reads as `camera`."""
     sensor, interior, priors, known, reservation = camera
     written: dict[str, Any] = sensor_keys(sensor) | model_keys(interior)
     if interior.residuals != "model":
@@ -203,7 +203,7 @@ def camera_section(camera: Camera) -> dict[str, Any]:
 
 
 def with_earlier_calibrations(settings: dict[str, Any], file: str, folder: Path) -> dict[str, Any]:
-    """The content of block.toml in `folder`, with earlier calibrations in the tables of their cameras.
+    """Return the content of block.toml in `folder`, with earlier calibrations in the tables of their cameras.
 
     Raises InputError for calibrations that cannot be read or are without covariance, and for keys that they give.
     """
@@ -243,7 +243,7 @@ def with_earlier_calibrations(settings: dict[str, Any], file: str, folder: Path)
 
 
 def known_cameras(cameras: Mapping[str, Camera]) -> tuple[KnownParameters, ...]:
-    """The joint prior information of each camera."""
+    """Return the joint prior information of each camera."""
     known = []
     for name, camera in cameras.items():
         if camera.known is not None:

@@ -52,7 +52,7 @@ class Ids(NamedTuple):
     owners: Names
 
     def find(self, table: Table, column: str, kind: str) -> np.ndarray:
-        """The index of the `kind` of thing in each line. Raises BlockError for one that does not exist."""
+        """Return the index of the `kind` of thing in each line. Raises BlockError for one that does not exist."""
         if kind == "image":
             return self.images.find(table, column)
         known, cure = self.points.ids, "is measured in no image; measure it or delete the row"
@@ -63,7 +63,7 @@ class Ids(NamedTuple):
 
 
 def known_kinds(more: Iterable[Kind]) -> tuple[Kind, ...]:
-    """The classes that files may hold: those of jaxphoto, then `more`. Raises BlockError where two have one name."""
+    """Return the classes that files may hold, of jaxphoto and `more`. Raises BlockError if two have one name."""
     kinds = tuple(dict.fromkeys((*OBSERVATIONS, *more)))
     taken = set(LAYOUTS) - {kind.group for kind in OBSERVATIONS}
     for kind in kinds:
@@ -74,7 +74,7 @@ def known_kinds(more: Iterable[Kind]) -> tuple[Kind, ...]:
 
 
 def own_tables(kinds: Iterable[Kind]) -> list[Kind]:
-    """The classes without a reader of their own."""
+    """Return the classes without a reader of their own."""
     return [kind for kind in kinds if kind.group not in LAYOUTS]
 
 
@@ -108,7 +108,7 @@ def layouts(kinds: Iterable[Kind], partitions: Sequence[str] = ()) -> dict[str, 
 def read_declared(
     kinds: Sequence[Kind], tables: Mapping[str, Table], ids: Ids, settings: Settings
 ) -> tuple[Distances, tuple[AbstractObservations | KnownParameters, ...]]:
-    """The distances of a block, and its `more`: a group a table, sets of correlated rows, known parameters."""
+    """Return the distances of a block, and its `more`: a group a table, sets of correlated rows, known parameters."""
     plain = [_rows(kind, tables[kind.group], ids, settings) for kind in own_tables(kinds)]
     joint = [group for kind in kinds for group in _correlated(kind, tables, ids)]
     (distances,) = (rows for rows in plain if isinstance(rows, Distances))
@@ -148,7 +148,7 @@ def _instance(kind: Kind, table: Table, fields: Mapping[str, np.ndarray]) -> Abs
 
 
 def _correlated(kind: Kind, tables: Mapping[str, Table], ids: Ids) -> list[Correlated]:
-    """Sets of rows of a class, those of one size together."""
+    """Return the sets of rows of a class, those of one size together."""
     table, groups = tables[JOINT + kind.group], []
     sets = list(_sets(table, tables[JOINT + kind.group + _MATRIX], *_square(kind), len(kind.axes)))
     for size in dict.fromkeys(len(lines) for lines, _ in sets):
@@ -173,13 +173,13 @@ def _known(tables: Mapping[str, Table]) -> list[KnownParameters]:
 
 
 def _square(kind: Kind) -> tuple[str, float]:
-    """The end of the column of covariances, in the square of the unit, and the factor to jaxphoto's unit."""
+    """Return the end of the column of covariances, in the square of the unit, and the factor to jaxphoto's unit."""
     unit = FILE_UNITS.get(kind.unit, kind.unit)
     return (f"_{unit.replace('_per_', '2_per_')}2" if unit else ""), (np.pi / 180) ** 2 if unit != kind.unit else 1.0
 
 
 def _sets(table: Table, matrices: Table, unit: str, scale: float, k: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The lines of each set, and its covariance matrix over `k` numbers of each line."""
+    """Return the lines of each set, and its covariance matrix over `k` numbers of each line."""
     named, owner = table.text("set"), matrices.text("set")
     matrices.find(
         "set", list(dict.fromkeys(named)), lambda name: f"set {name} is not in {table.file}; add or delete it"
@@ -209,13 +209,13 @@ def _sets(table: Table, matrices: Table, unit: str, scale: float, k: int) -> Ite
 
 
 def kinds_of(block: Block) -> list[Kind]:
-    """The classes of the observations of `more`."""
+    """Return the classes of the observations of `more`."""
     groups = [rows.rows if isinstance(rows, Correlated) else rows for rows in block.more]
     return list(dict.fromkeys(type(rows) for rows in groups if isinstance(rows, AbstractObservations)))
 
 
 def declared_tables(block: Block) -> dict[str, pd.DataFrame]:
-    """The tables of the distances and `more` of a block; groups of one class make one.
+    """Return the tables of the distances and `more` of a block; groups of one class make one.
 
     Raises BlockError for rows of a class whose table can hold only those of the block itself.
     """
@@ -241,7 +241,7 @@ def declared_tables(block: Block) -> dict[str, pd.DataFrame]:
 
 
 def _table(rows: AbstractObservations, names: Names, sigmas: bool = True) -> pd.DataFrame:
-    """The table of `rows`. Raises BlockError for a field that files do not have, and which is not zero."""
+    """Return the table of `rows`. Raises BlockError for a field that files do not have, and which is not zero."""
     columns = columns_of(type(rows))
     for name, value in vars(rows).items():
         if name not in [c.field for c in columns] and np.any(np.asarray(value) != 0):
@@ -257,7 +257,7 @@ def _cells(rows: AbstractObservations, column: ClassColumn, names: Names) -> np.
 
 
 def _correlated_tables(groups: Sequence[Correlated], names: Names) -> dict[str, pd.DataFrame]:
-    """The two tables of sets of rows of one class."""
+    """Return the two tables of sets of rows of one class."""
     parts: list[pd.DataFrame] = []
     matrices: list[np.ndarray] = []
     for group in groups:
@@ -272,7 +272,7 @@ def _correlated_tables(groups: Sequence[Correlated], names: Names) -> dict[str, 
 
 
 def _known_tables(groups: Sequence[KnownParameters]) -> dict[str, pd.DataFrame]:
-    """The two tables of parameters known together."""
+    """Return the two tables of parameters known together."""
     rows = [
         (k, label, value, group.reservation)
         for k, group in enumerate(groups, 1)

@@ -146,7 +146,7 @@ def check_motion_held(block: Block) -> None:
 
 
 def _late_pairs(rows: Iterable[Any], cameras: Sequence[str], late: Collection[str]) -> Iterator[tuple[int, str]]:
-    """The image of the reference camera, and the camera that exposes late beside it."""
+    """Return the image of the reference camera, and the camera that exposes late beside it."""
     for group in rows:
         if isinstance(group, RigPlaces | RigTurns):
             for reference, image in zip(group.reference.tolist(), group.image.tolist(), strict=True):
@@ -226,7 +226,7 @@ def _interpolated(records: Records, images: Images, frame: Frame, settings: Sett
 
 
 def _near(records: Records, times: np.ndarray) -> Records:
-    """The records about the exposures: hours of them at 200 Hz would only take time."""
+    """Return the records about the exposures: hours of them at 200 Hz would only take time."""
     n, at = len(records.time), np.searchsorted(records.time, times)
     change = np.zeros(n + 1, int)
     np.add.at(change, np.clip(at - _MARGIN, 0, n - SHORTEST), 1)

@@ -37,7 +37,7 @@ Refuse = Callable[[str, int, str], NoReturn]
 
 
 def tables_to_local(tables: Mapping[str, Table], frame: Frame) -> dict[str, Table]:
-    """The tables of a block folder with X_m, Y_m, Z_m and all angles in the local frame; others as they are.
+    """Return the tables of a block folder with X_m, Y_m, Z_m and all angles in the local frame; others as they are.
 
     `frame` has its origin. Raises InputError where a row cannot be converted.
     """
@@ -66,7 +66,7 @@ def tables_to_local(tables: Mapping[str, Table], frame: Frame) -> dict[str, Tabl
 
 
 def tables_to_map(tables: ArrayLike, frame: Frame) -> ArrayLike:
-    """The tables of `write_block` in the system of `frame`: the inverse of `tables_to_local`."""
+    """Return the tables of `write_block` in the system of `frame`: the inverse of `tables_to_local`."""
 
     def refuse(name: str, line: int, message: str) -> NoReturn:
         raise BlockError(f"{name}.csv, entry {line + 1}: {message}")
@@ -77,7 +77,7 @@ def tables_to_map(tables: ArrayLike, frame: Frame) -> ArrayLike:
 
 
 def with_origin(frame: Frame, tables: Mapping[str, Table], trajectory: Records | None, file: str) -> Frame:
-    """The frame with its origin: that of block.toml, else a round place amid the coordinates, at height zero.
+    """Return the frame with its origin: that of block.toml, else a round place amid the coordinates, at height zero.
 
     Raises InputError where the coordinates of a file are not in the area of the system, or far from the origin.
     """

@@ -65,7 +65,7 @@ class Images(NamedTuple):
     known: np.ndarray
 
     def find(self, table: Table, column: str = "image") -> np.ndarray:
-        """The index of the image in each line of `table`. Raises BlockError for one that is not listed."""
+        """Return the index of the image in each line of `table`. Raises BlockError for one that is not listed."""
         listed = self.table.file
         return table.find(column, self.ids, lambda name: f"image {name} is not in {listed}; add it or delete this row")
 
@@ -76,7 +76,7 @@ class Images(NamedTuple):
 
 
 def read_images(table: Table, settings: Settings) -> Images:
-    """The images of images.csv."""
+    """Return the images of images.csv."""
     if not len(table):
         raise BlockError(f"{table.file}: there are no images; list at least two")
     cameras, strips, times = table.text("camera"), table.text("strip"), table.numbers("time_s", empty=True)
@@ -125,7 +125,7 @@ def _centred(times: np.ndarray, strips: np.ndarray) -> np.ndarray:
 
 
 def partitions_of(images: Images, settings: Settings) -> dict[str, tuple[str, ...]]:
-    """The part that each image is in, by partition."""
+    """Return the part that each image is in, by partition."""
     parts = {name: images.table.text(name) for name in settings.keys.partitions}
     for name, part in parts.items():
         for line in np.flatnonzero(part == "default")[:1]:
@@ -150,7 +150,7 @@ def with_temperatures(images: Table, folder: Path) -> Table:
 
 
 def temperatures_of(images: Images, settings: Settings) -> Temperatures | None:
-    """The temperatures of the cameras, where any is known."""
+    """Return the temperatures of the cameras, where any is known."""
     celsius = images.table.numbers("temperature_c", empty=True)
     images.table.check(
         (celsius < _COLDEST_C) | (celsius > _WARMEST_C),
@@ -198,12 +198,12 @@ class ObservedPoints(NamedTuple):
     lines: np.ndarray
 
     def find(self, ids: np.ndarray) -> np.ndarray:
-        """The index of each point, -1 where it is observed in no image."""
+        """Return the index of each point, -1 where it is observed in no image."""
         return pd.Index(self.ids).get_indexer(pd.Index(ids))
 
 
 def read_image_points(table: Table, images: Images, settings: Settings) -> ObservedPoints:
-    """The measurements, sorted by point and image; points in order of first appearance."""
+    """Return the measurements, sorted by point and image; points in order of first appearance."""
     if not len(table):
         raise BlockError(f"{table.file}: there are no image points; list what was measured in the images")
     image = images.find(table)
@@ -293,7 +293,7 @@ class Control(NamedTuple):
 def sigmas_of(
     table: Table, column: str, settings: Settings, *keys: str, needed: np.ndarray | bool = True
 ) -> np.ndarray:
-    """A column of standard deviations, completed by the first of `keys` that [sigmas] has where they are `needed`."""
+    """Return a column of standard deviations, completed by the first of `keys` in [sigmas] where `needed`."""
     given = table.sigmas(column)
     sigma = np.where(np.isnan(given) & needed, default_sigma(settings, *keys), given)
     table.check(
@@ -352,7 +352,7 @@ def _given_coordinates(table: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _find_or_warn(table: Table, points: ObservedPoints) -> np.ndarray:
-    """The index of each line's point, -1 (and a warning) where no image shows it."""
+    """Return the index of each line's point, -1 (and a warning) where no image shows it."""
     named = table.text("point")
     index = points.find(named)
     if missing := list(dict.fromkeys(named[index < 0])):

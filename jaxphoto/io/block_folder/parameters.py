@@ -48,7 +48,7 @@ class Key(NamedTuple):
 
 
 def known_unknowns(more: Iterable[Kind]) -> tuple[Kind, ...]:
-    """The classes that [unknowns] may hold, `more` the last. Raises BlockError where two have one name."""
+    """Return the classes that [unknowns] may hold, `more` the last. Raises BlockError where two have one name."""
     kinds = tuple(
         kind for kind in dict.fromkeys((*UNKNOWNS, *more)) if kind not in UNKNOWNS or kind.kind not in _SEPARATE
     )
@@ -62,7 +62,7 @@ def known_unknowns(more: Iterable[Kind]) -> tuple[Kind, ...]:
 
 @functools.cache
 def keys_of(kind: Kind) -> tuple[Key, ...]:
-    """The keys of the fields of a class. Raises TypeError for fields that are neither numbers nor vectors."""
+    """Return the keys of the fields of a class. Raises TypeError for fields that are neither numbers nor vectors."""
     hints, keys = typing.get_type_hints(kind), []
     for field in dynamic_fields(kind):
         names = kind.names[field]
@@ -115,7 +115,7 @@ def _instance(kind: Kind, values: dict[str, Any], table: Section) -> Any:
 
 
 def parameters_section(parameters: AbstractParameters, priors: AbstractParameters) -> dict[str, Any]:
-    """The table that `read_parameters` reads as `parameters` and `priors`."""
+    """Return the table that `read_parameters` reads as `parameters` and `priors`."""
     written = {name: getattr(parameters, name) for name in static_fields(type(parameters))}
     for key in keys_of(type(parameters)):
         value = np.asarray(getattr(parameters, key.field))
@@ -130,7 +130,7 @@ def _read_each(kind: Kind, tables: dict[str, Section]) -> Pairs:
 
 
 def by_owner(section: Section, owners: Iterable[str]) -> dict[str, Section]:
-    """The table of each owner: its own, or that of "default"."""
+    """Return the table of each owner: its own, or that of "default"."""
     owners = list(owners)
     section.known("default", *owners)
     keys = {name: name if name in section else "default" for name in owners}
@@ -152,7 +152,7 @@ def read_mounts(section: Section, cameras: Iterable[str]) -> Pairs:
 
 
 def mounts_of(cameras: Iterable[str], mounts: Container[str]) -> dict[str, str]:
-    """The mount of each camera: the one that has its name, else "default", else none ("")."""
+    """Return the mount of each camera: the one that has its name, else "default", else none ("")."""
     return {name: name if name in mounts else "default" if "default" in mounts else "" for name in cameras}
 
 
@@ -165,7 +165,7 @@ def read_strips(section: Section, strips: Iterable[str]) -> Pairs:
 
 
 def read_scanner(section: Section) -> tuple[Scanner | None, Scanner | None]:
-    """The scanner and its priors; None without [scanner]."""
+    """Return the scanner and its priors; None without [scanner]."""
     section.known("boresight_deg", "boresight", "shifts")
     if not section.values:
         return None, None
@@ -181,7 +181,7 @@ def read_scanner(section: Section) -> tuple[Scanner | None, Scanner | None]:
 
 
 def scanner_section(scanner: Scanner | None, priors: Scanner | None) -> dict[str, Any]:
-    """The [scanner] table of `scanner`; empty without one."""
+    """Return the [scanner] table of `scanner`; empty without one."""
     if scanner is None or priors is None:
         return {}
     return {
@@ -213,7 +213,7 @@ def read_unknowns(section: Section, kinds: Iterable[Kind], block: Block) -> tupl
 
 
 def _tables(kind: Kind, section: Section, block: Block) -> dict[str, Section]:
-    """The table of each owner."""
+    """Return the table of each owner."""
     if kind.owner in _ONE:
         return {"": section}
     if kind.owner == _NAMED:
@@ -228,7 +228,7 @@ def _tables(kind: Kind, section: Section, block: Block) -> dict[str, Section]:
 
 
 def unknown_sections(block: Block) -> dict[str, Any]:
-    """The [unknowns] table of a block."""
+    """Return the [unknowns] table of a block."""
     priors, written = block.priors.more, {}
     for kind, owners in block.start.unknowns.more.items():
         tables: dict[str, Any] = {

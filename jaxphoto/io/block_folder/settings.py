@@ -146,7 +146,7 @@ class Settings:
 
 
 def read_settings(values: dict[str, Any], file: str = TOML, sigma_keys: Sequence[str] = ()) -> Settings:
-    """The settings in the content of block.toml; `sigma_keys` are those of further tables."""
+    """Return the settings in the content of block.toml; `sigma_keys` are those of further tables."""
     top = Section(file, "", values)
     keys = top.model(BlockKeys)
     top.section("sigmas").known(*_SIGMAS, *sigma_keys)
@@ -163,7 +163,7 @@ def read_settings(values: dict[str, Any], file: str = TOML, sigma_keys: Sequence
 
 
 def frame_of(keys: FrameKeys, file: str) -> Frame:
-    """The frame, of kind epsg without an origin where none is given."""
+    """Return the frame, of kind epsg without an origin where none is given."""
     if keys.kind == "epsg" and "vertical" not in keys.model_fields_set:
         warnings.warn(
             f"{file}, [frame]: heights are taken as above the ellipsoid (GNSS); write "
@@ -176,7 +176,7 @@ def frame_of(keys: FrameKeys, file: str) -> Frame:
 
 
 def corrections_in(frame: Frame, settings: Settings) -> Corrections:
-    """The corrections that [corrections] switches on in `frame`, which has its origin."""
+    """Return the corrections that [corrections] switches on in `frame`, which has its origin."""
     keys, section = settings.keys.corrections, settings.top.section("corrections")
     if keys.curvature and frame.kind != "grid":
         raise section.error(
@@ -200,7 +200,7 @@ def corrections_in(frame: Frame, settings: Settings) -> Corrections:
 
 
 def frame_section(frame: Frame) -> dict[str, Any]:
-    """The [frame] table of `frame`."""
+    """Return the [frame] table of `frame`."""
     if frame.kind != "epsg":
         return {"kind": frame.kind}
     vertical = "ellipsoidal" if frame.vertical is None else frame.vertical
@@ -210,7 +210,7 @@ def frame_section(frame: Frame) -> dict[str, Any]:
 
 
 def corrections_section(corrections: Corrections, frame: Frame) -> dict[str, Any]:
-    """The [corrections] table of `corrections`; empty where nothing is on."""
+    """Return the [corrections] table of `corrections`; empty where nothing is on."""
     written: dict[str, Any] = {name: True for name in ("refraction", "curvature") if getattr(corrections, name)}
     if corrections.refraction and frame.kind != "epsg":
         written["sea_level_m"] = corrections.sea_level_m
@@ -218,7 +218,7 @@ def corrections_section(corrections: Corrections, frame: Frame) -> dict[str, Any
 
 
 def datum_section(datum: Datum) -> dict[str, Any]:
-    """The [datum] table of `datum`."""
+    """Return the [datum] table of `datum`."""
     written: dict[str, Any] = {"kind": datum.kind}
     if datum.kind == "inner":
         written["over"] = datum.over if isinstance(datum.over, str) else list(datum.over)
@@ -228,5 +228,5 @@ def datum_section(datum: Datum) -> dict[str, Any]:
 
 
 def default_sigma(settings: Settings, *keys: str) -> float:
-    """The first of `keys` that [sigmas] has; NaN for none."""
+    """Return the first of `keys` that [sigmas] has; NaN for none."""
     return next((settings.sigmas[key] for key in keys if key in settings.sigmas), np.nan)

@@ -42,7 +42,7 @@ class TableLayout(NamedTuple):
     """No two rows have the same cells in these columns."""
 
     def names(self, required: bool) -> tuple[str, ...]:
-        """The columns that the file must, or may, have."""
+        """Return the columns that the file must, or may, have."""
         return tuple(c.name for c in self.columns if c.required == required)
 
     @property
@@ -94,19 +94,19 @@ LAYOUTS = {
 
 
 def coordinate_names(frame: Frame) -> tuple[str, ...]:
-    """The columns of coordinates in the files of a block in `frame`."""
+    """Return the columns of coordinates in the files of a block in `frame`."""
     geographic = frame.code is not None and map_system(frame.code).is_geographic
     return PLACE if geographic else XYZ
 
 
 def layout_in(frame: Frame, layout: TableLayout) -> TableLayout:
-    """The layout of a table of a block in `frame`."""
+    """Return the layout of a table of a block in `frame`."""
     names = dict(zip(XYZ, coordinate_names(frame), strict=True))
     return layout._replace(columns=tuple(c._replace(name=names.get(c.name, c.name)) for c in layout.columns))
 
 
 def checked(table: Table, layout: TableLayout) -> Table:
-    """The table with all columns of its layout: ids as text and numbers as floats, NaN and "" where they are empty.
+    """Return the table with all columns of its layout: text ids, float numbers, "" and NaN for empty cells.
 
     Raises RowError for the first cell that its column does not allow, and for rows that are given twice.
     """

@@ -103,12 +103,12 @@ def extent(
 
 
 def cloud_system(path: str | Path, *, epsg: int | None = None, unit: str | None = None) -> CoordinateSystem:
-    """The coordinate system of a cloud file."""
+    """Return the coordinate system of a cloud file."""
     return open_source(path, epsg, unit).system
 
 
 def point_count(path: str | Path) -> int | None:
-    """Number of points by the header of a cloud file; None without a header."""
+    """Return the number of points by the header of a cloud file; None without a header."""
     return open_source(path).count
 
 
@@ -194,7 +194,7 @@ def _no_selection(
     returns: Returns,
     within: np.ndarray | None,
 ) -> InputError:
-    """The error about a selection without points, with the classes and returns of the file."""
+    """Return the error about a selection without points, with the classes and returns of the file."""
     extents, by_class, by_return = [], Counter[int](), Counter[tuple[int, int]]()
     for chunk in (chunk for chunk in source.chunks() if len(chunk)):
         extents.append(chunk.extent)

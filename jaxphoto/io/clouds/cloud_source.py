@@ -38,7 +38,7 @@ class StripNumbers:
         self._index: dict[str, int] = {}
 
     def of(self, ids: np.ndarray) -> np.ndarray:
-        """The index in `names` of each of the strips `ids`."""
+        """Return the index in `names` of each of the strips `ids`."""
         codes, unique = pd.factorize(ids, sort=True)
         return np.array([self._index.setdefault(str(name), len(self._index)) for name in unique], np.int32)[codes]
 
@@ -57,7 +57,7 @@ def check_file(path: Path) -> None:
 
 
 def no_points(name: str) -> InputError:
-    """The error about a file without points."""
+    """Return the error about a file without points."""
     return InputError(f"{name} has no points; name another cloud")
 
 

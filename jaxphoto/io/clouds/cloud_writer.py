@@ -127,7 +127,7 @@ def _write_like(cloud: Cloud, path: Path, like: Path, frame: Frame | None, epsg:
 
 
 def _suffix(path: Path) -> str:
-    """The file name extension. Raises InputError for one that cannot be written."""
+    """Return the file name extension. Raises InputError for one that cannot be written."""
     if path.name.lower().endswith(".copc.laz"):
         raise InputError(f"{path.name}: COPC is read only; name a .laz file, and convert it (pdal translate, untwine)")
     if path.suffix.lower() not in SUFFIXES:

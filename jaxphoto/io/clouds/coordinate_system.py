@@ -52,7 +52,7 @@ class CoordinateSystem:
         return np.array([self.units[0], *self.units])
 
     def in_unit(self, unit: str | None) -> "CoordinateSystem":
-        """The system with coordinates in `unit` (a key of `UNITS`; None: unchanged).
+        """Return the system with coordinates in `unit` (a key of `UNITS`; None: unchanged).
 
         Raises InputError for an unknown unit.
         """
@@ -75,7 +75,7 @@ class CoordinateSystem:
 
 
 def system_of(crs: CRS, name: str) -> CoordinateSystem:
-    """The coordinate system `crs` of the file `name`; heights of an unknown system have the unit of the map.
+    """Return the coordinate system `crs` of the file `name`; heights of an unknown system have the unit of the map.
 
     Raises InputError for a geocentric system, and for axes that point south or west.
     """
@@ -99,7 +99,7 @@ def system_of(crs: CRS, name: str) -> CoordinateSystem:
 
 
 def epsg_system(code: int, name: str) -> CoordinateSystem:
-    """The coordinate system of the EPSG code that a user gives for the file `name`. Raises InputError if unknown."""
+    """Return the coordinate system of the EPSG code given for the file `name`. Raises InputError if unknown."""
     try:
         crs = CRS.from_epsg(code)
     except CRSError:
@@ -108,7 +108,7 @@ def epsg_system(code: int, name: str) -> CoordinateSystem:
 
 
 def frame_system(frame: Frame | None) -> CoordinateSystem:
-    """The system, in metres, of the map coordinates of a block's frame; a local frame without them."""
+    """Return the system, in metres, of the map coordinates of a block's frame; a local frame without them."""
     if frame is None or frame.code is None:
         return CoordinateSystem()
     return CoordinateSystem(map_system(frame.code), "ellipsoid" if frame.vertical is None else frame.vertical)
@@ -122,7 +122,7 @@ def _unbound(crs: CRS) -> CRS:
 
 
 def _in_metres(crs: CRS) -> CRS:
-    """The same projection with axes in metres; a false easting keeps its unit and value."""
+    """Convert the axes of a projection to metres; a false easting keeps its unit and value."""
     if crs.is_geographic or all(axis.unit_conversion_factor == 1 for axis in crs.axis_info):
         return crs
     definition = crs.to_json_dict()
@@ -191,7 +191,7 @@ class Placement:
         return self._map.local(np.stack([x, y, z / self._height_unit], axis=1))
 
     def metres(self, xyz: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """The inverse of `frame_from_metres`."""
+        """Return the inverse of `frame_from_metres`."""
         if self._map is None:
             return xyz
         x, y, z = self._map.map(xyz).T
@@ -210,7 +210,7 @@ class Placement:
         return np.stack([box.min(axis=0), box.max(axis=0)])
 
     def placed(self, cloud: Cloud) -> Cloud:
-        """A cloud in file coordinates, transformed to the frame. Raises InputError for points outside its area."""
+        """Transform a cloud from file coordinates to the frame. Raises InputError for points outside its area."""
         xyz = self.frame(cloud.xyz)
         outside = ~np.isfinite(xyz).all(axis=1)
         if outside.any():
@@ -241,7 +241,7 @@ class Placement:
         raise InputError(f"{self.name} ({_text(placed)}) does not overlap the block ({_text(within)}); {cure}")
 
     def _plane_transformer(self, source: CRS, target: CRS, place: tuple[float, float]) -> Transformer:
-        """The best transformation of plane coordinates near `place` that PROJ has on this computer."""
+        """Return the best transformation of plane coordinates near `place` that PROJ has on this computer."""
         transformers = ways(source, target, *place).transformers
         if not transformers:
             raise InputError(f"{self.name}: PROJ has no transformation from {source.name} to {target.name}")

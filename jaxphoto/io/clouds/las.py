@@ -28,7 +28,7 @@ _SCALE_M, _SCALE_DEG = 1e-3, 1e-8
 
 
 def open_las(path: Path, system: CoordinateSystem | None) -> CloudSource:
-    """A LAS or LAZ file without its withheld points, in `system` or, if None, its own. Raises InputError if damaged."""
+    """Read a LAS or LAZ file without withheld points, in `system` or its own. Raises InputError if damaged."""
     with _open(path) as reader:
         header = reader.header
         if header.point_count == 0:
@@ -122,7 +122,7 @@ def _chunks(path: Path) -> Iterator[Cloud]:
 def _points_and_clouds(
     reader: laspy.LasReader, name: str, *, withheld: bool
 ) -> Iterator[tuple[laspy.ScaleAwarePointRecord, Cloud]]:
-    """The points of a file in parts, with or without those `withheld`, as in the file and as a cloud.
+    """Return the points of a file in parts, with or without those `withheld`, as in the file and as a cloud.
 
     Raises InputError for points outside the extent of the header, which is what damaged bytes decode to.
     """
@@ -177,7 +177,7 @@ def _set_coordinates(points: laspy.ScaleAwarePointRecord, xyz: np.ndarray, heade
 
 
 def _system(header: laspy.LasHeader, name: str) -> CoordinateSystem:
-    """The system of the WKT or GeoTIFF records; laspy does not read the keys of units and heights."""
+    """Return the system of the WKT or GeoTIFF records; laspy does not read the keys of units and heights."""
     keys = {
         key.id: key.value_offset
         for record in header.vlrs.get_by_id("LASF_Projection")

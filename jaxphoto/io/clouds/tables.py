@@ -50,7 +50,7 @@ def _cloud(values: Mapping[str, np.ndarray], strips: StripNumbers) -> Cloud:
 
 
 def _columns(cloud: Cloud, xyz: np.ndarray) -> dict[str, np.ndarray]:
-    """The columns of a CSV but for the strip."""
+    """Return the columns of a CSV but for the strip."""
     columns = dict(zip(XYZ, xyz.T, strict=True))
     if cloud.classification is not None:
         columns["classification"] = cloud.classification
@@ -72,7 +72,7 @@ def _valid(name: str, values: np.ndarray) -> np.ndarray:
 def _first_error(
     file: str, rows: Iterable[tuple[int, list[str]]], names: Sequence[str], numbers: set[str]
 ) -> InputError:
-    """The error about the first invalid row."""
+    """Return the error about the first invalid row."""
     for row, cells in rows:
         if len(cells) > len(names):
             return InputError(
@@ -97,7 +97,7 @@ class _Layout(NamedTuple):
 
 
 def open_csv(path: Path, system: CoordinateSystem | None) -> CloudSource:
-    """A CSV, separated by commas or by semicolons (with decimal points or commas); # starts a comment.
+    """Return a CSV, separated by commas or by semicolons (with decimal points or commas); # starts a comment.
 
     Columns other than `COLUMNS` are skipped. Raises InputError for a missing column and, with its row, an invalid cell.
     """
@@ -182,7 +182,7 @@ class _Vertices(NamedTuple):
 
 
 def open_ply(path: Path, system: CoordinateSystem | None) -> CloudSource:
-    """A PLY file, ASCII or binary, whose vertices precede all other elements.
+    """Return a PLY file, ASCII or binary, whose vertices precede all other elements.
 
     Raises InputError for an invalid header, invalid numbers and a file that is cut off.
     """
@@ -265,7 +265,7 @@ def _ply_chunks(path: Path, vertices: _Vertices) -> Iterator[Cloud]:
 
 
 def _ply_tables(file: IO[bytes], vertices: _Vertices, keys: list[str]) -> Iterator[pd.DataFrame | np.ndarray]:
-    """The vertices, at most `CHUNK` together."""
+    """Return the vertices, at most `CHUNK` together."""
     if vertices.order:
         record = np.dtype([(key, vertices.order + kind) for key, (_, kind) in zip(keys, vertices.fields, strict=True)])
         left = vertices.n

@@ -48,7 +48,7 @@ _FIX: dict[float, Fix] = {1: "fixed", 2: "float", 3: "single", 4: "single", 5: "
 
 
 def exposure_files(folder: Path) -> list[Path]:
-    """The files of a folder with positions of its photographs, by `SUFFIXES` and `NAMES`; hidden ones are skipped."""
+    """List the position files of a folder by `SUFFIXES` and `NAMES`; hidden ones are skipped."""
     matching = (f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES or f.name.lower() in NAMES)
     return sorted(f for f in matching if f.is_file() and not f.name.startswith("."))
 
@@ -81,7 +81,7 @@ def read_exposures(path: Path, code: int | None = None, heights: Heights = "unkn
 
 
 def _without_errors(exposures: Exposures, errors: dict[int, str]) -> Exposures:
-    """The exposures without invalid rows. Raises InputError if half of the rows are invalid, or there is none."""
+    """Return the exposures without invalid rows. Raises InputError if half of them are invalid, or all are missing."""
     for k, axis in np.argwhere(np.abs(exposures.place[:, :2]) > [360.0, 90.0]):
         name, value = ("longitude", "latitude")[axis], exposures.place[k, axis]
         errors.setdefault(int(exposures.rows[k]), f"the {name} {value:g} degrees is impossible; exchange the columns?")
@@ -185,7 +185,7 @@ def _time(first: str, second: str) -> float | None:
 
 
 def _read_sbet(path: Path) -> Exposures:
-    """The records of an SBET, positions and attitudes of the IMU, at seconds of the GPS week."""
+    """Return the records of an SBET, positions and attitudes of the IMU, at seconds of the GPS week."""
     records = sbet_records(read_sbet(path), path.name)
     n = len(records.time)
     fix: Fix = "integrated"

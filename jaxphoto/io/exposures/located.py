@@ -55,7 +55,7 @@ class Clock(NamedTuple):
 
 
 def clock_of(photographs: Sequence[Photograph]) -> Clock:
-    """The clock of photographs, in GPS time if all known times have an offset to UTC."""
+    """Return the clock of photographs, in GPS time if all known times have an offset to UTC."""
     known = [p.taken for p in photographs if p.taken]
     gps = all(t.ahead_of_utc_s is not None for t in known)
     times = [
@@ -67,7 +67,7 @@ def clock_of(photographs: Sequence[Photograph]) -> Clock:
 
 
 def by_name(photographs: Sequence[Photograph], file: Exposures) -> Int[np.ndarray, "n"]:
-    """The exposure of the same name (case is ignored if the names stay different), -1 for none."""
+    """Return the exposure of the same name (case is ignored if the names stay different), -1 for none."""
     wanted, names = [p.name for p in photographs], list(file.names)
     folded = [name.lower() for name in wanted], [name.lower() for name in names]
     if all(len(set(several)) == len(several) for several in folded):
@@ -77,7 +77,7 @@ def by_name(photographs: Sequence[Photograph], file: Exposures) -> Int[np.ndarra
 
 
 def by_time(photographs: Sequence[Photograph], file: Exposures, clock: Clock) -> Matched | Ambiguous | None:
-    """Matches of times that differ by a constant; the photographs' own positions decide between constants."""
+    """Match times that differ by a constant; the photographs' own positions decide between constants."""
     positions, listed = _plane(photographs, file.place)
     return match_times(clock.time_s, file.time_s, clock.tolerance_s, positions, listed)
 
@@ -85,7 +85,7 @@ def by_time(photographs: Sequence[Photograph], file: Exposures, clock: Clock) ->
 def by_number_or_time(
     photographs: Sequence[Photograph], file: Exposures, clock: Clock
 ) -> tuple[Matched | Ambiguous | None, str]:
-    """Matches of numbers or times, and "by number" or "by time".
+    """Return the matches of numbers or times, and "by number" or "by time".
 
     A file that was renumbered after it lost an exposure has the numbers of their neighbours: times count if they bring
     the photographs' own positions nearer. Without positions, numbers that run from 1 without a gap and end before those
@@ -109,7 +109,7 @@ def by_number_or_time(
 
 
 def _by_number(photographs: Sequence[Photograph], file: Exposures, clock: Clock) -> Matched | None:
-    """Matches of the numbers in the names; None if they are missing, not unique, or contradict the times.
+    """Return the matches of the numbers in the names; None if they are missing, not unique, or contradict the times.
 
     Times tell the files of several flights that count from 1.
     """
@@ -155,7 +155,7 @@ def _plane(photographs: Sequence[Photograph], place: np.ndarray) -> tuple[np.nda
 
 
 def interpolated(track: Exposures, times_s: Float[np.ndarray, "n"]) -> Exposures:
-    """A trajectory at `times_s` by a cubic spline; positions before, after and in gaps of it are NaN.
+    """Return a trajectory at `times_s` by a cubic spline; positions before, after and in gaps of it are NaN.
 
     Standard deviations are interpolated linearly, rotations at constant angular velocity, the kind of solution is that
     of the nearest record.
@@ -197,7 +197,7 @@ def match_message(
 
 
 def no_match_message(result: Ambiguous | None) -> str:
-    """The reason why times match no photographs."""
+    """Return the reason why times match no photographs."""
     if result is None:
         return "no two photographs have times that differ from its times by one constant; not used"
     one, other = map(clock_words, result.offsets_s)
@@ -208,7 +208,7 @@ def no_match_message(result: Ambiguous | None) -> str:
 
 
 def count_message(photographs: Sequence[Photograph], file: Exposures, exposure: Int[np.ndarray, "n"]) -> str:
-    """Number of photographs with an exposure, those without, and rows without a photograph."""
+    """Return the number of photographs with an exposure, those without, and rows without a photograph."""
     used = set(exposure[exposure >= 0].tolist())
     without = [p.name for p, k in zip(photographs, exposure, strict=True) if k < 0]
     surplus = [str(row) for k, row in enumerate(file.rows.tolist()) if k not in used]
@@ -225,7 +225,7 @@ def fix_counts(file: Exposures, exposure: Int[np.ndarray, "n"]) -> str:
 
 
 def own_files_message(photographs: Sequence[Photograph]) -> list[str]:
-    """A message about attitudes, heights, sigmas and solutions in the files of the photographs; none without them."""
+    """Describe the attitudes, heights, sigmas and solutions in the files of the photographs."""
     positions = [p.gps for p in photographs if p.gps]
     known = {
         "attitudes": [p.attitude is not None for p in photographs],
@@ -272,7 +272,7 @@ def located(
     arm: Arm | None = None,
     heights: Heights | int | None = None,
 ) -> Assigned:
-    """The photographs with positions of the files `given` and of those in `folders`, with heights of one kind.
+    """Return the photographs with positions of the files `given` and of those in `folders`, with heights of one kind.
 
     `code` is the EPSG system of map coordinates in tables, `arm` the lever arm, `heights` the reference of heights that
     do not have one; "take-off" selects those above it, an EPSG code of heights adds its geoid. Invalid files in folders
@@ -296,7 +296,7 @@ def located(
 
 
 def with_exposures(photographs: Sequence[Photograph], files: Sequence[Exposures], arm: Arm | None = None) -> Assigned:
-    """The photographs with positions, sigmas and attitudes of the files; later kinds replace earlier ones.
+    """Return the photographs with positions, sigmas and attitudes of the files; later kinds replace earlier ones.
 
     Time marks are first: their times and lever arms serve positions of the antenna, at events and along trajectories.
     Tables, by name, are last. `arm` is that of positions without a lever arm of a time mark, and, without such a file,
@@ -334,7 +334,7 @@ class _Assignment:
         self.own = [True] * n
 
     def by_name(self, file: Exposures) -> str:
-        """A table."""
+        """Return a table."""
         exposure = by_name(self.photographs, file)
         if not (exposure >= 0).any():
             return f"none of its {len(file.names)} names is that of a photograph ({few(list(file.names))}); not used"
@@ -369,7 +369,7 @@ class _Assignment:
         return f"{message}; {self._set_antenna(file, match.exposure)}"
 
     def along(self, file: Exposures) -> str:
-        """A trajectory, at times of marks or events, or of photographs to the millisecond."""
+        """Return a trajectory, at times of marks or events, or of photographs to the millisecond."""
         times = np.where(np.isfinite(self.gps_s), self.gps_s, self.event_s)
         if not np.isfinite(times).any():
             clock = clock_of(self.photographs)
@@ -450,7 +450,7 @@ class _Assignment:
         return ", ".join(parts)
 
     def _other_flight(self, file: Exposures, exposure: Int[np.ndarray, "n"]) -> str:
-        """The reason not to use a file far from the photographs' own positions; "" if it is near."""
+        """Return the reason not to use a file far from the photographs' own positions; "" if it is near."""
         far = distance(self.photographs, file, exposure)
         if far is None or far <= _FAR_M:
             return ""
@@ -463,7 +463,7 @@ class _Assignment:
         return f"its positions are {far:,.0f} m from those of the photographs, as of another flight; not used"
 
     def _other_day(self, file: Exposures, match: Matched) -> str:
-        """The reason not to use a file of another day; "" if its positions prove that the clock is wrong."""
+        """Return the reason not to use a file of another day; "" if its positions prove that the clock is wrong."""
         if not abs(match.offset_s) > ZONES_S:
             return ""
         near = distance(self.photographs, file, match.exposure)

@@ -58,7 +58,7 @@ class Exposures(NamedTuple):
         )
 
     def take(self, chosen: np.ndarray) -> "Exposures":
-        """The entries of a mask."""
+        """Return the entries of a mask."""
         n, kept = len(self.rows), {}
         for name, values in self._asdict().items():
             if isinstance(values, np.ndarray):

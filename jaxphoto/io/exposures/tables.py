@@ -189,7 +189,7 @@ def _table(file: str, lines: Lines, errors: dict[int, str]) -> _Table:
 def _cells(
     records: dict[int, list[str]], columns: dict[str, int], errors: dict[int, str], surplus: int | None = None
 ) -> pd.DataFrame:
-    """The cells of rows by the names of their columns."""
+    """Return the cells of rows by the names of their columns."""
     for row, cells in list(records.items()):
         if surplus is not None and len(cells) > surplus:
             errors[row] = f"{len(cells)} cells, but the header has {surplus}; correct the row"
@@ -258,7 +258,7 @@ def _pospac(file: str, content: Lines, errors: dict[int, str]) -> _Table:
 
 
 def _mapping_frame(file: str, head: str) -> ControlSystem | None:
-    """The UTM zone of the head; None for another system."""
+    """Return the UTM zone of the head; None for another system."""
     datum = re.search(r"frame datum\s*:\s*([^;]*?)\s*;", head, re.IGNORECASE)
     names = ("central meridian", "latitude of the grid origin", "scale factor", "false easting", "false northing")
     matches = [re.search(name + r"\s*=\s*(-?[\d.]+)", head, re.IGNORECASE) for name in names]

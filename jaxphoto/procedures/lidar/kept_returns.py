@@ -76,7 +76,7 @@ class _Passed:
 
     @property
     def cells(self) -> dict[str, CellReturns]:
-        """By the name of each look."""
+        """Cells by surface."""
         return self._tally.strips
 
     def returns(self, part: Cloud, cells: dict[str, Int[np.ndarray, "cells"]]) -> Bool[np.ndarray, "n"]:
