@@ -320,8 +320,8 @@ def _cases(inputs: Path) -> dict[str, Case]:
 
 def _pictures(inputs: Path) -> None:
     """Photographs of a board, and of textured ground."""
-    from jaxphoto.image_measurement.targets import read_board, rendered
-    from tests.image_measurement import ground, test_targets
+    from jaxphoto.extras.photos.targets import read_board, rendered
+    from tests.photos import ground, test_targets
 
     pattern = read_board("chessboard:8x5:square_mm=22")
     (inputs / "board").mkdir()

@@ -61,16 +61,15 @@ def fly(
     from jaxphoto.camera import InteriorOrientation
     from jaxphoto.errors import counted
     from jaxphoto.extras.formats import read_control
+    from jaxphoto.extras.photos.control_targets import make_target_search
+    from jaxphoto.extras.photos.features import LONGEST_PX
+    from jaxphoto.extras.photos.matching import match_photographs
+    from jaxphoto.extras.photos.photograph_pairs import MostSimilar, photograph_pairs, usual_choice, usual_count
+    from jaxphoto.extras.photos.targets.on_ground import read_target
     from jaxphoto.georeferencing.map_frame import check_heights
     from jaxphoto.georeferencing.recorded_positions import WGS84
-    from jaxphoto.image_measurement.control_targets import target_looker
-    from jaxphoto.image_measurement.features import LONGEST_PX
-    from jaxphoto.image_measurement.matching import match_photographs
-    from jaxphoto.image_measurement.photograph_pairs import MostAlike, photograph_pairs, usual_choice, usual_count
-    from jaxphoto.image_measurement.targets.on_ground import read_target
     from jaxphoto.io.block_folder import whole_block
     from jaxphoto.io.exposures import exposure_files, located
-    from jaxphoto.io.kept_orientation import kept_orient
     from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
     from jaxphoto.io.photographs import (
         known_lens,
@@ -115,14 +114,14 @@ def fly(
         output.say(*positions.sentences)
         points = None
         if surveyed:
-            finder = target_looker(target, {p.name: p.path for p in read}) if target else None
+            finder = make_target_search(target, {p.name: p.path for p in read}) if target else None
             stations = [p.name for p in read], [p.gps for p in read]
             points, code = flight_control(surveyed, control_epsg, *stations, finder, code)
         camera = sensor_and_interior(read, pixel_mm, c_mm)
         distortion = distortion_model(model, camera.sensor)
         choice, number = pairs or usual_choice(read), features or usual_count(len(read))
         compared = photograph_pairs(read, choice)
-        matches = "pairs by similarity" if isinstance(compared, MostAlike) else counted(len(compared), "pair")
+        matches = "pairs by similarity" if isinstance(compared, MostSimilar) else counted(len(compared), "pair")
         output.say(camera.origin, f"{counted(len(read), 'photograph')}, {matches} to match")
         checkpoint = stack.enter_context(KeptPieces(beside(out)).alone())
         matched = match_photographs(
@@ -153,7 +152,6 @@ def fly(
                 sorted(taken, key=lambda name: taken[name][0]) if len(taken) == len(read) else (),
             ),
             progress.update,
-            kept_orient(checkpoint),
         )
         flight = flight._replace(left_out=matched.left_out | flight.left_out)
         progress.update("computing statistics")
@@ -221,8 +219,8 @@ def control(
     1: written, but the verdict is red.
     """
     from jaxphoto.extras.formats import read_control
-    from jaxphoto.image_measurement.control_targets import target_looker
-    from jaxphoto.image_measurement.targets.on_ground import read_target
+    from jaxphoto.extras.photos.control_targets import make_target_search
+    from jaxphoto.extras.photos.targets.on_ground import read_target
     from jaxphoto.io import read_block
     from jaxphoto.io.block_folder import whole_block
     from jaxphoto.io.photographs import skipped_messages, valid_photographs
@@ -255,7 +253,7 @@ def control(
             "report": progress.update,
         }
         if target:
-            finder = target_looker(target, paths, progress.update)
+            finder = make_target_search(target, paths, progress.update)
             result = control_block_with_targets(oriented, points, finder, **options)
         else:
             result = control_block(oriented, points, **options)
@@ -313,8 +311,8 @@ def calibrate(
 
     Exit code 1: written, but not converged.
     """
-    from jaxphoto.image_measurement.grey_values import read_grey
-    from jaxphoto.image_measurement.targets import find_targets, read_board
+    from jaxphoto.extras.photos.features import read_grey
+    from jaxphoto.extras.photos.targets import find_targets, read_board
     from jaxphoto.io import write_block
     from jaxphoto.io.photographs import photographs, sensor_and_interior
     from jaxphoto.procedures.calibration import calibrate, distortion_model, free_parameters
@@ -387,16 +385,16 @@ def orient(
     converged.
     """
     from jaxphoto.camera import InteriorOrientation
-    from jaxphoto.image_measurement.features import LONGEST_PX
-    from jaxphoto.image_measurement.matching import match_photographs
-    from jaxphoto.image_measurement.photograph_pairs import photograph_pairs, usual_choice
+    from jaxphoto.extras.photos.features import LONGEST_PX
+    from jaxphoto.extras.photos.matching import match_photographs
+    from jaxphoto.extras.photos.photograph_pairs import photograph_pairs, usual_choice
     from jaxphoto.io.block_folder import check_block_target, whole_block
     from jaxphoto.io.block_folder.table_layout import TOML
-    from jaxphoto.io.kept_orientation import kept_orient
     from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
     from jaxphoto.io.photographs import photographs, sensor_and_interior
     from jaxphoto.io.text_files import read_json
     from jaxphoto.procedures.calibration import distortion_model
+    from jaxphoto.procedures.orientation import orient
     from jaxphoto.report.orientation import print_orientation, write_orientation
 
     check_block_target(out, *images)
@@ -436,7 +434,7 @@ def orient(
             keep=checkpoint,
             progress=progress.steps,
         )
-        result = kept_orient(checkpoint)(
+        result = orient(
             [p.name for p in read],
             camera.sensor,
             InteriorOrientation(initial.c, initial.x_p, initial.y_p, distortion),

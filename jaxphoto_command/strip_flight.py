@@ -27,7 +27,7 @@ from jaxphoto.lidar.coverage import CoveredTimes
 from jaxphoto.lidar.raster import Raster, strip_differences
 from jaxphoto.lidar.strip_planes import CellTally, StripSettings
 from jaxphoto.procedures.control import SurveyedPoints
-from jaxphoto.procedures.control.system import system_of
+from jaxphoto.procedures.control.surveyed import system_of
 from jaxphoto.procedures.lidar import (
     Photographs,
     ScannerPriors,

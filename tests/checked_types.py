@@ -17,7 +17,7 @@ from beartype import BeartypeConf, beartype
 # The checked packages: all that compute.
 CHECKED = (
     "adjustment", "arrays", "block_from_arrays", "camera", "cloud", "collinearity", "columns", "experiment",
-    "georeferencing", "image_measurement", "io", "lidar", "observations", "orientation", "parameters", "procedures",
+    "georeferencing", "extras", "io", "lidar", "observations", "orientation", "parameters", "procedures",
     "report", "rotation", "sensitivity", "simulation", "small_matrices", "stability", "statistics", "unknowns",
 )  # fmt: skip
 

@@ -13,7 +13,7 @@ from tests.marks import QUICK
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "jaxphoto"
-TABLES_AND_FILES = ("io", "extras", "image_measurement", "report", "experiment")
+TABLES_AND_FILES = ("io", "extras", "report", "experiment")
 
 
 def imported(path: Path) -> set[str]:

@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 
 import jaxphoto
-from jaxphoto.image_measurement.targets import read_board, rendered
-from jaxphoto.procedures.calibration import rounds
+from jaxphoto.extras.photos.targets import read_board, rendered
+from jaxphoto.procedures.calibration import target_calibration
 from tests.commands import run
-from tests.image_measurement.test_targets import LENS, SENSOR, view
+from tests.photos.test_targets import LENS, SENSOR, view
 
 BOARD = "chessboard:8x5:square_mm=22"
 IMAGES = 5
@@ -83,7 +83,7 @@ def test_two_calibrations_are_compared(folder, monkeypatch, capsys, tmp_path):
 
 
 def test_rounds_that_do_not_settle_end_with_exit_code_1(folder, monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(rounds, "_ROUNDS", 1)
+    monkeypatch.setattr(target_calibration, "_ROUNDS", 1)
     arguments = (*sorted(folder.glob("p*.png")), "--board", BOARD, "--out", tmp_path / "out", "--pixel-mm", 0.008)
     code, screen, _ = run(monkeypatch, capsys, "calibrate", *arguments)
     assert code == 1

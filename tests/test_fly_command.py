@@ -12,7 +12,7 @@ from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.io import read_block
 from jaxphoto.procedures.georeference_photographs import utm_of
 from tests.commands import run
-from tests.image_measurement.ground import SENSOR, photograph, texture
+from tests.photos.ground import SENSOR, photograph, texture
 
 ORIGIN = (13.2, 55.7, 0.0)
 PIXEL_MM, C_MM = SENSOR.pixel_mm, 3.6

@@ -10,7 +10,7 @@ import pytest
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.io import read_block
 from tests.commands import run
-from tests.image_measurement.ground import photograph, texture
+from tests.photos.ground import photograph, texture
 from tests.procedures.controlled import CODE, ORIGIN
 from tests.procedures.test_control_targets import FIRST_M, SURVEYED, painted
 from tests.test_fly_command import C_MM, PIXEL_MM, with_position

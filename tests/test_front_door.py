@@ -28,7 +28,7 @@ from jaxphoto import (
 from tests.blocks import adjusted, simulated
 from tests.checked_types import unchecked
 
-ROOMS = {"camera", "lidar", "stability", "experiment", "georeferencing", "image_measurement", "io", "sensitivity"}
+ROOMS = {"camera", "lidar", "stability", "experiment", "georeferencing", "extras", "io", "sensitivity"}
 CAMERA = InteriorOrientation(35.0, 0.1, -0.2, Brown(k1=-9e-5))
 ABOVE = ExteriorOrientation.from_angles(np.array([10.0, 20.0, 900.0]), np.array([0.01, -0.02, 0.3]))
 LEVEL = ExteriorOrientation.from_angles(np.zeros((4, 3)), np.zeros((4, 3)))
@@ -52,7 +52,7 @@ def test_everything_can_be_found_by_tab():
 
 
 def test_rooms_and_studies_are_imported_when_they_are_asked_for():
-    late = ("lidar", "stability", "experiment", "io", "sensitivity", "image_measurement")
+    late = ("lidar", "stability", "experiment", "io", "sensitivity", "extras")
     program = f"""
 import sys, jaxphoto
 print(*[r for r in {late} if f"jaxphoto.{{r}}" in sys.modules], "|")

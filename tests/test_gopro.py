@@ -7,12 +7,12 @@ import pytest
 
 from jaxphoto import Outcome
 from jaxphoto.camera import rebalance
-from jaxphoto.image_measurement.targets import find_targets, read_board
+from jaxphoto.extras.photos.targets import find_targets, read_board
 from jaxphoto.io.photographs import photographs, sensor_and_interior
 from jaxphoto.procedures.calibration import calibrate, interior_covariance
 from jaxphoto.stability import analyse, image_grid
 
-# Quick: the targets of rendered photographs (image_measurement/test_targets.py) and mrcal's board.
+# Quick: the targets of rendered photographs (photos/test_targets.py) and mrcal's board.
 pytestmark = pytest.mark.slow
 PATTERN = read_board("chessboard:8x6:square_mm=30")
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxphoto.image_measurement.features import FEATURES
-from jaxphoto.image_measurement.matching import match_photographs
-from jaxphoto.image_measurement.photograph_pairs import photograph_pairs
+from jaxphoto.extras.photos.features import FEATURES
+from jaxphoto.extras.photos.matching import match_photographs
+from jaxphoto.extras.photos.photograph_pairs import photograph_pairs
 from jaxphoto.io.photographs import photographs, sensor_and_interior
 from jaxphoto.procedures.orientation import orient
-from jaxphoto.procedures.orientation.onto_known import similarity_between
+from jaxphoto.procedures.orientation.known_frame import similarity_between
 
 pytestmark = pytest.mark.slow
 

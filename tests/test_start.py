@@ -13,8 +13,8 @@ from typer.main import get_command
 
 from jaxphoto.camera.undistortion import Keep
 from jaxphoto.extras.formats import CAMERAS_WRITTEN, LOSS_PX
+from jaxphoto.extras.photos.features import LONGEST_PX
 from jaxphoto.georeferencing import PATTERN_OF, ScannerCalibration
-from jaxphoto.image_measurement.features import LONGEST_PX
 from jaxphoto.io.clouds.cloud_reader import Returns
 from jaxphoto.io.clouds.coordinate_system import UNITS
 from jaxphoto.io.shipped import EXAMPLES

@@ -1,1 +1,1 @@
-"""Rooms that the core does not need: other programs' formats."""
+"""Optional parts: photographs (extra `photos`) and formats of other programs."""

@@ -17,9 +17,9 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError, DatumError, RankError, few
 from jaxphoto.initial import approximate
 from jaxphoto.initial.approximate import PointsBehind, completed, intersected
+from jaxphoto.initial.rays import camera_rays, turn_to_object
 from jaxphoto.observations import AbstractObservations, KnownParameters
 from jaxphoto.procedures.orientation import orient_block
-from jaxphoto.procedures.orientation.network import empty_network, misfits, sight_of
 from jaxphoto.statistics import prepare_statistics
 from jaxphoto.unknowns import FREE, Unknowns
 from jaxphoto.variants import without_observations
@@ -277,13 +277,18 @@ def _reached(block: Block) -> tuple[Block, bool]:
 
 def _rays_fit(block: Block) -> bool:
     """Return True if 90 % of the rays to known points pass near them and none has its point behind the image."""
-    start = block.start.unknowns
-    sight = sight_of(block, start.interior)
-    network = empty_network(block)._replace(
-        positions=np.asarray(start.exterior.position),
-        camera_from_object=np.asarray(start.exterior.camera_from_object),
-        points=np.asarray(start.points),
-    )
-    rows = np.flatnonzero(np.asarray(block.start.point_known)[sight.point])
-    misfit = misfits(sight, network, rows) * sight.sigma[rows]
-    return bool(np.isfinite(misfit).all() and np.quantile(misfit, 0.9) < _MAX_MISCLOSURE_RAD)
+    start, rows = block.start.unknowns, block.image_points
+    known = np.asarray(block.start.point_known)[np.asarray(rows.point)]
+    image, point, xy = (np.asarray(v)[known] for v in (rows.image, rows.point, rows.xy))
+    if not len(image):
+        return False
+    camera = np.array(block.image_camera)[image]
+    rays = np.zeros((len(image), 3))
+    for name in set(camera):
+        rays[camera == name] = camera_rays(start.interior[name], xy[camera == name])
+    exterior = start.exterior
+    direction = turn_to_object(np.asarray(exterior.camera_from_object), image, rays)
+    towards = np.asarray(start.points)[point] - np.asarray(exterior.position)[image]
+    across = np.linalg.norm(np.cross(direction, towards), axis=1) / np.linalg.norm(towards, axis=1)
+    in_front = np.einsum("ni,ni->n", direction, towards) > 0
+    return bool(in_front.all() and np.quantile(across, 0.9) < _MAX_MISCLOSURE_RAD)

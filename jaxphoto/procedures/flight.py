@@ -1,7 +1,7 @@
 """Calibrate a flight from matched photographs: each connected part, the largest first."""
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from jaxphoto.adjustment import MINIMAL_SIZES, Adjustment
@@ -11,8 +11,8 @@ from jaxphoto.errors import BlockError, DatumError, GroupsError, InputError, Ran
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.procedures.adjust import adjust_for_tables
-from jaxphoto.procedures.control import ControlledBlock, rejudged
-from jaxphoto.procedures.control.of_flight import FlightControl, controlled_or_why, parts_with_marks
+from jaxphoto.procedures.control import ControlledBlock, retest
+from jaxphoto.procedures.control.of_flight import FlightControl, adjust_with_control, parts_with_marks
 from jaxphoto.procedures.georeference_photographs import (
     GeoreferencedPhotographs,
     georeference_photographs,
@@ -22,8 +22,7 @@ from jaxphoto.procedures.georeference_photographs import (
 from jaxphoto.procedures.known_lens import KnownLens, with_known_lens
 from jaxphoto.procedures.matched_part import MatchedPart
 from jaxphoto.procedures.orientation import Oriented, orient
-from jaxphoto.procedures.orientation.orient_photographs import CAMERA
-from jaxphoto.procedures.orientation.related_pairs import Report
+from jaxphoto.procedures.orientation.orient_photographs import CAMERA, Report
 from jaxphoto.procedures.rolling_shutter import NEIGHBOUR_M, Moment, with_rolling_shutter
 from jaxphoto.statistics import VarianceComponents, variance_components
 
@@ -85,14 +84,12 @@ def calibrate_flight(
     interior: InteriorOrientation,
     prior: KnownOfFlight,
     report: Report = lambda text: None,
-    orient: Callable[..., Oriented] = orient,
 ) -> CalibratedFlight:
     """Orient, georeference and adjust every connected part of the photographs of one camera, starting at `interior`.
 
-    Photographs that a part cannot orient, but that see enough of one another, form a part of their own. `orient` is the
-    function of this name, or one that caches its result. Photographs and parts that cannot be oriented are returned
-    with the reason. A part is adjusted without `known` information that contradicts it, also with the reason. Raises
-    InputError if no part can be oriented.
+    Photographs that a part cannot orient, but that see enough of one another, form a part of their own. Photographs and
+    parts that cannot be oriented are returned with the reason. A part is adjusted without `prior` information that
+    contradicts it, also with the reason. Raises InputError if no part can be oriented.
     """
     parts: list[FlightPart] = []
     left: dict[str, str] = {}
@@ -101,7 +98,7 @@ def calibrate_flight(
         part, number = waiting.popleft(), len(parts) + 1
         report(f"part {number} of {number + len(waiting)}")
         try:
-            parts.append(_calibrated(part, sensor, interior, prior, report, orient))
+            parts.append(_calibrated(part, sensor, interior, prior, report))
         except GroupsError as error:
             waiting += [part.among(group) for group in error.groups]
             left |= {name: _NO_PAIR for name in part.names if not any(name in group for group in error.groups)}
@@ -121,7 +118,7 @@ def calibrate_flight(
 
 
 def _calibrated(
-    matched: MatchedPart, sensor: Sensor, interior: InteriorOrientation, prior: KnownOfFlight, report: Report, orient
+    matched: MatchedPart, sensor: Sensor, interior: InteriorOrientation, prior: KnownOfFlight, report: Report
 ) -> FlightPart:
     title, lens = f"flight of {len(matched.names)} photographs", prior.lens
     oriented = orient(
@@ -142,7 +139,7 @@ def _calibrated(
             why_not = str(error)
     block = placed.block if placed else oriented.block
     if prior.control is not None:
-        controlled, no_control = controlled_or_why(block, prior.control, prior.code, prior.vertical, report)
+        controlled, no_control = adjust_with_control(block, prior.control, prior.code, prior.vertical, report)
     try:
         # Without positions it is the network of the orientation, which reuses its compiled code.
         sizes = MINIMAL_SIZES if placed else oriented.sizes
@@ -163,7 +160,7 @@ def _calibrated(
         adjusted = components.adjusted if bool(components.adjusted.converged) else adjusted
     return FlightPart(
         oriented, matched, placed, why_not, components, adjusted,
-        rejudged(controlled, adjusted) if controlled else None, no_control,
+        retest(controlled, adjusted) if controlled else None, no_control,
         lens.sentences(oriented.block, CAMERA) if lens else (), why_no_shutter,
     )  # fmt: skip
 

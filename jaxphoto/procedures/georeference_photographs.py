@@ -26,7 +26,7 @@ from jaxphoto.georeferencing.map_frame import MapFrame, map_name
 from jaxphoto.initial.rays import padded, padded_length
 from jaxphoto.least_squares import least_squares
 from jaxphoto.observations import CameraPositions
-from jaxphoto.procedures.orientation.onto_known import Similarity, similarity_between
+from jaxphoto.procedures.orientation.known_frame import Similarity, similarity_between
 from jaxphoto.procedures.position_steps import position_parts, with_part_shifts
 from jaxphoto.procedures.recorded_attitudes import RecordedRotation, recorded_rotation, with_attitudes
 from jaxphoto.rotation import small_angles, small_rotation

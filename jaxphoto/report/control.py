@@ -8,7 +8,7 @@ import pandas as pd
 from jaxphoto.errors import few
 from jaxphoto.observations import AXES
 from jaxphoto.procedures.control import ControlledBlock
-from jaxphoto.procedures.control.judged import CRITICAL
+from jaxphoto.procedures.control.control_block import CRITICAL
 from jaxphoto.report.findings import Finding
 from jaxphoto.report.formatting import of_sigma
 

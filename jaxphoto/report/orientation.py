@@ -27,17 +27,15 @@ def orientation_sentences(report: OrientationReport) -> list[str]:
     more = skipped[_SHOWN:]
     sentences = [
         f"{len(report.order)} of {report.n_images} images oriented, from {report.n_pairs} pairs with a relative "
-        f"orientation; first {', '.join(report.order[:3])}",
+        "orientation",
         *(f"image {name} is not oriented: {why}" for name, why in skipped[:_SHOWN]),
         *([f"and {len(more)} more: {', '.join(name for name, _ in more)}"] if more else []),
         f"{report.n_points} points from {report.n_image_points} image points",
         f"rejected of {report.n_matches} matches: {rejected.off_epipolar} off the epipolar line, "
-        f"{rejected.conflicting} with two positions of a point in one image, {rejected.unoriented} of images that are "
-        "not oriented",
+        f"{rejected.untriangulated} without a common point, {rejected.unoriented} of images that are not oriented",
         f"rejected image points: {rejected.beyond} with residuals over {report.limit_px:.2g} px, "
-        f"{rejected.small_angle} with a small intersection angle, {rejected.unsupported} two-ray points far "
-        "from their neighbours, "
-        f"{rejected.too_few} of points with too few rays left",
+        f"{rejected.unsupported} of two rays at a depth that neighbouring points contradict, {rejected.too_few} of "
+        "points or images with too few of them",
         f"residuals: {report.mean_px:.2f} px on average, sigma0 {report.sigma0:.2f}",
     ]
     if not report.settled:

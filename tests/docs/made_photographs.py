@@ -13,11 +13,11 @@ import numpy as np
 from PIL import Image
 
 from jaxphoto.camera import InteriorOrientation, Smac
+from jaxphoto.extras.photos.targets import read_board, rendered
 from jaxphoto.georeferencing.map_frame import MapFrame
-from jaxphoto.image_measurement.targets import read_board, rendered
 from jaxphoto.procedures.georeference_photographs import utm_of
-from tests.image_measurement.ground import C_MM, SENSOR, mapped, photograph, texture
-from tests.image_measurement.test_targets import view
+from tests.photos.ground import C_MM, SENSOR, mapped, photograph, texture
+from tests.photos.test_targets import view
 
 BOARD = "chessboard:8x6:square_mm=30"
 LENS = InteriorOrientation(C_MM, 0.03, -0.02, Smac(k1=-0.002))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from jaxphoto.errors import InputError
 from jaxphoto.extras.formats import export, read_control
-from jaxphoto.procedures.control.system import places, system_of
+from jaxphoto.procedures.control.surveyed import places, system_of
 from tests.io import control_files as files
 from tests.io.test_exports import photographs
 

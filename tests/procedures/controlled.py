@@ -9,7 +9,7 @@ import numpy as np
 from jaxphoto.block import Block
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.georeferencing.map_frame import MapFrame
-from jaxphoto.procedures.control.into_block import without_names
+from jaxphoto.procedures.control.marks import without_names
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 from jaxphoto.procedures.georeference_photographs import utm_of
 from jaxphoto.rotation import matrix_from_omega_phi_kappa

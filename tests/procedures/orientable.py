@@ -4,9 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxphoto.camera import Sensor
-from jaxphoto.initial.matches import PairMatches
-from jaxphoto.procedures.orientation.onto_known import similarity_between
+from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.initial.matches import PairMatches, tracks
+from jaxphoto.procedures.orientation.colmap import Network
+from jaxphoto.procedures.orientation.known_frame import similarity_between
+from jaxphoto.procedures.orientation.orient_photographs import network_block
 from jaxphoto.statistics import covariance
 from tests.formulas import camera_from_object
 
@@ -169,6 +171,24 @@ def with_epipolar_matches(photographs, per_pair, noise_px=0.3, seed=7):
             point_of[k] = np.append(point_of[k], np.full(len(rows), -1))
         matches.append(match._replace(features=np.concatenate([match.features, more])))
     return photographs._replace(features=features, matches=matches, point_of=point_of)
+
+
+def true_network(p):
+    """The network at the truth, and the true point of each of its rows; -1 for a false one."""
+    scene, found = p.scene, tracks([len(xy) for xy in p.features], p.matches)
+    true = np.array([p.point_of[i][f] for i, f in zip(found.image, found.feature, strict=True)])
+    points = np.zeros((int(found.point.max()) + 1, 3))
+    points[found.point] = scene.points[true]
+    n = len(p.names)
+    rows = (found.image, found.feature, found.point)
+    places = (scene.positions.copy(), scene.matrices.copy(), np.ones(n, bool), tuple(range(n)), points)
+    return Network(*places, *rows, (p.camera.c / PIXEL,), tuple(p.matches)), true
+
+
+def block_of(p, network):
+    """The block of a network, its camera at its true principal distance."""
+    sigmas = [np.full(len(xy), 0.3 * PIXEL) for xy in p.features]
+    return network_block("scene", p.names, SENSOR, InteriorOrientation(p.camera.c), p.features, sigmas, network)
 
 
 def placed(adjusted, scene):

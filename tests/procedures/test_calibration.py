@@ -13,12 +13,11 @@ from jaxphoto.procedures.calibration import (
     distortion_model,
     eccentricity,
     free_parameters,
-    rounds,
+    target_calibration,
 )
-from jaxphoto.procedures.calibration.eccentricity import eccentricities
-from jaxphoto.procedures.calibration.outliers import added_sigma
-from jaxphoto.procedures.calibration.reprojection import projections
 from jaxphoto.procedures.calibration.start import flat_start, nearest_distortion
+from jaxphoto.procedures.calibration.target_block import projections
+from jaxphoto.procedures.calibration.target_calibration import added_sigma, eccentricities
 from jaxphoto.report.target_calibration import findings
 from tests.derivatives import compiled
 
@@ -166,7 +165,7 @@ def test_views_of_one_row_do_not_spoil_the_start():
 
 
 def test_rounds_that_do_not_come_to_rest_are_said(monkeypatch):
-    monkeypatch.setattr(rounds, "_ROUNDS", 1)
+    monkeypatch.setattr(target_calibration, "_ROUNDS", 1)
     done = calibrate(flat_board(), seen(flat_board(), views(flat_board(), 12), SIGMA_PX), SENSOR)
     assert bool(done.adjusted.converged)
     assert not done.settled

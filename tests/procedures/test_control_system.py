@@ -5,8 +5,7 @@ import pytest
 from pyproj import Transformer
 
 from jaxphoto.errors import InputError
-from jaxphoto.procedures.control.surveyed import SurveyedPoints
-from jaxphoto.procedures.control.system import check_near, distance_m, fitting, places, system_of
+from jaxphoto.procedures.control.surveyed import SurveyedPoints, check_near, distance_m, fitting, places, system_of
 
 PLACE = (13.2, 55.7)
 

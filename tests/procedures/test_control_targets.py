@@ -11,9 +11,9 @@ from jaxphoto import adjust, covariance
 from jaxphoto.block import Block, Frame
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.errors import InputError
+from jaxphoto.extras.photos.control_targets import make_target_search
+from jaxphoto.extras.photos.targets.on_ground import read_target
 from jaxphoto.georeferencing.map_frame import MapFrame
-from jaxphoto.image_measurement.control_targets import target_looker
-from jaxphoto.image_measurement.targets.on_ground import read_target
 from jaxphoto.procedures.control import (
     GivenControl,
     Marks,
@@ -22,8 +22,8 @@ from jaxphoto.procedures.control import (
     control_block,
     control_block_with_targets,
 )
-from jaxphoto.procedures.control.search import Candidates, Looker
-from tests.image_measurement.ground import C_MM, GROUND_M, SENSOR, mapped, photograph, texture
+from jaxphoto.procedures.control.targets import Candidates, TargetSearch
+from tests.photos.ground import C_MM, GROUND_M, SENSOR, mapped, photograph, texture
 from tests.procedures.controlled import CODE, ORIGIN, marked_block
 
 BY_HAND = ("G0", "G16", "G32", "G34")
@@ -34,7 +34,7 @@ def known_only(control, names):
     return control._replace(marks=control.marks.take(np.isin(control.marks.point, names)))
 
 
-def looker_of(control, seen_twice=()):
+def search_of(control, seen_twice=()):
     """One that sees the targets of `control` where they were measured, and other things in one place and two."""
     marks = control.marks
     true = {
@@ -59,14 +59,14 @@ def looker_of(control, seen_twice=()):
             np.array(row, int), np.array(place).reshape(-1, 2), np.full(len(row), 0.5), np.full(len(row), 0.5)
         )
 
-    return Looker(look, False), looked
+    return TargetSearch(look, False), looked
 
 
 def test_targets_are_found_from_three_marked_by_hand():
     m = marked_block()
-    looker, looked = looker_of(m.control)
+    target_search, looked = search_of(m.control)
     found = control_block_with_targets(
-        m.block, known_only(m.control, ("G0", "G16", "G32", "G34")), looker, adjust=adjust
+        m.block, known_only(m.control, ("G0", "G16", "G32", "G34")), target_search, adjust=adjust
     )
     assert found.state[:6] == ("control",) * 6 and found.state[6:] == ("check",) * 3
     assert any("G21 in 9 of 9" in said for said in found.sentences)
@@ -76,16 +76,16 @@ def test_targets_are_found_from_three_marked_by_hand():
     off = MapFrame(CODE, None, ORIGIN).local(found.adjusted.block.frame.map.map(points)) - m.true_xyz
     assert np.abs(off / found.sigma_m).max() < 4.5
     # A block that lies by control already is not searched as one that only receivers have placed.
-    looker, again = looker_of(m.control)
-    control_block_with_targets(at_optimum(found.adjusted), known_only(m.control, ()), looker, adjust=adjust)
+    target_search, again = search_of(m.control)
+    control_block_with_targets(at_optimum(found.adjusted), known_only(m.control, ()), target_search, adjust=adjust)
     assert np.max(again) <= np.max(looked)
 
 
 def test_two_things_that_look_alike_are_not_believed():
     m = marked_block()
-    looker, _ = looker_of(m.control, seen_twice=("G21",))
+    target_search, _ = search_of(m.control, seen_twice=("G21",))
     found = control_block_with_targets(
-        m.block, known_only(m.control, ("G0", "G16", "G32", "G34")), looker, adjust=adjust
+        m.block, known_only(m.control, ("G0", "G16", "G32", "G34")), target_search, adjust=adjust
     )
     assert any("the target of G21" in said and "mark it by hand" in said for said in found.sentences)
     assert found.state[found.ids.index("G21")] == "not marked"
@@ -94,7 +94,7 @@ def test_two_things_that_look_alike_are_not_believed():
 def test_another_thing_at_a_check_point_gives_way_to_its_target():
     """At first the other thing is seen, 0.8 m away; then the target, or that thing again, which is said to be far."""
     m = marked_block()
-    true, _ = looker_of(m.control)
+    true, _ = search_of(m.control)
     calls = []
 
     def look(at, radius, images, ids):
@@ -109,7 +109,7 @@ def test_another_thing_at_a_check_point_gives_way_to_its_target():
     for target in (True, False):
         calls.clear()
         by_hand = known_only(m.control, BY_HAND)
-        found = control_block_with_targets(m.block, by_hand, Looker(look, False), adjust=adjust)
+        found = control_block_with_targets(m.block, by_hand, TargetSearch(look, False), adjust=adjust)
         off = np.linalg.norm(found.off_m[found.ids.index("G21")])
         said = "the target of G21 was found anew, 0.8" if target else "what was found for check point G21 lies 0.8"
         assert (off < 0.5) == target and any(said in text for text in found.sentences)
@@ -119,7 +119,7 @@ def test_without_a_place_nobody_knows_where_to_look():
     m = marked_block()
     with pytest.raises(InputError, match="mark three control points by hand"):
         control_block_with_targets(
-            m.block, m.control._replace(marks=Marks.none()), looker_of(m.control)[0], adjust=adjust
+            m.block, m.control._replace(marks=Marks.none()), search_of(m.control)[0], adjust=adjust
         )
 
 
@@ -194,8 +194,8 @@ def flown(folder, kind, rng):
 def test_targets_are_found_in_photographs_by_the_survey_alone(tmp_path, kind):
     block, control, true = flown(tmp_path, kind, np.random.default_rng(5))
     description = {"circle": f"circle:diameter_mm={SIDE_M * 1000}", "cross": f"cross:side_mm={SIDE_M * 1000}"}[kind]
-    looker = target_looker(read_target(description), {path.stem: path for path in tmp_path.glob("*.png")})
-    found = control_block_with_targets(block, control, looker, adjust=adjust)
+    target_search = make_target_search(read_target(description), {path.stem: path for path in tmp_path.glob("*.png")})
+    found = control_block_with_targets(block, control, target_search, adjust=adjust)
     assert found.state == ("control",) * 5 + ("check",) * 2
     assert sum(found.n_marks) > 30
     off = np.asarray(found.adjusted.unknowns.points)[-len(true) :] - true

@@ -9,6 +9,8 @@ from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
 from jaxphoto.procedures.matched_part import MatchedPart
 from tests.procedures.orientable import PIXEL, SENSOR, Camera, aerial, photographed
 
+pytest.importorskip("pycolmap", reason="pycolmap, which orients images, is not installed (extra photos)")
+
 LENS = Camera(8.0, 0.04, -0.03, 1e-4, -1e-6)
 NOISE_PX, FEW = 0.3, 20
 

@@ -12,7 +12,7 @@ from jaxphoto.errors import BlockError, GroupsError
 from jaxphoto.initial.matches import PairMatches
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.orientation import orient
-from jaxphoto.procedures.orientation.finish import _shared_covariance
+from jaxphoto.procedures.orientation.self_calibration import shared_covariance
 from jaxphoto.unknowns import FIXED, Weighted
 from tests.procedures.orientable import (
     PIXEL,
@@ -25,6 +25,8 @@ from tests.procedures.orientable import (
     photographed,
     placed,
 )
+
+pytest.importorskip("pycolmap", reason="pycolmap, which orients images, is not installed (extra photos)")
 
 FALSE = 0.3
 TRUTH = {"c_mm": 8.0, "xp_mm": 0.04, "yp_mm": -0.03, "k1": 1.5e-3, "k2": -2e-5}
@@ -55,7 +57,7 @@ def parameters(oriented):
     """Estimates and a posteriori sigmas of the interior orientation that is free."""
     adjusted = adjust(oriented.block)
     labels = [label.split("].")[1] for label in adjusted.structure.labels]
-    sigmas = np.sqrt(np.diagonal(_shared_covariance(adjusted))) * float(adjusted.sigma0)
+    sigmas = np.sqrt(np.diagonal(shared_covariance(adjusted))) * float(adjusted.sigma0)
     sigmas = dict(zip(labels, sigmas, strict=True))
     interior = oriented.block.start.unknowns.interior["camera"]
     return {n: (float(get_parameter(interior, n)), sigmas[n]) for n in oriented.report.estimated}

@@ -19,6 +19,8 @@ from tests.procedures.orientable import (
     with_epipolar_matches,
 )
 
+pytest.importorskip("pycolmap", reason="pycolmap, which orients images, is not installed (extra photos)")
+
 LENS = Camera(8.0, 0.04, -0.03, 1e-4, -1e-6)
 # A lens whose distortion in the corner is 37 pixels, and nothing is known of it.
 CHEAP = Camera()

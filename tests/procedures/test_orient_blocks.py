@@ -6,18 +6,17 @@ import numpy as np
 import pytest
 
 from jaxphoto.block import Start
-from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.initial.approximate import completed
-from jaxphoto.initial.matches import tracks
 from jaxphoto.observations import CameraPositions, ControlCoordinates, ImagePoints
 from jaxphoto.procedures.adjust import adjust, needs_orientation, start_of
 from jaxphoto.procedures.orientation import orient_block
-from jaxphoto.procedures.orientation.orient_photographs import _block_of
-from jaxphoto.procedures.orientation.refine import freed
+from jaxphoto.procedures.orientation.self_calibration import freed
 from tests.formulas import camera_from_object
-from tests.procedures.orientable import PIXEL, SENSOR, Camera, aerial, convergent, photographed
+from tests.procedures.orientable import Camera, aerial, block_of, convergent, photographed, true_network
+
+pytest.importorskip("pycolmap", reason="pycolmap, which orients images, is not installed (extra photos)")
 
 PLAIN = Camera(8.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -25,14 +24,17 @@ PLAIN = Camera(8.0, 0.0, 0.0, 0.0, 0.0)
 def unknown_block(scene, held=True):
     """Image points of the scene by a known camera, and the true point of each of the block."""
     p = photographed(scene, PLAIN, 0.3, clutter=0, found=1.0)
-    sigmas = [np.full(len(xy), 0.3 * PIXEL) for xy in p.features]
-    found = tracks([len(xy) for xy in p.features], p.matches)
-    block = _block_of("scene", p.names, SENSOR, InteriorOrientation(8.0), p.features, sigmas, found)
+    network, of_row = true_network(p)
+    block = block_of(p, network)
+    n, n_points = len(block.images), len(block.points)
+    exterior = ExteriorOrientation(np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
+    unknowns = dataclasses.replace(block.start.unknowns, exterior=exterior, points=np.zeros((n_points, 3)))
+    block = dataclasses.replace(block, start=Start(unknowns, np.zeros(n, bool), np.zeros(n_points, bool)))
     if held:
         interior = {"camera": freed(block.priors.interior["camera"], ())}
         block = dataclasses.replace(block, priors=dataclasses.replace(block.priors, interior=interior))
     true = np.zeros(len(block.points), int)
-    true[found.point] = [p.point_of[i][f] for i, f in zip(found.image, found.feature, strict=True)]
+    true[network.point] = of_row
     return block, true
 
 

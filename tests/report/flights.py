@@ -33,7 +33,7 @@ def part_report() -> PartReport:
     found = adjusted("cross")
     block, n = found.block, len(found.block.images)
     report = OrientationReport(
-        n, 500, 20, block.images, {}, GrossErrors(0, 3, 2, 1, 0, 0, 4), len(block.points), 300, 2,
+        n, 500, 20, block.images, {}, GrossErrors(0, 3, 2, 1, 0, 4), len(block.points), 300, 2,
         True, True, 2.0, 0.5, 1.0, ("c_mm",), (), 1.5,
     )  # fmt: skip
     placed = GeoreferencedPhotographs(block, block.images[:4], OFFSETS_M, np.array([True] * 3 + [False]), ())

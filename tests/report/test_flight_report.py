@@ -11,7 +11,7 @@ from matplotlib.quiver import Quiver
 
 from jaxphoto.camera.conditions import Conditions
 from jaxphoto.procedures.control import ControlledBlock
-from jaxphoto.procedures.control.marked import Marked
+from jaxphoto.procedures.control.marks import Marked
 from jaxphoto.report.findings import as_sentence, p_words
 from jaxphoto.report.flight import (
     axis_cell,

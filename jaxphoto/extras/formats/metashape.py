@@ -52,8 +52,7 @@ from jaxphoto.georeferencing.map_frame import map_system
 from jaxphoto.io.camera_files import CameraFile, CameraReader, CameraSource, joined_notes
 from jaxphoto.io.text_files import has_words, read_legacy_text
 from jaxphoto.io.text_tables import finite
-from jaxphoto.procedures.control.surveyed import GivenControl
-from jaxphoto.procedures.control.system import ControlSystem, system_of
+from jaxphoto.procedures.control.surveyed import ControlSystem, GivenControl, system_of
 
 CAMERAS_FILE, MARKERS_FILE = "cameras.xml", "markers.xml"
 _MODELS = {"frame": AGISOFT, "fisheye": AGISOFT_FISHEYE, "equidistant_fisheye": AGISOFT_FISHEYE}

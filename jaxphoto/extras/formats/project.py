@@ -24,8 +24,7 @@ from jaxphoto.io.block_folder.settings import frame_section
 from jaxphoto.io.block_folder.table_layout import ANGLES, SIGMA_XYZ, coordinate_names
 from jaxphoto.io.text_tables import Table
 from jaxphoto.observations import ControlCoordinates
-from jaxphoto.procedures.control.surveyed import SIGMA_M
-from jaxphoto.procedures.control.system import system_of
+from jaxphoto.procedures.control.surveyed import SIGMA_M, system_of
 from jaxphoto.procedures.georeference_photographs import utm_of
 from jaxphoto.unknowns import FIXED, FREE, Unknowns
 

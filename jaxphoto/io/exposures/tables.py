@@ -37,7 +37,7 @@ from jaxphoto.georeferencing.gps import Fix, Heights
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.io.control_table import PLACE, SYSTEM, columns_of, in_degrees, separator_of, split_row
 from jaxphoto.io.exposures.records import Exposures, Lines
-from jaxphoto.procedures.control.system import ControlSystem, system_of
+from jaxphoto.procedures.control.surveyed import ControlSystem, system_of
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
 
 _OPK, _RPY = ("omega", "phi", "kappa"), ("roll", "pitch", "yaw")

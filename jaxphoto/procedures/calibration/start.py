@@ -1,59 +1,108 @@
-"""Where a calibration starts when nothing is known of the camera: distortion from straightness, c from perspective.
+"""Distortion model, free parameters and initial values of a calibration: distortion from straightness, c from
+perspective.
 
-1. Radial distortion, `ideal = measured (1 - k1 r^2 - k2 r^4)` about the image centre: that with which the photographs
-   of a flat board are best what a pinhole makes of a plane, a homography each (lines are straight). The errors are
-   those in the plane of the board, so that a smaller image is no better one.
-2. The principal distance from the homographies (Zhang, 2000): the images of the board's axes are at right angles and of
-   one length, `h1' W h2 = 0`, `h1' W h1 = h2' W h2` with W = diag(1, 1, c^2), by least squares over all photographs.
-3. The coefficients of any distortion model that come nearest to this radial distortion over the format.
+1. Radial distortion, `ideal = measured (1 - k1 r^2 - k2 r^4)` about the image centre, for which the photographs of a
+flat board are best approximated by homographies (straight lines stay straight). Errors are measured in the plane of the
+board, so that a smaller image does not have smaller errors.
+
+2. The principal distance from the homographies (Zhang, 2000): the images of the axes of the board are orthogonal and of
+equal length, `h1' W h2 = 0`, `h1' W h1 = h2' W h2` with W = diag(1, 1, c^2), by least squares over all photographs.
+
+3. The coefficients of any distortion model nearest to this radial distortion over the format.
 """
 
 from collections.abc import Sequence
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from jaxphoto.camera import AbstractDistortion, Brown, InteriorOrientation, Sensor, get_parameter, set_parameter
+from jaxphoto.camera import (
+    AbstractDistortion,
+    Brown,
+    InteriorOrientation,
+    Sensor,
+    Smac,
+    get_parameter,
+    parameter_names,
+    set_parameter,
+)
 from jaxphoto.compiling import call_compiled
+from jaxphoto.errors import InputError
 from jaxphoto.initial.rays import ideal_coordinates
-from jaxphoto.procedures.calibration.board import Board
-from jaxphoto.procedures.calibration.calibration_block import TargetRows
-from jaxphoto.procedures.calibration.reprojection import projections
-from jaxphoto.procedures.calibration.resections import resected
+from jaxphoto.least_squares import least_squares
+from jaxphoto.procedures.calibration.target_block import Board, TargetRows, projections, resected
 
-# Points along each side of the format at which two distortions are compared, and Gauss-Newton steps.
-_SIDE, _STEPS = 15, 8
-# Principal distances, over the diagonal of the format, that a photograph of a board can have.
+_CENTRAL = ("c_mm", "xp_mm", "yp_mm")
+
+
+def distortion_model(name: str, sensor: Sensor, r0_mm: float = 0.0) -> AbstractDistortion:
+    """Return the distortion model `name` of block.toml without distortion, with constants that fit the sensor
+    (`plain`).
+
+    Raises InputError for an unknown name, for R0 of another model than SMAC, and for R0 beyond the format.
+    """
+    kind, longer = AbstractDistortion.called(name), max(sensor.width_mm, sensor.height_mm)
+    if kind is Smac:
+        if not 0 <= r0_mm <= longer:
+            raise InputError(f"R0 = {r0_mm:g} mm does not lie on an image of {longer:.4g} mm; give 0 to {longer:.4g}")
+        return Smac(r0=r0_mm)
+    if r0_mm:
+        raise InputError(f"R0 belongs to the model smac; leave it out with {name}, or choose smac")
+    return kind.plain(sensor)
+
+
+def free_parameters(name: str, distortion: AbstractDistortion, wanted: Sequence[str] | None = None) -> tuple[str, ...]:
+    """Return the parameters to estimate, in the order of the model: `wanted` (c, xp, yp stand for c_mm, ...), or the
+    default.
+
+    The default is c, the principal point, and the coefficients that a board determines (`AbstractDistortion.usual`):
+    for SMAC and Brown K1-K3, P1, P2. Raises InputError for unknown names, and for a scale coefficient together with c.
+    """
+    names = parameter_names(InteriorOrientation(1.0, distortion=distortion))
+    if wanted is None:
+        usual = distortion.usual()
+        return tuple(n for n in names if n in (*_CENTRAL, *usual))
+    asked = [f"{n}_mm" if n in ("c", "xp", "yp") else n for n in wanted]
+    for parameter in asked:
+        if parameter not in names:
+            raise InputError(f"the model {name} has no parameter {parameter!r}; it has {', '.join(names)}")
+    if both := [scale for scale in distortion.scales if scale in asked and "c_mm" in asked]:
+        raise InputError(f"{both[0]} changes the scale as c does: leave {both[0]} or c out of what is free")
+    return tuple(n for n in names if n in asked)
+
+
+# Points along each side of the format at which two distortions are compared.
+_SIDE = 15
+# Bounds of the principal distance over the diagonal of the format.
 _SHORTEST, _LONGEST = 0.15, 15.0
-# Of the typical mean square error of a homography: beyond, a view is no plane seen by this camera.
+# Limit of the mean square error of a homography over the median: beyond, a view is not a plane seen by this camera.
 _MISFIT = 25.0
-# Mean square errors of homographies, over the size of the board: of none that fits, and of measurements without noise.
+# Mean square errors of homographies over the size of the board: for an invalid lens, and the minimum.
 _FOLDED, _EXACT = 1e6, 1e-16
-# Of h1 and h2, what a view must be tilted by to tell c: below, all views are taken as square on.
+# Minimum tilt of a view (from h1 and h2) that determines c.
 _TILT = 1e-3
-# Of the largest singular value: below, points determine no homography, as those of one row and a single one beside it.
+# Minimum ratio of singular values for which points determine a homography.
 _DETERMINED = 1e-3
 
 
 def rough_interior(
     board: Board, rows: TargetRows, sensor: Sensor, known: InteriorOrientation | None = None
 ) -> InteriorOrientation:
-    """Where the calibration starts: from a flat board, else from what is `known`, else from resections with several c.
+    """Estimate the initial camera from a flat board, else `known`, else from resections with several c.
 
-    Of a board that is not flat, and of views square on, nothing is told by homographies: then c is that of `known`, or
-    the one of a few between half and three times the longer side with which resections leave least.
+    Homographies determine nothing for a board that is not flat, and no c for views without tilt: c is then that of
+    `known`, or that of seven between half and three times the longer side with the smallest resection errors.
     """
     plane = board.plane
     if plane is not None:
         middle, axes = plane
         flat = (board.xyz_m - middle) @ axes[:, :2]
-        own = [rows.image == k for k in range(len(rows.images))]
-        rough, told = flat_start([(flat[rows.point[k]], rows.xy_mm[k]) for k in own], sensor)
-        if told or known is None:
+        of_image = [rows.image == k for k in range(len(rows.images))]
+        rough, determined = flat_start([(flat[rows.point[k]], rows.xy_mm[k]) for k in of_image], sensor)
+        if determined or known is None:
             return rough
         return eqx.tree_at(lambda i: i.c, rough, float(known.c))
     if known is not None:
@@ -64,7 +113,7 @@ def rough_interior(
 
 
 def _resection_error(board: Board, rows: TargetRows, interior: InteriorOrientation) -> float:
-    """Median error (mm) of the resections of all photographs with an interior orientation."""
+    """Median error (mm) of the resections of all photographs."""
     exterior, why = resected(board, rows, interior)
     rows = rows.take(np.array([rows.images[k] not in why for k in rows.image], bool))
     if not len(rows.image):
@@ -77,16 +126,16 @@ def _resection_error(board: Board, rows: TargetRows, interior: InteriorOrientati
 def flat_start(
     views: Sequence[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]], sensor: Sensor
 ) -> tuple[InteriorOrientation, bool]:
-    """c, K1 and K2 (`Brown`) from views of flat boards: coordinates in the board (m) and measured ones (mm).
+    """Estimate c, K1 and K2 (`Brown`) from views of flat boards: board coordinates (m) and image coordinates (mm).
 
-    Views whose points lie on a line, or all but one of them, say nothing and are not looked at. The second value is
-    False where no view is tilted enough to tell c, which is then 1.2 times the longer side.
+    Views with collinear points, except for one, are skipped. The second value is False if no view has enough tilt to
+    determine c, which is then 1.2 times the longer side.
     """
     half = np.hypot(sensor.width_mm, sensor.height_mm) / 2
     views = [view for view in views if _determines(view[0])]
     if not views:
         return InteriorOrientation(1.2 * max(sensor.width_mm, sensor.height_mm)), False
-    # The mean of logarithms: a view of something else adds a constant and no more.
+    # The mean of logarithms is robust: a view of something else adds a constant.
     bend = lambda k: float(np.mean(np.log(_bends(views, k, half))))  # noqa: E731
     lens = scipy.optimize.minimize(bend, np.zeros(2), method="Nelder-Mead", options={"maxiter": 120}).x
     distortion_misfit = _bends(views, lens, half)
@@ -105,50 +154,47 @@ def flat_start(
     slope, wanted = np.array(rows), np.array(right)
     square = slope @ wanted / max(slope @ slope, 1e-300)
     c = np.sqrt(square) * half if square > 0 else np.nan
-    told = bool(np.max(np.abs(slope)) > _TILT and 2 * _SHORTEST * half < c < 2 * _LONGEST * half)
-    if not told:
+    determined = bool(np.max(np.abs(slope)) > _TILT and 2 * _SHORTEST * half < c < 2 * _LONGEST * half)
+    if not determined:
         c = 1.2 * max(sensor.width_mm, sensor.height_mm)
     k1, k2 = lens / half ** np.array([2, 4])
-    return InteriorOrientation(c, distortion=Brown(k1=k1, k2=k2)), told
+    return InteriorOrientation(c, distortion=Brown(k1=k1, k2=k2)), determined
 
 
 def nearest_distortion(
     known: InteriorOrientation, model: AbstractDistortion, free: Sequence[str], sensor: Sensor
 ) -> InteriorOrientation:
-    """`known` with the distortion `model`, whose coefficients among `free` come nearest to that of `known`.
+    """Return `known` with the distortion `model`, its coefficients `free` fitted to that of `known`.
 
-    Over 15 x 15 points of the format, by least squares of the residuals that an adjustment would have.
+    The fit is to 15 x 15 points of the format, by least squares of the residuals of an adjustment.
     """
     x, y = (np.linspace(-0.48, 0.48, _SIDE) * side for side in (sensor.width_mm, sensor.height_mm))
     measured = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     ideal = ideal_coordinates(known, measured)
-    given, wanted = (measured - np.asarray(known.principal_point), ideal)
+    source, wanted = (measured - np.asarray(known.principal_point), ideal)
     if model.domain == "ideal":
-        given, wanted = wanted, given
+        source, wanted = wanted, source
     interior = jax.tree.map(lambda v: np.asarray(v, float), InteriorOrientation(known.c, known.x_p, known.y_p, model))
     names = tuple(name for name in free if name in model.coefficients)
-    for _ in range(_STEPS if names else 0):
-        value, slope = call_compiled(_closed_form, interior, given, names)
-        slope = np.asarray(slope).reshape(-1, len(names))
-        length = np.maximum(np.linalg.norm(slope, axis=0), 1e-300)
-        step = np.linalg.lstsq(slope / length, (wanted - np.asarray(value)).ravel(), rcond=1e-10)[0] / length
-        for name, change in zip(names, step, strict=True):
-            interior = set_parameter(interior, name, np.asarray(get_parameter(interior, name) + change))
+    if names:
+        begin = np.array([float(get_parameter(interior, name)) for name in names])
+        values = np.asarray(call_compiled(_nearest, begin, interior, source, wanted, names))
+        interior = _with(interior, names, values)
     return interior
 
 
 @eqx.filter_jit
-def _closed_form(interior: InteriorOrientation, xy: Float[Array, "n 2"], names: tuple[str, ...]):
-    """What the distortion makes of `xy`, (n, 2), and the derivatives by the coefficients `names`, (n, 2, names)."""
+def _nearest(start: Float[Array, "u"], interior: InteriorOrientation, source, wanted, names: tuple[str, ...]):
+    def residuals(values, _):
+        return (jax.vmap(_with(interior, names, values).closed_form)(source) - wanted).ravel()
 
-    def value(parameters):
-        tree = interior
-        for name, parameter in zip(names, parameters, strict=True):
-            tree = set_parameter(tree, name, parameter)
-        return jax.vmap(tree.closed_form)(jnp.asarray(xy))
+    return least_squares(residuals, start).unknowns
 
-    start = jnp.stack([get_parameter(interior, name) for name in names])
-    return value(start), jax.jacfwd(value)(start)
+
+def _with(interior: InteriorOrientation, names: tuple[str, ...], values) -> InteriorOrientation:
+    for name, value in zip(names, values, strict=True):
+        interior = set_parameter(interior, name, value)
+    return interior
 
 
 def _straight(xy, lens, half):
@@ -162,7 +208,7 @@ def _bends(views, lens, half) -> Float[np.ndarray, "views"]:
     """Mean square error of the best homography of each view, in the board and over its size."""
     r = np.linspace(0, 1, 20)
     if np.any(1 - 3 * lens[0] * r**2 - 5 * lens[1] * r**4 <= 0.05):
-        return np.full(len(views), _FOLDED)  # the lens would fold the image inside the format
+        return np.full(len(views), _FOLDED)  # the lens is not invertible inside the format
     errors = []
     for board, xy in views:
         image = _straight(xy, lens, half)
@@ -174,28 +220,28 @@ def _bends(views, lens, half) -> Float[np.ndarray, "views"]:
 
 
 def _homography(board, image) -> Float[np.ndarray, "3 3"]:
-    """image ~ H board, by least squares in coordinates of one size (the direct linear transformation)."""
+    """Homography image ~ H board by the direct linear transformation, in conditioned coordinates."""
     (a, to_a), (b, to_b) = _conditioned(board), _conditioned(image)
     h = np.linalg.svd(_linear(a, b))[2][-1].reshape(3, 3)
     return np.linalg.solve(to_b, h @ to_a)
 
 
 def _determines(board) -> bool:
-    """Whether points of a plane determine a homography: then only one takes them to themselves."""
+    """Return True if points of a plane determine a homography: the map to themselves is unique."""
     same, _ = _conditioned(board)
     size = np.linalg.svd(_linear(same, same), compute_uv=False)
     return bool(len(size) > 7 and size[7] > _DETERMINED * size[0])
 
 
 def _linear(board, image) -> Float[np.ndarray, "rows 9"]:
-    """The equations of the direct linear transformation: these times the nine elements of H are zero."""
+    """Equations of the direct linear transformation: their product with the nine elements of H is zero."""
     one, zero = np.ones((len(board), 1)), np.zeros((len(board), 3))
     point = np.hstack([board, one])
     return np.vstack([np.hstack([point, zero, -image[:, :1] * point]), np.hstack([zero, point, -image[:, 1:] * point])])
 
 
 def _conditioned(xy):
-    """The same points about their middle and of size 1, and the matrix that makes them so."""
+    """Conditioned points, about their mean and of size 1, and the matrix of the conditioning."""
     middle = xy.mean(axis=0)
     size = max(float(np.sqrt(np.mean(np.sum((xy - middle) ** 2, axis=1)))), 1e-300)
     matrix = np.array([[1 / size, 0, -middle[0] / size], [0, 1 / size, -middle[1] / size], [0, 0, 1]])

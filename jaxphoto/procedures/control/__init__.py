@@ -1,8 +1,8 @@
-"""Control of a block from files: surveyed points and marks, placed, adjusted with, tested."""
+"""Control of a block: surveyed points and their marks, transformation to their frame, adjustment and tests."""
 
-from jaxphoto.procedures.control.control_block import ControlledBlock, at_optimum, control_block, rejudged
+from jaxphoto.procedures.control.control_block import ControlledBlock, at_optimum, control_block, retest
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
-from jaxphoto.procedures.control.with_targets import control_block_with_targets
+from jaxphoto.procedures.control.targets import control_block_with_targets
 
 __all__ = [
     "ControlledBlock",
@@ -12,5 +12,5 @@ __all__ = [
     "at_optimum",
     "control_block",
     "control_block_with_targets",
-    "rejudged",
+    "retest",
 ]

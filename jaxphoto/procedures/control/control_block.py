@@ -1,9 +1,14 @@
-"""An oriented block adjusted with control: placed, tested, and what contradicts the rest left out and named.
+"""Adjust an oriented block with control, and reject control that contradicts the rest.
 
-1. Rays of the marks meet in points; a mark that contradicts the others of its point goes.
-2. Three control points or more that agree bring the block to their frame. With fewer it stays where it is.
-3. It is adjusted with them. Then, in turns, the one observation of control that contradicts the rest most is left out,
-   and points that were left out come back where they agree. Check points never enter.
+1. Rays of marks are intersected; a mark that contradicts the others of its point is rejected.
+
+2. Three or more consistent control points transform the block to their frame. With fewer it stays where it is.
+
+3. The block is adjusted with them. Iteratively, the observation of control with the largest normalised residual is
+rejected, and rejected points that agree return. Check points never enter.
+
+Normalised residuals test observations (Baarda); check points and rejected points are tested by their difference over
+its standard deviation, of survey and adjustment together.
 """
 
 import dataclasses
@@ -17,23 +22,125 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Block, Start
 from jaxphoto.errors import DatumError, InputError, counted, few
 from jaxphoto.procedures.adjust import adjust_for_tables
-from jaxphoto.procedures.control.intersected import intersected
-from jaxphoto.procedures.control.into_block import into_block, with_gnss_bias, without_names
-from jaxphoto.procedures.control.judged import CRITICAL, JudgedControl, beyond, judged, poorer_survey, scatter
-from jaxphoto.procedures.control.marked import Marked, marked
-from jaxphoto.procedures.control.onto_control import MINIMAL_SIZES, on_a_line, onto_control
-from jaxphoto.procedures.control.placed import InFrame, in_frame
+from jaxphoto.procedures.control.frame import MIN_POINTS, InFrame, in_frame, on_a_line, onto_control
+from jaxphoto.procedures.control.marks import Marked, intersected, into_block, marked, with_gnss_bias, without_names
 from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, SIGMA_M, GivenControl, SurveyedPoints
+from jaxphoto.statistics import LEAST_CHECKED, covariance, normalised_residuals, redundancy_numbers
+
+CRITICAL = 4.0
+"""Limit of normalised residuals: one valid observation of 16,000 exceeds it."""
+
+# Minimum number of residuals of a scatter estimate, and the median of the larger of two normal errors.
+_ENOUGH, _LARGER = 8, 1.05
+# Minimum number of surveyed points of a scatter estimate, the median of a normal error, and the ratio of scatters that
+# rejects a default: the median of twelve exceeds 1.9 in one valid block of a hundred.
+_POINTS, _MEDIAN, _MORE = 6, 0.6745, 2.0
+# Change (of the logarithm) that is not worth another adjustment.
+_STILL = 0.15
+
+
+class TestedControl(NamedTuple):
+    """The last `points` of a block and the marks of them."""
+
+    adjusted_m: Float[np.ndarray, "points 3"]
+    off_m: Float[np.ndarray, "points 3"]
+    """Surveyed minus adjusted; NaN without survey."""
+    sigma_m: Float[np.ndarray, "points 3"]
+    """Of the adjusted coordinates, a posteriori."""
+    w: Float[np.ndarray, "points 3"]
+    """Normalised residuals; NaN if not tested."""
+    marks_px: Float[np.ndarray, "rows 2"]
+    """Measured minus computed, column and row, of the marks in the order of the block."""
+    marks_w: Float[np.ndarray, "rows"]
+    """Normalised residuals, the larger of both axes; NaN if not tested."""
+
+
+def test_control(
+    adjusted: Adjustment, n: int, xyz: Float[np.ndarray, "points 3"], sigma: Float[np.ndarray, "points 3"]
+) -> TestedControl:
+    """Test the last `n` points, surveyed at `xyz` with `sigma` (m), in any role."""
+    block = adjusted.block
+    first = len(block.points) - n
+    cov = covariance(adjusted, rows=True)
+    redundancy = redundancy_numbers(adjusted, cov)
+    tested = normalised_residuals(adjusted, redundancy)
+    place = np.asarray(adjusted.unknowns.points, float)[first:]
+    point_sigma = np.asarray(cov.point_sigma)[first:]
+    off = xyz - place
+    w = np.abs(off) / np.hypot(point_sigma, np.where(np.isfinite(sigma), sigma, 0.0))
+    control = block.control
+    if len(control):
+        r, normalised = np.asarray(redundancy["control_points"]), np.asarray(tested["control_points"])
+        mine = np.asarray(control.who) >= first
+        who, axis = np.asarray(control.who)[mine] - first, np.asarray(control.axis)[mine]
+        w[who, axis] = np.where(r[mine] > LEAST_CHECKED, np.abs(normalised[mine]), np.nan)
+    rows = np.asarray(block.image_points.point) >= first
+    pixel = np.array([block.sensors[c].pixel_mm for c in block.image_camera])[block.image_points.image[rows]]
+    residual = np.asarray(adjusted.residuals.image)[:, rows] * np.asarray(block.image_points.sigma).T[:, rows]
+    of_marks = np.where(
+        np.asarray(redundancy.image)[:, rows] > LEAST_CHECKED, np.abs(np.asarray(tested.image)[:, rows]), np.nan
+    )
+    marks_px = residual.T / pixel[:, None] * (1, -1)
+    return TestedControl(place, off, point_sigma, w, marks_px, _largest(of_marks))
+
+
+def _largest(w: Float[np.ndarray, "2 rows"]) -> Float[np.ndarray, "rows"]:
+    """Largest over the first axis; NaN if all are."""
+    largest = np.max(np.nan_to_num(w, nan=-1.0), axis=0, initial=-1.0)
+    return np.where(largest < 0, np.nan, largest)
+
+
+def scatter(marks_w: Float[np.ndarray, "rows"]) -> float:
+    """Robust scatter of the normalised residuals of marks; at least 1, and 1 for few marks.
+
+    Manual marks are often less accurate than stated, which makes no blunders of them.
+    """
+    finite = marks_w[np.isfinite(marks_w)]
+    return max(1.0, float(np.median(finite)) / _LARGER) if len(finite) >= _ENOUGH else 1.0
+
+
+def poorer_survey(
+    w: Float[np.ndarray, "points 3"],
+    sigma_m: Float[np.ndarray, "points 3"],
+    assumed: Bool[np.ndarray, "points 3"],
+    guess_m: tuple[float, float, float],
+) -> Float[np.ndarray, "3"] | None:
+    """Estimate sigmas (m) of the coordinates `assumed` that explain most of them; None if `sigma_m` does.
+
+    They follow from the medians of the normalised residuals of plan and height; up to half of the points may be
+    blunders. A block is deformed by control with too much weight, so that several adjustments are needed: after the
+    default `guess_m` is rejected, standard deviations may decrease, too. Heights are at first as poor as the plan.
+    """
+    now, given_up = np.array(guess_m), bool((sigma_m[assumed] > max(guess_m)).any())
+    factor = np.ones(3)
+    for axes in ([0, 1], [2]):
+        if assumed[:, axes].any():
+            now[axes] = np.median(sigma_m[:, axes][assumed[:, axes]])
+        tested = assumed[:, axes] & np.isfinite(w[:, axes])
+        if tested.any(axis=1).sum() >= _POINTS:
+            factor[axes] = np.median(w[:, axes][tested]) / _MEDIAN
+    if given_up:
+        return None if np.abs(np.log(factor)).max() < _STILL else np.maximum(factor * now, guess_m)
+    if factor.max() < _MORE:
+        return None
+    poorer = np.maximum(factor, 1) * now
+    return np.maximum(poorer, poorer[0])
+
+
+def beyond(w: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
+    """Return True for points with a significant normalised residual."""
+    return np.nan_to_num(w).max(axis=1, initial=0.0) > CRITICAL
+
 
 _ROUNDS = 8
-# Sentences about marks in an error, which is one line.
+# Maximum number of sentences about marks in an error message.
 _SAID = 2
-# Of the worst normalised residual: what is less is not left out beside it.
+# Fraction of the largest normalised residual below which no other observation is rejected with it.
 _BESIDE_THE_WORST = 0.7
 
 
 class ControlledBlock(NamedTuple):
-    """A block adjusted with control, and what became of each surveyed point. Arrays are over the surveyed points."""
+    """A block adjusted with control, and the result of each surveyed point. Arrays are over the surveyed points."""
 
     adjusted: Adjustment
     ids: tuple[str, ...]
@@ -42,17 +149,17 @@ class ControlledBlock(NamedTuple):
     """control, check, left out (it contradicts the rest), not marked (in too few photographs)."""
     n_marks: tuple[int, ...]
     xyz_m: Float[np.ndarray, "points 3"]
-    """Surveyed, in the local frame of the block; NaN for what is not known."""
+    """Surveyed, in the local frame of the block; NaN if unknown."""
     off_m: Float[np.ndarray, "points 3"]
-    """Surveyed minus adjusted, in the local frame of the block; NaN where there is none."""
+    """Surveyed minus adjusted, in the local frame of the block; NaN if undefined."""
     survey_sigma_m: Float[np.ndarray, "points 3"]
     sigma_m: Float[np.ndarray, "points 3"]
     """Of the adjusted coordinates, a posteriori."""
     w: Float[np.ndarray, "points 3"]
     marks: Marked
-    """Those that were adjusted with; `point` counts the surveyed points."""
+    """Accepted marks; `point` is the index of the surveyed points."""
     marks_px: Float[np.ndarray, "rows 2"]
-    """Their residuals, column and row."""
+    """Residuals of the marks, column and row."""
     sentences: tuple[str, ...]
 
 
@@ -67,141 +174,142 @@ def control_block(
     adjust: Callable[[Block], Adjustment] = adjust_for_tables,
     report: Callable[[str], object] = lambda text: None,
 ) -> ControlledBlock:
-    """`block`, whose images and points have a start, adjusted with `control`.
+    """Adjust `block`, whose images and points have initial values, with `control`.
 
-    `system` names that of the points where their file does not, `code` the EPSG code of a block that has none yet,
-    `vertical` that of the heights that it has in files. `elsewhere` are photographs that are known but not of this
-    block. Raises InputError for control that cannot be used as it stands: see `in_frame` and `onto_control`; and where
-    no mark is in a photograph of the block.
+    `system` names that of the points if their file does not, `code` the EPSG code of a block that has none yet,
+    `vertical` that of the heights of files. `elsewhere` are photographs of other blocks. Raises InputError for unusable
+    control (`in_frame`, `onto_control`), and if no mark is in a photograph of the block.
     """
     points, ids = control.points, control.points.ids
     frame = in_frame(block, points, system, code, vertical)
-    rows, said = marked(block, points, control.marks, elsewhere)
+    rows, messages = marked(block, points, control.marks, elsewhere)
     if not len(rows.image):
         first = f" ({few(list(dict.fromkeys(control.marks.image)))})" if control.marks.image else ""
         raise InputError(f"{points.file}: no mark{first} is in a photograph of the block ({few(block.images)})")
     met = intersected(block, block.start.unknowns, rows, ids)
-    rows, said = rows.take(met.good), [*said, *met.sentences]
+    rows, messages = rows.take(met.good), [*messages, *met.sentences]
     sigma = np.where(np.isnan(points.sigma_m), SIGMA_M, points.sigma_m)
     try:
-        block, start, agree, sigma, told = _placed(block, frame, met.points, met.covariance, sigma, points)
+        block, start, agree, sigma, seen_sigma = _placed(block, frame, met.points, met.covariance, sigma, points)
     except InputError as error:
-        # What marks say of one another is why there is too little, where there is.
+        # Contradicting marks explain why too few points are left.
         raise InputError("; ".join([str(error), *_one_height(points), *met.sentences[:_SAID]])) from error
-    said += told
+    messages += seen_sigma
     count = np.bincount(rows.point, minlength=len(ids))
     known = np.where(np.isnan(points.coordinates), np.nan, frame.xyz)
-    # One ray and a known place are an observation, one ray alone is none.
+    # One ray and a known point are an observation, one ray alone is not.
     seen = (count > 1) & np.isfinite(start).all(axis=1) | (count == 1) & ~points.check & np.isfinite(known).all(axis=1)
     start = np.where(np.isfinite(start), start, frame.xyz)
     base = without_names(block, ids)
     used = seen & ~points.check & agree
     if len(base.stations) and all(np.isfinite(known[used, axis]).any() for axis in range(3)):
         base = with_gnss_bias(base)
-        said.append("positions of the receiver have a shift of their own, which control tells")
+        messages.append("positions of the receiver have a shift of their own, which control tells")
     now = rows.take(seen[rows.point])
     tried: list[tuple] = []
     for number in range(_ROUNDS):
         report(f"adjusting with {int(used.sum())} control points")
         which = np.flatnonzero(seen)
         place = np.cumsum(seen) - 1
-        own = now._replace(point=place[now.point])
+        of_seen = now._replace(point=place[now.point])
         names = tuple(ids[k] for k in which)
-        # What is taken for the survey of check points is no ground to claim an accuracy on.
-        told = np.where(points.check[:, None] & np.isnan(points.sigma_m), 0.0, sigma)[which]
+        # A default standard deviation of check points must not enter the stated accuracy.
+        seen_sigma = np.where(points.check[:, None] & np.isnan(points.sigma_m), 0.0, sigma)[which]
         roles = used[which], points.check[which]
-        made = into_block(base, names, known[which], told, start[which], own, *roles)
+        controlled = into_block(base, names, known[which], seen_sigma, start[which], of_seen, *roles)
         try:
-            adjusted = adjust(made)
+            adjusted = adjust(controlled)
         except DatumError as error:
-            # What is taken of the control beforehand may be why it does not tell enough.
+            # The default standard deviations may be why control does not determine the datum.
             raise DatumError("; ".join([str(error), *_assumed(control, sigma)])) from error
         if not bool(adjusted.converged):
-            said.append("the adjustment with control did not converge; it is not tested")
-        found = _spread(judged(adjusted, len(which), known[which], sigma[which]), seen)
-        poorer = poorer_survey(found.w[used], sigma[used], np.isnan(points.sigma_m[used]), SIGMA_M)
+            messages.append("the adjustment with control did not converge; it is not tested")
+        tested = _spread(test_control(adjusted, len(which), known[which], sigma[which]), seen)
+        poorer = poorer_survey(tested.w[used], sigma[used], np.isnan(points.sigma_m[used]), SIGMA_M)
         if poorer is not None and number + 1 < _ROUNDS and bool(adjusted.converged):
-            # Before any is judged by a guess that most contradict.
+            # Before any point is tested with a default that most contradict.
             sigma = np.where(np.isnan(points.sigma_m), poorer, sigma)
             continue
-        new, gone, text = _tested(found, now, used, seen & ~points.check, ids, block.images)
+        new, rejected, text = _tested(tested, now, used, seen & ~points.check, ids, block.images)
         key = (used.tobytes(), len(now.image))
         if number + 1 == _ROUNDS or not text or key in tried or not bool(adjusted.converged):
             break
         tried.append(key)
-        said += text
-        used, now = new, now.take(~gone)
+        messages += text
+        used, now = new, now.take(~rejected)
         count = np.bincount(now.point, minlength=len(ids))
         seen &= count > 0
         used &= seen
         base = _from(base, adjusted)
         start[which] = np.asarray(adjusted.unknowns.points)[len(base.points) :]
     left = seen & ~points.check & ~used
-    said = [*_assumed(control, sigma), *said]
-    said += _left_out(ids, left, found, frame)
+    messages = [*_assumed(control, sigma), *messages]
+    messages += _left_out(ids, left, tested, frame)
     state = np.where(points.check, "check", np.where(used, "control", "left out"))
     state = np.where(seen, state, "not marked")
     if not_marked := [ids[k] for k in np.flatnonzero(~seen)]:
-        said.append(f"{len(not_marked)} surveyed points are marked in too few photographs: {few(not_marked)}")
+        messages.append(f"{len(not_marked)} surveyed points are marked in too few photographs: {few(not_marked)}")
     n_marks = tuple(int(v) for v in np.bincount(now.point, minlength=len(ids)))
     return ControlledBlock(
-        adjusted, ids, points.check, tuple(state.tolist()), n_marks, known, found.off_m, sigma, found.sigma_m,
-        found.w, now, found.marks_px, tuple(dict.fromkeys(filter(None, said))),
+        adjusted, ids, points.check, tuple(state.tolist()), n_marks, known, tested.off_m, sigma, tested.sigma_m,
+        tested.w, now, tested.marks_px, tuple(dict.fromkeys(filter(None, messages))),
     )  # fmt: skip
 
 
 def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: SurveyedPoints):
-    """The block in the frame of control, where its points begin, which agree with it, how well they were surveyed, and
-    what is to be said."""
+    """Transform the block to the frame of control.
+
+    Return block, initial points, consistent points, standard deviations of the survey, and messages.
+    """
     whole = np.isfinite(points.coordinates).all(axis=1)
     known = np.flatnonzero(np.isfinite(met).all(axis=1) & ~points.check & whole)
     agree = np.ones(len(met), bool)
     by_positions = len(block.stations) > 0 and not len(block.control)
-    line = len(known) >= MINIMAL_SIZES and on_a_line(met[known], frame.xyz[known])
-    if frame.at_place and (line or len(known) < MINIMAL_SIZES):
+    line = len(known) >= MIN_POINTS and on_a_line(met[known], frame.xyz[known])
+    if frame.at_place and (line or len(known) < MIN_POINTS):
         how = " lie on a line, which leaves a turn about it open" if line else ""
         stays = f"the block stays {'at its positions' if by_positions else 'where it lies'}"
-        said = [f"{counted(len(known), 'control point')} in two photographs or more{how}: {stays}"]
-        return block, met, agree, sigma, said
+        messages = [f"{counted(len(known), 'control point')} in two photographs or more{how}: {stays}"]
+        return block, met, agree, sigma, messages
     spread = np.sqrt(np.trace(covariance[known], axis1=1, axis2=2))
     assumed, surveyed = np.isnan(points.sigma_m[known]).any(axis=1), np.linalg.norm(sigma[known], axis=1)
     if not frame.at_place:
-        # In the unit of the block's own frame, which a similarity is to tell.
+        # In the unit of the block, until a similarity determines the scale.
         first = onto_control(met[known], frame.xyz[known], surveyed, points.file, assumed)
         spread = spread * first.similarity.scale
     onto = onto_control(met[known], frame.xyz[known], np.hypot(surveyed, spread), points.file, assumed)
     if onto.scatter_m is not None:
         sigma = np.where(np.isnan(points.sigma_m), onto.scatter_m, sigma)
     agree[known] = onto.agree
-    said = [f"{int(onto.agree.sum())} of {counted(len(known), 'control point')} bring the block to their frame"]
+    messages = [f"{int(onto.agree.sum())} of {counted(len(known), 'control point')} bring the block to their frame"]
     if frame.at_place:
         off = np.median((frame.xyz - met)[known[onto.agree]], axis=0)
-        told = ", ".join(f"{v:.2f}" for v in np.round(off, 2) + 0.0)
+        offset = ", ".join(f"{v:.2f}" for v in np.round(off, 2) + 0.0)
         there = "the positions of the photographs have" if by_positions else "the block has"
-        said.append(f"control lies {told} m (east, north, up) from where {there} it")
+        messages.append(f"control lies {offset} m (east, north, up) from where {there} it")
     block = dataclasses.replace(onto.similarity.of_block(block), frame=frame.frame)
-    return block, onto.similarity.of(met), agree, sigma, said
+    return block, onto.similarity.of(met), agree, sigma, messages
 
 
 def _assumed(control: GivenControl, sigma: Float[np.ndarray, "points 3"]) -> list[str]:
-    said, none = [], np.isnan(control.points.sigma_m)
+    messages, none = [], np.isnan(control.points.sigma_m)
     if n := int(none.any(axis=1).sum()):
         taken = np.where(none, sigma, 0.0).max(axis=0)
         why = "they scatter about the photographs: " if (taken > SIGMA_M).any() else ""
         east, north, up = np.where(none.any(axis=0), np.maximum(taken, SIGMA_M), SIGMA_M)
-        said.append(
+        messages.append(
             f"{n} surveyed points have no standard deviations: {why}{max(east, north):.2g} m east and north, "
             f"{up:.2g} m up are taken"
         )
-    said += _one_height(control.points)
+    messages += _one_height(control.points)
     if n := int(np.isnan(control.marks.sigma_px).sum()):
-        said.append(f"{n} marks have no standard deviations: {MARK_SIGMA_PX:g} px is taken")
-    return said
+        messages.append(f"{n} marks have no standard deviations: {MARK_SIGMA_PX:g} px is taken")
+    return messages
 
 
 def _one_height(points: SurveyedPoints) -> list[str]:
     height = points.coordinates[:, 2]
-    if len(height) < MINIMAL_SIZES or np.ptp(height) != 0:
+    if len(height) < MIN_POINTS or np.ptp(height) != 0:
         return []
     return [
         f"all {len(height)} surveyed heights are {height[0]:g} m; where nobody surveyed them, leave them empty and "
@@ -209,16 +317,16 @@ def _one_height(points: SurveyedPoints) -> list[str]:
     ]
 
 
-def _tested(found: JudgedControl, now: Marked, used, able, ids, images):
-    """Control points in use after the test, marks that go, and a sentence for each; nothing where all agree."""
-    new, gone, said = used.copy(), np.zeros(len(now.image), bool), []
-    of_points, of_marks = np.where(used, np.nan_to_num(found.w).max(axis=1), 0.0), np.nan_to_num(found.marks_w)
-    wide = scatter(found.marks_w)
+def _tested(tested: TestedControl, now: Marked, used, able, ids, images):
+    """Return accepted control points, marks to reject, and a sentence for each; no sentence if all agree."""
+    new, rejected, messages = used.copy(), np.zeros(len(now.image), bool), []
+    of_points, of_marks = np.where(used, np.nan_to_num(tested.w).max(axis=1), 0.0), np.nan_to_num(tested.marks_w)
+    wide = scatter(tested.marks_w)
     worst = max(of_points.max(initial=0.0), of_marks.max(initial=0.0) / wide)
     if not worst > CRITICAL:
-        back = able & ~used & ~beyond(found.w) & np.isfinite(found.w).any(axis=1)
-        return new | back, gone, [""] * bool(back.any())
-    # What a blunder does to the residuals about it is no second one.
+        back = able & ~used & ~beyond(tested.w) & np.isfinite(tested.w).any(axis=1)
+        return new | back, rejected, [""] * bool(back.any())
+    # Smaller residuals near a blunder are often caused by it.
     limit = max(CRITICAL, _BESIDE_THE_WORST * worst)
     for p in np.unique(now.point).tolist():
         row = max(np.flatnonzero(now.point == p), key=lambda k: of_marks[k])
@@ -226,48 +334,51 @@ def _tested(found: JudgedControl, now: Marked, used, able, ids, images):
             continue
         if of_marks[row] < of_points[p]:
             new[p] = False
-            said.append("")
+            messages.append("")
             continue
-        gone[row] = True
-        off, image = np.linalg.norm(found.marks_px[row]), images[now.image[row]]
-        said.append(f"the mark of {ids[p]} in {image} is {off:.3g} px off (w = {found.marks_w[row]:.3g}) and left out")
-    return new, gone, said
+        rejected[row] = True
+        off, image = np.linalg.norm(tested.marks_px[row]), images[now.image[row]]
+        messages.append(
+            f"the mark of {ids[p]} in {image} is {off:.3g} px off (w = {tested.marks_w[row]:.3g}) and left out"
+        )
+    return new, rejected, messages
 
 
-def _left_out(ids, left, found: JudgedControl, frame: InFrame):
+def _left_out(ids, left, tested: TestedControl, frame: InFrame):
     for k in np.flatnonzero(left):
-        told = ", ".join(f"{v:.3g}" for v in found.off_m[k])
-        text = f"control point {ids[k]} contradicts the rest by {told} m (east, north, up) and is left out"
-        near = np.linalg.norm(frame.xyz - found.adjusted_m[k], axis=1)
+        offset = ", ".join(f"{v:.3g}" for v in tested.off_m[k])
+        text = f"control point {ids[k]} contradicts the rest by {offset} m (east, north, up) and is left out"
+        near = np.linalg.norm(frame.xyz - tested.adjusted_m[k], axis=1)
         other = int(np.argmin(np.where(np.arange(len(ids)) == k, np.inf, near)))
-        if near[other] < 0.1 * np.linalg.norm(found.off_m[k]):
+        if near[other] < 0.1 * np.linalg.norm(tested.off_m[k]):
             text += f": its marks show {ids[other]}, so look at the names"
         yield text
 
 
-def _spread(own: JudgedControl, seen) -> JudgedControl:
-    """Over all surveyed points, NaN for those that are not in the block."""
+def _spread(tested: TestedControl, seen) -> TestedControl:
+    """Expand to all surveyed points, with NaN for those that are not in the block."""
     wide = lambda v: np.where(seen[:, None], v[np.cumsum(seen) - 1], np.nan)  # noqa: E731
-    return own._replace(
-        adjusted_m=wide(own.adjusted_m), off_m=wide(own.off_m), sigma_m=wide(own.sigma_m), w=wide(own.w)
+    return tested._replace(
+        adjusted_m=wide(tested.adjusted_m), off_m=wide(tested.off_m), sigma_m=wide(tested.sigma_m), w=wide(tested.w)
     )
 
 
-def rejudged(found: ControlledBlock, adjusted: Adjustment) -> ControlledBlock:
-    """The same by another adjustment of its block, as with other weights."""
-    seen = np.array(found.state, object) != "not marked"
-    own = _spread(judged(adjusted, int(seen.sum()), found.xyz_m[seen], found.survey_sigma_m[seen]), seen)
-    return found._replace(adjusted=adjusted, off_m=own.off_m, sigma_m=own.sigma_m, w=own.w, marks_px=own.marks_px)
+def retest(controlled: ControlledBlock, adjusted: Adjustment) -> ControlledBlock:
+    """Test again after another adjustment of the block, such as with other weights."""
+    seen = np.array(controlled.state, object) != "not marked"
+    xyz, sigma = controlled.xyz_m[seen], controlled.survey_sigma_m[seen]
+    new = _spread(test_control(adjusted, int(seen.sum()), xyz, sigma), seen)
+    return controlled._replace(adjusted=adjusted, off_m=new.off_m, sigma_m=new.sigma_m, w=new.w, marks_px=new.marks_px)
 
 
 def at_optimum(adjusted: Adjustment) -> Block:
-    """The block of an adjustment, all of whose images and points start where that has led."""
+    """Return the adjusted block, with initial values at the optimum."""
     block = adjusted.block
     known = (np.ones(len(names), bool) for names in (block.images, block.points))
     return dataclasses.replace(block, start=Start(adjusted.unknowns, *known))
 
 
 def _from(base: Block, adjusted: Adjustment) -> Block:
-    """`base` that starts at the optimum of the same with control."""
+    """Return `base` with initial values at the optimum of the same block with control."""
     unknowns = dataclasses.replace(adjusted.unknowns, points=np.asarray(adjusted.unknowns.points)[: len(base.points)])
     return dataclasses.replace(base, start=dataclasses.replace(base.start, unknowns=unknowns))

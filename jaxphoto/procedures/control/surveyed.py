@@ -1,44 +1,59 @@
-"""What is known of control before photographs are looked at: surveyed points, and where photographs show them."""
+"""Surveyed points, their marks in photographs, and their coordinate system.
 
+A system is an EPSG code, with one of heights (25832+7837) or without, "WGS84 UTM 32N" and PROJ strings as in
+OpenDroneMap, WKT as in Metashape, or "local" for Cartesian metres without a map.
+"""
+
+import functools
+import re
+import warnings
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from pyproj import CRS, Transformer
+from pyproj.aoi import AreaOfInterest
+from pyproj.database import query_crs_info
+from pyproj.enums import PJType
+from pyproj.exceptions import CRSError, ProjError
+
+from jaxphoto.errors import InputError, quoted
+from jaxphoto.georeferencing.map_frame import MapFrame, map_name, map_system
 
 SIGMA_M = (0.02, 0.02, 0.03)
-"""Of a surveyed point, east, north and up, where its file says none: a receiver with corrections, one occupation."""
+"""Default standard deviations of a surveyed point, east, north and up: RTK, one occupation."""
 MARK_SIGMA_PX = 1.0
-"""Of a mark set by hand where its file says none."""
+"""Default standard deviation of a manual mark."""
 
 
 class SurveyedPoints(NamedTuple):
-    """Points with coordinates, as a file has them."""
+    """Points with coordinates as in a file."""
 
     file: str
     ids: tuple[str, ...]
     coordinates: Float[np.ndarray, "points 3"]
-    """Easting, northing, height (m), or longitude, latitude (degrees), height; NaN for a height that is not known."""
+    """Easting, northing, height (m), or longitude, latitude (degrees), height; NaN for an unknown height."""
     sigma_m: Float[np.ndarray, "points 3"]
-    """East, north, up; NaN where the file says none."""
+    """East, north, up; NaN if not stated."""
     check: Bool[np.ndarray, "points"]
-    """Whether it only checks the block, and never enters the adjustment."""
+    """True for check points, which never enter the adjustment."""
     places: tuple[str, ...]
     """File and row of each."""
     system: str = ""
-    """What the file says of the coordinate system: an EPSG code, a string of PROJ, WKT, "local"; "" for nothing."""
+    """Coordinate system in the file: EPSG code, PROJ string, WKT, "local"; "" if not stated."""
     own_axes: bool = False
-    """Whether the first two coordinates are in the order of the system's own axes (EPSG:4326 has latitude first)."""
+    """True if the first two coordinates are in the axis order of the system (EPSG:4326: latitude first)."""
 
 
 class Marks(NamedTuple):
-    """Where photographs show points, in pixels: the centre of the upper-left pixel is (0.5, 0.5)."""
+    """Image coordinates of points in photographs (px); the centre of the upper-left pixel is (0.5, 0.5)."""
 
     image: tuple[str, ...]
-    """The name of the file or of the image."""
+    """Name of the file or of the image."""
     point: tuple[str, ...]
     column_row: Float[np.ndarray, "marks 2"]
     sigma_px: Float[np.ndarray, "marks"]
-    """NaN where the file says none."""
+    """NaN if not stated."""
     places: tuple[str, ...]
 
     @staticmethod
@@ -47,7 +62,7 @@ class Marks(NamedTuple):
         return Marks((), (), np.zeros((0, 2)), np.zeros(0), ())
 
     def take(self, chosen: np.ndarray) -> "Marks":
-        """Those that a mask or indices choose."""
+        """Select marks by mask or index."""
         which = np.arange(len(self.image))[chosen]
         names = (tuple(names[k] for k in which) for names in (self.image, self.point, self.places))
         image, point, places = names
@@ -55,7 +70,7 @@ class Marks(NamedTuple):
 
     @staticmethod
     def joined(one: "Marks", other: "Marks") -> "Marks":
-        """Both, one after the other."""
+        """Concatenate marks."""
         column_row = np.concatenate([one.column_row, other.column_row])
         sigma = np.concatenate([one.sigma_px, other.sigma_px])
         places = one.places + other.places
@@ -63,7 +78,174 @@ class Marks(NamedTuple):
 
 
 class GivenControl(NamedTuple):
-    """Surveyed points and marks of them; there may be none of these, where targets are to be found."""
+    """Surveyed points and their marks, which may be empty if targets are to be found."""
 
     points: SurveyedPoints
     marks: Marks
+
+
+LOCAL = "local"
+_CODES = re.compile(r"(?:EPSG::?)?\s*(\d{1,6})(?:\s*\+\s*(?:EPSG::?)?(\d{1,6}))?\s*(?:[<#].*)?", re.IGNORECASE)
+_UTM = re.compile(r"WGS\s?84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
+_WKT = re.compile(r"\s*(GEOGCS|PROJCS|COMPD_CS|GEOGCRS|GEODCRS|PROJCRS|COMPOUNDCRS|GEOCCS)\[")
+# PROJ parameters that read no files.
+_KEYS = {
+    "proj", "zone", "south", "ellps", "datum", "units", "no_defs", "type", "lat_0", "lon_0", "lat_1", "lat_2", "lat_ts",
+    "k", "k_0", "x_0", "y_0", "towgs84", "a", "b", "rf", "alpha", "gamma", "lonc", "lat_b", "pm", "vunits", "wktext",
+    "over",
+}  # fmt: skip
+_LONGEST = 20_000
+# Maximum distance of control from a flight.
+NEAR_M = 20_000.0
+
+
+class ControlSystem(NamedTuple):
+    """Coordinate system of surveyed points; `crs` None is local and Cartesian."""
+
+    crs: CRS | None
+    code: int | None
+    """EPSG code of the horizontal system, if any."""
+    vertical: int | None
+    """EPSG code of the heights; None for ellipsoidal heights, or if unknown."""
+
+    @property
+    def name(self) -> str:
+        """Name in messages."""
+        if self.crs is None:
+            return "a local system"
+        code = map_name(self.code, self.vertical) if self.code else ""
+        return f"{code} ({self.crs.name})" if code else str(self.crs.name)
+
+
+@functools.lru_cache(maxsize=64)
+def system_of(words: str, place: str) -> ControlSystem:
+    """Parse the system `words`, read at `place`. Raises InputError if they name none."""
+    words = words.strip()
+    if words.lower() == LOCAL or words.startswith("LOCAL_CS["):
+        return ControlSystem(None, None, None)
+    if utm := _UTM.fullmatch(words):
+        words = f"EPSG:{32600 + int(utm[1]) + 100 * (utm[2] in 'Ss')}"
+    if codes := _CODES.fullmatch(words):
+        vertical = int(codes[2]) if codes[2] else None
+        return ControlSystem(map_system(int(codes[1])), int(codes[1]), vertical)
+    wrong = InputError(
+        f"{place}: {quoted(words)} names no coordinate system; write EPSG:25832, EPSG:25832+7837 with heights, or local"
+    )
+    keys = {part.lstrip("+").split("=")[0] for part in words.split()}
+    is_wkt = bool(_WKT.match(words)) and "EXTENSION" not in words and "GRID" not in words.upper()
+    if len(words) > _LONGEST or not (is_wkt or (words.startswith("+proj=") and keys <= _KEYS)):
+        raise wrong
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            crs = CRS.from_user_input(words)
+            parts = crs.sub_crs_list if crs.is_compound else [crs]
+            codes_of = [part.to_epsg() for part in parts]
+    except CRSError:
+        raise wrong from None
+    if not (parts[0].is_projected or parts[0].is_geographic or parts[0].is_geocentric):
+        raise wrong
+    if len(parts) > 1 and None in codes_of:
+        raise InputError(f"{place}: the system of the heights has no EPSG code; write like EPSG:25832+7837")
+    return ControlSystem(parts[0], codes_of[0], codes_of[1] if len(parts) > 1 else None)
+
+
+def places(points: SurveyedPoints, system: ControlSystem, code: int) -> Float[np.ndarray, "points 3"]:
+    """Longitude, latitude (degrees) and height (m) of the points, on the ellipsoid of the EPSG system `code`.
+
+    Unknown heights are the median of the others. Raises InputError for coordinates outside the system, for a missing
+    geoid model, and if no point has a height.
+    """
+    crs = system.crs
+    assert crs is not None
+    xyz = filled(points)
+    if points.own_axes and crs.axis_info[0].direction == "north":
+        xyz = xyz[:, [1, 0, 2]]
+    ellipsoid = map_system(code).geodetic_crs
+    assert ellipsoid is not None
+    if system.vertical is not None and system.code is not None:
+        xyz = MapFrame(system.code, system.vertical, (0.0, 0.0, 0.0)).place(xyz)
+        geodetic = map_system(system.code).geodetic_crs
+        assert geodetic is not None
+        crs = geodetic
+    try:
+        change = Transformer.from_crs(crs if crs.is_geocentric else crs.to_3d(), ellipsoid.to_3d(), always_xy=True)
+    except ProjError:
+        raise InputError(
+            f"{points.file}: PROJ has no transformation from {system.name} to the ellipsoid of EPSG:{code}"
+        ) from None
+    there = np.stack(change.transform(*xyz.T), axis=1)
+    for k in np.flatnonzero(~np.isfinite(there).all(axis=1)):
+        text = ", ".join(f"{v:.10g}" for v in xyz[k])
+        raise InputError(
+            f"{points.places[k]}: {text} is no place of {system.name}; correct coordinates, their order or the system"
+        )
+    return there
+
+
+def filled(points: SurveyedPoints) -> Float[np.ndarray, "points 3"]:
+    """Coordinates with the median height for unknown ones. Raises InputError if no point has one."""
+    xyz = points.coordinates.copy()
+    if np.isnan(xyz[:, 2]).all():
+        raise InputError(f"{points.file}: no point has a height; add them")
+    xyz[np.isnan(xyz[:, 2]), 2] = np.nanmedian(xyz[:, 2])
+    return xyz
+
+
+def check_near(points: SurveyedPoints, system: ControlSystem, longitude: float, latitude: float) -> None:
+    """Raise InputError for points far from the photographs, with a system that would fit."""
+    code = system.code or 4326
+    try:
+        off = distance_m(places(points, system, code), longitude, latitude)
+    except InputError as error:
+        off, far = np.inf, str(error)
+    else:
+        far = f"{points.file}: its points lie {off / 1000:,.0f} km from where the photographs were taken"
+    if off <= NEAR_M:
+        return
+    would = fitting(points, system, longitude, latitude)
+    mend = f"they would fit {would}" if would else "correct the coordinates, or the system"
+    raise InputError(f"{far}, if their system is {system.name}: {mend}")
+
+
+def fitting(points: SurveyedPoints, system: ControlSystem | None, longitude: float, latitude: float) -> str:
+    """Describe the system in which the points are near the photographs; "" if there is none."""
+    exchanged = points._replace(coordinates=points.coordinates[:, [1, 0, 2]])
+    if system is not None and system.crs is not None and _near(exchanged, system, longitude, latitude):
+        return f"with the first two coordinates exchanged, in {system.name}"
+    for read, order in ((points, ""), (exchanged, ", with the first two coordinates exchanged")):
+        for code in (4326, *_systems_at(longitude, latitude)):
+            other = ControlSystem(CRS.from_epsg(code), code, None)
+            if _near(read._replace(own_axes=False), other, longitude, latitude):
+                return f"{other.name}{order}"
+    return ""
+
+
+def _near(points: SurveyedPoints, system: ControlSystem, longitude: float, latitude: float) -> bool:
+    try:
+        return distance_m(places(points, system, system.code or 4326), longitude, latitude) < NEAR_M
+    except InputError:
+        return False
+
+
+def _systems_at(longitude: float, latitude: float) -> list[int]:
+    """Projected systems in metres of the place: UTM first, then the national ones."""
+    area = AreaOfInterest(longitude, latitude, longitude, latitude)
+    listed = query_crs_info("EPSG", [PJType.PROJECTED_CRS], area, contains=True)
+    codes = sorted(listed, key=lambda info: (not info.name.startswith("WGS 84 / UTM"), int(info.code)))
+    usable = []
+    for info in codes:
+        try:
+            map_system(int(info.code))
+        except InputError:
+            continue
+        usable.append(int(info.code))
+    return usable
+
+
+def distance_m(places: Float[np.ndarray, "n 3"], longitude: float, latitude: float) -> float:
+    """Distance of the median of `places` (degrees) from a place, on a sphere."""
+    there = np.deg2rad(np.median(places[:, :2], axis=0))
+    here = np.deg2rad([longitude, latitude])
+    half = np.sin((there - here) / 2) ** 2
+    return float(2 * 6.371e6 * np.arcsin(np.sqrt(min(1.0, half[1] + np.cos(here[1]) * np.cos(there[1]) * half[0]))))

@@ -23,8 +23,7 @@ from jaxphoto.lidar.correction import ScannerPath
 from jaxphoto.lidar.strip_planes import StripSettings, fitting
 from jaxphoto.observations import StripPoints
 from jaxphoto.observations.strip_planes import return_at
-from jaxphoto.procedures.control.into_block import into_block
-from jaxphoto.procedures.control.marked import Marked
+from jaxphoto.procedures.control.marks import Marked, into_block
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
 from jaxphoto.procedures.lidar.plane_search import PointPlanes, PointSearch, StripSearch
 from jaxphoto.procedures.lidar.strip_model import Side, side_of

@@ -1,4 +1,4 @@
-"""Images oriented to one another from their common points alone: photographs, or a block without approximate values."""
+"""Orientation of images from their common points alone: photographs, or a block without initial values."""
 
 from jaxphoto.procedures.orientation.blocks import orient_block
 from jaxphoto.procedures.orientation.orient_photographs import GrossErrors, OrientationReport, Oriented, orient

@@ -1,7 +1,6 @@
-"""A block of which too little is known but what was measured in its images: oriented as photographs are.
+"""Orient a block without initial values by COLMAP; its points give the matches.
 
-Its points say which measurements belong together, so there is nothing to match. Gross errors stay in the block; they
-are only kept from spoiling its start.
+Gross errors stay in the block; COLMAP prevents their influence on initial values.
 """
 
 import dataclasses
@@ -11,55 +10,84 @@ import equinox as eqx
 import numpy as np
 
 from jaxphoto.block import Block, Start
-from jaxphoto.camera import Perspective
+from jaxphoto.camera import InteriorOrientation, Perspective, get_parameter
 from jaxphoto.errors import BlockError
 from jaxphoto.initial.approximate import completed
 from jaxphoto.initial.matches import PairMatches
-from jaxphoto.procedures.orientation.growing import grown
-from jaxphoto.procedures.orientation.network import Sight, sight_of
-from jaxphoto.procedures.orientation.onto_known import onto_known
-from jaxphoto.procedures.orientation.refine import calibration_of
-from jaxphoto.procedures.orientation.related_pairs import LENS_PX, MOST, Report, check_connected, relate
+from jaxphoto.initial.rays import ideal_coordinates
+from jaxphoto.procedures.orientation.colmap import MappedCamera, map_images
+from jaxphoto.procedures.orientation.known_frame import in_known_frame
+from jaxphoto.procedures.orientation.orient_photographs import Report
+from jaxphoto.unknowns import FIXED
 
-# Points measured by hand are few, and mostly right.
-_LEAST_MATCHES, _LEAST_POINTS = 8, 6
+# Manual image points are few, and mostly correct.
+_MIN_MATCHES, _MIN_POINTS = 8, 6
 
 
 def orient_block(block: Block, report: Report = lambda text: None) -> Block:
-    """`block` with a start for its images and points, found from its image points alone.
+    """Add initial values for images and points of `block`, from its image points alone.
 
-    The frame is that of its known points and camera stations, where three or more not on a line are seen, else that of
-    its known images; where nothing is known, it is a frame of its own. Interior orientation that is not fixed starts
-    where the images want it. What was known stays as it is; images and points that cannot be oriented stay unknown.
+    The frame is that of three or more known points and camera stations that are not collinear, else that of known
+    images, else arbitrary. A principal distance that is not fixed starts at COLMAP's estimate. Known values are
+    unchanged; images and points that cannot be oriented stay unknown.
 
-    Raises BlockError for cameras that are not perspective, where no two images begin a network, for groups of images
-    that nothing connects, and where known points and stations are too few for the frame.
+    Raises BlockError for cameras that are not perspective, if no two images can be oriented, for unconnected groups of
+    images, and for too few known points and stations.
     """
     _check_perspective(block)
-    sight = sight_of(block, block.start.unknowns.interior)
-    calibration = calibration_of(block)
-    pixel = float(np.median([s.pixel_mm / float(block.start.unknowns.interior[n].c) for n, s in block.sensors.items()]))
-    lens = LENS_PX * pixel if any(calibration.names.values()) else 0.0
-    rays = [sight.ray[sight.of_image(i)] for i in range(len(block.images))]
-    sigma = float(np.median(sight.sigma))
-    loose = float(np.hypot(sigma, lens))
-    related = relate(block.images, rays, loose, list(_common_points(sight, len(rays))), _LEAST_MATCHES, report)
-    check_connected(block.images, related)
-    most = MOST * loose / sigma
-    network = grown(block, related.pairs, calibration, _LEAST_POINTS, most, report).network
-    found = onto_known(block, network, completed(block))
+    start, measured = block.start.unknowns, block.image_points
+    cameras = sorted(set(block.image_camera))
+    rows = [np.flatnonzero(np.asarray(measured.image) == i) for i in range(len(block.images))]
+    point_of = [np.asarray(measured.point)[row] for row in rows]
+    features = [
+        block.sensors[name].px_from_mm(ideal_coordinates(start.interior[name], np.asarray(measured.xy, float)[row]))
+        for name, row in zip(block.image_camera, rows, strict=True)
+    ]
+    report(f"orienting {len(block.images)} images (COLMAP)")
+    network = map_images(
+        block.images,
+        [_mapped_camera(block, name) for name in cameras],
+        [cameras.index(name) for name in block.image_camera],
+        features,
+        list(_common_points(point_of)),
+        _MIN_MATCHES,
+        _MIN_POINTS,
+    )
+    # Of several points that COLMAP made of one, that with most rays.
+    points = np.full((len(block.points), 3), np.nan)
+    number = np.array([point_of[i][f] for i, f in zip(network.image, network.feature, strict=True)], int)
+    order = np.argsort(np.bincount(network.point)[network.point], kind="stable")
+    points[number[order]] = network.points[network.point[order]]
+    network = in_known_frame(block, network._replace(points=points), completed(block))
 
-    start = block.start.unknowns
     image_known, point_known = np.asarray(block.start.image_known), np.asarray(block.start.point_known)
-    met = np.isfinite(found.points).all(axis=1) & found.met(sight) & ~point_known
-    oriented = found.oriented & ~image_known
-    given = (start.exterior.position, start.exterior.camera_from_object, start.points)
-    new = (found.positions, found.camera_from_object, found.points)
+    met = np.isfinite(network.points).all(axis=1) & ~point_known
+    oriented = network.oriented & ~image_known
+    old = (start.exterior.position, start.exterior.camera_from_object, start.points)
+    new = (network.positions, network.camera_from_object, network.points)
     is_new = (oriented[:, None], oriented[:, None, None], met[:, None])
     places = lambda u: (u.exterior.position, u.exterior.camera_from_object, u.points)  # noqa: E731
-    unknowns = eqx.tree_at(places, start, tuple(np.where(*v) for v in zip(is_new, new, given, strict=True)))
-    unknowns = dataclasses.replace(unknowns, interior=found.interior)
+    unknowns = eqx.tree_at(places, start, tuple(np.where(*v) for v in zip(is_new, new, old, strict=True)))
+    interior = {
+        name: _with_c(start.interior[name], c_px * block.sensors[name].pixel_mm)
+        for name, c_px in zip(cameras, network.c_px, strict=True)
+        if not _fixed(block, name)
+    }
+    unknowns = dataclasses.replace(unknowns, interior=start.interior | interior)
     return dataclasses.replace(block, start=Start(unknowns, image_known | oriented, point_known | met))
+
+
+def _mapped_camera(block: Block, name: str) -> MappedCamera:
+    sensor, interior = block.sensors[name], block.start.unknowns.interior[name]
+    return MappedCamera(sensor.width_px, sensor.height_px, float(interior.c) / sensor.pixel_mm, _fixed(block, name))
+
+
+def _fixed(block: Block, name: str) -> bool:
+    return get_parameter(block.priors.interior[name], "c_mm") == FIXED
+
+
+def _with_c(interior: InteriorOrientation, c_mm: float) -> InteriorOrientation:
+    return dataclasses.replace(interior, c=np.asarray(c_mm))  # type: ignore[arg-type]
 
 
 def _check_perspective(block: Block) -> None:
@@ -72,11 +100,10 @@ def _check_perspective(block: Block) -> None:
             )
 
 
-def _common_points(sight: Sight, n_images: int) -> Iterator[PairMatches]:
-    """The points that each two images have in common, as indices of their rows."""
-    points = [sight.point[sight.of_image(i)] for i in range(n_images)]
-    for i in range(n_images):
-        for j in range(i + 1, n_images):
-            common, one, other = np.intersect1d(points[i], points[j], return_indices=True)
-            if len(common) >= _LEAST_MATCHES:
+def _common_points(points: list[np.ndarray]) -> Iterator[PairMatches]:
+    """Yield the common points of each two images, as indices of their rows."""
+    for i in range(len(points)):
+        for j in range(i + 1, len(points)):
+            _, one, other = np.intersect1d(points[i], points[j], return_indices=True)
+            if len(one):
                 yield PairMatches(i, j, np.column_stack([one, other]))

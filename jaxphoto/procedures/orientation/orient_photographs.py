@@ -1,118 +1,115 @@
 """From matched features to an oriented block, for a calibration of the camera that took them.
 
-1. Relative orientations of all pairs; matches off the epipolar lines go.
-2. What is left hangs together to points; a network grows over them (`growing`).
-3. With the camera as the network knows it now, and all images oriented, every match is tested again: lens distortion
-   has made true ones look false, in the corners of the format above all. Points anew, adjustments in rounds.
-4. Parameters of the camera that the images cannot tell are observed where they start, and the rounds run again.
+1. COLMAP orients the images and joins matches to points (`colmap`).
+2. The network is adjusted iteratively, all parameters of the camera observed; gross errors are rejected (`rejection`).
+3. Parameters of the camera that the images determine become free (`self_calibration`), and the iteration is repeated.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment import PaddedSizes
+from jaxphoto.adjustment import Adjustment, PaddedSizes, solve
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.initial.matches import PairMatches, Tracks, tracks
-from jaxphoto.initial.rays import ideal_coordinates, unit_rays
+from jaxphoto.errors import BlockError
+from jaxphoto.initial.matches import PairMatches
+from jaxphoto.initial.rays import ideal_coordinates
 from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
-from jaxphoto.procedures.orientation.finish import FIRST_ROUNDS, LAST_ROUNDS, finished, told
-from jaxphoto.procedures.orientation.growing import grown
-from jaxphoto.procedures.orientation.network import Fate, Network, empty_network, meet, sight_of
-from jaxphoto.procedures.orientation.refine import (
-    Asked,
+from jaxphoto.procedures.orientation.colmap import MappedCamera, Network, map_images
+from jaxphoto.procedures.orientation.rejection import beyond_limit, unsupported
+from jaxphoto.procedures.orientation.self_calibration import (
     SelfCalibration,
-    asked,
-    calibration_of,
-    early,
+    determined,
     freed,
-    observation,
-    part_of,
+    self_calibration,
 )
-from jaxphoto.procedures.orientation.related_pairs import LENS_PX, MOST, Report, check_connected, relate
-from jaxphoto.procedures.orientation.second_look import second_look
 from jaxphoto.short_repr import pretty_repr
 from jaxphoto.unknowns import Unknowns, default_priors
+from jaxphoto.variants import some_images, without_observations
 
 CAMERA = "camera"
-"""What the camera of the photographs is called in the block."""
-METHOD = 2
-"""Changes with the way photographs are oriented: what a run has kept of another way is not taken up."""
+"""Name of the camera of photographs in the block."""
 SIGMA_PX = 0.5
-"""Standard deviation of a feature, in pixels, where none is given."""
-LEAST_MATCHES = 15
-"""Of a pair of photographs: fewer false ones agree with some orientation by chance."""
-LEAST_POINTS = 10
-"""That an oriented photograph sees."""
+"""Default standard deviation of a feature, in pixels."""
+MIN_MATCHES = 15
+"""Minimum number of matches of a pair: fewer false ones agree by chance."""
+MIN_POINTS = 10
+"""Minimum number of points of an oriented photograph."""
+ITERATIONS = 20
+# The iteration ends if at most this fraction of the image points, or so many of them, are rejected.
+_CONVERGED, _FEW = 1e-3, 2
+# Over flat ground a weakly determined principal distance converges slowly.
+_MAX_STEPS = 200
+
+Report = Callable[[str], object]
 
 
 class GrossErrors(NamedTuple):
-    """What was left out on the way, counted by reason."""
+    """Rejected matches and image points, counted by reason."""
 
     unoriented: int
     """Matches of pairs in which an image is not oriented."""
     off_epipolar: int
-    """Matches off the epipolar line of their pair."""
-    conflicting: int
-    """Matches by which a point would show twice in an image."""
+    """Matches that do not agree with a relative orientation of their pair."""
+    untriangulated: int
+    """Other matches whose features are not of one point."""
     beyond: int
-    """Image points whose ray misses the point."""
-    small_angle: int
-    """Image points whose rays meet at too small an angle."""
+    """Image points whose residual exceeds the limit."""
     too_few: int
-    """Image points left alone by those that went."""
+    """Image points of points and images that are left with too few of them."""
     unsupported: int
-    """Image points of two rays that meet where nothing near them in the images is."""
+    """Image points of two rays at a depth that neighbouring points contradict."""
 
 
 class OrientationReport(NamedTuple):
-    """How an orientation came about."""
+    """Summary of an orientation."""
 
     n_images: int
     n_matches: int
     n_pairs: int
     """Pairs with a relative orientation."""
     order: tuple[str, ...]
-    """Images as they were oriented."""
+    """Oriented images."""
     unoriented: dict[str, str]
-    """Images that are not, and why."""
+    """Images that are not oriented, and why."""
     gross_errors: GrossErrors
     n_points: int
     n_image_points: int
     rounds: int
+    """Iterations of adjustment and rejection."""
     settled: bool
-    """Whether the last of them changed hardly any image point."""
+    """True if the last iteration rejected hardly any image point."""
     converged: bool
-    """Whether the last adjustment did, and the rounds settled."""
+    """True if the last adjustment converged, and the iteration settled."""
     limit_px: float
-    """Rays that missed their points by more were left out."""
+    """Image points with larger residuals were rejected."""
     mean_px: float
     """Mean length of the residuals."""
     sigma0: float
     estimated: tuple[str, ...]
     """Parameters of the interior orientation that are free in the block."""
     observed: tuple[str, ...]
-    """Why others are observed where they start, a sentence each."""
+    """Why others stay observed at their initial values, a sentence each."""
     alike: float
-    """By what the standard deviations of the camera are larger than if neighbouring rays erred independently."""
+    """Factor of the standard deviations of the camera for the correlation of neighbouring residuals."""
 
 
 @pretty_repr
 class Oriented(NamedTuple):
-    """A block of photographs, oriented as a free network of arbitrary scale, and how it was made."""
+    """Block of photographs, oriented as a free network of arbitrary scale, and the report."""
 
     block: Block
-    """It starts where the orientation left it; `jaxphoto.adjust` gives its statistics."""
+    """Initial values are those of the last adjustment; `jaxphoto.adjust` gives statistics."""
     residuals_mm: Float[np.ndarray, "rows 2"]
-    """Of its image points, observed minus computed."""
+    """Residuals of its image points, observed minus computed."""
     report: OrientationReport
     sizes: PaddedSizes
-    """That its adjustments were compiled for; with them that of `block` runs the same program."""
+    """Sizes of the compiled adjustments: with them that of `block` runs the same program."""
 
 
 def orient(
@@ -125,106 +122,157 @@ def orient(
     title: str = "photographs",
     report: Report = lambda text: None,
 ) -> Oriented:
-    """Orient the images `names` of one camera from matches of their features, false ones among them.
+    """Orient the images `names` of one camera from matches of their features, gross errors among them.
 
     `features` are measured image coordinates (mm, from the image centre) by image, `sigmas_mm` their standard
-    deviations (half a pixel where they are not given), `matches` index them. `interior` is where its parameters start;
-    those that the images tell are free in the block. `report` is told what is being done.
+    deviations (half a pixel by default), `matches` index them. `interior` is the initial camera; parameters that the
+    images determine are free in the block. `report` is called with the current step.
 
-    Raises BlockError where no two images begin a network, and for groups of images that nothing connects (all named).
+    Raises BlockError if no two images can be oriented, and for unconnected groups of images (all named).
     """
     features = [np.asarray(xy, float).reshape(-1, 2) for xy in features]
     if sigmas_mm is None:
         sigmas_mm = [np.full(len(xy), SIGMA_PX * sensor.pixel_mm) for xy in features]
+    report(f"orienting {len(names)} images (COLMAP)")
+    c_px = float(interior.c) / sensor.pixel_mm
+    network = map_images(
+        names,
+        [MappedCamera(sensor.width_px, sensor.height_px, c_px, False)],
+        [0] * len(names),
+        [sensor.px_from_mm(ideal_coordinates(interior, xy)) for xy in features],
+        matches,
+        MIN_MATCHES,
+        MIN_POINTS,
+    )
+    block = network_block(title, names, sensor, interior, features, sigmas_mm, network)
+    calibration = self_calibration(block, CAMERA)
+    start = set_parameter(block.start.unknowns.interior[CAMERA], "c_mm", np.asarray(network.c_px[0] * sensor.pixel_mm))
+    block = _started(block, dataclasses.replace(block.start.unknowns, interior={CAMERA: start}))
     sigma = float(np.median(np.concatenate(sigmas_mm)))
-    c = float(interior.c)
-    loose = float(np.hypot(sigma, LENS_PX * sensor.pixel_mm)) / c
-    rays = [unit_rays(c, ideal_coordinates(interior, xy)) for xy in features]
-    related = relate(names, rays, loose, matches, LEAST_MATCHES, report)
-    check_connected(names, related)
-
-    number = [len(xy) for xy in features]
-    found = tracks(number, list(related.matches))
-    block = _block_of(title, names, sensor, interior, features, sigmas_mm, found)
-    calibration = calibration_of(block)
-    start = grown(block, related.pairs, calibration, LEAST_POINTS, MOST * loose * c / sigma, report)
-    network, _, limit, rounds, _, lost = finished(
-        block, start.network, calibration, early(calibration), start.angle, LEAST_POINTS, report, FIRST_ROUNDS
-    )
-
-    look = second_look(network, network.interior[CAMERA], features, matches, sigma, limit)
-    found = tracks(number, list(look.matches))
-    block = _block_of(title, names, sensor, interior, features, sigmas_mm, found)
-    again = calibration_of(block)
-    calibration = again._replace(sizes=again.sizes | calibration.sizes)
-    network = empty_network(block)._replace(
-        interior=network.interior,
-        positions=network.positions,
-        camera_from_object=network.camera_from_object,
-        oriented=network.oriented,
-    )
-    network = meet(sight_of(block, network.interior), network, limit, start.angle)
-    observed = asked(calibration, {CAMERA: ()})
-    second = finished(block, network, calibration, observed, start.angle, LEAST_POINTS, report)
-    camera = told(second.adjusted, calibration)
-    estimated = asked(calibration, camera.names)
-    last = finished(block, second.network, calibration, estimated, start.angle, LEAST_POINTS, report, LAST_ROUNDS)
-
-    network = last.network
-    refused = start.refused | lost | second.lost | last.lost
-    made = _oriented_block(block, network, calibration, estimated)
-    residual = np.asarray(last.adjusted.residuals.image).T * np.asarray(made.image_points.sigma)
-    fate = np.bincount(network.fate, minlength=len(Fate))
+    first = _iterated(block, calibration, (), report)
+    camera = determined(first.adjusted, calibration)
+    last = _iterated(first.block, calibration, camera.names, report)
+    final = calibration.final_priors(last.block, camera.names)
+    rejected = {reason: first.rejected[reason] + last.rejected[reason] for reason in first.rejected}
+    residual = np.asarray(last.adjusted.residuals.image).T * np.asarray(final.image_points.sigma)
     return Oriented(
-        made,
+        final,
         residual,
         OrientationReport(
             n_images=len(names),
             n_matches=sum(len(m.features) for m in matches),
-            n_pairs=len({(p.first, p.second) for p in related.pairs}),
-            order=tuple(names[i] for i in start.order if network.oriented[i]),
-            unoriented={names[i]: refused[i] for i in np.flatnonzero(~network.oriented).tolist()},
-            gross_errors=GrossErrors(
-                look.unoriented, look.off_epipolar, found.n_conflicting, *(int(fate[f]) for f in _COUNTED)
-            ),
-            n_points=len(made.points),
-            n_image_points=len(made.image_points.image),
-            rounds=rounds + second.rounds + last.rounds,
+            n_pairs=len(network.verified),
+            order=tuple(names[i] for i in network.order if names[i] in final.images),
+            unoriented=_unoriented(names, network, final, first.lost | last.lost),
+            gross_errors=GrossErrors(*_match_errors(matches, network), **rejected),
+            n_points=len(final.points),
+            n_image_points=len(final.image_points.image),
+            rounds=first.iterations + last.iterations,
             settled=last.settled,
             converged=last.settled and bool(last.adjusted.converged),
             limit_px=last.limit * sigma / sensor.pixel_mm,
             mean_px=float(np.mean(np.hypot(*residual.T))) / sensor.pixel_mm,
             sigma0=float(last.adjusted.sigma0),
-            estimated=camera.names[CAMERA],
-            observed=tuple(camera.open),
-            alike=camera.alike,
+            estimated=camera.names,
+            observed=tuple(camera.observed),
+            alike=camera.correlation_factor,
         ),
         calibration.sizes,
     )
 
 
-_COUNTED = (Fate.BEYOND, Fate.SMALL_ANGLE, Fate.TOO_FEW, Fate.UNSUPPORTED)
+class _Iterated(NamedTuple):
+    """Adjusted network without gross errors."""
+
+    block: Block
+    adjusted: Adjustment
+    limit: float
+    """Limit of residuals over a priori standard deviations."""
+    iterations: int
+    settled: bool
+    rejected: dict[str, int]
+    lost: dict[str, str]
+    """Images with too few points without gross errors."""
 
 
-def _block_of(title, names, sensor, interior, features, sigmas_mm, found: Tracks) -> Block:
-    """A block of which nothing is known but the camera, and of that only where it starts."""
-    n, n_points = len(names), int(found.point.max(initial=-1)) + 1
+def _iterated(block: Block, calibration: SelfCalibration, free: tuple[str, ...], report: Report) -> _Iterated:
+    """Adjust `block` with the parameters `free`, the others observed, until hardly any image point is rejected."""
+    rejected, lost = {"beyond": 0, "too_few": 0, "unsupported": 0}, dict[str, str]()
+    for iteration in range(1, ITERATIONS + 1):
+        report(f"adjusting {len(block.images)} images, iteration {iteration}")
+        part = calibration.with_priors(block, free)
+        adjusted = solve(part, part.start.unknowns, part.priors, _MAX_STEPS, calibration.sizes)
+        if np.isfinite(float(adjusted.sum_of_squares)):
+            block = _started(block, adjusted.unknowns)
+        far, limit = beyond_limit(block, np.asarray(adjusted.residuals.image))
+        alone = unsupported(block) & ~far
+        out = far | alone
+        settled = bool(out.sum() <= max(_FEW, _CONVERGED * len(out)))
+        if settled or iteration == ITERATIONS:
+            break
+        before = len(out)
+        block, _ = without_observations(block, {"image_points": out})
+        seen = np.bincount(block.image_points.image, minlength=len(block.images))
+        if (seen < MIN_POINTS).any():
+            lost |= {
+                block.images[k]: f"only {seen[k]} of its points fit, and {MIN_POINTS} are needed"
+                for k in np.flatnonzero(seen < MIN_POINTS).tolist()
+            }
+            block = some_images(block, seen >= MIN_POINTS)
+            if len(block.images) < 2:
+                raise BlockError(f"no two images keep {MIN_POINTS} points without gross errors: {lost}")
+        rejected["beyond"] += int(far.sum())
+        rejected["unsupported"] += int(alone.sum())
+        rejected["too_few"] += before - len(block.image_points.image) - int(out.sum())
+    return _Iterated(block, adjusted, limit, iteration, settled, rejected, lost)
+
+
+def _started(block: Block, unknowns: Unknowns) -> Block:
+    return dataclasses.replace(block, start=dataclasses.replace(block.start, unknowns=unknowns))
+
+
+def _match_errors(matches: Sequence[PairMatches], network: Network) -> tuple[int, int, int]:
+    """Count matches of unoriented images, off the epipolar line, and of features without a common point."""
+    point = {(i, f): p for i, f, p in zip(network.image, network.feature, network.point, strict=True)}
+    of_pair = {(m.first, m.second): m.features for m in network.verified}
+    unoriented = off = untriangulated = 0
+    for m in matches:
+        if not (network.oriented[m.first] and network.oriented[m.second]):
+            unoriented += len(m.features)
+            continue
+        features = of_pair.get((m.first, m.second), np.zeros((0, 2), int))
+        off += len(m.features) - len(features)
+        ends = ((point.get((m.first, a), -1), point.get((m.second, b), -2)) for a, b in features.tolist())
+        untriangulated += sum(int(a != b) for a, b in ends)
+    return unoriented, off, untriangulated
+
+
+def _unoriented(names, network: Network, block: Block, lost: dict[str, str]) -> dict[str, str]:
+    """Reasons of unoriented images."""
+    paired = {names[k] for m in network.verified for k in (m.first, m.second)}
+    few = f"it shares too few points with the others that fit one orientation; {MIN_POINTS} are needed"
+    alone = "no other image has a relative orientation to it"
+    return {n: lost.get(n, few if n in paired else alone) for n in names if n not in block.images}
+
+
+def network_block(title, names, sensor, interior, features, sigmas_mm, network: Network) -> Block:
+    """Block of the oriented images and points of `network`; the usual parameters of the camera are free."""
     for name in parameter_names(interior):
         interior = set_parameter(interior, name, np.asarray(get_parameter(interior, name), float))
-    exterior = ExteriorOrientation(np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))  # type: ignore[arg-type]
-    rows = np.concatenate([[0], np.cumsum([len(xy) for xy in features])])[found.image] + found.feature
-    xy, sigma = np.concatenate(features)[rows], np.concatenate(sigmas_mm)[rows]
+    priors = freed(interior, ("c_mm", "xp_mm", "yp_mm", *interior.distortion.usual()))
+    begin = np.concatenate([[0], np.cumsum([len(xy) for xy in features])])[network.image] + network.feature
+    sigma = np.concatenate(sigmas_mm)[begin]
+    exterior = ExteriorOrientation(network.positions, network.camera_from_object)  # type: ignore[arg-type]
     block = photographs_block(
         title,
         names,
-        [f"t{k + 1}" for k in range(n_points)],
+        [f"t{k + 1}" for k in range(len(network.points))],
         sensor,
-        (interior, freed(interior, _candidates(interior))),
-        (exterior, np.zeros((n_points, 3))),
-        ImagePoints(found.image, found.point, xy, np.stack([sigma, sigma], axis=1)),
+        (interior, priors),
+        (exterior, network.points),
+        ImagePoints(network.image, network.point, np.concatenate(features)[begin], np.stack([sigma, sigma], axis=1)),
     )
-    nothing = dataclasses.replace(block.start, image_known=np.zeros(n, bool), point_known=np.zeros(n_points, bool))
-    return dataclasses.replace(block, start=nothing)
+    return block if network.oriented.all() else some_images(block, network.oriented)
 
 
 def photographs_block(
@@ -236,7 +284,9 @@ def photographs_block(
     start: tuple[ExteriorOrientation, Float[np.ndarray, "points 3"]],
     rows: ImagePoints,
 ) -> Block:
-    """Photographs of one `camera`, its interior orientation and the priors of that, as a free network from `start`."""
+    """Block of photographs of one `camera` (interior orientation and its priors), a free network with initial values
+    `start`.
+    """
     interior, priors = (dataclasses.replace(part, residuals="measured") for part in camera)
     unknowns = Unknowns({CAMERA: interior}, *start, {}, {})
     n, n_points = len(names), len(points)
@@ -260,18 +310,3 @@ def photographs_block(
         start=Start(unknowns, np.ones(n, bool), np.ones(n_points, bool)),
         priors=dataclasses.replace(default_priors(unknowns), interior={CAMERA: priors}),
     )
-
-
-def _candidates(interior: InteriorOrientation) -> tuple[str, ...]:
-    """Parameters that the images are asked for: c, principal point and the usual of the model."""
-    return ("c_mm", "xp_mm", "yp_mm", *interior.distortion.usual())
-
-
-def _oriented_block(block: Block, network: Network, calibration: SelfCalibration, estimated: Asked) -> Block:
-    images = np.flatnonzero(network.oriented)
-    points = np.unique(block.image_points.point[network.used])
-    made = part_of(block, network, images, points, network.used)
-    priors = freed(made.priors.interior[CAMERA], estimated.free[CAMERA])
-    for name in estimated.observed[CAMERA]:
-        priors = set_parameter(priors, name, observation(calibration, CAMERA, name))
-    return dataclasses.replace(made, priors=dataclasses.replace(made.priors, interior={CAMERA: priors}))

@@ -1,0 +1,304 @@
+"""Matches of photographs by descriptors and epipolar geometry.
+
+COLMAP matches descriptors (mutual nearest neighbours with Lowe's ratio test) and verifies pairs: inliers of a
+fundamental matrix or homography. Neither needs a principal distance: that of EXIF may be wrong by a third, and an
+essential matrix would reject correct matches.
+"""
+
+import contextlib
+import itertools
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.compiling.freed_memory import freed_memory_kept
+from jaxphoto.errors import InputError
+from jaxphoto.extras.photos.features import LONGEST_PX, METHOD, SiftFeatures, sift_features
+from jaxphoto.extras.photos.photograph_pairs import MostSimilar, largest_of, most_similar, usual_count
+from jaxphoto.initial.matches import PairMatches, connected_images, tracks
+from jaxphoto.initial.rays import ideal_coordinates
+from jaxphoto.io.kept_pieces import KeptPieces, name_of
+from jaxphoto.io.photographs import Photograph
+from jaxphoto.procedures.matched_part import MatchedPart
+from jaxphoto.procedures.orientation.colmap import MappedCamera, import_pycolmap, write_database
+
+MIN_MATCHES = 15
+"""Minimum number of matches of a pair, and of their inlier ratio: fewer agree by chance."""
+_MIN_RATIO = 0.3
+# Maximum distance from the epipolar line over the diagonal (4 of 1,300 pixels): unknown distortion increases it.
+_OFF_LINE = 0.003
+# Scatter is that of the 90 % quantile, 1.645 standard deviations: the median ignores the long tails of features, and
+# the sum of squares is sensitive to the remaining false matches.
+_QUANTILE, _QUANTILE_SIGMA = 0.9, 1.6449
+_BLANK = "it shows no features: it is blank or out of focus"
+_ALONE = f"it has {MIN_MATCHES} points in common with no other photograph it was compared with"
+# Pairs that are matched, and stored, at a time.
+_CHUNK = 200
+Progress = Callable[[str, int, int], None]
+"""Called with the step, the number of items done, and their total number."""
+
+
+class MatchedPhotographs(NamedTuple):
+    """Features of photographs and their matches."""
+
+    xy_mm: list[Float[np.ndarray, "n 2"]]
+    """Image coordinates of each photograph, as in `SiftFeatures`."""
+    sigma_mm: list[Float[np.ndarray, "n"]]
+    """Standard deviations of `SiftFeatures` times `sigma_factor`."""
+    sigma_factor: float
+    """Scatter of the matches about the epipolar lines over that of `SiftFeatures`."""
+    pairs: list[PairMatches]
+    """Pairs with enough matches."""
+    counts: Int[np.ndarray, "compared 4"]
+    """For all compared pairs: first, second, matches by descriptors, verified matches (0 if too few)."""
+    left_out: dict[str, str]
+    """Photographs by name without any match, and why."""
+
+    @property
+    def gross(self) -> Int[np.ndarray, "compared 3"]:
+        """For all compared pairs: first, second, number of rejected matches."""
+        return np.column_stack([self.counts[:, :2], self.counts[:, 2] - self.counts[:, 3]])
+
+    @property
+    def n_gross(self) -> int:
+        """Total number of rejected matches."""
+        return int(self.gross[:, 2].sum())
+
+    def named(self, names: list[str]) -> MatchedPart:
+        """Return the matches of photographs with these names, as `calibrate_flight` takes them."""
+        return MatchedPart(names, self.xy_mm, self.sigma_mm, self.pairs, self.gross, self.sigma_factor)
+
+
+class TieFeatures(NamedTuple):
+    """Points in several photographs, one row per measurement, sorted by point."""
+
+    photograph: Int[np.ndarray, "rows"]
+    """Index of the photograph."""
+    point: Int[np.ndarray, "rows"]
+    xy_mm: Float[np.ndarray, "rows 2"]
+
+
+def match_photographs(
+    photographs: Sequence[Photograph],
+    sensor: Sensor,
+    interior: InteriorOrientation,
+    pairs: Iterable[tuple[int, int]] | MostSimilar,
+    *,
+    count: int | None = None,
+    longest_px: int = LONGEST_PX,
+    in_parts: bool = False,
+    keep: KeptPieces | None = None,
+    progress: Progress = lambda step, done, of: None,
+) -> MatchedPhotographs:
+    """Match SIFT features of photographs of one camera in the `pairs` of indices.
+
+    Each has up to `count` features, by default 5,000, or 10,000 of up to 40 photographs, and is reduced to
+    `longest_px`. `interior` is the known camera; only its distortion and principal point are used. Results are stored
+    in the checkpoint `keep`, from which an interrupted run continues.
+
+    Photographs without features or matches are in `left_out`.
+
+    Raises InputError as `sift_features`, if no two photographs match, and, except `in_parts`, for unconnected groups;
+    BlockError if pycolmap is not installed.
+    """
+    if len(photographs) < 2:
+        raise InputError("an orientation needs two photographs that overlap, or more; give them all")
+    paths = [p.path for p in photographs]
+    matched = _matched(paths, sensor, interior, pairs, count, longest_px, keep, progress)
+    blank = [len(xy) == 0 for xy in matched.xy_mm]
+    alone = _alone([path.name for path in paths], blank, matched.pairs, in_parts)
+    return matched._replace(left_out={photographs[k].name: _BLANK if blank[k] else _ALONE for k in alone})
+
+
+def tie_features(
+    paths: list[Path], sensor: Sensor, count: int | None = None, least_photographs: int = 2
+) -> TieFeatures:
+    """Return the points that overlapping photographs of one camera have in common.
+
+    All pairs are matched by `match_photographs` and joined by `tracks`; points in fewer than `least_photographs` are
+    omitted. Raises InputError as `sift_features`, and if no two photographs have enough in common.
+    """
+    each = itertools.combinations(range(len(paths)), 2)
+    matched = _matched(paths, sensor, InteriorOrientation(1.0), each, count, LONGEST_PX, None, lambda *step: None)
+    image, feature, point, _ = tracks([len(xy) for xy in matched.xy_mm], matched.pairs)
+    kept = np.bincount(point)[point] >= least_photographs
+    if not kept.any():
+        raise InputError(
+            f"the {len(paths)} photographs have no point in common; give such as overlap, in the same size"
+        )
+    xy_mm = np.stack([matched.xy_mm[i][f] for i, f in zip(image[kept], feature[kept], strict=True)])
+    return TieFeatures(image[kept], np.unique(point[kept], return_inverse=True)[1], xy_mm)
+
+
+class _PairResult(NamedTuple):
+    """Concatenated results of several pairs."""
+
+    counts: Int[np.ndarray, "pairs 2"]
+    """Matches by descriptors, and verified matches."""
+    verified: Int[np.ndarray, "verified 2"]
+    off_line: Float[np.ndarray, "verified"]
+    """Distances from the epipolar lines over their standard deviations."""
+
+
+def _matched(
+    paths: list[Path],
+    sensor: Sensor,
+    interior: InteriorOrientation,
+    pairs: Iterable[tuple[int, int]] | MostSimilar,
+    most: int | None,
+    longest_px: int,
+    keep: KeptPieces | None,
+    progress: Progress,
+) -> MatchedPhotographs:
+    pycolmap, count = import_pycolmap(), most or usual_count(len(paths))
+
+    def find(path: Path) -> tuple[str, SiftFeatures]:
+        name = name_of("features", *METHOD, cv2.__version__, count, longest_px, sensor, path.read_bytes())
+        kept = keep.read(name) if keep else None
+        features = SiftFeatures(**kept) if kept else sift_features(path, sensor, count, longest_px)
+        if keep and kept is None:
+            keep.write(name, **features._asdict())
+        return name, features
+
+    names, features = [], []
+    with freed_memory_kept(), ThreadPoolExecutor(os.cpu_count()) as workers:
+        for k, (name, of_photograph) in enumerate(workers.map(find, paths)):
+            names.append(name)
+            features.append(of_photograph)
+            progress("features", k + 1, len(paths))
+    if isinstance(pairs, MostSimilar):
+        largest = [largest_of(of_photograph) for of_photograph in features]
+        pairs = most_similar(
+            largest, pairs.number, lambda done, of: progress("comparing the largest features", done, of)
+        )
+    compared = sorted({(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]})
+    ideal_px = [sensor.px_from_mm(ideal_coordinates(interior, f.xy_mm)) for f in features]
+    off_line_px = _OFF_LINE * float(np.hypot(sensor.width_px, sensor.height_px))
+    results = []
+    with contextlib.ExitStack() as opened:
+        database: Path | None = None
+        for begin in range(0, len(compared), _CHUNK):
+            chunk = compared[begin : begin + _CHUNK]
+            each = [(names[k], ideal_px[k].tobytes()) for pair in chunk for k in pair]
+            name = name_of("matches", *METHOD, pycolmap.__version__, _MIN_RATIO, off_line_px, *itertools.chain(*each))
+            kept = keep.read(name) if keep else None
+            if kept is None:
+                if database is None:
+                    folder = Path(opened.enter_context(tempfile.TemporaryDirectory()))
+                    database = _database(pycolmap, folder, sensor, features, ideal_px)
+                kept = _match_pairs(pycolmap, database, chunk, features, ideal_px, sensor, off_line_px)._asdict()
+                if keep:
+                    keep.write(name, **kept)
+            results.append(_PairResult(**kept))
+            progress("matches", begin + len(chunk), len(compared))
+    numbers = np.concatenate([np.zeros((0, 2), int), *(r.counts for r in results)])
+    verified = np.concatenate([np.zeros((0, 2), int), *(r.verified for r in results)])
+    off_line = np.concatenate([np.zeros(0), *(r.off_line for r in results)])
+    by_pair = np.split(verified, np.cumsum(numbers[:, 1]))[:-1]
+    factor = float(np.quantile(np.abs(off_line), _QUANTILE)) / _QUANTILE_SIGMA if len(off_line) else 1.0
+    return MatchedPhotographs(
+        [f.xy_mm for f in features],
+        [factor * f.sigma_mm for f in features],
+        factor,
+        [PairMatches(*pair, matches) for pair, matches in zip(compared, by_pair, strict=True) if len(matches)],
+        np.column_stack([np.array(compared, int).reshape(-1, 2), numbers]),
+        {},
+    )
+
+
+def _database(pycolmap: Any, folder: Path, sensor: Sensor, features: list[SiftFeatures], ideal_px: list) -> Path:
+    """Write a COLMAP database of descriptors; a feature with several of them has several keypoints."""
+    camera = MappedCamera(sensor.width_px, sensor.height_px, float(sensor.width_px), False)
+    keypoints = [xy[f.feature] for xy, f in zip(ideal_px, features, strict=True)]
+    write_database(folder / "photographs.db", [camera], [0] * len(features), keypoints, (), prior_c=False)
+    with pycolmap.Database.open(folder / "photographs.db") as stored:
+        for k, f in enumerate(features):
+            kind = pycolmap.FeatureExtractorType.SIFT
+            stored.write_descriptors(k + 1, pycolmap.FeatureDescriptors(kind, f.descriptors))
+    return folder / "photographs.db"
+
+
+def _match_pairs(
+    pycolmap: Any, database: Path, pairs: list[tuple[int, int]], features, ideal_px, sensor: Sensor, off_line_px: float
+) -> _PairResult:
+    (database.parent / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in pairs))
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = str(database.parent / "pairs.txt")
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.min_num_inliers, verification.min_inlier_ratio = MIN_MATCHES, _MIN_RATIO
+    verification.ransac.max_error, verification.ransac.random_seed = off_line_px, 0
+    verification.detect_watermark = False
+    pycolmap.match_image_pairs(
+        database, pairing_options=pairing, verification_options=verification, device=pycolmap.Device.cpu
+    )
+    counts, verified, off_line = [], [np.zeros((0, 2), int)], [np.zeros(0)]
+    with pycolmap.Database.open(database) as stored:
+        for a, b in pairs:
+            geometry = stored.read_two_view_geometry(a + 1, b + 1).inlier_matches
+            inliers = np.asarray(geometry, int).reshape(-1, 2)
+            rows = _places(inliers, features[a].feature, features[b].feature)
+            if len(rows) < MIN_MATCHES:
+                rows = rows[:0]
+            matched = np.asarray(stored.read_matches(a + 1, b + 1), int).reshape(-1, 2)
+            counts.append((len(_places(matched, features[a].feature, features[b].feature)), len(rows)))
+            verified.append(rows)
+            if len(rows):
+                one, other = ideal_px[a][rows[:, 0]], ideal_px[b][rows[:, 1]]
+                sigmas = (features[k].sigma_mm[r] / sensor.pixel_mm for k, r in zip((a, b), rows.T, strict=True))
+                off_line.append(_over_sigma(off_line_px, one, other, *sigmas))
+    return _PairResult(np.array(counts, int).reshape(-1, 2), np.concatenate(verified), np.concatenate(off_line))
+
+
+def _places(matches: Int[np.ndarray, "n 2"], one: np.ndarray, other: np.ndarray) -> Int[np.ndarray, "places 2"]:
+    """Return matches of descriptors as one-to-one matches of features."""
+    pairs = np.unique(np.column_stack([one[matches[:, 0]], other[matches[:, 1]]]), axis=0)
+    once = np.ones(len(pairs), bool)
+    for side in pairs.T:
+        _, inverse, times = np.unique(side, return_inverse=True, return_counts=True)
+        once &= times[inverse] == 1
+    return pairs[once]
+
+
+def _over_sigma(off_line_px: float, one: np.ndarray, other: np.ndarray, *sigmas: np.ndarray) -> np.ndarray:
+    """Misclosures other' F one of verified matches over their standard deviations; `sigmas` in the same unit."""
+    # Sampling with the weights of MAGSAC++ (Barath and others, 2020), from a fixed seed.
+    matrix, _ = cv2.findFundamentalMat(one, other, cv2.USAC_MAGSAC, off_line_px, 0.9999, 10_000)
+    if matrix is None:
+        return np.zeros(0)
+    one, other = (np.column_stack([xy, np.ones(len(xy))]) for xy in (one, other))
+    in_other, in_one = one @ matrix.T, other @ matrix
+    slopes = (np.square(line[:, :2]).sum(axis=1) for line in (in_one, in_other))
+    variance = sum(slope * sigma**2 for slope, sigma in zip(slopes, sigmas, strict=True))
+    return (in_other * other).sum(axis=1) / np.sqrt(variance)
+
+
+def _alone(names: list[str], blank: list[bool], pairs: list[PairMatches], in_parts: bool) -> list[int]:
+    """Return the photographs without matches. Raises InputError for unconnected groups, except `in_parts`."""
+    groups = connected_images(len(names), pairs)
+    joined = [group for group in groups if len(group) > 1]
+    if not joined:
+        empty = [name for name, nothing in zip(names, blank, strict=True) if nothing]
+        beside = f"; {_listed(empty)} show no features: blank or out of focus" if empty else ""
+        raise InputError(
+            f"no two of the {len(names)} photographs ({_listed(names)}) have {MIN_MATCHES} points in "
+            f"common{beside}; give photographs that overlap by half at least, in sharp focus, or compare more pairs"
+        )
+    if len(joined) > 1 and not in_parts:
+        each = "; ".join(_listed([names[k] for k in group]) for group in joined)
+        raise InputError(
+            f"the photographs fall into {len(joined)} groups without matches between them ({each}); add photographs "
+            "that see both, compare more pairs, or take each group by itself"
+        )
+    return [int(group[0]) for group in groups if len(group) == 1]
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names) if len(names) <= 12 else f"{', '.join(names[:10])} and {len(names) - 10} more"

@@ -1,0 +1,139 @@
+"""Pairs of photographs to match: all, neighbours in sequence or position, or the most similar ones.
+
+Similarity is the number of matches of the few widest features, at a thousandth of the cost of matching all; wide
+features are visible from everywhere (Wu 2013, Towards linear-time incremental structure from motion).
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from jaxtyping import Float, Int, UInt8
+
+from jaxphoto.errors import InputError
+from jaxphoto.extras.photos.features import FEATURES, OF_FEW, SiftFeatures
+from jaxphoto.io.photographs import Photograph
+
+_EARTH_M = 6_371_000.0
+# Default number of neighbours: all that overlap, at an overlap of 80 % both ways.
+_NEAREST = 20
+FEW = 2 * _NEAREST
+"""Up to this number of photographs, all pairs are matched, with more features."""
+
+LARGEST = 300
+"""Number of the widest features that are compared."""
+# Lowe's ratio test.
+_RATIO = 0.8
+# Photographs whose products with one are in memory at a time.
+_AT_ONCE = 32
+# Fewer matches of the widest features occur by chance.
+_MIN_VOTES = 2
+
+
+class MostSimilar(NamedTuple):
+    """Pairs of each photograph with the `number` most similar ones."""
+
+    number: int
+
+
+def usual_choice(photographs: Sequence[Photograph]) -> str:
+    """Default choice of pairs: all of few, else neighbours by position, else the most similar ones."""
+    if len(photographs) <= FEW:
+        return "exhaustive"
+    return f"{'position' if all(p.gps for p in photographs) else 'similar'}:{_NEAREST}"
+
+
+def usual_count(photographs: int) -> int:
+    """Default number of features of each of N photographs."""
+    return OF_FEW if photographs <= FEW else FEATURES
+
+
+def photograph_pairs(
+    photographs: Sequence[Photograph], choice: str = "exhaustive"
+) -> list[tuple[int, int]] | MostSimilar:
+    """Return the pairs (first < second) of indices of photographs that `choice` names.
+
+    `exhaustive`: all. `sequence:K`: each with the next K in the given order. `position:K`: each with the K nearest by
+    the GPS positions of EXIF, in plan. `similar:K`: each with the K most similar ones (`match_photographs` selects
+    them).
+
+    Raises InputError for another choice, and for `position` if a photograph has no position.
+    """
+    name, _, number = choice.partition(":")
+    if name == "exhaustive" and not number:
+        return list(itertools.combinations(range(len(photographs)), 2))
+    if name not in ("sequence", "position", "similar") or not number.isdecimal() or int(number) < 1:
+        raise InputError(
+            f"the choice of pairs is {choice!r}; give exhaustive, sequence:K, position:K or similar:K with a "
+            "whole number K, for example sequence:10"
+        )
+    if name == "similar":
+        return MostSimilar(int(number))
+    if name == "sequence":
+        n = len(photographs)
+        return [(k, other) for k in range(n) for other in range(k + 1, min(n, k + 1 + int(number)))]
+    without = [p.path.name for p in photographs if p.gps is None]
+    if without:
+        raise InputError(
+            f"{len(without)} photograph(s) have no GPS position in their EXIF ({', '.join(without[:5])}); choose the "
+            "pairs by similar:K, sequence:K or exhaustive"
+        )
+    places = np.deg2rad([(p.gps.longitude_deg, p.gps.latitude_deg) for p in photographs if p.gps])
+    longitude, latitude = places.reshape(-1, 2).T
+    level = np.stack([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
+    return nearest_pairs(_EARTH_M * level.T, int(number))
+
+
+def nearest_pairs(positions_m: Float[np.ndarray, "n axes"], count: int) -> list[tuple[int, int]]:
+    """Return the pairs (first < second) of which one is among the `count` nearest of the other."""
+    n = len(positions_m)
+    _, near = scipy.spatial.cKDTree(positions_m).query(positions_m, k=range(1, min(count + 1, n) + 1))
+    return sorted({(min(k, j), max(k, j)) for k in range(n) for j in near[k].tolist() if j != k})
+
+
+def largest_of(features: SiftFeatures) -> UInt8[np.ndarray, "_ 128"]:
+    """Descriptors of the `LARGEST` widest features."""
+    width = features.sigma_mm[features.feature]
+    return features.descriptors[np.sort(np.argsort(-width, kind="stable")[:LARGEST])]
+
+
+def most_similar(
+    largest: Sequence[UInt8[np.ndarray, "_ 128"]], count: int, progress: Callable[[int, int], None]
+) -> list[tuple[int, int]]:
+    """Return the pairs (first < second) of which one is among the `count` photographs most similar to the other.
+
+    `largest` are the descriptors of up to `LARGEST` of the widest features of each photograph.
+    """
+    n = len(largest)
+    votes = np.zeros((n, n), int)
+    for a in range(n):
+        for begin in range(a + 1, n, _AT_ONCE):
+            part = slice(begin, min(n, begin + _AT_ONCE))
+            votes[a, part] = _votes(largest[a], largest[part])
+        progress(a + 1, n)
+    votes += votes.T
+    order = np.argsort(-votes, axis=1, kind="stable")[:, :count]
+    return sorted({(min(a, b), max(a, b)) for a in range(n) for b in order[a].tolist() if votes[a, b] >= _MIN_VOTES})
+
+
+def _votes(one: UInt8[np.ndarray, "_ 128"], others: Sequence[UInt8[np.ndarray, "_ 128"]]) -> Int[np.ndarray, "others"]:
+    """Count the descriptors of `one` that pass the ratio test in each of `others`."""
+    if len(one) == 0:
+        return np.zeros(len(others), int)
+    # Padding up to LARGEST is infinitely far.
+    b = np.zeros((len(others), LARGEST, 128), np.float32)
+    square = np.full((len(others), LARGEST), np.inf, np.float32)
+    for k, other in enumerate(others):
+        b[k, : len(other)] = other
+        square[k, : len(other)] = np.square(other.astype(np.float32)).sum(axis=1)
+    a = one.astype(np.float32)
+    apart = square.reshape(-1) - 2 * (a @ b.reshape(-1, 128).T)
+    apart += np.square(a).sum(axis=1)[:, None]
+    apart = apart.reshape(len(a), len(others), LARGEST)
+    nearest = apart.argmin(axis=2)
+    first = np.take_along_axis(apart, nearest[:, :, None], axis=2)
+    np.put_along_axis(apart, nearest[:, :, None], np.inf, axis=2)
+    second = apart.min(axis=2)
+    return ((first[:, :, 0] < _RATIO**2 * second) & np.isfinite(second)).sum(axis=0)

@@ -1,0 +1,79 @@
+"""The description of a calibration board in one line, as on the command line.
+
+chessboard:8x6:square_mm=30            inner corners: along a row x rows
+circles:4x11:spacing_mm=20:diameter_mm=15
+aruco:5x7:marker_mm=30:gap_mm=6:dictionary=4X4_50
+charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50
+targets:FILE.csv                       circular targets with known coordinates
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from jaxphoto.errors import InputError
+from jaxphoto.extras.photos.targets.chessboard import Chessboard
+from jaxphoto.extras.photos.targets.circles import CircleGrid, CircularTargets
+from jaxphoto.extras.photos.targets.markers import DICTIONARIES, ArucoGrid, CharucoBoard
+from jaxphoto.extras.photos.targets.pattern import Pattern
+from jaxphoto.io.text_tables import is_number
+
+SYNTAX = {
+    "chessboard": "chessboard:8x6:square_mm=30",
+    "circles": "circles:4x11:spacing_mm=20:diameter_mm=15",
+    "aruco": "aruco:5x7:marker_mm=30:gap_mm=6:dictionary=4X4_50",
+    "charuco": "charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50",
+    "targets": "targets:FILE.csv",
+}
+"""Syntax of each kind of board."""
+
+_MADE: dict[str, tuple[Callable[..., Pattern], tuple[str, ...], int]] = {
+    "chessboard": (Chessboard, ("square_mm",), 3),
+    "circles": (CircleGrid, ("spacing_mm", "diameter_mm"), 2),
+    "aruco": (ArucoGrid, ("marker_mm", "gap_mm", "dictionary"), 1),
+    "charuco": (CharucoBoard, ("square_mm", "marker_mm", "dictionary"), 2),
+}
+
+
+def read_board(description: str) -> Pattern:
+    """Create the board of a one-line description (mm). Raises InputError, with the syntax, for an invalid one."""
+    kind, _, rest = description.partition(":")
+    if kind not in SYNTAX:
+        raise InputError(
+            f"--board {description}: there is no board of the kind {kind!r}; write one of {', '.join(SYNTAX.values())}"
+        )
+    if kind == "targets":
+        if not rest:
+            raise _bad(description, kind, "the file with the targets is missing")
+        return CircularTargets(Path(rest))
+    size, *settings = rest.split(":")
+    make, names, least = _MADE[kind]
+    counts = size.lower().split("x")
+    if len(counts) != 2 or not all(n.isdecimal() and least <= int(n) <= 500 for n in counts):
+        raise _bad(description, kind, f"{size!r} is no count of columns x rows, {least} to 500 each")
+    texts: dict[str, str] = {}
+    for setting in settings:
+        name, sign, value = setting.partition("=")
+        if not sign or name not in names or name in texts:
+            raise _bad(description, kind, f"{setting!r} is not one of {', '.join(f'{n}=...' for n in names)}")
+        texts[name] = value
+    if missing := [name for name in names if name not in texts]:
+        raise _bad(description, kind, f"{missing[0]} is missing")
+    values = {name.removesuffix("_mm"): _value(description, kind, name, text) for name, text in texts.items()}
+    try:
+        return make(*map(int, counts), **{f"{k}_m" if k != "dictionary" else k: v for k, v in values.items()})
+    except ValueError as error:
+        raise _bad(description, kind, str(error)) from None
+
+
+def _value(description: str, kind: str, name: str, text: str) -> float | str:
+    if name == "dictionary":
+        if text.upper() not in DICTIONARIES:
+            raise _bad(description, kind, f"there is no dictionary {text!r} (there are {', '.join(DICTIONARIES)})")
+        return text.upper()
+    if not is_number(text) or not 0 < float(text) < 1e6:
+        raise _bad(description, kind, f"{name} is {text!r}, not a positive number of millimetres")
+    return float(text) / 1000
+
+
+def _bad(description: str, kind: str, message: str) -> InputError:
+    return InputError(f"--board {description}: {message}; write it like {SYNTAX[kind]}")

@@ -1,0 +1,449 @@
+"""Circular targets: centres by least squares, asymmetric grids, and fields of coded arrangement.
+
+    grey = m + g . d + a (1 - erf(e / s)) / 2,   rho = |L' d|,   e = rho (rho - 1) / |L L' d|,   d = pixel - centre
+
+e is the distance from the ellipse rho = 1 to first order. The ten unknowns (centre, three of L, ln s, a, m, g) are
+fitted by `patches`. The centre of the ellipse is not the image of the circle's centre: see `eccentricity` in
+`jaxphoto.procedures.calibration.target_calibration`.
+
+Single targets with known coordinates on a plane are identified by arrangement and size. A circle of known size and its
+image give the affine map between board and picture up to a rotation; the direction to one neighbour gives the rotation,
+and the other neighbours test it. The best hypotheses are extended to homographies over all targets. The best fit among
+those of most targets is the result, unless another labelling fits as well: the arrangement is then symmetric. The side
+from which a field is seen is unknown (floor, ceiling, wall): both are tried; for a mirror-symmetric arrangement it is
+that of Z, except for vertical planes.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxphoto.errors import InputError
+from jaxphoto.extras.photos.targets.patches import Patches, TargetPlaces, fit_patches, fits
+from jaxphoto.extras.photos.targets.pattern import FoundBoard, Pattern
+from jaxphoto.io.text_tables import read_csv
+from jaxphoto.procedures.calibration import Board
+
+# Half width (px) of the ring about the edge, and the maximum number of pixels of one target.
+_RING, _MOST = 4.0, 1024
+_BLUR = 1.0
+# Tolerance of the area of a blob relative to the ellipse of its moments, its minimum area (px) and maximum elongation.
+_SHAPE, _MIN_AREA, _ELONGATION = 0.06, 20, 6.0
+# Maximum shift of a fitted centre over the smaller half axis.
+_MOVED = 0.5
+
+
+class Blobs(NamedTuple):
+    """Elliptic spots of a picture, dark or bright; the origin is the centre of the upper-left pixel."""
+
+    column_row: Float[np.ndarray, "n 2"]
+    shape: Float[np.ndarray, "n 2 2"]
+    """Q of the ellipse d' Q d = 1."""
+    dark: Bool[np.ndarray, "n"]
+    """True if the spot is darker than its surroundings."""
+
+    def take(self, chosen: np.ndarray) -> "Blobs":
+        """Select spots by index or mask."""
+        return Blobs(self.column_row[chosen], self.shape[chosen], self.dark[chosen])
+
+
+def elliptic_blobs(picture: np.ndarray, half_axes: tuple[np.ndarray, float] | None = None) -> Blobs:
+    """Detect all elliptic spots of a picture, by adaptive thresholds of several widths; none touches the border.
+
+    Of several at one place the most elliptic one is kept. With `half_axes` (larger first, px, and a factor), only spots
+    of that size within the factor compete: a bright disc on a dark one is then found.
+    """
+    smooth = cv2.GaussianBlur(picture, (3, 3), 0)
+    height, width = picture.shape
+    kept: list[tuple[np.ndarray, np.ndarray, float]] = []
+    for part in (8, 24):
+        window = max(15, (min(height, width) // part) | 1)
+        for above in (7, -7):
+            mask = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, window, above)
+            kept += [blob for blob in _components(mask) if half_axes is None or _of_size(blob[1], *half_axes)]
+    kept.sort(key=lambda blob: blob[2])
+    centres, shapes = np.zeros((len(kept), 2)), np.zeros((len(kept), 2, 2))
+    n = 0
+    for centre, shape, _ in kept:
+        d = centre - centres[:n]
+        if not (np.einsum("ni,nij,nj->n", d, shapes[:n], d) < 0.25).any():
+            centres[n], shapes[n] = centre, shape
+            n += 1
+    darks = [_is_dark(smooth, centre, shape) for centre, shape in zip(centres[:n], shapes[:n], strict=True)]
+    return Blobs(centres[:n], shapes[:n], np.array(darks, bool))
+
+
+def _of_size(shape: np.ndarray, half_axes: np.ndarray, factor: float) -> bool:
+    return bool((np.abs(np.log(half_axes / (1 / np.sqrt(np.linalg.eigvalsh(shape))))) < np.log(factor)).all())
+
+
+def _is_dark(picture: np.ndarray, centre: np.ndarray, shape: np.ndarray) -> bool:
+    """Return True if a spot is darker at half its radius than at one and a half."""
+    angle = np.arange(16) * np.pi / 8
+    to_edge = np.linalg.inv(np.linalg.cholesky(shape)).T @ np.stack([np.cos(angle), np.sin(angle)])
+    high, wide = picture.shape
+    grey = []
+    for part in (0.5, 1.5):
+        column, row = np.rint(centre[:, None] + part * to_edge).astype(int)
+        grey.append(picture[np.clip(row, 0, high - 1), np.clip(column, 0, wide - 1)].mean())
+    return bool(grey[0] < grey[1])
+
+
+def _components(mask: np.ndarray):
+    """Centre, Q and misfit of each elliptic connected component of a mask."""
+    height, width = mask.shape
+    contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    for contour in contours:
+        if len(contour) < 12:
+            continue
+        left, top, wide, high = cv2.boundingRect(contour)
+        if left <= 1 or top <= 1 or left + wide >= width - 1 or top + high >= height - 1 or wide * high < _MIN_AREA:
+            continue
+        m = cv2.moments(contour)
+        if m["m00"] < _MIN_AREA:
+            continue
+        centre = np.array([m["m10"], m["m01"]]) / m["m00"]
+        covariance = np.array([[m["mu20"], m["mu11"]], [m["mu11"], m["mu02"]]]) / m["m00"]
+        determinant = np.linalg.det(covariance)
+        if determinant <= 0 or np.linalg.cond(covariance) > _ELONGATION**2:
+            continue
+        misfit = abs(4 * np.pi * np.sqrt(determinant) / m["m00"] - 1)
+        shape = np.linalg.inv(4 * covariance)
+        d = contour.reshape(-1, 2) - centre
+        edge = np.abs(np.sqrt(np.einsum("ni,ij,nj->n", d, shape, d)) - 1)
+        if misfit < _SHAPE and np.mean(edge) < 2.5 * _SHAPE:
+            yield centre, shape, misfit
+
+
+def fit_discs(picture: np.ndarray, blobs: Blobs) -> TargetPlaces:
+    """Measure the centres of ellipses, with standard deviations, from `blobs`."""
+    n = len(blobs.column_row)
+    if not n:
+        return TargetPlaces(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool))
+    patches = _rings(picture, blobs)
+    _, grey, used = patches
+    lower = np.linalg.cholesky(blobs.shape)
+    contrast = np.where(blobs.dark, -1.0, 1.0) * _spread(grey, used)
+    mean = np.array([np.median(g[u]) for g, u in zip(grey, used, strict=True)]) - contrast / 2
+    edge = lower[:, 0, 0], lower[:, 1, 0], lower[:, 1, 1]
+    none = np.zeros(n)
+    start = np.column_stack([none, none, *edge, np.full(n, np.log(_BLUR)), contrast, mean, none, none])
+    fit = fit_patches(_discs, start, patches)
+    sigma = np.sqrt(np.einsum("pkk->pk", fit.covariance)[:, :2])
+    smaller = 1 / np.sqrt(np.linalg.eigvalsh(blobs.shape)[:, 1])
+    moved = np.linalg.norm(fit.parameters[:, :2], axis=1)
+    good = fit.fitted & (np.abs(fit.parameters[:, 6]) > 3 * fit.noise) & (sigma < 0.5).all(axis=1)
+    good &= moved < np.maximum(_MOVED * smaller, 1.0)
+    return TargetPlaces(blobs.column_row + np.where(good[:, None], fit.parameters[:, :2], 0.0), sigma, good)
+
+
+def _spread(grey, used) -> Float[np.ndarray, "n"]:
+    """Range of the grey values of each patch (10 % to 90 % quantile)."""
+    return np.array([np.subtract(*np.percentile(g[u], [90, 10])) for g, u in zip(grey, used, strict=True)])
+
+
+def _rings(picture: np.ndarray, blobs: Blobs) -> Patches:
+    """Pixels near the edge of each ellipse, thinned for large ones."""
+    height, width = picture.shape
+    places, greys = [], []
+    for centre, shape in zip(blobs.column_row, blobs.shape, strict=True):
+        reach = np.sqrt(np.diag(np.linalg.inv(shape))) + _RING
+        low = np.maximum(np.floor(centre - reach).astype(int), 0)
+        high = np.minimum(np.ceil(centre + reach).astype(int) + 1, (width, height))
+        whole = np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), axis=-1).reshape(-1, 2)
+        d = whole - centre
+        rho = np.sqrt(np.einsum("ni,ij,nj->n", d, shape, d))
+        distance = rho * (rho - 1) / np.maximum(np.linalg.norm(d @ shape, axis=1), 1e-12)
+        near = np.flatnonzero(np.abs(distance) < _RING)
+        near = near[:: max(1, -(-len(near) // _MOST))]
+        places.append(d[near])
+        greys.append(picture[whole[near, 1], whole[near, 0]].astype(float))
+    longest = max(map(len, places))
+    pixels, grey = np.zeros((len(places), longest, 2)), np.zeros((len(places), longest))
+    used = np.zeros((len(places), longest), bool)
+    for k, (place, values) in enumerate(zip(places, greys, strict=True)):
+        pixels[k, : len(place)], grey[k, : len(place)], used[k, : len(place)] = place, values, True
+    return Patches(pixels, grey, used)
+
+
+def _disc(parameters, pixel):
+    column, row, l1, l2, l3, blur, contrast, mean, in_column, in_row = parameters
+    x, y = pixel[0] - column, pixel[1] - row
+    u, v = l1 * x + l2 * y, l3 * y
+    # Q d = L (L' d); 1e-12 keeps the derivative finite at the centre, where e is far from zero.
+    rho = jnp.sqrt(u * u + v * v + 1e-12)
+    slope = jnp.sqrt((l1 * u) ** 2 + (l2 * u + l3 * v) ** 2 + 1e-12)
+    distance = rho * (rho - 1) / slope
+    width = jnp.sqrt(2 / 12 + jnp.exp(2 * blur))
+    return mean + in_column * x + in_row * y + contrast * (1 - jax.scipy.special.erf(distance / width)) / 2
+
+
+@eqx.filter_jit
+def _discs(start: Float[Array, "n 10"], pixels: Float[Array, "n m 2"], grey, used):
+    return fits(_disc, start, pixels, grey, used)
+
+
+# Distance (px) of neighbouring spots in the drawing, and its longest side.
+_APART_PX, _LONGEST_PX = 60, 6000
+# Fractional bits of drawn coordinates: on whole pixels some grids are not detected.
+_SHIFT = 4
+# Relative tolerance of the distance of diagonal neighbours, and the number of spots that are tested for each.
+_OFF_SPACING, _NEAREST = 0.35, 24
+
+
+class CircleGrid(Pattern):
+    """Asymmetric grid of `columns` circles in each of `rows` rows, `spacing_m` apart; twice that apart in a row.
+
+    Rows and columns are counted as in OpenCV's asymmetric grid (4x11 is the usual one).
+    """
+
+    def __init__(self, columns: int, rows: int, spacing_m: float, diameter_m: float) -> None:
+        if rows < 3:
+            raise ValueError("an asymmetric grid has 3 rows at least")
+        if diameter_m >= np.sqrt(2) * spacing_m:
+            raise ValueError("circles so large touch each other: the diameter is less than 1.41 times the spacing")
+        self.columns, self.rows, self.radius_m, self._spacing_m = columns, rows, diameter_m / 2, spacing_m
+        row, column = np.divmod(np.arange(rows * columns), columns)
+        ids = tuple(f"r{r + 1}c{c + 1}" for r, c in zip(row.tolist(), column.tolist(), strict=True))
+        xyz = np.stack([(2 * column + row % 2) * spacing_m, -row * spacing_m, 0.0 * row], axis=1)
+        self.board = Board("asymmetric circles", ids, xyz, np.full(len(ids), diameter_m))
+
+    def find(self, picture: np.ndarray) -> FoundBoard | None:
+        """Find the circles of the grid by rows; None if it is not found; without circles that have no clear edge."""
+        blobs = elliptic_blobs(picture)
+        for dark in (True, False):
+            candidates = self._like_the_grid(blobs.take(blobs.dark == dark))
+            if len(candidates.column_row) < len(self.board.points):
+                continue
+            drawn, scale, corner = _drawing(candidates.column_row)
+            for sheet, times, shift in ((drawn, scale, corner), (picture, 1.0, np.zeros(2))):
+                for how in (cv2.CALIB_CB_ASYMMETRIC_GRID, cv2.CALIB_CB_ASYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING):
+                    seen, centres = cv2.findCirclesGrid(sheet, (self.columns, self.rows), flags=how)  # type: ignore[call-overload]
+                    grid = self._placed(picture, candidates, centres.reshape(-1, 2) / times + shift) if seen else None
+                    if grid is not None:
+                        return grid
+        return None
+
+    def reflectance(self, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+        """Black circles on white."""
+        return disc_reflectance(self.board, xy_m)
+
+    def _like_the_grid(self, blobs: Blobs) -> Blobs:
+        """Largest connected set of spots whose distances, in radii, are those of diagonal neighbours of the grid.
+
+        In units of the ellipses distances do not depend on the view. OpenCV fails if many other round things are left.
+        """
+        n = len(blobs.column_row)
+        if n < 2:
+            return blobs
+        near = scipy.spatial.cKDTree(blobs.column_row).query(blobs.column_row, k=min(n, _NEAREST))[1][:, 1:]
+        d = blobs.column_row[near] - blobs.column_row[:, None]
+        apart = np.sqrt(2) * self._spacing_m / self.radius_m
+        good = np.ones(near.shape, bool)
+        for shape in (blobs.shape[:, None], blobs.shape[near]):
+            good &= np.abs(np.sqrt(np.einsum("nki,nkij,nkj->nk", d, shape, d)) / apart - 1) < _OFF_SPACING
+        one, other = np.nonzero(good)
+        web = scipy.sparse.csgraph.connected_components(
+            scipy.sparse.coo_array((np.ones(len(one)), (one, near[one, other])), shape=(n, n))
+        )[1]
+        return blobs.take(web == np.bincount(web).argmax())
+
+    def _placed(self, picture: np.ndarray, blobs: Blobs, centres: Float[np.ndarray, "n 2"]) -> FoundBoard | None:
+        along, down = centres[self.columns - 1] - centres[0], centres[2 * self.columns] - centres[0]
+        if along[0] * down[1] - along[1] * down[0] < 0:
+            if self.rows % 2 == 0:
+                return None  # a mirror image is impossible
+            centres = centres.reshape(self.rows, self.columns, 2)[::-1].reshape(-1, 2)
+        which = scipy.spatial.cKDTree(blobs.column_row).query(centres)[1]
+        d = centres - blobs.column_row[which]
+        # A circle of OpenCV may be no ellipse here: occluded, or half in shadow.
+        same = np.einsum("ni,nij,nj->n", d, blobs.shape[which], d) < 1
+        return FoundBoard(np.flatnonzero(same), fit_discs(picture, blobs.take(which[same])))
+
+
+def _drawing(places: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, float, Float[np.ndarray, "2"]]:
+    """Clean picture of spots at `places`, its scale and corner: `drawn = (place - corner) * scale`.
+
+    OpenCV's search needs evenly lit, separated spots of sufficient size.
+    """
+    distance = scipy.spatial.cKDTree(places).query(places, k=2)[0][:, 1]
+    scale = _APART_PX / float(np.median(distance))
+    scale = min(scale, _LONGEST_PX / float(np.ptp(places, axis=0).max()))
+    corner = places.min(axis=0) - 2 * _APART_PX / scale
+    spots = (places - corner) * scale
+    drawn = np.full(np.ceil(spots.max(axis=0) + 2 * _APART_PX).astype(int)[::-1], 255, np.uint8)
+    parts = 1 << _SHIFT
+    for spot in np.rint(spots * parts).astype(int).tolist():
+        cv2.circle(drawn, spot, _APART_PX // 4 * parts, 0, -1, shift=_SHIFT)
+    return drawn, scale, corner
+
+
+def disc_reflectance(board: Board, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+    """Black inside the circles of the board, white elsewhere."""
+    black = np.zeros(len(xy_m), bool)
+    for centre, diameter in zip(board.xyz_m[:, :2], board.diameter_m, strict=True):
+        black |= np.sum((xy_m - centre) ** 2, axis=1) < (diameter / 2) ** 2
+    return np.where(black, 0.0, 1.0)
+
+
+_MIN_TARGETS = 6
+_NEIGHBOURS = 8
+# Tolerances over the distance of neighbours: of a hypothesis, and of a homography of a distorted picture.
+_OFF, _NEAR = 0.25, 0.3
+_GUESSES = 40
+# A labelling competes with at least this fraction of the largest number of targets, and up to this multiple of the
+# misfit.
+_AS_GOOD, _AS_NEAR = 0.8, 2.0
+# Z of the normal of a vertical plane.
+_UPRIGHT = 0.1
+
+
+class CircularTargets(Pattern):
+    """Dark or bright circles on a plane, from a CSV file: point, X_mm, Y_mm, Z_mm, diameter_mm.
+
+    Raises InputError for an invalid file, fewer than six targets, and targets that are not coplanar.
+    """
+
+    def __init__(self, path: Path) -> None:
+        table = read_csv(path, ("point", "X_mm", "Y_mm", "Z_mm", "diameter_mm"))
+        xyz = np.stack([table.numbers(name) for name in ("X_mm", "Y_mm", "Z_mm")], axis=1) / 1000
+        diameter = table.sigmas("diameter_mm")
+        for line in np.flatnonzero(np.isnan(diameter)):
+            raise table.bad(line, "diameter_mm is empty; give the diameter of the target")
+        ids = tuple(table.ids("point").tolist())
+        if len(set(ids)) < len(ids):
+            raise InputError(f"{path.name}: a point stands there twice; give each target an id of its own")
+        if len(ids) < _MIN_TARGETS:
+            raise InputError(f"{path.name}: {len(ids)} targets are too few; a photograph needs {_MIN_TARGETS} of them")
+        self.board = Board(path.stem, ids, xyz, diameter / 1000)
+        plane = self.board.plane
+        if plane is None:
+            raise InputError(
+                f"{path.name}: the targets lie in no plane (to 1 % of their extent), and only those of one are told "
+                "apart; give those of one wall"
+            )
+        middle, axes = plane
+        self._flat = (xyz - middle) @ axes[:, :2]
+        self._upright = bool(abs(axes[2, 2]) < _UPRIGHT)
+
+    def find(self, picture: np.ndarray) -> FoundBoard | None:
+        """Find the visible targets; None if their arrangement is not found, or ambiguous."""
+        blobs = elliptic_blobs(picture)
+        for dark in (True, False):
+            candidates = blobs.take(blobs.dark == dark)
+            pairs = identified(self._flat, self.board.diameter_m / 2, candidates, self._upright)
+            if pairs is not None:
+                return FoundBoard(pairs[:, 0], fit_discs(picture, candidates.take(pairs[:, 1])))
+        return None
+
+    def reflectance(self, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+        """Black circles on white; of a board in the plane Z = 0."""
+        return disc_reflectance(self.board, xy_m)
+
+
+class _Labelling(NamedTuple):
+    """Pairs (target, blob), the RMS misfit (px) of their homography, and the side of the plane, 1 or -1."""
+
+    pairs: Int[np.ndarray, "pairs 2"]
+    misfit: float
+    side: int
+
+    def agrees(self, other: "_Labelling") -> bool:
+        """Return True if most of these pairs are in `other`, too."""
+        label = dict(other.pairs[:, ::-1].tolist())
+        same = sum(label.get(blob) == target for target, blob in self.pairs.tolist())
+        return self.side == other.side and same >= 0.5 * len(self.pairs)
+
+
+def identified(
+    flat: Float[np.ndarray, "targets 2"], radius: Float[np.ndarray, "targets"], blobs: Blobs, upright: bool = False
+) -> Int[np.ndarray, "pairs 2"] | None:
+    """Identify targets in the plane of the field: pairs (target, blob), or None if ambiguous.
+
+    Y is up if the field is seen from its front; the front of an `upright` field is unknown.
+    """
+    if len(blobs.column_row) < _MIN_TARGETS:
+        return None
+    labellings: list[_Labelling] = []
+    for side in (1, -1):
+        front = flat * (side, 1)
+        grown = (_grown(front, guess, blobs) for guess in _guesses(front * (1, -1), radius, blobs))
+        labellings += [_Labelling(*g, side) for g in grown if g is not None]
+    best = _best(labellings)
+    if best is None and not upright:
+        best = _best([one for one in labellings if one.side == 1])
+    return None if best is None else best.pairs
+
+
+def _best(labellings: list[_Labelling]) -> _Labelling | None:
+    """Select the best fit among the labellings of most targets; None if another one is as good."""
+    most = max((len(one.pairs) for one in labellings), default=0)
+    able = [one for one in labellings if len(one.pairs) >= _AS_GOOD * most]
+    best = min(able, key=lambda one: one.misfit, default=None)
+    if best is None or any(one.misfit < _AS_NEAR * best.misfit and not one.agrees(best) for one in able):
+        return None
+    return best
+
+
+def _nearest(places: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n k"]:
+    distance = np.linalg.norm(places[:, None] - places, axis=2)
+    return np.argsort(distance, axis=1)[:, 1 : _NEIGHBOURS + 1]
+
+
+def _guesses(down, radius, blobs) -> list[np.ndarray]:
+    """Hypotheses, as lists of pairs (target, blob): a target and its consistent neighbours; longest first."""
+    near_target, near_blob = _nearest(down), _nearest(blobs.column_row)
+    # Neighbours relative to a target, in radii, with ellipses transformed to circles: a rotation remains.
+    w = (down[near_target] - down[:, None]) / radius[:, None, None]
+    lower = np.linalg.cholesky(blobs.shape)
+    u = np.einsum("bji,bkj->bki", lower, blobs.column_row[near_blob] - blobs.column_row[:, None])
+    wc, uc = w[..., 0] + 1j * w[..., 1], u[..., 0] + 1j * u[..., 1]
+    guesses: list[np.ndarray] = []
+    for b in range(len(uc)):
+        # (target, neighbour of the target, neighbour of the blob)
+        turn = uc[b][None, None, :] / wc[:, :, None]
+        size = np.abs(turn)
+        turned = wc[:, None, None, :] * (turn / np.maximum(size, 1e-12))[..., None]
+        error = np.abs(turned[..., None] - uc[b])
+        nearest = error.argmin(axis=4)
+        agrees = (error.min(axis=4) < _OFF * np.abs(wc)[:, None, None, :]) & (np.abs(np.log(size)) < _OFF)[..., None]
+        score = agrees.sum(axis=3)
+        for t in np.flatnonzero(score.max(axis=(1, 2)) >= 4):
+            m, n = np.unravel_index(score[t].argmax(), score[t].shape)
+            ok = np.flatnonzero(agrees[t, m, n])
+            pairs = np.column_stack([near_target[t, ok], near_blob[b, nearest[t, m, n, ok]]])
+            guesses.append(np.vstack([np.array([[t, b]]), pairs]))
+    return sorted(guesses, key=len, reverse=True)[:_GUESSES]
+
+
+def _grown(flat, pairs, blobs) -> tuple[np.ndarray, float] | None:
+    """Extend a hypothesis by homographies to all pairs, with their misfit; None if that fails."""
+    spacing = np.linalg.norm(flat[_nearest(flat)[:, 0]] - flat, axis=1)
+    for _ in range(4):
+        if len(np.unique(pairs[:, 1])) < len(pairs) or len(pairs) < 4:
+            return None
+        h, _ = cv2.findHomography(flat[pairs[:, 0]], blobs.column_row[pairs[:, 1]])
+        if h is None:
+            return None
+        beside = flat + np.stack([spacing, np.zeros_like(spacing)], axis=1)
+        places, other = (cv2.perspectiveTransform(p[None], h)[0] for p in (flat, beside))
+        distance = np.linalg.norm(places[:, None] - blobs.column_row, axis=2)
+        blob = distance.argmin(axis=1)
+        good = distance.min(axis=1) < _NEAR * np.linalg.norm(other - places, axis=1)
+        good &= distance.argmin(axis=0)[blob] == np.arange(len(flat))
+        pairs = np.column_stack([np.flatnonzero(good), blob[good]])
+    if len(pairs) < _MIN_TARGETS:
+        return None
+    # Homography of the final pairs.
+    h, _ = cv2.findHomography(flat[pairs[:, 0]], blobs.column_row[pairs[:, 1]])
+    if h is None:
+        return None
+    off = cv2.perspectiveTransform(flat[pairs[:, 0]][None], h)[0] - blobs.column_row[pairs[:, 1]]
+    return pairs, float(np.sqrt(np.mean(np.sum(off**2, axis=1))))

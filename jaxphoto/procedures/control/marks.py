@@ -1,0 +1,280 @@
+"""Marks of surveyed points in the images of a block: usable marks, their intersection, and their rows of a block.
+
+Each two rays of a point give a position; the one that most rays pass within the limit is refined by least squares. A
+mark at the wrong target misses by far more than the limit, which leaves room for an orientation before adjustment.
+"""
+
+import dataclasses
+import ntpath
+import re
+from collections.abc import Collection, Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxphoto.arrays import as_jax_array
+from jaxphoto.block import Block
+from jaxphoto.block_parts import Datum, Start
+from jaxphoto.errors import counted, few
+from jaxphoto.georeferencing import FlightBias
+from jaxphoto.initial.intersection import intersect_points, intersect_with_covariance
+from jaxphoto.initial.rays import camera_rays, turn_to_object
+from jaxphoto.observations import ControlCoordinates, ImagePoints
+from jaxphoto.parameters import AbstractParameters
+from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, Marks, SurveyedPoints
+from jaxphoto.unknowns import FIXED, FREE, Unknowns
+
+_ENDING = re.compile(r"\.[A-Za-z]{2,4}$")
+
+
+class Marked(NamedTuple):
+    """Usable marks, sorted by point and image."""
+
+    image: Int[np.ndarray, "rows"]
+    """Index of the images of the block."""
+    point: Int[np.ndarray, "rows"]
+    """Index of the surveyed points."""
+    xy_mm: Float[np.ndarray, "rows 2"]
+    sigma_mm: Float[np.ndarray, "rows"]
+
+    def take(self, chosen: np.ndarray) -> "Marked":
+        """Select rows by mask or index."""
+        return Marked(*(v[chosen] for v in self))
+
+
+def marked(
+    block: Block, points: SurveyedPoints, marks: Marks, elsewhere: Collection[str] = ()
+) -> tuple[Marked, list[str]]:
+    """Return the marks of `points` in the images of `block`, and a sentence for those that are unusable.
+
+    Images are found by file name, whatever folder, extension and case. Marks in `elsewhere`, images of other blocks,
+    are ignored.
+    """
+    image = images_of(marks.image, block.images)
+    other = images_of(marks.image, tuple(elsewhere)) >= 0
+    place = {name: k for k, name in enumerate(points.ids)}
+    point = np.array([place.get(name, -1) for name in marks.point], int)
+    messages: list[str] = []
+    _say(messages, marks, (image < 0) & ~other, marks.image, "of no photograph that is used")
+    _say(messages, marks, (point < 0), marks.point, f"of points without coordinates in {points.file}")
+    size = np.array([(s.width_px, s.height_px) for s in (block.sensors[c] for c in block.image_camera)], float)
+    outside = ((marks.column_row < 0) | (marks.column_row > size[image])).any(axis=1) & (image >= 0) & (point >= 0)
+    _say(messages, marks, outside, marks.image, "outside of the picture")
+    kept = np.flatnonzero((image >= 0) & (point >= 0) & ~outside)
+    kept = kept[np.lexsort((image[kept], point[kept]))]
+    # The same photograph under two names.
+    twice = np.r_[False, (np.diff(image[kept]) == 0) & (np.diff(point[kept]) == 0)] if len(kept) else np.zeros(0, bool)
+    _say(messages, marks, np.isin(np.arange(len(image)), kept[twice]), marks.point, "there twice for one photograph")
+    kept = kept[~twice]
+    sigma = np.where(np.isnan(marks.sigma_px), MARK_SIGMA_PX, marks.sigma_px)[kept]
+    xy = np.zeros((len(kept), 2))
+    pixel = np.zeros(len(kept))
+    for k, row in enumerate(kept.tolist()):
+        sensor = block.sensors[block.image_camera[image[row]]]
+        xy[k], pixel[k] = sensor.mm_from_px(marks.column_row[row][None])[0], sensor.pixel_mm
+    return Marked(image[kept], point[kept], xy, sigma * pixel), messages
+
+
+def images_of(names: Sequence[str], images: Sequence[str]) -> Int[np.ndarray, "names"]:
+    """Index of the image that each name means; -1 for none, or for more than one."""
+    exact = {name: k for k, name in enumerate(images)}
+    loose: dict[str, int] = {}
+    for k, name in enumerate(images):
+        loose[name.lower()] = k if name.lower() not in loose else -1
+    indices = []
+    for name in names:
+        file = ntpath.basename(name)
+        stem = _ENDING.sub("", file)
+        hits = [exact[word] for word in (name, file, stem) if word in exact]
+        indices.append(hits[0] if hits else loose.get(stem.lower(), loose.get(file.lower(), -1)))
+    return np.array(indices, int)
+
+
+def _say(messages: list[str], marks: Marks, wrong: np.ndarray, names: Sequence[str], what: str) -> None:
+    """Add a sentence on the marks that are `wrong`, with the first of them."""
+    which = np.flatnonzero(wrong)
+    if len(which):
+        listed = few(list(dict.fromkeys(names[int(k)] for k in which)))
+        messages.append(f"left out: {counted(len(which), 'mark')} {what}: {listed} ({marks.places[which[0]]})")
+
+
+_BEYOND, _ROOM_PX = 4.0, 3.0
+# Maximum number of pairs of rays of one point.
+_PAIRS = 300
+# Minimum angle (rad) of two rays.
+_PARALLEL = np.deg2rad(0.5)
+
+
+class Intersected(NamedTuple):
+    """Intersections of the rays of marks, in the frame of the block."""
+
+    points: Float[np.ndarray, "points 3"]
+    """NaN for fewer than two rays."""
+    covariance: Float[np.ndarray, "points 3 3"]
+    good: Bool[np.ndarray, "rows"]
+    """True for marks whose rays pass their point, and for single marks."""
+    sentences: tuple[str, ...]
+
+
+def rays_of(block: Block, unknowns: Unknowns, rows: Marked) -> Float[np.ndarray, "rows 3"]:
+    """Return unit directions of the marks in the camera frames."""
+    rays = np.zeros((len(rows.image), 3))
+    camera = np.array(block.image_camera, object)[rows.image]
+    for name in set(camera.tolist()):
+        of_camera = camera == name
+        rays[of_camera] = camera_rays(unknowns.interior[name], rows.xy_mm[of_camera])
+    return rays
+
+
+def intersected(block: Block, unknowns: Unknowns, rows: Marked, ids: tuple[str, ...]) -> Intersected:
+    """Intersect the points of `rows` with the orientation `unknowns`; `ids` name them."""
+    n, good = len(ids), np.ones(len(rows.image), bool)
+    positions = np.asarray(unknowns.exterior.position, float)
+    matrices = np.asarray(unknowns.exterior.camera_from_object, float)
+    rays = rays_of(block, unknowns, rows)
+    directions, origins = turn_to_object(matrices, rows.image, rays), positions[rows.image]
+    c = np.array([float(unknowns.interior[name].c) for name in block.image_camera])[rows.image]
+    pixel = np.array([block.sensors[name].pixel_mm for name in block.image_camera])[rows.image]
+    limit = np.hypot(_BEYOND * rows.sigma_mm, _ROOM_PX * pixel) / c
+    messages: list[str] = []
+    for p in np.unique(rows.point).tolist():
+        of_point = np.flatnonzero(rows.point == p)
+        if len(of_point) < 2:
+            continue
+        passing = _passing(origins[of_point], directions[of_point], limit[of_point])
+        images = [block.images[i] for i in rows.image[of_point[~passing]]]
+        if passing.sum() < 2:
+            good[of_point] = False
+            messages.append(f"the marks of {ids[p]} in {few(images)} contradict one another, and none is used")
+        elif len(images):
+            good[of_point[~passing]] = False
+            messages.append(
+                f"the mark of {ids[p]} in {few(images)} contradicts those in {passing.sum()} others: left out"
+            )
+    used = np.flatnonzero(good)
+    intersection = intersect_with_covariance(
+        positions,
+        matrices,
+        rows.image[used],
+        rays[used],
+        rows.point[used],
+        n,
+        float(np.median((rows.sigma_mm / c)[used])) if len(used) else 1.0,
+        _PARALLEL,
+    )
+    return Intersected(intersection.points, intersection.covariance, good, tuple(messages))
+
+
+def _passing(origins, directions, limit) -> Bool[np.ndarray, "rays"]:
+    """Return True for the rays of one point that pass the position of most of them; all False if no two rays meet."""
+    n = len(origins)
+    pairs = list(combinations(range(n), 2))
+    pairs = [pairs[k] for k in np.linspace(0, len(pairs) - 1, min(len(pairs), _PAIRS)).astype(int)]
+    ray = np.array(pairs).ravel()
+    number = np.arange(len(pairs)).repeat(2)
+    met, determined = intersect_points(origins[ray], directions[ray], number, len(pairs), min_angle=_PARALLEL)
+    if not determined.any():
+        return np.ones(n, bool)
+    off = misses(met[determined], origins, directions)
+    inside = off < limit
+    score = inside.sum(axis=1) - np.minimum(off / limit, 1.0).mean(axis=1)
+    passing = inside[np.argmax(score)]
+    place, sure = intersect_points(origins[passing], directions[passing], np.zeros(passing.sum(), int), 1)
+    return misses(place, origins, directions)[0] < limit if sure[0] else passing
+
+
+def misses(places, origins, directions) -> Float[np.ndarray, "places rays"]:
+    """Angles (rad) by which rays miss positions; infinite behind the camera."""
+    towards = places[:, None] - origins
+    along = np.sum(towards * directions, axis=2)
+    across = np.linalg.norm(np.cross(directions[None], towards), axis=2)
+    return np.where(along > 0, across / np.maximum(along, 1e-300), np.inf)
+
+
+def into_block(
+    block: Block,
+    ids: tuple[str, ...],
+    xyz: Float[np.ndarray, "points 3"],
+    sigma: Float[np.ndarray, "points 3"],
+    start: Float[np.ndarray, "points 3"],
+    rows: Marked,
+    control: Bool[np.ndarray, "points"],
+    check: Bool[np.ndarray, "points"],
+) -> Block:
+    """Append the points `ids`, whose names are new, to `block`; `rows` are their marks.
+
+    `xyz` (m, NaN if unknown) are observed with `sigma` for `control` points, and are check coordinates for `check`
+    points, with a sigma of 0 if not stated. `start` are initial values in the frame of the block.
+    """
+    n = len(block.points)
+    new = ImagePoints(
+        rows.image, rows.point + n, as_jax_array(rows.xy_mm), as_jax_array(np.repeat(rows.sigma_mm[:, None], 2, 1))
+    )
+    unknowns = block.start.unknowns
+    unknowns = dataclasses.replace(unknowns, points=np.concatenate([np.asarray(unknowns.points, float), start]))
+    known = np.concatenate([np.asarray(block.start.point_known), np.ones(len(ids), bool)])
+    return dataclasses.replace(
+        block,
+        points=(*block.points, *ids),
+        image_points=ImagePoints.joined(block.image_points, new),
+        control=ControlCoordinates.joined(block.control, _coordinates(xyz, sigma, control, n)),
+        check=ControlCoordinates.joined(block.check, _coordinates(xyz, sigma, check, n)),
+        datum=Datum(),
+        start=Start(unknowns, block.start.image_known, known),
+    )
+
+
+def _coordinates(xyz, sigma, chosen, first: int) -> ControlCoordinates:
+    point, axis = np.nonzero(np.isfinite(xyz) & chosen[:, None])
+    return ControlCoordinates(first + point, axis, as_jax_array(xyz[point, axis]), as_jax_array(sigma[point, axis]))
+
+
+def without_names(block: Block, ids: tuple[str, ...]) -> Block:
+    """Remove the names `ids` from the points of `block`.
+
+    Surveyed points of these names are removed with their image points; tie points are renamed.
+    """
+    surveyed = {int(p) for rows in (block.control, block.fixed, block.check) for p in np.asarray(rows.who)}
+    taken = set(ids)
+    replaced = np.array([name in taken and k in surveyed for k, name in enumerate(block.points)], bool)
+    new = np.where(replaced, -1, np.cumsum(~replaced) - 1)
+    kept = [name for name, out in zip(block.points, replaced, strict=True) if not out]
+    names = set(kept) | taken
+    for k, name in enumerate(kept):
+        if name in taken:
+            while (name := f"tie_{name}") in names:
+                pass
+            names.add(name)
+            kept[k] = name
+    renumbered = lambda rows: rows.renumbered(point=new)  # noqa: E731
+    start = block.start
+    unknowns = dataclasses.replace(start.unknowns, points=np.asarray(start.unknowns.points, float)[~replaced])
+    changed = {
+        name: renumbered(getattr(block, name))
+        for name in ("image_points", "control", "fixed", "check", "surfaces", "distances")
+    }
+    return dataclasses.replace(
+        block,
+        points=tuple(kept),
+        **changed,
+        more=tuple(renumbered(m) if hasattr(m, "renumbered") else m for m in block.more),
+        start=Start(unknowns, start.image_known, np.asarray(start.point_known)[~replaced]),
+    )
+
+
+def with_gnss_bias(block: Block) -> Block:
+    """Add a common shift of the stations of `block`, which control determines: height reference or datum."""
+    unknowns, zero = block.start.unknowns, np.zeros(3)
+    # Parts of a flight without a shift are the reference of the others.
+    if "flight_bias" in unknowns.more or (unknowns.strips and unknowns.strips.keys() >= set(block.image_strip)):
+        return block
+    bias: dict[str, AbstractParameters] = {"": FlightBias(zero, zero)}  # type: ignore[arg-type]
+    freed: dict[str, AbstractParameters] = {"": FlightBias(FREE, FIXED)}  # type: ignore[arg-type]
+    more, priors = unknowns.more | {"flight_bias": bias}, block.priors.more | {"flight_bias": freed}
+    return dataclasses.replace(
+        block,
+        start=dataclasses.replace(block.start, unknowns=dataclasses.replace(unknowns, more=more)),
+        priors=dataclasses.replace(block.priors, more=priors),
+    )
