@@ -58,10 +58,8 @@ def run(path: Path, executed: Path) -> None:
 def entry(path: Path) -> str:
     """Write the notebook's part of the page."""
     notebook = with_outputs(path)
-    title, _, text = notebook.cells[0].source.partition("\n")
-    about = _on_page(" ".join(text.strip().split("\n\n")[0].split()))
-    title = title.lstrip("# ").strip()
-    parts = [f"## [{title}](../notebooks/{path.name})", about]
+    title = notebook.cells[0].source.partition("\n")[0].lstrip("# ").strip()
+    parts = [f"## [{title}](../notebooks/{path.name})"]
     if shown := picture(notebook):
         parts.append(f"![{title}]({shown})")
     if words := conclusion(notebook):

@@ -380,7 +380,7 @@ def control_block_with_targets(
         raise InputError(f"{points.file}: no target was found; {'; '.join(texts)}")
     distant = _far(now, by_hand)
     texts += [
-        f"the target of {ids[p]} was found anew, {off:.2g} m from what was first taken for it"
+        f"the target of {ids[p]} was found again, {off:.2g} m from its first detection"
         for p, off in replaced.items()
         if p not in distant
     ]
