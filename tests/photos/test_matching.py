@@ -253,5 +253,6 @@ def test_a_camera_with_distortion_is_matched_by_its_ideal_coordinates(taken, tmp
     found = match_photographs(bent, camera.sensor, known, [(0, 1)])
     unknown = match_photographs(bent, camera.sensor, camera.interior, [(0, 1)])
     assert found.counts[0, 3] > 0.98 * found.counts[0, 2]
-    # Pictures interpolated twice scatter a little more; what is taken for no lens at all, far more.
-    assert found.sigma_factor < 2 and 5 * found.sigma_factor < unknown.sigma_factor
+    # Pictures interpolated twice scatter a little more; without the distortion matches scatter up to COLMAP's inlier
+    # limit of 4 px, which bounds the ratio.
+    assert found.sigma_factor < 2 and 3 * found.sigma_factor < unknown.sigma_factor
