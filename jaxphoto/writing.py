@@ -79,7 +79,7 @@ def whole_folder(directory: Path, clashes: Clashes = lambda name: False) -> Iter
     with _work_place(target) as work:
         work.mkdir()
         yield work
-        files = {name: _digest(work / name) for name in _files(work)}
+        files = {name: _digest(work / name) for name in _files(work) if name != MARKER}
         text = json.dumps({"written by": "jaxphoto", "files": files}, indent=1)
         (work / MARKER).write_text(text + "\n", encoding="utf-8")
         for name in (*files, MARKER):

@@ -90,6 +90,14 @@ def test_what_is_written_before_goes_and_what_is_the_users_stays(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
+def test_a_folder_written_within_another_is_replaced_again(tmp_path):
+    out = tmp_path / "out"
+    for text in "12":
+        with whole_folder(out) as work:
+            write(work, a=text)
+    assert said(out) == {"a": "2"}
+
+
 @pytest.mark.parametrize("marker", [None, "{", "[]", '{"files": 1}', '{"files": {}}', '{"files": {"thesis": 1}}'])
 def test_a_folder_that_jaxphoto_did_not_write_is_refused(tmp_path, marker):
     (tmp_path / "thesis").write_text("years")
