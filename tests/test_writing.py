@@ -140,7 +140,7 @@ def test_what_cannot_be_written_is_said_before_anything_is_computed(tmp_path, mo
 
 
 def test_what_can_be_no_folder_is_said_before_that_its_place_cannot_be_written(tmp_path, monkeypatch):
-    with pytest.raises(InputError, match="/ is a disk of its own"):
+    with pytest.raises(InputError, match="/ is a mount point"):
         check_folder(Path("/"))
 
     def fails(*_, **__):
