@@ -16,8 +16,7 @@ import numpy as np
 import jaxphoto
 from jaxphoto import Block, JaxphotoError
 from jaxphoto.camera import get_parameter, set_parameter
-from jaxphoto.procedures import adjust_for_tables
-from jaxphoto.procedures.adjust import start_of
+from jaxphoto.procedures.adjust import adjust_for_tables, start_of
 from jaxphoto.report import Tables, verdict_of
 from jaxphoto.rotation import small_rotation
 

@@ -65,7 +65,7 @@ def _one(rng: np.random.Generator, number: int) -> str:
     """Draw a block and adjust it; what came of it in a word or two."""
     import jaxphoto
     from jaxphoto.errors import JaxphotoError
-    from jaxphoto.procedures import adjust_for_tables
+    from jaxphoto.procedures.adjust import adjust_for_tables
     from jaxphoto.report import Tables, verdict_of
     from jaxphoto.statistics import variance_components
 

@@ -64,27 +64,31 @@ from jaxphoto.observations import (
     index_of,
 )
 from jaxphoto.parameters import AbstractParameters
-from jaxphoto.procedures import adjust, boresight, georeference, robust, snoop
-from jaxphoto.simulation import simulate
-from jaxphoto.statistics import (
-    Selection,
-    angle_differences,
-    covariance,
-    point_differences,
-    significance,
-    variance_components,
-)
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted, default_priors
 
 if TYPE_CHECKING:
     from jaxphoto.extras.formats import convert, read_source
     from jaxphoto.io import read_block, read_recipe, write_block, write_simulation
+    from jaxphoto.procedures.adjust import adjust
+    from jaxphoto.procedures.boresight import boresight
     from jaxphoto.procedures.calibration import calibrate
     from jaxphoto.procedures.compare import compare, halves
+    from jaxphoto.procedures.georeference import georeference
     from jaxphoto.procedures.lidar import simultaneous
     from jaxphoto.procedures.orientation import orient
+    from jaxphoto.procedures.robust import robust
+    from jaxphoto.procedures.snooping import snoop
     from jaxphoto.report import Tables
     from jaxphoto.sensitivity import bias, monte_carlo, readjust
+    from jaxphoto.simulation import simulate
+    from jaxphoto.statistics import (
+        Selection,
+        angle_differences,
+        covariance,
+        point_differences,
+        significance,
+        variance_components,
+    )
     from jaxphoto.statistics.sigma_map import sigma_map
 
 __version__ = "0.1.0"
@@ -110,12 +114,26 @@ __all__ = [
 _LATER = {
     "extras.formats": ("convert", "read_source"),
     "io": ("read_block", "read_recipe", "write_block", "write_simulation"),
+    "procedures.adjust": ("adjust",),
+    "procedures.boresight": ("boresight",),
     "procedures.calibration": ("calibrate",),
     "procedures.compare": ("compare", "halves"),
+    "procedures.georeference": ("georeference",),
     "procedures.lidar": ("simultaneous",),
     "procedures.orientation": ("orient",),
+    "procedures.robust": ("robust",),
+    "procedures.snooping": ("snoop",),
     "report": ("Tables",),
     "sensitivity": ("bias", "monte_carlo", "readjust"),
+    "simulation": ("simulate",),
+    "statistics": (
+        "Selection",
+        "angle_differences",
+        "covariance",
+        "point_differences",
+        "significance",
+        "variance_components",
+    ),
     "statistics.sigma_map": ("sigma_map",),
 }
 

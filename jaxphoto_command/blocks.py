@@ -62,7 +62,7 @@ def adjust(
     from jaxphoto import report
     from jaxphoto.io import read_block, read_truth, write_block
     from jaxphoto.losses import LOSSES
-    from jaxphoto.procedures import adjust_for_tables
+    from jaxphoto.procedures.adjust import adjust_for_tables
     from jaxphoto.procedures.blunder_causes import inflated_components
     from jaxphoto.statistics import SPLITS
     from jaxphoto.writing import check_folder, whole_folder
@@ -135,7 +135,7 @@ def boresight(
     Exit code 1: written, but a step failed.
     """
     from jaxphoto.io import read_block
-    from jaxphoto.procedures import boresight as estimate
+    from jaxphoto.procedures.boresight import boresight as estimate
     from jaxphoto.report import print_boresight, write_boresight
     from jaxphoto.writing import check_folder
 
@@ -237,7 +237,7 @@ def monte_carlo(
     from jaxphoto.experiment import MonteCarlo
     from jaxphoto.io import read_block
     from jaxphoto.io.draws_folder import check_place
-    from jaxphoto.procedures import adjust
+    from jaxphoto.procedures.adjust import adjust
     from jaxphoto.report.draws import LONG, write_draws_page
     from jaxphoto.report.formatting import readable
     from jaxphoto.sensitivity import Readjustment, bias, check_draws, noise
@@ -307,7 +307,7 @@ def sensitivity(
 ) -> None:
     """Compute the exact sensitivity of interior orientation and check points to stations, and external reliability."""
     from jaxphoto.io import read_block
-    from jaxphoto.procedures import adjust_for_tables
+    from jaxphoto.procedures.adjust import adjust_for_tables
     from jaxphoto.report.formatting import in_figures
     from jaxphoto.report.sensitivity import SensitivityTables, write_sensitivity
     from jaxphoto.writing import check_folder

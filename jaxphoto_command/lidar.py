@@ -427,7 +427,7 @@ def orthophoto(
     from jaxphoto.errors import BlockError, InputError
     from jaxphoto.io import clouds, raster, read_block
     from jaxphoto.lidar.raster import orthophoto
-    from jaxphoto.procedures import adjust
+    from jaxphoto.procedures.adjust import adjust
     from jaxphoto.writing import check_file
 
     check_file(out, block, photo, dsm)

@@ -224,7 +224,7 @@ def control(
     from jaxphoto.io import read_block
     from jaxphoto.io.block_folder import whole_block
     from jaxphoto.io.photographs import skipped_messages, valid_photographs
-    from jaxphoto.procedures import adjust
+    from jaxphoto.procedures.adjust import adjust
     from jaxphoto.procedures.control import at_optimum, control_block, control_block_with_targets
     from jaxphoto.report import Tables, verdict_of
     from jaxphoto.report.control import control_findings, control_summary, write_control

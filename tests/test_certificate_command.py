@@ -13,7 +13,7 @@ from jaxphoto import Tables
 from jaxphoto.io import write_block
 from jaxphoto.io.conditions import CONDITIONS, conditions_of, read_conditions, write_conditions
 from jaxphoto.io.result_tables import block_inputs, read_inputs, write_inputs
-from jaxphoto.procedures import adjust_for_tables
+from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.report import verdict_of
 from jaxphoto.report.results import write_results
 from jaxphoto.statistics.block_geometry import coverage

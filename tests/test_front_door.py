@@ -68,8 +68,8 @@ def test_what_is_imported_late_is_what_readers_of_types_are_told():
 
     tree = ast.parse(Path(jaxphoto.__file__).read_text(encoding="utf-8"))
     block = next(n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING")
-    told = {n.module.removeprefix("jaxphoto."): tuple(a.name for a in n.names) for n in block.body}
-    assert told == jaxphoto._LATER
+    declared = {n.module.removeprefix("jaxphoto."): tuple(a.name for a in n.names) for n in block.body}
+    assert declared == jaxphoto._LATER
     assert len(set(jaxphoto.__all__)) == len(jaxphoto.__all__)
 
 

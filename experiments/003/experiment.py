@@ -11,7 +11,7 @@ from jaxphoto.experiment import (
     misalignment_agreement,
     principal_point,
 )
-from jaxphoto.procedures import step_block
+from jaxphoto.procedures.boresight import step_block
 from jaxphoto.variants import strips
 
 EAST_WEST = ("E1", "E2", "E3", "E4")

@@ -15,7 +15,7 @@ from jaxphoto.block import Block
 from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.io.recipe import recipe_from
 from jaxphoto.io.toml import read_toml
-from jaxphoto.procedures import adjust
+from jaxphoto.procedures.adjust import adjust
 from jaxphoto.report import Tables
 from jaxphoto.simulation import Recipe, Simulation, simulate
 

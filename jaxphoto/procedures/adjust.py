@@ -19,7 +19,6 @@ from jaxphoto.initial import approximate
 from jaxphoto.initial.approximate import PointsBehind, completed, intersected
 from jaxphoto.initial.rays import camera_rays, turn_to_object
 from jaxphoto.observations import AbstractObservations, KnownParameters
-from jaxphoto.procedures.orientation import orient_block
 from jaxphoto.statistics import prepare_statistics
 from jaxphoto.unknowns import FREE, Unknowns
 from jaxphoto.variants import without_observations
@@ -199,6 +198,8 @@ def _from_image_points(block: Block, from_start: _FromStart, report: Callable[[s
         is_control[rows.who, rows.axis] = True
     images, points = np.zeros_like(np.asarray(s.image_known)), is_control.all(axis=1) & np.asarray(s.point_known)
     try:
+        from jaxphoto.procedures.orientation import orient_block
+
         oriented = orient_block(
             dataclasses.replace(block, start=dataclasses.replace(s, image_known=images, point_known=points)), report
         )
@@ -250,6 +251,8 @@ def start_of(block: Block, report: Callable[[str], object] = lambda text: None) 
     if enough:
         return approximate(reached)
     try:
+        from jaxphoto.procedures.orientation import orient_block
+
         oriented = orient_block(block, report)
     except (BlockError, DatumError, RankError) as error:
         if not reached.start.image_known.any():

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.text import Text
 
 from jaxphoto.errors import InputError
-from jaxphoto.procedures import Step
+from jaxphoto.procedures.boresight import Step
 from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, Plot
 from jaxphoto.report.plots import axes_or_new, label, new_figure

@@ -13,10 +13,9 @@ from jaxphoto.block import Block
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import camera_words, few
 from jaxphoto.observations import PRIORS, AbstractObservations, Correlated
-from jaxphoto.procedures import Snooped
 from jaxphoto.procedures.adjust import ABSURD
 from jaxphoto.procedures.blunder_causes import InflatedComponent, coordinate_mistakes, is_mirrored
-from jaxphoto.procedures.snooping import SEVERAL, mostly_rejected, rejected_images
+from jaxphoto.procedures.snooping import SEVERAL, Snooped, mostly_rejected, rejected_images
 from jaxphoto.report.findings import SEVERITIES, Finding, Severity, p_words, symbol
 from jaxphoto.report.formatting import in_file_unit
 from jaxphoto.report.tables import Tables

@@ -9,7 +9,7 @@ import pytest
 
 from jaxphoto.camera import get_parameter, rebalance
 from jaxphoto.experiment import compare, load_experiment, read_published, run_experiment, simulated
-from jaxphoto.procedures import adjust
+from jaxphoto.procedures.adjust import adjust
 from jaxphoto.report import Tables
 from jaxphoto.stability import analyse, bundle_offsets
 

@@ -10,8 +10,7 @@ from benchmarks.basin import far_off
 from jaxphoto import adjust
 from jaxphoto.adjustment import solve
 from jaxphoto.compiling import run
-from jaxphoto.procedures import adjust_for_tables
-from jaxphoto.procedures.adjust import start_of
+from jaxphoto.procedures.adjust import adjust_for_tables, start_of
 from jaxphoto.report import Tables, verdict_of
 from jaxphoto.variants import without_observations
 from tests.blocks import adjusted_example, example, simulated

@@ -14,7 +14,7 @@ from jaxphoto import FIXED, FREE, BlockError, boresight
 from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.io import write_block
 from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates
-from jaxphoto.procedures import step_block
+from jaxphoto.procedures.boresight import step_block
 from jaxphoto.writing import MARKER
 from tests.blocks import BORESIGHT, BROWN, CONTROL, Simulated, aerial, all_attitudes, all_stations, bare, measured, rows
 from tests.blocks import free as free_interior

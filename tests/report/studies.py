@@ -8,8 +8,7 @@ import numpy as np
 from jaxphoto import Tables
 from jaxphoto.camera import Brown, InteriorOrientation, Sensor, Smac
 from jaxphoto.lidar import HeightFlag
-from jaxphoto.procedures import Step
-from jaxphoto.procedures.boresight import BoresightEstimate
+from jaxphoto.procedures.boresight import BoresightEstimate, Step
 from jaxphoto.procedures.compare import Cut, Halves
 from jaxphoto.procedures.lidar import LidarControl, Round, Simultaneous
 from jaxphoto.procedures.model_choice import Candidate, Judged, ModelChoice

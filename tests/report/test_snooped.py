@@ -8,8 +8,8 @@ import pytest
 from jaxphoto import snoop
 from jaxphoto.initial.approximate import in_front, looking_away
 from jaxphoto.observations import Distances
-from jaxphoto.procedures import Snooped
 from jaxphoto.procedures.blunder_causes import coordinate_mistakes
+from jaxphoto.procedures.snooping import Snooped
 from jaxphoto.report import Tables, verdict_of
 from jaxphoto.report.residual_findings import snooped_findings
 from jaxphoto.statistics import Suspect, covariance
