@@ -67,7 +67,7 @@ QUICK = {
     ),
     "optional": ("test_lean.py::test_every_extra_is_declared_and_documented",),
     "short_repr": ("test_front_door.py",),
-    "single": ("test_front_door.py",),
+    "argument_checks": ("test_front_door.py",),
     "simulation": (
         "simulation/test_flight_plan.py",
         "simulation/test_recipes.py",
