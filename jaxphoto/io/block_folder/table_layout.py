@@ -25,8 +25,7 @@ TURN = ("turn_right_m", "turn_forward_m", "turn_up_m")
 
 
 class Column(NamedTuple):
-    """A column: `text` or floats. A `sigma` is positive, an `angle` at most 360 degrees, a `whole` number an integer.
-    """
+    """A column of text or floats; a `sigma` is positive, an `angle` at most 360 degrees, a `whole` an integer."""
 
     name: str
     kind: Literal["text", "number", "coordinate", "sigma", "angle", "whole"] = "number"
