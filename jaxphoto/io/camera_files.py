@@ -104,7 +104,7 @@ class CameraSource(NamedTuple):
         """Return the sensor, and a note if its pixel size is assumed. The user's pixel size overrides `pixel_mm`."""
         if self.size_px is not None and self.size_px != (width, height):
             size = "{} x {}".format(*self.size_px)
-            raise self.error(f"its images have {width:g} x {height:g} pixels, not {size}; leave the size out")
+            raise self.error(f"image size is {width:g} x {height:g} px, not {size}; remove the size")
         if not all(0 < side <= _LARGEST_SIDE_PX and side == int(side) for side in (width, height)):
             raise self.error(f"an image of {width:g} x {height:g} pixels cannot be; give whole positive numbers")
         pixel = self.pixel_mm if self.pixel_mm is not None else pixel_mm

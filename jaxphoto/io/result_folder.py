@@ -75,7 +75,7 @@ def photograph_files(images: Sequence[str], folders: Iterable[Path], flight: Pat
     pictures: dict[str, Path] = {}
     for folder in folders:
         if not folder.is_dir():
-            raise InputError(f"there is no folder {folder}; name that of the photographs")
+            raise InputError(f"folder not found: {folder}; give the folder of the photographs")
         for file in sorted(folder.iterdir()):
             if file.suffix.lower() in _PICTURES and file.stem in set(images):
                 if file.stem in pictures:

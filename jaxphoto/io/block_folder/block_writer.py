@@ -97,9 +97,8 @@ def _settings(block: Block) -> dict[str, Any]:
     for image, camera, mount in zip(block.images, block.image_camera, block.image_mount, strict=True):
         if mount != mount_of[camera]:
             raise BlockError(
-                "block.toml has one mount for all images of a camera, by the name of the mount: image "
-                f"{image} of camera {camera} has {f'mount {mount}' if mount else 'none'}; name a mount {camera} or "
-                "default, and give a camera that was mounted in two ways two names"
+                f"image {image} of camera {camera} has {f'mount {mount}' if mount else 'no mount'}, but block.toml "
+                f"allows one mount per camera; name it {camera} or default, and split a camera with two mounts into two"
             )
     names = set(block.points)
     optional = {
@@ -137,8 +136,8 @@ def _mode_section(block: Block) -> dict[str, str]:
     if priors == (FIXED, FIXED) and block.start.image_known.all() and not sensors:
         return {"mode": "direct"}
     raise BlockError(
-        "block.toml can say of exterior orientation that all of it is FREE, or FIXED at known values and no station or "
-        "attitude observed; reset its priors, or hold it by jaxphoto.variants.direct"
+        "block.toml cannot represent these priors of exterior orientation; reset them to FREE, or fix all of it by "
+        "jaxphoto.variants.direct"
     )
 
 

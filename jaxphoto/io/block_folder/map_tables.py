@@ -99,8 +99,8 @@ def with_origin(frame: Frame, tables: Mapping[str, Table], trajectory: Records |
     if not placed:
         if frame.origin is None:
             raise InputError(
-                f"{file}, [frame]: no coordinate tells where the block lies; add origin = [longitude, latitude, "
-                "height] in degrees and metres"
+                f"{file}, [frame]: the block has no coordinates to place its origin; add origin = [longitude, "
+                "latitude, height] in degrees and metres"
             )
         return frame
     longitude, latitude, _ = np.median(np.concatenate(placed), axis=0)

@@ -205,7 +205,7 @@ class ObservedPoints(NamedTuple):
 def read_image_points(table: Table, images: Images, settings: Settings) -> ObservedPoints:
     """Read the image points, sorted by point and image; points are in order of first appearance."""
     if not len(table):
-        raise BlockError(f"{table.file}: there are no image points; list what was measured in the images")
+        raise BlockError(f"{table.file}: no image points; add the image measurements")
     image = images.find(table)
     sensors = [settings.cameras[camera].sensor for camera in images.cameras]
     pixel = np.array([s.pixel_mm for s in sensors])[image][:, None]

@@ -76,8 +76,8 @@ def _first_error(
     for row, cells in rows:
         if len(cells) > len(names):
             return InputError(
-                f"{file}, row {row}: {len(cells)} cells, but there are {len(names)} columns; delete the others "
-                "(decimal commas need semicolons between the columns)"
+                f"{file}, row {row}: {len(cells)} cells for {len(names)} columns; delete the extra cells "
+                "(with decimal commas, separate columns by semicolons)"
             )
         for name, cell in itertools.zip_longest(names, cells, fillvalue=""):
             try:

@@ -478,7 +478,7 @@ class _Assignment:
 
 
 def _aircraft(photograph: Photograph) -> Float[np.ndarray, "3 3"] | None:
-    """Return the rotation from aircraft axes (right, forward, up) to the level frame; without it, of the camera."""
+    """Return the rotation from aircraft axes (right, forward, up) to the level frame; if unknown, the camera's."""
     if photograph.aircraft_deg is not None:
         return level_from_body(photograph.aircraft_deg)
     return None if photograph.attitude is None else photograph.attitude.level_from_camera

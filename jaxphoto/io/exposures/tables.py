@@ -162,7 +162,7 @@ def _table(file: str, lines: Lines, errors: dict[int, str]) -> _Table:
         if {"image", "x", "y"} <= set(columns) and len(header) <= len(first):
             break
     else:
-        raise InputError(f"{file}: the column image is missing, or coordinates are (X_m, Y_m, Z_m); add a header")
+        raise InputError(f"{file}: missing column image or coordinate columns (X_m, Y_m, Z_m); add a header")
     if "z" not in columns:
         raise InputError(f"{file}: its header names no heights (Z, altitude or height); add them")
     if set(columns) & {*_OPK, *_RPY} and _GON.search(" ".join([*comments, *header])):
@@ -224,8 +224,8 @@ def _pospac(file: str, content: Lines, errors: dict[int, str]) -> _Table:
     header, head = headers[begin], " ".join(line for _, line in content[:begin])
     if not set(_POSPAC_COLUMNS.values()) <= set(header):
         raise InputError(
-            f"{file}: its columns are not those of photographs ({', '.join(_POSPAC_COLUMNS.values())}): export the "
-            "exterior orientation at the camera's events, or take the SBET, which has the whole trajectory"
+            f"{file}: missing photograph columns (required: {', '.join(_POSPAC_COLUMNS.values())}); export exterior "
+            "orientation at the camera events, or use the SBET trajectory"
         )
     if (first := re.search(r"first rotation is around the '(\w)'", head, re.IGNORECASE)) and first[1].lower() != "x":
         raise InputError(f"{file}: its angles turn about {first[1]} first: export omega, phi, kappa")

@@ -55,7 +55,7 @@ def _range(value: Any) -> Any:
     values = value if isinstance(value, list) else [value]
     if len(values) in (1, 2) and all(isinstance(v, int | float) for v in values) and values[0] <= values[-1]:
         return [values[0], values[-1]]
-    raise ValueError(f"{values} is no range; give one number, or the least and the greatest")
+    raise ValueError(f"{values} is not a range; give one number, or [minimum, maximum]")
 
 
 def _strip_name(name: str) -> str:

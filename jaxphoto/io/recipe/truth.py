@@ -44,8 +44,7 @@ def write_simulation(simulation: Simulation, folder: str | Path) -> None:
 def truth_tables(simulation: Simulation) -> dict[str, pd.DataFrame]:
     """Return the true values by name of the result table: interior, exterior, object_points, georeferencing.
 
-    With a scanner, georeferencing also has its parameters (table scanner), and trajectory_errors the shift and drift of
-    its trajectory.
+    With a scanner, the table scanner has its parameters, and trajectory_errors the shift and drift of its trajectory.
     """
     block, truth = simulation.block, simulation.truth
     interior = [
