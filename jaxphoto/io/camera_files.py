@@ -28,8 +28,7 @@ from jaxphoto.io.toml import Section, read_toml, toml_text
 from jaxphoto.unknowns import FIXED
 
 ASSUMED_PIXEL_MM = 0.001
-"""Pixel size if neither the file nor the user specifies one; c in micrometres then equals the focal length in pixels.
-"""
+"""Default pixel size if none is specified; c in micrometres then equals the focal length in pixels."""
 INTERIOR, CAMERA = "interior.csv", "camera.toml"
 CAMERAS_READ = (
     "OpenCV's and ROS' YAML, COLMAP's cameras.txt, Agisoft's XML, mrcal's .cameramodel, Kalibr's camera chain, a "
@@ -43,7 +42,7 @@ _ROUNDING = 1e-5
 
 
 class SeveralCamerasError(InputError):
-    """Several cameras in a file, and none selected."""
+    """Error: a file contains several cameras, and none was selected."""
 
 
 class CameraFile(NamedTuple):

@@ -237,11 +237,11 @@ ONE_CAMERA: list[tuple[str, Callable[[Photograph], Hashable], str]] = [
 
 
 def valid_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], dict[str, str]]:
-    """Read the photographs of one camera in files and folders `paths`; return them, and the reason for each skipped
-    file.
+    """Read the photographs of one camera in `paths`; return them, and the reason for each skipped file.
 
-    Skipped files: other formats, truncated files, duplicate names, identical and edited copies, and files that differ
-    from the majority in a property of `ONE_CAMERA`. Raises InputError for a missing path, and if all files are skipped.
+    `paths` are files and folders. Skipped files: other formats, truncated files, duplicate names, identical and edited
+    copies, and files that differ from the majority in a property of `ONE_CAMERA`. Raises InputError for a missing path,
+    and if all files are skipped.
     """
     files = picture_files(paths)
     if missing := [file for file in files if not (file.is_file() or file.is_symlink())]:

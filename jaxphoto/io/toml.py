@@ -119,11 +119,11 @@ class Section:
         return np.array(self._value(_vector(size), key, [0.0] * size), float)
 
     def prior(self, key: str, start: Any, unit: str = "", scale: float = 1.0) -> Prior | Weighted:
-        """Read a prior: `"free"`, `"fixed"` (the default) or `{ sigma = ..., value = ... }`; `value` defaults to
-        `start`.
+        """Read a prior: `"free"`, `"fixed"` (the default) or `{ sigma = ..., value = ... }`.
 
-        A vector may have `covariance`, the rows of a matrix, instead of `sigma`. `start` is in the unit of jaxphoto:
-        the value in the file times `scale`. `unit` is an optional suffix of the keys (sigma_deg).
+        `value` defaults to `start`. A vector may have `covariance`, the rows of a matrix, instead of `sigma`. `start`
+        is in the unit of jaxphoto: the value in the file times `scale`. `unit` is an optional suffix of the keys
+        (sigma_deg).
         """
         status = self.values.get(key, "fixed")
         if status in ("free", "fixed"):

@@ -40,9 +40,7 @@ from jaxphoto.writing import Clashes, check_folder, whole_folder
 
 
 def check_block_target(folder: Path, *inputs: Path) -> None:
-    """Raise InputError if a block cannot be written to `folder` (`check_folder`), or if `folder` contains a table of a
-    block.
-    """
+    """Raise InputError if `folder` cannot be written (`check_folder`), or contains tables of a block."""
     check_folder(folder, *inputs, clashes=_tables_of(OBSERVATIONS))
 
 

@@ -163,7 +163,7 @@ def temperatures_of(images: Images, settings: Settings) -> Temperatures | None:
 
 
 def check_times(images: Images, starts: Unknowns, priors: Unknowns) -> None:
-    """Raise BlockError if a time or temperature is missing that a drift or a camera change requires."""
+    """Raise BlockError if an image lacks a time or temperature that a drift or a camera change requires."""
 
     def changes(start: object, prior: object, *names: str) -> bool:
         return any(getattr(prior, n) != FIXED or np.any(np.asarray(getattr(start, n)) != 0) for n in names)
@@ -280,7 +280,10 @@ def check_rays(points: ObservedPoints, images: Images, controlled: np.ndarray) -
 
 
 class Control(NamedTuple):
-    """Object coordinates by role, initial coordinates (points, 3), and masks `known` (all three) and `controlled`."""
+    """Object coordinates by role, initial coordinates (points, 3), and masks of points.
+
+    `known`: all three initial coordinates are known. `controlled`: at least one control or fixed coordinate.
+    """
 
     control: ControlCoordinates
     fixed: ControlCoordinates
@@ -293,9 +296,7 @@ class Control(NamedTuple):
 def sigmas_of(
     table: Table, column: str, settings: Settings, *keys: str, needed: np.ndarray | bool = True
 ) -> np.ndarray:
-    """Read a column of standard deviations; missing ones that are `needed` are taken from the first of `keys` in
-    [sigmas].
-    """
+    """Read a column of sigmas; missing `needed` ones are taken from the first of `keys` in [sigmas]."""
     given = table.sigmas(column)
     sigma = np.where(np.isnan(given) & needed, default_sigma(settings, *keys), given)
     table.check(

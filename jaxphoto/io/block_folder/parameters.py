@@ -244,7 +244,7 @@ def unknown_sections(block: Block) -> dict[str, Any]:
 
 
 def check_shutters(images: Iterable[tuple[str, str]], starts: Unknowns, priors: Unknowns) -> None:
-    """Raise BlockError for readout times not in milliseconds, and for shutters or motions without each other.
+    """Raise BlockError for readout times not in milliseconds, shutters without motion, and motion without shutters.
 
     `images` are pairs (image, camera). A free readout time may have any initial value below one second.
     """

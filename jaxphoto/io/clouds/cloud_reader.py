@@ -154,9 +154,7 @@ def _selected_chunks(
 
 
 def selection(chunk: Cloud, classes: Collection[int] | None, returns: Returns, name: str) -> Bool[np.ndarray, "n"]:
-    """Return the mask of points of file `name` that `read_cloud` selects. Raises InputError if classes or returns are
-    missing.
-    """
+    """Return the mask of points that `read_cloud` selects. Raises InputError if `name` lacks classes or returns."""
     mask = np.ones(len(chunk), bool) if chunk.withheld is None else ~chunk.withheld
     if classes is not None and classes != EVERY_CLASS:
         if chunk.classification is None:

@@ -67,13 +67,12 @@ def rewrite_cloud(
     epsg: int | None = None,
     unit: str | None = None,
 ) -> int:
-    """Copy the cloud file `source` to `path`, of the same format, with new coordinates; return the number of unmoved
-    points.
+    """Copy cloud file `source` to `path` with new coordinates; return the number of unmoved points.
 
-    `moved` receives each part as in `read_cloud`, including noise and withheld points, and returns X, Y, Z (m) in the
-    same `frame`. System and units of `source` are retained. LAS and LAZ retain all other dimensions, CSV and PLY the
-    fields of `Cloud`. Memory is bounded by one part. Withheld points are not moved if they are outside the area of the
-    frame's system, or if `moved` returns NaN.
+    Both files have the same format. `moved` receives each part as in `read_cloud`, including noise and withheld points,
+    and returns X, Y, Z (m) in the same `frame`. System and units of `source` are retained. LAS and LAZ retain all other
+    dimensions, CSV and PLY the fields of `Cloud`. Memory is bounded by one part. Withheld points are not moved if they
+    are outside the area of the frame's system, or if `moved` returns NaN.
 
     Raises OSError if writing fails, and the errors of `read_cloud` and `moved`.
     """

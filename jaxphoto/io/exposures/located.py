@@ -33,11 +33,11 @@ from jaxphoto.io.photographs import Photograph
 
 # Number within the flight: DJI_20240501123456_0012_V, DJI_0012, 100_0042_0012.
 _NUMBER = re.compile(r"_(\d{3,5})(?:_[A-Za-z]\w*)?$")
-# Minimum fraction of photographs with a constant time difference for which numbers are valid.
+# Minimum fraction of photographs whose clock differs from the file's by a constant if matched by number.
 _CONSISTENT = 0.8
 # Tolerances (s) of times in whole seconds, and of finer times.
 _COARSE_S, FINE_S = 0.6, 0.2
-# Maximum clock difference (s) that is not reported: EXIF has whole seconds.
+# Maximum clock difference (s) that is not reported; EXIF times have a resolution of 1 s.
 _SMALL_S = 1.5
 _DEGREE_M = 111_320.0
 # Ratio of an interval between records to the median interval above which it is a gap.

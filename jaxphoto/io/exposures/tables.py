@@ -253,7 +253,7 @@ def _pospac(file: str, content: Lines, errors: dict[int, str]) -> _Table:
                     "the mapping frame of the head; export it again, or delete the columns LAT and LONG"
                 )
     table = _cells(records, {name: header.index(word) for name, word in _POSPAC_COLUMNS.items()}, errors)
-    # The accuracy is that of an integrated GNSS/IMU solution.
+    # POSPac solutions are integrated GNSS/IMU solutions.
     return _Table(table.assign(fix="integrated"), False, system, False, True)
 
 
