@@ -1,4 +1,4 @@
-"""Files of jaxphoto -> `Block` and back; other programs' formats are in `jaxphoto.extras.formats`."""
+"""Readers and writers of jaxphoto's own files; formats of other programs are in `jaxphoto.extras.formats`."""
 
 from jaxphoto.io.block_folder import read_block, write_block
 from jaxphoto.io.camera_files import read_camera_file

@@ -1,6 +1,6 @@
-"""Camera files: cameras of results and of block.toml, and a registry for the readers of other programs' files.
+"""Camera files: results, block.toml, and a registry of readers for formats of other programs.
 
-`jaxphoto.extras.formats` registers the formats of other programs in `CAMERA_READERS` when it is imported.
+`jaxphoto.extras.formats` registers its formats in `CAMERA_READERS` when it is imported.
 """
 
 import importlib
@@ -28,13 +28,13 @@ from jaxphoto.io.toml import Section, read_toml, toml_text
 from jaxphoto.unknowns import FIXED
 
 ASSUMED_PIXEL_MM = 0.001
-"""The pixel size if neither the file nor the user gives one: c in micrometres is then the focal length in pixels."""
+"""Default pixel size if none is specified; c in micrometres then equals the focal length in pixels."""
 INTERIOR, CAMERA = "interior.csv", "camera.toml"
 CAMERAS_READ = (
     "OpenCV's and ROS' YAML, COLMAP's cameras.txt, Agisoft's XML, mrcal's .cameramodel, Kalibr's camera chain, a "
     "SMAC report, interior.csv and block.toml"
 )
-"""The camera files that `read_camera_file` reads, for messages and help."""
+"""Formats that `read_camera_file` reads, for messages and help."""
 _IN_FOLDER = (INTERIOR, TOML, CAMERA, "cameras.txt", "cameras.bin")
 _LARGEST_SIDE_PX = 1e7
 _CORRELATION = ("parameter_a", "parameter_b", "rho")
@@ -42,11 +42,11 @@ _ROUNDING = 1e-5
 
 
 class SeveralCamerasError(InputError):
-    """A file holds several cameras and none was chosen."""
+    """Error: a file contains several cameras, and none was selected."""
 
 
 class CameraFile(NamedTuple):
-    """A camera as its file gives it."""
+    """A camera read from a file."""
 
     name: str
     sensor: Sensor
@@ -54,32 +54,32 @@ class CameraFile(NamedTuple):
     covariance: Float[np.ndarray, "n n"] | None = None
     """Covariance of `parameter_names(interior)`, zero rows for fixed parameters; None if not in the file."""
     note: str = ""
-    """Assumptions made and further content of the file; "" if none."""
+    """Assumptions of the reader and warnings about the camera; "" if none."""
 
 
 class CameraSource(NamedTuple):
-    """A file to read, and what the user adds to it."""
+    """A camera file and the user's options."""
 
     path: Path
     camera: str | None = None
     pixel_mm: float | None = None
     size_px: tuple[int, int] | None = None
     block: Path | None = None
-    """The block folder or block.toml that names the model of interior.csv."""
+    """Block folder or block.toml with the camera model of interior.csv."""
 
     def error(self, message: str) -> InputError:
         """Return an error about this file."""
         return InputError(f"{self.path}: {message}")
 
     def text(self) -> str:
-        """Return the whole text, UTF-8 or else Windows-1252. Raise InputError for a binary file."""
+        """Read the text, UTF-8 or else Windows-1252. Raise InputError for a binary file."""
         text = read_legacy_text(self.path)
         if "\0" in text:
             raise self.error("the file is no text; give a camera file")
         return text
 
     def number(self, name: str, text: Any) -> float:
-        """Return a finite number of the file."""
+        """Parse a finite number in the file. Raise InputError for other text."""
         try:
             value = float(text)
         except (TypeError, ValueError, OverflowError):
@@ -89,7 +89,7 @@ class CameraSource(NamedTuple):
         return value
 
     def chosen(self, names: list[str]) -> str:
-        """Return the requested camera of `names`, or the only one."""
+        """Return the requested camera of `names`, or the only one. Raise InputError otherwise."""
         listed = ", ".join(names)
         if not names:
             raise self.error("there is no camera in it; give a file with one")
@@ -100,10 +100,10 @@ class CameraSource(NamedTuple):
         return self.camera or names[0]
 
     def sensor(self, width: float, height: float, pixel_mm: float | None = None) -> tuple[Sensor, str]:
-        """Return the sensor and a note on its assumed pixel; the user's pixel size precedes `pixel_mm`."""
+        """Return the sensor, and a note if its pixel size is assumed. The user's pixel size overrides `pixel_mm`."""
         if self.size_px is not None and self.size_px != (width, height):
             size = "{} x {}".format(*self.size_px)
-            raise self.error(f"its images have {width:g} x {height:g} pixels, not {size}; leave the size out")
+            raise self.error(f"image size is {width:g} x {height:g} px, not {size}; remove the size")
         if not all(0 < side <= _LARGEST_SIDE_PX and side == int(side) for side in (width, height)):
             raise self.error(f"an image of {width:g} x {height:g} pixels cannot be; give whole positive numbers")
         pixel = self.pixel_mm if self.pixel_mm is not None else pixel_mm
@@ -117,7 +117,7 @@ class CameraSource(NamedTuple):
 
 @contextmanager
 def reading(path: Path, what: str) -> Iterator[None]:
-    """Turn any error of damaged content into one InputError about the file."""
+    """Convert any exception due to invalid content into an InputError about the file."""
     try:
         yield
     except JaxphotoError:
@@ -129,25 +129,25 @@ def reading(path: Path, what: str) -> Iterator[None]:
 
 
 def joined_notes(*notes: str) -> str:
-    """Join notes into one."""
+    """Join nonempty notes by semicolons."""
     return "; ".join(note for note in notes if note)
 
 
 class CameraReader(NamedTuple):
-    """A reader, and its test of name and content of a file."""
+    """A reader, and its predicate for name and content of a file."""
 
     recognise: Callable[[Path, str], bool]
     read: Callable[[CameraSource], CameraFile]
 
 
 def camera_readers() -> dict[str, CameraReader]:
-    """Return all readers by format, with those of other programs."""
+    """Return all readers by format; import the readers for other programs first."""
     importlib.import_module("jaxphoto.extras.formats")
     return CAMERA_READERS
 
 
 def is_camera_file(path: Path) -> bool:
-    """Return True if the content of a file is that of a camera file other than block.toml."""
+    """Return True if a file is a camera file, but not block.toml."""
     try:
         text = CameraSource(path).text()
     except InputError:
@@ -163,13 +163,13 @@ def read_camera_file(
     size_px: tuple[int, int] | None = None,
     block: str | Path | None = None,
 ) -> CameraFile:
-    """Read the camera in a file of another program (docs/formats.md) or of jaxphoto itself.
+    """Read the camera in a file of another program (docs/formats.md) or of jaxphoto.
 
-    The content tells the format. `path` may be a folder of results, of a flight, a block folder or a COLMAP model.
-    `camera` chooses one of several; `pixel_mm` and `size_px` complete what the file lacks; `block` is the block of an
-    interior.csv whose summary.json is missing.
+    The format is detected from the content. `path` may also be a result folder, a flight folder, a block folder or a
+    COLMAP model. `camera` selects one of several cameras. `pixel_mm` and `size_px` supply values that the file lacks.
+    `block` supplies the camera model of an interior.csv without summary.json.
 
-    Raises InputError for files that are missing or damaged, unknown formats and models, and missing numbers.
+    Raises InputError for missing or damaged files, unknown formats and models, and missing values.
     """
     path = Path(path)
     if path.is_dir():
@@ -199,13 +199,13 @@ def read_camera_file(
 
 
 def results_in(folder: Path) -> Path:
-    """Return the results of the largest part if `folder` is a flight, else `folder`."""
+    """Return the result folder of the largest part if `folder` is a flight, else `folder`."""
     result = folder / "result"
     return result if (result / INTERIOR).is_file() and not (folder / INTERIOR).is_file() else folder
 
 
 def read_block_camera(source: CameraSource) -> CameraFile:
-    """Read a camera of a block.toml, or of a file with [cameras.NAME] tables alone."""
+    """Read a camera of a block.toml, or of a file that contains [cameras.NAME] tables only."""
     cameras = read_settings(read_toml(source.path), source.path.name).cameras
     name = source.chosen(list(cameras))
     camera = cameras[name]
@@ -226,7 +226,7 @@ def write_block_camera(
     covariance: np.ndarray | None = None,
     reservation: str = "",
 ) -> None:
-    """Write the [cameras.NAME] table of a block.toml: parameters with a covariance are free, the others fixed."""
+    """Write a [cameras.NAME] table of block.toml. Parameters with a covariance are free, the others fixed."""
     known = None if covariance is None else known_together(interior, covariance)
     section = camera_section(Camera(sensor, interior, jax.tree.map(lambda _: FIXED, interior), known, reservation))
     for parameter in () if known is None else known.parameters:
@@ -235,9 +235,9 @@ def write_block_camera(
 
 
 def read_results(source: CameraSource) -> CameraFile:
-    """Read a camera of interior.csv with the covariance from its sigmas and correlation.csv.
+    """Read a camera of interior.csv, and its covariance from sigmas and correlation.csv.
 
-    Model and sensor are those of summary.json beside it, or of `source.block`.
+    Model and sensor are read from summary.json in the same folder, or from `source.block`.
     """
     summary = read_summary(source.path.parent)
     if summary.get("converged") is False:
@@ -273,7 +273,7 @@ def read_results(source: CameraSource) -> CameraFile:
 
 
 def _covariance(source: CameraSource, camera: str, names: tuple[str, ...], sigma: np.ndarray) -> np.ndarray | None:
-    """sigma_i rho_ij sigma_j, zero for fixed parameters; None without estimates or without correlation.csv."""
+    """Return sigma_i rho_ij sigma_j, zero for fixed parameters; None without estimates or without correlation.csv."""
     path = source.path.with_name("correlation.csv")
     free = [n for n, s in zip(names, sigma, strict=True) if s > 0]
     if not free or not path.is_file():
@@ -297,7 +297,7 @@ def _covariance(source: CameraSource, camera: str, names: tuple[str, ...], sigma
 
 
 def _described(source: CameraSource, camera: str) -> tuple[Sensor, InteriorOrientation]:
-    """Sensor and model (zeros for numbers) of a camera of the results."""
+    """Return sensor and camera model of a camera of the results, ignoring parameter values."""
     if source.block is not None:
         path = source.block / TOML if source.block.is_dir() else source.block
         cameras = read_settings(read_toml(path), path.name).cameras

@@ -17,13 +17,13 @@ from jaxphoto.io.photograph_metadata import TAG, Exif, number, open_picture, rea
 from jaxphoto.writing import input_file
 
 CONDITIONS = "conditions.csv"
-# Tags of EXIF 2.31 that Pillow does not name.
+# Tags of EXIF 2.31 without a name in Pillow.
 _TEMPERATURE, _HUMIDITY, _PRESSURE = 0x9400, 0x9401, 0x9402
 _TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)")
 
 
 def conditions_of(path: Path, used: bool = True) -> Conditions:
-    """Read the conditions of one photograph; damaged EXIF has none."""
+    """Read the conditions of one photograph; fields are empty if its EXIF is damaged."""
     known = Conditions(path.stem, path.name, input_file(path).sha256, used)
     try:
         with open_picture(path) as picture:
@@ -71,17 +71,17 @@ def _time(shot: Any) -> str:
 
 
 def marked(conditions: Sequence[Conditions], used: Collection[str]) -> list[Conditions]:
-    """Return the conditions, with `used` set for the images `used` of a block."""
+    """Set `used` of each photograph: True for the images `used` of a block."""
     return [one._replace(used=one.image in used) for one in conditions]
 
 
 def write_conditions(conditions: Sequence[Conditions], folder: Path, used: Collection[str]) -> None:
-    """Write conditions.csv, one row per photograph; `used` are the images of the block."""
+    """Write conditions.csv, one row per photograph; `used` lists the images of the block."""
     pd.DataFrame(marked(conditions, used), columns=Conditions._fields).to_csv(folder / CONDITIONS, index=False)
 
 
 def read_conditions(path: Path) -> list[Conditions]:
-    """Read conditions.csv. Raises InputError for a file without its columns or photographs."""
+    """Read conditions.csv. Raises InputError for missing columns or an empty table."""
     try:
         table = pd.read_csv(path, dtype=str, keep_default_na=False)
         numbers = {name: pd.to_numeric(table[name]) for name in NUMBERS if name in table}

@@ -1,6 +1,6 @@
-"""Tables whose columns are named in the words of many programs: control points, marks and exposures.
+"""Tables with column names of other programs: control points, image marks and exposures.
 
-Cells are separated by tabs, semicolons, commas or blanks; header words count in any case, order and unit.
+Cells are separated by tabs, semicolons, commas or blanks. Column names are matched ignoring case, order and unit.
 Source: Agisoft Metashape User Manual, "Reference pane"; Pix4D documentation, "Tie points import format".
 """
 
@@ -15,7 +15,7 @@ from jaxphoto.errors import InputError, RowError, quoted
 from jaxphoto.io.text_tables import LARGEST, finite
 
 SYSTEM = re.compile(r"EPSG:\d|\+proj=|WGS84\s+UTM\s", re.IGNORECASE)
-"""The first line of a file of OpenDroneMap, which names its coordinate system."""
+"""First line of an OpenDroneMap file, which names its coordinate system."""
 PLACE = {
     "x": ("x", "easting", "east", "e", "longitude", "lon", "long"),
     "y": ("y", "northing", "north", "n", "latitude", "lat"),
@@ -31,29 +31,29 @@ PLACE = {
         "accuracy horizontal", "horizontal accuracy",
     ),
 }  # fmt: skip
-"""Words for coordinates and their standard deviations."""
+"""Column names of coordinates and their standard deviations."""
 _UNIT = re.compile(r"\s*[\[(][^\])]*[\])]|\s+m$|\s+deg$")
 _LONGEST_WORD = 60
 
 Columns = dict[str, int]
-"""The place of each column by its meaning."""
+"""Index of each column, by its meaning."""
 
 
 class Cells(NamedTuple):
-    """The cells of the rows of one file."""
+    """Cells of the rows of a file."""
 
     file: str
     records: list[list[str]]
     rows: list[int]
     called: str = "row"
-    """The file's word for a row."""
+    """Word for a row in messages."""
 
     def place(self, k: int) -> str:
         """Return file and row for messages."""
         return f"{self.file}, {self.called} {self.rows[k]}"
 
     def bad(self, k: int, message: str) -> RowError:
-        """Return an error about one row."""
+        """Return an error about row `k`."""
         return RowError(f"{self.place(k)}: {message}", [self.rows[k]])
 
     def check(self, valid: Sequence[bool] | np.ndarray, message: Callable[[int], str]) -> None:
@@ -67,7 +67,7 @@ class Cells(NamedTuple):
         return InputError(f"{self.file}: {message}")
 
     def number(self, k: int, column: int, name: str) -> float:
-        """Return the finite number in a cell."""
+        """Parse a finite number. Raise RowError for other cells."""
         value = finite(self.records[k][column])
         if value is None:
             cell = quoted(self.records[k][column])
@@ -75,11 +75,11 @@ class Cells(NamedTuple):
         return value
 
     def height(self, k: int, column: int) -> float:
-        """Return the number in a cell, NaN if it is empty or nan."""
+        """Parse a height; NaN if the cell is empty or nan."""
         return np.nan if self.records[k][column].lower() in ("", "nan") else self.number(k, column, "the height")
 
     def sigma(self, k: int, column: int | None, name: str) -> float:
-        """Return a standard deviation, NaN if column or cell is missing."""
+        """Parse a standard deviation; NaN if column or cell is missing."""
         if column is None or len(self.records[k]) <= column or not self.records[k][column]:
             return np.nan
         value = self.number(k, column, name)
@@ -89,7 +89,7 @@ class Cells(NamedTuple):
 
 
 def columns_of(header: Sequence[str], words: Mapping[str, tuple[str, ...]]) -> Columns:
-    """Return the first column for each meaning; a column has one meaning only."""
+    """Return the first matching column of each meaning; a column has one meaning only."""
     cells = [header_words(cell) for cell in header]
     columns: Columns = {}
     for meaning, names in words.items():
@@ -100,12 +100,12 @@ def columns_of(header: Sequence[str], words: Mapping[str, tuple[str, ...]]) -> C
 
 
 def in_degrees(header: Sequence[str], columns: Columns) -> bool:
-    """Return True if the header calls the first two coordinates longitude and latitude."""
+    """Return True if the header names longitude or latitude."""
     return not {"longitude", "lon", "long", "latitude", "lat"}.isdisjoint(header_words(header[columns["x"]]))
 
 
 def header_words(cell: str) -> list[str]:
-    """Return a header cell without its unit, and its words on both sides of a slash."""
+    """Return a header cell without its unit, followed by its words on both sides of a slash."""
     if len(cell) > _LONGEST_WORD:
         return []
     text = re.sub(r"[\s_]+", " ", cell.strip().lstrip("#").strip().lower())
@@ -119,7 +119,7 @@ def separator_of(line: str) -> str:
 
 
 def split_row(file: str, line: str, row: int, separator: str) -> list[str]:
-    """Return the cells of a row. Raise RowError for quotation marks that do not pair and rows that are too long."""
+    """Split a row into cells. Raise RowError for unpaired quotation marks."""
     try:
         (cells,) = (
             [line.split()]
@@ -132,7 +132,7 @@ def split_row(file: str, line: str, row: int, separator: str) -> list[str]:
 
 
 def with_points(cells: Cells, separator: str, *text: int) -> Cells:
-    """Return cells with decimal points for decimal commas, except in the columns `text`."""
+    """Replace decimal commas by points, except in the columns `text`."""
     if separator == ",":
         return cells
     records = [[c if k in text else c.replace(",", ".") for k, c in enumerate(row)] for row in cells.records]

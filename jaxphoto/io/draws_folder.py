@@ -1,6 +1,6 @@
-"""Monte Carlo draws on disk: Parquet parts during a run, one file afterwards.
+"""Monte Carlo draws on disk: Parquet parts during a run, then one file.
 
-Parts are written atomically: an interrupted run resumes after its last part and gives the same file.
+Parts are written atomically. An interrupted run resumes after its last part and yields an identical file.
 """
 
 import contextlib
@@ -27,7 +27,8 @@ _RUN, _PARTS, DRAWS = "run.json", "parts", "draws.parquet"
 class DrawsFolder:
     """Folder of one run: settings, parts, and the file of all draws.
 
-    `settings` are all that the draws depend on. Raises InputError if the folder holds another run or other files.
+    `settings` contains every input of the draws. Raises InputError if the folder contains a different run or other
+    files.
     """
 
     def __init__(self, directory: Path, settings: dict, draws: int, per_part: int):
@@ -58,7 +59,7 @@ class DrawsFolder:
 
     @property
     def next_part(self) -> int:
-        """Index of the first missing part. Raises InputError for a damaged one."""
+        """Index of the first missing part. Raises InputError if a part is damaged."""
         k = 0
         while self._part(k).is_file():
             with _reading(self._part(k)):
@@ -73,7 +74,7 @@ class DrawsFolder:
 
     @contextlib.contextmanager
     def alone(self) -> Iterator[None]:
-        """Lock the folder against other processes. Raises InputError if another one draws into it."""
+        """Lock the folder against other processes. Raises InputError if another run uses it."""
         with locked(self.directory / _PARTS) as own:
             if own is False:
                 raise InputError(f"another run is drawing into {self.directory}: wait for it, or name a new folder")
@@ -82,7 +83,7 @@ class DrawsFolder:
     def write_part(self, k: int, table: pd.DataFrame) -> None:
         """Write the draws of part `k`."""
         with whole_file(self._part(k)) as work:
-            # Without pandas' metadata, which contains versions.
+            # Remove pandas' metadata: they contain versions.
             arrow = pa.Table.from_pandas(table, preserve_index=False).replace_schema_metadata(None)
             pq.write_table(arrow, work, write_page_checksum=True)
 
@@ -100,7 +101,7 @@ class DrawsFolder:
                     writer.write_table(pq.read_table(part, page_checksum_verification=True))
 
     def tidy(self) -> None:
-        """Remove the parts after they were joined."""
+        """Remove the parts after joining."""
         for k in range(self.n_parts):
             self._part(k).unlink(missing_ok=True)
         clear_leftovers(self.directory / _PARTS)
@@ -108,12 +109,12 @@ class DrawsFolder:
             (self.directory / _PARTS).rmdir()
 
     def columns(self) -> list[str]:
-        """Names of the columns."""
+        """Read the names of the columns."""
         with _reading(self._files[0]):
             return pq.read_schema(self._files[0]).names
 
     def read(self, names: list[str]) -> dict[str, np.ndarray]:
-        """Read columns of all draws so far."""
+        """Read columns of all draws written so far."""
         tables = []
         for file in self._files:
             with _reading(file):
@@ -123,7 +124,7 @@ class DrawsFolder:
 
     @property
     def _files(self) -> list[Path]:
-        """The file of all draws, or the parts so far."""
+        """File of all draws, or the parts written so far."""
         return [self.directory / DRAWS] if self.done else [self._part(k) for k in range(self.next_part)]
 
     def _part(self, k: int) -> Path:
@@ -131,7 +132,7 @@ class DrawsFolder:
 
 
 def digest_of(block: Block) -> str:
-    """SHA-256 of the content of a block."""
+    """Return the SHA-256 hash of a block."""
     arrays, structure = jax.tree.flatten(block)
     digest = hashlib.sha256(repr(structure).encode())
     for array in arrays:
@@ -140,7 +141,7 @@ def digest_of(block: Block) -> str:
 
 
 def check_place(directory: Path) -> None:
-    """Raise InputError if no run can be written: a file, or a folder with other files."""
+    """Raise InputError if no run can be written: `directory` is a file, or contains other files."""
     for path in (directory, *directory.parents):
         if path.is_file():
             raise InputError(f"{path} is a file: name a folder for the draws")

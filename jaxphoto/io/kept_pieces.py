@@ -1,7 +1,7 @@
-"""Checkpoints of a long run: intermediate results in a folder beside its output, from which a later run resumes.
+"""Checkpoints of a long run: intermediate results in a folder next to its output, from which a later run resumes.
 
-A piece is a set of arrays under a name that is a hash of all its inputs. It is written atomically and begins with the
-SHA-256 of its content; a damaged piece counts as missing and is computed again.
+A checkpoint is a set of arrays. Its name is a hash of all its inputs. It is written atomically and starts with the
+SHA-256 of its content; a damaged checkpoint is treated as missing and recomputed.
 """
 
 import contextlib
@@ -19,14 +19,14 @@ from jaxphoto.writing import check_room, clear_leftovers, is_place, locked, whol
 
 _MARKER, _SUFFIX = "kept.txt", ".piece"
 _SAYS = "What a run of jaxphoto has worked out so far. The same command goes on from here, and removes it at its end.\n"
-# Maximum size of a piece in bytes: some million features.
+# Maximum size of a checkpoint in bytes, sufficient for some million features.
 _MOST = 1_000_000_000
 
 
 class KeptPieces:
-    """The pieces in `folder`, which is created if missing.
+    """Checkpoints in `folder`, which is created if missing.
 
-    Raises InputError if `folder` is a file or holds something else.
+    Raises InputError if `folder` is a file or contains other files.
     """
 
     def __init__(self, folder: Path):
@@ -41,7 +41,7 @@ class KeptPieces:
         return self._path(name).is_file()
 
     def read(self, name: str) -> dict[str, np.ndarray] | None:
-        """Read the arrays of a piece; None if it is missing or damaged."""
+        """Read the arrays of a checkpoint; None if it is missing or damaged."""
         path = self._path(name)
         try:
             if path.stat().st_size > _MOST:
@@ -56,7 +56,7 @@ class KeptPieces:
             return dict(arrays)
 
     def write(self, name: str, **arrays: np.ndarray) -> None:
-        """Write `arrays` as the piece `name`."""
+        """Write `arrays` as the checkpoint `name`."""
         packed = io.BytesIO()
         np.savez(packed, **arrays)  # type: ignore[arg-type]
         content = packed.getvalue()
@@ -65,9 +65,9 @@ class KeptPieces:
 
     @contextmanager
     def alone(self) -> Iterator["KeptPieces"]:
-        """Lock the pieces against other processes; an empty folder is removed at the end.
+        """Lock the checkpoints against other processes; remove the folder at the end if it is empty.
 
-        Raises InputError if another process uses them.
+        Raises InputError if another process uses it.
         """
         with locked(self.folder) as own:
             if own is False:
@@ -83,7 +83,7 @@ class KeptPieces:
                     self.remove()
 
     def remove(self) -> None:
-        """Remove all pieces, and the folder if nothing else is in it."""
+        """Remove all checkpoints, and the folder if it contains no other files."""
         for path in self.folder.glob(f"*{_SUFFIX}"):
             path.unlink(missing_ok=True)
         clear_leftovers(self.folder)
@@ -100,13 +100,13 @@ class KeptPieces:
 
 
 def beside(out: Path) -> Path:
-    """Folder of the pieces of a run that writes to `out`."""
+    """Return the checkpoint folder of a run that writes to `out`."""
     target = Path(os.path.realpath(out))
     return target.with_name(f"{target.name}.progress")
 
 
 def check_pieces(folder: Path) -> None:
-    """Raise InputError if `folder` is a file or holds something else."""
+    """Raise InputError if `folder` is a file or contains other files."""
     if os.path.lexists(folder) and not folder.is_dir():
         raise InputError(f"{folder} is a file, where what is worked out is kept meanwhile: move it away")
     known = not folder.is_dir() or (folder / _MARKER).is_file()
@@ -119,7 +119,7 @@ def check_pieces(folder: Path) -> None:
 
 
 def name_of(*content: object) -> str:
-    """Name of a piece: a hash of `content` (bytes, text and numbers)."""
+    """Return the name of a checkpoint: a hash of `content` (bytes, text and numbers)."""
     digest = hashlib.sha256()
     for part in content:
         packed = b"bytes" + part if isinstance(part, bytes) else repr(part).encode()

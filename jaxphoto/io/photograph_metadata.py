@@ -1,4 +1,4 @@
-"""Metadata of photographs: EXIF by Pillow, and the XMP packets of drones.
+"""Metadata of photographs: EXIF, read by Pillow, and the XMP packets of drones.
 
 | make | namespace | position | attitude |
 | --- | --- | --- | --- |
@@ -31,12 +31,12 @@ from jaxphoto.georeferencing.exposure_times import Taken, gps_seconds
 from jaxphoto.georeferencing.gps import Fix, Gps, Heights
 
 TAG = ExifTags.Base
-# Attributes or elements. Cameras write packets that are not well-formed XML, or cut off: no XML parser reads these.
+# XMP attributes or elements. Search by regular expressions: some packets are truncated or not well-formed XML.
 _FIELD = re.compile(
     r"(?<![/\w-])(drone-(?:dji|autel|parrot|skydio)|drone|[Cc]amera|CRSInfo):(\w+)"
     r"\s*(?:=\s*[\"']([^\"']{0,100})[\"']|>([^<]{0,100})<)"
 )
-# Skydio writes the angles in several frames.
+# Skydio writes angles in several frames: use the north, east, down frame.
 _SKYDIO = re.compile(
     r"<drone-skydio:CameraOrientationNED\b(.{0,2000}?)(?:/>|</drone-skydio:CameraOrientationNED)", re.DOTALL
 )
@@ -46,11 +46,11 @@ _ANGLES = ("Yaw", "Pitch", "Roll")
 
 @contextmanager
 def open_picture(path: Path) -> Iterator[Image.Image]:
-    """Open a picture of any size: Pillow refuses more than 179 million pixels, which aerial cameras have."""
+    """Open a picture of any size; Pillow's limit of 179 million pixels is too small for aerial cameras."""
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
         with warnings.catch_warnings():
-            # About damaged EXIF.
+            # Ignore Pillow's warnings about damaged EXIF.
             warnings.simplefilter("ignore")
             with Image.open(path) as picture:
                 yield picture
@@ -59,13 +59,13 @@ def open_picture(path: Path) -> Iterator[Image.Image]:
 
 
 class Exif(NamedTuple):
-    """The tags of a photograph; empty where its EXIF is missing or damaged."""
+    """Metadata of a photograph; empty if its EXIF is missing or damaged."""
 
     top: Mapping[int, Any]
     shot: Mapping[int, Any]
     gps: Mapping[int, Any]
     xmp: Mapping[str, str]
-    """Attributes of drones by `namespace:name`."""
+    """XMP attributes of drones, by `namespace:name`."""
 
 
 def read_exif(picture: Image.Image) -> Exif:
@@ -80,7 +80,7 @@ def read_exif(picture: Image.Image) -> Exif:
 
 
 def number(value: Any, positive: bool = False) -> float | None:
-    """Return a finite number of EXIF or XMP (Parrot writes fractions); None for anything else."""
+    """Parse a finite number of EXIF or XMP (Parrot writes fractions); None for other values."""
     try:
         result = float(Fraction(value)) if isinstance(value, str) and "/" in value else float(value)
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
@@ -89,12 +89,12 @@ def number(value: Any, positive: bool = False) -> float | None:
 
 
 def text(value: Any) -> str:
-    """Return a text of EXIF without padding, "" for anything else."""
+    """Normalise whitespace in an EXIF text; "" for other values."""
     return " ".join(value.replace("\0", " ").split()) if isinstance(value, str) else ""
 
 
 def xmp_fields(packet: Any) -> dict[str, str]:
-    """Return the attributes of drones in an XMP packet by `namespace:name`."""
+    """Return the attributes of drones in an XMP packet, by `namespace:name`."""
     if isinstance(packet, bytes):
         packet = packet.decode("utf-8", "replace")
     if not isinstance(packet, str):
@@ -113,29 +113,29 @@ def _fields(packet: str) -> dict[str, str]:
 
 
 class DroneRecord(NamedTuple):
-    """Position and attitude of an XMP packet; None where it has none."""
+    """Position and attitude in an XMP packet; None if missing."""
 
     latitude_longitude_deg: tuple[float, float] | None = None
     altitude_m: float | None = None
     above_takeoff_m: float | None = None
     heights: Heights = "unknown"
-    """Reference of `altitude_m`, or of the height of EXIF if the packet has none."""
+    """Reference of `altitude_m`, or of the EXIF height if the packet has no height."""
     sigma_m: tuple[float, float, float] | None = None
-    """East, north and up."""
+    """Standard deviations east, north, up (m)."""
     fix: Fix = "unknown"
     attitude: CameraAttitude | None = None
     aircraft_deg: tuple[float, float, float] | None = None
-    """Roll, pitch and yaw."""
+    """Roll, pitch, yaw of the aircraft (degrees)."""
     utc: datetime | None = None
     """Time of exposure."""
 
 
 def drone_record(fields: Mapping[str, str]) -> DroneRecord:
-    """Position and attitude in the attributes of a packet."""
+    """Return position and attitude from the attributes of a packet."""
     value = lambda name: number(fields.get(name, ""))  # noqa: E731
     space = next((s for s in _DJI_LIKE if any(key.startswith(f"{s}:") for key in fields)), "")
     flag = value(f"{space}:RtkFlag")
-    # Without corrections, heights are barometric or mixed, and standard deviations are not those of the position.
+    # Without RTK corrections, the height reference is unknown, and stated sigmas do not apply to the position.
     corrected = fields.get(f"{space}:AltitudeType") == "RtkAlt" or (flag is not None and flag > 0)
     sigma = None if flag == 0 else _three([value(f"{space}:RtkStd{axis}") for axis in ("Lon", "Lat", "Hgt")], 0.0)
     plan, height = value("Camera:GPSXYAccuracy"), value("Camera:GPSZAccuracy")
@@ -147,7 +147,7 @@ def drone_record(fields: Mapping[str, str]) -> DroneRecord:
         heights = "geoid"
     above = "drone-skydio" if value("drone-skydio:AbsoluteAltitude") is not None else space
     try:
-        # "2023-04-05T06:07:08.123456", or with a blank.
+        # Format: "2023-04-05T06:07:08.123456", or a blank in place of T.
         utc = datetime.fromisoformat(fields.get(f"{space}:UTCAtExposure", "").rstrip("Z")).replace(tzinfo=None)
     except ValueError:
         utc = None
@@ -165,7 +165,7 @@ def drone_record(fields: Mapping[str, str]) -> DroneRecord:
 
 
 def fix_of(flag: float | None) -> Fix:
-    """Kind of solution of DJI's flag: 16 single, 32 to 49 float, 50 and more fixed."""
+    """Convert DJI's RTK flag to the kind of solution: 16 single, 32 to 49 float, 50 and more fixed."""
     if flag is None or not flag > 0:
         return "unknown"
     return "single" if flag < 32 else "float" if flag < 50 else "fixed"
@@ -199,15 +199,15 @@ def _attitude(value: Callable[[str], float | None], space: str) -> CameraAttitud
 
 
 def _three(values: Sequence[float | None], above: float = -math.inf) -> tuple[float, float, float] | None:
-    """Return the three numbers if all exist and exceed `above`."""
+    """Return the three values if all exist and exceed `above`, else None."""
     a, b, c = values
     return None if a is None or b is None or c is None or min(a, b, c) <= above else (a, b, c)
 
 
 def gps_position(tags: Mapping[int, Any], drone: DroneRecord) -> Gps | None:
-    """Position of EXIF, else of the drone's packet, with the height and accuracy of the latter.
+    """Return the position from EXIF, else from the drone's packet, with height and accuracy from the packet.
 
-    Latitudes beyond the poles stay: `georeferencing.recorded_positions` recognises exchanged coordinates.
+    Latitudes beyond the poles are retained: `georeferencing.recorded_positions` detects exchanged coordinates.
     """
     try:
         latitude, longitude = (
@@ -228,9 +228,9 @@ def gps_position(tags: Mapping[int, Any], drone: DroneRecord) -> Gps | None:
 
 
 def time_of_exposure(shot: Mapping[int, Any], gps: Mapping[int, Any], utc: datetime | None) -> Taken | None:
-    """Time of exposure: UTC of a drone's packet, else DateTimeOriginal; None without either.
+    """Return the time of exposure: UTC from a drone's packet, else DateTimeOriginal; None if both are missing.
 
-    The offset of the camera's clock to UTC is OffsetTimeOriginal, else that to the receiver's time of the position.
+    The UTC offset of the camera's clock is OffsetTimeOriginal, else its difference from the receiver's UTC time.
     """
     if utc is not None:
         return Taken(gps_seconds(utc), 1e-6 if utc.microsecond else 1.0, 0.0)
@@ -254,5 +254,5 @@ def _ahead_of_utc(shot: Mapping[int, Any], gps: Mapping[int, Any], clock: float)
     except (KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
     ahead = clock - (day + 3600 * hour + 60 * minute + second)
-    # Receivers note the time of their last position: only the time zone is certain.
+    # Receivers store the time of their last position: determine only the time zone.
     return 900.0 * round(ahead / 900.0) if abs(ahead) < 15 * 3600 else None

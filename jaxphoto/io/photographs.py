@@ -1,6 +1,6 @@
-"""Photographs: metadata of their files, the initial interior orientation, and the valid ones of a folder.
+"""Photographs: metadata of their files, initial interior orientation, and selection of the valid ones of a folder.
 
-A picture is taken as stored, which is as the sensor saw it: the EXIF orientation does not rotate it.
+Pictures are used as stored, in sensor orientation: the EXIF orientation flag is not applied.
 """
 
 import math
@@ -32,9 +32,9 @@ from jaxphoto.procedures.known_lens import KnownLens
 from jaxphoto.writing import MARKER, input_file
 
 _DIAGONAL_35_MM = math.hypot(36, 24)
-# Some cameras write 1 or 65535 if the focal length on film is unknown.
+# Valid range (mm) of the 35 mm equivalent focal length; some cameras write 1 or 65535 if it is unknown.
 _FILM_MM = (5.0, 5000.0)
-# Without EXIF: c over the longer side (a field of 45 degrees), and its relative sigma (fields of 20 to 80 degrees).
+# Without EXIF: c / longer side (field of view 45 degrees), and its relative sigma (fields of 20 to 80 degrees).
 _USUAL_C, _USUAL_C_SIGMA = 1.2, 0.5
 _NOMINAL_PIXEL_MM = 0.005
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
@@ -44,7 +44,7 @@ _RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".rw2", ".orf", ".raf", ".srw", 
 
 
 class Photograph(NamedTuple):
-    """Metadata of a photograph; None if its EXIF has none."""
+    """Metadata of a photograph; None if missing in EXIF."""
 
     name: str
     """File name without extension: the id of the image."""
@@ -55,35 +55,35 @@ class Photograph(NamedTuple):
     model: str | None = None
     focal_length_mm: float | None = None
     focal_length_35mm_mm: float | None = None
-    """Focal length with the same field on film of 36 mm x 24 mm."""
+    """Focal length with the same field of view on 36 mm x 24 mm film."""
     sensor_width_mm: float | None = None
-    """From the focal plane resolution and the size in EXIF."""
+    """Sensor width from the focal plane resolution and the image size in EXIF."""
     orientation: int = 1
     """EXIF orientation flag, 1 to 8."""
     gps: Gps | None = None
     above_takeoff_m: float | None = None
     attitude: CameraAttitude | None = None
     aircraft_deg: tuple[float, float, float] | None = None
-    """Roll, pitch and yaw of the aircraft, if its camera is in a gimbal."""
+    """Roll, pitch and yaw of the aircraft (degrees), if the camera is on a gimbal."""
     taken: Taken | None = None
     serial: str | None = None
-    """Serial number of the body."""
+    """Serial number of the camera body."""
     digital_zoom: float = 1.0
 
 
 class CameraStart(NamedTuple):
-    """The camera of photographs before a calibration."""
+    """Camera of photographs before calibration."""
 
     sensor: Sensor
     interior: InteriorOrientation
     origin: str
-    """Origin of pixel size and principal distance, a sentence."""
+    """Sentence about the origin of pixel size and principal distance."""
     c_rounding: float = 0.0
-    """Relative standard deviation of c, in pixels, due to rounding."""
+    """Relative standard deviation of c, in pixels, due to rounding in EXIF."""
 
 
 def photographs(paths: Sequence[str | Path]) -> list[Photograph]:
-    """Read the photographs `paths`. Raises InputError for missing files, other files than pictures, and equal names."""
+    """Read the photographs `paths`. Raises InputError for missing files, other formats, and duplicate names."""
     read: dict[str, Photograph] = {}
     for path in map(Path, paths):
         photograph = read_photograph(path)
@@ -94,7 +94,7 @@ def photographs(paths: Sequence[str | Path]) -> list[Photograph]:
 
 
 def read_photograph(path: Path) -> Photograph:
-    """Read the metadata of a photograph. Raises InputError for a file that is missing or not a picture."""
+    """Read the metadata of a photograph. Raises InputError for a missing file or another format."""
     if path.is_dir():
         raise InputError(f"{path} is a folder; name its photographs, for example {path}/*.jpg")
     if not path.is_file():
@@ -103,7 +103,7 @@ def read_photograph(path: Path) -> Photograph:
     try:
         with open_picture(path) as picture:
             return _photograph(path, *picture.size, read_exif(picture))
-    # Pillow raises many errors for damaged bytes.
+    # Pillow raises many kinds of exceptions for damaged bytes.
     except Exception as error:
         raise InputError(f"{path}: this is no picture that can be read; give a TIFF, PNG or JPEG") from error
 
@@ -131,13 +131,13 @@ def _photograph(path: Path, width_px: int, height_px: int, exif: Exif) -> Photog
         drone.aircraft_deg,
         time_of_exposure(shot, exif.gps, drone.utc),
         text(shot.get(TAG.BodySerialNumber)) or serial or None,
-        # 0 means no zoom.
+        # Zero means no digital zoom.
         number(shot.get(TAG.DigitalZoomRatio), positive=True) or 1.0,
     )
 
 
 def _sensor_width(shot: Mapping, width_px: int, height_px: int) -> float | None:
-    """Width (mm) of the size in EXIF at the focal plane resolution; None for a picture that was cropped since."""
+    """Return the sensor width (mm) from image size and focal plane resolution in EXIF; None for cropped pictures."""
     resolution = number(shot.get(TAG.FocalPlaneXResolution), positive=True)
     unit = _UNIT_MM.get(shot.get(TAG.FocalPlaneResolutionUnit, 2))
     if resolution is None or unit is None:
@@ -151,14 +151,14 @@ def _sensor_width(shot: Mapping, width_px: int, height_px: int) -> float | None:
 def sensor_and_interior(
     photographs: Sequence[Photograph], pixel_mm: float | None = None, c_mm: float | None = None
 ) -> CameraStart:
-    """Return the camera of `photographs`, all of one: from the arguments, else from EXIF.
+    """Return the initial camera of `photographs`, which share one camera, from the arguments, else from EXIF.
 
-    The pixel size is that of the focal plane resolution, or follows from the focal length f and that of the same field
-    on film, f35: the diagonal of the sensor is 43.27 mm f / f35. The principal distance is f; with a given pixel size
-    it follows from f35 if possible, which resizing does not change. Without EXIF it is 1.2 times the longer side. The
-    distortion is zero.
+    The pixel size follows from the focal plane resolution, or from the focal length f and the 35 mm equivalent focal
+    length f35: the sensor diagonal is 43.27 mm f / f35. The principal distance is f. With a given pixel size it follows
+    from f35 if possible, which is independent of resizing. Without EXIF it is 1.2 times the longer side. The distortion
+    is zero.
 
-    Raises InputError for no photographs, for different cameras (`ONE_CAMERA`), and for c_mm without a pixel size.
+    Raises InputError without photographs, for different cameras (`ONE_CAMERA`), and for c_mm without a pixel size.
     """
     if not photographs:
         raise InputError("no photographs; name the files of one camera")
@@ -195,7 +195,7 @@ def sensor_and_interior(
         c = f35 / _DIAGONAL_35_MM * diagonal_px * pixel
         c_origin, rounding = f"c from {f35:g} mm on film of 36 mm x 24 mm (EXIF)", _rounding(f35)
     elif f and not assumed:
-        # A pixel size from both focal lengths is as precise as the one on film, in whole millimetres.
+        # A pixel size computed from f and f35 has the precision of f35, which is rounded to millimetres.
         c, c_origin = f, "c is the focal length of EXIF"
         rounding = _rounding(f if first.sensor_width_mm or pixel_mm is not None else f35 or f)
     else:
@@ -207,13 +207,13 @@ def sensor_and_interior(
 
 
 def _rounding(mm: float) -> float:
-    """Relative standard deviation of a focal length, uniform within its last digit."""
+    """Return the relative standard deviation of a focal length that is rounded to its last digit."""
     step = next((step for step in (1.0, 0.1) if abs(mm / step - round(mm / step)) < 1e-6), 0.01)
     return step / math.sqrt(12) / mm
 
 
 def known_lens(photographs: Sequence[Photograph], camera: CameraStart, distortion: AbstractDistortion) -> KnownLens:
-    """Prior information about the lens by make and model, at `camera` without distortion."""
+    """Return prior information about the lens by make and model, at `camera` without distortion."""
     first = next((p for p in photographs if p.make or p.model), photographs[0])
     nominal = InteriorOrientation(camera.interior.c, 0.0, 0.0, distortion)
     return KnownLens(nominal, lens_prior(first.make, first.model), camera.c_rounding)
@@ -223,7 +223,7 @@ ONE_CAMERA: list[tuple[str, Callable[[Photograph], Hashable], str]] = [
     ("size", lambda p: f"{p.width_px} x {p.height_px} px", "give those of one camera, neither cropped nor resized"),
     (
         "orientation flag",
-        # A picture that is to be rotated by 90 degrees and has the size of the others was not rotated yet.
+        # Ignore flags of a rotation by 90 degrees: the picture has the size of the others, so it is not rotated yet.
         lambda p: None if p.orientation > 4 and p.width_px != p.height_px else p.orientation,
         "a program may have rotated some: if all are as the sensor saw them, set one flag (exiftool -n -Orientation=1 "
         "FILES), else omit the rotated ones",
@@ -237,11 +237,11 @@ ONE_CAMERA: list[tuple[str, Callable[[Photograph], Hashable], str]] = [
 
 
 def valid_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], dict[str, str]]:
-    """Return the photographs of one camera in files and folders `paths`, and the reason for each skipped file.
+    """Read the photographs of one camera in `paths`; return them, and the reason for each skipped file.
 
-    Skipped are files that are not pictures or cut off, second files of one name, identical and edited copies, and those
-    that differ from most in a property of `ONE_CAMERA`. Raises InputError for a path that does not exist, and if no
-    photograph is left.
+    `paths` are files and folders. Skipped files: other formats, truncated files, duplicate names, identical and edited
+    copies, and files that differ from the majority in a property of `ONE_CAMERA`. Raises InputError for a missing path,
+    and if all files are skipped.
     """
     files = picture_files(paths)
     if missing := [file for file in files if not (file.is_file() or file.is_symlink())]:
@@ -256,7 +256,7 @@ def valid_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
             skipped[str(file)] = str(error)
         else:
             identical.setdefault(input_file(file).sha256, []).append(photograph)
-    # Of copies, the usual name is that of the photograph: "DJI_0002", not "DJI_0002 (1)".
+    # Among identical files, prefer the most frequent form of name: "DJI_0002", not "DJI_0002 (1)".
     series = Counter(_series(file.stem) for file in files)
     by_name: dict[str, Photograph] = {}
     originals = [min(copies, key=lambda p: (-series[_series(p.name)], len(p.name))) for copies in identical.values()]
@@ -287,7 +287,7 @@ def valid_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
 
 
 def skipped_messages(skipped: Mapping[str, str]) -> list[str]:
-    """Return the reasons for skipped files, one message for more than three files with the same reason."""
+    """Return the reasons for skipped files; more than three files with one reason share one message."""
     files: dict[str, list[str]] = {}
     for path, reason in skipped.items():
         files.setdefault(reason.removeprefix(f"{path}: "), []).append(path)
@@ -301,7 +301,7 @@ def skipped_messages(skipped: Mapping[str, str]) -> list[str]:
 
 
 def picture_files(paths: Sequence[str | Path]) -> list[Path]:
-    """Return the files among `paths`, and all pictures of the folders among them, by name; hidden files are skipped."""
+    """List the files among `paths`, and the pictures in the folders among them, by name; hidden files are skipped."""
     files = []
     for path in map(Path, paths):
         inner = sorted(f for f in path.iterdir() if not f.name.startswith(".")) if path.is_dir() else []
@@ -310,7 +310,7 @@ def picture_files(paths: Sequence[str | Path]) -> list[Path]:
 
 
 def skipped_subfolders(paths: Sequence[str | Path]) -> dict[str, str]:
-    """Subfolders with pictures of folders in `paths` that are not in `paths`, with a message each."""
+    """Return subfolders with pictures that are not in `paths`, with a message each."""
     named = {Path(path).resolve() for path in paths}
     return {
         str(inner): f"{inner}: {counted(n, 'picture')} in a folder that is not named; name it, too"
@@ -321,7 +321,7 @@ def skipped_subfolders(paths: Sequence[str | Path]) -> dict[str, str]:
 
 
 def _subfolders(folder: Path) -> list[tuple[Path, int]]:
-    """Subfolders with pictures of cameras, without folders that jaxphoto wrote, and the numbers of pictures."""
+    """Return subfolders with camera pictures and their number of pictures, skipping folders that jaxphoto wrote."""
     counts = []
     for inner in sorted(folder.iterdir()) if folder.is_dir() else ():
         readable = inner.is_dir() and os.access(inner, os.R_OK | os.X_OK) and not inner.name.startswith(".")
@@ -332,7 +332,7 @@ def _subfolders(folder: Path) -> list[tuple[Path, int]]:
 
 
 def _hints(paths: Sequence[str | Path]) -> list[str]:
-    """Messages about subfolders and raw files in folders without pictures."""
+    """Return hints about subfolders and raw files in folders without pictures."""
     folders = [path for path in map(Path, paths) if path.is_dir()]
     inner = [str(path) for folder in folders for path, _ in _subfolders(folder)]
     raw = [file.name for folder in folders for file in folder.iterdir() if file.suffix.lower() in _RAW]
@@ -343,16 +343,16 @@ def _hints(paths: Sequence[str | Path]) -> list[str]:
 
 
 def _series(name: str) -> str:
-    """Return a name without its numbers."""
+    """Replace each run of digits in a name by "#"."""
     return re.sub(r"\d+", "#", name)
 
 
 def _check_complete(file: Path) -> None:
-    """Raise InputError for a JPEG or PNG that is cut off; a TIFF shows it when it is read."""
+    """Raise InputError for a truncated JPEG or PNG; truncated TIFFs are detected on reading."""
     try:
         with open_picture(file) as picture:
             if picture.format == "JPEG":
-                # Decoded at an eighth of its size.
+                # Decode at one eighth of the size.
                 picture.draft("L", (512, 512))
                 picture.load()
             else:

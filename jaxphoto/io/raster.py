@@ -1,4 +1,4 @@
-"""Rasters by rasterio: surface models, hillshades, photographs and orthophotos (docs/clouds.md)."""
+"""Read and write rasters by rasterio: surface models, hillshades, photographs and orthophotos (docs/clouds.md)."""
 
 import warnings
 from collections.abc import Iterator
@@ -29,9 +29,9 @@ _NODATA = -9999.0
 def read_dsm(path: str | Path, epsg: int | None = None) -> tuple[Raster, CoordinateSystem]:
     """Read the surface model in the first band of a raster, in metres, and its coordinate system.
 
-    `epsg` replaces the system of the file. Heights that are not finite are missing. Raises InputError for a file
-    that is not a raster, has no georeferencing, is not north up, is in degrees, has cells that are not square, or no
-    height.
+    `epsg` overrides the system of the file. Heights that are not finite are missing. Raises InputError for a file that
+    is not a raster, is not georeferenced, is not north up, is in degrees, has cells that are not square, or has no
+    heights.
     """
     path = Path(path)
     with _opened(path) as file:
@@ -68,7 +68,7 @@ def write_dsm(path: str | Path, raster: Raster, system: CoordinateSystem = Coord
 
 
 def write_hillshade(path: str | Path, shade: Float[np.ndarray, "rows columns"]) -> None:
-    """Write a hillshade of 0 to 1 as a grey PNG, transparent where it is NaN."""
+    """Write a hillshade (values 0 to 1) as a grey PNG; NaN is transparent."""
     grey = np.rint(255 * np.nan_to_num(shade)).astype(np.uint8)
     alpha = np.where(np.isnan(shade), 0, 255).astype(np.uint8)
     rows, columns = shade.shape
@@ -79,7 +79,7 @@ def write_hillshade(path: str | Path, shade: Float[np.ndarray, "rows columns"]) 
 def read_photograph(path: str | Path, sensor: Sensor) -> np.ndarray:
     """Read the pixels (bands, height, width) of a photograph as stored, without applying its EXIF orientation.
 
-    Raises InputError for a file that is not an image or damaged, or that does not have the size of the sensor.
+    Raises InputError for a file that is damaged, not an image, or not of the sensor's size.
     """
     path = Path(path)
     with _opened(path) as file:
@@ -98,9 +98,9 @@ def write_orthophoto(
     raster: Raster,
     system: CoordinateSystem = CoordinateSystem(),  # noqa: B008
 ) -> None:
-    """Write an orthophoto as GeoTIFF on the cells of `raster`, with a mask of the cells that the image sees."""
+    """Write an orthophoto as GeoTIFF on the cells of `raster`, with a mask of the cells visible in the image."""
     profile = _geotiff(raster, system) | {"dtype": picture.pixels.dtype, "count": len(picture.pixels)}
-    # Predictor 2 is that of integers, 3 that of floats.
+    # TIFF predictors: 2 for integers, 3 for floats.
     profile["predictor"] = 2 if picture.pixels.dtype.kind in "iu" else 3
     if len(picture.pixels) == 3:
         profile["photometric"] = "RGB"
@@ -128,7 +128,7 @@ def _geotiff(raster: Raster, system: CoordinateSystem) -> dict[str, Any]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[rasterio.DatasetReader]:
-    """Open a raster for reading. Raises InputError if there is none, or it is damaged."""
+    """Open a raster for reading. Raises InputError if it is missing or damaged."""
     check_file(path)
     try:
         with _without_georeferencing(), rasterio.open(path) as file:
@@ -140,7 +140,7 @@ def _opened(path: Path) -> Iterator[rasterio.DatasetReader]:
 
 @contextmanager
 def _whole_raster(path: str | Path, **profile: Any) -> Iterator[DatasetWriter]:
-    """Yield a raster to write, which becomes the file `path`; in memory, as GDAL does not report a full disk."""
+    """Yield a raster to write; its file is built in memory, because GDAL does not report a full disk."""
     with _without_georeferencing(), MemoryFile() as memory:
         with memory.open(**profile) as file:
             yield file
@@ -150,7 +150,7 @@ def _whole_raster(path: str | Path, **profile: Any) -> Iterator[DatasetWriter]:
 
 @contextmanager
 def _without_georeferencing() -> Iterator[None]:
-    """Ignore rasterio's warning about photographs and rasters of local frames."""
+    """Suppress rasterio's warning about rasters without georeferencing."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         yield

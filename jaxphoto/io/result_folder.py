@@ -1,7 +1,7 @@
-"""Results of `jaxphoto adjust` or `jaxphoto fly` -> their block with the adjusted values.
+"""Read results of `jaxphoto adjust` or `jaxphoto fly` as a block with adjusted values.
 
-Results have values by ids; image points, cameras of images and the frame are those of the block, which summary.json
-names: beside the result of `adjust`, in the list of parts of a flight.
+Results contain values by id only. Image points, cameras of images and frame are read from the block, which is named in
+summary.json of the result, or in the list of parts of a flight.
 """
 
 import csv
@@ -30,26 +30,26 @@ from jaxphoto.io.text_tables import read_csv
 
 EXTERIOR, POINTS = "exterior.csv", "object_points.csv"
 PHOTOGRAPHS = "photographs.csv"
-"""Names of the photographs of a flight by the ids of images."""
+"""File with the file name of the photograph of each image in a flight."""
 _from_angles = eqx.filter_jit(ExteriorOrientation.from_angles)
 _CURE = "name the block that was adjusted by --block, or adjust again"
 _PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".dng", ".bmp", ".webp", ".jp2")
 
 
 def is_result(folder: Path) -> bool:
-    """Return True for a folder of results of `adjust` or of `fly`."""
+    """Return True for a result folder of `adjust` or `fly`."""
     return (folder / INTERIOR).is_file() or _parts(folder) is not None
 
 
 def adjusted_block(folder: str | Path, block: str | Path | None = None, part: int = 1) -> Block:
-    """Return the block of results with the adjusted cameras, orientations and object points as its start.
+    """Return the block of a result, with the adjusted cameras, orientations and object points as initial values.
 
-    `folder` is that of `jaxphoto adjust --out`, or of `jaxphoto fly`, of which `part` counts the blocks, the largest
-    being 1. `block` is the block folder if the results do not name it, or it was moved. Mounts, strips and other
-    unknowns keep the start values of the block.
+    `folder` is the output folder of `jaxphoto adjust` or `jaxphoto fly`. `part` is the number of the block of a flight;
+    1 is the largest. `block` is the block folder if the result does not name it, or if it was moved. Mounts, strips and
+    other unknowns have the initial values of the block.
 
-    Warns if the verdict is red. Raises InputError for folders without results, of an adjustment that did not converge,
-    or of another block.
+    Warns if the verdict is red. Raises InputError for folders without results, an adjustment that did not converge, or
+    results of a different block.
     """
     result, source = _sources(Path(folder), None if block is None else Path(block), part)
     of = read_block(source)
@@ -68,14 +68,14 @@ def adjusted_block(folder: str | Path, block: str | Path | None = None, part: in
 
 
 def photograph_files(images: Sequence[str], folders: Iterable[Path], flight: Path | None = None) -> dict[str, str]:
-    """Return the names of photographs by the ids of images: pictures in `folders`, else those that a `flight` lists.
+    """Return the photograph's file name of each image: from `folders`, else from the table of a `flight`.
 
-    Raises InputError if two pictures of `folders` would be one image.
+    Raises InputError if two pictures in `folders` belong to one image.
     """
     pictures: dict[str, Path] = {}
     for folder in folders:
         if not folder.is_dir():
-            raise InputError(f"there is no folder {folder}; name that of the photographs")
+            raise InputError(f"folder not found: {folder}; give the folder of the photographs")
         for file in sorted(folder.iterdir()):
             if file.suffix.lower() in _PICTURES and file.stem in set(images):
                 if file.stem in pictures:
@@ -86,13 +86,13 @@ def photograph_files(images: Sequence[str], folders: Iterable[Path], flight: Pat
 
 
 def write_photograph_files(files: Mapping[str, str], flight: Path) -> None:
-    """Write the names of the photographs of a flight by the ids of images."""
+    """Write the photograph's file name of each image of a flight."""
     table = pd.DataFrame({"image": list(files), "file": list(files.values())})
     table.to_csv(flight / PHOTOGRAPHS, index=False, quoting=csv.QUOTE_NONNUMERIC)
 
 
 def _listed(flight: Path) -> dict[str, str]:
-    """Names in the table of a flight, or of the flight around a result."""
+    """Read the photograph table of a flight, or of the flight that contains a result."""
     path = next((p for p in (flight / PHOTOGRAPHS, flight.parent / PHOTOGRAPHS) if p.is_file()), None)
     if path is None:
         return {}
@@ -107,7 +107,7 @@ def _parts(folder: Path) -> list[Any] | None:
 
 
 def _sources(folder: Path, block: Path | None, part: int) -> tuple[Path, Path]:
-    """Return the folders of the results and of the block."""
+    """Return the result folder and the block folder."""
     result = folder
     parts = None if (folder / INTERIOR).is_file() else _parts(folder)
     if parts is not None:
@@ -129,7 +129,7 @@ def _sources(folder: Path, block: Path | None, part: int) -> tuple[Path, Path]:
 
 
 def _block_of(folder: Path) -> Path:
-    """Return the block of results that their summary names, or the flight around them."""
+    """Return the block folder named in the summary of the result, or of the flight that contains it."""
     name = read_json(folder / SUMMARY).get("block") if (folder / SUMMARY).is_file() else None
     if isinstance(name, str) and name:
         return folder / name
@@ -142,7 +142,7 @@ def _block_of(folder: Path) -> Path:
 
 
 def _below(folder: Path, name: Any) -> Path | None:
-    """Return a folder in `folder`; None for any other name."""
+    """Return the subfolder `name` of `folder`; None for any other path."""
     return folder / name if isinstance(name, str) and name != ".." and Path(name).name == name != "" else None
 
 
@@ -158,7 +158,7 @@ def _camera(result: Path, name: str, block: Block, source: Path) -> InteriorOrie
 def _values(
     result: Path, block: Path, file: str, column: str, ids: Sequence[str], numbers: tuple[str, ...]
 ) -> np.ndarray:
-    """Return the numbers of a table of results in the order of the block. Raise InputError for other ids."""
+    """Read numeric columns of a result table in the order of the block. Raise InputError for different ids."""
     path = result / file
     if not path.is_file():
         raise InputError(f"{path} is missing, which results have; adjust again")

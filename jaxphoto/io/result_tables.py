@@ -1,4 +1,4 @@
-"""Files of a result folder: tables, summary.json with its verdict, and the hashes of the inputs."""
+"""Files of a result folder: tables, summary.json with its verdict, and hashes of the inputs."""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,7 +15,7 @@ from jaxphoto.io.toml import read_toml
 from jaxphoto.writing import InputFile, input_file
 
 SUMMARY, INPUTS = "summary.json", "inputs.csv"
-# Ids that may look like numbers: image 0012 is not image 12.
+# Columns of text: ids may look like numbers, and image 0012 is not image 12.
 _TEXT = dict.fromkeys(
     (
         "camera", "image", "point", "parameter", "parameter_a", "parameter_b", "quantity", "file", "unit", "strip",
@@ -23,7 +23,7 @@ _TEXT = dict.fromkeys(
     ),
     str,
 )  # fmt: skip
-# Files of a folder that block.toml names, such as an earlier calibration.
+# Files read from a folder that block.toml names, such as an earlier calibration.
 _OF_FOLDER = ("interior.csv", "correlation.csv", SUMMARY, TOML, "camera.toml")
 
 
@@ -41,7 +41,7 @@ def read_result_tables(folder: str | Path, names: Sequence[str] = ()) -> dict[st
 
 
 def read_table(path: Path) -> pd.DataFrame:
-    """Read one table of results. Raises InputError for an invalid file."""
+    """Read one result table. Raises InputError for an invalid file."""
     try:
         return pd.read_csv(path, dtype=_TEXT, keep_default_na=False, na_values=[""])
     except (ValueError, UnicodeDecodeError) as error:
@@ -76,7 +76,7 @@ def reservation(summary: Mapping[str, Any]) -> str:
 
 
 def block_inputs(folder: Path) -> list[InputFile]:
-    """Hashes of block.toml, the tables beside it and the files that it names, sorted by name."""
+    """Return the hashes of block.toml, its tables, and all files that it names, sorted by name."""
     files = {path.name: path for path in sorted(folder.glob("*.csv"))} | {TOML: folder / TOML}
     for word in _words(read_toml(folder / TOML)):
         path = folder / word

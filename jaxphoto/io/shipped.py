@@ -1,4 +1,4 @@
-"""Examples and experiments that come with jaxphoto: in a wheel beside its modules, in a clone at its root."""
+"""Examples and experiments distributed with jaxphoto: inside the package of a wheel, or at the root of a clone."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ EXAMPLES = {
 
 
 def shipped(name: str) -> Path:
-    """Path of an example, a file or folder. Raises InputError for an unknown name."""
+    """Return the path of an example, a file or folder. Raises InputError for an unknown name."""
     if name not in EXAMPLES:
         raise InputError(f"there is no example {name}; there are {', '.join(EXAMPLES)}")
     root = next((r for r in (_PACKAGE / "shipped", _PACKAGE.parent) if (r / "examples").is_dir()), None)

@@ -1,4 +1,4 @@
-"""Whole files that users name: bytes, UTF-8 text and JSON objects."""
+"""Read whole files: bytes, UTF-8 text and JSON objects."""
 
 import json
 from pathlib import Path
@@ -6,9 +6,9 @@ from typing import Any
 
 from jaxphoto.errors import InputError
 
-# Bytes searched for the words that identify a format.
+# Maximum number of bytes searched for words that identify a format.
 _HEAD = 2_000_000
-# ZIP, as spreadsheets write their workbooks, and older workbooks.
+# First bytes of spreadsheet workbooks: ZIP archive, and the older binary format.
 _WORKBOOK = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
 
 
@@ -25,7 +25,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_text(path: Path) -> str:
-    """Read a UTF-8 file with line ends of any system, without byte order mark. Raises InputError for other content."""
+    """Read a UTF-8 file, normalising line ends and removing the byte order mark. Raises InputError if invalid."""
     content = read_bytes(path)
     if content.startswith(_WORKBOOK):
         raise InputError(f"{path.name} is a workbook (xlsx, ods) or another archive; save the sheet as CSV, UTF-8")
@@ -39,7 +39,7 @@ def read_text(path: Path) -> str:
 
 
 def read_legacy_text(path: Path) -> str:
-    """Read a text file of another program, UTF-8 or else Windows-1252, with line ends of any system."""
+    """Read a text file of another program, UTF-8 or else Windows-1252, normalising line ends."""
     content = read_bytes(path)
     try:
         text = content.decode("utf-8-sig")
@@ -49,7 +49,7 @@ def read_legacy_text(path: Path) -> str:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read the object in a JSON file. Raises InputError if there is none."""
+    """Read a JSON object from a file. Raises InputError for other content."""
     try:
         values = json.loads(read_text(path))
     except (ValueError, RecursionError) as error:

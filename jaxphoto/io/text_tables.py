@@ -1,6 +1,6 @@
-"""Text tables read by pandas; each line keeps its file and row for messages.
+"""Text tables, read by pandas; each line retains its file and row number for messages.
 
-Rows are counted as a spreadsheet counts them, from 1, including header, comments and empty lines.
+Rows are numbered from 1, including header, comments and empty lines, as in a spreadsheet.
 """
 
 import dataclasses
@@ -19,12 +19,12 @@ import pandas as pd
 from jaxphoto.errors import BlockError, InputError, RowError, quoted, shown
 from jaxphoto.io.text_files import read_text
 
-# Index of a line in its table, from Python or from NumPy.
+# Index of a line in its table, as Python or NumPy integer.
 Line = int | np.integer
 # Columns in which a comma is not a decimal comma.
 _TEXT = frozenset({"image", "camera", "strip", "point", "role"})
 LARGEST = 1e30
-"""Limit of lengths, angles, times and coefficients; the square of a smaller number is finite."""
+"""Maximum absolute value of lengths, angles, times and coefficients; squares of values below it are finite."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Table:
 
     @staticmethod
     def of(file: str, columns: dict[str, Any], rows: np.ndarray | None = None) -> "Table":
-        """Return a table of one file; without `rows`, lines are counted from 1."""
+        """Build a table of one file; without `rows`, lines are numbered from 1."""
         n = len(next(iter(columns.values()))) if columns else 0
         return Table(file, columns, np.full(n, file, object), np.arange(1, n + 1) if rows is None else rows)
 
@@ -57,15 +57,15 @@ class Table:
         return Table(self.file, columns, self.files[chosen], self.rows[chosen])
 
     def place(self, line: Line) -> str:
-        """File and row of a line, for messages."""
+        """Return file and row of a line, for messages."""
         return f"{self.files[line]}, row {self.rows[line]}"
 
     def bad(self, line: Line, message: str) -> RowError:
-        """Error in the content of one line."""
+        """Return an error about the content of one line."""
         return RowError(f"{self.place(line)}: {message}", [int(self.rows[line])])
 
     def misfit(self, line: Line, message: str) -> BlockError:
-        """Error in the relation of one line to others."""
+        """Return an error about the relation of one line to others."""
         return BlockError(f"{self.place(line)}: {message}")
 
     def check(self, wrong: np.ndarray, message: Callable[[Line], str]) -> None:
@@ -75,18 +75,18 @@ class Table:
             raise RowError(f"{self.place(lines[0])}: {message(lines[0])}", self.rows[lines].tolist())
 
     def text(self, column: str) -> np.ndarray:
-        """Return a column of text; empty strings if the file lacks it."""
+        """Return a text column; empty strings if the column is missing."""
         cells = self.columns.get(column)
         return np.full(len(self), "", object) if cells is None else np.asarray(cells, object)
 
     def ids(self, column: str) -> np.ndarray:
-        """Return a column of ids. Raises RowError for an empty one."""
+        """Return an id column. Raises RowError for an empty id."""
         values = self.text(column)
         self.check(values == "", lambda line: f"the {column} is empty; give its id or delete the row")
         return values
 
     def find(self, column: str, known: Sequence[str], message: Callable[[str], str]) -> np.ndarray:
-        """Index in `known` of the id of each line. Raises BlockError with the `message` about an unknown id."""
+        """Return the index in `known` of the id of each line. Raises BlockError with `message` for an unknown id."""
         named = self.ids(column)
         index = pd.Index(np.array(known, object)).get_indexer(pd.Index(named))
         for line in np.flatnonzero(index < 0)[:1]:
@@ -94,7 +94,7 @@ class Table:
         return index
 
     def numbers(self, column: str, *, empty: bool = False) -> np.ndarray:
-        """Return a column of finite numbers; `empty` permits NaN for empty cells and missing columns."""
+        """Return a column of finite floats; `empty` permits NaN for empty cells and missing columns."""
         cells = self.columns.get(column)
         if cells is None:
             return np.full(len(self), np.nan)
@@ -108,7 +108,7 @@ class Table:
         return values
 
     def matrix(self, columns: Sequence[str], *, empty: bool = False) -> np.ndarray:
-        """Columns of numbers, (n, columns)."""
+        """Return columns of finite floats, (n, columns)."""
         return np.stack([self.numbers(column, empty=empty) for column in columns], axis=1)
 
     def sigmas(self, column: str) -> np.ndarray:
@@ -123,7 +123,7 @@ class Table:
     def _parsed(self, column: str, cells: Any) -> np.ndarray:
         cells = np.asarray(cells, object)
         try:
-            # Python rounds correctly: a number written by repr comes back exactly.
+            # Parse by Python, which rounds correctly: numbers written by repr are restored exactly.
             values = np.where(cells == "", "nan", cells).astype(float)
             wrong = np.array(["_" in cell for cell in cells], bool)
         except ValueError:
@@ -151,12 +151,12 @@ def concatenate(tables: Sequence[Table]) -> Table:
 def read_csv(path: Path, needed: Sequence[str], optional: Sequence[str] = (), text: Sequence[str] = ()) -> Table:
     """Read a CSV file with a header, separated by commas, semicolons or tabs (the latter two also with decimal commas).
 
-    Lines that start with `#` and empty lines are skipped. Columns in neither list are skipped with a UserWarning. A
-    comma in the columns `text` is not a decimal comma.
+    Empty lines and lines that start with `#` are skipped. Columns in neither list are ignored with a UserWarning. In
+    the columns `text`, a comma is not a decimal comma.
 
-    Raises InputError if the file or a needed column is missing, or a row has too many cells.
+    Raises InputError if the file or a needed column is missing, or if a row has too many cells.
     """
-    # Not splitlines(): that also ends lines at form feeds and other characters an editor does not count.
+    # Avoid splitlines(): it also splits at form feeds and other characters that editors do not count as line ends.
     numbered = enumerate(read_text(path).split("\n"), 1)
     content = [(row, line) for row, line in numbered if line.strip() and not line.lstrip().startswith("#")]
     rows, lines = [row for row, _ in content], [line for _, line in content]
@@ -180,7 +180,7 @@ def read_csv(path: Path, needed: Sequence[str], optional: Sequence[str] = (), te
         if name in needed or name in optional:
             column = cells[j].iloc[1:].str.strip()
             if name in _TEXT or name in text:
-                # Ids repeat: each is kept once.
+                # Ids repeat: store each string once.
                 codes, ids = pd.factorize(column)
                 columns[name] = ids.to_numpy(object)[codes]
             else:
@@ -208,7 +208,7 @@ def _cells(path: Path, lines: list[str], rows: list[int], separator: str) -> pd.
 
 
 def points_matching(points: Sequence[str], patterns: Iterable[str], where: str) -> tuple[str, ...]:
-    """Return the points that match `patterns` (* for any characters). Raises InputError for one without a match."""
+    """Return the points that match `patterns` (* for any characters). Raises InputError for a pattern without match."""
     matching: dict[str, None] = {}
     for pattern in patterns:
         names = [point for point in points if fnmatch.fnmatchcase(point, pattern)]
@@ -219,7 +219,7 @@ def points_matching(points: Sequence[str], patterns: Iterable[str], where: str) 
 
 
 def finite(cell: str) -> float | None:
-    """Parse a number; None if it is not one, or larger than `LARGEST`."""
+    """Parse a finite number; None for other text, or above `LARGEST`."""
     value = float(cell) if is_number(cell) else math.inf
     return value if abs(value) <= LARGEST else None
 

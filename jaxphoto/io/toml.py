@@ -1,6 +1,6 @@
 """Tables of TOML and JSON files: read, validated by key or by a pydantic model, and written.
 
-A validation error is one sentence: file, [table] key, what is wrong, cure.
+A validation error is one sentence: file, [table] key, problem, cure.
 """
 
 import functools
@@ -39,12 +39,12 @@ Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 OneOrMore = Annotated[
     list[Number], BeforeValidator(lambda value: value if isinstance(value, list) else [value]), Field(min_length=1)
 ]
-"""A number or a list of numbers."""
+"""One number or a list of numbers."""
 M = TypeVar("M", bound="Keys")
 
 
 class KeyMistake(ValueError):
-    """Validation error of a model in one of its keys ("": in the table as a whole)."""
+    """Validation error of a model, in one of its keys; "" for the whole table."""
 
     def __init__(self, key: str, message: str):
         super().__init__(message)
@@ -52,7 +52,7 @@ class KeyMistake(ValueError):
 
 
 class Keys(BaseModel):
-    """The keys of a table, and their types."""
+    """Keys of a table, and their types."""
 
     model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True)
 
@@ -66,7 +66,7 @@ class Keys(BaseModel):
 
 
 class Section:
-    """A table of a file; `file` and `path` (cameras.kodak) are for messages."""
+    """Table of a file. `file` and `path` (such as cameras.kodak) are used in messages."""
 
     def __init__(self, file: str, path: str, values: Any):
         self.file, self.path, self.values = file, path, values
@@ -80,22 +80,22 @@ class Section:
         return iter(self.values)
 
     def error(self, key: str, message: str) -> InputError:
-        """Return an error about one key, or with key "" about the whole table."""
+        """Return an error about one key, or about the whole table if key is ""."""
         table = f"[{self.path}] " if self.path else ""
         return InputError(f"{self.file}, {table}{key}".rstrip(" ,") + f": {message}")
 
     def known(self, *keys: str) -> None:
-        """Raise InputError for a key that is not among `keys`."""
+        """Raise InputError for a key that is not in `keys`."""
         for key in self.values:
             if key not in keys:
                 raise self.error(key, f"no such key is known; use {', '.join(keys)} or remove it")
 
     def section(self, key: str) -> "Section":
-        """Return the table under `key`; empty if missing."""
+        """Return the subtable `key`; empty if missing."""
         return Section(self.file, f"{self.path}.{key}" if self.path else key, self.values.get(key, {}))
 
     def model(self, kind: type[M]) -> M:
-        """Return the table as a model."""
+        """Validate the table as a model."""
         return self._validated(kind.model_validate, self.values)
 
     def number(self, key: str, default: float | None = None) -> float:
@@ -111,19 +111,19 @@ class Section:
         return self._value(_COUNT, key)
 
     def text(self, key: str, default: str | None = None) -> str:
-        """Return a piece of text."""
+        """Return a text."""
         return self._value(_TEXT, key, default)
 
     def vector(self, key: str, size: int = 3) -> np.ndarray:
-        """Finite numbers; zeros if the key is missing."""
+        """Return a vector of finite numbers; zeros if the key is missing."""
         return np.array(self._value(_vector(size), key, [0.0] * size), float)
 
     def prior(self, key: str, start: Any, unit: str = "", scale: float = 1.0) -> Prior | Weighted:
-        """Read a prior: `"free"`, `"fixed"` (the default) or `{ sigma = ... }`, weighted at `start` unless `value` is
-        given.
+        """Read a prior: `"free"`, `"fixed"` (the default) or `{ sigma = ..., value = ... }`.
 
-        A vector may have `covariance`, the rows of a matrix, instead of `sigma`. `start` is in the unit of jaxphoto,
-        the file's times `scale`; `unit` may end the keys (sigma_deg).
+        `value` defaults to `start`. A vector may have `covariance`, the rows of a matrix, instead of `sigma`. `start`
+        is in the unit of jaxphoto: the value in the file times `scale`. `unit` is an optional suffix of the keys
+        (sigma_deg).
         """
         status = self.values.get(key, "fixed")
         if status in ("free", "fixed"):
@@ -142,7 +142,7 @@ class Section:
         return Weighted(as_jax_array(value), as_jax_array(sigma))
 
     def covariance(self, key: str, rows: Any, size: int) -> np.ndarray:
-        """Return the covariance matrix of `size` numbers with these rows."""
+        """Return the covariance matrix (`size` x `size`) with these rows."""
         if not isinstance(rows, list) or [len(r) if isinstance(r, list) else 0 for r in rows] != [size] * size:
             raise self.error(
                 key, f"the covariance is no matrix of {size} x {size}; write {size} lists of {size} numbers"
@@ -172,7 +172,7 @@ class Section:
             raise self._sentence(errors, key) from None
 
     def _sentence(self, errors: ValidationError, key: tuple[str, ...]) -> InputError:
-        """Return the first error of pydantic with its place and cure."""
+        """Return pydantic's first error, with its location and cure."""
         error = errors.errors()[0]
         mistake = error.get("ctx", {}).get("error")
         place: list[Any] = [*key, *error["loc"], *([mistake.key] if isinstance(mistake, KeyMistake) else [])]
@@ -235,12 +235,12 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def toml_text(values: dict[str, Any]) -> str:
-    """Write nested tables as TOML; numbers come back exactly."""
+    """Write nested tables as TOML; floats are restored exactly on reading."""
     return "\n".join(_table_lines("", values)).lstrip("\n") + "\n"
 
 
 def status(prior: Any, start: Any, scale: float = 1.0) -> str | dict[str, Any]:
-    """Return the status that `Section.prior` reads as `prior` of an unknown that starts at `start`."""
+    """Return the status from which `Section.prior` restores `prior` of an unknown with initial value `start`."""
     if isinstance(prior, Prior):
         return prior.name.lower()
     if not isinstance(prior, Weighted):
@@ -255,7 +255,7 @@ def status(prior: Any, start: Any, scale: float = 1.0) -> str | dict[str, Any]:
 
 
 def _table_lines(path: str, values: dict[str, Any]) -> list[str]:
-    # A weighted status is the only inline table.
+    # Only weighted priors are written as inline tables.
     tables = {k: v for k, v in values.items() if isinstance(v, dict) and not {"sigma", "covariance"} & set(v)}
     lines = [f"{_key(k)} = {_value(v)}" for k, v in values.items() if k not in tables]
     if path and lines:

@@ -1,9 +1,9 @@
-"""GNSS/IMU trajectories from CSV and Applanix SBET, in the frame of a block, and back (docs/georeferencing.md).
+"""GNSS/IMU trajectories: read CSV and Applanix SBET, transform to the frame of a block, and write.
 
-SBET (smoothed best estimate of trajectory) has 17 little-endian doubles per record and no header. Angles are radians,
-the altitude is ellipsoidal. Platform heading and horizontal velocities refer to axes rotated by the wander angle: true
-heading = platform heading - wander angle (FilePOSOutput.h of the CHARTS library, US Naval Oceanographic Office). It has
-no standard deviations.
+See docs/georeferencing.md. SBET (smoothed best estimate of trajectory) has 17 little-endian doubles per record and no
+header. Angles are in radians, the altitude is ellipsoidal. Platform heading and horizontal velocities refer to axes
+rotated by the wander angle: true heading = platform heading - wander angle (FilePOSOutput.h of the CHARTS library, US
+Naval Oceanographic Office). SBET has no standard deviations.
 """
 
 from pathlib import Path
@@ -34,7 +34,7 @@ FIELDS = (
     "platform_heading", "wander_angle", "x_acceleration", "y_acceleration", "z_acceleration", "x_rate", "y_rate",
     "z_rate",
 )  # fmt: skip
-"""Fields of an SBET record: s, rad, m, m/s, m/s^2, rad/s."""
+"""Fields of an SBET record; units s, rad, m, m/s, m/s^2, rad/s."""
 _SBET = np.dtype("<f8")
 _RECORD_BYTES = len(FIELDS) * _SBET.itemsize
 _MAP = ("X_m", "Y_m", "Z_m")
@@ -53,9 +53,9 @@ class Records(NamedTuple):
     """X, Y, Z (m) in the frame of the block; if `geographic`, longitude, latitude (deg) and ellipsoidal height (m)."""
     geographic: bool
     roll_pitch_yaw_deg: np.ndarray
-    """Yaw counts from true north if `geographic`."""
+    """Roll, pitch, yaw (degrees); yaw from true north if `geographic`."""
     sigma_m: np.ndarray
-    """NaN if unknown, as `sigma_deg`."""
+    """Standard deviations (m); NaN if unknown, as in `sigma_deg`."""
     sigma_deg: np.ndarray
 
 
@@ -65,12 +65,12 @@ def is_sbet(path: Path) -> bool:
 
 
 def read_records(path: Path) -> Records:
-    """Read a trajectory, SBET or CSV by its suffix."""
+    """Read a trajectory, SBET or CSV according to its suffix."""
     return sbet_records(read_sbet(path), path.name) if is_sbet(path) else read_flight_csv(path)
 
 
 def write_moved(moved: Records, given: Path, folder: Path) -> None:
-    """Write trajectory.csv, and an SBET of the same name if `given`, the file of all records, is one."""
+    """Write trajectory.csv; if the original file `given` is an SBET, also write an SBET of the same name."""
     write_flight_csv(moved, folder / "trajectory.csv")
     if is_sbet(given):
         write_sbet(with_records(read_sbet(given), moved), folder / given.name)
@@ -96,7 +96,7 @@ def read_flight_csv(path: Path) -> Records:
 
 
 def write_flight_csv(records: Records, path: Path) -> None:
-    """Write a CSV that `read_flight_csv` reads as the same numbers; unknown standard deviations are omitted."""
+    """Write a CSV from which `read_flight_csv` restores identical values; unknown standard deviations are omitted."""
     columns = {"time_s": records.time}
     for names, values in (
         (_PLACE if records.geographic else _MAP, records.coordinates),
@@ -109,7 +109,7 @@ def write_flight_csv(records: Records, path: Path) -> None:
 
 
 def _checked(records: Records, rows: np.ndarray, row: str) -> Records:
-    """Check times and ranges; `rows` are the numbers of the records, called `row` in messages."""
+    """Check times and ranges. `rows` are record numbers, and `row` is their name in messages."""
     file, time, angles = records.file, records.time, records.roll_pitch_yaw_deg
     if len(time) < SHORTEST:
         raise InputError(
@@ -132,7 +132,7 @@ def _checked(records: Records, rows: np.ndarray, row: str) -> Records:
 
 
 def read_sbet(path: Path) -> Float[np.ndarray, "records 17"]:
-    """Read the records of an SBET, columns `FIELDS`. Raises InputError for other content."""
+    """Read the records of an SBET, with columns `FIELDS`. Raises InputError for other content."""
     data = read_bytes(path)
     if len(data) % _RECORD_BYTES:
         raise InputError(
@@ -153,12 +153,12 @@ def read_sbet(path: Path) -> Float[np.ndarray, "records 17"]:
 
 
 def write_sbet(values: Float[np.ndarray, "records 17"], path: Path) -> None:
-    """Write SBET records, columns `FIELDS`."""
+    """Write SBET records, with columns `FIELDS`."""
     path.write_bytes(np.ascontiguousarray(values, _SBET).tobytes())
 
 
 def sbet_records(values: Float[np.ndarray, "records 17"], file: str) -> Records:
-    """Return the trajectory in the SBET records of `file`, with yaw from true north. Raises InputError."""
+    """Convert SBET records of `file` to a trajectory with yaw from true north. Raises InputError for invalid values."""
     column = dict(zip(FIELDS, values.T, strict=True))
     heading = np.mod(column["platform_heading"] - column["wander_angle"], 2 * np.pi)
     place = np.stack([*np.rad2deg([column["longitude"], column["latitude"]]), column["altitude"]], axis=1)
@@ -169,9 +169,9 @@ def sbet_records(values: Float[np.ndarray, "records 17"], file: str) -> Records:
 
 
 def with_records(values: Float[np.ndarray, "records 17"], records: Records) -> Float[np.ndarray, "records 17"]:
-    """Replace positions and attitudes of SBET records by those of `records`: the inverse of `sbet_records`.
+    """Replace positions and attitudes of SBET records by `records`: the inverse of `sbet_records`.
 
-    Velocities, accelerations, rates and the wander angle stay.
+    Velocities, accelerations, rates and the wander angle are unchanged.
     """
     old = dict(zip(FIELDS, values.T, strict=True))
     longitude, latitude = np.deg2rad(records.coordinates[:, :2].T)
@@ -188,7 +188,7 @@ def with_records(values: Float[np.ndarray, "records 17"], records: Records) -> F
 
 
 def _nearest_turn(angle: Float[np.ndarray, "n"], reference: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Add whole turns to bring angles nearest to `reference`."""
+    """Add multiples of 2 pi to angles, so that they are nearest to `reference`."""
     return reference + np.mod(angle - reference + np.pi, 2 * np.pi) - np.pi
 
 
@@ -216,7 +216,7 @@ def positions_in(records: Records, frame: Frame) -> Float[np.ndarray, "records 3
 def trajectory_in(
     records: Records, frame: Frame, sigma_m: Float[np.ndarray, "records 3"], sigma_rad: Float[np.ndarray, "records 3"]
 ) -> Trajectory:
-    """Return the trajectory in the frame of a block with the given standard deviations."""
+    """Transform a trajectory to the frame of a block, with the given standard deviations."""
     position = positions_in(records, frame)
     axes = _frame_from_axes(records, frame, position)
     quaternion = _quaternions(axes, np.deg2rad(records.roll_pitch_yaw_deg))
@@ -224,7 +224,7 @@ def trajectory_in(
 
 
 def records_of(trajectory: Trajectory, file: str) -> Records:
-    """Return records in the object frame, without standard deviations: the inverse of `trajectory_in`."""
+    """Convert a trajectory to records in the object frame, without sigmas: the inverse of `trajectory_in`."""
     position = np.asarray(trajectory.position)
     axes = np.broadcast_to(np.eye(3), (len(position), 3, 3))
     angles = np.rad2deg(np.asarray(_roll_pitch_yaw(axes, np.asarray(trajectory.quaternion))))
@@ -233,7 +233,7 @@ def records_of(trajectory: Trajectory, file: str) -> Records:
 
 
 def with_poses(records: Records, trajectory: Trajectory, frame: Frame) -> Records:
-    """Replace positions and attitudes of records by those of `trajectory`, which is in the frame of a block."""
+    """Replace positions and attitudes of records by `trajectory`, which is in the frame of a block."""
     position = np.asarray(trajectory.position)
     axes = np.swapaxes(_frame_from_axes(records, frame, position), 1, 2)
     angles = np.rad2deg(np.asarray(_roll_pitch_yaw(axes, np.asarray(trajectory.quaternion))))
@@ -241,7 +241,7 @@ def with_poses(records: Records, trajectory: Trajectory, frame: Frame) -> Record
 
 
 def with_positions(records: Records, position: Float[np.ndarray, "records 3"], frame: Frame) -> Records:
-    """Replace the positions of records by others (m) in the frame of a block."""
+    """Replace the positions of records by `position` (m), in the frame of a block."""
     if frame.kind != "epsg":
         return records._replace(coordinates=position)
     coordinates = frame.map.map(position)
@@ -249,7 +249,7 @@ def with_positions(records: Records, position: Float[np.ndarray, "records 3"], f
 
 
 def _frame_from_axes(records: Records, frame: Frame, position: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
-    """Rotations from the axes of roll, pitch and yaw to the frame of the block."""
+    """Return the rotations from the reference axes of roll, pitch and yaw to the frame of the block."""
     if frame.kind != "epsg":
         return np.broadcast_to(np.eye(3), (len(position), 3, 3))
     true_north = records.geographic or frame.yaw == "true"

@@ -1,4 +1,4 @@
-"""Resample photographs to a pinhole camera, without distortion."""
+"""Resample photographs to a pinhole camera without distortion."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,7 +16,7 @@ from jaxphoto.io.photographs import Photograph
 from jaxphoto.io.raster import read_photograph
 from jaxphoto.writing import whole_folder
 
-# Modes of Pillow that can be resampled.
+# Pillow modes that can be resampled.
 _MODES = ("L", "RGB", "RGBA", "I;16")
 _JPEG = (".jpg", ".jpeg")
 _TIFF = (".tif", ".tiff")
@@ -26,7 +26,7 @@ _TAG = ExifTags.Base
 
 
 class Undistorted(NamedTuple):
-    """The camera of the new photographs, and the reason for each skipped file."""
+    """Camera of the resampled photographs, and the reason for each skipped file."""
 
     camera: Pinhole
     left_out: dict[str, str]
@@ -39,14 +39,14 @@ def write_undistorted(
     keep: Keep = "crop",
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Undistorted:
-    """Write `photographs` of `camera` without distortion into `folder`, with camera.toml.
+    """Resample `photographs` of `camera` without distortion into `folder`, and write camera.toml.
 
-    Resampled bicubically (OpenCV, places to 1/32 px). Names, EXIF, XMP and colour profile are kept; JPEG has quality
-    95, TIFF is not compressed (libtiff would lose its EXIF), other formats become PNG. Pictures are read as stored,
-    whatever their orientation flag. `keep`: see `camera.undistortion.pinhole`.
+    Interpolation is bicubic (OpenCV, coordinates rounded to 1/32 px). Names, EXIF, XMP and colour profile are retained.
+    JPEG has quality 95; TIFF is uncompressed (libtiff would remove its EXIF); other formats are converted to PNG.
+    Pictures are read as stored, ignoring the orientation flag. `keep`: see `camera.undistortion.pinhole`.
 
-    Photographs of another size and damaged ones are skipped and reported. Raises InputError if none is left, and for a
-    camera without an equivalent pinhole.
+    Photographs that are damaged or of different size are skipped and reported. Raises InputError if all are skipped,
+    and for a camera without an equivalent pinhole.
     """
     try:
         new = pinhole(camera.sensor, camera.interior, keep)
@@ -70,14 +70,14 @@ def write_undistorted(
 
 
 def _read(path: Path, sensor: Sensor) -> tuple[np.ndarray, Image.Exif, dict[str, Any]]:
-    """Read the pixels of a photograph (rows, columns, bands), its EXIF, and other metadata to keep."""
-    # Not Pillow's pixels: it rotates a TIFF by its orientation flag.
+    """Read the pixels of a photograph (rows, columns, bands), its EXIF, and other metadata to retain."""
+    # Do not use Pillow's pixels: it rotates TIFFs by their orientation flag.
     bands = read_photograph(path, sensor)
     with Image.open(path) as picture:
         if picture.mode not in _MODES:
             known = ", ".join(_MODES)
             raise InputError(f"its pixels are {picture.mode}, and undistorted are {known}; convert it to RGB")
-        # Pillow reads 16-bit colours as 8-bit, and cannot write them.
+        # Reject 16-bit colours: Pillow reads them as 8-bit, and cannot write them.
         if bands.dtype != np.uint8 and picture.mode != "I;16":
             raise InputError("its colours have 16 bits, and undistorted are those of 8; convert it to 8 bits")
         kept: dict[str, Any] = {key: picture.info[key] for key in ("icc_profile", "xmp") if key in picture.info}
@@ -86,17 +86,17 @@ def _read(path: Path, sensor: Sensor) -> tuple[np.ndarray, Image.Exif, dict[str,
         exif = picture.getexif()
         for part in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo):
             exif.get_ifd(part)
-    # cv2 needs contiguous rows.
+    # cv2 requires contiguous rows.
     return np.ascontiguousarray(np.moveaxis(bands, 0, -1).squeeze()), exif, kept
 
 
 def _write(pixels: np.ndarray, exif: Image.Exif, kept: dict[str, Any], path: Path, folder: Path) -> None:
-    """Write the new photograph to `path`, with its size in EXIF."""
+    """Write the resampled photograph to `path`, and update the size in EXIF."""
     taken = exif.get_ifd(ExifTags.IFD.Exif)
     for tag, side in ((_TAG.ExifImageWidth, pixels.shape[1]), (_TAG.ExifImageHeight, pixels.shape[0])):
         if tag in taken:
             taken[tag] = side
-    # Tags of the layout of a TIFF; the new file has others.
+    # Remove tags of the TIFF layout: the new file has its own.
     for layout in [tag for tag in exif if tag in _LAYOUT]:
         del exif[layout]
     suffix = path.suffix.lower()

@@ -65,7 +65,7 @@ CASES = {
     "unknown strip": ([(T, "[strips.default]", "[strips.three]")], ["block.toml", "three", "one, two"]),
     # too little
     "no images": ([(I, "", "image,camera\n")], ["images.csv", "no images", "list"]),
-    "no image points": ([(P, "", "image,point,x_mm,y_mm\n")], ["image_points.csv", "no image points", "list"]),
+    "no image points": ([(P, "", "image,point,x_mm,y_mm\n")], ["image_points.csv", "no image points", "add"]),
     "two points in an image": ([(P, "c,p1,0.2,0.2,,\n", "")], ["images.csv, row 4", "image c", "measure more"]),
     "image never observed": ([(I, "c,kodak", "d,kodak,,1,,,,,,\nc,kodak")], ["images.csv, row 4", "image d has 0"]),
     "tie point seen once": (

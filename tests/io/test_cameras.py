@@ -434,7 +434,7 @@ def test_wrong_use_is_refused(tmp_path):
     with pytest.raises(InputError, match="the file is no text"):
         read_camera_file(tmp_path / "b.yml")
     path = written(tmp_path, OPENCV, "a.yml")
-    with pytest.raises(InputError, match="its images have 1280 x 960 pixels, not 100 x 100"):
+    with pytest.raises(InputError, match="image size is 1280 x 960 px, not 100 x 100"):
         read_camera_file(path, size_px=(100, 100))
     with pytest.raises(InputError, match="a pixel of -1 mm cannot be"):
         read_camera_file(path, pixel_mm=-1.0)

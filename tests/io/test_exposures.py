@@ -399,7 +399,7 @@ def test_tables_of_other_programs(tmp_path, form):
         ("= 15.0", "= 9.0", "row 17: its easting and northing lie .* from its latitude and longitude in EPSG:32632"),
         ("= 15.0", "= 14.0", "are map coordinates; give the EPSG code"),
         ("the 'x' by", "the 'y' by", "its angles turn about y first"),
-        ("ID, # EVENT, TIME", "TIME, DISTANCE, TIME", "its columns are not those of photographs"),
+        ("ID, # EVENT, TIME", "TIME, DISTANCE, TIME", "missing photograph columns"),
         ("EASTING, NORTHING", "E, N", "its head names no columns"),
     ],
 )

@@ -200,7 +200,7 @@ def test_frames_without_a_place(write_folder):
     ]
     images = ("images.csv", "", "image,camera,strip,time_s\na,kodak,one,10\nb,kodak,one,12\nc,kodak,two,20\n")
     distances = ("distances.csv", "", None)
-    with pytest.raises(InputError, match=r"block\.toml, \[frame\]: no coordinate .* add origin"):
+    with pytest.raises(InputError, match=r"block\.toml, \[frame\]: the block has no coordinates .* add origin"):
         read_block(write_folder(*changes, images, distances, FRAME))
 
 

@@ -290,6 +290,6 @@ def test_fixed_images_with_sensors_cannot_be_written(write_folder, tmp_path):
     block = read_block(write_folder(PLACED))
     both = lambda b: (b.priors.exterior.position, b.priors.exterior.camera_from_object)  # noqa: E731
     for held in ((FIXED, FIXED), (FIXED, FREE)):
-        with pytest.raises(BlockError, match=r"hold it by jaxphoto\.variants\.direct"):
+        with pytest.raises(BlockError, match=r"fix all of it by jaxphoto\.variants\.direct"):
             write_block(eqx.tree_at(both, block, held), tmp_path / "copy")
     assert not (tmp_path / "copy").exists()

@@ -125,7 +125,7 @@ def test_photographs_are_called_by_their_files(tmp_path):
     assert photograph_files(images, [tmp_path / "left"]) == {"a": "a.JPG", "b": "b.tif"}
     with pytest.raises(InputError, match=r"b\.tif and .*b\.jpg would both be the image b; give one"):
         photograph_files(images, [tmp_path / "left", tmp_path / "right"])
-    with pytest.raises(InputError, match="there is no folder"):
+    with pytest.raises(InputError, match="folder not found: "):
         photograph_files(images, [tmp_path / "none"])
     (tmp_path / "photographs.csv").write_text("image,file\na,a.png\nc,c.png\n")
     assert photograph_files(images, [tmp_path / "right"], tmp_path) == {"a": "a.png", "b": "b.jpg", "c": "c.png"}

@@ -203,7 +203,7 @@ def test_no_room_is_said():
         ({"terrain.buildings": [{"roof": "dome"}]}, "roof: 'dome' is unknown; write .flat"),
         ({"terrain.buildings": [{"slope_deg": 30.0}]}, "a flat roof has no slope"),
         ({"terrain.buildings": [{"roof": "gable", "slope_deg": 70.0}]}, "70 is steeper than 60 degrees"),
-        ({"terrain.buildings": [{"length_m": [20.0, 10.0]}]}, "is no range; give one number, or the least and the gr"),
+        ({"terrain.buildings": [{"length_m": [20.0, 10.0]}]}, "is not a range; give one number, or .minimum, max"),
         ({"terrain.buildings": [{"width_m": 0.0}]}, "width_m: 0.0 is not positive"),
         ({"terrain.trees": [{"crown_m": 2.0}]}, r"\[terrain.trees, number 1\] crown_m: no such key is known"),
         ({"terrain.trees": [{"at_m": [[1.0]]}]}, "has 1 entries; give 2"),

@@ -1,4 +1,4 @@
-"""A block folder -> `Block`. Readers of other formats fill the same `BlockTables` and share everything from there."""
+"""Read a block folder as `Block`. Readers of other formats also build `BlockTables` and call `assemble`."""
 
 import dataclasses
 import warnings
@@ -52,10 +52,10 @@ from jaxphoto.variants import MODES
 
 @dataclasses.dataclass(frozen=True)
 class BlockTables:
-    """The content of a block folder, not yet checked: block.toml and the tables by name of `layouts`.
+    """Unchecked content of a block folder: block.toml and its tables by name (`layouts`).
 
-    `file` is the name of the settings in messages; `trajectory` is the file named under [trajectory]; `more` are
-    classes of the user.
+    `file` is the name of the settings in messages. `trajectory` is the content of the file in [trajectory]. `more`
+    contains user-defined classes of observations and unknowns.
     """
 
     settings: Mapping[str, Any]
@@ -66,33 +66,33 @@ class BlockTables:
 
     @property
     def kinds(self) -> tuple[type[AbstractObservations], ...]:
-        """The classes of observations that there may be tables of."""
+        """Classes of observations that may have a table."""
         return known_kinds(kind for kind in self.more if issubclass(kind, AbstractObservations))
 
     @property
     def unknowns(self) -> tuple[type[AbstractParameters], ...]:
-        """The classes of parameters that [unknowns] may have."""
+        """Classes of parameters that are allowed in [unknowns]."""
         return known_unknowns(kind for kind in self.more if issubclass(kind, AbstractParameters))
 
 
 def read_block(folder: str | Path, more: Iterable[type] = ()) -> Block:
-    """Return the block that a folder describes (docs/block_folder.md).
+    """Read the block in a block folder (docs/block_folder.md).
 
-    `more` are classes of observations and of unknowns of your own (docs/extending.md).
+    `more` contains user-defined classes of observations and unknowns (docs/extending.md).
 
-    Raises InputError for a file, row or number that cannot be read and BlockError for observations that do not fit
-    together. Warns (UserWarning) of columns, points and cameras that are not used.
+    Raises InputError for an invalid file, row or value, and BlockError for inconsistent observations. Warns
+    (UserWarning) of unused columns, points and cameras.
     """
     return assemble(read_folder(Path(folder), more))
 
 
 def exposure_times(folder: str | Path) -> Float[np.ndarray, "images"]:
-    """Return `time_s` of images.csv, in the order of the block; NaN where it is empty."""
+    """Return `time_s` of images.csv in the order of the block's images; NaN for empty cells."""
     return read_folder(Path(folder)).tables["images"].numbers("time_s", empty=True)
 
 
 def read_folder(folder: Path, more: Iterable[type] = ()) -> BlockTables:
-    """Return the files of a block folder. Raises InputError for those that are missing or cannot be read."""
+    """Read the files of a block folder. Raises InputError for missing or invalid files."""
     if not folder.is_dir():
         raise InputError(f"there is no folder {folder}; give the folder that holds {TOML}")
     required = (TOML, *(f"{name}.csv" for name, layout in LAYOUTS.items() if layout.required))
@@ -118,7 +118,7 @@ def read_folder(folder: Path, more: Iterable[type] = ()) -> BlockTables:
 
 
 def assemble(source: BlockTables) -> Block:
-    """Return the block that settings and tables describe; all checks that need more than one line are made here."""
+    """Build the block from settings and tables, and check the relations between them."""
     kinds = source.kinds
     settings = read_settings(dict(source.settings), source.file, [sigma_key(kind) for kind in own_tables(kinds)])
     keys, top, frame = settings.keys, settings.top, settings.frame
@@ -161,7 +161,7 @@ def assemble(source: BlockTables) -> Block:
     if source.trajectory is None:
         check_attitude_units(tables["attitudes"], flight.stations, images)
     else:
-        # Cameras without a mount sit beside the reference camera of their rig.
+        # Remove stations and attitudes of rig cameras without a mount: their rig fixes them to the reference camera.
         rig = keys.unknowns.get(RigCamera.kind, {})
         heads = [c in rig and not m for c, m in zip(images.cameras, image_mount, strict=True)]
         flight = flight.without_heads(np.array(heads, bool))
@@ -238,7 +238,7 @@ def _warn(message: str) -> None:
 
 
 def _warn_of_fixed_orientations(block: Block, settings: Settings) -> None:
-    """Warn of images without sensors in direct georeferencing, whose approximate orientation is fixed."""
+    """Warn of images without station and attitude in direct georeferencing: their approximate orientation is fixed."""
     sensed = set(sensor_rows(block, block.start.unknowns).image.tolist())
     without = [name for k, name in enumerate(block.images) if k not in sensed]
     if without and len(block.stations.who) + len(block.attitudes.image):

@@ -1,4 +1,4 @@
-"""`Block` -> a block folder, whole or not at all."""
+"""Write a `Block` as a block folder, atomically."""
 
 import csv
 import math
@@ -40,20 +40,21 @@ from jaxphoto.writing import Clashes, check_folder, whole_folder
 
 
 def check_block_target(folder: Path, *inputs: Path) -> None:
-    """Raise InputError where no block can be written (`check_folder`), or a table lies that would be read with it."""
+    """Raise InputError if `folder` cannot be written (`check_folder`), or contains tables of a block."""
     check_folder(folder, *inputs, clashes=_tables_of(OBSERVATIONS))
 
 
 @outside_transformations
 def write_block(block: Block, folder: str | Path) -> None:
-    """Write `block` as a folder that `read_block` reads as the same block; numbers come back exactly.
+    """Write `block` as a folder that `read_block` reads as the same block, with identical floating-point values.
 
-    Angles are written in degrees, times as the file had them, coordinates of a frame of kind epsg in its system (1e-6
-    m); these come back to rounding. Velocities are written for images with a station, rates for those with an attitude.
-    A block that jaxphoto wrote there is replaced; other files in the folder stay (`whole_folder`).
+    Angles are written in degrees, times on the clock of the original file, and coordinates of an `epsg` frame in its
+    coordinate system (1e-6 m): these agree to rounding only. Velocities are written for images with a station, rates
+    for images with an attitude. A block that jaxphoto wrote to `folder` is replaced; other files are retained
+    (`whole_folder`).
 
-    Raises InputError where `folder` holds a block or anything else that jaxphoto did not write, or that was changed
-    since, BlockError for priors that block.toml cannot express.
+    Raises InputError if `folder` contains a block or file that jaxphoto did not write, or one modified since. Raises
+    BlockError for priors that block.toml cannot represent.
     """
     with whole_block(block, folder):
         pass
@@ -61,7 +62,7 @@ def write_block(block: Block, folder: str | Path) -> None:
 
 @contextmanager
 def whole_block(block: Block, folder: str | Path) -> Iterator[Path]:
-    """`write_block` into a folder that the caller may add files to before it takes its place."""
+    """Yield a temporary folder with the files of `write_block`; the caller may add files before it becomes `folder`."""
     check_motion_held(block)
     with whole_folder(Path(folder), _tables_of((*OBSERVATIONS, *kinds_of(block)))) as work:
         _write_files(block, work)
@@ -69,7 +70,7 @@ def whole_block(block: Block, folder: str | Path) -> Iterator[Path]:
 
 
 def _tables_of(kinds: Iterable[Kind]) -> Clashes:
-    """Return True for files that a block folder with these kinds of rows is read from."""
+    """Return a predicate of file names: True for files that are read as part of a block folder."""
     return {TOML, *(f"{name}.csv" for name in layouts(kinds))}.__contains__
 
 
@@ -80,7 +81,7 @@ def _write_files(block: Block, folder: Path) -> None:
     (folder / TOML).write_text(toml_text(settings), encoding="utf-8")
     for name, frame in tables.items():
         if len(frame) or (name in LAYOUTS and LAYOUTS[name].required):
-            # A first id that starts with # is quoted, or its line would be a comment.
+            # Quote ids that start with #: the first one would make its line a comment.
             comment = frame.iloc[:, 0].astype(str).str.startswith("#").any()
             quoting: Literal[0, 2] = csv.QUOTE_NONNUMERIC if comment else csv.QUOTE_MINIMAL
             frame.to_csv(folder / f"{name}.csv", index=False, quoting=quoting)
@@ -94,9 +95,8 @@ def _settings(block: Block) -> dict[str, Any]:
     for image, camera, mount in zip(block.images, block.image_camera, block.image_mount, strict=True):
         if mount != mount_of[camera]:
             raise BlockError(
-                "block.toml has one mount for all images of a camera, by the name of the mount: image "
-                f"{image} of camera {camera} has {f'mount {mount}' if mount else 'none'}; name a mount {camera} or "
-                "default, and give a camera that was mounted in two ways two names"
+                f"image {image} of camera {camera} has {f'mount {mount}' if mount else 'no mount'}, but block.toml "
+                f"allows one mount per camera; name it {camera} or default, and split a camera with two mounts into two"
             )
     names = set(block.points)
     optional = {
@@ -125,7 +125,7 @@ def _settings(block: Block) -> dict[str, Any]:
 
 
 def _mode_section(block: Block) -> dict[str, str]:
-    """Nothing, or that the exterior orientation is fixed and has no observations (`variants.direct`)."""
+    """Return [georeferencing]: empty, or mode "direct" for fixed exterior orientation without observations."""
     exterior = block.priors.exterior
     priors = (exterior.position, exterior.camera_from_object)
     if priors == (FREE, FREE):
@@ -134,8 +134,8 @@ def _mode_section(block: Block) -> dict[str, str]:
     if priors == (FIXED, FIXED) and block.start.image_known.all() and not sensors:
         return {"mode": "direct"}
     raise BlockError(
-        "block.toml can say of exterior orientation that all of it is FREE, or FIXED at known values and no station or "
-        "attitude observed; reset its priors, or hold it by jaxphoto.variants.direct"
+        "block.toml cannot represent these priors of exterior orientation; reset them to FREE, or fix all of it by "
+        "jaxphoto.variants.direct"
     )
 
 
@@ -188,7 +188,7 @@ def _images(block: Block) -> pd.DataFrame:
     columns |= block.partitions
     times = np.asarray(block.image_time if block.flight_time is None else block.flight_time)
     if times.any() or block.start.unknowns.strips:
-        # To a nanosecond: the decimals that the file had.
+        # Round to nanoseconds: this restores the decimals of the original file.
         columns["time_s"] = np.round(times + block.middle_s, 9) + 0.0 if block.middle_s else times
     if block.temperatures is not None:
         columns["temperature_c"] = np.asarray(block.temperatures.celsius)
@@ -207,7 +207,7 @@ def _with_motion(table: pd.DataFrame, block: Block, columns: tuple[str, ...]) ->
 
 
 def _xyz_rows(id_column: str, ids: np.ndarray, rows: AbstractCoordinates) -> pd.DataFrame:
-    """One line per point or image; coordinates that are not observed, and sigmas of zero, are left empty."""
+    """Tabulate coordinates, one row per point or image; cells of unobserved coordinates and zero sigmas are empty."""
     line, who = pd.factorize(np.asarray(rows.who))
     table = np.full((len(who), 6), math.nan)
     table[line, rows.axis] = rows.value

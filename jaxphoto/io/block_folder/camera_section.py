@@ -1,8 +1,8 @@
-"""The [cameras.X] tables of block.toml: sensor, interior orientation, what of it is free, and an earlier calibration.
+"""The tables [cameras.X] of block.toml: sensor, interior orientation and its priors, or an earlier calibration.
 
-`calibration = "../last_year"` stands for format, models, interior orientation and, as prior information with its full
-covariance, the parameters that it estimated ([cameras.X.known]). What it fixed is fixed here, too, unless
-[cameras.X.unknowns] says otherwise.
+`calibration = "../last_year"` replaces format, models and interior orientation. The parameters that this calibration
+estimated become prior information with their full covariance ([cameras.X.known]). Its fixed parameters are fixed,
+unless [cameras.X.unknowns] sets them.
 """
 
 import dataclasses
@@ -34,17 +34,17 @@ from jaxphoto.io.toml import Count, Keys, Number, Positive, Section, status
 from jaxphoto.observations import KnownParameters
 from jaxphoto.unknowns import FIXED, FREE
 
-# A principal distance beyond these multiples of the format's diagonal is in another unit than millimetres.
+# Maximum and minimum ratio of the principal distance to the format diagonal; beyond them, c_mm is not in millimetres.
 _LONGEST, _SHORTEST = 20.0, 0.05
-# Pixels of known sensors are 0.5 to 50 micrometres.
+# Minimum and maximum pixel size (mm); known sensors have 0.5 to 50 micrometres.
 PIXEL_MM = (2e-4, 0.1)
 _CALIBRATION = "calibration"
-# The keys that a table with an earlier calibration may have, too.
+# Keys that are allowed in addition to an earlier calibration.
 _OTHER_KEYS = (_CALIBRATION, "residuals", "unknowns")
 
 
 class SensorKeys(Keys):
-    """The format of a camera."""
+    """Keys of the image format."""
 
     width_px: Count
     height_px: Count
@@ -53,14 +53,14 @@ class SensorKeys(Keys):
 
 
 class CovarianceKeys(Keys):
-    """[cameras.X.known]"""
+    """Keys of [cameras.X.known]."""
 
     parameters: list[StrictStr]
     matrix: Any
 
 
 class CameraKeys(SensorKeys):
-    """[cameras.X], but for the choices of its models."""
+    """Keys of [cameras.X], without the options of its camera models."""
 
     distortion: StrictStr
     projection: StrictStr = Perspective.name
@@ -72,27 +72,27 @@ class CameraKeys(SensorKeys):
 
 
 class KnownTogether(NamedTuple):
-    """Parameters of a camera that an earlier calibration estimated, with their covariance (in their own units)."""
+    """Camera parameters that an earlier calibration estimated, with their joint covariance (in their own units)."""
 
     parameters: tuple[str, ...]
     covariance: np.ndarray
 
 
 class Camera(NamedTuple):
-    """A camera as block.toml gives it; `priors` has a prior in place of each number of `interior`."""
+    """A camera in block.toml; `priors` has the structure of `interior`, with a prior per parameter."""
 
     sensor: Sensor
     interior: InteriorOrientation
     priors: InteriorOrientation
     known: KnownTogether | None = None
-    """Joint prior information; these parameters are free in `priors`."""
+    """Joint prior information; its parameters are free in `priors`."""
     reservation: str = ""
-    """A warning about the calibration that it is from."""
+    """Warning about the earlier calibration; "" if none."""
 
 
 @functools.cache
 def _keys(distortion: type[AbstractDistortion], projection: type[AbstractProjection]) -> type[CameraKeys]:
-    """Return the keys of a camera with these models: each may have choices, such as a sign."""
+    """Return the keys of a camera with these models; a model may add options, such as a sign."""
     defaults = {f.name: f.default for kind in (distortion, projection) for f in dataclasses.fields(kind)}
     choices: dict[str, Any] = {
         key: (Literal[words], defaults[key])  # type: ignore[valid-type]
@@ -102,7 +102,7 @@ def _keys(distortion: type[AbstractDistortion], projection: type[AbstractProject
 
 
 def read_camera(section: Section) -> Camera:
-    """Return the camera of a [cameras.X] table."""
+    """Read the camera of a [cameras.X] table."""
     key = "distortion"
     try:
         distortion = AbstractDistortion.called(section.text(key))
@@ -134,7 +134,7 @@ def read_camera(section: Section) -> Camera:
 
 
 def _check_interior(values: Section, sensor: Sensor) -> None:
-    """Raise InputError for numbers in another unit than millimetres."""
+    """Raise InputError for a principal distance or principal point that is not in millimetres."""
     c, diagonal = values.number("c_mm"), float(np.hypot(sensor.width_mm, sensor.height_mm))
     if not _SHORTEST * diagonal < c < _LONGEST * diagonal:
         raise values.error(
@@ -170,7 +170,7 @@ def _priors(section: Section, keys: CameraKeys, interior: InteriorOrientation) -
 
 
 def read_sensor(section: Section) -> Sensor:
-    """Return the sensor of a table that may have other keys, too."""
+    """Return the sensor of a table; other keys of the table are ignored."""
     keys = section.values
     return Sensor(
         section.count("width_px"), section.count("height_px"), section.positive("pixel_mm"),
@@ -179,7 +179,7 @@ def read_sensor(section: Section) -> Sensor:
 
 
 def known_together(interior: InteriorOrientation, covariance: np.ndarray) -> KnownTogether:
-    """Return the estimated parameters in a covariance of all: those with a variance."""
+    """Select the estimated parameters, those with a positive variance, from a full covariance."""
     names = parameter_names(interior)
     free = np.flatnonzero(np.diagonal(covariance) > 0)
     part = covariance[np.ix_(free, free)]
@@ -187,7 +187,7 @@ def known_together(interior: InteriorOrientation, covariance: np.ndarray) -> Kno
 
 
 def camera_section(camera: Camera) -> dict[str, Any]:
-    """Return the [cameras.X] table that `read_camera` reads as `camera`."""
+    """Return the [cameras.X] table from which `read_camera` restores `camera`."""
     sensor, interior, priors, known, reservation = camera
     written: dict[str, Any] = sensor_keys(sensor) | model_keys(interior)
     if interior.residuals != "model":
@@ -203,14 +203,14 @@ def camera_section(camera: Camera) -> dict[str, Any]:
 
 
 def with_earlier_calibrations(settings: dict[str, Any], file: str, folder: Path) -> dict[str, Any]:
-    """Return the content of block.toml in `folder`, with earlier calibrations in the tables of their cameras.
+    """Return the content of block.toml in `folder`, replacing references to earlier calibrations by camera tables.
 
-    Raises InputError for calibrations that cannot be read or are without covariance, and for keys that they give.
+    Raises InputError for invalid calibrations, calibrations without covariance, and keys that the calibration sets.
     """
     cameras = settings.get("cameras", {})
     if not isinstance(cameras, dict) or not any(isinstance(t, dict) and _CALIBRATION in t for t in cameras.values()):
         return settings
-    # A camera file may be a block.toml, which it reads by modules of this package.
+    # Import here to avoid a cycle: `camera_files` imports this module to read a block.toml.
     from jaxphoto.io.camera_files import read_camera_file
 
     completed: dict[str, Any] = {}
@@ -243,7 +243,7 @@ def with_earlier_calibrations(settings: dict[str, Any], file: str, folder: Path)
 
 
 def known_cameras(cameras: Mapping[str, Camera]) -> tuple[KnownParameters, ...]:
-    """Return the joint prior information of each camera."""
+    """Return the joint prior information of each camera that has any."""
     known = []
     for name, camera in cameras.items():
         if camera.known is not None:

@@ -1,14 +1,14 @@
-"""Tables of declared observations, read and written by the columns of their classes (`observations.columns`).
+"""Read and write tables of declared observations by the columns of their classes (`observations.columns`).
 
-Numbers are in the object frame, whatever the frame of other files. Observations with a covariance matrix have two
-tables, the rows by set and the lower half of each matrix:
+Values are in the object frame, even if other files are in a map system. Observations with a covariance matrix have two
+tables, the rows by set and the lower triangle of each matrix:
 
     correlated_stations.csv                 set, image, axis, value_m
     correlated_stations_covariance.csv      set, a, b, covariance_m2
 
-`a` and `b` count the numbers of a set from 1: its rows in their order, and of each row its numbers. What is not listed
-is zero. Sets of a class need not be equally large. known_parameters.csv has set, label and value (in the unit that the
-label ends in), and the reservation about the source of a set.
+`a` and `b` are indices from 1 into the components of a set, ordered by row, then by component of the row. Missing
+entries are zero. The sets of a class may differ in size. known_parameters.csv has the columns set, label, value (in the
+unit suffix of the label), and reservation, a warning about the source of a set.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -45,14 +45,14 @@ KNOWN, JOINT, _MATRIX, _RESERVATION = "known_parameters", "correlated_", "_covar
 
 
 class Ids(NamedTuple):
-    """The ids that tables may name."""
+    """Ids that tables may contain."""
 
     images: Images
     points: ObservedPoints
     owners: Names
 
     def find(self, table: Table, column: str, kind: str) -> np.ndarray:
-        """Return the index of the `kind` of thing in each line. Raises BlockError for one that does not exist."""
+        """Return the index of the id of type `kind` in each line. Raises BlockError for unknown ids."""
         if kind == "image":
             return self.images.find(table, column)
         known, cure = self.points.ids, "is measured in no image; measure it or delete the row"
@@ -63,7 +63,7 @@ class Ids(NamedTuple):
 
 
 def known_kinds(more: Iterable[Kind]) -> tuple[Kind, ...]:
-    """Return the classes that files may hold, of jaxphoto and `more`. Raises BlockError if two have one name."""
+    """Return the classes that files may contain, of jaxphoto and `more`. Raises BlockError for duplicate names."""
     kinds = tuple(dict.fromkeys((*OBSERVATIONS, *more)))
     taken = set(LAYOUTS) - {kind.group for kind in OBSERVATIONS}
     for kind in kinds:
@@ -74,12 +74,12 @@ def known_kinds(more: Iterable[Kind]) -> tuple[Kind, ...]:
 
 
 def own_tables(kinds: Iterable[Kind]) -> list[Kind]:
-    """Return the classes without a reader of their own."""
+    """Select the classes that this module reads: all without a reader for their table."""
     return [kind for kind in kinds if kind.group not in LAYOUTS]
 
 
 def layouts(kinds: Iterable[Kind], partitions: Sequence[str] = ()) -> dict[str, TableLayout]:
-    """All tables that a folder may hold, by name; `partitions` are columns of images.csv."""
+    """Return the layouts of all tables of a folder, by name; `partitions` are columns of images.csv."""
     images = LAYOUTS["images"]
     tables = LAYOUTS | {"images": images._replace(columns=(*images.columns, *text(*partitions, required=False)))}
     matrix = text("set") + numbers("a", "b", required=True)
@@ -108,7 +108,7 @@ def layouts(kinds: Iterable[Kind], partitions: Sequence[str] = ()) -> dict[str, 
 def read_declared(
     kinds: Sequence[Kind], tables: Mapping[str, Table], ids: Ids, settings: Settings
 ) -> tuple[Distances, tuple[AbstractObservations | KnownParameters, ...]]:
-    """Return the distances of a block, and its `more`: a group a table, sets of correlated rows, known parameters."""
+    """Read the distances of a block and its `more`: one group per table, correlated sets, known parameters."""
     plain = [_rows(kind, tables[kind.group], ids, settings) for kind in own_tables(kinds)]
     joint = [group for kind in kinds for group in _correlated(kind, tables, ids)]
     (distances,) = (rows for rows in plain if isinstance(rows, Distances))
@@ -130,7 +130,7 @@ def _rows(kind: Kind, table: Table, ids: Ids, settings: Settings) -> AbstractObs
 
 
 def _fields(kind: Kind, table: Table, ids: Ids) -> dict[str, np.ndarray]:
-    """All fields; sigmas and those without a column are zero."""
+    """Return all fields; sigmas and fields without a column are zero."""
     fields = {name: np.zeros((len(table), *v.shape[1:]), v.dtype) for name, v in vars(kind.none()).items()}
     for column in columns_of(kind):
         if column.touches:
@@ -148,7 +148,7 @@ def _instance(kind: Kind, table: Table, fields: Mapping[str, np.ndarray]) -> Abs
 
 
 def _correlated(kind: Kind, tables: Mapping[str, Table], ids: Ids) -> list[Correlated]:
-    """Return the sets of rows of a class, those of one size together."""
+    """Read the correlated sets of a class, one group per size."""
     table, groups = tables[JOINT + kind.group], []
     sets = list(_sets(table, tables[JOINT + kind.group + _MATRIX], *_square(kind), len(kind.axes)))
     for size in dict.fromkeys(len(lines) for lines, _ in sets):
@@ -163,7 +163,7 @@ def _correlated(kind: Kind, tables: Mapping[str, Table], ids: Ids) -> list[Corre
 
 
 def _known(tables: Mapping[str, Table]) -> list[KnownParameters]:
-    """Parameters known together, an entry a set."""
+    """Read the joint prior information, one entry per set."""
     table = tables[KNOWN]
     value, label, reservation = table.numbers("value"), table.text("label"), table.text(_RESERVATION)
     return [
@@ -173,13 +173,13 @@ def _known(tables: Mapping[str, Table]) -> list[KnownParameters]:
 
 
 def _square(kind: Kind) -> tuple[str, float]:
-    """Return the end of the column of covariances, in the square of the unit, and the factor to jaxphoto's unit."""
+    """Return the unit suffix of the covariance column, and the factor that converts it to jaxphoto's unit."""
     unit = FILE_UNITS.get(kind.unit, kind.unit)
     return (f"_{unit.replace('_per_', '2_per_')}2" if unit else ""), (np.pi / 180) ** 2 if unit != kind.unit else 1.0
 
 
 def _sets(table: Table, matrices: Table, unit: str, scale: float, k: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Return the lines of each set, and its covariance matrix over `k` numbers of each line."""
+    """Yield the lines of each set, and its covariance matrix with `k` components per line."""
     named, owner = table.text("set"), matrices.text("set")
     matrices.find(
         "set", list(dict.fromkeys(named)), lambda name: f"set {name} is not in {table.file}; add or delete it"
@@ -209,15 +209,15 @@ def _sets(table: Table, matrices: Table, unit: str, scale: float, k: int) -> Ite
 
 
 def kinds_of(block: Block) -> list[Kind]:
-    """Return the classes of the observations of `more`."""
+    """Return the classes of the observations in `more`."""
     groups = [rows.rows if isinstance(rows, Correlated) else rows for rows in block.more]
     return list(dict.fromkeys(type(rows) for rows in groups if isinstance(rows, AbstractObservations)))
 
 
 def declared_tables(block: Block) -> dict[str, pd.DataFrame]:
-    """Return the tables of the distances and `more` of a block; groups of one class make one.
+    """Return the tables of the distances and `more` of a block; groups of one class are joined.
 
-    Raises BlockError for rows of a class whose table can hold only those of the block itself.
+    Raises BlockError for rows in `more` whose table is reserved for another field of the block.
     """
     names = {"image": block.images, "point": block.points}
     names |= {kind: tuple(owners) for kind, owners in block.start.unknowns.tables.items()}
@@ -241,7 +241,7 @@ def declared_tables(block: Block) -> dict[str, pd.DataFrame]:
 
 
 def _table(rows: AbstractObservations, names: Names, sigmas: bool = True) -> pd.DataFrame:
-    """Return the table of `rows`. Raises BlockError for a field that files do not have, and which is not zero."""
+    """Return the table of `rows`. Raises BlockError for a nonzero field that has no column."""
     columns = columns_of(type(rows))
     for name, value in vars(rows).items():
         if name not in [c.field for c in columns] and np.any(np.asarray(value) != 0):
@@ -257,7 +257,7 @@ def _cells(rows: AbstractObservations, column: ClassColumn, names: Names) -> np.
 
 
 def _correlated_tables(groups: Sequence[Correlated], names: Names) -> dict[str, pd.DataFrame]:
-    """Return the two tables of sets of rows of one class."""
+    """Return the two tables of the correlated sets of one class: rows and covariances."""
     parts: list[pd.DataFrame] = []
     matrices: list[np.ndarray] = []
     for group in groups:
@@ -272,7 +272,7 @@ def _correlated_tables(groups: Sequence[Correlated], names: Names) -> dict[str, 
 
 
 def _known_tables(groups: Sequence[KnownParameters]) -> dict[str, pd.DataFrame]:
-    """Return the two tables of parameters known together."""
+    """Return the two tables of known parameters: values and covariances."""
     rows = [
         (k, label, value, group.reservation)
         for k, group in enumerate(groups, 1)

@@ -1,4 +1,4 @@
-"""Stations, attitudes and motion: from their tables, or interpolated in the trajectory of [trajectory]."""
+"""Stations, attitudes and motion, read from tables or interpolated from the file of [trajectory]."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -24,9 +24,9 @@ from jaxphoto.observations import Attitudes, CameraPositions, RelativeAttitudes,
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 from jaxphoto.unknowns import FIXED, Unknowns, late_cameras
 
-# Records before and after each exposure that the spline is fitted to: others do not affect it.
+# Number of records before and after each exposure used for the spline; records farther away have no effect.
 _MARGIN = 64
-# An interval is a gap from this many times the usual interval: one record may be lost.
+# Ratio of an interval to the median interval above which it is a gap; one record may be missing.
 _GAP = 2.5
 
 _interpolate = jit_quickly(interpolate)
@@ -34,7 +34,7 @@ _angles = jit_quickly(jax.vmap(roll_pitch_yaw_from_matrix))
 
 
 class ObservedFlight(NamedTuple):
-    """Observed stations, attitudes and motion, and the images whose velocity and rate are known."""
+    """Observed stations, attitudes and motion, with masks of the images whose velocity and rate are known."""
 
     stations: CameraPositions
     attitudes: Attitudes
@@ -43,7 +43,7 @@ class ObservedFlight(NamedTuple):
     rate_known: np.ndarray
 
     def without_heads(self, head: np.ndarray) -> "ObservedFlight":
-        """Without stations and attitudes of the images that are `head` (a mask)."""
+        """Remove stations and attitudes of the images in the mask `head`."""
         stations, attitudes = self.stations, self.attitudes
         return self._replace(
             stations=stations.take(~head[stations.who]), attitudes=attitudes.take(~head[attitudes.image])
@@ -53,7 +53,7 @@ class ObservedFlight(NamedTuple):
 def read_flight(
     tables: Mapping[str, Table], trajectory: Records | None, images: Images, frame: Frame, settings: Settings
 ) -> ObservedFlight:
-    """Stations, attitudes and motion, from the trajectory or from their tables."""
+    """Read stations, attitudes and motion, from the trajectory or from their tables."""
     stations, attitudes = tables["stations"], tables["attitudes"]
     if trajectory is not None:
         for table in (stations, attitudes):
@@ -78,7 +78,7 @@ def read_flight(
 
 
 def _motion(table: Table, columns: tuple[str, ...], images: Images) -> tuple[np.ndarray, np.ndarray]:
-    """Values by image, zero where unknown, and where they are known."""
+    """Return the motion by image, zero if unknown, and the mask of images with known motion."""
     values = np.full((len(images.ids), 3), np.nan)
     given = table.matrix(columns, empty=True)
     table.check(
@@ -99,7 +99,7 @@ def check_motion(
     images: Images,
     file: str,
 ) -> None:
-    """Raise BlockError where a time offset of a mount, or a delay in a rig, needs motion that is not known."""
+    """Raise BlockError if the time offset of a mount, or a delay in a rig, requires motion that is unknown."""
     rows = list(rows)
     positions, turns = (
         [index for group in rows if isinstance(group, kind) for _, index in group.indices()]
@@ -134,7 +134,7 @@ def check_motion(
 
 
 def check_motion_held(block: Block) -> None:
-    """Raise BlockError where a folder cannot hold the motion that the delay of a camera in a rig needs."""
+    """Raise BlockError if the tables cannot contain the motion that the delay of a rig camera requires."""
     late = late_cameras(block.start.unknowns, block.priors)
     held = set(np.asarray(block.stations.who).tolist()) & set(np.asarray(block.attitudes.image).tolist())
     for reference, camera in _late_pairs(block.more, block.image_camera, late):
@@ -146,7 +146,7 @@ def check_motion_held(block: Block) -> None:
 
 
 def _late_pairs(rows: Iterable[Any], cameras: Sequence[str], late: Collection[str]) -> Iterator[tuple[int, str]]:
-    """Return the image of the reference camera, and the camera that exposes late beside it."""
+    """Yield (image of the reference camera, camera) for each rig observation of a camera with a delay."""
     for group in rows:
         if isinstance(group, RigPlaces | RigTurns):
             for reference, image in zip(group.reference.tolist(), group.image.tolist(), strict=True):
@@ -155,7 +155,7 @@ def _late_pairs(rows: Iterable[Any], cameras: Sequence[str], late: Collection[st
 
 
 def check_attitude_units(table: Table, stations: CameraPositions, images: Images) -> None:
-    """`_check_yaw` of attitudes.csv, against the flight from image to image of a strip."""
+    """Check the unit of attitudes.csv by the direction of flight between consecutive images (`_check_yaw`)."""
     yaw = np.full(len(images.ids), np.nan)
     yaw[images.find(table)] = table.numbers("yaw_deg")
     position = np.where(images.known[:, None], np.asarray(images.exterior.position), np.nan)
@@ -168,7 +168,7 @@ def check_attitude_units(table: Table, stations: CameraPositions, images: Images
 
 
 def _check_yaw(yaw: np.ndarray, flown: np.ndarray, file: str) -> None:
-    """Raise InputError where `yaw` follows the way `flown` when read as radians, and does not when read as degrees."""
+    """Raise InputError if `yaw` agrees with the direction of flight `flown` in radians but not in degrees."""
     course = np.arctan2(flown[:, 0], flown[:, 1])
     known = ~np.isnan(course) & ~np.isnan(yaw)
     if counts_in_radians(yaw[known], course[known]):
@@ -179,10 +179,10 @@ def _check_yaw(yaw: np.ndarray, flown: np.ndarray, file: str) -> None:
 
 
 def _interpolated(records: Records, images: Images, frame: Frame, settings: Settings) -> ObservedFlight:
-    """Stations, attitudes and motion of the images at `time_s` + `shift_s`.
+    """Interpolate stations, attitudes and motion of the images at `time_s` + `shift_s`.
 
-    Raises InputError where the trajectory does not fit the frame, BlockError where it does not cover the exposures or
-    has another clock.
+    Raises InputError if the trajectory does not fit the frame, and BlockError if it does not cover the exposures or has
+    a different time scale.
     """
     keys = settings.keys.trajectory
     shift = keys.shift_s if keys is not None else 0.0
@@ -226,7 +226,7 @@ def _interpolated(records: Records, images: Images, frame: Frame, settings: Sett
 
 
 def _near(records: Records, times: np.ndarray) -> Records:
-    """Return the records about the exposures: hours of them at 200 Hz would only take time."""
+    """Select the records near the exposures: interpolating in hours of 200 Hz data is slow."""
     n, at = len(records.time), np.searchsorted(records.time, times)
     change = np.zeros(n + 1, int)
     np.add.at(change, np.clip(at - _MARGIN, 0, n - SHORTEST), 1)
@@ -239,7 +239,7 @@ def _taken(records: Records, chosen: np.ndarray) -> Records:
 
 
 def _check_inside(times: np.ndarray, image: np.ndarray, records: Records, images: Images, shift: float) -> None:
-    """Raise BlockError for an exposure outside the trajectory, with the shift of the clock where one explains it."""
+    """Raise BlockError for an exposure outside the trajectory; report the clock shift if one explains it."""
     start, end = float(records.time[0]), float(records.time[-1])
     outside = np.flatnonzero((times < start) | (times > end))
     if not len(outside):
@@ -266,14 +266,14 @@ def _check_inside(times: np.ndarray, image: np.ndarray, records: Records, images
 def _check_leap_seconds(
     poses: Poses, times: np.ndarray, image: np.ndarray, records: Records, images: Images, frame: Frame, shift: float
 ) -> None:
-    """Raise BlockError where approximate positions fit a clock that is off by leap seconds, and not this one."""
+    """Raise BlockError if approximate positions fit the trajectory only after a shift by leap seconds."""
     known = images.known[image]
     if not known.any():
         return
     expected = np.asarray(images.exterior.position)[image[known]]
 
     def distance(leap: float) -> float:
-        """Median distance to the trajectory at shifted times; beyond its ends the ends are taken."""
+        """Return the median distance to the trajectory at shifted times, limited to its first and last record."""
         last = np.clip(np.searchsorted(records.time, times[known] + leap), 1, len(records.time) - 1)
         before, after = (positions_in(_taken(records, k), frame) for k in (last - 1, last))
         span = records.time[last] - records.time[last - 1]
@@ -281,7 +281,7 @@ def _check_leap_seconds(
         return float(np.median(np.linalg.norm((1 - part) * before + part * after - expected, axis=1)))
 
     now, speed = distance(0.0), float(np.median(np.linalg.norm(poses.velocity, axis=1)))
-    # Less than half of it is no leap: then the approximations decide nothing.
+    # Below half of the smallest leap-second shift, approximate positions cannot distinguish the time scales.
     if now <= 0.5 * min(LEAP_SECONDS) * speed:
         return
     distances = {sign * leap: distance(sign * leap) for leap in LEAP_SECONDS for sign in (1, -1)}

@@ -1,7 +1,7 @@
-"""The tables of a block in an EPSG system, converted to the local frame of the adjustment, and back.
+"""Convert the tables of a block in an EPSG system to the local frame of the adjustment, and back.
 
-A point or station with missing coordinates (height control) is completed for the conversion by what else is known of
-it: its other rows, then its approximate coordinates.
+For the conversion, missing coordinates of a point or station (height control) are completed from its other rows, then
+from its approximate coordinates.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,9 +26,9 @@ from jaxphoto.rotation import (
     roll_pitch_yaw_from_matrix,
 )
 
-# How far (degrees) a block may reach beyond the area of use of its system.
+# Maximum distance (degrees) of a block from the area of use of its system.
 _BEYOND = 3.0
-# So far (m) from the origin the vertical is tilted by 3 degrees.
+# Maximum distance (m) of the block from its origin; the vertical is tilted by 3 degrees there.
 _FAR_M = 3e5
 _PLACED = ("images", "control_points", "stations", "object_points")
 
@@ -37,9 +37,9 @@ Refuse = Callable[[str, int, str], NoReturn]
 
 
 def tables_to_local(tables: Mapping[str, Table], frame: Frame) -> dict[str, Table]:
-    """Return the tables of a block folder with X_m, Y_m, Z_m and all angles in the local frame; others as they are.
+    """Convert X_m, Y_m, Z_m and all angles of a block folder to the local frame; other columns are unchanged.
 
-    `frame` has its origin. Raises InputError where a row cannot be converted.
+    `frame` has its origin. Raises InputError for rows that cannot be converted.
     """
     names = dict(zip(coordinate_names(frame), XYZ, strict=True))
     converted_names = (*XYZ, *ANGLES, *ATTITUDE, *VELOCITY)
@@ -66,7 +66,7 @@ def tables_to_local(tables: Mapping[str, Table], frame: Frame) -> dict[str, Tabl
 
 
 def tables_to_map(tables: ArrayLike, frame: Frame) -> ArrayLike:
-    """Return the tables of `write_block` in the system of `frame`: the inverse of `tables_to_local`."""
+    """Convert the tables of `write_block` to the system of `frame`: the inverse of `tables_to_local`."""
 
     def refuse(name: str, line: int, message: str) -> NoReturn:
         raise BlockError(f"{name}.csv, entry {line + 1}: {message}")
@@ -77,12 +77,12 @@ def tables_to_map(tables: ArrayLike, frame: Frame) -> ArrayLike:
 
 
 def with_origin(frame: Frame, tables: Mapping[str, Table], trajectory: Records | None, file: str) -> Frame:
-    """Return the frame with its origin: that of block.toml, else a round place amid the coordinates, at height zero.
+    """Return the frame with its origin: from block.toml, or the rounded median of the coordinates at height zero.
 
-    Raises InputError where the coordinates of a file are not in the area of the system, or far from the origin.
+    Raises InputError if the coordinates of a file are outside the area of the system, or far from the origin.
     """
     assert frame.code is not None
-    # Places do not depend on the origin, which is not known yet.
+    # Use a zero origin: longitude and latitude do not depend on it.
     system, names = MapFrame(frame.code, frame.vertical, (0.0, 0.0, 0.0)), coordinate_names(frame)
     placed: list[np.ndarray] = []
     for table in (tables[name] for name in _PLACED if all(column in tables[name] for column in names)):
@@ -99,8 +99,8 @@ def with_origin(frame: Frame, tables: Mapping[str, Table], trajectory: Records |
     if not placed:
         if frame.origin is None:
             raise InputError(
-                f"{file}, [frame]: no coordinate tells where the block lies; add origin = [longitude, latitude, "
-                "height] in degrees and metres"
+                f"{file}, [frame]: the block has no coordinates to place its origin; add origin = [longitude, "
+                "latitude, height] in degrees and metres"
             )
         return frame
     longitude, latitude, _ = np.median(np.concatenate(placed), axis=0)
@@ -116,7 +116,7 @@ def with_origin(frame: Frame, tables: Mapping[str, Table], trajectory: Records |
 
 
 def _check_area(file: str, coordinates: np.ndarray, places: np.ndarray, frame: Frame) -> None:
-    """Raise InputError where the middle of a file's `coordinates`, at `places`, is not in the area of the system."""
+    """Raise InputError if the median of a file's `coordinates`, at `places`, is outside the area of the system."""
     assert frame.code is not None
     area, names = map_system(frame.code).area_of_use, coordinate_names(frame)
     if area is None:
@@ -132,7 +132,7 @@ def _check_area(file: str, coordinates: np.ndarray, places: np.ndarray, frame: F
 
 
 def _converted(tables: ArrayLike, frame: Frame, back: bool, refuse: Refuse) -> ArrayLike:
-    """All tables to the local frame, or back. Completed coordinates serve the conversion and are not kept."""
+    """Convert all tables to the local frame, or back. Completed coordinates are used, but not returned."""
     system, converted = frame.map, dict(tables)
     control, images = tables["control_points"], tables["images"]
     role = control["role"] if "role" in control else pd.Series("", index=control.index)
@@ -150,7 +150,7 @@ def _converted(tables: ArrayLike, frame: Frame, back: bool, refuse: Refuse) -> A
         given = table[list(XYZ)].to_numpy(float)
         whole = _completed(table, given, others)
         partly = np.isnan(whole).any(axis=1)
-        # The incomplete orientation of an image is kept for the warning that it is not used.
+        # Retain incomplete orientations of images: the reader warns that they are not used.
         for line in np.flatnonzero(partly & ~np.isnan(given).all(axis=1)) if name != "images" else ():
             missing = XYZ[int(np.flatnonzero(np.isnan(whole[line]))[0])]
             where = "images.csv" if name == "stations" else "object_points.csv"
@@ -189,7 +189,7 @@ def _converted(tables: ArrayLike, frame: Frame, back: bool, refuse: Refuse) -> A
 
 
 def _completed(table: pd.DataFrame, given: np.ndarray, sources: list[pd.DataFrame]) -> np.ndarray:
-    """`given`, with missing numbers from the first of `sources` that has them of the same point or image."""
+    """Complete missing values of `given` from the first of `sources` that has them for the same point or image."""
     values = given.copy()
     for source in sources:
         key = "point" if "point" in source else "image"
@@ -204,7 +204,7 @@ def _completed(table: pd.DataFrame, given: np.ndarray, sources: list[pd.DataFram
 def _rotated(
     table: pd.DataFrame, columns: tuple[str, ...], axes: Callable, local: np.ndarray, back: bool
 ) -> pd.DataFrame:
-    """Angles or velocities in the axes of the files at `local`, in those of the local frame, or back."""
+    """Rotate angles or velocities from the axes of the files at `local` to the local frame, or back."""
     values = table[list(columns)].to_numpy(float, copy=True)
     known = ~np.isnan(values).any(axis=1) & ~np.isnan(local).any(axis=1)
     rotation = axes(local[known])

@@ -1,6 +1,6 @@
-"""The tables of a block itself -> its rows: images, image points, control, stations, attitudes, surfaces.
+"""Read the tables of a block as its observations: images, image points, control, stations, attitudes, surfaces.
 
-Tables are `checked`: ids are text and cells are numbers, NaN where they are empty.
+Tables are `checked`: ids are text, other cells are floats, NaN if empty.
 """
 
 import dataclasses
@@ -36,47 +36,47 @@ from jaxphoto.observations import AXES, Attitudes, CameraPositions, ControlCoord
 from jaxphoto.unknowns import FIXED, Unknowns
 
 ROLES = ("control", "fixed", "check")
-# How far outside the format, in parts of its half, a measurement may lie: beyond, it is in another unit.
+# Maximum |x| / half width and |y| / half height of an image point; beyond it, the unit is wrong.
 _OUTSIDE = 1.5
-# Of a camera in use (degrees Celsius).
+# Minimum and maximum temperature of a camera in use (degrees Celsius).
 _COLDEST_C, _WARMEST_C = -90.0, 120.0
-# Columns of conditions.csv, the nearest to the lens first.
+# Columns of conditions.csv, in order of preference.
 _TEMPERATURES = ("lens_temperature_c", "sensor_temperature_c", "temperature_c")
-# By how much the length of a unit normal may differ from 1: more than rounding of a few written digits.
+# Maximum deviation of the length of a unit normal from 1; allows rounding to a few digits.
 _UNIT = 1e-3
 
 _from_angles = eqx.filter_jit(ExteriorOrientation.from_angles)
 
 
 class Images(NamedTuple):
-    """One entry per image, in the order of the file."""
+    """Images in the order of images.csv, one entry per image."""
 
     table: Table
     ids: tuple[str, ...]
     cameras: tuple[str, ...]
     strips: tuple[str, ...]
     times: np.ndarray
-    """Seconds from the mean of the image's strip."""
+    """Seconds from the mean time of the image's strip."""
     flight_times: np.ndarray
-    """Seconds from the mean of all images."""
+    """Seconds from the mean time of all images."""
     middle_s: float
-    """The mean of all images in the time of the file (s), to a nanosecond."""
+    """Mean time of all images on the clock of the file (s), rounded to a nanosecond."""
     exterior: ExteriorOrientation
     known: np.ndarray
 
     def find(self, table: Table, column: str = "image") -> np.ndarray:
-        """Return the index of the image in each line of `table`. Raises BlockError for one that is not listed."""
+        """Return the index of the image in each line of `table`. Raises BlockError for unknown images."""
         listed = self.table.file
         return table.find(column, self.ids, lambda name: f"image {name} is not in {listed}; add it or delete this row")
 
     @property
     def strips_are_the_flight(self) -> bool:
-        """True if the times of all strips have one mean, to a nanosecond: one strip, or a file that centred them."""
+        """True if all strips have the same mean time, to a nanosecond: one strip, or times centred in the file."""
         return bool(np.allclose(self.flight_times, self.times, rtol=0.0, atol=1e-9))
 
 
 def read_images(table: Table, settings: Settings) -> Images:
-    """Return the images of images.csv."""
+    """Read images.csv."""
     if not len(table):
         raise BlockError(f"{table.file}: there are no images; list at least two")
     cameras, strips, times = table.text("camera"), table.text("strip"), table.numbers("time_s", empty=True)
@@ -119,13 +119,13 @@ def read_images(table: Table, settings: Settings) -> Images:
 
 
 def _centred(times: np.ndarray, strips: np.ndarray) -> np.ndarray:
-    """Seconds from the mean time of the image's strip, zero where there is no time."""
+    """Return seconds from the mean time of the image's strip; zero without a time."""
     seconds = pd.Series(times)
     return (seconds - seconds.groupby(strips).transform("mean")).fillna(0.0).to_numpy()
 
 
 def partitions_of(images: Images, settings: Settings) -> dict[str, tuple[str, ...]]:
-    """Return the part that each image is in, by partition."""
+    """Return the part of each image, by partition."""
     parts = {name: images.table.text(name) for name in settings.keys.partitions}
     for name, part in parts.items():
         for line in np.flatnonzero(part == "default")[:1]:
@@ -134,9 +134,9 @@ def partitions_of(images: Images, settings: Settings) -> dict[str, tuple[str, ..
 
 
 def with_temperatures(images: Table, folder: Path) -> Table:
-    """images.csv with the temperatures of conditions.csv in `folder`, if it has none of its own.
+    """Return images.csv with temperatures from conditions.csv in `folder`, unless it has temperatures.
 
-    They are those of the lens, else of the sensor, else of the air: the first that is known for every image.
+    The first temperature that is known for every image is used: of the lens, else of the sensor, else of the air.
     """
     if "temperature_c" in images or not (folder / CONDITIONS).is_file():
         return images
@@ -150,7 +150,7 @@ def with_temperatures(images: Table, folder: Path) -> Table:
 
 
 def temperatures_of(images: Images, settings: Settings) -> Temperatures | None:
-    """Return the temperatures of the cameras, where any is known."""
+    """Return the temperatures of the cameras; None if none is known."""
     celsius = images.table.numbers("temperature_c", empty=True)
     images.table.check(
         (celsius < _COLDEST_C) | (celsius > _WARMEST_C),
@@ -163,7 +163,7 @@ def temperatures_of(images: Images, settings: Settings) -> Temperatures | None:
 
 
 def check_times(images: Images, starts: Unknowns, priors: Unknowns) -> None:
-    """Raise BlockError where a drift, or a change of a camera, needs a time or a temperature that is missing."""
+    """Raise BlockError if an image lacks a time or temperature that a drift or a camera change requires."""
 
     def changes(start: object, prior: object, *names: str) -> bool:
         return any(getattr(prior, n) != FIXED or np.any(np.asarray(getattr(start, n)) != 0) for n in names)
@@ -190,7 +190,7 @@ def check_times(images: Images, starts: Unknowns, priors: Unknowns) -> None:
 
 
 class ObservedPoints(NamedTuple):
-    """The observed points and their rows; `lines` is the line of the table each row comes from."""
+    """Observed points and their image points; `lines` is the line of the table of each row."""
 
     table: Table
     ids: tuple[str, ...]
@@ -198,14 +198,14 @@ class ObservedPoints(NamedTuple):
     lines: np.ndarray
 
     def find(self, ids: np.ndarray) -> np.ndarray:
-        """Return the index of each point, -1 where it is observed in no image."""
+        """Return the index of each point; -1 if it has no image point."""
         return pd.Index(self.ids).get_indexer(pd.Index(ids))
 
 
 def read_image_points(table: Table, images: Images, settings: Settings) -> ObservedPoints:
-    """Return the measurements, sorted by point and image; points in order of first appearance."""
+    """Read the image points, sorted by point and image; points are in order of first appearance."""
     if not len(table):
-        raise BlockError(f"{table.file}: there are no image points; list what was measured in the images")
+        raise BlockError(f"{table.file}: no image points; add the image measurements")
     image = images.find(table)
     sensors = [settings.cameras[camera].sensor for camera in images.cameras]
     pixel = np.array([s.pixel_mm for s in sensors])[image][:, None]
@@ -219,7 +219,7 @@ def read_image_points(table: Table, images: Images, settings: Settings) -> Obser
 
 
 def _coordinates(table: Table, pixel: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """(n, 2) millimetres from the image centre, from whichever pair of columns there is."""
+    """Return (n, 2) millimetres from the image centre, from millimetre or pixel columns."""
     pairs = [pair for pair in (("x_mm", "y_mm"), ("column_px", "row_px")) if any(name in table for name in pair)]
     if len(pairs) != 1 or not all(name in table for name in pairs[0]):
         raise InputError(
@@ -237,7 +237,7 @@ def _coordinates(table: Table, pixel: np.ndarray, half: np.ndarray) -> np.ndarra
 
 
 def _image_sigmas(table: Table, pixel: np.ndarray, settings: Settings) -> np.ndarray:
-    """(n, 2) in millimetres, from the columns or, where they are absent or empty, from [sigmas]."""
+    """Return (n, 2) sigmas in millimetres, from the columns; absent or empty cells are taken from [sigmas]."""
     in_mm = np.stack([table.sigmas("sigma_x_mm"), table.sigmas("sigma_y_mm")], axis=1)
     in_px = table.sigmas("sigma_px")[:, None] * pixel * np.ones(2)
     table.check(
@@ -259,9 +259,9 @@ def _image_sigmas(table: Table, pixel: np.ndarray, settings: Settings) -> np.nda
 
 
 def check_rays(points: ObservedPoints, images: Images, controlled: np.ndarray) -> None:
-    """Raise BlockError for an image with fewer than 3 points, or a point of one ray without control.
+    """Raise BlockError for an image with fewer than 3 points, or a point with one ray and no control.
 
-    `controlled` (points,) is true where a control coordinate or a fixed one is known.
+    `controlled` (points,): True if a control or fixed coordinate is known.
     """
     per_image = np.bincount(points.rows.image, minlength=len(images.ids))
     for i in np.flatnonzero(per_image < 3)[:1]:
@@ -280,7 +280,10 @@ def check_rays(points: ObservedPoints, images: Images, controlled: np.ndarray) -
 
 
 class Control(NamedTuple):
-    """Object coordinates by role, starting coordinates (points, 3) and for which points all three are known."""
+    """Object coordinates by role, initial coordinates (points, 3), and masks of points.
+
+    `known`: all three initial coordinates are known. `controlled`: at least one control or fixed coordinate.
+    """
 
     control: ControlCoordinates
     fixed: ControlCoordinates
@@ -293,7 +296,7 @@ class Control(NamedTuple):
 def sigmas_of(
     table: Table, column: str, settings: Settings, *keys: str, needed: np.ndarray | bool = True
 ) -> np.ndarray:
-    """Return a column of standard deviations, completed by the first of `keys` in [sigmas] where `needed`."""
+    """Read a column of sigmas; missing `needed` ones are taken from the first of `keys` in [sigmas]."""
     given = table.sigmas(column)
     sigma = np.where(np.isnan(given) & needed, default_sigma(settings, *keys), given)
     table.check(
@@ -307,10 +310,10 @@ def sigmas_of(
 
 
 def read_control(table: Table, approximations: Table, points: ObservedPoints, settings: Settings) -> Control:
-    """Control of each role; a point that no image shows is dropped with a UserWarning.
+    """Read the coordinates of each role; warn (UserWarning) of points without image points and skip them.
 
-    Starting coordinates are those of control and fixed points, axis by axis, then those of object_points.csv.
-    A point may stand in two rows that give different axes (control in X and Y, check in Z).
+    Initial coordinates are taken per axis from control and fixed points, else from object_points.csv. A point may have
+    two rows with different axes (control in X and Y, check in Z).
     """
     start = np.full((len(points.ids), 3), np.nan)
     index = _find_or_warn(approximations, points)
@@ -330,7 +333,7 @@ def read_control(table: Table, approximations: Table, points: ObservedPoints, se
         keys = (f"control_{axis}_m", "control_m")
         sigma[:, a] = sigmas_of(table, SIGMA_XYZ[a], settings, *keys, needed=needed)
     sigma[role == "fixed"] = 0.0
-    # A check coordinate needs no sigma: it never enters an adjustment.
+    # Set missing sigmas of check coordinates to zero: they are not used in the adjustment.
     sigma = np.nan_to_num(sigma)
     rows = ControlCoordinates(index[lines], axes, as_jax_array(value[lines, axes]), as_jax_array(sigma[lines, axes]))
     by_role = {name: rows.take((role[lines] == name) & (index[lines] >= 0)) for name in ROLES}
@@ -344,7 +347,7 @@ def read_control(table: Table, approximations: Table, points: ObservedPoints, se
 
 
 def _given_coordinates(table: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All coordinates (n, 3), and line and axis of those that are not empty, at least one in a row."""
+    """Return all coordinates (n, 3), and line and axis of each cell that is not empty. Every row needs at least one."""
     value = table.matrix(XYZ, empty=True)
     table.check(np.isnan(value).all(axis=1), lambda _: "there is no coordinate; give at least one, or delete the row")
     lines, axes = np.nonzero(~np.isnan(value))
@@ -352,7 +355,7 @@ def _given_coordinates(table: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _find_or_warn(table: Table, points: ObservedPoints) -> np.ndarray:
-    """Return the index of each line's point, -1 (and a warning) where no image shows it."""
+    """Return the index of each line's point; -1, with a warning, for points without image points."""
     named = table.text("point")
     index = points.find(named)
     if missing := list(dict.fromkeys(named[index < 0])):
@@ -365,7 +368,7 @@ def _find_or_warn(table: Table, points: ObservedPoints) -> np.ndarray:
 
 
 def check_datum_points(over: object, points: ObservedPoints, file: str) -> None:
-    """Raise InputError for a datum over points that no image shows."""
+    """Raise InputError for datum points without image points."""
     if isinstance(over, tuple):
         for name, index in zip(over, points.find(np.array(over, object)), strict=True):
             if index < 0:
@@ -373,7 +376,7 @@ def check_datum_points(over: object, points: ObservedPoints, file: str) -> None:
 
 
 def read_stations(table: Table, images: Images, settings: Settings) -> CameraPositions:
-    """Observed positions, one row per coordinate."""
+    """Read observed positions, one row per coordinate."""
     image, (value, lines, axes) = images.find(table), _given_coordinates(table)
     needed = ~np.isnan(value)
     columns = enumerate(SIGMA_XYZ)
@@ -382,16 +385,16 @@ def read_stations(table: Table, images: Images, settings: Settings) -> CameraPos
 
 
 def read_attitudes(table: Table, images: Images, settings: Settings) -> Attitudes:
-    """Observed attitudes, in radians."""
+    """Read observed attitudes (rad)."""
     sigma = np.stack([sigmas_of(table, c, settings, "attitude_deg") for c in SIGMA_ATTITUDE], axis=1)
     degrees = table.matrix(ATTITUDE)
     return Attitudes(images.find(table), as_jax_array(np.deg2rad(degrees)), as_jax_array(np.deg2rad(sigma)))
 
 
 def read_surfaces(table: Table, strips: tuple[str, ...], points: ObservedPoints, settings: Settings) -> SurfaceRows:
-    """Points on surfaces of a laser scanner, all in the object frame, whatever the frame of other files.
+    """Read points on laser-scanned surfaces. Values are in the object frame, even if other files are in a map system.
 
-    `strips` are those with a table of [scanner.shifts].
+    `strips`: strips with a table [scanner.shifts.X].
     """
     message = "is measured in no image; measure it or delete the row"
     point = table.find("point", points.ids, lambda name: f"point {name} {message}")

@@ -1,7 +1,7 @@
-"""Tables of parameters in block.toml, [mounts.X], [strips.X], [scanner] and [unknowns.KIND.OWNER]: starts and priors.
+"""Read and write initial values and priors of parameters: [mounts.X], [strips.X], [scanner], [unknowns.KIND.OWNER].
 
-Keys follow from the class: `shift_m` with the start of the field `shift`, in the unit that ends the names of its
-numbers (rad are degrees in files), and `shift` with its prior. A field without a unit starts as `shift_start`.
+Keys are derived from the class: `shift_m` has the initial value of the field `shift`, in the unit suffix of its
+component names (degrees in files for rad), and `shift` its prior. A field without a unit has `shift_start`.
 """
 
 import dataclasses
@@ -25,30 +25,30 @@ from jaxphoto.unknowns import FIXED, UNKNOWNS, Unknowns, Weighted
 
 Kind = type[AbstractParameters]
 Pairs = tuple[dict[str, Any], dict[str, Any]]
-"""Start values and priors, by owner."""
+"""Initial values and priors, by owner."""
 _DEG = np.pi / 180
-# Classes with tables of their own.
+# Kinds with a table outside [unknowns].
 _SEPARATE = ("scanner", "mounts", "strips")
 _OWNERS = ("image", "camera", "mount", "strip", "block")
-# Kinds with one owner, without a name, and the kind whose owners are named here only.
+# Owners without a name (one per block), and the owner whose names occur only in this section.
 _ONE, _NAMED = ("block", "lidar"), "knot"
-# Readout times of sensors (ms).
+# Minimum and maximum readout time of a sensor (ms).
 _FASTEST_MS, _SLOWEST_MS = 0.5, 1000.0
 
 
 class Key(NamedTuple):
-    """The keys of a field."""
+    """Keys of a field."""
 
     field: str
     start: str
     unit: str
-    """May end the keys of a prior, such as _m."""
+    """Optional suffix of the keys of a prior, such as _m."""
     scale: float
     shape: tuple[int, ...]
 
 
 def known_unknowns(more: Iterable[Kind]) -> tuple[Kind, ...]:
-    """Return the classes that [unknowns] may hold, `more` the last. Raises BlockError where two have one name."""
+    """Return the classes allowed in [unknowns], with `more` last. Raises BlockError for duplicate names."""
     kinds = tuple(
         kind for kind in dict.fromkeys((*UNKNOWNS, *more)) if kind not in UNKNOWNS or kind.kind not in _SEPARATE
     )
@@ -62,7 +62,7 @@ def known_unknowns(more: Iterable[Kind]) -> tuple[Kind, ...]:
 
 @functools.cache
 def keys_of(kind: Kind) -> tuple[Key, ...]:
-    """Return the keys of the fields of a class. Raises TypeError for fields that are neither numbers nor vectors."""
+    """Return the keys of the fields of a class. Raises TypeError for fields that are neither scalars nor vectors."""
     hints, keys = typing.get_type_hints(kind), []
     for field in dynamic_fields(kind):
         names = kind.names[field]
@@ -79,17 +79,17 @@ def keys_of(kind: Kind) -> tuple[Key, ...]:
 
 
 def static_fields(kind: Kind) -> dict[str, Any]:
-    """Fields that hold no numbers to solve for, with their defaults."""
+    """Return the fields without unknowns, with their defaults."""
     return {f.name: f.default for f in dataclasses.fields(kind) if f.name not in dynamic_fields(kind)}
 
 
 def read_parameters(kind: Kind, table: Section) -> tuple[Any, Any]:
-    """Start values and priors of one owner."""
+    """Read initial values and priors of one owner."""
     keys, static = keys_of(kind), static_fields(kind)
     table.known(*(k.start for k in keys), *static, *(k.field for k in keys))
     starts: dict[str, Any] = {name: table.values.get(name, default) for name, default in static.items()}
     priors = dict(starts)
-    # A static field of `sized` classes gives the size of the others.
+    # Fields of `sized` classes have the length given by a static field.
     empty = _instance(kind, starts | {key.field: np.zeros(0) for key in keys}, table) if kind.sized else None
     for key in keys:
         shape = (getattr(empty, kind.sized),) if kind.sized else key.shape
@@ -97,7 +97,7 @@ def read_parameters(kind: Kind, table: Section) -> tuple[Any, Any]:
         starts[key.field] = as_jax_array(value * key.scale)
         given, walk = table.values.get(key.field), f"walk{key.unit}"
         if empty is not None and isinstance(given, dict) and walk in given:
-            # How far the camera drifts in an hour.
+            # Standard deviation of the drift in one hour.
             drift = table.section(key.field)
             drift.known(walk)
             covariance = as_jax_array(empty.walk * drift.positive(walk) ** 2)
@@ -115,7 +115,7 @@ def _instance(kind: Kind, values: dict[str, Any], table: Section) -> Any:
 
 
 def parameters_section(parameters: AbstractParameters, priors: AbstractParameters) -> dict[str, Any]:
-    """Return the table that `read_parameters` reads as `parameters` and `priors`."""
+    """Return the table from which `read_parameters` restores `parameters` and `priors`."""
     written = {name: getattr(parameters, name) for name in static_fields(type(parameters))}
     for key in keys_of(type(parameters)):
         value = np.asarray(getattr(parameters, key.field))
@@ -130,7 +130,7 @@ def _read_each(kind: Kind, tables: dict[str, Section]) -> Pairs:
 
 
 def by_owner(section: Section, owners: Iterable[str]) -> dict[str, Section]:
-    """Return the table of each owner: its own, or that of "default"."""
+    """Return the table of each owner, else the table "default"."""
     owners = list(owners)
     section.known("default", *owners)
     keys = {name: name if name in section else "default" for name in owners}
@@ -138,7 +138,7 @@ def by_owner(section: Section, owners: Iterable[str]) -> dict[str, Section]:
 
 
 def read_mounts(section: Section, cameras: Iterable[str]) -> Pairs:
-    """Mounts and their priors by name: "default" or the id of a camera."""
+    """Read mounts and their priors by name: "default" or the id of a camera."""
     section.known("default", *cameras)
     for table in map(section.section, section):
         if table.values.get("image_x", "forward") not in IMAGE_X:
@@ -152,12 +152,12 @@ def read_mounts(section: Section, cameras: Iterable[str]) -> Pairs:
 
 
 def mounts_of(cameras: Iterable[str], mounts: Container[str]) -> dict[str, str]:
-    """Return the mount of each camera: the one that has its name, else "default", else none ("")."""
+    """Return the mount of each camera: of the same name, else "default", else none ("")."""
     return {name: name if name in mounts else "default" if "default" in mounts else "" for name in cameras}
 
 
 def read_strips(section: Section, strips: Iterable[str]) -> Pairs:
-    """Shift and drift of every strip that has a table or the default's, and their priors."""
+    """Read shift and drift, and their priors, of every strip that has a table or uses the default table."""
     strips = list(strips)
     if section.values and not strips:
         raise section.error("", "images.csv names no strips; add its column strip or remove the tables")
@@ -165,7 +165,7 @@ def read_strips(section: Section, strips: Iterable[str]) -> Pairs:
 
 
 def read_scanner(section: Section) -> tuple[Scanner | None, Scanner | None]:
-    """Return the scanner and its priors; None without [scanner]."""
+    """Read the scanner and its priors; None without [scanner]."""
     section.known("boresight_deg", "boresight", "shifts")
     if not section.values:
         return None, None
@@ -195,7 +195,7 @@ def scanner_section(scanner: Scanner | None, priors: Scanner | None) -> dict[str
 
 
 def read_unknowns(section: Section, kinds: Iterable[Kind], block: Block) -> tuple[dict, dict]:
-    """Start values and priors of [unknowns] by kind and owner."""
+    """Read initial values and priors of [unknowns] by kind and owner."""
     known = {kind.kind: kind for kind in kinds}
     starts: dict[str, dict[str, Any]] = {}
     priors: dict[str, dict[str, Any]] = {}
@@ -244,9 +244,9 @@ def unknown_sections(block: Block) -> dict[str, Any]:
 
 
 def check_shutters(images: Iterable[tuple[str, str]], starts: Unknowns, priors: Unknowns) -> None:
-    """Raise BlockError for readouts in another unit than milliseconds, and shutters or motions without the other.
+    """Raise BlockError for readout times not in milliseconds, shutters without motion, and motion without shutters.
 
-    `images` are image and camera. A readout that is free may start anywhere below a second.
+    `images` are pairs (image, camera). A free readout time may have any initial value below one second.
     """
     shutters: dict[str, Any] = starts.more.get(RollingShutter.kind, {})
     known_before: dict[str, Any] = priors.more.get(RollingShutter.kind, {})

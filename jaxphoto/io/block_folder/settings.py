@@ -1,4 +1,4 @@
-"""block.toml but for its cameras and unknowns: frame, corrections, trajectory, default sigmas and datum."""
+"""Keys of block.toml without cameras and unknowns: frame, corrections, trajectory, default sigmas, datum."""
 
 import dataclasses
 import warnings
@@ -24,7 +24,7 @@ _Texts = list[StrictStr]
 
 
 class FrameKeys(Keys):
-    """[frame]"""
+    """Keys of [frame]."""
 
     kind: Literal["local", "enu", "grid", "epsg"] = "local"
     code: Count | None = None
@@ -56,7 +56,7 @@ class FrameKeys(Keys):
 
 
 class CorrectionKeys(Keys):
-    """[corrections]"""
+    """Keys of [corrections]."""
 
     refraction: StrictBool = False
     curvature: StrictBool = False
@@ -64,7 +64,7 @@ class CorrectionKeys(Keys):
 
 
 class TrajectoryKeys(Keys):
-    """[trajectory]"""
+    """Keys of [trajectory]."""
 
     file: StrictStr
     shift_s: Number = 0.0
@@ -72,7 +72,7 @@ class TrajectoryKeys(Keys):
 
 
 class DatumKeys(Keys):
-    """[datum]"""
+    """Keys of [datum]."""
 
     kind: Literal["control", "minimal", "inner"] = "control"
     over: Any = "points"
@@ -89,13 +89,13 @@ class DatumKeys(Keys):
 
 
 class GeoreferencingKeys(Keys):
-    """[georeferencing]"""
+    """Keys of [georeferencing]."""
 
     mode: Literal[tuple(MODES)] = "integrated"  # type: ignore[valid-type]
 
 
 class BlockKeys(Keys):
-    """block.toml"""
+    """Keys of block.toml."""
 
     title: StrictStr = ""
     frame: FrameKeys = FrameKeys()
@@ -126,7 +126,7 @@ class BlockKeys(Keys):
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """The content of block.toml; tables of unknowns are read when their owners are known."""
+    """Content of block.toml. Tables of unknowns are read later, when their owners are known."""
 
     top: Section
     keys: BlockKeys
@@ -136,7 +136,7 @@ class Settings:
 
     @property
     def file(self) -> str:
-        """The file, for messages."""
+        """File name in messages."""
         return self.top.file
 
     @property
@@ -146,7 +146,7 @@ class Settings:
 
 
 def read_settings(values: dict[str, Any], file: str = TOML, sigma_keys: Sequence[str] = ()) -> Settings:
-    """Return the settings in the content of block.toml; `sigma_keys` are those of further tables."""
+    """Read the settings from the content of block.toml; `sigma_keys` are the additional keys of [sigmas]."""
     top = Section(file, "", values)
     keys = top.model(BlockKeys)
     top.section("sigmas").known(*_SIGMAS, *sigma_keys)
@@ -163,7 +163,7 @@ def read_settings(values: dict[str, Any], file: str = TOML, sigma_keys: Sequence
 
 
 def frame_of(keys: FrameKeys, file: str) -> Frame:
-    """Return the frame, of kind epsg without an origin where none is given."""
+    """Return the frame; a frame of kind epsg may lack its origin."""
     if keys.kind == "epsg" and "vertical" not in keys.model_fields_set:
         warnings.warn(
             f"{file}, [frame]: heights are taken as above the ellipsoid (GNSS); write "
@@ -176,7 +176,7 @@ def frame_of(keys: FrameKeys, file: str) -> Frame:
 
 
 def corrections_in(frame: Frame, settings: Settings) -> Corrections:
-    """Return the corrections that [corrections] switches on in `frame`, which has its origin."""
+    """Return the corrections that [corrections] enables in `frame`, which has its origin."""
     keys, section = settings.keys.corrections, settings.top.section("corrections")
     if keys.curvature and frame.kind != "grid":
         raise section.error(
@@ -210,7 +210,7 @@ def frame_section(frame: Frame) -> dict[str, Any]:
 
 
 def corrections_section(corrections: Corrections, frame: Frame) -> dict[str, Any]:
-    """Return the [corrections] table of `corrections`; empty where nothing is on."""
+    """Return the [corrections] table of `corrections`; empty if all are disabled."""
     written: dict[str, Any] = {name: True for name in ("refraction", "curvature") if getattr(corrections, name)}
     if corrections.refraction and frame.kind != "epsg":
         written["sea_level_m"] = corrections.sea_level_m
@@ -228,5 +228,5 @@ def datum_section(datum: Datum) -> dict[str, Any]:
 
 
 def default_sigma(settings: Settings, *keys: str) -> float:
-    """Return the first of `keys` that [sigmas] has; NaN for none."""
+    """Return the value of the first of `keys` in [sigmas]; NaN if there is none."""
     return next((settings.sigmas[key] for key in keys if key in settings.sigmas), np.nan)

@@ -1,4 +1,4 @@
-"""The tables of a block folder, declared once: columns, kinds, which are required, and the checks of each."""
+"""Tables of a block folder: their columns, kinds of cells, required columns, and checks."""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
@@ -25,39 +25,39 @@ TURN = ("turn_right_m", "turn_forward_m", "turn_up_m")
 
 
 class Column(NamedTuple):
-    """A column of `text` or numbers: a `sigma` is positive, an `angle` at most 360 degrees, a `whole` number whole."""
+    """A column of text or floats; a `sigma` is positive, an `angle` at most 360 degrees, a `whole` an integer."""
 
     name: str
     kind: Literal["text", "number", "coordinate", "sigma", "angle", "whole"] = "number"
     required: bool = False
-    """The file must have it, without empty cells (but for coordinates, and sigmas, which [sigmas] may complete)."""
+    """True if column and cells must be present; coordinates may be empty, and sigmas may come from [sigmas]."""
 
 
 class TableLayout(NamedTuple):
-    """One CSV file of the folder."""
+    """Layout of one CSV file of the folder."""
 
     columns: tuple[Column, ...]
     required: bool = False
     unique: tuple[str, ...] = ()
-    """No two rows have the same cells in these columns."""
+    """Columns whose combination is unique per row."""
 
     def names(self, required: bool) -> tuple[str, ...]:
-        """Return the columns that the file must, or may, have."""
+        """Return the required or the optional columns."""
         return tuple(c.name for c in self.columns if c.required == required)
 
     @property
     def text(self) -> tuple[str, ...]:
-        """The columns of text."""
+        """Names of the text columns."""
         return tuple(c.name for c in self.columns if c.kind == "text")
 
 
 def text(*names: str, required: bool = True) -> tuple[Column, ...]:
-    """Columns of text."""
+    """Return text columns."""
     return tuple(Column(name, "text", required) for name in names)
 
 
 def numbers(*names: str, required: bool = False) -> tuple[Column, ...]:
-    """Columns of numbers, of the kind that their names say."""
+    """Return numeric columns; the name determines the kind."""
     angles = (*ANGLES, *ATTITUDE)
     return tuple(
         Column(n, "sigma" if n.startswith("sigma_") else "angle" if n in angles else "number", required) for n in names
@@ -90,11 +90,11 @@ LAYOUTS = {
         (*text("point"), *numbers(*FOOT, *NORMAL, *TURN, "sigma_m", required=True), *text("strip", required=False))
     ),
 }  # fmt: skip
-"""The tables of the block itself; those of other observations follow from their classes (`declared_tables`)."""
+"""Layouts of the block's own tables; `declared_tables` derives the others from the classes of observations."""
 
 
 def coordinate_names(frame: Frame) -> tuple[str, ...]:
-    """Return the columns of coordinates in the files of a block in `frame`."""
+    """Return the names of the coordinate columns in the files of a block in `frame`."""
     geographic = frame.code is not None and map_system(frame.code).is_geographic
     return PLACE if geographic else XYZ
 
@@ -106,9 +106,9 @@ def layout_in(frame: Frame, layout: TableLayout) -> TableLayout:
 
 
 def checked(table: Table, layout: TableLayout) -> Table:
-    """Return the table with all columns of its layout: text ids, float numbers, "" and NaN for empty cells.
+    """Check a table and return all columns of its layout: text ids, floats, "" and NaN for empty cells.
 
-    Raises RowError for the first cell that its column does not allow, and for rows that are given twice.
+    Raises RowError for the first invalid cell, and for duplicate rows.
     """
     columns: dict[str, np.ndarray] = {}
     for column, kind, required in layout.columns:
@@ -130,14 +130,14 @@ def checked(table: Table, layout: TableLayout) -> Table:
 
 
 def check_angles(table: Table, degrees: np.ndarray, columns: Sequence[str]) -> None:
-    """Raise RowError for an angle beyond one turn: it is in another unit than degrees."""
+    """Raise RowError for an angle above 360 degrees."""
     for line, axis in np.argwhere(np.abs(degrees) > 360)[:1]:
         message = f"{columns[axis]} = {degrees[line, axis]:g} is more than a turn; give the angle in degrees"
         raise table.bad(line, message)
 
 
 def refuse_duplicates(table: Table, keys: dict[str, np.ndarray], thing: str = "") -> None:
-    """Raise RowError where two rows agree in all `keys`."""
+    """Raise RowError if two rows agree in all `keys`."""
     frame = pd.DataFrame(keys)
     for line in np.flatnonzero(frame.duplicated())[:1] if keys else ():
         first = int(np.flatnonzero((frame == frame.iloc[line]).all(axis=1))[0])

@@ -1,4 +1,4 @@
-"""Read clouds in the frame of a block, selected by chunks, in bounded memory."""
+"""Read point clouds in the frame of a block, filtered in chunks of bounded memory."""
 
 import dataclasses
 from collections import Counter
@@ -17,13 +17,13 @@ from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, Placement, ep
 from jaxphoto.io.clouds.tables import open_csv, open_ply
 
 Returns = Literal["all", "first", "last", "only"]
-"""Returns to read: all of a pulse, its first, its last, or those of pulses with a single return."""
+"""Selection by return: all returns of a pulse, first, last, or returns of single-return pulses."""
 SUFFIXES = (".las", ".laz", ".csv", ".ply")
 """File name extensions of clouds."""
 NOISE = (7, 18)
-"""Low and high noise, which are read only on request."""
+"""ASPRS classes of low and high noise, excluded by default."""
 EVERY_CLASS = range(256)
-"""All classes including noise, and points without a class."""
+"""All classes including noise; points without classification are included."""
 
 
 def read_cloud(
@@ -38,19 +38,18 @@ def read_cloud(
 ) -> Cloud:
     """Read a cloud (.las, .laz, .csv or .ply) in the frame of a block.
 
-    `frame` is that of the block (see `Placement`); without it, coordinates are those of the file in metres. `classes`
-    (all but `NOISE`) and `returns` select points; `within` (least and greatest X, Y in m) those over the block. `epsg`
-    and `unit` (m, ft, us_ft) replace the coordinate system and unit of the file.
+    `frame` is the frame of the block (see `Placement`); without it, coordinates remain in the system of the file, in
+    metres. `classes` (default: all except `NOISE`) and `returns` select points. `within` (minimum and maximum X, Y in
+    m) is the area of the block. `epsg` and `unit` (m, ft, us_ft) override the coordinate system and unit of the file.
 
-    Memory holds the selected points and one chunk of the file. Raises InputError for a file that is missing, damaged or
-    empty, a coordinate system that is missing, unknown or does not fit the frame, no overlap with `within`, and if no
-    point is selected.
+    Memory is bounded by the selected points and one chunk of the file. Raises InputError for a missing, damaged or
+    empty file, a missing, unknown or incompatible coordinate system, no overlap with `within`, and an empty selection.
     """
     source = open_source(path, epsg, unit)
     chunks = _selected_chunks(source, frame, classes, returns, within)
     if source.count is None:
         return _without_empty_strips(Cloud.joined(list(chunks)))
-    # Pages of memory that are never written are never allocated: reserve room for all points, and return the rest.
+    # Allocate for all points and shrink afterwards: the operating system commits only pages that are written.
     columns: dict[str, np.ndarray] = {}
     n, strips = 0, tuple[str, ...]()
     for chunk in chunks:
@@ -81,16 +80,16 @@ def cloud_chunks(
     unit: str | None = None,
     within: Real[np.ndarray, "2 2"] | None = None,
 ) -> Iterator[Cloud]:
-    """Yield the cloud of `read_cloud` in parts of bounded size, none empty; their `strips` are those up to the part."""
+    """Yield the cloud of `read_cloud` in nonempty parts of bounded size; `strips` lists the strips found so far."""
     return _selected_chunks(open_source(path, epsg, unit), frame, classes, returns, within)
 
 
 def extent(
     path: str | Path, frame: Frame | None = None, *, epsg: int | None = None, unit: str | None = None
 ) -> Float[np.ndarray, "2 3"]:
-    """Least and greatest X, Y, Z (m) of a cloud in the frame of a block, from the header if it has them.
+    """Return minimum and maximum X, Y, Z (m) of a cloud in the frame of a block, from the header if possible.
 
-    In a rotated frame it is the extent of the file's box, which is larger than that of the points.
+    In a rotated frame, the extent of the file's bounding box is returned, which is larger.
     """
     source = open_source(path, epsg, unit)
     placement = Placement(source.name, source.system, frame)
@@ -103,17 +102,17 @@ def extent(
 
 
 def cloud_system(path: str | Path, *, epsg: int | None = None, unit: str | None = None) -> CoordinateSystem:
-    """Return the coordinate system of a cloud file."""
+    """Read the coordinate system of a cloud file."""
     return open_source(path, epsg, unit).system
 
 
 def point_count(path: str | Path) -> int | None:
-    """Return the number of points by the header of a cloud file; None without a header."""
+    """Read the number of points from the header of a cloud file; None without a header."""
     return open_source(path).count
 
 
 def open_source(path: str | Path, epsg: int | None = None, unit: str | None = None) -> CloudSource:
-    """Open a cloud file; `epsg` and `unit` replace its coordinate system and unit."""
+    """Open a cloud file; `epsg` and `unit` override its coordinate system and unit."""
     path = Path(path)
     check_file(path)
     suffix = path.suffix.lower()
@@ -121,7 +120,7 @@ def open_source(path: str | Path, epsg: int | None = None, unit: str | None = No
         raise InputError(f"{path.name} is not a cloud; name a file {', '.join(SUFFIXES)}")
     system = None if epsg is None else epsg_system(epsg, path.name)
     if suffix in (".las", ".laz"):
-        # laspy takes 0.2 s to import.
+        # Import here: laspy takes 0.2 s.
         from jaxphoto.io.clouds.las import open_las
 
         source = open_las(path, system)
@@ -155,7 +154,7 @@ def _selected_chunks(
 
 
 def selection(chunk: Cloud, classes: Collection[int] | None, returns: Returns, name: str) -> Bool[np.ndarray, "n"]:
-    """Mask of the points of the file `name` that `read_cloud` selects. Raises InputError without classes or returns."""
+    """Return the mask of points that `read_cloud` selects. Raises InputError if `name` lacks classes or returns."""
     mask = np.ones(len(chunk), bool) if chunk.withheld is None else ~chunk.withheld
     if classes is not None and classes != EVERY_CLASS:
         if chunk.classification is None:
@@ -172,7 +171,7 @@ def selection(chunk: Cloud, classes: Collection[int] | None, returns: Returns, n
 
 
 def _take(cloud: Cloud, mask: np.ndarray) -> Cloud:
-    """`Cloud.take`, without a copy if all points are taken."""
+    """Apply `Cloud.take`; do not copy if all points are selected."""
     return cloud if mask.all() else cloud.take(mask)
 
 
@@ -194,7 +193,7 @@ def _no_selection(
     returns: Returns,
     within: np.ndarray | None,
 ) -> InputError:
-    """Return the error about a selection without points, with the classes and returns of the file."""
+    """Return the error about an empty selection, listing the classes and returns of the file."""
     extents, by_class, by_return = [], Counter[int](), Counter[tuple[int, int]]()
     for chunk in (chunk for chunk in source.chunks() if len(chunk)):
         extents.append(chunk.extent)

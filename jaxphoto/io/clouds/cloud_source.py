@@ -1,4 +1,4 @@
-"""An open cloud file, before its coordinates are transformed and its points selected."""
+"""An open cloud file, before transformation and selection."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -13,15 +13,15 @@ from jaxphoto.errors import InputError
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
 
 CHUNK = 500_000
-"""Number of points read, transformed and selected together."""
+"""Number of points processed at a time."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CloudSource:
-    """A cloud file; `chunks` yields its points in file coordinates, at most `CHUNK` at a time.
+    """A cloud file; `chunks` yields points in file coordinates, at most `CHUNK` at a time.
 
-    `count` is the number of points and `extent` their least and greatest coordinates by the header, None without one.
-    The `strips` of a chunk are those up to it.
+    `count` (number of points) and `extent` (minimum and maximum coordinates) are read from the header; None without
+    one. `strips` of a chunk lists the strips found so far.
     """
 
     name: str
@@ -32,19 +32,19 @@ class CloudSource:
 
 
 class StripNumbers:
-    """Indices of strips in the order of their first points."""
+    """Strip indices in order of first appearance."""
 
     def __init__(self) -> None:
         self._index: dict[str, int] = {}
 
     def of(self, ids: np.ndarray) -> np.ndarray:
-        """Return the index in `names` of each of the strips `ids`."""
+        """Return the index in `names` of each of the strip ids `ids`."""
         codes, unique = pd.factorize(ids, sort=True)
         return np.array([self._index.setdefault(str(name), len(self._index)) for name in unique], np.int32)[codes]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The strips up to now."""
+        """Strips found so far."""
         return tuple(self._index)
 
 
@@ -62,7 +62,7 @@ def no_points(name: str) -> InputError:
 
 
 def source_ids(cloud: Cloud) -> np.ndarray:
-    """Point source IDs: the names of the strips if they are 16-bit numbers, else their indices from 1."""
+    """Return point source IDs: the strip names if they are 16-bit integers, else their indices from 1."""
     assert cloud.strip is not None
     numbers = [int(name) if name.isdecimal() else 1 << 16 for name in cloud.strips]
     ids = np.array(numbers) if max(numbers, default=0) < 1 << 16 else np.arange(1, len(numbers) + 1)

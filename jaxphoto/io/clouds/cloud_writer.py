@@ -1,4 +1,4 @@
-"""Write clouds: LAS, LAZ, CSV and PLY, complete or not at all."""
+"""Write clouds as LAS, LAZ, CSV or PLY, atomically."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,14 +27,15 @@ def write_cloud(
     epsg: int | None = None,
     unit: str | None = None,
 ) -> None:
-    """Write `cloud`, which is in `frame`, as .las, .laz, .csv or .ply.
+    """Write `cloud`, whose coordinates are in `frame`, as .las, .laz, .csv or .ply.
 
-    With `like`, the LAS or LAZ file from which it was read as a whole (with `epsg` and `unit`): that file with other
-    coordinates, in its own system, units and scale, and with all other dimensions; withheld points, which were not
-    read, stay. Otherwise in the map system of `frame`, or in metres; LAS 1.4 to the millimetre, CSV and PLY in double
+    `like`: the LAS or LAZ file from which the whole cloud was read (with `epsg` and `unit`). It is copied with its
+    system, units, scale, other dimensions and withheld points; only coordinates are replaced. Without `like`,
+    coordinates are written in the map system of `frame`, or in metres: LAS 1.4 to the millimetre, CSV and PLY in double
     precision.
 
-    Raises OSError if it cannot be written, InputError if `like` has another number of points, and for other names.
+    Raises OSError if writing fails, and InputError for an unsupported file name, or if `like` has a different number of
+    points.
     """
     path = Path(path)
     suffix = _suffix(path)
@@ -66,14 +67,14 @@ def rewrite_cloud(
     epsg: int | None = None,
     unit: str | None = None,
 ) -> int:
-    """Write the cloud file `source` to `path`, of the same kind, with other coordinates; return the points that stay.
+    """Copy cloud file `source` to `path` with new coordinates; return the number of unmoved points.
 
-    `moved` receives each part as of `read_cloud`, including noise and withheld points, and returns X, Y, Z (m) in the
-    same `frame`. System and units stay those of `source`; LAS and LAZ keep all other dimensions, CSV and PLY those of
-    a `Cloud`. Memory holds one part. Withheld points stay where they are if they are outside the area of the frame's
-    system or if `moved` returns NaN.
+    Both files have the same format. `moved` receives each part as in `read_cloud`, including noise and withheld points,
+    and returns X, Y, Z (m) in the same `frame`. System and units of `source` are retained. LAS and LAZ retain all other
+    dimensions, CSV and PLY the fields of `Cloud`. Memory is bounded by one part. Withheld points are not moved if they
+    are outside the area of the frame's system, or if `moved` returns NaN.
 
-    Raises OSError if it cannot be written, and what `read_cloud` and `moved` raise.
+    Raises OSError if writing fails, and the errors of `read_cloud` and `moved`.
     """
     source, path = Path(source), Path(path)
     suffix, cloud = _suffix(path), open_source(source, epsg, unit)
@@ -127,7 +128,7 @@ def _write_like(cloud: Cloud, path: Path, like: Path, frame: Frame | None, epsg:
 
 
 def _suffix(path: Path) -> str:
-    """Return the file name extension. Raises InputError for one that cannot be written."""
+    """Return the file name extension. Raises InputError for formats that cannot be written."""
     if path.name.lower().endswith(".copc.laz"):
         raise InputError(f"{path.name}: COPC is read only; name a .laz file, and convert it (pdal translate, untwine)")
     if path.suffix.lower() not in SUFFIXES:

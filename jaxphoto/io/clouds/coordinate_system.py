@@ -1,4 +1,4 @@
-"""Coordinate systems of clouds and rasters, and the transformation of their coordinates to the frame of a block."""
+"""Coordinate systems of clouds and rasters, and their transformation to the frame of a block."""
 
 import dataclasses
 import warnings
@@ -17,8 +17,8 @@ from jaxphoto.georeferencing.datum_change import ways
 from jaxphoto.georeferencing.map_frame import MapFrame, map_system
 
 UNITS: Mapping[str, float] = {"m": 1.0, "ft": 0.3048, "us_ft": 1200 / 3937}
-"""Metres in a metre, an international foot and a US survey foot."""
-# EPSG codes of heights in feet (NAVD88, NGVD29, mean sea level) and of the same heights in metres.
+"""Metres per unit: metre, international foot, US survey foot."""
+# EPSG codes of vertical systems in feet (NAVD88, NGVD29, mean sea level), and of their equivalents in metres.
 _METRIC_HEIGHTS = {6360: 5703, 8228: 5703, 5702: 7968, 8050: 5714}
 
 
@@ -26,9 +26,9 @@ _METRIC_HEIGHTS = {6360: 5703, 8228: 5703, 5702: 7968, 8050: 5714}
 class CoordinateSystem:
     """Coordinate system and units of a file.
 
-    `plane` is its projected system with axes in metres, its geographic system, or None (a local frame). `heights` is
-    the EPSG code of its heights, "ellipsoid", or None if unknown. `units` are metres per unit of X and Y, and of Z, in
-    the file; 1 for degrees. `heights_unit` is the unit of the system `heights`, in which PROJ expects heights.
+    `plane` is the projected system with axes in metres, the geographic system, or None (local frame). `heights` is the
+    EPSG code of the vertical system, "ellipsoid", or None if unknown. `units` are metres per unit of X and Y, and of Z,
+    in the file; 1 for degrees. `heights_unit` is the unit of the vertical system, which PROJ expects.
     """
 
     plane: CRS | None = None
@@ -64,7 +64,7 @@ class CoordinateSystem:
 
     @property
     def metric(self) -> CRS | None:
-        """The system of the coordinates in metres, including the heights if their system has metres."""
+        """Compound system in metres; the plane system only if its vertical system is unknown or not in metres."""
         heights = _METRIC_HEIGHTS.get(self.heights, self.heights)  # type: ignore[arg-type]
         if self.plane is None or not isinstance(heights, int):
             return self.plane
@@ -75,9 +75,9 @@ class CoordinateSystem:
 
 
 def system_of(crs: CRS, name: str) -> CoordinateSystem:
-    """Return the coordinate system `crs` of the file `name`; heights of an unknown system have the unit of the map.
+    """Convert `crs` of the file `name` to a coordinate system; heights of an unknown system have the unit of the map.
 
-    Raises InputError for a geocentric system, and for axes that point south or west.
+    Raises InputError for geocentric systems, and for axes that point south or west.
     """
     plane, *vertical = [_unbound(part) for part in (crs.sub_crs_list if crs.is_compound else [crs])]
     axes = plane.axis_info
@@ -99,7 +99,7 @@ def system_of(crs: CRS, name: str) -> CoordinateSystem:
 
 
 def epsg_system(code: int, name: str) -> CoordinateSystem:
-    """Return the coordinate system of the EPSG code given for the file `name`. Raises InputError if unknown."""
+    """Return the coordinate system of the EPSG code `code` of file `name`. Raises InputError if unknown."""
     try:
         crs = CRS.from_epsg(code)
     except CRSError:
@@ -108,7 +108,7 @@ def epsg_system(code: int, name: str) -> CoordinateSystem:
 
 
 def frame_system(frame: Frame | None) -> CoordinateSystem:
-    """Return the system, in metres, of the map coordinates of a block's frame; a local frame without them."""
+    """Return the coordinate system, in metres, of the map coordinates of a frame; a local frame has none."""
     if frame is None or frame.code is None:
         return CoordinateSystem()
     return CoordinateSystem(map_system(frame.code), "ellipsoid" if frame.vertical is None else frame.vertical)
@@ -122,7 +122,7 @@ def _unbound(crs: CRS) -> CRS:
 
 
 def _in_metres(crs: CRS) -> CRS:
-    """Convert the axes of a projection to metres; a false easting keeps its unit and value."""
+    """Convert the axes of a projection to metres; false easting and northing retain unit and value."""
     if crs.is_geographic or all(axis.unit_conversion_factor == 1 for axis in crs.axis_info):
         return crs
     definition = crs.to_json_dict()
@@ -132,19 +132,20 @@ def _in_metres(crs: CRS) -> CRS:
     for axis in definition["coordinate_system"]["axis"]:
         axis["unit"] = "metre"
     metric = CRS.from_json_dict(definition)
-    # EPSG has a metric twin of most systems in feet: its name and code are better known.
+    # EPSG has a metric equivalent of most systems in feet: use its name and code.
     code = metric.to_epsg()
     return metric if code is None else CRS.from_epsg(code)
 
 
 class Placement:
-    """Transformation from coordinates of the file `name`, in `system`, to the frame of a block (m), and back.
+    """Transformation of coordinates of file `name`, in `system`, to the frame of a block (m), and back.
 
-    Without a frame, coordinates stay those of the file, in metres. A frame `local` or `enu` takes coordinates without a
-    system unchanged, a frame `grid` also those of a map. A frame `epsg` transforms them to its map system and to
-    its local frame; heights of an unknown system are taken as those of the block.
+    Without a frame, coordinates are only converted to metres. The frames `local` and `enu` accept coordinates without a
+    system, unchanged; a frame `grid` also accepts map coordinates. A frame `epsg` transforms coordinates to its map
+    system, then to its local frame. Heights of an unknown system are assumed to be in the block's vertical system.
 
-    Raises InputError if system and frame do not fit; `option` names the option that gives the file's system.
+    Raises InputError if system and frame are incompatible. `option` is the option that sets the file's system, for
+    messages.
     """
 
     def __init__(self, name: str, system: CoordinateSystem, frame: Frame | None, option: str = "--cloud-epsg"):
@@ -178,11 +179,11 @@ class Placement:
             self._plane = self._plane_transformer(system.plane, block_plane, self._map.origin[:2])
 
     def frame(self, xyz: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """X, Y, Z (m) in the frame of the block; infinite outside the area of a system."""
+        """Transform to X, Y, Z (m) in the frame of the block; infinite outside the area of a system."""
         return self.frame_from_metres(xyz * self.system.factors)
 
     def frame_from_metres(self, xyz: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """X, Y, Z (m) in the frame of the block, of file coordinates converted to metres (or degrees)."""
+        """Transform file coordinates in metres (or degrees) to X, Y, Z (m) in the frame of the block."""
         if self._map is None:
             return xyz
         x, y, z = xyz.T
@@ -200,11 +201,11 @@ class Placement:
         return np.stack([x, y, z * self._height_unit], axis=1)
 
     def file(self, xyz: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Coordinates in the system and units of the file: the inverse of `frame`."""
+        """Transform to the system and units of the file: the inverse of `frame`."""
         return self.metres(xyz) / self.system.factors
 
     def extent(self, extent: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "2 3"]:
-        """Least and greatest X, Y, Z (m) in the frame, of the box `extent` in file coordinates."""
+        """Return minimum and maximum X, Y, Z (m) in the frame of the box `extent` in file coordinates."""
         x, y, z = (np.linspace(low, high, 9) for low, high in extent.T)
         box = self.frame(np.stack(np.meshgrid(x, y, z[[0, -1]], indexing="ij"), axis=-1).reshape(-1, 3))
         return np.stack([box.min(axis=0), box.max(axis=0)])
@@ -224,7 +225,7 @@ class Placement:
     def check_overlap(self, extent: Float[np.ndarray, "2 3"], within: Real[np.ndarray, "2 2"]) -> None:
         """Raise InputError if a file of `extent` does not overlap `within` (X, Y in m) of the block.
 
-        The message has both extents, and the unit of the file in which they would overlap.
+        The message contains both extents, and the unit of the file in which they would overlap.
         """
         self.placed(Cloud(extent))
         placed = self.extent(extent)
@@ -241,7 +242,7 @@ class Placement:
         raise InputError(f"{self.name} ({_text(placed)}) does not overlap the block ({_text(within)}); {cure}")
 
     def _plane_transformer(self, source: CRS, target: CRS, place: tuple[float, float]) -> Transformer:
-        """Return the best transformation of plane coordinates near `place` that PROJ has on this computer."""
+        """Return PROJ's best installed transformation of plane coordinates near `place`."""
         transformers = ways(source, target, *place).transformers
         if not transformers:
             raise InputError(f"{self.name}: PROJ has no transformation from {source.name} to {target.name}")

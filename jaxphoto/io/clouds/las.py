@@ -1,4 +1,4 @@
-"""LAS, LAZ and COPC, which is LAZ in the order of an octree, by laspy."""
+"""Read and write LAS, LAZ and COPC (LAZ in octree order) by laspy."""
 
 import errno
 from collections.abc import Callable, Iterator
@@ -21,14 +21,14 @@ with extra():
     import laspy
     import lazrs
 
-# GeoTIFF keys that laspy does not read, and the metres of their codes of linear units.
+# GeoTIFF keys that laspy does not read, and metres per EPSG code of linear units.
 _PLANE_UNIT, _HEIGHTS, _HEIGHT_UNIT = 3076, 4096, 4099
 _LINEAR_UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
 _SCALE_M, _SCALE_DEG = 1e-3, 1e-8
 
 
 def open_las(path: Path, system: CoordinateSystem | None) -> CloudSource:
-    """Read a LAS or LAZ file without withheld points, in `system` or its own. Raises InputError if damaged."""
+    """Open a LAS or LAZ file without withheld points; `system` overrides its system. Raises InputError if damaged."""
     with _open(path) as reader:
         header = reader.header
         if header.point_count == 0:
@@ -40,7 +40,7 @@ def open_las(path: Path, system: CoordinateSystem | None) -> CloudSource:
 
 
 def write_las(parts: Callable[[], Iterator[tuple[Cloud, np.ndarray]]], path: Path, frame: Frame | None) -> None:
-    """Write the clouds and coordinates of `parts`, in the map system of `frame`, as LAS 1.4 or LAZ."""
+    """Write pairs (cloud, coordinates), in the map system of `frame`, as LAS 1.4 or LAZ."""
     header = laspy.LasHeader(point_format=6, version="1.4")
     first = np.concatenate([xyz[[0]] for _, xyz in parts()])
     plane_scale = _SCALE_DEG if frame is not None and frame.map.geographic else _SCALE_M
@@ -63,10 +63,10 @@ def write_las(parts: Callable[[], Iterator[tuple[Cloud, np.ndarray]]], path: Pat
 
 
 def rewrite_las(source: Path, path: Path, coordinates: Callable[[Cloud], Float[np.ndarray, "n 3"]]) -> None:
-    """Write `source` to `path` with other coordinates, given for each part; all other dimensions stay."""
+    """Copy `source` to `path` with new coordinates, computed per part; all other dimensions are retained."""
     with _open(source) as reader:
         header = reader.header
-        # Without the octree of COPC: laspy writes the points in other chunks.
+        # Remove the octree of COPC: laspy writes points in different chunks.
         for records in filter(None, (header.vlrs, header.evlrs)):
             for record in [record for record in records if record.user_id == "copc"]:
                 records.remove(record)
@@ -88,7 +88,7 @@ def _open(path: Path) -> Iterator[laspy.LasReader]:
 
 @contextmanager
 def _las_writer(path: Path, header: laspy.LasHeader) -> Iterator[laspy.LasWriter]:
-    """Open a file for points; on a full disk, where laspy leaves its file open, it is closed, too."""
+    """Open a file for writing points, and close it after errors: laspy leaves it open if the disk is full."""
     compress = path.suffix.lower() == ".laz"
     try:
         with (
@@ -102,12 +102,12 @@ def _las_writer(path: Path, header: laspy.LasHeader) -> Iterator[laspy.LasWriter
 
 @contextmanager
 def _damage(name: str) -> Iterator[None]:
-    """Raise InputError for whatever laspy or its decoder raise for damaged bytes."""
+    """Convert any exception that laspy or its decoder raises for damaged bytes to InputError."""
     try:
         yield
     except (KeyboardInterrupt, SystemExit, GeneratorExit):
         raise
-    # A panic of the decoder is no Exception.
+    # A panic of the decoder is not an Exception.
     except BaseException as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:80]
         raise InputError(f"{name} is cut off or damaged ({reason}); copy it again from its source") from None
@@ -122,13 +122,13 @@ def _chunks(path: Path) -> Iterator[Cloud]:
 def _points_and_clouds(
     reader: laspy.LasReader, name: str, *, withheld: bool
 ) -> Iterator[tuple[laspy.ScaleAwarePointRecord, Cloud]]:
-    """Return the points of a file in parts, with or without those `withheld`, as in the file and as a cloud.
+    """Yield the points of a file in parts, as laspy records and as a cloud, with or without `withheld` points.
 
-    Raises InputError for points outside the extent of the header, which is what damaged bytes decode to.
+    Raises InputError for points outside the extent of the header, which indicate damaged bytes.
     """
     strips, header, read = StripNumbers(), reader.header, 0
     low, high = np.asarray(header.mins), np.asarray(header.maxs)
-    # Headers are rounded in different ways.
+    # Tolerate rounding of the extent in the header.
     slack = 2 * np.asarray(header.scales) + 1e-6 * (high - low)
     has_time = "gps_time" in header.point_format.dimension_names
     while read < header.point_count:
@@ -177,7 +177,7 @@ def _set_coordinates(points: laspy.ScaleAwarePointRecord, xyz: np.ndarray, heade
 
 
 def _system(header: laspy.LasHeader, name: str) -> CoordinateSystem:
-    """Return the system of the WKT or GeoTIFF records; laspy does not read the keys of units and heights."""
+    """Read the system from WKT or GeoTIFF records, and units and vertical system from GeoTIFF keys."""
     keys = {
         key.id: key.value_offset
         for record in header.vlrs.get_by_id("LASF_Projection")

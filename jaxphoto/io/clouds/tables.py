@@ -1,4 +1,4 @@
-"""Clouds as tables of one row per point: CSV and PLY."""
+"""Read and write clouds as tables with one row per point: CSV and PLY."""
 
 import csv
 import itertools
@@ -21,7 +21,7 @@ _RETURNS = ("return_number", "number_of_returns")
 _BYTES = ("classification", *_RETURNS)
 COLUMNS = (*XYZ, *_BYTES, "time_s", "strip")
 """Columns of a CSV; the first three are required."""
-# Properties of PLY in lower case, without the "scalar_" of CloudCompare.
+# PLY properties, in lower case and without CloudCompare's prefix "scalar_", and their CSV columns.
 _PROPERTIES = {
     "x": "X_m", "y": "Y_m", "z": "Z_m", "classification": "classification", "class": "classification",
     "return_number": "return_number", "returnnumber": "return_number", "number_of_returns": "number_of_returns",
@@ -50,7 +50,7 @@ def _cloud(values: Mapping[str, np.ndarray], strips: StripNumbers) -> Cloud:
 
 
 def _columns(cloud: Cloud, xyz: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the columns of a CSV but for the strip."""
+    """Return the columns of a CSV, except strip."""
     columns = dict(zip(XYZ, xyz.T, strict=True))
     if cloud.classification is not None:
         columns["classification"] = cloud.classification
@@ -62,7 +62,7 @@ def _columns(cloud: Cloud, xyz: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _valid(name: str, values: np.ndarray) -> np.ndarray:
-    """Mask of the valid numbers of a column."""
+    """Return the mask of valid values of a column."""
     limits = (0, 255) if name in _BYTES else (-_LARGEST_INTEGER, _LARGEST_INTEGER) if name == "strip" else None
     if limits is None:
         return np.isfinite(values)
@@ -76,8 +76,8 @@ def _first_error(
     for row, cells in rows:
         if len(cells) > len(names):
             return InputError(
-                f"{file}, row {row}: {len(cells)} cells, but there are {len(names)} columns; delete the others "
-                "(decimal commas need semicolons between the columns)"
+                f"{file}, row {row}: {len(cells)} cells for {len(names)} columns; delete the extra cells "
+                "(with decimal commas, separate columns by semicolons)"
             )
         for name, cell in itertools.zip_longest(names, cells, fillvalue=""):
             try:
@@ -97,9 +97,9 @@ class _Layout(NamedTuple):
 
 
 def open_csv(path: Path, system: CoordinateSystem | None) -> CloudSource:
-    """Return a CSV, separated by commas or by semicolons (with decimal points or commas); # starts a comment.
+    """Open a CSV separated by commas, or by semicolons with decimal points or commas; # starts a comment.
 
-    Columns other than `COLUMNS` are skipped. Raises InputError for a missing column and, with its row, an invalid cell.
+    Columns not in `COLUMNS` are ignored. Raises InputError for a missing column and, with its row, for an invalid cell.
     """
     lines = [cells[0] for _, cells in itertools.islice(_csv_rows(path, "\n", "."), 2)]
     if not lines:
@@ -117,11 +117,11 @@ def open_csv(path: Path, system: CoordinateSystem | None) -> CloudSource:
 
 def _csv_chunks(path: Path, layout: _Layout) -> Iterator[Cloud]:
     numbers = [name for name in layout.header if name in COLUMNS and name != "strip"]
-    # Unique names: pandas strips none and takes none twice.
+    # Make names unique: pandas does not strip names, and rejects duplicates.
     names = [name if name in COLUMNS else f"#{j}" for j, name in enumerate(layout.header)]
     strips = StripNumbers()
     try:
-        # With all columns and no index: otherwise pandas shifts the cells of rows that are too long.
+        # Read all columns without an index: otherwise pandas shifts the cells of rows that are too long.
         with pd.read_csv(
             path,
             sep=layout.separator,
@@ -151,7 +151,7 @@ def _csv_chunks(path: Path, layout: _Layout) -> Iterator[Cloud]:
 
 
 def _csv_rows(path: Path, separator: str, decimal: str) -> Iterator[tuple[int, list[str]]]:
-    """Row number and cells of the lines that are neither empty nor comments."""
+    """Yield row number and cells of each line, skipping empty lines and comments."""
     try:
         with path.open(encoding="utf-8-sig") as lines:
             for row, line in enumerate(lines, start=1):
@@ -162,7 +162,7 @@ def _csv_rows(path: Path, separator: str, decimal: str) -> Iterator[tuple[int, l
 
 
 def write_csv(parts: Iterable[tuple[Cloud, np.ndarray]], count: int | None, path: Path) -> None:
-    """Write clouds with the coordinates beside them, with `COLUMNS`."""
+    """Write pairs (cloud, coordinates) as one CSV file with the columns `COLUMNS`."""
     with path.open("w", encoding="utf-8", newline="") as file:
         for k, (part, xyz) in enumerate(parts):
             table = pd.DataFrame(_columns(part, xyz))
@@ -172,7 +172,7 @@ def write_csv(parts: Iterable[tuple[Cloud, np.ndarray]], count: int | None, path
 
 
 class _Vertices(NamedTuple):
-    """Vertices of a PLY file from byte `begin`, after `lines` lines of header."""
+    """Vertex layout of a PLY file; vertices start at byte `begin`, after `lines` header lines."""
 
     order: str
     n: int
@@ -182,9 +182,9 @@ class _Vertices(NamedTuple):
 
 
 def open_ply(path: Path, system: CoordinateSystem | None) -> CloudSource:
-    """Return a PLY file, ASCII or binary, whose vertices precede all other elements.
+    """Open a PLY file, ASCII or binary, whose vertices precede all other elements.
 
-    Raises InputError for an invalid header, invalid numbers and a file that is cut off.
+    Raises InputError for an invalid header, invalid values and a truncated file.
     """
     vertices = _ply_header(path)
     if vertices.n == 0:
@@ -265,7 +265,7 @@ def _ply_chunks(path: Path, vertices: _Vertices) -> Iterator[Cloud]:
 
 
 def _ply_tables(file: IO[bytes], vertices: _Vertices, keys: list[str]) -> Iterator[pd.DataFrame | np.ndarray]:
-    """Return the vertices, at most `CHUNK` together."""
+    """Yield the vertices, at most `CHUNK` at a time."""
     if vertices.order:
         record = np.dtype([(key, vertices.order + kind) for key, (_, kind) in zip(keys, vertices.fields, strict=True)])
         left = vertices.n
@@ -273,7 +273,7 @@ def _ply_tables(file: IO[bytes], vertices: _Vertices, keys: list[str]) -> Iterat
             left -= len(records)
             yield records
         return
-    # At most `count` rows: lines of other elements have other lengths.
+    # Read vertex lines only: lines of other elements differ in length.
     with pd.read_csv(
         file,
         sep=r"\s+",
@@ -291,7 +291,7 @@ def _ply_tables(file: IO[bytes], vertices: _Vertices, keys: list[str]) -> Iterat
 
 
 def write_ply(parts: Iterable[tuple[Cloud, np.ndarray]], count: int | None, path: Path) -> None:
-    """Write `count` points, clouds with the coordinates beside them, as binary PLY."""
+    """Write pairs (cloud, coordinates), `count` points in total, as one binary PLY file."""
     types = {"<f8": "double", "|u1": "uchar", "<u2": "ushort"}
     with path.open("wb") as file:
         for k, (part, xyz) in enumerate(parts):
@@ -306,5 +306,5 @@ def write_ply(parts: Iterable[tuple[Cloud, np.ndarray]], count: int | None, path
                 header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
                 header += [f"property {types[values.dtype.str]} {name}" for name, values in columns.items()]
                 file.write("\n".join([*header, "end_header", ""]).encode("ascii"))
-            # `file.write` raises OSError on a full disk; `ndarray.tofile` does not say why.
+            # Use `file.write`, which raises OSError on a full disk; `ndarray.tofile` does not report the cause.
             file.write(records.tobytes())

@@ -1,4 +1,4 @@
-"""Positions of photographs in files beside them (docs/exposures.md)."""
+"""Positions of photographs in separate files (docs/exposures.md)."""
 
 from jaxphoto.io.exposures.files import exposure_files, read_exposures
 from jaxphoto.io.exposures.located import Assigned, located, with_exposures

@@ -1,18 +1,18 @@
-"""Files of positions beside photographs: DJI's time marks, RTKLIB's .pos, SBET and tables (docs/exposures.md).
+"""Read position files of photographs: DJI's time marks, RTKLIB's .pos, SBET and tables (docs/exposures.md).
 
 A time mark (`..._Timestamp.MRK`) is
 
     12  268619.354051  [2129]  24,N  9,E  193,V  22.97273819,Lat  113.93433129,Lon  91.071,Ellh  1.05, 1.08, 3.24  16,Q
 
-number, seconds of the GPS week, week, from the antenna's phase centre to the centre of the sensor in north, east and
-down (mm), latitude, longitude and ellipsoidal height of the camera, standard deviations north, east, up (m) and kind of
-solution (DJI, user manual of the Matrice 4 series, "Image Log File": "after compensation"; Phantom 4 RTK,
+number, seconds of the GPS week, week, lever arm from the antenna's phase centre to the centre of the sensor (north,
+east, down, mm), latitude, longitude and ellipsoidal height of the camera, standard deviations north, east, up (m) and
+kind of solution (DJI, user manual of the Matrice 4 series, "Image Log File": "after compensation"; Phantom 4 RTK,
 "Timestamp.MRK Information").
 
-A .pos file has positions of the antenna, a trajectory or events. The last line of its header names the clock: GPST, UTC
-or JST, as date and time or as week and seconds; then latitude, longitude, height, quality Q (1 fixed, 2 float, 3 SBAS,
-4 differential, 5 single, 6 precise point), satellites, and standard deviations north, east, up (RTKLIB ver. 2.4.2,
-Manual, B.1 "Positioning Solution File").
+A .pos file has positions of the antenna, as a trajectory or at events. The last line of its header names the time
+scale: GPST, UTC or JST, as date and time or as week and seconds; then latitude, longitude, height, quality Q (1 fixed,
+2 float, 3 SBAS, 4 differential, 5 single, 6 precise point), number of satellites, and standard deviations north, east,
+up (RTKLIB ver. 2.4.2, Manual, B.1 "Positioning Solution File").
 """
 
 import re
@@ -33,22 +33,22 @@ from jaxphoto.io.text_tables import finite
 from jaxphoto.io.trajectory import read_sbet, sbet_records
 
 SUFFIXES = (".mrk", ".pos", ".sbet")
-"""Extensions of files of exposures."""
+"""File name extensions of position files."""
 NAMES = ("exposures.csv", "geo.txt")
-"""Names of tables of exposures."""
+"""File names of position tables."""
 _N = r"([-+]?\d{1,12}(?:\.\d{1,15})?)"
 _MARK = re.compile(
     rf"\s*(\d{{1,9}})\s+{_N}\s+\[\s*(\d{{1,5}})\s*\]\s+{_N},N\s+{_N},E\s+{_N},V\s+{_N},Lat\s+{_N},Lon\s+{_N},Ellh"
     rf"\s+{_N},\s*{_N},\s*{_N}\s+(\d{{1,3}}),Q\s*",
     re.ASCII,
 )
-# Seconds that a clock is behind GPS time.
+# GPS time minus time scale (s).
 _BEHIND_S = {"GPST": 0.0, "UTC": LEAP_SECONDS, "JST": LEAP_SECONDS - 9 * 3600}
 _FIX: dict[float, Fix] = {1: "fixed", 2: "float", 3: "single", 4: "single", 5: "single", 6: "float"}
 
 
 def exposure_files(folder: Path) -> list[Path]:
-    """List the position files of a folder by `SUFFIXES` and `NAMES`; hidden ones are skipped."""
+    """List the position files in a folder, by `SUFFIXES` and `NAMES`; hidden files are skipped."""
     matching = (f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES or f.name.lower() in NAMES)
     return sorted(f for f in matching if f.is_file() and not f.name.startswith("."))
 
@@ -65,7 +65,7 @@ def read_exposures(path: Path, code: int | None = None, heights: Heights = "unkn
     content = read_text(path)
     lines = [(row, line) for row, line in enumerate(content.split("\n"), 1) if line.strip()]
     errors: dict[int, str] = {}
-    # Half a number reads as well as a whole one: only missing cells show that the last row is cut off.
+    # Detect a truncated last row by missing cells: a truncated number is still valid.
     if len(lines) > 2 and not content.endswith("\n"):
         separator = separator_of(lines[-2][1])
         before, last = (len(line.split(None if separator == " " else separator)) for _, line in lines[-2:])
@@ -81,7 +81,7 @@ def read_exposures(path: Path, code: int | None = None, heights: Heights = "unkn
 
 
 def _without_errors(exposures: Exposures, errors: dict[int, str]) -> Exposures:
-    """Return the exposures without invalid rows. Raises InputError if half of them are invalid, or all are missing."""
+    """Remove invalid rows. Raises InputError if at least half of the rows are invalid, or if there are none."""
     for k, axis in np.argwhere(np.abs(exposures.place[:, :2]) > [360.0, 90.0]):
         name, value = ("longitude", "latitude")[axis], exposures.place[k, axis]
         errors.setdefault(int(exposures.rows[k]), f"the {name} {value:g} degrees is impossible; exchange the columns?")
@@ -114,7 +114,7 @@ def _read_marks(file: str, lines: Lines, errors: dict[int, str]) -> Exposures:
     columns = np.array(list(values.values())).reshape(-1, 13).T
     number, second, week, north, east, down, latitude, longitude, height, s_north, s_east, s_up, flag = columns
     place, sigma = np.stack([longitude, latitude, height], axis=1), np.stack([s_east, s_north, s_up], axis=1)
-    # A receiver without a position writes zeros.
+    # Receivers write zeros if they have no position.
     place[(flag == 0) | ((longitude == 0) & (latitude == 0))] = np.nan
     sigma[(sigma <= 0).any(axis=1)] = np.nan
     return Exposures(
@@ -171,7 +171,7 @@ def _read_pos(file: str, lines: Lines, errors: dict[int, str]) -> Exposures:
 
 
 def _time(first: str, second: str) -> float | None:
-    """GPS seconds of a date and time, or of a week and its seconds; None for anything else."""
+    """Convert date and time, or week and seconds, to GPS seconds; None for other text."""
     if "/" in first:
         clock, _, digits = second.partition(".")
         try:
@@ -185,7 +185,7 @@ def _time(first: str, second: str) -> float | None:
 
 
 def _read_sbet(path: Path) -> Exposures:
-    """Return the records of an SBET, positions and attitudes of the IMU, at seconds of the GPS week."""
+    """Read an SBET: positions and attitudes of the IMU, times in seconds of the GPS week."""
     records = sbet_records(read_sbet(path), path.name)
     n = len(records.time)
     fix: Fix = "integrated"

@@ -31,21 +31,21 @@ from jaxphoto.io.exposures.files import exposure_files, read_exposures
 from jaxphoto.io.exposures.records import Exposures
 from jaxphoto.io.photographs import Photograph
 
-# DJI_20240501123456_0012_V, DJI_0012, 100_0042_0012: the number within the flight.
+# Number within the flight: DJI_20240501123456_0012_V, DJI_0012, 100_0042_0012.
 _NUMBER = re.compile(r"_(\d{3,5})(?:_[A-Za-z]\w*)?$")
-# Numbers are valid if the times of this fraction of the photographs differ by a constant.
+# Minimum fraction of photographs whose clock differs from the file's by a constant if matched by number.
 _CONSISTENT = 0.8
-# Tolerance of times in whole seconds, and of finer ones.
+# Tolerances (s) of times in whole seconds, and of finer times.
 _COARSE_S, FINE_S = 0.6, 0.2
-# Differences of clocks that are not reported: EXIF counts seconds.
+# Maximum clock difference (s) that is not reported; EXIF times have a resolution of 1 s.
 _SMALL_S = 1.5
 _DEGREE_M = 111_320.0
-# A longer interval between records than this multiple of the median is a gap.
+# Ratio of an interval between records to the median interval above which it is a gap.
 _GAP = 2.5
 
 
 class Clock(NamedTuple):
-    """Times of exposure by the files of photographs."""
+    """Exposure times from the files of the photographs."""
 
     time_s: Float[np.ndarray, "n"]
     """NaN if unknown."""
@@ -55,7 +55,7 @@ class Clock(NamedTuple):
 
 
 def clock_of(photographs: Sequence[Photograph]) -> Clock:
-    """Return the clock of photographs, in GPS time if all known times have an offset to UTC."""
+    """Return the exposure times of photographs, as GPS times if all known times have an offset to UTC."""
     known = [p.taken for p in photographs if p.taken]
     gps = all(t.ahead_of_utc_s is not None for t in known)
     times = [
@@ -67,7 +67,7 @@ def clock_of(photographs: Sequence[Photograph]) -> Clock:
 
 
 def by_name(photographs: Sequence[Photograph], file: Exposures) -> Int[np.ndarray, "n"]:
-    """Return the exposure of the same name (case is ignored if the names stay different), -1 for none."""
+    """Match exposures by name, ignoring case if names remain unique; -1 for none."""
     wanted, names = [p.name for p in photographs], list(file.names)
     folded = [name.lower() for name in wanted], [name.lower() for name in names]
     if all(len(set(several)) == len(several) for several in folded):
@@ -77,7 +77,7 @@ def by_name(photographs: Sequence[Photograph], file: Exposures) -> Int[np.ndarra
 
 
 def by_time(photographs: Sequence[Photograph], file: Exposures, clock: Clock) -> Matched | Ambiguous | None:
-    """Match times that differ by a constant; the photographs' own positions decide between constants."""
+    """Match times up to a constant offset; if several offsets fit, the photographs' own positions decide."""
     positions, listed = _plane(photographs, file.place)
     return match_times(clock.time_s, file.time_s, clock.tolerance_s, positions, listed)
 
@@ -85,11 +85,11 @@ def by_time(photographs: Sequence[Photograph], file: Exposures, clock: Clock) ->
 def by_number_or_time(
     photographs: Sequence[Photograph], file: Exposures, clock: Clock
 ) -> tuple[Matched | Ambiguous | None, str]:
-    """Return the matches of numbers or times, and "by number" or "by time".
+    """Match by number or by time; return the matches, and "by number" or "by time".
 
-    A file that was renumbered after it lost an exposure has the numbers of their neighbours: times count if they bring
-    the photographs' own positions nearer. Without positions, numbers that run from 1 without a gap and end before those
-    of the photographs may have been renumbered.
+    If a file lost an exposure and was renumbered, its numbers belong to the neighbours. Times are therefore preferred
+    if they bring the photographs' own positions nearer. Without positions, times are preferred if the numbers run from
+    1 without a gap and end before the last number of the photographs.
     """
     assert file.sequence is not None
     numbered, timed = _by_number(photographs, file, clock), by_time(photographs, file, clock)
@@ -109,9 +109,9 @@ def by_number_or_time(
 
 
 def _by_number(photographs: Sequence[Photograph], file: Exposures, clock: Clock) -> Matched | None:
-    """Return the matches of the numbers in the names; None if they are missing, not unique, or contradict the times.
+    """Match by the numbers in the names; None if they are missing, not unique, or contradict the times.
 
-    Times tell the files of several flights that count from 1.
+    Times distinguish the files of several flights that are numbered from 1.
     """
     assert file.sequence is not None
     numbers = [int(match[1]) if (match := _NUMBER.search(p.name)) else None for p in photographs]
@@ -133,15 +133,15 @@ def _by_number(photographs: Sequence[Photograph], file: Exposures, clock: Clock)
 
 
 def distance(photographs: Sequence[Photograph], file: Exposures, exposure: Int[np.ndarray, "n"]) -> float | None:
-    """Median horizontal distance (m) of exposures to the photographs' own positions; None if none are known."""
+    """Return the median horizontal distance (m) of exposures to the photographs' own positions; None if unknown."""
     positions, listed = _plane(photographs, file.place)
     d = np.linalg.norm(positions - listed[exposure], axis=1)[exposure >= 0]
     return float(np.median(d[np.isfinite(d)])) if np.isfinite(d).any() else None
 
 
 def _plane(photographs: Sequence[Photograph], place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """East and north (m), and 0 for the height, of photographs and of `place`: files have different height systems."""
-    # (0, 0) is no position.
+    """Return east and north (m) of photographs and of `place`. Heights are zero: files differ in their reference."""
+    # (0, 0) means no position.
     known = [p.gps is not None and (p.gps.longitude_deg, p.gps.latitude_deg) != (0, 0) for p in photographs]
     positions = np.array(
         [(p.gps.longitude_deg, p.gps.latitude_deg) if p.gps and k else (np.nan,) * 2
@@ -155,10 +155,10 @@ def _plane(photographs: Sequence[Photograph], place: np.ndarray) -> tuple[np.nda
 
 
 def interpolated(track: Exposures, times_s: Float[np.ndarray, "n"]) -> Exposures:
-    """Return a trajectory at `times_s` by a cubic spline; positions before, after and in gaps of it are NaN.
+    """Interpolate a trajectory at `times_s` by a cubic spline; positions outside it and in its gaps are NaN.
 
-    Standard deviations are interpolated linearly, rotations at constant angular velocity, the kind of solution is that
-    of the nearest record.
+    Standard deviations are interpolated linearly, rotations at constant angular velocity. The kind of solution is taken
+    from the nearest record.
     """
     time, first = np.unique(track.time_s, return_index=True)
     inside = np.isfinite(times_s) & (times_s >= time[0]) & (times_s <= time[-1])
@@ -184,7 +184,7 @@ def interpolated(track: Exposures, times_s: Float[np.ndarray, "n"]) -> Exposures
 def match_message(
     photographs: Sequence[Photograph], file: Exposures, match: Matched, clock: Clock, how: str = "by time"
 ) -> str:
-    """Numbers of matched, missing and surplus exposures, and the difference of the clocks."""
+    """Report the counts of matched, missing and surplus exposures, and the clock difference."""
     message = f"positions of {count_message(photographs, file, match.exposure)} {how}{fix_counts(file, match.exposure)}"
     small = _SMALL_S if clock.tolerance_s > FINE_S else FINE_S
     if not np.isfinite(match.offset_s) or (clock.gps and abs(match.offset_s) <= small):
@@ -197,7 +197,7 @@ def match_message(
 
 
 def no_match_message(result: Ambiguous | None) -> str:
-    """Return the reason why times match no photographs."""
+    """Report the reason why times match no photographs."""
     if result is None:
         return "no two photographs have times that differ from its times by one constant; not used"
     one, other = map(clock_words, result.offsets_s)
@@ -208,7 +208,7 @@ def no_match_message(result: Ambiguous | None) -> str:
 
 
 def count_message(photographs: Sequence[Photograph], file: Exposures, exposure: Int[np.ndarray, "n"]) -> str:
-    """Return the number of photographs with an exposure, those without, and rows without a photograph."""
+    """Report the counts of photographs with and without exposure, and of exposures without photograph."""
     used = set(exposure[exposure >= 0].tolist())
     without = [p.name for p, k in zip(photographs, exposure, strict=True) if k < 0]
     surplus = [str(row) for k, row in enumerate(file.rows.tolist()) if k not in used]
@@ -220,12 +220,12 @@ def count_message(photographs: Sequence[Photograph], file: Exposures, exposure: 
 
 
 def fix_counts(file: Exposures, exposure: Int[np.ndarray, "n"]) -> str:
-    """Numbers of solutions of each kind, after a comma."""
+    """Report the counts of each kind of solution, after a comma."""
     return _fix_counts([file.fix[k] for k in exposure if k >= 0])
 
 
 def own_files_message(photographs: Sequence[Photograph]) -> list[str]:
-    """Describe the attitudes, heights, sigmas and solutions in the files of the photographs."""
+    """Report attitudes, heights, sigmas and kinds of solution in the files of the photographs."""
     positions = [p.gps for p in photographs if p.gps]
     known = {
         "attitudes": [p.attitude is not None for p in photographs],
@@ -246,18 +246,18 @@ def _fix_counts(kinds: Sequence[Fix]) -> str:
 Arm = tuple[float, float, float]
 """Lever arm from the camera to the antenna, right, forward, up of the aircraft (m)."""
 
-# A trajectory has more records per photograph than this; events are about as many as photographs.
+# Minimum ratio of records to photographs of a trajectory; events have about one record per photograph.
 _TRACK = 3
-# Positions farther from the photographs' own are of another flight.
+# Maximum distance (m) of positions from the photographs' own; beyond it, they belong to another flight.
 _FAR_M = 200.0
-# Agreement of positions without and with corrections.
+# Maximum distance (m) of agreeing positions, allowing for GNSS without corrections.
 _SAME_M = 5.0
-# Resolution of times for a trajectory: a centimetre at 10 m/s.
+# Maximum resolution (s) of times for interpolation in a trajectory: 1 cm at 10 m/s.
 _EXACT_S = 1e-3
 
 
 class Assigned(NamedTuple):
-    """Photographs with the positions and attitudes of files, and a message per file."""
+    """Photographs with positions and attitudes from files, and a message per file."""
 
     photographs: list[Photograph]
     sentences: list[str]
@@ -272,11 +272,12 @@ def located(
     arm: Arm | None = None,
     heights: Heights | int | None = None,
 ) -> Assigned:
-    """Return the photographs with positions of the files `given` and of those in `folders`, with heights of one kind.
+    """Assign positions of the files `given`, and of the files in `folders`; convert heights to one reference.
 
-    `code` is the EPSG system of map coordinates in tables, `arm` the lever arm, `heights` the reference of heights that
-    do not have one; "take-off" selects those above it, an EPSG code of heights adds its geoid. Invalid files in folders
-    are reported; those in `given` raise InputError, as does a geoid that is not installed.
+    `code` is the EPSG system of map coordinates in tables, `arm` the lever arm. `heights` is the reference of heights
+    whose reference is unknown. "take-off" selects heights above take-off; an EPSG code of a vertical system applies its
+    geoid model. Invalid files in folders are reported. Invalid files in `given`, or a missing geoid model, raise
+    InputError.
     """
     kind: Heights = "geoid" if isinstance(heights, int) else heights or "unknown"
     files, messages = [read_exposures(path, code, kind) for path in given], []
@@ -296,11 +297,11 @@ def located(
 
 
 def with_exposures(photographs: Sequence[Photograph], files: Sequence[Exposures], arm: Arm | None = None) -> Assigned:
-    """Return the photographs with positions, sigmas and attitudes of the files; later kinds replace earlier ones.
+    """Assign positions, sigmas and attitudes of the files to photographs; later files override earlier ones.
 
-    Time marks are first: their times and lever arms serve positions of the antenna, at events and along trajectories.
-    Tables, by name, are last. `arm` is that of positions without a lever arm of a time mark, and, without such a file,
-    of the photographs' own positions.
+    Time marks are processed first: their times and lever arms are used for antenna positions, at events and along
+    trajectories. Tables are processed last and matched by name. `arm` is the lever arm of antenna positions that have
+    none from a time mark. If no file has antenna positions, it applies to the photographs' own positions.
     """
     assignment = _Assignment(photographs, arm)
     track = lambda f: len(f.rows) > _TRACK * len(photographs) or f.aircraft_deg is not None  # noqa: E731
@@ -322,19 +323,19 @@ def with_exposures(photographs: Sequence[Photograph], files: Sequence[Exposures]
 
 
 class _Assignment:
-    """Photographs with what is known of each; every method takes one file and returns its message."""
+    """Assignment of files to photographs; each method processes one file and returns its message."""
 
     def __init__(self, photographs: Sequence[Photograph], arm: Arm | None):
         n = len(photographs)
         self.photographs, self.arm = list(photographs), arm
-        # GPS times of time marks and of events.
+        # GPS times from time marks, and from events.
         self.gps_s, self.event_s = np.full(n, np.nan), np.full(n, np.nan)
         self.camera_from_antenna_m = np.full((n, 3), np.nan)
-        # True if the position is that of the photograph's own file.
+        # True if the position is from the photograph's own file.
         self.own = [True] * n
 
     def by_name(self, file: Exposures) -> str:
-        """Return a table."""
+        """Assign the rows of a table by name."""
         exposure = by_name(self.photographs, file)
         if not (exposure >= 0).any():
             return f"none of its {len(file.names)} names is that of a photograph ({few(list(file.names))}); not used"
@@ -348,7 +349,7 @@ class _Assignment:
         return message
 
     def by_time(self, file: Exposures) -> str:
-        """Time marks of DJI, by number or time, or events of the antenna, by time."""
+        """Assign DJI's time marks by number or time, or antenna positions at events by time."""
         clock = clock_of(self.photographs)
         match: Matched | Ambiguous | None
         if file.sequence is not None:
@@ -369,7 +370,7 @@ class _Assignment:
         return f"{message}; {self._set_antenna(file, match.exposure)}"
 
     def along(self, file: Exposures) -> str:
-        """Return a trajectory, at times of marks or events, or of photographs to the millisecond."""
+        """Interpolate a trajectory at times of marks or events, or of photographs with a resolution of 1 ms."""
         times = np.where(np.isfinite(self.gps_s), self.gps_s, self.event_s)
         if not np.isfinite(times).any():
             clock = clock_of(self.photographs)
@@ -396,7 +397,7 @@ class _Assignment:
         return f"{message}; {self._set_antenna(at, exposure)}"
 
     def move_own(self, arm: Arm) -> str:
-        """Reduce positions of the photographs' own files by the lever arm."""
+        """Reduce the photographs' own positions from the antenna to the camera by the lever arm."""
         moved_count = left = 0
         for i, p in enumerate(self.photographs):
             if not self.own[i] or p.gps is None:
@@ -410,7 +411,7 @@ class _Assignment:
         return f"the lever arm is taken off {moved_count} positions of the photographs' own files{without}"
 
     def _set_camera(self, file: Exposures, exposure: Int[np.ndarray, "n"]) -> None:
-        """Take positions of the camera, times and lever arms."""
+        """Assign camera positions, times and lever arms."""
         for i in np.flatnonzero(exposure >= 0):
             k = int(exposure[i])
             if (gps := file.gps(k)) is not None:
@@ -421,7 +422,7 @@ class _Assignment:
                 self.camera_from_antenna_m[i] = file.camera_from_antenna_m[k]
 
     def _set_antenna(self, file: Exposures, exposure: Int[np.ndarray, "n"]) -> str:
-        """Take positions of the antenna, reduced to the camera; return how."""
+        """Assign antenna or IMU positions, reduced to the camera; report the lever arms used."""
         marked = given = none = 0
         for i in np.flatnonzero(exposure >= 0):
             k = int(exposure[i])
@@ -432,7 +433,7 @@ class _Assignment:
                 roll, pitch, yaw = file.aircraft_deg[k].tolist()
                 fixed = CameraAttitude(level_from_body((roll, pitch, yaw)))
                 photograph = photograph._replace(attitude=fixed, aircraft_deg=(roll, pitch, yaw))
-            # Lever arms of time marks are those to the antenna; a trajectory with attitudes is that of the IMU.
+            # Time marks have lever arms of the antenna, but a trajectory with attitudes has positions of the IMU.
             if file.aircraft_deg is None and np.isfinite(self.camera_from_antenna_m[i]).all():
                 gps, marked = moved(gps, self.camera_from_antenna_m[i]), marked + 1
             elif self.arm is not None and (rotation := _aircraft(photograph)) is not None:
@@ -450,7 +451,7 @@ class _Assignment:
         return ", ".join(parts)
 
     def _other_flight(self, file: Exposures, exposure: Int[np.ndarray, "n"]) -> str:
-        """Return the reason not to use a file far from the photographs' own positions; "" if it is near."""
+        """Return the reason to reject a file far from the photographs' own positions; "" if it is near."""
         far = distance(self.photographs, file, exposure)
         if far is None or far <= _FAR_M:
             return ""
@@ -463,7 +464,7 @@ class _Assignment:
         return f"its positions are {far:,.0f} m from those of the photographs, as of another flight; not used"
 
     def _other_day(self, file: Exposures, match: Matched) -> str:
-        """Return the reason not to use a file of another day; "" if its positions prove that the clock is wrong."""
+        """Return the reason to reject a file of another day; "" if its positions show that only the clock is wrong."""
         if not abs(match.offset_s) > ZONES_S:
             return ""
         near = distance(self.photographs, file, match.exposure)
@@ -477,7 +478,7 @@ class _Assignment:
 
 
 def _aircraft(photograph: Photograph) -> Float[np.ndarray, "3 3"] | None:
-    """Rotation from the aircraft's axes right, forward, up to the level frame, by its attitude or the camera's."""
+    """Return the rotation from aircraft axes (right, forward, up) to the level frame; if unknown, the camera's."""
     if photograph.aircraft_deg is not None:
         return level_from_body(photograph.aircraft_deg)
     return None if photograph.attitude is None else photograph.attitude.level_from_camera

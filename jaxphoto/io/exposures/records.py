@@ -1,4 +1,4 @@
-"""Exposures of a file beside the photographs, in its order."""
+"""Exposures read from a position file, in its order."""
 
 from typing import NamedTuple
 
@@ -9,41 +9,41 @@ from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.gps import Fix, Gps, Heights
 
 Lines = list[tuple[int, str]]
-"""Row numbers from 1 and lines."""
+"""Pairs (row number from 1, line)."""
 
 
 class Exposures(NamedTuple):
-    """One entry per row of a file; NaN and None for unknown values."""
+    """Exposures, one entry per row of a file; NaN or None for unknown values."""
 
     file: str
     rows: Int[np.ndarray, "n"]
     """Row numbers from 1."""
     time_s: Float[np.ndarray, "n"]
-    """Seconds since 1980-01-06, by the clock of the file."""
+    """Seconds since 1980-01-06, on the clock of the file."""
     place: Float[np.ndarray, "n 3"]
     """Longitude, latitude (degrees) and height (m)."""
     sigma_m: Float[np.ndarray, "n 3"]
-    """East, north, up."""
+    """Standard deviations east, north, up (m)."""
     fix: tuple[Fix, ...]
     heights: Heights
     names: tuple[str, ...] = ()
-    """Photographs, without extension."""
+    """Names of the photographs, without extension."""
     sequence: Int[np.ndarray, "n"] | None = None
     """Number of the photograph within its flight."""
     camera_from_antenna_m: Float[np.ndarray, "n 3"] | None = None
-    """Lever arm from the antenna to the camera, east, north, up."""
+    """Lever arm from the antenna to the camera: east, north, up (m)."""
     of_antenna: bool = False
-    """True if `place` is that of the antenna or IMU."""
+    """True if `place` is the position of the antenna or IMU."""
     aircraft_deg: Float[np.ndarray, "n 3"] | None = None
-    """Roll, pitch, yaw."""
+    """Roll, pitch, yaw of the aircraft (degrees)."""
     attitude: tuple[CameraAttitude | None, ...] = ()
     without: tuple[int, ...] = ()
-    """Invalid rows, which were skipped."""
+    """Numbers of invalid rows, which were skipped."""
     why: str = ""
-    """Message about them."""
+    """Message about the skipped rows."""
 
     def gps(self, k: int) -> Gps | None:
-        """Position of entry `k`; None if unknown."""
+        """Return the position of entry `k`; None if unknown."""
         longitude, latitude, height = self.place[k].tolist()
         if not np.isfinite([longitude, latitude]).all():
             return None
@@ -58,7 +58,7 @@ class Exposures(NamedTuple):
         )
 
     def take(self, chosen: np.ndarray) -> "Exposures":
-        """Return the entries of a mask."""
+        """Select the entries of a mask."""
         n, kept = len(self.rows), {}
         for name, values in self._asdict().items():
             if isinstance(values, np.ndarray):

@@ -1,21 +1,21 @@
-"""Tables of exposures, by photograph, of jaxphoto and other programs.
+"""Read tables of photograph positions, written by jaxphoto or other programs.
 
     jaxphoto      image, X_m, Y_m, Z_m or longitude_deg, latitude_deg, height_m [, omega_deg, phi_deg, kappa_deg or
                   roll_deg, pitch_deg, yaw_deg] [, sigma_X_m ... sigma_yaw_deg] [, fix]
     Pix4D         imagename,latitude,longitude,altitude[,accuracy horizontal,accuracy vertical] and
                   omega,phi,kappa or yaw,pitch,roll
-    Metashape     #Label,X/Longitude,Y/Latitude,Z/Altitude,Yaw,Pitch,Roll[,X_acc ...], #CoordinateSystem: WKT above it
+    Metashape     #Label,X/Longitude,Y/Latitude,Z/Altitude,Yaw,Pitch,Roll[,X_acc ...], after #CoordinateSystem: WKT
     --to opk      imageName X Y Z Omega Phi Kappa, with a comment about the system
     OpenDroneMap  geo.txt: the system in the first line, then name x y z [yaw pitch roll [accuracy in plan, in height]];
                   angles that are all 0 are unknown
-    POSPac        exterior orientation as text (POS Export Utility): a head of free text with the mapping frame, then
+    POSPac        exterior orientation as text (POS Export Utility): header text with the mapping frame, then
                   ID, # EVENT, TIME (s), EASTING, NORTHING, ELLIPSOID HEIGHT, OMEGA, PHI, KAPPA [, LAT, LONG]
 
-Cells are separated by tabs, semicolons, commas or blanks; header words in any case and order. Yaw, pitch and roll are
-of a camera that looks down with the top of its picture to the north at zero; yaw counts from true north (ours:
-from the north of the coordinates), omega, phi, kappa from grid north. Positions are those of the camera.
+Cells are separated by tabs, semicolons, commas or blanks; column names are matched ignoring case and order. At yaw =
+pitch = roll = 0, the camera looks down and the top of its picture points north. Yaw refers to true north (jaxphoto: to
+the north of the coordinates); omega, phi, kappa refer to grid north. Positions are of the camera.
 Sources: Pix4D support, articles 202558539 and 202558969; OpenDroneMap documentation, "Image Geolocation Files", and its
-`compute_opk`; Agisoft Metashape User Manual, "Reference pane"; POSPac's head in the comments of auvlib
+`compute_opk`; Agisoft Metashape User Manual, "Reference pane"; POSPac's header in the comments of auvlib
 (github.com/nilsbore/auvlib, src/data_tools/src/csv_data.cpp).
 """
 
@@ -59,7 +59,7 @@ _POSPAC_COLUMNS = {
     "x": "EASTING", "y": "NORTHING", "z": "ELLIPSOID HEIGHT", "omega": "OMEGA", "phi": "PHI", "kappa": "KAPPA",
     "image": "ID",
 }  # fmt: skip
-# UTM zones of EPSG, before the first zone of each datum, north and south.
+# EPSG codes of UTM zones minus the zone number, by datum: north and south.
 _UTM = {"WGS84": (32600, 32700), "WGS 84": (32600, 32700), "ETRS89": (25800, None), "NAD83": (26900, None)}
 
 
@@ -69,12 +69,12 @@ class _Table(NamedTuple):
     geographic: bool
     system: ControlSystem | None
     true_north: bool
-    """True if yaw counts from true north in map coordinates, too."""
+    """True if yaw refers to true north even with map coordinates."""
     ellipsoid: bool
 
 
 def read_table(file: str, lines: Lines, errors: dict[int, str], code: int | None, heights: Heights) -> Exposures:
-    """Read a table; `errors` takes the invalid rows, `code` is the EPSG system of map coordinates.
+    """Read a table; row errors are added to `errors`. `code` is the EPSG system of map coordinates.
 
     Raises InputError for a table without image, position or heights, with angles in gon, or without a system.
     """
@@ -112,7 +112,7 @@ def read_table(file: str, lines: Lines, errors: dict[int, str], code: int | None
     finite = np.isfinite(place).all(axis=1)
     if on_map and finite.any():
         assert code is not None
-        # Rows that are not finite are skipped: any place serves.
+        # Replace rows that are not finite by a valid one: they are skipped later.
         place, grid = _from_map(np.where(finite[:, None], place, place[finite][0]), code, vertical, heights)
         check(~np.isfinite(place).all(axis=1), "x", f"the coordinates are outside the area of EPSG:{code}")
         turn = turn if true_north and _RPY[0] in numbers else grid
@@ -162,7 +162,7 @@ def _table(file: str, lines: Lines, errors: dict[int, str]) -> _Table:
         if {"image", "x", "y"} <= set(columns) and len(header) <= len(first):
             break
     else:
-        raise InputError(f"{file}: the column image is missing, or coordinates are (X_m, Y_m, Z_m); add a header")
+        raise InputError(f"{file}: missing column image or coordinate columns (X_m, Y_m, Z_m); add a header")
     if "z" not in columns:
         raise InputError(f"{file}: its header names no heights (Z, altitude or height); add them")
     if set(columns) & {*_OPK, *_RPY} and _GON.search(" ".join([*comments, *header])):
@@ -189,7 +189,7 @@ def _table(file: str, lines: Lines, errors: dict[int, str]) -> _Table:
 def _cells(
     records: dict[int, list[str]], columns: dict[str, int], errors: dict[int, str], surplus: int | None = None
 ) -> pd.DataFrame:
-    """Return the cells of rows by the names of their columns."""
+    """Return the cells by column name."""
     for row, cells in list(records.items()):
         if surplus is not None and len(cells) > surplus:
             errors[row] = f"{len(cells)} cells, but the header has {surplus}; correct the row"
@@ -209,14 +209,14 @@ def _open_drone_map(file: str, content: Lines, errors: dict[int, str]) -> _Table
         if cells[4:7] and all(re.fullmatch(r"[-+]?0*\.?0*", cell) for cell in cells[4:7]):
             cells[4:7] = [""] * 3
     width = max(map(len, records.values()), default=0)
-    # Three angles, and two accuracies.
+    # Optional columns: three angles, then two accuracies.
     names = _ODM[: 9 if width >= 9 else 7 if width >= 7 else 4]
     columns = {name: k for k, name in enumerate(names)}
     return _Table(_cells(records, columns, errors), False, _system(file, content[0][1].strip()), True, False)
 
 
 def _pospac(file: str, content: Lines, errors: dict[int, str]) -> _Table:
-    """Exterior orientation of POSPac. Raises InputError for a trajectory, and for angles in another order."""
+    """Read exterior orientation of POSPac. Raises InputError for a trajectory, and for another rotation order."""
     headers = [[cell.partition("(")[0].strip().upper() for cell in line.split(",")] for _, line in content[:100]]
     begin = next((k for k, header in enumerate(headers) if {"TIME", "EASTING", "NORTHING"} <= set(header)), None)
     if begin is None:
@@ -224,8 +224,8 @@ def _pospac(file: str, content: Lines, errors: dict[int, str]) -> _Table:
     header, head = headers[begin], " ".join(line for _, line in content[:begin])
     if not set(_POSPAC_COLUMNS.values()) <= set(header):
         raise InputError(
-            f"{file}: its columns are not those of photographs ({', '.join(_POSPAC_COLUMNS.values())}): export the "
-            "exterior orientation at the camera's events, or take the SBET, which has the whole trajectory"
+            f"{file}: missing photograph columns (required: {', '.join(_POSPAC_COLUMNS.values())}); export exterior "
+            "orientation at the camera events, or use the SBET trajectory"
         )
     if (first := re.search(r"first rotation is around the '(\w)'", head, re.IGNORECASE)) and first[1].lower() != "x":
         raise InputError(f"{file}: its angles turn about {first[1]} first: export omega, phi, kappa")
@@ -253,12 +253,12 @@ def _pospac(file: str, content: Lines, errors: dict[int, str]) -> _Table:
                     "the mapping frame of the head; export it again, or delete the columns LAT and LONG"
                 )
     table = _cells(records, {name: header.index(word) for name, word in _POSPAC_COLUMNS.items()}, errors)
-    # The accuracy is that of GNSS and IMU, integrated afterwards.
+    # POSPac solutions are integrated GNSS/IMU solutions.
     return _Table(table.assign(fix="integrated"), False, system, False, True)
 
 
 def _mapping_frame(file: str, head: str) -> ControlSystem | None:
-    """Return the UTM zone of the head; None for another system."""
+    """Return the UTM zone in the header; None for other systems."""
     datum = re.search(r"frame datum\s*:\s*([^;]*?)\s*;", head, re.IGNORECASE)
     names = ("central meridian", "latitude of the grid origin", "scale factor", "false easting", "false northing")
     matches = [re.search(name + r"\s*=\s*(-?[\d.]+)", head, re.IGNORECASE) for name in names]
@@ -282,7 +282,7 @@ def _system(file: str, words: str) -> ControlSystem:
 def _from_map(
     coordinates: np.ndarray, code: int, vertical: int | None, heights: Heights
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Longitude, latitude, height of WGS 84, and the rotations from the axes of the grid to those of true north."""
+    """Convert to longitude, latitude, height in WGS 84, and return the rotations from grid to true-north axes."""
     place = MapFrame(code, vertical, (0.0, 0.0, 0.0)).place(coordinates)
     inside = np.isfinite(place).all(axis=1)
     on_wgs84, rotation = np.full_like(place, np.nan), np.tile(np.eye(3), (len(place), 1, 1))
@@ -299,7 +299,7 @@ def _attitudes(
     angles: np.ndarray, sigma: np.ndarray, level_from_axes: np.ndarray, opk: bool
 ) -> tuple[CameraAttitude | None, ...]:
     if opk:
-        # Near the nadir, omega is about x, right, as pitch; phi about y, as roll.
+        # Near nadir, omega is about the x axis (right) like pitch, and phi about y like roll: exchange their sigmas.
         sigma = sigma[:, [1, 0, 2]]
         camera = np.swapaxes(np.asarray(_matrices(np.deg2rad(angles))), 1, 2)
     else:

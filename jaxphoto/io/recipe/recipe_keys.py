@@ -1,6 +1,6 @@
-"""Keys of a recipe, table by table (docs/simulation.md).
+"""Keys of a recipe, by table (docs/simulation.md).
 
-Tables that describe a plan of `jaxphoto.simulation` have the fields of its class, with its defaults.
+Tables that describe a plan have the fields and defaults of its class in `jaxphoto.simulation`.
 """
 # mypy: disable-error-code="valid-type"
 
@@ -39,11 +39,11 @@ from jaxphoto.simulation import (
 
 _KINDS: tuple[type[AbstractParameters], ...] = (*RATES, CameraSpline, StripCamera)
 CHANGES = {kind.kind: kind for kind in _KINDS}
-"""Changes of cameras by the names of their tables."""
+"""Classes of camera changes, by the name of their table."""
 IMAGES = 20_000
-# Maximum number of pairs of image and point: more would take hours.
+# Maximum number of pairs (image, point); larger simulations take hours.
 PAIRS = 2_000_000_000
-# Steeper roofs rise by more than their width; beyond this angle a rolling aircraft scans the horizon.
+# Maximum roof slope and maximum scan angle (degrees); beyond it, a rolling aircraft scans the horizon.
 _STEEPEST_DEG, _WIDEST_DEG = 60.0, 60.0
 
 
@@ -55,7 +55,7 @@ def _range(value: Any) -> Any:
     values = value if isinstance(value, list) else [value]
     if len(values) in (1, 2) and all(isinstance(v, int | float) for v in values) and values[0] <= values[-1]:
         return [values[0], values[-1]]
-    raise ValueError(f"{values} is no range; give one number, or the least and the greatest")
+    raise ValueError(f"{values} is not a range; give one number, or [minimum, maximum]")
 
 
 def _strip_name(name: str) -> str:
@@ -85,7 +85,7 @@ Prefix = Annotated[StrictStr, AfterValidator(_prefix)]
 
 
 def plain(value: Any) -> Any:
-    """Convert values of a dataclass: lists to tuples, tables to plans."""
+    """Convert values of a model to values of a dataclass: lists to tuples, tables to plans."""
     if isinstance(value, PlanKeys):
         return value.plan()
     if isinstance(value, dict):
@@ -94,18 +94,18 @@ def plain(value: Any) -> Any:
 
 
 class PlanKeys(Keys):
-    """Keys of a dataclass of `jaxphoto.simulation`: its fields."""
+    """Keys of a table with the fields of a dataclass of `jaxphoto.simulation`."""
 
     kind_of_plan: ClassVar[type]
 
     def plan(self, **more: Any) -> Any:
-        """Return the plan; missing keys have its defaults."""
+        """Build the plan; missing keys have its defaults."""
         fields = {f.name for f in dataclasses.fields(self.kind_of_plan)}
         given = {name: plain(getattr(self, name)) for name in self.model_fields_set & fields}
         return self.kind_of_plan(**(given | more))
 
 
-# Types of keys by types of fields.
+# Types of keys, by types of fields.
 _TYPES: dict[Any, Any] = {
     float: Number, int: Whole, bool: StrictBool, str: StrictStr,
     plans.Triple: Triple, scene.Range: PositiveRange,
@@ -115,14 +115,14 @@ _TYPES: dict[Any, Any] = {
 
 
 def plan_keys(kind: type, base: type[PlanKeys] = PlanKeys, /, **keys: Any) -> Any:
-    """Return a model of the fields of a dataclass; `keys` replace types of fields, None removes a field."""
+    """Build a model with the fields of a dataclass. `keys` overrides the types of fields; None removes a field."""
     hints, types = typing.get_type_hints(kind), {}
     for field in dataclasses.fields(kind):
         hint = hints[field.name]
         optional = type(None) in typing.get_args(hint)
         inner = typing.get_args(hint)[0] if optional else hint
         key = keys.get(field.name, _TYPES.get(inner, inner)) if field.name not in base.model_fields else None
-        # Optional keys have the default of the field.
+        # Optional keys default to None: `plan` then uses the default of the field.
         required = field.default is field.default_factory is dataclasses.MISSING
         if key is not None:
             types[field.name] = (
@@ -148,7 +148,7 @@ class _TargetKeys(PlanKeys):
     grid: Annotated[list[Annotated[Whole, Field(ge=2, le=2_000)]], Field(min_length=2, max_length=2)] | None = None
 
     def plan(self: Any, **more: Any) -> TargetPlan:
-        """Return the plan; the places of a grid are further places."""
+        """Build the plan; grid nodes are added to the listed positions."""
         sides = [np.linspace(-1, 1, n).tolist() for n in self.grid or ()]
         grid = tuple((x, y) for y in sides[1] for x in sides[0]) if sides else ()
         return super().plan(at=plain(self.at or []) + grid, **more)
@@ -191,7 +191,7 @@ LidarTruthKeys = plan_keys(
 
 
 class TerrainKeys(Keys):
-    """[terrain]"""
+    """Keys of [terrain]."""
 
     kind: Literal["flat", "plane", "waves", "random", "rolling"] = "flat"
     height_m: Number = 0.0
@@ -220,7 +220,7 @@ class TerrainKeys(Keys):
         return self
 
     def terrain(self, section: Section) -> Terrain:
-        """Return the terrain."""
+        """Build the terrain."""
         if self.kind == "rolling":
             return dataclasses.replace(ROLLING, seed=self.seed)
         random = None
@@ -232,7 +232,7 @@ class TerrainKeys(Keys):
 
 
 class _Flown(Keys):
-    """Keys of [flight] that its strips may override; alternatives in pairs."""
+    """Keys of [flight] that its strips may override, and their pairs of alternatives."""
 
     height_m: Positive | None = None
     gsd_m: Positive | None = None
@@ -254,12 +254,12 @@ class _Flown(Keys):
         return self
 
     def either(self, thing: str) -> tuple[str, float] | None:
-        """Return the given one of two alternative keys, and its value."""
+        """Return the specified key of two alternatives, and its value; None if both are missing."""
         return next(((key, getattr(self, key)) for key in self.pairs[thing] if getattr(self, key) is not None), None)
 
 
 class StripKeys(_Flown):
-    """[[flight.strips]]"""
+    """Keys of [[flight.strips]]."""
 
     name: Name
     camera: StrictStr | None = None
@@ -273,7 +273,7 @@ class StripKeys(_Flown):
 
 
 class FlightKeys(_Flown):
-    """[flight]"""
+    """Keys of [flight]."""
 
     speed_m_per_s: Positive | None = None
     turn_s: Positive | None = None
@@ -281,7 +281,7 @@ class FlightKeys(_Flown):
 
 
 class StationKeys(Keys):
-    """[[convergent.stations]]: the product of distances, azimuths, tilts and rolls"""
+    """Keys of [[convergent.stations]]: one station per combination of distance, azimuth, tilt and roll."""
 
     name: StrictStr
     camera: StrictStr | None = None
@@ -302,14 +302,14 @@ class StationKeys(Keys):
         return self
 
     def stations(self, camera: str) -> Iterator[Station]:
-        """Return the stations of the table."""
+        """Yield the stations of the table."""
         each = itertools.product(self.distance_m, self.azimuth_deg, self.tilt_deg, self.roll_deg)
         for k, numbers in enumerate(each, start=1):
             yield Station(f"{self.name}_{k:02d}", camera, *numbers)
 
 
 class ConvergentKeys(Keys):
-    """[convergent]"""
+    """Keys of [convergent]."""
 
     field_m: Annotated[list[Positive], Field(min_length=2, max_length=2)]
     stations: list[StationKeys] = []  # noqa: RUF012
@@ -323,7 +323,7 @@ class ConvergentKeys(Keys):
 
 
 class LidarStripKeys(Keys):
-    """[[lidar.strips]]"""
+    """Keys of [[lidar.strips]]."""
 
     name: Name
     heading_deg: Number
@@ -334,7 +334,7 @@ class LidarStripKeys(Keys):
 
 
 class LidarKeys(PlanKeys):
-    """[lidar]"""
+    """Keys of [lidar]."""
 
     kind_of_plan = ScanPlan
     density_per_m2: Positive
@@ -355,7 +355,7 @@ class LidarKeys(PlanKeys):
 
 
 class WalkKeys(Keys):
-    """[camera_walk], or its truth"""
+    """Keys of [camera_walk] and [camera_walk.truth]."""
 
     c_mm: NotNegative = 0.0
     xp_mm: NotNegative = 0.0
@@ -364,7 +364,7 @@ class WalkKeys(Keys):
 
 
 class TruthKeys(Keys):
-    """[truth]"""
+    """Keys of [truth]."""
 
     datum_offset_m: Vector = [0.0, 0.0, 0.0]  # noqa: RUF012
 
@@ -396,4 +396,4 @@ RecipeKeys: Any = create_model(
     __base__=_RecipeKeys,
     **{name: (dict[str, dict[str, Any]], {}) for name in (*CHANGES, RigCamera.kind)},  # type: ignore[call-overload]
 )
-"""A recipe"""
+"""Keys of a recipe."""

@@ -1,6 +1,6 @@
-"""Read a recipe in TOML as `Recipe`.
+"""Read a TOML recipe as `Recipe`.
 
-Cameras, mounts, strips and datum are written as in block.toml; a table `truth` below each holds true values that differ
+Cameras, mounts, strips and datum have the keys of block.toml. Their subtable `truth` contains true values that differ
 (docs/simulation.md).
 """
 
@@ -55,28 +55,28 @@ from jaxphoto.simulation import (
 from jaxphoto.unknowns import FREE
 
 _ZERO = (0.0, 0.0, 0.0)
-# Default error of approximate positions at close range, as a fraction of the shortest distance.
+# Default error of approximate positions at close range, divided by the shortest object distance.
 _NEAR = 0.02
-# Approximate interval of nodes along a strip of the scanner.
+# Approximate interval (s) of nodes along a scanner strip.
 _NODES_S = 5.0
 
 
 class BiasTruthKeys(Keys):
-    """Standard deviations from which [strips.X.truth] draws."""
+    """Keys of [strips.X.truth]: standard deviations of randomly drawn biases."""
 
     shift_sigma_m: Triple = [0.0, 0.0, 0.0]  # noqa: RUF012
     drift_sigma_m_per_s: Triple = [0.0, 0.0, 0.0]  # noqa: RUF012
 
 
 class MotionKeys(Keys):
-    """Errors of the motion of images with a rolling shutter."""
+    """Keys of the motion errors of images with a rolling shutter."""
 
     velocity_m_per_s: Positive = 0.0
     rate_deg_per_s: Positive = 0.0
 
 
 def read_recipe(path: str | Path) -> Recipe:
-    """Read the recipe in a TOML file. Raises InputError with file, key and cure."""
+    """Read a recipe from a TOML file. Raises InputError with file, key and cure."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"there is no file {path}; give the TOML file of a recipe")
@@ -84,13 +84,13 @@ def read_recipe(path: str | Path) -> Recipe:
 
 
 def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
-    """Read the recipe in the content of a TOML file; `file` is its name in messages.
+    """Build a recipe from the content of a TOML file; `file` is its name in messages.
 
     Experiments modify `values` before this call. Raises InputError.
     """
     top = Section(file, "", dict(values))
     keys = top.model(RecipeKeys)
-    # Tables of block.toml; the default of residuals is "measured", because noise is added to measured coordinates.
+    # Read the tables of block.toml. Residuals default to "measured": noise is added to measured coordinates.
     stated = {name: _without_truth(getattr(keys, name)) for name in ("cameras", "mounts", "strips")}
     stated["cameras"] = {name: {"residuals": "measured"} | camera for name, camera in stated["cameras"].items()}
     settings = read_settings(stated | {key: top.values[key] for key in ("title", "datum") if key in top}, file)
@@ -169,9 +169,9 @@ def _camera(stated: Section, section: Section, camera: Camera) -> Assumed[Interi
 
 
 def _truth(kind: type[AbstractParameters], section: Section, *others: str, drawn: bool = False) -> tuple[Any, Any]:
-    """Read the true parameters of a table, and the priors by which they may be `drawn`; `others` are no parameters.
+    """Read the true parameters of a table, and the priors from which they are drawn if `drawn`.
 
-    Parameters that `truth` does not give have the values of the block.
+    `others` are keys that are not parameters. Parameters missing in `truth` have the values of the block.
     """
     starts = {key.start for key in keys_of(kind)} | set(static_fields(kind))
     truth = section.section("truth")
@@ -183,7 +183,7 @@ def _truth(kind: type[AbstractParameters], section: Section, *others: str, drawn
 
 
 def _biases(stated: Section, section: Section, strips: list[str]) -> dict[str, SimulatedBias]:
-    """Read biases; a table with a `truth` only omits the bias from the block's model."""
+    """Read biases; the block's model omits a bias whose table has `truth` only."""
     tables = by_owner(section, strips)
     modelled = Section(stated.file, stated.path, {name: values for name, values in stated.values.items() if values})
     starts, priors = read_strips(modelled, strips)
@@ -213,7 +213,7 @@ def _shutter(table: Section) -> SimulatedShutter:
 
 
 def _change(kind: type[AbstractParameters], section: Section, owners: Iterable[str]) -> dict[str, SimulatedChange]:
-    """Read changes by owner; a table with a `truth` only is unknown to the block's model."""
+    """Read changes by owner; the block's model omits a change whose table has `truth` only."""
     changes = {}
     for name, table in by_owner(section, owners).items():
         true, spread = _truth(kind, table, drawn=True)
@@ -254,7 +254,7 @@ def _walk(top: Section, keys: Any) -> CameraWalk | None:
 
 
 def _sigmas(top: Section, keys: Any, targets: Sequence[Any]) -> tuple[Sigmas, Sigmas]:
-    """Read stated and true sigmas; the latter are equal unless [noise] overrides them."""
+    """Read stated and true sigmas; true sigmas equal the stated ones unless [noise] overrides them."""
     section, image = top.section("sigmas"), keys.sigmas.image_mm
     stated = keys.sigmas.plan(target_mm=keys.sigmas.target_mm or image)
     for key in keys.noise.model_fields_set:
@@ -268,7 +268,7 @@ def _sigmas(top: Section, keys: Any, targets: Sequence[Any]) -> tuple[Sigmas, Si
         raise section.error("control_m", "the key is missing, but there are control points; add it")
     noise = vars(stated) | {name: plain(getattr(keys.noise, name)) for name in keys.noise.model_fields_set}
     if "target_mm" not in section and "target_mm" not in keys.noise.model_fields_set:
-        # The default standard deviation of targets is that of ties.
+        # Targets have the standard deviation of tie points by default.
         noise["target_mm"] = noise["image_mm"]
     return stated, Sigmas(**noise)
 
@@ -277,7 +277,7 @@ def _sigmas(top: Section, keys: Any, targets: Sequence[Any]) -> tuple[Sigmas, Si
 
 
 def _flown_cameras(top: Section, rig: Section, cameras: list[str]) -> list[str]:
-    """All cameras, or the reference camera of the rig."""
+    """Return all cameras, or the reference camera of the rig only."""
     rig.known(*cameras)
     flown = [name for name in cameras if name not in rig]
     if rig.values and len(flown) != 1:
@@ -288,11 +288,11 @@ def _flown_cameras(top: Section, rig: Section, cameras: list[str]) -> list[str]:
 
 
 Flown = Mapping[str, tuple[Sensor, InteriorOrientation, Any]]
-"""Sensor, interior orientation and direction of the x axis of each camera."""
+"""Sensor, interior orientation and direction of the x axis, by camera."""
 
 
 def _plan(top: Section, keys: Any, cameras: Flown) -> FlightPlan | ConvergentPlan:
-    """Read the flight or the convergent set; every camera must be used."""
+    """Read the flight or the convergent stations; every camera must be used."""
     if ("flight" in top) == ("convergent" in top):
         raise top.error("", "a recipe has a table [flight] or a table [convergent]; give one of the two")
     plan = _flight(top, keys.flight, cameras) if keys.flight else _convergent(top, keys.convergent, list(cameras))
@@ -308,7 +308,7 @@ def _plan(top: Section, keys: Any, cameras: Flown) -> FlightPlan | ConvergentPla
 
 
 def _camera_of(section: Section, name: str | None, cameras: Iterable[str], number: int) -> str:
-    """Camera of a strip or station; the only camera by default."""
+    """Return the camera of a strip or station; the only camera by default."""
     cameras = list(cameras)
     if name is None and len(cameras) == 1:
         return cameras[0]
@@ -350,7 +350,7 @@ def _flight(top: Section, keys: Any, cameras: Flown) -> FlightPlan:
 
 
 def _strips(table: Any, flight: Any, camera: str, flown: tuple, section: Section) -> list[Strip]:
-    """Return the parallel strips of one table, flown in alternating directions, from left to right of the first."""
+    """Build the parallel strips of one table, flown in alternating directions, from left to right of the first."""
     sensor, interior, image_x = flown
 
     def either(thing: str) -> tuple[str, float]:
@@ -372,7 +372,7 @@ def _strips(table: Any, flight: Any, camera: str, flown: tuple, section: Section
     along = table.along_m + table.along_bases * base
     strips = []
     for k in range(table.count):
-        # Along and across refer to the heading of the first strip, and change sign in the opposite direction.
+        # `along_m` and `across_m` refer to the strip's own heading: change their signs in the opposite direction.
         sign = -1 if k % 2 else 1
         across = table.across_m + (table.across_spacings + k - (table.count - 1) / 2) * spacing
         strips.append(

@@ -1,4 +1,4 @@
-"""Write a simulation as a block folder with point cloud and trajectory; the truth has the columns of result tables."""
+"""Write a simulation as a block folder with point cloud and trajectory, and its true values as result tables."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,10 +27,10 @@ _DRIFT = "trajectory_errors"
 
 @outside_transformations
 def write_simulation(simulation: Simulation, folder: str | Path) -> None:
-    """Write the block, and its truth into the sub-folder `truth` (docs/simulation.md).
+    """Write the block, and the true values into its subfolder `truth` (docs/simulation.md).
 
-    A lidar adds `cloud.laz` and `trajectory.csv`. Everything is written in one step and replaces an older simulation.
-    Raises what `write_block` raises.
+    A lidar adds `cloud.laz` and `trajectory.csv`. Files are written atomically and replace an older simulation. Raises
+    the errors of `write_block`.
     """
     with whole_block(simulation.block, folder) as work:
         (work / FOLDER).mkdir()
@@ -42,9 +42,9 @@ def write_simulation(simulation: Simulation, folder: str | Path) -> None:
 
 
 def truth_tables(simulation: Simulation) -> dict[str, pd.DataFrame]:
-    """Return the truth by name of the corresponding result table: interior, exterior, object_points, georeferencing.
+    """Return the true values by name of the result table: interior, exterior, object_points, georeferencing.
 
-    The table scanner also joins georeferencing; trajectory_errors has the shift and drift of its trajectory.
+    With a scanner, the table scanner has its parameters, and trajectory_errors the shift and drift of its trajectory.
     """
     block, truth = simulation.block, simulation.truth
     interior = [
@@ -68,7 +68,7 @@ def truth_tables(simulation: Simulation) -> dict[str, pd.DataFrame]:
 
 
 def read_truth(folder: str | Path) -> dict[str, pd.DataFrame]:
-    """Read the truth beside a block; empty if the block of `folder` was not simulated."""
+    """Read the true values in the folder of a block; empty if the block was not simulated."""
     return {path.stem: read_table(path) for path in sorted((Path(folder) / FOLDER).glob("*.csv"))}
 
 
@@ -97,7 +97,7 @@ def _georeferencing(simulation: Simulation) -> list[tuple[str, float]]:
 
 
 def _scanner_rows(scanner: Scanner, errors: StripErrors) -> list[tuple[str, float]]:
-    """Table parameter, value of the scanner, with labels of the result tables; calibration values that are not zero."""
+    """Return (parameter, value) of the scanner, with the labels of result tables; omit zero calibration values."""
     angles = zip(("right", "forward", "up"), np.degrees(scanner.boresight), strict=True)
     rows = [(f"scanner.boresight_{axis}_deg", float(v)) for axis, v in angles]
     for name, shift in scanner.shifts.items():
@@ -106,13 +106,13 @@ def _scanner_rows(scanner: Scanner, errors: StripErrors) -> list[tuple[str, floa
 
 
 def _in_degrees(parameters: AbstractParameters, owner: str) -> list[tuple[str, float]]:
-    """Table parameter, value of declared parameters, angles in degrees."""
+    """Return (label, value) of declared parameters, angles in degrees."""
     pairs = zip(parameters.labels(owner), numbers_of(parameters), strict=True)
     return [(name.replace("_rad", "_deg"), float(np.degrees(v) if "_rad" in name else v)) for name, v in pairs]
 
 
 def _drift_table(errors: StripErrors, strips: Sequence[str]) -> pd.DataFrame:
-    """Table strip, time_s, X_m ... right_deg ...: errors of the trajectory at the knots of its splines."""
+    """Return a table strip, time_s, X_m ... right_deg ...: trajectory errors at the knots of its splines."""
     of = np.repeat(np.array(strips, object), [s.size for s in errors.splines])
     time = np.concatenate([s.times for s in errors.splines])
     values = np.column_stack([errors.position, np.rad2deg(errors.attitude)])
