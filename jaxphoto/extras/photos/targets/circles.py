@@ -326,8 +326,8 @@ class CircularTargets(Pattern):
         plane = self.board.plane
         if plane is None:
             raise InputError(
-                f"{path.name}: the targets are not coplanar (to 1 % of their extent), but only those of one plane can be "
-                "identified; give the targets of one wall"
+                f"{path.name}: the targets are not coplanar (to 1 % of their extent), but only those of one plane can "
+                "be identified; give the targets of one wall"
             )
         middle, axes = plane
         self._flat = (xyz - middle) @ axes[:, :2]
