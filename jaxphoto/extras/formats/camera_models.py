@@ -75,7 +75,7 @@ def in_pixels(
 ) -> InteriorOrientation:
     """Convert focal lengths and principal point in pixels to an interior orientation: c is fy, b1 is fx / fy - 1."""
     if not (fx > 0 and fy > 0):
-        raise source.error(f"focal lengths of {fx:g} and {fy:g} pixels cannot be; give positive ones")
+        raise source.error(f"focal lengths {fx:g} and {fy:g} px are not positive; give positive values")
     if fx != fy:
         terms["b1"] = fx / fy - 1
     x_p, y_p = sensor.mm_from_px(np.array([centre], float))[0]

@@ -272,7 +272,7 @@ def _camera(script: _Script) -> dict[str, Any]:
     if (unit := script.text(f"{c}/unit", "mm")) != "mm":
         raise script.error(f"the camera's unit is {unit!r}; give the camera in mm")
     if (model := script.text(f"{c}/model", "3")) not in _MODELS:
-        raise script.error(f"lens model {model} has no equal here; use one of {', '.join(_MODELS)}")
+        raise script.error(f"lens model {model} is not supported; use one of {', '.join(_MODELS)}")
     width, height = (int(n) for n in script.numbers(f"{c}/image", "", 2))
     if min(width, height) < 1:
         raise script.error(f"<image> is {width} x {height} pixels; give the format of the camera")

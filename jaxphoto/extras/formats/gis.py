@@ -295,7 +295,9 @@ def _read_layer(path: Path, file: sqlite3.Connection) -> SurveyedPoints:
         if point_attributes(["x", "y", *(c for c in columns if c != geometry)]) is not None:
             layers.append((name, geometry, srs, columns))
     if len(layers) != 1:
-        raise InputError(f"{path.name} has {len(layers)} layers of points with an attribute point, name, label or id")
+        raise InputError(
+            f"{path.name}: {len(layers)} point layers with an attribute point, name, label or id; export exactly one"
+        )
     ((name, geometry, srs, columns),) = layers
     if geometry not in columns:
         raise InputError(f"{path.name}: layer {quoted(name)} has no column {quoted(geometry)}; export it again")
@@ -308,7 +310,7 @@ def _read_layer(path: Path, file: sqlite3.Connection) -> SurveyedPoints:
         return _surveyed(path.name, features, "local")
     system = file.execute(_SRS, (srs,)).fetchone()
     if system is None or str(system[0]).upper() != "EPSG" or not isinstance(system[1], int):
-        raise InputError(f"{path.name}: the layer is in no EPSG system; export it in one")
+        raise InputError(f"{path.name}: the layer's coordinate system has no EPSG code; re-export it in an EPSG system")
     return _surveyed(path.name, features, f"EPSG:{system[1]}")
 
 

@@ -246,8 +246,8 @@ def _photos(path: Path, chunk: ElementTree.Element) -> tuple[list[_Aligned], str
     ((component, count),) = Counter(photo.component for photo in photos).most_common(1)
     if unaligned or count < len(photos):
         warn(
-            f"{path.name}: {unaligned} camera(s) that are not aligned and {len(photos) - count} of smaller components "
-            "are not read"
+            f"{path.name}: skipped {unaligned} unaligned camera(s) and {len(photos) - count} camera(s) of smaller "
+            "components"
         )
     return [photo for photo in photos if photo.component == component], component
 
@@ -288,7 +288,7 @@ def _transform(path: Path, chunk: ElementTree.Element, component: str) -> tuple[
         values.append(number_rows([words], (size,), lambda _, key=key: f"{path.name}, transform, {key}")[0])  # type: ignore[misc]
     rotation, translation, (scale,) = values
     if not scale > 0:
-        raise InputError(f"{path.name}, transform: a scale of {scale:g} cannot be. Export the cameras again")
+        raise InputError(f"{path.name}, transform: scale {scale:g} is not positive; re-export the cameras")
     return rotation.reshape(3, 3), translation, float(scale), True
 
 

@@ -77,7 +77,7 @@ def _camera(path: Path, place: str, values: dict[str, Any]) -> ProjectCamera:
     model, coefficients = _KINDS[kind]
     for name in _TERMS:
         if name not in coefficients and section.number(name, 0.0) != 0:
-            raise section.error(name, f"cameras of kind {kind} have no such term here; calibrate without it")
+            raise section.error(name, f"unsupported term for camera model {kind}; recalibrate without it")
     if not ("w" in section and "h" in section):
         raise InputError(f"{path.name} does not say how large its photographs are. Add w and h (pixels)")
     width, height = section.number("w"), section.number("h")

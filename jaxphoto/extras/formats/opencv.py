@@ -86,7 +86,7 @@ def _camera(source: CameraSource, storage: Any) -> CameraFile:
     coefficients = _matrix(source, storage, "distortion_coefficients").ravel()
     n = len(coefficients)
     if fisheye and n != len(FISHEYE_TERMS):
-        raise source.error(f"there are {n} distortion_coefficients; OpenCV's fisheye model has 4")
+        raise source.error(f"{n} distortion_coefficients, but OpenCV's fisheye model has 4; give 4")
     if n not in _COUNTS:
         raise source.error(f"there are {n} distortion_coefficients; OpenCV has one of {', '.join(map(str, _COUNTS))}")
     _check_plane(source, coefficients)

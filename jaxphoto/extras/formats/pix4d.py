@@ -63,13 +63,18 @@ def _read_cameras(path: Path) -> tuple[list[str], list[tuple[int, int]], np.ndar
     rows = [(k + 1, line) for k, line in enumerate(lines) if k >= begin and line.strip()]
     each = len(_ROWS) + 1
     if not rows or len(rows) % each:
-        raise InputError(f"{path.name} has {len(rows)} rows, not {each} a photograph: it ends early, or has fisheyes")
+        raise InputError(
+            f"{path.name}: {len(rows)} rows, not a multiple of {each} (rows per photograph); the file is truncated "
+            "or has fisheye cameras. Re-export it for perspective cameras"
+        )
     names, sizes, numbers = [], [], []
     for first in range(0, len(rows), each):
         row, line = rows[first]
         words = line.rsplit(maxsplit=2)
         if len(words) != 3 or not all(word.isdigit() and len(word) < 9 for word in words[1:]):
-            raise InputError(f"{path.name}, row {row}: {quoted(line)} is no name with width and height")
+            raise InputError(
+                f'{path.name}, row {row}: expected "NAME WIDTH HEIGHT", got {quoted(line)}; re-export the file'
+            )
         names.append(words[0])
         sizes.append((int(words[1]), int(words[2])))
         below = zip(rows[first + 1 : first + each], _ROWS, strict=True)

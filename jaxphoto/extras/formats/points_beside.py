@@ -168,10 +168,7 @@ def write_image_points(p: Project, folder: Path, names: Sequence[str] | None = N
         x, y = p.sigma_px.T
         columns["sigma_px"] = np.sqrt((x**2 + y**2) / 2)
         if (np.abs(x - y) > _ROUNDING * x).any():
-            warn(
-                f"{TABLE} has one standard deviation for x and y, and those of the block differ: their root mean "
-                "square is written"
-            )
+            warn(f"sigma_x and sigma_y differ, but {TABLE} has one column for both; writing their root mean square")
     # Quote the names if one starts with #: an unquoted first line would be a comment.
     quoting: Literal[0, 2] = csv.QUOTE_NONNUMERIC if any(n.startswith("#") for n in images) else csv.QUOTE_MINIMAL
     pd.DataFrame(columns).to_csv(folder / TABLE, index=False, quoting=quoting)

@@ -181,8 +181,8 @@ def read_bal(path: Path) -> Project:
     counts = row_numbers(path, rows[0][0], rows[0][1].split(), 3) if rows else [0.0]
     if not all(count > 0 and count == int(count) for count in counts):
         raise InputError(
-            f"{path.name}, row {rows[0][0] if rows else 1}: a BAL problem begins with the positive numbers of its "
-            "cameras, points and observations. Write these three"
+            f"{path.name}, row {rows[0][0] if rows else 1}: invalid BAL header; write the positive counts of cameras, "
+            "points and observations"
         )
     n_cameras, n_points, n = map(int, counts)
     if len(rows) <= n:

@@ -323,7 +323,10 @@ def _of_matrices(path: Path, rows: list[_Row]) -> ExteriorText:
     for at in range(0, len(rows), 3):
         (k, cells, line), below = rows[at], rows[at + 1 : at + 3]
         if len(cells) <= 3 or len(below) < 2:
-            raise InputError(f"{path.name}, row {k}: {quoted(line)} is not the first of three rows of a photograph.")
+            raise InputError(
+                f"{path.name}, row {k}: {quoted(line)} does not start a three-row photograph record; "
+                "complete the record"
+            )
         matrix = [
             x for (n, words, _), many in zip(below, _MATRIX, strict=True) for x in row_numbers(path, n, words, many)
         ]

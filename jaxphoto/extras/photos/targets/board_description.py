@@ -1,10 +1,10 @@
 """One-line descriptions of calibration boards, as on the command line.
 
-    chessboard:8x6:square_mm=30            inner corners: columns x rows
-    circles:4x11:spacing_mm=20:diameter_mm=15
-    aruco:5x7:marker_mm=30:gap_mm=6:dictionary=4X4_50
-    charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50
-    targets:FILE.csv                       circular targets with known coordinates
+chessboard:8x6:square_mm=30            inner corners: columns x rows
+circles:4x11:spacing_mm=20:diameter_mm=15
+aruco:5x7:marker_mm=30:gap_mm=6:dictionary=4X4_50
+charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50
+targets:FILE.csv                       circular targets with known coordinates
 """
 
 from collections.abc import Callable
@@ -35,8 +35,7 @@ _MADE: dict[str, tuple[Callable[..., Pattern], tuple[str, ...], int]] = {
 
 
 def read_board(description: str) -> Pattern:
-    """Create a board from a one-line description (mm). Raise InputError, with the syntax, for an invalid description.
-    """
+    """Create a board from a one-line description (mm). Raise InputError, with the syntax, for an invalid one."""
     kind, _, rest = description.partition(":")
     if kind not in SYNTAX:
         raise InputError(

@@ -1,5 +1,4 @@
-"""ArUco boards, and ChArUco boards (chessboards with a marker in each white square). Partly visible boards are allowed.
-"""
+"""ArUco boards, and ChArUco boards (chessboards with a marker in each white square). Boards may be partly visible."""
 
 from typing import NamedTuple
 
@@ -61,8 +60,7 @@ class FoundMarkers(NamedTuple):
 
 
 def found_markers(picture: np.ndarray, dictionary, margin: float) -> FoundMarkers:
-    """Detect all markers of a dictionary; `margin` is the width of the bright border as a fraction of the marker side.
-    """
+    """Detect all markers of a dictionary; `margin` is the width of the bright border (unit: marker side)."""
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)
     if ids is None:
         return FoundMarkers(np.zeros(0, int), TargetPlaces(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool)))
