@@ -1,1 +1,1 @@
-"""Optional parts: photographs (extra `photos`) and formats of other programs."""
+"""Optional subpackages: photographs (extra `photos`) and file formats of other programs."""

@@ -229,9 +229,9 @@ def _package(folder, *statements):
 
 
 PACKAGE_REFUSED = {
-    "layers": (("ALTER TABLE object_points RENAME COLUMN point TO what",), "has 0 layers of points with an attribute"),
+    "layers": (("ALTER TABLE object_points RENAME COLUMN point TO what",), "0 point layers with an attribute"),
     "geometry": (("UPDATE object_points SET geom = x'4750' WHERE fid = 3",), "feature 3: the geometry is no point"),
-    "system": (("UPDATE gpkg_contents SET srs_id = 0",), "the layer is in no EPSG system"),
+    "system": (("UPDATE gpkg_contents SET srs_id = 0",), "coordinate system has no EPSG code"),
     "tables": (("DROP TABLE gpkg_geometry_columns",), "is no GeoPackage that can be read"),
     "column": (("UPDATE gpkg_geometry_columns SET column_name = 'shape'",), "has no column 'shape'"),
     "names": (("UPDATE object_points SET point = 'p7'",), "feature 2: the point 'p7' stands in photographs.gpkg, fe"),

@@ -68,7 +68,7 @@ def test_the_principal_point_of_model_5_is_that_of_model_3_in_the_reports_of_dba
     [
         (2, 0.99, "<all>false</all>", "lens model 2 has neither aspect nor skew"),
         (1, 1.0, "<all>true</all>", "lens model 1 has neither aspect nor skew"),
-        (6, 1.0, "<all>true</all>", "lens model 6 has no equal here; use one of 1, 2, 3, 4, 5"),
+        (6, 1.0, "<all>true</all>", "lens model 6 is not supported; use one of 1, 2, 3, 4, 5"),
     ],
 )
 def test_a_lens_model_that_has_no_equal_is_refused(tmp_path, model, aspect, estimated, message):

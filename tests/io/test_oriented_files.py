@@ -235,7 +235,7 @@ REFUSED = {
     "cut": (_metashape(lambda text: text[:-30]), "cameras.xml: damaged"),
     "no sensor": (_metashape(_without("<calibration.*</calibration>")), "'a b': its sensor is not calibrated"),
     "matrix": (_metashape(lambda text: text.replace(" 1.0</tr", " x</tr")), "'a b', transform: .* 16 fi"),
-    "scale": (_metashape(lambda text: text.replace(">1.0</scale>", ">-1</scale>")), "a scale of -1 cannot be"),
+    "scale": (_metashape(lambda text: text.replace(">1.0</scale>", ">-1</scale>")), "scale -1 is not positive"),
     "moved": (
         _metashape(lambda text: re.sub("<translation.*?</translation>", "<translation>0 0 0</translation>", text)),
         "not on the earth",
@@ -247,7 +247,7 @@ REFUSED = {
     "no points": (lambda folder: without(write_angles(folder), "ties.dat") / "exterior.txt", "has no image points"),
     "point": (lambda folder: appended(write_angles(folder), "a b c\n7 1\n"), "row [0-9]+: '7 1' is not point"),
     "xy": (lambda folder: appended(write_angles(folder), "a b c\n7 1 x\n"), "'1 x' is not 2 numbers"),
-    "matrix end": (_patb(lambda text: text.rsplit("\n", 2)[0]), "patb.ori, row 10: .* first of three rows"),
+    "matrix end": (_patb(lambda text: text.rsplit("\n", 2)[0]), "patb.ori, row 10: .* not start a three-row"),
     "bingo's row": (
         lambda folder: write_bingo(folder, change=lambda t: re.sub(r" \S+ 1$", "", t.rstrip())) / "itera.dat",
         r"itera.dat, row \d+: .* is not ORIA, name, X, Y, Z, phi, omega, kappa",
@@ -367,7 +367,7 @@ def test_instant_ngp_fisheye_and_unknown_terms(tmp_path):
     (fisheye,) = read_source(tmp_path, "nerfstudio").start.unknowns.interior.values()
     assert fisheye.projection.name == "equidistant"
     path.write_text(json.dumps(content | {"k4": 0.1}))
-    with pytest.raises(InputError, match="k4: cameras of kind OPENCV have no such term here"):
+    with pytest.raises(InputError, match="k4: unsupported term for camera model OPENCV"):
         read_source(tmp_path, "nerfstudio")
 
 

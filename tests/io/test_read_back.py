@@ -48,7 +48,7 @@ def test_image_points_come_back_with_their_standard_deviations(tmp_path, format)
 @pytest.mark.filterwarnings("ignore:.*fewer than")
 def test_different_standard_deviations_of_x_and_y_are_reported(tmp_path):
     p = inside("opencv", "local")
-    with pytest.warns(UserWarning, match="image_points.csv has one standard deviation for x and y"):
+    with pytest.warns(UserWarning, match="sigma_x and sigma_y differ, but image_points.csv has one column"):
         export(p._replace(sigma_px=np.tile([3.0, 4.0], (len(p.image), 1))), tmp_path / "out", "nerfstudio")
     block = read_source(tmp_path / "out")
     np.testing.assert_allclose(np.asarray(block.image_points.sigma) / 0.001, np.sqrt(12.5), rtol=1e-12)

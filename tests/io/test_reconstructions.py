@@ -477,7 +477,7 @@ REFUSED = {
         _bundle(lambda lines: [*lines[:-4], f"10{lines[-4][1:]}", *lines[-3:], "0 0 0"]),
         "number of measurements of point 6 is nan",
     ),
-    "cameras that end": (_pix4d(lambda text: text[: text.rindex("\n", 0, -1)]), "has 29 rows"),
+    "cameras that end": (_pix4d(lambda text: text[: text.rindex("\n", 0, -1)]), "29 rows, not a multiple"),
     "focal lengths": (_pix4d(_replaced("0 800.0 239", "0 801.0 239")), "one focal"),
     "of camera": (_bundle(lambda lines: [*lines[:-1], "1 17 0 1.0 1.0"]), "in a camera that is none of 0 to 3"),
 }  # fmt: skip

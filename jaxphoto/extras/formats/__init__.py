@@ -1,7 +1,7 @@
-"""Formats of other programs: every module reads into and writes from `Project`, and declares its formats.
+"""Formats of other programs. Each module converts between its files and `Project`, and declares its formats.
 
-Modules declare FORMATS (oriented projects), CAMERAS (camera files) and CONTROL (control points and marks); `convert`
-registers them and loops over them.
+Modules declare FORMATS (oriented projects), CAMERAS (camera files) and CONTROL (control points and image marks);
+`convert` registers them.
 """
 
 from jaxphoto.extras.formats.camera_models import ProjectCamera

@@ -1,8 +1,8 @@
 """AICON / JAG3D close-range projects: .ior, .phc, .eor, .obc, .scale.
 
-Lengths are millimetres. Image coordinates are ours (x right, y up, from the centre); the rotation is
-`object_from_camera = Rx(omega) Ry(phi) Rz(kappa)`, the transpose of our `camera_from_object`. The model is `Balanced`
-with A1-A3, B1, B2, C1, C2 and R0 as they stand; the principal distance changes its sign.
+Lengths are in millimetres. Image coordinates follow docs/conventions.md (x right, y up, from the image centre). The
+rotation is `object_from_camera = Rx(omega) Ry(phi) Rz(kappa)`, the transpose of our `camera_from_object`. The
+distortion is `Balanced` with unchanged A1-A3, B1, B2, C1, C2 and R0; the principal distance has the opposite sign.
 Source: github.com/applied-geodesy/bundle-adjustment, which reads these files.
 """
 
@@ -18,7 +18,7 @@ from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
 from jaxphoto.io.text_tables import Table, finite
 
 _MM = 0.001
-# The program's sigma of every image coordinate; columns 5 and 6 of .phc are results.
+# Standard deviation of image coordinates (mm) in AICON; columns 5 and 6 of .phc are adjustment results.
 _SIGMA_MM = 0.0005
 _NEEDED = (".ior", ".phc", ".eor", ".obc")
 _PHC = ("image", "point", "x", "y", "sx", "sy", "vx", "vy", "flag_1", "flag_2", "flag_3")
@@ -29,7 +29,7 @@ _FREE = ("c_mm", "xp_mm", "yp_mm", "a1", "a2", "b1", "b2")
 
 
 def find(source: Path) -> list[Path]:
-    """Return the .phc files of complete projects; any file of one names it."""
+    """Return the .phc file of each complete project; `source` is a folder or any file of a project."""
     paths = sorted(source.glob("*.phc")) if source.is_dir() else []
     if source.suffix in (*_NEEDED, ".scale"):
         paths = [source.with_suffix(".phc")]
@@ -37,9 +37,9 @@ def find(source: Path) -> list[Path]:
 
 
 def read(path: Path) -> BlockTables:
-    """Read a project from its values; image points count if all flags are 1 and the point is in .obc.
+    """Read a project; image points are used if all flags are 1 and the point is in .obc.
 
-    The datum is inner over the points; scale bars, if given, determine the scale.
+    The datum is defined by inner constraints over the points; scale bars, if given, determine the scale.
     """
     camera, interior = _camera(path.with_suffix(".ior"))
     images, points, observed = (
@@ -77,7 +77,7 @@ def read(path: Path) -> BlockTables:
 
 
 def _camera(path: Path) -> tuple[str, dict[str, Any]]:
-    """Return the camera's id and its [cameras.X] table, from the five lines of one camera."""
+    """Read the camera's id and its [cameras.X] table from the five lines of .ior."""
     rows = [(row, line.split()) for row, line in content_rows(path)]
     if [len(cells) for _, cells in rows] != [8, 1, 2, 2, 4]:
         raise InputError(f"{path.name}: the five lines of one camera (8, 1, 2, 2, 4 numbers) are expected")
@@ -90,7 +90,7 @@ def _camera(path: Path) -> tuple[str, dict[str, Any]]:
     if min(values[-1]) <= 0:
         raise InputError(f"{path.name}, row {rows[-1][0]}: the format in mm and pixels is positive; correct it")
     (_, _, c, x, y, a1, a2, r0), (a3,), (b1, b2), (c1, c2), (width_mm, height_mm, width, height) = values
-    # One pixel size for both axes: only the format is derived from it.
+    # Use the mean pixel size of both axes: it affects only the format.
     pixel = (width_mm / width + height_mm / height) / 2
     interior = {
         "c_mm": -c, "xp_mm": x, "yp_mm": y, "a1": a1, "a2": a2, "a3": a3, "b1": b1, "b2": b2, "c1": c1, "c2": c2,

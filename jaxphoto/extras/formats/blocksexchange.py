@@ -1,4 +1,4 @@
-"""BlocksExchange XML of Bentley's ContextCapture and iTwin Capture, which Metashape and Pix4D export, too.
+"""BlocksExchange XML of Bentley's ContextCapture and iTwin Capture; Metashape and Pix4D export it, too.
 
     SpatialReferenceSystems/SRS                 Id, Definition
     Block/Photogroups/Photogroup                ImageDimensions, FocalLengthPixels (or FocalLength with SensorSize, mm),
@@ -6,11 +6,11 @@
     .../Photo                                   Id, ImagePath, Pose/Rotation (M_00 to M_22), Pose/Center
     Block/TiePoints/TiePoint                    Position, Measurement (PhotoId, x, y)
 
-Pixels count from the *centre* of the upper left one; <Rotation> takes the system of the block to axes x right, y down,
-z ahead; K1 to K3, P1 and P2 are Agisoft's formula (OpenCV's with P1 and P2 exchanged). The system is
-ENU:latitude,longitude (east, north and up of that place on WGS 84), an EPSG code, WKT, or a local one. Written is the
-east-north-up frame at the block's origin, else a local one. Source: ContextCapture User Guide, "BlocksExchange XML/XMLZ
-format" and "Perspective camera model".
+Pixel (0, 0) is at the *centre* of the upper left pixel. <Rotation> transforms from the block's coordinate system to
+camera axes x right, y down, z forward. K1 to K3, P1 and P2 are Agisoft's coefficients (OpenCV's with P1 and P2
+exchanged). The system is ENU:latitude,longitude (east, north, up at this origin on WGS 84), an EPSG code, WKT, or
+local. The export uses the east-north-up frame at the block's origin if it has one, otherwise a local system. Source:
+ContextCapture User Guide, "BlocksExchange XML/XMLZ format" and "Perspective camera model".
 """
 
 import io
@@ -35,7 +35,7 @@ _NUMBER = r"\s*([-+]?\d{1,4}(?:\.\d*)?(?:e-\d\d)?)\s*"
 _ENU = re.compile(f"ENU:{_NUMBER},{_NUMBER}(?:,{_NUMBER})?")
 _FIRST_PX = 0.5
 _MATRIX = [f"M_{row}{column}" for row in range(3) for column in range(3)]
-# Signs of the camera's y and z axes that make them y down, z ahead.
+# Sign that converts the camera's y and z axes to y down, z forward.
 _AXES = {"XRightYDown": 1.0, "XRightYUp": -1.0}
 _COLOUR = "<Color><Red>0</Red><Green>0</Green><Blue>0</Blue></Color>"
 
@@ -49,7 +49,7 @@ class _Photo(NamedTuple):
 
 
 class _Ties(NamedTuple):
-    """Tie points as text, and of each measurement photograph, point and place."""
+    """Tie point coordinates as text; photograph, point index and image coordinates of each measurement."""
 
     xyz: list[list[str | None]]
     photo: list[str]
@@ -58,7 +58,7 @@ class _Ties(NamedTuple):
 
 
 def read(path: Path) -> Project:
-    """Read a block; cameras are free in c, xp, yp, k1 to k3, p1, p2. Control is not read."""
+    """Read a block; cameras have free c, xp, yp, k1 to k3, p1, p2. Control points are not read."""
     root, ties, n_control = _parsed(path)
     blocks = root.findall("Block")
     if len(blocks) != 1:
@@ -95,7 +95,7 @@ def read(path: Path) -> Project:
 
 
 def _parsed(path: Path) -> tuple[ElementTree.Element, _Ties, int]:
-    """Return the tree without tie points (gigabytes in it), the tie points, and the number of control points."""
+    """Parse the tree without tie points (they may take gigabytes), the tie points, and the number of control points."""
     ties, n_control = _Ties([], [], [], []), 0
     events = ElementTree.iterparse(io.BytesIO(read_bytes(path)), ("start", "end"))
     _, root = next(events)
@@ -114,7 +114,7 @@ def _parsed(path: Path) -> tuple[ElementTree.Element, _Ties, int]:
 
 
 def _system(path: Path, root: ElementTree.Element, block: ElementTree.Element) -> str:
-    """Return the words that name the system of the block, "" for a local one. Raise InputError for a geographic one."""
+    """Return the block's system as EPSG code, ENU or WKT; "" if local. Raise InputError for a geographic system."""
     number = (block.findtext("SRSId") or "").strip()
     for system in root.iterfind("SpatialReferenceSystems/SRS"):
         words = (system.findtext("Definition") or "").strip()
@@ -131,7 +131,7 @@ def _system(path: Path, root: ElementTree.Element, block: ElementTree.Element) -
 
 
 def _photogroups(path: Path, block: ElementTree.Element) -> tuple[dict[str, ProjectCamera], list[_Photo], int]:
-    """Cameras by name, photographs with a pose, and the number of those without."""
+    """Return cameras by name, photographs with a pose, and the number of photographs without pose."""
     cameras: dict[str, ProjectCamera] = {}
     photos: list[_Photo] = []
     n_unposed = 0
@@ -184,9 +184,9 @@ def _camera(source: CameraSource, name: str, group: ElementTree.Element) -> Proj
 
 
 def write(p: Project, folder: Path) -> None:
-    """Write blocks_exchange.xml; heights are above the ellipsoid, or local."""
+    """Write blocks_exchange.xml; heights are ellipsoidal, or local."""
     root = ElementTree.Element("BlocksExchange", version="2.1")
-    # Its frame lies on the ellipsoid under our origin.
+    # The ENU frame has its origin on the ellipsoid below our origin: add the origin's height.
     shift = np.zeros(3)
     if p.place is not None:
         longitude, latitude, height = p.place
@@ -207,7 +207,7 @@ def write(p: Project, folder: Path) -> None:
             _add_all(add(position, "Rotation"), **dict(zip(_MATRIX, rotations[i].ravel().tolist(), strict=True)))
             _add_all(add(position, "Center"), **dict(zip("xyz", centres[i].tolist(), strict=True)))
     add(block, "TiePoints")
-    # As text: elements of a million image points take a gigabyte.
+    # Write tie points as text: XML elements of a million image points take a gigabyte.
     before, after = xml_text(root).split("<TiePoints />")
     images, places, ties = p.image.tolist(), (p.column_row - _FIRST_PX).tolist(), []
     for (x, y, z), rows in zip((np.asarray(p.xyz) + shift).tolist(), p.rows_of_points, strict=True):

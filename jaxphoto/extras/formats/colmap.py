@@ -1,9 +1,9 @@
-"""COLMAP: `cameras`, `images` and `points3D`, all .txt or all .bin; cameras.txt or cameras.bin alone are camera files.
+"""COLMAP models: `cameras`, `images` and `points3D`, all .txt or all .bin. A single cameras file is a camera file.
 
-COLMAP's camera looks along +z, with x right and y down: x_camera = R x_world + t. Pixels are ours. All its models
-without fisheye are parts of `OpenCv`, those with it of `OpenCvFisheye` on the equidistant projection. Frames and rigs
-repeat the poses of the images and are not read. Written models have no colours, errors or standard deviations. Source:
-the documentation of COLMAP, "Camera models" and "Output format", and its src/colmap/sensor/models.h.
+COLMAP's camera axes are x right, y down, z forward: x_camera = R x_world + t. Pixel coordinates are the same as ours.
+Its perspective models are special cases of `OpenCv`, its fisheye models of `OpenCvFisheye` with the equidistant
+projection. Frames and rigs repeat the image poses and are not read. Exported models have no colours, errors or standard
+deviations. Source: COLMAP documentation, "Camera models" and "Output format"; src/colmap/sensor/models.h.
 """
 
 import math
@@ -41,29 +41,29 @@ _FISHEYES = {
     "THIN_PRISM_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "s1", "s2"),
 }
 MODELS = _PLANES | _FISHEYES
-"""Parameters of each model in COLMAP's order, simplest model first; `f` stands for both focal lengths."""
+"""Parameters of each model in COLMAP's order, simplest model first; `f` means fx = fy."""
 FISHEYE = OPENCV_FISHEYE._replace(lacks=("b2",))
 PARTS = {
     name: (OPENCV if name in _PLANES else FISHEYE).only(*parameters, *["b1"] * ("fx" in parameters))
     for name, parameters in MODELS.items()
 }
-"""Each model as part of ours."""
-# By the number in a binary file; some are unknown here.
+"""Distortion and projection of each COLMAP model."""
+# Model names by model id in binary files; some are not supported here.
 _NUMBERS = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
     "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
 )  # fmt: skip
 _PLACES = ("f", "fx", "fy", "cx", "cy")
 _NO_POINT = 2**64 - 1
-# Quaternions of any program have nearly unit length.
+# Maximum length of a quaternion, and inverse of its minimum; unit quaternions are expected.
 _LONGEST = 1e6
 _FEATURE = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
-# Colour (black) and mean error (unknown) of a written point.
+# Colour (black) and mean error (unknown) of exported points.
 _COLOUR, _ERROR = (0, 0, 0), -1
 
 
 class ColmapCamera(NamedTuple):
-    """A camera: model, format in pixels, and parameters in the order of `MODELS`."""
+    """Camera: model, format in pixels, and parameters in the order of `MODELS`."""
 
     model: str
     width_px: int
@@ -72,7 +72,7 @@ class ColmapCamera(NamedTuple):
 
 
 class ColmapImage(NamedTuple):
-    """An image: `x_camera = R x_world + t`, its camera, and the features of points."""
+    """Image: pose `x_camera = R x_world + t`, its camera, and the features that have an object point."""
 
     name: str
     camera: int
@@ -84,7 +84,7 @@ class ColmapImage(NamedTuple):
 
 
 class ColmapModel(NamedTuple):
-    """The content of the three files, images sorted by name."""
+    """Content of the three files; images sorted by name."""
 
     cameras: dict[int, ColmapCamera]
     images: list[ColmapImage]
@@ -93,7 +93,7 @@ class ColmapModel(NamedTuple):
 
 
 class _Binary:
-    """Little-endian records."""
+    """Reader of little-endian records."""
 
     def __init__(self, path: Path):
         self.path, self.data, self.at = path, read_bytes(path), 0
@@ -109,7 +109,7 @@ class _Binary:
         return values
 
     def count(self, size: int) -> int:
-        """Return the number of the records that follow, of at least `size` bytes."""
+        """Read the number of records; each has at least `size` bytes."""
         (count,) = self.take("Q")
         if count * size > len(self.data) - self.at:
             raise InputError(f"{self.path}: the file ends early. Copy it again")
@@ -129,14 +129,14 @@ class _Binary:
 
 
 def find(source: Path) -> list[Path]:
-    """Return the file of cameras of a model, the text if there are both kinds."""
+    """Return the cameras file of a model; .txt is preferred to .bin."""
     folder = source if source.is_dir() else source.parent if source.stem == FILES[0] else Path("/nonexistent")
     suffixes = (end for end in (".txt", ".bin") if all((folder / (name + end)).is_file() for name in FILES))
     return [folder / (FILES[0] + end) for end in suffixes][:1]
 
 
 def read(path: Path) -> Project:
-    """Read a model; cameras are free in what COLMAP's model has, points have COLMAP's numbers as ids."""
+    """Read a model; free camera parameters are the parameters of COLMAP's model, point ids are COLMAP's ids."""
     model = read_model(path)
     images, ids = model.images, np.sort(model.point_ids)
     point = np.concatenate([np.zeros(0, int), *(i.point for i in images)])
@@ -147,7 +147,7 @@ def read(path: Path) -> Project:
         )
     cameras = {str(k): _project_camera(path, model.cameras[k]) for k in sorted({i.camera for i in images})}
     quaternions = np.array([i.quaternion for i in images]).reshape(-1, 4)[:, [1, 2, 3, 0]]
-    # SciPy before 1.17 takes no empty array.
+    # SciPy before 1.17 rejects empty arrays.
     of = scipy.spatial.transform.Rotation.from_quat
     rotations = of(quaternions).as_matrix() if len(quaternions) else np.zeros((0, 3, 3))
     moved = np.array([i.translation for i in images]).reshape(-1, 3)
@@ -161,7 +161,7 @@ def read(path: Path) -> Project:
 
 
 def read_model(path: Path) -> ColmapModel:
-    """Read the model of a folder, or of its file of cameras. Raise InputError for content that does not fit."""
+    """Read a model from its folder or its cameras file. Raise InputError for inconsistent content."""
     path = find(path)[0] if path.is_dir() else path
     images_path, points_path = (path.with_name(name + path.suffix) for name in FILES[1:])
     cameras = read_cameras(CameraSource(path))
@@ -253,7 +253,7 @@ def _binary_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def recognise_cameras(path: Path, text: str) -> bool:
-    """Return True for the file names of COLMAP, or if the first line is an id, a model and numbers."""
+    """Return True for COLMAP's file names, or if the first line is an id, a model and numeric values."""
     lines = (line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#"))
     first = next(lines, [])
     named = path.name in ("cameras.txt", "cameras.bin")
@@ -261,7 +261,7 @@ def recognise_cameras(path: Path, text: str) -> bool:
 
 
 def read_camera(source: CameraSource) -> CameraFile:
-    """Read one camera of the file; the others need not be valid."""
+    """Read one camera; other cameras in the file may be invalid."""
     lines = read_cameras(source) if source.path.suffix == ".bin" else _lines_by_id(source)
     name = source.chosen([str(identifier) for identifier in lines])
     chosen = lines[int(name)]
@@ -335,7 +335,7 @@ def _project_camera(path: Path, camera: ColmapCamera) -> ProjectCamera:
 
 
 def colmap_camera(sensor: Sensor, interior: InteriorOrientation) -> ColmapCamera:
-    """Return a camera in the simplest model that holds it."""
+    """Return a camera in the simplest COLMAP model with all its nonzero coefficients."""
     fx, fy, column, row = pixels_of(interior, sensor)
     d = interior.distortion
     coefficients = {k: float(getattr(d, k)) for k in d.coefficients if k not in ("b1", "b2")}
@@ -354,7 +354,7 @@ def _cameras_text(cameras: dict[int, ColmapCamera]) -> str:
 
 
 def write_camera(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
-    """Write cameras.txt; a `name` that is a number is the id."""
+    """Write cameras.txt; the id is `name` if it is an integer, otherwise 1."""
     identifier = int(name) if name.isascii() and name.isdigit() else 1
     path.write_text(_cameras_text({identifier: colmap_camera(sensor, interior)}), encoding="utf-8")
 
@@ -366,11 +366,11 @@ class _Point(NamedTuple):
     id: int
     xyz: list[float]
     track: np.ndarray
-    """Image id and feature."""
+    """Image id and feature index of each measurement."""
 
 
 def _model(p: Project) -> tuple[dict[int, ColmapCamera], list[ColmapImage], list[_Point]]:
-    """Cameras, images in the order of their ids (from 1), and points; numeric ids of cameras and points are kept."""
+    """Return cameras, images by id (from 1), and points; numeric ids of cameras and points are retained."""
     camera_ids, point_ids = numbered(tuple(p.cameras)), np.array(list(numbered(p.points).values()), int)
     rotations = p.world_to_camera
     quaternions = scipy.spatial.transform.Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]].tolist()

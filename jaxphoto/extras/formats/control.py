@@ -1,14 +1,14 @@
-"""Control points and marks as tables, gcp_list.txt of OpenDroneMap, and geoin.dat of BINGO.
+"""Control points and image marks: tables, gcp_list.txt of OpenDroneMap, and geoin.dat of BINGO.
 
     tables        points (point, X_m, Y_m, Z_m, sigma_X_m ..., role) or marks (image, point, x_px, y_px, sigma_px) of
                   jaxphoto, Metashape and Pix4D, separated by commas, semicolons, tabs or blanks. A comment may name the
-                  system: "# EPSG:25832+7837", "#CoordinateSystem: ..." with WKT. Without a header, as Pix4D's: label,
-                  coordinates in the order of the system's axes, z [, horizontal and vertical accuracy], or image,
-                  label, x, y [, accuracy]. Pixels are ours.
-    gcp_list.txt  a line that names the system, then geo_x geo_y geo_z im_x im_y image_name [gcp_name] [extras]; geo_x
-                  is the easting or longitude; pixels count from the centre of the upper left one. A list without marks
-                  has rows of gcp_name geo_x geo_y geo_z, or of geo_x geo_y geo_z [gcp_name].
-    geoin.dat     rows that begin with CONT are control, with CHCK check points: CONT point X Y Z ...
+                  system: "# EPSG:25832+7837", "#CoordinateSystem: ..." with WKT. Without a header, as in Pix4D: label,
+                  coordinates in the axis order of the system, z [, horizontal and vertical accuracy], or image,
+                  label, x, y [, accuracy]. Pixel coordinates are the same as ours.
+    gcp_list.txt  a line with the coordinate system, then geo_x geo_y geo_z im_x im_y image_name [gcp_name] [extras];
+                  geo_x is easting or longitude; pixel (0, 0) is at the centre of the upper left pixel. A list without
+                  marks has rows of gcp_name geo_x geo_y geo_z, or of geo_x geo_y geo_z [gcp_name].
+    geoin.dat     rows starting with CONT are control points, with CHCK check points: CONT point X Y Z ...
 
 Sources: OpenDroneMap and OpenSfM documentation, "Ground Control Points"; for BINGO, whose manual is not public, S.
 Turek's bundle block adjustment for GRASS, 2014.
@@ -67,11 +67,11 @@ _BINGO_CHECK = {"CONT": False, "CHCK": True}
 
 
 Mark = tuple[str, str, list[float], float, str]
-"""Image, point, column and row, sigma in pixels, place for messages."""
+"""Image, point, (column, row) in pixels, sigma in pixels, source location for messages."""
 
 
 class SurveyRows:
-    """Surveyed points in the order of the file."""
+    """Surveyed points in file order."""
 
     def __init__(self, file: str) -> None:
         self.file = file
@@ -82,7 +82,7 @@ class SurveyRows:
         return len(self._rows)
 
     def named_by(self, xyz: Sequence[float]) -> str:
-        """Return the name of a point without one: P1, P2 ..., one for each position."""
+        """Return a generated name for an unnamed point: P1, P2 ..., one per position."""
         return self._names.setdefault(tuple(map(repr, xyz)), f"P{len(self._names) + 1}")
 
     def add(
@@ -94,7 +94,7 @@ class SurveyRows:
         check: bool = False,
         once: bool = False,
     ) -> None:
-        """Add a point; with `once`, even a repeated point with the same coordinates is an error."""
+        """Add a point. With `once`, repeated points raise InputError even if the coordinates are equal."""
         check_name(name, "point", place)
         row = (xyz, sigma or [np.nan] * 3, check, place)
         first = self._rows.setdefault(name, row)
@@ -113,7 +113,7 @@ class SurveyRows:
 
 
 def read_marks(rows: Sequence[Mark]) -> Marks:
-    """Return marks of rows. Raise InputError for invalid names, and for a point marked twice in an image."""
+    """Collect marks. Raise InputError for empty names, and for a point marked twice in an image."""
     seen: dict[tuple[str, str], str] = {}
     for image, point, _, _, place in rows:
         check_name(image, "image", place)
@@ -132,7 +132,7 @@ def check_name(name: str, what: str, place: str) -> None:
 
 
 def numbered_lines(text: str) -> list[tuple[int, str]]:
-    """Return lines that are not empty, with their rows."""
+    """Return (row number, line) for each line that is not empty."""
     return [(row, line) for row, line in enumerate(text.split("\n"), 1) if line.strip()]
 
 
@@ -157,7 +157,7 @@ def read_table(path: Path, text: str) -> SurveyedPoints | Marks:
     for k, header in enumerate([cells.records[0], *in_comments]):
         below = cells._replace(records=cells.records[k == 0 :], rows=cells.rows[k == 0 :])
         marks, points = columns_of(header, _MARK), columns_of(header, _POINT)
-        # A comment whose columns the rows do not have is a sentence.
+        # Treat a comment as a header only if the rows have all its columns.
         if _has(marks, ("image", "point", "x", "y"), width if k else len(header)):
             return _marks(below, marks, separator)
         if "image" not in marks and _has(points, ("point", "x", "y"), width if k else len(header)):
@@ -183,7 +183,7 @@ def _has(columns: Columns, names: tuple[str, ...], width: int) -> bool:
 
 
 def _without_header(records: Sequence[Sequence[str]]) -> tuple[str, Columns]:
-    """Classify rows without a header as "points", "marks" or "" (neither), with columns; most rows decide."""
+    """Classify rows without a header as "points", "marks" or "" (neither) by majority; return the columns, too."""
     width = {len(r) for r in records}
     if not any(map(is_number, records[0][1:])):
         return "", {}
@@ -198,7 +198,7 @@ def _without_header(records: Sequence[Sequence[str]]) -> tuple[str, Columns]:
 
 
 def read_points(cells: Cells, columns: Columns, separator: str, system: str, degrees: bool) -> SurveyedPoints:
-    """Return rows of points with known columns; `degrees`: the header says longitude and latitude."""
+    """Read points from rows with known columns. `degrees`: True if the header names longitude and latitude."""
     cells, points = with_points(cells, separator, columns["point"]), SurveyRows(cells.file)
     for k, row in enumerate(cells.records):
         if len(row) <= max(columns["point"], columns["x"], columns["y"]):
@@ -225,7 +225,7 @@ def read_points(cells: Cells, columns: Columns, separator: str, system: str, deg
 
 
 def point_attributes(header: Sequence[str]) -> Columns | None:
-    """Return the columns of point features by their attributes; None for other features, such as images."""
+    """Return the columns of point features by attribute name; None for other features, such as images."""
     columns = columns_of(header, _POINT)
     of_images = {"image", "image name", "filename"} & {name.lower() for name in header}
     return columns if {"point", "x", "y"} <= set(columns) and not of_images else None
@@ -261,8 +261,8 @@ def _is_gcp_list(path: Path, text: str) -> bool:
 
 
 def _unmarked(cells: list[str]) -> tuple[str, int] | None:
-    """Name ("" for none) and first coordinate of a row without a mark; None for other rows."""
-    # A number with decimals is no name: names may stand last, and be numbers too.
+    """Return name ("" if none) and index of the first coordinate of a row without a mark; None for other rows."""
+    # Decimal numbers are coordinates. Names may be integers, and may be in the last column.
     if len(cells) == 4 and all(map(is_number, cells[1:])) and not (is_number(cells[0]) and "." in cells[0]):
         return cells[0], 1
     if len(cells) in (3, 4) and all(map(is_number, cells[:3])):
@@ -271,7 +271,7 @@ def _unmarked(cells: list[str]) -> tuple[str, int] | None:
 
 
 def read_gcp_list(path: Path, text: str) -> GivenControl:
-    """Read points, all of them control, and marks."""
+    """Read control points and marks."""
     (_, system), *rows = _gcp_lines(text)
     cells = Cells(path.name, [line.split() for _, line in rows], [row for row, _ in rows])
     if not cells.records:
@@ -293,7 +293,9 @@ def read_gcp_list(path: Path, text: str) -> GivenControl:
 
 
 def write_gcp_list(p: Project, folder: Path) -> None:
-    """Write gcp_list.txt if the block has control on a map; heights are ellipsoidal, check points are left out."""
+    """Write gcp_list.txt if the block has control points in a map system. Heights are ellipsoidal; check points are
+    omitted.
+    """
     if p.control is None or not len(p.control.point):
         return
     chosen = np.flatnonzero(~p.control.check & ~np.isnan(p.control.xyz[:, :2]).any(axis=1))
@@ -324,7 +326,7 @@ def write_gcp_list(p: Project, folder: Path) -> None:
 
 
 def is_geoin(lines: list[str]) -> bool:
-    """Return True if all lines are records of BINGO, points among them."""
+    """Return True if all lines are BINGO records and at least one is a point."""
     rows = [row for line in lines if (row := line.split(maxsplit=5)) and row[0][0] not in "*#"]
     records = all(re.fullmatch("[A-Z]{4}|C", row[0]) for row in rows)
     points = (row for row in rows if row[0] in _BINGO_CHECK and len(row) >= 5)
@@ -350,4 +352,4 @@ CONTROL = (
     ),
 )
 TABLES = ControlFormat("tables", "CSV, table of Metashape or Pix4D", lambda path, text: True, read_table)
-"""The format of every text that is no other."""
+"""Format of all text files that no other control format recognises."""

@@ -25,7 +25,7 @@ from jaxphoto.io.text_files import read_legacy_text
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 from jaxphoto.writing import check_folder, whole_file, whole_folder
 
-# One module per program, in the order of docs and help; a new format is one file here and its line below.
+# One module per program, in the order of docs and help. To add a format, write a module and add its line below.
 # ruff: isort: off
 from jaxphoto.extras.formats import dbat as dbat
 from jaxphoto.extras.formats import photomodeler as photomodeler
@@ -56,35 +56,35 @@ def _declared(name: str) -> list[Any]:
 _BLOCK = Format("block", "block folder", by_content(TOML, lambda p: p.name == TOML), lambda p: read_folder(p.parent))
 _DECLARED: tuple[Format, ...] = (_BLOCK, *_declared("FORMATS"))
 FORMATS = {format.name: format for format in _DECLARED if format.read}
-"""The formats of projects that are read."""
+"""Project formats that can be read."""
 EXPORTS = {format.name: format for format in _DECLARED if format.write}
-"""The formats of projects that are written, in the order of docs and help."""
+"""Project formats that can be written, in the order of docs and help."""
 _CAMERAS: list[CameraFormat] = _declared("CAMERAS")
 CAMERA_FORMATS = {format.name: format for format in (*_CAMERAS, CameraFormat("block", suffixes=(".toml",)))}
-"""The formats of camera files of other programs, and block.toml."""
+"""Camera file formats of other programs, and block.toml."""
 CAMERA_READERS.update({format.name: format.reader for format in _CAMERAS if format.reader})
 CAMERAS_WRITTEN = tuple(name for name, format in CAMERA_FORMATS.items() if format.write or name == "block")
 CAMERA_MODELS = tuple(dict.fromkeys(name for format in CAMERA_FORMATS.values() for name in format.models))
-"""The models of camera formats that may be requested."""
+"""Camera models that can be requested by name."""
 CONTROL_FORMATS = {f.name: f for f in (*gis.CONTROL[::-1], *metashape.CONTROL, *control.CONTROL)}
-"""The formats of control files that are recognised by their content; every other text is a table."""
+"""Control file formats recognised by content; every other text file is a table."""
 FORMS = (*(f.about for f in CONTROL_FORMATS.values()), control.TABLES.about)
-"""What `read_control` reads, for help."""
+"""Control formats for the help text."""
 LOSS_PX = 1.0
-"""The largest loss of a camera conversion, at its worst point, unless more is allowed."""
+"""Default maximum loss of a camera conversion at the worst point (px)."""
 
 
 # Projects -----------------------------------------------------------------------------------------------------
 
 
 def recognise(source: Path) -> list[str]:
-    """Return the formats of a file or folder; a fallback format only if there is no other."""
+    """Return the formats of a file or folder; a fallback format only if no other matches."""
     names = [name for name, format in FORMATS.items() if format.find and len(format.find(source)) == 1]
     return [name for name in names if not FORMATS[name].fallback] or names
 
 
 def read_tables(source: str | Path, format: str | None = None) -> BlockTables:
-    """Return the tables of a file or folder of any of `FORMATS`, recognised unless `format` names it."""
+    """Read the tables of a file or folder in one of `FORMATS`. The format is detected unless `format` names it."""
     source = Path(source)
     if not source.exists():
         raise InputError(f"there is no file or folder {source}; correct the name")
@@ -105,10 +105,10 @@ def read_tables(source: str | Path, format: str | None = None) -> BlockTables:
 
 
 def read_source(source: str | Path, format: str | None = None, *, stations: bool = True) -> Block:
-    """Return the block in a file or folder of any of `FORMATS`, recognised unless `format` names it.
+    """Read the block in a file or folder in one of `FORMATS`. The format is detected unless `format` names it.
 
-    `stations` False leaves observed camera positions out. Raises InputError for an unknown format, and what
-    `jaxphoto.io.read_block` raises.
+    `stations=False` omits observed camera positions. Raises InputError for an unknown format, and the errors of
+    `jaxphoto.io.read_block`.
     """
     source = Path(source)
     tables = read_tables(source, format)
@@ -123,7 +123,7 @@ def read_source(source: str | Path, format: str | None = None, *, stations: bool
 
 
 def convert(source: str | Path, folder: str | Path, format: str | None = None, *, stations: bool = True) -> Block:
-    """Write what `read_source` reads as a block folder, and return it."""
+    """Read a block by `read_source`, write it as a block folder, and return it."""
     block = read_source(source, format, stations=stations)
     write_block(block, folder)
     return block
@@ -147,7 +147,7 @@ def _format_name(source: Path, name: str | None) -> str:
 
 
 class Misfit(NamedTuple):
-    """Lengths of displacements of image points in pixels."""
+    """RMS and maximum length of image point displacements (px)."""
 
     rms_px: float
     max_px: float
@@ -158,17 +158,17 @@ class Exported(NamedTuple):
 
     cameras: dict[str, Conversion]
     map_misfit: Misfit | None
-    """Of the image points, if collinearity is computed in map coordinates; None in a Cartesian frame."""
+    """Displacements if collinearity is computed in map coordinates; None in a Cartesian frame."""
     moved: Misfit | None = None
-    """Of the image points, if the format keeps their rays."""
+    """Displacements if the format preserves rays instead of image points."""
 
 
 def export(project: Project, folder: str | Path, format: str) -> Exported:
     """Write a project into `folder` in one of `EXPORTS`, and return the losses.
 
-    Interior orientations are converted exactly if the format holds their distortion, else fitted over the image format.
-    Warns of corrections that other programs do not have. Raises InputError for an unknown format, a folder that holds
-    something else, and a camera or frame that the format cannot hold.
+    Interior orientations are converted exactly if the format supports their distortion, otherwise fitted over the image
+    format. Warns of corrections that the format cannot represent. Raises InputError for an unknown format, a folder
+    with other content, and a camera or frame that the format cannot represent.
     """
     if format not in EXPORTS:
         raise InputError(f"nothing can be exported as {format!r}; choose one of {', '.join(EXPORTS)}")
@@ -193,18 +193,18 @@ def export(project: Project, folder: str | Path, format: str) -> Exported:
 
 
 def check_export_target(folder: Path, *inputs: Path) -> None:
-    """Raise InputError if nothing can be written, or anything else lies in the folder, which programs would read."""
+    """Raise InputError if the folder is not writable or not empty: programs would read other files in it."""
     check_folder(folder, *inputs, clashes=lambda name: True)
 
 
 def _converted(project: Project, name: str, format: Format) -> Conversion:
-    """Return a camera as one that the format has."""
+    """Convert a camera to the model of the format."""
     sensor, interior, _ = project.cameras[name]
     model = format.plane if type(interior.projection) is Perspective else format.fisheye
     if format.plane is None:
         return Conversion(interior, 0.0, 0.0, 1.0)
     if model is None:
-        # A polynomial on the plane misses by hundreds of pixels at the border of a fisheye image.
+        # Perspective polynomials misfit fisheye images by hundreds of pixels at the border.
         others = ", ".join(key for key, other in EXPORTS.items() if other.fisheye)
         raise InputError(
             f"camera {name} cannot be written as {format.name}, whose cameras are perspective, because it is a "
@@ -217,7 +217,7 @@ def _converted(project: Project, name: str, format: Format) -> Conversion:
 
 
 def map_misfit(project: Project) -> Misfit | None:
-    """Return the misfit of collinearity in map coordinates, before distortion; None if these are no metres."""
+    """Return the misfit of collinearity in map coordinates, without distortion; None if they are not in metres."""
     on_map = project.in_map()
     if on_map.geographic or not len(project.image):
         return None
@@ -258,14 +258,14 @@ def write_camera_file(
 ) -> Conversion:
     """Write a camera in one of `CAMERAS_WRITTEN`, and return the difference between the file's camera and `interior`.
 
-    `format` None: cameras.txt is COLMAP's, else the suffix decides. The distortion is converted exactly if its terms
-    allow it, else fitted over the image format. `model` is the largest of the format's own models to use, one of
-    `CAMERA_MODELS`. The loss is a comment of formats that have such; more than `loss_px` at the worst point is an
-    error. `distortion` chooses the model in a block.toml, which keeps the `covariance` of `parameter_names(interior)`
-    if the model stays, and the `reservation` about the calibration.
+    If `format` is None, the suffix determines it; cameras.txt is COLMAP's. The distortion is converted exactly if the
+    file's model has all its terms, otherwise fitted over the image format. `model`, one of `CAMERA_MODELS`, is the
+    largest model of the format to use. The loss is written as a comment if the format has comments; a loss of more than
+    `loss_px` at the worst point is an error. `distortion` is the model in a block.toml. A block.toml also stores the
+    `reservation` about the calibration and, if the model is unchanged, the `covariance` of `parameter_names(interior)`.
 
-    Raises InputError for unknown formats, a `distortion` or `model` that the format does not have, and cameras that it
-    cannot hold.
+    Raises InputError for an unknown format, a `distortion` or `model` that the format does not support, and a camera
+    that it cannot represent.
     """
     path = Path(path)
     if format is None:
@@ -294,7 +294,7 @@ def write_camera_file(
             # JSON has no comments.
             if note and chosen.comment and path.suffix.lower() != ".json":
                 text = work.read_text(encoding="utf-8")
-                # The first line of YAML by OpenCV and of XML must stay. Two dashes would end a comment of XML.
+                # Keep the first line of OpenCV's YAML and of XML first. Two dashes would end an XML comment.
                 first, end, rest = text.partition("\n") if text.startswith(("%YAML", "<?xml")) else ("", "", text)
                 work.write_text(
                     f"{first}{end}{chosen.comment.format(note.replace('--', '- -'))}\n{rest}", encoding="utf-8"
@@ -309,7 +309,7 @@ def _target(
     model: str | None,
     distortion: type[AbstractDistortion] | None,
 ) -> CameraModel:
-    """Return the model in which a camera is written."""
+    """Return the camera model to write."""
     if format.plane is not None and format.fisheye is None and type(interior.projection) is not Perspective:
         others = ", ".join(n for n in CAMERAS_WRITTEN if CAMERA_FORMATS[n].fisheye or not CAMERA_FORMATS[n].plane)
         raise InputError(f"{path}: cameras of {format.name} are perspective, this is a fisheye; write one of {others}")
@@ -331,15 +331,15 @@ def _target(
 
 
 def is_control_file(path: Path) -> bool:
-    """Return True if the content of a file is that of a control file other than a plain table."""
+    """Return True for a control file of any format but plain tables, by its content."""
     text = "" if gis.is_geopackage(path) else read_legacy_text(path)
     return any(format.recognise(path, text) for format in CONTROL_FORMATS.values())
 
 
 def read_control(control: str | Path, marks: str | Path | None = None) -> GivenControl:
-    """Return the points of the file `control` with the marks in it, and those of the file `marks`.
+    """Read the points and marks of the file `control`, and further marks from the file `marks`.
 
-    The content tells the format of `FORMS`. Raises InputError if either is none.
+    The format, one of `FORMS`, is detected from the content. Raises InputError if it is not detected.
     """
     content = _read_control(Path(control))
     if isinstance(content, Marks):
@@ -350,7 +350,7 @@ def read_control(control: str | Path, marks: str | Path | None = None) -> GivenC
         if isinstance(other, SurveyedPoints):
             raise InputError(f"{Path(marks).name} has coordinates but no marks; give rows of image, point, x_px, y_px")
         other = other.marks if isinstance(other, GivenControl) else other
-        # Of a mark in both files the second is taken.
+        # Marks of the second file replace repeated ones of the first.
         repeated = set(zip(other.image, other.point, strict=True))
         kept = np.array([key not in repeated for key in zip(seen.image, seen.point, strict=True)], bool)
         seen = Marks.joined(seen.take(kept), other)

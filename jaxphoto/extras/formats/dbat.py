@@ -1,11 +1,11 @@
-"""DBAT (Damped Bundle Adjustment Toolbox): a script as XML and the text files that it names.
+"""DBAT (Damped Bundle Adjustment Toolbox): an XML script and the text files that it references.
 
-DBAT counts pixels from (1, 1) at the centre of the upper left one, we from (0.5, 0.5); its principal point is in mm
-from pixel (0, 0); it *adds* K, P and the aspect `as` to the measured coordinate where our Brown model subtracts, so all
-of them change sign. Its model 3 applies 1 + as and the skew before the polynomial: `affine_brown` with b1 = -as;
-<aspect> is 1 - as. Models 1 and 2 have neither aspect nor skew. Model 4 applies both after it, `brown_affine`. Model 5
-applies 1 + as before the principal point is subtracted, which divides px by it, and the skew after the polynomial:
-`stretched_brown`. Source: DBAT, github.com/niclasborlin/dbat.
+DBAT's pixel coordinates are (1, 1) at the centre of the upper left pixel, ours (0.5, 0.5). Its principal point is in mm
+from pixel (0, 0). It *adds* K, P and the aspect `as` to the measured coordinates; our Brown model subtracts them, so
+all of them change sign. Model 3 applies 1 + as and the skew before the polynomial: `affine_brown` with b1 = -as;
+<aspect> is 1 - as. Models 1 and 2 have neither aspect nor skew. Model 4 applies both after the polynomial:
+`brown_affine`. Model 5 applies 1 + as before the principal point is subtracted, which divides px by it, and the skew
+after the polynomial: `stretched_brown`. Source: DBAT, github.com/niclasborlin/dbat.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -26,7 +26,7 @@ _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _DEGREES = {"degrees": 1.0, "radian": float(np.rad2deg(1.0)), "gon": 0.9}
 _INPUT = ("c", "ctrl_pts", "check_pts", "images", "image_pts", "cameras", "prior_eo")
 _POSITION, _ANGLES, _SIGMAS = ("x", "y", "z"), ("omega", "phi", "kappa"), ("sxyz", "sx", "sy", "sz")
-# DBAT's lens models ("Backward (Photogrammetry)") as ours, up to sign.
+# Our distortion for each of DBAT's lens models ("Backward (Photogrammetry)"), up to sign.
 _MODELS = {
     "1": "affine_brown", "2": "affine_brown", "3": "affine_brown", "4": "brown_affine", "5": "stretched_brown"
 }  # fmt: skip
@@ -34,7 +34,7 @@ _CAMERA_PLACE = "input/cameras/camera"
 
 
 class _Script(NamedTuple):
-    """A script; places are paths of tags from its root."""
+    """DBAT script; elements are addressed by tag paths from the root."""
 
     path: Path
     root: ElementTree.Element
@@ -52,7 +52,7 @@ class _Script(NamedTuple):
         return (self.root.findtext(place) or default).strip()
 
     def numbers(self, place: str, default: str, n: int | None = None) -> list[float]:
-        """Return the comma-separated numbers of an element, `n` of them if given."""
+        """Parse the comma-separated values of an element; `n` is the required count, if given."""
         text = self.text(place, default)
         values = [finite(part) for part in text.split(",")]
         numbers = [value for value in values if value is not None]
@@ -62,7 +62,7 @@ class _Script(NamedTuple):
         return numbers
 
     def file(self, element: ElementTree.Element) -> Path:
-        """Return the file that an element names, by the base folder of <input>."""
+        """Return the path of a file element, relative to the base folder of <input>."""
         base = self.find("input").get("base_dir", "$HERE").replace("$HERE", str(self.path.parent))
         base = base.replace("$HOME", str(Path.home()))
         name = (element.text or "").strip()
@@ -71,7 +71,7 @@ class _Script(NamedTuple):
         return Path(base) / name
 
     def tables(self, tag: str, *columns: str) -> list[tuple[Table, ElementTree.Element]]:
-        """Return the files of <input><tag>, columns named by the attribute `format`; `columns` are needed."""
+        """Read the files of <input><tag>; the attribute `format` names their columns, `columns` are required."""
         elements = self.find(f"input/{tag}").findall("file")
         if not elements:
             raise self.error(f"<{tag}> names 0 files; add <file format='{','.join(columns)}'>")
@@ -86,7 +86,7 @@ class _Script(NamedTuple):
         return tables
 
     def setting(self, operation: str, key: str) -> str:
-        """Return the text of an operation's element, or of its <all>."""
+        """Return the text of an operation's element, or of its <all> child."""
         element = self.root.find(f"operations/operation/{operation}/{key}")
         return "default" if element is None else (element.findtext("all") or element.text or "").strip()
 
@@ -108,7 +108,7 @@ def _open(path: Path) -> _Script:
 
 
 def read(path: Path) -> BlockTables:
-    """Read the block of a script. Raise InputError for operations that have no equal here."""
+    """Read the block of a script. Raise InputError for unsupported input and lens models."""
     script = _open(path)
     for element in script.find("input"):
         if element.tag not in _INPUT:
@@ -135,13 +135,13 @@ def read(path: Path) -> BlockTables:
         tables["control_points"] = concatenate(known)
     settings: dict[str, Any] = {"title": script.text("meta/name", path.stem), "cameras": {CAMERA: camera}}
     if script.text("operations/operation/set_datum", "") == "depend":
-        # Any minimal datum gives the same interior orientation, residuals and sigma naught.
+        # All minimal datums give the same interior orientation, residuals and sigma naught.
         settings["datum"] = {"kind": "minimal"}
     return BlockTables(settings, tables, path.name)
 
 
 def _include_cameras(script: _Script) -> None:
-    """Put the cameras of the files that <cameras> names in place of these."""
+    """Replace the file references in <cameras> by the cameras of these files."""
     cameras = script.find("input/cameras")
     for element in cameras.findall("file"):
         path = script.file(element)
@@ -153,7 +153,7 @@ def _include_cameras(script: _Script) -> None:
 
 
 def _check_images(table: Table, column: str, name_of: dict[str, str], file: str) -> np.ndarray:
-    """Names of the images in a column of ids."""
+    """Return the image names for a column of ids. Raise InputError for an unknown id."""
     ids = table.ids(column)
     for line, image in enumerate(ids):
         if image not in name_of:
@@ -162,7 +162,7 @@ def _check_images(table: Table, column: str, name_of: dict[str, str], file: str)
 
 
 def _prior_orientations(script: _Script, file: str, name_of: dict[str, str]) -> Table:
-    """Image, camera position, and where given angles in degrees and standard deviations."""
+    """Return image, camera position and, if given, angles in degrees and standard deviations."""
     ((table, element), *more) = script.tables("prior_eo", "id", *_POSITION)
     if more:
         raise script.error(f"<prior_eo> names {1 + len(more)} files, and one is read; put all orientations into it")
@@ -184,7 +184,7 @@ def _prior_orientations(script: _Script, file: str, name_of: dict[str, str]) -> 
 
 
 def _oriented(images: Table, prior: Table) -> Table:
-    """Return the images with orientations where all six values are given."""
+    """Add orientations to the images table, for images with all six values."""
     columns = (*XYZ, *(f"{name}_deg" for name in _ANGLES))
     if not all(name in prior for name in columns):
         return images
@@ -213,7 +213,7 @@ def _image_points(script: _Script, file: str, name_of: dict[str, str], pixel_mm:
 
 
 def _image_sigma(script: _Script, element: ElementTree.Element, table: Table, axis: str) -> np.ndarray:
-    """Pixels; the attribute precedes the column."""
+    """Return the standard deviation in pixels; the <file> attribute has priority over the column."""
     for name in ("sxy", f"s{axis}"):
         if name in element.attrib:
             value = finite(element.attrib[name])
@@ -226,7 +226,7 @@ def _image_sigma(script: _Script, element: ElementTree.Element, table: Table, ax
 
 
 def _control(script: _Script, tag: str, role: str) -> Table | None:
-    """Control points (fixed without standard deviations) or check points, in metres."""
+    """Return control points (fixed if without standard deviations) or check points, in metres."""
     section = script.root.find(f"input/{tag}")
     if section is None:
         return None
@@ -242,14 +242,14 @@ def _control(script: _Script, tag: str, role: str) -> Table | None:
 
 
 def control_table(table: Table, role: str, metres: float) -> Table:
-    """Return a control file of DBAT as control_points.csv; `role` "" is control, or fixed for rows without sigma."""
+    """Convert a control file of DBAT to control_points.csv. `role` "": control, or fixed for rows without sigma."""
     columns: dict[str, np.ndarray] = {"point": table.ids("id")}
     columns |= {name: table.numbers(axis) * metres for name, axis in zip(XYZ, "xyz", strict=True)}
     sigmas = []
     for axis in "xyz":
         column = _first(table, f"s{axis}", "sxy" if axis != "z" else "sz", "sxyz")
         sigmas.append(np.zeros(len(table)) if column is None else table.numbers(column) * metres)
-    # A standard deviation of zero means a fixed point.
+    # DBAT marks fixed points by zero standard deviations.
     zero = (np.array(sigmas) == 0).all(axis=0)
     columns["role"] = np.array([role or ("fixed" if z else "control") for z in zero], object)
     for name, sigma in zip(SIGMA_XYZ, sigmas, strict=True):
@@ -265,19 +265,19 @@ def _first(table: Table, *names: str) -> str | None:
 
 
 def _camera(script: _Script) -> dict[str, Any]:
-    """Return the [cameras.X] table of the one camera."""
+    """Return the [cameras.X] table of the only camera."""
     c = _CAMERA_PLACE
     if len(script.find("input/cameras").findall("camera")) != 1:
         raise script.error("there is not exactly one <camera>; this reader takes one, so convert the project by hand")
     if (unit := script.text(f"{c}/unit", "mm")) != "mm":
         raise script.error(f"the camera's unit is {unit!r}; give the camera in mm")
     if (model := script.text(f"{c}/model", "3")) not in _MODELS:
-        raise script.error(f"lens model {model} has no equal here; use one of {', '.join(_MODELS)}")
+        raise script.error(f"lens model {model} is not supported; use one of {', '.join(_MODELS)}")
     width, height = (int(n) for n in script.numbers(f"{c}/image", "", 2))
     if min(width, height) < 1:
         raise script.error(f"<image> is {width} x {height} pixels; give the format of the camera")
     pixel = _pixel_mm(script, f"{c}/sensor", width, height)
-    # Their pixel (1, 1) is our (0.5, 0.5): the image centre lies at (width / 2 + 0.5) pixels.
+    # DBAT's pixel (1, 1) is our (0.5, 0.5): the image centre is at (width / 2 + 0.5) pixels.
     middle = pixel * (width / 2 + 0.5), pixel * (height / 2 + 0.5)
     interior = dict.fromkeys(("c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2", "b1"), 0.0)
     interior["c_mm"] = script.numbers(f"{c}/focal", "0")[0]
@@ -321,7 +321,7 @@ def _coefficients(script: _Script, tag: str, most: int) -> dict[str, float]:
 
 
 def _free(script: _Script) -> dict[str, str]:
-    """Return the interior parameters that the script estimates."""
+    """Return the names of the interior parameters that the script estimates."""
     n_k, n_p = (int(script.numbers(f"{_CAMERA_PLACE}/{name}", n)[0]) for name, n in (("nK", "3"), ("nP", "2")))
     if n_k > 3 or n_p > 2:
         raise script.error(f"nK = {n_k}, nP = {n_p} are more coefficients than Brown's model has; use at most 3 and 2")

@@ -1,4 +1,4 @@
-"""Declarations of formats, and reading of their files: text, trees and numbers with the place of an error."""
+"""Format declarations; readers of text, XML, JSON and numeric rows with error locations."""
 
 import json
 import warnings
@@ -24,51 +24,53 @@ Find = Callable[[Path], list[Path]]
 
 
 class Format(NamedTuple):
-    """A format of oriented projects, to be read, written or both."""
+    """Format of oriented projects that can be read, written or both."""
 
     name: str
     about: str
     find: Find | None = None
-    """Its main files in a folder, or the file itself; the format is recognised if there is one."""
+    """Return the main files of the format in a folder, or the file given; exactly one means that the format is
+    recognised.
+    """
     read: Callable[[Path], Project | BlockTables] | None = None
     fallback: bool = False
-    """True if other formats' files may look alike: recognised only if no other format is."""
+    """True if files of other formats may match, too: recognised only if no other format matches."""
     write: Callable[[Project, Path], None] | None = None
     plane: CameraModel | None = None
-    """The model of its perspective cameras; None, as `fisheye`, if it has no such."""
+    """Camera model for perspective cameras. `plane` or `fisheye` is None if not supported."""
     fisheye: CameraModel | None = None
     endings: tuple[str, ...] = ()
-    """Endings of the files that it writes."""
+    """Suffixes of the exported files."""
     in_map: bool = False
-    """True if written coordinates are those of the map, where collinearity holds approximately."""
+    """True if exported coordinates are map coordinates, where collinearity is approximate."""
     keeps_rays: bool = False
-    """True if image points move to where the fitted camera sees the same rays."""
+    """True if image points are recomputed so that the fitted camera has the same rays."""
     lacks: tuple[str, ...] = ()
-    """What it has no place for: cameras, points, image points."""
+    """Content that the format does not support: cameras, points, image points."""
 
 
 class CameraFormat(NamedTuple):
-    """A format of camera files, to be read, written or both."""
+    """Format of camera files that can be read, written or both."""
 
     name: str
     reader: CameraReader | None = None
     write: Callable[[Path, str, Sensor, InteriorOrientation], None] | None = None
     plane: CameraModel | None = None
-    """The model of its perspective cameras; if this and `fisheye` are None, it holds any camera."""
+    """Camera model for perspective cameras; if `plane` and `fisheye` are None, the format supports all cameras."""
     fisheye: CameraModel | None = None
     suffixes: tuple[str, ...] = ()
     comment: str = ""
-    """A comment line; "" if the format has none."""
+    """Template of a comment line; "" if the format has no comments."""
     models: Mapping[str, CameraModel] = {}
-    """Models that may be requested, by the format's own names."""
+    """Camera models that can be requested, by their names in the format."""
 
     def model_of(self, interior: InteriorOrientation) -> CameraModel | None:
-        """Return the model in which a camera is written."""
+        """Return the camera model to write for `interior`."""
         return self.plane if type(interior.projection) is Perspective else self.fisheye
 
 
 class ControlFormat(NamedTuple):
-    """A format of control points or marks; `recognise` and `read` take the path and the text ("" if binary)."""
+    """Format of control points or marks; `recognise` and `read` take path and text (text "" if the file is binary)."""
 
     name: str
     about: str
@@ -77,7 +79,7 @@ class ControlFormat(NamedTuple):
 
 
 def by_content(pattern: str, is_file: Callable[[Path], bool]) -> Find:
-    """Return the function that finds files of a folder which match `pattern` and `is_file`."""
+    """Return a function that finds the files in a folder that match `pattern` and `is_file`."""
 
     def find(source: Path) -> list[Path]:
         paths = sorted(source.glob(pattern)) if source.is_dir() else [source]
@@ -87,7 +89,7 @@ def by_content(pattern: str, is_file: Callable[[Path], bool]) -> Find:
 
 
 def warn(message: str) -> None:
-    """Warn the user."""
+    """Issue a UserWarning."""
     warnings.warn(message, UserWarning, stacklevel=3)
 
 
@@ -98,19 +100,19 @@ def begins_with(path: Path, words: str) -> bool:
 
 
 def beginning(path: Path, n_bytes: int) -> list[str]:
-    """Return the lines that are not empty among the first `n_bytes` of a file."""
+    """Return the nonempty lines in the first `n_bytes` of a file."""
     with path.open("rb") as file:
         return [line for line in file.read(n_bytes).decode("utf-8", "replace").splitlines() if line.strip()]
 
 
 def content_rows(path: Path) -> list[tuple[int, str]]:
-    """Return numbered lines that are neither empty nor comments."""
+    """Return (row number, line) for each line that is neither empty nor a comment."""
     rows = enumerate(read_legacy_text(path).split("\n"), 1)
     return [(row, line) for row, line in rows if line.strip() and not line.lstrip().startswith("#")]
 
 
 def read_columns(path: Path, columns: Sequence[str], separator: str | None = ",") -> Table:
-    """Return a file without a header in named columns; `separator` None means blanks."""
+    """Read a file without a header into named columns; `separator=None` means whitespace."""
     rows = [(row, [cell.strip() for cell in line.split(separator)]) for row, line in content_rows(path)]
     for row, cells in rows:
         if len(cells) != len(columns):
@@ -128,7 +130,7 @@ def read_json(path: Path) -> Any:
 
 
 def add(parent: ElementTree.Element, tag: str, content: Any = None, **attributes: str) -> ElementTree.Element:
-    """Add an element with text, or with numbers in full precision."""
+    """Add an element with text, or with numeric content in full precision."""
     element = ElementTree.SubElement(parent, tag, attributes)
     if content is not None:
         numbers = not isinstance(content, str)
@@ -137,7 +139,7 @@ def add(parent: ElementTree.Element, tag: str, content: Any = None, **attributes
 
 
 def xml_text(root: ElementTree.Element) -> str:
-    """Return the content of an XML file."""
+    """Format an element as the text of an XML file."""
     ElementTree.indent(root)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{ElementTree.tostring(root, "unicode")}\n'
 
@@ -145,7 +147,7 @@ def xml_text(root: ElementTree.Element) -> str:
 def number_rows(
     values: Sequence[Any], shape: tuple[int, ...], place: Callable[[int], str]
 ) -> Float[np.ndarray, "n *shape"]:
-    """Return values of one shape each as an array. Raise InputError at `place(k)` for the first of another shape."""
+    """Convert equally shaped values to an array. Raise InputError at `place(k)` for the first deviating shape."""
     try:
         rows = np.array(values, float).reshape(-1, *shape)
         if len(rows) == len(values) and np.shape(values)[1:] in (shape, ()) and (np.abs(rows) <= LARGEST).all():
@@ -164,7 +166,7 @@ def number_rows(
 
 
 def row_numbers(path: Path, row: int, words: Sequence[str], many: int) -> list[float]:
-    """Return `many` numbers of a row of text. Raise InputError with the row for anything else."""
+    """Parse `many` numeric cells of a text row. Raise InputError with the row number for anything else."""
     try:
         values = [float(word) for word in words]
     except ValueError:

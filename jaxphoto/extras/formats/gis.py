@@ -1,10 +1,10 @@
-"""GeoJSON and GeoPackage: stations, footprints and object points to a GIS, control points from it.
+"""GeoJSON and GeoPackage: export of stations, footprints and object points; import of control points.
 
-GeoJSON is in longitude, latitude, height above the ellipsoid of WGS 84; files of 2008 and of QGIS may name another
-system in a member "crs". Easting or longitude is first, rings are counter-clockwise. A GeoPackage is an SQLite file of
-few tables. Control points are features whose attributes are named as the columns of tables of points. Sources: RFC
-7946; The GeoJSON Format Specification (2008), 3; OGC 12-128r18, GeoPackage Encoding Standard 1.3: tables of clause 1.1
-and 2.1, geometry of 2.1.3.
+GeoJSON coordinates are longitude, latitude and ellipsoidal height on WGS 84; files of the 2008 version and of QGIS may
+name another system in a member "crs". Easting or longitude is first; rings are counter-clockwise. A GeoPackage is an
+SQLite file with a few tables. Control points are point features; attribute names are the column names of control
+tables. Sources: RFC 7946; The GeoJSON Format Specification (2008), 3; OGC 12-128r18, GeoPackage Encoding Standard 1.3:
+tables in clauses 1.1 and 2.1, geometry in 2.1.3.
 """
 
 import contextlib
@@ -38,12 +38,12 @@ from jaxphoto.io.text_tables import LARGEST
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
 
 PACKAGE = "photographs.gpkg"
-# Points along each side of the format, whose image on the ground is bent.
+# Number of points per side of the image format; projected sides are curved on the ground.
 _ALONG = 8
-# A ray longer than so many flying heights is taken for one to the horizon.
+# Maximum length of a ray in flying heights; longer rays are treated as above the horizon.
 _FARTHEST = 20.0
 _APPLICATION, _VERSION = 0x47504B47, 10300  # "GPKG", 1.3.0
-# Ids of systems: undefined Cartesian and geographic ones, and WGS 84.
+# srs_id of undefined Cartesian and undefined geographic systems, and of WGS 84.
 _CARTESIAN, _GEOGRAPHIC, _WGS84 = -1, 0, 4326
 _TABLES = """
 CREATE TABLE gpkg_spatial_ref_sys (srs_name TEXT NOT NULL, srs_id INTEGER PRIMARY KEY, organization TEXT NOT NULL,
@@ -61,9 +61,9 @@ CREATE TABLE gpkg_geometry_columns (table_name TEXT NOT NULL, column_name TEXT N
 _KINDS = {str: "TEXT", float: "DOUBLE", int: "INTEGER"}
 _POINT_Z, _POLYGON_Z = 1001, 1003
 _MAGIC = b"SQLite format 3\0"
-# Byte of the header that says whether changes are logged in a file beside.
+# Offset in the SQLite header of the two bytes that select rollback journal (1) or write-ahead log (2).
 _JOURNAL = 18
-# Bytes of the envelope of a geometry by its code, and coordinates of a point by its kind.
+# Size of a geometry's envelope in bytes by envelope code; number of coordinates of a point by geometry type.
 _ENVELOPES, _POINTS = (0, 32, 48, 48, 64), {1: 2, 1001: 3, 2001: 2, 3001: 3}
 _LAYERS = """SELECT c.table_name, g.column_name, c.srs_id FROM gpkg_contents c
 JOIN gpkg_geometry_columns g ON g.table_name = c.table_name WHERE c.data_type = 'features'
@@ -77,11 +77,11 @@ _EPSG, _CRS84 = re.compile(r"\bEPSG:(?:[\d.]*:)?(\d{4,6})$", re.IGNORECASE), re.
 
 
 class _Features(NamedTuple):
-    """One entry an image; positions and rings in the block's frame."""
+    """Features, one per image; positions and rings are in the block's frame."""
 
     positions: np.ndarray
     rings: list[np.ndarray | None]
-    """Closed; None for an image of the horizon."""
+    """Closed footprints; None for an image that includes the horizon."""
     attributes: list[dict[str, Any]]
 
 
@@ -99,7 +99,9 @@ def _features(p: Project) -> _Features:
 
 
 def footprints(p: Project) -> list[Float[np.ndarray, "n 3"] | None]:
-    """Return the border of each image on the mean height of its points, counter-clockwise; None at the horizon."""
+    """Project the format of each image to the mean height of its points. Rings are counter-clockwise; None if the image
+    includes the horizon.
+    """
     xyz = np.asarray(p.xyz)
     mean_height = float(np.mean(xyz[:, 2])) if len(xyz) else 0.0
     rings = []
@@ -153,7 +155,7 @@ def write_geojson(p: Project, folder: Path) -> None:
 
 
 def write_geopackage(p: Project, folder: Path) -> None:
-    """Write photographs.gpkg with the layers stations, footprints and object_points, in the map system."""
+    """Write photographs.gpkg with the layers stations, footprints and object_points in the map system."""
     features = _features(p)
     on_map = (lambda local: p.frame.map.map(local)) if p.frame.kind == "epsg" else np.asarray
     n_images = np.bincount(p.point, minlength=len(p.points)).tolist()
@@ -182,7 +184,7 @@ def _add_layer(
     shapes: Sequence[np.ndarray | None],
     attributes: Sequence[dict[str, Any]],
 ) -> None:
-    """Add a table of points or closed rings, None for no geometry."""
+    """Add a table of points or closed rings; None means no geometry."""
     columns = attributes[0] if attributes else {}
     kinds = "".join(f", {column} {_KINDS[type(value)]}" for column, value in columns.items())
     file.execute(f"CREATE TABLE {name} (fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom {kind}{kinds})")
@@ -201,7 +203,7 @@ def _add_layer(
 
 
 def _blob(shape: np.ndarray, kind: str, srs: int) -> bytes:
-    """Header without envelope, little-endian, then ISO well-known binary with Z."""
+    """Encode a geometry: little-endian header without envelope, then ISO well-known binary with Z."""
     head = b"GP" + struct.pack("<BBi", 0, 1, srs)
     point, polygon = struct.pack("<BI", 1, _POINT_Z), struct.pack("<BIII", 1, _POLYGON_Z, 1, len(shape))
     return head + (point if kind == "POINT" else polygon) + np.ascontiguousarray(shape, "<f8").tobytes()
@@ -211,7 +213,9 @@ def _blob(shape: np.ndarray, kind: str, srs: int) -> bytes:
 
 
 def _surveyed(file: str, features: Sequence[tuple[Sequence[float], dict[str, Any]]], system: str) -> SurveyedPoints:
-    """Return the points of features with attributes; the height is of the geometry, else an attribute."""
+    """Convert features with attributes to surveyed points; the height is from the geometry, otherwise from an
+    attribute.
+    """
     keys = list(dict.fromkeys(key for _, attributes in features for key in attributes))
     solid = any(len(coordinates) > 2 for coordinates, _ in features)
     header = [*("xyz" if solid else "xy"), *keys]
@@ -230,7 +234,7 @@ def _surveyed(file: str, features: Sequence[tuple[Sequence[float], dict[str, Any
 
 
 def read_geojson(path: Path, text: str) -> SurveyedPoints:
-    """Read the points of a collection of features."""
+    """Read the points of a feature collection."""
     content = read_json(path)
     features = content.get("features")
     if not isinstance(features, list) or not features:
@@ -261,7 +265,7 @@ def _geojson_system(path: Path, content: dict[str, Any]) -> str:
 
 
 def is_geopackage(path: Path) -> bool:
-    """Return True if a file is a database of SQLite."""
+    """Return True if a file is an SQLite database."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
@@ -269,12 +273,12 @@ def is_geopackage(path: Path) -> bool:
 
 
 def read_geopackage(path: Path, text: str) -> SurveyedPoints:
-    """Read the one layer of points with an attribute that names them."""
+    """Read the only point layer with an attribute for point names."""
     content, log = read_bytes(path), path.with_name(path.name + "-wal")
     if log.is_file() and log.stat().st_size:
         raise InputError(f"{path.name} is open in another program, which has not written all of it; close it there")
     try:
-        # In memory, as nothing must be written beside a file that may be open elsewhere.
+        # Open a copy in memory: SQLite would write files into a folder where the original may be open elsewhere.
         with contextlib.closing(sqlite3.connect(":memory:")) as file:
             file.deserialize(content[:_JOURNAL] + b"\1\1" + content[_JOURNAL + 2 :])
             file.text_factory = lambda text: text.decode("utf-8", "replace")
@@ -291,7 +295,9 @@ def _read_layer(path: Path, file: sqlite3.Connection) -> SurveyedPoints:
         if point_attributes(["x", "y", *(c for c in columns if c != geometry)]) is not None:
             layers.append((name, geometry, srs, columns))
     if len(layers) != 1:
-        raise InputError(f"{path.name} has {len(layers)} layers of points with an attribute point, name, label or id")
+        raise InputError(
+            f"{path.name}: {len(layers)} point layers with an attribute point, name, label or id; export exactly one"
+        )
     ((name, geometry, srs, columns),) = layers
     if geometry not in columns:
         raise InputError(f"{path.name}: layer {quoted(name)} has no column {quoted(geometry)}; export it again")
@@ -304,7 +310,7 @@ def _read_layer(path: Path, file: sqlite3.Connection) -> SurveyedPoints:
         return _surveyed(path.name, features, "local")
     system = file.execute(_SRS, (srs,)).fetchone()
     if system is None or str(system[0]).upper() != "EPSG" or not isinstance(system[1], int):
-        raise InputError(f"{path.name}: the layer is in no EPSG system; export it in one")
+        raise InputError(f"{path.name}: the layer's coordinate system has no EPSG code; re-export it in an EPSG system")
     return _surveyed(path.name, features, f"EPSG:{system[1]}")
 
 

@@ -5,16 +5,18 @@
     document/chunk/sensors/sensor            id, label, calibration
     .../components/component/transform       rotation, translation, scale: from the chunk to geocentric axes of the
                                              datum, or to the local system; chunk/transform in older files
-    .../cameras//camera                      id, sensor_id, component_id, label; transform: 4 x 4, from the axes of the
-                                             camera, x right, y down, z ahead, to the chunk
+    .../cameras//camera                      id, sensor_id, component_id, label; transform: 4 x 4, from camera axes x
+                                             right, y down, z forward to the chunk
     .../markers//marker                      id, label; reference: x, y, z [sx, sy, sz] enabled (if not: check point)
-    .../frames/frame/markers/marker/location camera_id, pinned (only these are measured), x, y in our pixels
+    .../frames/frame/markers/marker/location camera_id, pinned (measured; others are ignored), x, y in our pixels
     .../reference                            WKT of the coordinate system
 
-Calibrations with fx, fy and skew are of PhotoScan before 1.2 and of Agisoft Lens: cx and cy count from the upper left
+PhotoScan before 1.2 and Agisoft Lens write calibrations with fx, fy and skew: cx and cy count from the upper left
 corner, f = fy, b1 = fx - fy, b2 = skew, and p1 and p2 are in OpenCV's order. A "fisheye" (from 2.3 on
-"equidistant_fisheye") is the same polynomial on the equidistant projection. Exported cameras have no tie points: these
-are read from a text beside the file, and written to image_points.csv; markers also from and to markers.xml.
+"equidistant_fisheye") is the same polynomial on the equidistant projection. Exported cameras have no tie points: they
+are read from a text file in the same folder, and written to image_points.csv. Markers are also read from and written to
+markers.xml.
+
 Source: Agisoft Metashape User Manual, "Export cameras", "Export markers" and Appendix D; Metashape Python Reference,
 Chunk.transform and Camera.transform; Agisoft Lens User Manual 0.4; Agisoft's forum, topic 6437; exported files of
 versions 1.5 and 2.0.
@@ -76,7 +78,7 @@ def read_calibration(source: CameraSource) -> CameraFile:
 
 
 def _sensors(root: ElementTree.Element) -> dict[str, tuple[ElementTree.Element, str | None]]:
-    """Calibration and pixel size of every calibrated sensor by label."""
+    """Return calibration and pixel size of each calibrated sensor by label."""
     sensors = {}
     for sensor in root.iter("sensor"):
         calibration, pixel = _calibration(sensor)
@@ -87,7 +89,7 @@ def _sensors(root: ElementTree.Element) -> dict[str, tuple[ElementTree.Element, 
 
 
 def _calibration(sensor: ElementTree.Element) -> tuple[ElementTree.Element | None, str | None]:
-    """Return the adjusted calibration of a sensor, else the initial one, and its pixel size."""
+    """Return the adjusted calibration of a sensor, otherwise the initial one, and its pixel size."""
     calibrations = {c.get("class", "adjusted"): c for c in sensor.findall("calibration")}
     sizes = {p.get("name"): p.get("value") for p in sensor.iter("property")}
     return calibrations.get("adjusted", calibrations.get("initial")), sizes.get("pixel_width")
@@ -117,7 +119,7 @@ def _camera(source: CameraSource, name: str, calibration: ElementTree.Element, p
 
 
 def _values(source: CameraSource, calibration: ElementTree.Element, sensor: Sensor) -> tuple[dict[str, float], str]:
-    """f, cx, cy, b1, b2 and coefficients as in Metashape, and a note on an older file."""
+    """Return f, cx, cy, b1, b2 and coefficients in Metashape's units, and a note if the file is of an old version."""
     older = calibration.find("f") is None and calibration.find("fx") is not None
     numbers = {child.tag: source.number(child.tag, child.text) for child in calibration if child.tag in _TERMS}
     for key in ("fx", "fy") if older else ("f",):
@@ -137,7 +139,7 @@ def _values(source: CameraSource, calibration: ElementTree.Element, sensor: Sens
 
 
 def write_calibration(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
-    """Write a calibration file without terms that are zero."""
+    """Write a calibration file; terms equal to zero are omitted."""
     root = ElementTree.Element("calibration")
     add(root, "projection", _kind_of(interior))
     add(root, "width", str(sensor.width_px))
@@ -166,13 +168,13 @@ def _add_values(calibration: ElementTree.Element, sensor: Sensor, interior: Inte
 class _Aligned(NamedTuple):
     label: str
     sensor: str
-    """The id of its sensor."""
+    """Sensor id."""
     component: str
     transform: str
 
 
 def find(source: Path) -> list[Path]:
-    """Return exported cameras, in a folder those that are aligned if any is; markers.xml only if it is alone."""
+    """Return files of exported cameras. In a folder, files with aligned cameras have priority; markers.xml is last."""
     paths = sorted(source.glob("*.xml")) if source.is_dir() else [source]
     exported = [path for path in paths if has_words(path, "<document", "<chunk", "<cameras")]
     cameras = [path for path in exported if path.name != MARKERS_FILE] or exported
@@ -180,10 +182,11 @@ def find(source: Path) -> list[Path]:
 
 
 def read(path: Path) -> Project:
-    """Read exported cameras with the tie points beside them; cameras are free in what Metashape estimated.
+    """Read exported cameras, and tie points from the same folder. Free camera parameters are Metashape's estimated
+    ones.
 
-    Positions are in the file's coordinate system, in which markers are control. Of several components that with the
-    most cameras is read.
+    Positions are in the file's coordinate system; markers are control points there. If there are several components,
+    the one with most cameras is read.
     """
     chunk = _chunk(path, read_legacy_text(path))
     photos, component = _photos(path, chunk)
@@ -228,7 +231,7 @@ def _control(rows: SurveyRows, points: list[str]) -> ControlPoints:
 
 
 def _photos(path: Path, chunk: ElementTree.Element) -> tuple[list[_Aligned], str]:
-    """Return the aligned cameras of the largest component, and that component."""
+    """Return the aligned cameras of the largest component, and the id of this component."""
     photos, unaligned = [], 0
     for camera in chunk.iterfind("cameras//camera"):
         transform, label = camera.findtext("transform"), (camera.get("label") or "").strip()
@@ -243,14 +246,14 @@ def _photos(path: Path, chunk: ElementTree.Element) -> tuple[list[_Aligned], str
     ((component, count),) = Counter(photo.component for photo in photos).most_common(1)
     if unaligned or count < len(photos):
         warn(
-            f"{path.name}: {unaligned} camera(s) that are not aligned and {len(photos) - count} of smaller components "
-            "are not read"
+            f"{path.name}: skipped {unaligned} unaligned camera(s) and {len(photos) - count} camera(s) of smaller "
+            "components"
         )
     return [photo for photo in photos if photo.component == component], component
 
 
 def _project_cameras(path: Path, chunk: ElementTree.Element) -> dict[str, ProjectCamera]:
-    """Calibrated cameras by the ids of their sensors."""
+    """Return calibrated cameras by sensor id."""
     cameras = {}
     for sensor in chunk.iterfind("sensors/sensor"):
         calibration, pixel = _calibration(sensor)
@@ -267,14 +270,14 @@ def _project_cameras(path: Path, chunk: ElementTree.Element) -> dict[str, Projec
 
 
 def _sensor_names(chunk: ElementTree.Element) -> dict[str, str]:
-    """Names of cameras by the ids of their sensors: the label, with the id if two are the same."""
+    """Return camera names by sensor id: the sensor's label, followed by the id if labels are equal."""
     labels = {s.get("id", ""): (s.get("label") or "camera").strip() for s in chunk.iterfind("sensors/sensor")}
     times = Counter(labels.values())
     return {key: label if times[label] == 1 else f"{label} {key}" for key, label in labels.items()}
 
 
 def _transform(path: Path, chunk: ElementTree.Element, component: str) -> tuple[np.ndarray, np.ndarray, float, bool]:
-    """Rotation, translation and scale from the chunk to the world, and whether the file has them."""
+    """Return rotation, translation and scale from the chunk to the world, and False if the file has no transform."""
     transforms = [c.find("transform") for c in chunk.iterfind("components/component") if c.get("id", "") == component]
     transform = next((t for t in [*transforms, chunk.find("transform")] if t is not None), None)
     if transform is None or transform.find("rotation") is None:
@@ -285,18 +288,18 @@ def _transform(path: Path, chunk: ElementTree.Element, component: str) -> tuple[
         values.append(number_rows([words], (size,), lambda _, key=key: f"{path.name}, transform, {key}")[0])  # type: ignore[misc]
     rotation, translation, (scale,) = values
     if not scale > 0:
-        raise InputError(f"{path.name}, transform: a scale of {scale:g} cannot be. Export the cameras again")
+        raise InputError(f"{path.name}, transform: scale {scale:g} is not positive; re-export the cameras")
     return rotation.reshape(3, 3), translation, float(scale), True
 
 
 def _system(path: Path, chunk: ElementTree.Element, centres: Float[np.ndarray, "images 3"]) -> ControlSystem:
-    """Return the system of the file; WGS 84 if it names none and positions are geocentric."""
+    """Return the coordinate system of the file; if none is named, WGS 84 for geocentric positions, otherwise local."""
     words = _system_words(chunk) or (f"EPSG:{WGS84}" if is_geocentric(centres) else "local")
     return system_of(words, path.name)
 
 
 def _datum_code(path: Path, system: ControlSystem) -> int:
-    """Return the EPSG code of the system, else that of its geographic system."""
+    """Return the EPSG code of the system, otherwise of its geographic system."""
     if system.code is not None:
         return system.code
     geodetic = None if system.crs is None else system.crs.geodetic_crs
@@ -311,7 +314,7 @@ def _datum_code(path: Path, system: ControlSystem) -> int:
 
 
 def read_markers(path: Path, text: str) -> GivenControl:
-    """Read markers with reference coordinates and their pinned projections."""
+    """Read markers with reference coordinates, and their pinned projections."""
     chunk = _chunk(path, text)
     rows, marks = _markers_of(path.name, chunk)
     return GivenControl(rows.surveyed(_system_words(chunk)), read_marks(marks))
@@ -331,7 +334,7 @@ def _system_words(chunk: ElementTree.Element) -> str:
 
 
 def _markers(path: Path, chunk: ElementTree.Element) -> tuple[SurveyRows, list[Mark]]:
-    """Read the markers of the file, else of markers.xml in its folder."""
+    """Read the markers of the file, otherwise of markers.xml in the same folder."""
     beside = path.with_name(MARKERS_FILE)
     if chunk.find("markers//marker") is not None or not beside.is_file() or beside == path:
         return _markers_of(path.name, chunk)
@@ -342,7 +345,7 @@ def _markers(path: Path, chunk: ElementTree.Element) -> tuple[SurveyRows, list[M
 
 
 def _markers_of(file: str, chunk: ElementTree.Element) -> tuple[SurveyRows, list[Mark]]:
-    """Markers with reference coordinates, and the pinned projections of all markers, by the labels of cameras."""
+    """Return markers with reference coordinates, and the pinned projections of all markers by camera label."""
     cameras = {e.get("id", ""): (e.get("label") or "").strip() for e in chunk.iterfind("cameras//camera")}
     labels = {e.get("id", ""): (e.get("label") or "").strip() for e in chunk.iterfind("markers//marker")}
     points = SurveyRows(file)
@@ -381,7 +384,7 @@ def _number(element: ElementTree.Element, key: str, place: str) -> float:
 
 
 def _sigma(reference: ElementTree.Element, key: str, place: str) -> float:
-    """Return the standard deviation of an axis, or of all three; Metashape writes 0 for none."""
+    """Return the standard deviation of an axis, or the common one; 0 means unknown in Metashape."""
     key = key if reference.get(key) is not None else "sxyz"
     value = _number(reference, key, place) if reference.get(key) is not None else np.nan
     if value < 0:
@@ -393,9 +396,9 @@ def _sigma(reference: ElementTree.Element, key: str, place: str) -> float:
 
 
 def write(p: Project, folder: Path) -> None:
-    """Write cameras.xml, beside it image_points.csv and, of control, markers.xml. Labels of cameras are ids of images.
+    """Write cameras.xml, image_points.csv and, if there are control points, markers.xml. Camera labels are image ids.
 
-    The axes of the chunk are those of the block, and the component's transform takes them to geocentric axes.
+    The chunk uses the axes of the block; the component's transform converts to geocentric axes.
     """
     root, chunk = _document(p)
     sensors = add(chunk, "sensors", next_id=str(len(p.cameras)))
@@ -430,7 +433,7 @@ def _add_cameras(chunk: ElementTree.Element, p: Project) -> list[ElementTree.Ele
 
 
 def _write_markers(p: Project, folder: Path) -> None:
-    """Write control and check points as markers in the coordinate system of the file."""
+    """Write control and check points as markers in the coordinate system of the export."""
     control = p.in_map().control
     assert control is not None
     placed = np.flatnonzero(~np.isnan(control.xyz[:, :2]).any(axis=1))

@@ -1,11 +1,11 @@
-"""transforms.json of nerfstudio and instant-ngp, with image points beside it.
+"""transforms.json of nerfstudio and instant-ngp; image points are in another file of the same folder.
 
-    camera_model, w, h, fl_x, fl_y, cx, cy, k1 ...      at the top, or with each of
-    frames          file_path, transform_matrix: 4 x 4, from x right, y up, z backwards of the camera to the world
+    camera_model, w, h, fl_x, fl_y, cx, cy, k1 ...      at the top, or in each frame
+    frames          file_path, transform_matrix: 4 x 4, from camera axes x right, y up, z backward to the world
 
-Pixels are ours. `applied_transform` and `applied_scale` are in the matrices already. Of OpenCV's terms k4 is a further
-radial one, which is not read.
-Source: nerfstudio documentation, "Data conventions"; nerfstudio/cameras/camera_utils.py.
+Pixel coordinates are the same as ours. The matrices already include `applied_transform` and `applied_scale`. In OPENCV
+cameras k4 is an additional radial term, which is not supported. Source: nerfstudio documentation, "Data conventions";
+nerfstudio/cameras/camera_utils.py.
 """
 
 import json
@@ -51,7 +51,7 @@ def _is_transforms(path: Path) -> bool:
 
 
 def read(path: Path) -> Project:
-    """Read frames; those of the same values have one camera, free in c, xp, yp and coefficients that are not zero."""
+    """Read frames. Frames with equal camera values share a camera with free c, xp, yp and nonzero coefficients."""
     content = read_json(path)
     frames = content["frames"]
     files = [Section(path.name, f"frames.{k}", frame).text("file_path") for k, frame in enumerate(frames)]
@@ -70,14 +70,14 @@ def read(path: Path) -> Project:
 
 def _camera(path: Path, place: str, values: dict[str, Any]) -> ProjectCamera:
     section, source = Section(path.name, place, values), CameraSource(path)
-    # instant-ngp names no kind.
+    # instant-ngp does not specify a camera model.
     kind = section.text("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") is True else "OPENCV")
     if kind not in _KINDS:
         raise section.error("camera_model", f"{quoted(kind)} is not known here; known are {', '.join(_KINDS)}")
     model, coefficients = _KINDS[kind]
     for name in _TERMS:
         if name not in coefficients and section.number(name, 0.0) != 0:
-            raise section.error(name, f"cameras of kind {kind} have no such term here; calibrate without it")
+            raise section.error(name, f"unsupported term for camera model {kind}; recalibrate without it")
     if not ("w" in section and "h" in section):
         raise InputError(f"{path.name} does not say how large its photographs are. Add w and h (pixels)")
     width, height = section.number("w"), section.number("h")
@@ -92,7 +92,7 @@ def _camera(path: Path, place: str, values: dict[str, Any]) -> ProjectCamera:
 
 
 def write(p: Project, folder: Path) -> None:
-    """Write transforms.json, cameras at the top if there is one, else with every frame; and image_points.csv."""
+    """Write transforms.json and image_points.csv. A single camera is at the top, otherwise in each frame."""
     cameras = {name: _written(camera) for name, camera in p.cameras.items()}
     kinds = {camera.pop("camera_model") for camera in cameras.values()}
     if len(kinds) != 1:

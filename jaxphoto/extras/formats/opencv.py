@@ -1,7 +1,7 @@
 """Camera files of OpenCV, ROS, Kalibr and mrcal. OpenCV's centre of the upper left pixel is (0, 0), ours (0.5, 0.5).
 
-    OpenCV    YAML, XML or JSON of cv2.FileStorage; what stands at the place of a skew is ignored, as OpenCV does; files
-              of cv2.fisheye say `fisheye_model: 1` and have four coefficients
+    OpenCV    YAML, XML or JSON of cv2.FileStorage; the skew element is ignored, as in OpenCV; files of cv2.fisheye
+              contain `fisheye_model: 1` and have four coefficients
     ROS       camera_info: the same keys and a distortion_model
     Kalibr    camchain.yaml: cam0, cam1 ... with intrinsics (fu, fv, pu, pv), distortion_coeffs (radtan: k1, k2, p1, p2;
               equidistant: k1 to k4), resolution
@@ -45,7 +45,7 @@ _KALIBR: dict[str, tuple[CameraModel, tuple[str, ...]]] = {
     "equidistant": (OPENCV_FISHEYE, FISHEYE_TERMS),
     "none": (OPENCV, ()),
 }
-# Number of coefficients; those after k6 are of a thin prism.
+# Number of coefficients of each lens model; coefficients after k6 belong to a thin prism.
 _MRCAL = {"LENSMODEL_PINHOLE": 0} | {f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)}
 MRCAL_MODELS = {name: OPENCV.only("b1", *OPENCV_ORDER[:n]) for name, n in _MRCAL.items() if n <= len(OPENCV_ORDER)}
 
@@ -57,7 +57,7 @@ def _recognise(path: Path, text: str) -> bool:
 
 
 def read_opencv(source: CameraSource) -> CameraFile:
-    """Read a file of OpenCV or ROS."""
+    """Read a camera file of OpenCV or ROS."""
     import cv2
 
     text = source.text()
@@ -86,7 +86,7 @@ def _camera(source: CameraSource, storage: Any) -> CameraFile:
     coefficients = _matrix(source, storage, "distortion_coefficients").ravel()
     n = len(coefficients)
     if fisheye and n != len(FISHEYE_TERMS):
-        raise source.error(f"there are {n} distortion_coefficients; OpenCV's fisheye model has 4")
+        raise source.error(f"{n} distortion_coefficients, but OpenCV's fisheye model has 4; give 4")
     if n not in _COUNTS:
         raise source.error(f"there are {n} distortion_coefficients; OpenCV has one of {', '.join(map(str, _COUNTS))}")
     _check_plane(source, coefficients)
@@ -120,11 +120,11 @@ def _matrix(source: CameraSource, storage: Any, key: str) -> np.ndarray:
     node = storage.getNode(key)
     if node.empty():
         raise source.error(f"{key} is missing; add it, as OpenCV's calibration writes it")
-    # Part by part: FileNode.mat() ends the process if one of them is missing.
+    # Read element by element: FileNode.mat() terminates the process if one is missing.
     rows, columns = (_number(node.getNode(side)) if node.isMap() else None for side in ("rows", "cols"))
     values = _numbers(node.getNode("data") if node.isMap() else node)
     if rows is None and node.isMap() and len(sizes := _numbers(node.getNode("sizes"))) == 1:
-        # A list of one dimension, as OpenCV 5 writes it.
+        # One-dimensional list, as written by OpenCV 5.
         rows, columns = 1.0, sizes[0]
     if not rows or not columns or rows % 1 or columns % 1 or None in values or not rows * columns == len(values) > 0:
         raise source.error(f"{key} is no matrix with rows, cols and as many numbers in data")
@@ -135,7 +135,7 @@ def _matrix(source: CameraSource, storage: Any, key: str) -> np.ndarray:
 
 
 def _parts(sensor: Sensor, interior: InteriorOrientation) -> tuple[bool, list[float], list[float]]:
-    """Return True for a fisheye, the camera matrix by rows, and as many coefficients as OpenCV needs."""
+    """Return True for a fisheye, the camera matrix in row-major order, and the coefficients that OpenCV requires."""
     fx, fy, column, row = pixels_of(interior, sensor)
     fisheye = isinstance(interior.distortion, OpenCvFisheye)
     values = [float(getattr(interior.distortion, k)) for k in (FISHEYE_TERMS if fisheye else OPENCV_ORDER)]
@@ -144,7 +144,7 @@ def _parts(sensor: Sensor, interior: InteriorOrientation) -> tuple[bool, list[fl
 
 
 def write_opencv(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
-    """Write a camera as YAML, XML or JSON, by the suffix of `path`."""
+    """Write a camera as YAML, XML or JSON; the suffix of `path` determines the format."""
     import cv2
 
     fisheye, matrix, values = _parts(sensor, interior)
@@ -159,7 +159,7 @@ def write_opencv(path: Path, name: str, sensor: Sensor, interior: InteriorOrient
 
 
 def write_ros(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
-    """Write a camera_info file of ROS, whose image is not rectified."""
+    """Write a ROS camera_info file for unrectified images."""
     fisheye, matrix, values = _parts(sensor, interior)
     model = _ROS_FISHEYE if fisheye else list(ROS_MODELS)[len(values) > 5]
     matrices = {
@@ -184,7 +184,7 @@ def _recognise_kalibr(path: Path, text: str) -> bool:
 
 
 def yaml_cameras(source: CameraSource) -> dict[str, dict[str, Any]]:
-    """Return the tables of a YAML file by name."""
+    """Return the mappings in a YAML file by name."""
     import yaml
 
     try:
@@ -195,7 +195,7 @@ def yaml_cameras(source: CameraSource) -> dict[str, dict[str, Any]]:
 
 
 def read_kalibr(source: CameraSource) -> CameraFile:
-    """Read one camera of a chain of Kalibr."""
+    """Read one camera of a Kalibr camera chain."""
     chain = yaml_cameras(source)
     name = source.chosen(list(chain))
     camera = chain[name]
@@ -227,7 +227,7 @@ def _recognise_mrcal(path: Path, text: str) -> bool:
 
 
 def read_mrcal(source: CameraSource) -> CameraFile:
-    """Read a .cameramodel."""
+    """Read a mrcal .cameramodel file."""
     values = ast.literal_eval(source.text())
     model = values.get("lensmodel", values.get("lens_model"))
     if not isinstance(model, str) or model not in _MRCAL:
@@ -241,7 +241,7 @@ def read_mrcal(source: CameraSource) -> CameraFile:
 
 
 def write_mrcal(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
-    """Write a .cameramodel in the smallest model that holds the camera, at the origin."""
+    """Write a .cameramodel file in the smallest lens model with all nonzero coefficients; extrinsics are zero."""
     fx, fy, column, row = pixels_of(interior, sensor)
     coefficients = [float(getattr(interior.distortion, k)) for k in OPENCV_ORDER]
     model = next(m for m, n in _MRCAL.items() if not any(coefficients[n:]))

@@ -5,9 +5,9 @@
     extrinsics      key of a pose: rotation, center; x_camera = R (x_world - center)
     structure       key of a point: X, observations (key of a view: x in pixels)
 
-Axes are x right, y down, z ahead; the centre of the upper left pixel is (0, 0). Objects are wrapped as by cereal: the
-first of a kind has its name with its number, and each object a number of its own.
-Source: OpenMVG documentation, "sfm: Structure from Motion"; openMVG/sfm/sfm_data_io_cereal.cpp, sfm_view_io.hpp,
+Camera axes are x right, y down, z forward; the centre of the upper left pixel is (0, 0). Objects are serialised by
+cereal: the first object of a class has the class name and its id; each object has a pointer id. Source: OpenMVG
+documentation, "sfm: Structure from Motion"; openMVG/sfm/sfm_data_io_cereal.cpp, sfm_view_io.hpp,
 openMVG/cameras/Camera_*_io.hpp.
 """
 
@@ -37,7 +37,7 @@ from jaxphoto.io.toml import Section
 FILE = "sfm_data.json"
 _LISTS = ("views", "intrinsics", "extrinsics", "structure")
 _FIRST_PX = 0.5
-# The bit of a kind's number where its name follows, and the number of an object of the declared kind.
+# Bit of a class id that is followed by the class name; class id of an object of the declared class.
 _NEW, _AS_DECLARED = 0x80000000, 0x40000000
 _KINDS: dict[str, tuple[CameraModel, str, tuple[str, ...]]] = {
     "pinhole": (OPENCV, "", ()),
@@ -53,7 +53,7 @@ def _is_scene(path: Path) -> bool:
 
 
 def read(path: Path) -> Project:
-    """Read a scene; cameras are free in c, xp, yp and the coefficients of their kind."""
+    """Read a scene; cameras have free c, xp, yp and the coefficients of their model."""
     content = read_json(path)
     views, intrinsics, poses, points = (_by_key(path, content, name) for name in _LISTS)
     kinds = {_kind_number(v): v["polymorphic_name"] for v in intrinsics.values() if "polymorphic_name" in v}
@@ -118,7 +118,7 @@ def _by_key(path: Path, content: dict[str, Any], name: str) -> dict[str, dict[st
 
 
 def _data(value: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of an object and of its base class."""
+    """Return the fields of an object and of its base class."""
     data = value["ptr_wrapper"]["data"]
     return {**data.get("value0", {}), **data}
 
@@ -144,7 +144,7 @@ def _camera(path: Path, key: str, value: dict[str, Any], kinds: dict[int | None,
 
 
 def write(p: Project, folder: Path) -> None:
-    """Write sfm_data.json; points with numeric ids keep them, others are counted from 1."""
+    """Write sfm_data.json; numeric point ids are retained, otherwise points are counted from 1."""
     camera_of = {name: k for k, name in enumerate(p.cameras)}
     cameras = [_written(camera) for camera in p.cameras.values()]
     kinds = {kind: k for k, kind in enumerate(dict.fromkeys(kind for kind, _ in cameras), 1)}
@@ -173,13 +173,13 @@ def write(p: Project, folder: Path) -> None:
         "sfm_data_version": "0.3", "root_path": "", "views": views, "intrinsics": intrinsics, "extrinsics": poses,
         "structure": structure, "control_points": [],
     }  # fmt: skip
-    # One line a list: indents of every number take minutes.
+    # Write one line per list: indented JSON takes minutes.
     lines = ",\n".join(f"{json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
     (folder / FILE).write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
 
 
 def _written(camera: ProjectCamera) -> tuple[str, dict[str, Any]]:
-    """Return the first kind that holds a camera, and its values."""
+    """Return the first camera class with all nonzero coefficients, and its values."""
     sensor, interior, _ = camera
     d = interior.distortion
     needed = {name for name in d.coefficients if float(getattr(d, name)) != 0}
@@ -198,7 +198,7 @@ def _item(key: int, value: dict[str, Any]) -> dict[str, Any]:
 
 
 def _wrapped(number: int, data: dict[str, Any]) -> dict[str, Any]:
-    """Return the object `number` of the file behind a pointer."""
+    """Wrap object `number` of the file as a cereal pointer."""
     return {"ptr_wrapper": {"id": _NEW | (number + 1), "data": data}}
 
 

@@ -1,13 +1,14 @@
-"""OpenSfM, WebODM and OpenDroneMap: a reconstruction with its tracks.
+"""OpenSfM, WebODM and OpenDroneMap: a reconstruction and its tracks.
 
-    reconstruction.json     cameras, shots (rotation as axis times angle, translation: x_camera = R x_world + t), points
-    tracks.csv              photograph, track, feature, x, y, ...; a track is a point of the same name
-    reference_lla.json      the place on WGS 84 from which the world counts east, north and up (or in the former)
+    reconstruction.json     cameras, shots (rotation vector (axis times angle), translation: x_camera = R x_world + t),
+                            points
+    tracks.csv              photograph, track, feature, x, y, ...; a track is the point of the same name
+    reference_lla.json      origin on WGS 84 of the east-north-up world frame (may also be in reconstruction.json)
 
-Image coordinates are from the middle of the format, y down, over its longer side; so are focal lengths and c_x, c_y. Of
-several reconstructions that with most shots is read. Written are cameras `brown` and `fisheye_opencv`, and gcp_list.txt
-of control on a map.
-Source: OpenSfM documentation, "Geometric Models", "Reconstruction file format"; opensfm/io.py, opensfm/geo.py,
+Image coordinates are relative to the image centre, y down, divided by the longer side of the format; focal lengths and
+c_x, c_y are divided by it, too. If there are several reconstructions, the one with most shots is read. The export
+contains cameras `brown` and `fisheye_opencv`, and gcp_list.txt if the control points are in a map system. Source:
+OpenSfM documentation, "Geometric Models", "Reconstruction file format"; opensfm/io.py, opensfm/geo.py,
 src/map/tracks_manager.
 """
 
@@ -54,7 +55,7 @@ def _is_reconstruction(path: Path) -> bool:
 
 
 def read(path: Path) -> Project:
-    """Read a reconstruction; cameras are free in c, the coefficients of their kind and, where given, xp, yp and b1."""
+    """Read a reconstruction; cameras have free c, the coefficients of their model and, if given, xp, yp and b1."""
     folder = path.parent
     if not (folder / TRACKS).is_file():
         raise InputError(f"{path} has no {TRACKS} beside it. Copy it from the project's folder (opensfm)")
@@ -86,7 +87,7 @@ def read(path: Path) -> Project:
 
 
 def _reference(folder: Path, content: Section) -> Place | None:
-    """Return the origin of the world on WGS 84; None if unknown (0, 0 in a reconstruction without GPS)."""
+    """Return the origin of the world on WGS 84; None if unknown (0, 0 in reconstructions without GPS)."""
     path = folder / REFERENCE
     if "reference_lla" in content:
         reference = content.section("reference_lla")
@@ -129,7 +130,7 @@ def _camera(path: Path, camera: Section) -> ProjectCamera:
 def _tracks(
     path: Path, files: list[str], ids: list[str], cameras: list[ProjectCamera]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Image, point and pixels of the image points of known shots and points."""
+    """Return image index, point index and pixel coordinates of the image points of known shots and points."""
     lines = read_legacy_text(path).split("\n")
     begin = 1 if lines[0].startswith("OPENSFM_TRACKS_VERSION_") else 0
     shot_of, point_of = {name: k for k, name in enumerate(files)}, {name: k for k, name in enumerate(ids)}
@@ -149,7 +150,7 @@ def _tracks(
 
 
 def write(p: Project, folder: Path) -> None:
-    """Write reconstruction.json, camera_models.json, tracks.csv, on WGS 84 reference_lla.json, and gcp_list.txt."""
+    """Write reconstruction.json, camera_models.json, tracks.csv, gcp_list.txt and, on WGS 84, reference_lla.json."""
     rotations = p.world_to_camera
     vectors = scipy.spatial.transform.Rotation.from_matrix(rotations).as_rotvec().tolist()
     moved = translations(rotations, p.exterior.position).tolist()

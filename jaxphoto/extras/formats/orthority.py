@@ -1,13 +1,14 @@
-"""Interior and exterior parameters of orthority, with image points beside them.
+"""Interior and exterior parameters of orthority; image points are in another file of the same folder.
 
-    *.yaml          of each camera: type, im_size, focal_len, sensor_size, cx, cy, k1 ... of OpenCV
-    *.geojson       world_crs, and of each photograph: filename, camera, xyz, opk (radians)
-    or *.csv        filename, x, y, z, omega, phi, kappa (degrees) [, camera], and its system in a .prj of the same name
+    *.yaml          for each camera: type, im_size, focal_len, sensor_size, cx, cy, k1 ... as in OpenCV
+    *.geojson       world_crs, and for each photograph: filename, camera, xyz, opk (radians)
+    or *.csv        filename, x, y, z, omega, phi, kappa (degrees) [, camera]; the coordinate system is in a .prj of the
+                    same name
 
-cx and cy are from the middle of the format, y down, over its longer side; focal_len has the unit of sensor_size,
-without it that of the longer side; angles are those of docs/conventions.md. Written are int_param.yaml, ext_param.csv
-and ext_param.prj in map coordinates. Source: orthority documentation, "Orthority interior parameters", "Orthority
-exterior parameters" and "CSV exterior parameters"; orthority/camera.py.
+cx and cy are relative to the image centre, y down, divided by the longer side of the format. focal_len has the unit of
+sensor_size; without sensor_size it is divided by the longer side. Angles are defined in docs/conventions.md. The export
+is int_param.yaml, ext_param.csv and ext_param.prj in map coordinates. Source: orthority documentation, "Orthority
+interior parameters", "Orthority exterior parameters" and "CSV exterior parameters"; orthority/camera.py.
 """
 
 import csv
@@ -51,7 +52,7 @@ class _Exterior(NamedTuple):
 
 
 def find(source: Path) -> list[Path]:
-    """Return the files of exterior parameters beside one of interior ones."""
+    """Return the files of exterior parameters, if the folder has exactly one file of interior parameters."""
     folder = source if source.is_dir() else source.parent
     if len(_interiors(folder)) != 1:
         return []
@@ -71,7 +72,7 @@ def _begin(path: Path) -> str:
 
 
 def read(path: Path) -> Project:
-    """Read parameters; cameras are free in c, xp, yp and coefficients that are not zero."""
+    """Read parameters; cameras have free c, xp, yp and nonzero coefficients."""
     interiors = _interiors(path.parent)
     if len(interiors) != 1:
         raise InputError(f"{path.parent} has {len(interiors)} files of interior parameters; leave one")
@@ -139,7 +140,7 @@ def _camera(source: CameraSource, section: Section) -> ProjectCamera:
 
 
 def write(p: Project, folder: Path) -> None:
-    """Write the three files, the .prj only for a map system, and image_points.csv."""
+    """Write the interior and exterior parameters, a .prj if in a map system, and image_points.csv."""
     m = p.in_map()
     if m.geographic:
         raise InputError(f"orthority counts metres, and the block is in {m.system}, in degrees")
@@ -178,7 +179,7 @@ def _written(name: str, camera: ProjectCamera) -> str:
 
 
 def _number(value: float) -> str:
-    """Return a number of YAML 1.1, which has a point before the exponent."""
+    """Format a number for YAML 1.1, which requires a decimal point before the exponent."""
     digits, e, exponent = repr(float(value)).partition("e")
     return digits + ("" if "." in digits else ".0") + e + exponent
 

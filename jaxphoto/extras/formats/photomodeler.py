@@ -1,17 +1,19 @@
-"""PhotoModeler's text export, with DBAT's control files beside it or alone.
+"""PhotoModeler's text export, optionally with DBAT's control files in the same folder.
 
     title; tolerance, iterations, width, height; standard deviations; c, px, py, width, height (mm), K1 K2 K3 P1 P2
-    of every photograph six lines with its number: name; X Y Z kappa phi omega; their sigmas; covariances or nothing;
-        its camera; its sigmas
-    an empty line, then of each control point, object point and mark in turn, an empty line after each kind:
-        id X Y Z and sigmas; the same; photograph id x y and sigmas (pixels, counted as by DBAT, see dbat.py)
+    for each photograph six lines: number name; X Y Z kappa phi omega; standard deviations; covariances or nothing;
+        camera; standard deviations of the camera
+    an empty line, then three tables, each ended by an empty line:
+        control points (id X Y Z and sigmas); object points (the same);
+        marks (photograph id x y and sigmas; pixels counted as in DBAT, see dbat.py)
 
-K and P are added to a coordinate that is reduced to the principal point, where our Brown model subtracts: all change
-sign. px and py count from pixel (0, 0), as DBAT takes them, half a pixel outside the upper left corner; y down. The
-angles are those of docs/conventions.md in degrees. Control is read from `ctrlpts-weighted.txt`, camera stations from
-`fake-camera-positions.txt`, in the same folder. Orientations and object points, in a frame of their own, are read only
-without such control.
-Sources: PhotoModeler's help, "Lens Distortion Formulation" and "Decentering lens distortion"; exports that come with
+K and P are added to coordinates reduced to the principal point; our Brown model subtracts them, so all change sign. px
+and py are relative to DBAT's pixel (0, 0), half a pixel outside the upper left corner; y points down. Angles are
+defined in docs/conventions.md, in degrees. Control points are read from `ctrlpts-weighted.txt`, camera stations from
+`fake-camera-positions.txt`, in the same folder. The orientations and object points of the export are in an arbitrary
+frame; they are read only if these control files do not exist.
+
+Sources: PhotoModeler's help, "Lens Distortion Formulation" and "Decentering lens distortion"; exports distributed with
 DBAT.
 """
 
@@ -30,15 +32,16 @@ from jaxphoto.io.text_files import read_legacy_text
 from jaxphoto.io.text_tables import Table, is_number
 
 CONTROL, STATIONS = "ctrlpts-weighted.txt", "fake-camera-positions.txt"
-# The export's own sigmas are flags (1 manual, 0 automatic); DBAT takes 1 pixel for all.
+# Assumed standard deviation of image points (px), as in DBAT: the sigmas of the export are flags (1 manual, 0
+# automatic).
 _SIGMA_PX = 1.0
-# Numbers in rows 2 to 4 of the header; the second may lack the size of photographs.
+# Number of values in rows 2 to 4 of the header; row 2 may lack the size of the photographs.
 _HEADERS = ((4, 9, 10), (2, 9, 10))
 _LINES_PER_PHOTOGRAPH = 6
 _POINT, _MARK = ("id", "x", "y", "z", "sx", "sy", "sz"), ("im", "id", "x", "y", "sx", "sy")
 _FREE = {"c_mm": "free", "xp_mm": "free", "yp_mm": "free"}
 _LEAST_CONTROL = 3
-# Relative difference of the sides of square pixels.
+# Maximum relative difference of the sides of a pixel treated as square.
 _SQUARE = 1e-9
 
 
@@ -50,10 +53,11 @@ def _is_export(path: Path) -> bool:
 
 
 def read(path: Path) -> BlockTables:
-    """Read the block of an export and the files beside it.
+    """Read the block of an export and of DBAT's control files in the same folder.
 
-    Without these it starts at the orientations and points of the export, with its control if that has three points and
-    as a free network otherwise; the camera is free in c, xp, yp and the coefficients that are not zero.
+    Without control files the initial values are the orientations and points of the export. Its control points define
+    the datum if there are at least three, otherwise the network is free. The camera has free c, xp, yp and nonzero
+    coefficients.
     """
     lines = read_legacy_text(path).split("\n")
     if len(lines) < 6:
@@ -87,7 +91,7 @@ def read(path: Path) -> BlockTables:
             if len(control):
                 warn(f"{path.name}: {len(control)} control points are too few for a datum; the block is a free network")
         else:
-            # A fixed coordinate has a negative sigma here, zero in DBAT.
+            # Negative sigmas mark fixed coordinates in PhotoModeler, zeros in DBAT.
             sigmas = {name: np.maximum(control.numbers(name), 0.0) for name in ("sx", "sy", "sz")}
             fixed = Table(path.name, control.columns | sigmas, control.files, control.rows)
             tables["control_points"] = control_table(fixed, "", 1.0)
@@ -101,7 +105,7 @@ def read(path: Path) -> BlockTables:
 
 
 def _camera(path: Path, lines: list[str]) -> dict[str, Any]:
-    """Return the [cameras.X] table."""
+    """Return the [cameras.X] table of the camera."""
     if len(lines[1].split()) == 2:
         raise InputError(f"{path.name}, row 2: it has no size of the photographs; write width, height at its end")
     _, _, width, height = row_numbers(path, 2, lines[1].split(), 4)
@@ -112,7 +116,7 @@ def _camera(path: Path, lines: list[str]) -> dict[str, Any]:
     if not all(PIXEL_MM[0] <= side <= PIXEL_MM[1] for side in sides):
         raise InputError(f"{path.name}: pixels of {sides[0]:g} x {sides[1]:g} mm cannot be. Export it again")
     square = abs(sides[0] / sides[1] - 1) < _SQUARE
-    # The affinity makes pixels square before anything else is applied.
+    # Affinity is applied first: it makes the pixels square.
     pixel = sides[0] if square else sides[1]
     b1 = 0.0 if square else 1.0 - sides[0] / pixel
     xp, yp = px / (1.0 - b1) - pixel * (width / 2 + 0.5), -(py - pixel * (height / 2 + 0.5))
@@ -125,7 +129,7 @@ def _camera(path: Path, lines: list[str]) -> dict[str, Any]:
 
 
 def _photographs(path: Path, lines: list[str]) -> tuple[dict[str, str], Table, int]:
-    """Names of photographs by number, images.csv, and the line after them."""
+    """Return photograph names by number, the images table, and the index of the next line."""
     at, names = 5, dict[str, str]()
     poses, rows = [], []
     while at < len(lines) and lines[at].strip():
@@ -147,7 +151,7 @@ def _photographs(path: Path, lines: list[str]) -> tuple[dict[str, str], Table, i
 
 
 def _sections(path: Path, lines: list[str], at: int) -> list[Table]:
-    """Control points, object points and marks, each up to the next empty line."""
+    """Read control points, object points and marks; an empty line ends each table."""
     tables = []
     for columns in (_POINT, _POINT, _MARK):
         at, cells, rows = at + 1, [], []

@@ -1,13 +1,14 @@
-"""The folder "params" of Pix4D.
+"""Pix4D's folder "params".
 
-    NAME_calibrated_camera_parameters.txt   of every photograph: name width height; K; radial R1 R2 R3; tangential
+    NAME_calibrated_camera_parameters.txt   for each photograph: name width height; K; radial R1 R2 R3; tangential
                                             T1 T2; position t; rotation R
-    NAME_tp_pix4d.txt                       of every photograph its name, then rows of point x y size, then -99
-    NAME_offset.xyz                         what is added to positions to be in the map's system
+    NAME_tp_pix4d.txt                       for each photograph: name; rows of point x y size; -99
+    NAME_offset.xyz                         offset to add to positions to obtain map coordinates
 
-A point is seen at K (u, v, 1), where (u, v) are the first two of R (X - t) over the third, x right, y down, z ahead,
-with OpenCV's distortion k1, k2, k3 = R1, R2, R3 and p1, p2 = T1, T2. Pixels are ours. The files have no object points:
-these are intersected.
+The projection is K (u, v, 1), where (u, v) are the first two components of R (X - t) divided by the third, with camera
+axes x right, y down, z forward, and OpenCV's distortion k1, k2, k3 = R1, R2, R3 and p1, p2 = T1, T2. Pixel coordinates
+are the same as ours. The files have no object points: they are intersected.
+
 Sources: Pix4D support, articles 202977149 ("What does the Output Params Folder contain?") and 202559089 ("How are the
 Internal and External Camera Parameters defined?").
 """
@@ -26,19 +27,19 @@ from jaxphoto.io.text_files import read_legacy_text
 
 CAMERAS_FILE, POINTS_FILE, OFFSET_FILE = "calibrated_camera_parameters.txt", "tp_pix4d.txt", "offset.xyz"
 _HEAD = "fileName imageWidth imageHeight"
-# Numbers in the rows below name and size: K, radial, tangential, t, R.
+# Number of values in each row below name and size: K, radial, tangential, t, R.
 _ROWS = (3, 3, 3, 3, 2, 3, 3, 3, 3)
 
 
 def find(source: Path) -> list[Path]:
-    """Return the files of cameras in the folder, or in that of a project."""
+    """Return the camera parameter files in a params folder or a project folder."""
     folders = (source, source / "params", source / "1_initial" / "params") if source.is_dir() else ()
     paths = [path for folder in folders for path in sorted(folder.glob(f"*{CAMERAS_FILE}"))] or [source]
     return [p for p in paths if p.is_file() and p.name.endswith(CAMERAS_FILE) and begins_with(p, _HEAD)]
 
 
 def read(path: Path) -> Project:
-    """Read a project; photographs with the same K and distortion have one camera, free in all terms."""
+    """Read a project. Photographs with equal K and distortion share a camera with all parameters free."""
     name = path.name.removesuffix(CAMERAS_FILE)
     files, sizes, numbers = _read_cameras(path)
     kinds, number = np.unique(np.column_stack([sizes, numbers[:, :14]]), axis=0, return_inverse=True)
@@ -55,20 +56,25 @@ def read(path: Path) -> Project:
 
 
 def _read_cameras(path: Path) -> tuple[list[str], list[tuple[int, int]], np.ndarray]:
-    """Names, sizes, and 26 numbers of each photograph."""
+    """Return names, sizes, and 26 values per photograph."""
     lines = read_legacy_text(path).split("\n")
-    # The head ends at the first empty line.
+    # The header ends at the first empty line.
     begin = lines.index("") + 1 if "" in lines else len(lines)
     rows = [(k + 1, line) for k, line in enumerate(lines) if k >= begin and line.strip()]
     each = len(_ROWS) + 1
     if not rows or len(rows) % each:
-        raise InputError(f"{path.name} has {len(rows)} rows, not {each} a photograph: it ends early, or has fisheyes")
+        raise InputError(
+            f"{path.name}: {len(rows)} rows, not a multiple of {each} (rows per photograph); the file is truncated "
+            "or has fisheye cameras. Re-export it for perspective cameras"
+        )
     names, sizes, numbers = [], [], []
     for first in range(0, len(rows), each):
         row, line = rows[first]
         words = line.rsplit(maxsplit=2)
         if len(words) != 3 or not all(word.isdigit() and len(word) < 9 for word in words[1:]):
-            raise InputError(f"{path.name}, row {row}: {quoted(line)} is no name with width and height")
+            raise InputError(
+                f'{path.name}, row {row}: expected "NAME WIDTH HEIGHT", got {quoted(line)}; re-export the file'
+            )
         names.append(words[0])
         sizes.append((int(words[1]), int(words[2])))
         below = zip(rows[first + 1 : first + each], _ROWS, strict=True)

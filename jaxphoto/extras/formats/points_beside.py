@@ -1,11 +1,12 @@
-"""Image points in a file beside the orientations: image_points.csv, texts of BINGO, PATB and Pix4D, and marks.
+"""Image points in the folder of the orientations: image_points.csv, texts of BINGO, PATB and Pix4D, and marks.
 
-    IMAGE [CAMERA | c flags]            the head of a photograph
-    point x y ...                       its points
-    -99                                 its end; in BINGO's of Pix4D an empty line
+    IMAGE [CAMERA | c flags]            header of a photograph
+    point x y ...                       its image points
+    -99                                 end of the photograph; an empty line in Pix4D's BINGO files
 
-BINGO's coordinates are millimetres, PATB's in the unit of the principal distance in its heads, mostly micrometres; x
-right, y up, from the middle of the photograph. Pix4D's and those of image_points.csv are our pixels.
+BINGO's coordinates are in millimetres, PATB's in the unit of the principal distance in its headers, usually
+micrometres; x right, y up, from the image centre. Pix4D's coordinates and image_points.csv are in our pixels.
+
 Sources: Pix4D support, articles 203590305 ("What is the bingo file generated during Initial Processing?") and
 202977149; PCI Geomatics, OrthoEngine, "Exporting a project to PATB".
 """
@@ -31,18 +32,18 @@ from jaxphoto.io.text_tables import is_number, read_csv
 TABLE = "image_points.csv"
 _ENDINGS = (".txt", ".dat", ".im", ".img", ".ima", ".pho", ".pat", ".bingo", ".patb", "")
 _END = "-99"
-# Bytes with the end of the first photograph.
+# Maximum number of bytes searched for the end of the first photograph.
 _HEAD = 1_000_000
-# A principal distance in micrometres is 1000 times that in millimetres, up to the difference of two calibrations.
+# Micrometres per millimetre; maximum ratio of the principal distances of header and camera if both are in micrometres.
 _UM, _NEAR = 1000.0, 2.0
-# A mark that was exported as tie point too differs by rounding only.
+# Maximum distance (px) between a mark and the same mark exported as tie point; they differ by rounding.
 _SAME_PX = 2.0
 _RENAMED = " (tie)"
 _ROUNDING = 1e-12
 
 
 class Shown(NamedTuple):
-    """Image points by the names of their object points."""
+    """Image points, and the names of their object points."""
 
     points: list[str]
     image: Int[np.ndarray, "n"]
@@ -53,9 +54,9 @@ class Shown(NamedTuple):
 
 
 def points_beside(path: Path, files: Sequence[str], cameras: Sequence[ProjectCamera]) -> Shown:
-    """Read the one file of image points in the folder of `path`; nothing if there is none.
+    """Read the only file of image points in the folder of `path`; return no points if there is none.
 
-    Points of photographs other than `files` are skipped (UserWarning). Raises InputError for several files.
+    Points of photographs not in `files` are skipped (UserWarning). Raises InputError if there are several files.
     """
     texts = measured_texts(path)
     if len(texts) > 1:
@@ -69,13 +70,15 @@ def points_beside(path: Path, files: Sequence[str], cameras: Sequence[ProjectCam
 
 
 def measured_texts(path: Path) -> list[Path]:
-    """Return the files of image points in the folder of `path`, other than `path`."""
+    """Return files of image points in the folder of `path`, other than `path`."""
     near = (p for p in sorted(path.parent.iterdir()) if p.is_file() and p != path)
     return [p for p in near if p.name == TABLE or (p.suffix.lower() in _ENDINGS and _is_measured(p))]
 
 
 def points_of(text: Path, files: Sequence[str], of: str, cameras: Sequence[ProjectCamera] | None = None) -> Shown:
-    """Read a text of image points; in pixels without `cameras`. `of` names the file that lists `files`."""
+    """Read image points from a text file; in pixels if `cameras` is None. `of` is the name of the file that lists
+    `files`.
+    """
     heads, photograph, points, xy = _read_measured(text)
     places = places_by_name(files)
     photographs = [_photograph(head, places) for head in heads]
@@ -94,14 +97,14 @@ def named(
     column_row: Float[np.ndarray, "n 2"],
     sigma_px: Float[np.ndarray, "n 2"] | None = None,
 ) -> Shown:
-    """Return image points, whose object points are numbered by name."""
+    """Build `Shown` from point names; object points are sorted by name."""
     ids, point = np.unique(np.array(points, object), return_inverse=True)
     sigma = np.full((len(column_row), 2), np.nan) if sigma_px is None else sigma_px
     return Shown(ids.tolist(), np.array(image, int), point.astype(int), column_row, sigma)
 
 
 def marks_shown(marks: Sequence[Mark], files: Sequence[str]) -> Shown:
-    """Return the marks in the photographs `files`."""
+    """Select the marks in the photographs `files`."""
     place = {name: k for k, name in enumerate(files)}
     there = [mark for mark in marks if mark[0] in place]
     at, sigma = np.array([mark[2] for mark in there]).reshape(-1, 2), np.array([[mark[3]] * 2 for mark in there])
@@ -109,9 +112,9 @@ def marks_shown(marks: Sequence[Mark], files: Sequence[str]) -> Shown:
 
 
 def joined(ties: Shown, marks: Shown, of: str) -> Shown:
-    """Return tie points and marks; a tie point with a mark's name is the mark if they coincide in an image.
+    """Merge tie points and marks. A tie point with a mark's name is identical to it if they coincide in an image.
 
-    Otherwise it is renamed (UserWarning).
+    Otherwise the tie point is renamed (UserWarning).
     """
     names = [[shown.points[k] for k in shown.point.tolist()] for shown in (ties, marks)]
     marked = dict(zip(zip(marks.image.tolist(), names[1], strict=True), marks.column_row, strict=True))
@@ -129,7 +132,7 @@ def joined(ties: Shown, marks: Shown, of: str) -> Shown:
         )
     kept = np.array([key[1] not in same or key not in marked for key in where], bool)
     tie_names = [n + _RENAMED if n in clash else n for n, keep in zip(names[0], kept.tolist(), strict=True) if keep]
-    # A mark without standard deviation gets that of its tie point.
+    # Marks without standard deviation take the tie point's.
     of_ties = dict(zip(where, ties.sigma_px.tolist(), strict=True))
     sigma = [
         of_ties.get(key, s) if key[1] in same and np.isnan(s[0]) else s
@@ -144,7 +147,7 @@ def joined(ties: Shown, marks: Shown, of: str) -> Shown:
 
 
 def places_by_name(files: Sequence[str]) -> dict[str, int]:
-    """Return photographs by their names, and by those without folder or ending if they are unique."""
+    """Return photograph indices by file name, and by name without folder or suffix where this is unique."""
     paths = [PurePosixPath(PureWindowsPath(file).as_posix()) for file in files]
     places: dict[str, int] = {}
     for names in ([path.stem for path in paths], [path.name for path in paths]):
@@ -154,9 +157,9 @@ def places_by_name(files: Sequence[str]) -> dict[str, int]:
 
 
 def write_image_points(p: Project, folder: Path, names: Sequence[str] | None = None) -> None:
-    """Write image_points.csv; `names` are those of photographs, by default of their files.
+    """Write image_points.csv. `names` are the photograph names, by default the file names.
 
-    Warns if the standard deviations of x and y differ, of which the table has the root of their mean square.
+    Warns if the standard deviations of x and y differ: the table contains their root mean square.
     """
     images = names or p.files
     columns = {"image": np.array(images, object)[p.image], "point": np.array(p.points, object)[p.point]}
@@ -165,17 +168,14 @@ def write_image_points(p: Project, folder: Path, names: Sequence[str] | None = N
         x, y = p.sigma_px.T
         columns["sigma_px"] = np.sqrt((x**2 + y**2) / 2)
         if (np.abs(x - y) > _ROUNDING * x).any():
-            warn(
-                f"{TABLE} has one standard deviation for x and y, and those of the block differ: their root mean "
-                "square is written"
-            )
-    # A first name that starts with # is quoted, or its line would be a comment.
+            warn(f"sigma_x and sigma_y differ, but {TABLE} has one column for both; writing their root mean square")
+    # Quote the names if one starts with #: an unquoted first line would be a comment.
     quoting: Literal[0, 2] = csv.QUOTE_NONNUMERIC if any(n.startswith("#") for n in images) else csv.QUOTE_MINIMAL
     pd.DataFrame(columns).to_csv(folder / TABLE, index=False, quoting=quoting)
 
 
 def _is_measured(path: Path) -> bool:
-    """Return True if a file begins with a head and a row of point, x, y, and has an end somewhere."""
+    """Return True if a file starts with a header and a row of point, x, y, and contains an end marker if needed."""
     begin = beginning(path, _HEAD)
     lines = [line.split() for line in begin]
     if len(lines) < 3 or is_geoin(begin) or not _is_row(lines[1]) or _is_head(lines[1]):
@@ -188,12 +188,12 @@ def _is_row(words: list[str]) -> bool:
 
 
 def _is_head(words: list[str]) -> bool:
-    """Return True for a head without an end before it: an image and what cannot be a coordinate."""
+    """Return True for a header without an end marker before it: an image name and a word that is not numeric."""
     return len(words) == 2 and not is_number(words[1])
 
 
 def _read_measured(path: Path) -> tuple[list[str], np.ndarray, list[str], np.ndarray]:
-    """Heads, and of every point the number of its head, its name and coordinates."""
+    """Return headers; header index, name and coordinates of each image point."""
     heads, photograph, points, rows, within = [], [], [], [], False
     for k, line in enumerate(read_legacy_text(path).split("\n"), 1):
         words = line.split()
@@ -224,7 +224,7 @@ def _read_table(text: Path, files: Sequence[str], of: str) -> Shown:
 
 
 def _photograph(head: str, places: dict[str, int]) -> tuple[int, list[str]]:
-    """Return the photograph that a head names, -1 for none, and the words after its name."""
+    """Return the index of the photograph named in a header (-1 if unknown) and the words after the name."""
     words = head.split()
     for n in range(len(words), 0, -1):
         name = head if n == len(words) else " ".join(words[:n])
@@ -234,9 +234,9 @@ def _photograph(head: str, places: dict[str, int]) -> tuple[int, list[str]]:
 
 
 def _scale(camera: ProjectCamera | None, rest: list[str], centred: bool) -> list[list[float]]:
-    """Factors and offsets that make pixels of a photograph's coordinates.
+    """Return factors and offsets that convert a photograph's coordinates to pixels.
 
-    They are pixels if the head is a name alone and no coordinate of the file is negative.
+    Coordinates are in pixels if the header has only a name and no coordinate in the file is negative.
     """
     if camera is None or not (rest or centred):
         return [[1.0, 1.0], [0.0, 0.0]]

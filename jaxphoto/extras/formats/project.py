@@ -1,4 +1,4 @@
-"""The neutral model of every format: cameras, oriented images, object points, image points and control."""
+"""Format-independent project: cameras, oriented images, object points, image points and control points."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -29,38 +29,38 @@ from jaxphoto.procedures.georeference_photographs import utm_of
 from jaxphoto.unknowns import FIXED, FREE, Unknowns
 
 _PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".ppm", ".pgm", ".dng")
-# Rounded digits leave R R' off from I by no more.
+# Maximum element of R R' - I; rounded digits stay below it.
 _ROTATION_TOLERANCE = 1e-3
-# An orientation needs so many points, the datum of a block so many control points.
+# Minimum number of points per image orientation, and of control points per datum.
 _LEAST = 3
-# Standard deviation of a fixed coordinate in formats without fixed ones.
+# Standard deviation (m) of fixed coordinates in formats without fixed coordinates.
 _FIXED_M = 1e-4
-# Semi-major axis (m) of the ellipsoids of WGS 84 and of GRS 80, which differ by 0.1 mm.
+# Semi-major axis (m) of WGS 84 and GRS 80.
 _WGS84_M = 6378137.0
 WGS84 = 4326
-# Distances (m) of places from the centre of the earth.
+# Minimum and maximum distance (m) of positions from the centre of the earth.
 _EARTH_M = (6.3e6, 6.5e6)
-# Largest distance from the origin of a block's frame.
+# Maximum distance (m) of camera positions from the origin of the frame.
 _NEAR_M = 100e3
 
 
 class ControlPoints(NamedTuple):
-    """Control and check points, in the coordinates of their project.
+    """Control and check points, in the coordinate system of their project.
 
-    A point that is control in some coordinates and a check in others is control in the former alone.
+    A point with both control and check coordinates has its control coordinates only.
     """
 
     point: Int[np.ndarray, "known"]
-    """Index into the points of the project."""
+    """Index into the project's points."""
     xyz: Float[np.ndarray, "known 3"]
-    """NaN for a coordinate that is not given."""
+    """Coordinates (m, or degrees in a geographic system); NaN if not given."""
     sigma_m: Float[np.ndarray, "known 3"]
-    """NaN if there is none; 0.1 mm for a fixed coordinate."""
+    """Standard deviations; NaN if unknown, 0.1 mm for fixed coordinates."""
     check: Bool[np.ndarray, "known"]
 
     @staticmethod
     def of(block: Block) -> "ControlPoints":
-        """Return those of a block, control first."""
+        """Return the control and check points of a block, control points first."""
         control = _points([(block.control, np.nan), (block.fixed, _FIXED_M)], len(block.points))
         check = _points([(block.check, np.nan)], len(block.points))
         only = ~np.isin(check.point, control.point)
@@ -69,7 +69,7 @@ class ControlPoints(NamedTuple):
 
 
 def _points(kinds: list[tuple[ControlCoordinates, float]], n_points: int) -> ControlPoints:
-    """Rows by point, each kind with the standard deviation that stands for none."""
+    """Collect coordinates by point; each kind has a default for missing standard deviations."""
     xyz, sigma = np.full((n_points, 3), np.nan), np.full((n_points, 3), np.nan)
     for rows, none in kinds:
         at, sigmas = (np.asarray(rows.who), np.asarray(rows.axis)), np.asarray(rows.sigma)
@@ -79,12 +79,14 @@ def _points(kinds: list[tuple[ControlCoordinates, float]], n_points: int) -> Con
 
 
 class Project(NamedTuple):
-    """Oriented images with their tie points; metres, pixels, and the axes of docs/conventions.md."""
+    """Oriented images with image points and object points, in metres and pixels; axes are defined in
+    docs/conventions.md.
+    """
 
     title: str
     cameras: Mapping[str, ProjectCamera]
     images: Sequence[str]
-    """Ids; if empty, `tables` makes them of the names of the files."""
+    """Image ids; if empty, `tables` derives them from the file names."""
     files: Sequence[str]
     image_camera: Sequence[str]
     exterior: ExteriorOrientation
@@ -92,30 +94,31 @@ class Project(NamedTuple):
     xyz: Float[np.ndarray, "points 3"] | None
     """None if the file has no object points."""
     image: Int[np.ndarray, "n"]
-    """Index of the image of every image point."""
+    """Index of each image point's image."""
     point: Int[np.ndarray, "n"]
     column_row: Float[np.ndarray, "n 2"]
-    """In pixels; the centre of the upper left one is (0.5, 0.5)."""
+    """Pixel coordinates; the centre of the upper left pixel is (0.5, 0.5)."""
     frame: Frame = Frame("local")
     changes: tuple[str, ...] = ()
-    """Corrections of the block that other programs do not have."""
+    """Corrections of the block that other programs cannot represent."""
     sigma_px: Float[np.ndarray, "n 2"] | None = None
-    """Standard deviations along columns and rows; NaN or None if unknown."""
+    """Standard deviations of column and row; NaN or None if unknown."""
     control: ControlPoints | None = None
     on_map: bool = False
-    """True if coordinates are those of the frame's map and rotations refer to grid east, grid north and up at each
-    image; False for the Cartesian frame of the block."""
+    """True if positions are in the frame's map system and rotations refer to grid east, grid north and up at each
+    image; False in the block's Cartesian frame.
+    """
     file: str = ""
-    """The file that was read, for messages."""
+    """Name of the source file, for messages."""
 
     @staticmethod
     def of(adjusted: Adjustment, files: Mapping[str, str] | None = None) -> "Project":
-        """Return the values of an adjustment; `files` are names of photographs by ids of images."""
+        """Return the results of an adjustment; `files` are photograph names by image id."""
         return Project.of_block(adjusted.block, adjusted.unknowns, files)
 
     @staticmethod
     def of_block(block: Block, unknowns: Unknowns, files: Mapping[str, str] | None = None) -> "Project":
-        """Return the values `unknowns` of `block`. Raise InputError if two photographs have one file name."""
+        """Convert `block` with the values `unknowns`. Raise InputError if two images have one file name."""
         names = tuple((files or {}).get(name, name) for name in block.images)
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
@@ -144,17 +147,17 @@ class Project(NamedTuple):
 
     @property
     def rows_of_images(self) -> list[np.ndarray]:
-        """Indices of the image points of each image."""
+        """Row indices of each image's image points."""
         return _groups(self.image, len(self.files))
 
     @property
     def rows_of_points(self) -> list[np.ndarray]:
-        """Indices of the image points of each object point."""
+        """Row indices of each object point's image points."""
         return _groups(self.point, len(self.points))
 
     @property
     def number_in_image(self) -> Int[np.ndarray, "n"]:
-        """Number of every image point among those of its image, from 0."""
+        """Index of each image point within its image, from 0."""
         number = np.zeros(len(self.image), int)
         for rows in self.rows_of_images:
             number[rows] = np.arange(len(rows))
@@ -162,12 +165,12 @@ class Project(NamedTuple):
 
     @property
     def world_to_camera(self) -> Float[np.ndarray, "n 3 3"]:
-        """Rotations into axes x right, y down, z ahead."""
+        """Rotations from the world to camera axes x right, y down, z forward."""
         return flipped(self.exterior.camera_from_object)
 
     @property
     def place(self) -> tuple[float, float, float] | None:
-        """Longitude, latitude (degrees) and ellipsoidal height (m) of the origin; None unless on WGS 84 or GRS 80."""
+        """Longitude, latitude (degrees) and ellipsoidal height (m) of the origin; None except on WGS 84 or GRS 80."""
         if self.frame.kind != "epsg" or self.frame.code is None or self.frame.origin is None:
             return None
         ellipsoid = map_system(self.frame.code).ellipsoid
@@ -178,7 +181,7 @@ class Project(NamedTuple):
 
     @property
     def system(self) -> str:
-        """EPSG:code, with the code of the heights unless these are ellipsoidal; "" for a local frame."""
+        """EPSG:code, with the code of the vertical system unless heights are ellipsoidal; "" for a local frame."""
         return map_name(self.frame.code, self.frame.vertical) if self.frame.code is not None else ""
 
     @property
@@ -187,10 +190,10 @@ class Project(NamedTuple):
         return self.frame.code is not None and map_system(self.frame.code).is_geographic
 
     def in_map(self, *, ellipsoidal: bool = False) -> "Project":
-        """Return the project in map coordinates of its frame; a local frame stays.
+        """Convert the project to map coordinates of its frame; a local frame is unchanged.
 
-        Positions and rotations are exact there; collinearity holds as far as the map is true to scale and the earth
-        flat. `ellipsoidal` gives heights above the ellipsoid whatever the frame has.
+        Positions and rotations are exact. Collinearity is approximate because of map scale and earth curvature.
+        `ellipsoidal` requests ellipsoidal heights in every frame.
         """
         if self.on_map or self.frame.kind != "epsg" or self.frame.code is None:
             return self
@@ -200,7 +203,7 @@ class Project(NamedTuple):
         rotations = np.asarray(self.exterior.camera_from_object) @ system.local_from_grid(position)
         control = self.control
         if control is not None:
-            # Adjusted coordinates complete missing ones for the conversion.
+            # Use adjusted coordinates in place of missing ones for the conversion.
             missing = np.isnan(control.xyz)
             points = np.zeros_like(control.xyz) if self.xyz is None else self.xyz[control.point]
             on_map = system.map(np.where(missing, points, control.xyz))
@@ -213,13 +216,15 @@ class Project(NamedTuple):
         )
 
     def tables(self) -> BlockTables:
-        """Return the tables of a self-calibration with the values of the project as start.
+        """Return the tables of a self-calibrating block with the project's values as initial values.
 
-        An image has its file's name without the ending as id. Image coordinates without standard deviation get one
-        pixel. The datum is inner over the points, or that of three complete control points. Repeated measurements,
-        points with fewer than two images and images with fewer than three points are skipped (UserWarnings).
+        Image ids are the file names without suffix. The default standard deviation of image coordinates is one pixel.
+        The datum is defined by at least three complete control points, otherwise by inner constraints over the points.
+        Repeated measurements, points in fewer than two images and images with fewer than three points are skipped
+        (UserWarnings).
 
-        Raises InputError if no image is oriented or tied, two have one name, or a rotation matrix is not orthonormal.
+        Raises InputError if no image is oriented or has tie points, two images have one name, or a rotation matrix is
+        not orthonormal.
         """
         p = self.in_map()
         if not len(p.files):
@@ -269,7 +274,7 @@ class Project(NamedTuple):
         return BlockTables(settings, {key: Table.of(p.file, values) for key, values in tables.items()}, p.file)
 
     def _control_table(self) -> dict[str, np.ndarray] | None:
-        """control_points.csv of the points that images show; None if these do not determine the datum."""
+        """Return control_points.csv with the measured points; None if they do not determine the datum."""
         control = self.control
         if control is None:
             return None
@@ -288,10 +293,11 @@ class Project(NamedTuple):
         return {"point": np.array(self.points, object)[point], **dict(zip(columns, values, strict=True)), "role": role}
 
     def _measurements(self, image: np.ndarray, control: dict[str, np.ndarray] | None) -> tuple[np.ndarray, ...]:
-        """Image, point, pixels and sigma of valid measurements."""
+        """Return image, point, pixel coordinates and sigma of valid measurements."""
         point, xy = self.point, self.column_row
         sigma = np.full(len(point), np.nan) if self.sigma_px is None else self.sigma_px[:, 0]
-        # One feature is of the point with the smaller number; one point in an image is its first feature.
+        # A feature of several points belongs to the lowest index; a point measured twice in an image takes the first
+        # feature.
         order = np.lexsort((point, image))
         image, point, xy, sigma = image[order], point[order], xy[order], sigma[order]
         for by in ("xy", "point"):
@@ -317,22 +323,22 @@ class Project(NamedTuple):
 
 
 def flipped(rotations: ArrayLike) -> Float[np.ndarray, "n 3 3"]:
-    """Return rotations into a camera with y down and z ahead for one with y up and z backwards, or the reverse."""
+    """Convert rotations between camera axes with y up, z backward and with y down, z forward."""
     return np.array([[1.0], [-1.0], [-1.0]]) * np.asarray(rotations)
 
 
 def translations(rotations: ArrayLike, positions: ArrayLike) -> np.ndarray:
-    """Return t of x = R X + t."""
+    """Return t of x = R (X - position) = R X + t."""
     return -np.einsum("nij,nj->ni", np.asarray(rotations), np.asarray(positions))
 
 
 def pose(rotations: Float[np.ndarray, "n 3 3"], positions: Float[np.ndarray, "n 3"]) -> ExteriorOrientation:
-    """Return the exterior orientation of rotations from the world to axes x right, y down, z ahead."""
+    """Return the exterior orientation for rotations from the world to camera axes x right, y down, z forward."""
     return ExteriorOrientation(positions, flipped(rotations))  # type: ignore[arg-type]
 
 
 def numbered(names: Sequence[str]) -> dict[str, int]:
-    """Return the names as numbers if all are positive ones, otherwise counted from 1."""
+    """Return integer ids: the names if all are positive integers and distinct, otherwise counted from 1."""
     numbers = [int(name) if name.isascii() and name.isdigit() else 0 for name in names]
     kept = min(numbers, default=1) > 0 and len(set(numbers)) == len(numbers) and max(numbers, default=1) < 2**31
     return dict(zip(names, numbers if kept else range(1, len(names) + 1), strict=True))
@@ -348,12 +354,12 @@ def _warn(message: str) -> None:
 
 
 def _cells(values: Float[np.ndarray, "n"]) -> np.ndarray:
-    """Numbers as cells of a table, empty for NaN."""
+    """Format values as table cells; NaN is an empty cell."""
     return np.array(["" if np.isnan(v) else repr(v) for v in values.tolist()], object)
 
 
 def _section(camera: ProjectCamera) -> dict[str, Any]:
-    """Return the table [cameras.X]."""
+    """Return the [cameras.X] table of a camera."""
     priors = jax.tree.map(lambda _: FIXED, camera.interior)
     for name in camera.free:
         priors = set_parameter(priors, name, FREE)
@@ -370,7 +376,7 @@ def _check_rotations(p: Project) -> None:
 
 
 def _image_names(files: list[str]) -> list[str]:
-    """Names of the files without endings of photographs, unless two would be the same; absolute folders are removed."""
+    """Return file names without photograph suffix, unless two would be equal; absolute folders are removed."""
     paths = [PurePosixPath(PureWindowsPath(file).as_posix()) for file in files]
     if any(path.is_absolute() or PureWindowsPath(str(path)).is_absolute() for path in paths):
         paths = [PurePosixPath(path.name) for path in paths]
@@ -382,14 +388,14 @@ def _image_names(files: list[str]) -> list[str]:
 
 
 def is_geocentric(xyz: Float[np.ndarray, "n 3"]) -> bool:
-    """Return True if all positions are as far from the origin as places are from the centre of the earth."""
+    """Return True if the distance of all positions from the origin is near the radius of the earth."""
     with np.errstate(over="ignore"):
         distance = np.linalg.norm(xyz, axis=1)
     return len(xyz) > 0 and bool(((distance > _EARTH_M[0]) & (distance < _EARTH_M[1])).all())
 
 
 def geocentric(p: Project, code: int, vertical: int | None) -> Project:
-    """Return a project in geocentric axes of the datum of the EPSG system `code` in a frame of that system."""
+    """Convert geocentric coordinates on the datum of the EPSG system `code` to a frame of this system."""
     centres = np.asarray(p.exterior.position)
     if not is_geocentric(centres):
         raise InputError(f"{p.file}: its transform puts photographs not on the earth")
@@ -400,9 +406,9 @@ def geocentric(p: Project, code: int, vertical: int | None) -> Project:
 
 
 def about_place(p: Project, place: Place) -> Project:
-    """Return a project east, north and up of a `place` on WGS 84 in a frame of the UTM zone there.
+    """Place a project in east-north-up axes at `place` (WGS 84) into a frame of the UTM zone there.
 
-    It stays local, with a UserWarning, if it lies farther off than a block does.
+    The frame stays local, with a UserWarning, if camera positions are more than 100 km away or `place` is invalid.
     """
     far = float(np.abs(np.asarray(p.exterior.position)).max(initial=0.0))
     if not (far < _NEAR_M and abs(place[0]) <= 180 and abs(place[1]) <= 90):
@@ -414,7 +420,7 @@ def about_place(p: Project, place: Place) -> Project:
 
 
 def in_system(p: Project, words: str) -> Project:
-    """Return a project in the map coordinates that `words` name; local, with a UserWarning, if they name none."""
+    """Set the map system named in `words`; the project stays local, with a UserWarning, if this fails."""
     try:
         return with_system(p, words)
     except InputError as error:
@@ -422,9 +428,9 @@ def in_system(p: Project, words: str) -> Project:
 
 
 def with_system(p: Project, words: str) -> Project:
-    """Return a project in the map coordinates that `words` name: an EPSG code, WKT, a string of PROJ, "local" or "".
+    """Set the map system of a project in map coordinates; `words` is an EPSG code, WKT, a PROJ string, "local" or "".
 
-    Raises InputError if they name none, or one without EPSG code, or positions are no places of it.
+    Raises InputError for an unknown system, a system without EPSG code, and positions outside its domain.
     """
     system = system_of(words or "local", p.file)
     if system.crs is None:
@@ -438,7 +444,7 @@ def with_system(p: Project, words: str) -> Project:
 
 
 def _frame_amid(code: int, vertical: int | None, places: Float[np.ndarray, "n 3"]) -> Frame:
-    """Return a frame with a rounded place amid `places` as its origin."""
+    """Return a frame whose origin is the rounded median of `places`."""
     longitude, latitude, _ = np.median(places, axis=0)
     return Frame("epsg", code, vertical, "true", (round(float(longitude), 4), round(float(latitude), 4), 0.0))
 

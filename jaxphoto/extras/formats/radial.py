@@ -1,4 +1,4 @@
-"""Bundler and "Bundle Adjustment in the Large" (BAL): cameras of f, k1 and k2 alone, one an image.
+"""Bundler and "Bundle Adjustment in the Large" (BAL): one camera per image, with parameters f, k1 and k2.
 
     bundle.out of Bundler, VisualSFM, Metashape        problem-N-M-pre.txt of BAL
     # Bundle file v0.3                                  cameras points observations
@@ -7,12 +7,12 @@
     X Y Z, R G B, n (camera feature x y) ...            X Y Z                      of every point
                                   of every point
 
-The camera sees P = R X + t along its -z, x right and y up, as ours; p = -P / P_z is seen at f (1 + k1 |p|^2 + k2 |p|^4)
-p pixels from the middle of the image. f = 0 in Bundler marks an image that is not oriented; names of photographs are in
-list.txt beside it (OpenSfM: list_r000.out beside bundle_r000.out). Neither has the format of an image: the smallest
-about its middle that holds its points is taken. Written image points lie where the camera of f, k1 and k2 sees the rays
-of the adjusted one, so nothing of the geometry is lost. Sources: N. Snavely, Bundler v0.4 User's Manual, "Output format
-and scene representation"; grail.cs.washington.edu/projects/bal.
+Camera coordinates P = R X + t have x right, y up and view along -z, like ours. With p = -P / P_z the image point is f
+(1 + k1 |p|^2 + k2 |p|^4) p pixels from the image centre. In Bundler f = 0 marks an image without orientation; names of
+photographs are in list.txt of the same folder (OpenSfM: list_r000.out for bundle_r000.out). Neither file contains the
+image format: the smallest centred format that contains the image points is used. Exported image points are computed
+from the rays of the adjusted camera by the exported one, so the geometry is preserved exactly. Sources: N. Snavely,
+Bundler v0.4 User's Manual, "Output format and scene representation"; grail.cs.washington.edu/projects/bal.
 """
 
 from collections.abc import Mapping
@@ -42,7 +42,7 @@ from jaxphoto.io.text_tables import LARGEST
 BUNDLE, LIST = "bundle.out", "list.txt"
 RADIAL = CameraModel(BundlerRadial, (), Perspective())
 _HEAD = "# Bundle file v0.3"
-# Least half format in f, for images with few points about the middle, and largest half format (px).
+# Minimum half format as a fraction of f (for images with central points only), and maximum half format (px).
 _LEAST_HALF, _LARGEST_HALF = 0.05, 1e6
 
 
@@ -87,7 +87,7 @@ def _project(path: Path, title: str, s: _Scene) -> Project:
 
 
 def read_bundler(path: Path) -> Project:
-    """Read a bundle file; images that are not oriented are skipped."""
+    """Read a bundle file; images without orientation are skipped."""
     lines = read_legacy_text(path).split("\n")
     numbers = np.array(" ".join(line for line in lines if not line.startswith("#")).split(), float)
     if not (np.abs(numbers) <= LARGEST).all():
@@ -123,7 +123,7 @@ def read_bundler(path: Path) -> Project:
 
 
 def _listed_names(path: Path, number: int) -> list[str]:
-    """Names of photographs: the first word of each row of list.txt, else their numbers."""
+    """Return photograph names: the first word of each row of list.txt, otherwise the camera indices."""
     stem = path.stem.replace("bundle", "list", 1)
     for name in (f"{path.stem}.txt", f"{stem}.txt", f"{stem}.out", LIST, "bundle.out.list.txt"):
         file = path.with_name(name)
@@ -144,7 +144,7 @@ def _count(path: Path, numbers: np.ndarray, at: int, what: str) -> int:
 
 
 def write_bundler(p: Project, folder: Path) -> None:
-    """Write bundle.out and list.txt; points without image points are left out."""
+    """Write bundle.out and list.txt; object points without image points are omitted."""
     for file in p.files:
         if len(file.split()) != 1:
             raise InputError(f"{LIST} ends names at blanks, and {quoted(file)} has one; rename the photograph")
@@ -168,7 +168,7 @@ def write_bundler(p: Project, folder: Path) -> None:
 
 
 def _is_bal(path: Path) -> bool:
-    """Return True for three counts, then two indices and two numbers."""
+    """Return True if the first row has three counts and the second two indices and two coordinates."""
     with path.open("rb") as file:
         first, second = (file.readline(200).split() for _ in range(2))
     indices = [cell.isdigit() for cell in (*first, *second[:2])]
@@ -176,13 +176,13 @@ def _is_bal(path: Path) -> bool:
 
 
 def read_bal(path: Path) -> Project:
-    """Read a problem; images and points have its numbers as ids."""
+    """Read a problem; ids of images and points are their indices."""
     rows = content_rows(path)
     counts = row_numbers(path, rows[0][0], rows[0][1].split(), 3) if rows else [0.0]
     if not all(count > 0 and count == int(count) for count in counts):
         raise InputError(
-            f"{path.name}, row {rows[0][0] if rows else 1}: a BAL problem begins with the positive numbers of its "
-            "cameras, points and observations. Write these three"
+            f"{path.name}, row {rows[0][0] if rows else 1}: invalid BAL header; write the positive counts of cameras, "
+            "points and observations"
         )
     n_cameras, n_points, n = map(int, counts)
     if len(rows) <= n:
@@ -222,7 +222,7 @@ def read_bal(path: Path) -> Project:
 
 
 def write_bal(p: Project, folder: Path) -> None:
-    """Write problem-N-M-pre.txt of N images and M points, without points that have no image points."""
+    """Write problem-N-M-pre.txt of N images and M points; object points without image points are omitted."""
     rotations = np.asarray(p.exterior.camera_from_object)
     vectors = scipy.spatial.transform.Rotation.from_matrix(rotations).as_rotvec()
     cameras = np.hstack([vectors, translations(rotations, p.exterior.position), _radial_values(p)])
@@ -239,16 +239,16 @@ def write_bal(p: Project, folder: Path) -> None:
 
 
 def on_same_rays(p: Project, cameras: Mapping[str, Conversion]) -> Float[np.ndarray, "n 2"]:
-    """Return the image points (px) at which converted cameras see the rays of `p`.
+    """Return the image points (px) of the converted cameras for the rays of `p`.
 
-    Raises InputError for an image point without ray, where a distortion is not invertible.
+    Raises InputError for image points where a distortion is not invertible.
     """
     column_row, of_row = p.column_row.copy(), np.array(p.image_camera, object)[p.image]
     for name, (sensor, interior, _) in p.cameras.items():
         rows = np.flatnonzero(of_row == name)
         if cameras[name].max_px == 0 or not len(rows):
             continue
-        # To a power of two: one program serves many cameras.
+        # Pad to a power of two, so one compiled program serves many cameras.
         xy = np.zeros((1 << (len(rows) - 1).bit_length(), 2))
         xy[: len(rows)] = sensor.mm_from_px(column_row[rows])
         moved, good = (np.asarray(v)[: len(rows)] for v in call_compiled(_moved, interior, cameras[name].interior, xy))
@@ -263,7 +263,9 @@ def on_same_rays(p: Project, cameras: Mapping[str, Conversion]) -> Float[np.ndar
 
 @eqx.filter_jit
 def _moved(one: InteriorOrientation, other: InteriorOrientation, xy):
-    """Where `other` sees the rays that `one` has at image points (mm), and whether these have any."""
+    """Map image points (mm) of camera `one` to camera `other` by their rays; the mask is True if both are invertible
+    there.
+    """
 
     def of_one(at):
         ideal = one.ideal_from_measured(at)
@@ -277,7 +279,7 @@ def _moved(one: InteriorOrientation, other: InteriorOrientation, xy):
 
 
 def _from_middle(p: Project) -> Float[np.ndarray, "n 2"]:
-    """Image points in pixels from the principal point, x right and y up."""
+    """Return image points in pixels relative to the principal point, x right, y up."""
     middle = {
         name: sensor.px_from_mm(np.array([[float(interior.x_p), float(interior.y_p)]]))[0]
         for name, (sensor, interior, _) in p.cameras.items()
@@ -287,7 +289,7 @@ def _from_middle(p: Project) -> Float[np.ndarray, "n 2"]:
 
 
 def _radial_values(p: Project) -> Float[np.ndarray, "images 3"]:
-    """f in pixels, k1 and k2 of each image."""
+    """Return f in pixels, k1 and k2 of each image."""
     values = {
         name: [float(c.interior.c) / c.sensor.pixel_mm, *c.terms(("k1", "k2")).values()]
         for name, c in p.cameras.items()

@@ -1,8 +1,8 @@
-"""The USGS "Report of Calibration" with the parameters of SMAC, as text.
+"""SMAC parameters in a USGS "Report of Calibration", as text.
 
 Coordinates are in mm, x right and y up from the indicated principal point; distortion is added (`Smac`, sign "add").
-A report has no pixel size; unless the user gives it, the format of aerial film is assumed. Source: USGS report
-OSL/2985.
+Reports do not contain the pixel size; unless the user specifies it, the format of aerial film is assumed. Source: USGS
+report OSL/2985.
 """
 
 import collections
@@ -19,13 +19,14 @@ from jaxphoto.io.camera_files import CameraFile, CameraReader, CameraSource, joi
 
 _PARAMETERS = ("K0", "K1", "K2", "K3", "K4", "P1", "P2", "P3", "P4", "xp", "yp")
 _NEEDED = ("K0", "K1", "K2", "xp", "yp")
-# 9 x 9 inches.
+# Side of the film format (mm): 9 inches.
 _FILM_MM, _FILM_PIXEL_MM = 228.6, 0.01
-# Powers are printed as 0.2616 x 10-4 or 0.2616E-04, with minus signs of either kind; no match starts within a number.
+# Powers are printed as 0.2616 x 10-4 or 0.2616E-04, with two kinds of minus signs. A match must not start within a
+# number.
 _NUMBER = (
     r"(?:[-+−]\s?|(?<![\d.]))(?:\d+(?:\.\d*)?|\.\d+)(?:[eEdD][-+−]?\d+|\s*[x×*]\s*10\s*(?:\^|\*\*)?\s*[-+−]\s?\d+)?"
 )
-# A truncated power of ten makes its number invalid.
+# A truncated power of ten invalidates its number.
 _CUT = r"(?:\s*[x×*]\s*10(?!\d))?"
 _TOKEN = re.compile(rf"(?P<name>\b(?:K[0-4]|P[1-4]|[xy]p)\b)|(?P<equals>=)|(?P<number>{_NUMBER}{_CUT})")
 _FOCAL = re.compile(r"calibrated\s+focal\s+length", re.IGNORECASE)
@@ -41,7 +42,7 @@ def _recognise(path: Path, text: str) -> bool:
 def read_smac_report(source: CameraSource) -> CameraFile:
     """Read the camera of a report. Raise InputError for missing parameters."""
     text = source.text()
-    # A missing number must not be replaced by that of the principal point.
+    # Remove the principal point: its values in mm must not be taken for a missing focal length.
     plain = _POINT.sub(" ", text)
     named = _FOCAL.search(plain)
     focal = _IN_MM.search(plain, named.end()) if named is not None else None
@@ -61,7 +62,7 @@ def read_smac_report(source: CameraSource) -> CameraFile:
 
 
 def write_smac_report(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
-    """Write a camera with the distortion `Smac`, converted exactly to R0 = 0 and added distortion."""
+    """Write a camera with the distortion `Smac`, converted exactly to R0 = 0 and sign "add"."""
     d = interior.distortion
     at_zero = rebalance(interior, 0.0) if isinstance(d, Smac) and float(d.r0) != 0 else interior
     interior = with_sign(at_zero, "add")
@@ -89,9 +90,10 @@ def write_smac_report(path: Path, name: str, sensor: Sensor, interior: InteriorO
 
 
 def _values(source: CameraSource, text: str) -> tuple[dict[str, float], set[str]]:
-    """Values by name, and all names in the text.
+    """Return values by name, and all names in the text.
 
-    A name precedes its value; the text of a PDF may give all names of a column, then all signs, then all values.
+    Each name precedes its value. Text extracted from a PDF may list all names of a column, then all signs, then all
+    values.
     """
     tokens = [(m.lastgroup, m.group()) for m in _TOKEN.finditer(text)]
     values: dict[str, float] = {}

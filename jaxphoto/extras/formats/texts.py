@@ -1,20 +1,20 @@
-"""A folder of texts: exterior orientations, image points (`points_beside`) and a camera file.
+"""Folder of text files: exterior orientations, image points (`points_beside`) and a camera file.
 
-    imageName X Y Z Omega Phi Kappa         a row a photograph, separated by blanks, tabs, commas or semicolons
+    imageName X Y Z Omega Phi Kappa         one row per photograph, separated by blanks, tabs, commas or semicolons
 
-    photograph [c] X Y Z                    PATB: three rows a photograph
+    photograph [c] X Y Z                    PATB: three rows per photograph
     a11 a12 a13 a21 a22
     a23 a31 a32 a33
 
-    ORIA photograph X Y Z phi omega kappa   BINGO's itera.dat: among rows that begin with other words
+    ORIA photograph X Y Z phi omega kappa   BINGO's itera.dat; other rows are ignored
 
-omega, phi, kappa are those of docs/conventions.md, in degrees, or gon if the lines above the first row say gon, grads
-or gradians. Other columns and orders are read if the last line above the first row names them. PATB's matrix takes the
-axes of the camera, x right, y up, z backwards, to those of the object. BINGO's angles are camera_from_object =
-R3(kappa) R1(omega) R2(phi), in gon. A comment or a .prj beside names the system. With several cameras, images.csv says
-which photograph has which (image, camera). Sources: Pix4D support, articles 202977149 and 202558969 ("Yaw, Pitch, Roll
-and Omega, Phi, Kappa angles"); PCI Geomatics support, article 204186705 ("Using Pat-B in OrthoEngine"); for BINGO,
-whose manual is not public, S. Turek's bundle block adjustment for GRASS, 2014.
+omega, phi, kappa are defined in docs/conventions.md, in degrees, or gon if the header contains gon, grads or gradians.
+Other columns and orders are read if the last line above the first row names them. PATB's matrix rotates from camera
+axes x right, y up, z backward to object axes. BINGO's angles are camera_from_object = R3(kappa) R1(omega) R2(phi), in
+gon. A comment or a .prj in the same folder names the coordinate system. If there are several cameras, images.csv
+(image, camera) assigns a camera to each photograph. Sources: Pix4D support, articles 202977149 and 202558969 ("Yaw,
+Pitch, Roll and Omega, Phi, Kappa angles"); PCI Geomatics support, article 204186705 ("Using Pat-B in OrthoEngine"); for
+BINGO, whose manual is not public, S. Turek's bundle block adjustment for GRASS, 2014.
 """
 
 import csv
@@ -53,10 +53,10 @@ from jaxphoto.unknowns import FIXED
 EXTERIOR, IMAGES = "exterior.txt", "images.csv"
 _TEXTS = (".txt", ".csv", ".dat", ".ori", ".eo", ".opk", ".pat", ".out", "")
 _CAMERAS = (".toml", ".xml", ".yml", ".yaml", ".json", ".cameramodel")
-# Another reading of the rotations is taken if rays then miss by so many times less.
+# Minimum ratio of the ray misfits of the first and another interpretation of the rotations to prefer the other.
 _WORSE = 3.0
 _GON = re.compile(r"\b(gons?|grads|gradians?)\b", re.IGNORECASE)
-# Gon in English, degrees in German.
+# "Grad" means gon in English, degrees in German.
 _GRAD = re.compile(r"\bgrad\b", re.IGNORECASE)
 _UNIT = re.compile(r"[\[(][^\])]*[\])]")
 _SYSTEM = re.compile(r"\b(EPSG:\s*\d{4,6}(?:\s*\+\s*\d{4,6})?)", re.IGNORECASE)
@@ -71,31 +71,31 @@ _MEANINGS = {
     for word in words
 }  # fmt: skip
 _COLUMNS = ("x", "y", "z", "omega", "phi", "kappa")
-# Numbers of the rows below the first of a photograph in PATB.
+# Number of values in the second and third row of a photograph in PATB.
 _MATRIX = (5, 4)
 _ORIA, _ORIA_ROW = "ORIA", re.compile(rb"(?:\A|\n)[ \t]{0,20}ORIA[ \t]")
 _GON_DEG = 0.9
-# Lines of a file among which its first row stands, and their bytes.
+# Maximum number of lines, and of bytes, searched for the first row.
 _BEGIN, _HEAD = 40, 20_000
 
 _Row = tuple[int, list[str], str]
-"""Number, cells, and the line."""
+"""Row number, cells, and line."""
 
 
 class ExteriorText(NamedTuple):
-    """The orientations in a text."""
+    """Orientations read from a text file."""
 
     names: list[str]
     positions: Float[np.ndarray, "images 3"]
     camera_from_object: Float[np.ndarray, "images 3 3"]
     others: tuple[Float[np.ndarray, "images 3 3"], ...] = ()
-    """Other readings of the same numbers: transposes of matrices, BINGO's angles in another order or unit."""
+    """Other interpretations: transposed matrices, BINGO's angles in another order or unit."""
     system: str = ""
-    """Words that name the coordinate system."""
+    """EPSG code, WKT, or "" if the file names none."""
 
 
 def find(source: Path) -> list[Path]:
-    """Return the texts of orientations; in a folder, which then has image points beside them."""
+    """Return text files of orientations; in a folder only if it contains image points, too."""
     if source.is_file():
         return [source] if source.suffix.lower() in _TEXTS and is_exterior(source) else []
     paths = sorted(source.iterdir()) if source.is_dir() else []
@@ -104,7 +104,7 @@ def find(source: Path) -> list[Path]:
 
 
 def read(path: Path) -> Project:
-    """Read orientations with image points and cameras beside them; cameras are free in terms that are not zero."""
+    """Read orientations, and image points and cameras of the same folder; cameras have free nonzero parameters."""
     exterior = read_exterior(path)
     cameras, camera_of = _cameras(path, exterior.names)
     of_image = [cameras[name] for name in camera_of]
@@ -123,7 +123,7 @@ def oriented_project(
     shown: Shown,
     system: str = "",
 ) -> Project:
-    """Return the project of orientations in the system named by words, and of the image points beside them."""
+    """Build a project from orientations, image points and the name of the coordinate system."""
     if not len(shown.image):
         raise InputError(f"{path.name} has no image points; write BINGO, PATB or image_points.csv beside it")
     project = Project(
@@ -134,7 +134,7 @@ def oriented_project(
 
 
 def _cameras(path: Path, names: list[str]) -> tuple[dict[str, ProjectCamera], list[str]]:
-    """Return the cameras of the folder, and the camera of each photograph."""
+    """Return the cameras of the folder, and each photograph's camera."""
     near = (p for p in sorted(path.parent.iterdir()) if p.is_file() and not p.name.startswith("."))
     files = [p for p in near if p.suffix.lower() in _CAMERAS]
     if len(files) != 1:
@@ -158,7 +158,7 @@ def _cameras(path: Path, names: list[str]) -> tuple[dict[str, ProjectCamera], li
 
 
 def _best_rotations(exterior: ExteriorText, cameras: list[ProjectCamera], shown: Shown) -> np.ndarray:
-    """Rotations from the object to the camera, in the reading by which rays meet best."""
+    """Select the interpretation of the rotations with the best ray intersections."""
     if not exterior.others:
         return exterior.camera_from_object
     rays = np.zeros((len(shown.image), 3))
@@ -179,7 +179,8 @@ def ray_misfit(
     image: Int[np.ndarray, "n"],
     point: Int[np.ndarray, "n"],
 ) -> float:
-    """Return the median angle (rad) between rays, in camera axes, and the point nearest to all rays of their point.
+    """Return the median angle (rad) between rays (in camera axes) and the directions to their least-squares
+    intersections.
 
     NaN if no point has two rays.
     """
@@ -194,7 +195,7 @@ def ray_misfit(
     normal, right = np.zeros((point.max() + 1, 3, 3)), np.zeros((point.max() + 1, 3))
     np.add.at(normal, point, across)
     np.add.at(right, point, np.einsum("nij,nj->ni", across, start))
-    # Regularised by more than rounding, for parallel rays.
+    # Regularise the normal equations of parallel rays well above rounding errors.
     normal += 1e-12 * np.maximum(np.einsum("pii->p", normal), 1.0)[:, None, None] * np.eye(3)
     to = np.linalg.solve(normal, right[:, :, None])[point, :, 0] - start
     off = np.linalg.norm(np.einsum("nij,nj->ni", across, to), axis=1)
@@ -205,7 +206,7 @@ def ray_misfit(
 
 
 def is_exterior(path: Path) -> bool:
-    """Return True if a file begins as a text of orientations, or has a row of BINGO's."""
+    """Return True if a file starts like a text of orientations, or contains an ORIA row of BINGO."""
     if _ORIA_ROW.search(path.read_bytes()):
         return True
     lines = beginning(path, _HEAD)
@@ -214,7 +215,7 @@ def is_exterior(path: Path) -> bool:
 
 
 def read_exterior(path: Path) -> ExteriorText:
-    """Read the orientations in a text. Raise InputError with the row that is invalid."""
+    """Read the orientations in a text file. Raise InputError with the row number if a row is invalid."""
     numbered = [(k, line) for k, line in enumerate(read_legacy_text(path).split("\n"), 1) if line.strip()]
     begin = [line for _, line in numbered[:_BEGIN]]
     if any(_oria(line.split()) is not None for _, line in numbered):
@@ -243,7 +244,7 @@ def read_exterior(path: Path) -> ExteriorText:
 
 
 def _system(path: Path, head: str) -> str:
-    """Return an EPSG code in the head, else the content of a .prj of the same name or of the only one in the folder."""
+    """Return the EPSG code in the header, otherwise the .prj of the same name or the only one in the folder."""
     if named := _SYSTEM.search(head):
         return named[1]
     same = path.with_suffix(".prj")
@@ -252,7 +253,7 @@ def _system(path: Path, head: str) -> str:
 
 
 def _cells(line: str) -> list[str]:
-    """Return the cells between the first separator that is frequent enough, else between blanks."""
+    """Split a line at the first separator that occurs at least three times, otherwise at whitespace."""
     for separator in ("\t", ";", ","):
         if line.count(separator) >= 3:
             return [cell.strip() for cell in line.strip().split(separator)]
@@ -260,7 +261,7 @@ def _cells(line: str) -> list[str]:
 
 
 def _is_angles(row: list[str]) -> bool:
-    """Return True for a name and six numbers; a name of several words has no three numbers in it."""
+    """Return True for a name and six values; a name of several words contains fewer than three values."""
     surplus = len(row) - len(_COLUMNS)
     if surplus < 1 or not all(map(is_number, row[surplus:])):
         return False
@@ -274,7 +275,7 @@ def _first_of_angles(lines: list[str]) -> int | None:
         if places and len(below) > -min(places.values()) and all(is_number(below[at]) for at in places.values()):
             return k + 1
     first = next((k for k, row in enumerate(rows) if _is_angles(row) and not row[0].startswith("#")), None)
-    # Most rows below the first one are of the same kind; in other files one may be so by chance.
+    # Require most rows below the first to be of the same kind: in other files a single row may match by chance.
     return first if first is not None and 2 * sum(map(_is_angles, rows[first:])) > len(rows) - first else None
 
 
@@ -283,7 +284,7 @@ def _first_of_matrices(lines: list[str]) -> int | None:
     widths = [len(row) if all(map(is_number, row)) else 0 for row in rows]
     begins = [len(row) > 3 and all(map(is_number, row[-3:])) and not row[0].startswith("#") for row in rows]
     for k in range(len(rows) - 2):
-        # The next photograph, if there is one, follows at once.
+        # The next photograph, if any, must follow immediately.
         next_begins = k + 3 >= len(rows) or begins[k + 3] or rows[k + 3] == ["-99"]
         if begins[k] and tuple(widths[k + 1 : k + 3]) == _MATRIX and next_begins:
             return k
@@ -291,13 +292,13 @@ def _first_of_matrices(lines: list[str]) -> int | None:
 
 
 def _meanings(head: str) -> list[str]:
-    """Meanings of the words of a header, "" for other words; units are no words."""
+    """Return the meaning of each header word, "" if unknown; units are ignored."""
     words = [re.findall(r"[A-Za-z]+", cell) for cell in _cells(_UNIT.sub("", head))]
     return [_MEANINGS.get(word[0].lower(), "") if word else "" for word in words]
 
 
 def _places(head: str) -> dict[str, int] | None:
-    """Places of the columns, counted from the end of a row; None if the header does not name each once."""
+    """Return column indices counted from the end of a row; None unless the header names each column once."""
     meanings = _meanings(head)
     if any(meanings.count(name) != 1 for name in _COLUMNS):
         return None
@@ -322,12 +323,15 @@ def _of_matrices(path: Path, rows: list[_Row]) -> ExteriorText:
     for at in range(0, len(rows), 3):
         (k, cells, line), below = rows[at], rows[at + 1 : at + 3]
         if len(cells) <= 3 or len(below) < 2:
-            raise InputError(f"{path.name}, row {k}: {quoted(line)} is not the first of three rows of a photograph.")
+            raise InputError(
+                f"{path.name}, row {k}: {quoted(line)} does not start a three-row photograph record; "
+                "complete the record"
+            )
         matrix = [
             x for (n, words, _), many in zip(below, _MATRIX, strict=True) for x in row_numbers(path, n, words, many)
         ]
         values.append(row_numbers(path, k, cells[-3:], 3) + matrix)
-        # The principal distance may precede the position.
+        # A principal distance may precede the position.
         name = cells[:-3]
         names.append(" ".join(name[:-1] if len(name) > 1 and is_number(name[-1]) else name))
     numbers = np.array(values).reshape(-1, 12)
@@ -336,7 +340,7 @@ def _of_matrices(path: Path, rows: list[_Row]) -> ExteriorText:
 
 
 def _oria(words: list[str]) -> int | None:
-    """Where the six numbers of a row of BINGO's orientations begin; None for another row."""
+    """Return the index of the first of six values in an ORIA row of BINGO; None for other rows."""
     if not words or words[0] != _ORIA:
         return None
     return next((k for k in range(2, len(words) - 5) if all(map(is_number, words[k : k + 6]))), None)
@@ -367,7 +371,7 @@ def angles_deg(exterior: ExteriorOrientation) -> Float[np.ndarray, "images 3"]:
 
 
 def write(p: Project, folder: Path) -> None:
-    """Write exterior.txt, camera.toml, image_points.csv, and images.csv if there are several cameras."""
+    """Write exterior.txt, camera.toml, image_points.csv and, if there are several cameras, images.csv."""
     m = p.in_map()
     place = "longitude and latitude (degrees) and height (m)" if m.geographic else "X Y Z (m)"
     heights = "above the ellipsoid" if p.frame.vertical is None else f"of EPSG:{p.frame.vertical}"

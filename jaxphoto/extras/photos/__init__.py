@@ -1,4 +1,4 @@
-"""Measurements in photographs by OpenCV, COLMAP and least squares: targets of boards, features, matches."""
+"""Image measurement by OpenCV, COLMAP and least squares: board targets, features, matches."""
 
 from jaxphoto.extras.photos.features import Features, SiftFeatures, interest_points, read_grey, sift_features
 from jaxphoto.extras.photos.matching import MatchedPhotographs, TieFeatures, match_photographs, tie_features

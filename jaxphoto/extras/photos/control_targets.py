@@ -1,4 +1,4 @@
-"""Search for targets of surveyed points in photographs, near their predicted image coordinates."""
+"""Search for targets of surveyed points in photographs near their predicted image coordinates."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,7 +10,8 @@ from jaxphoto.extras.photos.features import read_grey
 from jaxphoto.extras.photos.targets.on_ground import GroundTarget
 from jaxphoto.procedures.control.targets import Candidates, Predicted, TargetSearch
 
-# Standard deviation (px) of blur, compression and shadows, added to that of a fit.
+# Standard deviation (px) due to blur, compression and shadows; added in quadrature to the standard deviation of the
+# fit.
 _MIN_SIGMA_PX = 0.1
 _HALF = 0.5
 
@@ -18,7 +19,7 @@ _HALF = 0.5
 def make_target_search(
     target: GroundTarget, paths: Mapping[str, Path], progress: Callable[[str], object] = lambda image: None
 ) -> TargetSearch:
-    """Return the search for `target` in the photographs at `paths`, by image names; other images are skipped."""
+    """Return the search function for `target`. `paths`: photograph by image name; other images are skipped."""
 
     def look(
         at: Predicted, radius: Float[np.ndarray, "n"], images: tuple[str, ...], ids: tuple[str, ...]

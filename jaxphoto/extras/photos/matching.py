@@ -1,7 +1,7 @@
-"""Matches of photographs by descriptors and epipolar geometry.
+"""Matching of photographs by descriptors and epipolar geometry.
 
-COLMAP matches descriptors (mutual nearest neighbours with Lowe's ratio test) and verifies pairs: inliers of a
-fundamental matrix or homography. Neither needs a principal distance: that of EXIF may be wrong by a third, and an
+COLMAP matches descriptors (mutual nearest neighbours with Lowe's ratio test) and verifies pairs by the inliers of a
+fundamental matrix or homography. Neither requires the principal distance. The EXIF value may be wrong by a third, so an
 essential matrix would reject correct matches.
 """
 
@@ -31,40 +31,42 @@ from jaxphoto.procedures.matched_part import MatchedPart
 from jaxphoto.procedures.orientation.colmap import MappedCamera, import_pycolmap, write_database
 
 MIN_MATCHES = 15
-"""Minimum number of matches of a pair, and of their inlier ratio: fewer agree by chance."""
+"""Minimum number of verified matches of a pair; fewer may agree by chance."""
+# Minimum ratio of inliers to matches of a pair.
 _MIN_RATIO = 0.3
-# Maximum distance from the epipolar line over the diagonal (4 of 1,300 pixels): unknown distortion increases it.
+# Maximum distance from the epipolar line as a fraction of the image diagonal (4 of 1,300 px); allows for unknown
+# distortion.
 _OFF_LINE = 0.003
-# Scatter is that of the 90 % quantile, 1.645 standard deviations: the median ignores the long tails of features, and
-# the sum of squares is sensitive to the remaining false matches.
+# Quantile that defines the scatter, and the same quantile in standard deviations of a normal distribution. The median
+# ignores the long tails of the features; the sum of squares is sensitive to remaining false matches.
 _QUANTILE, _QUANTILE_SIGMA = 0.9, 1.6449
 _BLANK = "it shows no features: it is blank or out of focus"
 _ALONE = f"it has {MIN_MATCHES} points in common with no other photograph it was compared with"
-# Pairs that are matched, and stored, at a time.
+# Number of pairs matched and stored in one batch.
 _CHUNK = 200
 Progress = Callable[[str, int, int], None]
-"""Called with the step, the number of items done, and their total number."""
+"""Called with the step, the number of items done, and the total number."""
 
 
 class MatchedPhotographs(NamedTuple):
     """Features of photographs and their matches."""
 
     xy_mm: list[Float[np.ndarray, "n 2"]]
-    """Image coordinates of each photograph, as in `SiftFeatures`."""
+    """Image coordinates by photograph, as in `SiftFeatures`."""
     sigma_mm: list[Float[np.ndarray, "n"]]
-    """Standard deviations of `SiftFeatures` times `sigma_factor`."""
+    """Standard deviations by photograph: `SiftFeatures` times `sigma_factor`."""
     sigma_factor: float
-    """Scatter of the matches about the epipolar lines over that of `SiftFeatures`."""
+    """Ratio of the scatter about the epipolar lines to the standard deviations of `SiftFeatures`."""
     pairs: list[PairMatches]
     """Pairs with enough matches."""
     counts: Int[np.ndarray, "compared 4"]
-    """For all compared pairs: first, second, matches by descriptors, verified matches (0 if too few)."""
+    """Rows for all compared pairs: first, second, descriptor matches, verified matches (0 if too few)."""
     left_out: dict[str, str]
-    """Photographs by name without any match, and why."""
+    """Reason by name of each photograph without matches."""
 
     @property
     def gross(self) -> Int[np.ndarray, "compared 3"]:
-        """For all compared pairs: first, second, number of rejected matches."""
+        """Rows for all compared pairs: first, second, number of rejected matches."""
         return np.column_stack([self.counts[:, :2], self.counts[:, 2] - self.counts[:, 3]])
 
     @property
@@ -73,12 +75,12 @@ class MatchedPhotographs(NamedTuple):
         return int(self.gross[:, 2].sum())
 
     def named(self, names: list[str]) -> MatchedPart:
-        """Return the matches of photographs with these names, as `calibrate_flight` takes them."""
+        """Return the matches with these photograph names, as the input of `calibrate_flight`."""
         return MatchedPart(names, self.xy_mm, self.sigma_mm, self.pairs, self.gross, self.sigma_factor)
 
 
 class TieFeatures(NamedTuple):
-    """Points in several photographs, one row per measurement, sorted by point."""
+    """Tie points in several photographs, one row per measurement, sorted by point."""
 
     photograph: Int[np.ndarray, "rows"]
     """Index of the photograph."""
@@ -98,15 +100,15 @@ def match_photographs(
     keep: KeptPieces | None = None,
     progress: Progress = lambda step, done, of: None,
 ) -> MatchedPhotographs:
-    """Match SIFT features of photographs of one camera in the `pairs` of indices.
+    """Match SIFT features between photographs of one camera; `pairs` contains index pairs.
 
-    Each has up to `count` features, by default 5,000, or 10,000 of up to 40 photographs, and is reduced to
-    `longest_px`. `interior` is the known camera; only its distortion and principal point are used. Results are stored
-    in the checkpoint `keep`, from which an interrupted run continues.
+    `count` limits the features per photograph: default 5,000, or 10,000 for up to 40 photographs. Photographs are
+    reduced to `longest_px`. `interior` is the known camera; only its distortion and principal point are used. Results
+    are stored in the checkpoint `keep`; an interrupted run continues from it.
 
     Photographs without features or matches are in `left_out`.
 
-    Raises InputError as `sift_features`, if no two photographs match, and, except `in_parts`, for unconnected groups;
+    Raises InputError as `sift_features`, if no two photographs match, and, unless `in_parts`, for unconnected groups;
     BlockError if pycolmap is not installed.
     """
     if len(photographs) < 2:
@@ -121,10 +123,10 @@ def match_photographs(
 def tie_features(
     paths: list[Path], sensor: Sensor, count: int | None = None, least_photographs: int = 2
 ) -> TieFeatures:
-    """Return the points that overlapping photographs of one camera have in common.
+    """Return the tie points of overlapping photographs of one camera.
 
     All pairs are matched by `match_photographs` and joined by `tracks`; points in fewer than `least_photographs` are
-    omitted. Raises InputError as `sift_features`, and if no two photographs have enough in common.
+    omitted. Raises InputError as `sift_features`, and if there is no point in enough photographs.
     """
     each = itertools.combinations(range(len(paths)), 2)
     matched = _matched(paths, sensor, InteriorOrientation(1.0), each, count, LONGEST_PX, None, lambda *step: None)
@@ -142,10 +144,10 @@ class _PairResult(NamedTuple):
     """Concatenated results of several pairs."""
 
     counts: Int[np.ndarray, "pairs 2"]
-    """Matches by descriptors, and verified matches."""
+    """Descriptor matches and verified matches."""
     verified: Int[np.ndarray, "verified 2"]
     off_line: Float[np.ndarray, "verified"]
-    """Distances from the epipolar lines over their standard deviations."""
+    """Distances from the epipolar lines divided by their standard deviations."""
 
 
 def _matched(
@@ -215,7 +217,7 @@ def _matched(
 
 
 def _database(pycolmap: Any, folder: Path, sensor: Sensor, features: list[SiftFeatures], ideal_px: list) -> Path:
-    """Write a COLMAP database of descriptors; a feature with several of them has several keypoints."""
+    """Write a COLMAP database of descriptors; a feature with several descriptors becomes several keypoints."""
     camera = MappedCamera(sensor.width_px, sensor.height_px, float(sensor.width_px), False)
     keypoints = [xy[f.feature] for xy, f in zip(ideal_px, features, strict=True)]
     write_database(folder / "photographs.db", [camera], [0] * len(features), keypoints, (), prior_c=False)
@@ -258,7 +260,7 @@ def _match_pairs(
 
 
 def _places(matches: Int[np.ndarray, "n 2"], one: np.ndarray, other: np.ndarray) -> Int[np.ndarray, "places 2"]:
-    """Return matches of descriptors as one-to-one matches of features."""
+    """Convert descriptor matches to one-to-one feature matches."""
     pairs = np.unique(np.column_stack([one[matches[:, 0]], other[matches[:, 1]]]), axis=0)
     once = np.ones(len(pairs), bool)
     for side in pairs.T:
@@ -268,8 +270,10 @@ def _places(matches: Int[np.ndarray, "n 2"], one: np.ndarray, other: np.ndarray)
 
 
 def _over_sigma(off_line_px: float, one: np.ndarray, other: np.ndarray, *sigmas: np.ndarray) -> np.ndarray:
-    """Misclosures other' F one of verified matches over their standard deviations; `sigmas` in the same unit."""
-    # Sampling with the weights of MAGSAC++ (Barath and others, 2020), from a fixed seed.
+    """Return the misclosures other' F one of verified matches, divided by their standard deviations; same unit in
+    `sigmas`.
+    """
+    # Sample with the weights of MAGSAC++ (Barath and others, 2020) from OpenCV's fixed seed.
     matrix, _ = cv2.findFundamentalMat(one, other, cv2.USAC_MAGSAC, off_line_px, 0.9999, 10_000)
     if matrix is None:
         return np.zeros(0)
@@ -281,7 +285,7 @@ def _over_sigma(off_line_px: float, one: np.ndarray, other: np.ndarray, *sigmas:
 
 
 def _alone(names: list[str], blank: list[bool], pairs: list[PairMatches], in_parts: bool) -> list[int]:
-    """Return the photographs without matches. Raises InputError for unconnected groups, except `in_parts`."""
+    """Return the photographs without matches. Raise InputError for unconnected groups, unless `in_parts`."""
     groups = connected_images(len(names), pairs)
     joined = [group for group in groups if len(group) > 1]
     if not joined:

@@ -1,7 +1,7 @@
-"""Pairs of photographs to match: all, neighbours in sequence or position, or the most similar ones.
+"""Selection of photograph pairs to match: all, neighbours in sequence or position, or the most similar ones.
 
-Similarity is the number of matches of the few widest features, at a thousandth of the cost of matching all; wide
-features are visible from everywhere (Wu 2013, Towards linear-time incremental structure from motion).
+Similarity is the number of matches of the few widest features. It costs a thousandth of matching all features; wide
+features are visible at all image scales (Wu 2013, Towards linear-time incremental structure from motion).
 """
 
 import itertools
@@ -17,49 +17,51 @@ from jaxphoto.extras.photos.features import FEATURES, OF_FEW, SiftFeatures
 from jaxphoto.io.photographs import Photograph
 
 _EARTH_M = 6_371_000.0
-# Default number of neighbours: all that overlap, at an overlap of 80 % both ways.
+# Default number of neighbours: contains all overlapping photographs at 80 % end and side overlap.
 _NEAREST = 20
 FEW = 2 * _NEAREST
-"""Up to this number of photographs, all pairs are matched, with more features."""
+"""Maximum number of photographs for which all pairs are matched (with more features each)."""
 
 LARGEST = 300
-"""Number of the widest features that are compared."""
-# Lowe's ratio test.
+"""Number of widest features compared."""
+# Maximum ratio of the nearest to the second nearest distance (Lowe).
 _RATIO = 0.8
-# Photographs whose products with one are in memory at a time.
+# Number of photographs compared with one photograph in a batch; limits memory.
 _AT_ONCE = 32
-# Fewer matches of the widest features occur by chance.
+# Minimum number of matches of the widest features; fewer may match by chance.
 _MIN_VOTES = 2
 
 
 class MostSimilar(NamedTuple):
-    """Pairs of each photograph with the `number` most similar ones."""
+    """Request for the pairs of each photograph with its `number` most similar photographs."""
 
     number: int
 
 
 def usual_choice(photographs: Sequence[Photograph]) -> str:
-    """Default choice of pairs: all of few, else neighbours by position, else the most similar ones."""
+    """Return the default choice of pairs: all for few photographs, otherwise neighbours by position if known, otherwise
+    similar ones.
+    """
     if len(photographs) <= FEW:
         return "exhaustive"
     return f"{'position' if all(p.gps for p in photographs) else 'similar'}:{_NEAREST}"
 
 
 def usual_count(photographs: int) -> int:
-    """Default number of features of each of N photographs."""
+    """Return the default maximum number of features per photograph for N photographs."""
     return OF_FEW if photographs <= FEW else FEATURES
 
 
 def photograph_pairs(
     photographs: Sequence[Photograph], choice: str = "exhaustive"
 ) -> list[tuple[int, int]] | MostSimilar:
-    """Return the pairs (first < second) of indices of photographs that `choice` names.
+    """Return index pairs (first < second) selected by `choice`.
 
-    `exhaustive`: all. `sequence:K`: each with the next K in the given order. `position:K`: each with the K nearest by
-    the GPS positions of EXIF, in plan. `similar:K`: each with the K most similar ones (`match_photographs` selects
-    them).
+    `exhaustive`: all pairs. `sequence:K`: each photograph with the next K in the given order. `position:K`: each with
+    the K nearest by horizontal EXIF GPS position. `similar:K`: each with the K most similar (selected by
+    `match_photographs`).
 
-    Raises InputError for another choice, and for `position` if a photograph has no position.
+    Raises InputError for an invalid choice, and for `position` if a photograph has no position.
     """
     name, _, number = choice.partition(":")
     if name == "exhaustive" and not number:
@@ -87,14 +89,14 @@ def photograph_pairs(
 
 
 def nearest_pairs(positions_m: Float[np.ndarray, "n axes"], count: int) -> list[tuple[int, int]]:
-    """Return the pairs (first < second) of which one is among the `count` nearest of the other."""
+    """Return index pairs (first < second) in which one is among the `count` nearest of the other."""
     n = len(positions_m)
     _, near = scipy.spatial.cKDTree(positions_m).query(positions_m, k=range(1, min(count + 1, n) + 1))
     return sorted({(min(k, j), max(k, j)) for k in range(n) for j in near[k].tolist() if j != k})
 
 
 def largest_of(features: SiftFeatures) -> UInt8[np.ndarray, "_ 128"]:
-    """Descriptors of the `LARGEST` widest features."""
+    """Return the descriptors of the `LARGEST` widest features."""
     width = features.sigma_mm[features.feature]
     return features.descriptors[np.sort(np.argsort(-width, kind="stable")[:LARGEST])]
 
@@ -102,9 +104,9 @@ def largest_of(features: SiftFeatures) -> UInt8[np.ndarray, "_ 128"]:
 def most_similar(
     largest: Sequence[UInt8[np.ndarray, "_ 128"]], count: int, progress: Callable[[int, int], None]
 ) -> list[tuple[int, int]]:
-    """Return the pairs (first < second) of which one is among the `count` photographs most similar to the other.
+    """Return index pairs (first < second) in which one is among the `count` photographs most similar to the other.
 
-    `largest` are the descriptors of up to `LARGEST` of the widest features of each photograph.
+    `largest`: descriptors of up to `LARGEST` widest features per photograph.
     """
     n = len(largest)
     votes = np.zeros((n, n), int)
@@ -122,7 +124,7 @@ def _votes(one: UInt8[np.ndarray, "_ 128"], others: Sequence[UInt8[np.ndarray, "
     """Count the descriptors of `one` that pass the ratio test in each of `others`."""
     if len(one) == 0:
         return np.zeros(len(others), int)
-    # Padding up to LARGEST is infinitely far.
+    # Pad up to LARGEST descriptors at infinite distance.
     b = np.zeros((len(others), LARGEST, 128), np.float32)
     square = np.full((len(others), LARGEST), np.inf, np.float32)
     for k, other in enumerate(others):

@@ -1,4 +1,4 @@
-"""Targets of calibration boards in photographs: detected by OpenCV, measured by least squares."""
+"""Calibration board targets in photographs: detection by OpenCV, measurement by least squares."""
 
 from jaxphoto.extras.photos.targets.board_description import SYNTAX, read_board
 from jaxphoto.extras.photos.targets.chessboard import Chessboard

@@ -1,6 +1,6 @@
-"""The description of a calibration board in one line, as on the command line.
+"""One-line descriptions of calibration boards, as on the command line.
 
-chessboard:8x6:square_mm=30            inner corners: along a row x rows
+chessboard:8x6:square_mm=30            inner corners: columns x rows
 circles:4x11:spacing_mm=20:diameter_mm=15
 aruco:5x7:marker_mm=30:gap_mm=6:dictionary=4X4_50
 charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50
@@ -24,7 +24,7 @@ SYNTAX = {
     "charuco": "charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50",
     "targets": "targets:FILE.csv",
 }
-"""Syntax of each kind of board."""
+"""Syntax by kind of board."""
 
 _MADE: dict[str, tuple[Callable[..., Pattern], tuple[str, ...], int]] = {
     "chessboard": (Chessboard, ("square_mm",), 3),
@@ -35,7 +35,7 @@ _MADE: dict[str, tuple[Callable[..., Pattern], tuple[str, ...], int]] = {
 
 
 def read_board(description: str) -> Pattern:
-    """Create the board of a one-line description (mm). Raises InputError, with the syntax, for an invalid one."""
+    """Create a board from a one-line description (mm). Raise InputError, with the syntax, for an invalid one."""
     kind, _, rest = description.partition(":")
     if kind not in SYNTAX:
         raise InputError(

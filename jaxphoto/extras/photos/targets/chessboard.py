@@ -11,19 +11,19 @@ from jaxphoto.extras.photos.targets.pattern import FoundBoard, Pattern
 from jaxphoto.procedures.calibration import Board
 
 _FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-# Radius of a window over the distance to the neighbouring edges.
+# Ratio of the window radius to the distance of the nearest other edge.
 _PART = 0.6
 
 
 class Chessboard(Pattern):
-    """Chessboard of `columns` x `rows` inner corners, one less than the squares each way."""
+    """Chessboard with `columns` x `rows` inner corners, one fewer than squares in each direction."""
 
     def __init__(self, columns: int, rows: int, square_m: float) -> None:
         self.columns, self.rows, self.square_m = columns, rows, square_m
         self.board = Board("chessboard", *grid_points(columns, rows, square_m), np.zeros(columns * rows))
 
     def find(self, picture: np.ndarray) -> FoundBoard | None:
-        """All inner corners by rows; None if OpenCV does not find all."""
+        """Detect all inner corners, row by row; None if OpenCV does not find all."""
         size = (self.columns, self.rows)
         seen, corners = cv2.findChessboardCorners(picture, size, None, _FLAGS)
         if not seen:
@@ -35,13 +35,13 @@ class Chessboard(Pattern):
         return FoundBoard(np.arange(len(edges)), fit_crossings(picture, near.reshape(-1, 2), edges, _PART * apart))
 
     def reflectance(self, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Squares, black in the upper left, with a white margin."""
+        """Return the reflectance of squares, black in the upper left, with a white margin."""
         column, row = np.floor(xy_m[:, 0] / self.square_m) + 1, np.floor(-xy_m[:, 1] / self.square_m) + 1
         inside = (column >= 0) & (row >= 0) & (column <= self.columns) & (row <= self.rows)
         return np.where(inside, (column + row) % 2, 1.0)
 
     def hint(self, pictures: Sequence[np.ndarray]) -> str | None:
-        """Describe the largest grid of corners in the pictures."""
+        """Describe the largest grid of corners in the images."""
         counts = []
         for picture in pictures:
             flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
@@ -57,14 +57,14 @@ class Chessboard(Pattern):
 
 
 def grid_points(columns: int, rows: int, apart_m: float) -> tuple[tuple[str, ...], Float[np.ndarray, "n 3"]]:
-    """Return ids r1c1, r1c2, ... and coordinates of a grid: X to the right, Y up, from the upper-left point."""
+    """Return ids r1c1, r1c2, ... and coordinates of a grid: X right, Y up, origin at the upper left point."""
     row, column = np.divmod(np.arange(rows * columns), columns)
     ids = tuple(f"r{r + 1}c{c + 1}" for r, c in zip(row.tolist(), column.tolist(), strict=True))
     return ids, np.stack([column * apart_m, -row * apart_m, 0.0 * row], axis=1)
 
 
 def facing(grid: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows columns 2"]:
-    """Return the grid with rows ordered as seen from the front."""
+    """Reverse the rows of a grid if it is seen from behind."""
     along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     return grid if along[0] * down[1] - along[1] * down[0] > 0 else grid[::-1]
 
@@ -72,7 +72,7 @@ def facing(grid: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows
 def _neighbours(
     grid: Float[np.ndarray, "rows columns 2"],
 ) -> tuple[Float[np.ndarray, "n 2 2"], Float[np.ndarray, "n"]]:
-    """Directions along row and column of each corner, and the distance (px) to the nearest other edge."""
+    """Return the directions of row and column at each corner, and the distance (px) to the nearest other edge."""
     along, down = np.gradient(grid, axis=1), np.gradient(grid, axis=0)
     area = np.abs(along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0])
     length = np.linalg.norm(along, axis=-1), np.linalg.norm(down, axis=-1)

@@ -1,17 +1,17 @@
-"""Circular targets: centres by least squares, asymmetric grids, and fields of coded arrangement.
+"""Circular targets: centres by least squares, asymmetric grids, and fields of targets identified by arrangement.
 
     grey = m + g . d + a (1 - erf(e / s)) / 2,   rho = |L' d|,   e = rho (rho - 1) / |L L' d|,   d = pixel - centre
 
-e is the distance from the ellipse rho = 1 to first order. The ten unknowns (centre, three of L, ln s, a, m, g) are
-fitted by `patches`. The centre of the ellipse is not the image of the circle's centre: see `eccentricity` in
+e is the first-order distance from the ellipse rho = 1. The ten unknowns (centre, three elements of L, ln s, a, m, g)
+are estimated by `patches`. The centre of the ellipse is not the image of the circle's centre: see `eccentricity` in
 `jaxphoto.procedures.calibration.target_calibration`.
 
-Single targets with known coordinates on a plane are identified by arrangement and size. A circle of known size and its
-image give the affine map between board and picture up to a rotation; the direction to one neighbour gives the rotation,
-and the other neighbours test it. The best hypotheses are extended to homographies over all targets. The best fit among
-those of most targets is the result, unless another labelling fits as well: the arrangement is then symmetric. The side
-from which a field is seen is unknown (floor, ceiling, wall): both are tried; for a mirror-symmetric arrangement it is
-that of Z, except for vertical planes.
+Targets with known coordinates on a plane are identified by arrangement and size. A circle of known size and its image
+define the affine map from board to image up to a rotation. The direction to one neighbour defines the rotation; the
+other neighbours test it. The best hypotheses are extended to homographies over all targets. The result is the best fit
+among the labellings with most targets. If a different labelling fits as well, the arrangement is symmetric and there is
+no result. The visible side of a field is unknown (floor, ceiling, wall), so both are tried. For a mirror-symmetric
+arrangement it is the side of positive Z; vertical planes with such an arrangement are ambiguous.
 """
 
 from pathlib import Path
@@ -31,21 +31,21 @@ from jaxphoto.extras.photos.targets.pattern import FoundBoard, Pattern
 from jaxphoto.io.text_tables import read_csv
 from jaxphoto.procedures.calibration import Board
 
-# Half width (px) of the ring about the edge, and the maximum number of pixels of one target.
+# Half width (px) of the ring about the edge; maximum number of pixels per target.
 _RING, _MOST = 4.0, 1024
 _BLUR = 1.0
-# Tolerance of the area of a blob relative to the ellipse of its moments, its minimum area (px) and maximum elongation.
+# Maximum relative difference of the area from the ellipse of equal moments; minimum area (px); maximum ratio of axes.
 _SHAPE, _MIN_AREA, _ELONGATION = 0.06, 20, 6.0
-# Maximum shift of a fitted centre over the smaller half axis.
+# Maximum shift of a fitted centre as a fraction of the smaller half axis.
 _MOVED = 0.5
 
 
 class Blobs(NamedTuple):
-    """Elliptic spots of a picture, dark or bright; the origin is the centre of the upper-left pixel."""
+    """Elliptic spots, dark or bright; the origin is the centre of the upper left pixel."""
 
     column_row: Float[np.ndarray, "n 2"]
     shape: Float[np.ndarray, "n 2 2"]
-    """Q of the ellipse d' Q d = 1."""
+    """Matrix Q of the ellipse d' Q d = 1."""
     dark: Bool[np.ndarray, "n"]
     """True if the spot is darker than its surroundings."""
 
@@ -55,10 +55,11 @@ class Blobs(NamedTuple):
 
 
 def elliptic_blobs(picture: np.ndarray, half_axes: tuple[np.ndarray, float] | None = None) -> Blobs:
-    """Detect all elliptic spots of a picture, by adaptive thresholds of several widths; none touches the border.
+    """Detect elliptic spots in an image by adaptive thresholds with several window sizes. Spots at the border are
+    rejected.
 
-    Of several at one place the most elliptic one is kept. With `half_axes` (larger first, px, and a factor), only spots
-    of that size within the factor compete: a bright disc on a dark one is then found.
+    Of several spots with the same centre the most elliptic one is retained. `half_axes`: expected half axes (px, larger
+    first) and a tolerance factor; spots of other sizes are ignored, so a bright disc on a dark disc can be detected.
     """
     smooth = cv2.GaussianBlur(picture, (3, 3), 0)
     height, width = picture.shape
@@ -85,7 +86,7 @@ def _of_size(shape: np.ndarray, half_axes: np.ndarray, factor: float) -> bool:
 
 
 def _is_dark(picture: np.ndarray, centre: np.ndarray, shape: np.ndarray) -> bool:
-    """Return True if a spot is darker at half its radius than at one and a half."""
+    """Return True if a spot is darker at 0.5 than at 1.5 times its radius."""
     angle = np.arange(16) * np.pi / 8
     to_edge = np.linalg.inv(np.linalg.cholesky(shape)).T @ np.stack([np.cos(angle), np.sin(angle)])
     high, wide = picture.shape
@@ -97,7 +98,7 @@ def _is_dark(picture: np.ndarray, centre: np.ndarray, shape: np.ndarray) -> bool
 
 
 def _components(mask: np.ndarray):
-    """Centre, Q and misfit of each elliptic connected component of a mask."""
+    """Yield centre, Q and misfit of each elliptic connected component of a mask."""
     height, width = mask.shape
     contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     for contour in contours:
@@ -123,7 +124,7 @@ def _components(mask: np.ndarray):
 
 
 def fit_discs(picture: np.ndarray, blobs: Blobs) -> TargetPlaces:
-    """Measure the centres of ellipses, with standard deviations, from `blobs`."""
+    """Measure ellipse centres and their standard deviations, starting from `blobs`."""
     n = len(blobs.column_row)
     if not n:
         return TargetPlaces(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool))
@@ -145,12 +146,12 @@ def fit_discs(picture: np.ndarray, blobs: Blobs) -> TargetPlaces:
 
 
 def _spread(grey, used) -> Float[np.ndarray, "n"]:
-    """Range of the grey values of each patch (10 % to 90 % quantile)."""
+    """Return the range of the grey values in each patch (10 % to 90 % quantile)."""
     return np.array([np.subtract(*np.percentile(g[u], [90, 10])) for g, u in zip(grey, used, strict=True)])
 
 
 def _rings(picture: np.ndarray, blobs: Blobs) -> Patches:
-    """Pixels near the edge of each ellipse, thinned for large ones."""
+    """Return the pixels near the edge of each ellipse; large ellipses are subsampled."""
     height, width = picture.shape
     places, greys = [], []
     for centre, shape in zip(blobs.column_row, blobs.shape, strict=True):
@@ -177,7 +178,7 @@ def _disc(parameters, pixel):
     column, row, l1, l2, l3, blur, contrast, mean, in_column, in_row = parameters
     x, y = pixel[0] - column, pixel[1] - row
     u, v = l1 * x + l2 * y, l3 * y
-    # Q d = L (L' d); 1e-12 keeps the derivative finite at the centre, where e is far from zero.
+    # Q d = L (L' d). Adding 1e-12 makes the derivative finite at the centre.
     rho = jnp.sqrt(u * u + v * v + 1e-12)
     slope = jnp.sqrt((l1 * u) ** 2 + (l2 * u + l3 * v) ** 2 + 1e-12)
     distance = rho * (rho - 1) / slope
@@ -190,18 +191,18 @@ def _discs(start: Float[Array, "n 10"], pixels: Float[Array, "n m 2"], grey, use
     return fits(_disc, start, pixels, grey, used)
 
 
-# Distance (px) of neighbouring spots in the drawing, and its longest side.
+# Distance (px) of neighbouring spots in the drawing; maximum side length (px) of the drawing.
 _APART_PX, _LONGEST_PX = 60, 6000
-# Fractional bits of drawn coordinates: on whole pixels some grids are not detected.
+# Number of fractional bits of drawn coordinates: with integer coordinates some grids are not detected.
 _SHIFT = 4
-# Relative tolerance of the distance of diagonal neighbours, and the number of spots that are tested for each.
+# Maximum relative difference of the distance of diagonal neighbours; number of neighbours tested per spot.
 _OFF_SPACING, _NEAREST = 0.35, 24
 
 
 class CircleGrid(Pattern):
-    """Asymmetric grid of `columns` circles in each of `rows` rows, `spacing_m` apart; twice that apart in a row.
+    """Asymmetric grid of `rows` rows with `columns` circles; rows are `spacing_m` apart, circles in a row twice that.
 
-    Rows and columns are counted as in OpenCV's asymmetric grid (4x11 is the usual one).
+    Rows and columns are counted as in OpenCV's asymmetric grid (usually 4x11).
     """
 
     def __init__(self, columns: int, rows: int, spacing_m: float, diameter_m: float) -> None:
@@ -216,7 +217,7 @@ class CircleGrid(Pattern):
         self.board = Board("asymmetric circles", ids, xyz, np.full(len(ids), diameter_m))
 
     def find(self, picture: np.ndarray) -> FoundBoard | None:
-        """Find the circles of the grid by rows; None if it is not found; without circles that have no clear edge."""
+        """Detect the circles, row by row; None if the grid is not found. Circles without a clear edge are omitted."""
         blobs = elliptic_blobs(picture)
         for dark in (True, False):
             candidates = self._like_the_grid(blobs.take(blobs.dark == dark))
@@ -232,13 +233,14 @@ class CircleGrid(Pattern):
         return None
 
     def reflectance(self, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Black circles on white."""
+        """Return the reflectance of black circles on white."""
         return disc_reflectance(self.board, xy_m)
 
     def _like_the_grid(self, blobs: Blobs) -> Blobs:
-        """Largest connected set of spots whose distances, in radii, are those of diagonal neighbours of the grid.
+        """Select the largest connected set of spots whose distances, in radii, match diagonal neighbours of the grid.
 
-        In units of the ellipses distances do not depend on the view. OpenCV fails if many other round things are left.
+        Distances in units of the ellipses are independent of the view. OpenCV's grid search fails if many other round
+        objects are included.
         """
         n = len(blobs.column_row)
         if n < 2:
@@ -263,15 +265,15 @@ class CircleGrid(Pattern):
             centres = centres.reshape(self.rows, self.columns, 2)[::-1].reshape(-1, 2)
         which = scipy.spatial.cKDTree(blobs.column_row).query(centres)[1]
         d = centres - blobs.column_row[which]
-        # A circle of OpenCV may be no ellipse here: occluded, or half in shadow.
+        # Reject centres outside their ellipse: the circle is occluded or half in shadow.
         same = np.einsum("ni,nij,nj->n", d, blobs.shape[which], d) < 1
         return FoundBoard(np.flatnonzero(same), fit_discs(picture, blobs.take(which[same])))
 
 
 def _drawing(places: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, float, Float[np.ndarray, "2"]]:
-    """Clean picture of spots at `places`, its scale and corner: `drawn = (place - corner) * scale`.
+    """Draw spots at `places`; return the image, scale and corner: `drawn = (place - corner) * scale`.
 
-    OpenCV's search needs evenly lit, separated spots of sufficient size.
+    OpenCV's grid search requires evenly lit, separated spots of sufficient size.
     """
     distance = scipy.spatial.cKDTree(places).query(places, k=2)[0][:, 1]
     scale = _APART_PX / float(np.median(distance))
@@ -286,7 +288,7 @@ def _drawing(places: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, float, Float
 
 
 def disc_reflectance(board: Board, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-    """Black inside the circles of the board, white elsewhere."""
+    """Return the reflectance: 0 inside the circles of the board, 1 outside."""
     black = np.zeros(len(xy_m), bool)
     for centre, diameter in zip(board.xyz_m[:, :2], board.diameter_m, strict=True):
         black |= np.sum((xy_m - centre) ** 2, axis=1) < (diameter / 2) ** 2
@@ -295,20 +297,20 @@ def disc_reflectance(board: Board, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.n
 
 _MIN_TARGETS = 6
 _NEIGHBOURS = 8
-# Tolerances over the distance of neighbours: of a hypothesis, and of a homography of a distorted picture.
+# Maximum error relative to the distance of neighbours: in a hypothesis, and after a homography (lens distortion).
 _OFF, _NEAR = 0.25, 0.3
 _GUESSES = 40
-# A labelling competes with at least this fraction of the largest number of targets, and up to this multiple of the
-# misfit.
+# A labelling is a rival if it has at least this fraction of the maximum number of targets, and at most this multiple of
+# the smallest misfit.
 _AS_GOOD, _AS_NEAR = 0.8, 2.0
-# Z of the normal of a vertical plane.
+# Maximum Z component of the unit normal of a plane treated as vertical.
 _UPRIGHT = 0.1
 
 
 class CircularTargets(Pattern):
     """Dark or bright circles on a plane, from a CSV file: point, X_mm, Y_mm, Z_mm, diameter_mm.
 
-    Raises InputError for an invalid file, fewer than six targets, and targets that are not coplanar.
+    Raises InputError for an invalid file, for fewer than six targets, and if the targets are not coplanar.
     """
 
     def __init__(self, path: Path) -> None:
@@ -334,7 +336,7 @@ class CircularTargets(Pattern):
         self._upright = bool(abs(axes[2, 2]) < _UPRIGHT)
 
     def find(self, picture: np.ndarray) -> FoundBoard | None:
-        """Find the visible targets; None if their arrangement is not found, or ambiguous."""
+        """Detect the visible targets; None if the arrangement is not found or ambiguous."""
         blobs = elliptic_blobs(picture)
         for dark in (True, False):
             candidates = blobs.take(blobs.dark == dark)
@@ -344,19 +346,19 @@ class CircularTargets(Pattern):
         return None
 
     def reflectance(self, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Black circles on white; of a board in the plane Z = 0."""
+        """Return the reflectance of black circles on white, for a board in the plane Z = 0."""
         return disc_reflectance(self.board, xy_m)
 
 
 class _Labelling(NamedTuple):
-    """Pairs (target, blob), the RMS misfit (px) of their homography, and the side of the plane, 1 or -1."""
+    """Pairs (target, blob), RMS misfit (px) of their homography, and side of the plane, 1 or -1."""
 
     pairs: Int[np.ndarray, "pairs 2"]
     misfit: float
     side: int
 
     def agrees(self, other: "_Labelling") -> bool:
-        """Return True if most of these pairs are in `other`, too."""
+        """Return True if at least half of these pairs are in `other`, and the sides are equal."""
         label = dict(other.pairs[:, ::-1].tolist())
         same = sum(label.get(blob) == target for target, blob in self.pairs.tolist())
         return self.side == other.side and same >= 0.5 * len(self.pairs)
@@ -365,9 +367,9 @@ class _Labelling(NamedTuple):
 def identified(
     flat: Float[np.ndarray, "targets 2"], radius: Float[np.ndarray, "targets"], blobs: Blobs, upright: bool = False
 ) -> Int[np.ndarray, "pairs 2"] | None:
-    """Identify targets in the plane of the field: pairs (target, blob), or None if ambiguous.
+    """Identify targets in the plane of the field. Return pairs (target, blob), or None if ambiguous.
 
-    Y is up if the field is seen from its front; the front of an `upright` field is unknown.
+    `flat` has Y up as seen from the front; the front of an `upright` field is unknown.
     """
     if len(blobs.column_row) < _MIN_TARGETS:
         return None
@@ -383,7 +385,9 @@ def identified(
 
 
 def _best(labellings: list[_Labelling]) -> _Labelling | None:
-    """Select the best fit among the labellings of most targets; None if another one is as good."""
+    """Return the labelling with the smallest misfit among those with most targets; None if a different one fits as
+    well.
+    """
     most = max((len(one.pairs) for one in labellings), default=0)
     able = [one for one in labellings if len(one.pairs) >= _AS_GOOD * most]
     best = min(able, key=lambda one: one.misfit, default=None)
@@ -398,16 +402,16 @@ def _nearest(places: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n k"]:
 
 
 def _guesses(down, radius, blobs) -> list[np.ndarray]:
-    """Hypotheses, as lists of pairs (target, blob): a target and its consistent neighbours; longest first."""
+    """Return hypotheses, longest first: pairs (target, blob) of a target and its consistent neighbours."""
     near_target, near_blob = _nearest(down), _nearest(blobs.column_row)
-    # Neighbours relative to a target, in radii, with ellipses transformed to circles: a rotation remains.
+    # Neighbours relative to a target, in radii, with ellipses transformed to circles: only a rotation is unknown.
     w = (down[near_target] - down[:, None]) / radius[:, None, None]
     lower = np.linalg.cholesky(blobs.shape)
     u = np.einsum("bji,bkj->bki", lower, blobs.column_row[near_blob] - blobs.column_row[:, None])
     wc, uc = w[..., 0] + 1j * w[..., 1], u[..., 0] + 1j * u[..., 1]
     guesses: list[np.ndarray] = []
     for b in range(len(uc)):
-        # (target, neighbour of the target, neighbour of the blob)
+        # Axes: target, neighbour of the target, neighbour of the blob.
         turn = uc[b][None, None, :] / wc[:, :, None]
         size = np.abs(turn)
         turned = wc[:, None, None, :] * (turn / np.maximum(size, 1e-12))[..., None]
@@ -424,7 +428,7 @@ def _guesses(down, radius, blobs) -> list[np.ndarray]:
 
 
 def _grown(flat, pairs, blobs) -> tuple[np.ndarray, float] | None:
-    """Extend a hypothesis by homographies to all pairs, with their misfit; None if that fails."""
+    """Extend a hypothesis by homographies to all targets. Return pairs and misfit; None if this fails."""
     spacing = np.linalg.norm(flat[_nearest(flat)[:, 0]] - flat, axis=1)
     for _ in range(4):
         if len(np.unique(pairs[:, 1])) < len(pairs) or len(pairs) < 4:

@@ -1,4 +1,4 @@
-"""ArUco boards, and ChArUco boards: chessboards with a marker in each white square. Any part may be visible."""
+"""ArUco boards, and ChArUco boards (chessboards with a marker in each white square). Boards may be partly visible."""
 
 from typing import NamedTuple
 
@@ -14,13 +14,13 @@ from jaxphoto.procedures.calibration import Board
 DICTIONARIES: tuple[str, ...] = tuple(
     sorted(name.removeprefix("DICT_") for name in dir(cv2.aruco) if name.startswith("DICT_") and name.isupper())
 )
-"""Names of OpenCV's marker dictionaries, without DICT_."""
-# Radius of a window over the width of the cells beside a corner.
+"""Names of OpenCV's marker dictionaries without the prefix DICT_."""
+# Ratio of the window radius to the width of the cells at a corner.
 _PART = 0.8
 
 
 class ArucoGrid(Pattern):
-    """`columns` x `rows` markers of `marker_m`, `gap_m` apart, numbered by rows from 0; targets are their corners."""
+    """Grid of `columns` x `rows` markers, numbered by rows from 0; the targets are the marker corners."""
 
     def __init__(self, columns: int, rows: int, marker_m: float, gap_m: float, dictionary: str) -> None:
         self._dictionary = _dictionary(dictionary, columns * rows)
@@ -33,7 +33,7 @@ class ArucoGrid(Pattern):
         self.board = Board("ArUco markers", ids, np.column_stack([xy, np.zeros(len(xy))]), np.zeros(len(xy)))
 
     def find(self, picture: np.ndarray) -> FoundBoard | None:
-        """Find the corners of all visible markers of the board; None if there is none."""
+        """Detect the corners of all visible markers of the board; None if there are none."""
         markers = found_markers(picture, self._dictionary, self.gap_m / self.marker_m)
         valid = (markers.number < self.columns * self.rows) & (np.bincount(markers.number)[markers.number] == 1)
         if not valid.any():
@@ -42,7 +42,7 @@ class ArucoGrid(Pattern):
         return FoundBoard(point, TargetPlaces(*(v[np.repeat(valid, 4)] for v in markers.corners)))
 
     def reflectance(self, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Black-framed markers on white."""
+        """Return the reflectance of black-framed markers on white."""
         pitch = self.marker_m + self.gap_m
         column, row = np.floor(xy_m[:, 0] / pitch).astype(int), np.floor(-xy_m[:, 1] / pitch).astype(int)
         inside = (column >= 0) & (row >= 0) & (column < self.columns) & (row < self.rows)
@@ -56,11 +56,11 @@ class FoundMarkers(NamedTuple):
 
     number: Int[np.ndarray, "n"]
     corners: TargetPlaces
-    """Four of each marker."""
+    """Four corners per marker."""
 
 
 def found_markers(picture: np.ndarray, dictionary, margin: float) -> FoundMarkers:
-    """Detect all markers of a dictionary, with a bright `margin` (in sides of a marker) around each."""
+    """Detect all markers of a dictionary; `margin` is the width of the bright border (unit: marker side)."""
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)
     if ids is None:
         return FoundMarkers(np.zeros(0, int), TargetPlaces(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool)))
@@ -75,7 +75,7 @@ def found_markers(picture: np.ndarray, dictionary, margin: float) -> FoundMarker
 
 
 class CharucoBoard(Pattern):
-    """`columns` x `rows` squares of `square_m` with markers of `marker_m`; targets are the inner corners."""
+    """Board of `columns` x `rows` squares with markers in the white ones; the targets are the inner corners."""
 
     def __init__(self, columns: int, rows: int, square_m: float, marker_m: float, dictionary: str) -> None:
         if marker_m >= square_m:
@@ -87,7 +87,7 @@ class CharucoBoard(Pattern):
         self.board = Board("ChArUco", ids, xyz + np.array([square_m, -square_m, 0.0]), np.zeros(len(ids)))
 
     def find(self, picture: np.ndarray) -> FoundBoard | None:
-        """Find the visible inner corners between markers; None for fewer than four, or for one row."""
+        """Detect the visible inner corners; None if fewer than four, or all in one row or column."""
         corners, ids, *_ = cv2.aruco.CharucoDetector(self._drawn).detectBoard(picture)
         if ids is None or len(ids) < 4:
             return None
@@ -102,13 +102,13 @@ class CharucoBoard(Pattern):
         projected = cv2.perspectiveTransform(ends.reshape(1, -1, 2), homography).reshape(-1, 3, 2)
         sides = projected[:, 1:] - projected[:, :1]
         length = np.linalg.norm(sides, axis=2, keepdims=True)
-        # The nearest marker begins behind its margin, in both directions: on the diagonal.
+        # The distance to the nearest marker is its margin along the diagonal.
         margin = (1 - self.marker_m / self.square_m) / 2 * np.sqrt(2)
         reach = _PART * margin * length.min(axis=(1, 2))
         return FoundBoard(point, fit_crossings(picture, near, sides / length, reach))
 
     def reflectance(self, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Squares, black in the upper left, with markers in the white ones."""
+        """Return the reflectance of squares, black in the upper left, with markers in the white ones."""
         column, row = (
             np.floor(xy_m[:, 0] / self.square_m).astype(int),
             np.floor(-xy_m[:, 1] / self.square_m).astype(int),
@@ -130,7 +130,7 @@ def _dictionary(name: str, needed: int):
 
 
 def _marker_reflectance(dictionary, number, u, v, inside) -> Float[np.ndarray, "n"]:
-    """Reflectance of marker `number` at (u, v) from its upper-left corner, in sides; white outside."""
+    """Return the reflectance of marker `number` at (u, v) from its upper left corner (unit: side); 1 outside."""
     cells = dictionary.markerSize + 2
     drawn = np.stack([cv2.aruco.generateImageMarker(dictionary, k, cells) > 0 for k in range(number.max() + 1)])
     inside = inside & (u >= 0) & (u < 1) & (v >= 0) & (v < 1)

@@ -1,10 +1,10 @@
-"""Targets on the ground in a window of a photograph: circles, numbered markers, and crosses of four squares.
+"""Ground targets in a window of a photograph: circles, numbered markers, and crosses of four squares.
 
     circle:diameter_mm=300              bright or dark, identified by size and shape
-    aruco:dictionary=4X4_50             the number is the last one in the name of the point: GCP7 is marker 7
-    cross:side_mm=600                   two black and two white squares that meet, of this width together
+    aruco:dictionary=4X4_50             the last number in the point name is the marker number: GCP7 is marker 7
+    cross:side_mm=600                   two black and two white squares around a common corner; total width
 
-The size in the picture follows from the derivative of the projection, for a horizontal target.
+The size in the image is derived from the derivative of the projection, assuming a horizontal target.
 """
 
 import abc
@@ -25,39 +25,40 @@ SYNTAX = {
     "aruco": "aruco:dictionary=4X4_50",
     "cross": "cross:side_mm=600",
 }
-# Tolerance (factor) of the size.
+# Maximum ratio of measured and expected size, or its inverse.
 _LIKE = 1.5
-# Diameter or side (px) of the smallest target that is distinguished from noise.
+# Minimum diameter or side (px) of a target that can be distinguished from noise.
 _SMALLEST_PX = 5.0
-# Cross: samples of a circle, its radius over the side, minimum correlation of opposite and maximum of adjacent squares.
+# Cross: number of samples on a circle; ratio of its radius to the side; minimum autocorrelation after half a turn,
+# maximum after a quarter turn.
 _ANGLES, _OUT, _OPPOSITE, _BESIDE = 72, 0.3, 0.7, -0.5
 _MOST = 6
 
 
 class GroundTarget(abc.ABC):
-    """Kind of target."""
+    """Kind of ground target."""
 
     named = False
-    """True if a target identifies its point."""
+    """True if the target's appearance identifies its point."""
     side_m = 0.0
 
     @abc.abstractmethod
     def find(self, window: np.ndarray, point: str, px_per_m: Float[np.ndarray, "2 2"]) -> TargetPlaces:
-        """Candidates for the target of `point` in a window; the origin is the centre of the upper-left pixel."""
+        """Return candidates for the target of `point` in a window; the origin is the centre of the upper left pixel."""
 
     def reach_px(self, px_per_m: Float[np.ndarray, "2 2"]) -> float:
-        """Half the width (px) of a window about the target."""
+        """Return the half width (px) of a window that contains the target."""
         return 8.0 * self.side_m * float(np.linalg.norm(px_per_m, 2)) + 8.0
 
 
 class Circle(GroundTarget):
-    """Circle of `diameter_m`."""
+    """Circle with diameter `diameter_m`."""
 
     def __init__(self, diameter_m: float) -> None:
         self.side_m = diameter_m
 
     def find(self, window: np.ndarray, point: str, px_per_m: Float[np.ndarray, "2 2"]) -> TargetPlaces:
-        """Ellipses of the right size."""
+        """Detect ellipses of the expected size."""
         should = np.linalg.svd(px_per_m, compute_uv=False) * self.side_m / 2
         if 2 * should[1] < _SMALLEST_PX:
             return _nothing()
@@ -65,7 +66,7 @@ class Circle(GroundTarget):
 
 
 class Marker(GroundTarget):
-    """Marker of one of OpenCV's dictionaries."""
+    """Marker from one of OpenCV's dictionaries."""
 
     named = True
 
@@ -73,7 +74,7 @@ class Marker(GroundTarget):
         self.dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))
 
     def find(self, window: np.ndarray, point: str, px_per_m: Float[np.ndarray, "2 2"]) -> TargetPlaces:
-        """Find the intersection of the diagonals of the marker with the number of the point."""
+        """Return the intersection of the diagonals of each marker with the number of the point."""
         digits = re.findall(r"\d+", point)
         markers = found_markers(window, self.dictionary, 1.0)
         matching = np.flatnonzero(markers.number == int(digits[-1][:9])) if digits else np.zeros(0, int)
@@ -88,18 +89,18 @@ class Marker(GroundTarget):
         return TargetPlaces(np.array(middle).reshape(-1, 2), np.array(sigma).reshape(-1, 2), np.ones(len(middle), bool))
 
     def reach_px(self, px_per_m: Float[np.ndarray, "2 2"]) -> float:
-        """Half the width for a large marker: the size is unknown."""
+        """Return half the window width for a large marker: the marker size is unknown."""
         return 2.0 * float(np.linalg.norm(px_per_m, 2)) + 20.0
 
 
 class Cross(GroundTarget):
-    """Four squares that meet, `side_m` together."""
+    """Four squares around a common corner, with total width `side_m`."""
 
     def __init__(self, side_m: float) -> None:
         self.side_m = side_m
 
     def find(self, window: np.ndarray, point: str, px_per_m: Float[np.ndarray, "2 2"]) -> TargetPlaces:
-        """Saddle points with four edges around them."""
+        """Detect saddle points of the grey values with four edges around them."""
         side = float(np.sqrt(abs(np.linalg.det(px_per_m)))) * self.side_m
         if side < _SMALLEST_PX:
             return _nothing()
@@ -124,7 +125,7 @@ class Cross(GroundTarget):
 
 
 def read_target(description: str) -> GroundTarget:
-    """Create the target of a one-line description. Raises InputError, with the syntax, for an invalid one."""
+    """Create a target from a one-line description. Raise InputError, with the syntax, for an invalid description."""
     kind, _, rest = description.partition(":")
     name, _, value = rest.partition("=")
     if kind not in SYNTAX:
@@ -142,7 +143,7 @@ def read_target(description: str) -> GroundTarget:
 
 
 def _edges(grey: np.ndarray, place: np.ndarray, radius: float) -> Float[np.ndarray, "2 2"] | None:
-    """Find the unit directions of the two edges of a crossing at a place; None if there is none."""
+    """Return the unit directions of the two edges that cross at `place`; None if there is no crossing."""
     angle = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
     around = (place + radius * np.column_stack([np.cos(angle), np.sin(angle)])).astype(np.float32)
     high, wide = grey.shape
@@ -160,7 +161,7 @@ def _edges(grey: np.ndarray, place: np.ndarray, radius: float) -> Float[np.ndarr
         return None
     part = value[change] / (value[change] - after[change])
     at = angle[change] + part * 2 * np.pi / _ANGLES
-    # Opposite changes are one edge.
+    # Average opposite sign changes: they belong to the same edge.
     middle = (at[:2] + at[2:] - np.pi) / 2
     return np.column_stack([np.cos(middle), np.sin(middle)])
 

@@ -1,17 +1,17 @@
-"""Least-squares fits of models to many small patches of a picture, side by side, and corners of squares.
+"""Least-squares fits of models to many small image patches in parallel, and corners of squares.
 
     grey(pixel) = model(parameters, pixel) + noise,   v'v -> min,   C = s0^2 (J'J)^-1,   s0^2 = v'v / (n - u)
 
-The noise is that of the residuals: a model that does not fit (halos of sharpening, compression, shadows) gives larger
-standard deviations.
+s0 is estimated from the residuals, so model errors (sharpening halos, compression, shadows) increase the standard
+deviations.
 
-Corners where four squares meet, as on a chessboard, and corners of single squares are two straight edges, blurred with
-one width s (and by the pixels), over a brightness that changes linearly, with d = pixel - corner:
+A corner where four squares meet (chessboard) and the corner of a single square are modelled as two straight edges with
+a common blur s (in addition to the pixel aperture) and a brightness that changes linearly, with d = pixel - corner:
 
     four squares   grey = m + g . d + a erf(e1 / s) erf(e2 / s)
     one square     grey = m + g . d + a (1 + erf(e1 / s)) (1 + erf(e2 / s)) / 4,    ek = d . (cos tk, sin tk)
 
-The nine unknowns (corner, t1, t2, ln s, a, m, g) are fitted to a round window.
+The nine unknowns (corner, t1, t2, ln s, a, m, g) are estimated in a circular window.
 """
 
 from collections.abc import Callable
@@ -27,42 +27,43 @@ from jaxphoto.compiling import call_compiled
 from jaxphoto.initial.rays import padded, padded_length
 from jaxphoto.least_squares import Fit, least_squares
 
-# Iterations, and the last change of the grey values over the residuals (about 1e-3 of a sigma), or in grey values.
+# Maximum number of iterations; relative tolerance of the grey values with respect to the residuals (about 1e-3 sigma);
+# absolute tolerance in grey values.
 _STEPS, _RTOL, _ATOL = 40, 1e-4, 1e-3
-# Patches are padded to a multiple of these pixels.
+# Pad patches to a multiple of this number of pixels.
 _PIXELS = 64
 
 
 class PatchFit(NamedTuple):
-    """Fitted parameters of each patch; the first two are column and row from the origin of the patch."""
+    """Fitted parameters of each patch; the first two are column and row relative to the patch origin."""
 
     parameters: Float[np.ndarray, "patches parameters"]
     covariance: Float[np.ndarray, "patches parameters parameters"]
     noise: Float[np.ndarray, "patches"]
-    """Standard deviation of a grey value, s0."""
+    """Estimated standard deviation s0 of the grey values."""
     fitted: Bool[np.ndarray, "patches"]
-    """False if the fit did not converge or the parameters are not determined."""
+    """False if the fit did not converge or parameters are undetermined."""
 
 
 class Patches(NamedTuple):
-    """Pixels of patches of a picture."""
+    """Pixels of image patches."""
 
     pixels: Float[np.ndarray, "patches pixels 2"]
-    """Column and row from the origin of the patch."""
+    """Column and row relative to the patch origin."""
     grey: Float[np.ndarray, "patches pixels"]
     used: Bool[np.ndarray, "patches pixels"]
-    """False for padding and pixels beyond the border of the picture."""
+    """False for padding and pixels outside the image."""
 
 
 def fit_patches(program: Callable, start: Float[np.ndarray, "patches parameters"], patches: Patches) -> PatchFit:
-    """Fit a model to patches from initial parameters; `program` is `eqx.filter_jit` of `fits` of that model."""
+    """Fit a model to patches from initial parameters. `program`: `eqx.filter_jit` of `fits` with this model."""
     (n, unknowns), used = start.shape, patches.used
     wide = -used.shape[1] % _PIXELS
     arrays = (np.pad(v, ((0, 0), (0, wide), *((0, 0),) * (v.ndim - 2))) for v in patches)
     fit: Fit = call_compiled(program, *(padded(v, padded_length(n)) for v in (start.astype(float), *arrays)))
     parameters, normal, cost, converged = (np.array(v)[:n] for v in fit[:4])
     noise = np.sqrt(cost / np.maximum(used.sum(axis=1) - unknowns, 1))
-    # A parameter that the picture does not determine at all, such as a blur far below a pixel, stays where it is.
+    # Fix parameters without effect on the grey values (such as a blur far below a pixel) at their current values.
     scale = np.sqrt(np.einsum("pkk->pk", normal))
     unseen = scale <= 1e-5 * scale.max(axis=1, keepdims=True)
     scale = np.where(unseen, np.inf, scale)
@@ -76,7 +77,7 @@ def fit_patches(program: Callable, start: Float[np.ndarray, "patches parameters"
 
 
 def fits(model: Callable, start, pixels, grey, used) -> Fit:
-    """Least-squares fits of `model(parameters, pixel)` to patches, side by side."""
+    """Fit `model(parameters, pixel)` to each patch by least squares (vectorised)."""
 
     def fit(start, pixels, grey, used):
         grey_of = jax.vmap(model, in_axes=(None, 0))
@@ -89,7 +90,7 @@ def fits(model: Callable, start, pixels, grey, used) -> Fit:
 def windows(
     picture: np.ndarray, centre: Float[np.ndarray, "patches 2"], radius: Float[np.ndarray, "patches"]
 ) -> Patches:
-    """Round windows about `centre`, (column, row) from the centre of the upper-left pixel."""
+    """Extract circular windows about `centre`: (column, row) relative to the centre of the upper left pixel."""
     reach = int(np.ceil(radius.max())) + 1
     along = np.arange(-reach, reach + 1)
     offset = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
@@ -102,19 +103,22 @@ def windows(
     return Patches(pixels, picture[row, column].astype(float), used)
 
 
-# Initial blur (px), and maximum distance of a corner from its initial place.
+# Initial blur (px); maximum distance (px) of a corner from its initial position.
 _BLUR, _FAR = 1.0, 2.0
-# Bounds of the radius of a window: a lens bends longer edges.
+# Maximum and minimum radius (px) of a window; lens distortion bends longer edges.
 _LARGEST_PX, _SMALLEST_PX = 7.0, 2.9
 
 
 class TargetPlaces(NamedTuple):
-    """Targets in a picture and standard deviations; the origin is the centre of the upper-left pixel (OpenCV)."""
+    """Image coordinates of targets (px) and their standard deviations.
+
+    The origin is the centre of the upper left pixel, as in OpenCV.
+    """
 
     column_row: Float[np.ndarray, "n 2"]
     sigma_px: Float[np.ndarray, "n 2"]
     found: Bool[np.ndarray, "n"]
-    """False if the picture shows no such target there."""
+    """False if the target was not found."""
 
 
 def fit_crossings(
@@ -123,8 +127,10 @@ def fit_crossings(
     edges: Float[np.ndarray, "n 2 2"],
     reach_px: Float[np.ndarray, "n"],
 ) -> TargetPlaces:
-    """Measure corners where four squares meet; `edges` are unit directions along the two edges of each, `reach_px` is
-    the distance within which the picture shows nothing else.
+    """Measure corners where four squares meet.
+
+    `edges`: unit directions along the two edges of each corner. `reach_px`: radius around each corner without other
+    edges.
     """
     return _fit(_crossings, np.multiply, picture, near, edges, reach_px)
 
@@ -135,7 +141,7 @@ def fit_square_corners(
     edges: Float[np.ndarray, "n 2 2"],
     reach_px: Float[np.ndarray, "n"],
 ) -> TargetPlaces:
-    """Measure corners of single squares; `edges` as in `fit_crossings`, along the sides of the square."""
+    """Measure corners of single squares. `edges`: unit directions along the sides; see `fit_crossings`."""
     return _fit(_square_corners, lambda one, other: (1 + one) * (1 + other) / 4, picture, near, edges, reach_px)
 
 
@@ -154,10 +160,10 @@ def _fit(program, shape, picture, near, edges, reach_px) -> TargetPlaces:
 
 
 def _start(shape, patches, edges):
-    """Return initial parameters: corner in the middle, edges as given, brightness by linear least squares."""
+    """Return initial parameters: corner at the centre, given edges, brightness by linear least squares."""
     pixels, grey, used = patches
     across = np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
-    # The normal of each edge points to the other edge: a single square is on the positive side of both.
+    # Orient the normal of each edge towards the other edge: a single square is on the positive side of both.
     side = np.sign(np.sum(across * edges[:, ::-1], axis=2))
     across = across * np.where(side == 0, 1.0, side)[:, :, None]
     angle = np.arctan2(across[..., 1], across[..., 0])
@@ -172,7 +178,7 @@ def _start(shape, patches, edges):
 
 def _edges(parameters, pixel):
     x, y = pixel[0] - parameters[0], pixel[1] - parameters[1]
-    # A pixel integrates over its square (variance 1/12), which bounds the sharpness of an edge.
+    # Pixel integration (variance 1/12 per axis) limits the sharpness of an edge.
     width = jnp.sqrt(2 / 12 + jnp.exp(2 * parameters[4]))
     first, second = (
         jax.scipy.special.erf((x * jnp.cos(t) + y * jnp.sin(t)) / width) for t in (parameters[2], parameters[3])

@@ -1,4 +1,4 @@
-"""Calibration boards: targets with known coordinates, their detection in photographs, and rendered photographs."""
+"""Calibration boards: known target coordinates, detection in photographs, and rendered photographs."""
 
 import abc
 import math
@@ -21,15 +21,15 @@ from jaxphoto.procedures.calibration import Board, Detection
 
 
 class FoundBoard(NamedTuple):
-    """Targets of a board in a picture."""
+    """Detected targets of a board in an image."""
 
     point: Int[np.ndarray, "n"]
-    """Index of the points of the board."""
+    """Indices of the board's points."""
     places: TargetPlaces
 
 
 class Pattern(abc.ABC):
-    """Kind of calibration board; `board` has the coordinates of its targets."""
+    """Kind of calibration board; `board` contains the target coordinates."""
 
     board: Board
 
@@ -39,23 +39,23 @@ class Pattern(abc.ABC):
 
     @abc.abstractmethod
     def reflectance(self, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Reflectance at places of the board (m, in the frame of `board`): 0 black, 1 white."""
+        """Return the reflectance at points of the board (m, in the frame of `board`): 0 black, 1 white."""
 
     def hint(self, pictures: Sequence[np.ndarray]) -> str | None:
-        """Describe what pictures without this board show instead, if anything."""
+        """Describe any similar board in images without this board; None if there is none."""
         return None
 
 
-# Maximum number of photographs that are searched for another board.
+# Maximum number of photographs searched for another board.
 _LOOKED_AT = 5
 
 
 class Targets(NamedTuple):
-    """Targets of a board in photographs."""
+    """Detections of a board in photographs."""
 
     detections: list[Detection]
     left_out: dict[str, str]
-    """Photographs without the board, by image name, and why."""
+    """Reason by image name of each photograph without detection."""
 
 
 def find_targets(
@@ -63,7 +63,7 @@ def find_targets(
 ) -> Targets:
     """Detect the board in all photographs; `progress` is called with each image name.
 
-    Raises InputError for a file that OpenCV cannot read, and if no photograph shows the board.
+    Raises InputError for a file that OpenCV cannot read, and if the board is not found in any photograph.
     """
     detections: list[Detection] = []
     left_out: dict[str, str] = {}
@@ -75,7 +75,7 @@ def find_targets(
             left_out[photograph.name] = "the board was not found"
             continue
         good, places = seen.places.found, seen.places
-        # OpenCV's origin is the centre of the upper-left pixel, which is (0.5, 0.5) here.
+        # OpenCV's origin is the centre of the upper left pixel, (0.5, 0.5) in our convention.
         column_row = places.column_row[good] + 0.5
         detections.append(Detection(photograph.name, seen.point[good], column_row, places.sigma_px[good]))
     if not detections:
@@ -103,11 +103,11 @@ def rendered(
     margin_m: float = 0.03,
     seed: int = 0,
 ) -> np.ndarray:
-    """Render a photograph of the board, in the plane Z = 0 of its frame: grey values (rows, columns) of 0 to 255.
+    """Render a photograph of the board in the plane Z = 0: grey values (rows, columns) of 0 to 255.
 
-    Each pixel is the mean of `rays`, traced through lens and plane; the lens blurs by a Gaussian of `blur_px`; `noise`
-    is the standard deviation of a grey value. The board ends `margin_m` beyond its outermost target, and is surrounded
-    by grey.
+    Each pixel is the mean of `rays` rays, traced through the lens to the plane. The image is blurred by a Gaussian of
+    `blur_px`; `noise` is the standard deviation of the grey values. The board extends `margin_m` beyond its outermost
+    targets on a grey background.
     """
     column, row = np.meshgrid(np.arange(sensor.width_px), np.arange(sensor.height_px))
     corner = np.stack([column.ravel(), row.ravel()], axis=1)
@@ -117,7 +117,7 @@ def rendered(
     total = np.zeros(len(corner))
     step = next(n for n in range(round(_GOLDEN * rays), 2 * rays) if math.gcd(n, rays) == 1)
     for k in range(rays):
-        # A lattice in which no two rays of a pixel share a column or a row: edges along them are as fine as others.
+        # Lattice in which no two rays of a pixel have the same column or row, to sample edges along them finely.
         inside = (np.array([k, k * step % rays]) + 0.5) / rays
         ray = camera_rays(interior, sensor.mm_from_px(corner + inside)) @ turn
         along = -position[2] / np.where(ray[:, 2] == 0, 1e-300, ray[:, 2])
@@ -125,7 +125,7 @@ def rendered(
         on = (along > 0) & np.all((place > low - margin_m) & (place < high + margin_m), axis=1)
         total += _BACKGROUND * ~on
         total[on] += pattern.reflectance(place[on])
-    # Grey values from 30 to 225: noise is not clipped.
+    # Use grey values from 30 to 225 to avoid clipping of noise.
     grey = 30 + 195 * total.reshape(sensor.height_px, sensor.width_px) / rays
     grey = cv2.GaussianBlur(grey, (0, 0), blur_px) + noise * np.random.default_rng(seed).standard_normal(grey.shape)
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
