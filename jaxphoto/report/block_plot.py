@@ -234,7 +234,7 @@ def _images(source: Block | Adjustment, places: BlockPlaces) -> list[dict[str, A
 
 
 def _position_residuals(adjusted: Adjustment, places: BlockPlaces) -> list[dict[str, Any]]:
-    """Draw enlarged lines from stations to their observed positions; the residual of an unobserved coordinate is zero."""
+    """Draw enlarged lines from stations to observed positions; residuals of unobserved coordinates are zero."""
     rows, residuals = adjusted.block.stations, physical_residuals(adjusted)
     if rows.group not in residuals or not len(rows.who):
         return []

@@ -60,7 +60,7 @@ def steps_table(steps: Sequence[Step]) -> pd.DataFrame:
 
 
 def boresight_figure(steps: Sequence[Step]) -> Figure | None:
-    """Draw misalignments of steps 3 and 4 and strip shifts of step 2 with error bars; None if there are no estimates."""
+    """Draw misalignments of steps 3 and 4 and strip shifts of step 2 with error bars; None without estimates."""
     sets = [shifts for shifts in (False, True) if len(_rows(steps, shifts))]
     if not sets:
         return None
