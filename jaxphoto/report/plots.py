@@ -195,8 +195,9 @@ def plot_density(tables: Tables, camera: str | None = None, ax: Axes | None = No
 
 
 def _cells(sensor: Sensor, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cell index of image points (2 x n, mm), and the centres of all cells (2 x cells, mm), bottom row
-    first.
+    """Return the cell index of image points (2 x n, mm), and the centres of all cells (2 x cells, mm).
+
+    Cells are in rows, bottom row first.
     """
     size = np.array([sensor.width_mm, sensor.height_mm])[:, None]
     across, down = np.maximum(1, np.round(_CELLS * size[:, 0] / size.max())).astype(int)

@@ -34,8 +34,9 @@ class _Column(NamedTuple):
 
 
 def sweep_table(sweep: Sweep) -> pd.DataFrame:
-    """Tabulate the sweep, one row per value: design parameters, design, converged, determined, quantity, of, value,
-    unit.
+    """Tabulate the sweep, one row per value.
+
+    Columns: design parameters, design, converged, determined, quantity, of, value, unit.
 
     | quantity | of |
     | --- | --- |

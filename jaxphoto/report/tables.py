@@ -228,9 +228,7 @@ class Tables:
 
     @cached_property
     def exterior_map(self) -> pd.DataFrame:
-        """Exterior orientation in the system of the block's files; omega, phi, kappa relative to grid east, north and
-        up.
-        """
+        """Exterior orientation in the system of the block's files; angles relative to grid east, north and up."""
         exterior, system = self.adjusted.unknowns.exterior, self.adjusted.block.frame.map
         position = np.asarray(exterior.position)
         table = self._in_map(position)
@@ -352,15 +350,15 @@ class Tables:
 
     @cached_property
     def positional_accuracy(self) -> pd.DataFrame:
-        """Positional accuracy (ASPRS Edition 2): component, check_points, fit_m, survey_m, rmse_m, class_cm, claimed."""
+        """Accuracy (ASPRS Edition 2): component, check_points, fit_m, survey_m, rmse_m, class_cm, claimed."""
         return accuracy_table(self.tested_accuracy)
 
     @cached_property
     def correlation(self) -> pd.DataFrame:
-        """Correlations (parameter_a, parameter_b, rho) of interior parameters, and of each image's exterior
-        orientation.
+        """Correlations of interior parameters and exterior orientations: parameter_a, parameter_b, rho.
 
-        Exterior elements are correlated with each other and with the interior parameters.
+        Pairs are all interior parameters of a camera, and the exterior elements of each image with each other and with
+        these.
         """
         rows = []
         for camera, c in self.correlations.items():

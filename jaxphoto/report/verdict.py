@@ -131,7 +131,7 @@ def behind_findings(adjusted: Adjustment) -> Iterator[Finding]:
 
 
 def duplicate_images(block: Block) -> list[tuple[str, str, int]]:
-    """Return pairs of images with mostly equal image points (within a tenth of their sigma), and the number of these."""
+    """Return pairs of images with mostly equal image points (to a tenth of sigma), and the number of equal points."""
     least_count, least_fraction, tolerance = 4, 0.5, 0.1
     rows = block.image_points
     x, y = np.asarray(rows.xy).T
