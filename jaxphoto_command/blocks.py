@@ -21,7 +21,7 @@ _BIASES = Literal[
     "station", "attitude", "trajectory", "trajectory-attitude", "control", "image-points", "lever-arm", "boresight",
     "interior", "noise"
 ]  # fmt: skip
-# Unit and option of the standard deviation of each bias; metres otherwise.
+# Biases whose standard deviation is in degrees; option of the standard deviation by unit.
 _DEGREES = ("attitude", "trajectory-attitude", "boresight")
 _SIGMA_OPTIONS = {"m": "--sigma-m", "deg": "--sigma-deg", "mm": "--sigma-mm", "own": "--sigma"}
 _SHOWN = 12
@@ -56,7 +56,7 @@ def adjust(
 ) -> None:
     """Adjust a block and write tables, statistics and a report.
 
-    Exit code 1: written, but the verdict is red.
+    Exit code 1: results written, but the verdict is red.
     """
     import jaxphoto
     from jaxphoto import report
@@ -132,7 +132,7 @@ def boresight(
 ) -> None:
     """Estimate the boresight misalignment in four steps.
 
-    Exit code 1: written, but a step failed.
+    Exit code 1: results written, but a step failed.
     """
     from jaxphoto.io import read_block
     from jaxphoto.procedures import boresight as estimate
@@ -165,7 +165,7 @@ def certificate(
     ] = None,
     camera: opt.Camera = None,
 ) -> None:
-    """Write the certificate of a calibration: parameters, precision, stability, inputs."""
+    """Write a calibration certificate: parameters, precision, stability, inputs."""
     from jaxphoto.io.result_tables import read_summary, reservation
     from jaxphoto.writing import check_room
     from jaxphoto_command.certificate import certificate_document, write_certificate
@@ -188,7 +188,7 @@ def tables(
     out: Annotated[Path, Option(help="Output folder; earlier tables in it are replaced.")],
     only: Annotated[str, Option(help="Tables, comma-separated, like interior,exterior (default: all).")] = "",
 ) -> None:
-    """Write tables of results as CSV, Parquet, Markdown or LaTeX, rounded to their standard deviations."""
+    """Write result tables as CSV, Parquet, Markdown or LaTeX, rounded to their standard deviations."""
     from jaxphoto.io import read_result_tables
     from jaxphoto.io.result_tables import read_summary, reservation
     from jaxphoto.report import write_table
@@ -231,7 +231,7 @@ def monte_carlo(
         list[str] | None, Option("--with", help="Also keep exterior, or points with check points (repeatable).")
     ] = None,
 ) -> None:
-    """Re-adjust a block with drawn errors; write draws, their statistics and a report."""
+    """Re-adjust a block with random errors; write draws, their statistics and a report."""
     import numpy as np
 
     from jaxphoto.experiment import MonteCarlo
@@ -305,7 +305,7 @@ def sensitivity(
     delta0: Annotated[float, Option(help="Non-centrality parameter of the test of normalised residuals.")] = 4.13,
     max_steps: opt.MaxSteps = 100,
 ) -> None:
-    """Compute the exact sensitivity of interior orientation and check points to stations, and external reliability."""
+    """Compute exact effects of station errors on interior orientation and check points, and external reliability."""
     from jaxphoto.io import read_block
     from jaxphoto.procedures import adjust_for_tables
     from jaxphoto.report.formatting import in_figures
@@ -392,7 +392,7 @@ def halves(
 
 
 def warn_of_contradictions(adjusted: Any, output: Output) -> None:
-    """Warn of the worst contradiction among the observations of a block that is the input of a further computation."""
+    """Warn of the worst contradiction among the observations of an input block."""
     from jaxphoto.report import Tables, Verdict
     from jaxphoto.report.residual_findings import contradictions
 

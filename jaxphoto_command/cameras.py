@@ -33,7 +33,7 @@ def stability(
     block: opt.ResultBlock = None,
     out: OptionalOut = None,
 ) -> None:
-    """Compare the bundles of rays of two interior orientations (Habib et al. 2006), with uncertainty."""
+    """Compare the ray bundles of two interior orientations (Habib et al. 2006), with uncertainty."""
     from jaxphoto.report.stability import print_stability, stability_summary, write_stability
     from jaxphoto.stability import analyse
     from jaxphoto.writing import check_folder
@@ -70,7 +70,7 @@ def compare(
     block: opt.ResultBlock = None,
     out: OptionalOut = None,
 ) -> None:
-    """Test whether a camera has changed between two calibrations, by its parameters and by its bundle of rays."""
+    """Test whether a camera has changed between two calibrations: parameters and ray bundle."""
     from jaxphoto.report.stability import change_summary, print_change, write_change
     from jaxphoto.stability import change
     from jaxphoto.writing import check_folder
@@ -102,7 +102,7 @@ def combine(
 ) -> None:
     """Combine calibrations of one camera by their full covariances.
 
-    Exit code 1: written, but they disagree.
+    Exit code 1: result written, but the calibrations disagree.
     """
     import numpy as np
 
@@ -196,7 +196,7 @@ def models(
 
 
 def _compared(output: Output, paths: tuple[Path, Path], files: tuple[Any, Any]) -> tuple[Any, Any]:
-    """Return both calibrations for a comparison, A and B, and print the notes of their files."""
+    """Return calibrations A and B for a comparison, and print the notes of their files."""
     from jaxphoto_command.certificate import compared
 
     for letter, file in zip("AB", files, strict=True):

@@ -1,4 +1,4 @@
-"""Options that several commands share, and checks of option values."""
+"""Options shared by several commands, and checks of option values."""
 
 import math
 from pathlib import Path
@@ -9,26 +9,26 @@ from typer import Argument, Option
 
 
 def positive(context: typer.Context, value: float | None) -> float | None:
-    """Check a positive, finite number."""
+    """Raise BadParameter unless a value is positive and finite."""
     if value is not None and not 0 < value < math.inf:
         raise typer.BadParameter(f"{value:g} is not a positive number.")
     return value
 
 
 def finite(context: typer.Context, value: float) -> float:
-    """Check a finite number."""
+    """Raise BadParameter unless a value is finite."""
     if not math.isfinite(value):
         raise typer.BadParameter(f"{value:g} is not a finite number.")
     return value
 
 
 def names(text: str | None) -> list[str]:
-    """Return comma-separated names."""
+    """Split comma-separated names."""
     return [name.strip() for name in (text or "").split(",") if name.strip()]
 
 
 def pair(option: str, text: str, example: str) -> tuple[float, float]:
-    """Return the two positive numbers of `15x11`."""
+    """Parse two positive numbers such as `15x11`."""
     try:
         first, second = (float(part) for part in text.lower().split("x"))
     except ValueError:
@@ -106,7 +106,7 @@ CloudUnit = Annotated[
 
 
 def class_numbers(text: str | None) -> list[int] | None:
-    """Return the classes of --class; None for all."""
+    """Parse the classes of --class; None for all."""
     if text is None:
         return None
     if not all(part.isdigit() for part in names(text)):

@@ -54,7 +54,7 @@ def fly(
 ) -> None:
     """Calibrate the camera of a flight from its photographs and their positions: orient, georeference, adjust, assess.
 
-    Unusable photographs are skipped and named. Exit code 1: written, but the verdict is red.
+    Unusable photographs are skipped and listed. Exit code 1: results written, but the verdict is red.
     """
     import datetime
 
@@ -215,8 +215,8 @@ def control(
 ) -> None:
     """Adjust an oriented block with surveyed points and their image measurements.
 
-    A block without a datum is transformed to the control. Contradicting observations are rejected and named. Exit code
-    1: written, but the verdict is red.
+    A block without a datum is transformed to the control. Contradictory observations are rejected and listed. Exit code
+    1: results written, but the verdict is red.
     """
     from jaxphoto.extras.formats import read_control
     from jaxphoto.extras.photos.control_targets import make_target_search
@@ -309,7 +309,7 @@ def calibrate(
 ) -> None:
     """Calibrate a camera with photographs of a board.
 
-    Exit code 1: written, but not converged.
+    Exit code 1: results written, but not converged.
     """
     from jaxphoto.extras.photos.features import read_grey
     from jaxphoto.extras.photos.targets import find_targets, read_board
@@ -355,7 +355,7 @@ def calibrate(
             detections=targets.detections,
             start=camera.origin,
             record=output.command_record(*images),
-            # An assumed pixel size is the unit of every length in the report.
+            # With an assumed pixel size, all lengths in the report are in units of this size: add a note.
             notes=() if pixel_mm is not None else (camera.origin,),
         )
     output.say(camera.origin)
@@ -381,8 +381,8 @@ def orient(
 ) -> None:
     """Orient photographs by their features, as initial values for `jaxphoto adjust`.
 
-    For a block folder, determine the approximate orientation that its images.csv lacks. Exit code 1: written, but not
-    converged.
+    For a block folder, determine the approximate orientation missing in its images.csv. Exit code 1: results written,
+    but not converged.
     """
     from jaxphoto.camera import InteriorOrientation
     from jaxphoto.extras.photos.features import LONGEST_PX
@@ -444,7 +444,7 @@ def orient(
             title=f"{len(read)} photographs",
             report=progress.update,
         )
-        # Photographs without matches are not oriented for the reason that matching states.
+        # Report the reason of the matching for photographs without matches.
         reasons = {name: matched.left_out.get(name, text) for name, text in result.report.unoriented.items()}
         result = result._replace(report=result.report._replace(unoriented=reasons))
         progress.update(f"writing {out}")
@@ -493,7 +493,7 @@ def undistort(
 ) -> None:
     """Resample photographs to a camera without distortion.
 
-    Exit code 1: written, but some were skipped.
+    Exit code 1: results written, but some photographs were skipped.
     """
     from jaxphoto.io.camera_files import read_camera_file
     from jaxphoto.io.photographs import skipped_messages, skipped_subfolders, valid_photographs
@@ -519,7 +519,7 @@ def undistort(
 
 
 def map_codes(text: str | None) -> tuple[int | None, int | None]:
-    """Return the EPSG codes of a map system and of its heights, of `25832+7837`."""
+    """Parse the EPSG codes of a map system and of its heights, such as `25832+7837`."""
     from jaxphoto.georeferencing.map_frame import check_heights, map_system
 
     if text is None:
@@ -538,7 +538,7 @@ def map_codes(text: str | None) -> tuple[int | None, int | None]:
 
 
 def height_reference(text: str | None) -> Any:
-    """Return the reference of heights, or the EPSG code of their system."""
+    """Return the height reference, or the EPSG code of the height system."""
     from jaxphoto.georeferencing.gps import Heights
 
     if text is None or (text in get_args(Heights) and text != "unknown"):
@@ -550,7 +550,7 @@ def height_reference(text: str | None) -> Any:
 
 
 def _lever_arm(text: str | None) -> tuple[float, float, float] | None:
-    """Return metres to the right, forward and up."""
+    """Parse a lever arm: metres to the right, forward and up."""
     if text is None:
         return None
     try:
