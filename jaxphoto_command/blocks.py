@@ -31,7 +31,7 @@ _SHOWN = 12
     "adjust",
     PANEL,
     f"{_EXAMPLE}jaxphoto adjust cross_block --out results",
-    "Earlier calibrations that block.toml names may be OpenCV's and ROS' YAML, COLMAP's cameras.txt, Agisoft's XML, "
+    "Earlier calibrations in block.toml may be OpenCV's and ROS' YAML, COLMAP's cameras.txt, Agisoft's XML, "
     "mrcal's .cameramodel, Kalibr's camera chain, a SMAC report, interior.csv and block.toml.",
 )
 def adjust(
@@ -127,7 +127,7 @@ def boresight(
     output: Output,
     block: opt.Block,
     out: opt.Out,
-    go_on: Annotated[bool, Option("--go-on", help="Continue after a step that fails its test.")] = False,
+    go_on: Annotated[bool, Option("--go-on", help="Continue after a step fails its test.")] = False,
     max_steps: opt.MaxSteps = 100,
 ) -> None:
     """Estimate the boresight misalignment in four steps.
@@ -156,12 +156,12 @@ def boresight(
 @command("certificate", PANEL, f"{_ADJUSTED}jaxphoto certificate results --out camera.pdf")
 def certificate(
     output: Output,
-    results: Annotated[Path, Argument(help="Results of adjust or fly.")],
+    results: Annotated[Path, Argument(help="Result folder of adjust or fly.")],
     out: Annotated[Path, Option(help="Certificate to write (.html or .pdf).")],
-    last: Annotated[Path | None, Option(help="Last calibration (results or camera file), to compare.")] = None,
-    halves: Annotated[Path | None, Option(help="Results of jaxphoto halves on the block.")] = None,
+    last: Annotated[Path | None, Option(help="Previous calibration to compare (results or camera file).")] = None,
+    halves: Annotated[Path | None, Option(help="Result folder of jaxphoto halves for this block.")] = None,
     photographs: Annotated[
-        list[Path] | None, Option(help="Photographs or folders of them, if the results name none.")
+        list[Path] | None, Option(help="Photographs or their folders, if not in the results.")
     ] = None,
     camera: opt.Camera = None,
 ) -> None:
@@ -183,7 +183,7 @@ def certificate(
 @command("tables", PANEL, f"{_ADJUSTED}jaxphoto tables results --to latex --only interior --out tables")
 def tables(
     output: Output,
-    results: Annotated[Path, Argument(help="Folder of results, as of adjust.")],
+    results: Annotated[Path, Argument(help="Result folder, for example of adjust.")],
     to: Annotated[Literal["csv", "parquet", "markdown", "latex"], Option(help="Format.")],
     out: Annotated[Path, Option(help="Output folder; earlier tables in it are replaced.")],
     only: Annotated[str, Option(help="Tables, comma-separated, like interior,exterior (default: all).")] = "",
@@ -215,7 +215,7 @@ def monte_carlo(
     output: Output,
     block: opt.Block,
     out: Annotated[Path, Option(help="Output folder; an interrupted run in it is resumed.")],
-    kind: Annotated[_BIASES, Option("--bias", help="Observations or parameters in error.")],
+    kind: Annotated[_BIASES, Option("--bias", help="Observations or parameters with errors.")],
     per: Annotated[str | None, Option(help="Draw one error per block, strip, image, point ...")] = None,
     sigma_m: Annotated[
         str | None, Option(help="Standard deviation (m): one number, or three, comma-separated.")
@@ -228,7 +228,7 @@ def monte_carlo(
     draws: Annotated[int, Option(help="Number of draws.")] = 1000,
     seed: opt.Seed = 0,
     keep: Annotated[
-        list[str] | None, Option("--with", help="Also keep exterior, or points with check points (repeatable).")
+        list[str] | None, Option("--with", help="Also store exterior, or points with check points (repeatable).")
     ] = None,
 ) -> None:
     """Re-adjust a block with random errors; write draws, their statistics and a report."""
@@ -300,8 +300,8 @@ def sensitivity(
     output: Output,
     block: opt.Block,
     out: opt.Out,
-    per: Annotated[Literal["block", "strip", "image"], Option(help="Bias the stations of each.")] = "strip",
-    bias_m: Annotated[float, Option(help="Station bias.")] = 0.10,
+    per: Annotated[Literal["block", "strip", "image"], Option(help="Unit with a common station bias.")] = "strip",
+    bias_m: Annotated[float, Option(help="Size of the station bias.")] = 0.10,
     delta0: Annotated[float, Option(help="Non-centrality parameter of the test of normalised residuals.")] = 4.13,
     max_steps: opt.MaxSteps = 100,
 ) -> None:

@@ -25,8 +25,8 @@ def stability(
     method: opt.Alignment = "rot",
     grid: opt.Grid = "15x11",
     extent: opt.Extent = None,
-    noise_px: Annotated[float, Option(callback=opt.positive, help="Noise of image coordinates.")] = 1.0,
-    relief: Annotated[float, Option(help="Relief of the object points of spr, as a fraction of distance.")] = 0.0,
+    noise_px: Annotated[float, Option(callback=opt.positive, help="Standard deviation of image coordinates.")] = 1.0,
+    relief: Annotated[float, Option(help="Relief of the object points for spr, as a fraction of distance.")] = 0.0,
     camera: opt.Camera = None,
     camera_b: opt.CameraB = None,
     pixel_mm: opt.PixelSize = None,
@@ -97,7 +97,7 @@ def compare(
 def combine(
     output: Output,
     calibrations: Annotated[list[Path], Argument(help="Results or camera files with a covariance.")],
-    out: Annotated[Path, Option(help="Camera file (.toml) to write, prior information for blocks.")],
+    out: Annotated[Path, Option(help="Camera file (.toml) to write; it can be a prior of blocks.")],
     camera: opt.Camera = None,
 ) -> None:
     """Combine calibrations of one camera by their full covariances.
@@ -124,7 +124,9 @@ def combine(
     for name, file in files.items():
         check_one_sensor(first, file, calibrations[0], Path(name))
         if file.covariance is None:
-            raise InputError(f"{name} has no covariance; give results of jaxphoto adjust, or a camera file of them")
+            raise InputError(
+                f"{name} has no covariance; give a result folder of jaxphoto adjust, or a camera file written from one"
+            )
         covariances.append(file.covariance)
         if file.note:
             output.warn(f"{name}: {file.note}")
@@ -169,7 +171,7 @@ def models(
     block: opt.Block,
     out: opt.Out,
     models: Annotated[
-        str, Option(help="Comma-separated: brown (usual parameters), brown:all, brown:none, brown:k1+k2, smac.")
+        str, Option(help="Models, comma-separated: brown (usual parameters), brown:all, brown:none, brown:k1+k2, smac.")
     ] = "brown:none,brown:k1,brown:k1+k2,brown:k1+k2+k3,brown,brown:all",
     folds: Annotated[int, Option(min=0, help="Folds of the cross-validation; 0 for none.")] = 5,
     seed: opt.Seed = 0,

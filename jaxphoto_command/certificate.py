@@ -50,7 +50,7 @@ def certificate_document(
     """
     folder = results_in(folder)
     if not (folder / "interior.csv").is_file():
-        raise InputError(f"{folder} holds no interior.csv: name a folder that jaxphoto adjust or fly wrote")
+        raise InputError(f"{folder}: interior.csv not found; give a result folder of jaxphoto adjust or fly")
     file = read_camera_file(folder, camera=camera)
     conditions: list[Conditions] = []
     inputs: list[InputFile] = []
@@ -141,9 +141,9 @@ def check_one_sensor(a: CameraFile, b: CameraFile, first: Path, second: Path) ->
         )
     if not math.isclose(one.pixel_mm, other.pixel_mm, rel_tol=1e-6):
         raise InputError(
-            f"the pixel of {first} is {one.pixel_mm:g} mm, that of {second} {other.pixel_mm:g} mm. If one of them was "
-            "assumed, give the true one by --pixel-mm. Results that state the assumed one must be written in pixels "
-            "first: jaxphoto camera RESULTS --out pixels.yml"
+            f"pixel sizes differ: {first} {one.pixel_mm:g} mm, {second} {other.pixel_mm:g} mm; if one is assumed, give "
+            "the true size with --pixel-mm (convert its results to pixels first: jaxphoto camera RESULTS --out "
+            "pixels.yml)"
         )
 
 

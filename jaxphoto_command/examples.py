@@ -103,7 +103,9 @@ def experiment(
     name: Annotated[str, Argument(help="Folder of the experiment, like 000, or all.")],
     out: Annotated[Path, Option(help="Output folder; an earlier run in it is replaced.")] = Path("results"),
     experiments: Annotated[Path, Option(help="Folder of the experiments.")] = Path("experiments"),
-    layouts: Annotated[int | None, Option(min=1, help="Simulated layouts (default: of the experiment).")] = None,
+    layouts: Annotated[
+        int | None, Option(min=1, help="Number of simulated layouts (default: as in the experiment).")
+    ] = None,
 ) -> None:
     """Run experiments; write tables.csv and report.html with the published values."""
     from jaxphoto.experiment import compare, find_experiments, load_experiment, run_experiment, write_runs

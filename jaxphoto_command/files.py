@@ -56,8 +56,8 @@ def convert(
     to: Annotated[
         str, Option(metavar="FORMAT", callback=_one_of("EXPORTS"), help="Format of --out (docs/formats.md).")
     ] = "block",
-    block: Annotated[Path | None, Option(help="Block of the results in SOURCE, if it was moved.")] = None,
-    part: Annotated[int, Option(min=1, help="Part of a flight; the largest is 1.")] = 1,
+    block: Annotated[Path | None, Option(help="Block folder of the results in SOURCE, if moved.")] = None,
+    part: Annotated[int, Option(min=1, help="Number of the part of a flight; 1 is the largest.")] = 1,
     photographs: Annotated[list[Path] | None, Option(help="Folder of the photographs, for their file names.")] = None,
     adjust: Annotated[bool, Option("--adjust", help="Adjust the block in SOURCE first.")] = False,
 ) -> None:
@@ -157,8 +157,8 @@ def camera(
     pixel_mm: opt.PixelSize = None,
     width_px: Annotated[int | None, Option(min=1, help="Image width, if SOURCE lacks it.")] = None,
     height_px: Annotated[int | None, Option(min=1, help="Image height, if SOURCE lacks it.")] = None,
-    block: Annotated[Path | None, Option(help="Block of the results in SOURCE.")] = None,
-    distortion: Annotated[str | None, Option(help="Distortion model of a .toml (default: of SOURCE).")] = None,
+    block: Annotated[Path | None, Option(help="Block folder of the results in SOURCE.")] = None,
+    distortion: Annotated[str | None, Option(help="Distortion model of a .toml file (default: as in SOURCE).")] = None,
     model: Annotated[
         str | None, Option(help="Largest model of the format to use, like OPENCV (default: as required).")
     ] = None,

@@ -18,8 +18,8 @@ SCANNER = ("boresight", "lever-arm", "range-offset", "range-scale", "angle-scale
 """Scanner parameters that may be estimated."""
 
 SigmaZ = Annotated[float, Option(callback=opt.positive, help="Standard deviation of a laser point in Z.")]
-SigmaXY = Annotated[float, Option(help="Standard deviation of a laser point in each of X, Y.")]
-Systematic = Annotated[float, Option(help="Standard deviation of a common error of all heights.")]
+SigmaXY = Annotated[float, Option(help="Standard deviation of a laser point in X and in Y.")]
+Systematic = Annotated[float, Option(help="Standard deviation of an error common to all heights.")]
 MaxRounds = Annotated[int, Option(min=1, help="Maximum number of outer iterations (surface lookup, adjustment).")]
 Trajectory = Annotated[
     Path | None, Option(help="Trajectory of the scanner (docs/georeferencing.md), on the clock of the cloud.")
@@ -28,7 +28,7 @@ TrajectoryShift = Annotated[float, Option(callback=opt.finite, help="Trajectory 
 ExposureShift = Annotated[float, Option(callback=opt.finite, help="Point cloud time minus time_s of images.csv.")]
 Control = Annotated[Path | None, Option(help="Surveyed points on smooth surfaces (docs/control.md).")]
 Breaklines = Annotated[
-    str | None, Option(help="Tie points on breaklines, comma-separated, * as wildcard (default: those of block.toml).")
+    str | None, Option(help="Tie points on breaklines, comma-separated, * as wildcard (default: from block.toml).")
 ]
 Pattern = Annotated[
     Literal["line", "circle", "oscillating", "rotating", "risley", "nutating"] | None,
@@ -49,7 +49,7 @@ def lidar_control(
     cloud: opt.Cloud,
     out: opt.BlockOut,
     method: Annotated[
-        Literal["plane", "local", "tin", "idw", "image"], Option(help="Height from laser points.")
+        Literal["plane", "local", "tin", "idw", "image"], Option(help="Interpolation of heights between laser points.")
     ] = "plane",
     sigma_z_m: SigmaZ = 0.15,
     sigma_xy_m: SigmaXY = 0.5,
@@ -159,7 +159,7 @@ def simultaneous(
     max_rounds: MaxRounds = 20,
     adjust: Annotated[
         str | None,
-        Option(help="Estimate of the whole system, comma-separated: scanner,trajectory,camera (docs/boresight.md)."),
+        Option(help="Parts of the system to estimate, comma-separated: scanner,trajectory,camera (docs/boresight.md)."),
     ] = None,
     exposure_shift_s: ExposureShift = 0.0,
     control: Control = None,
@@ -290,15 +290,17 @@ def strips(
     ] = 100.0,
     sigma_position_m: Annotated[
         float | None,
-        Option(callback=opt.positive, help="Standard deviation of positions (default: of the trajectory, or 0.08)."),
+        Option(callback=opt.positive, help="Standard deviation of positions (default: from the trajectory, or 0.08)."),
     ] = None,
     sigma_attitude_deg: Annotated[
         float | None,
-        Option(callback=opt.positive, help="Standard deviation of roll, pitch (default: of the trajectory, or 0.005)."),
+        Option(
+            callback=opt.positive, help="Standard deviation of roll, pitch (default: from the trajectory, or 0.005)."
+        ),
     ] = None,
     sigma_heading_deg: Annotated[
         float | None,
-        Option(callback=opt.positive, help="Standard deviation of heading (default: of the trajectory, or 0.01)."),
+        Option(callback=opt.positive, help="Standard deviation of heading (default: from the trajectory, or 0.01)."),
     ] = None,
     sigma_exposure_m: Annotated[
         float, Option(callback=opt.positive, help="Additional standard deviation of exposure positions.")
@@ -367,8 +369,10 @@ def dsm(
     cell_m: Annotated[float, Option(callback=opt.positive, help="Cell size.")] = 1.0,
     classes: opt.Classes = None,
     returns: opt.Returns = "all",
-    statistic: Annotated[Literal["highest", "mean", "lowest"], Option(help="Height of a cell.")] = "highest",
-    fill_m: Annotated[float, Option(min=0.0, help="Fill gaps within this distance of heights.")] = 0.0,
+    statistic: Annotated[
+        Literal["highest", "mean", "lowest"], Option(help="Statistic of the heights in a cell.")
+    ] = "highest",
+    fill_m: Annotated[float, Option(min=0.0, help="Fill gaps up to this distance from a height.")] = 0.0,
     cloud_epsg: opt.CloudEpsg = None,
     cloud_unit: opt.CloudUnit = None,
     shading: Annotated[Path | None, Option("--hillshade", help="PNG of the shaded surface to write.")] = None,

@@ -32,17 +32,15 @@ def fly(
     pixel_mm: opt.PixelSize = None,
     model: opt.Distortion = "brown",
     no_lens_prior: Annotated[
-        bool, Option("--no-lens-prior", help="Omit the prior information of such lenses (docs/target_calibration.md).")
+        bool, Option("--no-lens-prior", help="Ignore prior information on the lens type (docs/target_calibration.md).")
     ] = False,
     rolling_shutter: Annotated[
-        bool, Option("--rolling-shutter", help="Estimate the readout time of the rows from positions and times.")
+        bool, Option("--rolling-shutter", help="Estimate the rolling-shutter readout from positions and times.")
     ] = False,
     exposures: Annotated[
         list[Path] | None, Option(help="Exposure files outside the folders: .MRK, .pos, SBET, a table.")
     ] = None,
-    lever_arm: Annotated[
-        str | None, Option(help="From camera to antenna in m: right,forward,up of the aircraft.")
-    ] = None,
+    lever_arm: Annotated[str | None, Option(help="Lever arm from camera to antenna (m): right,forward,up.")] = None,
     heights: Annotated[
         str | None,
         Option(help="Height reference, if not in the files: ellipsoid, geoid, take-off, or EPSG code (EGM96: 5773)."),
@@ -209,7 +207,7 @@ def control(
     control_epsg: opt.ControlSystem = None,
     targets: opt.Targets = None,
     photographs: Annotated[
-        list[Path] | None, Option(help="Folder of the photographs of the block, to find targets.")
+        list[Path] | None, Option(help="Folder of the block's photographs, to find targets.")
     ] = None,
     epsg: opt.MapSystem = None,
 ) -> None:
@@ -293,8 +291,8 @@ def control(
 )
 def calibrate(
     output: Output,
-    images: Annotated[list[Path], Argument(help="Photographs of the board by one camera at one focus.")],
-    board: Annotated[str, Option(help="Board, as below.")],
+    images: Annotated[list[Path], Argument(help="Photographs of the board, taken by one camera at constant focus.")],
+    board: Annotated[str, Option(help="Board; see the formats below.")],
     out: opt.Out,
     model: opt.Distortion = "smac",
     r0_mm: opt.R0 = None,
@@ -488,7 +486,7 @@ def undistort(
     out: Annotated[Path, Option(help="Output folder for the photographs and their camera.toml.")],
     which: opt.Camera = None,
     keep: Annotated[
-        Literal["crop", "all"], Option(help="crop: no black borders; all: the whole image with black borders.")
+        Literal["crop", "all"], Option(help="crop: without black borders; all: whole image with black borders.")
     ] = "crop",
 ) -> None:
     """Resample photographs to a camera without distortion.

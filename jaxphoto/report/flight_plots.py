@@ -188,7 +188,7 @@ def plot_time_line(
     line = time_line(report, taken)
     shown = quantities_in_time(report, line)
     if what not in shown:
-        raise InputError(f"of this part no {what!r} are known by time; there are {', '.join(shown)}")
+        raise InputError(f"this part has no quantity {what!r}; use one of {', '.join(shown)}")
     ax, (name, values) = axes_or_new(ax), shown[what]
     for k in np.flatnonzero(line.gap):
         ax.axvspan(line.since[k], line.since[k + 1], color="0.9", lw=0)

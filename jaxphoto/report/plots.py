@@ -552,7 +552,7 @@ def plot_link_strength(tables: Tables, ax: Axes | None = None) -> Axes:
 def plot_convergence(tables: Tables, ax: Axes | None = None, *, steps: bool = False) -> Axes:
     """Draw sigma naught by iteration, or with `steps` the step lengths in sigmas. Raises InputError if unknown."""
     if tables.adjusted.history is None:
-        raise InputError("of this adjustment no iteration is known: adjust the block to draw its convergence")
+        raise InputError("this adjustment has no iteration history; adjust the block to draw its convergence")
     ax, table = axes_or_new(ax), tables.convergence
     ax.locator_params(axis="x", integer=True)
     if steps:
