@@ -74,7 +74,7 @@ def main() -> None:
     try:
         app(prog_name="jaxphoto")
     except (KeyboardInterrupt, SystemExit) as stop:
-        # typer exits with 130 after an interruption.
+        # Treat exit code 130 as an interruption: typer exits with it.
         if isinstance(stop, SystemExit) and stop.code != 130:
             raise
         typer.echo("jaxphoto: interrupted", err=True)
@@ -99,7 +99,7 @@ def message(error: Exception) -> str | None:
         return str(MissingExtra(module)) if module in EXTRAS else None
     if isinstance(error, OSError):
         return f"{error.filename or 'a file'}: {error.strerror or error}. Name a path that can be read and written."
-    # XLA has a single class for all its errors.
+    # Match the text of the error: XLA has a single class for all its errors.
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
         return "not enough memory. Close other programs, or reduce the input (a part of the block, fewer points)."
     return None

@@ -93,7 +93,7 @@ def _last_calibration(current: CameraFile, folder: Path, last: Path) -> LastCali
     try:
         file = read_camera_file(last, camera=current.name)
     except InputError:
-        # The only camera of the previous calibration may have a different name.
+        # Read the only camera: its name in the previous calibration may be different.
         file = read_camera_file(last)
     check_one_sensor(current, file, folder, last)
     inside = results_in(last)

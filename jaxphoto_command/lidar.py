@@ -521,7 +521,7 @@ def _block_and_cloud(block: Path, cloud: Path, selection: dict[str, Any], progre
     progress.update("reading the cloud")
     xy = np.asarray(approximate(read).points)[:, :2]
     low, high = xy.min(axis=0), xy.max(axis=0)
-    # Approximate points may be wrong by 100 m plus a tenth of the block.
+    # Allow for errors of the approximate points: 100 m plus a tenth of the block.
     margin = 100.0 + 0.1 * (high - low)
     return read, clouds.read_cloud(cloud, read.frame, within=np.stack([low - margin, high + margin]), **selection)
 

@@ -353,7 +353,7 @@ def calibrate(
             detections=targets.detections,
             start=camera.origin,
             record=output.command_record(*images),
-            # With an assumed pixel size, all lengths in the report are in units of this size: add a note.
+            # Add a note if the pixel size is assumed: all lengths in the report scale with it.
             notes=() if pixel_mm is not None else (camera.origin,),
         )
     output.say(camera.origin)
@@ -442,7 +442,7 @@ def orient(
             title=f"{len(read)} photographs",
             report=progress.update,
         )
-        # Report the reason of the matching for photographs without matches.
+        # Report the reason given by the matching for photographs without matches.
         reasons = {name: matched.left_out.get(name, text) for name, text in result.report.unoriented.items()}
         result = result._replace(report=result.report._replace(unoriented=reasons))
         progress.update(f"writing {out}")

@@ -63,7 +63,7 @@ class BlockPlaces(NamedTuple):
 
 
 def places_of(source: Block | Adjustment) -> BlockPlaces:
-    """Return the estimates of an adjusted block, or the approximate values of any other.
+    """Return the estimates of an adjusted block, or the approximate values of a block without adjustment.
 
     Unknown approximate values are replaced by observed coordinates.
     """
@@ -83,7 +83,7 @@ def places_of(source: Block | Adjustment) -> BlockPlaces:
 
 
 def _completed(places: np.ndarray, given: Any, groups: tuple[Any, ...]) -> np.ndarray:
-    """Replace unknown coordinates by observed ones in place, and return a mask of the rows with X and Y."""
+    """Fill unknown coordinates with observed ones in place. Return a mask of the rows with X and Y."""
     has = np.repeat(np.asarray(given, bool)[:, None], 3, axis=1)
     for rows in groups:
         unknown = ~has[rows.who, rows.axis]
@@ -180,7 +180,7 @@ def block_in_space(source: Block | Adjustment, covariance: Covariance | None = N
         traces += _position_residuals(source, places)
         traces += _ellipsoids(covariance, places) if covariance is not None else []
     for trace in traces:
-        # Coordinates of a diverged adjustment may exceed the range of WebGL.
+        # Clip coordinates: after divergence they may exceed the range of WebGL.
         at = np.clip(trace.pop("at") - origin, -1e30, 1e30).astype(np.float32)
         trace |= dict(zip("xyz", at.T, strict=True))
     names = (
@@ -290,7 +290,7 @@ def ellipsoid_mesh(
         triangles.append(np.stack([above + here, below + right, above + right], axis=1))
     triangles.append(np.stack([0 * here + last, last - around + right, last - around + here], axis=1))
     variance, axes = np.linalg.eigh(covariance)
-    # Rounding may make the zero variance of a fixed coordinate negative.
+    # Clip at zero: rounding may make the zero variance of a fixed coordinate negative.
     semi_axes = axes * np.sqrt(np.maximum(variance, 0.0))[:, None, :]
     corners = centre[:, None, :] + np.einsum("nij,cj->nci", semi_axes, sphere)
     shifted = np.concatenate(triangles) + len(sphere) * np.arange(len(centre))[:, None, None]

@@ -33,7 +33,8 @@ _GRID = (15, 11)
 # Step between tabulated rows of the distortion curve.
 _EVERY = 3
 _HIGH = 0.9
-# Alignments of the ray bundle by applications of the calibration; each compensates part of the camera's errors.
+# Alignments of the ray bundle in applications of the calibration; an estimated attitude or position compensates part of
+# the camera's errors.
 _ALIGNMENTS: tuple[tuple[Method, str], ...] = (
     ("zrot", "position and attitude known"),
     ("rot", "attitude re-estimated"),
@@ -193,7 +194,7 @@ def dates(conditions: Sequence[Conditions]) -> str:
 
 
 def known_conditions(conditions: Sequence[Conditions]) -> Iterator[tuple[str, str]]:
-    """Return the ranges of exposure, aperture, sensitivity, focus and weather over the used images, where recorded."""
+    """Return the recorded ranges of exposure, aperture, sensitivity, focus and weather over the used images."""
     for name, field, unit in _QUANTITIES:
         values = [v for c in conditions if c.used and (v := getattr(c, field)) is not None]
         if values:

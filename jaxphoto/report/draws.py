@@ -160,7 +160,7 @@ def plot_draws(draws: pd.DataFrame, summary: pd.DataFrame, quantity: str, ax: Ax
 def _draw_histogram(axes: Axes, name: str, values: np.ndarray, summary: pd.DataFrame) -> None:
     of = summary.set_index("quantity")
     nominal, sigma = (float(of[column].loc[name]) for column in ("nominal", "predicted_sigma"))
-    # Draws that differ only by rounding cannot be binned.
+    # Skip the histogram if draws differ only by rounding.
     if len(values) and np.ptp(values) > 1e-12 * np.abs(values).max(initial=1e-300):
         axes.hist(values, bins=min(60, max(5, int(np.sqrt(len(values))))), density=True, color="0.75")
     axes.axvline(nominal, color="tab:red", lw=1)
@@ -220,7 +220,7 @@ def write_draws_page(
     for name, (heading, words) in _PICTURES.items():
         if (file := directory / f"{name}.png").is_file():
             parts += [Heading(heading), Paragraph(words), Plot(file, f"{heading}: {words}")]
-    # Draw the errors last: their distribution is known.
+    # List the errors last: their distribution is known.
     ordered = table[few].sort_values("quantity", key=lambda name: name.str.startswith("bias."), kind="stable")
     parts += [Heading("Means and standard deviations"), ordered]
     if not few.all():
@@ -230,9 +230,8 @@ def write_draws_page(
         work.write_text(text, encoding="utf-8")
 
 
-# Arrays of more than two dimensions as xarray: correlations by image, draws by image and point.
-#
-# Values are in radians, metres and millimetres, as the coordinate names say.
+# xarray data sets for arrays of more than two dimensions: correlations by image, draws by image and point. Values are
+# in radians, metres and millimetres, as stated in the coordinate names.
 
 
 def correlation_cube(correlations: Correlations) -> xr.Dataset:
@@ -241,7 +240,7 @@ def correlation_cube(correlations: Correlations) -> xr.Dataset:
     Variables: `interior` (parameter, with_parameter), `exterior` (image, element, parameter), `within_image` (image,
     element, with_element).
     """
-    # Importing xarray takes a third of a second.
+    # Import locally: xarray takes a third of a second.
     import xarray as xr
 
     c = correlations

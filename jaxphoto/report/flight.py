@@ -58,7 +58,8 @@ from jaxphoto.report.verdict import lens_findings, shutter_findings, verdict_of
 from jaxphoto.statistics.block_geometry import Coverage, coverage, image_links, weak_links
 from jaxphoto.writing import InputFile, digest_of_all, whole_folder
 
-# Maximum number of images in the table on the page; number of those with the largest residuals if there are more.
+# Maximum number of images in the table on the page; number of images with the largest residuals that a longer table is
+# reduced to.
 _MOST, _WORST = 150, 50
 # Minimum numbers of covering images in the table of areas.
 _COVERED_BY = (1, 2, 3, 5, 9)
@@ -476,7 +477,7 @@ def images_section(reports: Sequence[PartReport]) -> Iterator[Part]:
 
 
 def provenance_section(source: FlightSource) -> Iterator[Part]:
-    """Yield dates, camera, conditions, command, options, versions, and hashes of all input files but images."""
+    """Yield dates, camera, conditions, command, options, versions, and hashes of all input files except images."""
     rows, conditions = {"computed": source.written}, source.conditions
     if any(c.time for c in conditions):
         rows["images taken"] = dates(conditions)

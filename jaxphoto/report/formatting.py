@@ -134,7 +134,7 @@ _BY_SIGMA = (
     "before", "after", "moved",
 )  # fmt: skip
 _BY_SD = ("nominal", "mean", "q025", "q50", "q975")
-# Columns whose standard deviation has a different name; of several columns the largest value counts.
+# Columns whose standard deviation has a different name; of several columns the largest value is used.
 _BY_OTHERS = {
     **dict.fromkeys(("column_px", "row_px", "d_column_px", "d_row_px"), ("sigma_px",)),
     **{f"d{a}_m": (f"sigma_survey_{a}_m", f"sigma_adjusted_{a}_m") for a in "XYZ"},

@@ -75,7 +75,7 @@ def moved_table(result: Simultaneous) -> pd.DataFrame:
     """
     after, before = result.adjusted, result.before
     sigma = np.asarray(Tables(after).covariance.shared_sigma)
-    # Scanner parameters are zero before the adjustment.
+    # Missing values before the adjustment are the scanner parameters, which are zero.
     then, now = (dict(zip(a.parameters, np.asarray(a.values.shared).tolist(), strict=True)) for a in (before, after))
     rows: list[tuple] = []
     for path, s in zip(after.structure.labels, sigma, strict=True):
@@ -188,10 +188,10 @@ def heights_figure(control: LidarControl) -> Figure:
 def write_simultaneous(
     result: Simultaneous, directory: Path, seconds: dict[str, float], record: CommandRecord
 ) -> Iterator[Path]:
-    """Write tables of iterations, changes, surfaces and correlations, plot, report, summary.json, folder `adjustment`.
+    """Write the tables of iterations, changes, surfaces and correlations, a plot, the report and the adjustment.
 
-    Yields the temporary folder so that the caller can add files. Raises InputError if `directory` contains anything but
-    an earlier result.
+    Files also include summary.json and the result folder `adjustment`. Yields the temporary folder so that the caller
+    can add files. Raises InputError if `directory` contains anything but an earlier result.
     """
     began = time.perf_counter()
     with whole_folder(directory) as work:

@@ -36,7 +36,7 @@ _SHOWN: dict[str, Callable[[Any], str]] = {
 _IN_TERMINAL = ("model", "parameters", "rms_px", "cv_rms_px", "cv_excess_se", "delta_bic", "f_p")
 # Difference of BIC below which two models are equally good (Kass and Raftery 1995).
 _EQUAL = 2.0
-# Ticks of the logarithmic axis; value from which labels have no decimal places.
+# Ticks of the logarithmic axis; value above which labels have no decimal places.
 _MARKS = (0, 2, 10, 100, 1000, 10_000, 100_000, 1_000_000)
 _FAR = 100.0
 

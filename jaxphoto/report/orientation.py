@@ -1,4 +1,4 @@
-"""Report on the orientation of images: counts, plots of the network and of its residuals."""
+"""Report on the orientation of images: counts, plots of the network and the residuals."""
 
 from __future__ import annotations
 
@@ -62,11 +62,11 @@ def print_orientation(report: OrientationReport, console: Console) -> None:
 def network_figure(oriented: Oriented) -> Figure:
     """Draw stations and points along their principal axes, in plan and from the side.
 
-    The principal axes replace those of the coordinate system, which are arbitrary in a free network.
+    The coordinate axes of a free network are arbitrary.
     """
     start = oriented.block.start.unknowns
     stations, points = np.asarray(start.exterior.position, float), np.asarray(start.points, float)
-    # The farthest 5 % would shrink everything else.
+    # Omit the farthest 5 %, which would shrink everything else.
     middle = np.median(points, axis=0)
     distance = np.linalg.norm(points - middle, axis=1)
     near = points[distance <= np.percentile(distance, 95)]

@@ -37,7 +37,7 @@ _BARS = 2.0
 
 def new_figure(width: float, height: float) -> Figure:
     """Return an empty figure of a size in inches."""
-    # Importing matplotlib takes a third of a second.
+    # Import locally: matplotlib takes a third of a second.
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), dpi=110, layout="constrained")
@@ -240,7 +240,7 @@ def plot_station_residuals(tables: Tables, ax: Axes | None = None) -> Axes:
         raise InputError("the block has no observed stations to be drawn")
     ax = axes_or_new(ax)
     time = np.asarray(a.block.image_time if a.block.flight_time is None else a.block.flight_time, float)
-    # Times relative to the middle of each strip are not unique.
+    # Use times only if they are unique; times relative to the middle of each strip are not.
     timed = np.isfinite(time).all() and len(np.unique(time)) == len(time)
     number = np.argsort(np.argsort(time)) if timed else np.arange(len(time))
     observed = tables.residuals[tables.residuals["group"] == "stations"]
@@ -327,8 +327,8 @@ def correlation_figure(tables: Tables, camera: str | None = None) -> Figure:
     return figure
 
 
-# Minimum number of contours; candidate contour levels (times powers of ten). The first set with enough contours is
-# used.
+# Minimum number of contours; candidate contour levels (times powers of ten), of which the first set with enough
+# contours is used.
 _LINES = 5
 _ROUND = (
     (1.0, 2.0, 5.0),
@@ -395,7 +395,7 @@ def ellipse_axes(
 ) -> tuple[Float[np.ndarray, n], Float[np.ndarray, n], Float[np.ndarray, n]]:
     """Return the semi-axes a >= b of error ellipses, and the direction of a from X towards Y (rad)."""
     variance, axes = np.linalg.eigh(covariance)
-    # Rounding may make the zero variance of a fixed coordinate negative.
+    # Clip at zero: rounding may make the zero variance of a fixed coordinate negative.
     b, a = np.sqrt(np.maximum(variance, 0.0)).T
     return a, b, np.arctan2(axes[:, 1, 1], axes[:, 0, 1])
 

@@ -217,7 +217,8 @@ def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
         if t.size > 0 and unit:
             detail = f", size {factor * t.size:.2g} {unit} ({t.size / t.sigma:.2g} sigma)"
         together = t.significant_terms
-        # Estimated parameters absorb part of an effect, which may hide its size in the noise.
+        # Test both the size and the estimated terms: estimated parameters absorb part of an effect, which may hide its
+        # size in the noise.
         matters = t.size > _VISIBLE * t.sigma or any(abs(h.amount) > _VISIBLE * t.sigma for h in together)
         if together or (t.hints and t.hints[0].share > MOST_OF_IT):
             likely = together or [t.hints[0]]
@@ -232,7 +233,7 @@ def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
             detail += ": no single usual term is most of it; try a distortion of more terms (docs/stability.md)"
         elif several := [h for h in t.hints if abs(h.amount) > SIGNIFICANT_RATIO * h.sigma][:_SHOWN]:
             detail += f", each alone {_terms(t.pattern, several)}"
-        # Suspects explained by the term are not blunders.
+        # Count the suspects explained by the terms: these are not blunders.
         most = t.matching_blunders >= _SHOWN and t.matching_blunders > len(tables.blunders.suspects) / 2
         chance = (0.0 if most else t.p_value) if matters and likely else 1.0
         subject = t.pattern.begins or f"systematic residuals of {t.pattern.what}"

@@ -59,8 +59,7 @@ _TABLES = (
 )  # fmt: skip
 # Additional tables if the files of the block are in an EPSG system.
 _MAP_TABLES = ("exterior_map", "object_points_map")
-# Maximum number of plotted cameras, of rows of the largest residuals, of rows of the iteration history, and of findings
-# at the top.
+# Maximum numbers: plotted cameras, rows of the largest residuals, rows of the iteration history, findings at the top.
 _PLOTTED, _LARGEST, _STEPS, _TOP = 6, 20, 40, 3
 _RELIABILITY = {
     "c_moves": "c moves [sigma]", "xp_moves": "xp moves [sigma]", "yp_moves": "yp moves [sigma]",

@@ -155,7 +155,7 @@ def write_stability(
         by_method(analyses, sensor.pixel_mm, noise_mm),
         Plot(figure, "offsets of the two bundles over the image"),
     ]
-    # The terminal encoding may lack the letter.
+    # Write µm only in the report: a terminal may be unable to display it.
     verdict = f"Bundles {ALIGNED[method]} ({method}): {chosen.verdict(noise_mm)}".replace(" um", " µm")
     tables = {"stability": stability_table(analyses, sensor.pixel_mm, noise_mm), "offsets": offsets_table(chosen)}
     colour = "green" if chosen.similar(noise_mm) else "amber"

@@ -121,7 +121,7 @@ def errors_along(
     place = {path: k for k, path in enumerate(result.adjusted.structure.labels)}
     covariances, variance = np.asarray(result.covariance.matrix)[-len(place) :, -len(place) :], np.zeros_like(value)
     for c in range(value.shape[1]):
-        # Fixed knots are not among the estimated parameters.
+        # Fixed knots (-1) are not estimated: they add no variance.
         columns = np.array([place.get(labels[k][c], -1) for k in range(spline.first, spline.first + spline.size)])
         estimated, by = columns[columns >= 0], weights[:, columns >= 0]
         variance[:, c] = np.einsum("ni,ij,nj->n", by, covariances[np.ix_(estimated, estimated)], by)

@@ -357,8 +357,8 @@ class Tables:
     def correlation(self) -> pd.DataFrame:
         """Correlations of interior parameters and exterior orientations: parameter_a, parameter_b, rho.
 
-        Pairs are all interior parameters of a camera, and the exterior elements of each image with each other and with
-        these.
+        The table contains all pairs of interior parameters of a camera, and all pairs of an exterior element of an
+        image with its interior parameters and its other exterior elements.
         """
         rows = []
         for camera, c in self.correlations.items():

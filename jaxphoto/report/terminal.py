@@ -80,5 +80,5 @@ def print_components(components: VarianceComponents, console: Console) -> None:
 
 
 def print_warning(warning: str, console: Console, **options) -> None:
-    """Print a warning behind a yellow mark."""
+    """Print a warning with a yellow mark."""
     console.print(Text.assemble(("!", "yellow"), " ", plain(warning)), **options)

@@ -70,7 +70,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
     adjusted = tables.adjusted
     if not bool(adjusted.converged):
         yield from _not_converged(adjusted)
-        # Statistics are valid only at an optimum.
+        # Stop here: statistics are valid only at an optimum.
         return
     prepare_hat_matrix(adjusted.equations, adjusted.seconds)
     yield from (Finding("prior_information", "warning", doubt) for doubt in adjusted.block.prior_warnings)
