@@ -171,9 +171,8 @@ def simultaneous(
 ) -> None:
     """Adjust a block and a point cloud together; write results, corrected cloud and corrected trajectory.
 
-    With --adjust, strips are also fitted to each other by planes in their overlaps, and trajectory errors are
-    estimated. Individual scanner parameters may replace `scanner`, as in jaxphoto strips. All other parameters are
-    fixed.
+    With --adjust, strips are also fitted to each other by planes in their overlaps. Individual scanner parameters may
+    replace scanner, as in jaxphoto strips. Parts that are not given are fixed.
 
     --class and --returns select the points of the surface; the whole cloud is corrected. Exit code 1: results written,
     but not converged.
