@@ -1,10 +1,10 @@
-"""The command `jaxphoto`: options in, library calls, results out.
+"""Command `jaxphoto`: reads options, calls the library, reports results.
 
-This package lies beside `jaxphoto` because importing that imports JAX, which takes a second. Help, version and shell
-completion need neither: commands import what they need when they run.
+This package is separate from `jaxphoto` because importing `jaxphoto` imports JAX, which takes a second. Help, version
+and shell completion need neither: commands import the library when they run.
 """
 
-# Panels of the help come in this order.
+# Order of the help panels.
 from jaxphoto_command import blocks, photographs, cameras, lidar, files, examples  # noqa: I001
 from jaxphoto_command.application import app, command, main, share_one_pool
 

@@ -22,7 +22,7 @@ _COMMON = {
         bool, Option("--verbose", "-v", help="Log each step, iteration and compilation.", rich_help_panel=_PANEL)
     ],
 }
-# M_ARENA_MAX of <malloc.h>.
+# Parameter M_ARENA_MAX of glibc's mallopt (malloc.h).
 _ARENA_MAX = -8
 
 app = typer.Typer(
@@ -45,7 +45,7 @@ def root(show_version: Annotated[bool, Option("--version", help="Print the versi
 def command(name: str, panel: str, example: str, more: str = "") -> Callable[[_Function], _Function]:
     """Register a function of an `Output` and options as a command with --json, --quiet and --verbose.
 
-    `more` is a paragraph of its help after the docstring.
+    `more` is an additional paragraph of the help, after the docstring.
     """
 
     def register(function: _Function) -> _Function:
@@ -69,12 +69,12 @@ def command(name: str, panel: str, example: str, more: str = "") -> Callable[[_F
 
 
 def main() -> None:
-    """Run the command line; a user's mistake is one sentence and exit code 2."""
+    """Run the command line. An error of the user gives one sentence and exit code 2."""
     share_one_pool()
     try:
         app(prog_name="jaxphoto")
     except (KeyboardInterrupt, SystemExit) as stop:
-        # typer exits with 130 after an interruption.
+        # Treat exit code 130 as an interruption: typer exits with it.
         if isinstance(stop, SystemExit) and stop.code != 130:
             raise
         typer.echo("jaxphoto: interrupted", err=True)
@@ -88,7 +88,7 @@ def main() -> None:
 
 
 def message(error: Exception) -> str | None:
-    """Message for an error that a user can resolve; None for any other."""
+    """Return the message of an error that a user can resolve; None for any other error."""
     from jaxphoto.errors import JaxphotoError
     from jaxphoto.optional import EXTRAS, MissingExtra
 
@@ -99,16 +99,16 @@ def message(error: Exception) -> str | None:
         return str(MissingExtra(module)) if module in EXTRAS else None
     if isinstance(error, OSError):
         return f"{error.filename or 'a file'}: {error.strerror or error}. Name a path that can be read and written."
-    # XLA has one class for all of its errors.
+    # Match the text of the error: XLA has a single class for all its errors.
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
         return "not enough memory. Close other programs, or reduce the input (a part of the block, fewer points)."
     return None
 
 
 def share_one_pool() -> None:
-    """Make all threads allocate from one pool of glibc; call it before there are threads.
+    """Make all threads allocate from one glibc arena. Call it before threads are started.
 
-    A thread's own pool returns large arrays to the system at once, and each new one costs page faults.
+    An arena of a thread returns large arrays to the system at once, and each new array costs page faults.
     """
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
         libc.mallopt(_ARENA_MAX, 1)

@@ -21,7 +21,7 @@ _BIASES = Literal[
     "station", "attitude", "trajectory", "trajectory-attitude", "control", "image-points", "lever-arm", "boresight",
     "interior", "noise"
 ]  # fmt: skip
-# Unit and option of the standard deviation of each bias; metres otherwise.
+# Biases whose standard deviation is in degrees; option of the standard deviation by unit.
 _DEGREES = ("attitude", "trajectory-attitude", "boresight")
 _SIGMA_OPTIONS = {"m": "--sigma-m", "deg": "--sigma-deg", "mm": "--sigma-mm", "own": "--sigma"}
 _SHOWN = 12
@@ -31,7 +31,7 @@ _SHOWN = 12
     "adjust",
     PANEL,
     f"{_EXAMPLE}jaxphoto adjust cross_block --out results",
-    "Earlier calibrations that block.toml names may be OpenCV's and ROS' YAML, COLMAP's cameras.txt, Agisoft's XML, "
+    "Earlier calibrations in block.toml may be OpenCV's and ROS' YAML, COLMAP's cameras.txt, Agisoft's XML, "
     "mrcal's .cameramodel, Kalibr's camera chain, a SMAC report, interior.csv and block.toml.",
 )
 def adjust(
@@ -56,7 +56,7 @@ def adjust(
 ) -> None:
     """Adjust a block and write tables, statistics and a report.
 
-    Exit code 1: written, but the verdict is red.
+    Exit code 1: results written, but the verdict is red.
     """
     import jaxphoto
     from jaxphoto import report
@@ -127,12 +127,12 @@ def boresight(
     output: Output,
     block: opt.Block,
     out: opt.Out,
-    go_on: Annotated[bool, Option("--go-on", help="Continue after a step that fails its test.")] = False,
+    go_on: Annotated[bool, Option("--go-on", help="Continue after a step fails its test.")] = False,
     max_steps: opt.MaxSteps = 100,
 ) -> None:
     """Estimate the boresight misalignment in four steps.
 
-    Exit code 1: written, but a step failed.
+    Exit code 1: results written, but a step failed.
     """
     from jaxphoto.io import read_block
     from jaxphoto.procedures.boresight import boresight as estimate
@@ -156,16 +156,16 @@ def boresight(
 @command("certificate", PANEL, f"{_ADJUSTED}jaxphoto certificate results --out camera.pdf")
 def certificate(
     output: Output,
-    results: Annotated[Path, Argument(help="Results of adjust or fly.")],
+    results: Annotated[Path, Argument(help="Result folder of adjust or fly.")],
     out: Annotated[Path, Option(help="Certificate to write (.html or .pdf).")],
-    last: Annotated[Path | None, Option(help="Last calibration (results or camera file), to compare.")] = None,
-    halves: Annotated[Path | None, Option(help="Results of jaxphoto halves on the block.")] = None,
+    last: Annotated[Path | None, Option(help="Previous calibration to compare (results or camera file).")] = None,
+    halves: Annotated[Path | None, Option(help="Result folder of jaxphoto halves for this block.")] = None,
     photographs: Annotated[
-        list[Path] | None, Option(help="Photographs or folders of them, if the results name none.")
+        list[Path] | None, Option(help="Photographs or their folders, if not in the results.")
     ] = None,
     camera: opt.Camera = None,
 ) -> None:
-    """Write the certificate of a calibration: parameters, precision, stability, inputs."""
+    """Write a calibration certificate: parameters, precision, stability, inputs."""
     from jaxphoto.io.result_tables import read_summary, reservation
     from jaxphoto.writing import check_room
     from jaxphoto_command.certificate import certificate_document, write_certificate
@@ -183,12 +183,12 @@ def certificate(
 @command("tables", PANEL, f"{_ADJUSTED}jaxphoto tables results --to latex --only interior --out tables")
 def tables(
     output: Output,
-    results: Annotated[Path, Argument(help="Folder of results, as of adjust.")],
+    results: Annotated[Path, Argument(help="Result folder, for example of adjust.")],
     to: Annotated[Literal["csv", "parquet", "markdown", "latex"], Option(help="Format.")],
     out: Annotated[Path, Option(help="Output folder; earlier tables in it are replaced.")],
     only: Annotated[str, Option(help="Tables, comma-separated, like interior,exterior (default: all).")] = "",
 ) -> None:
-    """Write tables of results as CSV, Parquet, Markdown or LaTeX, rounded to their standard deviations."""
+    """Write result tables as CSV, Parquet, Markdown or LaTeX, rounded to their standard deviations."""
     from jaxphoto.io import read_result_tables
     from jaxphoto.io.result_tables import read_summary, reservation
     from jaxphoto.report import write_table
@@ -215,7 +215,7 @@ def monte_carlo(
     output: Output,
     block: opt.Block,
     out: Annotated[Path, Option(help="Output folder; an interrupted run in it is resumed.")],
-    kind: Annotated[_BIASES, Option("--bias", help="Observations or parameters in error.")],
+    kind: Annotated[_BIASES, Option("--bias", help="Observations or parameters with errors.")],
     per: Annotated[str | None, Option(help="Draw one error per block, strip, image, point ...")] = None,
     sigma_m: Annotated[
         str | None, Option(help="Standard deviation (m): one number, or three, comma-separated.")
@@ -228,10 +228,10 @@ def monte_carlo(
     draws: Annotated[int, Option(help="Number of draws.")] = 1000,
     seed: opt.Seed = 0,
     keep: Annotated[
-        list[str] | None, Option("--with", help="Also keep exterior, or points with check points (repeatable).")
+        list[str] | None, Option("--with", help="Also store exterior, or points with check points (repeatable).")
     ] = None,
 ) -> None:
-    """Re-adjust a block with drawn errors; write draws, their statistics and a report."""
+    """Re-adjust a block with random errors; write draws, their statistics and a report."""
     import numpy as np
 
     from jaxphoto.experiment import MonteCarlo
@@ -300,12 +300,12 @@ def sensitivity(
     output: Output,
     block: opt.Block,
     out: opt.Out,
-    per: Annotated[Literal["block", "strip", "image"], Option(help="Bias the stations of each.")] = "strip",
-    bias_m: Annotated[float, Option(help="Station bias.")] = 0.10,
+    per: Annotated[Literal["block", "strip", "image"], Option(help="Unit with a common station bias.")] = "strip",
+    bias_m: Annotated[float, Option(help="Size of the station bias.")] = 0.10,
     delta0: Annotated[float, Option(help="Non-centrality parameter of the test of normalised residuals.")] = 4.13,
     max_steps: opt.MaxSteps = 100,
 ) -> None:
-    """Compute the exact sensitivity of interior orientation and check points to stations, and external reliability."""
+    """Compute exact effects of station errors on interior orientation and check points, and external reliability."""
     from jaxphoto.io import read_block
     from jaxphoto.procedures.adjust import adjust_for_tables
     from jaxphoto.report.formatting import in_figures
@@ -392,7 +392,7 @@ def halves(
 
 
 def warn_of_contradictions(adjusted: Any, output: Output) -> None:
-    """Warn of the worst contradiction among the observations of a block that is the input of a further computation."""
+    """Warn of the worst contradiction among the observations of an input block."""
     from jaxphoto.report import Tables, Verdict
     from jaxphoto.report.residual_findings import contradictions
 

@@ -25,15 +25,15 @@ def stability(
     method: opt.Alignment = "rot",
     grid: opt.Grid = "15x11",
     extent: opt.Extent = None,
-    noise_px: Annotated[float, Option(callback=opt.positive, help="Noise of image coordinates.")] = 1.0,
-    relief: Annotated[float, Option(help="Relief of the object points of spr, as a fraction of distance.")] = 0.0,
+    noise_px: Annotated[float, Option(callback=opt.positive, help="Standard deviation of image coordinates.")] = 1.0,
+    relief: Annotated[float, Option(help="Relief of the object points for spr, as a fraction of distance.")] = 0.0,
     camera: opt.Camera = None,
     camera_b: opt.CameraB = None,
     pixel_mm: opt.PixelSize = None,
     block: opt.ResultBlock = None,
     out: OptionalOut = None,
 ) -> None:
-    """Compare the bundles of rays of two interior orientations (Habib et al. 2006), with uncertainty."""
+    """Compare the ray bundles of two interior orientations (Habib et al. 2006), with uncertainty."""
     from jaxphoto.report.stability import print_stability, stability_summary, write_stability
     from jaxphoto.stability import analyse
     from jaxphoto.writing import check_folder
@@ -70,7 +70,7 @@ def compare(
     block: opt.ResultBlock = None,
     out: OptionalOut = None,
 ) -> None:
-    """Test whether a camera has changed between two calibrations, by its parameters and by its bundle of rays."""
+    """Test whether a camera has changed between two calibrations: parameters and ray bundle."""
     from jaxphoto.report.stability import change_summary, print_change, write_change
     from jaxphoto.stability import change
     from jaxphoto.writing import check_folder
@@ -97,12 +97,12 @@ def compare(
 def combine(
     output: Output,
     calibrations: Annotated[list[Path], Argument(help="Results or camera files with a covariance.")],
-    out: Annotated[Path, Option(help="Camera file (.toml) to write, prior information for blocks.")],
+    out: Annotated[Path, Option(help="Camera file (.toml) to write; it can be a prior of blocks.")],
     camera: opt.Camera = None,
 ) -> None:
     """Combine calibrations of one camera by their full covariances.
 
-    Exit code 1: written, but they disagree.
+    Exit code 1: result written, but the calibrations disagree.
     """
     import numpy as np
 
@@ -124,7 +124,9 @@ def combine(
     for name, file in files.items():
         check_one_sensor(first, file, calibrations[0], Path(name))
         if file.covariance is None:
-            raise InputError(f"{name} has no covariance; give results of jaxphoto adjust, or a camera file of them")
+            raise InputError(
+                f"{name} has no covariance; give a result folder of jaxphoto adjust, or a camera file written from one"
+            )
         covariances.append(file.covariance)
         if file.note:
             output.warn(f"{name}: {file.note}")
@@ -169,7 +171,7 @@ def models(
     block: opt.Block,
     out: opt.Out,
     models: Annotated[
-        str, Option(help="Comma-separated: brown (usual parameters), brown:all, brown:none, brown:k1+k2, smac.")
+        str, Option(help="Models, comma-separated: brown (usual parameters), brown:all, brown:none, brown:k1+k2, smac.")
     ] = "brown:none,brown:k1,brown:k1+k2,brown:k1+k2+k3,brown,brown:all",
     folds: Annotated[int, Option(min=0, help="Folds of the cross-validation; 0 for none.")] = 5,
     seed: opt.Seed = 0,
@@ -196,7 +198,7 @@ def models(
 
 
 def _compared(output: Output, paths: tuple[Path, Path], files: tuple[Any, Any]) -> tuple[Any, Any]:
-    """Return both calibrations for a comparison, A and B, and print the notes of their files."""
+    """Return calibrations A and B for a comparison, and print the notes of their files."""
     from jaxphoto_command.certificate import compared
 
     for letter, file in zip("AB", files, strict=True):

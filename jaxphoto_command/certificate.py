@@ -1,4 +1,4 @@
-"""Provenance of results (hashes of inputs, conditions of photographs), certificates, and pairs of camera files."""
+"""Provenance of results (hashes of inputs, conditions of photographs), certificates, pairs of camera files."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -23,13 +23,13 @@ from jaxphoto.report.stability import Compared
 from jaxphoto.writing import InputFile, input_file, whole_file
 
 _MIN_CELLS = 4
-# Files that identify the last calibration.
+# Files that identify the previous calibration.
 _CAMERA_FILES = ("interior.csv", "correlation.csv", "camera.toml", "block.toml")
 _MEASUREMENTS = ("image_points.csv", *SUFFIXES)
 
 
 def write_certificate(page: str, path: Path) -> None:
-    """Write HTML or, printed by a browser, PDF."""
+    """Write the certificate as HTML, or as PDF printed by a browser."""
     with whole_file(path) as work:
         if path.suffix.lower() == ".pdf":
             write_pdf(page, work)
@@ -44,13 +44,13 @@ def certificate_document(
     halves: Path | None = None,
     photographs: list[Path] | None = None,
 ) -> str:
-    """Return the certificate of a folder of results; for a flight, of its largest part.
+    """Return the certificate of a result folder; for a flight, of its largest part.
 
     Raises InputError if there are no results or the adjustment did not converge.
     """
     folder = results_in(folder)
     if not (folder / "interior.csv").is_file():
-        raise InputError(f"{folder} holds no interior.csv: name a folder that jaxphoto adjust or fly wrote")
+        raise InputError(f"{folder}: interior.csv not found; give a result folder of jaxphoto adjust or fly")
     file = read_camera_file(folder, camera=camera)
     conditions: list[Conditions] = []
     inputs: list[InputFile] = []
@@ -93,7 +93,7 @@ def _last_calibration(current: CameraFile, folder: Path, last: Path) -> LastCali
     try:
         file = read_camera_file(last, camera=current.name)
     except InputError:
-        # The only camera of the other file may have another name.
+        # Read the only camera: its name in the previous calibration may be different.
         file = read_camera_file(last)
     check_one_sensor(current, file, folder, last)
     inside = results_in(last)
@@ -116,7 +116,7 @@ def _format_band(folder: Path) -> FormatBand:
 def read_two(
     paths: tuple[Path, Path], cameras: tuple[str | None, str | None], pixel_mm: float | None, block: Path | None
 ) -> tuple[CameraFile, CameraFile]:
-    """Read camera files A and B of one sensor; the camera of B has the name of that of A by default."""
+    """Read camera files A and B of one sensor. By default both cameras have the same name."""
     names = (cameras[0], cameras[1] if cameras[1] is not None else cameras[0])
     a, b = (
         read_camera_file(path, camera=name, pixel_mm=pixel_mm, block=block)
@@ -127,7 +127,7 @@ def read_two(
 
 
 def compared(letter: str, path: Path, file: CameraFile) -> Compared:
-    """Return a camera file with its label for tables and figures."""
+    """Label a camera file for tables and figures."""
     return Compared(f"{letter} ({path})", file.interior, file.covariance is not None, file.sensor)
 
 
@@ -141,9 +141,9 @@ def check_one_sensor(a: CameraFile, b: CameraFile, first: Path, second: Path) ->
         )
     if not math.isclose(one.pixel_mm, other.pixel_mm, rel_tol=1e-6):
         raise InputError(
-            f"the pixel of {first} is {one.pixel_mm:g} mm, that of {second} {other.pixel_mm:g} mm. If one of them was "
-            "assumed, give the true one by --pixel-mm. Results that state the assumed one must be written in pixels "
-            "first: jaxphoto camera RESULTS --out pixels.yml"
+            f"pixel sizes differ: {first} {one.pixel_mm:g} mm, {second} {other.pixel_mm:g} mm; if one is assumed, give "
+            "the true size with --pixel-mm (convert its results to pixels first: jaxphoto camera RESULTS --out "
+            "pixels.yml)"
         )
 
 
@@ -154,19 +154,19 @@ def check_two_calibrations(a: CameraFile, b: CameraFile, first: Path, second: Pa
 
 
 def share_measurements(first: Path, second: Path) -> bool:
-    """Return True if two folders of results are based on the same photograph or file of image points."""
+    """Return True if two result folders are based on the same photograph or file of image points."""
     return not _measurements(first).isdisjoint(_measurements(second))
 
 
 def _measurements(results: Path) -> set[str]:
-    """Return the SHA-256 of photographs and files of image points of a folder of results."""
+    """Return the SHA-256 of the photographs and files of image points of a result folder."""
     inputs, conditions = (results_in(results) / name for name in (INPUTS, CONDITIONS))
     files = read_inputs(inputs) if inputs.is_file() else []
     photographs = read_conditions(conditions) if conditions.is_file() else []
     return {f.sha256 for f in files if f.file.lower().endswith(_MEASUREMENTS)} | {c.sha256 for c in photographs}
 
 
-# Files read of a folder of results or of an experiment.
+# Suffixes of the hashed files of a result folder or an experiment.
 _READ = (".csv", ".json", ".toml", ".py")
 
 
@@ -189,13 +189,16 @@ class Provenance(NamedTuple):
 
     @classmethod
     def of(cls, photographs: Sequence[Path], others: Sequence[Path]) -> "Provenance":
-        """Return the provenance of a flight; `others` are files of control and exposures."""
+        """Return the provenance of a flight. `others`: files of control and exposures."""
         conditions = [conditions_of(path) for path in photographs]
         return cls(conditions, [*_photograph_hashes(conditions, photographs), *map(input_file, others)])
 
     @classmethod
     def of_block(cls, block: Path, others: Sequence[Path] = (), photographs: Sequence[Path] = ()) -> "Provenance":
-        """Return the provenance of a block folder, other files and photographs; it prefers the block's conditions."""
+        """Return the provenance of a block folder, other files and photographs.
+
+        Conditions of the block folder take precedence over the photographs.
+        """
         inspected = [conditions_of(path) for path in photographs]
         conditions = read_conditions(block / CONDITIONS) if (block / CONDITIONS).is_file() else inspected
         return cls(
@@ -214,7 +217,7 @@ class Provenance(NamedTuple):
 
 
 def certify(flight: Path) -> str:
-    """Write certificate.html of the largest part of a flight, or return why not."""
+    """Write certificate.html of the largest part of a flight. Return "", or the reason for a missing certificate."""
     try:
         page = certificate_document(flight)
     except InputError as error:

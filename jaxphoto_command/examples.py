@@ -20,7 +20,7 @@ NEXT = {
     "--adjust boresight,range-offset,angle-scale --cell-m 8 --knots-s 5 --out joint",
     "experiments": "jaxphoto experiment 000 --experiments OUT --layouts 4 --out runs",
 }
-"""The command to type after each example, which lies in OUT."""
+"""Next command for each example. OUT is replaced by the path of the example."""
 
 
 @command("example", PANEL, "jaxphoto example cross_block")
@@ -31,7 +31,7 @@ def example(
     ] = None,
     out: Annotated[Path | None, Option(help="Path to write (default: NAME or NAME.toml).")] = None,
 ) -> None:
-    """Write an example block, recipe or experiment that comes with jaxphoto."""
+    """Write an example block, recipe or experiment."""
     import shutil
 
     from jaxphoto.io import read_recipe, write_simulation
@@ -70,7 +70,7 @@ def simulate(
     out: opt.BlockOut,
     seed: opt.Seed = 0,
 ) -> None:
-    """Simulate a block with known truth."""
+    """Simulate a block with known true parameters."""
     from jaxphoto.io import read_recipe, write_simulation
     from jaxphoto.io.block_folder import check_block_target
     from jaxphoto.io.recipe.truth import CLOUD, TRAJECTORY
@@ -103,7 +103,9 @@ def experiment(
     name: Annotated[str, Argument(help="Folder of the experiment, like 000, or all.")],
     out: Annotated[Path, Option(help="Output folder; an earlier run in it is replaced.")] = Path("results"),
     experiments: Annotated[Path, Option(help="Folder of the experiments.")] = Path("experiments"),
-    layouts: Annotated[int | None, Option(min=1, help="Simulated layouts (default: of the experiment).")] = None,
+    layouts: Annotated[
+        int | None, Option(min=1, help="Number of simulated layouts (default: as in the experiment).")
+    ] = None,
 ) -> None:
     """Run experiments; write tables.csv and report.html with the published values."""
     from jaxphoto.experiment import compare, find_experiments, load_experiment, run_experiment, write_runs
@@ -116,7 +118,7 @@ def experiment(
     for folder, declaration in declared.items():
         with output.progress(folder.name) as progress:
             runs[folder] = run_experiment(declaration, folder, layouts, progress.update)
-        # After each, to keep results if a later experiment fails.
+        # Write after each experiment, so that results remain if a later one fails.
         write_runs(runs, out, record)
         judged = compare(runs[folder], folder)
         groups = list(judged.groupby("table", sort=False))

@@ -17,7 +17,7 @@ Second = Annotated[Path | None, Argument(hidden=True, metavar="OUT")]
 
 
 def _one_of(table: str) -> Any:
-    """Return a check that a value names a format of `table`; formats are imported only if a value is given."""
+    """Return a check that a value is a format of `table`; formats are imported only if a value is given."""
 
     def check(context: typer.Context, value: str | None) -> str | None:
         if value not in (None, "block"):
@@ -56,12 +56,12 @@ def convert(
     to: Annotated[
         str, Option(metavar="FORMAT", callback=_one_of("EXPORTS"), help="Format of --out (docs/formats.md).")
     ] = "block",
-    block: Annotated[Path | None, Option(help="Block of the results in SOURCE, if it was moved.")] = None,
-    part: Annotated[int, Option(min=1, help="Part of a flight; the largest is 1.")] = 1,
+    block: Annotated[Path | None, Option(help="Block folder of the results in SOURCE, if moved.")] = None,
+    part: Annotated[int, Option(min=1, help="Number of the part of a flight; 1 is the largest.")] = 1,
     photographs: Annotated[list[Path] | None, Option(help="Folder of the photographs, for their file names.")] = None,
     adjust: Annotated[bool, Option("--adjust", help="Adjust the block in SOURCE first.")] = False,
 ) -> None:
-    """Convert another program's files to a block folder, or a block or results to files of other programs."""
+    """Convert files of other programs to a block folder, or a block or results to files of other programs."""
     from jaxphoto.extras.formats import EXPORTS, Project, check_export_target, export, read_source
     from jaxphoto.io import write_block
     from jaxphoto.io.block_folder import check_block_target
@@ -107,7 +107,7 @@ def convert(
 
 
 def _values(block: Any, adjust: bool) -> tuple[Any, str]:
-    """Return initial or adjusted values of a block, and what they are."""
+    """Return initial or adjusted values of a block, and their description."""
     import jaxphoto
     from jaxphoto.errors import InputError
     from jaxphoto.procedures.adjust import start_of
@@ -121,7 +121,7 @@ def _values(block: Any, adjust: bool) -> tuple[Any, str]:
 
 
 def _report_export(output: Output, written: Any, values: str, cameras: bool) -> None:
-    """Print what was written and the loss of accuracy."""
+    """Report the written values and the loss of accuracy."""
     output.say(values)
     losses = {name: {"rms_px": c.rms_px, "max_px": c.max_px} for name, c in written.cameras.items()}
     misfits = {"map_misfit": written.map_misfit, "moved": written.moved}
@@ -157,14 +157,14 @@ def camera(
     pixel_mm: opt.PixelSize = None,
     width_px: Annotated[int | None, Option(min=1, help="Image width, if SOURCE lacks it.")] = None,
     height_px: Annotated[int | None, Option(min=1, help="Image height, if SOURCE lacks it.")] = None,
-    block: Annotated[Path | None, Option(help="Block of the results in SOURCE.")] = None,
-    distortion: Annotated[str | None, Option(help="Distortion model of a .toml (default: of SOURCE).")] = None,
+    block: Annotated[Path | None, Option(help="Block folder of the results in SOURCE.")] = None,
+    distortion: Annotated[str | None, Option(help="Distortion model of a .toml file (default: as in SOURCE).")] = None,
     model: Annotated[
         str | None, Option(help="Largest model of the format to use, like OPENCV (default: as required).")
     ] = None,
     loss_px: Annotated[float, Option(min=0, help="Maximum misfit of a fitted model.")] = 1.0,
 ) -> None:
-    """Convert a camera file: exactly where the models allow it, otherwise fitted, with the misfit in pixels."""
+    """Convert a camera file: exactly if possible, otherwise by a fitted model with its misfit in pixels."""
     from jaxphoto.camera import AbstractDistortion, get_parameter, parameter_names
     from jaxphoto.extras.formats import write_camera_file
     from jaxphoto.io.camera_files import read_camera_file

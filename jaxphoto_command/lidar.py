@@ -18,8 +18,8 @@ SCANNER = ("boresight", "lever-arm", "range-offset", "range-scale", "angle-scale
 """Scanner parameters that may be estimated."""
 
 SigmaZ = Annotated[float, Option(callback=opt.positive, help="Standard deviation of a laser point in Z.")]
-SigmaXY = Annotated[float, Option(help="Standard deviation of a laser point in each of X, Y.")]
-Systematic = Annotated[float, Option(help="Standard deviation of a common error of all heights.")]
+SigmaXY = Annotated[float, Option(help="Standard deviation of a laser point in X and in Y.")]
+Systematic = Annotated[float, Option(help="Standard deviation of an error common to all heights.")]
 MaxRounds = Annotated[int, Option(min=1, help="Maximum number of outer iterations (surface lookup, adjustment).")]
 Trajectory = Annotated[
     Path | None, Option(help="Trajectory of the scanner (docs/georeferencing.md), on the clock of the cloud.")
@@ -28,7 +28,7 @@ TrajectoryShift = Annotated[float, Option(callback=opt.finite, help="Trajectory 
 ExposureShift = Annotated[float, Option(callback=opt.finite, help="Point cloud time minus time_s of images.csv.")]
 Control = Annotated[Path | None, Option(help="Surveyed points on smooth surfaces (docs/control.md).")]
 Breaklines = Annotated[
-    str | None, Option(help="Tie points on breaklines, comma-separated, * as wildcard (default: those of block.toml).")
+    str | None, Option(help="Tie points on breaklines, comma-separated, * as wildcard (default: from block.toml).")
 ]
 Pattern = Annotated[
     Literal["line", "circle", "oscillating", "rotating", "risley", "nutating"] | None,
@@ -37,7 +37,7 @@ Pattern = Annotated[
 CellSize = Annotated[float, Option(callback=opt.positive, help="Cell size of the plane search.")]
 Roughness = Annotated[float, Option(callback=opt.positive, help="Maximum scatter of the returns of a plane.")]
 KnotSpacing = Annotated[float, Option(callback=opt.positive, help="Knot spacing of the trajectory errors.")]
-# Options of `simultaneous` without and with --adjust.
+# Options of `simultaneous` that apply only without, and only with --adjust.
 _SURFACE_OPTIONS = ("boresight", "shift", "method", "sigma_z_m", "sigma_xy_m", "sigma_systematic_m")
 _PLANE_OPTIONS = ("exposure_shift_s", "control", "breaklines", "pattern", "cell_m", "roughness_m", "knots_s")
 
@@ -49,7 +49,7 @@ def lidar_control(
     cloud: opt.Cloud,
     out: opt.BlockOut,
     method: Annotated[
-        Literal["plane", "local", "tin", "idw", "image"], Option(help="Height from laser points.")
+        Literal["plane", "local", "tin", "idw", "image"], Option(help="Interpolation of heights between laser points.")
     ] = "plane",
     sigma_z_m: SigmaZ = 0.15,
     sigma_xy_m: SigmaXY = 0.5,
@@ -109,7 +109,7 @@ def roof_control(
     cloud_unit: opt.CloudUnit = None,
     max_rounds: MaxRounds = 20,
 ) -> None:
-    """Constrain tie points to planes of roof faces, and centroids of roofs in X, Y and Z; write the block."""
+    """Constrain tie points to roof planes, and roof centroids in X, Y and Z; write the block."""
     from jaxphoto.io import write_block
     from jaxphoto.io.block_folder import check_block_target
     from jaxphoto.lidar import HeightSettings
@@ -159,7 +159,7 @@ def simultaneous(
     max_rounds: MaxRounds = 20,
     adjust: Annotated[
         str | None,
-        Option(help="Estimate of the whole system, comma-separated: scanner,trajectory,camera (docs/boresight.md)."),
+        Option(help="Parts of the system to estimate, comma-separated: scanner,trajectory,camera (docs/boresight.md)."),
     ] = None,
     exposure_shift_s: ExposureShift = 0.0,
     control: Control = None,
@@ -171,11 +171,11 @@ def simultaneous(
 ) -> None:
     """Adjust a block and a point cloud together; write results, corrected cloud and corrected trajectory.
 
-    With --adjust, strips are also fitted to each other by planes in their overlaps, and the trajectory may drift.
-    Single scanner parameters may be named instead of scanner, as in strips. What is not named is fixed.
+    With --adjust, strips are also fitted to each other by planes in their overlaps. Individual scanner parameters may
+    replace scanner, as in jaxphoto strips. Parts that are not given are fixed.
 
-    --class and --returns select the points of the surface; the whole cloud is corrected. Exit code 1: written, but
-    not converged.
+    --class and --returns select the points of the surface; the whole cloud is corrected. Exit code 1: results written,
+    but not converged.
     """
     import numpy as np
 
@@ -289,15 +289,17 @@ def strips(
     ] = 100.0,
     sigma_position_m: Annotated[
         float | None,
-        Option(callback=opt.positive, help="Standard deviation of positions (default: of the trajectory, or 0.08)."),
+        Option(callback=opt.positive, help="Standard deviation of positions (default: from the trajectory, or 0.08)."),
     ] = None,
     sigma_attitude_deg: Annotated[
         float | None,
-        Option(callback=opt.positive, help="Standard deviation of roll, pitch (default: of the trajectory, or 0.005)."),
+        Option(
+            callback=opt.positive, help="Standard deviation of roll, pitch (default: from the trajectory, or 0.005)."
+        ),
     ] = None,
     sigma_heading_deg: Annotated[
         float | None,
-        Option(callback=opt.positive, help="Standard deviation of heading (default: of the trajectory, or 0.01)."),
+        Option(callback=opt.positive, help="Standard deviation of heading (default: from the trajectory, or 0.01)."),
     ] = None,
     sigma_exposure_m: Annotated[
         float, Option(callback=opt.positive, help="Additional standard deviation of exposure positions.")
@@ -313,11 +315,11 @@ def strips(
 ) -> None:
     """Fit the strips of a point cloud to each other; write errors, corrected cloud and corrected trajectory.
 
-    With --block, the photographs of the flight are adjusted too: trajectory, scanner and camera at once. With
+    With --block, the photographs of the flight are also adjusted: trajectory, scanner and camera simultaneously. With
     --control, surveyed points define the datum.
 
-    --class and --returns select the points of the planes; the whole cloud is corrected. Exit code 1: written, but the
-    verdict is red, or not converged.
+    --class and --returns select the points of the planes; the whole cloud is corrected. Exit code 1: results written,
+    but the verdict is red, or not converged.
     """
     from jaxphoto.lidar.strip_planes import StripSettings
     from jaxphoto_command.strip_flight import StripChoices, StripFiles, adjust_flight, scanner_priors
@@ -366,8 +368,10 @@ def dsm(
     cell_m: Annotated[float, Option(callback=opt.positive, help="Cell size.")] = 1.0,
     classes: opt.Classes = None,
     returns: opt.Returns = "all",
-    statistic: Annotated[Literal["highest", "mean", "lowest"], Option(help="Height of a cell.")] = "highest",
-    fill_m: Annotated[float, Option(min=0.0, help="Fill gaps within this distance of heights.")] = 0.0,
+    statistic: Annotated[
+        Literal["highest", "mean", "lowest"], Option(help="Statistic of the heights in a cell.")
+    ] = "highest",
+    fill_m: Annotated[float, Option(min=0.0, help="Fill gaps up to this distance from a height.")] = 0.0,
     cloud_epsg: opt.CloudEpsg = None,
     cloud_unit: opt.CloudUnit = None,
     shading: Annotated[Path | None, Option("--hillshade", help="PNG of the shaded surface to write.")] = None,
@@ -385,7 +389,7 @@ def dsm(
     selected, options = opt.class_numbers(classes), {"epsg": cloud_epsg, "unit": cloud_unit}
     with output.progress("reading the cloud") as progress:
         system = clouds.cloud_system(cloud, **options)  # type: ignore[arg-type]
-        # Headers are rounded: one more cell on each side, removed if empty.
+        # Headers are rounded: add one cell on each side, and remove it if empty.
         extent = clouds.extent(cloud, **options)[:, :2] + np.array([[-cell_m], [cell_m]])  # type: ignore[arg-type]
         parts = partial(clouds.cloud_chunks, cloud, classes=selected, returns=returns, **options)  # type: ignore[arg-type]
         total = clouds.point_count(cloud) if selected is None and returns == "all" else None
@@ -420,7 +424,7 @@ def orthophoto(
     dsm_epsg: Annotated[int | None, Option(help="EPSG code of the surface model, if not in the file.")] = None,
     max_steps: opt.MaxSteps = 100,
 ) -> None:
-    """Adjust a block and project the photograph of one of its images onto a surface model."""
+    """Adjust a block and project the photograph of one image onto a surface model."""
     import jax
     import numpy as np
 
@@ -472,7 +476,7 @@ def orthophoto(
 
 
 def _check_options(output: Output, options: tuple[str, ...]) -> None:
-    """Raise BadParameter for options that have no effect with --adjust, or none without it."""
+    """Raise BadParameter for options that have no effect with --adjust, or need it."""
     defaults = {parameter.name: parameter.default for parameter in output.context.command.params}
     for name in options:
         if output.context.params[name] != defaults[name]:
@@ -481,7 +485,7 @@ def _check_options(output: Output, options: tuple[str, ...]) -> None:
 
 
 def _scanner_parameters(text: str, others: tuple[str, ...] = ()) -> set[str]:
-    """Return the comma-separated scanner parameters, or names of `others`."""
+    """Split comma-separated scanner parameters, or names of `others`. Raises BadParameter for an unknown name."""
     for name in opt.names(text) or [""]:
         if name not in (*others, *SCANNER):
             raise typer.BadParameter(f"--adjust {name or repr(text)}: choose from {', '.join((*others, *SCANNER))}.")
@@ -489,7 +493,7 @@ def _scanner_parameters(text: str, others: tuple[str, ...] = ()) -> set[str]:
 
 
 def _prior(option: str, text: str, unit: float) -> Any:
-    """Return FREE, FIXED, or weighted at zero."""
+    """Return FREE, FIXED, or a prior of zero with the given standard deviation."""
     import numpy as np
 
     from jaxphoto.unknowns import FIXED, FREE, Weighted
@@ -506,7 +510,7 @@ def _prior(option: str, text: str, unit: float) -> Any:
 
 
 def _block_and_cloud(block: Path, cloud: Path, selection: dict[str, Any], progress: Progress) -> tuple[Any, Any]:
-    """Read a block, and the cloud in the area of its points."""
+    """Read a block, and the part of the cloud near its points."""
     import numpy as np
 
     from jaxphoto.initial import approximate
@@ -516,13 +520,13 @@ def _block_and_cloud(block: Path, cloud: Path, selection: dict[str, Any], progre
     progress.update("reading the cloud")
     xy = np.asarray(approximate(read).points)[:, :2]
     low, high = xy.min(axis=0), xy.max(axis=0)
-    # Approximate points may be off by 100 m and a tenth of the block.
+    # Allow for errors of the approximate points: 100 m plus a tenth of the block.
     margin = 100.0 + 0.1 * (high - low)
     return read, clouds.read_cloud(cloud, read.frame, within=np.stack([low - margin, high + margin]), **selection)
 
 
 def _report_rounds(progress: Progress) -> Any:
-    """Return a function that shows each outer iteration."""
+    """Return a function that displays each outer iteration."""
     progress.update("adjusting for the first iteration")
 
     def report(iteration: Any) -> None:
@@ -533,7 +537,7 @@ def _report_rounds(progress: Progress) -> Any:
 
 
 def _end_of_rounds(output: Output, result: Any) -> None:
-    """Report the outer iterations; exit code 1 if they did not converge."""
+    """Report the outer iterations; exit code 1 without convergence."""
     output.add(rounds=len(result.rounds), iteration_converged=result.converged, rmse_m=result.rounds[-1].rmse_m)
     if not result.converged:
         raise typer.Exit(1)

@@ -1,4 +1,4 @@
-"""Options that several commands share, and checks of option values."""
+"""Options shared by several commands, and checks of option values."""
 
 import math
 from pathlib import Path
@@ -9,26 +9,26 @@ from typer import Argument, Option
 
 
 def positive(context: typer.Context, value: float | None) -> float | None:
-    """Check a positive, finite number."""
+    """Raise BadParameter unless a value is positive and finite."""
     if value is not None and not 0 < value < math.inf:
         raise typer.BadParameter(f"{value:g} is not a positive number.")
     return value
 
 
 def finite(context: typer.Context, value: float) -> float:
-    """Check a finite number."""
+    """Raise BadParameter unless a value is finite."""
     if not math.isfinite(value):
         raise typer.BadParameter(f"{value:g} is not a finite number.")
     return value
 
 
 def names(text: str | None) -> list[str]:
-    """Return comma-separated names."""
+    """Split comma-separated names."""
     return [name.strip() for name in (text or "").split(",") if name.strip()]
 
 
 def pair(option: str, text: str, example: str) -> tuple[float, float]:
-    """Return the two positive numbers of `15x11`."""
+    """Parse two positive numbers such as `15x11`."""
     try:
         first, second = (float(part) for part in text.lower().split("x"))
     except ValueError:
@@ -55,20 +55,20 @@ MaxSteps = Annotated[int, Option(min=1, help="Maximum number of iterations.")]
 Seed = Annotated[int, Option(min=0, help="Seed of the random numbers.")]
 
 Alignment = Annotated[
-    Literal["zrot", "rot", "spr"], Option("--method", help="What the exterior orientation may compensate.")
+    Literal["zrot", "rot", "spr"], Option("--method", help="Alignment of the ray bundles (docs/stability.md).")
 ]
 Grid = Annotated[str, Option(help="Columns and rows of the grid.")]
 Extent = Annotated[
     str | None, Option(help="Width and height of the grid in mm, like 4.0x3.0 (default: the image format).")
 ]
-Camera = Annotated[str | None, Option(help="Camera, where there are several.")]
-CameraB = Annotated[str | None, Option(help="Camera of B, if its name differs.")]
-ResultBlock = Annotated[Path | None, Option(help="Block of the results, where they lack the camera model.")]
+Camera = Annotated[str | None, Option(help="Camera name, if there are several.")]
+CameraB = Annotated[str | None, Option(help="Camera name in B, if different from A.")]
+ResultBlock = Annotated[Path | None, Option(help="Block folder of the results, if they lack the camera model.")]
 
 Photographs = Annotated[list[Path], Argument(help="Photographs of one camera, or folders of them.")]
 Distortion = Annotated[str, Option(help="Distortion model, like brown, smac or opencv (docs/models.md).")]
 FreeParameters = Annotated[
-    str | None, Option(help="Parameters to estimate, comma-separated: c,xp,yp,k1 (default: usual ones).")
+    str | None, Option(help="Parameters to estimate, comma-separated: c,xp,yp,k1 (default: the usual ones).")
 ]
 R0 = Annotated[float | None, Option(help="Balance radius R0 of SMAC (default: 0).")]
 PixelSize = Annotated[float | None, Option(help="Pixel size (default: from the file).")]
@@ -89,7 +89,7 @@ ControlSystem = Annotated[
     str | None, Option(help="Coordinate system of the points, if not in the file: 25832, 25832+7837, local.")
 ]
 MapSystem = Annotated[
-    str | None, Option(help="Map system of the block, like 25832 or with heights 25832+7837 (default: UTM zone).")
+    str | None, Option(help="Map system of the block: EPSG code, or with heights 25832+7837 (default: UTM zone).")
 ]
 Targets = Annotated[
     str | None,
@@ -106,7 +106,7 @@ CloudUnit = Annotated[
 
 
 def class_numbers(text: str | None) -> list[int] | None:
-    """Return the classes of --class; None for all."""
+    """Parse the classes of --class; None for all."""
     if text is None:
         return None
     if not all(part.isdigit() for part in names(text)):

@@ -1,4 +1,4 @@
-"""Output of one command: text for people, one JSON object for programs, progress on standard error."""
+"""Output of a command: text for people, one JSON object for programs, progress on standard error."""
 
 import json
 import logging
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
 
 COMPILE_NOTE_S = 2.0
-"""Compile time (s) from which a note is printed at the end."""
-# Programs that compile faster than this (s) are not logged.
+"""Minimum total compile time (s) that is reported at the end."""
+# Minimum compile time (s) of a program that is logged.
 _COMPILE_LOG_S = 0.1
 _COMPILED = "/jax/core/compile/backend_compile_duration"
 _FLAGS = ("json", "quiet", "verbose")
@@ -26,7 +26,7 @@ _LOG = logging.getLogger("jaxphoto")
 
 
 class Progress:
-    """Progress of long work: a line on a terminal, or log records with --verbose."""
+    """Progress of a long operation: a line on a terminal, or log records with --verbose."""
 
     def __init__(self, bar: "Bar", description: str) -> None:
         self._bar, self._task, self._description = bar, bar.add_task(""), ""
@@ -37,13 +37,13 @@ class Progress:
         self._start(description, None)
 
     def steps(self, description: str, done: int, total: int | None) -> None:
-        """Report that `done` of `total` steps are done; rich estimates the time left."""
+        """Report that `done` of `total` steps are complete; rich estimates the remaining time."""
         if description != self._description:
             self._start(description, total)
         self._bar.update(self._task, completed=done)
 
     def points(self, description: str, parts: Callable[[], Iterator], total: int | None) -> Callable[[], Iterator]:
-        """Return `parts` of a point cloud, which report how many points have been read."""
+        """Return an iterator over `parts` of a point cloud that reports the number of points read."""
 
         def counted() -> Iterator:
             done = 0
@@ -78,7 +78,7 @@ class Output:
         self._log = logging.StreamHandler() if verbose else None
 
     def __enter__(self) -> "Output":
-        # Before JAX, which reads the environment that jaxphoto sets.
+        # Import jaxphoto before JAX: it sets environment variables that JAX reads.
         import jaxphoto  # noqa: F401
 
         self._showwarning = warnings.showwarning
@@ -105,7 +105,7 @@ class Output:
 
     @contextmanager
     def progress(self, description: str) -> Iterator[Progress]:
-        """Show progress of long work on standard error."""
+        """Display progress of a long operation on standard error."""
         from rich import progress
         from rich.console import Console
 
@@ -137,14 +137,14 @@ class Output:
 
         table = Table(title=title)
         for heading in headings:
-            # A long number is folded, not cut.
+            # Wrap long numbers instead of truncating them.
             table.add_column(heading, overflow="fold")
         for row in rows:
             table.add_row(*row)
         self.screen.print(table)
 
     def wrote(self, path: Path, text: str) -> None:
-        """Print that a file or folder was written; its summary.json goes into the JSON object."""
+        """Report a written file or folder; its summary.json is added to the JSON object."""
         from jaxphoto.io.text_files import read_json
         from jaxphoto.writing import files_in
 
@@ -159,7 +159,7 @@ class Output:
         self._summary |= values
 
     def command_line(self) -> str:
-        """Return the command with all options but the output folder, as it can be typed."""
+        """Return the command line with all options except the output folder, quoted for a shell."""
         words = ["jaxphoto", str(self.context.info_name)]
         for parameter in self.context.command.params:
             value = self.context.params.get(str(parameter.name))
@@ -184,7 +184,7 @@ class Output:
         )
 
     def options(self, **values: Any) -> dict[str, Any]:
-        """Return the options that are not paths, with those of `values` replaced, as the method of a result."""
+        """Return the options that are not paths, updated by `values`, as the method of a result."""
         params = {name: v for name, v in (self.context.params | values).items() if name not in _FLAGS}
         return {
             "method": {
@@ -221,6 +221,6 @@ class Output:
             "seconds": time.perf_counter() - self._start,
             "compiling": {"seconds": seconds, "programs": self._compile_s},
         }
-        # Arrays as lists, paths as text; NaN and infinity, which JSON lacks, as null.
+        # Write arrays as lists, paths as text, and NaN and infinity as null: JSON has neither.
         text = json.dumps(values, default=lambda v: v.tolist() if hasattr(v, "tolist") else str(v))
         typer.echo(json.dumps(json.loads(text, parse_constant=lambda _: None), indent=2))

@@ -32,17 +32,15 @@ def fly(
     pixel_mm: opt.PixelSize = None,
     model: opt.Distortion = "brown",
     no_lens_prior: Annotated[
-        bool, Option("--no-lens-prior", help="Omit the prior information of such lenses (docs/target_calibration.md).")
+        bool, Option("--no-lens-prior", help="Ignore prior information on the lens type (docs/target_calibration.md).")
     ] = False,
     rolling_shutter: Annotated[
-        bool, Option("--rolling-shutter", help="Estimate the readout time of the rows from positions and times.")
+        bool, Option("--rolling-shutter", help="Estimate the rolling-shutter readout from positions and times.")
     ] = False,
     exposures: Annotated[
         list[Path] | None, Option(help="Exposure files outside the folders: .MRK, .pos, SBET, a table.")
     ] = None,
-    lever_arm: Annotated[
-        str | None, Option(help="From camera to antenna in m: right,forward,up of the aircraft.")
-    ] = None,
+    lever_arm: Annotated[str | None, Option(help="Lever arm from camera to antenna (m): right,forward,up.")] = None,
     heights: Annotated[
         str | None,
         Option(help="Height reference, if not in the files: ellipsoid, geoid, take-off, or EPSG code (EGM96: 5773)."),
@@ -54,7 +52,7 @@ def fly(
 ) -> None:
     """Calibrate the camera of a flight from its photographs and their positions: orient, georeference, adjust, assess.
 
-    Unusable photographs are skipped and named. Exit code 1: written, but the verdict is red.
+    Unusable photographs are skipped and listed. Exit code 1: results written, but the verdict is red.
     """
     import datetime
 
@@ -209,14 +207,14 @@ def control(
     control_epsg: opt.ControlSystem = None,
     targets: opt.Targets = None,
     photographs: Annotated[
-        list[Path] | None, Option(help="Folder of the photographs of the block, to find targets.")
+        list[Path] | None, Option(help="Folder of the block's photographs, to find targets.")
     ] = None,
     epsg: opt.MapSystem = None,
 ) -> None:
     """Adjust an oriented block with surveyed points and their image measurements.
 
-    A block without a datum is transformed to the control. Contradicting observations are rejected and named. Exit code
-    1: written, but the verdict is red.
+    A block without a datum is transformed to the control. Contradictory observations are rejected and listed. Exit code
+    1: results written, but the verdict is red.
     """
     from jaxphoto.extras.formats import read_control
     from jaxphoto.extras.photos.control_targets import make_target_search
@@ -293,8 +291,8 @@ def control(
 )
 def calibrate(
     output: Output,
-    images: Annotated[list[Path], Argument(help="Photographs of the board by one camera at one focus.")],
-    board: Annotated[str, Option(help="Board, as below.")],
+    images: Annotated[list[Path], Argument(help="Photographs of the board, taken by one camera at constant focus.")],
+    board: Annotated[str, Option(help="Board; see the formats below.")],
     out: opt.Out,
     model: opt.Distortion = "smac",
     r0_mm: opt.R0 = None,
@@ -309,7 +307,7 @@ def calibrate(
 ) -> None:
     """Calibrate a camera with photographs of a board.
 
-    Exit code 1: written, but not converged.
+    Exit code 1: results written, but not converged.
     """
     from jaxphoto.extras.photos.features import read_grey
     from jaxphoto.extras.photos.targets import find_targets, read_board
@@ -355,7 +353,7 @@ def calibrate(
             detections=targets.detections,
             start=camera.origin,
             record=output.command_record(*images),
-            # An assumed pixel size is the unit of every length in the report.
+            # Add a note if the pixel size is assumed: all lengths in the report scale with it.
             notes=() if pixel_mm is not None else (camera.origin,),
         )
     output.say(camera.origin)
@@ -381,8 +379,8 @@ def orient(
 ) -> None:
     """Orient photographs by their features, as initial values for `jaxphoto adjust`.
 
-    For a block folder, determine the approximate orientation that its images.csv lacks. Exit code 1: written, but not
-    converged.
+    For a block folder, determine the approximate orientation missing in its images.csv. Exit code 1: results written,
+    but not converged.
     """
     from jaxphoto.camera import InteriorOrientation
     from jaxphoto.extras.photos.features import LONGEST_PX
@@ -444,7 +442,7 @@ def orient(
             title=f"{len(read)} photographs",
             report=progress.update,
         )
-        # Photographs without matches are not oriented for the reason that matching states.
+        # Report the reason given by the matching for photographs without matches.
         reasons = {name: matched.left_out.get(name, text) for name, text in result.report.unoriented.items()}
         result = result._replace(report=result.report._replace(unoriented=reasons))
         progress.update(f"writing {out}")
@@ -488,12 +486,12 @@ def undistort(
     out: Annotated[Path, Option(help="Output folder for the photographs and their camera.toml.")],
     which: opt.Camera = None,
     keep: Annotated[
-        Literal["crop", "all"], Option(help="crop: no black borders; all: the whole image with black borders.")
+        Literal["crop", "all"], Option(help="crop: without black borders; all: whole image with black borders.")
     ] = "crop",
 ) -> None:
     """Resample photographs to a camera without distortion.
 
-    Exit code 1: written, but some were skipped.
+    Exit code 1: results written, but some photographs were skipped.
     """
     from jaxphoto.io.camera_files import read_camera_file
     from jaxphoto.io.photographs import skipped_messages, skipped_subfolders, valid_photographs
@@ -519,7 +517,7 @@ def undistort(
 
 
 def map_codes(text: str | None) -> tuple[int | None, int | None]:
-    """Return the EPSG codes of a map system and of its heights, of `25832+7837`."""
+    """Parse the EPSG codes of a map system and of its heights, such as `25832+7837`."""
     from jaxphoto.georeferencing.map_frame import check_heights, map_system
 
     if text is None:
@@ -538,7 +536,7 @@ def map_codes(text: str | None) -> tuple[int | None, int | None]:
 
 
 def height_reference(text: str | None) -> Any:
-    """Return the reference of heights, or the EPSG code of their system."""
+    """Return the height reference, or the EPSG code of the height system."""
     from jaxphoto.georeferencing.gps import Heights
 
     if text is None or (text in get_args(Heights) and text != "unknown"):
@@ -550,7 +548,7 @@ def height_reference(text: str | None) -> Any:
 
 
 def _lever_arm(text: str | None) -> tuple[float, float, float] | None:
-    """Return metres to the right, forward and up."""
+    """Parse a lever arm: metres to the right, forward and up."""
     if text is None:
         return None
     try:

@@ -1,4 +1,4 @@
-"""Adjustment of the strips of a flight, with or without its photographs, from files to results."""
+"""Adjustment of the strips of a flight, with or without photographs, from files to results."""
 
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -51,7 +51,7 @@ from jaxphoto_command.output import Output
 
 
 class StripFiles(NamedTuple):
-    """Files of a flight, and how to read them."""
+    """Files of a flight, and options for reading them."""
 
     cloud: Path
     trajectory: Path | None
@@ -60,7 +60,7 @@ class StripFiles(NamedTuple):
     """Block of the photographs."""
     exposure_shift_s: float
     classes: list[int] | None
-    """Classes of the returns in which planes are sought; all returns are corrected."""
+    """Classes of the returns used for the plane search; all returns are corrected."""
     returns: str
     epsg: int | None
     unit: str | None
@@ -71,11 +71,11 @@ class StripFiles(NamedTuple):
 
 
 class StripChoices(NamedTuple):
-    """Parameters to adjust and their options."""
+    """Parameters to adjust, and their settings."""
 
     settings: StripSettings
     stated: set[str]
-    """Standard deviations of the settings that override those of the trajectory."""
+    """Names of the standard deviations in `settings` that override those of the trajectory."""
     priors: ScannerPriors | None
     fixed_strips: list[str] | Literal["all"]
     """Strips with a fixed trajectory."""
@@ -85,7 +85,7 @@ class StripChoices(NamedTuple):
 
 
 def scanner_priors(free: Collection[str], pattern: str | None) -> ScannerPriors:
-    """Return priors with the scanner parameters `free` FREE and the others FIXED."""
+    """Return priors with the scanner parameters `free` FREE and all others FIXED."""
     boresight, *calibration = (FREE if name in free else FIXED for name in SCANNER)
     return ScannerPriors(boresight, ScannerCalibration(*calibration, PATTERN_OF[pattern or "line"]))  # type: ignore[arg-type, call-arg]
 
@@ -93,7 +93,7 @@ def scanner_priors(free: Collection[str], pattern: str | None) -> ScannerPriors:
 def adjust_flight(output: Output, flight: StripFiles, choices: StripChoices, out: Path) -> None:
     """Adjust the strips of a flight and its photographs, and write the results; exit code 1 if the verdict is red.
 
-    The cloud is read in parts; only the returns on its planes are kept in memory.
+    The cloud is read in parts; only the returns on its planes are stored in memory.
     """
     cloud, trajectory, block = flight.cloud, flight.trajectory, flight.block
     if flight.breaklines is not None and block is None:
@@ -118,7 +118,7 @@ def adjust_flight(output: Output, flight: StripFiles, choices: StripChoices, out
         track = None if path is None else scanner_path(path)
         selection: dict[str, Any] = {"classes": flight.classes, "returns": flight.returns}
         parts = partial(clouds.cloud_chunks, cloud, map_frame, **selection, **options)
-        # The number of points that a filter leaves is unknown.
+        # The number of points is unknown if a filter is applied.
         total = clouds.point_count(cloud) if flight.classes is None and flight.returns == "all" else None
         coverage = None if path is None else CoveredTimes(path)
         planes = kept_returns(
@@ -183,7 +183,7 @@ def adjust_flight(output: Output, flight: StripFiles, choices: StripChoices, out
 
 
 def cloud_records(trajectory: Path, shift_s: float) -> Records:
-    """Read a trajectory, with times on the clock of the cloud."""
+    """Read a trajectory and convert its times to the clock of the cloud."""
     records = read_records(trajectory)
     return records._replace(time=records.time - shift_s)
 
@@ -195,7 +195,7 @@ def _photographs(block: Path, flight: StripFiles, fixed_camera: bool) -> Photogr
 
 
 def _stated_sigmas(records: Records, stated: set[str]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Return standard deviations (m, rad) of a trajectory; zero if unknown or overridden by `stated` ones."""
+    """Return standard deviations (m, rad) of a trajectory; zero if unknown or overridden (`stated`)."""
     sigma_m, sigma_deg = np.nan_to_num(records.sigma_m), np.nan_to_num(records.sigma_deg)
     if "sigma_position_m" in stated:
         sigma_m = np.zeros_like(sigma_m)
@@ -205,9 +205,9 @@ def _stated_sigmas(records: Records, stated: set[str]) -> tuple[Float[np.ndarray
 
 
 class Differences:
-    """Maps of height differences between strips before and after, of a cloud that is read in parts.
+    """Maps of height differences between strips before and after correction; the cloud is read in parts.
 
-    The maps are in the coordinate system of the cloud, or if that is geographic, in the frame of the block.
+    The maps are in the coordinate system of the cloud, or in the frame of the block if the former is geographic.
     """
 
     def __init__(self, placement: Placement, settings: StripSettings) -> None:
@@ -219,7 +219,7 @@ class Differences:
         self._before, self._after = CellTally(settings), CellTally(settings)
 
     def add(self, part: Cloud, corrected: Float[np.ndarray, "n 3"]) -> None:
-        """Add returns as measured, and as corrected (m)."""
+        """Add returns as measured and as corrected (m)."""
         for look in looks_of(part, None, "line"):
             if len(look.returns):
                 self._before.add(look.name, self._on_map(part.xyz[look.returns]))
@@ -227,14 +227,14 @@ class Differences:
 
     @property
     def maps(self) -> tuple[Raster, Raster] | None:
-        """Maps before and after; None if strips have no planes in common."""
+        """Maps before and after correction; None if strips have no planes in common."""
         before, after = (strip_differences(t.strips.values(), self.settings) for t in (self._before, self._after))
         return None if before is None or after is None else (before, after)
 
 
 def _frame_at(records: Records, system: CoordinateSystem, cloud: Path) -> Frame:
-    """Return a local frame at the middle of a trajectory in longitude and latitude."""
-    # Any system of the same datum suffices: points are transformed from their own.
+    """Return a local frame at the middle of a geographic trajectory."""
+    # Any system of the same datum suffices: points are transformed from their own system.
     datum = None if system.plane is None else system.plane.geodetic_crs
     code = None if datum is None else datum.to_epsg()
     if code is None:
@@ -251,7 +251,7 @@ def _tie_points(block: Block) -> Float[np.ndarray, "points 3"]:
 
 
 def _covered(coverage: CoveredTimes | None, parts: Callable[[], Iterator[Cloud]]) -> Callable[[], Iterator[Cloud]]:
-    """Return `parts`, whose times are added to `coverage`."""
+    """Return an iterator over `parts` that adds their times to `coverage`."""
 
     def covered() -> Iterator[Cloud]:
         for part in parts():
@@ -280,9 +280,10 @@ def write_corrected(
     frame: Frame | None,
     system: dict[str, Any],
 ) -> None:
-    """Write `cloud` with `corrected` coordinates of each part, whose strips are numbered as in `strips`.
+    """Write `cloud` with the coordinates `corrected` of each part; strips are numbered as in `strips`.
 
-    Withheld points of other strips, or at times without trajectory, are not corrected; a UserWarning counts them.
+    Withheld points of other strips, or at times without trajectory, are not corrected; a UserWarning contains their
+    number.
     """
     coverage = None if trajectory is None else CoveredTimes(trajectory)
 
@@ -309,10 +310,10 @@ def write_corrected(
 
 
 def control_in_frame(path: Path, placement: Placement) -> SurveyedPoints:
-    """Read surveyed points in the coordinate system of the cloud, in the frame of its `placement`.
+    """Read surveyed points in the coordinate system of the cloud, and transform them to the frame of `placement`.
 
-    Raises InputError for points in another system, without heights or sigmas, or outside the system. A UserWarning
-    says that image measurements are not used.
+    Raises InputError for points in a different system, without heights or sigmas, or outside the system. Warns that
+    image measurements are not used.
     """
     points, marks = read_control(path)
     if len(marks.image):

@@ -132,7 +132,7 @@ def test_bad_input_is_one_sentence(results, tmp_path, monkeypatch, capsys):
     code, _, error = run(monkeypatch, capsys, "certificate", results, "--out", tmp_path / "a.doc")
     assert code == 2 and "name a file that ends in .html or .pdf" in error
     code, _, error = run(monkeypatch, capsys, "certificate", tmp_path, "--out", tmp_path / "a.pdf")
-    assert code == 2 and "holds no interior.csv" in error
+    assert code == 2 and "interior.csv not found" in error
     open_end = tmp_path / "open"
     open_end.mkdir()
     for file in results.glob("*.*"):

@@ -105,7 +105,7 @@ def test_cameras_of_different_sensors_are_refused(sets, monkeypatch, capsys):
     other.write_text((sets / "bare.toml").read_text().replace("0.00155", "0.0015"))
     code, _, error = run(monkeypatch, capsys, "stability", sets / "one", other)
     assert code == 2
-    assert "give the true one by --pixel-mm" in error
+    assert "give the true size with --pixel-mm" in error
     code, _, error = run(monkeypatch, capsys, "stability", sets / "one", other, "--pixel-mm", SENSOR["pixel_mm"])
     assert code == 2
     assert "other.toml: it says itself that a pixel is 0.0015 mm, not 0.00155: leave --pixel-mm out, or" in error

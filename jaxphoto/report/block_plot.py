@@ -1,4 +1,4 @@
-"""A block in plan or in space, before or after adjustment: matplotlib plot and interactive 3-D view (plotly)."""
+"""Plots of a block before or after adjustment: in plan or 3-D by matplotlib, and an interactive 3-D view by plotly."""
 
 from __future__ import annotations
 
@@ -20,24 +20,25 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from plotly.graph_objects import Figure
 
-# Points and image frames of the plot; of more, every n-th.
+# Maximum number of points and of image frames in the plot; of more, every n-th is drawn.
 _POINTS, _FRAMES = 20_000, 300
-# The same of the 3-D view, and its error ellipsoids of stations and of tie points.
+# Maximum number of points, image frames and error ellipsoids (each of stations and tie points) in the 3-D view.
 _POINTS_3D, _FRAMES_3D, _ELLIPSOIDS = 5_000, 500, 80
-# Ellipsoids this many times longer than the median are skipped: they would hide the block.
+# Ratio of ellipsoid length to median length above which an ellipsoid is skipped: it would hide the block.
 _LONGEST = 10.0
 # Drawn lengths as fractions of the extent: image pyramids, median ellipsoid, RMS position residual.
 _PYRAMID, _ELLIPSOID, _OFFSET = 0.06, 0.015, 0.05
-# Coordinates beyond this are shown relative to a round origin: WebGL has seven digits.
+# Coordinate (m) above which coordinates are drawn relative to an origin, because WebGL has seven digits; rounding of
+# the origin (m).
 _FAR, _ROUND = 1e4, 1e3
-# The outline of an image and lines to its projection centre (None), drawn as one line.
+# Indices of image corners along the outline of an image pyramid, drawn as one line; None: projection centre.
 _OUTLINE = (0, 1, 2, 3, 0, None, 0, None, 1, None, 2, None, 3)
 _CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
 _GREY, _BLUE, _RED, _GREEN, _PURPLE, _SKY = "#8a8f96", "#2f8fd0", "#d55e00", "#009e73", "#cc79a7", "#56b4e9"
 
 
 class BlockPlaces(NamedTuple):
-    """Positions in the block's frame (m), and which are known."""
+    """Coordinates of stations and points in the block's frame (m), and masks of the known ones."""
 
     stations: Float[np.ndarray, "images 3"]
     points: Float[np.ndarray, "points 3"]
@@ -56,13 +57,16 @@ class BlockPlaces(NamedTuple):
         return float(np.ptp(known, axis=0).max()) or 1.0 if len(known) else 1.0
 
     def ties(self, most: int) -> Int[np.ndarray, drawn]:
-        """Return indices of known points; of more than `most` every n-th."""
+        """Return the indices of known points; of more than `most`, every n-th."""
         known = np.flatnonzero(self.point_known)
         return known[:: max(1, -(-len(known) // most))]
 
 
 def places_of(source: Block | Adjustment) -> BlockPlaces:
-    """Estimates of an adjusted block; otherwise approximate values, completed by observed coordinates."""
+    """Return the estimates of an adjusted block, or the approximate values of a block without adjustment.
+
+    Unknown approximate values are replaced by observed coordinates.
+    """
     block = source if isinstance(source, Block) else source.block
     unknowns = source.start.unknowns if isinstance(source, Block) else source.unknowns
     stations, points = (np.array(v, float) for v in (unknowns.exterior.position, unknowns.points))
@@ -79,7 +83,7 @@ def places_of(source: Block | Adjustment) -> BlockPlaces:
 
 
 def _completed(places: np.ndarray, given: Any, groups: tuple[Any, ...]) -> np.ndarray:
-    """Fill unknown coordinates by observed ones, and return which rows have X and Y."""
+    """Fill unknown coordinates with observed ones in place. Return a mask of the rows with X and Y."""
     has = np.repeat(np.asarray(given, bool)[:, None], 3, axis=1)
     for rows in groups:
         unknown = ~has[rows.who, rows.axis]
@@ -89,7 +93,7 @@ def _completed(places: np.ndarray, given: Any, groups: tuple[Any, ...]) -> np.nd
 
 
 def pyramids(source: Block | Adjustment, places: BlockPlaces, most: int) -> Float[np.ndarray, "images corners 3"]:
-    """Return a line along the edges of each image's pyramid; of more than `most` images for every n-th."""
+    """Return a line along the edges of each image's pyramid; of more than `most` images, of every n-th."""
     block, start = (source, source.start.unknowns) if isinstance(source, Block) else (source.block, source.unknowns)
     images = np.flatnonzero(places.image_known & (np.asarray(block.start.image_known, bool) | (source is not block)))
     images = images[:: max(1, -(-len(images) // most))]
@@ -105,10 +109,10 @@ def pyramids(source: Block | Adjustment, places: BlockPlaces, most: int) -> Floa
 
 @outside_transformations
 def plot_block(source: Block | Adjustment, ax: Axes | None = None, *, in_3d: bool = False) -> Axes:
-    """Camera stations with their strips, object points, control and check points; coordinates in metres.
+    """Draw camera stations with their strips, object points, control and check points; coordinates in metres.
 
-    Of a block that is not adjusted, approximate values are drawn: given or observed positions and points. `ax` has the
-    projection "3d" if `in_3d`.
+    For a block without adjustment, the approximate values or the observed positions are drawn. With `in_3d`, `ax` must
+    have the projection "3d".
     """
     ax = axes_or_new(ax, in_3d=in_3d)
     places, n = places_of(source), 3 if in_3d else 2
@@ -139,7 +143,7 @@ def plot_block(source: Block | Adjustment, ax: Axes | None = None, *, in_3d: boo
 
 
 def block_words(block: Block) -> str:
-    """Return the description of a plot of a block."""
+    """Return the description of a block plot."""
     control, check = (len(np.unique(rows.who)) for rows in (block.control, block.check))
     return (
         f"The block: {counted(len(block.images), 'camera station')}, {counted(len(block.points), 'object point')}, "
@@ -151,7 +155,7 @@ def block_words(block: Block) -> str:
 
 
 def block_view(adjusted: Adjustment, covariance: Covariance | None) -> Markup | None:
-    """Return the 3-D view as part of a page, with plotly.js; None without plotly (extra `report`)."""
+    """Return the HTML of the 3-D view, including plotly.js; None if plotly is not installed (extra `report`)."""
     try:
         figure = block_in_space(adjusted, covariance)
     except ImportError:
@@ -162,10 +166,10 @@ def block_view(adjusted: Adjustment, covariance: Covariance | None) -> Markup | 
 
 
 def block_in_space(source: Block | Adjustment, covariance: Covariance | None = None) -> Figure:
-    """Stations with image pyramids, strips, object, control and check points as a plotly figure, in metres.
+    """Draw stations with image pyramids, strips, object, control and check points as a plotly figure, in metres.
 
-    Of an adjustment also position residuals (GNSS) as lines from the stations and, with its `covariance`, error
-    ellipsoids of stations and points (one sigma, a posteriori); the legend has their magnification.
+    For an adjustment also position residuals (GNSS), as lines from the stations. With its `covariance` also error
+    ellipsoids of stations and points (one sigma, a posteriori). The legend contains their magnification.
     """
     from plotly.graph_objects import Figure
 
@@ -176,7 +180,7 @@ def block_in_space(source: Block | Adjustment, covariance: Covariance | None = N
         traces += _position_residuals(source, places)
         traces += _ellipsoids(covariance, places) if covariance is not None else []
     for trace in traces:
-        # Coordinates of an adjustment that diverged may exceed the range of WebGL.
+        # Clip coordinates: after divergence they may exceed the range of WebGL.
         at = np.clip(trace.pop("at") - origin, -1e30, 1e30).astype(np.float32)
         trace |= dict(zip("xyz", at.T, strict=True))
     names = (
@@ -195,7 +199,7 @@ def block_in_space(source: Block | Adjustment, covariance: Covariance | None = N
 
 
 def _origin(places: BlockPlaces) -> Float[np.ndarray, 3]:
-    """Return a round origin of the drawn coordinates (m); zero where coordinates are small."""
+    """Return a round origin for the drawn coordinates (m); zero if the coordinates are small."""
     known = places.points[places.point_known] if places.point_known.any() else places.stations[places.image_known]
     known = known[np.isfinite(known).all(axis=1)]
     middle = np.median(known, axis=0) if len(known) else np.zeros(3)
@@ -230,7 +234,7 @@ def _images(source: Block | Adjustment, places: BlockPlaces) -> list[dict[str, A
 
 
 def _position_residuals(adjusted: Adjustment, places: BlockPlaces) -> list[dict[str, Any]]:
-    """Lines from stations to their observed positions, enlarged; unobserved coordinates are zero."""
+    """Draw enlarged lines from stations to observed positions; residuals of unobserved coordinates are zero."""
     rows, residuals = adjusted.block.stations, physical_residuals(adjusted)
     if rows.group not in residuals or not len(rows.who):
         return []
@@ -269,7 +273,7 @@ def _ellipsoids(covariance: Covariance, places: BlockPlaces) -> list[dict[str, A
 def ellipsoid_mesh(
     centre: Float[np.ndarray, "n 3"], covariance: Float[np.ndarray, "n 3 3"]
 ) -> tuple[Float[np.ndarray, "corners 3"], Int[np.ndarray, "triangles 3"]]:
-    """Corners, and corner indices of triangles, of the surfaces d' covariance^-1 d = 1 around the centres.
+    """Return vertices, and vertex indices of triangles, of the ellipsoids d' covariance^-1 d = 1 around the centres.
 
     A singular covariance gives a flat ellipsoid.
     """
@@ -286,7 +290,7 @@ def ellipsoid_mesh(
         triangles.append(np.stack([above + here, below + right, above + right], axis=1))
     triangles.append(np.stack([0 * here + last, last - around + right, last - around + here], axis=1))
     variance, axes = np.linalg.eigh(covariance)
-    # A fixed coordinate has a variance of zero or, by rounding, below.
+    # Clip at zero: rounding may make the zero variance of a fixed coordinate negative.
     semi_axes = axes * np.sqrt(np.maximum(variance, 0.0))[:, None, :]
     corners = centre[:, None, :] + np.einsum("nij,cj->nci", semi_axes, sphere)
     shifted = np.concatenate(triangles) + len(sphere) * np.arange(len(centre))[:, None, None]
@@ -300,7 +304,7 @@ def _markers(name: str, at: np.ndarray, names: np.ndarray, marker: dict[str, Any
 
 
 def _lines(name: str, lines: Any, colour: str, width: float) -> dict[str, Any]:
-    """Several lines as one trace, with gaps."""
+    """Draw several lines as one trace, separated by gaps."""
     gap = np.full((1, 3), np.nan)
     at = np.concatenate([part for line in lines for part in (line, gap)])
     style = {"type": "scatter3d", "mode": "lines", "hoverinfo": "skip", "line": {"color": colour, "width": width}}

@@ -1,4 +1,4 @@
-"""Results of a boresight calibration: verdict, estimates of all steps, and a result folder for each step."""
+"""Results of a boresight calibration: verdict, estimates of all steps, and one result folder per step."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Sigmas of error bars.
+# Length of error bars in standard deviations.
 _BARS = 2.0
 _ANGLES = re.compile(r"mounts\[.*\]\.boresight_._deg")
 _SHIFTS = re.compile(r"strips\[.*\]\.shift_._m")
 
 
 def boresight_verdict(steps: Sequence[Step]) -> str:
-    """Return the result of the steps in one sentence."""
+    """Summarise the result of the steps in one sentence."""
     failed = [step.number for step in steps if not step.go_on]
     last = steps[-1].number
     if not failed:
@@ -46,9 +46,10 @@ def boresight_verdict(steps: Sequence[Step]) -> str:
 
 
 def steps_table(steps: Sequence[Step]) -> pd.DataFrame:
-    """step, parameter, value, sigma, unit: sigma0 and every estimate; sigmas are a posteriori.
+    """Tabulate sigma0 and all estimates of each step.
 
-    That of sigma0 is sigma0 / sqrt(2 f) with the redundancy f.
+    Columns: step, parameter, value, sigma (a posteriori), unit. The sigma of sigma0 is sigma0 / sqrt(2 f) with the
+    redundancy f.
     """
     rows: list[tuple] = []
     for step in steps:
@@ -59,7 +60,7 @@ def steps_table(steps: Sequence[Step]) -> pd.DataFrame:
 
 
 def boresight_figure(steps: Sequence[Step]) -> Figure | None:
-    """Misalignments of steps 3 and 4 and shifts of strips of step 2 with error bars; None without any."""
+    """Draw misalignments of steps 3 and 4 and strip shifts of step 2 with error bars; None without estimates."""
     sets = [shifts for shifts in (False, True) if len(_rows(steps, shifts))]
     if not sets:
         return None
@@ -70,9 +71,9 @@ def boresight_figure(steps: Sequence[Step]) -> Figure | None:
 
 
 def plot_boresight(steps: Sequence[Step], ax: Axes | None = None, *, shifts: bool = False) -> Axes:
-    """Misalignments of steps 3 and 4 (deg), or `shifts` of strips of step 2 (m), with bars of two sigmas.
+    """Draw misalignments of steps 3 and 4 (deg), or strip `shifts` of step 2 (m), with error bars of two sigmas.
 
-    Raises InputError if the steps estimated none.
+    Raises InputError if the steps have no such estimates.
     """
     rows = _rows(steps, shifts)
     if not len(rows):
@@ -103,13 +104,13 @@ def _rows(steps: Sequence[Step], shifts: bool) -> pd.DataFrame:
 
 
 def _short(path: str) -> str:
-    """`E1 X` of strips[E1].shift_X_m, `default x` of mounts[default].boresight_x_deg."""
+    """Shorten a label: strips[E1].shift_X_m to `E1 X`, mounts[default].boresight_x_deg to `default x`."""
     name, parameter = path.split("[", 1)[1].rsplit("].", 1)
     return f"{name} {parameter.split('_')[1]}"
 
 
 def boresight_parts(steps: Sequence[Step]) -> list[Part]:
-    """Return the page: misalignments, then findings and estimates of each step."""
+    """Return the parts of the page: misalignments, then findings and estimates of each step."""
     parts: list[Part] = []
     if figure := boresight_figure(steps):
         parts.append(Heading("Misalignment and shifts"))
@@ -126,9 +127,9 @@ def boresight_parts(steps: Sequence[Step]) -> list[Part]:
 
 
 def write_boresight(steps: Sequence[Step], directory: Path, seconds: dict[str, float], record: CommandRecord) -> None:
-    """steps.csv, summary.json, report.html and step_1 ... step_4.
+    """Write steps.csv, summary.json, report.html and the result folders step_1 to step_4.
 
-    Raises InputError if `directory` holds something else than an earlier result.
+    Raises InputError if `directory` contains anything but an earlier result.
     """
     began, passed = time.perf_counter(), all(step.go_on for step in steps)
     block, verdict = steps[0].adjusted.block, boresight_verdict(steps)

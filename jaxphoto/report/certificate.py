@@ -1,7 +1,7 @@
-"""A certificate of calibration: camera, flight, conditions, method, results and inputs, with gaps stated.
+"""Calibration certificate: camera, flight, conditions, method, results, inputs, and missing information.
 
 The order follows certificates after DIN 18740 and EuroSDR's reports on camera calibration; no conformity is claimed. It
-contains no time of writing: equal inputs give equal bytes.
+contains no creation time: equal inputs give equal bytes.
 """
 
 import math
@@ -30,10 +30,11 @@ from jaxphoto.statistics.correlation import high_pairs
 from jaxphoto.writing import InputFile, digest_of_all
 
 _GRID = (15, 11)
-# Every third row of the distortion curve is tabulated.
+# Step between tabulated rows of the distortion curve.
 _EVERY = 3
 _HIGH = 0.9
-# What a user of the calibration estimates, which absorbs errors of the camera.
+# Alignments of the ray bundle in applications of the calibration; an estimated attitude or position compensates part of
+# the camera's errors.
 _ALIGNMENTS: tuple[tuple[Method, str], ...] = (
     ("zrot", "position and attitude known"),
     ("rot", "attitude re-estimated"),
@@ -54,13 +55,13 @@ class LastCalibration(NamedTuple):
     interior: InteriorOrientation
     covariance: Float[np.ndarray, "q q"] | None
     input: InputFile
-    """The file it was read from."""
+    """File of the earlier calibration."""
     shared: bool = False
-    """True if it has images in common with the certified one."""
+    """True if both calibrations have images in common."""
 
 
 class FormatBand(NamedTuple):
-    """Split-half validation of the same camera (`jaxphoto halves`): 95 % of the errors over the image format."""
+    """Split-half validation of the same camera (`jaxphoto halves`): 95 % radius of the errors over the image format."""
 
     cells_mm: Float[np.ndarray, "cells 2"]
     band_px: Float[np.ndarray, "cells"]
@@ -79,27 +80,27 @@ class ExteriorCorrelation(NamedTuple):
 
 
 class Certified(NamedTuple):
-    """A calibrated camera, and how it was calibrated."""
+    """A calibrated camera with the data and method of its calibration."""
 
     camera: str
     sensor: Sensor
     interior: InteriorOrientation
     covariance: Float[np.ndarray, "p p"] | None
-    """A posteriori, of `parameter_names(interior)`, zero where fixed."""
+    """A posteriori covariance of `parameter_names(interior)`; zero for fixed parameters."""
     summary: Mapping[str, Any]
-    """summary.json."""
+    """Content of summary.json."""
     with_exterior: Sequence[ExteriorCorrelation]
     conditions: Sequence[Conditions]
-    """Conditions of the images, if their files were read."""
+    """Conditions of the images; empty if their files were not read."""
     inputs: Sequence[InputFile]
     all_inputs: bool
-    """True if all input files are known; image files alone are not all."""
+    """True if all input files are known, not only the image files."""
     last: LastCalibration | None = None
     band: FormatBand | None = None
 
     @property
     def sigma_factor(self) -> float:
-        """Factor of sigmas for spatially correlated residuals; 1 if unknown."""
+        """Factor of the standard deviations for spatially correlated residuals; 1 if unknown."""
         factor = self.summary.get("sigma_factor", 1.0)
         return float(factor) if isinstance(factor, int | float) and math.isfinite(factor) and factor > 1 else 1.0
 
@@ -117,13 +118,13 @@ class Certified(NamedTuple):
 
     @property
     def findings(self) -> list[tuple[str, str]]:
-        """Severities and sentences of the findings in summary.json."""
+        """Severities and texts of the findings in summary.json."""
         rows = self.summary.get("findings", [])
         return [(str(f.get("severity", "")), str(f.get("text", ""))) for f in rows if isinstance(f, dict)]
 
 
 def certificate_page(certified: Certified) -> str:
-    """Return the certificate as HTML. Raises InputError for a non-invertible distortion, and what `change` raises."""
+    """Return the certificate as HTML. Raises InputError for a non-invertible distortion, and the errors of `change`."""
     model = next((f"{c.camera} {c.serial}".strip() for c in certified.conditions if c.camera), "")
     foot = f"inputs SHA-256 {digest_of_all(certified.files)[:16]}" if certified.all_inputs else "inputs unknown"
     parts = [part for section in _SECTIONS for part in section(certified)]
@@ -184,7 +185,7 @@ def _flight(certified: Certified) -> Iterator[Part]:
 
 
 def dates(conditions: Sequence[Conditions]) -> str:
-    """First and last exposure by the clock of the camera."""
+    """Return the first and last exposure by the camera clock."""
     times = sorted(c.time for c in conditions if c.time)
     if not times:
         return _UNKNOWN
@@ -193,7 +194,7 @@ def dates(conditions: Sequence[Conditions]) -> str:
 
 
 def known_conditions(conditions: Sequence[Conditions]) -> Iterator[tuple[str, str]]:
-    """Ranges of exposure, aperture, sensitivity, focus and weather over the used images, where known."""
+    """Return the recorded ranges of exposure, aperture, sensitivity, focus and weather over the used images."""
     for name, field, unit in _QUANTITIES:
         values = [v for c in conditions if c.used and (v := getattr(c, field)) is not None]
         if values:

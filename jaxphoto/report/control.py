@@ -14,7 +14,11 @@ from jaxphoto.report.formatting import of_sigma
 
 
 def surveyed_points(control: ControlledBlock) -> pd.DataFrame:
-    """point, role, state, n_marks, dX_m to dZ_m (surveyed minus adjusted), sigmas of both, w_X to w_Z."""
+    """Tabulate the surveyed points.
+
+    Columns: point, role, state, n_marks, dX_m to dZ_m (surveyed minus adjusted), standard deviations of surveyed and
+    adjusted coordinates, w_X to w_Z.
+    """
     roles = np.where(control.check, "check", "control")
     columns: dict = {"point": control.ids, "role": roles, "state": control.state, "n_marks": control.n_marks}
     for pattern, values in (
@@ -26,7 +30,10 @@ def surveyed_points(control: ControlledBlock) -> pd.DataFrame:
 
 
 def control_marks(control: ControlledBlock) -> pd.DataFrame:
-    """image, point, column_px, row_px, sigma_px, d_column_px, d_row_px (measured minus computed) of used marks."""
+    """Tabulate the used image measurements of surveyed points.
+
+    Columns: image, point, column_px, row_px, sigma_px, d_column_px, d_row_px (measured minus computed).
+    """
     block, marks = control.adjusted.block, control.marks
     sensors = [block.sensors[block.image_camera[i]] for i in marks.image]
     places = [s.px_from_mm(xy[None])[0] for s, xy in zip(sensors, marks.xy_mm, strict=True)]
@@ -44,14 +51,14 @@ def control_marks(control: ControlledBlock) -> pd.DataFrame:
 
 
 def rmse(control: ControlledBlock, state: str) -> np.ndarray:
-    """RMS of surveyed minus adjusted X, Y, Z (m) of the points in a state; NaN if there are none."""
+    """Return the RMS of surveyed minus adjusted X, Y, Z (m) of the points with a state; NaN if there are none."""
     discrepancy = control.off_m[np.array(control.state, object) == state]
     n = np.isfinite(discrepancy).sum(axis=0)
     return np.where(n > 0, np.sqrt(np.nansum(discrepancy**2, axis=0) / np.maximum(n, 1)), np.nan)
 
 
 def control_findings(control: ControlledBlock) -> list[Finding]:
-    """Rejected control points, RMSE and outliers of check points."""
+    """Report rejected control points, RMSE and outliers of check points."""
     found, check = [], [k for k, state in enumerate(control.state) if state == "check"]
     rejected = [name for name, state in zip(control.ids, control.state, strict=True) if state == "left out"]
     if rejected:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def distortion_of(tables: Tables, camera: str | None = None) -> DistortionCurve:
-    """Distortion of a camera by distance, with a posteriori sigmas."""
+    """Return the distortion curve of a camera by radial distance, with a posteriori standard deviations."""
     name, a = one_camera(tables.adjusted.block, camera), tables.adjusted
     interior = a.unknowns.interior[name]
     covariance = tables.covariance.of_interior(name, parameter_names(interior))
@@ -23,14 +23,14 @@ def distortion_of(tables: Tables, camera: str | None = None) -> DistortionCurve:
 
 
 def plot_distortion(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
-    """Radial distortion by distance from the principal point with its 95 % band, and the remaining distortion."""
+    """Draw radial distortion by distance from the principal point with its 95 % band, and the non-radial distortion."""
     ax = axes_or_new(ax)
     draw_distortion(ax, distortion_of(tables, camera))
     return ax
 
 
 def draw_distortion(axes: Axes, curve: DistortionCurve, factor: float = 1.0) -> None:
-    """Radial distortion (um) with its 95 % band times `factor`, and the remaining distortion."""
+    """Draw radial distortion (um) with its 95 % band times `factor`, and the non-radial distortion."""
     um = 1e3
     if curve.sigma is not None:
         half = um * NORMAL_95 * factor * curve.sigma
@@ -45,7 +45,10 @@ def draw_distortion(axes: Axes, curve: DistortionCurve, factor: float = 1.0) -> 
 
 
 def plot_distortion_band(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
-    """Half width of the 95 % band of the radial distortion, which is often thinner than the line of the curve."""
+    """Draw the half width of the 95 % band of the radial distortion.
+
+    In a plot of the curve the band is often thinner than the line.
+    """
     ax, curve = axes_or_new(ax), distortion_of(tables, camera)
     if curve.sigma is not None:
         ax.plot(curve.r, 1e3 * NORMAL_95 * curve.sigma, "-", color="#08519c")

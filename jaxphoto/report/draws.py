@@ -1,4 +1,4 @@
-"""Monte Carlo draws: a table with one row per draw, a summary compared with the prediction, plots."""
+"""Monte Carlo draws: a table with one row per draw, a summary that compares them with the prediction, plots."""
 
 from __future__ import annotations
 
@@ -40,18 +40,18 @@ _PICTURES = {
     ),
 }
 LONG = ("exterior.", "point.", "check.", f"{TrajectoryKnot.kind}.")
-"""Prefixes of quantities of images, points and trajectory knots, which only files contain."""
+"""Column prefixes of images, points and trajectory knots; these quantities are written to files only."""
 EXTERIOR = ("X_m", "Y_m", "Z_m", "omega_rad", "phi_rad", "kappa_rad")
 _QUANTILES = {"q025": 0.025, "q50": 0.5, "q975": 0.975}
-# Histograms of a figure, and its maximum width (inches).
+# Maximum number of histograms in a figure; maximum width of the figure (inches).
 _SHOWN, _WIDEST = 12, 10.5
 
 
 def draws_table(draws: Draws, adjusted: Adjustment, first: int = 0) -> pd.DataFrame:
-    """One row per draw: draw (from `first`), converged, iterations, fallback, bias.*, then the estimates.
+    """Tabulate the draws: draw (from `first`), converged, iterations, fallback, bias.*, then the estimates.
 
-    `<camera>.c_mm` and so on; `scanner.*`, `mounts.*`, `strips.*`; if kept, `exterior.<image>.X_m ... kappa_deg` and
-    `point.<id>.X_m`; and with the points `check.<id>.dX_m`, surveyed minus computed. Angles are in degrees.
+    Estimates are `<camera>.c_mm` etc., `scanner.*`, `mounts.*`, `strips.*`. If stored, also `exterior.<image>.X_m ...
+    kappa_deg` and `point.<id>.X_m`; with points, also `check.<id>.dX_m` (surveyed minus computed). Angles in degrees.
     """
     block = adjusted.block
     columns: dict[str, np.ndarray] = {
@@ -77,12 +77,12 @@ def draws_table(draws: Draws, adjusted: Adjustment, first: int = 0) -> pd.DataFr
 
 
 def in_degrees(name: str) -> str:
-    """Return the name of a column whose angles are in degrees."""
+    """Replace the suffix _rad of a column name by _deg."""
     return name.removesuffix("_rad") + "_deg" if name.endswith("_rad") else name
 
 
 def column_of(path: str) -> str:
-    """`interior[kodak].c_mm` -> `kodak.c_mm`, `strips[E1].shift_X_m` -> `strips.E1.shift_X_m`."""
+    """Convert `interior[kodak].c_mm` to `kodak.c_mm`, `strips[E1].shift_X_m` to `strips.E1.shift_X_m`."""
     return in_degrees(_in_radians(path))
 
 
@@ -95,7 +95,7 @@ def _in_radians(path: str) -> str:
 
 
 class Moments(NamedTuple):
-    """Mean, standard deviation and quantiles of the draws of one column."""
+    """Mean, standard deviation and quantiles of one column of the draws."""
 
     mean: float
     sd: float
@@ -103,7 +103,7 @@ class Moments(NamedTuple):
 
 
 def moments(values: np.ndarray) -> Moments:
-    """Moments of the draws of one column; NaN if there are too few."""
+    """Compute the moments of one column of the draws; NaN for too few draws."""
     values = np.asarray(values, float)
     if not len(values):
         return Moments(np.nan, np.nan, (np.nan,) * len(_QUANTILES))
@@ -117,7 +117,10 @@ def summary_table(
     predicted: Mapping[str, float],
     cameras: Mapping[str, InteriorOrientation],
 ) -> pd.DataFrame:
-    """quantity, nominal, mean, sd, quantiles, predicted_sigma, ratio (sd over predicted), unit."""
+    """Tabulate the moments of the draws and their prediction.
+
+    Columns: quantity, nominal, mean, sd, quantiles, predicted_sigma, ratio (sd over predicted), unit.
+    """
     rows = [(name, nominal.get(name, np.nan), m.mean, m.sd, *m.quantiles) for name, m in moments_of.items()]
     table = pd.DataFrame(rows, columns=["quantity", "nominal", "mean", "sd", *_QUANTILES])
     table["predicted_sigma"] = [predicted.get(name, np.nan) for name in moments_of]
@@ -126,7 +129,7 @@ def summary_table(
 
 
 def draws_figure(columns: Mapping[str, np.ndarray], summary: pd.DataFrame) -> Figure:
-    """Histograms of some columns, with the nominal value and the predicted normal density."""
+    """Draw histograms of some columns, with the nominal value and the predicted normal density."""
     chosen = list(columns)[:_SHOWN]
     across = min(3, len(chosen))
     down = -(-len(chosen) // across)
@@ -140,10 +143,10 @@ def draws_figure(columns: Mapping[str, np.ndarray], summary: pd.DataFrame) -> Fi
 
 
 def plot_draws(draws: pd.DataFrame, summary: pd.DataFrame, quantity: str, ax: Axes | None = None) -> Axes:
-    """Histogram of a quantity, with its value without errors and the predicted normal density.
+    """Draw the histogram of a quantity, with its error-free value and the predicted normal density.
 
-    `draws` is that of `draws_table` (draws.parquet), `summary` that of `summary_table` (summary.csv). Raises InputError
-    for a quantity that is not in both.
+    `draws` is the table of `draws_table` (draws.parquet), `summary` the table of `summary_table` (summary.csv). Raises
+    InputError for a quantity that is missing in either.
     """
     quantities = summary["quantity"].tolist()
     if quantity not in quantities or quantity not in draws:
@@ -157,7 +160,7 @@ def plot_draws(draws: pd.DataFrame, summary: pd.DataFrame, quantity: str, ax: Ax
 def _draw_histogram(axes: Axes, name: str, values: np.ndarray, summary: pd.DataFrame) -> None:
     of = summary.set_index("quantity")
     nominal, sigma = (float(of[column].loc[name]) for column in ("nominal", "predicted_sigma"))
-    # Draws that differ by rounding only cannot be binned.
+    # Skip the histogram if draws differ only by rounding.
     if len(values) and np.ptp(values) > 1e-12 * np.abs(values).max(initial=1e-300):
         axes.hist(values, bins=min(60, max(5, int(np.sqrt(len(values))))), density=True, color="0.75")
     axes.axvline(nominal, color="tab:red", lw=1)
@@ -174,9 +177,10 @@ def _draw_histogram(axes: Axes, name: str, values: np.ndarray, summary: pd.DataF
 def plot_effects(
     effects: pd.DataFrame, summary: pd.DataFrame, quantities: Sequence[str], ax: Axes | None = None
 ) -> Axes:
-    """Effect of one sigma of each error on `quantities`, relative to their predicted sigmas.
+    """Draw the effect of one sigma of each error on `quantities`, relative to their predicted sigmas.
 
-    `effects` is effects.csv and `summary` summary.csv of a Monte Carlo. Raises InputError for unknown quantities.
+    `effects` is effects.csv and `summary` is summary.csv of a Monte Carlo simulation. Raises InputError for unknown
+    quantities.
     """
     names = list(quantities)
     available = [name for name in summary["quantity"] if name in effects]
@@ -192,7 +196,7 @@ def plot_effects(
 
 
 def effects_figure(effects: pd.DataFrame, summary: pd.DataFrame, quantities: list[str]) -> Figure:
-    """`plot_effects` in a figure of suitable size."""
+    """Draw `plot_effects` in a figure of suitable size."""
     figure = new_figure(min(1.8 + 0.8 * len(quantities), _WIDEST), max(3.2, 1.8 + 0.26 * len(effects)))
     plot_effects(effects, summary, quantities, figure.subplots())
     return figure
@@ -205,7 +209,7 @@ def write_draws_page(
     directory: Path,
     record: CommandRecord,
 ) -> None:
-    """report.html of the draws in `directory`, from the summary, its table and the plots in the folder."""
+    """Write report.html of the draws into `directory`: summary, its table, and the plots in the folder."""
     few = ~table["quantity"].str.startswith(LONG)
     ratio = table.loc[few, "ratio"].dropna()
     ratios = "No estimate is predicted to change."
@@ -216,7 +220,7 @@ def write_draws_page(
     for name, (heading, words) in _PICTURES.items():
         if (file := directory / f"{name}.png").is_file():
             parts += [Heading(heading), Paragraph(words), Plot(file, f"{heading}: {words}")]
-    # Errors come last: their distribution is known.
+    # List the errors last: their distribution is known.
     ordered = table[few].sort_values("quantity", key=lambda name: name.str.startswith("bias."), kind="stable")
     parts += [Heading("Means and standard deviations"), ordered]
     if not few.all():
@@ -226,18 +230,17 @@ def write_draws_page(
         work.write_text(text, encoding="utf-8")
 
 
-# Arrays of more than two dimensions as xarray: correlations by image, draws by image and point.
-#
-# Values are in radians, metres and millimetres, as the coordinate names say.
+# xarray data sets for arrays of more than two dimensions: correlations by image, draws by image and point. Values are
+# in radians, metres and millimetres, as stated in the coordinate names.
 
 
 def correlation_cube(correlations: Correlations) -> xr.Dataset:
-    """Return the correlations of a camera.
+    """Return the correlations of a camera as an xarray data set.
 
-    `interior` (parameter, with_parameter), `exterior` (image, element, parameter) and `within_image` (image, element,
-    with_element).
+    Variables: `interior` (parameter, with_parameter), `exterior` (image, element, parameter), `within_image` (image,
+    element, with_element).
     """
-    # Imported here because it takes a third of a second.
+    # Import locally: xarray takes a third of a second.
     import xarray as xr
 
     c = correlations
@@ -259,8 +262,10 @@ def correlation_cube(correlations: Correlations) -> xr.Dataset:
 
 
 def covariance_array(known: Covariance) -> xr.DataArray:
-    """All correlations of exterior orientations and shared unknowns: (unknown, with_unknown), with `sigma` (unknown),
-    a posteriori, in the units of the labels. A fixed unknown has a sigma of zero, and no correlation.
+    """Return the correlations of all exterior orientations and shared unknowns as an xarray array.
+
+    Dimensions: (unknown, with_unknown). The coordinate `sigma` (unknown) is a posteriori, in the units of the labels. A
+    fixed unknown has zero sigma and no correlation.
     """
     import xarray as xr
 
@@ -271,10 +276,10 @@ def covariance_array(known: Covariance) -> xr.DataArray:
 
 
 def draws_cube(draws: Draws, adjusted: Adjustment) -> xr.Dataset:
-    """Return a Monte Carlo as a cube.
+    """Return the draws of a Monte Carlo simulation as an xarray data set.
 
-    `shared` (draw, parameter), `error` (draw, of_error), `converged`, `iterations` and `fallback` (draw); if kept,
-    `exterior` (draw, image, element) and `points` (draw, point, axis).
+    Variables: `shared` (draw, parameter), `error` (draw, of_error), `converged`, `iterations` and `fallback` (draw). If
+    stored, also `exterior` (draw, image, element) and `points` (draw, point, axis).
     """
     import xarray as xr
 
@@ -303,11 +308,11 @@ _NORMAL_97_5 = 1.959964
 
 
 def posterior_table(posterior: Posterior) -> pd.DataFrame:
-    """Least squares and posterior of each parameter; both a priori.
+    """Tabulate the least-squares estimate and the posterior of each parameter, both with the a priori variance factor.
 
     Columns: parameter, optimum, laplace_sigma, laplace_2.5_percent, laplace_97.5_percent, posterior_mean,
-    posterior_sigma, posterior_2.5_percent, posterior_97.5_percent, skewness, rhat, ess. Units are in the parameters'
-    names, angles in degrees.
+    posterior_sigma, posterior_2.5_percent, posterior_97.5_percent, skewness, rhat, ess. Units are part of the parameter
+    names; angles in degrees.
     """
     names, factor = _names_and_factors(posterior)
     optimum, sigma = posterior.optimum * factor, np.sqrt(np.diagonal(posterior.laplace)) * factor
@@ -325,7 +330,7 @@ def posterior_table(posterior: Posterior) -> pd.DataFrame:
 
 
 def posterior_figure(posterior: Posterior) -> Figure:
-    """Return the sample of each parameter with its Gaussian, and the pair that deviates most from its 95 % ellipse."""
+    """Draw the sample of each parameter with its Gaussian, and the pair that deviates most from its 95 % ellipse."""
     names, factor = _names_and_factors(posterior)
     k = len(names)
     panels = k + (k > 1)
@@ -351,7 +356,7 @@ def posterior_figure(posterior: Posterior) -> Figure:
 
 
 def _names_and_factors(posterior: Posterior) -> tuple[list[str], np.ndarray]:
-    """Names with units, and factors to these units."""
+    """Return the names with units, and the factors to these units."""
     names, factor = [], np.ones(len(posterior.parameters))
     for j, parameter in enumerate(posterior.parameters):
         last = parameter.rsplit(".", 1)[-1]

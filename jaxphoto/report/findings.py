@@ -1,6 +1,6 @@
-"""Findings about a result as a table: code, severity, subject, value, limit, hint; and the verdict they give.
+"""Findings about a result (code, severity, subject, value, limit, hint) and the verdict derived from them.
 
-The sentence of a finding follows from its numbers by the template of its code (templates/findings.toml).
+The text of a finding is its template (templates/findings.toml, by code) filled with its values.
 """
 
 import dataclasses
@@ -18,7 +18,8 @@ from jaxphoto.report.formatting import of_p, without_powers
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-"""The worst first: an error makes results unusable, a warning is a reservation, a note needs no action."""
+"""Severities in decreasing order: an error makes results unusable, a warning is a reservation, a note needs no action.
+"""
 COLOURS: dict[Severity, str] = {"error": "red", "warning": "amber", "note": "green"}
 MARKS: dict[Severity, str] = {"error": "!!", "warning": "!", "note": "-"}
 _SYMBOLS = {"c_mm": "c", "xp_mm": "x_p", "yp_mm": "y_p"}
@@ -29,7 +30,7 @@ _TEMPLATES: dict[str, str] = tomllib.loads(
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """One finding; `numbers` are further numbers and words of its sentence."""
+    """One finding. `numbers` contains additional values and texts for its template."""
 
     code: str
     severity: Severity
@@ -41,14 +42,14 @@ class Finding:
 
     @property
     def text(self) -> str:
-        """The finding as a sentence, followed by its hint."""
+        """Text of the finding, followed by its hint."""
         fields = {"subject": self.subject, "value": self.value, "limit": self.limit}
         fact = _TEMPLATES[self.code].format_map(fields | dict(self.numbers))
         return without_powers(in_symbols(f"{fact}. {self.hint}" if self.hint else fact))
 
     @property
     def row(self) -> dict[str, Any]:
-        """The finding as a row of `Verdict.table`; missing numbers are None."""
+        """The finding as a row of `Verdict.table`; missing values are None."""
         numbers = {name: v if math.isfinite(v := float(getattr(self, name))) else None for name in ("value", "limit")}
         words = {name: getattr(self, name) for name in ("code", "severity", "subject")}
         return words | numbers | {"hint": self.hint, "text": self.text}
@@ -56,7 +57,7 @@ class Finding:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Verdict:
-    """All findings, the worst first; within a severity in the order of the tests."""
+    """All findings by decreasing severity; within a severity in the order of the tests."""
 
     findings: tuple[Finding, ...]
 
@@ -73,23 +74,23 @@ class Verdict:
 
     @property
     def table(self) -> pd.DataFrame:
-        """One row per finding: code, severity, subject, value, limit, hint, text."""
+        """Table with one row per finding: code, severity, subject, value, limit, hint, text."""
         columns = ["code", "severity", "subject", "value", "limit", "hint", "text"]
         return pd.DataFrame([f.row for f in self.findings], columns=columns)
 
     @property
     def severity(self) -> Severity:
-        """The worst severity."""
+        """Highest severity of all findings."""
         return self.findings[0].severity if self.findings else "note"
 
     @property
     def colour(self) -> str:
-        """green, amber or red."""
+        """Colour of the verdict: green, amber or red."""
         return COLOURS[self.severity]
 
     @property
     def headline(self) -> str:
-        """The verdict in one line."""
+        """One-line verdict."""
         n = sum(f.severity == self.severity for f in self.findings)
         several = f"{n} {self.severity}{'s' * (n > 1)}"
         if self.severity == "error":
@@ -100,29 +101,29 @@ class Verdict:
 
     @property
     def summary(self) -> dict:
-        """The verdict in summary.json."""
+        """Content of summary.json: verdict and findings."""
         return {"verdict": self.colour, "findings": [f.row for f in self.findings]}
 
     @property
     def texts(self) -> list[str]:
-        """The sentences."""
+        """Texts of all findings."""
         return [f.text for f in self.findings]
 
 
 def as_sentence(text: str) -> str:
-    """Return a text with a capital (except for symbols such as c and k2) and a full stop."""
+    """Capitalise a text (except for symbols such as c and k2) and end it with a full stop."""
     first = text.split(maxsplit=1)[0] if text.strip() else ""
     start = text if len(first) == 1 or re.search(r"[_\d]", first) else f"{text[:1].upper()}{text[1:]}"
     return start if start.endswith((".", "!", "?")) else f"{start}."
 
 
 def symbol(parameter: str) -> str:
-    """Return the symbol of a parameter: c of c_mm."""
+    """Return the symbol of a parameter, such as c for c_mm."""
     return _SYMBOLS.get(parameter, parameter)
 
 
 def in_symbols(text: str) -> str:
-    """Replace parameter paths by symbols: k1 of camera kodak."""
+    """Replace parameter paths by symbols, such as "k1 of camera kodak"."""
 
     def words(path: re.Match) -> str:
         return f"{symbol(path[2])} of {camera_words(path[1])}"
@@ -131,6 +132,6 @@ def in_symbols(text: str) -> str:
 
 
 def p_words(p_value: float, digits: int = 1) -> str:
-    """Return a p-value in a sentence."""
+    """Format a p-value for a sentence, such as "p = 0.02"."""
     text = of_p(p_value, digits)
     return f"p {text}" if text.startswith("<") else f"p = {text}"

@@ -1,4 +1,4 @@
-"""A flight: one page for all parts, and a result folder for every part."""
+"""Report of a flight: one page for all parts, and one result folder per part."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -58,41 +58,42 @@ from jaxphoto.report.verdict import lens_findings, shutter_findings, verdict_of
 from jaxphoto.statistics.block_geometry import Coverage, coverage, image_links, weak_links
 from jaxphoto.writing import InputFile, digest_of_all, whole_folder
 
-# Images of the table on the page; of more, those with the largest residuals.
+# Maximum number of images in the table on the page; number of images with the largest residuals that a longer table is
+# reduced to.
 _MOST, _WORST = 150, 50
-# Numbers of images that cover a place, in the table of areas.
+# Minimum numbers of covering images in the table of areas.
 _COVERED_BY = (1, 2, 3, 5, 9)
 _HECTARE = 1e4
-# Probabilities of a normal error within so many sigmas (%).
+# Probabilities (%) that a normally distributed error is within k standard deviations.
 _WITHIN = ((1, 68.3), (2, 95.4), (3, 99.7))
 
 
 class FlightSource(NamedTuple):
-    """Optional information on a flight besides its adjustment."""
+    """Optional information on a flight in addition to its adjustment."""
 
     positions_from: Sequence[str] = ()
-    """Sentences on the source of positions."""
+    """Sentences on the source of the positions."""
     camera_from: str = ""
-    """A sentence on the source of the initial camera."""
+    """Sentence on the source of the initial camera."""
     start: InteriorOrientation | None = None
-    """The initial camera."""
+    """Initial camera."""
     taken: Mapping[str, Moment] = MappingProxyType({})
     """Exposure times by image."""
     conditions: Sequence[Conditions] = ()
     inputs: Sequence[InputFile] = ()
     entries: Mapping[str, Any] = MappingProxyType({})
-    """Further entries of the summaries: options and inputs."""
+    """Additional entries of summary.json: options and inputs."""
     written: str = ""
-    """Date of the results."""
+    """Creation date of the results."""
     command: str = ""
-    """The command line."""
+    """Command line."""
 
 
 # Judgement -------------------------------------------------------------------------------------------------------
 
 
 def report_of(part: FlightPart) -> PartReport:
-    """Judge a part: adjustment, weights, lens, positions, control and correlated residuals."""
+    """Assess a part: adjustment, weights, lens, positions, control and correlated residuals."""
     tables = Tables(part.adjusted)
     found = [*verdict_of(tables).findings, *(component_findings(part.components) if part.components else [])]
     verdict = Verdict.of([*found, *lens_findings(tables), *_findings(part)])
@@ -142,7 +143,7 @@ def _images(part: FlightPart) -> pd.DataFrame:
 
 
 def flight_verdict(flight: CalibratedFlight, reports: Sequence[PartReport], spoilt: Mapping[str, str]) -> Verdict:
-    """Return the verdict of the largest part, unconnected parts and unused images."""
+    """Return the verdict on the largest part, with unconnected parts and unused images as additional findings."""
     unused, found = len(flight.left_out) + len(spoilt), list(reports[0].verdict.findings)
     sizes = [len(r.part.oriented.block.images) for r in reports]
     if len(reports) > 1:
@@ -154,7 +155,7 @@ def flight_verdict(flight: CalibratedFlight, reports: Sequence[PartReport], spoi
 
 
 def camera_sentences(report: PartReport) -> Iterator[str]:
-    """c, x_p and y_p with their standard deviations, and the readout of a rolling shutter."""
+    """Yield sentences on c, x_p and y_p with their standard deviations, and on the rolling-shutter readout."""
     table = report.tables.interior
     estimated = table[table["sigma"].notna() & table["parameter"].isin(("c_mm", "xp_mm", "yp_mm"))]
     each = zip(estimated["parameter"], estimated["value"], estimated["sigma"], strict=True)
@@ -174,7 +175,7 @@ def flight_page(
     source: FlightSource,
     folders: Sequence[str],
 ) -> str:
-    """Return the page as HTML; `folders` have the results of the parts. The largest part is reported in full."""
+    """Return the page as HTML, with the largest part in full. `folders`: result folders of the parts."""
     n_images = sum(len(r.images) for r in reports) + len(left_out) + len(spoilt)
     parts: list[Part] = [flight_summary(reports, n_images), *verdict_parts(verdict)]
     parts += _unused(left_out, spoilt)
@@ -199,7 +200,7 @@ def flight_page(
 
 
 def flight_summary(reports: Sequence[PartReport], n_images: int) -> pd.DataFrame:
-    """Return the summary of each part of the images that were `given`."""
+    """Tabulate the summary of each part. `n_images`: total number of images."""
     columns = {}
     for number, r in enumerate(reports, 1):
         adjusted, used = r.part.adjusted, r.images[r.images["position"] == "used"]
@@ -217,7 +218,7 @@ def flight_summary(reports: Sequence[PartReport], n_images: int) -> pd.DataFrame
 
 
 def flight_words(cover: Coverage | None, block: Block) -> dict[str, str]:
-    """Map system, height and area; `cover` is None without a metric scale."""
+    """Return map system, height over ground and area. `cover` is None for a block without metric scale."""
     if cover is None:
         return {"map system": "none: arbitrary frame and scale"}
     code = block.frame.code
@@ -235,7 +236,7 @@ def _unused(left_out: Mapping[str, str], spoilt: Mapping[str, str]) -> list[Part
 
 
 def coverage_section(report: PartReport) -> Iterator[Part]:
-    """Heights, ground sample distances, areas by overlap, and a map of the overlap."""
+    """Yield heights, ground sample distances, areas by overlap, and a map of the overlap."""
     cover = report.coverage
     if cover is None:
         return
@@ -253,7 +254,7 @@ def coverage_section(report: PartReport) -> Iterator[Part]:
 
 
 def positions_section(report: PartReport, source: FlightSource) -> Iterator[Part]:
-    """Return the recorded minus adjusted positions: statistics, plots, and residuals compared with their sigmas."""
+    """Yield recorded minus adjusted positions: statistics, plots, and residuals compared with their sigmas."""
     part, table = report.part, report.images
     yield Heading("Recorded positions")
     yield from (Paragraph(as_sentence(s)) for s in source.positions_from)
@@ -287,7 +288,7 @@ def positions_section(report: PartReport, source: FlightSource) -> Iterator[Part
 
 
 def in_order(table: pd.DataFrame, taken: Mapping[str, Moment]) -> tuple[pd.DataFrame, str]:
-    """Images in order of time if all times are known, and the name of the order."""
+    """Sort images by time if all times are known. Return them with the name of the order."""
     if not all(name in taken for name in table["image"]):
         return table, "in the order of the block"
     at = np.array([taken[name][0] for name in table["image"]])
@@ -295,7 +296,10 @@ def in_order(table: pd.DataFrame, taken: Mapping[str, Moment]) -> tuple[pd.DataF
 
 
 def offset_statistics(table: pd.DataFrame) -> pd.DataFrame:
-    """axis, n, mean_m, sd_m, rms_m, rms_of_steps_m, largest_m, image: offsets of images in their order, by axis."""
+    """Compute statistics by axis of the position offsets of images in their order.
+
+    Columns: axis, n, mean_m, sd_m, rms_m, rms_of_steps_m, largest_m, image.
+    """
     rows = []
     for axis in AXES:
         with_offset = table[table[f"d{axis}_m"].notna()]
@@ -313,7 +317,7 @@ def offset_statistics(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def surveyed_section(report: PartReport) -> Iterator[Part]:
-    """Statistics of control and check points, and every point."""
+    """Yield statistics of control and check points, and a table of all surveyed points."""
     yield Heading("Surveyed points")
     if report.part.controlled:
         yield from surveyed_parts(report.part.controlled)
@@ -326,7 +330,7 @@ def surveyed_section(report: PartReport) -> Iterator[Part]:
 
 
 def surveyed_parts(control: ControlledBlock) -> Iterator[Part]:
-    """Return the recorded positions without a heading."""
+    """Yield the section of surveyed points without its heading."""
     state, rows = np.array(control.state, object), []
     for what in ("control", "check"):
         discrepancy = control.off_m[state == what]
@@ -348,7 +352,7 @@ def surveyed_parts(control: ControlledBlock) -> Iterator[Part]:
 
 
 def axis_cell(off_m: np.ndarray, rms_m: float) -> str:
-    """Mean, standard deviation and RMS of the points that have the axis; "-" is undefined."""
+    """Format mean, standard deviation and RMS of the points with this axis; "-" if undefined."""
     values = off_m[np.isfinite(off_m)]
     if not len(values):
         return ""
@@ -357,7 +361,7 @@ def axis_cell(off_m: np.ndarray, rms_m: float) -> str:
 
 
 def links_section(report: PartReport) -> Iterator[Part]:
-    """Return the network of images by common points, and its weakest links."""
+    """Yield the image network (common points) and its weakest links."""
     adjusted, images = report.part.adjusted, report.part.adjusted.block.images
     links = image_links(adjusted)
     of_image = np.bincount(np.concatenate([links.first, links.second]), minlength=len(images))
@@ -383,7 +387,7 @@ def links_section(report: PartReport) -> Iterator[Part]:
 
 
 def time_section(report: PartReport, taken: Mapping[str, Moment]) -> Iterator[Part]:
-    """Gaps and speed, and plots by time."""
+    """Yield gaps, speed, and plots over time."""
     line = time_line(report, taken)
     yield Heading("Time line")
     yield Paragraph(" ".join(time_sentences(line, report.part.adjusted.block.images)))
@@ -394,7 +398,7 @@ def time_section(report: PartReport, taken: Mapping[str, Moment]) -> Iterator[Pa
 
 
 def time_sentences(line: TimeLine, images: Sequence[str]) -> Iterator[str]:
-    """Duration, gaps and speed."""
+    """Yield sentences on duration, gaps and speed."""
     if not line.timed:
         yield "No times are known: images are in the order of the block, without speeds or gaps."
         return
@@ -415,7 +419,7 @@ def time_sentences(line: TimeLine, images: Sequence[str]) -> Iterator[str]:
 
 
 def weights_section(report: PartReport) -> Iterator[Part]:
-    """Variance components."""
+    """Yield the variance components."""
     if report.part.components:
         yield Heading("Variance components")
         table = component_tables(report.part.components)["variance_components"]
@@ -440,7 +444,7 @@ def _orientation(report: PartReport) -> Iterator[Part]:
 
 
 def _smaller_part(report: PartReport, number: int, source: FlightSource) -> Iterator[Part]:
-    """Return the findings, camera, offsets, surveyed points, and orientation."""
+    """Yield findings, camera, offsets, surveyed points and orientation of a part."""
     yield Heading(f"Part {number}")
     yield Paragraph(as_sentence(report.verdict.headline), f"verdict {report.verdict.colour}")
     yield from verdict_parts(report.verdict)
@@ -455,7 +459,7 @@ def _smaller_part(report: PartReport, number: int, source: FlightSource) -> Iter
 
 
 def images_section(reports: Sequence[PartReport]) -> Iterator[Part]:
-    """One row per image: image points, residual, position offset, height, ground sample distance, part."""
+    """Yield a table of the images: image points, residual, position offset, height, ground sample distance, part."""
     yield Heading("All images")
     tables = []
     for number, r in enumerate(reports, 1):
@@ -473,7 +477,7 @@ def images_section(reports: Sequence[PartReport]) -> Iterator[Part]:
 
 
 def provenance_section(source: FlightSource) -> Iterator[Part]:
-    """Dates, camera, conditions, command, options, versions, and hashes of all files but images."""
+    """Yield dates, camera, conditions, command, options, versions, and hashes of all input files except images."""
     rows, conditions = {"computed": source.written}, source.conditions
     if any(c.time for c in conditions):
         rows["images taken"] = dates(conditions)
@@ -519,9 +523,9 @@ def write_flight(
     source: FlightSource,
     beside: Callable[[FlightPart, Path], None] = lambda part, folder: None,
 ) -> Verdict:
-    """report.html, summary.json and images.csv, and a result folder for every part, into the folder `work`.
+    """Write report.html, summary.json, images.csv and one result folder per part into the folder `work`.
 
-    `beside` writes further files into result folders.
+    `beside` writes additional files into each result folder.
     """
     verdict, folders = flight_verdict(flight, reports, spoilt), [part_folder(k) for k in range(1, len(reports) + 1)]
     for folder_name, r in zip(folders, reports, strict=True):
@@ -552,7 +556,7 @@ def write_flight(
 
 
 def write_part_orientation(part: FlightPart, folder: Path) -> None:
-    """Write the files of `jaxphoto orient` into a block folder."""
+    """Write the orientation files of `jaxphoto orient` into a block folder."""
     write_orientation(part.oriented, folder, n_gross=part.matched.n_gross, sigma_factor=part.matched.sigma_factor)
 
 

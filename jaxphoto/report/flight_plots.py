@@ -1,4 +1,4 @@
-"""Plots of a flight: recorded positions, residuals by image, and quantities by time."""
+"""Plots of a flight: recorded positions, residuals by image, and quantities over time."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from jaxphoto.statistics.block_geometry import Coverage
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Images that are named in plots.
+# Number of images labelled in plots.
 _NAMED = 3
-# Range of the height axis over the largest used offset.
+# Ratio of the height axis range to the largest used offset.
 _ROOM = 1.25
 
 
@@ -36,8 +36,9 @@ class PartReport(NamedTuple):
     tables: Tables
     verdict: Verdict
     images: pd.DataFrame
-    """image, n_image_points, rms_px, dX_m to dZ_m (recorded minus adjusted position), position (used, left out,
-    none)."""
+    """Columns: image, n_image_points, rms_px, dX_m to dZ_m (recorded minus adjusted position), position (used, left
+    out, none).
+    """
     coverage: Coverage | None
     """Coverage of the ground; None if the block has no metric scale."""
 
@@ -48,14 +49,16 @@ class PartReport(NamedTuple):
 
     @property
     def sigma_factor(self) -> float:
-        """Factor of camera sigmas for spatially correlated residuals; 1 if not significant."""
+        """Factor of the camera's standard deviations for spatially correlated residuals; 1 if not significant."""
         factor = self.part.oriented.report.alike
         return factor if factor > CORRELATED else 1.0
 
 
 def offsets_less_mean(report: PartReport) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Position offsets (images x 3, m) minus the mean of used ones, which may be a receiver shift; masks of images with
-    a position, and with a used one."""
+    """Return the position offsets (images x 3, m) minus the mean of the used ones, a possible receiver shift.
+
+    Also return masks of the images with a position, and with a used position.
+    """
     d = report.images[["dX_m", "dY_m", "dZ_m"]].to_numpy(float)
     has = np.isfinite(d).all(axis=1)
     used = has & (report.images["position"] == "used").to_numpy()
@@ -74,7 +77,7 @@ def plot_position_offsets(report: PartReport, ax: Axes | None = None, *, upright
         ax.bar(np.flatnonzero(has), d[has, 2], color=np.where(used[has], "tab:blue", "tab:red"))
         ax.axhline(0, color="0.4", lw=0.6)
         if used.any() and (most := _ROOM * np.abs(d[used, 2]).max()) > 0:
-            # Rejected positions may be tens of metres off: their bars are cut.
+            # Clip the bars of rejected positions, which may be tens of metres long.
             ax.set_ylim(-most, most)
         ax.set(ylabel="dZ [m]")
         _name_ends(ax, report.images["image"])
@@ -104,7 +107,7 @@ def plot_position_offsets(report: PartReport, ax: Axes | None = None, *, upright
 
 
 def plot_photograph_residuals(report: PartReport, ax: Axes | None = None) -> Axes:
-    """RMS residual of each image (px); the largest are named."""
+    """Draw the RMS residual of each image (px); the largest are labelled."""
     ax, rms = axes_or_new(ax), report.images["rms_px"].to_numpy(float)
     ax.bar(np.arange(len(rms)), rms, color="0.5")
     for k in np.argsort(-rms)[:_NAMED]:
@@ -128,23 +131,23 @@ class TimeLine(NamedTuple):
     """Images in order of exposure."""
 
     order: Int[np.ndarray, taken]
-    """Indices of images; those without a time are skipped, unless none has one."""
+    """Indices of images in order of exposure. Images without a time are skipped, unless all times are unknown."""
     since: Float[np.ndarray, taken]
-    """Seconds since the first; consecutive numbers if no times are known."""
+    """Seconds since the first exposure; image indices if no times are known."""
     timed: bool
     gap: Bool[np.ndarray, intervals]
-    """Intervals longer than `GAP` usual ones."""
+    """Mask of intervals longer than `GAP` usual intervals."""
     speed: Float[np.ndarray, taken]
-    """m/s; NaN if unknown."""
+    """Speed (m/s); NaN if unknown."""
 
     @property
     def usual(self) -> float:
-        """The usual interval (s); infinite if no two times differ."""
+        """Usual interval (s); infinite if all times are equal."""
         return usual_interval(self.since)
 
 
 def time_line(report: PartReport, taken: Mapping[str, Moment]) -> TimeLine:
-    """Return the images of a part in the order in which they were `taken`."""
+    """Sort the images of a part by their exposure times `taken`."""
     images, position = report.part.adjusted.block.images, np.asarray(report.part.adjusted.unknowns.exterior.position)
     moments = np.array([taken.get(name, (np.nan, 1.0)) for name in images]).reshape(-1, 2)
     timed_images, n = np.isfinite(moments[:, 0]), len(images)
@@ -160,7 +163,7 @@ def time_line(report: PartReport, taken: Mapping[str, Moment]) -> TimeLine:
 
 
 def quantities_in_time(report: PartReport, line: TimeLine) -> dict[str, tuple[str, dict[str, np.ndarray]]]:
-    """Available quantities by time: axis label, and values by name. Offsets are without their mean."""
+    """Return the available quantities over time: axis label, and values by name. Offsets are without their mean."""
     shown: dict[str, tuple[str, dict[str, np.ndarray]]] = {}
     if report.images["position"].eq("used").any():
         d, _, used = offsets_less_mean(report)
@@ -178,14 +181,14 @@ def plot_time_line(
     report: PartReport, what: str = "residuals", ax: Axes | None = None, *,
     taken: Mapping[str, Moment] = MappingProxyType({}),
 ) -> Axes:  # fmt: skip
-    """`offsets` of positions, `residuals`, `height` or `speed` by the times at which images were `taken`.
+    """Draw position `offsets`, `residuals`, `height` or `speed` over the exposure times `taken`.
 
-    Without times in the order of the block. Raises InputError for an unavailable quantity.
+    Without times, images are drawn in the order of the block. Raises InputError for an unavailable quantity.
     """
     line = time_line(report, taken)
     shown = quantities_in_time(report, line)
     if what not in shown:
-        raise InputError(f"of this part no {what!r} are known by time; there are {', '.join(shown)}")
+        raise InputError(f"this part has no quantity {what!r}; use one of {', '.join(shown)}")
     ax, (name, values) = axes_or_new(ax), shown[what]
     for k in np.flatnonzero(line.gap):
         ax.axvspan(line.since[k], line.since[k + 1], color="0.9", lw=0)

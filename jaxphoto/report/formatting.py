@@ -1,7 +1,7 @@
-"""Format numbers and tables for readers: significant digits, units, text, HTML, terminal, Markdown, LaTeX.
+"""Formatting of values and tables: significant digits, units, text, HTML, terminal, Markdown, LaTeX.
 
-CSV and Parquet hold full precision under the column names of docs/block_folder.md. All other formats show units in the
-heads and end a number at the second digit of its standard deviation.
+CSV and Parquet contain full precision under the column names of docs/block_folder.md. All other formats show units in
+the column heads and round values to the second digit of their standard deviation.
 """
 
 import math
@@ -19,16 +19,16 @@ from jaxphoto.errors import InputError, printable
 
 # Numbers ---------------------------------------------------------------------------------------------------------
 
-# From here on a number is written without a power of ten, as by Python's "g".
+# Smallest absolute value written without exponent, as in Python's "g".
 _LEAST = 1e-4
-# Digits beyond these are rounding errors.
+# Maximum number of significant digits: more are rounding errors.
 _MOST = 12
-# Numbers of up to ten digits that are written with a power of ten.
+# Values of up to ten digits written with an exponent.
 _LARGE = re.compile(r"(?<![\w.])([+-]?)(\d(?:\.\d*)?e\+0\d)(?!\w)")
 
 
 def with_sigma(value: float, sigma: float) -> str:
-    """Format a number to the second digit of its standard deviation."""
+    """Round a value to the second digit of its standard deviation."""
     if not sigma > 0 or not value or not math.isfinite(value):
         return f"{value:.8g}"
     power = math.floor(math.log10(max(abs(value), sigma)))
@@ -45,32 +45,32 @@ def with_sigma(value: float, sigma: float) -> str:
 
 
 def of_sigma(sigma: float) -> str:
-    """Format a standard deviation with two digits; "" for zero."""
+    """Format a standard deviation with two significant digits; "" for zero."""
     return in_figures(sigma, 2) if sigma > 0 else ""
 
 
 def plus_minus(value: float, sigma: float) -> str:
-    """Format a number with its standard deviation: 12.3 +- 1.2."""
+    """Format a value with its standard deviation: 12.3 +- 1.2."""
     return f"{with_sigma(value, sigma)} +- {of_sigma(sigma)}"
 
 
 def of_p(p_value: float, digits: int = 2) -> str:
-    """Format a p-value; one below the smallest number is not zero."""
+    """Format a p-value; "< 1e-300" if it underflows to zero."""
     return f"{p_value:.{digits}g}" if p_value > 0 else "< 1e-300"
 
 
 def in_figures(value: float, figures: int) -> str:
-    """Format a number with `figures` significant digits, trailing zeros included: 0.00350; zero is 0."""
+    """Format a value with `figures` significant digits, trailing zeros included: 0.00350; zero is 0."""
     return without_powers(f"{value:#.{figures}g}").replace(".e", "e").rstrip(".") if value else "0"
 
 
 def without_powers(text: str) -> str:
-    """Write out large numbers in a text: 400 m, not 4e+02 m."""
+    """Replace exponents of large values in a text: 400 m, not 4e+02 m."""
     return _LARGE.sub(lambda number: f"{number[1]}{float(number[2]):.0f}", text)
 
 
 def in_equal_figures(values: Iterable[float], most: int) -> list[str]:
-    """Format the numbers of a column with equal significant digits: those of the longest, at most `most`."""
+    """Format the values of a column with an equal number of significant digits, at most `most`."""
     texts = [f"{v:.{most}g}" for v in values]
     digits = (len(text.partition("e")[0].lstrip("-").replace(".", "").lstrip("0")) for text in texts)
     figures = max(digits, default=most)
@@ -79,7 +79,7 @@ def in_equal_figures(values: Iterable[float], most: int) -> list[str]:
 
 # Units -----------------------------------------------------------------------------------------------------------
 
-# A name ends in its unit; the longest first.
+# Units by name suffix, longest first.
 _UNITS = {
     "m_per_s": "m/s", "deg_per_s": "deg/s", "rad_per_s": "rad/s", "mm_per_s": "mm/s", "mm_per_h": "mm/h",
     "per_h": "1/h", "mm_per_K": "mm/K", "per_K": "1/K", "deg": "deg", "rad": "rad", "mm": "mm", "ms": "ms",
@@ -89,13 +89,13 @@ _UNIT = re.compile(r"_(" + "|".join(_UNITS) + r")$")
 
 
 def without_unit(name: str) -> tuple[str, str]:
-    """Split a name from its unit: ("sigma_X", "m") of sigma_X_m; "" where there is none."""
+    """Split a name and its unit: sigma_X_m gives ("sigma_X", "m"). The unit is "" if there is none."""
     unit = _UNIT.search(name)
     return (name[: unit.start()], _UNITS[unit[1]]) if unit else (name, "")
 
 
 def head_of(name: str) -> str:
-    """Return a column's name with its unit in brackets: "sigma X [m]" of sigma_X_m."""
+    """Return a column's name with its unit in brackets: "sigma X [m]" for sigma_X_m."""
     words, unit = without_unit(name)
     return words.replace("_", " ") + (f" [{unit}]" if unit else "")
 
@@ -110,7 +110,7 @@ def label_unit(label: str, cameras: Mapping[str, InteriorOrientation]) -> str:
 
 
 def column_unit(column: str, cameras: Mapping[str, InteriorOrientation]) -> str:
-    """Return the unit of a column of Monte Carlo draws: `kodak.k1`, `bias.kodak.k1`, `strips.E1.shift_X_m`."""
+    """Return the unit of a column of Monte Carlo draws: `kodak.k1`, `bias.kodak.k1` or `strips.E1.shift_X_m`."""
     camera, _, parameter = column.removeprefix("bias.").rpartition(".")
     return _unit_of(camera, parameter, cameras)
 
@@ -122,31 +122,32 @@ def _unit_of(camera: str, parameter: str, cameras: Mapping[str, InteriorOrientat
 
 
 def in_file_unit(unit: str) -> tuple[float, str]:
-    """Factor and name of the unit in which a quantity is shown: degrees for rad."""
+    """Return the factor to the displayed unit and its name: degrees for rad."""
     return (180 / np.pi, "deg") if unit == "rad" else (1.0, unit)
 
 
 # Tables as text --------------------------------------------------------------------------------------------------
 
-# Columns whose standard deviation is the column `sigma`, or `sd` for Monte Carlo draws.
+# Columns whose standard deviation is in the column `sigma`, or `sd` for Monte Carlo draws.
 _BY_SIGMA = (
     "value", "estimate", "truth", "error", "first", "second", "difference", "residual", "amount",
     "before", "after", "moved",
 )  # fmt: skip
 _BY_SD = ("nominal", "mean", "q025", "q50", "q975")
-# Columns whose standard deviation (or the largest of several) has another name.
+# Columns whose standard deviation has a different name; of several columns the largest value is used.
 _BY_OTHERS = {
     **dict.fromkeys(("column_px", "row_px", "d_column_px", "d_row_px"), ("sigma_px",)),
     **{f"d{a}_m": (f"sigma_survey_{a}_m", f"sigma_adjusted_{a}_m") for a in "XYZ"},
     "gap_m": ("sigma_m",),
 }
 _SIGMAS = ("sd", "predicted_sigma", "worst_px")
-# Significant digits of numbers without a standard deviation; names without units.
+# Number of significant digits of values without a standard deviation, by name without unit.
 _DIGITS = {
     "w": 3, "w_X": 3, "w_Y": 3, "w_Z": 3, "detectable": 3, "share": 2, "ratio": 3, "rmse": 3, "rms": 3, "fit": 3,
     "survey": 3, "max_abs": 3, "factor": 3, "time": 10,
 }  # fmt: skip
-# Decimal places: fractions, multiples of a standard deviation, coordinates and angles without a standard deviation.
+# Number of decimal places: fractions, multiples of a standard deviation, coordinates and angles without a standard
+# deviation.
 _PLACES = {
     "redundancy_number": 2, "largest_share": 3, "inside": 3, "effect_over_sigma": 2, "over_sigma": 2, "c_moves": 2,
     "xp_moves": 2, "yp_moves": 2, "most_moves": 1, "rho": 3, "mean_abs_rho": 3, "max_abs_rho": 3,
@@ -164,9 +165,9 @@ def readable(table: pd.DataFrame) -> pd.DataFrame:
 def _texts(table: pd.DataFrame, name: str) -> list[str]:
     column = table[name]
     if name == "parameter":
-        # Paths such as mounts[default].boresight_x_deg stay as they are.
+        # Paths such as mounts[default].boresight_x_deg stay unchanged.
         words = [head_of(v) if not re.search(r"[\[.]", v) and without_unit(v)[1] else v for v in column.astype(str)]
-        # A correlation has no unit; other tables may have a column of units.
+        # Correlations have no unit; a table may have a column of units instead.
         return [word.partition(" [")[0] for word in words] if {"unit", "rho"} & set(table.columns) else words
     if name == "group":
         return [str(v).replace("_", " ") for v in column]
@@ -187,7 +188,7 @@ def _texts(table: pd.DataFrame, name: str) -> list[str]:
 
 
 def _sigmas_of(table: pd.DataFrame, name: str) -> pd.Series | None:
-    """Return the standard deviations of a column, where the table has them; NaN or zero for fixed parameters."""
+    """Return the standard deviations of a column, if the table has them; NaN or zero for fixed parameters."""
     if name == "mean" and {"rmse", "n"} <= set(table.columns):
         return table["rmse"] / np.sqrt(table["n"])
     if others := [other for other in _BY_OTHERS.get(name, ()) if other in table]:
@@ -206,12 +207,12 @@ def without_empty(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def numeric_columns(table: pd.DataFrame) -> list[bool]:
-    """Return True for each column of numbers, which is aligned right."""
+    """Return a mask of the numeric columns, which are right-aligned."""
     return [bool(pd.api.types.is_numeric_dtype(table[c]) and table[c].dtype != bool) for c in table.columns]
 
 
 def to_rich(table: pd.DataFrame, title: str = "") -> Table:
-    """Return a table for the terminal, numbers aligned right."""
+    """Convert a table for the terminal, numeric columns right-aligned."""
     shown = Table(title=title or None)
     for name, number in zip(table.columns, numeric_columns(table), strict=True):
         shown.add_column(head_of(str(name)), justify="right" if number else "left")
@@ -221,7 +222,7 @@ def to_rich(table: pd.DataFrame, title: str = "") -> Table:
 
 
 def to_markdown(table: pd.DataFrame, name: str = "") -> str:
-    """Return a Markdown table, numbers aligned right."""
+    """Convert a table to Markdown, numeric columns right-aligned."""
     shown = readable(table)
     cells = [[head_of(str(c)) for c in shown.columns], *shown.to_numpy(object).tolist()]
     lines = ["| " + " | ".join(str(cell).replace("|", r"\|") for cell in row) + " |" for row in cells]
@@ -238,12 +239,12 @@ _SPECIAL = {letter: f"\\{letter}" for letter in "&%$#_{}"} | {
 _POWER = re.compile(r"^(-?[\d.]+)e([+-]?\d+)$")
 _PER_MM = re.compile(r"^1/mm(?:\^(\d+))?$")
 _GREEK = ("omega", "phi", "kappa", "sigma")
-# A LaTeX table of more rows continues on the next page.
+# Maximum number of rows of a LaTeX table on one page.
 _PAGE = 45
 
 
 def to_latex(table: pd.DataFrame, name: str = "") -> str:
-    """Return a LaTeX table with booktabs rules (\\usepackage{booktabs}, and longtable for long ones)."""
+    """Convert a table to LaTeX with booktabs rules (\\usepackage{booktabs}, and longtable for long ones)."""
     shown = readable(table)
     shown = pd.DataFrame({_latex_head(str(c)): [_latex(v) for v in shown[c]] for c in shown.columns})
     return shown.to_latex(
@@ -263,13 +264,13 @@ def _latex(text: str) -> str:
         return f"mm$^{{-{per_mm[1] or 1}}}$"
     escaped = "".join(_SPECIAL.get(letter, letter) for letter in text)
     if escaped.startswith(("[", "*")):
-        # After the end of a row LaTeX would read them as its option.
+        # LaTeX would read a bracket after the end of a row as its option.
         escaped = f"{{}}{escaped}"
     return rf"$-${escaped[1:]}" if re.fullmatch(r"-[\d.]+", text) else escaped
 
 
 def _latex_head(name: str) -> str:
-    """Return a head with Greek letters: `$\\sigma_{\\omega}$ [deg]` of sigma_omega_deg."""
+    """Return a column head with Greek letters: `$\\sigma_{\\omega}$ [deg]` for sigma_omega_deg."""
     head, _, unit = head_of(name).partition(" [")
     words = [rf"\{word}" if word in _GREEK else word for word in head.split()]
     if words[:1] == [r"\sigma"] and len(words) == 2:
@@ -297,7 +298,7 @@ def check_table_format(kind: str) -> None:
 
 
 def write_table(table: pd.DataFrame, name: str, folder: Path, kind: str) -> Path:
-    """Write a table as `name` plus the suffix of its format into a folder, and return the path."""
+    """Write a table to the file `name` plus the suffix of its format in a folder. Return the path."""
     check_table_format(kind)
     suffix, write = _WRITERS[kind]
     path = folder / f"{name}{suffix}"

@@ -1,4 +1,4 @@
-"""Laser point cloud and images: heights as vertical control, and simultaneous adjustment."""
+"""Results of point clouds and images: heights as vertical control, and simultaneous adjustment."""
 
 from __future__ import annotations
 
@@ -33,17 +33,20 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Rows of a long table on a page.
+# Maximum number of rows of a long table on a page.
 _ROWS = 30
 
 
 def rounds_table(rounds: Sequence[Round]) -> pd.DataFrame:
-    """round, observed, left_out, moved_m, largest_change (in standard deviations), rmse_m."""
+    """Tabulate the iterations: round, observed, left_out, moved_m, largest_change (in standard deviations), rmse_m."""
     return pd.DataFrame(rounds, columns=["round", *Round._fields[1:]])
 
 
 def heights_table(control: LidarControl) -> pd.DataFrame:
-    """point, X_m, Y_m, Z_m of the adjusted point, height_m of the cloud, sigma_m, flags, used."""
+    """Tabulate the control heights at tie points.
+
+    Columns: point, X_m, Y_m, Z_m (adjusted), height_m (of the cloud), sigma_m, flags, used.
+    """
     points = np.asarray(control.adjusted.unknowns.points)[control.points]
     names = np.array(control.block.points, object)[control.points]
     flags = [" ".join(f.name.lower() for f in HeightFlag if f and f & int(flag) and f.name) for flag in control.flag]
@@ -53,7 +56,10 @@ def heights_table(control: LidarControl) -> pd.DataFrame:
 
 
 def surfaces_table(result: Simultaneous) -> pd.DataFrame:
-    """point, strip, X_m, Y_m, Z_m, and heights above the surface before and after the adjustment (m)."""
+    """Tabulate heights of object points above the surface (m), before and after the adjustment.
+
+    Columns: point, strip, X_m, Y_m, Z_m, above_before_m, above_m.
+    """
     points = np.asarray(result.adjusted.unknowns.points)[result.points]
     columns = {"point": np.array(result.adjusted.block.points, object)[result.points]}
     columns |= {"strip": np.array(tuple(result.scanner.shifts), object)[result.strip]}
@@ -62,14 +68,14 @@ def surfaces_table(result: Simultaneous) -> pd.DataFrame:
 
 
 def moved_table(result: Simultaneous) -> pd.DataFrame:
-    """Tabulate what, before, after, moved, sigma, unit of the parameters of cameras, scanner, mounts and strips.
+    """Tabulate the changes of the parameters of cameras, scanner, mounts and strips.
 
-    Then the RMS moves of camera stations, rotations, object points and laser points, and the RMS height of points above
-    the surface. Sigmas are a posteriori.
+    Columns: what, before, after, moved, sigma (a posteriori), unit. The last rows are RMS changes of camera stations,
+    rotations, object points and laser points, and the RMS height of points above the surface.
     """
     after, before = result.adjusted, result.before
     sigma = np.asarray(Tables(after).covariance.shared_sigma)
-    # The scanner is zero before the adjustment.
+    # Missing values before the adjustment are the scanner parameters, which are zero.
     then, now = (dict(zip(a.parameters, np.asarray(a.values.shared).tolist(), strict=True)) for a in (before, after))
     rows: list[tuple] = []
     for path, s in zip(after.structure.labels, sigma, strict=True):
@@ -97,7 +103,10 @@ def _rms(values: np.ndarray) -> float:
 
 
 def scanner_correlations(adjusted: Adjustment) -> pd.DataFrame:
-    """parameter_a, parameter_b, rho: boresight and shifts of the scanner with each other and with the cameras."""
+    """Tabulate correlations of boresight and scanner shifts with each other and with the cameras.
+
+    Columns: parameter_a, parameter_b, rho.
+    """
     covariance = Tables(adjusted).covariance
     first = 6 * covariance.n_images
     rho, paths = correlation_matrix(covariance)[first:, first:], covariance.labels[first:]
@@ -107,9 +116,9 @@ def scanner_correlations(adjusted: Adjustment) -> pd.DataFrame:
 
 
 def plot_above(result: Simultaneous, ax: Axes | None = None, *, before: bool = False) -> Axes:
-    """Heights of points above the surface of the cloud (m), after the adjustment or `before` it.
+    """Draw heights of points above the surface of the cloud (m), after the adjustment or `before` it.
 
-    Colours span 95 % of the heights before.
+    The colour scale spans 95 % of the heights before.
     """
     ax, values = axes_or_new(ax), result.apart_before if before else result.apart
     points = np.asarray(result.adjusted.unknowns.points)[result.points]
@@ -119,9 +128,9 @@ def plot_above(result: Simultaneous, ax: Axes | None = None, *, before: bool = F
 
 
 def plot_lidar_heights(control: LidarControl, ax: Axes | None = None, *, residuals: bool = False) -> Axes:
-    """Heights of a cloud that are control, rejected and unavailable; or the `residuals` of control (m).
+    """Draw heights of a cloud that are control, rejected or unavailable; or the `residuals` of control (m).
 
-    Residuals are cloud minus adjusted heights. Raises InputError for them if no height is control.
+    Residuals are cloud minus adjusted heights. Raises InputError if residuals are requested but no height is control.
     """
     points, used = np.asarray(control.adjusted.unknowns.points)[control.points], control.used
     if residuals and not used.any():
@@ -143,7 +152,7 @@ def plot_lidar_heights(control: LidarControl, ax: Axes | None = None, *, residua
 
 
 def _draw_heights(axes: Axes, points: np.ndarray, values: np.ndarray, scale: np.ndarray, words: str, name: str) -> None:
-    """Values over the ground in colours that span 95 % of `scale`."""
+    """Draw values in plan; the colour scale spans 95 % of `scale`."""
     limit = float(np.nanpercentile(np.abs(scale), 95)) or 1.0
     colours: dict[str, Any] = {"c": values, "cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
     shown = axes.scatter(points[:, 0], points[:, 1], s=18, edgecolor="0.6", **colours)
@@ -159,7 +168,7 @@ def _ground(axes: Axes) -> None:
 
 
 def above_figure(result: Simultaneous) -> Figure:
-    """`plot_above` before and after."""
+    """Draw `plot_above` before and after."""
     figure = new_figure(10.0, 4.6)
     for axes, before in zip(figure.subplots(1, 2, sharex=True, sharey=True), (True, False), strict=True):
         plot_above(result, axes, before=before)
@@ -167,7 +176,7 @@ def above_figure(result: Simultaneous) -> Figure:
 
 
 def heights_figure(control: LidarControl) -> Figure:
-    """Both plots of `plot_lidar_heights`."""
+    """Draw both plots of `plot_lidar_heights`."""
     figure = new_figure(10.0, 4.6)
     for axes, residuals in zip(figure.subplots(1, 2, sharex=True, sharey=True), (False, True), strict=True):
         if not residuals or control.used.any():
@@ -179,10 +188,10 @@ def heights_figure(control: LidarControl) -> Figure:
 def write_simultaneous(
     result: Simultaneous, directory: Path, seconds: dict[str, float], record: CommandRecord
 ) -> Iterator[Path]:
-    """Tables of iterations, moves, surfaces and correlations, plot, report, summary.json, and the folder `adjustment`.
+    """Write the tables of iterations, changes, surfaces and correlations, a plot, the report and the adjustment.
 
-    Yields the folder before it is in place, for further files. Raises InputError if `directory` holds something else
-    than an earlier result.
+    Files also include summary.json and the result folder `adjustment`. Yields the temporary folder so that the caller
+    can add files. Raises InputError if `directory` contains anything but an earlier result.
     """
     began = time.perf_counter()
     with whole_folder(directory) as work:
@@ -222,7 +231,7 @@ def write_simultaneous(
 
 
 def _strongest(correlations: pd.DataFrame) -> pd.DataFrame:
-    """Return the strongest correlations, each pair once."""
+    """Return the strongest correlations, each pair only once."""
     names = ["parameter_a", "parameter_b"]
     repeated = pd.DataFrame(np.sort(correlations[names].to_numpy(str), axis=1), correlations.index).duplicated()
     strongest = correlations[~repeated].sort_values("rho", key=np.abs, ascending=False, kind="stable")[:_ROWS]
@@ -230,7 +239,7 @@ def _strongest(correlations: pd.DataFrame) -> pd.DataFrame:
 
 
 def rounds_words(rounds: Sequence[Round], converged: bool) -> tuple[str, str]:
-    """Return the outer iterations in two sentences."""
+    """Summarise the outer iterations in two sentences."""
     last = rounds[-1]
     end = f"converged after {len(rounds)} iterations" if converged else f"not converged after {len(rounds)} iterations"
     return (
@@ -246,7 +255,7 @@ def print_rounds(rounds: Sequence[Round], converged: bool, console: Console) -> 
 
 
 def heights_page(control: LidarControl, figure: Figure, record: CommandRecord) -> str:
-    """Return the page of heights of a cloud as control: iterations, flags, plot, and the largest differences."""
+    """Return the page of cloud heights as control: iterations, flags, plot, and the largest differences."""
     heights = heights_table(control)
     heights.insert(5, "difference_m", heights["height_m"] - heights["Z_m"])
     largest = heights.sort_values("difference_m", key=np.abs, ascending=False, kind="stable")[:_ROWS]

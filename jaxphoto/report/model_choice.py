@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Columns of `choice_table` on the page, with their formats; the terminal shows a few of them.
+# Columns of `choice_table` on the page, with their formats; the terminal shows only some of them.
 _SHOWN: dict[str, Callable[[Any], str]] = {
     "model": str, "parameters": str, "sigma0": "{:.3f}".format, "rms_px": "{:.4f}".format,
     "cv_rms_px": "{:.4f}".format, "cv_excess_se": "{:.1f}".format, "delta_aicc": "{:.1f}".format,
@@ -34,19 +34,19 @@ _SHOWN: dict[str, Callable[[Any], str]] = {
     "weakest_ratio": "{:.1f}".format,
 }  # fmt: skip
 _IN_TERMINAL = ("model", "parameters", "rms_px", "cv_rms_px", "cv_excess_se", "delta_bic", "f_p")
-# Differences of BIC below this are not significant (Kass and Raftery 1995).
+# Difference of BIC below which two models are equally good (Kass and Raftery 1995).
 _EQUAL = 2.0
-# Ticks of the logarithmic axis; numbers from `_FAR` on are shown without decimals.
+# Ticks of the logarithmic axis; value above which labels have no decimal places.
 _MARKS = (0, 2, 10, 100, 1000, 10_000, 100_000, 1_000_000)
 _FAR = 100.0
 
 
 def choice_table(choice: ModelChoice) -> pd.DataFrame:
-    """One row per candidate; `delta_` are differences from the smallest, NaN where undefined.
+    """Tabulate the candidates; `delta_` are differences from the smallest value, NaN if undefined.
 
-    model, distortion, coefficients, parameters, observations, redundancy, square_sum (v'Pv), sigma0, rms_px, cv_rms_px,
-    cv_excess_se, aic, aicc, bic, delta_aic, delta_aicc, delta_bic, smaller, f, f_p, weakest, weakest_ratio, weakest_p,
-    problem: see `jaxphoto.procedures.model_choice`.
+    Columns: model, distortion, coefficients, parameters, observations, redundancy, square_sum (v'Pv), sigma0, rms_px,
+    cv_rms_px, cv_excess_se, aic, aicc, bic, delta_aic, delta_aicc, delta_bic, smaller, f, f_p, weakest, weakest_ratio,
+    weakest_p, problem. See `jaxphoto.procedures.model_choice`.
     """
     rows = []
     for j in choice.judged:
@@ -68,7 +68,10 @@ def choice_table(choice: ModelChoice) -> pd.DataFrame:
 
 
 def parameter_table(choice: ModelChoice) -> pd.DataFrame:
-    """model, camera, parameter, value, sigma (a posteriori), unit, ratio, p_value of every interior parameter."""
+    """Tabulate the interior parameters of all models.
+
+    Columns: model, camera, parameter, value, sigma (a posteriori), unit, ratio, p_value.
+    """
     rows = [
         (j.candidate.name, s.camera, s.parameter, s.value, s.sigma, s.unit, s.ratio, s.p_value)
         for j in choice.judged
@@ -78,7 +81,7 @@ def parameter_table(choice: ModelChoice) -> pd.DataFrame:
 
 
 def choice_verdict(choice: ModelChoice) -> list[str]:
-    """Return the choice in sentences."""
+    """Return the model choice as text, one sentence per item."""
     if not choice.by_bic:
         return ["no model could be adjusted; see the column problem"]
     best = min(j.bic for j in choice.judged if math.isfinite(j.bic))
@@ -94,7 +97,7 @@ def choice_verdict(choice: ModelChoice) -> list[str]:
 
 
 def choice_figure(choice: ModelChoice) -> Figure:
-    """Both plots of `plot_models` side by side; empty if no model could be adjusted."""
+    """Draw both plots of `plot_models` side by side; empty if no model could be adjusted."""
     known = [j for j in choice.judged if math.isfinite(j.bic)]
     figure = new_figure(9.6, 1.2 + 0.36 * max(len(known), 3))
     if known:
@@ -104,9 +107,9 @@ def choice_figure(choice: ModelChoice) -> Figure:
 
 
 def plot_models(choice: ModelChoice, ax: Axes | None = None, *, rms: bool = False) -> Axes:
-    """BIC above the smallest by model, or the `rms` of adjusted and held-out image points (px).
+    """Draw BIC minus the smallest BIC by model, or the `rms` of adjusted and held-out image points (px).
 
-    The number of interior parameters stands behind each name. Raises InputError if no model could be adjusted.
+    Each label contains the number of interior parameters. Raises InputError if no model could be adjusted.
     """
     judged = [j for j in choice.judged if math.isfinite(j.bic)]
     if not judged:
@@ -123,7 +126,7 @@ def plot_models(choice: ModelChoice, ax: Axes | None = None, *, rms: bool = Fals
     else:
         above = np.array([j.bic for j in judged])
         above -= above.min()
-        # Bars start at one because a logarithmic axis has no zero.
+        # Start bars at one because a logarithmic axis has no zero.
         ax.barh(at, above, left=1.0, color="tab:blue")
         for k, one in enumerate(above):
             ax.text(1 + one, k, f" {one:.1f}" if one < _FAR else f" {one:,.0f}", va="center", fontsize=8)
@@ -143,9 +146,9 @@ def plot_models(choice: ModelChoice, ax: Axes | None = None, *, rms: bool = Fals
 def write_model_choice(
     choice: ModelChoice, block: Block, directory: Path, seconds: dict[str, float], record: CommandRecord
 ) -> None:
-    """models.csv, parameters.csv, models.png, report.html and summary.json.
+    """Write models.csv, parameters.csv, models.png, report.html and summary.json.
 
-    Raises InputError if `directory` holds something else than an earlier result.
+    Raises InputError if `directory` contains anything but an earlier result.
     """
     began, verdict, figure = time.perf_counter(), choice_verdict(choice), choice_figure(choice)
     table, parameters = choice_table(choice), parameter_table(choice)
@@ -177,6 +180,6 @@ def print_model_choice(choice: ModelChoice, console: Console) -> None:
 
 
 def _shown(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the columns for reading, as text."""
+    """Format the displayed columns as text."""
     columns = {name: ["" if pd.isna(v) else form(v) for v in table[name]] for name, form in _SHOWN.items()}
     return without_empty(pd.DataFrame(columns))

@@ -1,4 +1,4 @@
-"""Orientation of images: counts in sentences, plots of the network and of its residuals."""
+"""Report on the orientation of images: counts, plots of the network and the residuals."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 _SHOWN = 6
 CORRELATED = 1.2
-"""Factor of spatially correlated residuals that is significant with a few hundred rays."""
+"""Factor of standard deviations above which residuals are significantly correlated (from a few hundred rays)."""
 
 
 def orientation_sentences(report: OrientationReport) -> list[str]:
-    """Oriented images, rejected matches by reason, residuals and estimated camera parameters."""
+    """Summarise oriented images, rejected matches by reason, residuals and estimated camera parameters in sentences."""
     rejected, skipped = report.gross_errors, list(report.unoriented.items())
     more = skipped[_SHOWN:]
     sentences = [
@@ -60,10 +60,13 @@ def print_orientation(report: OrientationReport, console: Console) -> None:
 
 
 def network_figure(oriented: Oriented) -> Figure:
-    """Stations and points along their principal axes, in plan and from the side: a free network has no axes."""
+    """Draw stations and points along their principal axes, in plan and from the side.
+
+    The coordinate axes of a free network are arbitrary.
+    """
     start = oriented.block.start.unknowns
     stations, points = np.asarray(start.exterior.position, float), np.asarray(start.points, float)
-    # The farthest 5 % would make everything else small.
+    # Omit the farthest 5 %, which would shrink everything else.
     middle = np.median(points, axis=0)
     distance = np.linalg.norm(points - middle, axis=1)
     near = points[distance <= np.percentile(distance, 95)]
@@ -81,7 +84,7 @@ def network_figure(oriented: Oriented) -> Figure:
 
 
 def image_residuals_figure(oriented: Oriented) -> Figure:
-    """Mean residuals by cell of the image format, and the histogram of all residuals."""
+    """Draw mean residuals by cell of the image format, and the histogram of all residuals."""
     sensor, xy = oriented.block.sensors[CAMERA], np.asarray(oriented.block.image_points.xy).T
     v, across = oriented.residuals_mm.T / sensor.pixel_mm, 12
     size = np.array([[sensor.width_mm], [sensor.height_mm]])
@@ -106,7 +109,7 @@ def image_residuals_figure(oriented: Oriented) -> Figure:
 def write_orientation(oriented: Oriented, folder: Path, **matching: float) -> None:
     """Write orientation.json, orientation_network.png and orientation_residuals.png into the folder of the block.
 
-    `matching` are numbers of the matching, under that name in the first.
+    `matching`: statistics of the matching, written as `matching` to orientation.json.
     """
     report = oriented.report
     summary = report._asdict() | {"gross_errors": report.gross_errors._asdict(), "matching": matching}

@@ -1,4 +1,4 @@
-"""HTML pages: one self-contained file each, from headings, paragraphs, tables (DataFrames) and figures.
+"""Self-contained HTML pages of headings, paragraphs, tables (DataFrames) and figures.
 
 All pages share one template, style sheet and script (templates/). Figures are inline SVG, drawn by matplotlib.
 """
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 _TEMPLATES = Environment(loader=PackageLoader("jaxphoto.report"), autoescape=True, trim_blocks=True)
 _PACKAGES = ("jaxphoto", "jax", "optimistix", "equinox", "lineax", "numpy", "pandas")
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "msedge")
-# A cell that is read as a number, with its unit or standard deviation.
+# Pattern of cells that are right-aligned: a value, with its unit or standard deviation.
 _NUMBER = re.compile(r"(< ?)?[-+]?(\d|-$)")
-# Text without ids of its own, so that a page holds many drawings; no date, so that equal input gives equal bytes.
+# Settings of SVG: text stays text; a constant hash salt and no date, so that equal inputs give equal bytes.
 _SVG: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "jaxphoto"}
 _NO_METADATA: dict[str, Any] = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 
@@ -60,9 +60,9 @@ class Plot(NamedTuple):
 
     figure: Figure | Callable[[Axes], object] | Path
     alt: str
-    """Description for readers who do not see it."""
+    """Description for screen readers."""
     height: float = 3.4
-    """Height of a panel (inches); its width is 4.8."""
+    """Height of a panel (inches); its width is 4.8 inches."""
 
 
 class Link(NamedTuple):
@@ -73,18 +73,19 @@ class Link(NamedTuple):
 
 
 class PictureFile(NamedTuple):
-    """A picture in a folder next to the page."""
+    """Picture in a folder next to the page."""
 
     alt: str
     file: str
 
 
 Part = Heading | Paragraph | pd.DataFrame | dict[str, str] | Plot | list[Plot] | Link | PictureFile | Markup
-"""A part of a page: a dict is a list of names and values, a list of plots stands side by side, Markup as it is."""
+"""A part of a page. A dict is a list of names and values, a list of plots is drawn side by side, Markup is unchanged.
+"""
 
 
 class CommandRecord(NamedTuple):
-    """How results came about: the command line without its output path, and the files that were read."""
+    """Origin of results: the command line without its output path, and the input files."""
 
     command: str
     inputs: Sequence[InputFile] = ()
@@ -93,9 +94,9 @@ class CommandRecord(NamedTuple):
 def page(
     title: str, parts: Iterable[Part], verdict: tuple[str, str] = ("", ""), style: str = "", foot: str = ""
 ) -> str:
-    """Return the page as HTML; `verdict` is its first sentence and its colour (green, amber, red or none).
+    """Return the page as HTML. `verdict` is its first sentence and its colour (green, amber, red or none).
 
-    Paragraphs before the first heading stand above the contents. `style` are additional rules.
+    Paragraphs before the first heading precede the contents. `style` contains additional CSS rules.
     """
     parts = list(parts)
     first = next((k for k, part in enumerate(parts) if isinstance(part, Heading)), 0)
@@ -108,7 +109,7 @@ def page(
 
 
 def html(part: Part) -> Markup:
-    """One part of a page."""
+    """Render one part of a page as HTML."""
     if isinstance(part, Markup):
         return part
     if isinstance(part, Heading):
@@ -146,7 +147,7 @@ def _mostly_numbers(column: pd.Series) -> bool:
 
 
 def _svg(plot: Plot) -> Markup:
-    """Return a figure as inline SVG that scales to the width of the page."""
+    """Return a figure as inline SVG that scales with the width of the page."""
     from matplotlib import rc_context
 
     figure = plot.figure
@@ -169,12 +170,12 @@ def anchor(heading: str) -> str:
 
 
 def verdict_parts(verdict: Verdict) -> list[Part]:
-    """Return the findings, each with its severity."""
+    """Return the findings as paragraphs, each with its severity."""
     return [Paragraph(as_sentence(f.text), f.severity) for f in verdict.findings]
 
 
 def provenance(record: CommandRecord) -> list[Part]:
-    """Section of date, command, versions and hashes of the input files."""
+    """Return the section of date, command, versions and hashes of the input files."""
     about = {
         "computed": datetime.date.today().isoformat(),
         "command": record.command,
@@ -184,13 +185,13 @@ def provenance(record: CommandRecord) -> list[Part]:
 
 
 def hash_table(files: Iterable[InputFile]) -> pd.DataFrame:
-    """Files with their sizes and SHA-256."""
+    """Tabulate files with their sizes and SHA-256."""
     rows = [(f.file, str(f.n_bytes) if f.n_bytes else "", f.sha256) for f in files]
     return pd.DataFrame(rows, columns=["file", "bytes", "SHA-256"])
 
 
 def versions() -> dict[str, str]:
-    """Versions of jaxphoto and of the packages its numbers depend on."""
+    """Return the versions of jaxphoto and of the packages that affect its results."""
     return {name: version(name) for name in _PACKAGES}
 
 

@@ -1,4 +1,4 @@
-"""Plots of an adjustment, each a function that takes and returns matplotlib axes (`ax`; by default a new figure).
+"""Plots of an adjustment. Each function draws on matplotlib axes `ax` (default: a new figure) and returns them.
 
 `camera` may be omitted if the block has one camera.
 """
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _COLOURS = ("tab:blue", "tab:orange", "tab:green")
 _MARKS = ("o", "s", "^")
 _BARS = 2.0
-"""Standard deviations of error bars."""
+"""Length of error bars in standard deviations."""
 
 
 # Axes and figures ------------------------------------------------------------------------------------------------
@@ -37,16 +37,16 @@ _BARS = 2.0
 
 def new_figure(width: float, height: float) -> Figure:
     """Return an empty figure of a size in inches."""
-    # Imported here because matplotlib takes a third of a second.
+    # Import locally: matplotlib takes a third of a second.
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), dpi=110, layout="constrained")
 
 
 def axes_or_new(axes: Axes | None, *, in_3d: bool = False) -> Axes:
-    """`axes`, or those of a new pyplot figure, which a notebook shows.
+    """Return `axes`, or new pyplot axes, which a notebook displays.
 
-    Raises InputError if a 3-D plot is to be drawn on flat axes.
+    Raises InputError for a 3-D plot on 2-D axes.
     """
     if axes is None:
         from matplotlib import pyplot
@@ -59,12 +59,12 @@ def axes_or_new(axes: Axes | None, *, in_3d: bool = False) -> Axes:
 
 
 def label(name: str) -> str:
-    """Return a name as matplotlib text: a dollar would begin a formula."""
+    """Escape a name for matplotlib, which would read a dollar sign as the start of a formula."""
     return printable(name).replace("$", r"\$")
 
 
 def prepare_pictures() -> None:
-    """Import and load matplotlib, which takes half a second: for a thread while something else is computed."""
+    """Import and initialise matplotlib (half a second). Run it in a thread during other computations."""
     new_figure(1.0, 1.0).savefig(io.BytesIO())
 
 
@@ -82,7 +82,7 @@ def log_ticks(axes: Axes) -> None:
 
 
 def draw_format(axes: Axes, sensor: Sensor) -> None:
-    """Return the outline of the image format on axes of millimetres from its centre."""
+    """Draw the outline of the image format; axes in millimetres from its centre."""
     w, h = sensor.width_mm / 2, sensor.height_mm / 2
     axes.plot([-w, w, w, -w, -w], [-h, -h, h, h, -h], color="0.4", lw=0.8)
     axes.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
@@ -91,7 +91,7 @@ def draw_format(axes: Axes, sensor: Sensor) -> None:
 def draw_format_map(
     axes: Axes, sensor: Sensor, cells_mm: Float[np.ndarray, "cells 2"], name: str, values: Float[np.ndarray, cells]
 ) -> None:
-    """Return a colour map over the image format; `name` is its title."""
+    """Draw a colour map over the image format with the title `name`."""
     if np.ptp(values) > 1e-9 * max(np.abs(values).max(), 1e-300):
         filled = axes.tricontourf(cells_mm[:, 0], cells_mm[:, 1], values, levels=12, cmap="cividis")
         axes.figure.colorbar(filled, ax=axes, shrink=0.85)
@@ -102,11 +102,11 @@ def draw_format_map(
 
 
 def draw_matrix(axes: Axes, values: np.ndarray, rows: Sequence[str], columns: Sequence[str], name: str) -> None:
-    """Correlations `values` of `rows` with `columns`, in colours and numbers."""
+    """Draw correlations `values` of `rows` with `columns` as colours and text."""
     axes.imshow(values, vmin=-1, vmax=1, cmap="RdBu_r", aspect="auto")
     axes.set_xticks(range(len(columns)), [label(symbol(name)) for name in columns], rotation=45, ha="right", fontsize=8)
     axes.set_yticks(range(len(rows)), [label(symbol(name)) for name in rows], fontsize=8)
-    # No minus sign in front of zeros.
+    # Avoid a minus sign before zeros.
     shown = np.round(values, 2) + 0.0
     for i, j in np.ndindex(values.shape):
         colour = "white" if abs(values[i, j]) > 0.6 else "black"
@@ -115,7 +115,7 @@ def draw_matrix(axes: Axes, values: np.ndarray, rows: Sequence[str], columns: Se
 
 
 def draw_arrows(axes: Axes, at: np.ndarray, v: np.ndarray, key: float, length: float, text: str) -> None:
-    """Arrows `v` at `at` (2 x n); one of size `key` has a drawn `length` and is the key, labelled `text`."""
+    """Draw arrows `v` at `at` (2 x n). The key is an arrow of size `key`, drawn length `length` and label `text`."""
     arrows = axes.quiver(*at, *v, angles="xy", scale_units="xy", scale=key / length, width=0.003, color="tab:blue")
     axes.quiverkey(arrows, 0.93, 1.04, key, text, labelpos="W")
     axes.update_datalim((at + v * length / key).T)
@@ -123,23 +123,23 @@ def draw_arrows(axes: Axes, at: np.ndarray, v: np.ndarray, key: float, length: f
 
 
 def round_key(v: np.ndarray) -> float:
-    """Return a round number near three times the RMS of `v`."""
+    """Round three times the RMS of `v` to one significant digit."""
     rms = float(np.sqrt(np.nanmean(v**2))) if np.isfinite(v).any() else 1.0
     return float(f"{3 * max(rms, 1e-12):.0e}")
 
 
 # Residuals -------------------------------------------------------------------------------------------------------
 
-# More arrows hide each other; the largest are always drawn.
+# Maximum number of arrows; number of the largest arrows that are always drawn.
 _ARROWS, _LARGEST = 4000, 100
-# Cells along the longer side of the format, and residuals that a mean needs.
+# Number of cells along the longer side of the format; minimum number of residuals per cell mean.
 _CELLS, _FEW = 12, 5
-# Rings of equally many image points, and residuals that a ring needs.
+# Number of rings with equal numbers of image points; minimum number of residuals per ring.
 _RINGS, _OF_RING = 12, 10
 
 
 def residuals_of(tables: Tables, camera: str) -> tuple[np.ndarray, np.ndarray]:
-    """Image points of a camera and their residuals (2 x n, mm)."""
+    """Return the image points of a camera and their residuals (2 x n, mm)."""
     a = tables.adjusted
     of_camera = np.array([c == camera for c in a.block.image_camera])[a.structure.image]
     return np.asarray(a.values.xy)[:, of_camera], (np.asarray(a.residuals.image) * np.asarray(a.values.sigma_xy))[
@@ -148,7 +148,7 @@ def residuals_of(tables: Tables, camera: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def plot_residuals(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
-    """Image residuals over the format of a camera, all images together."""
+    """Draw the image residuals of all images over the format of a camera."""
     ax, camera = axes_or_new(ax), one_camera(tables.adjusted.block, camera)
     xy, v = residuals_of(tables, camera)
     name = f"image residuals of {label(camera_words(camera))}"
@@ -160,7 +160,7 @@ def plot_residuals(tables: Tables, camera: str | None = None, ax: Axes | None = 
 
 
 def plot_mean_residuals(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
-    """Mean residuals by cell of the format: systematic residuals of all images."""
+    """Draw mean residuals by cell of the format, which show systematic residuals of all images."""
     ax, camera = axes_or_new(ax), one_camera(tables.adjusted.block, camera)
     xy, v = residuals_of(tables, camera)
     cell, centres = _cells(tables.adjusted.block.sensors[camera], xy)
@@ -181,7 +181,7 @@ def _over_format(ax: Axes, tables: Tables, camera: str, xy: np.ndarray, v: np.nd
 
 
 def plot_density(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
-    """Return the number of image points in each cell of the format."""
+    """Draw the number of image points in each cell of the format."""
     ax, camera = axes_or_new(ax), one_camera(tables.adjusted.block, camera)
     sensor = tables.adjusted.block.sensors[camera]
     cell, centres = _cells(sensor, residuals_of(tables, camera)[0])
@@ -195,7 +195,10 @@ def plot_density(tables: Tables, camera: str | None = None, ax: Axes | None = No
 
 
 def _cells(sensor: Sensor, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cell number of image points (2 x n, mm), and the centres of all cells (2 x cells, mm), row by row from below."""
+    """Return the cell index of image points (2 x n, mm), and the centres of all cells (2 x cells, mm).
+
+    Cells are in rows, bottom row first.
+    """
     size = np.array([sensor.width_mm, sensor.height_mm])[:, None]
     across, down = np.maximum(1, np.round(_CELLS * size[:, 0] / size.max())).astype(int)
     column, row = np.clip((xy / size + 0.5) * [[across], [down]], 0, [[across - 1], [down - 1]]).astype(int)
@@ -204,7 +207,7 @@ def _cells(sensor: Sensor, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def plot_residuals_by_radius(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
-    """Mean radial and tangential residuals by distance from the principal point, with bars of two sigmas."""
+    """Draw mean radial and tangential residuals by distance from the principal point, with bars of two sigmas."""
     ax, camera = axes_or_new(ax), one_camera(tables.adjusted.block, camera)
     xy, v = residuals_of(tables, camera)
     title(ax, "residuals by distance from the principal point" if xy.size else "no residuals")
@@ -220,7 +223,7 @@ def plot_residuals_by_radius(tables: Tables, camera: str | None = None, ax: Axes
         mean = 1e3 * np.array([values[ring].mean() for ring in rings])
         bars = 1e3 * _BARS * np.array([values[ring].std() / np.sqrt(len(ring)) for ring in rings])
         text = f"{name} (RMS {1e3 * np.sqrt((values**2).mean()):.2g} µm)"
-        # Side by side, so that bars do not hide each other.
+        # Offset the two series horizontally so that their bars do not overlap.
         shift = 0.008 * np.ptp(radius) * (2 * k - 1)
         style: dict[str, Any] = {"ms": 4, "lw": 1, "capsize": 2, "color": _COLOURS[k], "label": text}
         ax.errorbar(at + shift, mean, yerr=bars, fmt=f"{_MARKS[k]}-", **style)
@@ -231,13 +234,13 @@ def plot_residuals_by_radius(tables: Tables, camera: str | None = None, ax: Axes
 
 
 def plot_station_residuals(tables: Tables, ax: Axes | None = None) -> Axes:
-    """Residuals of camera stations in the order of the flight. Raises InputError without observed stations."""
+    """Draw residuals of camera stations in the order of the flight. Raises InputError without observed stations."""
     a = tables.adjusted
     if not len(a.block.stations.who):
         raise InputError("the block has no observed stations to be drawn")
     ax = axes_or_new(ax)
     time = np.asarray(a.block.image_time if a.block.flight_time is None else a.block.flight_time, float)
-    # Times relative to the middle of each strip are not unique.
+    # Use times only if they are unique; times relative to the middle of each strip are not.
     timed = np.isfinite(time).all() and len(np.unique(time)) == len(time)
     number = np.argsort(np.argsort(time)) if timed else np.arange(len(time))
     observed = tables.residuals[tables.residuals["group"] == "stations"]
@@ -259,7 +262,7 @@ def plot_station_residuals(tables: Tables, ax: Axes | None = None) -> Axes:
 def plot_check_points(
     tables: Tables, ax: Axes | None = None, *, upright: bool = False, key: float | None = None
 ) -> Axes:
-    """Discrepancies at check points (surveyed minus computed) in plan, or in height if `upright`.
+    """Draw discrepancies at check points (surveyed minus computed) in plan, or in height if `upright`.
 
     Arrows are scaled for a length of `key` metres. Raises InputError without check points.
     """
@@ -283,12 +286,12 @@ def plot_check_points(
 
 
 def discrepancies(tables: Tables) -> np.ndarray:
-    """Surveyed minus computed coordinates of the check points (3 x n, m)."""
+    """Return surveyed minus computed coordinates of the check points (3 x n, m)."""
     return tables.check_points[["dX_m", "dY_m", "dZ_m"]].to_numpy(float).T
 
 
 def check_points_figure(adjustments: Mapping[str, Tables]) -> Figure:
-    """Discrepancies at check points in plan and in height; one row per adjustment, all with one scale."""
+    """Draw discrepancies at check points in plan and in height; one row per adjustment, all at one scale."""
     key = round_key(np.concatenate([discrepancies(tables).ravel() for tables in adjustments.values()]))
     figure = new_figure(9.6, 4.2 * len(adjustments))
     rows = figure.subplots(len(adjustments), 2, squeeze=False)
@@ -303,28 +306,29 @@ def check_points_figure(adjustments: Mapping[str, Tables]) -> Figure:
 
 
 def plot_interior_correlation(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
-    """Correlations within the interior orientation."""
+    """Draw the correlations within the interior orientation."""
     ax, c = axes_or_new(ax), tables.correlations[one_camera(tables.adjusted.block, camera)]
     draw_matrix(ax, c.interior, c.parameters, c.parameters, "correlation of IOP")
     return ax
 
 
 def plot_exterior_correlation(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
-    """Mean absolute correlation of exterior and interior orientation over the images."""
+    """Draw the mean absolute correlation of exterior and interior orientation over the images."""
     ax, c = axes_or_new(ax), tables.correlations[one_camera(tables.adjusted.block, camera)]
     draw_matrix(ax, c.mean_abs, c.eop_names, c.parameters, "mean |correlation| of EOP and IOP")
     return ax
 
 
 def correlation_figure(tables: Tables, camera: str | None = None) -> Figure:
-    """Both correlation matrices of a camera side by side."""
+    """Draw both correlation matrices of a camera side by side."""
     figure = new_figure(9.6, 4.0)
     for axes, plot in zip(figure.subplots(1, 2), (plot_interior_correlation, plot_exterior_correlation), strict=True):
         plot(tables, camera, axes)
     return figure
 
 
-# Contours are drawn at these times powers of ten: the first set that gives `_LINES` of them.
+# Minimum number of contours; candidate contour levels (times powers of ten), of which the first set with enough
+# contours is used.
 _LINES = 5
 _ROUND = (
     (1.0, 2.0, 5.0),
@@ -336,14 +340,14 @@ _ROUND = (
 def plot_sigma_map(
     tables: Tables, camera: str | None = None, ax: Axes | None = None, *, distance_m: float = float("inf")
 ) -> Axes:
-    """Projection uncertainty over the image format for points at a distance (`jaxphoto.sigma_map`)."""
+    """Draw the projection uncertainty over the image format for points at a distance (`jaxphoto.sigma_map`)."""
     ax, name = axes_or_new(ax), one_camera(tables.adjusted.block, camera)
     draw_sigma_map(ax, tables.adjusted.block.sensors[name], sigma_map(tables.adjusted, name, distance_m=distance_m))
     return ax
 
 
 def draw_sigma_map(axes: Axes, sensor: Sensor, one: SigmaMap) -> None:
-    """Sigma in its worst direction (px), with contours at round numbers."""
+    """Draw the standard deviation in the worst direction (px), with contours at round values."""
     x, y = (np.unique(v) for v in one.points.T)
     if len(x) * len(y) != len(one.points):
         raise ValueError("a map is drawn of cells in rows and columns")
@@ -361,14 +365,14 @@ def draw_sigma_map(axes: Axes, sensor: Sensor, one: SigmaMap) -> None:
 
 
 def distance_words(distance_m: float) -> str:
-    """Such as "of a point at 1050 m"."""
+    """Describe the distance of a point, such as "of a point at 1050 m"."""
     if np.isinf(distance_m):
         return "of a point at infinity"
     return f"of a point at {distance_m:.0f} m" if distance_m >= 100 else f"of a point at {distance_m:.3g} m"
 
 
 def _levels(values: np.ndarray) -> list[float]:
-    """Round contour levels that enclose all values, of nearly equal ratio."""
+    """Choose round contour levels that enclose all values, in nearly constant ratio."""
     values = values[values > 0]
     if not len(values):
         return []
@@ -389,15 +393,15 @@ _ELLIPSE = 0.03
 def ellipse_axes(
     covariance: Float[np.ndarray, "n 2 2"],
 ) -> tuple[Float[np.ndarray, n], Float[np.ndarray, n], Float[np.ndarray, n]]:
-    """Semi-axes a >= b of error ellipses, and the direction of a from X towards Y (rad)."""
+    """Return the semi-axes a >= b of error ellipses, and the direction of a from X towards Y (rad)."""
     variance, axes = np.linalg.eigh(covariance)
-    # A fixed coordinate has a variance of zero or, by rounding, below.
+    # Clip at zero: rounding may make the zero variance of a fixed coordinate negative.
     b, a = np.sqrt(np.maximum(variance, 0.0)).T
     return a, b, np.arctan2(axes[:, 1, 1], axes[:, 0, 1])
 
 
 def plot_error_ellipses(tables: Tables, ax: Axes | None = None, *, unit: str = "m") -> Axes:
-    """Draw standard ellipses of the projection centres in plan (39 % lie within), enlarged; colour: sigma of Z."""
+    """Draw enlarged standard ellipses (39 % probability) of the projection centres in plan; colour: sigma of Z."""
     from matplotlib.collections import EllipseCollection
 
     ax, covariance = axes_or_new(ax), tables.covariance.positions * float(tables.covariance.variance_factor)
@@ -427,7 +431,7 @@ def plot_error_ellipses(tables: Tables, ax: Axes | None = None, *, unit: str = "
 
 
 def plot_intersection_angles(tables: Tables, ax: Axes | None = None) -> Axes:
-    """Histogram of the largest intersection angle of each object point."""
+    """Draw the histogram of the largest intersection angle of each object point."""
     ax = axes_or_new(ax)
     ax.hist(tables.object_points["angle_deg"].dropna().to_numpy(), bins=45, color="tab:blue")
     ax.set(xlabel="largest angle between rays [deg]", ylabel="points")
@@ -436,7 +440,7 @@ def plot_intersection_angles(tables: Tables, ax: Axes | None = None) -> Axes:
 
 
 def plot_point_sigmas(tables: Tables, ax: Axes | None = None, *, unit: str = "m") -> Axes:
-    """Histograms of the standard deviations of object points by axis, up to the 99th percentile."""
+    """Draw histograms of the standard deviations of object points by axis, up to the 99th percentile."""
     ax, points = axes_or_new(ax), tables.object_points
     sigma = points.loc[points["n_images"] > 0, [f"sigma_{a}_m" for a in AXES]].to_numpy()
     known = sigma[np.isfinite(sigma) & (sigma > 0)]
@@ -452,7 +456,7 @@ def plot_point_sigmas(tables: Tables, ax: Axes | None = None, *, unit: str = "m"
 
 
 def plot_rays(tables: Tables, ax: Axes | None = None) -> Axes:
-    """Return the number of object points by number of rays."""
+    """Draw the number of object points by number of rays."""
     ax, most = axes_or_new(ax), 15
     rays = np.minimum(np.bincount(tables.adjusted.structure.point), most)
     ax.bar(np.arange(2, most + 1), np.bincount(rays, minlength=most + 1)[2:], color="tab:blue")
@@ -462,14 +466,14 @@ def plot_rays(tables: Tables, ax: Axes | None = None) -> Axes:
 
 
 def plot_overlap(tables: Tables, ax: Axes | None = None) -> Axes:
-    """Return the number of images that cover each cell of the ground; coordinates are metres."""
+    """Draw the number of images that cover each cell of the ground; coordinates in metres."""
     ax = axes_or_new(ax)
     draw_overlap(ax, coverage(tables.adjusted), tables.adjusted)
     return ax
 
 
 def draw_overlap(ax: Axes, cover: Coverage, adjusted: Adjustment) -> None:
-    """Return the number of images per cell, and the stations."""
+    """Draw the number of images per cell, and the stations."""
     counts = np.ma.masked_less(cover.seen_by, 1)
     x, y = (np.append(v - cover.step_m / 2, v[-1] + cover.step_m / 2) for v in (cover.x, cover.y))
     shown = ax.pcolormesh(x, y, counts, cmap="viridis", rasterized=True)
@@ -480,16 +484,16 @@ def draw_overlap(ax: Axes, cover: Coverage, adjusted: Adjustment) -> None:
     title(ax, "overlap: images per cell of the ground")
 
 
-# Links of a class that are drawn, classes, and weakest links that are named.
+# Maximum number of drawn links per class, number of classes, number of highlighted weakest links.
 _LINKS, _CLASSES, WEAKEST = 2000, 5, 5
-# Fraction of the plot that lines may cover, and its width in points: where most images are linked, lines are thinner.
+# Maximum fraction of the plot covered by lines, width of the plot (points), minimum line width (points).
 _INK, _ACROSS, _THINNEST = 0.5, 200.0, 0.05
 
 
 def plot_links(tables: Tables, ax: Axes | None = None, *, unit: str = "m") -> Axes:
-    """Return the network of images in plan by common points, dark lines for strong links; the weakest in red.
+    """Draw the image network in plan by common points: dark lines for strong links, the weakest in red.
 
-    Of a class of many links an even sample is drawn, as title and legend say.
+    Of a class of many links an even sample is drawn; title and legend state the fraction.
     """
     ax, links = axes_or_new(ax), image_links(tables.adjusted)
     draw_network(ax, np.asarray(tables.adjusted.unknowns.exterior.position)[:, :2], links,
@@ -499,7 +503,7 @@ def plot_links(tables: Tables, ax: Axes | None = None, *, unit: str = "m") -> Ax
 
 
 def draw_network(axes: Axes, station: Float[np.ndarray, "n 2"], links: ImageLinks, weak: Sequence[WeakLink]) -> None:
-    """Links between stations by class of strength."""
+    """Draw links between stations by class of strength."""
     limits = strength_classes(links.common)
     lines = []
     for k, low in enumerate(limits):
@@ -530,12 +534,12 @@ def draw_network(axes: Axes, station: Float[np.ndarray, "n 2"], links: ImageLink
 
 
 def strength_classes(common: np.ndarray) -> list[int]:
-    """Lower limits of the classes of links by common points, in steps of about the same factor."""
+    """Return lower limits of classes of links by common points, in approximately constant ratio."""
     return sorted({int(v) for v in np.geomspace(1, max(common.max() / 2, 1), _CLASSES).round()})
 
 
 def plot_link_strength(tables: Tables, ax: Axes | None = None) -> Axes:
-    """Histogram of the common points of pairs of images."""
+    """Draw the histogram of the number of common points per pair of images."""
     ax, common = axes_or_new(ax), image_links(tables.adjusted).common
     edges = np.unique(np.geomspace(1, max(common.max(), 2) + 1, 16).round())
     number, _ = np.histogram(common, edges)
@@ -546,9 +550,9 @@ def plot_link_strength(tables: Tables, ax: Axes | None = None) -> Axes:
 
 
 def plot_convergence(tables: Tables, ax: Axes | None = None, *, steps: bool = False) -> Axes:
-    """Sigma naught by iteration, or the length of each of the `steps` in sigmas. Raises InputError if unknown."""
+    """Draw sigma naught by iteration, or with `steps` the step lengths in sigmas. Raises InputError if unknown."""
     if tables.adjusted.history is None:
-        raise InputError("of this adjustment no iteration is known: adjust the block to draw its convergence")
+        raise InputError("this adjustment has no iteration history; adjust the block to draw its convergence")
     ax, table = axes_or_new(ax), tables.convergence
     ax.locator_params(axis="x", integer=True)
     if steps:

@@ -1,4 +1,4 @@
-"""Findings from residuals: sigma naught, blunders, systematic effects; from reliability, rejections and weights."""
+"""Findings on residuals: sigma naught, blunders, systematic effects; and on reliability, rejections and weights."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -39,35 +39,35 @@ from jaxphoto.statistics import (
 from jaxphoto.unknowns import Weighted
 
 ANOTHER_UNIT = 0.1
-"""Sigma naught below which standard deviations are in another unit."""
+"""Sigma naught below which standard deviations are assumed to be in a wrong unit."""
 NOTHING_FITS = 3.0
-"""Sigma naught above which weights are not the cause: something is wrong."""
+"""Sigma naught above which wrong weights are not a sufficient explanation."""
 MOST_OF_IT = 0.5
-"""Fraction of the square sum of a systematic effect that one term explains to be named."""
+"""Fraction of a systematic effect's sum of squares above which a single term explains it."""
 _SHOWN = 3
 _NOT_DISTORTION = ("c_mm", "xp_mm", "yp_mm")
-# A suspect is an error beyond this factor times the critical value, or if it moves an interior parameter by more than
-# `_SPOILT` sigma; effects below `_REPORTED` are not reported.
+# Ratio of |w| to the critical value, and shift of an interior parameter (sigma), above which a blunder is an error;
+# minimum reported shift (sigma).
 _FAR_OUT, _SPOILT, _REPORTED = 1.25, 0.5, 0.05
-# Deviation of the expected sigma naught from 1 that is reported.
+# Minimum reported deviation of the expected sigma naught from 1.
 _STRETCHED = 0.01
-# A systematic effect is a warning above this fraction of the sigma of its observations, or if it moves an interior
-# parameter by more than `_MOVED` sigma, and an error if by more than `_SPOILT_BY_EFFECT` sigma.
+# Ratio of a systematic effect to the sigma of its observations, and shift of an interior parameter (sigma), above which
+# the effect is a warning; shift above which it is an error.
 _VISIBLE, _MOVED, _SPOILT_BY_EFFECT = 0.25, 1.0, 10.0
-# A changed camera looks like a common bias of stations; where p-values are similar (logarithms within a tenth), the
-# prior of the camera is questioned first, because it is older.
+# Exponent of the p-values of common station biases, which a changed camera imitates. If p-values are similar
+# (logarithms within a tenth), the camera's prior is reported first, because it is older.
 _SIMILAR = 1.1
-# MDB over sigma above which an observation is hardly checked (r < 0.17).
+# Ratio of MDB to sigma above which an observation is hardly checked (r < 0.17).
 _HIDDEN = 10.0
 
 
 def residual_findings(tables: Tables) -> Iterator[Finding]:
-    """Return the tests of sigma naught, of single residuals and of systematic effects."""
+    """Yield the tests of sigma naught, of single residuals and of systematic effects."""
     yield from _global_test(tables)
     fits = global_test(tables.adjusted, tables.redundancy).sigma <= ABSURD
     effects, suspects = list(_systematic(tables, fits)), tables.blunders.suspects
-    # An effect that is more certain than the worst suspect comes first: it makes blunders of many observations. Where
-    # nothing fits, first-order theory does not separate the two.
+    # Report effects that are more certain than the worst suspect first: they imitate blunders in many observations. If
+    # sigma naught is absurd, first-order theory cannot separate the two.
     first = [e for e in effects if e.chance < _chance_of_the_worst(tables)] if suspects and fits else []
     blunders = list(_blunders(tables, tables.culprits)) if first else []
     worst = min((SEVERITIES.index(f.severity) for f in blunders), default=len(SEVERITIES) - 1)
@@ -82,13 +82,13 @@ def residual_findings(tables: Tables) -> Iterator[Finding]:
 
 
 def contradictions(tables: Tables) -> Iterator[Finding]:
-    """Return the tests of sigma naught and of single residuals."""
+    """Yield the tests of sigma naught and of single residuals."""
     yield from _global_test(tables)
     yield from _blunders(tables, tables.culprits)
 
 
 def _priors_of_lens_type(block: Block) -> bool:
-    """Return True if the priors are the spread of a lens type, which has zero distortion as its mean."""
+    """Return True if the priors describe the spread of a lens type, whose mean distortion is zero."""
     values = [
         float(prior.value)
         for priors in block.priors.interior.values()
@@ -99,7 +99,7 @@ def _priors_of_lens_type(block: Block) -> bool:
 
 
 def _global_test(tables: Tables) -> Iterator[Finding]:
-    """Sigma naught against its expectation, and the groups of observations that cause a deviation."""
+    """Compare sigma naught with its expectation, and find the groups of observations that cause a deviation."""
     whole = global_test(tables.adjusted, tables.redundancy)
     if whole.redundancy <= 0:
         yield Finding("no_redundancy", "warning", hint="Add observations")
@@ -107,7 +107,7 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
     tested = group_factors(tables.adjusted, tables.redundancy)
     factors = [f for f in tested if f.p_value < LEVEL / len(tested)]
     if whole.p_value >= LEVEL:
-        # A few observations among many do not show in sigma naught.
+        # Test the groups separately: a few observations among many do not affect sigma naught.
         for f in factors:
             p = {"p": p_words(f.p_value)}
             if not f.group.startswith(PRIORS):
@@ -123,7 +123,7 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
     numbers = {"p": p_words(whole.p_value), "groups": f"; by group: {groups}" if groups else ""}
     severity: Severity = "warning"
     if whole.sigma < 1:
-        # With a single group the variance factor absorbs a wrong sigma; with several, the weights are wrong.
+        # With a single group the variance factor absorbs a wrong sigma; with several, the relative weights are wrong.
         several = sum(n > 0 for n in tables.adjusted.n_observations.values()) > 1
         unit = whole.sigma < ANOTHER_UNIT and several
         code, severity = ("sigma0_unit", "error") if unit else ("sigma0_small", "warning")
@@ -140,7 +140,7 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
 
 
 def stretch_findings(adjusted: Adjustment) -> Iterator[Finding]:
-    """Cameras whose distortion stretches residuals, so that sigma naught is not expected to be 1."""
+    """Yield cameras whose distortion scales residuals, so that the expected sigma naught differs from 1."""
     for camera, factor in expected_residual_scale(adjusted).items() if adjusted.redundancy > 0 else ():
         if abs(factor - 1) > _STRETCHED:
             hint = f'Set residuals = "measured" in [cameras.{camera}]'
@@ -148,10 +148,10 @@ def stretch_findings(adjusted: Adjustment) -> Iterator[Finding]:
 
 
 def _blunders(tables: Tables, suspects: Sequence[Suspect]) -> Iterator[Finding]:
-    """Return the most likely blunders.
+    """Yield the most likely blunders.
 
-    An error if far beyond the critical value or if it moves the interior orientation, otherwise a warning: of many
-    thousand real observations a few are slightly beyond.
+    A blunder is an error if it is far above the critical value or shifts the interior orientation. Otherwise it is a
+    warning: among thousands of valid observations a few slightly exceed the limit.
     """
     limit = tables.blunders.limit
     effects = [(s, *_effect(tables, s)) for s in suspects]
@@ -174,7 +174,7 @@ def _blunders(tables: Tables, suspects: Sequence[Suspect]) -> Iterator[Finding]:
 
 
 def _effect(tables: Tables, suspect: Suspect) -> tuple[str, float]:
-    """Return the interior parameter that the error of a suspect moves most, in a posteriori sigmas."""
+    """Return the interior parameter that the error of a suspect shifts most, and the shift in a posteriori sigmas."""
     moved = {
         parameter: float(np.atleast_2d(of[suspect.group])[suspect.number, suspect.row]) * abs(suspect.w) / DELTA0
         for parameter, of in tables.undetected.interior.items()
@@ -183,7 +183,7 @@ def _effect(tables: Tables, suspect: Suspect) -> tuple[str, float]:
 
 
 def _chance_of_the_worst(tables: Tables) -> float:
-    """Probability of the largest normalised residual among all."""
+    """Return the p-value of the largest normalised residual among all (Bonferroni)."""
     w = max(abs(s.w) for s in tables.blunders.suspects)
     return tables.blunders.n * float(scipy.special.erfc(w / np.sqrt(2)))
 
@@ -192,14 +192,14 @@ class _Effect(NamedTuple):
     """A significant systematic effect."""
 
     chance: float
-    """Its p-value: 1 if no usual term explains it or it does not matter, 0 if it explains most of the suspects."""
+    """p-value; 1 if no usual term explains the effect or it is negligible, 0 if it explains most of the suspects."""
     severity: Severity
     subject: str
     value: float
     limit: float
     numbers: dict[str, Any]
     terms: tuple[tuple[SystematicEffect, EffectTerm], ...]
-    """Terms that are most of it."""
+    """Terms that explain most of the effect."""
 
 
 def _systematic_finding(effect: _Effect, severity: Severity) -> Finding:
@@ -207,7 +207,7 @@ def _systematic_finding(effect: _Effect, severity: Severity) -> Finding:
 
 
 def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
-    """Significant systematic effects, the most certain first; those of cameras only where the block `fits`."""
+    """Yield significant systematic effects by increasing p-value; effects of cameras only if `fits`."""
     level = LEVEL / max(len(tables.tested_trends), 1)
     found = (t for t in tables.tested_trends if t.p_value < level and (fits or not t.pattern.camera))
     for t in sorted(found, key=lambda t: t.p_value ** (_SIMILAR if t.pattern.begins else 1.0)):
@@ -216,7 +216,8 @@ def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
         if t.size > 0 and unit:
             detail = f", size {factor * t.size:.2g} {unit} ({t.size / t.sigma:.2g} sigma)"
         together = t.significant_terms
-        # Estimated parameters absorb part of an effect, so that its size is lost in noise.
+        # Test both the size and the estimated terms: estimated parameters absorb part of an effect, which may hide its
+        # size in the noise.
         matters = t.size > _VISIBLE * t.sigma or any(abs(h.amount) > _VISIBLE * t.sigma for h in together)
         if together or (t.hints and t.hints[0].share > MOST_OF_IT):
             likely = together or [t.hints[0]]
@@ -231,7 +232,7 @@ def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
             detail += ": no single usual term is most of it; try a distortion of more terms (docs/stability.md)"
         elif several := [h for h in t.hints if abs(h.amount) > SIGNIFICANT_RATIO * h.sigma][:_SHOWN]:
             detail += f", each alone {_terms(t.pattern, several)}"
-        # Suspects that the term explains are no blunders.
+        # Count the suspects explained by the terms: these are not blunders.
         most = t.matching_blunders >= _SHOWN and t.matching_blunders > len(tables.blunders.suspects) / 2
         chance = (0.0 if most else t.p_value) if matters and likely else 1.0
         subject = t.pattern.begins or f"systematic residuals of {t.pattern.what}"
@@ -242,7 +243,7 @@ def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
 
 
 def _terms(pattern: SystematicEffect, likely: list[TermEstimate]) -> str:
-    """Return the likely terms with their amounts, and the cure."""
+    """Describe the likely terms with their estimates, and the cure."""
     factor, unit = in_file_unit(pattern.unit)
     amounts = (f" {factor * h.amount:+.3g} +- {factor * h.sigma:.2g} {unit}".rstrip() for h in likely)
     names = ", ".join(h.term.name + (a if h.term.report_amount else "") for h, a in zip(likely, amounts, strict=True))
@@ -254,7 +255,7 @@ def _terms(pattern: SystematicEffect, likely: list[TermEstimate]) -> str:
 
 
 def reliability_findings(tables: Tables) -> Iterator[Finding]:
-    """Points of two rays, external reliability, and observations with large MDBs."""
+    """Yield points with two rays, external reliability, and observations with large MDBs."""
     adjusted = tables.adjusted
     if (n := len(adjusted.block.sensors)) > MAX_GROUPS:
         yield Finding("not_tested_by_camera", "note", value=n, limit=MAX_GROUPS)
@@ -274,7 +275,7 @@ def reliability_findings(tables: Tables) -> Iterator[Finding]:
 
 
 def _common_biases(tables: Tables) -> Iterator[Finding]:
-    """MDB of a bias common to all rows of a group, and its effect on the interior orientation."""
+    """Yield the MDB of a bias common to all rows of a group, and its effect on the interior orientation."""
     for t in (t for t in tables.tested_trends if t.pattern.group):
         worst: tuple[float, str, TermEstimate] | None = None
         for h in (h for h in t.hints if h.amount != 0.0):
@@ -291,14 +292,15 @@ def _common_biases(tables: Tables) -> Iterator[Finding]:
 # Rejected observations -------------------------------------------------------------------------------------------
 
 _REJECTED_SHOWN = 5
-# Errors have a common bias if they scatter by no more than so many sigmas.
+# Maximum scatter of errors with a common bias, in standard deviations.
 _COMMON = 3.0
 
 
 def left_out_table(snooped: Snooped, block: Block) -> pd.DataFrame:
-    """group, image, point, observation, error, sigma, unit, w of everything rejected, the worst first.
+    """Tabulate all rejected observations by decreasing error.
 
-    `error` is observed minus predicted by the others. Points that were rejected as a whole follow without numbers.
+    Columns: group, image, point, observation, error, sigma, unit, w. `error` is the observed minus the predicted value.
+    Points that were rejected completely follow without values.
     """
     groups, rows = block.named_observations, list[tuple]()
     for s in snooped.left_out:
@@ -314,7 +316,7 @@ def left_out_table(snooped: Snooped, block: Block) -> pd.DataFrame:
 
 
 def snooped_findings(snooped: Snooped, block: Block) -> list[Finding]:
-    """Yield findings on corrected and rejected observations, systematic errors first."""
+    """Return findings on corrected and rejected observations, systematic errors first."""
     found = [*_too_many(snooped, block)]
     found += [Finding("exchanged", "warning", exchange.words) for exchange in snooped.exchanged]
     found += _common(snooped, block)
@@ -330,7 +332,7 @@ def snooped_findings(snooped: Snooped, block: Block) -> list[Finding]:
 
 
 def _common(snooped: Snooped, block: Block) -> Iterator[Finding]:
-    """Rejected rows of a group (besides image points) with a common bias along an axis, overall or in a strip."""
+    """Find rejected rows of a group (except image points) with a common bias along an axis, overall or in a strip."""
     for name, rows in block.named_observations.items():
         left = [s for s in snooped.left_out if s.group == name]
         if name != IMAGE_POINTS and not isinstance(rows, Correlated) and len(left) >= SEVERAL:
@@ -349,7 +351,7 @@ def _common_of(name: str, rows: AbstractObservations, left: list[Suspect], block
         mean = float(np.average(error, weights=sigma**-2.0))
         scatter = float(np.sqrt(np.mean(((error - mean) / sigma) ** 2)))
         if axis not in reported and len(own) >= SEVERAL and len(own) > part.sum() / 2 and scatter < _COMMON:
-            # A bias of all strips is reported once.
+            # A bias of all strips is reported only once.
             reported |= {axis} if strip is None else set()
             factor, unit = in_file_unit(own[0].unit)
             subject = f"{name.replace('_', ' ')}{f' in strip {strip}' if strip else ''} along {axis}"
@@ -359,7 +361,7 @@ def _common_of(name: str, rows: AbstractObservations, left: list[Suspect], block
 
 
 def _too_many(snooped: Snooped, block: Block) -> Iterator[Finding]:
-    """Images and groups of which too much is rejected to be single errors."""
+    """Find images and groups with too many rejections for isolated errors."""
     most = rejected_images(snooped, block)
     mirrored = [k for k in most if is_mirrored(snooped, block, k)]
     for which, hint in (
@@ -381,10 +383,10 @@ def _too_many(snooped: Snooped, block: Block) -> Iterator[Finding]:
 
 
 def component_tables(components: VarianceComponents) -> dict[str, pd.DataFrame]:
-    """Tables by file name: variance_components, and variance_component_correlation.
+    """Return the tables variance_components and variance_component_correlation by file name.
 
-    Columns are group, observations, redundancy, factor, sigma_factor, degrees_of_freedom, supported; and group_a,
-    group_b, rho. A group that supports no component has the factor 1 and no sigma.
+    Columns: group, observations, redundancy, factor, sigma_factor, degrees_of_freedom, supported; and group_a, group_b,
+    rho. A group whose component is not estimable has factor 1 and no sigma.
     """
     c = components
     columns = {
@@ -398,7 +400,7 @@ def component_tables(components: VarianceComponents) -> dict[str, pd.DataFrame]:
 
 
 def component_findings(components: VarianceComponents, blunders: Sequence[InflatedComponent] = ()) -> list[Finding]:
-    """Components caused by blunders, missing convergence, and groups that support no component."""
+    """Report components caused by blunders, missing convergence, and groups whose component is not estimable."""
     found = []
     for component in blunders:
         hint = "Blunders are no measure of precision: adjust with --snoop as well"

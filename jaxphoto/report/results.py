@@ -57,16 +57,16 @@ _TABLES = (
     "interior", "exterior", "object_points", "residuals", "trends", "check_points", "positional_accuracy",
     "correlation", "correlation_summary", "correlation_ground", "sigma_map", "convergence",
 )  # fmt: skip
-# Written as well if the files of the block are in an EPSG system.
+# Additional tables if the files of the block are in an EPSG system.
 _MAP_TABLES = ("exterior_map", "object_points_map")
-# Cameras that are plotted, rows of the largest residuals and of the iteration history, findings at the top.
+# Maximum numbers: plotted cameras, rows of the largest residuals, rows of the iteration history, findings at the top.
 _PLOTTED, _LARGEST, _STEPS, _TOP = 6, 20, 40, 3
 _RELIABILITY = {
     "c_moves": "c moves [sigma]", "xp_moves": "xp moves [sigma]", "yp_moves": "yp moves [sigma]",
     "most_moves": "any moves [sigma]", "redundancy_number": "r", "detectable": "MDB",
 }  # fmt: skip
 _EFFECTS = {"pattern": "systematic effect", "freedom": "degrees of freedom", "share": "fraction", "amount": "estimate"}
-# Classes of the table of object points: numbers of rays from each to below the next.
+# Classes in the table of object points: minimum number of rays of each class.
 _RAYS = (2, 3, 4, 6, 11, 21)
 _SMALL_DEG = 2.0
 _STANDARD = "ASPRS Positional Accuracy Standards for Digital Geospatial Data, Edition 2 (2023)"
@@ -83,16 +83,16 @@ def write_results(
     entries: Mapping[str, Any] = MappingProxyType({}),
     record: CommandRecord | None = None,
 ) -> None:
-    """Write the files of docs/block_folder.md into `directory`, replacing earlier results when all is written.
+    """Write the files of docs/block_folder.md into `directory`. Complete results replace earlier ones.
 
-    `seconds` (read, compile, solve, covariance) and `entries` (options and inputs) go into summary.json; `record` is
-    the provenance in the report. Raises what `whole_folder` raises.
+    summary.json contains `seconds` (read, compile, solve, covariance) and `entries` (options and inputs). `record` is
+    the provenance in the report. Raises the errors of `whole_folder`.
     """
     began = time.perf_counter()
     with whole_folder(directory) as work:
         for name in table_names(tables):
             getattr(tables, name).to_csv(work / f"{name}.csv", index=False)
-            # A table of millions of rows leaves hundreds of MB behind.
+            # Return memory to the system: a table of millions of rows leaves hundreds of MB.
             return_freed_memory()
         (work / "report.html").write_text(report_page(tables, verdict, record), encoding="utf-8")
         summary = summary_of(tables, verdict, seconds | {"write": time.perf_counter() - began})
@@ -100,7 +100,7 @@ def write_results(
 
 
 def table_names(tables: Tables) -> tuple[str, ...]:
-    """Return the tables in the result folder of an adjustment."""
+    """Return the names of the tables in the result folder of an adjustment."""
     in_map = tables.adjusted.block.frame.kind == "epsg"
     drifting = any(rates.kind in tables.adjusted.unknowns.more for rates in RATES)
     return (
@@ -112,9 +112,9 @@ def table_names(tables: Tables) -> tuple[str, ...]:
 
 
 def write_tables(tables: Tables, directory: str | Path, kind: str = "csv", names: Sequence[str] = ()) -> None:
-    """Write all tables of an adjustment, or those of `names`, as csv, parquet, markdown or latex into a folder.
+    """Write all tables of an adjustment, or the tables `names`, as csv, parquet, markdown or latex into a folder.
 
-    Raises InputError for an unknown format or table, and what `whole_folder` raises.
+    Raises InputError for an unknown format or table, and the errors of `whole_folder`.
     """
     check_table_format(kind)
     known = table_names(tables)
@@ -186,12 +186,12 @@ def write_study(
 
 
 def rounded(seconds: Mapping[str, float]) -> dict[str, float]:
-    """Return the times to the microsecond."""
+    """Round times to microseconds."""
     return {name: round(value, 6) for name, value in seconds.items()}
 
 
 def _global_test(tables: Tables) -> dict[str, Any]:
-    """Return the test of sigma naught, if the adjustment converged and has redundancy."""
+    """Return the test of sigma naught; empty without convergence or redundancy."""
     if not bool(tables.adjusted.converged) or tables.adjusted.redundancy <= 0:
         return {}
     test = global_test(tables.adjusted, tables.redundancy)
@@ -216,7 +216,7 @@ def report_page(tables: Tables, verdict: Verdict, record: CommandRecord | None =
 
 
 def summary_table(tables: Tables) -> dict[str, str]:
-    """Images, points, flying height, camera, sigma naught, residuals, control and check points."""
+    """Summarise images, points, flying height, camera, sigma naught, residuals, control and check points."""
     a, block = tables.adjusted, tables.adjusted.block
     rays = len(a.structure.image) / max(len(np.unique(a.structure.point)), 1)
     rows = {
@@ -254,7 +254,10 @@ def summary_table(tables: Tables) -> dict[str, str]:
 
 
 def flying_height(adjusted: Adjustment) -> tuple[float, float] | None:
-    """Median height above the seen points and ground sample distance (m); None without metric, vertical images."""
+    """Return the median height above the observed points, and the ground sample distance (m).
+
+    Returns None unless images are near-vertical and the scale is metric.
+    """
     block, s = adjusted.block, adjusted.structure
     known = len(block.stations.who) + len(block.control.who) + len(block.fixed.who)
     if not known or not len(s.image):
@@ -272,7 +275,7 @@ def flying_height(adjusted: Adjustment) -> tuple[float, float] | None:
 def adjustment_sections(
     tables: Tables, start: InteriorOrientation | None = None, factor: float = 1.0, unit: str = "m"
 ) -> Iterator[Part]:
-    """All sections of an adjustment; `start` are initial values of the camera, `factor` widens its sigmas."""
+    """Yield all sections of an adjustment. `start`: initial camera; `factor`: factor of its standard deviations."""
     a, cameras = tables.adjusted, plotted_cameras(tables)
     yield from _interior(tables, cameras, start, factor)
     if mapped := [camera for camera in tables.sigma_maps if camera in cameras]:
@@ -331,7 +334,7 @@ def adjustment_sections(
 
 
 def plotted_cameras(tables: Tables) -> list[str]:
-    """Return the cameras that are plotted: of many those with the most image points."""
+    """Return the cameras to plot; of many, those with the most image points."""
     block, structure = tables.adjusted.block, tables.adjusted.structure
     cameras, of_image = list(tables.adjusted.unknowns.interior), np.array(block.image_camera)
     n_points = np.bincount(structure.image, minlength=len(of_image))
@@ -340,7 +343,7 @@ def plotted_cameras(tables: Tables) -> list[str]:
 
 
 def interior_table(tables: Tables, start: InteriorOrientation | None = None, factor: float = 1.0) -> pd.DataFrame:
-    """Interior parameters for reading: initial values, estimates, sigmas (times `factor`), in pixels, significance."""
+    """Tabulate interior parameters: initial values, estimates, sigmas (times `factor`), in pixels, significance."""
     table = with_correlated_sigma(tables.interior, tables.adjusted, factor)
     rows = []
     for p in table[table["sigma"].notna() | (table["value"] != 0)].to_dict("records"):
@@ -429,7 +432,7 @@ def _residuals(tables: Tables, cameras: Sequence[str]) -> Iterator[Part]:
 
 
 def points_section(tables: Tables, unit: str = "m") -> Iterator[Part]:
-    """Rays, intersection angles and standard deviations of the measured object points."""
+    """Yield rays, intersection angles and standard deviations of the measured object points."""
     table = tables.object_points
     table = table[table["n_images"] > 0]
     if table.empty:
@@ -495,7 +498,7 @@ def _correlations(tables: Tables) -> Iterator[Part]:
 
 
 def convergence_words(adjusted: Adjustment) -> str:
-    """Return the number of steps and the reason of the end."""
+    """Describe the number of steps and the reason for termination."""
     history, n = adjusted.history, int(adjusted.steps)
     if history is None or not n:
         return ""
@@ -513,18 +516,18 @@ def convergence_words(adjusted: Adjustment) -> str:
 
 
 def report_title(block: Block) -> str:
-    """Return the title of a block and its source."""
+    """Return the title of a block and the program it was converted from."""
     name = block.title or "jaxphoto adjustment"
     return f"{name}, converted from {block.converted_from}" if block.converted_from else name
 
 
 def assumed_pixels(sensors: Mapping[str, Sensor]) -> list[Part]:
-    """Return a paragraph on cameras whose pixel size is assumed, if there are any."""
+    """Return a paragraph on cameras with assumed pixel size, if there are any."""
     return [Paragraph(words)] if (words := assumed_pixel_words(sensors)) else []
 
 
 def assumed_pixel_words(sensors: Mapping[str, Sensor]) -> str:
-    """Return a sentence on cameras whose pixel size is assumed; "" if there are none."""
+    """Return a sentence on cameras with assumed pixel size; "" if there are none."""
     cameras = [name for name, sensor in sensors.items() if sensor.pixel_assumed]
     if not cameras:
         return ""
@@ -564,7 +567,7 @@ def accuracy_sentences(accuracy: PositionalAccuracy) -> list[str]:
 
 
 def class_sentences(accuracy: PositionalAccuracy) -> list[str]:
-    """Return the accuracy class of each component, horizontal first."""
+    """Return one sentence on the accuracy class of each component, horizontal first."""
     return [_class_sentence(t) for t in accuracy.tested]
 
 

@@ -27,16 +27,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Columns of the largest change in summary.json.
+# Columns of the largest changes in summary.json.
 _LARGEST = ("unit", "axis", "exact", "first_order", "over_sigma", "estimate_unit")
-# Interior parameters in the figure.
+# Maximum number of interior parameters in the figure.
 _SHOWN = 6
 
 
 class SensitivityTables:
     """Sensitivity of the shared unknowns and check points of an adjustment.
 
-    Numbers are in the estimate's own unit (`estimate_unit`). `bias_m` is the station bias, common to the stations of
+    Values are in the unit of each estimate (`estimate_unit`). `bias_m` is the station bias, common to the stations of
     each unit of `per`: block, strip or image.
     """
 
@@ -46,17 +46,17 @@ class SensitivityTables:
 
     @cached_property
     def exact(self) -> Sensitivity:
-        """The exact derivatives."""
+        """Exact derivatives of the estimates."""
         return sensitivity(self.adjusted, points=self.check)
 
     @cached_property
     def first_order(self) -> Sensitivity:
-        """The classical first-order derivatives."""
+        """First-order derivatives of the estimates."""
         return sensitivity(self.adjusted, curvature=False, points=self.check)
 
     @property
     def _rows(self) -> slice:
-        """All estimates except the exterior orientations."""
+        """Index range of all estimates except the exterior orientations."""
         return slice(6 * len(self.adjusted.block.images), None)
 
     @cached_property
@@ -75,7 +75,10 @@ class SensitivityTables:
 
     @cached_property
     def bias(self) -> pd.DataFrame:
-        """unit, axis, bias_m, estimate, exact, first_order, difference, estimate_unit: effects of the station bias."""
+        """Effects of the station bias.
+
+        Columns: unit, axis, bias_m, estimate, exact, first_order, difference, estimate_unit.
+        """
         of = [station_bias(self.adjusted, d, self.per, self.bias_m) for d in (self.exact, self.first_order)]
         exact, first = (b.change[self._rows].transpose(1, 2, 0) for b in of)
         index = pd.MultiIndex.from_product([of[0].units, AXES, self._estimates], names=["unit", "axis", "estimate"])
@@ -87,8 +90,10 @@ class SensitivityTables:
 
     @cached_property
     def largest(self) -> pd.DataFrame:
-        """The largest effect on each interior parameter: estimate, exact, over_sigma (a priori), first_order, unit,
-        axis, estimate_unit."""
+        """Largest effect on each interior parameter.
+
+        Columns: estimate, exact, over_sigma (a priori), first_order, unit, axis, estimate_unit.
+        """
         interior = self.bias[self.bias["estimate"].str.startswith("interior")]
         most = interior.loc[interior.groupby("estimate", sort=False)["exact"].apply(lambda v: v.abs().idxmax())]
         sigma = dict(zip(self.exact.labels, self._sigma, strict=True))
@@ -98,7 +103,11 @@ class SensitivityTables:
 
     @cached_property
     def variance_shares(self) -> pd.DataFrame:
-        """estimate, group, share, and the observation (image, point, axis) with the largest_share."""
+        """Variance contributions by observation group.
+
+        Columns: estimate, group, share, image, point and axis of the observation with the largest contribution, and
+        largest_share.
+        """
         tables = []
         for group, share in variance_shares(self.adjusted, self.exact).groups.items():
             if not share.size:
@@ -113,10 +122,11 @@ class SensitivityTables:
 
     @cached_property
     def external_reliability(self) -> pd.DataFrame:
-        """For each estimate and group the observation whose bias of one MDB has the largest effect.
+        """Observation whose bias of one MDB has the largest effect, by estimate and group.
 
-        estimate, group, image, point, axis, redundancy_number, detectable (MDB), unit, effect, effect_over_sigma (a
-        priori), estimate_unit. Unchecked observations are skipped; the summary counts them.
+        Columns: estimate, group, image, point, axis, redundancy_number, detectable (MDB), unit, effect,
+        effect_over_sigma (a priori), estimate_unit. Unchecked observations are skipped; the summary contains their
+        number.
         """
         reliability, sigma, tables = external_reliability(self.adjusted, self.exact, self.delta0), self._sigma, []
         for group, effect in reliability.effect.items():
@@ -138,14 +148,14 @@ class SensitivityTables:
 
     @cached_property
     def _observations(self) -> dict[str, pd.DataFrame]:
-        """The observation of each column of `Sensitivity.groups`, with the factor to the unit of tables."""
+        """Observations by group, one row per column of `Sensitivity.groups`, with the factor to the unit of tables."""
         table = Tables(self.adjusted).residuals[["group", "image", "point", "axis", "redundancy_number", "unit"]]
         table = table.assign(factor=np.where(table["unit"] == "deg", 180 / np.pi, 1.0))
         return {str(group): rows for group, rows in table.groupby("group")}
 
     @cached_property
     def panels(self) -> dict[str, list[str]]:
-        """Panels of the figure by title, with their estimates: interior orientation, check points by axis."""
+        """Panels of the figure by title, with their estimates: interior orientation, and check points by axis."""
         interior = [e for e in dict.fromkeys(self.bias["estimate"]) if e.startswith("interior")]
         panels = {e.split("].")[1] if len(self.adjusted.unknowns.interior) == 1 else e: [e] for e in interior}
         return panels | {
@@ -153,7 +163,7 @@ class SensitivityTables:
         }
 
     def figure(self) -> Figure:
-        """Effects of the bias of each unit and axis on interior orientation and check points."""
+        """Draw effects of the bias of each unit and axis on interior orientation and check points."""
         interior = [name for name, (first, *_) in self.panels.items() if first.startswith("interior")]
         panels = [name for name in self.panels if name not in interior[_SHOWN:]]
         down = max(1, -(-len(panels) // 3))
@@ -169,9 +179,9 @@ class SensitivityTables:
 
 
 def plot_sensitivity(tables: SensitivityTables, title: str, ax: Axes | None = None) -> Axes:
-    """Effects of a station bias of each unit on an estimate or the check points: exact, first-order, difference.
+    """Draw effects of a station bias of each unit on an estimate or the check points: exact, first-order, difference.
 
-    `title` is one of `tables.panels`, such as `c_mm`. Raises InputError for another.
+    `title` is a key of `tables.panels`, such as `c_mm`. Raises InputError for an unknown title.
     """
     if title not in tables.panels:
         raise InputError(f"there is no {title!r} to be drawn; there are {'; '.join(tables.panels)}")
@@ -202,9 +212,9 @@ def _rms(values: pd.Series) -> float:
 def write_sensitivity(
     tables: SensitivityTables, directory: Path, seconds: dict[str, float], record: CommandRecord
 ) -> None:
-    """Three tables, sensitivity.png, report.html and summary.json in `directory`.
+    """Write three tables, sensitivity.png, report.html and summary.json into `directory`.
 
-    Raises InputError if `directory` holds something else than an earlier result.
+    Raises InputError if `directory` contains anything but an earlier result.
     """
     began, adjusted, figure = time.perf_counter(), tables.adjusted, tables.figure()
     files = {

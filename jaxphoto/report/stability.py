@@ -1,4 +1,4 @@
-"""Two calibrations of a camera compared: stability of the bundle of rays, and change of parameters and rays."""
+"""Comparison of two calibrations of a camera: stability of the ray bundle, change of parameters and rays."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Range of the colour scale over the largest offset: light colours, on which arrows are visible.
+# Ratio of the colour scale range to the largest offset: arrows remain visible on light colours.
 _LIGHT = 1.7
 
 
@@ -46,7 +46,7 @@ class Compared(NamedTuple):
 
 
 def about_sets(sets: tuple[Compared, Compared]) -> list[str]:
-    """Both calibrations, the source of the uncertainty, and assumed pixel sizes."""
+    """Describe both calibrations, the source of the uncertainty, and assumed pixel sizes."""
     without = [one.name for one in sets if not one.known]
     uncertainty = "Uncertainty by the covariances of both sets, which are assumed to be of different images."
     if len(without) == 1:
@@ -61,9 +61,10 @@ def about_sets(sets: tuple[Compared, Compared]) -> list[str]:
 
 
 def stability_table(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_mm: float) -> pd.DataFrame:
-    """One row per method: method, unknowns, rmse_offset_mm, rmse_offset_px, rmse_measured_mm, largest_mm, similar, ...
+    """Tabulate the comparison, one row per method.
 
-    The uncertainty follows (sigma_mm to unexplained_mm, see `OffsetUncertainty`) if a covariance is known, then the
+    Columns: method, unknowns, rmse_offset_mm, rmse_offset_px, rmse_measured_mm, largest_mm, similar. If a covariance is
+    known, the uncertainty follows (sigma_mm to unexplained_mm, see `OffsetUncertainty`). The last columns are the
     alignment: rotations in degrees, positions as fractions of the object distance.
     """
     rows = []
@@ -84,7 +85,7 @@ def stability_table(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_
 
 
 def by_method(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_mm: float) -> pd.DataFrame:
-    """Return the stability table in micrometres, with a column per method."""
+    """Transpose the stability table to one column per method, in micrometres."""
     table = stability_table(analyses, pixel_mm, noise_mm).set_index("method")
     um = {"RMSE_offset": "rmse_offset_mm", "as measured": "rmse_measured_mm", "largest": "largest_mm"}
     with_sigma = "sigma_mm" in table
@@ -100,14 +101,14 @@ def by_method(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_mm: fl
 
 
 def offsets_table(analysis: Analysis) -> pd.DataFrame:
-    """x_mm, y_mm of the grid, dx_mm, dy_mm on the virtual image plane, and in the measured image."""
+    """Tabulate the offsets: grid x_mm, y_mm; dx_mm, dy_mm on the virtual image plane, and in the measured image."""
     v = analysis.offsets
     columns = ["x_mm", "y_mm", "dx_mm", "dy_mm", "dx_measured_mm", "dy_measured_mm"]
     return pd.DataFrame(np.hstack([v.points, v.offsets, v.measured]), columns=columns)
 
 
 def plot_ray_offsets(analysis: Analysis, sensor: Sensor, ax: Axes | None = None) -> Axes:
-    """Offsets of corresponding rays over the image format (um): size as colour, vectors as arrows."""
+    """Draw offsets of corresponding rays over the image format (um): size as colour, vectors as arrows."""
     ax = axes_or_new(ax)
     points, v = np.asarray(analysis.offsets.points), 1e3 * np.asarray(analysis.offsets.offsets)
     size = np.linalg.norm(v, axis=1)
@@ -127,7 +128,7 @@ def print_stability(
     analyses: Mapping[Method, Analysis], sets: tuple[Compared, Compared], pixel_mm: float, noise_mm: float,
     method: Method, console: Console,
 ) -> None:  # fmt: skip
-    """Print both calibrations, a column per method, and the verdict by `method`."""
+    """Print both calibrations, one column per method, and the verdict by `method`."""
     print_lines(about_sets(sets), console)
     name = f"stability; noise {1e3 * noise_mm:.4g} um = {noise_mm / pixel_mm:.4g} px"
     console.print(to_rich(by_method(analyses, pixel_mm, noise_mm), name))
@@ -140,9 +141,9 @@ def write_stability(
     analyses: Mapping[Method, Analysis], sets: tuple[Compared, Compared], sensor: Sensor, noise_mm: float,
     method: Method, directory: Path, record: CommandRecord,
 ) -> None:  # fmt: skip
-    """stability.csv, and of `method` offsets.csv and offsets.png; report.html and summary.json.
+    """Write stability.csv, report.html and summary.json, and offsets.csv and offsets.png of `method`.
 
-    Raises InputError if `directory` holds something else than an earlier result.
+    Raises InputError if `directory` contains anything but an earlier result.
     """
     chosen, figure = analyses[method], new_figure(7.2, 5.4)
     plot_ray_offsets(chosen, sensor, figure.subplots())
@@ -154,7 +155,7 @@ def write_stability(
         by_method(analyses, sensor.pixel_mm, noise_mm),
         Plot(figure, "offsets of the two bundles over the image"),
     ]
-    # A terminal may lack the letter.
+    # Write µm only in the report: a terminal may be unable to display it.
     verdict = f"Bundles {ALIGNED[method]} ({method}): {chosen.verdict(noise_mm)}".replace(" um", " µm")
     tables = {"stability": stability_table(analyses, sensor.pixel_mm, noise_mm), "offsets": offsets_table(chosen)}
     colour = "green" if chosen.similar(noise_mm) else "amber"
@@ -168,7 +169,7 @@ def write_stability(
 def stability_summary(
     analyses: Mapping[Method, Analysis], sets: tuple[Compared, Compared], noise_mm: float, method: Method
 ) -> dict[str, Any]:
-    """Return the comparison in summary.json."""
+    """Return the comparison for summary.json."""
     chosen = analyses[method]
     return {
         "verdict": f"{method}: {chosen.verdict(noise_mm)}", "method": method, "similar": chosen.similar(noise_mm),
@@ -181,8 +182,10 @@ def stability_summary(
 
 
 def parameter_changes(change: Change) -> pd.DataFrame:
-    """parameter, first, second, difference (second minus first), sigma (of it), ratio, p_value, unit; empty for
-    different models."""
+    """Tabulate the differences of the parameters; empty if the distortion models differ.
+
+    Columns: parameter, first, second, difference (second minus first), sigma (of the difference), ratio, p_value, unit.
+    """
     columns = ["parameter", "first", "second", "difference", "sigma", "p_value", "unit"]
     table = pd.DataFrame(change.parameters, columns=columns)
     estimated = table["sigma"] > 0
@@ -191,8 +194,11 @@ def parameter_changes(change: Change) -> pd.DataFrame:
 
 
 def change_cells(change: Change, sensor: Sensor) -> pd.DataFrame:
-    """One row per point of the format: x_mm, y_mm; dx_px, dy_px (first minus second bundle, aligned, in the measured
-    image), offset_px, limit_px (95 % for two calibrations of one camera), beyond."""
+    """Tabulate the differences of the ray bundles, one row per point of the format.
+
+    Columns: x_mm, y_mm; dx_px, dy_px (first minus second bundle, aligned, in the measured image), offset_px, limit_px
+    (95 % for two calibrations of an unchanged camera), beyond.
+    """
     v = change.field.offsets
     columns = ["x_mm", "y_mm", "dx_px", "dy_px"]
     table = pd.DataFrame(np.hstack([v.points, np.asarray(v.measured) / sensor.pixel_mm]), columns=columns)
@@ -202,7 +208,7 @@ def change_cells(change: Change, sensor: Sensor) -> pd.DataFrame:
 
 
 def change_verdict(change: Change, sensor: Sensor) -> list[str]:
-    """Return the tests in sentences."""
+    """Summarise the tests in sentences."""
     sentences = []
     if change.degrees_of_freedom:
         sentences.append(
@@ -232,12 +238,12 @@ def change_verdict(change: Change, sensor: Sensor) -> list[str]:
 
 
 def change_headline(change: Change) -> str:
-    """Return the result of both tests: the camera has changed if one of them says so."""
+    """Return the result of both tests: the camera has changed if at least one is significant."""
     return change_meaning(float(np.nanmin([change.p_parameters, change.p_field])))
 
 
 def plot_change(change: Change, sensor: Sensor, ax: Axes | None = None, *, over_usual: bool = False) -> Axes:
-    """Offsets of the rays of two calibrations over the format (px), or relative to the limit for one camera."""
+    """Draw offsets of the rays of two calibrations over the format (px), or their ratio to the limit."""
     ax = axes_or_new(ax)
     name = f"offset over its {100 * LEVEL:.0f} % limit" if over_usual else "offset [px]"
     values = change.offset_mm / (change.limit_mm if over_usual else sensor.pixel_mm)
@@ -246,7 +252,7 @@ def plot_change(change: Change, sensor: Sensor, ax: Axes | None = None, *, over_
 
 
 def change_figure(change: Change, sensor: Sensor) -> Figure:
-    """Both maps of `plot_change` side by side."""
+    """Draw both maps of `plot_change` side by side."""
     figure = new_figure(9.6, 3.9)
     for axes, usual in zip(figure.subplots(1, 2), (False, True), strict=True):
         plot_change(change, sensor, axes, over_usual=usual)
@@ -254,7 +260,7 @@ def change_figure(change: Change, sensor: Sensor) -> Figure:
 
 
 def change_table(change: Change) -> pd.DataFrame:
-    """Return the changed parameters for reading; fixed ones without p."""
+    """Tabulate the changed parameters as text; fixed parameters have no p-value."""
     table = parameter_changes(change).drop(columns="ratio")
     return table[(table["sigma"] > 0) | (table["first"] != 0) | (table["second"] != 0)]
 
@@ -272,9 +278,9 @@ def print_change(change: Change, sets: tuple[Compared, Compared], sensor: Sensor
 def write_change(
     change: Change, sets: tuple[Compared, Compared], sensor: Sensor, directory: Path, record: CommandRecord
 ) -> None:
-    """parameters.csv, cells.csv, change.png, report.html and summary.json.
+    """Write parameters.csv, cells.csv, change.png, report.html and summary.json.
 
-    Raises InputError if `directory` holds something else than an earlier result.
+    Raises InputError if `directory` contains anything but an earlier result.
     """
     parameters, figure = parameter_changes(change), change_figure(change, sensor)
     parts: list[Part] = [
@@ -295,7 +301,7 @@ def write_change(
 
 
 def change_summary(change: Change, sensor: Sensor) -> dict[str, Any]:
-    """Return the comparison in summary.json."""
+    """Return the comparison for summary.json."""
     field = change.field.uncertainty
     return {
         "verdict": change_verdict(change, sensor),
@@ -309,17 +315,18 @@ def change_summary(change: Change, sensor: Sensor) -> dict[str, Any]:
     }
 
 
-# Sigmas from 1 from which on a factor is significant.
+# Deviation of a factor from 1 in standard deviations above which it is significant.
 _SURE = 2.0
-# Fraction of the squared differences that one unit explains, and the number of splits that makes it significant.
+# Fraction of the squared differences above which one unit explains them; minimum number of splits for this test.
 _LEADS, _ENOUGH_CUTS = 0.5, 16
 
 
 def cell_table(halves: Halves) -> pd.DataFrame:
-    """One row per cell: x_mm, y_mm from the image centre; then, in pixels of the measured image,
+    """Tabulate the assessment, one row per cell of the format.
 
-    promised_px (RMS error by the covariance of the whole block), factor, halves_px (RMS difference of two halves),
-    halves_band_px and band_px: radii that hold 95 % of the differences of halves, and of the errors of the calibration.
+    Columns: x_mm, y_mm from the image centre; then, in pixels of the measured image, promised_px (RMS error by the
+    covariance of the whole block), factor, halves_px (RMS difference of two halves), halves_band_px and band_px (radii
+    that contain 95 % of the differences of halves, and of the errors of the calibration).
     """
     offsets = np.stack([cut.offsets_px for cut in halves.cuts])
     columns = {
@@ -331,8 +338,11 @@ def cell_table(halves: Halves) -> pd.DataFrame:
 
 
 def cut_table(halves: Halves) -> pd.DataFrame:
-    """One row per split: cut, factor, inside (fraction of cells within the band of the other splits), rms_px (of the
-    difference over the format), sigma0_first, sigma0_second, problem, first (units of one half)."""
+    """Tabulate the splits.
+
+    Columns: cut, factor, inside (fraction of cells within the band of the other splits), rms_px (of the difference over
+    the format), sigma0_first, sigma0_second, problem, first (units of the first half).
+    """
     by, rows = halves.adjusted.block.owners(halves.by), []
     for k, cut in enumerate([*halves.cuts, *halves.failed]):
         good = k < len(halves.cuts)
@@ -349,7 +359,7 @@ def cut_table(halves: Halves) -> pd.DataFrame:
 
 
 def halves_verdict(halves: Halves) -> list[str]:
-    """Return the result in sentences."""
+    """Summarise the result in sentences."""
     band, n, camera = halves.band, len(halves.cuts), camera_words(halves.camera)
     deviation, factor = (band.factor - 1) / band.sigma_factor, f"{band.factor:.2f} +- {band.sigma_factor:.2f}"
     size = "too small" if deviation > _SURE else "too large" if deviation < -_SURE else "consistent with the halves"
@@ -381,7 +391,7 @@ def halves_verdict(halves: Halves) -> list[str]:
 
 
 def plot_halves(halves: Halves, ax: Axes | None = None, *, band: bool = False) -> Axes:
-    """Return the factor of the standard deviations over the format, or the radius of the 95 % `band` (px)."""
+    """Draw the factor of the standard deviations over the format, or the radius of the 95 % `band` (px)."""
     ax = axes_or_new(ax)
     name = "95 % of the errors are smaller [px]" if band else "factor of the standard deviations"
     values = halves.band.calibration if band else halves.band.cell_factor
@@ -390,7 +400,7 @@ def plot_halves(halves: Halves, ax: Axes | None = None, *, band: bool = False) -
 
 
 def halves_figure(halves: Halves) -> Figure:
-    """Both maps of `plot_halves` side by side."""
+    """Draw both maps of `plot_halves` side by side."""
     figure = new_figure(9.6, 3.9)
     for axes, band in zip(figure.subplots(1, 2), (False, True), strict=True):
         plot_halves(halves, axes, band=band)
@@ -405,9 +415,9 @@ def print_halves(halves: Halves, console: Console) -> None:
 def write_halves(
     halves: Halves, directory: Path, write_camera: Callable[[Path], object], record: CommandRecord
 ) -> None:
-    """cells.csv, cuts.csv, halves.png, report.html and summary.json; `write_camera` writes the camera as well.
+    """Write cells.csv, cuts.csv, halves.png, report.html, summary.json, and the camera by `write_camera`.
 
-    Raises InputError if `directory` holds something else than an earlier result.
+    Raises InputError if `directory` contains anything but an earlier result.
     """
     cells, cuts, verdict, figure = cell_table(halves), cut_table(halves), halves_verdict(halves), halves_figure(halves)
     colour = "amber" if abs(halves.band.factor - 1) > _SURE * halves.band.sigma_factor else "green"

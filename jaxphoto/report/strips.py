@@ -38,11 +38,12 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 _OF_POINTS = (PHOTOGRAPHS, CONTROL, CHECK)
-# Gaps to surveyed points over their noise that are a warning; for few planes plus this number of sigmas.
+# Ratio of gaps at surveyed points to their noise above which they are a warning; additional tolerance for few planes
+# (sigmas).
 _FAR, _BEYOND = 2.0, 3.0
-# Deviation over expectation from which on the input contradicts itself and no result is usable.
+# Ratio of deviation to expectation above which the input is contradictory and no result is usable.
 _CONTRADICTS = 10.0
-# From internal units of a knot (m, rad) to those of files.
+# Factors from internal units of a knot (m, rad) to units of files.
 _IN_FILES = np.array([1.0, 1.0, 1.0, 180 / np.pi, 180 / np.pi, 180 / np.pi])
 _COLUMNS = ["X_m", "Y_m", "Z_m", "right_deg", "forward_deg", "up_deg"]
 
@@ -51,32 +52,35 @@ _COLUMNS = ["X_m", "Y_m", "Z_m", "right_deg", "forward_deg", "up_deg"]
 
 
 def differences_table(differences: Sequence[StripDifference]) -> pd.DataFrame:
-    """One row per pair of strips: planes, mean and RMS of their gaps (m) before and after."""
+    """Tabulate the pairs of strips: number of planes, mean and RMS of their gaps (m) before and after."""
     return pd.DataFrame(differences, columns=list(StripDifference._fields))
 
 
 def strip_rounds_table(rounds: Sequence[StripRound]) -> pd.DataFrame:
-    """round, planes, points, control, left_out, rms_m, largest_change (in standard deviations)."""
+    """Tabulate the iterations.
+
+    Columns: round, planes, points, control, left_out, rms_m, largest_change (in standard deviations).
+    """
     return pd.DataFrame(rounds, columns=["round", *StripRound._fields[1:]])
 
 
 def surveyed_table(result: StripAdjustment) -> pd.DataFrame:
-    """One row per surveyed point in a strip, the largest normalised gap first."""
+    """Tabulate the surveyed points in each strip by decreasing normalised gap."""
     table = pd.DataFrame(result.surveyed, columns=list(SurveyedGap._fields))
     return table.sort_values("w", key=np.abs, ascending=False, kind="stable", ignore_index=True)
 
 
 def all_correlations(result: StripAdjustment) -> pd.DataFrame:
-    """Correlation matrix of all unknowns of scanner, trajectory and cameras, indexed by `parameter`."""
+    """Return the correlation matrix of all unknowns of scanner, trajectory and cameras, indexed by `parameter`."""
     labels = list(result.adjusted.structure.labels)
     rho = correlation_matrix(result.covariance)[-len(labels) :, -len(labels) :]
     return pd.DataFrame(rho, columns=labels).set_index(pd.Index(labels, name="parameter"))
 
 
 def calibration_table(result: StripAdjustment) -> pd.DataFrame:
-    """parameter, value, sigma, with (the most correlated parameter), rho, unit of scanner, cameras and mounts.
+    """Tabulate the parameters of scanner, cameras and mounts; angles in degrees.
 
-    Angles in degrees.
+    Columns: parameter, value, sigma, with (the most correlated parameter), rho, unit.
     """
     covariance, s = result.covariance, result.adjusted.structure
     rho, sigma = correlation_matrix(covariance), np.asarray(covariance.shared_sigma)
@@ -96,7 +100,7 @@ def calibration_table(result: StripAdjustment) -> pd.DataFrame:
 
 
 def trajectory_errors_table(result: StripAdjustment) -> pd.DataFrame:
-    """strip, time_s, spline coefficients X_m ... up_deg and their sigmas; a sigma of 0 if fixed."""
+    """Tabulate trajectory errors: strip, time_s, spline coefficients X_m ... up_deg and their sigmas (0 if fixed)."""
     errors, labels, rows = result.errors, _knot_labels(result), []
     sigmas = dict(zip(result.adjusted.structure.labels, np.asarray(result.covariance.shared_sigma), strict=True))
     for name, spline in zip(result.cloud.strips, errors.splines, strict=True):
@@ -110,14 +114,14 @@ def trajectory_errors_table(result: StripAdjustment) -> pd.DataFrame:
 def errors_along(
     result: StripAdjustment, strip: int, time: Float[np.ndarray, n]
 ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 6"]]:
-    """Trajectory errors at times (s) of a strip: X, Y, Z (m), right, forward, up (degrees), and their sigmas."""
+    """Return trajectory errors of a strip at times (s): X, Y, Z (m), right, forward, up (degrees), and their sigmas."""
     value = np.concatenate(result.errors.at(strip, time), axis=1)
     spline, labels = result.errors.splines[strip], _knot_labels(result)
     _, weights = spline.all_weights(time)
     place = {path: k for k, path in enumerate(result.adjusted.structure.labels)}
     covariances, variance = np.asarray(result.covariance.matrix)[-len(place) :, -len(place) :], np.zeros_like(value)
     for c in range(value.shape[1]):
-        # Fixed knots are not among the estimated ones.
+        # Fixed knots (-1) are not estimated: they add no variance.
         columns = np.array([place.get(labels[k][c], -1) for k in range(spline.first, spline.first + spline.size)])
         estimated, by = columns[columns >= 0], weights[:, columns >= 0]
         variance[:, c] = np.einsum("ni,ij,nj->n", by, covariances[np.ix_(estimated, estimated)], by)
@@ -125,7 +129,7 @@ def errors_along(
 
 
 def _knot_labels(result: StripAdjustment) -> list[list[str]]:
-    """Return the paths of the six numbers of every knot of all strips."""
+    """Return the paths of the six components of every knot of all strips."""
     zero = np.zeros(3)
     knot = TrajectoryKnot(zero, zero)  # type: ignore[arg-type]
     return [list(knot.labels(owner)) for owner in result.adjusted.unknowns.more[TrajectoryKnot.kind]]
@@ -135,7 +139,7 @@ def _knot_labels(result: StripAdjustment) -> list[list[str]]:
 
 
 def strips_verdict(result: StripAdjustment, tables: Tables | None) -> Verdict:
-    """Judge a strip adjustment; `tables` are those of the adjustment if it has images."""
+    """Assess a strip adjustment; `tables` contains its adjustment if it has images."""
     found = _sigma_naught(result) if tables is None else verdict_of(tables).findings
     warnings = (Finding("message", "warning", sentence) for sentence in result.warnings)
     return Verdict.of((*_lookups(result), *_steps(result), *warnings, *_surveyed(result), *found))
@@ -149,7 +153,7 @@ def _lookups(result: StripAdjustment) -> Iterator[Finding]:
 
 
 def _steps(result: StripAdjustment) -> Iterator[Finding]:
-    """Trajectories that are bent far beyond their standard deviations to fit the strips."""
+    """Report trajectories whose corrections are far above their standard deviations."""
     for steps, errors, unit in (
         (PositionSteps, result.errors.position, "m"),
         (AttitudeSteps, np.rad2deg(result.errors.attitude), "degrees"),
@@ -166,7 +170,7 @@ def _steps(result: StripAdjustment) -> Iterator[Finding]:
 
 
 def _surveyed(result: StripAdjustment) -> Iterator[Finding]:
-    """Gaps to control and check points compared with their expectation."""
+    """Compare gaps at control and check points with their expectation."""
     for what, of in surveyed_summary(result).items():
         rms, noise, planes = of["rms_m"], of["noise_m"], int(of["planes"])
         far = rms > max(_FAR, 1 + _BEYOND / np.sqrt(2 * planes)) * noise
@@ -181,7 +185,7 @@ def _surveyed(result: StripAdjustment) -> Iterator[Finding]:
 
 
 def surveyed_summary(result: StripAdjustment) -> dict[str, dict[str, float]]:
-    """Control and check points over all strips: planes, RMS of their gaps (m) before and after, and noise."""
+    """Summarise control and check points over all strips: planes, RMS of their gaps (m) before and after, noise."""
     summary: dict[str, dict[str, float]] = {}
     for what in (CONTROL, CHECK):
         rows = [d for d in result.differences if d.one == what]
@@ -194,12 +198,12 @@ def surveyed_summary(result: StripAdjustment) -> dict[str, dict[str, float]]:
 
 
 def _pooled(rms: Sequence[float], counts: Sequence[int]) -> float:
-    """RMS of several sets; NaN of an empty set is skipped."""
+    """Return the RMS of several sets; NaN (empty set) is skipped."""
     return float(np.sqrt(np.nansum(np.square(rms) * counts) / max(sum(counts), 1)))
 
 
 def _sigma_naught(result: StripAdjustment) -> Iterator[Finding]:
-    """Convergence and sigma naught of planes and trajectory."""
+    """Report convergence and sigma naught of planes and trajectory."""
     if not bool(result.adjusted.converged):
         yield Finding("not_converged", "error", result.adjusted.outcome.value)
         return
@@ -212,7 +216,7 @@ def _sigma_naught(result: StripAdjustment) -> Iterator[Finding]:
         else:
             gaps += " and the trajectory's standard deviations"
             hint = "These are too large" if small else "These are too small, or knots too far apart"
-        # Shifts alone leave other trajectory errors, and may be all that is possible.
+        # Without a trajectory, shifts cannot model all errors: report only a warning.
         absurd = result.trajectory is not None and whole.factor > _CONTRADICTS**2
         severity: Severity = "error" if absurd else "warning"
         numbers = {"p": p_words(whole.p_value)}
@@ -222,7 +226,7 @@ def _sigma_naught(result: StripAdjustment) -> Iterator[Finding]:
 # Plots -----------------------------------------------------------------------------------------------------------
 
 _GAP = "later strip above earlier (cm)"
-# Places of a curve per knot, and strips per row of panels.
+# Number of points of a curve per knot; number of strips per row of panels.
 _PLACES, _ABREAST = 12, 4
 _COMPONENTS = (("position (cm)", 100.0, ("X", "Y", "Z")), ("attitude (mdeg)", 1000.0, ("right", "forward", "up")))
 # Okabe and Ito (2008): distinguishable by colour-blind readers.
@@ -230,7 +234,7 @@ _COLOURS = ("#0072B2", "#E69F00", "#009E73")
 
 
 def differences_figure(before: Raster, after: Raster) -> Figure:
-    """Gaps of strips before and after, in the same colours, which span 95 % of the gaps before."""
+    """Draw gaps of strips before and after; one colour scale spans 95 % of the gaps before."""
     figure = new_figure(10.0, 4.6)
     both = figure.subplots(1, 2, sharex=True, sharey=True)
     for axes, raster, name in zip(both, (before, after), ("before", "after"), strict=True):
@@ -241,7 +245,7 @@ def differences_figure(before: Raster, after: Raster) -> Figure:
 
 
 def plot_strip_differences(gaps: Raster, ax: Axes | None = None, *, limit_m: float | None = None) -> Axes:
-    """Gaps of strips over the ground (`lidar.strip_differences`), in colours up to `limit_m` (default: 95 %)."""
+    """Draw gaps of strips in plan (`lidar.strip_differences`); colours up to `limit_m` (default: 95 % of the gaps)."""
     ax = axes_or_new(ax)
     shown = _draw_differences(ax, gaps, _limit(gaps) if limit_m is None else 100 * limit_m)
     ax.figure.colorbar(shown, ax=ax, label=_GAP, shrink=0.8)
@@ -253,7 +257,7 @@ def _limit(gaps: Raster) -> float:
 
 
 def _draw_differences(axes: Axes, gaps: Raster, limit: float) -> AxesImage:
-    """Gaps in centimetres, as is `limit`."""
+    """Draw gaps and `limit` in centimetres."""
     (west, south), (east, north) = gaps.extent
     shown = axes.imshow(100 * gaps.heights, extent=(west, east, south, north), cmap="RdBu_r", vmin=-limit, vmax=limit)
     axes.set_title(f"{100 * float(np.sqrt(np.nanmean(gaps.heights**2))):.2g} cm RMS", loc="left")
@@ -263,7 +267,7 @@ def _draw_differences(axes: Axes, gaps: Raster, limit: float) -> AxesImage:
 
 
 def plot_scanner_correlation(result: StripAdjustment, ax: Axes | None = None, *, itself: bool = False) -> Axes:
-    """Correlations of the scanner with cameras and mounts, or with `itself`.
+    """Draw correlations of the scanner with cameras and mounts, or with `itself`.
 
     Raises InputError if none of these are estimated.
     """
@@ -277,7 +281,7 @@ def plot_scanner_correlation(result: StripAdjustment, ax: Axes | None = None, *,
 
 
 def scanner_correlation_figure(result: StripAdjustment) -> Figure:
-    """Correlations of the scanner with cameras and mounts, and with itself."""
+    """Draw correlations of the scanner with cameras and mounts, and with itself."""
     _, scanner, others = _scanner_and_others(result)
     sets = [(itself, names) for itself, names in ((False, others), (True, scanner)) if names]
     figure = new_figure(3.4 + 0.52 * sum(len(names) for _, names in sets), 1.9 + 0.33 * len(scanner))
@@ -288,7 +292,7 @@ def scanner_correlation_figure(result: StripAdjustment) -> Figure:
 
 
 def _scanner_and_others(result: StripAdjustment) -> tuple[pd.DataFrame, list[str], list[str]]:
-    """All correlations, the unknowns of the scanner, and those of cameras and mounts."""
+    """Return all correlations, the unknowns of the scanner, and the unknowns of cameras and mounts."""
     rho = all_correlations(result)
     labels = [name for name in rho.index if not name.startswith(TrajectoryKnot.kind)]
     scanner = [name for name in labels if name.startswith("scanner")]
@@ -296,7 +300,7 @@ def _scanner_and_others(result: StripAdjustment) -> tuple[pd.DataFrame, list[str
 
 
 def _short(labels: list[str]) -> list[str]:
-    """Parameter names without units, with the owner's name only where they repeat."""
+    """Shorten parameter names: no units, owner's name only if a name repeats."""
     short = [name.split(".")[-1].removesuffix("_rad") for name in labels]
     owners = [name.rsplit(".", 1)[0].partition("[")[2].removesuffix("]") for name in labels]
     return [f"{o} {name}" if short.count(name) > 1 and o else name for o, name in zip(owners, short, strict=True)]
@@ -305,7 +309,7 @@ def _short(labels: list[str]) -> list[str]:
 def plot_trajectory_errors(
     result: StripAdjustment, strip: str, ax: Axes | None = None, *, attitude: bool = False
 ) -> Axes:
-    """Position errors (cm), or those of the `attitude` (mdeg), along a strip, with bands of two sigmas.
+    """Draw position errors (cm), or `attitude` errors (mdeg), along a strip, with bands of two sigmas.
 
     Raises InputError for an unknown strip.
     """
@@ -326,7 +330,7 @@ def plot_trajectory_errors(
 
 
 def trajectory_errors_figure(result: StripAdjustment) -> Figure:
-    """Position and attitude errors along each strip."""
+    """Draw position and attitude errors along each strip."""
     names = result.cloud.strips
     rows, columns = 2 * -(-len(names) // _ABREAST), min(len(names), _ABREAST)
     figure = new_figure(1.2 + 2.6 * columns, 0.6 + 1.9 * rows)
@@ -343,9 +347,9 @@ def trajectory_errors_figure(result: StripAdjustment) -> Figure:
 
 # Files and terminal ----------------------------------------------------------------------------------------------
 
-# Shifts of strips without a trajectory.
+# Columns of the strip shifts without a trajectory.
 _SHIFTS = ["strip", "X_m", "Y_m", "Z_m", "sigma_X_m", "sigma_Y_m", "sigma_Z_m"]
-# Digits of correlations, and surveyed points on the page.
+# Decimal places of correlations; maximum number of surveyed points on the page.
 _DIGITS, _SHOWN = 6, 20
 _PATTERNS = {
     "line": "Angles are those of scan lines across the track.",
@@ -361,11 +365,11 @@ def write_strips(
     write_corrected: Callable[[Path], tuple[Raster, Raster] | None],
     record: CommandRecord,
 ) -> None:
-    """Tables, differences.png, report.html, summary.json; with images the folder `adjustment`.
+    """Write tables, differences.png, report.html, summary.json; with images also the folder `adjustment`.
 
-    `tables` are those of the adjustment if it has images. `write_corrected` writes cloud and trajectory into the folder
-    and returns the gaps of the strips before and after. Raises InputError if `directory` holds something else than an
-    earlier result.
+    `tables` contains the adjustment if it has images. `write_corrected` writes cloud and trajectory into the folder and
+    returns the gaps of the strips before and after. Raises InputError if `directory` contains anything but an earlier
+    result.
     """
     began, seconds = time.perf_counter(), dict(result.adjusted.seconds)
     files = {
@@ -429,7 +433,7 @@ def _sections(result: StripAdjustment, files: dict[str, pd.DataFrame], gaps: Fig
 
 
 def _in_tenths_of_mm(table: pd.DataFrame) -> pd.DataFrame:
-    """Numbers rounded to a tenth of a millimetre, without minus zeros."""
+    """Round values to a tenth of a millimetre, without negative zeros."""
     numbers = table.select_dtypes(float).round(4) + 0.0
     return table.assign(**{str(name): numbers[name] for name in numbers})
 

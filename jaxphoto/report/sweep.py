@@ -1,4 +1,4 @@
-"""A sweep of designs as a tidy table and as plots."""
+"""Sweep of designs as a tidy table and as plots."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 _COLUMNS = ("design", "converged", "determined", "quantity", "of", "value", "unit")
 _DEG = 180 / np.pi
-# Ratio of largest to smallest value from which on an axis is logarithmic.
+# Ratio of largest to smallest value above which an axis is logarithmic.
 _FAR_APART = 20.0
 
 
 class _Column(NamedTuple):
-    """One quantity of every design."""
+    """Values of one quantity for all designs."""
 
     quantity: str
     of: str
@@ -34,7 +34,9 @@ class _Column(NamedTuple):
 
 
 def sweep_table(sweep: Sweep) -> pd.DataFrame:
-    """One row per number: the design's parameters, design, converged, determined, quantity, of, value, unit.
+    """Tabulate the sweep, one row per value.
+
+    Columns: design parameters, design, converged, determined, quantity, of, value, unit.
 
     | quantity | of |
     | --- | --- |
@@ -45,9 +47,10 @@ def sweep_table(sweep: Sweep) -> pd.DataFrame:
     | `check_sigma`, `check_rmse` | `X_m`, `Y_m`, `Z_m` of check points: predicted, and of the simulated observations |
     | `sigma0` | `block` |
 
-    Standard deviations are a priori; times `sigma0` they are a posteriori. Unknowns go by their last name, `c_mm`, and
-    by their whole path, `interior[kodak].c_mm`, where two have the same. Rows of a design that did not converge, or
-    cannot tell its unknowns apart, have NaN as value. Raises InputError for a parameter with the name of a column.
+    Standard deviations are a priori; multiply by `sigma0` for a posteriori values. Unknowns are named by the last part
+    of their path, `c_mm`, or by the full path, `interior[kodak].c_mm`, if the short names are not unique. Values are
+    NaN for a design without convergence or with undetermined unknowns. Raises InputError for a parameter named like a
+    column.
     """
     names = list(sweep.parameters[0])
     taken = [name for name in names if name in _COLUMNS]
@@ -62,7 +65,7 @@ def sweep_table(sweep: Sweep) -> pd.DataFrame:
     table["quantity"], table["of"] = [c.quantity for c in columns] * n, [c.of for c in columns] * n
     table["value"] = np.stack([c.values for c in columns], axis=1).ravel()
     table["unit"] = [c.unit for c in columns] * n
-    # NaN of a determined design means that it lacks the quantity.
+    # NaN in a determined design: the design lacks the quantity.
     usable = table["value"].notna() | ~(table["converged"] & table["determined"])
     return table[usable].reset_index(drop=True)
 
@@ -86,7 +89,7 @@ def _columns(sweep: Sweep) -> Iterator[_Column]:
 
 
 def _shared_names(labels: Sequence[str]) -> tuple[list[str], list[float]]:
-    """Names of the shared unknowns, with angles in degrees, and the factors that this takes."""
+    """Return the names of the shared unknowns, with angles in degrees, and the factors of this conversion."""
     last = [label.rpartition("].")[2] for label in labels]
     chosen = last if len(set(last)) == len(last) else labels
     factors = [_DEG if label.endswith("_rad") else 1.0 for label in labels]
@@ -94,15 +97,15 @@ def _shared_names(labels: Sequence[str]) -> tuple[list[str], list[float]]:
 
 
 def _unit(name: str) -> str:
-    """Return the unit at the end of a name; none of a coefficient (docs/models.md)."""
+    """Return the unit at the end of a name; "" for a distortion coefficient (docs/models.md)."""
     return without_unit(name)[1]
 
 
 def sweep_figure(table: pd.DataFrame, x: str, shown: Sequence[tuple[str, str]], by: Sequence[str] = ()) -> Figure:
-    """One panel for each (quantity, of) of `shown`: its value against the parameter `x`, one line for each `by`.
+    """Draw one panel per (quantity, of) of `shown`: values against the parameter `x`, one line per value of `by`.
 
-    `table` is that of `sweep_table`, or a part of it in which `x` and `by` identify each design. Raises InputError
-    where they do not, where there is no such column, or where nothing of `shown` is in the table.
+    `table` is the table of `sweep_table`, or a subset in which `x` and `by` identify each design. Raises InputError if
+    they do not, or for missing columns or quantities.
     """
     figure = new_figure(3.4 * min(len(shown), 3), 2.9 * -(-len(shown) // 3))
     panels = figure.subplots(-(-len(shown) // 3), min(len(shown), 3), squeeze=False).ravel()
@@ -118,9 +121,9 @@ def sweep_figure(table: pd.DataFrame, x: str, shown: Sequence[tuple[str, str]], 
 def plot_sweep(
     table: pd.DataFrame, x: str, quantity: str, of: str, ax: Axes | None = None, *, by: Sequence[str] = ()
 ) -> Axes:
-    """One panel of `sweep_figure`: a quantity of something against the parameter `x`, one line for each `by`.
+    """Draw one panel of `sweep_figure`: a quantity against the parameter `x`, one line per value of `by`.
 
-    Raises InputError where that does.
+    Raises the errors of `sweep_figure`.
     """
     rows = _chosen(table, x, quantity, of, by)
     ax = axes_or_new(ax)
@@ -131,7 +134,7 @@ def plot_sweep(
 
 
 def _chosen(table: pd.DataFrame, x: str, quantity: str, of: str, by: Sequence[str]) -> pd.DataFrame:
-    """Return the rows to be drawn."""
+    """Select the rows to draw."""
     for column in (x, *by):
         if column not in table:
             raise InputError(f"the table has no column {column}: choose among {', '.join(map(str, table.columns))}")

@@ -1,4 +1,4 @@
-"""The tables of an adjustment as DataFrames, with the columns of the result folder (docs/block_folder.md)."""
+"""Tables of an adjustment as DataFrames, with the columns of the result folder (docs/block_folder.md)."""
 
 from collections.abc import Callable, Mapping
 from functools import cached_property
@@ -61,12 +61,12 @@ from jaxphoto.unknowns import Weighted
 
 
 class Tables:
-    """An adjustment as tables, each computed at first use.
+    """Tables of an adjustment, computed at first access.
 
-    `rotations` selects the rotations of the correlations (see `jaxphoto.covariance`). Sigmas are a posteriori (times
-    sigma0) unless a column says otherwise; units are in the column names or in a column `unit`. `truth` is that of a
-    simulation (`jaxphoto.io.truth_tables`, `read_truth`), for `recovery`. `known` is the covariance of this adjustment
-    with omega, phi, kappa, if already computed, preferably with its `rows`.
+    `rotations` selects the rotation parameters of the correlations (see `jaxphoto.covariance`). Standard deviations are
+    a posteriori (times sigma0) unless a column is documented otherwise; units are in the column names or in a column
+    `unit`. `truth`: true values of a simulation (`jaxphoto.io.truth_tables`, `read_truth`), for `recovery`. `known`:
+    covariance of this adjustment with omega, phi, kappa, if already computed, preferably with its `rows`.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class Tables:
         return covariance(self.adjusted, rows=True) if self._known is None else self._known
 
     def _if_converged(self, sigma: ArrayLike) -> np.ndarray:
-        """Return the standard deviations; NaN where the adjustment did not converge."""
+        """Return the standard deviations; NaN for an adjustment that did not converge."""
         return np.where(bool(self.adjusted.converged), np.asarray(sigma), np.nan)
 
     @cached_property
@@ -122,7 +122,7 @@ class Tables:
 
     @cached_property
     def culprits(self) -> tuple[Suspect, ...]:
-        """Suspects that larger blunders do not explain."""
+        """Suspects that are not explained by larger blunders."""
         return multiple_outlier_test(self.adjusted, self.blunders)
 
     @cached_property
@@ -144,7 +144,7 @@ class Tables:
 
     @cached_property
     def significance(self) -> list[Significance]:
-        """Ratio and t-test of every estimated interior parameter; none if the adjustment did not converge."""
+        """Ratio and t-test of every estimated interior parameter; empty if the adjustment did not converge."""
         return significance(self.adjusted, self.covariance) if bool(self.adjusted.converged) else []
 
     @cached_property
@@ -171,7 +171,7 @@ class Tables:
 
     @cached_property
     def interior(self) -> pd.DataFrame:
-        """camera, parameter, value, sigma, significant, unit; without sigma if fixed or not converged."""
+        """Interior orientation: camera, parameter, value, sigma (NaN if fixed or not converged), significant, unit."""
         tests = {(s.camera, s.parameter): s for s in self.significance}
         rows = []
         for camera, interior in self.adjusted.unknowns.interior.items():
@@ -184,7 +184,7 @@ class Tables:
 
     @cached_property
     def georeferencing(self) -> pd.DataFrame:
-        """parameter, value, sigma of the estimated parameters of scanner, mounts and strips; units in the names."""
+        """Estimated parameters of scanner, mounts and strips: parameter (with unit), value, sigma."""
         s = self.adjusted.structure
         rows = []
         for k, label, sigma in zip(s.free, s.labels, self._if_converged(self.covariance.shared_sigma), strict=True):
@@ -196,9 +196,10 @@ class Tables:
 
     @cached_property
     def camera_drift(self) -> pd.DataFrame:
-        """camera, along, span, parameter, change (over the span), sigma, p_value, detectable (MDB), unit.
+        """Drift of the cameras.
 
-        `span` is in the unit that ends `along`; `p_value` and `detectable` are of a change of this parameter alone.
+        Columns: camera, along, span, parameter, change (over the span), sigma, p_value, detectable (MDB), unit. `span`
+        is in the unit at the end of `along`; `p_value` and `detectable` refer to a change of this parameter alone.
         """
         units = {
             name.split("_")[0]: unit_of(name).rpartition("per_")[0].removesuffix("_")
@@ -215,7 +216,7 @@ class Tables:
 
     @cached_property
     def exterior(self) -> pd.DataFrame:
-        """image, X_m ... kappa_deg and their sigmas."""
+        """Exterior orientation: image, X_m ... kappa_deg and their standard deviations."""
         exterior = self.adjusted.unknowns.exterior
         angles = angles_deg(np.asarray(exterior.camera_from_object))
         sigma = self._if_converged(self.covariance.exterior_sigma) * [1, 1, 1, *[180 / np.pi] * 3]
@@ -227,7 +228,7 @@ class Tables:
 
     @cached_property
     def exterior_map(self) -> pd.DataFrame:
-        """image, position in the system of the block's files, and omega, phi, kappa against grid east, north and up."""
+        """Exterior orientation in the system of the block's files; angles relative to grid east, north and up."""
         exterior, system = self.adjusted.unknowns.exterior, self.adjusted.block.frame.map
         position = np.asarray(exterior.position)
         table = self._in_map(position)
@@ -238,7 +239,7 @@ class Tables:
 
     @cached_property
     def object_points_map(self) -> pd.DataFrame:
-        """point and its coordinates in the system of the block's files."""
+        """Object points in the system of the block's files."""
         table = self._in_map(np.asarray(self.adjusted.unknowns.points))
         table.insert(0, "point", self.adjusted.block.points)
         return table
@@ -250,7 +251,7 @@ class Tables:
 
     @cached_property
     def object_points(self) -> pd.DataFrame:
-        """point, coordinates, sigmas, n_images, angle_deg (largest angle between two rays)."""
+        """Object points: point, coordinates, sigmas, n_images, angle_deg (largest intersection angle of two rays)."""
         names = [f"{a}_m" for a in AXES]
         values = np.hstack([np.asarray(self.adjusted.unknowns.points), self._if_converged(self.covariance.point_sigma)])
         table = pd.DataFrame(values, columns=[*names, *(f"sigma_{n}" for n in names)])
@@ -261,13 +262,15 @@ class Tables:
 
     @cached_property
     def residuals(self) -> pd.DataFrame:
-        """One row per observation: group, image, point, axis, residual, sigma, unit, redundancy_number, w, detectable,
-        c_moves, xp_moves, yp_moves, most_moves.
+        """Residuals, one row per observation.
 
-        `sigma` is a priori; `w` is the normalised residual, v / (sigma0 sigma sqrt(r)); `detectable` is the minimal
-        detectable bias (power 80 %). The last four are the external reliability: how many standard deviations a bias of
-        one MDB moves c, x_p, y_p, and any unknown at most. Names are categories, and each column is built on its own,
-        because millions of observations would otherwise take ten times the memory.
+        Columns: group, image, point, axis, residual, sigma (a priori), unit, redundancy_number, w, detectable, c_moves,
+        xp_moves, yp_moves, most_moves.
+
+        `w` is the normalised residual, v / (sigma0 sigma sqrt(r)); `detectable` is the minimal detectable bias (power
+        80 %). The last four columns are the external reliability: shift of c, x_p, y_p, and the largest shift of any
+        unknown, by a bias of one MDB, in standard deviations. Names are categories, and columns are built one by one:
+        otherwise millions of observations would need ten times the memory.
         """
         adjusted, block, s = self.adjusted, self.adjusted.block, self.adjusted.structure
         residual, sigma = physical_residuals(adjusted), a_priori_sigmas(adjusted)
@@ -277,7 +280,7 @@ class Tables:
         groups = {name: rows for name, rows in observation_groups(adjusted).items() if np.size(residual[name])}
 
         def column(of: Callable[[str, AbstractObservations], Any]) -> np.ndarray:
-            # Rows run along the last axis; the components of a row stand together.
+            # Rows are along the last axis; in the table the components of a row are consecutive.
             flat = (np.broadcast_to(of(g, rows), np.shape(residual[g])).T.ravel() for g, rows in groups.items())
             return np.concatenate(list(flat))
 
@@ -308,10 +311,10 @@ class Tables:
 
     @cached_property
     def trends(self) -> pd.DataFrame:
-        """One row per systematic effect: pattern, freedom (degrees of freedom), p_value, rms, unit; term, share,
-        amount and sigma of the term that explains most.
+        """Systematic effects, one row each.
 
-        `rms` is the explained part of the residuals without noise, NaN if none.
+        Columns: pattern, freedom (degrees of freedom), p_value, rms, unit; term, share, amount and sigma of the term
+        that explains most. `rms` is the explained part of the residuals without noise, NaN if there is none.
         """
         rows = []
         for t in self.tested_trends:
@@ -324,15 +327,15 @@ class Tables:
 
     @cached_property
     def residual_spread(self) -> pd.DataFrame:
-        """group, axis, n, mean, rmse, max_abs, unit (paper 000, Table 3)."""
+        """Spread of the residuals: group, axis, n, mean, rmse, max_abs, unit (paper 000, Table 3)."""
         columns = ["group", "axis", "n", "mean", "rmse", "max_abs", "unit"]
         return pd.DataFrame([[getattr(s, c) for c in columns] for s in residual_spread(self.adjusted)], columns=columns)
 
     @cached_property
     def check_points(self) -> pd.DataFrame:
-        """point; dX_m, dY_m, dZ_m (surveyed minus computed); sigma_dX_m, ... of survey and adjustment combined.
+        """Discrepancies at check points: point; dX_m, dY_m, dZ_m (surveyed minus computed); sigma_dX_m, ...
 
-        NaN where an axis was not surveyed.
+        The standard deviations combine survey and adjustment. Values are NaN for axes that were not surveyed.
         """
         rows = check_discrepancies(self.adjusted)
         points = list(dict.fromkeys(rows.who.tolist()))
@@ -347,12 +350,16 @@ class Tables:
 
     @cached_property
     def positional_accuracy(self) -> pd.DataFrame:
-        """component, check_points, fit_m, survey_m, rmse_m, class_cm, claimed (ASPRS Edition 2)."""
+        """Accuracy (ASPRS Edition 2): component, check_points, fit_m, survey_m, rmse_m, class_cm, claimed."""
         return accuracy_table(self.tested_accuracy)
 
     @cached_property
     def correlation(self) -> pd.DataFrame:
-        """parameter_a, parameter_b, rho: every IOP with every other; each image's EOP with its IOP and itself."""
+        """Correlations of interior parameters and exterior orientations: parameter_a, parameter_b, rho.
+
+        The table contains all pairs of interior parameters of a camera, and all pairs of an exterior element of an
+        image with its interior parameters and its other exterior elements.
+        """
         rows = []
         for camera, c in self.correlations.items():
             labels = [f"interior[{camera}].{p}" for p in c.parameters]
@@ -365,7 +372,10 @@ class Tables:
 
     @cached_property
     def correlation_summary(self) -> pd.DataFrame:
-        """camera, exterior, interior, mean_abs_rho, max_abs_rho over the camera's images (paper 000, Table 4)."""
+        """Correlations over the images of each camera (paper 000, Table 4).
+
+        Columns: camera, exterior, interior, mean_abs_rho, max_abs_rho.
+        """
         rows = [
             (camera, name, parameter, c.mean_abs[i, j], c.max_abs[i, j])
             for camera, c in self.correlations.items()
@@ -377,8 +387,11 @@ class Tables:
 
     @cached_property
     def correlation_ground(self) -> pd.DataFrame:
-        """camera, ground (height, flying_height, dome), sigma_m, parameter, rho; of the parameter `all` the multiple
-        correlation with all of the camera. Empty if the images do not look down."""
+        """Correlations of each camera with height and doming of the ground; empty unless the images look down.
+
+        Columns: camera, ground (height, flying_height, dome), sigma_m, parameter, rho. The parameter `all` has the
+        multiple correlation with all parameters of the camera.
+        """
         rows = [
             (camera, form, g.sigma_m[k], parameter, rho)
             for camera, g in self.ground_correlations.items()
@@ -389,7 +402,10 @@ class Tables:
 
     @cached_property
     def sigma_map(self) -> pd.DataFrame:
-        """camera, distance_m (inf: a direction), x_mm, y_mm, sigma_x_px, sigma_y_px, worst_px; one row per cell."""
+        """Projection uncertainty, one row per cell.
+
+        Columns: camera, distance_m (inf: direction), x_mm, y_mm, sigma_x_px, sigma_y_px, worst_px.
+        """
         names = ["distance_m", "x_mm", "y_mm", "sigma_x_px", "sigma_y_px", "worst_px"]
         frames = [pd.DataFrame({"camera": [], **dict.fromkeys(names, np.zeros(0))})]
         for one in (one for both in self.sigma_maps.values() for one in both):
@@ -401,12 +417,12 @@ class Tables:
 
     @cached_property
     def convergence(self) -> pd.DataFrame:
-        """step, sigma0, length, damping, bent, taken; the last row is the end of the iteration."""
+        """Iteration history: step, sigma0, length, damping, bent, taken; the last row is the final state."""
         return convergence_table(self.adjusted)
 
     @cached_property
     def recovery(self) -> pd.DataFrame:
-        """parameter, estimate, truth, error, sigma, ratio, unit of a simulation."""
+        """Recovery of a simulation: parameter, estimate, truth, error, sigma, ratio, unit."""
         return recovery_table(self, self.truth or {})
 
 
@@ -415,7 +431,7 @@ def _is_table(member: object) -> bool:
 
 
 def angles_deg(camera_from_object: Float[np.ndarray, "images 3 3"]) -> Float[np.ndarray, "images 3"]:
-    """omega, phi, kappa (degrees)."""
+    """Angles omega, phi, kappa (degrees)."""
     return np.degrees(np.asarray(call_compiled(_angles, camera_from_object)))
 
 
@@ -425,16 +441,17 @@ def _angles(camera_from_object):
 
 
 def convergence_table(adjusted: Adjustment) -> pd.DataFrame:
-    """step, sigma0 before it, length (standard deviations), damping, bent, taken (yes, no); empty if unknown.
+    """Tabulate the iteration history; empty if unknown.
 
-    `length` bounds the move of every unknown in its standard deviations. `bent` is the fraction of the step that was
-    tried along its curve (geodesic acceleration), NaN for a straight step. The last row is the end.
+    Columns: step, sigma0 (before the step), length, damping, bent, taken (yes, no). `length` is the largest change of
+    an unknown in its standard deviations. `bent` is the fraction of the step that was tried along its curve (geodesic
+    acceleration), NaN for a straight step. The last row is the final state.
     """
     history, redundancy = adjusted.history, max(adjusted.redundancy, 1)
     if history is None:
         return pd.DataFrame(columns=["step", "sigma0", "length", "damping", "bent", "taken"])
     n = len(history.length)
-    # A very long iteration keeps its first steps; the end is known in any case.
+    # A very long history contains only the first steps; the final state is always known.
     end = n == int(adjusted.steps)
     sums = np.append(history.sum_of_squares, float(adjusted.sum_of_squares)) if end else history.sum_of_squares
     columns = {
@@ -449,7 +466,7 @@ def convergence_table(adjusted: Adjustment) -> pd.DataFrame:
 
 
 def check_spread(check: pd.DataFrame) -> pd.DataFrame:
-    """axis, n, mean, rmse, max_abs, unit of the discrepancies at check points."""
+    """Tabulate the discrepancies at check points: axis, n, mean, rmse, max_abs, unit."""
     values = check[[f"d{axis}_m" for axis in AXES]].set_axis(AXES, axis=1)
     columns = {
         "n": values.count(),
@@ -461,14 +478,14 @@ def check_spread(check: pd.DataFrame) -> pd.DataFrame:
 
 
 def accuracy_table(accuracy: PositionalAccuracy) -> pd.DataFrame:
-    """component, check_points, fit_m, survey_m, rmse_m (survey included), class_cm, claimed."""
+    """Tabulate the accuracy: component, check_points, fit_m, survey_m, rmse_m (including survey), class_cm, claimed."""
     columns = ["component", "check_points", "fit_m", "survey_m", "rmse_m", "class_cm", "claimed"]
     rows = [(t.symbol, t.n, t.fit_m, t.survey_m, t.rmse_m, t.class_cm, t.claimed) for t in accuracy.tested]
     return pd.DataFrame(rows, columns=columns)
 
 
 def side_by_side(table: pd.DataFrame, rows: list[str], column: str, value: str) -> pd.DataFrame:
-    """Pivot a table of correlations for reading; the camera is dropped if there is only one."""
+    """Pivot a table of correlations as text; the column camera is dropped if there is only one."""
     names = table[column].map(lambda name: symbol(name).replace("_", ""))
     texts = table.assign(**{column: names, value: table[value].map("{:.3f}".format)})
     wide = texts.pivot_table(value, rows, column, aggfunc="first", sort=False).fillna("").reset_index()
@@ -476,10 +493,11 @@ def side_by_side(table: pd.DataFrame, rows: list[str], column: str, value: str) 
 
 
 def with_correlated_sigma(interior: pd.DataFrame, adjusted: Adjustment, factor: float) -> pd.DataFrame:
-    """Return the interior orientations with the column `sigma_correlated`: `sigma` for spatially correlated residuals.
+    """Add the column `sigma_correlated`: standard deviations for spatially correlated residuals.
 
-    The information of the rays is divided by `factor`^2, that of priors is not: with sigma s and prior p, the rays
-    alone give 1 / d^2 = 1 / s^2 - 1 / p^2, and `sigma_correlated` combines p and `factor` d, parameter by parameter.
+    The information of the rays is divided by `factor`^2, the information of priors is not. With sigma s and prior p,
+    the rays alone give 1 / d^2 = 1 / s^2 - 1 / p^2; `sigma_correlated` combines p and `factor` d, parameter by
+    parameter.
     """
     weights = []
     for camera, parameter in interior[["camera", "parameter"]].itertuples(index=False):
@@ -491,18 +509,18 @@ def with_correlated_sigma(interior: pd.DataFrame, adjusted: Adjustment, factor: 
     return interior.assign(sigma_correlated=np.where(np.isfinite(sigma), np.maximum(scaled, sigma), np.nan))
 
 
-# Recovery of a simulation: (estimate - truth) / sigma is standard normal if the model is right, except for the datum.
+# In a recovered simulation (estimate - truth) / sigma is standard normal if the model is correct, except for the datum.
 
-# Tables with one column per quantity: the column of names, and the prefix of the labels.
+# Tables with one column per quantity: column of the names, and prefix of the labels.
 _WIDE = {"exterior": ("image", "exterior"), "object_points": ("point", "points")}
 _COLUMNS = ("parameter", "estimate", "truth", "sigma")
 
 
 def recovery_table(tables: Tables, truth: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """parameter, estimate, truth, error (estimate - truth), sigma, ratio (error / sigma), unit of all estimates.
+    """Tabulate estimates and true values: parameter, estimate, truth, error, sigma, ratio (error / sigma), unit.
 
-    `truth` are the tables of `jaxphoto.io.truth_tables(simulation)`, with columns as in the result tables. Quantities
-    that one side lacks are skipped.
+    `truth` contains the tables of `jaxphoto.io.truth_tables(simulation)`, with columns as in the result tables.
+    Quantities missing on one side are skipped.
     """
     frames = [_long(getattr(tables, name), truth[name]) for name in ("interior", "georeferencing") if name in truth]
     frames += [_wide(getattr(tables, k), truth[k], *names) for k, names in _WIDE.items() if k in truth]
@@ -519,7 +537,7 @@ def recovery_table(tables: Tables, truth: Mapping[str, pd.DataFrame]) -> pd.Data
 
 
 def recovery_spread(recovery: pd.DataFrame) -> pd.DataFrame:
-    """group, n, rms_ratio, beyond_2_sigma of a `recovery_table`: about 1 and 5 % where the model is right.
+    """Summarise a `recovery_table`: group, n, rms_ratio, beyond_2_sigma (about 1 and 5 % if the model is correct).
 
     Groups are each camera, mount and strip, and each coordinate and angle of all images and of all points.
     """
@@ -536,7 +554,7 @@ def recovery_spread(recovery: pd.DataFrame) -> pd.DataFrame:
 
 
 def _long(table: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
-    """Recovery of tables with one number per row: cameras, or mounts and strips."""
+    """Compute the recovery of tables with one value per row: cameras, mounts and strips."""
     keys = [c for c in ("camera", "parameter") if c in table and c in truth]
     both = table.merge(truth, on=keys, suffixes=("", "_true"))
     label = both["parameter"]
@@ -547,7 +565,7 @@ def _long(table: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
 
 
 def _wide(table: pd.DataFrame, truth: pd.DataFrame, key: str, prefix: str) -> pd.DataFrame:
-    """Recovery of tables with one row per image or point."""
+    """Compute the recovery of tables with one row per image or point."""
     names = [c for c in truth.columns if c != key]
     both = table.assign(**{key: table[key].astype(str)}).merge(
         truth.assign(**{key: truth[key].astype(str)}), on=key, suffixes=("", "_true")

@@ -1,4 +1,4 @@
-"""Results of a calibration with targets: those of its adjustment, and the residuals of every image."""
+"""Results of a calibration with targets: its adjustment, and the residuals of every image."""
 
 import json
 import time
@@ -25,15 +25,15 @@ from jaxphoto.writing import whole_folder
 
 PICTURES = "photographs"
 _WIDTH_INCHES = 6.4
-# Length of the arrow of an RMS residual as a fraction of the width of the picture.
+# Length of the arrow of an RMS residual as a fraction of the image width.
 _ARROW = 0.03
 _SHOWN = 4
-# Misfit over measurement sigma that is reported.
+# Ratio of misfit to measurement sigma above which the misfit is reported.
 _MISFIT = 2.0
 
 
 def photographs_table(calibration: Calibration) -> pd.DataFrame:
-    """image, used, n_points, rms_px, max_px, reason: every image, skipped ones last."""
+    """Tabulate all images, skipped ones last: image, used, n_points, rms_px, max_px, reason."""
     rows, residuals = calibration.measured, calibration.residuals_px
     lines: list[tuple] = []
     for k, name in enumerate(rows.images):
@@ -44,7 +44,7 @@ def photographs_table(calibration: Calibration) -> pd.DataFrame:
 
 
 def targets_figure(calibration: Calibration, image: str, picture: np.ndarray | None = None) -> Figure:
-    """Return the targets of one image, over its grey values if given, with enlarged residual vectors."""
+    """Draw the targets of one image, over its grey values if given, with enlarged residual vectors."""
     rows, sensor = calibration.measured, calibration.sensor
     of_image = rows.image == rows.images.index(image)
     place, v = sensor.px_from_mm(rows.xy_mm[of_image]), calibration.residuals_px[of_image]
@@ -59,7 +59,7 @@ def targets_figure(calibration: Calibration, image: str, picture: np.ndarray | N
 def left_out_figure(
     calibration: Calibration, image: str, picture: np.ndarray | None = None, found: Detection | None = None
 ) -> Figure:
-    """Return a skipped image with the reason and the targets that were detected in it."""
+    """Draw a skipped image with the reason and its detected targets."""
     place = np.zeros((0, 2)) if found is None else found.column_row
     figure = _image_figure(calibration.sensor, picture, f"{image}: not used, {calibration.left_out[image]}")
     figure.axes[0].plot(*place.T, "x", ms=5, color="tab:orange")
@@ -67,7 +67,7 @@ def left_out_figure(
 
 
 def _image_figure(sensor: Sensor, picture: np.ndarray | None, title: str) -> Figure:
-    """Return the image format in pixels, with grey values if given."""
+    """Draw the image format in pixels, with grey values if given."""
     figure = new_figure(_WIDTH_INCHES, _WIDTH_INCHES * sensor.height_px / sensor.width_px + 0.6)
     axes = figure.subplots()
     if picture is not None:
@@ -81,7 +81,7 @@ def _image_figure(sensor: Sensor, picture: np.ndarray | None, title: str) -> Fig
 
 
 def findings(calibration: Calibration) -> list[str]:
-    """Sentences on convergence, skipped images, rejected image points and misfit."""
+    """Return sentences on convergence, skipped images, rejected image points and misfit."""
 
     def some(names: Sequence[str]) -> str:
         return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
@@ -120,10 +120,10 @@ def write_calibration(
 ) -> Tables:
     """Write the results of the adjustment, photographs.csv, photographs.html and a picture of each image.
 
-    summary.json gains rms_px, n_images_used, n_image_points, added_sigma_px, settled, left_out, removed and `start`, a
-    sentence on the initial camera. `pictures` read the grey values of images by name, including skipped ones, of which
-    `detections` are the detected targets; `notes` become findings; `beside` writes further files into the folder.
-    Raises InputError if `directory` holds something else than an earlier result.
+    summary.json also contains rms_px, n_images_used, n_image_points, added_sigma_px, settled, left_out, removed and
+    `start`, a sentence on the initial camera. `pictures`: functions by image that read the grey values, also of skipped
+    images, whose detected targets are in `detections`. `notes` become findings. `beside` writes additional files into
+    the folder. Raises InputError if `directory` contains anything but an earlier result.
     """
     began = time.perf_counter()
     tables = Tables(calibration.adjusted)
@@ -154,7 +154,7 @@ def write_calibration(
 
 
 def _images_page(calibration: Calibration, photographs: pd.DataFrame, shown: Sequence[str]) -> str:
-    """Every image with its targets, the worst first, skipped ones last."""
+    """Return the page of every image with its targets, by decreasing residual, skipped images last."""
     order = photographs.sort_values("rms_px", ascending=False, kind="stable")
     parts: list[Part] = [Link("all results", "report.html"), Heading("Residuals"), order]
     for name in (name for name in order["image"] if name in shown):
@@ -178,7 +178,7 @@ def calibration_summary(calibration: Calibration) -> dict:
 
 
 def print_calibration(calibration: Calibration, console: Console) -> None:
-    """Print the numbers of images and image points, and the findings."""
+    """Print the number of images and image points, and the findings."""
     n, points = len(calibration.measured.images), len(calibration.residuals_px)
     print_lines([f"{n} photographs used, {points} image points, RMS {calibration.rms_px:.3f} px"], console)
     print_lines((f"  - {sentence}" for sentence in findings(calibration)), console)

@@ -16,12 +16,12 @@ _COLOURS = {"note": "green", "warning": "yellow", "error": "red"}
 
 
 def plain(text: str) -> Text:
-    """Text without rich markup."""
+    """Return text without rich markup."""
     return Text(printable(text))
 
 
 def print_lines(lines, console: Console) -> None:
-    """Print sentences as they are, one per line."""
+    """Print sentences unchanged, one per line."""
     for line in lines:
         console.print(plain(line), soft_wrap=True)
 
@@ -80,5 +80,5 @@ def print_components(components: VarianceComponents, console: Console) -> None:
 
 
 def print_warning(warning: str, console: Console, **options) -> None:
-    """Print a warning behind a yellow mark."""
+    """Print a warning with a yellow mark."""
     console.print(Text.assemble(("!", "yellow"), " ", plain(warning)), **options)

@@ -1,4 +1,4 @@
-"""The verdict on an adjustment: findings by tests of convergence, residuals, geometry and reliability."""
+"""Verdict on an adjustment: findings on convergence, residuals, geometry and reliability."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -38,16 +38,16 @@ HIGH_CORRELATION = 0.9
 HIGH_OWN_CORRELATION = 0.95
 WEAK_CORRELATION = 0.9
 FLAT = 0.2
-"""Height range over flying height below which the ground is nearly flat."""
+"""Ratio of height range to flying height below which the ground is nearly flat."""
 NEAR_VERTICAL_DEG = 15.0
 FELT = 10.0
-"""Standard deviations of an image point by which an interior parameter may move the corner of the image.
+"""Maximum shift of the image corner by one sigma of an interior parameter, in standard deviations of an image point.
 
-Half of `adjustment.POOR`: up to here GNSS calls a dilution of precision moderate. Well-determined blocks over flat
-ground stay below 8, undetermined ones begin at 15 (benchmarks/defects.py).
+Half of `adjustment.POOR`: the limit of a moderate dilution of precision in GNSS. Well-determined blocks over flat
+ground remain below 8, undetermined ones exceed 15 (benchmarks/defects.py).
 """
 SEEN = 3.0
-"""Standard deviations from which on a rolling-shutter readout is significant."""
+"""Ratio of a rolling-shutter readout to its standard deviation above which it is significant."""
 _FOR_POINT = "strips in both directions with stations (GNSS), relief or oblique images"
 _CURES = {
     "c_mm": "stations (GNSS) that do not shift, relief, a second flying height or oblique images",
@@ -56,13 +56,13 @@ _CURES = {
 }
 _FOR_DISTORTION = "image points towards the corners, more overlap or cross strips"
 _FOR_FIELD = "images rotated by 90 degrees about the line of sight, and tilted ones"
-# Rows of the correlations: positions, then rotations.
+# Rows of the correlations: horizontal position, height, tilts.
 _PLAN, _HEIGHT, _TILTS = slice(0, 2), slice(2, 3), slice(3, 5)
 _C, _POINT = ("c_mm",), ("xp_mm", "yp_mm")
 
 
 def verdict_of(tables: Tables) -> Verdict:
-    """Judge an adjustment: convergence, residuals, weak geometry, correlations, significance, reliability."""
+    """Assess an adjustment: convergence, residuals, weak geometry, correlations, significance, reliability."""
     return Verdict.of(_findings(tables))
 
 
@@ -70,7 +70,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
     adjusted = tables.adjusted
     if not bool(adjusted.converged):
         yield from _not_converged(adjusted)
-        # Statistics hold at an optimum only.
+        # Stop here: statistics are valid only at an optimum.
         return
     prepare_hat_matrix(adjusted.equations, adjusted.seconds)
     yield from (Finding("prior_information", "warning", doubt) for doubt in adjusted.block.prior_warnings)
@@ -104,7 +104,7 @@ def _not_converged(adjusted: Adjustment) -> Iterator[Finding]:
     if names := [adjusted.block.points[p] for p in np.flatnonzero(adjusted.diverged_points)]:
         yield Finding("diverged_points", "error", few(names), len(names), hint="Check their image measurements")
     sigma0 = float(adjusted.sigma0)
-    # Where the observations fit at the stop, it is no bad start but a direction the block does not determine.
+    # Good fit without convergence indicates an undetermined direction, not poor initial values.
     if sigma0 <= NOTHING_FITS:
         yield from (Finding("undetermined", "error", w.sentence) for w in weaknesses_of(adjusted))
     elif np.isfinite(sigma0):
@@ -113,7 +113,7 @@ def _not_converged(adjusted: Adjustment) -> Iterator[Finding]:
 
 
 def behind_findings(adjusted: Adjustment) -> Iterator[Finding]:
-    """Images that look away from their points, and single points behind images."""
+    """Yield images that look away from their points, and single points behind images."""
     block = adjusted.block
     rows, seen = block.image_points, in_front(block, adjusted.unknowns)
     away = looking_away(block, seen)
@@ -131,7 +131,7 @@ def behind_findings(adjusted: Adjustment) -> Iterator[Finding]:
 
 
 def duplicate_images(block: Block) -> list[tuple[str, str, int]]:
-    """Pairs of images of which most image points are equal to a tenth of their sigma, and the number of these."""
+    """Return pairs of images with mostly equal image points (to a tenth of sigma), and the number of equal points."""
     least_count, least_fraction, tolerance = 4, 0.5, 0.1
     rows = block.image_points
     x, y = np.asarray(rows.xy).T
@@ -148,7 +148,7 @@ def duplicate_images(block: Block) -> list[tuple[str, str, int]]:
 
 
 def duplicate_findings(block: Block) -> Iterator[Finding]:
-    """Return the first pair of duplicate images, and the number of further ones."""
+    """Report the first pair of duplicate images, and the number of further pairs."""
     if pairs := duplicate_images(block):
         one, other, n = pairs[0]
         others = f"; {len(pairs) - 1} further pairs" if len(pairs) > 1 else ""
@@ -166,15 +166,15 @@ class Weakness(NamedTuple):
     finding: Finding
     explains: frozenset[tuple[str, str]]
     labels: frozenset[str]
-    """Paths of its parameters."""
+    """Paths of the parameters."""
 
 
 def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
-    """Interior parameters that near-vertical images over flat ground do not determine.
+    """Find interior parameters that near-vertical images over flat ground do not determine.
 
-    There, a longer principal distance and a higher flight give the same images, and so do a shifted principal point and
-    a shifted, tilted camera. The criteria are a correlation above `WEAK_CORRELATION` with the exterior orientation and
-    a sigma that moves the corner of the image by more than `FELT` sigmas of an image point (docs/statistics.md).
+    In this geometry, principal distance and flying height have equal effects, and so do principal point and a shift
+    with tilt of the camera. Criteria are a correlation above `WEAK_CORRELATION` with the exterior orientation, and a
+    sigma that moves the corner of the image by more than `FELT` sigmas of an image point (docs/statistics.md).
     """
     adjusted = tables.adjusted
     images = np.flatnonzero(np.array(adjusted.block.image_camera) == camera)
@@ -208,7 +208,7 @@ def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
 
 
 def at_corner(tables: Tables, camera: str) -> dict[str, float]:
-    """Shift of the image corner by one sigma of each estimated parameter, in sigmas of an image point.
+    """Return the shift of the image corner by one sigma of each estimated parameter, in sigmas of an image point.
 
     c acts along the radius, the principal point directly; coefficients are in yardsticks (`adjustment.yardsticks`).
     """
@@ -225,7 +225,7 @@ def at_corner(tables: Tables, camera: str) -> dict[str, float]:
 
 
 def _geometry(adjusted: Adjustment, images: np.ndarray) -> tuple[float, float]:
-    """Relief over flying height, and the largest tilt (degrees); infinite if the images do not look down."""
+    """Return relief over flying height, and the largest tilt (degrees); infinite unless the images look down."""
     rows = adjusted.structure
     points = np.unique(rows.point[np.isin(rows.image, images)])
     heights = np.asarray(adjusted.unknowns.points)[points, 2]
@@ -237,7 +237,7 @@ def _geometry(adjusted: Adjustment, images: np.ndarray) -> tuple[float, float]:
 
 
 def _stations(adjusted: Adjustment, images: np.ndarray, axes: tuple[int, ...]) -> tuple[str, str]:
-    """Why stations on `axes` do not separate the interior orientation, and the cure."""
+    """Explain why stations along `axes` do not separate the interior orientation, and return the cure."""
     block, priors = adjusted.block, adjusted.priors
     rows = np.isin(block.stations.who, images) & np.isin(block.stations.axis, axes)
     observed = np.unique(block.stations.who[rows]).tolist()
@@ -258,7 +258,7 @@ def _strongest(c: Correlations, rows: slice, parameters: tuple[str, ...]) -> flo
 
 
 def _weak(tables: Tables, reported: frozenset[str]) -> Iterator[Finding]:
-    """Unknowns with a sigma above `POOR` yardsticks, except interior orientations `reported` already."""
+    """Report unknowns with a sigma above `POOR` yardsticks, except the interior orientations in `reported`."""
     adjusted, q = tables.adjusted, tables.covariance
     yard, a_priori = yardsticks(adjusted), 1 / np.sqrt(float(q.variance_factor))
     in_yardsticks = (
@@ -276,7 +276,7 @@ def _weak(tables: Tables, reported: frozenset[str]) -> Iterator[Finding]:
 
 
 def _not_significant(tables: Tables, s: Significance) -> Finding:
-    """Return the effect of holding an insignificant parameter at zero."""
+    """Report the effect of fixing an insignificant parameter at zero."""
     change, sensor = fix_at_zero(tables.adjusted, tables.covariance, s), tables.adjusted.block.sensors[s.camera]
     others = {name: abs(v) for name, v in change.in_sigmas.items() if name != s.parameter}
     most = max(others, key=lambda name: others[name], default="")
@@ -287,17 +287,17 @@ def _not_significant(tables: Tables, s: Significance) -> Finding:
 
 
 def _all_known(block: Block) -> bool:
-    """Return True if all points are known in advance: a field of targets."""
+    """Return True if all points have prior coordinates, as in a field of targets."""
     return len(np.union1d(block.control.who, block.fixed.who)) == len(block.points)
 
 
 def _correlated(
     camera: str, c: Correlations, explained: frozenset[tuple[str, str]], felt: set[str], field: bool
 ) -> Iterator[Finding]:
-    """High correlations, except pairs that are `explained` already.
+    """Report high correlations, except the pairs in `explained`.
 
-    A warning where the images feel the parameter (`felt`), otherwise a note. The cure depends on the parameter and on
-    whether all images show a `field` of known targets.
+    A finding is a warning if the parameter affects the images (`felt`), otherwise a note. The cure depends on the
+    parameter and on whether all images show a `field` of known targets.
     """
     subject = camera_words(camera)
 
@@ -336,14 +336,14 @@ def _correlated(
 
 
 def ground_findings(tables: Tables) -> Iterator[Finding]:
-    """Correlation of c with heights, and of the camera with doming of the ground."""
+    """Report correlations of c with heights, and of the camera with doming of the ground."""
     flown, dome = len(tables.adjusted.block.stations.who) > 0, FORMS.index("dome")
     for camera, g in tables.ground_correlations.items():
         sigma = tables.interior[tables.interior["camera"] == camera].set_index("parameter")["sigma"]
         if "c_mm" in g.parameters:
             rho = g.rho[:2, g.parameters.index("c_mm")]
             k = int(np.abs(rho).argmax())
-            # Without stations nobody flies, or the flying height is of no interest.
+            # Without stations, the block is terrestrial or its flying height is irrelevant.
             height = flown or k == 0
             above = "the flying height over the ground" if height else "the distance of the images from the points"
             numbers = {
@@ -365,7 +365,7 @@ def ground_findings(tables: Tables) -> Iterator[Finding]:
 
 
 def _invertible(adjusted: Adjustment, name: str, sensor: Sensor) -> bool:
-    """Return True if the corner of the format lies within the monotonic range of the distortion."""
+    """Return True if the corner of the format is within the monotonic range of the distortion."""
     corner = np.array([sensor.width_mm, sensor.height_mm]) / 2
     r = np.linspace(0.0, 1.0, 65)[:, None] * corner
     out = np.asarray(call_compiled(_closed_form, adjusted.unknowns.interior[name], r))
@@ -381,7 +381,7 @@ def _closed_form(interior, xy):
 
 
 def lens_findings(tables: Tables) -> Iterator[Finding]:
-    """Return the adjusted c compared with its prior; a warning if the block hardly adds to the prior."""
+    """Compare the adjusted c with its prior; a warning if the block hardly improves the prior."""
     adjusted, little = tables.adjusted, 0.7
     if not bool(adjusted.converged):
         return
@@ -402,12 +402,12 @@ def lens_findings(tables: Tables) -> Iterator[Finding]:
 
 
 def readout_of(camera: str) -> str:
-    """Return the parameter name of a camera's rolling-shutter readout."""
+    """Return the path of a camera's rolling-shutter readout."""
     return f"{RollingShutter.kind}[{camera}].readout_ms"
 
 
 def shutter_findings(tables: Tables) -> Iterator[Finding]:
-    """Return the estimated readout of every rolling shutter, and whether it is significant."""
+    """Report the estimated readout of every rolling shutter, and its significance."""
     table = tables.georeferencing
     for label, value, sigma in table[table["parameter"].str.startswith(f"{RollingShutter.kind}[")].to_numpy():
         words = camera_words(label.split("[", 1)[1].rsplit("]", 1)[0])
@@ -419,7 +419,7 @@ def shutter_findings(tables: Tables) -> Iterator[Finding]:
 
 
 def drift_findings(tables: Tables) -> Iterator[Finding]:
-    """Return the changes of cameras with estimated rates or splines, and differences between strips."""
+    """Report changes of cameras with estimated rates or splines, and differences between strips."""
     yield from map(drift_finding, tables.tested_drifts)
     yield from map(differences_finding, camera_spline_differences(tables.adjusted, tables.covariance))
     if (strips := strip_differences(tables.adjusted, tables.covariance)) is not None:
@@ -427,7 +427,7 @@ def drift_findings(tables: Tables) -> Iterator[Finding]:
 
 
 def drift_finding(drift: CameraDrift) -> Finding:
-    """Change of one camera: the significant parameters if any, otherwise the MDBs."""
+    """Report the change of one camera: significant parameters if there are any, otherwise the MDBs."""
     test = drift.change
     if drift.rates is ThermalRates:
         over = f"with its temperature over {drift.span:.2g} K"
@@ -443,7 +443,7 @@ def drift_finding(drift: CameraDrift) -> Finding:
 
 
 def differences_finding(differences: CameraDifferences) -> Finding:
-    """Differences between the cameras of all strips, or between all knots of a spline."""
+    """Report differences between the cameras of all strips, or between all knots of a spline."""
     test, names, spline = differences.more, np.array(differences.parameters), bool(differences.camera)
     words = camera_words(differences.camera) if spline else "the camera"
     over = "from knot to knot of its spline" if spline else "from strip to strip"
@@ -486,7 +486,7 @@ def _symbol(name: str) -> str:
 
 
 def _scale(name: str, size: float) -> tuple[float, str]:
-    """Factor and unit in which a change of `size` (mm) is shown: micrometres below a tenth of a millimetre."""
+    """Return factor and unit of a change of `size` (mm): micrometres below a tenth of a millimetre."""
     if name == "k1":
         return 1.0, ""
     return (1.0, " mm") if size >= 0.0995 else (1e3, " um")

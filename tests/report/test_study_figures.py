@@ -46,7 +46,7 @@ def test_a_time_line_is_in_the_order_of_time(axes):
     y = axes.lines[0].get_ydata()
     np.testing.assert_allclose(y[np.isfinite(y)], report.images["rms_px"])
     assert plot_time_line(report, "offsets", Figure().add_subplot(), taken=taken).get_legend() is not None
-    with pytest.raises(InputError, match="no 'wind' are known by time; there are offsets, residuals"):
+    with pytest.raises(InputError, match="no quantity 'wind'; use one of offsets, residuals"):
         plot_time_line(report, "wind")
     bars = plot_photograph_residuals(report, Figure().add_subplot()).patches
     np.testing.assert_allclose([bar.get_height() for bar in bars], report.images["rms_px"])
