@@ -105,7 +105,7 @@ def row_function(group: ObservedGroup, s: AbstractStructure) -> Callable[[RowVar
     def residual(z: RowVariables, given: RowInputs) -> Float[Array, "c"]:
         parameters = given.parameters
         if group.place:
-            # Use a list: indexing an array would copy it for each parameter, and there are few.
+            # Add to all parameters in one operation: separate updates would copy the array each time.
             parameters = parameters.at[jnp.array(group.place)].add(z.shared * given.scale.shared)
         position = given.position + z.eop[:, :3] * given.scale.eop[:, :3]
         points = given.points + z.points * given.scale.points
