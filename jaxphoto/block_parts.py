@@ -1,4 +1,4 @@
-"""Parts of a block besides observations: datum, sensor motion, frame, start values."""
+"""Parts of a block other than observations: datum, sensor motion, frame, start values."""
 
 import dataclasses
 from typing import Literal

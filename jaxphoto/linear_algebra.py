@@ -21,7 +21,7 @@ def one_at_a_time(function: Callable) -> Callable:
 
 
 def _solver(function: Callable, small: Callable | None = None) -> Callable:
-    """Return `function(matrix, right)` with a batching rule; `small` solves many small matrices side by side."""
+    """Return `function(matrix, right)` with a batching rule; `small` solves many small systems without LAPACK."""
     solve = jax.custom_batching.custom_vmap(function)
 
     @solve.def_vmap

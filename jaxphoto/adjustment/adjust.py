@@ -63,11 +63,11 @@ def solve(
     and its times, to `prepare` further programs.
 
     `losses` replace squared residuals by group of observations. The unknowns then minimise the total loss. Residuals
-    and normal equations of the result are those of least squares at this optimum: `jaxphoto.robust` computes statistics
-    from them.
+    and normal equations of the result are evaluated at this optimum without losses: `jaxphoto.robust` computes
+    statistics from them.
 
-    Raises DatumError if the datum is not determined by observations or constraints, RankError if the observations do
-    not determine an unknown or cannot separate unknowns.
+    Raises DatumError if the datum is determined neither by observations nor by constraints, RankError if the
+    observations do not determine an unknown or cannot separate unknowns.
     """
     laid = build_problem(block, start, priors, sizes)
     if not laid.traced and is_traced(block.start.unknowns):

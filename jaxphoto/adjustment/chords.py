@@ -24,7 +24,7 @@ TOLERANCE = 1e-6
 """Maximum remaining distance of an unknown of a draw from its optimum, as a fraction of its standard deviation."""
 # Ratio of successive step lengths above which a draw is abandoned, and maximum number of steps.
 _CONTRACTS, _MOST_STEPS = 0.5, 20
-# Fraction of the first step assumed to remain after it.
+# Ratio of successive step lengths assumed for the first step.
 _FIRST_RATIO = 0.1
 # Leaves other than image coordinates that change the residuals of image rows.
 _OF_IMAGE_ROWS = {"xy", "sigma_xy", "position", "rotation", "shared", "points"}

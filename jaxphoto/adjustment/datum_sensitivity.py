@@ -141,7 +141,7 @@ def row_sensitivity(
 ) -> SeenMotions:
     """Return the sensitivity of all rows except image rows, which no motion changes; `chosen` are shared unknowns."""
     width = 7 + len(chosen)
-    # Append a column for missing unknowns and those not chosen.
+    # Append a column for missing unknowns and unknowns not chosen.
     place = np.full(s.n_shared + 1, width)
     place[chosen] = 7 + np.arange(len(chosen))
     found: dict[bool, list[scipy.sparse.csr_array]] = {

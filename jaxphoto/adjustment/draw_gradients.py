@@ -168,7 +168,7 @@ def _group_cotangent(
 ) -> tuple[UnknownArrays, Array]:
     """Differentiate the sum of q over the rows of a group with respect to the state and to `bent`.
 
-    `bent` holds the camera parameters by image if declared parameters modify them; derivatives by the state's camera
+    `bent` contains the camera parameters by image if declared parameters modify them; derivatives by the state's camera
     parameters are then zero.
     """
     n, size = state.position.shape[1:]

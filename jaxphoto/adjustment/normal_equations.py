@@ -177,7 +177,7 @@ class CoupledUnknowns(NamedTuple):
         sums = sums.with_pairs(f, s, k)
         columns, last = sums.band
         width, size = len(last), s.n_shared + k
-        # Only one triangle of each pair of images is stored.
+        # Only one triangle of the pairs of images is stored.
         none = jnp.zeros((0, 6 * (n - width)))
         pairs = dense(Band(columns.reshape(-1, 12 * width, 6 * width), none, last.reshape(6 * width, -1)))
         own = sums.own.reshape(n, -1, sums.across.shape[2])[:, :6, :6]

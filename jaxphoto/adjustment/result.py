@@ -167,7 +167,7 @@ class Adjustment(eqx.Module):
 
     @property
     def n_observations(self) -> dict[str, int]:
-        """Number of observations by group: image_points, those of `Block.observations`, priors; 0 if none."""
+        """Number of observations by group: image_points, the groups of `Block.observations`, priors; 0 if none."""
         groups = (self.block.image_points, *self.block.observations)
         none = {rows.group: 0 for rows in groups} | {PRIORS: 0}
         return none | {name: int(np.size(v)) for name, v in self.residuals.named.items()}
@@ -189,7 +189,7 @@ class Adjustment(eqx.Module):
 
     @property
     def n_constraints(self) -> int:
-        """Number of constraints that close the datum."""
+        """Number of constraints that fix the datum."""
         return self.residuals.datum.shape[0]
 
     @property

@@ -26,8 +26,8 @@ def batch_size(structure: Structure) -> int:
 class RowList(eqx.Module):
     """Image rows of the cameras of one group, in chunks: index in the block, and the objects they touch.
 
-    Images and points are those of a padded structure, points ascending. The last chunk repeats its last row, with zero
-    weight.
+    Images and points are indices into a padded structure, points ascending. The last chunk repeats its last row, with
+    zero weight.
     """
 
     row: Int[np.ndarray, "chunks rows"]

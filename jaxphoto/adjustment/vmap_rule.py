@@ -237,7 +237,7 @@ def _from_start(values: PaddedValues, state: UnknownArrays, draws: _Draws) -> In
 
 
 def _by_row(v: Float[Array, "draws batches 2 chunks p"], ray: Int[np.ndarray, "rows"]) -> Float[Array, "2 rows draws"]:
-    """Return numbers of rays by image row, draws last."""
+    """Return values of rays by image row, draws last."""
     return jnp.moveaxis(v, 2, 0).reshape(2, len(v), -1)[:, :, ray].transpose(0, 2, 1)
 
 

@@ -1,6 +1,6 @@
 """Execution of compiled functions, with separate compile and run times; compiled at most once per process.
 
-Tracing and lowering hold Python's global lock; compiling does not. Programs that are needed soon (`prepare`) are
+Tracing and lowering block Python's global lock; compiling does not. Programs that are needed soon (`prepare`) are
 compiled on another core meanwhile.
 """
 
@@ -41,7 +41,7 @@ class _Program(NamedTuple):
 MOST = 100
 _programs: dict[object, _Program] = {}
 _gone = 0
-"""Programs dropped since the last `jax.clear_caches`."""
+"""Number of programs dropped since the last `jax.clear_caches`."""
 _prepared: dict[object, Future[_Program]] = {}
 _workers = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="jaxphoto-compile")
 keep_freed_memory()

@@ -86,12 +86,12 @@ class PaddedStructure(AbstractStructure):
 
     @property
     def ray_points(self) -> Int[Array, "batches chunks p"]:
-        """Point of each ray, among those of this device."""
+        """Point of each ray, as an index into the points of this device."""
         return self._here(self.rays.ray_point, self.n_points // self.shards)
 
     @property
     def pairs(self) -> Int[Array, "pair_batches pair_chunks 2 q"]:
-        """Indices of rays among those of this device."""
+        """Pairs as indices into the rays of this device."""
         # Each device stores only its own shard of rays.
         return self._here(self.rays.pair, math.prod(self.rays.ray_point.shape))
 

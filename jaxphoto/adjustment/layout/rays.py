@@ -1,7 +1,7 @@
 """Order of images and points; rays in chunks of one image, pairs of rays in chunks of two images.
 
 A ray is an image row: one image sees one point. Rays of an image are contiguous, so their contribution to the image is
-one matrix product per chunk. The same holds for pairs of rays that see a free point from the same two images, which
+one matrix product per chunk. The same applies to pairs of rays that see a free point from the same two images, which
 contribute to the block of these images in the reduced normal matrix. Images are numbered by reverse Cuthill-McKee,
 which makes that matrix banded. If all points are fixed there are no pairs, and the matrix is an arrow: block-diagonal
 images with a border of shared unknowns.

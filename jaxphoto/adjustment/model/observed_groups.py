@@ -78,8 +78,8 @@ class ObservedGroup(eqx.Module):
     point: Int[np.ndarray, "j rows"]
     parameter: Int[np.ndarray, "p *_"]
     """Indices of the parameters that a row touches in the vector of shared parameters; its length if there is none. The
-    parameters of each image come first, table by table, then those of the other arguments. (p, rows), or by point
-    (p, rows, points).
+    parameters of each image come first, table by table, then the parameters of the other arguments. (p, rows), or by
+    point (p, rows, points).
     """
     place: tuple[int, ...] = eqx.field(static=True)
     """Indices of the parameters that are unknown in at least one row."""

@@ -32,7 +32,7 @@ class ParameterTable(eqx.Module):
     units: tuple[str, ...] = eqx.field(static=True)
     """Unit suffix of each parameter name; "" if it has none."""
     of_images: bool = eqx.field(static=True)
-    """True if any image has such parameters."""
+    """True if the parameters belong to images."""
     of_image: Int[np.ndarray, "images"]
     """Owner of each image; the number of owners if it has none."""
 
@@ -167,7 +167,7 @@ def _checked(entry: SharedParameter) -> SharedParameter:
 
 
 def _components(prior: object, n: int) -> list[object]:
-    """Return one prior for each of `n` numbers."""
+    """Return one prior for each of `n` scalars."""
     if not isinstance(prior, Weighted):
         return [prior] * n
     traced = is_traced((prior.value, prior.sigma))

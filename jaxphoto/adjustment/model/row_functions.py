@@ -241,7 +241,7 @@ def reduced_places(g: ObservedGroup, n_images: int) -> Int[Array, "z rows"]:
 def non_image_residuals(
     increments: Increments, scale: Increments, values: AbstractValues, structure: AbstractStructure
 ) -> NonImageResiduals:
-    """Evaluate all residuals except those of image rows."""
+    """Evaluate all residuals except image rows."""
     others = tuple(
         group_residuals(g, numbers, increments, scale, values, structure)
         for g, numbers in zip(structure.observed, values.groups, strict=True)

@@ -58,7 +58,7 @@ class AbstractStructure(eqx.Module):
 
     groups: tuple[CameraGroup, ...]
     tables: tuple[ParameterTable, ...]
-    """Declared parameters, in their order after those of the cameras."""
+    """Declared parameters, in their order after the camera parameters."""
     n_images: int = eqx.field(static=True)
     n_points: int = eqx.field(static=True)
     corrections: Corrections = eqx.field(static=True)

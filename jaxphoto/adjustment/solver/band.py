@@ -129,7 +129,7 @@ def selected_inverse(factor: BandFactor) -> SelectedInverse:
 
 
 def invert_band(factor: BandFactor) -> Float[Array, "unknowns unknowns"]:
-    """Return the full A^-1, symmetric, images first; 2 n^2 m operations in addition to those of `selected_inverse`."""
+    """Return the full A^-1, symmetric, images first; 2 n^2 m operations in addition to `selected_inverse`."""
     inside, gains = _invert_inside(factor)
     inner, _, m = inside.columns.shape
     if not inner:

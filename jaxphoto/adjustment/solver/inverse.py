@@ -216,7 +216,7 @@ def _of_group(full: Array, rows: RowsOfPoints, seen: _Propagated, reduced: Reduc
 def _without_open_motions(q: Cofactors, at: Linearised, factored: FactoredNormal) -> Cofactors:
     """Subtract E E': the component of the cofactors along the motions that the datum constraints D fix.
 
-    E = (N + D'D)^-1 D' spans those motions exactly, because they are in the null space of N. If all motions are open,
+    E = (N + D'D)^-1 D' spans these motions exactly, because they are in the null space of N. If all motions are open,
     they are known in advance.
     """
     defect = len(at.values.datum_eop)

@@ -201,12 +201,12 @@ class SolverState(NamedTuple):
     """Fields of an `IterationHistory`, one step per row."""
 
 
-# Initial damping, relative to the diagonal of the normal matrix: close to zero. A rejected step v raises it to at least
-# v'N v / v' diag(N) v, the stiffness along v, which about halves the step, and then by factors of 2, 4, 8, ... (Nielsen
-# 1999).
+# Initial damping, relative to the diagonal of the normal matrix, and its initial growth factor. The damping starts
+# close to zero. A rejected step v raises it to at least v'N v / v' diag(N) v, the stiffness along v, which about halves
+# the step, and then by factors of 2, 4, 8, ... (Nielsen 1999).
 _FIRST_DAMPING, _GROWTH = 1e-8, 2.0
-# Ratio of actual to predicted reduction above which a step is accepted. Minimum factor by which damping decreases with
-# that ratio (Nielsen's rule).
+# Ratio of actual to predicted reduction above which a step is accepted. Minimum factor of the damping after an accepted
+# step; it decreases with that ratio (Nielsen's rule).
 _ACCEPT, _LEAST_FACTOR = 0.001, 0.2
 # Ratio of actual to predicted reduction below which a step is curved; ratio above which a curve is not shortened
 # further; minimum fraction t.
@@ -416,7 +416,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         less = jnp.where(near, (1 - h) * p.gradient - h * held * weight * p.step, 0.0)
         system, x, b = jax.lax.cond(
             fresh | near,
-            # For rows with losses, the residuals in the normal equations differ from those of the cost.
+            # For rows with losses, the residuals in the normal equations differ from the residuals of the cost.
             lambda: self._solved(
                 self._at(y, loose), damping, None if s.has_losses else rows, less, chord, state.system
             ),

@@ -159,7 +159,7 @@ def _typical_of_camera(
     interior_at: Callable[[Array], InteriorOrientation], at: Float[Array, "n"], sigma: Array, corner: Float[Array, "2"]
 ) -> Float[Array, "n"]:
     """Return the change of each camera parameter that moves the image of a point by `sigma` (mm); 1 if none does."""
-    # Use a point near the axis and measured coordinates in the corner: c moves the first, coefficients move the second.
+    # Use a point near the axis (moved by c), and measured coordinates in the corner (moved by the coefficients).
     aim, centre = jnp.array([0.1, 0.1, -1.0]), ExteriorOrientation(jnp.zeros(3), jnp.eye(3))
     by_number = jax.jacfwd(lambda p: image_residual(interior_at(p), centre, aim, corner))(at)
     typical = sigma / jnp.maximum(jnp.max(jnp.abs(by_number), axis=0), 1e-30)

@@ -273,7 +273,7 @@ class ProductSums(NamedTuple):
 
     @classmethod
     def of(cls, border: Float[Array, "points d c"], s: PaddedStructure, k: int) -> "ProductSums":
-        """Return initial sums, including those of the border."""
+        """Return initial sums, including the products of the border."""
         places, n, e, size = border_places(s, k), s.n_images, 6 + image_places(s, k).shape[1], s.n_shared + k + 2
         width, inner = n // s.rays.columns, s.rays.columns - 1
         band = jnp.zeros((inner, 2 * width, 6, width, 6)), jnp.zeros((width, 6, width, 6))
