@@ -32,7 +32,7 @@ EFFICIENCY = 0.95
 
 
 class AbstractLoss(eqx.Module):
-    """Loss of the rows of a group. All fields are values: another value requires no compilation."""
+    """Loss of the rows of a group. All fields are values: a change of them requires no recompilation."""
 
     name: eqx.AbstractClassVar[str]
     threshold: Float[ArrayLike, ""] | float | None = None

@@ -228,7 +228,7 @@ _WHOLE: dict[str, Callable[[Unknowns], Any]] = {
     "rotation": lambda u: u.exterior.camera_from_object,
     "points": lambda u: u.points,
 }
-# Parameters of the interior orientation by their Python names.
+# Names of the interior orientation in tables, by their Python names.
 _FIELDS = {"c": "c_mm", "x_p": "xp_mm", "y_p": "yp_mm"}
 
 

@@ -1,7 +1,7 @@
 """Execution of compiled functions, with separate compile and run times; compiled at most once per process.
 
-Tracing and lowering block Python's global lock; compiling does not. Programs that are needed soon (`prepare`) are
-compiled on another core meanwhile.
+Tracing and lowering require Python's global interpreter lock; compiling releases it. Programs that are needed soon
+(`prepare`) are compiled on another core meanwhile.
 """
 
 import contextlib

@@ -83,7 +83,7 @@ def load(key: str) -> Stored | None:
 
 
 def save(key: str, program: Stored) -> None:
-    """Store a program if possible; programs with callbacks to Python and a full disk are skipped."""
+    """Store a program if possible; skip programs with callbacks to Python, and ignore a full disk."""
     folder = _folder()
     if folder is None:
         return
