@@ -1,6 +1,6 @@
 """jaxphoto: differentiable photogrammetry on JAX.
 
-Importing it switches JAX to float64 (docs/statistics.md) and, unless you chose otherwise, keeps compiled code in a
+Importing it switches JAX to float64 (docs/statistics.md) and, unless configured otherwise, enables JAX's compilation
 cache on disk.
 """
 
@@ -20,9 +20,9 @@ jax.config.update("jax_enable_x64", True)
 # One JAX device per core: large blocks are sharded over them (docs/solver.md).
 _chosen = "host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
 if jax.config.values["jax_num_cpu_devices"] <= 0 and not _chosen:
-    # Too late if JAX has already computed: its devices then stay as they are.
+    # If JAX is already initialised, its number of devices cannot be changed.
     with contextlib.suppress(RuntimeError):
-        # Those that this process may use, where the system says it (macOS and Windows do not).
+        # Cores available to this process, where the system reports them (macOS and Windows do not).
         _cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         jax.config.update("jax_num_cpu_devices", _cores)
 if jax.config.values["jax_compilation_cache_dir"] is None:
@@ -109,8 +109,8 @@ __all__ = [
     "write_block", "write_simulation",
 ]  # fmt: skip
 
-# Imported at first use: files and tables need pandas, a third of a second. Names by package, as imported above for
-# type checkers.
+# Imported at first use: files and tables require pandas, which takes 0.3 s to import. Names by package, as imported
+# above for type checkers.
 _LATER = {
     "extras.formats": ("convert", "read_source"),
     "io": ("read_block", "read_recipe", "write_block", "write_simulation"),

@@ -1,6 +1,6 @@
 """Argument checks of functions of one image and one point: convert lists, detect a missing `jax.vmap`.
 
-Under `jit` they run while tracing only.
+Under `jit` they run only during tracing.
 """
 
 from typing import Any
@@ -14,9 +14,9 @@ from jaxphoto.errors import InputError
 
 
 def single(name: str, values: Any, *shape: int | None) -> Float[Array, "..."]:
-    """Convert `values` to an array of `shape`, in which None is any number.
+    """Convert `values` to an array of `shape`, in which None is any size.
 
-    Raises InputError for another shape, and for anything but numbers.
+    Raises InputError for another shape, and for values that are not numbers.
     """
     if not isinstance(values, jax.Array | np.ndarray):
         try:

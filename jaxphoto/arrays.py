@@ -1,4 +1,4 @@
-"""NumPy or JAX arrays: the former for concrete values, the latter when traced."""
+"""NumPy or JAX arrays: NumPy for concrete values, JAX for traced values."""
 
 import functools
 import operator
@@ -16,9 +16,9 @@ ArrayLike = jax.Array | np.ndarray
 
 
 def to_numpy(values) -> Any:
-    """Convert to NumPy, whose operations need no compilation; leave traced values unchanged.
+    """Convert to NumPy, whose operations need no compilation; return traced values unchanged.
 
-    Values sharded over several processes are gathered: each process has to call this.
+    Values sharded over several processes are gathered: each process must call this function.
     """
     if isinstance(values, jax.core.Tracer):
         return values
@@ -33,7 +33,7 @@ def from_list(values: Any) -> Any:
 
 
 def is_traced(tree: Any) -> bool:
-    """Return True if a JAX transformation traces any number of `tree`."""
+    """Return True if a JAX transformation traces any leaf of `tree`."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
@@ -58,7 +58,7 @@ def as_jax_array(values) -> jax.Array:
 
 
 def sum_terms(terms: Iterable[Any]) -> Any:
-    """Sum the terms. Python's `sum` starts with zero, one more operation of every program."""
+    """Sum the terms. Python's `sum` starts with zero, which adds an operation to every program."""
     return functools.reduce(operator.add, terms)
 
 
@@ -81,6 +81,6 @@ def annotated(hint: Any) -> tuple[list[str], bool] | None:
     kind = next((a for a in (*typing.get_args(hint), hint) if hasattr(a, "dim_str")), None)
     if kind is None:
         return None
-    # Axes of many objects, as in "3 *images", do not belong to one object.
+    # Skip axes of several objects, as in "3 *images": they do not belong to one object.
     axes = [axis for axis in kind.dim_str.split() if not axis.startswith("*")]
     return axes, not any("float" in name for name in kind.dtypes)

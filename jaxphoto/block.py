@@ -1,7 +1,7 @@
 """Block: observations as rows, with the images and points they refer to.
 
-Observations are rows (`jaxphoto.observations`): vertical control is rows with axis 2, so neither NaN nor infinite
-sigmas occur, and the redundancy is a count. Units are metres, radians and millimetres on the image.
+Observations are rows (`jaxphoto.observations`). Vertical control is rows with axis 2: neither NaN nor infinite sigmas
+occur, and the redundancy is a count. Units are metres, radians and millimetres on the image.
 """
 
 import dataclasses
@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 class Block(BlockEdits):
     """Block of images: ids, observations, start values and priors.
 
-    Index arrays refer to `images`, `points`, `strips` in their order. `jaxphoto.adjust` uses `start` and `priors`
-    unless given others. Check points never enter an adjustment.
+    Index arrays refer to `images`, `points`, `strips` in their order. `jaxphoto.adjust` uses `start` and `priors` if no
+    others are given. Check points never enter an adjustment.
     """
 
     title: str = eqx.field(static=True)
@@ -77,10 +77,10 @@ class Block(BlockEdits):
     middle_s: float = eqx.field(static=True, default=0.0)
     """Middle of the flight in the time scale of the files (s)."""
     temperatures: Temperatures | None = None
-    """Camera temperatures; None: unknown, and no camera changes with them."""
+    """Camera temperatures; None: unknown, and the cameras do not change with temperature."""
     partitions: dict[str, tuple[str, ...]] = eqx.field(static=True, default_factory=dict, converter=StaticDict)
-    """Owners of parameters that are neither cameras nor mounts nor strips: for each partition, the part of each image
-    ("" for none), such as intervals of time.
+    """Partitions: owners of parameters other than cameras, mounts and strips, such as intervals of time. For each
+    partition, the part of each image ("" for none).
     """
     converted_from: str = eqx.field(static=True, default="")
     """Format and file of another program from which it was converted; "" for none."""
@@ -113,7 +113,7 @@ class Block(BlockEdits):
         return {self.image_points.group: self.image_points, **named_rows(self.observations)}
 
     def with_observations(self, rows: Mapping[str, AbstractObservations]) -> "Block":
-        """Return a copy with other rows in place of some of `named_observations`."""
+        """Return a copy with some of `named_observations` replaced by other rows."""
         new = {id(old): rows[name] for name, old in self.named_observations.items() if name in rows}
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         changed: dict[str, Any] = {name: new[id(value)] for name, value in fields.items() if id(value) in new}
@@ -130,7 +130,7 @@ class Block(BlockEdits):
             "mount": self.image_mount,
             "strip": self.image_strip,
             "block": ("",) * len(self.images),
-            # A laser scanner belongs to the block, but not to an image.
+            # A laser scanner belongs to the block, not to an image.
             "lidar": ("none",) * len(self.images),
             "knot": ("none",) * len(self.images),
         } | self.partitions
@@ -225,9 +225,9 @@ def direct_exterior(rows: SensorRows) -> ExteriorOrientation:
 
 
 def mountings(block: Block, unknowns: Unknowns) -> tuple[Mount, StripBias]:
-    """Return mount and strip bias of every image, with a leading axis over the images; zeros if it has none.
+    """Return mount and strip bias of every image, with a leading axis over the images; zeros if an image has none.
 
-    The direction of the camera's x axis is part of `exposures`: a stack needs mounts of one kind.
+    The direction of the camera's x axis is part of `exposures`: stacking requires mounts of one class.
     """
     none = jnp.zeros(3)
     mounts = {name: Mount(m.lever_arm, m.boresight, m.time_offset) for name, m in unknowns.mounts.items()}
@@ -247,7 +247,7 @@ def _by_name(table: dict, names: tuple[str, ...], absent):
 def bent_cameras(block: Block, unknowns: Unknowns) -> dict[str, InteriorOrientation] | None:
     """Return the interior orientations at all exposures, by camera (with a leading axis over its images).
 
-    None if nothing modifies them: no rolling shutter, no change of a camera during the flight.
+    None if no camera changes: no rolling shutter, no drift during the flight.
     """
     bending = []
     for owners in unknowns.tables.values():
@@ -269,7 +269,7 @@ def bent_cameras(block: Block, unknowns: Unknowns) -> dict[str, InteriorOrientat
 
 
 def exposures(block: Block) -> Exposure:
-    """Return the properties of every exposure that are not observed, with a leading axis over the images."""
+    """Return the unobserved properties of every exposure, with a leading axis over the images."""
     none = np.zeros((len(block.images), 3))
     motion = block.motion if block.motion is not None else Motion(none, none)
     mounts = block.start.unknowns.mounts

@@ -1,4 +1,4 @@
-"""Edits of a block: priors, cameras, control, stations. Numbers may be traced by JAX; names may not."""
+"""Edits of a block: priors, cameras, control, stations. Values may be traced by JAX; names may not."""
 
 import dataclasses
 from collections.abc import Callable, Collection, Mapping
@@ -28,9 +28,9 @@ class BlockEdits(eqx.Module):
     def fix(self, *names: str, of: str | None = None) -> Self:
         """Return a copy with parameters fixed at their start values: `block.fix("k2")`.
 
-        Names are those of tables (`c_mm`, `k1`), fields of mounts and strips (`lever_arm`, `shift`), and `position`,
-        `rotation` (all images) and `points`. `of` names the camera, mount or strip; by default all that have the
-        parameter. Raises InputError for a parameter that the block does not have, and without a name.
+        Names are the names in tables (`c_mm`, `k1`), fields of mounts and strips (`lever_arm`, `shift`), and
+        `position`, `rotation` (all images) and `points`. `of` names the camera, mount or strip; by default all owners
+        of the parameter. Raises InputError for a parameter that the block does not have, and without a name.
         """
         return self._with_priors(names, lambda start: FIXED, of)
 
@@ -42,7 +42,7 @@ class BlockEdits(eqx.Module):
         """Return a copy with a parameter observed with `sigma`, in its own unit (mm, m, rad); names as in `fix`.
 
         The observed `value` defaults to the start value; for all positions, rotations or points it is required. Raises
-        InputError for a sigma that is not positive, and for values that are not numbers or have another shape.
+        InputError for a sigma that is not positive, and for values that are not numbers or have a different shape.
         """
         if value is None and name in ("position", "rotation", "points"):
             raise InputError(f"weigh({name!r}) needs a value with its sigma: its start value is not an observation")
@@ -57,11 +57,11 @@ class BlockEdits(eqx.Module):
         free: Collection[str] | None = None,
         sensor: Sensor | None = None,
     ) -> Self:
-        """Return a copy in which `camera` has another interior orientation, with its priors.
+        """Return a copy with a new interior orientation of `camera`, and its priors.
 
-        `free` names the estimated parameters; all others are FIXED. Without it, parameters keep the priors of the block
-        for their names, and new ones are FIXED. Raises InputError for a camera that the block does not have, and for a
-        parameter that `interior` does not have.
+        `free` names the estimated parameters; all others are FIXED. Without `free`, parameters retain the priors of the
+        block for their names, and new ones are FIXED. Raises InputError for a camera that the block does not have, and
+        for a parameter that `interior` does not have.
         """
         block: Any = self
         name, others = one_camera(block, camera), parameter_names(interior) if free is None else ()
@@ -70,10 +70,9 @@ class BlockEdits(eqx.Module):
         return changed if sensor is None else dataclasses.replace(changed, sensors={**block.sensors, name: sensor})
 
     def with_distortion(self, camera: str, distortion: AbstractDistortion, free: Collection[str] = ()) -> Self:
-        """Return a copy in which `camera` has another distortion: `block.with_distortion("kodak", Smac(), free=("k1",
-        "k2"))`.
+        """Return a copy with a new distortion of `camera`: `block.with_distortion("kodak", Smac(), free=("k1", "k2"))`.
 
-        `free` names the estimated coefficients; the others are FIXED, and c_mm, xp_mm and yp_mm keep their priors.
+        `free` names the estimated coefficients; the others are FIXED, and c_mm, xp_mm and yp_mm retain their priors.
         Raises InputError as `with_camera` does.
         """
         block: Any = self
@@ -87,8 +86,8 @@ class BlockEdits(eqx.Module):
     def shift_stations(self, shift: Any, per: str = "block") -> Self:
         """Return a copy with stations shifted by (X, Y, Z) in metres: `block.shift_stations([0, 0, 0.1])`.
 
-        With `per` ("strip", "image", "camera" or a partition) each owner has its own shift: rows in the order in which
-        `images` meets the owners, or a dictionary by their names.
+        With `per` ("strip", "image", "camera" or a partition) each owner has its own shift: rows in order of first
+        appearance of the owners in `images`, or a dictionary by owner name.
         """
         return shifted_stations(self, shift, per)
 
@@ -146,7 +145,7 @@ def with_interior(block: Any, camera: str, interior: InteriorOrientation, priors
 def priors_of_camera(
     interior: InteriorOrientation, known: InteriorOrientation, free: Collection[str], others: Collection[str]
 ) -> InteriorOrientation:
-    """Return priors of a camera: `free` are FREE, `others` keep their prior in `known`, the rest are FIXED.
+    """Return priors of a camera: `free` are FREE, `others` retain their prior in `known`, the rest are FIXED.
 
     Raises InputError for a parameter that the camera does not have.
     """

@@ -49,16 +49,16 @@ def block_fields(
 ) -> dict[str, Any]:
     """Return the fields of a block from `image_points` (image, point, x_mm, y_mm), `cameras`, and optional tables.
 
-    `sigma_mm` applies to image points without the columns sigma_x_mm, sigma_y_mm. `images` (image) sets their order,
-    and gives `camera`, required if there are several, `strip`, `time_s` and start values: X_m to Z_m and omega_deg to
-    kappa_deg. `control` (point, X_m to Z_m, NaN if unknown; sigma_X_m to sigma_Z_m; role control, fixed or check),
-    `stations` (image, X_m to Z_m and their sigmas), `attitudes` (image, roll_deg to yaw_deg, sigma_roll_deg to
-    sigma_yaw_deg) and `distances` (point_a, point_b, distance_m, sigma_m) are observations; sigma_m or sigma_deg
-    applies to all three. `points` (point, X_m to Z_m) are approximate values, `mounts` by camera, `free` the parameters
-    that every camera estimates. `adjust` computes missing approximate values. `datum` is minimal if only images and
-    distances are given.
+    `sigma_mm` applies to image points without the columns sigma_x_mm, sigma_y_mm. `images` (image) sets the order of
+    the images. Its other columns are `camera`, required if there are several, `strip`, `time_s` and start values: X_m
+    to Z_m and omega_deg to kappa_deg. Observations are `control` (point, X_m to Z_m, NaN if unknown; sigma_X_m to
+    sigma_Z_m; role control, fixed or check), `stations` (image, X_m to Z_m and their sigmas), `attitudes` (image,
+    roll_deg to yaw_deg, sigma_roll_deg to sigma_yaw_deg) and `distances` (point_a, point_b, distance_m, sigma_m); a
+    column sigma_m or sigma_deg applies to all three coordinates or angles. `points` (point, X_m to Z_m) are approximate
+    values, `mounts` is by camera, `free` are the parameters estimated for every camera. `adjust` computes missing
+    approximate values. `datum` is minimal if only images and distances are given.
 
-    Raises InputError for a missing or wrong column, name or number, BlockError if they do not form a block.
+    Raises InputError for a missing or invalid column, name or value, BlockError if they do not form a block.
     """
     if not cameras:
         raise InputError('cameras: there is none; give {"name": (Sensor(...), InteriorOrientation(...))}')
@@ -168,7 +168,7 @@ def _priors(unknowns: Unknowns, free: Sequence[str]) -> Unknowns:
 def _scalars(
     table: CheckedColumns, who: np.ndarray, observed: np.ndarray | None = None, kind: Any = ControlCoordinates
 ) -> tuple[Any, np.ndarray]:
-    """Return one row per coordinate, and the entry it belongs to; those not `observed` need no sigma."""
+    """Return one row per coordinate, and its entry in the table; entries not `observed` need no sigma."""
     value = table.numbers(*_XYZ, empty=True)
     there = ~np.isnan(value)
     needed = there if observed is None else there & observed[:, None]
@@ -178,7 +178,7 @@ def _scalars(
 
 
 def _start(ids: tuple[str, ...], near: CheckedColumns, *held: ControlCoordinates) -> tuple[np.ndarray, np.ndarray]:
-    """Return approximate coordinates of all points, control first, and which points have all three."""
+    """Return approximate coordinates of all points, control first, and a mask of points with all three coordinates."""
     start = np.full((len(ids), 3), np.nan)
     start[near.index("point", ids, "point {name} is measured in no image")] = near.numbers(*_XYZ)
     for rows in held:

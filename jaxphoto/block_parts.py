@@ -1,4 +1,4 @@
-"""Parts of a block besides observations: datum, sensor motion, frame, start values."""
+"""Parts of a block other than observations: datum, sensor motion, frame, start values."""
 
 import dataclasses
 from typing import Literal
@@ -18,11 +18,11 @@ from jaxphoto.unknowns import Unknowns
 @pretty_repr
 @dataclasses.dataclass(frozen=True)
 class Datum:
-    """Definition of position, orientation and scale where observations leave them open.
+    """Definition of position, orientation and scale where observations leave them undetermined.
 
-    `control`: they must not be open. `minimal`: the minimum number of point coordinates fixed at their start values.
-    `inner`: inner constraints over all points, all images or the named points (`over`); `scale` None means "constrain
-    the scale if it is open".
+    `control`: the observations must determine them. `minimal`: the minimum number of point coordinates fixed at their
+    start values. `inner`: inner constraints over all points, all images or the named points (`over`); `scale` None
+    means "constrain the scale if it is open".
     """
 
     kind: Literal["control", "minimal", "inner"] = "control"
@@ -47,11 +47,11 @@ class Temperatures(eqx.Module):
     celsius: Float[ArrayLike, "images"]
     """NaN if unknown: the reference temperature is assumed."""
     reference_c: float = eqx.field(static=True)
-    """Temperature at which the interior orientation holds."""
+    """Temperature to which the interior orientation refers."""
 
     @property
     def above(self) -> Float[ArrayLike, "images"]:
-        """Kelvins above the reference."""
+        """Temperature difference from the reference (K)."""
         return jnp.where(jnp.isnan(self.celsius), 0.0, self.celsius - self.reference_c)
 
 
@@ -82,7 +82,7 @@ class Frame:
 
 @pretty_repr
 class Start(eqx.Module):
-    """Approximate unknowns, and the images and points for which they are known.
+    """Approximate unknowns, and masks of images and points with known values.
 
     Arrays of unknown images and points are zero (identity rotations) until approximations are computed.
     """

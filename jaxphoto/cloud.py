@@ -15,11 +15,11 @@ OF_POINTS = ("xyz", "classification", "returns", "time", "strip", "withheld")
 
 @pretty_repr
 class Cloud(eqx.Module):
-    """Laser points in one Cartesian frame (m): that of the block they were read for, or that of their file.
+    """Laser points in one Cartesian frame (m): the frame of the block they were read for, or of their file.
 
-    Missing fields are None. `time` (s) is that of the file; `strip` is the index, in `strips`, of the flight line of a
-    point (LAS: point source ID). `returns` are return number and number of returns of the pulse. `withheld` marks
-    points that the file excludes: only `rewrite_cloud` handles them.
+    Missing fields are None. `time` (s) is the time in the file; `strip` is the index, in `strips`, of the flight line
+    of a point (LAS: point source ID). `returns` are return number and number of returns of the pulse. `withheld` marks
+    points that the file excludes: only `rewrite_cloud` processes them.
     """
 
     xyz: Float[np.ndarray, "n 3"]
@@ -39,7 +39,7 @@ class Cloud(eqx.Module):
         return dataclasses.replace(self, **kept)
 
     def numbered(self, names: Sequence[str]) -> "Cloud":
-        """Renumber strips as in `names`; others follow after these."""
+        """Renumber strips as in `names`; other strips follow after these."""
         if self.strip is None:
             return self
         order = (*names, *(name for name in self.strips if name not in names))
@@ -48,7 +48,7 @@ class Cloud(eqx.Module):
 
     @staticmethod
     def joined(parts: Sequence["Cloud"]) -> "Cloud":
-        """Concatenate parts of one cloud; the strips of the last apply to all."""
+        """Concatenate parts of one cloud; the strip list of the last part applies to all."""
         columns = {}
         for name in OF_POINTS:
             values = [getattr(part, name) for part in parts]

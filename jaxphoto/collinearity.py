@@ -21,9 +21,10 @@ from jaxphoto.linear_algebra import solve
 from jaxphoto.rotation import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix, rotate
 from jaxphoto.short_repr import pretty_repr
 
-# Eager, every operation would be compiled separately; inside another program these functions are inlined.
+# Without jit every operation would be compiled separately. Inside another jitted function these are inlined.
 _compiled = functools.partial(jax.jit, inline=True)
-# Iterations for the row of a rolling shutter that sees a point: each reduces the error to a hundredth or less.
+# Number of iterations to find the row of a rolling shutter that sees a point: each reduces the error to a hundredth or
+# less.
 _ROWS = 10
 
 
@@ -73,9 +74,10 @@ def project_ideal(
 
 
 def in_field(interior: InteriorOrientation, exterior: ExteriorOrientation, point: Float[Array, "3"]) -> Bool[Array, ""]:
-    """Return True if a point (m) has an image, in any format.
+    """Return True if a point (m) has an image; the image format is not checked.
 
-    Its direction must have an image (a perspective camera needs it in front), and the distortion be invertible there.
+    Its direction must have an image (a perspective camera requires the point in front), and the distortion must be
+    invertible there.
     """
     u, v, w = camera_coordinates(exterior, point)
     return interior.projection.sees(u, v, w) & interior.invertible(interior.ideal_from_direction(u, v, w))
@@ -86,8 +88,8 @@ def project(
 ) -> Float[Array, "2"]:
     """Return the measured image coordinate (mm, from the image centre) of an object point (m).
 
-    For a rolling shutter, that of the row exposed when it sees the point, by iteration. Meaningless if the point is not
-    `in_field`.
+    For a rolling shutter, the coordinate in the row exposed when it sees the point, by iteration. Meaningless if the
+    point is not `in_field`.
     """
     return _project(interior, _single(exterior), single("point", point, 3))
 
@@ -122,12 +124,12 @@ def image_residual(
     point: Float[Array, "3"],
     xy: Float[Array, "2"],
 ) -> Float[Array, "2"]:
-    """Return observed minus computed image coordinate, in mm, in the domain where the distortion has a closed form.
+    """Return observed minus computed image coordinate (mm), in the image in which the distortion has a closed form.
 
     `ideal(measured) - projection` for models in the measured coordinate; `measured - distorted projection` for models
     in the ideal one. If `interior.residuals` is "measured", the former is transformed to the measured image by the
-    derivative of the distortion at the measured coordinate. With a rolling shutter the camera is where it was when the
-    row of the measured coordinate was exposed (`camera.rolling_shutter`).
+    derivative of the distortion at the measured coordinate. With a rolling shutter, the camera pose is the pose at
+    which the row of the measured coordinate was exposed (`camera.rolling_shutter`).
     """
     return camera_residual(interior, camera_coordinates(exterior, point), xy)
 
@@ -136,7 +138,7 @@ def camera_residual(
     interior: InteriorOrientation, in_camera: Float[Array, "3"] | tuple[Array, Array, Array], xy: Float[Array, "2"]
 ) -> Float[Array, "2"]:
     """Return `image_residual` of a point in the camera frame (m; see `camera_coordinates`)."""
-    # By component: intermediate arrays of two numbers cost an adjustment a tenth of its time.
+    # Compute by component: intermediate arrays of length two would cost 10 % of an adjustment's time.
     u, v, w = in_camera
     if interior.rows is not None:
         u, v, w = interior.rows.at_row(xy[1], (u, v, w))
@@ -163,12 +165,12 @@ def intersect(
 ) -> Float[Array, "3"]:
     """Intersect rays: the point (m) closest to all of them, `sum w (I - d d') (X - origin) = 0`.
 
-    `directions` are unit vectors; rays of weight zero do not count. Parallel rays give NaN or a distant point.
+    `directions` are unit vectors; rays of weight zero are ignored. Parallel rays give NaN or a distant point.
     """
     origins, directions = single("origins", origins, None, 3), single("directions", directions, len(origins), 3)
     w = jnp.ones(len(origins)) if weights is None else single("weights", weights, len(origins))
     across = w[:, None, None] * (jnp.eye(3) - directions[:, :, None] * directions[:, None, :])
-    # Relative to the first origin, so that large coordinates lose no digits.
+    # Relative to the first origin: large coordinates lose no digits.
     b = jnp.einsum("nij,nj->i", across, origins - origins[0])
     return origins[0] + solve(jnp.sum(across, 0), b)
 

@@ -19,10 +19,10 @@ class TableLike(Protocol):
 
 
 class CheckedColumns:
-    """Columns of a table, called `name` in messages."""
+    """Checked columns of a table in memory; `name` appears in messages."""
 
     def __init__(self, name: str, columns: TableLike | None, *bare: str) -> None:
-        """None stands for an empty table with the columns `bare`."""
+        """Create from a table; None is an empty table with the columns `bare`."""
         self.name = name
         given: TableLike = dict.fromkeys(bare, ()) if columns is None else columns
         self.columns = {str(key): np.asarray(given[key]) for key in given}
@@ -40,7 +40,7 @@ class CheckedColumns:
         return InputError(f"{self.name}, entry {entry}: {message}")
 
     def ids(self, column: str) -> list[str]:
-        """Return names; numbers as they are written."""
+        """Return names as text; numbers in their written form."""
         return [str(v) for v in self._column(column).tolist()]
 
     def numbers(self, *columns: str, empty: bool = False) -> Float[np.ndarray, "n k"]:
@@ -57,7 +57,7 @@ class CheckedColumns:
     def sigmas(
         self, columns: Sequence[str], of_all: str, default: float | None = None, needed: np.ndarray | None = None
     ) -> Float[np.ndarray, "n k"]:
-        """Return positive standard deviations: one column each, or one column or number for all.
+        """Return positive standard deviations: one column each, or one column or value for all.
 
         Not required where `needed` (n, k) is false: zero there.
         """
@@ -80,8 +80,8 @@ class CheckedColumns:
         return self.find(self.ids(column), known, message)
 
     def find(self, names: Sequence[str], known: Sequence[str], message: str) -> Int[np.ndarray, "n"]:
-        """Return the index of each of `names` in `known`. Raises InputError with `message` of {name} for an unknown
-        name.
+        """Return the index of each of `names` in `known`. Raises InputError for an unknown name; `message` is a
+        template with {name}.
         """
         places = {name: k for k, name in enumerate(known)}
         for entry, name in enumerate(names):

@@ -1,16 +1,17 @@
-"""Errors caused by input, each one sentence with the place and the cure.
+"""Errors caused by input: one sentence each, with the location and the cure.
 
-Every message says what is wrong, where (file, row, id or unknown), and what to do. A solution that fails is not an
-error but an outcome of the result (see `jaxphoto.adjustment.result.Outcome`).
+Every message specifies the problem, the location (file, row, id or unknown), and the cure. A solution that fails is not
+an error but an outcome of the result (see `jaxphoto.adjustment.result.Outcome`).
 """
 
 import re
 import reprlib
 from collections.abc import Iterable, Sequence
 
-# Longer messages are cut in the middle: the place is at the start, the cure at the end.
+# Maximum length of a message in characters. Longer messages are cut in the middle: the location is at the start, the
+# cure at the end.
 _BEGINNING, _END = 900, 500
-# Limits of one word (a path may be this long), and of a quoted value.
+# Maximum lengths of one word (a path may be this long), and of a quoted value, in characters.
 _WORD = re.compile(r"\S{400,}")
 _QUOTED = 100
 
@@ -41,7 +42,7 @@ class JaxphotoError(ValueError):
 
 
 class InputError(JaxphotoError):
-    """File, row or number that cannot be read."""
+    """File, row or value that cannot be read."""
 
 
 class RowError(InputError):
@@ -60,7 +61,7 @@ class BlockError(JaxphotoError):
 
 
 class GroupsError(BlockError):
-    """Images in `groups` (of names) that cannot be oriented relative to one another, although matches join them."""
+    """Images in `groups` (of names) that cannot be oriented relative to each other, although matches connect them."""
 
     def __init__(self, message: str, groups: Iterable[Iterable[str]]):
         super().__init__(message)
@@ -74,7 +75,7 @@ class DatumError(JaxphotoError):
 class RankError(JaxphotoError):
     """Unknowns that the observations cannot separate, although the datum is determined.
 
-    `points` are the indices of object points if they alone are the cause: rays that do not determine them.
+    `points` are the indices of object points if the cause is only that their rays do not determine them.
     """
 
     def __init__(self, message: str = "", points: Sequence[int] = ()):
@@ -83,7 +84,7 @@ class RankError(JaxphotoError):
 
 
 def few(names: Sequence[str], joint: str = ", ") -> str:
-    """Return the first three names, and the number of others."""
+    """Format the first three names, and the number of others."""
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return joint.join(names[:_NAMED]) + more
 
@@ -97,7 +98,7 @@ def counted(number: int, thing: str) -> str:
 
 
 def camera_words(name: str) -> str:
-    """Return the name of a camera for a sentence; "the camera" if it is called just that."""
+    """Return the name of a camera for a sentence; "the camera" if its name is "camera"."""
     return "the camera" if name == "camera" else f"camera {name}"
 
 

@@ -1,10 +1,10 @@
-"""Levenberg-Marquardt for small least-squares problems, one or many side by side under `jax.vmap`.
+"""Levenberg-Marquardt for small least-squares problems, one or many together under `jax.vmap`.
 
     r'r -> min,    (N + lambda diag N) step = -J'r,    N = J'J
 
-The iteration is that of optimistix. The solver is a small one because `optimistix.LevenbergMarquardt` damps all
-unknowns alike, whatever their units, and calls LAPACK for many problems at once, which may deadlock
-(`jaxphoto.linear_algebra`). An adjustment of a block has its own solver, `jaxphoto.adjustment.solver`.
+optimistix runs the iteration, with the solver of this module. `optimistix.LevenbergMarquardt` is not used: it damps all
+unknowns equally, whatever their units, and calls LAPACK for many problems at once, which may deadlock
+(`jaxphoto.linear_algebra`). The adjustment of a block has its own solver, `jaxphoto.adjustment.solver`.
 """
 
 from collections.abc import Callable
@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-# Relative change of r'r that is rounding, and the least lambda: with less, the rounding errors of a step in a direction
-# that the residuals hardly see would be large.
+# Relative change of r'r below which it is a rounding error, and minimum lambda: with a smaller one, the rounding errors
+# of a step in a weakly determined direction would be large.
 _ROUNDING, _LEAST_DAMPING = 1e-13, 1e-12
 
 
@@ -80,7 +80,7 @@ class _LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
 
 def _solve(a: Float[Array, "n n"], b: Float[Array, "n"]) -> Float[Array, "n"]:
-    """Solve a positive definite system by elimination; of a few unknowns, many side by side."""
+    """Solve a positive definite system of a few unknowns by elimination, without LAPACK under `jax.vmap`."""
     rows = jnp.column_stack([a, b])
 
     def eliminate(k, rows):
@@ -102,8 +102,8 @@ def least_squares(
 ) -> Fit:
     """Minimise the sum of squares of `residuals(unknowns, data)` from `start`.
 
-    `damping` is the first lambda. The iteration ends with a step that changes the residuals by less than `rtol` of
-    their norm or by `atol`, and after `max_steps`, not converged.
+    `damping` is the initial lambda. The iteration converges if a step changes the residuals by less than `rtol` of
+    their norm or by `atol`; otherwise it ends after `max_steps`, not converged.
     """
     solver: Any = _LevenbergMarquardt(rtol, atol, optx.two_norm, damping)
     solution: Any = optx.least_squares(residuals, solver, start, data, max_steps=max_steps, throw=False)

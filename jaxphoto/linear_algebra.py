@@ -11,17 +11,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-# Systems up to this size are eliminated without LAPACK if there are many.
+# Maximum size of systems that are eliminated without LAPACK if there are many.
 _SMALL = 7
 
 
 def one_at_a_time(function: Callable) -> Callable:
-    """Make `jax.vmap` of `function` a loop. The caller provides derivatives."""
+    """Evaluate `function` in a loop under `jax.vmap`. The caller provides derivatives."""
     return jax.custom_batching.sequential_vmap(function)
 
 
 def _solver(function: Callable, small: Callable | None = None) -> Callable:
-    """Return `function(matrix, right)` with a batching rule; `small` solves many small matrices side by side."""
+    """Return `function(matrix, right)` with a batching rule; `small` solves many small systems without LAPACK."""
     solve = jax.custom_batching.custom_vmap(function)
 
     @solve.def_vmap
@@ -41,7 +41,7 @@ def _solver(function: Callable, small: Callable | None = None) -> Callable:
 
 
 def _eliminated(a: Float[Array, "n n"], b: Float[Array, "n c"]) -> Float[Array, "n c"]:
-    """Unrolled Gauss-Jordan elimination with partial pivoting."""
+    """Solve by unrolled Gauss-Jordan elimination with partial pivoting."""
     n = len(a)
     rows, at = jnp.concatenate([a, b], axis=1), jnp.arange(n)[:, None]
     for k in range(n):
@@ -55,7 +55,7 @@ def _eliminated(a: Float[Array, "n n"], b: Float[Array, "n c"]) -> Float[Array, 
 
 _lu = _solver(jnp.linalg.solve, _eliminated)
 _lu_transposed = _solver(lambda a, b: jnp.linalg.solve(a.T, b), lambda a, b: _eliminated(a.T, b))
-# LAPACK stores by column: the transpose of a JAX array needs no copy. So solve x' L' = b' and x' L = b'.
+# LAPACK stores by column: the transpose of a JAX array needs no copy. Therefore solve x' L' = b' and x' L = b'.
 _down = _solver(lambda lower, b: jax.lax.linalg.triangular_solve(lower.T, b.T, left_side=False, lower=False).T)
 _up = _solver(
     lambda lower, b: jax.lax.linalg.triangular_solve(lower.T, b.T, left_side=False, lower=False, transpose_a=True).T
@@ -78,7 +78,7 @@ def inverse(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def unit_like(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Return the unit matrix, varying over the devices of a mesh like `a`, as a right-hand side must."""
+    """Return the unit matrix, sharded over the devices of a mesh like `a`, as required of a right-hand side."""
     unit = jnp.eye(len(a))
     return jnp.where(a == a, unit, unit)
 
@@ -101,7 +101,7 @@ def solve_lower_right(lower: Float[Array, "n n"], b: Float[Array, "c n"]) -> Flo
 def solve_tridiagonal(
     lower: Float[Array, "n"], diagonal: Float[Array, "n"], upper: Float[Array, "n"], b: Float[Array, "n c"]
 ) -> Float[Array, "n c"]:
-    """Solve A x = b for A with the diagonals `lower` (from its second number on), `diagonal` and `upper`."""
+    """Solve A x = b for A with the diagonals `lower` (from its second element on), `diagonal` and `upper`."""
     bands = jnp.stack([lower, diagonal, upper])
 
     def product(x):
@@ -119,7 +119,7 @@ def cholesky(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 @cholesky.defjvp
 def _cholesky_jvp(primals, tangents):
-    """dL = L Phi(L^-1 dA L'^-1), with Phi the lower triangle and half the diagonal."""
+    """Differentiate: dL = L Phi(L^-1 dA L'^-1), with Phi the lower triangle and half the diagonal."""
     (a,), (change,) = primals, tangents
     lower = cholesky(a)
     change = jnp.tril(change) + jnp.tril(change, -1).T
@@ -136,7 +136,7 @@ def eigh(a: Float[Array, "n n"]) -> tuple[Float[Array, "n"], Float[Array, "n n"]
 
 @eigh.defjvp
 def _eigh_jvp(primals, tangents):
-    """dw = diag(V' dA V), dV = V (F * V' dA V) with F[i, j] = 1 / (w[j] - w[i])."""
+    """Differentiate: dw = diag(V' dA V), dV = V (F * V' dA V) with F[i, j] = 1 / (w[j] - w[i])."""
     w, v = eigh(*primals)
     change = v.T @ (0.5 * (tangents[0] + tangents[0].T)) @ v
     apart = w - w[:, None] + jnp.eye(len(w))
@@ -144,7 +144,7 @@ def _eigh_jvp(primals, tangents):
 
 
 def _linear(product: Callable, b: Array, solve: Callable, transposed: Callable) -> Array:
-    """Solve product(x) = b, differentiable in everything that the product depends on and in b."""
+    """Solve product(x) = b, differentiable with respect to b and all inputs of the product."""
     return jax.lax.custom_linear_solve(product, b, lambda _, b: solve(b), lambda _, b: transposed(b))
 
 

@@ -1,12 +1,12 @@
-"""Robust loss functions: large residuals of a row count less than their squares.
+"""Robust loss functions: large residuals of a row have less influence than their squares.
 
-With v the whitened residual of a row (k numbers: an image point has two) and u = v'v / (s k0)^2 for a scale s and a
-constant k0, the cost of a row is v'v gain(u) in place of v'v. It is implemented as the residual v sqrt(gain(u)), whose
-square it is: derivatives of any order stay exact, and one solver serves all losses. The weight of the row is the
-derivative of its cost by v'v.
+With v the whitened residual of a row (k components: an image point has two) and u = v'v / (s k0)^2 for a scale s and a
+constant k0, the cost of a row is v'v gain(u) instead of v'v. It is implemented as the residual v sqrt(gain(u)), whose
+square is the cost: derivatives of any order are exact, and one solver supports all losses. The weight of the row is the
+derivative of its cost with respect to v'v.
 
 k0 is chosen for 95 % efficiency: estimates from normal errors have standard deviations as if 5 % of the observations
-were missing. For single numbers these are the constants of textbooks (Huber 1.345, Tukey 4.685).
+were missing. For scalar rows these are the constants of textbooks (Huber 1.345, Tukey 4.685).
 
 Sources: Huber (1981), Robust statistics; Beaton and Tukey (1974), Technometrics 16; Geman and McClure (1987), Bulletin
 of the ISI 52; Lange, Little and Taylor (1989), Robust statistical modeling using the t distribution, JASA 84.
@@ -32,20 +32,20 @@ EFFICIENCY = 0.95
 
 
 class AbstractLoss(eqx.Module):
-    """Loss of the rows of a group. Numbers only: another value compiles nothing."""
+    """Loss of the rows of a group. All fields are values: a change of them requires no recompilation."""
 
     name: eqx.AbstractClassVar[str]
     threshold: Float[ArrayLike, ""] | float | None = None
-    """k0, in standard deviations, from which rows count less. None: by `EFFICIENCY`."""
+    """k0, in standard deviations, beyond which rows have less weight. None: derived from `EFFICIENCY`."""
     scale: Float[ArrayLike, ""] | float = 1.0
-    """s: standard deviation of whitened residuals. Defines what is far; changes no row's sigma."""
+    """s: standard deviation of whitened residuals. Scales the threshold; the sigmas of rows are unchanged."""
 
     @abc.abstractmethod
     def gain(self, u: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the cost of a row over its square: 1 for u = 0, and smooth there."""
 
     def for_rows_of(self, numbers: int) -> Self:
-        """Return the loss with k0 for rows of this many numbers, as arrays."""
+        """Return the loss with k0 for rows of this number of components, as arrays."""
         k0 = _usual_threshold(type(self), numbers) if self.threshold is None else self.threshold
         return jax.tree.map(lambda v: np.asarray(v, float), dataclasses.replace(self, threshold=k0))
 
@@ -55,7 +55,7 @@ class AbstractLoss(eqx.Module):
         return tuple(x * root for x in v)
 
     def weights(self, square: Float[np.ndarray, "n"], numbers: int) -> Float[np.ndarray, "n"]:
-        """Return weights of rows with these numbers and v'v: 1 full, 0 none."""
+        """Return weights of rows with this number of components and v'v: 1 full, 0 none."""
         return np.asarray(call_compiled(_weights, self.for_rows_of(numbers), np.asarray(square, float)))
 
     def factor(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -65,12 +65,12 @@ class AbstractLoss(eqx.Module):
 
 
 class LinearisedLoss(eqx.Module):
-    """Linearisation of a loss for normal equations: J'r is half the gradient of the cost, J'J about half its second
-    derivative.
+    """Linearisation of a loss for normal equations: J'r is half the gradient of the cost, J'J approximately half its
+    second derivative.
 
-    The second derivative of a row by its whitened residual v is w across v, and w + 2 w' v'v along it, with w' the
-    derivative of the weight by v'v. The latter is zero or negative for large residuals: at least `_LEAST_SLOPE` w is
-    used.
+    The second derivative of a row with respect to its whitened residual v is w across v, and w + 2 w' v'v along it,
+    with w' the derivative of the weight with respect to v'v. The latter is zero or negative for large residuals: it is
+    limited to at least `_LEAST_SLOPE` w.
     """
 
     loss: AbstractLoss
@@ -89,12 +89,13 @@ class LinearisedLoss(eqx.Module):
         return tuple(root * (d + (along - 1) * both * x0 + x0 / along) for d, x0 in zip(step, at, strict=True))
 
 
-# Closer to zero, points with contradicting rays diverge; 1 (reweighting) takes twice as many steps.
+# Minimum second derivative along the residual, relative to the weight. Closer to zero, points with contradicting rays
+# diverge; 1 (reweighting) takes twice as many steps.
 _LEAST_SLOPE = 0.5
 
 
 class Huber(AbstractLoss):
-    """Squares within k0, distances beyond: one optimum, and every row keeps some influence."""
+    """Huber loss: squares up to k0, linear beyond: a unique optimum, and every row retains some influence."""
 
     name: ClassVar[str] = "huber"
 
@@ -105,7 +106,7 @@ class Huber(AbstractLoss):
 
 
 class Tukey(AbstractLoss):
-    """Biweight: rows beyond k0 have no influence."""
+    """Tukey biweight: rows beyond k0 have no influence."""
 
     name: ClassVar[str] = "tukey"
 
@@ -116,7 +117,7 @@ class Tukey(AbstractLoss):
 
 
 class GemanMcClure(AbstractLoss):
-    """The weight decreases with the fourth power of the distance."""
+    """Geman-McClure loss: the weight decreases with the fourth power of the residual."""
 
     name: ClassVar[str] = "geman_mcclure"
 
@@ -126,16 +127,17 @@ class GemanMcClure(AbstractLoss):
 
 
 class StudentT(AbstractLoss):
-    """-2 log of Student's density of `scale` s and k0^2 degrees of freedom, multivariate for rows of several numbers.
+    """Student's t: -2 log of the density of `scale` s and k0^2 degrees of freedom, multivariate for rows of several
+    components.
 
-    Up to a factor, so that rows without residuals have the weight of their sigmas relative to other groups.
+    Scaled to a weight of 1 at zero residual: the sigmas of rows retain their meaning relative to other groups.
     """
 
     name: ClassVar[str] = "student_t"
 
     def gain(self, u: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return log(1 + u) / u."""
-        # For smaller u the quotient loses digits; the neglected terms of the series are smaller.
+        # For smaller u the quotient loses digits; the neglected terms of the series are below rounding errors.
         small = u < 1e-3
         far = jnp.where(small, 1.0, u)
         return jnp.where(small, 1 - u / 2 + u**2 / 3 - u**3 / 4 + u**4 / 5, jnp.log1p(far) / far)
@@ -158,8 +160,8 @@ def _weights(loss: AbstractLoss, square: Array) -> Array:
 def _usual_threshold(kind: type[AbstractLoss], numbers: int) -> float:
     """Return k0 of efficiency `EFFICIENCY` for normal errors by bisection.
 
-    E[w q]^2 / (k E[w^2 q]), with q chi-square of k degrees of freedom. (E[w q] / k is the mean second derivative, by
-    Stein's lemma.)
+    The efficiency is E[w q]^2 / (k E[w^2 q]), with q chi-square of k degrees of freedom. (E[w q] / k is the mean second
+    derivative, by Stein's lemma.)
     """
     s = np.linspace(0.0, _FARTHEST, _NODES)
     density = s ** (numbers - 1) * np.exp(-(s**2) / 2)
@@ -177,5 +179,6 @@ def _usual_threshold(kind: type[AbstractLoss], numbers: int) -> float:
     return high
 
 
-# No normal row of few numbers lies farther out (standard deviations); limit of the integrals of `_usual_threshold`.
+# Maximum residual of a row with normal errors (standard deviations), the limit of the integrals of `_usual_threshold`,
+# and number of nodes.
 _FARTHEST, _NODES = 12.0, 2401

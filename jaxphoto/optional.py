@@ -10,11 +10,11 @@ EXTRAS = {
     "plotly": "report", "xarray": "report",
     "blackjax": "posterior",
 }  # fmt: skip
-"""The extra that installs each optional module."""
+"""Extra of jaxphoto that installs each optional module."""
 
 
 class MissingExtra(ModuleNotFoundError):
-    """An optional module that is not installed, and the line that installs it."""
+    """Optional module that is not installed, and the command that installs it."""
 
     def __init__(self, module: str):
         super().__init__(f"{module} is not installed: pip install 'jaxphoto[{EXTRAS[module]}]'", name=module)

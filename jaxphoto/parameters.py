@@ -1,8 +1,8 @@
-"""Declared parameters: unknowns that belong together and have one owner.
+"""Declared parameters: related unknowns with one owner.
 
 A file that adds an unknown defines one final subclass of `AbstractParameters`. It declares the owner, the name of each
-number (ending in its unit), and possibly the effect on an interior orientation or a station. Order, priors, scales,
-correlations, tables and files follow.
+scalar (ending in its unit), and optionally the effect on an interior orientation or a station. Order, priors, scales,
+correlations, tables and files are derived from it.
 """
 
 import dataclasses
@@ -19,29 +19,30 @@ from jaxphoto.short_repr import pretty_repr
 UNITS = (
     "m", "rad", "mm", "s", "ms", "m_per_s", "rad_per_s", "mm_per_s", "mm_per_h", "per_h", "mm_per_K", "per_K", "ppm",
 )  # fmt: skip
-"""Units that the names of declared parameters may end in; a typical scale is known of these, of `per_h` and
-`per_K` where cameras are bent."""
+"""Allowed unit suffixes of the names of declared parameters. Each has a typical scale, `per_h` and `per_K` only for
+parameters that modify cameras.
+"""
 Owner = Literal["image", "camera", "mount", "strip", "block"] | str
-"""Owner of parameters: each image, each camera and so on, or the whole block. Any other word is a partition of the
-images that the block names (`Block.partitions`), such as intervals of time.
+"""Owner of parameters: each image, each camera etc., or the whole block. Any other string is a partition of the images
+defined by the block (`Block.partitions`), such as intervals of time.
 """
 
 
 @pretty_repr
 class AbstractParameters(eqx.Module):
-    """Parameters of one owner; fields are numbers or vectors."""
+    """Parameters of one owner; fields are scalars or vectors."""
 
     kind: eqx.AbstractClassVar[str]
-    """Name of their table: the first word of their labels, as in `strips[a].shift_X_m`."""
+    """Name of their table: the first part of their labels, as in `strips[a].shift_X_m`."""
     owner: eqx.AbstractClassVar[str]
     names: eqx.AbstractClassVar[Mapping[str, tuple[str, ...]]]
-    """Name of every number of every field, ending in its unit: _m, _rad, _s, _ms, _mm, _m_per_s, _ppm ..."""
+    """Name of every scalar of every field, ending in its unit: _m, _rad, _s, _ms, _mm, _m_per_s, _ppm ..."""
     modifies_interior: ClassVar[tuple[str, ...]] = ()
     """Fields of the interior orientation that `interior` changes, such as ("c",); it is then evaluated for every image.
     """
     sized: ClassVar[str] = ""
-    """Field with the number of numbers in each other field, if that differs between blocks; `names` then has one name
-    for all of them, and `labels` has one each.
+    """Field that contains the size of the other fields, if it differs between blocks; `names` then has one name for all
+    scalars of a field, and `labels` has one each.
     """
 
     def __check_init__(self) -> None:
@@ -53,7 +54,9 @@ class AbstractParameters(eqx.Module):
         return interior
 
     def station(self, position: Any, exposure: Any) -> Any:
-        """Return what GNSS observes (m) for a sensor at `position`; overridden by subclasses that move stations."""
+        """Return the position (m) that GNSS observes for a sensor at `position`; overridden by subclasses that move
+        stations.
+        """
         return position
 
     def labels(self, owner: str) -> tuple[str, ...]:
@@ -68,7 +71,7 @@ def unit_of(name: str) -> str:
 
 
 def dynamic_fields(cls: type) -> list[str]:
-    """Return the fields of a module that hold numbers."""
+    """Return the fields of a module that contain values."""
     return [f.name for f in dataclasses.fields(cls) if not f.metadata.get("static", False)]
 
 
@@ -85,12 +88,12 @@ def leaves_in_order(tree: Any) -> Iterator[Any]:
 
 
 def numbers_of(parameters: AbstractParameters) -> list:
-    """Return all numbers of the fields, concatenated."""
+    """Return all scalars of the fields, concatenated."""
     return [v for leaf in leaves_in_order(parameters) for v in (leaf if np.ndim(leaf) else (leaf,))]
 
 
 def form_of(tree: Any) -> Hashable:
-    """Return parameters without their numbers, for `filled`; hashable."""
+    """Return parameters without their values, for `filled`; hashable."""
     if isinstance(tree, AbstractParameters):
         cls = type(tree)
         fields = tuple((name, form_of(getattr(tree, name))) for name in dynamic_fields(cls))
@@ -102,7 +105,7 @@ def form_of(tree: Any) -> Hashable:
 
 
 def filled(form: Any, numbers: Any) -> Any:
-    """Fill a form with numbers along the first axis; further axes stay."""
+    """Fill a form with values along the first axis; further axes are retained."""
     return _filled(form, numbers, 0)[0]
 
 
@@ -119,7 +122,7 @@ def _filled(form: Any, numbers: Any, first: int) -> tuple[Any, int]:
 
 
 def size_of(form: Any) -> int:
-    """Return the number of numbers of a form."""
+    """Return the number of scalars in a form."""
     if form and isinstance(form[0], type):
         return sum(size_of(inner) for _, inner in form[1])
     return int(np.prod(form, dtype=int))

@@ -1,18 +1,18 @@
 """Conversions between rotation matrices and omega-phi-kappa, roll-pitch-yaw, quaternions, small rotations.
 
-Frames, signs and units are those of docs/conventions.md: angles in radians; the name of a matrix gives its target and
-source frames. Every function takes one rotation and is differentiable where the rotation is.
+Frames, signs and units: docs/conventions.md. Angles are in radians; the name of a matrix gives its target and source
+frames. Every function takes one rotation and is differentiable where the rotation is.
 """
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-# Body axes (right, forward, up) <-> (forward, right, down), and ENU <-> NED: its own inverse. In NumPy, because a JAX
-# array would start a device and compile at import.
+# Matrix between the body axes (right, forward, up) and (forward, right, down), and between ENU and NED: its own
+# inverse. In NumPy, because a JAX array would start a device and compile at import.
 _RFU_FRD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
-# `CROSS @ v` is [v]x: one product with constants; assembled from components it takes a dozen operations.
+# `CROSS @ v` is [v]x: one product with constants; assembly from components takes a dozen operations.
 _UNIT = np.eye(3)
 CROSS = np.cross(_UNIT, _UNIT[:, None])
 
@@ -20,8 +20,8 @@ CROSS = np.cross(_UNIT, _UNIT[:, None])
 def rotate(matrix: Float[Array, "3 3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
     """Return `matrix @ vector`, by component.
 
-    Under `vmap` over the last axis this is a handful of elementwise operations, several times faster on a CPU than a
-    batch of 3 x 3 products.
+    Under `vmap` over the last axis the elementwise operations are several times faster on a CPU than a batch of 3 x 3
+    products.
     """
     x, y, z = vector
     return jnp.stack([row[0] * x + row[1] * y + row[2] * z for row in matrix])
@@ -45,12 +45,12 @@ def matrix_from_omega_phi_kappa(angles: Float[Array, "3"]) -> Float[Array, "3 3"
 def omega_phi_kappa_from_matrix(camera_from_object: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """Return (omega, phi, kappa) in radians of `camera_from_object`; omega and kappa in (-pi, pi], |phi| <= pi/2.
 
-    At phi = +-pi/2 only omega +- kappa is determined: omega and kappa are then one choice of many, valid together.
+    At phi = +-pi/2 only omega +- kappa is determined: omega and kappa are then one valid pair of many.
     """
     m = camera_from_object
     omega = jnp.arctan2(-m[2, 1], m[2, 2])
-    # From M with omega removed: near phi = 90 degrees omega and atan2(-m10, m00) are both rounding, independent of one
-    # another, and together would be another rotation.
+    # Use M with omega removed: near phi = 90 degrees omega and atan2(-m10, m00) are both dominated by rounding errors,
+    # which are independent, and together would give a different rotation.
     s, c = jnp.sin(omega), jnp.cos(omega)
     kappa = jnp.arctan2(c * m[0, 1] + s * m[0, 2], c * m[1, 1] + s * m[1, 2])
     return jnp.stack([omega, jnp.arctan2(m[2, 0], _norm(m[2, 1], m[2, 2])), kappa])
@@ -60,8 +60,8 @@ def matrix_from_roll_pitch_yaw(angles: Float[Array, "3"]) -> Float[Array, "3 3"]
     """Return `object_from_body` from (roll, pitch, yaw) in radians; body right-forward-up, object east-north-up.
 
     Roll is right wing down positive, pitch nose up positive, yaw clockwise from north, in the sequence of airborne
-    IMUs, `P Rz(yaw) Ry(pitch) Rx(roll) P` with P between right-forward-up and forward-right-down (paper 000, equations
-    (1)-(4)).
+    IMUs, `P Rz(yaw) Ry(pitch) Rx(roll) P`. P converts between the axes right-forward-up and forward-right-down (paper
+    000, equations (1)-(4)).
     """
     (sr, sp, sy), (cr, cp, cy) = jnp.sin(angles), jnp.cos(angles)
     ned_from_frd = jnp.stack(
@@ -101,8 +101,8 @@ def matrix_from_quaternion(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]
 def quaternion_from_matrix(matrix: Float[Array, "3 3"]) -> Float[Array, "4"]:
     """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix.
 
-    Of the four equivalent formulas the one with the largest divisor is used, so none loses digits at rotations by half
-    a turn.
+    Of the four equivalent formulas the one with the largest divisor is used: no digits are lost near rotations by 180
+    degrees.
     """
     m = matrix
     t = jnp.stack([m[0, 0] + m[1, 1] + m[2, 2], m[0, 0], m[1, 1], m[2, 2]])
@@ -120,10 +120,10 @@ def quaternion_from_matrix(matrix: Float[Array, "3 3"]) -> Float[Array, "4"]:
 
 
 def small_rotation(theta: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Return `exp(-[theta]x)`, theta in rad: takes V to `V - theta x V` to first order (docs/models.md).
+    """Return `exp(-[theta]x)`, theta in rad: maps V to `V - theta x V` to first order (docs/models.md).
 
     Exact for any angle, smooth at zero. The adjustment updates rotations by it on the camera side: `camera_from_object
-    = small_rotation(theta) @ start`, so phi = 90 degrees is no singularity.
+    = small_rotation(theta) @ start`, so phi = 90 degrees is not a singularity.
     """
     t2 = jnp.sum(theta**2)
     # Two `where`: the series replaces 0/0 of the closed form, and neither branch has NaN derivatives.
@@ -137,7 +137,7 @@ def small_rotation(theta: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def small_angles(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """Return the rotation vector theta (rad) of `small_rotation(theta) = matrix`; |theta| below half a turn."""
+    """Return the rotation vector theta (rad) of `small_rotation(theta) = matrix`; |theta| < pi."""
     m = matrix
     s = -0.5 * jnp.tensordot(m, CROSS)
     cosine = 0.5 * (m[0, 0] + m[1, 1] + m[2, 2] - 1)

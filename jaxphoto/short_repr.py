@@ -1,7 +1,7 @@
-"""Short `repr` and HTML of objects: counts, numbers, outcome, sigma naught.
+"""Short `repr` and HTML of objects: counts, values, outcome, sigma naught.
 
-Tables and plots are made by `jaxphoto.report`, which this module must not import; objects get its functions by name
-when they are called (`from_upstairs`).
+Tables and plots are created by `jaxphoto.report`, which this module must not import; objects import its functions by
+name when they are called (`from_upstairs`).
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 T = TypeVar("T", bound=type)
-# Of an object by its fields: longest text of a field, most numbers and names shown, most rows and fields.
+# Limits of a printed object: characters per field, numbers or names shown, table rows, fields.
 _LONGEST, _FEW, _ROWS, _FIELDS = 72, 4, 20, 24
 
 # Two-sided 0.1 % quantile of the normal distribution.
@@ -23,7 +23,7 @@ _ONE_IN_A_THOUSAND = 3.29
 
 
 def from_upstairs(name: str, room: str = "report") -> Any:
-    """Return a function of a package above, imported now."""
+    """Import and return a function of a package that depends on this module."""
     return getattr(importlib.import_module(f"jaxphoto.{room}"), name)
 
 
@@ -120,13 +120,13 @@ def _several_word(value: Any) -> str:
 
 
 def number_word(value: Any) -> str:
-    """Format a number or a few in six digits; describe a larger array by its shape."""
+    """Format a scalar or short vector with six significant digits; describe a larger array by its shape."""
     if np.ndim(value) == 0 and isinstance(value, int | float | np.generic | np.ndarray):
         return f"{float(value):.6g}"
     if hasattr(value, "shape") and not np.ndim(value):
-        # A traced JAX number has no value.
+        # A traced JAX array has no value.
         return f"{float(value):.6g}" if getattr(value, "is_fully_addressable", False) else type(value).__name__
-    # As above.
+    # A traced JAX array has no value.
     known = isinstance(value, np.ndarray) or getattr(value, "is_fully_addressable", False)
     if known and value.dtype.kind in "iuf" and value.ndim == 1 and 0 < value.size <= _FEW:
         return " ".join(number_word(v) for v in np.asarray(value))
@@ -191,7 +191,7 @@ def block_repr(block: Any) -> str:
 def adjustment_repr(adjusted: Any) -> str:
     """Return `Adjustment of 'title': converged ...`, steps, sigma naught and redundancy, in two lines."""
     of = f"Adjustment of {adjusted.block.title!r}"
-    # A traced number has no value, and several have no common one; `factored` is None in a JAX transformation.
+    # Traced arrays have no value, and several blocks have no common one; `factored` is None in a JAX transformation.
     if adjusted.factored is None or np.ndim(adjusted.converged) != 0:
         return f"{of} inside a transformation of JAX or of several blocks at once: its numbers are arrays"
     observations, unknowns = (sum(n.values()) for n in (adjusted.n_observations, adjusted.n_unknowns))
@@ -207,7 +207,7 @@ def _sigma0_words(adjusted: Any) -> str:
     sigma0, redundancy = float(adjusted.sigma0), adjusted.redundancy
     if redundancy <= 0:
         return f"{sigma0:.4g}"
-    # With many degrees of freedom, sigma naught is normal about 1 with the variance 1 / (2 redundancy).
+    # With many degrees of freedom, sigma naught is normally distributed about 1 with the variance 1 / (2 redundancy).
     expected = _ONE_IN_A_THOUSAND / (2 * redundancy) ** 0.5
     asks = f" (expected 1 +- {expected:.2g}: see .verdict())" if abs(sigma0 - 1) > expected else ""
     return f"{sigma0:.4g}{asks}"
@@ -253,7 +253,7 @@ def _change_words(found: Any) -> str:
 
 
 def _tests(found: Any) -> dict[str, str]:
-    """Describe each test that was made."""
+    """Describe each test of the comparison."""
     of_all = f"at {int(found.beyond.sum())} of {len(found.limit_mm)} points of the format"
     tests = {"beyond the 95 % limit": of_all}
     if np.isfinite(found.p_field):
@@ -270,5 +270,7 @@ def _counted(n: int, name: str) -> str:
 
 
 def _length(rows: Any) -> int:
-    """Return 0 for anything but an array: a tree may hold anything while JAX maps over it."""
+    """Return the length of an array, 0 for any other value: while JAX maps over a tree, its leaves are arbitrary
+    objects.
+    """
     return next(iter(getattr(rows, "shape", ())), 0)

@@ -1,8 +1,8 @@
 """Static values in the structure of a tree: index arrays, masks and dictionaries of descriptions.
 
-`jax.jit`, `jax.vmap` and `jax.grad` treat the leaves of a tree as numbers. Indices are not: they relate rows to each
-other. A `StaticArray` is a tree without leaves, so JAX does not trace it, and two trees with equal arrays have one
-structure, hence share a compiled program.
+`jax.jit`, `jax.vmap` and `jax.grad` treat the leaves of a tree as values. Indices must not be traced: they define the
+relation between rows. A `StaticArray` is a tree without leaves, so JAX does not trace it, and two trees with equal
+arrays have one structure, hence share a compiled program.
 """
 
 import functools
@@ -17,7 +17,7 @@ import numpy as np
 
 
 class Content:
-    """Content of an array as a dictionary key: compared by its numbers, hashed once."""
+    """Content of an array as a dictionary key: compared by its values, hashed once."""
 
     def __init__(self, array: np.ndarray):
         self.array = array
@@ -51,7 +51,7 @@ class StaticArray(np.ndarray):
     _content: Content | None
 
     def __new__(cls, values: Any) -> "StaticArray":
-        """Copy `values`; return a static array, or the static array of a plain view, unchanged."""
+        """Copy `values` to a static array; return a static array, or the static array of a plain view, unchanged."""
         if isinstance(values, cls) and values._content is not None:
             return values
         known = _contents.get(id(values))
@@ -77,7 +77,7 @@ class StaticArray(np.ndarray):
 
     @property
     def plain(self) -> np.ndarray:
-        """The plain array for JAX functions: an argument, not structure."""
+        """Plain array for JAX functions: an argument, not structure."""
         return self.content.array
 
     @property
@@ -89,7 +89,7 @@ class StaticArray(np.ndarray):
 
 
 _contents: weakref.WeakValueDictionary[int, Content] = weakref.WeakValueDictionary()
-"""By identity of the array, which each content keeps alive."""
+"""Contents by identity of the array, which each content references."""
 
 
 def _static(content: Content) -> StaticArray:
@@ -111,7 +111,7 @@ def _plain_method(name: str) -> Callable[..., Any]:
 for _name in ("astype", "copy", "reshape", "ravel", "flatten", "transpose", "repeat", "take"):
     setattr(StaticArray, _name, _plain_method(_name))
 
-# A new object each time: `equinox.tree_at` distinguishes nodes of a tree by identity.
+# Return a new object each time: `equinox.tree_at` distinguishes nodes of a tree by identity.
 jax.tree_util.register_pytree_node(StaticArray, lambda array: ((), array.content), lambda content, _: _static(content))
 
 
@@ -130,19 +130,21 @@ def map_arrays(function: Callable[[Any], Any], tree: Any) -> Any:
 
 
 def with_plain_arrays(tree: Any) -> Any:
-    """Return `tree` with its static arrays as leaves, for programs that serve blocks of any content."""
+    """Return `tree` with its static arrays as leaves, for programs that run on blocks of any content."""
     return jax.tree.map(lambda value: np.asarray(value) if is_static(value) else value, tree, is_leaf=is_static)
 
 
 class StaticDict(dict):
-    """Hashable dictionary for static fields of modules. It must not be changed."""
+    """Hashable dictionary for static fields of modules. It must not be modified."""
 
     def __hash__(self) -> int:  # type: ignore[override]
         return hash(frozenset(self.items()))
 
 
 def ordered(value: Any) -> Any:
-    """Return a dictionary whose order JAX keeps (it sorts the keys of a plain one); anything else unchanged."""
+    """Return a dictionary whose order JAX preserves (it sorts the keys of a plain one); return any other value
+    unchanged.
+    """
     if not isinstance(value, dict):
         return value
     return OrderedDict((key, ordered(inner)) for key, inner in value.items())

@@ -1,4 +1,4 @@
-"""Errors for functions that JAX transformations cannot trace, naming the alternative."""
+"""Errors for functions that JAX transformations cannot trace, with the alternative."""
 
 import functools
 from collections.abc import Callable
@@ -11,7 +11,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def refuse_traced(what: str, tree: Any) -> None:
-    """Raise InputError if a JAX transformation traces any number of `tree`."""
+    """Raise InputError if a JAX transformation traces any leaf of `tree`."""
     if is_traced(tree):
         raise InputError(
             f"{what} needs concrete numbers, which jit, grad and vmap do not have: return the adjustment or the block "

@@ -1,7 +1,7 @@
 """Unknowns of an adjustment, and prior information about them.
 
-`Unknowns` is a tree of numbers; `priors` is the same tree with FREE, FIXED or Weighted(value, sigma) in place of them.
-"The second experiment without k_2" is `block.fix("k2")`, or for the tree itself
+`Unknowns` is a tree of values; `priors` is the same tree with FREE, FIXED or Weighted(value, sigma) as leaves. "The
+second experiment without k_2" is `block.fix("k2")`, or for the tree
 
     priors = with_prior(priors, "k2", lambda start: FIXED, start)
 
@@ -42,16 +42,16 @@ UNKNOWNS: tuple[type[AbstractParameters], ...] = (
     Scanner, Mount, StripBias, FlightBias, CameraRates, ThermalRates, CameraSpline, StripCamera, RollingShutter,
     ImageMotion, RigCamera, ScannerCalibration, TrajectoryKnot,
 )  # fmt: skip
-"""The classes of declared parameters that a block folder may hold; one of your own is given to `read_block`."""
+"""Classes of declared parameters that a block folder may contain; pass your own classes to `read_block`."""
 
 
 class Prior:
-    """FREE, an unknown without prior information, or FIXED, not an unknown. Compare with `==`.
+    """FREE, an unknown without prior information, or FIXED, a constant. Compare with `==`.
 
     Part of the structure of a tree: JAX does not trace it.
     """
 
-    # Makes NumPy use `__eq__` below.
+    # NumPy then uses `__eq__` below.
     __array_ufunc__ = None
 
     def __init__(self, name: str):
@@ -67,7 +67,7 @@ class Prior:
         return self.name
 
 
-# A new object each time: `equinox.tree_at` distinguishes nodes of a tree by identity.
+# Return a new object each time: `equinox.tree_at` distinguishes nodes of a tree by identity.
 jax.tree_util.register_pytree_node(Prior, lambda prior: ((), prior.name), lambda name, _: Prior(name))
 FREE, FIXED = Prior("FREE"), Prior("FIXED")
 
@@ -75,9 +75,9 @@ FREE, FIXED = Prior("FREE"), Prior("FIXED")
 class Weighted(eqx.Module):
     """Unknown with prior `value` and standard deviation `sigma` (its own units, arrays allowed).
 
-    A vector may have a full `covariance` matrix instead: (3, 3), or for positions and points (n, 3, 3), one each. The
-    value of `exterior.camera_from_object` is rotation matrices, its sigma of small rotations in the camera frame (rad).
-    Joint priors of several parameters: `observations.KnownParameters`.
+    A vector may have a full `covariance` matrix instead: (3, 3), or for positions and points (n, 3, 3), one each. For
+    `exterior.camera_from_object` the value is rotation matrices, the sigma refers to small rotations in the camera
+    frame (rad). Joint priors of several parameters: `observations.KnownParameters`.
     """
 
     value: Float[ArrayLike, "..."] | float
@@ -100,8 +100,8 @@ class Unknowns(eqx.Module):
     """Parameters of a block: per camera, image, point, mount and strip; and of a laser scanner.
 
     `exterior` has a leading axis over the images and `points` (m) over the points of the block, in its order. `more`
-    holds further declared parameters (`jaxphoto.parameters`) by kind and owner, `{"camera_rates": {"kodak": rates}}`.
-    The owner of parameters of the whole block is "".
+    contains further declared parameters (`jaxphoto.parameters`) by kind and owner, `{"camera_rates": {"kodak":
+    rates}}`. The owner of parameters of the whole block is "".
     """
 
     interior: dict[str, InteriorOrientation] = eqx.field(converter=ordered)
@@ -189,12 +189,12 @@ def late_cameras(start: Unknowns, priors: Unknowns) -> list[str]:
 
 
 def uniform_priors(unknowns: Unknowns, prior: Prior) -> Unknowns:
-    """Return a tree of priors shaped like `unknowns`, `prior` everywhere."""
+    """Return a tree of priors with the structure of `unknowns`, `prior` everywhere."""
     return jax.tree.map(lambda _: prior, unknowns)
 
 
 def default_priors(unknowns: Unknowns) -> Unknowns:
-    """Exterior orientation and object points FREE, everything else FIXED."""
+    """Return priors: exterior orientation and object points FREE, all other parameters FIXED."""
     priors = uniform_priors(unknowns, FIXED)
     places = lambda u: (u.exterior.position, u.exterior.camera_from_object, u.points)  # noqa: E731
     return eqx.tree_at(places, priors, (FREE, FREE, FREE))
@@ -203,7 +203,7 @@ def default_priors(unknowns: Unknowns) -> Unknowns:
 def weighted(name: str, start: Any, value: Any, sigma: Any) -> Weighted:
     """Return the prior of a parameter that was observed as `value` with `sigma`; arrays have the shape of its `start`.
 
-    Raises InputError, which names the parameter, for what no observation can be.
+    Raises InputError, which names the parameter, for invalid values.
     """
     shape, turns = np.shape(start), np.ndim(start) > 2
     for what, given, whole in (("value", value, shape), ("sigma", sigma, shape[:-1] if turns else shape)):
@@ -222,25 +222,25 @@ def weighted(name: str, start: Any, value: Any, sigma: Any) -> Weighted:
     return Weighted(value, sigma)
 
 
-# What has one prior for all images or all points, by the names that `with_prior` has for it.
+# Parameters with one prior for all images or all points, by their names in `with_prior`.
 _WHOLE: dict[str, Callable[[Unknowns], Any]] = {
     "position": lambda u: u.exterior.position,
     "rotation": lambda u: u.exterior.camera_from_object,
     "points": lambda u: u.points,
 }
-# Of the interior orientation, as Python has them.
+# Names of the interior orientation in tables, by their Python names.
 _FIELDS = {"c": "c_mm", "x_p": "xp_mm", "y_p": "yp_mm"}
 
 
 def with_prior(
     priors: Unknowns, name: str, prior_of: Callable[[Any], Any], start: Unknowns, of: str | None = None
 ) -> Unknowns:
-    """`priors` with another prior of the parameter `name`, which is made from its value in `start`.
+    """Return `priors` with a new prior of the parameter `name`; `prior_of` computes it from the value in `start`.
 
-    Names are those of the interior orientation (`c_mm` or `c`, `k1` ...), the fields of declared parameters
-    (`lever_arm`, `boresight`, `shift` ...), and `position`, `rotation` and `points` for those of all images and points.
-    `of` is the owner, such as a camera or a strip; without it, it is done for each that has such a parameter. Raises
-    InputError where none has.
+    Names are the names of the interior orientation (`c_mm` or `c`, `k1` ...), the fields of declared parameters
+    (`lever_arm`, `boresight`, `shift` ...), and `position`, `rotation` and `points` for all images and points. `of` is
+    the owner, such as a camera or a strip; by default all owners of the parameter. Raises InputError if no owner has
+    it.
     """
     if name in _WHOLE and of is not None:
         raise InputError(f"{name} has one prior for the whole block, not one of {of!r}: leave the owner out")
@@ -267,7 +267,7 @@ def with_prior(
         there = [one for owner, one in known if of in (None, owner)]
         if known and not there:
             raise InputError(
-                f"nothing is called {of!r}; parameters are of {', '.join(dict.fromkeys(o for o, _ in known))}"
+                f"unknown parameter owner {of!r}; use one of {', '.join(dict.fromkeys(o for o, _ in known))}"
             )
         raise InputError(
             f"there is no parameter {name!r}{whose}; there are {', '.join(dict.fromkeys([*there, *_WHOLE]))}"

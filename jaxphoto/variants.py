@@ -1,9 +1,9 @@
-"""Variants of a block for experiments: short pure functions from block to block, composed by calling.
+"""Variants of a block for experiments: pure functions from block to block, composed by calling.
 
     vertical_control(strips(block, ["north", "south"]))
 
 The modes of georeferencing of paper 004 are three of them (`MODES`): they differ in observations and fixed parameters,
-never in the adjustment (docs/georeferencing.md).
+not in the adjustment (docs/georeferencing.md).
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ from jaxphoto.observations import (
 from jaxphoto.parameters import AbstractParameters, dynamic_fields
 from jaxphoto.unknowns import FIXED, FREE, late_cameras
 
-# Observations of exposures by GNSS, and by an IMU.
+# Kinds of observations of exposures by GNSS, and by an IMU.
 _POSITIONS: tuple[type, ...] = (CameraPositions, RelativePositions)
 _TURNS: tuple[type, ...] = (Attitudes, RelativeAttitudes)
 
@@ -45,16 +45,16 @@ def indirect(block: Block) -> Block:
 
 
 def integrated(block: Block) -> Block:
-    """Keep stations and attitudes as weighted observations in addition to the image points: the block unchanged."""
+    """Return the block unchanged: stations and attitudes are weighted observations in addition to the image points."""
     return block
 
 
 def direct(block: Block) -> Block:
     """Compute the exterior orientation from stations, attitudes and mounts, and fix it.
 
-    An image without full station and attitude keeps its start value. Stations and attitudes are removed: as
-    observations of what was computed from them they would fake redundancy. Raises BlockError for an image whose
-    orientation neither sensors nor start values give.
+    An image without full station and attitude retains its start value. Stations and attitudes are removed: the
+    orientation is computed from them, and using them again as observations would create false redundancy. Raises
+    BlockError for an image whose orientation is determined neither by sensors nor by start values.
     """
     rows = sensor_rows(block, block.start.unknowns)
     known = np.array(block.start.image_known, bool)
@@ -78,12 +78,14 @@ MODES: dict[str, Callable[[Block], Block]] = {"direct": direct, "integrated": in
 
 
 def without_stations(block: Block) -> Block:
-    """Remove GNSS positions, also relative ones, and fix what only they determine: lever arms, shifts and drifts."""
+    """Remove GNSS positions, also relative ones, and fix the parameters that only they determine: lever arms, shifts
+    and drifts.
+    """
     return _hold_unseen(dataclasses.replace(block, stations=CameraPositions.none(), more=_without(block, _POSITIONS)))
 
 
 def without_attitudes(block: Block) -> Block:
-    """Remove observed roll, pitch and yaw, also relative ones, and fix what only they determine well: the boresight."""
+    """Remove observed roll, pitch, yaw, also relative ones, and fix the boresight, which only they determine well."""
     return _hold_unseen(dataclasses.replace(block, attitudes=Attitudes.none(), more=_without(block, _TURNS)))
 
 
@@ -93,7 +95,7 @@ def without_control(block: Block) -> Block:
 
 
 def control_only(block: Block, points: Collection[str]) -> Block:
-    """Keep control only at the named `points`; that of all others becomes check points.
+    """Retain control only at the named `points`; the control at all others becomes check points.
 
     Raises ValueError for a name that has no control.
     """
@@ -131,7 +133,7 @@ def with_control(block: Block, points: Collection[str], sigma: float | Float[np.
 def vertical_control(block: Block) -> Block:
     """Use control in height only: Z of control and check points is control, X and Y are check coordinates.
 
-    A check coordinate without sigma gets that of the control (`all_control`). Fixed heights stay fixed.
+    A check coordinate without sigma gets the sigma of the control (`all_control`). Fixed heights remain fixed.
     """
     control, check, fixed = block.control, block.check, block.fixed
     upright = check.axis == 2
@@ -148,7 +150,7 @@ def vertical_control(block: Block) -> Block:
 def all_control(block: Block, sigma: float | Float[np.ndarray, "3"] | None = None) -> Block:
     """Convert check points to control, each coordinate with its own sigma or, if it has none (zero), with `sigma`.
 
-    `sigma` in m, one or one per axis; None means that of the block's control on the axis. Raises ValueError if the
+    `sigma` in m, one or one per axis; None: the sigma of the block's control on the axis. Raises ValueError if the
     block has none or several.
     """
     promoted = _as_control(block.check, block.control, sigma)
@@ -180,26 +182,26 @@ def common_shift(block: Block, name: str = "block") -> Block:
 
 
 def strips(block: Block, names: Collection[str]) -> Block:
-    """Keep only the images of the strips `names`, and the points that at least two of them show.
+    """Retain only the images of the strips `names`, and the points that at least two of them show.
 
-    Cameras, mounts and strips without an image are removed, as are observations of removed objects; ids stay. Raises
-    ValueError for a name that is not a strip.
+    Cameras, mounts and strips without an image are removed, as are observations of removed objects; ids are unchanged.
+    Raises ValueError for an unknown strip name.
     """
     if unknown := [name for name in names if not name or name not in block.image_strip]:
         known = ", ".join(sorted(set(block.image_strip) - {""}))
-        raise ValueError(f"{unknown[0]!r} is no strip of this block; its strips are {known or 'none'}")
+        raise ValueError(f"unknown strip {unknown[0]!r}; use one of {known or 'none'}")
     return some_images(block, np.array([strip in names for strip in block.image_strip]))
 
 
 def without_images(block: Block, names: Collection[str]) -> Block:
-    """Remove the named images, as `some_images` does. Raises InputError for a name that is not an image."""
+    """Remove the named images, as `some_images` does. Raises InputError for an unknown image name."""
     if unknown := [name for name in names if name not in block.images]:
         raise InputError(f"there is no image {unknown[0]!r}; the block has {few(block.images)}")
     return some_images(block, np.array([image not in names for image in block.images]))
 
 
 def some_images(block: Block, chosen: Bool[np.ndarray, "images"]) -> Block:
-    """Keep only the images `chosen`, and the points that at least two of them show, as `strips` does."""
+    """Retain only the images `chosen`, and the points that at least two of them show, as `strips` does."""
     image = np.flatnonzero(chosen)
     seen = block.image_points.point[np.isin(block.image_points.image, image)]
     point = np.flatnonzero(np.bincount(seen, minlength=len(block.points)) >= 2)
@@ -288,7 +290,9 @@ def _exterior(block: Block):
 
 
 def _hold_unseen(block: Block) -> Block:
-    """Fix mounts and strips that no remaining observation determines; remove the motion if nothing acts with it."""
+    """Fix mounts and strips that no remaining observation determines; remove the motion if no remaining parameter
+    depends on it.
+    """
     own = {_kind(rows) for rows in block.more}
     positions = len(block.stations.who) > 0 or bool(own & {*_POSITIONS})
     turns = len(block.attitudes.image) > 0 or bool(own & {*_TURNS})
@@ -319,7 +323,9 @@ def _kind(rows: AbstractObservations | KnownParameters) -> type:
 def _as_control(
     check: ControlCoordinates, control: ControlCoordinates, sigma: float | Float[np.ndarray, "3"] | None = None
 ) -> ControlCoordinates:
-    """Convert check coordinates to control; those without a sigma get `sigma`, or that of the control on their axis."""
+    """Convert check coordinates to control; coordinates without a sigma get `sigma`, or the sigma of the control on
+    their axis.
+    """
     own, taken = to_numpy(check.sigma), np.zeros(3)
     if not len(check):
         return check
@@ -331,17 +337,17 @@ def _as_control(
     for axis in np.unique(check.axis[own == 0]):
         of_axis = np.unique(np.asarray(control.sigma)[control.axis == axis])
         if sigma is None and len(of_axis) != 1:
-            several = len(of_axis) or "none"
+            several = len(of_axis) or "no"
             raise ValueError(
-                f"check coordinates in {AXES[axis]} have no sigma, and the control there has {several} to take; make "
-                "them control by all_control(block, sigma) first"
+                f"check coordinates in {AXES[axis]} have no sigma, and control has {several} sigmas in that axis "
+                "instead of one; call all_control(block, sigma) first"
             )
         taken[axis] = of_axis[0] if sigma is None else np.broadcast_to(sigma, 3)[axis]
     return dataclasses.replace(check, sigma=np.where(own == 0, taken[check.axis], own))
 
 
 def _numbers(kept: np.ndarray, n: int) -> np.ndarray:
-    """Return the new index of each of `n` objects of which some are kept, -1 for the others."""
+    """Return the new index of each of `n` objects of which some are retained, -1 for the others."""
     new = np.full(n, -1)
     new[kept] = np.arange(len(kept))
     return new

@@ -1,8 +1,8 @@
 """Atomic writing of files and directories: complete or not at all, without loss of a user's files.
 
-A directory written by jaxphoto holds the file `MARKER`, which lists what jaxphoto wrote, by SHA-256. Only such a
-directory is replaced, only if these files are unchanged, and all other files in it stay. Work in progress lies in a
-hidden directory beside its target.
+A directory written by jaxphoto contains the file `MARKER`, a list of the files written by jaxphoto with their SHA-256.
+Only such a directory is replaced, only if these files are unchanged, and all other files in it are retained. Temporary
+files are in a hidden directory next to their target.
 """
 
 import contextlib
@@ -24,10 +24,10 @@ except ImportError:  # Windows has no such locks.
     fcntl = None  # type: ignore[assignment]
 
 Clashes = Callable[[str], bool]
-"""True for a user's file (its path in the directory) that cannot stay beside what jaxphoto writes."""
+"""Predicate: True for a user's file (its path in the directory) that conflicts with the files of jaxphoto."""
 MARKER = ".jaxphoto.json"
 _PREFIX = ".jaxphoto-"
-# Left by file managers in every directory they show.
+# Files created by file managers in every directory they display.
 _DEBRIS = {".DS_Store", "Thumbs.db", "desktop.ini"}
 
 
@@ -45,7 +45,7 @@ def input_file(path: Path, name: str | None = None) -> InputFile:
 
 
 def digest_of_all(files: Iterable[InputFile]) -> str:
-    """Return the SHA-256 of the lines that `sha256sum` writes of `files`, sorted by name."""
+    """Return the SHA-256 of the lines that `sha256sum` prints for `files`, sorted by name."""
     lines = "".join(f"{f.sha256}  {f.file}\n" for f in sorted(files))
     return hashlib.sha256(lines.encode()).hexdigest()
 
@@ -71,8 +71,8 @@ def whole_file(path: Path) -> Iterator[Path]:
 def whole_folder(directory: Path, clashes: Clashes = lambda name: False) -> Iterator[Path]:
     """Yield a directory to write into, which replaces `directory` when it is complete.
 
-    What jaxphoto wrote there before is removed, all else stays. After an error nothing has changed. Raises InputError
-    as `check_folder`, OSError if it cannot be written.
+    Files previously written there by jaxphoto are removed, all others are retained. After an error nothing has changed.
+    Raises InputError as `check_folder`, OSError if it cannot be written.
     """
     target = _real(directory)
     check_folder(directory, clashes=clashes)
@@ -101,8 +101,8 @@ def whole_folder(directory: Path, clashes: Clashes = lambda name: False) -> Iter
 def check_folder(directory: Path, *inputs: Path, clashes: Clashes = lambda name: False) -> None:
     """Raise InputError if `directory` cannot be written or replaced without loss.
 
-    That is: a file; a directory that jaxphoto did not write, or with a file that was changed since or that `clashes`;
-    one that holds one of the `inputs`; a place without permission or room.
+    Reasons: it is a file; a directory that jaxphoto did not write, or with a file that was modified since or that
+    `clashes`; it contains one of the `inputs`; permissions or disk space are insufficient.
     """
     target = _real(directory)
     for given in inputs:
@@ -132,7 +132,7 @@ def check_file(path: Path, *inputs: Path) -> None:
 
 
 def check_room(target: Path) -> None:
-    """Raise InputError if nothing can be created beside `target`."""
+    """Raise InputError if no file can be created next to `target`."""
     folder = next(parent for parent in target.parents if parent.is_dir())
     try:
         with _work_place(folder / "room") as work:
@@ -142,18 +142,18 @@ def check_room(target: Path) -> None:
 
 
 def files_in(folder: Path) -> list[str]:
-    """Return the files that jaxphoto wrote in `folder`, by their paths in it; all files without a marker."""
+    """Return the files that jaxphoto wrote in `folder`, by their paths in it; all files if there is no marker."""
     listed = _listed(folder)
     return sorted(_files(folder) if listed is None else listed)
 
 
 def is_place(name: str) -> bool:
-    """Return True for the name of a hidden directory of work in progress."""
+    """Return True for the name of a hidden directory of temporary files."""
     return name.startswith(_PREFIX)
 
 
 def clear_leftovers(folder: Path) -> None:
-    """Remove what killed processes left in `folder`, which the caller has `locked`."""
+    """Remove temporary files of killed processes from `folder`, which the caller has `locked`."""
     for place in folder.glob(f"{_PREFIX}*/"):
         shutil.rmtree(place, ignore_errors=True)
 
@@ -170,14 +170,14 @@ def locked(folder: Path) -> Iterator[bool]:
         except BlockingIOError:
             yield False
             return
-        except OSError:  # A file system without locks, or a folder that is gone.
+        except OSError:  # The file system does not support locks, or the folder was removed.
             pass
         yield True
 
 
 @contextmanager
 def _work_place(target: Path) -> Iterator[Path]:
-    """Yield a path named like `target` in a hidden directory beside it; an OSError in there names `target`."""
+    """Yield a path named like `target` in a hidden directory next to it; an OSError there names `target`."""
     place = None
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -194,7 +194,7 @@ def _work_place(target: Path) -> Iterator[Path]:
 
 
 def _written(folder: Path, clashes: Clashes) -> set[str]:
-    """Return the files that jaxphoto wrote in `folder`. Raises InputError if replacing them could lose something."""
+    """Return the files that jaxphoto wrote in `folder`. Raises InputError if replacing them could lose data."""
     if not set(os.listdir(folder)) - _DEBRIS:
         return set()
     listed = _listed(folder)
@@ -216,7 +216,9 @@ def _written(folder: Path, clashes: Clashes) -> set[str]:
 
 
 def _keep_foreign(old: Path, new: Path, written: set[str]) -> None:
-    """Link all that jaxphoto did not write from `old` into `new`. Raises InputError if a name is taken there."""
+    """Link all files that jaxphoto did not write from `old` into `new`. Raises InputError if a name already exists
+    there.
+    """
     for root, folders, names in os.walk(old):
         inside = Path(root).relative_to(old)
         links = [name for name in folders if (Path(root) / name).is_symlink()]
@@ -231,7 +233,7 @@ def _keep_foreign(old: Path, new: Path, written: set[str]) -> None:
             to.parent.mkdir(parents=True, exist_ok=True)
             try:
                 os.link(path, to, follow_symlinks=False)
-            except (OSError, NotImplementedError):  # A file system without hard links.
+            except (OSError, NotImplementedError):  # The file system does not support hard links.
                 shutil.copy2(path, to, follow_symlinks=False)
 
 
@@ -260,7 +262,7 @@ def _check_parents(target: Path, cure: str) -> None:
 
 
 def _flush(path: Path) -> None:
-    """Write a file to the disk; some file systems report only here that there is no room for it."""
+    """Flush a file to disk; some file systems report only here that the disk is full."""
     if path.is_symlink() or not path.is_file():
         return
     with contextlib.closing(os.fdopen(os.open(path, os.O_RDONLY))) as file:
@@ -268,5 +270,5 @@ def _flush(path: Path) -> None:
 
 
 def _real(path: Path) -> Path:
-    """Resolve links: they stay, and their targets are written."""
+    """Resolve links: the links are retained, and their targets are written."""
     return Path(os.path.realpath(path))

@@ -158,7 +158,7 @@ def test_of_several_owners_one_is_named_or_all_are_meant():
             lambda b: b.fix("k9"),
             r"there is no parameter 'k9'; there are c_mm, xp_mm, .*k1.* position, rotation",
         ),
-        (lambda b: b.free("k1", of="sony"), "nothing is called 'sony'; parameters are of one"),
+        (lambda b: b.free("k1", of="sony"), "unknown parameter owner 'sony'; use one of one"),
         (lambda b: b.fix("a1", of="one"), "there is no parameter 'a1' of 'one'; there are c_mm"),
         (lambda b: b.fix("points", of="one"), "points has one prior for the whole block, not one of 'one'"),
         (lambda b: b.fix(), "no parameter is named: give names"),

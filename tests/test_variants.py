@@ -131,7 +131,7 @@ def test_check_points_take_the_sigma_of_the_control_or_the_one_given():
     given = all_control(block, 0.5)
     assert sorted(set(given.control.sigma)) == [0.02, 0.03, 0.05, 0.5]
     np.testing.assert_array_equal(vertical_control(block).control.sigma, 0.05)
-    with pytest.raises(ValueError, match=r"in X have no sigma.*has none to take"):
+    with pytest.raises(ValueError, match=r"in X have no sigma.*control has no sigmas in that axis"):
         all_control(dataclasses.replace(block, control=ControlCoordinates.none()))
     mixed = dataclasses.replace(
         block, control=dataclasses.replace(block.control, sigma=0.01 + 0.01 * block.control.who)
@@ -213,7 +213,7 @@ def test_strips_drop_the_cameras_and_mounts_that_took_none_of_their_images():
     part = strips(block, ["b"])
     assert set(part.sensors) == set(part.start.unknowns.interior) == set(part.priors.interior) == {"two"}
     for wrong in ("c", ""):
-        with pytest.raises(ValueError, match=f"'{wrong}' is no strip of this block; its strips are a, b"):
+        with pytest.raises(ValueError, match=f"unknown strip '{wrong}'; use one of a, b"):
             strips(block, [wrong])
 
 

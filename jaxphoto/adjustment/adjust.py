@@ -53,25 +53,25 @@ def solve(
     meanwhile: Callable[[NormalEquations, dict[str, float]], None] = lambda equations, seconds: None,
     losses: Mapping[str, AbstractLoss] = MappingProxyType({}),
 ) -> Adjustment:
-    """Adjust `block` by least squares from `start`, with the unknowns that `priors` leaves free.
+    """Adjust `block` by least squares from `start`; `priors` specifies which unknowns are free.
 
-    A pure function of the numbers in its arguments. `jax.grad`, `jax.jvp` and `jax.vmap` apply (exactly, by the
-    implicit function theorem), with concrete ids and index arrays. `start` needs all images and points;
-    `jaxphoto.adjust` computes missing ones first.
+    A pure function of the arrays in its arguments. `jax.grad`, `jax.jvp` and `jax.vmap` apply (exactly, by the implicit
+    function theorem), with concrete ids and index arrays. `start` requires all images and points; `jaxphoto.adjust`
+    computes missing ones first.
 
-    `sizes` are minimum sizes to compile for (`common_sizes`). `meanwhile` is called during compilation with the
-    abstract result and its times, to `prepare` programs that will be needed.
+    `sizes` are minimum padded sizes (`common_sizes`). `meanwhile` is called during compilation with the abstract result
+    and its times, to `prepare` further programs.
 
-    `losses` replace squared residuals by group of observations. The unknowns then minimise the total loss, while
-    residuals and normal equations of the result are those of least squares there: `jaxphoto.robust` computes statistics
-    from them.
+    `losses` replace squared residuals by group of observations. The unknowns then minimise the total loss. Residuals
+    and normal equations of the result are evaluated at this optimum without losses: `jaxphoto.robust` computes
+    statistics from them.
 
-    Raises DatumError if the observations leave the datum open and no constraint closes it, RankError if they do not
-    determine an unknown or cannot separate unknowns.
+    Raises DatumError if the datum is determined neither by observations nor by constraints, RankError if the
+    observations do not determine an unknown or cannot separate unknowns.
     """
     laid = build_problem(block, start, priors, sizes)
     if not laid.traced and is_traced(block.start.unknowns):
-        # The result does not depend on them; a derivative would silently be zero.
+        # The result does not depend on block.start: its derivative would silently be zero.
         raise InputError(
             "a JAX transformation traces block.start, but the argument start replaces it: change start, or omit it"
         )
@@ -85,23 +85,23 @@ def solve(
         found, state = _differentiable(numbers, padded, max_steps)
     else:
         arguments = (numbers, structure, to_optimum(max_steps))
-        # The longest first: the others are traced while it compiles.
+        # Compile the slowest program first; trace the others meanwhile.
         if prepare(_optimise, arguments, seconds):
             prepare(_residuals, (numbers, plain), seconds)
             meanwhile(NormalEquations(numbers, plain, _factored_like(numbers, plain)), seconds)
         found = run_compiled(_optimise, arguments, seconds, "solve")
-        # Arrays returned by several devices have another type than those passed in.
+        # Arrays returned by several devices have a different type from those passed in.
         state = UnknownArrays(*map(to_numpy, found.state))
         history = IterationHistory(*(to_numpy(v)[: int(found.steps)] for v in found.history))
     steps, converged = found.steps, found.converged
     assert steps is not None and converged is not None, "only of a tangent is this unknown"
-    # Its normal equations are the largest array, and are recomputed.
+    # Discard the normal equations: they are the largest array and can be recomputed.
     del found
     adjusted = _at(state, laid, block, start, priors, seconds)
     adjusted = dataclasses.replace(adjusted, steps=steps, converged=converged, history=history, sizes=sizes)
     if laid.traced:
         return adjusted
-    # Concrete numbers, also inside a traced function.
+    # Concrete arrays, also inside a traced function.
     with jax.ensure_compile_time_eval():
         log_iterations(adjusted)
         if adjusted.diverged_points.any():
@@ -112,8 +112,8 @@ def solve(
 
 @functools.partial(jax.jit, static_argnums=(1, 2))
 def _differentiable(values: PaddedValues, padded: PaddedBlock, max_steps: int) -> Any:
-    """Return the optimum and its state as one program: operation by operation, derivatives would be a thousand
-    programs.
+    """Return the optimum and its state as one program: without it, derivatives would compile every operation
+    separately.
     """
     s = padded.structure
     found = find_optimum(weigh_datum(values, s), s, to_optimum(max_steps), image_row_lists(padded))
@@ -123,7 +123,8 @@ def _differentiable(values: PaddedValues, padded: PaddedBlock, max_steps: int) -
 def linearise(block: Block, unknowns: Unknowns, priors: Unknowns, sizes: PaddedSizes = MINIMAL_SIZES) -> Adjustment:
     """Evaluate residuals and normal equations of `block` at `unknowns`, which need not be its optimum.
 
-    Used to judge all observations after an adjustment of some. Raises what `solve` raises before it computes.
+    Used to evaluate all observations after an adjustment of a subset. Raises the errors that `solve` raises before it
+    computes.
     """
     laid = build_problem(block, unknowns, priors, sizes)
     v = laid.padded_values
@@ -134,7 +135,7 @@ def _at(state: UnknownArrays, laid: "Problem", block: Block, start: Unknowns, pr
     """Evaluate residuals and normal equations at `state`."""
     padded, numbers = laid.padded, with_start(laid.padded_values, state)
     structure, factored = padded.structure, None
-    # Statistics need the factored normal matrix; derivatives of the unknowns do not, and would pay for it dearly.
+    # Statistics require the factored normal matrix. Derivatives of the unknowns do not: omit it there.
     if not laid.traced:
         again = run_compiled(_optimise, (numbers, structure, to_factor()), seconds, "covariance")
         factored = gathered(again.factored)
@@ -157,7 +158,7 @@ def _at(state: UnknownArrays, laid: "Problem", block: Block, start: Unknowns, pr
 
 
 class Problem(NamedTuple):
-    """Problem to solve: index arrays and numbers, in block order and padded."""
+    """Problem to solve: index arrays and values, in block order and padded."""
 
     padded: PaddedBlock
     values: Values
@@ -165,16 +166,16 @@ class Problem(NamedTuple):
 
     @property
     def traced(self) -> bool:
-        """True if any number is traced by a JAX transformation."""
+        """True if a JAX transformation traces any value."""
         return is_traced(self.values)
 
 
 def build_problem(
     block: Block, start: Unknowns, priors: Unknowns, sizes: PaddedSizes = MINIMAL_SIZES, alone: bool = False
 ) -> Problem:
-    """Close the datum of a block and pad it; for one device if `alone`.
+    """Constrain the datum of a block and pad it; for one device if `alone`.
 
-    Raises what `solve` raises before it computes.
+    Raises the errors that `solve` raises before it computes.
     """
     check_arguments(block, start, priors)
     check_priors(block, priors)
@@ -187,7 +188,8 @@ def build_problem(
     constraints = close_datum(block, values, structure)
     values = with_datum(values, constraints.eop, constraints.points)
     constrained, coupled = len(constraints.eop) > 0, bool(structure.coupled)
-    # Such rows may join points of two devices; statistics handle constraints in closed form only for the open motions.
+    # Use one device: such rows may couple points of two devices, and the closed form of constraints in statistics is
+    # valid only for the open motions.
     alone = alone or is_traced(values) or coupled or (constrained and not n_open_motions(values, structure))
     shards = 1 if alone else _devices_worth_using(len(structure.image))
     dense = constrained or coupled
@@ -198,21 +200,22 @@ def build_problem(
     return Problem(padded, values, padded.pad(values))
 
 
-# A study may alternate between a few blocks. Index arrays of 1,000 images and a million image points take 30 MB.
+# Cache several layouts, as a study may alternate between a few blocks. Index arrays of 1,000 images and a million image
+# points take 30 MB.
 _LAYOUTS = 4
 _layouts: LruCache[tuple[Structure, dict[Hashable, PaddedBlock]]] = LruCache(_LAYOUTS)
 
 
 def _layout_key(block: Block, priors: Unknowns, observed: ObservedRows) -> Hashable:
-    """Return everything that a layout depends on: ids, indices, what is free, shapes, but no value of a number."""
+    """Return all properties that determine a layout: ids, indices, free parameters and shapes, without values."""
     leaves, tree = jax.tree.flatten((block, priors))
-    # JAX sorts dictionary keys; unknowns keep their order.
+    # JAX sorts dictionary keys, but unknowns require insertion order.
     order = tuple(entry.label for entry in observed.entries)
     return tree, order, *(np.shape(v) if is_float(v) else Content(np.asarray(v)) for v in leaves)
 
 
 def _factored_like(values: PaddedValues, structure: PaddedStructure) -> FactoredNormal:
-    """Return arrays of the right types without memory."""
+    """Return abstract arrays of the right types, without memory."""
     zero = zero_increments(structure)
     system = jax.eval_shape(zero_system, zero, values, structure)
     reduced, factor, scale = jax.tree.map(
@@ -221,7 +224,7 @@ def _factored_like(values: PaddedValues, structure: PaddedStructure) -> Factored
     return FactoredNormal(reduced, factor, scale)
 
 
-# Number of image rows that keep a device busy for longer than the communication of its sums.
+# Minimum number of image rows per device; with fewer, communication takes longer than computation.
 _ROWS_PER_DEVICE = 20_000
 
 
@@ -230,7 +233,7 @@ def _devices_worth_using(rows: int) -> int:
 
 
 def common_sizes(blocks: Iterable[Block]) -> PaddedSizes:
-    """Return sizes that fit all `blocks`: with them, `solve` compiles once for blocks that differ only in numbers."""
+    """Return sizes that fit all `blocks`: with them, `solve` compiles once for blocks that differ only in values."""
     return functools.reduce(operator.or_, (sizes_of(structure_of(b, b.priors)) for b in blocks), MINIMAL_SIZES)
 
 

@@ -1,4 +1,4 @@
-"""Checks of the arguments of an adjustment: types, shapes, finite numbers."""
+"""Checks of the arguments of an adjustment: types, shapes, finite values."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -13,7 +13,7 @@ from jaxphoto.unknowns import Unknowns, is_prior
 
 
 def check_arguments(block: Any, start: Any, priors: Any) -> None:
-    """Raise InputError for inconsistent arguments; traced numbers are not examined."""
+    """Raise InputError for inconsistent arguments; traced values are not examined."""
     if not isinstance(block, Block):
         raise InputError(f"adjust takes a Block first, got {type(block).__name__}")
     for name, tree, cure in (
@@ -72,7 +72,7 @@ def _check_shapes(block: Block, start: Unknowns) -> None:
 
 
 def _no_numbers(block: Block, start: Unknowns, priors: Unknowns) -> Iterator[str]:
-    """Return the labels of NaN and infinite numbers."""
+    """Return the labels of NaN and infinite values."""
     for group, rows in block.named_observations.items():
         for name, values in (("value", rows.observation), ("sigma", rows.sigmas)):
             # An infinite standard deviation means zero weight.
@@ -92,7 +92,7 @@ def _no_numbers(block: Block, start: Unknowns, priors: Unknowns) -> Iterator[str
 
 
 def _bad(values: Any, may_be_infinite: bool = False) -> tuple[int, ...] | None:
-    """Return the index of the first NaN or infinite number; None if all are finite or traced."""
+    """Return the index of the first NaN or infinite value; None if all are finite or traced."""
     array = to_numpy(values)
     if isinstance(array, jax.core.Tracer) or array.dtype.kind != "f":
         return None

@@ -1,11 +1,11 @@
-"""Many adjustments of one block with one factor: chord steps from the nominal optimum, with exact gradients.
+"""Adjustments of many draws of one block with one factor: chord steps from the nominal optimum, with exact gradients.
 
 With N the nominal normal matrix, factored once, and G_i the gradient of draw i,
 
     y <- y - N^-1 G_i(y)        until the remaining distance is small
 
-converges to the optimum of draw i itself, because its gradient is exact. The rate of convergence depends on the
-difference between N and the draw's own normal matrix. Draws whose steps do not contract need a full adjustment.
+converges to the optimum of draw i, because its gradient is exact. The rate of convergence depends on the difference
+between N and the draw's own normal matrix. Draws whose steps do not contract need a full adjustment.
 """
 
 from typing import Any, NamedTuple
@@ -21,10 +21,10 @@ from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays
 from jaxphoto.devices import AXIS, mesh_of
 
 TOLERANCE = 1e-6
-"""No unknown of a draw misses its optimum by more than this fraction of its standard deviation."""
-# A draw is given up if a step is longer than this fraction of the previous one, or after this number of steps.
+"""Maximum remaining distance of an unknown of a draw from its optimum, as a fraction of its standard deviation."""
+# Ratio of successive step lengths above which a draw is abandoned, and maximum number of steps.
 _CONTRACTS, _MOST_STEPS = 0.5, 20
-# Fraction of the first step assumed to remain after it.
+# Ratio of successive step lengths assumed for the first step.
 _FIRST_RATIO = 0.1
 # Leaves other than image coordinates that change the residuals of image rows.
 _OF_IMAGE_ROWS = {"xy", "sigma_xy", "position", "rotation", "shared", "points"}
@@ -87,7 +87,7 @@ def _find(varying: Varying, common: Common, first_only: bool) -> Found:
 
 
 def chord_steps(varying: Varying, common: Common, first_only: bool = False, polished: bool = True) -> Way:
-    """Iterate chord steps of every draw from the nominal optimum; if `polished`, its gradient is exactly zero."""
+    """Iterate chord steps of every draw from the nominal optimum. `polished`: the nominal gradient is exactly zero."""
     size = next(iter(varying.values())).shape[-1]
     y = jax.tree.map(lambda v: jnp.broadcast_to(jnp.asarray(v)[..., None], (*v.shape, size)), common.at.increments)
     of_image_rows = bool(_OF_IMAGE_ROWS & set(varying))
@@ -95,7 +95,7 @@ def chord_steps(varying: Varying, common: Common, first_only: bool = False, poli
     way = Way(y, jnp.full(size, jnp.inf), jnp.zeros(size), none, none, jnp.zeros(size, int))
     if not of_image_rows:
         way = _taken(way, _others_alone(y, varying, common), common)
-        # The remaining nominal gradient may exceed the tolerance.
+        # Without `polished`, the remaining nominal gradient may exceed the tolerance.
         way = way if polished else way._replace(settled=none)
     elif first_only:
         way = _taken(way, _all(y, varying, common), common)
@@ -117,12 +117,12 @@ def _taken(way: Way, b: Increments, common: Common) -> Way:
     contracts = (ratio <= _CONTRACTS) & (way.steps < _MOST_STEPS)
     worst = jnp.maximum(ratio, way.ratio)
     missing = length * worst / jnp.maximum(1 - worst, 1e-3)
-    # Steps below the tolerance are rounding, which need not contract.
+    # Steps below the tolerance are rounding errors, which need not contract.
     settled = active & ((missing <= TOLERANCE) & contracts | (length <= 0.1 * TOLERANCE))
     return Way(
         y=jax.tree.map(lambda a, d: jnp.where(active, a - d, a), way.y, x),
         length=length,
-        # The assumption about the first step does not apply to the second.
+        # The assumed contraction of the first step does not apply to the second.
         ratio=jnp.where(jnp.isinf(way.length), 0.0, ratio),
         settled=way.settled | settled,
         failed=way.failed | (active & ~settled & ~contracts),
@@ -136,7 +136,7 @@ def _all(y: Increments, varying: Varying, common: Common) -> Increments:
 
 
 def _others_alone(zero: Increments, varying: Varying, common: Common) -> Increments:
-    """Return the gradient at the nominal optimum for draws with nominal image rows, which cancel there."""
+    """Return the gradient at the nominal optimum for draws with nominal image rows, which contribute nothing there."""
     nominal = other_gradients(jax.tree.map(lambda v: v[..., :1], zero), {}, common)
     return jax.tree.map(jnp.subtract, other_gradients(zero, varying, common), nominal)
 

@@ -1,9 +1,9 @@
-"""Datum: position, orientation and scale that observations leave open, and the constraints that close it.
+"""Datum: position, orientation and scale that the observations leave undetermined, and the constraints that fix them.
 
 The seven parameters of a similarity transformation (3 shifts, 3 rotations, scale) move images and points together
 without changing any image coordinate. Only other observations (control, stations, distances ...) and fixed unknowns
-determine them, possibly only in combination with a free shift or lever arm. What none determines is the datum defect,
-closed by inner or minimal constraints.
+determine them, possibly only in combination with a free shift or lever arm. The undetermined combinations are the datum
+defect, removed by inner or minimal constraints.
 """
 
 from typing import TYPE_CHECKING
@@ -26,20 +26,22 @@ from jaxphoto.observations import PRIORS, ControlCoordinates
 if TYPE_CHECKING:
     from jaxphoto.adjustment.datum_sensitivity import SeenMotions
 
-# A rotation (rad) or scale determined no better than this is as good as open: it is no longer small.
+# A rotation (rad) or scale with a larger standard deviation is treated as undetermined: linearisation is not valid at
+# this size.
 _VAGUE = 0.05
 
 
 def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows:
-    """Return the constraints that close the datum defect (leading axis: the defect).
+    """Return the constraints that remove the datum defect (leading axis: the defect).
 
-    Raises DatumError if the datum is open and its kind is "control", or if the requested constraints cannot close it.
+    Raises DatumError if the datum is open and its kind is "control", or if the requested constraints cannot remove the
+    defect.
     """
     judged = block.datum.kind == "control" and not is_traced((values, block))
     without_place = is_traced((values.points, values.position)) and is_traced(block.start.unknowns)
     values = _concrete(values, block)
     if judged:
-        # At observed places: approximate values scatter about a line on which control lies.
+        # Use observed positions: approximate values scatter about a line of collinear control.
         values = _as_observed(block, values)
     if _plainly_closed(block, values, structure, _VAGUE if judged else np.inf):
         return DatumRows(np.zeros((0, 6, structure.n_images)), np.zeros((0, 3, structure.n_points)))
@@ -86,10 +88,10 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
 
 
 def _concrete(values: Values, block: Block) -> Values:
-    """Replace traced numbers: the datum depends only roughly on positions.
+    """Replace traced values: the datum depends only weakly on positions.
 
-    Unknown positions are drawn at random: whether observations determine the datum depends on which observation touches
-    what, except for coincidences.
+    Unknown positions are drawn at random. Whether observations determine the datum depends, except for coincidences,
+    only on the unknowns that each observation touches.
     """
     known = block.start.unknowns
     place = {"position": known.exterior.position, "points": known.points}
@@ -97,7 +99,7 @@ def _concrete(values: Values, block: Block) -> Values:
     anywhere = np.random.default_rng(0)
 
     def number(path, v):
-        # Derivatives need only the primal number.
+        # Derivatives require only the primal value.
         v = jax.lax.stop_gradient(v)
         if not isinstance(v, jax.core.Tracer):
             return np.asarray(v)
@@ -106,14 +108,14 @@ def _concrete(values: Values, block: Block) -> Values:
             return near[name]
         if name in ("rotation", "nominal", "whitener"):
             return np.broadcast_to(np.eye(v.shape[0])[..., None], v.shape)
-        # All standard deviations equal one.
+        # All standard deviations are one.
         return np.ones(v.shape) if name in ("sigma", "sigma_xy") else anywhere.normal(size=v.shape)
 
     return jax.tree_util.tree_map_with_path(number, values)
 
 
 def _as_observed(block: Block, values: Values) -> Values:
-    """Move control points and images to their observed places."""
+    """Move control points and images to their observed positions."""
     position, points = np.array(values.position), np.array(values.points)
     position[block.stations.axis, block.stations.who] = to_numpy(block.stations.value)
     points[block.control.axis, block.control.who] = to_numpy(block.control.value)
@@ -124,7 +126,7 @@ def _plainly_closed(block: Block, values: Values, structure: Structure, vague: f
     """Return True for three full control points (or stations without free mounts and strips) that are not collinear.
 
     They suffice if the rotation about their line of best fit is determined better than `vague` (rad). Without images
-    only points can move, and nothing can if all of these are control.
+    only points can move; if all of them are control, the datum is determined.
     """
     seen = np.zeros((3, structure.n_points))
     seen[block.control.axis, block.control.who] = 1
@@ -146,7 +148,7 @@ def _plainly_closed(block: Block, values: Values, structure: Structure, vague: f
 
 
 def _check_vague(block: Block, sensitivity: "SeenMotions", named: list[str]) -> None:
-    """Raise DatumError if observations close the datum only by their noise, as control on a line does."""
+    """Raise DatumError if the datum is determined only by noise, as for control on a line."""
     weak, sigma = sensitivity.weak_motions(_VAGUE)
     if len(weak):
         raise DatumError(datum_sentence(weak, block, named, sigma))
@@ -169,7 +171,7 @@ def _datum_sensitivity(
     weighted = {int(j) for g in s.observed if g.name.startswith(PRIORS) for j in g.column.ravel()}
     placed = {g.name for g in s.observed if len(g.image) or len(g.point)}
     if placed <= {ControlCoordinates.group}:
-        # Control alone: nothing to differentiate, its rows are the motions of its points.
+        # With control only, there is nothing to differentiate: its rows are the motions of its points.
         control = block.control
         rows = motions.points[:, control.axis, control.who].T / _control_sigma(values, s)[:, None]
         sensitivity = SeenMotions.of_motions(rows)
@@ -199,7 +201,7 @@ def _combine(motions: DatumRows, combinations: np.ndarray) -> DatumRows:
 
 
 def _inner(null: DatumRows, block: Block, over) -> DatumRows:
-    """Return inner constraints: the open motions, restricted to the positions or points over which they are taken."""
+    """Return inner constraints: the open motions, restricted to the positions or points of the datum."""
     if over == "images":
         eop = null.eop.copy()
         eop[:, 3:] = 0.0
@@ -217,7 +219,9 @@ def _orthonormal(rows: DatumRows) -> DatumRows:
 
 
 def _minimal(null: DatumRows, structure: Structure) -> DatumRows:
-    """Return as many fixed point coordinates as the defect requires, chosen by pivoting for best conditioning."""
+    """Return the minimal constraints: fixed point coordinates, one per defect, chosen by pivoting for best
+    conditioning.
+    """
     k = len(null.points)
     flat = null.points.transpose(0, 2, 1).reshape(k, -1) * structure.point_free.T.reshape(-1)
     rows = np.zeros_like(flat)

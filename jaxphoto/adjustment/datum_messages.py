@@ -1,4 +1,4 @@
-"""Messages about an open datum: the motions by name, the observations present, and the cure."""
+"""Messages about an undetermined datum: open motions by name, available observations, and the cure."""
 
 import numpy as np
 from jaxtyping import Float
@@ -30,7 +30,9 @@ def motion_names(combinations: Float[np.ndarray, "n motions"]) -> list[str]:
 
 
 def datum_sentence(null_motions: np.ndarray, block: Block, named: list[str], sigma: float = np.inf) -> str:
-    """Return what is open, the observations present, and the cure; `sigma` if closed by noise (rad, or relative)."""
+    """Return a message: open motions, available observations, cure; `sigma` if only noise determines them (rad, or
+    relative).
+    """
     names = motion_names(null_motions)
     counts = {rows.group: int(np.size(rows.observation)) for rows in block.observations if len(rows)}
     if n := counts.pop(ControlCoordinates.group, 0) + len(block.fixed.who):

@@ -1,7 +1,7 @@
-"""Sensitivity of the observations to the seven datum motions, for any change of the declared unknowns.
+"""Sensitivity of the observations to the seven datum motions, under any change of the declared unknowns.
 
-Unknowns determined by rows of their own, such as priors and steps between knots of a trajectory, cannot compensate a
-motion that no row sees. There may be thousands: their rows are sparse, only their normal matrix is full.
+Unknowns determined by their own rows, such as priors and differences between knots of a trajectory, cannot compensate a
+motion that changes no row. There may be thousands: their rows are sparse, only their normal matrix is full.
 """
 
 from dataclasses import dataclass, replace
@@ -23,13 +23,13 @@ from jaxphoto.compiling import jit_quickly
 
 # Singular values of a scaled sensitivity below this are zero.
 _OPEN = 1e-9
-# The same for their squares, as far as double precision separates these from zero.
+# Squared singular values below this are zero: limit of double precision.
 _OPEN_SQUARED = 1e-13
-# Squares above this are not zero, whatever the rounding.
+# Squared singular values above this are nonzero for any rounding error.
 _PLAIN = 1e-10
 # Number of rows per column that are triangularised at a time.
 _WIDE = 4
-# Step of the numbers of rows that are compiled for.
+# Row counts are padded to a multiple of this for compilation.
 _ROWS = 64
 
 
@@ -43,36 +43,37 @@ class SeenMotions:
     """Rows that touch only declared unknowns."""
 
     def null_motions(self) -> Float[np.ndarray, "defect 7"]:
-        """Return orthonormal combinations of the seven motions that no row sees; unknowns may compensate them.
+        """Return orthonormal combinations of the seven motions that change no row; unknowns may compensate them.
 
-        Unknowns determined by rows of their own may not: otherwise these rows would see the motion.
+        Unknowns determined by their own rows may not: these rows would change.
         """
         open_ones = np.setdiff1d(np.arange(7, self.alone.shape[1]), self.determined)
         kept = np.concatenate([np.arange(7), open_ones])
         sensitivity = scipy.sparse.vstack([self.placed, self.alone]).tocsr()[:, kept].toarray()
-        # Most rows see none of these.
+        # Most rows depend on none of these columns.
         sensitivity = sensitivity[sensitivity.any(axis=1)]
         if not len(sensitivity):
             return np.eye(7)
-        # Motions have similar size by construction; unknowns are scaled accordingly.
+        # Motions have similar size by construction; scale the unknowns accordingly.
         norm = np.sqrt((sensitivity**2).sum(0))
         norm[:7] = norm[:7].max()
         norm = np.where(norm > 0, norm, 1.0)
-        # The triangle has the same singular values and directions, and no more rows than columns.
+        # The triangular factor has the same singular values and right singular vectors, and no more rows than columns.
         _, s, vt = np.linalg.svd(np.linalg.qr(sensitivity / norm, mode="r"), full_matrices=True)
         rank = int((s > _OPEN * max(s.max(initial=0.0), 1e-300)).sum())
         if np.abs(vt[rank:, :7]).max(initial=0.0) < _OPEN:
-            # Motions of unknowns alone, such as a camera's rates, are unseen: their parts of the motions are rounding.
+            # Null vectors of unknowns alone, such as rates of a camera, do not move the block: their motion components
+            # are rounding errors.
             return np.zeros((0, 7))
         null = (vt[rank:] / norm)[:, :7]
         _, s2, basis = np.linalg.svd(null / max(np.abs(null).max(initial=0.0), 1e-300), full_matrices=False)
         return basis[s2 > 1e-9]
 
     def weak_motions(self, sigma: float) -> tuple[Float[np.ndarray, "weak 7"], float]:
-        """Return combinations of motions whose rotations and scale are determined no better than `sigma` (rad), and the
-        worst.
+        """Return the combinations of motions whose rotations and scale have a standard deviation above `sigma` (rad),
+        and the largest standard deviation.
 
-        All unknowns compensate as far as rows of their own allow.
+        All unknowns compensate as far as their own rows allow.
         """
         rows = scipy.sparse.vstack([self.placed, self.alone]).tocsr()
         normal = (rows.T @ rows).toarray()
@@ -80,23 +81,23 @@ class SeenMotions:
         kept = np.setdiff1d(np.arange(len(normal)), gone)
         normal = _eliminated(normal[np.ix_(kept, kept)], normal[np.ix_(kept, gone)], normal[np.ix_(gone, gone)])
         squares, directions = np.linalg.eigh(_eliminated(normal[:7, :7], normal[:7, 7:], normal[7:, 7:]))
-        # Only rotations and scale: shifts that accompany them make them visible.
+        # Use rotations and scale only: shifts that accompany them are determined.
         found = np.linalg.norm(directions[3:], axis=0) / np.sqrt(np.maximum(squares, 1e-300))
         return directions.T[found > sigma], float(found.max())
 
     @classmethod
     def of_motions(cls, rows: Float[np.ndarray, "rows 7"]) -> "SeenMotions":
-        """Create from rows that see only motions."""
+        """Create from rows that depend only on motions."""
         return cls(scipy.sparse.csr_array(rows), scipy.sparse.csr_array((0, 7)))
 
     def with_motions(self, rows: Float[np.ndarray, "rows 7"]) -> "SeenMotions":
-        """Append rows that see only motions."""
+        """Append rows that depend only on motions."""
         more = scipy.sparse.csr_array(np.pad(rows, [(0, 0), (0, self.placed.shape[1] - 7)]))
         return replace(self, placed=scipy.sparse.vstack([self.placed, more]).tocsr())
 
     @cached_property
     def determined(self) -> Int[np.ndarray, "k"]:
-        """Return columns of unknowns determined by their own rows, judged for all that these rows join together."""
+        """Return columns of unknowns determined by their own rows, testing each connected set of unknowns jointly."""
         own = self.alone[:, 7:].tocsc()
         count, part = scipy.sparse.csgraph.connected_components(own.T @ own, directed=False)
         found = [np.zeros(0, int)]
@@ -109,13 +110,13 @@ class SeenMotions:
 
 
 def _determines_all(rows: scipy.sparse.csr_array) -> bool:
-    """Return True if rows determine each of their columns; of 100,000 rows most never become dense."""
+    """Return True if rows determine each of their columns. Most of 100,000 rows are never converted to dense form."""
     n = rows.shape[1]
     rows = rows @ scipy.sparse.diags_array(1 / np.sqrt(rows.power(2).sum(axis=0)))
     squares = np.linalg.eigvalsh((rows.T @ rows).toarray())
     if squares[0] > _PLAIN * squares[-1]:
         return True
-    # Squares are inconclusive for the rest. A triangle has the singular values of its rows.
+    # The squares are inconclusive for the rest. The triangular factor has the singular values of its rows.
     triangle: np.ndarray = np.zeros((0, n))
     for first in range(0, rows.shape[0], _WIDE * n):
         triangle = np.asarray(np.linalg.qr(np.vstack([triangle, rows[first : first + _WIDE * n].toarray()]), mode="r"))
@@ -126,7 +127,7 @@ def _determines_all(rows: scipy.sparse.csr_array) -> bool:
 def _eliminated(
     kept: Float[np.ndarray, "n n"], cross: Float[np.ndarray, "n k"], gone: Float[np.ndarray, "k k"]
 ) -> Float[np.ndarray, "n n"]:
-    """Eliminate some unknowns from the normal matrix; unknowns that no row sees change nothing."""
+    """Eliminate some unknowns from the normal matrix; unknowns that touch no row change nothing."""
     size = np.sqrt(np.diag(gone))
     size = np.where(size > 0, size, 1.0)
     values, vectors = np.linalg.eigh(gone / size / size[:, None])
@@ -138,9 +139,9 @@ def _eliminated(
 def row_sensitivity(
     values: Values, s: Structure, motions: DatumRows, chosen: Int[np.ndarray, "unknowns"]
 ) -> SeenMotions:
-    """Return the sensitivity of all rows except image rows, which see no motion; `chosen` are shared unknowns."""
+    """Return the sensitivity of all rows except image rows, which no motion changes; `chosen` are shared unknowns."""
     width = 7 + len(chosen)
-    # Unknowns not chosen, and missing ones, have an extra last column.
+    # Append a column for missing unknowns and unknowns not chosen.
     place = np.full(s.n_shared + 1, width)
     place[chosen] = 7 + np.arange(len(chosen))
     found: dict[bool, list[scipy.sparse.csr_array]] = {
@@ -161,13 +162,13 @@ def row_sensitivity(
 
 
 def _in_few_sizes(values: Values, s: Structure) -> tuple[Values, Structure]:
-    """Drop image rows and pad the others to few sizes.
+    """Drop image rows and pad the other groups to few sizes.
 
-    A search for blunders removes a row or two at a time, and each size is compiled separately.
+    A search for blunders removes one or two rows at a time, and each size is compiled separately.
     """
     observed, numbers = [], []
     for g, own in zip(s.observed, values.groups, strict=True):
-        # A few rows with many numbers may fill the memory.
+        # A few rows with many components may fill the memory.
         more = size_class(g.n_rows, max(1, _ROWS // g.components)) - g.n_rows
 
         def longer(v: Any, more: int = more) -> np.ndarray:
@@ -187,13 +188,13 @@ def _in_few_sizes(values: Values, s: Structure) -> tuple[Values, Structure]:
 
 @jit_quickly
 def _slopes(values: Values, s: Structure, motions: DatumRows):
-    """Return derivatives of the rows of each group by the motions and by the shared unknowns they touch."""
+    """Return derivatives of the rows of each group with respect to the motions and the shared unknowns they touch."""
     zero = zero_increments(s)
     one = jax.tree.map(jnp.ones_like, zero)
     slopes = []
     for g, numbers in zip(s.observed, values.groups, strict=True):
         row = row_jacobian(g, numbers, zero, one, values, s)
-        # Rows last, with the numbers of one image or point each.
+        # Rows last, with the components of one image or point each.
         by_motion = jnp.einsum("ckar,makr->cmr", row.eop, jnp.asarray(motions.eop)[..., g.image])
         by_motion += jnp.einsum("cjar,majr->cmr", row.points, jnp.asarray(motions.points)[..., g.point])
         slopes.append((by_motion, row.shared))

@@ -1,15 +1,16 @@
 """Gradients of many adjustments of one block.
 
-Adjustments that differ only in numbers are computed side by side. The last axis runs over the draws, so the numbers of
-an image row are contiguous. Unlike the rays of a single adjustment (`adjustment.layout`) there are no empty slots:
-image rows are listed, and gather and scatter contiguous numbers in chunks that fit in the cache of a core.
+Adjustments that differ only in their values (draws) are computed together. The last axis runs over the draws, so the
+values of an image row are contiguous. Unlike the rays of a single adjustment (`adjustment.layout`) there are no empty
+slots: image rows are listed, and contiguous values are gathered and scattered in chunks that fit in the cache of a
+core.
 
 With u the point of an image row in the camera frame and q half the sum of its squared weighted residuals,
 
     dq/d(image) = (du/d(image))' dq/du,    dq/d(point) = (du/d(point))' dq/du,    dq/d(camera)
 
-by automatic differentiation of the model of one row. Each is stored before it is summed: XLA recomputes what it fuses
-for every result that needs it.
+by automatic differentiation of the model of one row. Each is stored before it is summed: XLA would recompute fused
+terms for every result that uses them.
 """
 
 from collections.abc import Callable, Sequence
@@ -45,7 +46,7 @@ class Common(eqx.Module):
     """Data common to all draws, in padded sizes; image rows (2, rows) by row of the block."""
 
     at: Linearised
-    """Nominal optimum, at which all draws start."""
+    """Nominal optimum, the start of all draws."""
     factored: FactoredNormal
     xy: Float[ArrayLike, "2 rows"]
     sigma_xy: Float[ArrayLike, "2 rows"]
@@ -53,7 +54,7 @@ class Common(eqx.Module):
 
     @property
     def values(self) -> PaddedValues:
-        """Nominal numbers."""
+        """Nominal values."""
         return self.at.values
 
     @property
@@ -67,12 +68,12 @@ class Common(eqx.Module):
         return self.at.structure
 
     def solve(self, b: Increments) -> Increments:
-        """Solve N x = b with the nominal N; use `jax.vmap` for many."""
+        """Solve N x = b with the nominal N; use `jax.vmap` for many right-hand sides."""
         return solve_factored(self.factored.reduced, self.factored.factor, b, self.at)
 
 
 def held_in(structure: PaddedStructure, parameters: int) -> dict[str, np.ndarray]:
-    """Return masks of fixed values by leaf of `Values` with start values: only fixed ones distinguish draws."""
+    """Return masks of fixed values by leaf of `Values` with start values: draws differ only in fixed ones."""
     s = structure
     return {
         "position": s.eop_free[:3] == 0,
@@ -131,7 +132,7 @@ def _bent_cameras(shared: Float[Array, "parameters draws"], varying: Varying, co
 def _values_with(varying: Varying, common: Common) -> PaddedValues:
     def of_draw(path: Any, nominal: Any) -> Any:
         name = path_name(path)
-        # Image rows are not padded here, and their parameters are not needed.
+        # Image rows are not padded here; their parameters are not needed.
         return nominal if name in ("xy", "sigma_xy") else varying.get(name, nominal)
 
     return jax.tree_util.tree_map_with_path(of_draw, common.values)
@@ -167,7 +168,7 @@ def _group_cotangent(
 ) -> tuple[UnknownArrays, Array]:
     """Differentiate the sum of q over the rows of a group with respect to the state and to `bent`.
 
-    `bent` holds the camera parameters by image if declared parameters modify them; derivatives by the state's camera
+    `bent` contains the camera parameters by image if declared parameters modify them; derivatives by the state's camera
     parameters are then zero.
     """
     n, size = state.position.shape[1:]
@@ -179,14 +180,14 @@ def _group_cotangent(
     table = state.shared[own].reshape(cameras, m, size) if bent is None else bent
     zero = _Sums(nothing, nothing, jnp.zeros_like(table), jnp.zeros_like(of_points))
     if bent is not None:
-        # Each image is a camera of its own.
+        # Treat each image as a separate camera.
         rows = eqx.tree_at(lambda r: r.camera, rows, rows.image)
 
     def add(sums: _Sums, rows: RowList) -> tuple[_Sums, None]:
         return _with_chunk(sums, group, rows, of_images, of_points, table, seen, s), None
 
     sums, _ = jax.lax.scan(add, zero, rows)
-    # Of the cotangent of a matrix R that changes by -t x R, the part along such changes.
+    # Project the cotangent of a rotation matrix R onto its changes -t x R.
     rotation = -0.5 * jnp.cross(sums.turn.transpose(1, 0, 2)[:, None], state.rotation, axis=0)
     shared = jnp.zeros_like(state.shared)
     if bent is None:
@@ -215,12 +216,12 @@ def _with_chunk(
         return tuple(camera_coordinates(ExteriorOrientation(image[9:], rotation_of(image)), aim_of(image, point)))
 
     def back_to_aim(image, to_u):
-        """Differentiate by the point that the ray aims at, in the object frame."""
+        """Differentiate with respect to the point that the ray aims at, in the object frame."""
         here = lambda aim: tuple(rotate(rotation_of(image), aim))  # noqa: E731
         return jax.linear_transpose(here, jnp.zeros(3))(to_u)[0]
 
     def back_to_turn(u, to_u):
-        """Differentiate by a small rotation t of the image, which adds u x t to u."""
+        """Differentiate with respect to a small rotation t of the image, which adds u x t to u."""
 
         def turned(t):
             return u[1] * t[2] - u[2] * t[1], u[2] * t[0] - u[0] * t[2], u[0] * t[1] - u[1] * t[0]
@@ -250,7 +251,7 @@ def _with_chunk(
 
 
 def _units(of: tuple[Array, ...]) -> list[tuple[Array, ...]]:
-    """Return the unit vectors of a tuple of scalars, as such tuples."""
+    """Return the unit vectors of the space of a tuple of scalars, as tuples."""
     return [tuple(jnp.ones(()) if j == k else jnp.zeros(()) for j in range(len(of))) for k in range(len(of))]
 
 
@@ -272,7 +273,7 @@ def _camera_cotangent(
 ) -> tuple[Array, tuple[Array, ...]]:
     """Return dq/d(table), summed over the rows of a group, and dq/du of each row."""
     cameras, m = table.shape[:2]
-    # One camera: the same for all rows.
+    # One camera: its parameters are the same for all rows.
     leaves = [table[rows.camera, k] if cameras > 1 else table[0, k] for k in range(m)]
     chosen = tuple(leaves[k] for k in group.free_leaves)
 
@@ -284,7 +285,7 @@ def _camera_cotangent(
     def weighed(chosen, u, leaves, xy, weight):
         return tuple(w * w * r for w, r in zip(weight, residual(chosen, u, leaves, xy), strict=True))
 
-    # Forward derivatives of two numbers by a few scalars: less than half the work of reverse mode.
+    # Use forward derivatives of two components with respect to a few scalars: less than half the work of reverse mode.
     def back(function: Callable, at: tuple[Array, ...], to_residual) -> tuple[Array, ...]:
         along = (jax.jvp(function, (at,), (unit,))[1] for unit in _units(at))
         return tuple(_dot(to_residual, slope) for slope in along)

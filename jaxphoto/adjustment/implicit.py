@@ -1,4 +1,4 @@
-"""Derivatives of the optimum with respect to the numbers of a block, by the implicit function theorem.
+"""Derivatives of the optimum with respect to the values of a block, by the implicit function theorem.
 
 At the optimum the gradient G(y, v) of half the weighted sum of squares vanishes, so dy = -H^-1 (dG/dv) dv with H the
 full second derivative (Gauss-Newton part and curvature). H is never formed: conjugate gradients use products with it,
@@ -28,7 +28,7 @@ from jaxphoto.adjustment.vmap_rule import ImageRowLists, optimum_of
 def find_optimum(values: PaddedValues, structure: PaddedStructure, task: SolveMode, rows: ImageRowLists) -> Optimum:
     """Run Levenberg-Marquardt from the start in `values`; under `jax.vmap`, use `side_by_side`.
 
-    Differentiable in every number of `values`.
+    Differentiable with respect to every value in `values`.
     """
     # Indices stay concrete: they are not arguments of the differentiated and mapped function.
     find = eqx.filter_custom_jvp(lambda values: optimum_of(values, structure, task, rows))
@@ -55,10 +55,11 @@ def _derivative(values: PaddedValues, direction: Any, at: Increments, structure:
     moved, still = eqx.partition(values, jax.tree.map(lambda t: t is not None, direction, is_leaf=lambda t: t is None))
     _, change = jax.jvp(lambda m: gradient(at, eqx.combine(m, still)), (moved,), (direction,))
     right, unravel = ravel_pytree(jax.tree.map(lambda c, k: -c * k, change, scale))
-    # One flat vector: the transposed solution requires that its right-hand side depends on the direction as a whole.
+    # Use one flat vector: the transposed solution requires that its right-hand side depends on the direction as a
+    # whole.
     flat = lambda tree: ravel_pytree(tree)[0]  # noqa: E731
 
-    # jit keeps the trace for the product and for its inverse.
+    # jit caches the trace for the product and for its inverse.
     @jax.jit
     def hessian(of_block, x):
         values, at, scale = of_block
@@ -70,7 +71,7 @@ def _derivative(values: PaddedValues, direction: Any, at: Increments, structure:
     def solve(of_block, rights):
         """Solve H x = b for the rows of `rights`."""
         values, at, scale = of_block
-        # The preconditioner belongs to the optimum, and needs its place in scaled increments.
+        # The preconditioner is evaluated at the optimum, in scaled increments.
         place = jax.tree.map(lambda a, k: jnp.where(k > 0, a / jnp.where(k > 0, k, 1.0), 0.0), at, scale)
         there = Linearised(place, scale, values, structure).for_normal_equations
         a, reduced, _ = reduce_normal(there, 0.0)
@@ -85,7 +86,7 @@ def _derivative(values: PaddedValues, direction: Any, at: Increments, structure:
 
     @solve.def_vmap
     def rule(size: int, batched: list[Any], of_block: Any, rights: Array) -> tuple[Array, bool]:
-        """Batching rule: right-hand sides of one block share its factor; several blocks are solved one at a time."""
+        """Batching rule: right-hand sides of one block share its factor; several blocks are solved sequentially."""
         if not any(jax.tree.leaves(batched[0])):
             found = solve(of_block, rights.reshape(-1, rights.shape[-1]))
             return found.reshape(rights.shape), True

@@ -1,4 +1,4 @@
-"""Log of the iteration for the logger `jaxphoto.adjustment` (level INFO)."""
+"""Iteration log for the logger `jaxphoto.adjustment` (level INFO)."""
 
 import logging
 from collections.abc import Iterator
@@ -18,7 +18,9 @@ def log_iterations(adjusted: Adjustment) -> None:
 
 
 def step_lines(adjusted: Adjustment) -> Iterator[str]:
-    """Return one line per step: sigma0 before it and its length in standard deviations; the last one is the outcome."""
+    """Return one line per step: sigma0 before the step and step length in standard deviations; the last line is the
+    outcome.
+    """
     history, redundancy = adjusted.history, max(adjusted.redundancy, 1)
     if history is None:
         return

@@ -1,4 +1,4 @@
-"""Normal equations of a block at its optimum: the interface of statistics and sensitivity to the solver.
+"""Normal equations of a block at its optimum: interface of statistics and sensitivity to the solver.
 
 In scaled increments and padded order; `Adjustment.padded` converts to the order of the block.
 """
@@ -45,11 +45,11 @@ class NormalEquations(eqx.Module):
     """N x = b at the optimum, undamped and factored."""
 
     values: PaddedValues
-    """Their start values are the optimum."""
+    """Values of the block; the start values are the optimum."""
     structure: PaddedStructure
     factored: FactoredNormal
     is_weighed: bool = eqx.field(static=True, default=False)
-    """True if the datum constraints are already scaled as `at` needs them."""
+    """True if the datum constraints already have the scale required by `at`."""
 
     @property
     def scale(self) -> Increments:
@@ -58,7 +58,7 @@ class NormalEquations(eqx.Module):
 
     @property
     def at(self) -> Linearised:
-        """Place of linearisation: zero increments, with scaled datum constraints."""
+        """Linearisation point: zero increments, with scaled datum constraints."""
         s = self.structure
         values = self.values if self.is_weighed else weigh_datum(self.values, s)
         return Linearised(jax.tree.map(jnp.zeros_like, self.scale), self.scale, values, s)
@@ -77,7 +77,7 @@ class NormalEquations(eqx.Module):
         return dataclasses.replace(self, values=values, structure=self.structure.on_one_device, factored=factored)
 
     def solve(self, b: Increments) -> Increments:
-        """Solve N x = b; use `jax.vmap` for many."""
+        """Solve N x = b; use `jax.vmap` for many right-hand sides."""
         return solve_factored(self.factored.reduced, self.factored.factor, b, self.at)
 
     def jt_product(self, z: PaddedResiduals) -> Increments:
@@ -101,11 +101,11 @@ class NormalEquations(eqx.Module):
         return cofactors_of(self.at, self.factored, of_rows)
 
     def row_variances(self, q: Cofactors, of_rows: RowCofactors) -> tuple[Array, tuple[Array, ...]]:
-        """Return J Q J' of image rows, and of the numbers of each other row (c, c, ...)."""
+        """Return J Q J' of the image rows, and of every other group as (c, c, ...), c components per row."""
         return row_variances(self.at, q, of_rows, self.factored)
 
     def reduce(self, b: Increments) -> tuple[Float[Array, "reduced"], Float[Array, "constraints"]]:
-        """Eliminate points from a right-hand side; returns the parts for the reduced unknowns and for mu."""
+        """Eliminate points from a right-hand side; return its parts for the reduced unknowns and for mu."""
         return reduce_right(self.factored.reduced, b, self.at)
 
     def expand(
@@ -127,8 +127,8 @@ class NormalEquations(eqx.Module):
         return invert_band(self.factored.factor)
 
     def pivots(self) -> Float[Array, "reduced"]:
-        """Return the remaining information of each reduced unknown after elimination of those before: 1 full, 0 rank
-        defect.
+        """Return the remaining information of each reduced unknown after elimination of the preceding ones: 1 full, 0
+        rank defect.
         """
         return call_compiled(_pivots, self.factored.reduced.diagonal, self.factored.factor)
 
@@ -149,20 +149,20 @@ class NormalEquations(eqx.Module):
 
 
 class CoupledUnknowns(NamedTuple):
-    """Unknowns coupled with points, as places among the reduced unknowns and k constraints; beyond these if none."""
+    """Unknowns coupled with points, as indices among the reduced unknowns and k constraints; larger for none."""
 
     of_images: Int[Array, "images e"]
-    """Unknowns that an image is eliminated with: exterior orientation, and its camera's if `RayLists.by_image`."""
+    """Unknowns eliminated with an image: exterior orientation, and camera parameters if `RayLists.by_image`."""
     of_points: Int[Array, "points c"]
     """Interior unknowns, constraints, the right-hand side (none), and unknowns that rows at the points of a group
     touch.
     """
     interior: int
-    """Number of interior unknowns among these."""
+    """Number of interior unknowns in `of_points`."""
 
     @classmethod
     def of(cls, s: PaddedStructure, k: int) -> "CoupledUnknowns":
-        """Return those of a block."""
+        """Return the coupled unknowns of a block."""
         of_images, of_groups = reduced_columns(s, k)
         return cls(of_images, jnp.repeat(of_groups, GROUP, axis=0), interior_in_border(s))
 
@@ -177,7 +177,7 @@ class CoupledUnknowns(NamedTuple):
         sums = sums.with_pairs(f, s, k)
         columns, last = sums.band
         width, size = len(last), s.n_shared + k
-        # Only one half of each pair of images is stored.
+        # Only one triangle of the pairs of images is stored.
         none = jnp.zeros((0, 6 * (n - width)))
         pairs = dense(Band(columns.reshape(-1, 12 * width, 6 * width), none, last.reshape(6 * width, -1)))
         own = sums.own.reshape(n, -1, sums.across.shape[2])[:, :6, :6]
@@ -186,7 +186,7 @@ class CoupledUnknowns(NamedTuple):
         return jnp.block([[own - pairs, across.T], [across, sums.border[:size, :size]]])
 
 
-# Without jit each operation would be compiled separately, and the first takes half a second every time.
+# Without jit each operation would be compiled separately, and the first takes 0.5 s every time.
 _weighed = eqx.filter_jit(weigh_datum)
 _pivots = eqx.filter_jit(pivots)
 

@@ -1,4 +1,4 @@
-"""Warnings about numbers with fewer digits than an adjustment needs (docs/statistics.md)."""
+"""Warnings about values with fewer digits than an adjustment needs (docs/statistics.md)."""
 
 import warnings
 
@@ -10,7 +10,7 @@ from jaxphoto.unknowns import Unknowns
 
 
 def warn_of_precision_loss(block: Block, start: Unknowns, priors: Unknowns) -> None:
-    """Warn if JAX computes in 32 bits, and about numbers given with fewer than 64."""
+    """Warn if JAX computes in 32 bits, and about values with fewer than 64 bits."""
     if not jax.config.values["jax_enable_x64"]:
         warnings.warn(
             "JAX computes with 32 bits (jax_enable_x64 was switched off after jaxphoto was imported): an adjustment "

@@ -1,4 +1,4 @@
-"""Rank defects: unknowns that the observations cannot determine or separate, by name."""
+"""Rank defects: names of unknowns that the observations cannot determine or separate."""
 
 import math
 from collections.abc import Iterable
@@ -24,19 +24,19 @@ from jaxphoto.observations import AbstractObservations, CameraPositions, Correla
 from jaxphoto.parameters import dynamic_fields
 from jaxphoto.unknowns import FREE, Unknowns, late_cameras
 
-# Pivots of the unit-diagonal reduced matrix below this are a rank defect: rounding of float64, not geometry.
+# Pivot of the unit-diagonal reduced matrix below which it is singular: a rounding error of float64, not geometry.
 DEFECT = 1e-13
 
 
 def check_priors(block: Block, priors: Unknowns) -> None:
     """Raise RankError or DatumError for free unknowns that no observation can determine.
 
-    Uses only which observation touches which unknown, so nothing is compiled.
+    Uses only the unknowns that each observation touches, so nothing is compiled.
     """
     _check_scales(priors)
     with_station = _images_of_stations(block)
     with_attitude = set(np.asarray(block.attitudes.image).tolist())
-    # Another observation of an image may determine its mount, as the trajectory shared with a scanner does.
+    # Another observation of an image may determine its mount: for example, a trajectory shared with a scanner.
     further = _images_touched(block)
     _check_mounts(block, priors, with_station | further, with_attitude | further)
     _check_strips(block, priors, with_station)
@@ -62,8 +62,8 @@ def _images_touched(block: Block) -> set[int]:
 def _check_scales(priors: Unknowns) -> None:
     """Raise RankError if a camera's principal distance and a coefficient of the same effect are both free.
 
-    The normal matrix would not show it: residuals refer to ideal coordinates, so a smaller scale reduces the residuals,
-    and the sum of squares has no minimum.
+    The normal matrix would not be singular. Residuals refer to ideal coordinates, so a smaller scale reduces the
+    residuals, and the sum of squares has no minimum.
     """
     for camera, interior in priors.interior.items():
         for name in interior.distortion.scales:
@@ -120,7 +120,7 @@ def _check_strips(block: Block, priors: Unknowns, with_station: set[int]) -> Non
 
 
 def _check_shifts(block: Block, priors: Unknowns, with_station: set[int]) -> None:
-    """Raise an error if free shifts of all stations leave the position of the block open."""
+    """Raise an error if free shifts of all stations leave the position of the block undetermined."""
     if block.datum.kind != "control" or not with_station:
         return
     if len(block.control.who) + len(block.fixed.who) + len(block.surfaces.point):
@@ -156,7 +156,7 @@ def _check_camera_rates(block: Block, priors: Unknowns) -> None:
         owners, what = priors.more.get(rates.kind, {}), rates.along.split("_")[0]
         if not owners:
             continue
-        # Concrete numbers, also inside a traced function.
+        # Concrete values, also inside a traced function.
         with jax.ensure_compile_time_eval():
             along = to_numpy(rates.argument(exposures(block)))
         for name, prior in owners.items():
@@ -176,7 +176,7 @@ def _check_camera_rates(block: Block, priors: Unknowns) -> None:
 
 
 def _check_camera_splines(block: Block) -> None:
-    """Check that splines cover their flight and share one interval: they are evaluated side by side."""
+    """Check that splines cover their flight and have a common interval: they are evaluated together."""
     splines: Any = block.start.unknowns.more.get(CameraSpline.kind, {})
     if not splines:
         return
@@ -197,7 +197,7 @@ def _check_camera_splines(block: Block) -> None:
 
 
 def _check_rigs(block: Block, priors: Unknowns) -> None:
-    """Check that images of a rig belong to its cameras, and that their motion is known if one exposes late."""
+    """Check that images of a rig belong to its cameras, and that their motion is known if a camera exposes late."""
     known = block.start.unknowns.more.get(RigCamera.kind, {})
     late = late_cameras(block.start.unknowns, priors)
     if late and block.motion is None:
@@ -221,7 +221,7 @@ def _images_of(name: str, names: Iterable[str]) -> set[int]:
 
 
 def check_rank(adjusted: Adjustment) -> None:
-    """Raise RankError if the normal matrix at the optimum is singular, naming what is open and the cure."""
+    """Raise RankError if the normal matrix at the optimum is singular, with the undetermined unknowns and the cure."""
     if adjusted.factored is None or not bool(adjusted.converged):
         return
     if adjusted.equations.least_pivot() > DEFECT:
@@ -234,7 +234,7 @@ def check_rank(adjusted: Adjustment) -> None:
 
 @eqx.filter_jit
 def reduced_matrix(equations: NormalEquations) -> Band:
-    """Return the undamped reduced normal matrix; the solver keeps only its factor, which is incomplete at a defect."""
+    """Return the undamped reduced normal matrix; the solver stores only its factor, which is incomplete at a defect."""
 
     def of_device(at: Linearised) -> Band:
         return reduce_normal(at, 0.0)[0]

@@ -51,15 +51,16 @@ class Outcome(enum.Enum):
     )
 
 
-# Relative to the median distance of a point: float64 resolves directions over a base of a few nanoradians.
+# Ratio of a point's distance to the median distance, above which it has diverged: float64 resolves directions over a
+# base of a few nanoradians.
 _FARTHEST = 1e7
-# Image coordinates of one adjustment: batches, x and y, chunks, rays.
+# Number of axes of the image coordinates of one adjustment: batches, x and y, chunks, rays.
 _DIMENSIONS = 4
 _factored = eqx.filter_jit(factor_normal)
 
 
 class Seconds(dict):
-    """Seconds by activity. All compare equal, so that no JAX program depends on them."""
+    """Seconds by activity. All instances compare equal: no JAX program depends on them."""
 
     def __hash__(self) -> int:  # type: ignore[override]
         return 0
@@ -69,7 +70,7 @@ class Seconds(dict):
 
 
 class Adjustment(eqx.Module):
-    """Result of `jaxphoto.adjust`; see `jaxphoto.statistics` for statistics of it.
+    """Result of `jaxphoto.adjust`; `jaxphoto.statistics` computes its statistics.
 
     `residuals` are observed minus computed over the a priori sigma, by group. `sigma0` is the square root of the a
     posteriori variance factor v'Pv / redundancy.
@@ -83,12 +84,12 @@ class Adjustment(eqx.Module):
     padded: PaddedBlock = eqx.field(static=True)
     padded_values: PaddedValues
     factored: FactoredNormal | None
-    """None in an adjustment that is differentiated or mapped; see `equations`."""
+    """None if the adjustment is differentiated or mapped; see `equations`."""
     steps: Int[ArrayLike, ""]
     converged: Bool[ArrayLike, ""]
     seconds: dict[str, float] = eqx.field(static=True, converter=lambda v: v if isinstance(v, Seconds) else Seconds(v))
     left_out: tuple[str, ...] = eqx.field(static=True, default=())
-    """Tie points of the given block that are omitted: their rays do not intersect."""
+    """Omitted tie points of the given block: their rays do not intersect."""
     sizes: PaddedSizes = eqx.field(static=True, default=MINIMAL_SIZES)
     """Minimum sizes it was compiled for; with them the block is re-adjusted by the same program."""
 
@@ -101,7 +102,7 @@ class Adjustment(eqx.Module):
         return adjustment_html(self, self.unknowns.words)
 
     def verdict(self) -> "Verdict":
-        """Verdict (green, amber or red) and the findings behind it (docs/trust.md)."""
+        """Verdict (green, amber or red) and its findings (docs/trust.md)."""
         return from_upstairs("verdict_of")(from_upstairs("Tables")(self))
 
     def plot(self, ax: "Axes | None" = None, *, in_3d: bool = False) -> "Axes":
@@ -151,13 +152,13 @@ class Adjustment(eqx.Module):
 
     @property
     def diverged_points(self) -> Bool[np.ndarray, "points"]:
-        """True for points so far away, compared with the others, that the directions of their rays do not differ.
+        """True for points so distant, compared with the others, that their rays are parallel.
 
-        Their standard deviations are larger still, so that any such place is as good as the optimum.
+        Their standard deviations are even larger: the optimum is not better than any other such position.
         """
         s, u = self.structure, self.unknowns
         x, y, z = (to_numpy(u.points)[s.point] - to_numpy(u.exterior.position)[s.image]).T
-        # No squares: they overflow from 1e154 m on.
+        # Do not square: squares overflow from 1e154 m on.
         distance = np.hypot(np.hypot(x, y), z)
         far = np.zeros(len(self.block.points), bool)
         if len(distance):
@@ -166,7 +167,7 @@ class Adjustment(eqx.Module):
 
     @property
     def n_observations(self) -> dict[str, int]:
-        """Number of observations by group: image_points, those of `Block.observations`, priors; 0 if none."""
+        """Number of observations by group: image_points, the groups of `Block.observations`, priors; 0 if none."""
         groups = (self.block.image_points, *self.block.observations)
         none = {rows.group: 0 for rows in groups} | {PRIORS: 0}
         return none | {name: int(np.size(v)) for name, v in self.residuals.named.items()}
@@ -188,7 +189,7 @@ class Adjustment(eqx.Module):
 
     @property
     def n_constraints(self) -> int:
-        """Number of constraints that close the datum."""
+        """Number of constraints that fix the datum."""
         return self.residuals.datum.shape[0]
 
     @property

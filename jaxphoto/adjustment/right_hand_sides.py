@@ -1,4 +1,4 @@
-"""Solution of N x = b for many right-hand sides by one program per block."""
+"""Solution of N x = b for many right-hand sides with one program per block."""
 
 from collections.abc import Iterator
 from operator import itemgetter
@@ -12,15 +12,15 @@ from jaxphoto.adjustment.normal_equations import NormalEquations
 from jaxphoto.arrays import is_traced, to_numpy
 from jaxphoto.compiling import prepare, run_compiled
 
-# Number of right-hand sides solved side by side: recomputing F of a large block costs more than they do. Together they
-# have at most this many numbers, as several arrays of them are held.
+# Maximum number of right-hand sides solved at a time: recomputing F of a large block costs more than solving for them.
+# Maximum number of their elements in total: several such arrays are in memory.
 _AT_ONCE, _NUMBERS = 48, 8_000_000
 
 
 def solve_many(equations: NormalEquations, b: Increments, seconds: dict[str, float]) -> Increments:
     """Solve N x = b for right-hand sides along a leading axis, in scaled increments.
 
-    `equations` must be on one device with scaled datum constraints: others would need another program.
+    `equations` must be on one device with scaled datum constraints; any other form would require a second program.
     """
     if is_traced((equations, b)):
         return _solve(equations, b)
@@ -30,22 +30,22 @@ def solve_many(equations: NormalEquations, b: Increments, seconds: dict[str, flo
 
 
 def joined(parts: list[Increments], one: Increments, many: int) -> Increments:
-    """Concatenate batches of increments like `one`, without padding; also of none."""
+    """Concatenate batches of increments like `one`, without padding; the list may be empty."""
     return jax.tree.map(lambda like, *v: np.concatenate([np.zeros((0, *like.shape)), *v])[:many], one, *parts)
 
 
 def prepare_solving(equations: NormalEquations, seconds: dict[str, float]) -> None:
-    """Compile in the background what `solve_many` needs."""
+    """Compile the programs of `solve_many` in the background."""
     prepare(_solve, (equations, blank(equations.scale, at_once(equations.scale))), seconds)
 
 
 def blank(one: Increments, many: int) -> Increments:
-    """Return right-hand sides without memory, for their shapes."""
+    """Return abstract right-hand sides, without memory."""
     return jax.tree.map(lambda v: np.broadcast_to(0.0, (many, *v.shape)), one)
 
 
 def at_once(one: Increments) -> int:
-    """Return the number of right-hand sides like `one` that are solved side by side."""
+    """Return the number of right-hand sides like `one` that are solved at a time."""
     return int(np.clip(_NUMBERS // sum(np.size(v) for v in jax.tree.leaves(one)), 1, _AT_ONCE))
 
 

@@ -1,4 +1,4 @@
-"""Lists of image rows for many draws, and numbers of rows and draws processed at a time."""
+"""Lists of image rows for many draws, and number of rows and draws processed at a time."""
 
 import equinox as eqx
 import numpy as np
@@ -7,36 +7,36 @@ from jaxtyping import Float, Int
 from jaxphoto.adjustment.layout.rays import Places
 from jaxphoto.adjustment.model.structure import Structure
 
-# Draws that a device computes side by side (last axis). 32 suffice for vectorisation and for recomputed intermediates
-# (see `solver.elimination`); up to 64 pay off while image rows x draws stay below this number, fewer only if unknowns x
-# draws exceed this one, of which memory holds several.
+# Usual, maximum and minimum number of draws that a device computes together (last axis). 32 suffice for vectorisation
+# and to recompute intermediates (`solver.elimination`). More are used while image rows x draws stay below the fourth
+# value, fewer if unknowns x draws exceed the fifth: several such arrays are in memory.
 _FEW, _MOST, _LEAST = 32, 64, 8
 _ROWS, _UNKNOWNS = 100_000, 8_000_000
-# Image rows x draws that are processed at a time, so that intermediate arrays stay in the cache of a core.
+# Number of image rows x draws processed at a time: intermediate arrays then fit in the cache of a core.
 _AT_ONCE = 16_384
 
 
 def batch_size(structure: Structure) -> int:
-    """Return the number of draws of a block that a device computes side by side."""
+    """Return the number of draws of a block that a device computes together."""
     s = structure
     rows, unknowns = max(len(s.image), 1), max(int(s.eop_free.sum() + len(s.free) + s.point_free.sum()), 1)
     return int(max(_LEAST, min(np.clip(_ROWS // rows, _FEW, _MOST), _UNKNOWNS // unknowns)))
 
 
 class RowList(eqx.Module):
-    """Image rows of the cameras of one group, in chunks: index in the block, and what they touch.
+    """Image rows of the cameras of one group, in chunks: index in the block, and the objects they touch.
 
-    Images and points are those of a padded structure, points ascending. The last chunk repeats its last row, without
-    weight.
+    Images and points are indices into a padded structure, points ascending. The last chunk repeats its last row, with
+    zero weight.
     """
 
     row: Int[np.ndarray, "chunks rows"]
     image: Int[np.ndarray, "chunks rows"]
     point: Int[np.ndarray, "chunks rows"]
     camera: Int[np.ndarray, "chunks rows"]
-    """Camera within the group."""
+    """Camera (within the group) of each row."""
     counts: Float[np.ndarray, "chunks rows"]
-    """1; 0 for a repeated row."""
+    """Weight: 1, or 0 for a repeated row."""
 
 
 def row_lists(s: Structure, places: Places, at_once: int | None = None) -> tuple[RowList, ...]:

@@ -1,9 +1,10 @@
-"""Many adjustments of one block: the batching rule of the solver under `jax.vmap`.
+"""Adjustments of many draws of one block: the batching rule of the solver under `jax.vmap`.
 
 The first draw is adjusted by Levenberg-Marquardt. With its factored normal matrix all others take chord steps from its
-optimum to their own (`chords`), some draws at a time. The first draw that does not contract is adjusted by itself, and
-its factor is tried on the remaining draws; after a few factors the last ones are adjusted individually. All draws end
-where a loop over single adjustments would, and memory grows only with the results.
+optimum to their own (`chords`), some draws at a time. The first draw that does not contract is adjusted by
+Levenberg-Marquardt, and its factor is tried on the remaining draws; after a few factors the last ones are adjusted
+individually. All draws converge to the results of a loop over single adjustments, and memory grows only with the
+results.
 """
 
 from typing import Any, NamedTuple
@@ -26,9 +27,9 @@ from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import Optimum, iterate
 from jaxphoto.rotation import small_angles
 
-# Number of factors tried before the remaining draws are adjusted individually.
+# Maximum number of factors tried before the remaining draws are adjusted individually.
 _FACTORS = 3
-# Leaves of the values with start values, and those derived from the start.
+# Leaves of the values with start values, and leaves derived from the start.
 _STARTS, _DATUM = {"position", "rotation", "shared", "points"}, {"datum_eop", "datum_points"}
 
 
@@ -39,11 +40,11 @@ class ImageRowLists(NamedTuple):
     slot: Int[np.ndarray, "rows"]
     """Index of the ray."""
     draws: int
-    """Number of draws computed side by side."""
+    """Number of draws computed together."""
 
 
 def image_row_lists(padded: PaddedBlock) -> ImageRowLists:
-    """Return those of a block."""
+    """Return the row lists of a block."""
     return ImageRowLists(row_lists(padded.own, padded.places), padded.places.row, batch_size(padded.own))
 
 
@@ -52,7 +53,7 @@ def optimum_of(values: PaddedValues, structure: PaddedStructure, task: SolveMode
 
     @jax.custom_batching.custom_vmap
     def one(values: PaddedValues) -> Optimum:
-        # The history has no derivative, and is not needed where something is differentiated.
+        # The history has no derivative, and is not needed under differentiation.
         return iterate(values, structure, task)[0]._replace(history=None)
 
     @one.def_vmap
@@ -68,27 +69,27 @@ class _Draws(NamedTuple):
 
     number: int
     batched: PaddedValues
-    """True for each leaf with an axis of draws, its first."""
+    """True for each leaf whose first axis is the draws."""
     structure: PaddedStructure
     task: SolveMode
     rows: ImageRowLists
 
     @property
     def names(self) -> set[str]:
-        """Names of leaves that differ between draws; datum constraints follow from others."""
+        """Names of leaves that differ between draws; datum constraints are derived from others."""
         leaves = jax.tree_util.tree_leaves_with_path(self.batched)
         return {path_name(path) for path, batched in leaves if batched} - _DATUM
 
     def together(self, values: PaddedValues) -> bool:
-        """Return True if draws may start at each other's optimum."""
+        """Return True if draws may start at the optimum of another draw."""
         if self.structure.has_losses or self.names <= {"position", "rotation", "points"}:
-            # If only the start varies, the user asks where each start leads.
+            # If only the start varies, the result of each start is required.
             return False
-        # A datum about the start differs for every start.
+        # Datum constraints relative to the start differ for every start.
         return not (self.names & _STARTS and values.datum_eop.shape[-3])
 
     def some(self, values: PaddedValues, begin: Array, size: int) -> PaddedValues:
-        """Return the values of `size` draws from `begin` on."""
+        """Return the values of `size` draws starting at index `begin`."""
         cut = lambda v, batched: jax.lax.dynamic_slice_in_dim(v, begin, size) if batched else v  # noqa: E731
         return jax.tree.map(cut, values, self.batched)
 
@@ -106,7 +107,7 @@ def _optima(draws: _Draws, values: PaddedValues) -> Optimum:
 
     @many.def_vmap
     def rule(outer: int, outer_batched: list[Any], values: PaddedValues) -> tuple[Optimum, Optimum]:
-        """Draws of draws are flattened."""
+        """Flatten nested draws."""
         n = draws.number
 
         def joined(v: Array, is_outer: bool, is_inner: bool) -> Array:
@@ -137,7 +138,7 @@ def _found(draws: _Draws, values: PaddedValues) -> Optimum:
 
     def adjust_next(found: _Found) -> _Found:
         k = jnp.argmin(found.done)
-        # XLA must not know it to be positive (see `compiling.once`); it would know that of a constant.
+        # XLA must not infer that the value is positive (see `compiling.once`), as it would from a constant.
         free = draws.structure.eop_free * jnp.where(k >= 0, 1.0, 0.0)
         own = draws._replace(structure=eqx.tree_at(lambda s: s.eop_free, draws.structure, free))
         nominal = draws.one(values, k)
@@ -162,7 +163,7 @@ def _found(draws: _Draws, values: PaddedValues) -> Optimum:
 def _common(
     nominal: PaddedValues, optimum: Optimum, system: FactoredSystem, scale: Increments, draws: _Draws
 ) -> Common:
-    """Return data common to draws that start at the optimum of one of them."""
+    """Return the data common to draws that start at the optimum of one of them."""
     at = jax.tree.map(lambda x, k: jnp.where(k > 0, x / jnp.where(k > 0, k, 1.0), 0.0), optimum.increments, scale)
     xy, sigma = (_by_row(v[None], draws.rows.slot)[..., 0] for v in (nominal.xy, nominal.sigma_xy))
     factored = FactoredNormal(system.reduced, system.factor, scale)
@@ -170,11 +171,11 @@ def _common(
 
 
 def _with_chords(draws: _Draws, values: PaddedValues, common: Common, found: _Found) -> _Found:
-    """Apply chord steps to the draws that are not done, and keep those that converge."""
+    """Apply chord steps to the draws that are not done, and store the draws that converge."""
     size = min(draws.rows.draws, draws.number)
 
     def batch(k: Array, found: _Found) -> _Found:
-        # The last batch overlaps the one before; no draw is taken twice.
+        # The last batch overlaps the one before; no draw is adjusted twice.
         begin = jnp.minimum(k * size, draws.number - size)
         cut = lambda v: jax.lax.dynamic_slice_in_dim(v, begin, size)  # noqa: E731
         done = cut(found.done)
@@ -202,7 +203,7 @@ def _with_chords(draws: _Draws, values: PaddedValues, common: Common, found: _Fo
 
 
 def _varying(draws: _Draws, values: PaddedValues, common: Common) -> Varying:
-    """Return what differs between draws, draws last: of leaves with start values, only fixed ones."""
+    """Return the leaves that differ between draws, draws last; of leaves with start values, only fixed ones."""
     held = held_in(draws.structure, values.shared.shape[-1])
     varying = {}
     for path, v in jax.tree_util.tree_leaves_with_path(values):
@@ -236,7 +237,7 @@ def _from_start(values: PaddedValues, state: UnknownArrays, draws: _Draws) -> In
 
 
 def _by_row(v: Float[Array, "draws batches 2 chunks p"], ray: Int[np.ndarray, "rows"]) -> Float[Array, "2 rows draws"]:
-    """Return numbers of rays by image row, draws last."""
+    """Return values of rays by image row, draws last."""
     return jnp.moveaxis(v, 2, 0).reshape(2, len(v), -1)[:, :, ray].transpose(0, 2, 1)
 
 

@@ -6,9 +6,9 @@ the standard deviation of the observed positions or attitudes. With C the covari
     C u = mu u,    |u| = 1
 
 a direction u of large mu is weak: within one standard deviation unknown k moves by u_k sqrt(mu). A standard deviation
-in yardsticks is the dilution of precision of GNSS: the factor by which geometry amplifies observation errors. Found by
-subspace iteration with the factored normal matrix. Where that may be singular, slight damping gives an unseen direction
-a very large standard deviation instead of none.
+in yardsticks is the dilution of precision of GNSS: the factor by which geometry amplifies observation errors. The
+directions are computed by subspace iteration with the factored normal matrix. If that may be singular, slight damping
+gives an undetermined direction a very large, finite standard deviation.
 """
 
 import dataclasses
@@ -36,14 +36,14 @@ POOR = 20.0
 (Langley, Dilution of precision, GPS World 10(5), 1999).
 """
 OPEN = 1e4
-"""Above this the direction is unseen: only damping or noise remains."""
-# Relative to the diagonal of N: larger than rounding, smaller than any observation's contribution.
+"""Standard deviation in yardsticks above which a direction is undetermined: only damping or noise remains."""
+# Damping relative to the diagonal of N: larger than rounding errors, smaller than the contribution of any observation.
 _DAMPING = 1e-12
-# If all pivots of the reduced unknowns exceed this, damping would change them by a millionth, and the equations of the
-# adjustment suffice. Points with nearly parallel rays are then as in the adjustment.
+# Smallest pivot of the reduced unknowns above which damping is omitted: it would change them by a millionth. Points
+# with nearly parallel rays are then treated as in the adjustment.
 _FELT = 1e-6
 _DIRECTIONS, _ITERATIONS = 12, 6
-# Fraction of a direction's largest motion from which an unknown participates.
+# Fraction of a direction's largest motion above which an unknown participates.
 _MOVES = 0.1
 
 
@@ -98,14 +98,14 @@ class WeakDirection(NamedTuple):
 
     @property
     def shared(self) -> np.ndarray:
-        """Shared unknowns that participate, and those most of whose variance is due to this direction."""
+        """Shared unknowns that participate, and shared unknowns whose variance is mostly due to this direction."""
         moves = np.abs(self.moved.shared) > _MOVES * self.sigma
         return np.flatnonzero((self.share > 0.5) | (moves & (self.share > _MOVES)))
 
 
 def yardsticks(adjusted: Adjustment) -> Yardsticks:
     """Return the yardsticks of the unknowns of `adjusted`."""
-    # A camera may be turned inside out, with negative c and yardsticks, if the optimum does not fit.
+    # If the optimum does not fit, a camera may be inverted, with negative c and yardsticks.
     scale, block = jax.tree.map(lambda v: np.abs(to_numpy(v)), adjusted.equations.scale), adjusted.block
     ground = float(max(scale.eop[:3].max(initial=0.0), scale.points.max(initial=0.0)))
     angle = float(scale.eop[3:].max(initial=0.0))
@@ -128,8 +128,8 @@ def _unit(label: str) -> str:
 def weak_directions(adjusted: Adjustment, least: float = POOR) -> list[WeakDirection]:
     """Return directions with standard deviations above `least` yardsticks, the weakest first, a dozen at most.
 
-    Evaluated at the unknowns of `adjusted`: the optimum, or wherever the solver stopped. None if numbers there are
-    infinite. The standard deviations are a priori.
+    Evaluated at the unknowns of `adjusted`: the optimum, or the last iterate. None if any unknown is infinite. The
+    standard deviations are a priori.
     """
     equations, padded = _sound(adjusted), adjusted.padded
     yard = yardsticks(adjusted)
@@ -174,7 +174,7 @@ def _direction(of: Increments, variance: np.ndarray, padded: PaddedBlock) -> Wea
 
 
 def _increments(eop: Any, shared: Any, points: Any) -> Increments:
-    """Return increments of NumPy arrays."""
+    """Convert NumPy arrays to increments."""
     return Increments(eop, shared, points)
 
 
@@ -183,7 +183,7 @@ def _flat(tree: Increments) -> np.ndarray:
 
 
 def _columns(tree: Increments) -> np.ndarray:
-    """Return increments along a leading axis as columns."""
+    """Convert increments along a leading axis to columns."""
     return np.concatenate([to_numpy(v).reshape(len(v), math.prod(np.shape(v)[1:])) for v in tree], axis=1).T
 
 

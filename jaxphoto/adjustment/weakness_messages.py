@@ -1,8 +1,8 @@
-"""Messages about weak directions: which unknowns move together, how far, and the simplest cure.
+"""Messages about weak directions: unknowns that move together, size of the motion, and the simplest cure.
 
-A direction is named by what moves in it: points alone, an image, the block or a part of it as a rigid body, or shared
-parameters with compensating motions of the images. Fixing a parameter is proposed only if that leaves the direction no
-weaker than `POOR`, and control only if points move.
+A direction is named by the unknowns that move: points only, an image, the block or a part of it as a rigid body, or
+shared parameters with compensating motions of the images. Fixing a parameter is proposed only if the remaining
+direction is not weaker than `POOR`, and control only if points move.
 """
 
 from typing import NamedTuple
@@ -17,11 +17,11 @@ from jaxphoto.adjustment.weak_directions import OPEN, POOR, WeakDirection, weak_
 from jaxphoto.arrays import to_numpy
 from jaxphoto.errors import counted, few
 
-# Fraction of the squared motion that a similarity must explain.
+# Minimum fraction of the squared motion that a similarity must explain.
 _RIGID = 0.9
-# Image points whose second principal extent is below this fraction of the first are collinear.
+# Ratio of second to first principal extent below which image points are collinear.
 _LINE = 0.15
-# A motion of more than this fraction of all images is one of the whole block.
+# Fraction of all images above which a motion is one of the whole block.
 _WHOLE = 0.9
 _SHOWN = 3
 _SENTENCES = 3
@@ -34,9 +34,9 @@ class WeakUnknowns(NamedTuple):
     sentence: str
     labels: frozenset[str]
     sigma: float
-    """In yardsticks."""
+    """Standard deviation in yardsticks."""
     points: tuple[int, ...] = ()
-    """Points that may lie anywhere along their rays, if nothing else participates."""
+    """Points that may lie anywhere along their rays, if no other unknowns participate."""
 
 
 def weaknesses_of(adjusted: Adjustment, least: float = POOR) -> list[WeakUnknowns]:
@@ -48,13 +48,13 @@ def weaknesses_of(adjusted: Adjustment, least: float = POOR) -> list[WeakUnknown
             continue
         alike.setdefault(words.kind(direction), []).append(direction)
     told = [words.told(kind, directions) for kind, directions in list(alike.items())[:_SENTENCES]]
-    # If hardly any point is determined, nothing else needs a cure of its own.
+    # If most points are undetermined, report only that: all other defects follow from it.
     nowhere = next(iter(alike), ()) == ("points",) and 2 * len(next(iter(alike.values()))[0].points) > len(words.xyz)
     return told[:1] if nowhere else told
 
 
 class _Words:
-    """Data of a block needed to describe its directions."""
+    """Properties of a block needed to describe its directions."""
 
     def __init__(self, adjusted: Adjustment) -> None:
         self.block, self.structure = adjusted.block, adjusted.structure
@@ -65,7 +65,7 @@ class _Words:
         self.cameras = adjusted.unknowns.interior
 
     def kind(self, d: WeakDirection) -> tuple[str, ...]:
-        """Key of directions that share one message."""
+        """Key that groups directions into one message."""
         images, fields = tuple(self.block.images[i] for i in d.images), _fields(self._labels(d))
         if not images:
             return ("shared", *fields) if fields else ("points",)
@@ -76,14 +76,15 @@ class _Words:
         return ("images", *fields)
 
     def harmless(self, d: WeakDirection) -> bool:
-        """Return True if only images move and what they show remains: a tilt compensates a shift.
+        """Return True if only images move and their projections remain valid: a rotation compensates a shift.
 
-        Images of few points do so in valid blocks, if the place of a new point in the middle or a corner, seen from the
-        image, changes by less than `POOR` yardsticks.
+        Images of few points do so in valid blocks, if the position of a new point in the middle or a corner, as
+        projected by the image, changes by less than `POOR` yardsticks.
         """
         images = d.images
         if not (len(images) or len(d.shared) or len(d.points)):
-            # If the parameter that moves most owes most of its variance to another direction, that one reports it.
+            # If most of the variance of the parameter that moves most is due to another direction, that direction
+            # reports it.
             return True
         if not len(images) or len(d.shared) or np.abs(d.moved.points).max(initial=0.0) > POOR:
             return False
@@ -103,7 +104,7 @@ class _Words:
         return bool(np.linalg.norm(across, axis=2).max() < POOR * self.yard.ground)
 
     def told(self, kind: tuple[str, ...], directions: list[WeakDirection]) -> WeakUnknowns:
-        """Return the message about directions of one kind, led by the weakest."""
+        """Return the message about directions of one kind; the weakest comes first."""
         d = directions[0]
         labels = list(dict.fromkeys(label for one in directions for label in self._labels(one)))
         if kind[0] in ("block", "part"):
@@ -198,7 +199,7 @@ class _Words:
         return f"{what}: {_hardly(d)} ({self._sigmas(d)}) and not told apart: {_or(cures)}"
 
     def _holding(self, d: WeakDirection, labels: list[str]) -> str:
-        """Return the unknowns that suffice if fixed, one at a time."""
+        """Return the cure: fix one of several unknowns if one suffices, otherwise all."""
         enough = {label for label, left in zip(self.structure.labels, self._left(d), strict=True) if left < POOR}
         will_do = [label for label in labels if label in enough]
         if will_do:
@@ -206,11 +207,11 @@ class _Words:
         return f"fix {few(labels, ' and ')} at known values, or give them weights"
 
     def _left(self, d: WeakDirection) -> np.ndarray:
-        """Return the remaining fraction of the direction's sigma for each shared unknown fixed."""
+        """Return the remaining sigma of the direction, for each shared unknown if it is fixed."""
         return np.sqrt(1 - d.share) * d.sigma
 
     def _as_body(self, d: WeakDirection) -> Float[np.ndarray, "motions"] | None:
-        """Return the similarity of the motion; None if it is not one."""
+        """Return the similarity of the motion; None if it is not a similarity."""
         images, points = d.images, d.points
         places = self.xyz[points] if len(points) else self.position[images]
         centre = places.mean(axis=0)
@@ -228,7 +229,7 @@ class _Words:
         seen = np.concatenate([d.moved.exterior[images].ravel(), d.moved.points[points].ravel()])
         found, *_ = np.linalg.lstsq(columns, seen, rcond=None)
         left = np.sum((seen - columns @ found) ** 2) / np.sum(seen**2)
-        # Without points, images alone determine little: a similarity moves their points along.
+        # Without points, images alone determine little: a similarity also moves their points.
         return found / np.abs(found).max() if left < 1 - _RIGID and len(points) else None
 
     def _coordinates(self, d: WeakDirection) -> str:
@@ -240,7 +241,7 @@ class _Words:
         return _and([name for name, part in zip(names, parts, strict=True) if part > 0.3 * parts.max()])
 
     def _sigmas(self, d: WeakDirection) -> str:
-        """Return the motions of what participates."""
+        """Format the motions of the unknowns that participate."""
         if d.sigma > OPEN:
             return "nothing sees it"
         moved, yard, found = d.moved, self.yard, []
@@ -262,7 +263,7 @@ class _Words:
 
 
 def _those(names: tuple[str, ...], which: np.ndarray) -> str:
-    """Return some of the names by index."""
+    """Format some of the names, selected by index."""
     return few([names[k] for k in which])
 
 
@@ -272,7 +273,9 @@ def _fields(labels: list[str]) -> tuple[str, ...]:
 
 
 def _turns_with_heading(labels: list[str]) -> bool:
-    """Return True if the effect on the ground rotates with the heading: strips flown both ways reveal it."""
+    """Return True if the effect on the ground rotates with the heading: strips flown in opposite directions separate
+    it.
+    """
     ours = any(label.startswith(("mounts[", "interior[")) for label in labels)
     return ours and not any(label.endswith(("lever_arm_up_m", "c_mm")) for label in labels)
 

@@ -1,8 +1,8 @@
-"""Text that identifies what a program is compiled for, equal in every process.
+"""Text that identifies a compiled program, equal in every process.
 
 Two different programs must never have the same text. Only values that the text identifies completely are described:
-plain values, arrays by their type, containers, dataclasses, and functions and classes of packages whose sources or
-versions are in the key of `store`, by name.
+plain values, arrays by their type, containers, dataclasses, and, by name, functions and classes of packages whose
+sources or versions are in the key of `store`.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxphoto.static_values import StaticArray
 
-# Packages whose sources or versions are part of the key, so that a name in them identifies its content.
+# Packages whose sources or versions are part of the key: a name in them identifies its content.
 _KNOWN = frozenset({"jaxphoto", "jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy", "builtins"})
 _PLAIN = (type(None), bool, int, float, complex, str, bytes)
 
@@ -69,7 +69,7 @@ def _content(value: Any) -> list:
 
 
 def _array(value: Any) -> str:
-    """Return the type of an array: all that a compiled program requires of an argument."""
+    """Return the type of an array: a compiled program depends on no other property of an argument."""
     text = f"array {np.dtype(value.dtype).name} {value.shape}"
     if not isinstance(value, jax.Array):
         return text

@@ -10,12 +10,13 @@ import numpy as np
 from jaxphoto.compiling.options import quick_to_compile
 
 _Result = TypeVar("_Result")
-# A program takes up to 5 MB, and every block has other shapes.
+# Maximum number of cached shapes per function. A compiled program takes up to 5 MB, and every block has different
+# shapes.
 _SHAPES = 16
 
 
 def jit_quickly(function: Callable[..., _Result], static_argnum: int | None = None) -> Callable[..., _Result]:
-    """Return `jax.jit` of a function that runs once per block: hardly optimised, few shapes cached.
+    """Return `jax.jit` of a function that runs once per block: minimal optimisation, few cached shapes.
 
     Under a transformation of JAX it is the plain function, because compiler options apply to a whole program.
     """

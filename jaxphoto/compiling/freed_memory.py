@@ -1,17 +1,17 @@
-"""Freed memory: kept by the C library, or returned to the system."""
+"""Freed memory: retained by the C library, or returned to the system."""
 
 import contextlib
 import ctypes
 import sys
 from collections.abc import Callable, Iterator
 
-# From <malloc.h>.
+# Constants of <malloc.h>.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _MMAP_MAX = -1, -3, -4
 _USUAL_MMAPS = 65_536
 _ALL = 2**31 - 1
-# Blocks up to this size come from freed memory, of which glibc keeps this much: the values it adapts to by itself once
-# it has freed such a block. Until then it may map new work space at each call: 3.3 MB and a third of the solution time
-# of P31.
+# Maximum size of blocks that reuse freed memory, and maximum amount of freed memory that glibc retains. glibc adapts to
+# these values after it has freed such a block. Until then it may map new work space at each call: 3.3 MB and a third of
+# the solution time of P31.
 _LARGEST, _KEPT = 32 * 2**20, 64 * 2**20
 
 
@@ -23,9 +23,9 @@ def keep_freed_memory() -> None:
 
 
 def return_freed_memory() -> None:
-    """Make glibc return freed memory; of the small blocks of XLA's compiler it would keep 50 MB per program.
+    """Make glibc return freed memory; it would retain 50 MB of small blocks of XLA's compiler per program.
 
-    Other C libraries do so by themselves or have no such call.
+    Other C libraries return it automatically or have no such call.
     """
     if trim := _of_glibc("malloc_trim"):
         trim(0)
@@ -33,11 +33,11 @@ def return_freed_memory() -> None:
 
 @contextlib.contextmanager
 def freed_memory_kept() -> Iterator[None]:
-    """Make glibc keep freed memory, for code that repeatedly allocates and frees the same gigabyte.
+    """Make glibc retain freed memory, for code that repeatedly allocates and frees the same gigabyte.
 
-    Otherwise every page is cleared and mapped again each time, a third of the time of feature extraction. At the end it
-    is returned. Threads benefit only where all share one arena, as in the command `jaxphoto`. Other C libraries are
-    unaffected.
+    Otherwise every page is cleared and mapped again each time, which takes a third of the time of feature extraction.
+    The memory is returned at the end. Threads benefit only if all share one arena, as in the command `jaxphoto`. Other
+    C libraries are unaffected.
     """
     option = _of_glibc("mallopt")
     if option is None:

@@ -1,4 +1,4 @@
-"""Least-recently-used cache, safe to share between threads."""
+"""Least-recently-used cache, safe for use by several threads."""
 
 from collections.abc import Callable, Hashable
 from threading import Lock
@@ -8,7 +8,7 @@ _Value = TypeVar("_Value")
 
 
 class LruCache(Generic[_Value]):
-    """Keep the `capacity` values that were used last, by key."""
+    """Cache of the `capacity` most recently used values, by key."""
 
     def __init__(self, capacity: int):
         self._capacity = capacity
@@ -16,7 +16,7 @@ class LruCache(Generic[_Value]):
         self._lock = Lock()
 
     def get(self, key: Hashable, make: Callable[[], _Value]) -> _Value:
-        """Return the value of `key`; `make` it if it is not cached."""
+        """Return the value of `key`; call `make` if it is not cached."""
         with self._lock:
             if key in self._values:
                 self._values[key] = self._values.pop(key)

@@ -9,28 +9,30 @@ import os
 import jax
 
 Options = dict[str, bool | int | str]
-# XLA splits a program into 32 parts that many cores compile in parallel, each with overhead: with two parts, compiling
-# a flight of eleven photographs takes a quarter less CPU time, and no longer on two cores.
+# Number of parts into which XLA splits a program. The default is 32 parts, which many cores compile in parallel, each
+# with overhead. With two parts, compiling a flight of eleven photographs takes a quarter less CPU time, and the same
+# time on two cores.
 _PARTS = 2
 
 
 def _options(level: int, fusion_emitters: bool) -> Options:
     return {
         "xla_backend_optimization_level": level,
-        # Up to jaxlib 0.11; the older code generator compiles faster.
+        # Available up to jaxlib 0.11; the older code generator compiles faster.
         "xla_cpu_use_fusion_emitters": fusion_emitters,
         "xla_cpu_parallel_codegen_split_count": _PARTS,
     }
 
 
-# For the adjustment (docs/solver.md).
+# Options of the adjustment (docs/solver.md).
 _ADJUSTMENT = _options(1, fusion_emitters=False)
-# For programs that run thousands of times: four times the compile time, a quarter less run time (docs/monte_carlo.md).
+# Options of programs that run thousands of times: four times the compile time, a quarter less run time
+# (docs/monte_carlo.md).
 _THOROUGH = _options(3, fusion_emitters=True)
 
 
 def quick_to_compile() -> Options:
-    """Return options for programs that run once per block, where only compile time matters."""
+    """Return options for programs that run once per block: only their compile time matters."""
     return _known(_options(0, fusion_emitters=False))
 
 

@@ -1,7 +1,7 @@
 """Compiled CPU program as plain JSON and the bytes that XLA serialises, and back.
 
-`jax.experimental.serialize_executable` uses pickle, which executes what it reads. Here XLA reads all that is not JSON.
-The types are internal to JAX: in a version where they differ, nothing is stored and everything is compiled.
+`jax.experimental.serialize_executable` uses pickle, which executes code on reading. Here XLA reads all data except
+JSON. The types are internal to JAX: in a version with different types, nothing is stored and everything is compiled.
 """
 
 import base64
@@ -15,14 +15,14 @@ try:
     from jax._src.interpreters.pxla import UnloadedMeshExecutable
     from jax._src.lib import xla_client
     from jax._src.sharding_impls import GSPMDSharding
-except ImportError:  # Another JAX: `as_plain` and `program_of` fail, and who calls them does without.
+except ImportError:  # Other JAX version: `as_plain` and `program_of` fail, and callers compile instead.
     pass
 
 _NOTHING: dict[str, Any] = {
     "unordered_effects": [], "ordered_effects": [], "keepalive": [], "host_callbacks": [], "mut": None,
     "pgle_profiler": None,
 }  # fmt: skip
-"""Attributes that are empty for a program that is a function of its arguments."""
+"""Attributes that are empty if a program depends only on its arguments."""
 
 
 class PlainProgram(NamedTuple):
@@ -33,13 +33,13 @@ class PlainProgram(NamedTuple):
 
 
 def as_plain(program: jax.stages.Compiled) -> PlainProgram:
-    """Serialise a program. Raises TypeError if it cannot be stored, and what JAX and XLA raise."""
+    """Serialise a program. Raises TypeError if it cannot be stored, and any error of JAX and XLA."""
     executable: Any = program._executable
     inner = executable._unloaded_executable
     if any(getattr(inner, name) for name in _NOTHING) or program._params.const_args:
-        raise TypeError("a program that calls back or holds arrays cannot be kept")
+        raise TypeError("cannot serialise a program with host callbacks or constant arrays; compile it in each process")
     if any(layout is not None for layout in inner.dispatch_in_layouts):
-        raise TypeError("a program that chose the layout of its arguments cannot be kept")
+        raise TypeError("cannot serialise a program with custom argument layouts; compile it in each process")
     text = {
         "name": inner.name,
         "committed": inner.committed,
@@ -59,7 +59,9 @@ def as_plain(program: jax.stages.Compiled) -> PlainProgram:
 
 
 def program_of(plain: PlainProgram) -> jax.stages.Compiled:
-    """Deserialise a program from and to lists of arrays. Raises various errors if `plain` is invalid."""
+    """Deserialise a program that maps a list of arrays to a list of arrays. Raises various errors if `plain` is
+    invalid.
+    """
     devices_here: list[Any] = jax.devices()
     text, by_id = plain.text, {device.id: device for device in devices_here}
     devices = xla_client.DeviceList(tuple(by_id[number] for number in text["devices"]))

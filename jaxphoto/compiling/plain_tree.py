@@ -44,19 +44,19 @@ def from_json(text: Any) -> Any:
     kind = _class(name)
     names = _fields(kind)
     if names is None:
-        raise TypeError(f"{name} is no class of plain fields")
+        raise TypeError(f"unsupported class {name}; use a NamedTuple or an equinox Module")
     values = [from_json(part) for part in content]
     if issubclass(kind, tuple):
         return kind._make(values)  # type: ignore[attr-defined]
     made = object.__new__(kind)
     for field, value in zip(names, values, strict=True):
-        # As JAX builds trees: without `__init__`, which may not accept placeholders.
+        # Bypass `__init__`, which may not accept placeholders, as JAX does when it rebuilds trees.
         object.__setattr__(made, field, value)
     return made
 
 
 def _fields(kind: type) -> tuple[str, ...] | None:
-    """Return the names of the fields of an instance; None for an unsupported class."""
+    """Return the field names of a class; None for an unsupported class."""
     if issubclass(kind, tuple) and hasattr(kind, "_fields"):
         return kind._fields
     if issubclass(kind, eqx.Module):
@@ -65,7 +65,7 @@ def _fields(kind: type) -> tuple[str, ...] | None:
 
 
 def _class(name: str) -> type:
-    """Return an imported class of the packages in the key. Raises TypeError."""
+    """Return the class called "module:name". Raises TypeError unless its package is imported and in the cache key."""
     module, _, qualified = name.partition(":")
     found: Any = sys.modules.get(module) if is_known(module) else None
     for part in qualified.split("."):

@@ -1,8 +1,8 @@
-"""Directory of files that only this user can have written, each bound to its name.
+"""Directory of files that only this user can write, each authenticated with its name.
 
-Its content is executed. So the directory and its files belong to the user, nobody else may write to them, and each file
-begins with an HMAC-SHA256 of its name and content, with a secret that only the user can read. A file of another
-machine, one under another name, or a damaged one is ignored.
+Its content is executed. Therefore the directory and its files belong to the user, nobody else may write to them, and
+each file begins with an HMAC-SHA256 of its name and content, with a secret that only the user can read. A file of
+another machine, a renamed file or a damaged file is ignored.
 """
 
 import contextlib
@@ -18,12 +18,13 @@ from pathlib import Path
 
 _SECRET = "secret"
 _DIGEST = hashlib.sha256().digest_size
-# Names are hashes; other files were left by a process killed while writing (seconds).
+# Pattern of the names (hashes), and minimum age (s) of other files that are deleted: a process was killed while writing
+# them.
 _NAME, _LEFT = re.compile("[0-9a-f]{64}"), 3600.0
 
 
 def read(folder: Path, name: str) -> bytes | None:
-    """Return the content of a file, or None if it is missing, invalid or not trusted. Updates its time of use."""
+    """Return the content of a file, or None if it is missing, invalid or not trusted. Updates its time of last use."""
     try:
         _make_private(folder)
         content = _own_content(folder / name)
@@ -37,7 +38,7 @@ def read(folder: Path, name: str) -> bytes | None:
 
 
 def write(folder: Path, name: str, content: bytes) -> None:
-    """Write a file completely, or not at all where it cannot be written."""
+    """Write a file atomically; skip it if the directory is not writable."""
     with contextlib.suppress(OSError):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         _make_private(folder)
@@ -64,7 +65,8 @@ def _secret(folder: Path) -> bytes:
     with contextlib.suppress(OSError):
         if len(known := _own_content(path)) == _DIGEST:
             return known
-    # If two processes create one at once, the later wins; files hashed with the other are rewritten.
+    # If two processes create a secret at once, the later one is retained; files authenticated with the other are
+    # rewritten.
     _write(path, secrets.token_bytes(_DIGEST))
     return _own_content(path)
 
@@ -94,12 +96,12 @@ def _own_content(path: Path) -> bytes:
 
 
 def _opened_itself(path: str, flags: int) -> int:
-    """Open without following a link or waiting for the other end of a pipe."""
+    """Open without following a link or blocking on a pipe."""
     return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
 
 
 def _write(path: Path, content: bytes) -> None:
-    # Written completely, then renamed; readable by this user only.
+    # Written to a temporary name, then renamed; readable by this user only.
     opened, beside = tempfile.mkstemp(dir=path.parent)
     try:
         with open(opened, "wb") as file:

@@ -1,7 +1,7 @@
-"""Run compiled functions: compile and run times apart, compiled at most once per process.
+"""Execution of compiled functions, with separate compile and run times; compiled at most once per process.
 
-Tracing and lowering are Python and hold its lock; compiling does not, so programs needed soon (`prepare`) are compiled
-on another core meanwhile.
+Tracing and lowering require Python's global interpreter lock; compiling releases it. Programs that are needed soon
+(`prepare`) are compiled on another core meanwhile.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from jaxphoto.compiling.plain_tree import Slot
 
 
 class _Program(NamedTuple):
-    """Compiled function of arrays, and the tree that its results fill: leaves that are `Slot` are arrays."""
+    """Compiled function of arrays, and the tree of its results: leaves that are `Slot` are arrays."""
 
     compiled: jax.stages.Compiled
     leaves: list
@@ -30,18 +30,18 @@ class _Program(NamedTuple):
     loaded: bool
 
     def __call__(self, arrays: list) -> Any:
-        """Run it and wait for the result."""
+        """Run the program and wait for the result."""
         found = iter(jax.block_until_ready(self.compiled(*arrays)))
         leaves = [next(found) if isinstance(leaf, Slot) else leaf for leaf in self.leaves]
         return jax.tree.unflatten(self.structure, leaves)
 
 
-# Programs kept by a process; beyond, the least recently used is dropped. A large program takes 300 memory mappings of
-# 65,530 that Linux gives a process; running out of them crashes it.
+# Maximum number of programs cached by a process; then the least recently used is dropped. A large program uses 300 of
+# the 65,530 memory mappings that Linux gives a process; a process without free mappings crashes.
 MOST = 100
 _programs: dict[object, _Program] = {}
 _gone = 0
-"""Programs dropped since the last `jax.clear_caches`."""
+"""Number of programs dropped since the last `jax.clear_caches`."""
 _prepared: dict[object, Future[_Program]] = {}
 _workers = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="jaxphoto-compile")
 keep_freed_memory()
@@ -50,8 +50,9 @@ keep_freed_memory()
 def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], name: str, thorough: bool = False) -> Any:
     """Call `function` (of `eqx.filter_jit`), first compiling it or loading it from disk (`store`).
 
-    Adds to `seconds["compile"]` the time of compiling or loading, and to `seconds[name]` that of the call. `thorough`
-    compilation pays for programs that run thousands of times. Under a transformation of JAX it is a plain call.
+    Adds to `seconds["compile"]` the time of compiling or loading, and to `seconds[name]` the time of the call.
+    `thorough` compilation is useful for programs that run thousands of times. Under a transformation of JAX it is a
+    plain call.
     """
     began = time.perf_counter()
     found = _key_and_arrays(function, arguments, thorough)
@@ -68,7 +69,7 @@ def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], nam
     try:
         result = program(arrays)
     except Exception:
-        # A file may be valid and yet not run on this machine: this shows only in the call, as various errors.
+        # A valid file may still fail on this machine: this appears only in the call, as various errors.
         if not program.loaded:
             raise
         program = _program_of(function.__wrapped__, arguments, thorough, anew=True)()
@@ -105,8 +106,8 @@ def prepare(function: Any, arguments: tuple, seconds: dict[str, float]) -> bool:
 def _keep(key: object, program: _Program) -> None:
     """Cache `program` as the most recently used; drop the least recently used beyond `MOST`.
 
-    JAX keeps its own traces of each, some MB. They are cleared when `MOST` programs have been dropped, together with
-    whatever the calling process has compiled itself, which is then compiled again when called.
+    JAX caches its own traces of each program, some MB. They are cleared after `MOST` programs have been dropped. This
+    also clears the functions that the calling process has compiled; they are recompiled when called.
     """
     global _gone
     _programs.pop(key, None)
@@ -122,7 +123,7 @@ def _keep(key: object, program: _Program) -> None:
 def _key_and_arrays(function: Any, arguments: tuple, thorough: bool) -> tuple[object, list] | None:
     """Return the key of a program within this process, and its array arguments; None if any is traced.
 
-    Flattening the arguments costs more than the rest, so it is done once.
+    Both are computed together, because flattening the arguments takes most of the time.
     """
     leaves, structure = jax.tree.flatten(arguments)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
@@ -139,9 +140,9 @@ def _type(array: Any) -> tuple:
 
 
 def _program_of(function: Any, arguments: tuple, thorough: bool, anew: bool = False) -> Callable[[], _Program]:
-    """Return a function that gives the program: from disk, or compiled and stored (always with `anew`).
+    """Return a function that returns the program: loaded from disk, or compiled and stored (always with `anew`).
 
-    All that depends on the thread, such as `with jax.enable_x64(False)`, is done before this returns.
+    All steps that depend on the thread, such as `with jax.enable_x64(False)`, are completed before this returns.
     """
     options = options_here(thorough)
     key = store.key_of(function, arguments, options)
@@ -164,7 +165,9 @@ def _program_of(function: Any, arguments: tuple, thorough: bool, anew: bool = Fa
 
 
 def _lowered(function: Any, arguments: tuple) -> tuple[jax.stages.Lowered, Any]:
-    """Lower `function` as one from list to list of arrays, which JAX can serialise; return also its result tree."""
+    """Lower `function` as a function from list of arrays to list of arrays, which JAX can serialise; also return its
+    result tree.
+    """
     dynamic, static = eqx.partition(arguments, eqx.is_array)
     arrays, structure = jax.tree.flatten(dynamic)
     skeleton: Any = None
@@ -175,7 +178,7 @@ def _lowered(function: Any, arguments: tuple) -> tuple[jax.stages.Lowered, Any]:
         skeleton = jax.tree.map(lambda leaf: Slot() if eqx.is_array(leaf) else leaf, result)
         return [leaf for leaf in jax.tree.leaves(result) if eqx.is_array(leaf)]
 
-    # A name of its own: JAX's cache must not substitute its entry of `function` (`_not_in_cache`).
+    # Use a different name: JAX's cache must not substitute its entry of `function` (`_not_in_cache`).
     flat.__name__ = f"{function.__name__}_of_arrays"
     return jax.jit(flat).lower(*arrays), skeleton
 
@@ -183,7 +186,7 @@ def _lowered(function: Any, arguments: tuple) -> tuple[jax.stages.Lowered, Any]:
 _THRESHOLD = "jax_persistent_cache_min_compile_time_secs"
 _lock = threading.Lock()
 _kept_out: list[float] = []
-"""The user's threshold, once per compilation in progress in `_not_in_cache`."""
+"""Value of the user's threshold, once per compilation in progress in `_not_in_cache`."""
 
 
 @contextlib.contextmanager

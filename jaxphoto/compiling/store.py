@@ -1,8 +1,8 @@
-"""Compiled programs on disk, beside JAX's own cache, run by a later process without tracing them.
+"""Compiled programs on disk, in addition to JAX's own cache; a later process runs them without tracing.
 
-JAX's cache holds what XLA compiled, but needs the traced and lowered program to find it, half of the start-up time. A
-file's name is a hash of all that a program depends on (`key_of`); its content is JSON and XLA's serialised program, in
-a directory that only holds what this user wrote (`private_folder`): like JAX's cache it contains code.
+JAX's cache contains the results of XLA's compiler, but requires the traced and lowered program to find them, half of
+the start-up time. Here the file name is a hash of all inputs of a program (`key_of`); the content is JSON and XLA's
+serialised program, in a directory with files of this user only (`private_folder`): like JAX's cache it contains code.
 """
 
 import contextlib
@@ -24,18 +24,18 @@ from jaxphoto.compiling.description import Indescribable, describe
 from jaxphoto.compiling.plain_program import PlainProgram, as_plain, program_of
 from jaxphoto.compiling.plain_tree import from_json, to_json
 
-with contextlib.suppress(ImportError):  # Another jaxlib: `load` finds nothing.
+with contextlib.suppress(ImportError):  # Other jaxlib version: `load` finds nothing.
     from jaxlib import lapack
 
-# Most bytes in the directory; beyond, the least recently used programs are deleted.
+# Maximum size of the directory in bytes; then the least recently used programs are deleted.
 MOST = 1_000_000_000
 _PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy")
-# Bytes of the length of the text, which precedes it.
+# Number of bytes of the text length that precedes the text.
 _LENGTH = 8
 
 
 class Stored(NamedTuple):
-    """Program whose arguments and results are lists of arrays, and the tree that its results fill."""
+    """Program whose arguments and results are lists of arrays, and the tree of its results."""
 
     compiled: jax.stages.Compiled
     skeleton: Any
@@ -50,12 +50,12 @@ def _digest_of_sources() -> str:
     return digest.hexdigest()
 
 
-# Hashed at import: later edits are not what this process runs.
+# Hashed at import: this process does not run later edits.
 _SOURCES = _digest_of_sources()
 
 
 def key_of(function: Any, arguments: tuple, options: dict | None) -> str | None:
-    """Return the name of a program; None if nothing is stored, or no name identifies it."""
+    """Return the name of a program; None if storing is disabled, or the arguments cannot be identified."""
     if _folder() is None or jax.default_backend() != "cpu" or jax.process_count() > 1:
         return None
     try:
@@ -72,32 +72,32 @@ def load(key: str) -> Stored | None:
     if content is None:
         return None
     try:
-        # A program finds LAPACK by pointers that JAX sets when it lowers a call of it; nothing is lowered here.
+        # A program calls LAPACK by pointers that JAX sets when it lowers such a call; no call is lowered here.
         lapack.prepare_lapack_call("potrf", np.dtype(float))
         length = int.from_bytes(content[:_LENGTH], "big")
         text = json.loads(content[_LENGTH : _LENGTH + length])
         compiled = program_of(PlainProgram(text["program"], content[_LENGTH + length :]))
         return Stored(compiled, from_json(text["skeleton"]))
-    except Exception:  # Whatever is wrong with a file or other in this JAX, the program can be compiled.
+    except Exception:  # If the file is invalid or JAX has changed, the program is compiled instead.
         return None
 
 
 def save(key: str, program: Stored) -> None:
-    """Store a program, if possible: not one that calls back into Python, nor on a full disk."""
+    """Store a program if possible; skip programs with callbacks to Python, and ignore a full disk."""
     folder = _folder()
     if folder is None:
         return
     try:
         plain = as_plain(program.compiled)
         text = json.dumps({"program": plain.text, "skeleton": to_json(program.skeleton)}).encode()
-    except Exception:  # JAX and XLA say in many ways that something cannot be kept.
+    except Exception:  # JAX and XLA raise various errors for programs that cannot be stored.
         return
     private_folder.write(folder, key, len(text).to_bytes(_LENGTH, "big") + text + plain.executable)
     private_folder.limit(folder, MOST)
 
 
 def _folder() -> Path | None:
-    """Return the directory beside JAX's cache; None if that is off or remote."""
+    """Return the directory next to JAX's cache; None if the cache is disabled or remote."""
     chosen = jax.config.values["jax_compilation_cache_dir"]
     if not jax.config.values["jax_enable_compilation_cache"] or not chosen or "://" in chosen:
         return None
@@ -123,7 +123,7 @@ def _surroundings() -> tuple[str, ...]:
 
 
 def _processor() -> str:
-    """Identify the kind of processor: code is compiled for its instructions."""
+    """Identify the processor model: code is compiled for its instruction set."""
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         return "\n".join(sorted({line for line in lines if line.startswith(("model", "flags", "Features", "CPU"))}))

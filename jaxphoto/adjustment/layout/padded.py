@@ -22,8 +22,8 @@ from jaxphoto.short_repr import pretty_repr
 class RayLists(eqx.Module):
     """Rays in chunks of one image, pairs of rays in chunks of two images; chunks in batches.
 
-    One batch is processed at a time, so that its intermediate arrays stay in the cache of a core. Batches are sharded
-    over devices. Empty slots are rows of infinite sigma at an arbitrary image and point.
+    One batch is processed at a time to keep its intermediate arrays in the cache of a core. Batches are sharded over
+    devices. Empty slots are rows of infinite sigma at an arbitrary image and point.
     """
 
     chunk_image: Int[np.ndarray, "batches chunks"]
@@ -39,8 +39,8 @@ class RayLists(eqx.Module):
     free_points: bool = eqx.field(static=True)
     """True if any point has a free coordinate; otherwise nothing is eliminated."""
     by_image: bool = eqx.field(static=True)
-    """True if camera unknowns are eliminated with the unknowns of their images rather than as border unknowns that
-    every point may touch: for many more cameras than an image has.
+    """True if camera unknowns are eliminated with the unknowns of their images, not as border unknowns that every point
+    may touch. Used if there are many more cameras than one image depends on.
     """
     columns: int = eqx.field(static=True)
     """Number of column blocks of the reduced matrix, K."""
@@ -86,13 +86,13 @@ class PaddedStructure(AbstractStructure):
 
     @property
     def ray_points(self) -> Int[Array, "batches chunks p"]:
-        """Point of each ray, among those of this device."""
+        """Point of each ray, as an index into the points of this device."""
         return self._here(self.rays.ray_point, self.n_points // self.shards)
 
     @property
     def pairs(self) -> Int[Array, "pair_batches pair_chunks 2 q"]:
-        """Indices of rays among those of this device."""
-        # A device holds only its own shard of rays.
+        """Pairs as indices into the rays of this device."""
+        # Each device stores only its own shard of rays.
         return self._here(self.rays.pair, math.prod(self.rays.ray_point.shape))
 
     def _here(self, index: Any, of_device: int) -> Array:
@@ -101,12 +101,12 @@ class PaddedStructure(AbstractStructure):
         return index - jax.lax.axis_index(AXIS) * of_device
 
     def each(self, body: Callable, carry: Any, numbers: Any, into: Any = None) -> tuple[Any, Any]:
-        """Scan rays with `each_batch`; `body` receives the carry and (images, points, *numbers)."""
+        """Scan rays with `each_batch`; `body` receives the carry and (images, points, *values)."""
         rays = self.rays
         return each_batch(body, carry, (rays.chunk_image, self.ray_points, *numbers), rays.used[0, 0], into)
 
     def each_ray(self, function: Callable, numbers: tuple) -> Any:
-        """Apply `function` to (images, points, *numbers) of every batch of rays."""
+        """Apply `function` to (images, points, *values) of every batch of rays."""
         return self.each(lambda _, own: ((), function(own)), (), numbers)[1]
 
     def by_group(self, array: Shaped[Array, "*c points"]) -> Shaped[Array, "groups *c p"]:

@@ -1,6 +1,6 @@
 """Padding of observation groups, in lists or by point, and its inverse.
 
-Padding repeats the first row without weight: its values stay finite and contribute nothing.
+Padding repeats the first row with zero weight: its values stay finite and contribute nothing.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ def pad_groups(
 ) -> tuple[ObservedGroup, ...]:
     """Pad the groups of a structure to at least `rows` rows; `width` is the number of images of a column block.
 
-    `slots` gives, for groups stored by point, the slots of the shared unknowns that rows touch.
+    `slots` contains, for groups stored by point, the slots of the shared unknowns that rows touch.
     """
 
     def padded(g: ObservedGroup) -> ObservedGroup:
@@ -48,7 +48,7 @@ def _pad_at_points(
     g: ObservedGroup, slot: Int[np.ndarray, "l rows"], places: Places, n_points: int, depth: int, n_shared: int
 ) -> ObservedGroup:
     at = _row_places(g, places, n_points)
-    # Empty places repeat the first row.
+    # Empty slots repeat the first row.
     index = put(np.arange(g.n_rows), at, depth * n_points, 0).reshape(depth, n_points)
 
     def of_rows(v: np.ndarray, fill: int) -> np.ndarray:
@@ -71,7 +71,7 @@ def _pad_list(g: ObservedGroup, places: Places, n_images: int, width: int, wante
     padded = dataclasses.replace(g, image=image, point=places.point[g.point], pair=_pairs(image, width))
     if g.elimination == "coupled":
         return padded
-    # These lists have no size classes of their own: they are as long as usual for this number of images.
+    # These lists have no separate size classes: their length is typical for this number of images.
     more = size_class(max(g.n_rows, wanted), (3 if g.scalar else 1) * n_images) - g.n_rows
     filled = lambda v: np.concatenate([v, np.repeat(v[..., :1], more, axis=-1)], axis=-1)  # noqa: E731
     last = lambda v: np.moveaxis(filled(np.moveaxis(v, 1, -1)), -1, 1)  # noqa: E731
@@ -87,7 +87,7 @@ def _pad_list(g: ObservedGroup, places: Places, n_images: int, width: int, wante
 
 
 def _pairs(image: Int[np.ndarray, "k rows"], width: int) -> Int[np.ndarray, "pairs rows 4"]:
-    """Return column block, row and column of each pair of images of a row, and 1 if the second image comes later."""
+    """Return column block, row and column of each pair of images of a row, and 1 if it is transposed."""
     found = []
     for a in range(len(image)):
         for b in range(a):
@@ -98,7 +98,7 @@ def _pairs(image: Int[np.ndarray, "k rows"], width: int) -> Int[np.ndarray, "pai
 
 
 def _row_places(g: ObservedGroup, places: Places, n_points: int) -> Int[np.ndarray, "rows"]:
-    """Return the place of each row of a group stored by point in (rows, points)."""
+    """Return the position of each row of a group stored by point in (rows, points)."""
     order = np.argsort(g.point[0], kind="stable")
     of_point = g.point[0][order]
     below = np.arange(len(order)) - np.searchsorted(of_point, of_point)
@@ -108,7 +108,7 @@ def _row_places(g: ObservedGroup, places: Places, n_points: int) -> Int[np.ndarr
 
 
 def pad_rows(v: Values, s: Structure, padded: PaddedStructure, places: Places) -> tuple[RowsInList | RowsAtPoints, ...]:
-    """Bring the numbers of all rows to the sizes and order of the padded structure."""
+    """Convert the values of all rows to the sizes and order of the padded structure."""
     groups = zip(s.observed, padded.observed, v.groups, strict=True)
     return tuple(_pad_numbers(g, wide, numbers, places) for g, wide, numbers in groups)
 
@@ -120,7 +120,7 @@ def _pad_numbers(g: ObservedGroup, wide: ObservedGroup, numbers: Any, places: Pl
         at = _row_places(g, places, shape[1])
     else:
         shape, at = (wide.n_rows,), np.arange(g.n_rows)
-    # Padding repeats the first row, without weight.
+    # Padding repeats the first row, with zero weight.
     idle = rows_of(g, RowsInList(jax.tree.map(lambda x: x[..., 0], own))).without_weight()
     size = int(np.prod(shape))
 
@@ -133,7 +133,7 @@ def _pad_numbers(g: ObservedGroup, wide: ObservedGroup, numbers: Any, places: Pl
 
 
 def crop_rows(g: ObservedGroup, v: np.ndarray, places: Places) -> np.ndarray:
-    """Return numbers of padded rows (components, ...) in the order of the block; (rows) if a row is one number."""
+    """Return padded rows (components, ...) in the order of the block; (rows) if a row is one scalar."""
     if v.ndim == 3:
         v = v.reshape(len(v), -1)[:, _row_places(g, places, v.shape[2])]
     v = v[:, : g.n_rows]

@@ -1,6 +1,6 @@
-"""Padding of blocks to size classes, so that a compiled program serves all blocks of similar size.
+"""Padding of blocks to size classes: one compiled program serves all blocks of similar size.
 
-A block is arranged in rays (`rays`) and padded with images and points without effect: rows of infinite standard
+A block is arranged in rays (`rays`) and padded with images and points that have no effect: rows of infinite standard
 deviation, fixed unknowns. Results are cropped and returned in the order of the block. No program depends on ids.
 """
 
@@ -35,7 +35,7 @@ from jaxphoto.static_values import Content
 @pretty_repr
 @dataclasses.dataclass(frozen=True, eq=False)
 class PaddedBlock:
-    """A block in its own order and padded, with the conversions between both.
+    """Block in its own order and padded, with the conversions between both.
 
     Compared by content and hashed once: for JAX it is static structure of an `Adjustment`.
     """
@@ -76,7 +76,7 @@ class PaddedBlock:
         return Residuals(others, to_numpy(residuals.datum), residuals.names, self.crop_image(residuals.image))
 
     def pad_residuals(self, own: Residuals, fill: float) -> PaddedResiduals:
-        """Invert `crop_residuals`: place one number per observation, `fill` elsewhere."""
+        """Invert `crop_residuals`: scatter one value per observation into padded arrays, `fill` elsewhere."""
         s = self.structure
 
         def rows(g: ObservedGroup) -> tuple[int, ...]:
@@ -99,11 +99,11 @@ class PaddedBlock:
         return split(laid)
 
     def crop_rows(self, group: ObservedGroup, numbers: np.ndarray) -> np.ndarray:
-        """Crop padded rows (components, ...) to the order of the block; (rows) if a row is one number."""
+        """Crop padded rows (components, ...) to the order of the block; (rows) if a row is one scalar."""
         return crop_rows(group, numbers, self.places)
 
     def crop_image(self, image: Any) -> np.ndarray:
-        """Return numbers of rays (batches, k, chunks, p) by image row of the block (k, rows)."""
+        """Return values of rays (batches, k, chunks, p) by image row of the block (k, rows)."""
         by_ray = np.moveaxis(to_numpy(image), 1, 0)
         return by_ray.reshape(len(by_ray), -1)[:, self.places.row]
 
@@ -115,7 +115,7 @@ class PaddedBlock:
         return matrix[np.ix_(kept, kept)]
 
 
-# Number of rays and pairs per batch, and the smallest size of a single batch.
+# Number of rays per batch, number of pairs per batch, and minimum size of a single batch.
 _RAYS, _PAIRS, _FEWEST = 4096, 2048, 2048
 
 
@@ -124,15 +124,15 @@ def pad_structure(
 ) -> PaddedBlock:
     """Build the padded structure of a block; its last image is padding.
 
-    `sizes` are minimum sizes, such as those common to all blocks of a study; `shards` is the number of devices; `dense`
-    requests a dense reduced matrix in place of a band.
+    `sizes` are minimum sizes, such as `common_sizes` of all blocks of a study; `shards` is the number of devices;
+    `dense` requests a dense reduced matrix instead of a band.
     """
     s, layout = structure, RayLayout.of(structure, sizes, shards, dense)
     have = layout.sizes | sizes
     n_images, n_points = layout.columns * layout.width, shards * have.point_groups * GROUP
     chunks = min(size_class(have.chunks, _FEWEST // CHUNK), _RAYS // CHUNK)
     batches, pair_chunks = size_class(-(-have.chunks // chunks), 1), _PAIRS // PAIRS
-    # In steps of four; unused batches cost no time.
+    # Round up to multiples of four; unused batches cost no time.
     pair_batches = size_class(max(-(-have.pair_chunks // pair_chunks), 1), 4)
     image = np.full((shards, batches * chunks), n_images - 1, np.int32)
     # Empty slots refer to a point of the same device.
@@ -194,14 +194,14 @@ def pad_structure(
 
 
 def _eliminates_cameras(s: Structure) -> bool:
-    """Decide `RayLists.by_image`."""
+    """Return `RayLists.by_image`."""
     return s.n_interior > 4 * s.n_image_colours
 
 
 def pad_values(values: Values, structure: Structure, padded: PaddedStructure, places: Places) -> PaddedValues:
-    """Bring the arrays of a block to the sizes and order of its padded structure.
+    """Convert the arrays of a block to the sizes and order of its padded structure.
 
-    Empty slots have infinite standard deviation: finite values, no weight.
+    Empty slots have infinite standard deviation: finite values with zero weight.
     """
     v, p, own = values, padded, structure
     n_images, n_points = p.n_images, p.n_points
@@ -239,7 +239,7 @@ def pad_values(values: Values, structure: Structure, padded: PaddedStructure, pl
 
 
 def _pad_group(group: CameraGroup, at: np.ndarray, n_images: int) -> CameraGroup:
-    """Pad a camera group and drop its names; padded images have its first camera."""
+    """Pad a camera group and remove its names; padded images use its first camera."""
     return dataclasses.replace(
         group,
         names=tuple("" for _ in group.names),

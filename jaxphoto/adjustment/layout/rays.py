@@ -1,7 +1,7 @@
 """Order of images and points; rays in chunks of one image, pairs of rays in chunks of two images.
 
 A ray is an image row: one image sees one point. Rays of an image are contiguous, so their contribution to the image is
-one matrix product per chunk. The same holds for pairs of rays that see a free point from the same two images, which
+one matrix product per chunk. The same applies to pairs of rays that see a free point from the same two images, which
 contribute to the block of these images in the reduced normal matrix. Images are numbered by reverse Cuthill-McKee,
 which makes that matrix banded. If all points are fixed there are no pairs, and the matrix is an arrow: block-diagonal
 images with a border of shared unknowns.
@@ -19,11 +19,11 @@ from jaxphoto.short_repr import pretty_repr
 
 @pretty_repr
 class PaddedSizes(NamedTuple):
-    """Length of each list of a block, or of the sizes compiled for; per device."""
+    """Padded length of each list of a block, per device."""
 
     images: int = 1
     bandwidth: int = 1
-    """Largest difference of places of two images that share a free point."""
+    """Largest difference of the indices of two images that share a free point."""
     point_groups: int = 1
     chunks: int = 1
     """Number of chunks of rays."""
@@ -34,7 +34,7 @@ class PaddedSizes(NamedTuple):
     """Number of rows of each observation group; for rows stored by point, the largest number at a point."""
 
     def __or__(self, other: object) -> "PaddedSizes":
-        """Return sizes that hold both."""
+        """Return sizes that are sufficient for both."""
         if not isinstance(other, PaddedSizes):
             return NotImplemented
         most = [dict(self.rows), dict(other.rows)]
@@ -44,27 +44,28 @@ class PaddedSizes(NamedTuple):
 
 
 MINIMAL_SIZES = PaddedSizes()
-"""Minimum sizes: no more than a block needs."""
+"""Minimum sizes: no larger than the block requires."""
 
 
 class Places(NamedTuple):
-    """Places of the block's images, points and image rows in the padded arrays."""
+    """Indices of the block's images, points and image rows in the padded arrays."""
 
     image: Int[np.ndarray, "images"]
     point: Int[np.ndarray, "points"]
     row: Int[np.ndarray, "rows"]
-    """Index of the ray: chunk * `CHUNK` + place in it."""
+    """Index of the ray: chunk * `CHUNK` + position in the chunk."""
 
 
 GROUP = 32
 """Number of points that share a list of the unknowns that their rows touch (`MetUnknowns`)."""
 CHUNK, PAIRS = 64, 16
-"""Number of rays, and of pairs of rays, per chunk. Half or twice as many change the time of a solution by less than a
-tenth, for blocks of 31 to 200 images and points of five to twenty rays.
+"""Number of rays, and of pairs of rays, per chunk. Half or double these sizes change the solution time by less than 10
+%, for blocks of 31 to 200 images and points of five to twenty rays.
 """
-# Up to this number of images, a larger reduced matrix costs less than another program, and their order is irrelevant.
+# Maximum number of images of a block that are not sorted: a larger reduced matrix costs less than another compiled
+# program.
 _SMALL = 64
-# Constant cost of a column block, counted in operations (measured: about 10 microseconds).
+# Constant cost of a column block, in floating-point operations (measured: about 10 microseconds).
 _OVERHEAD = 2e5
 
 NO_SLOT = int(np.iinfo(np.int32).max)
@@ -72,7 +73,7 @@ NO_SLOT = int(np.iinfo(np.int32).max)
 
 
 def size_class(n: int, step: int) -> int:
-    """Round up to a multiple of `step`; above 16 steps, to 8 to 16 times a power of two of them."""
+    """Round up to a multiple of `step`; above 16 steps, to 8 to 16 times a power of two times `step`."""
     while n > 16 * step:
         step *= 2
     return -(-n // step) * step
@@ -90,12 +91,12 @@ class MetUnknowns(NamedTuple):
     key: Int[np.ndarray, "met"]
     """Group * (number of unknowns + 1) + unknown, sorted."""
     slot: Int[np.ndarray, "met"]
-    """Slot of each in the list of its group."""
+    """Slot of each unknown in the list of its group."""
     n_shared: int
 
     @classmethod
     def of(cls, s: Structure, group_of: Int[np.ndarray, "points"]) -> "MetUnknowns":
-        """Collect them; `group_of` is the group of each point of the block."""
+        """Collect the unknowns; `group_of` is the group of each point of the block."""
         touched = [np.zeros(0, np.int64)]
         for g in (g for g in s.observed if g.elimination == "point"):
             touched.append(_keys(group_of[g.point[0]], g.column, s.n_shared))
@@ -105,7 +106,7 @@ class MetUnknowns(NamedTuple):
 
     @property
     def most(self) -> int:
-        """Largest number in a group, rounded up to few size classes."""
+        """Largest number of unknowns of a group, rounded up to few size classes."""
         return size_class(int(self.slot.max(initial=-1)) + 1, 8)
 
     def listed(self, groups: int, size: int) -> Int[np.ndarray, "groups size"]:
@@ -127,11 +128,11 @@ def _keys(group: np.ndarray, column: np.ndarray, n_shared: int) -> np.ndarray:
 
 
 class Chunks(NamedTuple):
-    """Numbers sorted by a key and cut into chunks of one key each."""
+    """Elements sorted by a key and cut into chunks of one key each."""
 
     key: Int[np.ndarray, "chunks"]
     slot: Int[np.ndarray, "numbers"]
-    """chunk * size + place in it, of each number."""
+    """Slot of each element: chunk * size + position in the chunk."""
 
     @classmethod
     def of(cls, key: Int[np.ndarray, "numbers"], size: int) -> "Chunks":
@@ -146,14 +147,14 @@ class DeviceLists(NamedTuple):
     """Rays and pairs of the points of one device."""
 
     ray: Int[np.ndarray, "rays"]
-    """Image rows of the block, by image and place of the point."""
+    """Image rows of the block, sorted by image and index of the point."""
     image: Int[np.ndarray, "rays"]
     pair: Int[np.ndarray, "2 pairs"]
     """Indices in `ray` of two rays of a free point; the image of the first does not precede that of the second. Sorted
     by images.
     """
     images: Int[np.ndarray, "pairs"]
-    """Both images as one number: place of the first * `n_images` + place of the second."""
+    """Both images as one integer: index of the first * `n_images` + index of the second."""
     chunks: Chunks
     """Chunks of rays, by image."""
     pair_chunks: Chunks
@@ -161,12 +162,12 @@ class DeviceLists(NamedTuple):
 
     @classmethod
     def of(cls, row, image, point, own, n_images: int) -> "DeviceLists":
-        """Build the lists from image rows `row`, places of their images and points, and flags of free points."""
+        """Build the lists from image rows `row`, indices of their images and points, and flags of free points."""
         order = np.lexsort((point, image))
         row, image, point, own = row[order], image[order], point[order], own[order]
         by_point = np.argsort(np.where(own, point, np.iinfo(np.int32).max), kind="stable")[: int(own.sum())]
         at, one, other = point[by_point], [], []
-        # Images of a point ascend.
+        # The images of a point are in ascending order.
         for step in range(1, int(np.bincount(at).max(initial=0))):
             same = np.flatnonzero(at[step:] == at[:-step])
             one.append(by_point[same + step])
@@ -203,7 +204,7 @@ class RayLayout(NamedTuple):
         groups = size_class(max(-(-s.n_points // (GROUP * shards)), wanted.point_groups), 16)
         image = place[s.image]
         point_place = np.empty(s.n_points, np.int32)
-        # All devices hold equally many points, whatever the padding.
+        # All devices store the same number of points, including padding.
         of_device, number = np.divmod(np.arange(s.n_points), max(-(-s.n_points // shards), 1))
         point_place[_order_points(image, s.point, s.n_points)] = of_device * groups * GROUP + number
         device = point_place[s.point] // (groups * GROUP)
@@ -216,7 +217,7 @@ class RayLayout(NamedTuple):
             images=images,
             bandwidth=bandwidth,
             point_groups=groups,
-            # At least one ray is empty: padding of pairs refers to it.
+            # Add at least one empty ray: padding of pairs refers to it.
             chunks=max(len(d.chunks.key) + 1 for d in lists),
             pair_chunks=max(len(d.pair_chunks.key) for d in lists),
             met=met.most,
@@ -226,10 +227,10 @@ class RayLayout(NamedTuple):
 
 
 def order_images(image: np.ndarray, point: np.ndarray, n_images: int, n_points: int) -> tuple[np.ndarray, int]:
-    """Return the place of each image, and the largest difference of places of two images that share a point."""
+    """Return the index of each image, and the largest index difference of two images that share a point."""
     if n_images < _SMALL or not len(image):
         return np.arange(n_images, dtype=np.int32), n_images if len(image) else 1
-    # Imported here: takes 0.1 s, which small blocks need not spend.
+    # Import here: it takes 0.1 s, and small blocks do not need it.
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
@@ -242,7 +243,7 @@ def order_images(image: np.ndarray, point: np.ndarray, n_images: int, n_points: 
 
 
 def _order_points(image: np.ndarray, point: np.ndarray, n_points: int) -> Int[np.ndarray, "points"]:
-    """Sort points by first, last and mean image, so that neighbours are contiguous."""
+    """Sort points by first, last and mean image to store neighbours contiguously."""
     low, high, total = np.full(n_points, np.inf), np.zeros(n_points), np.zeros(n_points)
     np.minimum.at(low, point, image)
     np.maximum.at(high, point, image)
@@ -252,8 +253,8 @@ def _order_points(image: np.ndarray, point: np.ndarray, n_points: int) -> Int[np
 
 
 def column_blocks(n_images: int, bandwidth: int) -> tuple[int, int]:
-    """Choose the number k of column blocks and the images w of each; images further apart than `bandwidth` share no
-    point.
+    """Choose the number k of column blocks and the number w of images in each; images further apart than `bandwidth`
+    share no point.
 
     w >= bandwidth and k w >= n_images. The cost is the number of operations of the factorisation: n^3 / 3 if dense,
     with n = 6 n_images; m^3 / 3 for each of k column blocks with m = 6 w, 3 m^3 for each but the last (triangular
@@ -267,7 +268,7 @@ def column_blocks(n_images: int, bandwidth: int) -> tuple[int, int]:
 
     n = max(n_images, 1)
     narrowest = min(max(bandwidth, 1), n)
-    # The narrowest for each number of column blocks; anything wider is padding.
+    # Try the minimum width for each number of column blocks; a larger width only adds padding.
     widths = {max(narrowest, -(-n // k)) for k in range(1, -(-n // narrowest) + 1)}
     choices = [(-(-n // w), w) for w in sorted(widths)]
     best = min(choices, key=lambda choice: cost(*choice))
@@ -275,7 +276,7 @@ def column_blocks(n_images: int, bandwidth: int) -> tuple[int, int]:
 
 
 def _meetings(s: Structure, own: Bool[np.ndarray, "rows"]) -> tuple[np.ndarray, np.ndarray, int, int]:
-    """Return image and point of the rays of free points; images joined by an observation share an artificial point."""
+    """Return image and point of the rays of free points; images coupled by an observation share an artificial point."""
     image, point, n = [s.image[own]], [s.point[own]], s.n_points
     for g in s.observed:
         if g.elimination == "reduced" and len(g.image) > 1:

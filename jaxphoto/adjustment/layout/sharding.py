@@ -59,10 +59,10 @@ def _spec(path: tuple[Any, ...], array: Any) -> P:
         return along_points(array.ndim)
     if "listed" in names:
         return EVERYWHERE
-    # Fields of rays, not the equally named fields of observation groups.
+    # Fields of rays, not the fields of observation groups with the same names.
     if name in _OF_RAYS and "observed" not in names:
         return BATCHES
-    # Rows stored by point, not those in lists.
+    # Rows stored by point, not rows in lists.
     if name in _OF_ROWS and array.ndim == 3:
         return along_points(array.ndim)
     return along_points(array.ndim) if name in _OF_POINTS else EVERYWHERE

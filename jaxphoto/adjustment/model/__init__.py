@@ -1,1 +1,1 @@
-"""Model of an adjustment: unknowns, observation groups, residuals of a row, numbering."""
+"""Model of an adjustment: unknowns, observation groups, residuals of a row, indexing."""

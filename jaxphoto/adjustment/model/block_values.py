@@ -23,7 +23,7 @@ SomeValues = TypeVar("SomeValues", bound=AbstractValues)
 def values_of(
     block: Block, start: Unknowns, priors: Unknowns, structure: AbstractStructure, observed: ObservedRows | None = None
 ) -> Values:
-    """Return observations and start values as arrays. Numbers only, so all of them can be differentiated.
+    """Return observations and start values as arrays. All leaves are real, so all are differentiable.
 
     `observed` is the result of `observed_in(block, priors)`, if already computed.
     """
@@ -60,7 +60,7 @@ def with_datum(values: SomeValues, eop: ArrayLike, points: ArrayLike) -> SomeVal
 
 
 def with_start(values: SomeValues, state: UnknownArrays) -> SomeValues:
-    """Replace the start values by `state`, so that its increments are zero."""
+    """Replace the start values by `state`, with zero increments."""
     where = lambda v: (v.position, v.rotation, v.shared, v.points)  # noqa: E731
     return eqx.tree_at(where, values, tuple(state))
 
@@ -83,7 +83,7 @@ def unknowns_of(state: UnknownArrays, like: Unknowns, structure: AbstractStructu
 
 
 def _hold(points, block: Block):
-    """Set fixed coordinates to the values of the block, whatever the start values."""
+    """Set fixed coordinates to their values in the block, for any start values."""
     if not len(block.fixed.who):
         return points
     held = jnp.asarray(points).at[block.fixed.axis, block.fixed.who].set(block.fixed.value)

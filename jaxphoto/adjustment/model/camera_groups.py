@@ -15,7 +15,7 @@ from jaxphoto.parameters import filled, size_of
 
 
 class CameraGroup(eqx.Module):
-    """Cameras of one model. Their parameters are the rows of one table, so one `vmap` serves them all."""
+    """Cameras of one model. Their parameters are the rows of one table, so one `vmap` evaluates all of them."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     treedef: jax.tree_util.PyTreeDef = eqx.field(static=True)
@@ -26,7 +26,7 @@ class CameraGroup(eqx.Module):
     """True if the image's camera belongs to this group."""
     free_leaves: tuple[int, ...] = eqx.field(static=True)
     bent: jax.tree_util.PyTreeDef = eqx.field(static=True)
-    """Tree of the interior orientation of an image, including parameters that modify it. It has more leaves where image
+    """Tree of the interior orientation of an image, including parameters that modify it. It has more leaves if image
     rows move during exposure (`camera.RowMotion`).
     """
 
@@ -42,7 +42,7 @@ def n_parameters(cameras: tuple[CameraGroup, ...]) -> int:
 
 
 def places_of_cameras(cameras: tuple[CameraGroup, ...]) -> np.ndarray | None:
-    """Return the places of the parameters of each image's camera (parameters, images); None if the models differ."""
+    """Return the indices of the parameters of each image's camera (parameters, images); None if the models differ."""
     if len(cameras) != 1:
         return None
     (g,) = cameras
@@ -80,7 +80,7 @@ def with_free(group: CameraGroup, free: np.ndarray, tables: tuple[ParameterTable
 
 
 def _bent_by(interior: InteriorOrientation, forms: list) -> InteriorOrientation:
-    """Return the tree of an interior orientation modified by parameters of these forms, without numbers."""
+    """Return the tree of an interior orientation modified by parameters of these forms, without values."""
     still = np.zeros(3)
 
     def bent(interior: InteriorOrientation) -> InteriorOrientation:

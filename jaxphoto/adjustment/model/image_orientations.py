@@ -20,7 +20,7 @@ class ImageOrientations(NamedTuple):
     centre: Float[Array, "images 3"]
     rotation: Float[Array, "images 3 3"]
     cameras: tuple[Array, ...]
-    """For each camera group its parameters: (m) for a single unmodified camera, else (images, m)."""
+    """Parameters of each camera group: (m) for a single unmodified camera, else (images, m)."""
 
 
 class OrientationDerivatives(NamedTuple):
@@ -79,7 +79,7 @@ def orientation_derivatives(
     """Differentiate orientations and camera parameters at the increments `y`."""
 
     turned = jax.vmap(jax.jacfwd(small_rotation), in_axes=-1, out_axes=-1)(y.eop[3:] * scale.eop[3:]) * scale.eop[3:]
-    # Term by term: a batch of 3 x 3 matrix products takes several times as long.
+    # Expand the products: a batch of 3 x 3 matrix products takes several times as long.
     rotation = sum_terms(turned[:, j, None] * values.rotation[j, :, None] for j in range(3))
     rotation = rotation.transpose(3, 0, 1, 2)
     own, n = slice(0, s.n_interior), s.n_image_colours
@@ -87,7 +87,7 @@ def orientation_derivatives(
     cameras = []
     if s.modifies_interior:
         shared = jnp.asarray(values.shared).at[s.free].add(y.shared * scale.shared, unique_indices=True)
-        # One product per colour: an image has one owner per kind, so no other owner's parameters contribute.
+        # One product per colour: an image has one owner per kind, so parameters of other owners do not contribute.
         along = jax.vmap(lambda d: jax.jvp(lambda p: cameras_at(p, values, s), (shared,), (d,))[1], -1, 1)(by_colour)
         cameras = [c[..., list(g.free_leaves)] for g, c in zip(s.groups, along, strict=True)]
     else:

@@ -31,11 +31,11 @@ class Increments(NamedTuple):
 
 
 class NonImageResiduals(eqx.Module):
-    """Residuals (observed minus computed, over sigma) of all groups except image rows; `datum` holds the datum
+    """Residuals (observed minus computed, over sigma) of all groups except image rows; `datum` contains the datum
     constraints.
 
     In padded sizes: (components, rows), or (components, rows, points) for rows stored by point. In a result, a group
-    with one number per row has shape (rows).
+    with scalar rows has shape (rows).
     """
 
     others: tuple[Float[ArrayLike, "..."], ...]
@@ -63,7 +63,7 @@ class AbstractValues(eqx.Module):
     """Batch-last arrays of an adjustment: observations, sigmas, start values, datum constraints."""
 
     groups: tuple[RowsInList | RowsAtPoints, ...]
-    """Numbers of the rows of `Structure.observed`, which holds their indices."""
+    """Observed values of the rows of `Structure.observed`, which contains their indices."""
     time: Float[Array, "images"]
     velocity: Float[Array, "3 images"]
     rate: Float[Array, "3 images"]
@@ -113,7 +113,7 @@ def state_at(
     """Move the start values by scaled increments; fixed unknowns do not move."""
     eop = increments.eop * scale.eop
     turn = jax.vmap(small_rotation, in_axes=-1, out_axes=-1)(eop[3:])
-    # Term by term: a batch of 3 x 3 matrix products takes several times as long.
+    # Expand the products: a batch of 3 x 3 matrix products takes several times as long.
     rotation = sum_terms(turn[:, j, None] * values.rotation[j] for j in range(3))
     return UnknownArrays(
         values.position + eop[:3],

@@ -1,11 +1,12 @@
-"""Groups of observations except image points: index arrays of what each row touches, built once on the host.
+"""Groups of observations except image points: index arrays of the unknowns that each row touches, built once on the
+host.
 
 The unknowns that rows of a group touch determine how they enter the normal equations:
 
     reduced     no point: rows add to the reduced normal matrix of images and shared unknowns
     point       one point and no image: rows add to the block of the point before it is eliminated, and touch few
                 shared unknowns (`layout.padded.RayLists.met`)
-    coupled     all others, such as two points, or a point and an image: few rows, carried by extra unknowns
+    coupled     all others, such as two points, or a point and an image: few rows, represented by extra unknowns
                 (`solver.normal`)
 """
 
@@ -44,7 +45,7 @@ class Argument(NamedTuple):
     what: str
     """"image", "point", "parameter", or a kind of declared parameters."""
     shape: tuple[int, ...]
-    """() for one, (m,) for a stack of m."""
+    """() for one object, (m,) for a stack of m."""
 
 
 class RowsInList(NamedTuple):
@@ -60,38 +61,40 @@ class RowsAtPoints(NamedTuple):
 
 
 class ObservedGroup(eqx.Module):
-    """Group of observations: index arrays of its rows and of what they touch, rows last."""
+    """Group of observations: index arrays of its rows and of the objects they touch, rows last."""
 
     name: str = eqx.field(static=True)
     elimination: RowElimination = eqx.field(static=True)
     scalar: bool = eqx.field(static=True)
-    """True if a row is one number; its residuals in results then have no component axis."""
+    """True if a row is a scalar; its residuals in results then have no component axis."""
     components: int = eqx.field(static=True)
     arguments: tuple[Argument, ...] = eqx.field(static=True)
     uses_interior: bool = eqx.field(static=True)
     rigid_invariant: bool = eqx.field(static=True)
     rows: RowsInList | RowsAtPoints
-    """Indices only; the numbers are in `Values.groups`."""
+    """Indices only; the observed values are in `Values.groups`."""
     image: Int[np.ndarray, "k rows"]
     """Images that a row touches."""
     point: Int[np.ndarray, "j rows"]
     parameter: Int[np.ndarray, "p *_"]
-    """Places of the parameters that a row touches in the vector of shared parameters; its length where there is none.
-    First the parameters of each image, table by table, then those of the other arguments. (p, rows), or by point (p,
-    rows, points).
+    """Indices of the parameters that a row touches in the vector of shared parameters; its length if there is none. The
+    parameters of each image come first, table by table, then the parameters of the other arguments. (p, rows), or by
+    point (p, rows, points).
     """
     place: tuple[int, ...] = eqx.field(static=True)
-    """Parameters that are unknown in at least one row."""
+    """Indices of the parameters that are unknown in at least one row."""
     column: Int[np.ndarray, "l *_"]
-    """Shared unknown of each of these; the number of shared unknowns where a row has none."""
+    """Shared unknown of each of these; the number of shared unknowns if a row has none."""
     slot: Int[np.ndarray, "l _ _"]
-    """For rows stored by point: slot of the shared unknown in the list of the point's group, see `RayLists.met`; else
-    empty.
+    """For rows stored by point: slot of the shared unknown in the list of the point's group, see `RayLists.met`;
+    otherwise empty.
     """
     loss: AbstractLoss | LinearisedLoss | None
     """Loss of a row if it is not quadratic."""
     pair: Int[np.ndarray, "pairs rows 4"]
-    """In a padded structure: place of a pair of images of a row in the band (`RayLists.block`), and 1 if transposed."""
+    """In a padded structure: position of each pair of images of a row in the band (`RayLists.block`), and 1 if
+    transposed.
+    """
 
     @property
     def own(self) -> AbstractObservations:
@@ -105,7 +108,7 @@ class ObservedGroup(eqx.Module):
 
     @property
     def n_rows(self) -> int:
-        """Number of rows, including empty ones where rows are stored by point."""
+        """Number of rows, including empty slots of rows stored by point."""
         return int(np.shape(jax.tree.leaves(self.own)[0])[-1])
 
 
@@ -135,7 +138,7 @@ def observations_of(
 
 
 def weighted_parameters(priors: Sequence[object], together: Sequence[JointPrior]) -> ParameterRows:
-    """Return the scalar priors of shared parameters, in their order."""
+    """Return the scalar priors of shared parameters, in parameter order."""
     joint = {int(k) for t in together for k in t.parameters}
     own = {k: prior for k, prior in enumerate(priors) if isinstance(prior, Weighted) and k not in joint}
     value = vector_of([prior.value for prior in own.values()])
@@ -192,7 +195,7 @@ def group_of(
 ) -> ObservedGroup:
     """Build the index arrays of a group.
 
-    `cameras` holds the places of the interior orientation of each image, `unknown_of` the shared unknown of each
+    `cameras` contains the indices of the interior orientation of each image, `unknown_of` the shared unknown of each
     parameter (`n_shared` for none).
     """
     if rows.uses_interior and any(t.modifies_interior for t in tables):
@@ -261,7 +264,7 @@ def _stack(parts: list[np.ndarray], n: int) -> np.ndarray:
 
 
 def image_tables(tables: Sequence[ParameterTable]) -> list[ParameterTable]:
-    """Return the tables whose parameters a row receives with its images."""
+    """Return the tables that contain parameters of the images of a row."""
     return [t for t in tables if t.of_images and not t.modifies_interior]
 
 
@@ -272,7 +275,7 @@ def indices_of(rows: AbstractObservations) -> AbstractObservations:
 
 
 def numbers_in(rows: AbstractObservations) -> AbstractObservations:
-    """Return the numbers of rows without indices, rows last; float64."""
+    """Return the numeric fields of the rows as float64, indices omitted, with the row axis last."""
     whole = eqx.filter(with_plain_arrays(rows), _is_number)
 
     def last(v: Any) -> Any:

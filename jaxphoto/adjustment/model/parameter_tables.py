@@ -25,24 +25,24 @@ class ParameterTable(eqx.Module):
     form: Any = eqx.field(static=True)
     """Constructor argument of `parameters.filled`."""
     offset: int = eqx.field(static=True)
-    """Place of the first number in the vector of shared parameters."""
+    """Index of the first parameter in the vector of shared parameters."""
     size: int = eqx.field(static=True)
     modifies_interior: bool = eqx.field(static=True)
-    """True if it modifies the interior orientation of its images."""
+    """True if the parameters modify the interior orientation of their images."""
     units: tuple[str, ...] = eqx.field(static=True)
-    """Unit suffix of each number's name; "" if it has none."""
+    """Unit suffix of each parameter name; "" if it has none."""
     of_images: bool = eqx.field(static=True)
-    """True if any image has such parameters."""
+    """True if the parameters belong to images."""
     of_image: Int[np.ndarray, "images"]
-    """Owner of each image; the number of owners where it has none."""
+    """Owner of each image; the number of owners if it has none."""
 
     def numbers_at(self, owner: np.ndarray, nowhere: int) -> Int[np.ndarray, "size n"]:
-        """Return the places of the numbers of owners; `nowhere` where there is none."""
+        """Return the indices of the parameters of owners; `nowhere` if there is none."""
         own = self.offset + self.size * owner + np.arange(self.size)[:, None]
         return np.where(owner < len(self.owners), own, nowhere)
 
     def all_owners(self, shared: Array) -> Any:
-        """Return the parameters of all owners and, last, of none (zeros), along the last axis."""
+        """Return the parameters of all owners along the last axis, followed by zeros for a missing owner."""
         numbers = shared[self.offset : self.offset + self.size * len(self.owners)].reshape(-1, self.size)
         return filled(self.form, jnp.concatenate([numbers, jnp.zeros((1, self.size))]).T)
 
@@ -57,7 +57,7 @@ class SharedParameter(NamedTuple):
 
 
 class JointPrior(NamedTuple):
-    """Prior with a full covariance matrix of parameters, given by their places in the vector of shared parameters."""
+    """Prior with a full covariance matrix. `parameters` are indices into the vector of shared parameters."""
 
     parameters: np.ndarray
     value: Any
@@ -65,7 +65,7 @@ class JointPrior(NamedTuple):
 
 
 def tables_of(block: Block, unknowns: Unknowns, offset: int) -> tuple[ParameterTable, ...]:
-    """Return the declared parameters of a block in order: those that modify cameras, those that points touch, all
+    """Return the declared parameters of a block in order: parameters that modify cameras, parameters that points touch,
     others.
     """
     met = {kind for rows in block.observations if "image" not in dict(rows.indices()) for kind in rows.block_parameters}
@@ -100,7 +100,7 @@ def shared_vector(unknowns: Unknowns, cameras: Iterable[str], tables: Sequence[P
 
 
 def unknowns_from(shared: ArrayLike, like: Unknowns, tables: Sequence[ParameterTable]) -> Unknowns:
-    """Replace the declared parameters of `like` by those of the vector of shared parameters."""
+    """Replace the declared parameters of `like` by the values in the vector of shared parameters."""
     found: dict[str, dict[str, Any]] = {kind: {} for kind in like.tables}
     for t in tables:
         for k, name in enumerate(t.owners):
@@ -147,7 +147,7 @@ def shared_entries(
 
 
 def scalar_priors(priors: Any, like: Any) -> list:
-    """Return the prior of each number of the declared parameters `like`."""
+    """Return the prior of each scalar of the declared parameters `like`."""
     pairs = zip(_leaves(priors, like), leaves_in_order(like), strict=True)
     return [each for prior, value in pairs for each in _components(prior, np.size(value))]
 
@@ -167,7 +167,7 @@ def _checked(entry: SharedParameter) -> SharedParameter:
 
 
 def _components(prior: object, n: int) -> list[object]:
-    """Return one prior for each of `n` numbers."""
+    """Return one prior for each of `n` scalars."""
     if not isinstance(prior, Weighted):
         return [prior] * n
     traced = is_traced((prior.value, prior.sigma))
@@ -177,7 +177,7 @@ def _components(prior: object, n: int) -> list[object]:
 
 
 def _leaf_names(interior: InteriorOrientation) -> list[str]:
-    """Return parameter names in the order of the tree's leaves; constants keep their field's name."""
+    """Return parameter names in the order of the tree's leaves; constants use the name of their field."""
     estimable = dict(zip(("c", "x_p", "y_p"), parameter_names(interior), strict=False))
     paths = jax.tree_util.tree_flatten_with_path(interior)[0]
     return [estimable.get(path[-1].name, path[-1].name) for path, _ in paths]

@@ -1,6 +1,6 @@
 """Residuals of observation groups and their derivatives with respect to the unknowns that each row touches.
 
-A row is a function of few numbers: the increments z of its images (6 each), its shared unknowns and its points (3
+A row is a function of few variables: the increments z of its images (6 each), its shared unknowns and its points (3
 each). All rows of a group are evaluated together and differentiated automatically; no dense Jacobian is formed. Rows
 are the last axis; for rows stored by point, rows and points are the last two.
 """
@@ -45,11 +45,11 @@ class RowInputs(NamedTuple):
     points: Float[Array, "j 3"]
 
 
-# Limit of numbers in memory at a time: 100,000 rows that touch fifty unknowns each would exceed the memory.
+# Maximum number of array elements in memory at a time: 100,000 rows with fifty unknowns each would exceed the memory.
 _AT_ONCE = 1 << 24
-# Number of derivatives from which reverse mode is faster (forty times for 365 knots).
+# Minimum number of derivatives for which reverse mode is faster (forty times for 365 knots).
 _MANY_SLOPES = 16
-# Axes of points and of rows where rows are stored by point.
+# Mapped axes: over points and over rows, for rows stored by point.
 _OVER_POINTS = RowVariables(None, -1, -1), RowInputs(-1, RowVariables(None, -1, -1), None, None, None, -1, -1)  # type: ignore[arg-type]
 _OVER_ROWS = RowVariables(None, -1, None), RowInputs(-1, RowVariables(None, -1, None), None, None, None, -1, None)  # type: ignore[arg-type]
 
@@ -64,7 +64,7 @@ def each_row(
 
 
 def rows_of(group: ObservedGroup, numbers: Any) -> AbstractObservations:
-    """Combine indices and numbers of rows."""
+    """Combine indices and values of rows."""
     own = numbers.at_points if isinstance(numbers, RowsAtPoints) else numbers.listed
     return eqx.combine(group.own, own)
 
@@ -72,7 +72,7 @@ def rows_of(group: ObservedGroup, numbers: Any) -> AbstractObservations:
 def gathered_rows(
     group: ObservedGroup, numbers: Any, y: Increments, scale: Increments, v: AbstractValues
 ) -> tuple[RowVariables, RowInputs]:
-    """Gather what every row of a group touches at the increments `y`."""
+    """Gather the unknowns of every row of a group at the increments `y`."""
     at_points = isinstance(group.rows, RowsAtPoints)
 
     def of_images(a: Array) -> Array:
@@ -98,14 +98,14 @@ def gathered_rows(
 
 
 def row_function(group: ObservedGroup, s: AbstractStructure) -> Callable[[RowVariables, RowInputs], Float[Array, "c"]]:
-    """Evaluate observed minus computed over sigma of one row."""
+    """Return the function that evaluates observed minus computed, over sigma, of one row."""
     tables = image_tables(s.tables)
     forms = {t.kind: (t.form, t.size) for t in s.tables}
 
     def residual(z: RowVariables, given: RowInputs) -> Float[Array, "c"]:
         parameters = given.parameters
         if group.place:
-            # Indexing an array would copy it for each number; there are few here.
+            # Add to all parameters in one operation: separate updates would copy the array each time.
             parameters = parameters.at[jnp.array(group.place)].add(z.shared * given.scale.shared)
         position = given.position + z.eop[:, :3] * given.scale.eop[:, :3]
         points = given.points + z.points * given.scale.points
@@ -127,7 +127,7 @@ def row_function(group: ObservedGroup, s: AbstractStructure) -> Callable[[RowVar
             exposure = Exposure(*(a[k] for a in given.exposure))
             return ImageState(position[k], turn @ given.rotation[k], exposure, own, camera)
 
-        # Images take their parameters first, in the order of `observed_groups.group_of`.
+        # Image parameters come first, in the order of `observed_groups.group_of`.
         states = [state(k) for k in range(len(group.image))]
         for what, shape in group.arguments:
             count = math.prod(shape)
@@ -155,7 +155,7 @@ def row_function(group: ObservedGroup, s: AbstractStructure) -> Callable[[RowVar
 
 
 def _stacked(parts: list[Any], shape: tuple[int, ...]) -> Any:
-    """Return one of `parts`, or all of them stacked with leading axes `shape`."""
+    """Return the first of `parts`, or all of them stacked with leading axes `shape`."""
     if not shape:
         return parts[0]
     return jax.tree.map(lambda *v: jnp.stack(v).reshape(*shape, *jnp.shape(v[0])), *parts)
@@ -184,7 +184,7 @@ def row_jacobian(
     function = row_function(group, s)
 
     def ahead(z: RowVariables, given: RowInputs) -> tuple[Float[Array, "c"], RowVariables]:
-        # The residuals are computed along with them.
+        # Residuals are computed together with the derivatives.
         slopes, residual = jax.jacfwd(lambda z: (function(z, given),) * 2, has_aux=True)(z)
         return residual, slopes
 
@@ -204,7 +204,7 @@ def row_jacobian(
 
 
 def rows_at_once(numbers: int) -> int:
-    """Return the number of rows of `numbers` numbers each that fit in memory."""
+    """Return the number of rows of `numbers` elements each that fit in memory."""
     return max(1, _AT_ONCE // max(numbers, 1))
 
 
@@ -230,9 +230,9 @@ def _together(portions: Shaped[Array, "portions *k size"]) -> Shaped[Array, "*k 
 
 
 def reduced_places(g: ObservedGroup, n_images: int) -> Int[Array, "z rows"]:
-    """Return the places of the images' and shared unknowns of a group's rows among the reduced unknowns.
+    """Return the indices of the image unknowns and shared unknowns of a group's rows among the reduced unknowns.
 
-    Entries without an unknown get a place beyond the last.
+    Entries without an unknown get an index beyond the last.
     """
     images = 6 * jnp.asarray(g.image)[:, None] + jnp.arange(6)[:, None]
     return jnp.concatenate([images.reshape(-1, images.shape[-1]), 6 * n_images + jnp.asarray(g.column)])
@@ -241,7 +241,7 @@ def reduced_places(g: ObservedGroup, n_images: int) -> Int[Array, "z rows"]:
 def non_image_residuals(
     increments: Increments, scale: Increments, values: AbstractValues, structure: AbstractStructure
 ) -> NonImageResiduals:
-    """Evaluate all residuals except those of image rows."""
+    """Evaluate all residuals except image rows."""
     others = tuple(
         group_residuals(g, numbers, increments, scale, values, structure)
         for g, numbers in zip(structure.observed, values.groups, strict=True)

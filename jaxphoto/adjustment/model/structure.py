@@ -58,17 +58,18 @@ class AbstractStructure(eqx.Module):
 
     groups: tuple[CameraGroup, ...]
     tables: tuple[ParameterTable, ...]
-    """Declared parameters, in their order after those of the cameras."""
+    """Declared parameters, in their order after the camera parameters."""
     n_images: int = eqx.field(static=True)
     n_points: int = eqx.field(static=True)
     corrections: Corrections = eqx.field(static=True)
     n_interior: int = eqx.field(static=True)
-    """Number of shared unknowns that image rows touch (cameras and what modifies them); they come first."""
+    """Number of shared unknowns that image rows touch (cameras and the parameters that modify them); they come first.
+    """
     n_image_colours: int = eqx.field(static=True)
     free: Int[np.ndarray, "shared"]
     """Index of each shared unknown in the vector of shared parameters."""
     column: Int[np.ndarray, "images colours"]
-    """Shared unknown of each colour and image; the number of shared unknowns where there is none. Colours of image rows
+    """Shared unknown of each colour and image; the number of shared unknowns if there is none. Colours of image rows
     come first.
     """
     colour: Int[np.ndarray, "shared"]
@@ -112,7 +113,7 @@ class AbstractStructure(eqx.Module):
 
     @property
     def n_cameras(self) -> int:
-        """Number of parameters of all cameras: the first ones of the vector of shared parameters."""
+        """Number of parameters of all cameras: the first elements of the vector of shared parameters."""
         return n_parameters(self.groups)
 
     @property
@@ -148,12 +149,12 @@ class Structure(AbstractStructure):
 
     @property
     def shards(self) -> int:
-        """Always one device."""
+        """Number of devices: always 1."""
         return 1
 
 
 def total(x, s: AbstractStructure):
-    """Sum over all devices."""
+    """Return the sum over all devices."""
     return jax.lax.psum(x, AXIS) if s.shards > 1 else x
 
 
@@ -164,7 +165,7 @@ class ObservedRows(NamedTuple):
     tables: tuple[ParameterTable, ...]
     entries: list[SharedParameter]
     together: list[JointPrior]
-    """Joint priors of several numbers."""
+    """Joint priors of several parameters."""
     named: list[tuple[str, AbstractObservations]]
     """Rows by group name."""
 
@@ -188,7 +189,7 @@ def observed_in(block: Block, priors: Unknowns) -> ObservedRows:
 
 
 def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None = None) -> Structure:
-    """Build everything about the adjustment of `block` that does not depend on a measured value.
+    """Build the part of the adjustment of `block` that does not depend on measured values.
 
     `observed` is the result of `observed_in(block, priors)`, if already computed.
     """
@@ -235,7 +236,7 @@ def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None =
 
 
 def _check_rows(image: np.ndarray, point: np.ndarray) -> None:
-    """Raise ValueError for image rows that are not sorted by point, or repeat a point in an image."""
+    """Raise ValueError if image rows are not sorted by point or contain a point of an image twice."""
     if (np.diff(point) < 0).any():
         raise ValueError("the rows of image_points must be sorted by point: reorder them by np.argsort(point)")
     key = point.astype(np.int64) * (int(image.max(initial=0)) + 1) + image

@@ -10,12 +10,12 @@ the diagonal block and W the Schur complement after elimination of columns 1..j-
 
     Ljj Ljj' = Wjj,   LPj = WPj Ljj'^-1,   WPP -= LPj LPj'                                   10 m^3 / 3 operations
 
-The inverse Z of A obeys Z L = L'^-1. Backwards, from the blocks ZPP below (Takahashi, Fagan and Chin):
+The inverse Z of A satisfies Z L = L'^-1. Backwards, from the blocks ZPP below (Takahashi, Fagan and Chin):
 
     G = LPj Ljj^-1,   ZPj = -ZPP G,   Zjj = Ljj'^-1 Ljj^-1 + G' ZPP G
 
 requires only the blocks of Z in the band and the border; columns of the full inverse follow by ZRj = -[ZR,j+1 ZR,q] G.
-The last column block and the shared unknowns form one dense block, the end; for k = 1 there is nothing else.
+The last column block and the shared unknowns form one dense block, the end; for k = 1 there is no other block.
 """
 
 from typing import NamedTuple
@@ -27,7 +27,8 @@ from jaxtyping import Array, Float
 
 from jaxphoto.linear_algebra import cholesky, solve_lower, solve_lower_right, solve_lower_transposed, unit_like
 
-# Inverses of larger triangles are assembled from halves: a product is five times as fast as trsm of BLAS.
+# Maximum size of a triangle inverted directly. Larger ones are assembled from halves: a matrix product is five times as
+# fast as trsm of BLAS.
 _LEAF = 32
 
 
@@ -35,7 +36,7 @@ class Band(NamedTuple):
     """Symmetric matrix of images, ordered so that only adjacent column blocks are coupled, and shared unknowns."""
 
     columns: Float[Array, "inner 2m m"]
-    """Column block j, of all but the last: rows 0..m-1 are A[j, j] (lower triangle), rows m..2m-1 are A[j+1, j]."""
+    """All column blocks j but the last: rows 0..m-1 are A[j, j] (lower triangle), rows m..2m-1 are A[j+1, j]."""
     border: Float[Array, "q inner*m"]
     """A[shared, images of these blocks]."""
     end: Float[Array, "m+q m+q"]
@@ -59,8 +60,8 @@ class SelectedInverse(NamedTuple):
 
 
 def factor_band(band: Band) -> BandFactor:
-    """Return L of A = L L'; NaN from the first column block that is not positive definite (the last includes the
-    shared).
+    """Return L of A = L L'; NaN from the first column block that is not positive definite (the last includes the shared
+    unknowns).
     """
     inner, _, m = band.columns.shape
     if not inner:
@@ -100,7 +101,7 @@ def solve_band(factor: BandFactor, right: Float[Array, "unknowns *c"]) -> Float[
     n = (inner + 1) * m
     images, shared = b[:n].reshape(inner + 1, m, -1), b[n:]
 
-    # Columns are read in place: as scanned arguments they would be copied, which takes as long as the solution.
+    # Read columns in place: as scanned arguments they would be copied, which takes as long as the solution.
     def down(left, at):
         j, following = at
         column = jax.lax.dynamic_index_in_dim(columns, j, keepdims=False)
@@ -128,7 +129,7 @@ def selected_inverse(factor: BandFactor) -> SelectedInverse:
 
 
 def invert_band(factor: BandFactor) -> Float[Array, "unknowns unknowns"]:
-    """Return the full A^-1, symmetric, images first; 2 n^2 m operations in addition to those of `selected_inverse`."""
+    """Return the full A^-1, symmetric, images first; 2 n^2 m operations in addition to `selected_inverse`."""
     inside, gains = _invert_inside(factor)
     inner, _, m = inside.columns.shape
     if not inner:
@@ -166,9 +167,10 @@ def diagonal_of(stored: Band | BandFactor) -> Float[Array, " unknowns"]:
 
 
 def pivots(diagonal: Float[Array, " unknowns"], factor: BandFactor) -> Float[Array, " unknowns"]:
-    """Return the squared diagonal of L over the diagonal of A (over 1 where that is not positive), images first.
+    """Return the squared diagonal of L over the diagonal of A (over 1 if that is not positive), images first.
 
-    The information of an unknown that remains after elimination of those before it: near zero at a rank defect.
+    This is the information of an unknown that remains after elimination of the preceding unknowns: near zero at a rank
+    defect.
     """
     return diagonal_of(factor) ** 2 / jnp.where(diagonal > 0, diagonal, 1.0)
 
@@ -182,7 +184,7 @@ def _invert_inside(factor: BandFactor) -> tuple[SelectedInverse, Float[Array, "i
     corner = end[m:, m:]
 
     def invert(after, at):
-        # Only products A B': XLA takes twice as long for A' B.
+        # Use only products A B': XLA takes twice as long for A' B.
         column, shared = at
         own = _invert_triangle(column[:m])
         gain = own @ jnp.concatenate([column[m:], shared]).T
@@ -220,12 +222,14 @@ def _invert_triangle(lower: Float[Array, "m m"]) -> Float[Array, "m m"]:
 
 
 def _symmetric(lower: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Return the symmetric matrix of a lower triangle."""
+    """Complete a symmetric matrix from its lower triangle."""
     return jnp.tril(lower) + jnp.tril(lower, -1).T
 
 
 def _mean(a: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Symmetrise to the last bit, which a floating-point product need not be."""
+    """Return the exactly symmetric mean of a matrix and its transpose: floating-point products may differ in the last
+    bit.
+    """
     return 0.5 * (a + a.T)
 
 

@@ -44,7 +44,7 @@ def solve_factored(reduced: Reduced, factor: BandFactor, b: Increments, at: Line
 
 
 def reduce_right(reduced: Reduced, b: Increments, at: Linearised) -> tuple[Array, Array]:
-    """Eliminate the points from a right-hand side; returns the parts for the reduced unknowns and for mu."""
+    """Eliminate the points from a right-hand side; return its parts for the reduced unknowns and for mu."""
     s, k = at.structure, len(reduced.k)
     if not s.rays.free_points:
         return jnp.concatenate([b.eop.T.reshape(-1), b.shared]), jnp.zeros(k)
@@ -107,7 +107,7 @@ def jt_product(z: PaddedResiduals, at: Linearised) -> Increments:
 
 
 def gradient(rows: LinearisedRows, at: Linearised) -> Increments:
-    """Return J'r of the residuals at which the rows were linearised."""
+    """Return J'r at the linearisation point of the rows."""
     s = at.structure
     of_points = rows.of_points.v[:, 6:].T * at.scale.points
     b = _by_unknown(total(rows.by_image[:, None, :-1, -1], s), of_points[None], s)
@@ -152,14 +152,14 @@ def _pull_others(z: NonImageResiduals, jacobians: tuple[RowJacobian, ...], at: L
 
 
 def _of_many(function: Callable[[Any], Any], values: Any, many: int, s: PaddedStructure) -> Any:
-    """Map `function` over the leading axes of `values`, as many at a time as memory allows.
+    """Map `function` over the leading axes of `values`, limiting the number at a time to the available memory.
 
-    Every row holds numbers of all unknowns it touches.
+    Every row contains elements of all unknowns it touches.
     """
     most = rows_at_once(sum(g.components * g.n_rows * len(g.parameter) for g in s.observed))
     if many <= most:
         return jax.vmap(function)(values)
-    # Equal batches: a remainder would be compiled separately.
+    # Use equal batches: a remainder would be compiled separately.
     size = next(k for k in range(most, 0, -1) if many % k == 0)
     batches = jax.tree.map(lambda v: v.reshape(many // size, size, *v.shape[1:]), values)
     found = jax.lax.map(jax.vmap(function), batches)
@@ -174,7 +174,7 @@ def j_product(x: Increments, at: Linearised) -> PaddedResiduals:
 
 
 def _push_images(x: Increments, at: Linearised) -> Float[Array, "batches 2 chunks p"]:
-    """Return J x of the image rows by batch, so that intermediate arrays stay in the processor's cache."""
+    """Return J x of the image rows by batch: intermediate arrays then fit in the processor's cache."""
     _, scale, values, s = at
     scene, moved = jax.jvp(partial(_scene_at, at), at.increments[:2], x[:2])
     points, steps = at.state.points, x.points * scale.points

@@ -7,9 +7,9 @@ With S~ = [S g; g' -K] the reduced matrix bordered by the few rows that couple p
     Q_pp  = L^-T (I + F' Q~ F) L^-1                 3 x 3 per point
     j Q j' = z'z + (j_r - F z)' Q~ (j_r - F z)      of an image row with derivatives j_r and j_p, z = L^-1 j_p'
 
-summed over rays and pairs of rays; the same holds for rows stored by point that touch shared unknowns. The full matrix
-is never inverted. In a free network the part along the open motions, which the datum constraints fix, is subtracted:
-the covariance under inner (or minimal) constraints remains.
+summed over rays and pairs of rays. The same formulas apply to rows stored by point that touch shared unknowns. The full
+matrix is never inverted. In a free network the component along the open motions, which the datum constraints fix, is
+subtracted: the result is the covariance under inner (or minimal) constraints.
 """
 
 from typing import NamedTuple
@@ -50,12 +50,12 @@ class Cofactors(NamedTuple):
 
 
 class RowCofactors(NamedTuple):
-    """Cofactors j Q j' of the numbers of a row, in padded sizes."""
+    """Cofactors j Q j' of the components of a row, in padded sizes."""
 
     image: Float[Array, "batches 3 m p"]
     """Variances of x and y, and their covariance."""
     at_points: tuple[Float[Array, "c c rows points"], ...]
-    """For the groups of `AbstractStructure.with_shared`."""
+    """Cofactors of the groups of `AbstractStructure.with_shared`."""
 
 
 def cofactors_of(at: Linearised, factored: FactoredNormal, of_rows: bool) -> tuple[Cofactors, RowCofactors | None]:
@@ -92,7 +92,7 @@ class _Propagated(NamedTuple):
     """Q~ F of each point by coupled unknowns, and I + F' Q~ F."""
 
     rays: Float[Array, "batches m p d e"]
-    """For the unknowns of the ray's image."""
+    """Product for the unknowns of the ray's image."""
     border: Float[Array, "points c 3"]
     inner: Float[Array, "3 3 points"]
 
@@ -214,9 +214,10 @@ def _of_group(full: Array, rows: RowsOfPoints, seen: _Propagated, reduced: Reduc
 
 
 def _without_open_motions(q: Cofactors, at: Linearised, factored: FactoredNormal) -> Cofactors:
-    """Subtract E E': the part of the cofactors along the motions that the datum constraints D fix.
+    """Subtract E E': the component of the cofactors along the motions that the datum constraints D fix.
 
-    E = (N + D'D)^-1 D' spans those motions exactly, because N does not see them; if all are open, they are known.
+    E = (N + D'D)^-1 D' spans these motions exactly, because they are in the null space of N. If all motions are open,
+    they are known in advance.
     """
     defect = len(at.values.datum_eop)
     if not defect:
@@ -240,7 +241,7 @@ def _without_open_motions(q: Cofactors, at: Linearised, factored: FactoredNormal
 def row_variances(
     at: Linearised, q: Cofactors, of_rows: RowCofactors, factored: FactoredNormal
 ) -> tuple[Array, tuple[Array, ...]]:
-    """Return J Q J' of image rows, and of the numbers of each other row (c, c, ...)."""
+    """Return J Q J' of the image rows, and of every other group as (c, c, ...), c components per row."""
     at = at._replace(structure=at.structure.on_one_device)
     s = at.structure
     rest = non_image_rows(at)
@@ -259,7 +260,7 @@ def row_variances(
 def _of_reduced(g: ObservedGroup, j: RowJacobian, q: Array, s: PaddedStructure) -> Float[Array, "c c rows"]:
     def of(touched: Array, own: Array) -> Array:
         at = touched.T
-        # A missing unknown has the place after the last.
+        # A missing unknown has the index after the last.
         met = q.at[at[:, :, None], at[:, None]].get(mode="fill", fill_value=0.0)
         seen = jnp.einsum("nab,dbn->dan", met, own)
         return jnp.einsum("can,dan->cdn", own, seen)
@@ -270,7 +271,7 @@ def _of_reduced(g: ObservedGroup, j: RowJacobian, q: Array, s: PaddedStructure) 
 
 
 def _of_coupled(g: ObservedGroup, j: RowJacobian, at: Linearised, factored: FactoredNormal) -> Float[Array, "c c rows"]:
-    """Return j Q j' of coupled rows by one solution per number: their unknowns are not coupled otherwise."""
+    """Return j Q j' of coupled rows by one solution per component: no other rows couple their unknowns."""
     s, zero = at.structure, at.increments
 
     def whole(k, c) -> Increments:

@@ -2,22 +2,23 @@
 
 optimistix runs the iteration. Each iteration evaluates the residuals of one candidate. If it is accepted, the normal
 equations are summed there, points are eliminated (`reduced`), the rest is factored (`band`), and a new step is
-proposed. Once a step is shorter than a hundredth of the previous one, the factor is kept: such a chord step needs only
-the gradient.
+proposed. Once a step is shorter than a hundredth of the previous one, the factor is reused: such a chord step needs
+only the gradient.
 
-With weakly determined unknowns the sum of squares is a narrow, bent valley. A straight step leaves it, and the damping
-that keeps it inside makes convergence very slow. Therefore a step v that reduces the sum of squares by less than the
-linear model predicts is bent (geodesic acceleration, Transtrum and Sethna 2012): with r'' the second derivative of the
-residuals along v,
+With weakly determined unknowns the sum of squares is a narrow, curved valley. A straight step leaves it, and the
+damping that keeps the iterate inside makes convergence very slow. Therefore a step v that reduces the sum of squares by
+less than the linear model predicts is curved (geodesic acceleration, Transtrum and Sethna 2012). With r'' the second
+derivative of the residuals along v,
 
     (N + D) v = -J'r,    (N + D) a = -J'r'',    x(t) = x + t v + t^2 a / 2
 
-and t is halved until the reduction is close to the prediction for x(t). The acceleration costs residuals and one more
-solution with the same factor.
+and t is halved until the reduction is close to the prediction for x(t). The acceleration costs one evaluation of the
+residuals and one more solution with the same factor.
 
-Stop rule (`LevenbergMarquardt.step`, `settled`): a step is the last if the distance to the optimum that remains after
-it, extrapolated from the last two steps, is below `TOLERANCE` standard deviations of the unknowns, and the damping did
-not shorten it. Otherwise the iteration ends at `SolveMode.max_steps` or in a flat valley (`IterationHistory.is_flat`).
+Stop rule (`LevenbergMarquardt.step`, `settled`): a step is the last if the remaining distance to the optimum,
+extrapolated from the last two steps, is below `TOLERANCE` standard deviations of the unknowns, and the damping did not
+shorten the step. Otherwise the iteration ends at `SolveMode.max_steps` or in a flat valley
+(`IterationHistory.is_flat`).
 """
 
 from collections.abc import Callable
@@ -47,7 +48,7 @@ from jaxphoto.adjustment.solver.similarity import after, n_open_motions, onto_da
 from jaxphoto.arrays import ArrayLike
 from jaxphoto.short_repr import pretty_repr
 
-# No unknown misses its optimum by more than this fraction of its standard deviation.
+# Maximum remaining distance of an unknown from its optimum, as a fraction of its standard deviation.
 TOLERANCE = 1e-5
 Vector = Float[Array, "unknowns"]
 """Scaled increments as one vector: one operation to compile instead of three."""
@@ -61,7 +62,7 @@ class FactoredSystem(NamedTuple):
 
 
 def zero_system(y: Increments, values: PaddedValues, s: PaddedStructure) -> FactoredSystem:
-    """Return a system of the right shapes as initial value."""
+    """Return a system of zeros with the shapes of the factored system, as initial value."""
     n, q, k = 6 * s.n_images, s.n_shared, s.n_coupled + len(values.datum_eop)
     colours, three = image_places(s, k).shape[1], 3 if s.rays.free_points else 0
     n_points, c = y.points.shape[1], border_places(s, k).shape[1]
@@ -83,11 +84,11 @@ def zero_system(y: Increments, values: PaddedValues, s: PaddedStructure) -> Fact
 
 
 class SolveMode(NamedTuple):
-    """Purpose of an iteration, as numbers, so that one program serves all."""
+    """Purpose of an iteration as array values: one program serves all purposes."""
 
     max_steps: Int[ArrayLike, ""]
     only_factor: Bool[ArrayLike, ""]
-    """True for one undamped step, to obtain its system."""
+    """True for one undamped step, to compute its system."""
 
 
 def to_optimum(max_steps: int) -> SolveMode:
@@ -102,7 +103,7 @@ def to_factor() -> SolveMode:
 
 @pretty_repr
 class IterationHistory(NamedTuple):
-    """Iteration history, one number per step: the first `MOST_KEPT` steps, NaN beyond."""
+    """Iteration history, one value per step: the first `MOST_KEPT` steps, NaN beyond."""
 
     sum_of_squares: Float[ArrayLike, "steps"]
     """Sum of squares before the step."""
@@ -116,20 +117,22 @@ class IterationHistory(NamedTuple):
     """Fraction of the step at the end of its curve; 0 for a straight step."""
 
     def is_flat(self, k: int | Int[Array, ""]) -> Bool[Array, ""] | np.bool_:
-        """Return True if the sum of squares hardly fell in the steps before step k (0, 1, ...), although these did not
-        shorten.
+        """Return True if the sum of squares hardly decreased in the steps before step k (0, 1, ...), although the steps
+        did not shorten.
 
-        In all of them it fell by less than moving one unknown by two standard deviations changes it: the observations
-        hardly distinguish these places.
+        Their total decrease was less than the effect of moving one unknown by two standard deviations: the observations
+        hardly distinguish these iterates.
         """
         first, within = jnp.maximum(k - _WINDOW, 0), (k >= _WINDOW) & (k < MOST_KEPT)
         fall = self.sum_of_squares[first] - self.sum_of_squares[k]
         return within & (fall < _FALL) & (self.length[k] > _SHRUNK * self.length[first])
 
 
-# Adjustments end within tens of steps; this history is all that is kept besides the unknowns.
+# Maximum number of steps in the history. Adjustments converge within tens of steps; only the unknowns and this history
+# are stored.
 MOST_KEPT = 128
-# Number of steps that decide that the sum of squares is flat, its largest fall, and the ratio of last to first length.
+# Number of steps over which the sum of squares must be flat, maximum decrease over them, minimum ratio of last to first
+# length.
 _WINDOW, _FALL, _SHRUNK = 20, 4.0, 0.5
 
 
@@ -151,7 +154,7 @@ class Proposal(NamedTuple):
     """Sum of squares after the whole step without acceleration; infinite before it is computed."""
 
     def part(self, t: Scalar, straight: Bool[Array, ""]) -> Vector:
-        """Increment after the fraction t of the step, along the curve or `straight`."""
+        """Return the increment after the fraction t of the step, along the curve or `straight`."""
         return t * self.step + jnp.where(straight, 0.0, t**2) * self.half
 
     @property
@@ -160,12 +163,12 @@ class Proposal(NamedTuple):
         return jnp.sqrt(jnp.maximum(self.seen, 0.0))
 
     def gain(self, t: Scalar, sum_of_squares: Scalar) -> Scalar:
-        """Ratio of actual to predicted reduction of the sum of squares after the fraction t of the step."""
+        """Return the ratio of actual to predicted reduction of the sum of squares after the fraction t of the step."""
         return (self.sum_of_squares - sum_of_squares) / (2 * t * (self.seen + self.damped) - t**2 * self.seen)
 
 
-# Kind of the next candidate: the next iterate (initially, after a rejected step, or where a curve diverged), the whole
-# step, a place near the iterate for the second derivative of the residuals, or a place along the curve.
+# Kind of the next candidate: the next iterate (initially, after a rejected step, or after a diverged curve), the whole
+# step, a point near the iterate for the second derivative of the residuals, or a point along the curve.
 _HERE, _STRAIGHT, _NEAR, _CURVE = range(4)
 
 
@@ -177,7 +180,7 @@ class SolverState(NamedTuple):
     t: Scalar
     """Fraction of the step that leads to the candidate."""
     shortest: Scalar
-    """Smallest fraction that is tried."""
+    """Minimum fraction that is tried."""
     proposal: Proposal
     damping: Scalar
     growth: Scalar
@@ -188,34 +191,36 @@ class SolverState(NamedTuple):
     loose: Bool[Array, ""]
     """True if damping replaces the datum constraints."""
     tightened: Bool[Array, ""]
-    """True if it did before: it does so once."""
+    """True if damping replaced them before: it does so only once."""
     done: Bool[Array, ""]
     """True at the result of the task: the optimum, or the system."""
     flat: Bool[Array, ""]
-    """True if more steps are useless: the sum of squares does not determine the optimum."""
+    """True if further steps are useless: the sum of squares does not determine the optimum."""
     steps: Int[Array, ""]
     history: Float[Array, "steps numbers"]
-    """Numbers of a `IterationHistory`, one step per row."""
+    """Fields of an `IterationHistory`, one step per row."""
 
 
-# Damping is added to the normal matrix, relative to its diagonal. It starts close to zero. A rejected step v raises it
-# to at least v'N v / v' diag(N) v, the stiffness along v, which about halves the step, and then by factors of 2, 4, 8,
-# ... (Nielsen 1999).
+# Initial damping, relative to the diagonal of the normal matrix, and its initial growth factor. The damping starts
+# close to zero. A rejected step v raises it to at least v'N v / v' diag(N) v, the stiffness along v, which about halves
+# the step, and then by factors of 2, 4, 8, ... (Nielsen 1999).
 _FIRST_DAMPING, _GROWTH = 1e-8, 2.0
-# A step is accepted above this ratio of actual to predicted reduction. Damping falls with that ratio (Nielsen's rule),
-# at most to this fraction.
+# Ratio of actual to predicted reduction above which a step is accepted. Minimum factor of the damping after an accepted
+# step; it decreases with that ratio (Nielsen's rule).
 _ACCEPT, _LEAST_FACTOR = 0.001, 0.2
-# A step below the first ratio is bent, and shortened until the ratio exceeds the second or t is below this fraction.
+# Ratio of actual to predicted reduction below which a step is curved; ratio above which a curve is not shortened
+# further; minimum fraction t.
 _GOOD, _ENOUGH, _SHORTEST = 0.75, 0.25, 0.1
-# Largest fraction of the step by which bending moves, in the metric of diag(N): 2 |a| / |v| < 1.5 (Transtrum, Sethna).
+# Maximum displacement by the curvature as a fraction of the step, in the metric of diag(N): 2 |a| / |v| < 1.5
+# (Transtrum, Sethna).
 _BENT = 0.375
-# Fraction of a step for its second derivative: the difference of residuals keeps enough digits.
+# Fraction of a step used for its second derivative: the difference of residuals retains enough digits.
 _DIFFERENCE = 0.01
-# Smallest ratio of successive steps assumed when the remaining distance is estimated.
+# Minimum ratio of successive steps assumed when the remaining distance is estimated.
 _SLOWEST_SHOWN = 0.1
-# After a step shorter than this fraction of the previous one, the next is a chord with the existing factor. N changes
-# by about that fraction, and so does the remaining error after a chord; a new factor takes several times as long. At
-# twice this value, large blocks need two more steps than with new factors.
+# Ratio to the previous step below which a step is followed by a chord step with the existing factor. N changes by about
+# that fraction, and so does the remaining error after a chord; a new factor takes several times as long. At twice this
+# value, large blocks need two more steps than with new factors.
 _CHORD = 0.01
 
 
@@ -226,11 +231,11 @@ class Judgement(NamedTuple):
     """True if the proposal is accepted or rejected now."""
     accept: Bool[Array, ""]
     bend: Bool[Array, ""]
-    """True if the acceleration is needed first."""
+    """True if the acceleration must be computed first."""
     shorten: Bool[Array, ""]
     """True if a smaller fraction of the curve is tried first."""
     diverged_points: Bool[Array, ""]
-    """True if the straight step had a smaller sum of squares than the curve; it is judged instead."""
+    """True if the straight step had a smaller sum of squares than the curve; then the straight step is judged."""
     t: Scalar
     """Fraction of the step that is judged."""
     gain: Scalar
@@ -241,7 +246,7 @@ def _judged(state: SolverState, sum_of_squares: Scalar, has_losses: bool) -> Jud
     """Judge the candidate by its sum of squares."""
     p, straight, curve = state.proposal, state.stage == _STRAIGHT, state.stage == _CURVE
     gain = p.gain(state.t, sum_of_squares)
-    # Far from the optimum the linear model of a loss predicts little, although there is no bent valley.
+    # With a robust loss the linear model predicts poorly far from the optimum, even without a curved valley.
     bend = straight & ~(gain >= _GOOD) & jnp.isfinite(sum_of_squares) & (not has_losses)
     shorten = curve & (state.t > state.shortest) & ~(gain >= _ENOUGH)
     judged = (straight & ~bend) | (curve & ~shorten)
@@ -260,7 +265,7 @@ def _next_damping(
     # A shortened step does not reduce damping.
     gain = jnp.where(t < 1, jnp.minimum(gain, 0.5), gain)
     less = state.damping * jnp.maximum(_LEAST_FACTOR, 1 - (2 * gain - 1) ** 3)
-    # Only damping keeps the matrix of a loose network regular.
+    # Without datum constraints only damping makes the matrix regular.
     less = jnp.maximum(less, jnp.where(state.loose, _FIRST_DAMPING, 0.0))
     more = jnp.maximum(state.growth * state.damping, stiffness)
     damping, growth = jnp.where(accept, less, more), jnp.where(accept, _GROWTH, _GROWTH * state.growth)
@@ -273,14 +278,14 @@ def as_vector(x: Increments) -> Vector:
 
 
 class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, SolverState]):
-    """Levenberg-Marquardt, stopped by the remaining distance to the optimum in standard deviations.
+    """Levenberg-Marquardt, terminated by the remaining distance to the optimum in standard deviations.
 
-    The function to minimise returns the residuals; the solver differentiates by itself.
+    The function to minimise returns the residuals; the solver computes its own derivatives.
 
     The length of a step d in the metric of the normal matrix, sqrt(d' N d), bounds |d| / sigma of every single unknown.
     After a step of length l that follows one of length k, about l (l / k) remains; at least a tenth of l is assumed,
     because the first ratios are optimistic: they decrease quadratically until the curvature of the residuals dominates.
-    Once the remaining part is below `tolerance`, the (practically undamped) step is taken as the last.
+    Once the remaining distance is below `tolerance`, the (practically undamped) step is taken as the last.
     """
 
     rtol: float
@@ -301,7 +306,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         self.tolerance, self.task = tolerance, task
 
     def increments(self, y: Vector) -> Increments:
-        """Return the vector as increments."""
+        """Convert the vector to increments."""
         n = 6 * self.structure.n_images
         eop, shared, points = jnp.split(y, [n, n + self.structure.n_shared])
         return Increments(eop.reshape(6, -1), shared, points.reshape(3, -1))
@@ -351,9 +356,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         chord: Bool[Array, ""],
         old: FactoredSystem,
     ) -> tuple[FactoredSystem, Vector, Vector]:
-        """Return the system, x of (N + D) x = J'r - `less`, and J'r - `less`; a `chord` keeps the `old` system."""
+        """Return the system, x of (N + D) x = J'r - `less`, and J'r - `less`; a `chord` reuses the `old` system."""
         place = at.for_normal_equations
-        # New derivatives overwrite the old F; a chord keeps it.
+        # New derivatives overwrite the old F; a chord reuses it.
         linearised = linearise_rows(place, rows, old.reduced.f, chord)
         old = old._replace(reduced=old.reduced._replace(f=linearised.w))
 
@@ -391,7 +396,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         record = IterationHistory(
             p.sum_of_squares, p.length, held, accept.astype(float), jnp.where(curve & ~diverged, t, 0.0)
         )
-        # A candidate that is not judged is overwritten.
+        # The record of a candidate that is not judged is overwritten.
         history = state.history.at[state.steps].set(jnp.stack(record), mode="drop")
         is_flat, steps, loose = (
             accept & IterationHistory(*history.T).is_flat(state.steps),
@@ -399,11 +404,11 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
             state.loose,
         )
         if n_open_motions(self.values, s):
-            # Enforced about distant start values, the constraints bend the path: the iteration continues without them,
-            # and its end is moved onto them as a whole.
+            # Datum constraints linearised at poor initial values make the path curved. Iterate without them, then
+            # transform the result onto the datum by a similarity.
             loose = loose | (judged & ~accept & ~state.tightened)
 
-        # Near the optimum N hardly changes: keep its factor.
+        # Near the optimum N hardly changes: reuse its factor.
         near_optimum = (gain >= _GOOD) & (p.length <= _CHORD * state.length) & jnp.isfinite(state.length)
         chord = accept & (state.stage == _STRAIGHT) & ~loose & near_optimum
 
@@ -411,7 +416,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         less = jnp.where(near, (1 - h) * p.gradient - h * held * weight * p.step, 0.0)
         system, x, b = jax.lax.cond(
             fresh | near,
-            # For rows with losses, the residuals in the normal equations differ from those of the cost.
+            # For rows with losses, the residuals in the normal equations differ from the residuals of the cost.
             lambda: self._solved(
                 self._at(y, loose), damping, None if s.has_losses else rows, less, chord, state.system
             ),
@@ -430,21 +435,21 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
             sum_of_squares=jnp.where(fresh, sum_of_squares, p.sum_of_squares),
             straight_sum=jnp.where(fresh, jnp.inf, straight_sum),
         )
-        # An old factor leaves up to twice the remainder of a new one.
+        # With an old factor, up to twice the distance remains.
         left = jnp.where(chord, 2.0, 1.0) * p.length / last
         missing = p.length * jnp.clip(left, _SLOWEST_SHOWN, 1.0)
         settled = fresh & (missing <= self.tolerance) & (p.damped <= p.seen + self.tolerance**2)
         settled = settled & (steps < self.task.max_steps) & ~self.task.only_factor
         end = jnp.stack([p.sum_of_squares, p.length, held, jnp.ones(()), jnp.zeros(())])
         history = history.at[jnp.where(settled, steps, MOST_KEPT)].set(end, mode="drop")
-        # The last step is short and starts from an accepted iterate: it needs no evaluation.
+        # The last step is short and starts from an accepted iterate: do not evaluate it.
         y, tighten = jnp.where(settled, y + p.step, y), settled & loose
         if n_open_motions(self.values, s):
             y = jax.lax.cond(tighten, lambda y: as_vector(onto_datum(self._at(y, jnp.array(False)))), lambda y: y, y)
         bent = jnp.sqrt(self._dot(p.half, weight * p.half) / self._dot(p.step, weight * p.step))
         begin = jnp.minimum(_BENT / bent, 1.0)
         stages = [tighten, fresh, bend, near, shorten]
-        # Restore the iterate after a rejected step, the straight step after a curve that diverged.
+        # Restore the iterate after a rejected step, the straight step after a diverged curve.
         t = jnp.select(stages, [0.0, 1.0, h, begin, state.t / 2], jnp.where(accept, 1.0, 0.0))
         reached = as_vector(after(self._at(y, loose), self.increments(p.part(t, diverged)), system.reduced.weight))
         progress = SolverState(
@@ -467,7 +472,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         return y, progress, None
 
     def terminate(self, fn, y, args, options, state: SolverState, tags):
-        """Stop after the final step, at the limit of the task, or after many useless steps."""
+        """Stop after the final step, at the step limit of the task, or in a flat valley."""
         ended = ~state.done & ((state.steps >= self.task.max_steps) | state.flat)
         results = optx.RESULTS
         return state.done | ended, results.where(ended, results.nonlinear_max_steps_reached, results.successful)

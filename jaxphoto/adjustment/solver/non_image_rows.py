@@ -16,7 +16,7 @@ from jaxphoto.compiling import once
 
 
 class RowsOfPoints(NamedTuple):
-    """Rows that touch a point and shared unknowns: residuals, and derivatives by both."""
+    """Rows that touch a point and shared unknowns: residuals, and derivatives with respect to both."""
 
     residual: Float[Array, "c rows points"]
     shared: Float[Array, "c l rows points"]
@@ -25,7 +25,7 @@ class RowsOfPoints(NamedTuple):
     """Slots of these unknowns in the list of the point's group."""
 
     def of_group(self, size: int) -> Float[Array, "size rows points c"]:
-        """Return derivatives by all `size` shared unknowns of a group of points."""
+        """Return derivatives with respect to all `size` shared unknowns of a group of points."""
         _, rows, points = self.slot.shape
         at = self.slot, jnp.arange(rows)[:, None], jnp.arange(points)
         zero = jnp.zeros((size, rows, points, len(self.residual)))
@@ -54,11 +54,11 @@ class NonImageRows(NamedTuple):
 class NormalSums(NamedTuple):
     """Sums of the normal equations of images and shared unknowns (see `normal`), before points are eliminated.
 
-    Shared unknowns have one extra column, for rows without an unknown there.
+    Shared unknowns have one extra column, for rows that touch none.
     """
 
     band: tuple[Float[Array, "inner 2w 6 w 6"], Float[Array, "w 6 w 6"]]
-    """Pairs of images, by column block; images by themselves are in `u`."""
+    """Pairs of two different images, by column block; products of an image with itself are in `u`."""
     u: Float[Array, "images 6 6"]
     us: Float[Array, "images 6 shared+1"]
     uss: Float[Array, "shared+1 shared+1"]
@@ -84,7 +84,7 @@ def non_image_rows(at: Linearised, residuals: NonImageResiduals | None = None) -
     coupled = []
     for g, j in zip(s.observed, jacobians, strict=True):
         if isinstance(g.rows, RowsAtPoints):
-            # Term by term and pair by pair of rows: few, each as long as the number of points.
+            # Expand the sums by element and by pair of rows: they are few, each as long as the number of points.
             flat = j.points.reshape(-1, 3, *j.points.shape[3:])
             flat = jnp.moveaxis(flat, 2, 1).reshape(-1, 3, n)
             r = j.residual.reshape(-1, n)
@@ -106,7 +106,7 @@ def non_image_rows(at: Linearised, residuals: NonImageResiduals | None = None) -
 
 
 def _coupled(g: ObservedGroup, j: RowJacobian, s: PaddedStructure, n_points: int) -> tuple[Array, Array, Array]:
-    """Return the rows of a group in full, by images, shared unknowns and points."""
+    """Return dense rows of a group, by images, shared unknowns and points."""
     c, each = g.components, jnp.arange(g.n_rows)
     e = jnp.zeros((c, g.n_rows, s.n_images, 6))
     for k, image in enumerate(g.image):
@@ -170,7 +170,7 @@ def _add_products(
 
     if n <= size:
         return added(uss, (column, shared))[0]
-    # Padding of the last portion has no derivatives.
+    # Padding of the last portion has zero derivatives.
     shared = jnp.pad(shared, ((0, 0), (0, 0), (0, -n % size)))
     return jax.lax.scan(added, uss, (in_portions(column, size), in_portions(shared, size)))[0]
 
@@ -184,7 +184,7 @@ def add_blocks(
 ) -> tuple[Array, Array]:
     """Add blocks of pairs of images to the inner column blocks or to the last (see `RayLists.block`).
 
-    Blocks outside both are dropped. `distinct` asserts that no two blocks share a place, which is faster.
+    Blocks outside both are dropped. `distinct` asserts that no two blocks have the same position, which is faster.
     """
     columns, last = band
     which, row, column = place.T
@@ -195,7 +195,8 @@ def add_blocks(
     return columns, last.at[row, :, column].add(blocks, mode="drop")
 
 
-# XLA compiles the loop over the rows of a scatter as one function if rows are short, otherwise as several calls a row.
+# XLA compiles the loop over the rows of a scatter as one function if rows are short, otherwise as several calls per
+# row.
 _PIECE = 36
 
 

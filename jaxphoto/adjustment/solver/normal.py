@@ -6,8 +6,8 @@ In scaled increments, with e the exterior orientations, s the shared unknowns an
     N = [ Us'  Uss  Ws'] [s] = [b_s]        V block-diagonal (3 x 3 per point), W 6 x 3 per ray
         [ W'   Ws   V  ] [p]   [b_p]
 
-Few rows couple points, D: distances, all that touches two points or a point and an image (`model.observed_groups`), and
-the datum constraints. Their part D'D of N is represented by extra unknowns mu = D x with the block -I, so V stays
+Few rows couple points, D: distances, all rows that touch two points or a point and an image (`model.observed_groups`),
+and the datum constraints. Their part D'D of N is represented by extra unknowns mu = D x with the block -I, so V stays
 block-diagonal. With V = L L', Y = W L^-T, Ys = L^-1 Ws, Yd = L^-1 D_p', and D_r the part of D for images and shared
 unknowns:
 
@@ -37,7 +37,7 @@ from jaxphoto.arrays import sum_terms
 
 
 class Linearised(NamedTuple):
-    """Place of linearisation: `start + scale * increments`."""
+    """Linearisation point: `start + scale * increments`."""
 
     increments: Increments
     scale: Increments
@@ -46,7 +46,7 @@ class Linearised(NamedTuple):
 
     @property
     def state(self) -> UnknownArrays:
-        """Unknowns at that place."""
+        """Unknowns at the linearisation point."""
         return state_at(self.increments, self.scale, self.values, self.structure)
 
     @property
@@ -103,7 +103,7 @@ class ResidualRows(NamedTuple):
 
 
 class Reduced(NamedTuple):
-    """Reduced normal matrix and what elimination and back-substitution of vectors need."""
+    """Reduced normal matrix, and the arrays for elimination and back-substitution of vectors."""
 
     diagonal: Float[Array, "reduced"]
     """Diagonal of A."""
@@ -117,7 +117,7 @@ class Reduced(NamedTuple):
     l: Float[Array, "6 points"]  # noqa: E741
     """Cholesky factors of V: l11, l21, l22, l31, l32, l33."""
     weight: Increments
-    """Diagonal of N without damping and D'D: what unit damping adds."""
+    """Diagonal of N without damping and D'D: the matrix that damping multiplies."""
     damping: Scalar
 
 

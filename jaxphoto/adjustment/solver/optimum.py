@@ -73,7 +73,7 @@ def _iterate(
     solver = LevenbergMarquardt(structure, values, scale, TOLERANCE, task)
 
     def residuals(y: Any, args: Any) -> Any:
-        # The solver differentiates by itself: optimistix has nothing to linearise.
+        # The solver computes its own Jacobian: hide the residuals from optimistix's linearisation.
         return jax.lax.stop_gradient(Linearised(solver.increments(y), *args).residual_rows())
 
     solution: optx.Solution = optx.least_squares(
@@ -81,7 +81,7 @@ def _iterate(
         solver,
         jnp.zeros_like(as_vector(scale)),
         args=(scale, values, structure),
-        # The task sets the limit.
+        # The task limits the number of steps.
         max_steps=None,
         throw=False,
     )
@@ -93,7 +93,8 @@ def _iterate(
 def weigh_datum(values: PaddedValues, structure: PaddedStructure) -> PaddedValues:
     """Scale the datum constraints to unit length in scaled increments.
 
-    Their weight does not change the optimum (no observation contradicts them); this one keeps N well conditioned.
+    Their weight does not change the optimum, because no observation contradicts them. This weight keeps N well
+    conditioned.
     """
     if not values.datum_eop.shape[0]:
         return values
@@ -109,7 +110,7 @@ def weigh_datum(values: PaddedValues, structure: PaddedStructure) -> PaddedValue
 def typical_scale(values: PaddedValues, structure: PaddedStructure) -> Increments:
     """Return the change of each unknown that moves an image point by about its standard deviation; zero if fixed.
 
-    With these scales the columns of the Jacobian agree within a factor of some tens, which suffices for the
+    With these scales the norms of the Jacobian's columns agree within a factor of some tens, which suffices for the
     factorisation: unknowns range from 1e-7 (k2) to 1e3 m.
     """
     s, v = structure, jax.tree.map(jax.lax.stop_gradient, values)
@@ -128,7 +129,7 @@ def typical_scale(values: PaddedValues, structure: PaddedStructure) -> Increment
         vector = vector.at[group.offset : stop].set(jnp.tile(typical, len(group.names)))
     sigma, ground, angle = _typical_of_places(s, v, filled, sigma)
     eop = jnp.stack([ground, ground, ground, angle, angle, angle])
-    # By the unit at the end of a declared parameter's name.
+    # Scale per unit; the unit is the suffix of the declared parameter's name.
     by_unit = {
         "m": ground,
         "rad": angle,
@@ -157,8 +158,8 @@ def _camera_of(group: CameraGroup, numbers: Array) -> InteriorOrientation:
 def _typical_of_camera(
     interior_at: Callable[[Array], InteriorOrientation], at: Float[Array, "n"], sigma: Array, corner: Float[Array, "2"]
 ) -> Float[Array, "n"]:
-    """Return the change of each camera number that moves the image of a point by `sigma` (mm); one if none does."""
-    # A point halfway to the corner, and one beside it: c moves the first, coefficients move the second.
+    """Return the change of each camera parameter that moves the image of a point by `sigma` (mm); 1 if none does."""
+    # Use a point near the axis (moved by c), and measured coordinates in the corner (moved by the coefficients).
     aim, centre = jnp.array([0.1, 0.1, -1.0]), ExteriorOrientation(jnp.zeros(3), jnp.eye(3))
     by_number = jax.jacfwd(lambda p: image_residual(interior_at(p), centre, aim, corner))(at)
     typical = sigma / jnp.maximum(jnp.max(jnp.abs(by_number), axis=0), 1e-30)
@@ -168,7 +169,9 @@ def _typical_of_camera(
 def _typical_of_bending(
     s: PaddedStructure, v: PaddedValues, t: ParameterTable, sigma: Array, corner: Float[Array, "2"]
 ) -> Float[Array, "n"]:
-    """Return the same for what modifies cameras, far from mid-flight and from the reference temperature."""
+    """Return the typical change of parameters that modify cameras, far from mid-flight and from the reference
+    temperature.
+    """
     farthest, of_groups = jnp.argmax(jnp.abs(v.flight_time)), []
     exposure = Exposure(*(jnp.asarray(a)[..., farthest] for a in v.exposures))
     exposure = dataclasses.replace(exposure, temperature=jnp.max(jnp.abs(v.temperature)))
@@ -179,12 +182,12 @@ def _typical_of_bending(
     return jnp.min(jnp.stack(of_groups), axis=0)
 
 
-# Laser strips without images: typical sigma of a laser point, and of the attitude it is measured with.
+# Typical standard deviations for laser strips without images: of a laser point (m), and of the attitude (rad).
 _LASER_M, _LASER_RAD = 0.01, 1e-5
 
 
 def _typical_of_places(s: PaddedStructure, v: PaddedValues, filled: Array, sigma: Array) -> tuple[Array, Array, Array]:
-    """Return the typical sigma of an image point (mm), and its size on the ground (m) and as an angle (rad)."""
+    """Return the typical sigma of an image point (mm), its size on the ground (m), and as an angle (rad)."""
     if not s.groups:
         return jnp.ones(()), jnp.array(_LASER_M), jnp.array(_LASER_RAD)
     c = v.shared[s.groups[0].offset]

@@ -1,8 +1,8 @@
 """Residuals of a batch of rays and their derivatives, in all slots at once.
 
-A row touches one image, one point and the parameters of one camera. Rays lie in chunks of one image, so what depends
-only on the image is computed once per chunk. Each column of the Jacobian is one forward derivative of `image_residual`,
-mapped over chunks and rays. Arrays end in (m, p): chunks, rays of a chunk.
+A row touches one image, one point and the parameters of one camera. Rays are stored in chunks of one image, so
+quantities that depend only on the image are computed once per chunk. Each column of the Jacobian is one forward
+derivative of `image_residual`, mapped over chunks and rays. Arrays end in (m, p): chunks, rays of a chunk.
 """
 
 from collections.abc import Callable
@@ -28,12 +28,11 @@ class RayMeasurements(NamedTuple):
     xy: Float[Array, "2 m p"]
     weight: Float[Array, "2 m p"]
     member: tuple[Bool[Array, "m"], ...]
-    """For each camera group: true if the image's camera belongs to it."""
+    """For each camera group: True if the image's camera belongs to it."""
 
 
 Pair = tuple[Float[Array, "*batches m p"], Float[Array, "*batches m p"]]
-"""x and y of the rows of a batch, or of all. Joined to one array they would be computed one number at a time, not as
-vectors.
+"""x and y of the rows of a batch, or of all rows. Two arrays: XLA does not vectorise operations that join them to one.
 """
 
 
@@ -42,7 +41,9 @@ Triple = tuple[Float[Array, "m p"], Float[Array, "m p"], Float[Array, "m p"]]
 
 
 class RayJacobian(NamedTuple):
-    """Weighted residuals of rows, x or y, and their derivatives by scaled increments; by points in metres."""
+    """Weighted residuals of rows, x or y, and their derivatives with respect to scaled increments; for points, in
+    metres.
+    """
 
     residual: Float[Array, "m p"]
     eop: Float[Array, "6 m p"]
@@ -51,7 +52,7 @@ class RayJacobian(NamedTuple):
 
 
 def points_at(numbers: Float[Array, "c points"], point: Array) -> Float[Array, "c m p"]:
-    """Gather numbers of the points of rays."""
+    """Gather values of the points of rays."""
     return jnp.moveaxis(jnp.asarray(numbers).T.at[point].get(mode="promise_in_bounds"), -1, 0)
 
 
@@ -74,7 +75,7 @@ def _in_cameras(centre: Array, rotation: Array, points: Array, seen: RayMeasurem
 
     def one(centre, rotation, point, weight):
         aim = apparent_point(centre, point, s.corrections)
-        # An empty slot looks straight ahead, so that its numbers stay finite.
+        # In an empty slot the point is on the optical axis: all values stay finite.
         aim = jnp.where(weight > 0, aim, centre - rotation[2])
         u, v, w = camera_coordinates(ExteriorOrientation(centre, rotation), aim)
         return u, v, w
@@ -120,10 +121,10 @@ def ray_jacobian(
 ) -> tuple[RayJacobian, RayJacobian]:
     """Evaluate residuals and Jacobian of a batch, x and y, by the chain rule through the camera frames."""
     centre, rotation, unit = scene.centre, scene.rotation, jnp.eye(3)
-    # One loop for all six: joined afterwards, they would be computed one number at a time.
+    # Use one loop for all six derivatives: XLA does not vectorise a loop over arrays that are joined afterwards.
     zero, turns = jnp.zeros((3, *rotation.shape)), jnp.moveaxis(slopes.rotation, -1, 0)
     seeds = jnp.concatenate([unit[:, None] * slopes.centre, zero[:, :, 0]]), jnp.concatenate([zero, turns])
-    # jit keeps the trace for every derivative below.
+    # jit caches the trace for all derivatives below.
     place = jax.jit(partial(_in_cameras, seen=seen, s=s))
     by_eop = _slope(lambda *x: place(*x, points), centre, rotation)(*seeds)
     by_point = _by_point(lambda x: place(centre, rotation, x), points, s)
@@ -139,7 +140,7 @@ def ray_jacobian(
 
 
 def _by_point(place: Callable, points: Float[Array, "3 m p"], s: PaddedStructure):
-    """Differentiate the coordinates in the camera frames by those of the points; empty if all points are fixed."""
+    """Differentiate the coordinates in the camera frames with respect to the points; empty if all points are fixed."""
     if not s.rays.free_points:
         return tuple(jnp.zeros((3, *v.shape)) for v in jax.eval_shape(place, points))
     return _slope(place, points)(jnp.broadcast_to(jnp.eye(3)[:, :, None, None], (3, *points.shape)))
@@ -148,9 +149,11 @@ def _by_point(place: Callable, points: Float[Array, "3 m p"], s: PaddedStructure
 def _camera_columns(
     cameras: tuple[Array, ...], slopes: tuple[Array, ...], in_camera: Triple, seen: RayMeasurements, s: PaddedStructure
 ):
-    """Evaluate residuals and their derivatives by the point in the camera frame and by the camera unknowns."""
+    """Evaluate residuals and their derivatives with respect to the point in the camera frame and to the camera
+    unknowns.
+    """
     leaves = [_leaves_of(c) for c in cameras]
-    # Only free parameters: derivatives of the others would be computed although they are zero.
+    # Only free parameters: XLA would compute the other derivatives although they are zero.
     free = [[own[k] for k in g.free_leaves] for g, own in zip(s.groups, leaves, strict=True)]
 
     def with_free(free):

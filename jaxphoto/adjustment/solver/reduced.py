@@ -1,8 +1,8 @@
 """Sums of the reduced normal matrix: contributions of rays to points, images and pairs of images, by chunk.
 
 Each ray has three rows of F for the unknowns of its image; each point has three for its other coupled unknowns (see
-`normal`). Products of F for one image come from chunks of rays, those for two images from chunks of pairs of rays.
-Coupled unknowns other than images (`border_places`) are summed by point.
+`normal`). Products of F for one image are computed from chunks of rays, products for two images from chunks of pairs of
+rays. Coupled unknowns other than images (`border_places`) are summed by point.
 """
 
 from functools import partial
@@ -35,9 +35,10 @@ from jaxphoto.compiling import once
 from jaxphoto.linear_algebra import solve
 from jaxphoto.small_matrices import cholesky_3x3, whiten
 
-# XLA compiles the loop over the rows of a scatter as one function if rows are short, otherwise as several calls a row.
+# XLA compiles the loop over the rows of a scatter as one function if rows are short, otherwise as several calls per
+# row.
 _PIECE = 36
-# Number of groups of points that are processed at a time.
+# Number of groups of points processed at a time.
 _GROUPS = 64
 
 
@@ -57,7 +58,7 @@ def interior_in_border(s: PaddedStructure) -> int:
 def border_places(s: PaddedStructure, k: int) -> Int[Array, "groups border"]:
     """Return the unknowns, except images, that the points of each group couple with.
 
-    Interior unknowns, k constraints, the right-hand side, and shared unknowns of rows at points; as places among all
+    Interior unknowns, k constraints, the right-hand side, and shared unknowns of rows at points. As indices among all
     shared unknowns, the constraints, the right-hand side, and one more for none.
     """
     n, met = s.n_shared, jnp.asarray(s.rays.met)
@@ -67,17 +68,17 @@ def border_places(s: PaddedStructure, k: int) -> Int[Array, "groups border"]:
 
 
 def image_places(s: PaddedStructure, k: int) -> Int[Array, "images colours"]:
-    """Return the places of each image's camera unknowns if `RayLists.by_image`."""
+    """Return the indices of each image's camera unknowns if `RayLists.by_image`."""
     colours = s.n_image_colours if s.rays.by_image else 0
     column = jnp.asarray(s.column)[:, :colours]
     return jnp.where(column < s.n_shared, column, s.n_shared + k + 1)
 
 
 def reduced_columns(s: PaddedStructure, k: int) -> tuple[Int[Array, "images e"], Int[Array, "groups border"]]:
-    """Return the places of the images' unknowns and of each group's border among the reduced unknowns and k
+    """Return the indices of the images' unknowns and of each group's border among the reduced unknowns and k
     constraints.
 
-    Missing unknowns have a place beyond these.
+    Missing unknowns have an index beyond these.
     """
     n = 6 * s.n_images
     eop = 6 * jnp.arange(s.n_images)[:, None] + jnp.arange(6)
@@ -105,7 +106,7 @@ class _AtPoints(NamedTuple):
     v: Float[Array, "points 9"]
     """J_p' J_p (6) and J_p' r (3)."""
     w: Float[Array, "points interior+1 3"]
-    """J_s' J_p; the last serves colours without an unknown in an image."""
+    """J_s' J_p; the last row is for colours without an unknown in an image."""
 
     @classmethod
     def none(cls, s: PaddedStructure, n: int) -> "_AtPoints":
@@ -174,7 +175,7 @@ class LinearisedRows(NamedTuple):
 
     rest: NonImageRows
     by_image: Float[Array, "images c c"]
-    """Products of derivatives by exterior orientation and camera unknowns, and of the residual."""
+    """Products of derivatives with respect to exterior orientation and camera unknowns, and of the residual."""
     of_points: _AtPoints
     w: Float[Array, "batches m p d e"]
     """W of each ray, of points in metres; in memory a batch is ordered (d, e, m, p)."""
@@ -185,7 +186,7 @@ def linearise_rows(
 ) -> LinearisedRows:
     """Linearise all rows with their residuals, or with `rows`.
 
-    W is written `into` an array of its size; if `keep` is true, the previous content is returned in its place.
+    W is written `into` an array of its size; if `keep` is true, the previous content is returned instead.
     """
     s, columns_of = at.structure, ray_columns(at)
 
@@ -230,7 +231,7 @@ def _whitened(w: Float[Array, "m p d e"], of_rays: Float[Array, "9 m p"], s: Pad
     def by_component(w, of_rays):
         return jnp.stack(whiten([own * scale for own, scale in zip(w, of_rays[6:], strict=True)], of_rays[:6]))
 
-    # Brought to the order of rays afterwards: anything computed in that step would be computed one number at a time.
+    # Reorder to rays afterwards: XLA does not vectorise operations fused with this step.
     f = once(by_component, s.eop_free, w.reshape(3, e, *shape), of_rays)
     return f.reshape(3 * e, -1).T.reshape(*shape, 3, e)
 
@@ -238,7 +239,7 @@ def _whitened(w: Float[Array, "m p d e"], of_rays: Float[Array, "9 m p"], s: Pad
 def reduce_normal(
     at: Linearised, damping, rows: LinearisedRows | None = None, less: Increments | None = None
 ) -> tuple[Band, Reduced, RightSide]:
-    """Eliminate the points of N + damping diag(N); returns A, what accompanies it, and the right-hand side.
+    """Eliminate the points of N + damping diag(N); return A, the arrays for back-substitution, and the right-hand side.
 
     The right-hand side is J'r - `less` for the residuals of `rows`. Fixed unknowns (zero columns) get a unit diagonal.
     """
@@ -268,11 +269,11 @@ class ProductSums(NamedTuple):
     across: Float[Array, "images places e"]
     border: Float[Array, "places places"]
     band: tuple[Array, Array]
-    """Negative products of pairs of images, by column block; without images by themselves."""
+    """Negative products of pairs of different images, by column block."""
 
     @classmethod
     def of(cls, border: Float[Array, "points d c"], s: PaddedStructure, k: int) -> "ProductSums":
-        """Return initial sums, including those of the border."""
+        """Return initial sums, including the products of the border."""
         places, n, e, size = border_places(s, k), s.n_images, 6 + image_places(s, k).shape[1], s.n_shared + k + 2
         width, inner = n // s.rays.columns, s.rays.columns - 1
         band = jnp.zeros((inner, 2 * width, 6, width, 6)), jnp.zeros((width, 6, width, 6))
@@ -332,7 +333,7 @@ def _of_cameras(sums: ProductSums, product: Array, block: Array, own: Array, s: 
 
 
 def pair_images(block: Array, s: PaddedStructure) -> tuple[Array, Array]:
-    """Return the two images of each chunk of pairs; a place beyond the last for empty chunks."""
+    """Return the two images of each chunk of pairs; an index beyond the last for empty chunks."""
     width = s.n_images // s.rays.columns
     which, row, column = jnp.asarray(block).T
     none = which == s.rays.columns
@@ -420,7 +421,7 @@ def _assembled(
     g = jnp.concatenate([ge.reshape(6 * n, k), rest.rows_s.T - s_coupled])
     of_mu = sums.border[n_shared : n_shared + k, n_shared : n_shared + k + 1]
     kk, d = jnp.eye(k) + of_mu[:, :k], of_mu[:, k]
-    # Parts are written whole: `block` would be computed one number at a time.
+    # Write whole parts: XLA does not vectorise the computation of `block` inside an update.
     end = jnp.zeros((6 * width + n_shared,) * 2).at[: 6 * width, : 6 * width].set(last.reshape(6 * width, -1))
     end = end.at[6 * width :, : 6 * width].set(us[:, 6 * of_inner :]).at[6 * width :, 6 * width :].set(uss)
     if k:
@@ -437,7 +438,7 @@ def _assembled(
 
 
 def _by_unknown(m: Float[Array, "images c c"], s: PaddedStructure):
-    """Bring sums by image and colour to the columns of the shared unknowns; the last column is a dummy."""
+    """Rearrange sums by image and colour to the columns of the shared unknowns; the last column is a dummy."""
     q, n = s.n_image_colours, s.n_shared
     each, column = jnp.arange(s.n_images), jnp.asarray(s.column)[:, : s.n_image_colours]
     us = jnp.zeros((s.n_images, 6, n + 1)).at[each[:, None], :, column].add(m[:, :6, 6 : 6 + q].transpose(0, 2, 1))

@@ -15,16 +15,18 @@ from jaxphoto.arrays import ArrayLike, joined
 from jaxphoto.linear_algebra import one_at_a_time, solve
 from jaxphoto.rotation import CROSS, small_angles, small_rotation
 
-# Number of Newton iterations; from such close start values each doubles the correct digits.
+# Number of Newton iterations; with such close start values each iteration doubles the number of correct digits.
 _NEWTON_STEPS = 5
-# Relative to the mean weight of the motions: regularises the seven dependent motions of a single image.
+# Regularisation of the seven dependent motions of a single image, relative to the mean weight of the motions.
 _RIDGE = 1e-9
 
 _svd = one_at_a_time(lambda a: tuple(jnp.linalg.svd(a)))
 
 
 class DatumRows(NamedTuple):
-    """Derivatives of increments by the seven motions (about the centroid, shifts in units of the block's size)."""
+    """Derivatives of increments with respect to the seven motions (about the centroid, shifts in units of the block's
+    size).
+    """
 
     eop: Float[np.ndarray, "7 6 images"]
     points: Float[np.ndarray, "7 3 points"]
@@ -66,10 +68,11 @@ def motions(
 
 
 def n_open_motions(values: AbstractValues, s: AbstractStructure) -> int:
-    """Return the number of open motions if these are all seven, or all but the scale that distances determine; else 0.
+    """Return the number of open motions if these are all seven, or all but the scale if distances determine it; else 0.
 
-    Such motions change no residual except the datum's, wherever images and points are. Others (a rotation about the
-    only control point, a shift compensated by a strip's) depend on the place, or on more than images and points.
+    Such motions change only the residuals of the datum constraints, at any position of images and points. Other motions
+    (a rotation about the only control point, a shift compensated by the shift of a strip) depend on the position, or on
+    more than images and points.
     """
     k = len(values.datum_eop)
     invariant = all(g.rigid_invariant for g in s.observed)
@@ -78,7 +81,7 @@ def n_open_motions(values: AbstractValues, s: AbstractStructure) -> int:
 
 
 def onto_datum(at: Linearised) -> Increments:
-    """Move the increments by the similarity that fulfils the datum constraints.
+    """Apply to the increments the similarity that satisfies the datum constraints.
 
     Newton's method starts from the similarity that brings the points closest to their start values (Umeyama 1991); if
     it fails, the increments are returned unchanged.
@@ -100,7 +103,9 @@ def onto_datum(at: Linearised) -> Increments:
 
 
 def along_motions(values: PaddedValues, scale: Increments, s: PaddedStructure) -> Increments:
-    """Return scaled increments along each of the `n_open_motions` (leading axis), which only the datum sees."""
+    """Return scaled increments along each of the `n_open_motions` (leading axis), which only the datum constraints
+    determine.
+    """
     k, shared = n_open_motions(values, s), scale.shared
     eop, points = motions(values.position, values.rotation, values.points, *_extent(values.points, s))
     return Increments(_scaled(eop[:k], scale.eop), jnp.zeros((k, *shared.shape)), _scaled(points[:k], scale.points))
@@ -109,9 +114,9 @@ def along_motions(values: PaddedValues, scale: Increments, s: PaddedStructure) -
 def after(at: Linearised, step: Increments, weight: Increments) -> Increments:
     """Return the increments after `step`: its common motion is applied as a similarity, the rest is added.
 
-    Added, a rotation of the whole block would distort it, and where few observations see the position of the block,
-    that distortion alone would decide on the step. The similarity is separated in the metric of `weight`. Steps of a
-    free network are added: its constraints are linear.
+    A rotation of the whole block that is added to the increments would distort the block. If few observations determine
+    its position, that distortion alone would decide on the step. The similarity is separated in the metric of `weight`.
+    Steps of a free network are added: its constraints are linear.
     """
     (y, scale, values, s), state = at, at.state
     if n_open_motions(values, s):
@@ -154,7 +159,7 @@ def _scaled(v, scale):
 
 
 def _nearest(points, start, own, centre, size, s: PaddedStructure) -> Float[Array, "7"]:
-    """Return the similarity that brings `points` closest to `start`; only `own` points count."""
+    """Return the similarity that brings `points` closest to `start`; points outside `own` are ignored."""
     weight = own / total(jnp.sum(own), s)
     mean, target = total((points @ weight, start @ weight), s)
     a, b = points - mean[:, None], start - target[:, None]
