@@ -1,4 +1,4 @@
-"""Procedures: short scripts that combine the packages below."""
+"""Procedures: complete workflows that combine the packages below."""
 
 from jaxphoto.procedures.adjust import adjust, adjust_for_tables
 from jaxphoto.procedures.boresight import BoresightEstimate, Step, boresight, judge, step_block
