@@ -280,7 +280,7 @@ def _differences(
     is taken from step 4, because control errors do not increase it.
     """
     if last is None or last.number != 3:
-        raise ValueError("step 4 is judged against step 3: give it as `last`")
+        raise ValueError("step 4 needs the result of step 3; pass it as `last`")
     before, s0 = _shared_parameters(last.adjusted, last.covariance), float(adjusted.sigma0)
     q4, q3 = (dict(zip(c.labels, np.diagonal(c.matrix).tolist(), strict=True)) for c in (cov, last.covariance))
     estimates, worst = [], (0.0, "")
@@ -356,8 +356,8 @@ def step_block(block: Block, number: int, biases: Biases = (), before: Unknowns 
     """Return the block adjusted in step `number` (1 to 4), derived from `block`.
 
     `biases` are the shifts and drifts retained from step 2 (`Step.biases`). `before` contains the unknowns of the
-    previous step: start values and, in step 4, the fixed values of those shifts and drifts. If None, the block's start
-    values are used. Raises BlockError if the block lacks observations for the step.
+    previous step: initial values and, in step 4, the fixed values of those shifts and drifts. If None, the initial
+    values of the block are used. Raises BlockError if the block lacks observations for the step.
     """
     _require(block, number)
     free = strip_biases(block) if number == 2 else biases if number == 3 else ()

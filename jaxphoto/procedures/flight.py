@@ -59,7 +59,7 @@ class FlightPart(NamedTuple):
     why_not: str
     """Reason for missing stations, or "". If also `placed`, the positions were used for georeferencing only."""
     components: VarianceComponents | None
-    """Of image points, stations and marks, if the adjustment converged."""
+    """Variance components of image points, stations and marks, if the adjustment converged."""
     adjusted: Adjustment
     controlled: ControlledBlock | None = None
     """Block adjusted with the given control."""

@@ -87,7 +87,7 @@ def robust(
     loss = Huber() if loss is None else loss
     losses = dict(loss) if isinstance(loss, Mapping) else dict.fromkeys(rows, loss)
     if unknown := [name for name in losses if name not in rows]:
-        raise BlockError(f"the block has no observations {unknown[0]}, only {', '.join(rows)}")
+        raise BlockError(f"unknown observation group {unknown[0]}; use one of {', '.join(rows)}")
     unknowns = start_of(block, report) if start is None else start
     left = {name: np.zeros(len(group), bool) for name, group in rows.items()}
     estimated: dict[str, AbstractLoss] = {name: dataclasses.replace(loss, scale=_WIDE) for name, loss in losses.items()}

@@ -124,7 +124,7 @@ _NEAR_TIES = 8
 # Maximum distance (px) of a candidate from the intersection of the rays of its point.
 _MISS_PX = 2.0
 _MIN_IMAGES, _MIN_UNNAMED = 2, 3
-# Minimum ratio of the photographs of another position to those of the target for an ambiguity.
+# Minimum ratio of photographs (another position / target) at which the target is ambiguous.
 _ALIKE = 0.6
 _PARALLEL = np.deg2rad(0.5)
 # Ratio of fits above which a target is sharper than another candidate; ratio above which it is duller than other

@@ -211,9 +211,8 @@ def _check_heights(first: Adjustment, surface: SurfaceAtPoints) -> None:
     offset, height = (float(np.median(v)) for v in (apart, camera - surface.foot[surface.usable, 2]))
     if abs(offset) > _FAR * abs(height):
         raise BlockError(
-            f"the cloud lies {abs(offset):.0f} m {'below' if offset > 0 else 'above'} where the block puts its points, "
-            f"with the cameras {height:.0f} m over the cloud: its heights may count in feet or belong to another "
-            "vertical system, or the principal distance that the block begins with is wrong"
+            f"the cloud is {abs(offset):.0f} m {'below' if offset > 0 else 'above'} the block's points (flying height "
+            f"{height:.0f} m); check the cloud's height unit and vertical datum, and the initial principal distance"
         )
 
 

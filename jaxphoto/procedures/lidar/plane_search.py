@@ -110,8 +110,8 @@ def check_joined(names: Sequence[str], planes: Sequence[CommonPlanes]) -> None:
     alone = [name for k, name in enumerate(names) if k not in joined]
     if alone and len(names) > 1:
         raise BlockError(
-            f"strip {alone[0]} has fewer than {_FEWEST} planes in common with any other: leave it out, take larger "
-            "cells (--cell-m) or rougher planes (--roughness-m), or check that all strips overlap and are in one system"
+            f"strip {alone[0]} has fewer than {_FEWEST} planes in common with any other; check overlap and coordinate "
+            "system, increase --cell-m or --roughness-m, or remove the strip"
         )
     for common in apart:
         up = float(np.median(common.pairs.gap / common.pairs.normal[:, 2]))

@@ -104,8 +104,8 @@ def _check_pattern(positions: _FromBody, pattern: Pattern) -> None:
     spread = f"to the side by {right:.2f} of the height and ahead by {ahead:.2f}"
     if right < _ALIKE * ahead:
         raise BlockError(
-            f"the laser points of a second spread {spread}, as those of no scanner that was flown along its x axis: "
-            "correct the yaw of the trajectory, or turn it to the axes of the scanner"
+            f"laser points of one second spread {spread}: the scan is not across the x axis. Correct the trajectory's "
+            "yaw, or rotate it to the scanner axes"
         )
     around = ahead > _ALIKE * right
     if around and pattern == "line":

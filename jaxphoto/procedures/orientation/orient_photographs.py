@@ -1,4 +1,4 @@
-"""From matched features to an oriented block, for a calibration of the camera that took them.
+"""Orient a block from matched features, for a calibration of the camera that took them.
 
 1. COLMAP orients the images and joins matches to points (`colmap`).
 2. The network is adjusted iteratively, all parameters of the camera observed; gross errors are rejected (`rejection`).
