@@ -50,7 +50,7 @@ class Georeferenced(eqx.Module):
     images: tuple[str, ...] = eqx.field(static=True)
     """Images with both a complete station and an attitude."""
     points: tuple[str, ...] = eqx.field(static=True)
-    """Points intersected by two or more of these."""
+    """Points with rays in two or more of these images."""
     exterior: ExteriorOrientation
     exterior_covariance: Float[ArrayLike, "images 6 6"]
     """Covariance of X, Y, Z (m) and a small rotation in the camera frame (rad)."""

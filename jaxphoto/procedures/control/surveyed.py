@@ -53,7 +53,7 @@ class Marks(NamedTuple):
     point: tuple[str, ...]
     column_row: Float[np.ndarray, "marks 2"]
     sigma_px: Float[np.ndarray, "marks"]
-    """NaN if not stated."""
+    """Standard deviation of each mark; NaN if not stated."""
     places: tuple[str, ...]
 
     @staticmethod

@@ -50,7 +50,7 @@ class Predicted(NamedTuple):
     point: Int[np.ndarray, "n"]
     column_row: Float[np.ndarray, "n 2"]
     covariance: Float[np.ndarray, "n 2 2"]
-    """px^2."""
+    """Covariance of the image coordinates (px^2)."""
     px_per_m: Float[np.ndarray, "n 2 3"]
     """Derivatives of the image coordinates by X, Y, Z of the point."""
 
@@ -370,7 +370,7 @@ def control_block_with_targets(
         why_not |= found.why_not
         if not len(found.marks.image):
             break
-        # After a rejection another target may be found; distant ones are replaced as a whole.
+        # Replace re-detected marks, and all marks of distant targets.
         again = set(zip(found.marks.image, found.marks.point, strict=True))
         names = {ids[p] for p in distant_points}
         kept = [(i, p) not in again and p not in names for i, p in zip(every.image, every.point, strict=True)]

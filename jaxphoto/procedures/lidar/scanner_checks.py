@@ -199,7 +199,7 @@ def _probed(cloud: Cloud) -> Int[np.ndarray, "n"]:
 
 
 def _positions_in_body(cloud: Cloud, path: ScannerPath) -> _FromBody | None:
-    """Return the positions; None for a narrow swath, or for few points."""
+    """Return the positions of the points by second; None for a narrow swath, or for few points."""
     some = _probed(cloud)
     time = cloud.time[some]  # type: ignore[index]
     tangents = aside(cloud, some, path)

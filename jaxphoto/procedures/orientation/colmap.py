@@ -222,7 +222,7 @@ def _options(pycolmap: Any, cameras, angle: float, free: bool, min_matches: int,
 
 
 def _score(model: Any, cameras: Sequence[MappedCamera]) -> tuple[bool, int, int]:
-    """Return True if all principal distances are plausible; number of images; number of image points."""
+    """Return (True if all principal distances are plausible, number of images, number of image points)."""
     ratios = [c.focal_length / cameras[k - 1].c_px for k, c in model.cameras.items()]
     plausible = all(1 / _PLAUSIBLE < ratio < _PLAUSIBLE for ratio in ratios)
     return plausible, model.num_reg_images(), model.compute_num_observations()
