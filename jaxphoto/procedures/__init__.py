@@ -1,1 +1,1 @@
-"""Procedures: short scripts that combine the packages below, a module each."""
+"""Procedures: complete workflows that combine the packages below, a module each."""

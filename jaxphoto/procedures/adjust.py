@@ -1,4 +1,4 @@
-"""Bundle adjustment with completion of approximate values."""
+"""Bundle adjustment, including the search for missing approximate values."""
 
 import dataclasses
 import time
@@ -26,12 +26,12 @@ from jaxphoto.variants import without_observations
 _FromStart = Callable[[Block, Unknowns], Adjustment]
 
 ABSURD = 30.0
-"""A sigma0 that neither blunders nor weights explain: the approximate values are wrong."""
-# Maximum ratio of v'Pv of a solution with large sigma0 that replaces another.
+"""Value of sigma0 above which the approximate values are wrong: neither blunders nor weights explain it."""
+# Maximum ratio of v'Pv (new / old) at which a new solution with large sigma0 replaces the old one.
 _VPV_RATIO = 0.01
 # Maximum fraction of diverged tie points that may be rejected; more indicate wrong orientations.
 _MAX_DIVERGED = 0.05
-# Maximum ratio of sigma0 with reinstated points to that without them.
+# Maximum ratio of sigma0 with reinstated points to sigma0 without them.
 _SIGMA0_RATIO = 1.5
 # Maximum misclosure (rad) of rays that lens distortion may explain.
 _MAX_MISCLOSURE_RAD = 0.02
@@ -46,20 +46,20 @@ def adjust(
     max_steps: int = MAX_STEPS,
     sizes: PaddedSizes = MINIMAL_SIZES,
 ) -> Adjustment:
-    """Self-calibrating bundle adjustment of `block`.
+    """Adjust `block` by a self-calibrating bundle adjustment.
 
-    `start` are approximate values of all unknowns. By default those of the block are completed by resection and
-    intersection; if these do not reach all images, or diverge, images are oriented by their image points alone and
-    transformed to the frame of the control (docs/photographs.md). `priors` are FREE, FIXED or Weighted, by default the
-    block's. `more` are further observations of any kind, also your own (docs/extending.md), and jointly known
-    parameters; they are added to `block.more` of the result.
+    `start`: approximate values of all unknowns. By default the values of the block are completed by resection and
+    intersection. If these do not reach all images, or diverge, images are oriented by their image points alone and
+    transformed to the frame of the control (docs/photographs.md). `priors` are FREE, FIXED or Weighted; the default is
+    the block's priors. `more` contains further observations of any kind, including user-defined ones
+    (docs/extending.md), and jointly known parameters; they are added to `block.more` of the result.
 
-    Compiled code serves all blocks of similar size; a study of many blocks compiles once if it gives common `sizes`
-    (`common_sizes`). With `start`, the result is a pure function of the numbers in the arguments: `jax.grad` and
+    Compiled code serves all blocks of similar size. A study of many blocks compiles once if it passes common `sizes`
+    (`common_sizes`). With `start`, the result is a pure function of the values in the arguments: `jax.grad` and
     `jax.vmap` apply.
 
     Raises BlockError if approximate values cannot be found, DatumError if position, orientation or scale are
-    undetermined, RankError if unknowns are inseparable. Failure to converge is no error: see `Adjustment.outcome`.
+    undetermined, RankError if unknowns are inseparable. Failure to converge is not an error: see `Adjustment.outcome`.
     """
     if more:
         block = dataclasses.replace(block, more=(*block.more, *more))
@@ -85,7 +85,7 @@ def adjust_for_tables(
     report: Callable[[str], object] = lambda text: None,
     sizes: PaddedSizes = MINIMAL_SIZES,
 ) -> Adjustment:
-    """`adjust`, compiling the statistics of tables and reports meanwhile; `report` receives progress.
+    """Run `adjust` and compile the statistics of tables and reports meanwhile; `report` receives progress.
 
     `seconds["start"]` of the result includes the search for approximate values.
     """
@@ -106,7 +106,7 @@ def adjust_for_tables(
 
 
 def left_out_words(adjusted: Adjustment) -> str:
-    """Message about `Adjustment.left_out`."""
+    """Return the message about `Adjustment.left_out`."""
     return (
         f"rejected points whose rays do not intersect: {few(adjusted.left_out)}. Check their image points, or use "
         "jaxphoto adjust --snoop"
@@ -123,7 +123,7 @@ def _adjust_from_best_start(
 ) -> Adjustment:
     """Adjust from the given approximate values; if that fails, from image points alone.
 
-    Warns if the second is used.
+    Warns if the second method is used.
     """
     first, refused = None, None
     try:
@@ -132,7 +132,7 @@ def _adjust_from_best_start(
         refused = error
     if first is not None and may_lose_points:
         first = _without_diverged_points(first, from_start)
-    # Prior information about exterior orientations excludes a search elsewhere.
+    # Prior information about exterior orientations excludes other approximate values.
     free = priors.exterior.position == FREE and priors.exterior.camera_from_object == FREE
     elsewhere = free and np.asarray(block.start.image_known).any()
     if first is not None and (not elsewhere or _is_plausible(first, max_steps)):
@@ -157,7 +157,7 @@ def _adjust_from_best_start(
 def _without_diverged_points(adjusted: Adjustment, from_start: _FromStart) -> Adjustment:
     """Repeat the adjustment without diverged tie points, if these are few.
 
-    Their positions are then recomputed, and they are reinstated if they converge and fit.
+    Their positions are then recomputed. Points that converge and fit are reinstated.
     """
     if adjusted.factored is None:
         return adjusted
@@ -192,7 +192,7 @@ def _without_diverged_points(adjusted: Adjustment, from_start: _FromStart) -> Ad
 
 
 def _from_image_points(block: Block, from_start: _FromStart, report: Callable[[str], object]) -> Adjustment | None:
-    """Adjust without given exterior orientations and tie points; None if that fails."""
+    """Adjust without given exterior orientations and tie points; return None if that fails."""
     is_control, s = np.zeros((len(block.points), 3), bool), block.start
     for rows in (block.control, block.fixed):
         is_control[rows.who, rows.axis] = True
@@ -217,14 +217,14 @@ def _better(one: Adjustment, other: Adjustment | None) -> bool:
 
 
 def _is_plausible(adjusted: Adjustment, max_steps: int) -> bool:
-    """Return True if the solution is plausible, or had too few steps to tell."""
+    """Return True if the solution is plausible, or stopped too early to decide."""
     if adjusted.factored is None or (adjusted.outcome is Outcome.STEPS and max_steps < MAX_STEPS):
         return True
     return adjusted.outcome in (Outcome.CONVERGED, Outcome.STEPS, Outcome.FLAT) and float(adjusted.sigma0) < ABSURD
 
 
 def _start_in_transformation(block: Block) -> Unknowns:
-    """Approximate values of a traced block; only given values have derivatives."""
+    """Return approximate values of a traced block; only given values have derivatives."""
     numbers, start = jax.lax.stop_gradient(block), block.start.unknowns
     if block.start.image_known.all() and block.start.point_known.all():
         return start
@@ -242,7 +242,8 @@ def _start_in_transformation(block: Block) -> Unknowns:
 
 
 def start_of(block: Block, report: Callable[[str], object] = lambda text: None) -> Unknowns:
-    """Approximate values of all unknowns: `approximate`, after relative orientation of the images if necessary.
+    """Compute approximate values of all unknowns by `approximate`, after relative orientation of the images if
+    necessary.
 
     `report` receives progress. Raises BlockError, with the images, if some cannot be oriented, and for points whose
     rays do not intersect.
@@ -270,7 +271,7 @@ def needs_orientation(block: Block) -> bool:
 
 
 def _reached(block: Block) -> tuple[Block, bool]:
-    """Complete the start by resection and intersection; also return True if that suffices."""
+    """Complete the approximate values by resection and intersection; also return True if they are sufficient."""
     reached = dataclasses.replace(block, start=completed(block))
     is_given = np.array(block.start.image_known)
     if not is_given.all():
@@ -279,7 +280,7 @@ def _reached(block: Block) -> tuple[Block, bool]:
 
 
 def _rays_fit(block: Block) -> bool:
-    """Return True if 90 % of the rays to known points pass near them and none has its point behind the image."""
+    """Return True if 90 % of the rays to known points pass near them and no ray has its point behind the image."""
     start, rows = block.start.unknowns, block.image_points
     known = np.asarray(block.start.point_known)[np.asarray(rows.point)]
     image, point, xy = (np.asarray(v)[known] for v in (rows.image, rows.point, rows.xy))

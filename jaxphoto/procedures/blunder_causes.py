@@ -1,10 +1,10 @@
 """Causes of rejected observations: units, axes or signs of a file, mirrored images, inflated variance components.
 
-The images determine where rejected control and stations should be. If stated coordinates agree with these in feet, or
-with X and Y exchanged, that is no coincidence.
+The images determine the true positions of rejected control and stations. A file error is identified if the stated
+coordinates agree with these positions in feet, or with X and Y exchanged.
 
-A few contradicting observations inflate a variance component: one control height off by 70 standard deviations makes
-the component of thirteen heights 270, and then nothing contradicts anything.
+A few blunders inflate a variance component: one control height with an error of 70 standard deviations raises the
+component of thirteen heights to 270. No observation is then significant.
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ from jaxphoto.statistics import (
     variance_components,
 )
 
-# Ratio of stated to correct value. The US survey foot differs from the international one by 2 ppm, rarely observable.
+# Ratio of stated to correct value. International and US survey foot differ by 2 ppm, which is rarely observable.
 _FACTORS = {
     1 / 0.3048: "in feet, not in metres",
     0.3048: "converted from feet, but were metres",
@@ -42,15 +42,15 @@ _FACTORS = {
     -1.0: "of the other sign",
 }
 _AXES = "XYZ"
-# Maximum ratio of the median error remaining after the correction: without the group, the others determine it less
-# well.
+# Maximum ratio of the median error after the correction to that before. Without the group, the other observations
+# determine it less accurately.
 _LEFT = 0.1
-# Maximum median image residual, in standard deviations: distortion may be poorly known.
+# Maximum median image residual, in standard deviations: large, because distortion may be poorly known.
 _FIT = 10.0
 
 
 def coordinate_mistakes(snooped: Snooped, block: Block) -> dict[str, str]:
-    """Usual mistakes that explain coordinate groups that are mostly rejected, by group."""
+    """Return common file errors that explain coordinate groups with mostly rejected observations, by group."""
     causes = {}
     for name, counts in mostly_rejected(snooped, block).items():
         rows = block.named_observations[name]
@@ -64,7 +64,7 @@ def coordinate_mistakes(snooped: Snooped, block: Block) -> dict[str, str]:
 
 
 def is_mirrored(snooped: Snooped, block: Block, image: int) -> bool:
-    """Return True if a contradicting image of `block` fits when mirrored, seen from the side of the others."""
+    """Return True if a rejected image of `block` fits when mirrored, on the same side of the object as the others."""
     adjusted, p = snooped.adjusted, block.image_points
     place = dict(zip(adjusted.block.points, to_numpy(adjusted.unknowns.points), strict=True))
     rows = np.flatnonzero((p.image == image) & np.isin(np.array(block.points, object)[p.point], list(place)))
@@ -83,7 +83,7 @@ def is_mirrored(snooped: Snooped, block: Block, image: int) -> bool:
         to_numpy(pose.camera_from_object)[None],
     )
     others = to_numpy(adjusted.unknowns.exterior.position).mean(axis=0)
-    # Mirrored flat ground also fits from below.
+    # Flat ground, mirrored, also fits from below.
     if (others - points.mean(axis=0)) @ (to_numpy(pose.position) - points.mean(axis=0)) <= 0:
         return False
     return bool(np.median(errors) < _FIT * np.median(to_numpy(p.sigma)[rows]))
@@ -92,7 +92,7 @@ def is_mirrored(snooped: Snooped, block: Block, image: int) -> bool:
 def _stated_and_predicted(
     snooped: Snooped, name: str, rows: AbstractCoordinates
 ) -> tuple[Float[np.ndarray, "who 3"], Float[np.ndarray, "who 3"]]:
-    """Stated positions, and those predicted by the others (m); NaN if missing."""
+    """Return stated positions, and positions predicted by the other observations (m); NaN if missing."""
     stated = np.full((int(rows.who.max()) + 1, 3), np.nan)
     stated[rows.who, rows.axis] = to_numpy(rows.value)
     predicted = stated.copy()
@@ -112,7 +112,7 @@ def _explains(stated: np.ndarray, instead: np.ndarray, predicted: np.ndarray) ->
 
 
 def _exchanged_axes(stated: Float[np.ndarray, "who 3"], predicted: Float[np.ndarray, "who 3"]) -> str:
-    """Message naming exchanged axes."""
+    """Return a message that names exchanged axes."""
     for order in permutations(range(3)):
         moved = [k for k in range(3) if order[k] != k]
         if moved and all(_explains(stated[:, k], stated[:, order[k]], predicted[:, k]) for k in moved):
@@ -121,7 +121,7 @@ def _exchanged_axes(stated: Float[np.ndarray, "who 3"], predicted: Float[np.ndar
 
 
 def _scaled_axes(stated: Float[np.ndarray, "who 3"], predicted: Float[np.ndarray, "who 3"], axes: list[int]) -> str:
-    """Message naming axes in other units."""
+    """Return a message that names axes in other units."""
     messages = []
     for factor, words in _FACTORS.items():
         if scaled := [k for k in axes if _explains(stated[:, k], stated[:, k] / factor, predicted[:, k])]:
@@ -129,9 +129,9 @@ def _scaled_axes(stated: Float[np.ndarray, "who 3"], predicted: Float[np.ndarray
     return ", ".join(messages)
 
 
-# Minimum decrease of a variance without the contradicting observations: maximum fraction of these. Normal errors with
-# too small a stated sigma do not reach it: without the largest tenth a variance decreases by 1.6, without the largest
-# third by 3.4.
+# Minimum ratio of the variance to the variance without the contradicting observations (key), by the maximum fraction of
+# these (value). Normal errors with too small a stated sigma do not reach it: the ratio is 1.6 without the largest
+# tenth, 3.4 without the largest third.
 _INFLATION = {4.0: 0.1, 10.0: 1 / 3}
 
 
@@ -141,7 +141,7 @@ class InflatedComponent(NamedTuple):
     label: str
     factor: float
     without: float
-    """The factor without them."""
+    """Variance factor without these observations."""
     words: tuple[str, ...]
     """Labels of the observations, worst first."""
 
@@ -156,8 +156,8 @@ def inflated_components(
 ) -> tuple[InflatedComponent, ...]:
     """Return the components `found` of `adjusted` (weights as stated) that a few blunders inflate.
 
-    Blunders are detected by `snoop`, and components estimated without them, if a component exceeds 1 significantly and
-    observations contradict the others at the stated weights.
+    A component is examined if it exceeds 1 significantly and observations contradict the others at the stated weights.
+    Blunders are detected by `snoop`, and the components re-estimated without them.
     """
     raised = [k for k, factor in enumerate(components.factor) if components.supported[k] and factor > min(_INFLATION)]
     if not raised or not blunder_test(adjusted, redundancy_numbers(adjusted, covariance(adjusted, rows=True))).suspects:
@@ -167,7 +167,7 @@ def inflated_components(
         report("estimating variance components without blunders")
         clean = variance_components(snooped.adjusted, partition, max_steps=max_steps)
     except JaxphotoError:
-        # Then most observations contradict one another.
+        # Most observations are inconsistent in this case.
         return ()
     without = dict(zip(clean.labels, clean.factor.tolist(), strict=True))
     inflated = []
@@ -185,7 +185,7 @@ def inflated_components(
 def _rejected_in_part(
     adjusted: Adjustment, snooped: Snooped, partition: Partition, part: int
 ) -> tuple[int, tuple[str, ...]]:
-    """Return the number of rejected or exchanged components in a part, and their labels."""
+    """Return the number of rejected or exchanged components in a group of observations, and their labels."""
     parts = partition_observations(adjusted, partition).part_of
     in_part = {name: np.atleast_2d(part_of) == part for name, part_of in parts.items()}
     out = [(s.words, in_part[s.group][:, s.row]) for s in snooped.left_out]

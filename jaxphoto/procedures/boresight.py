@@ -1,14 +1,14 @@
-"""Boresight misalignment of a camera in four steps, each with a judgement.
+"""Boresight misalignment of a camera in four steps, each with a decision.
 
-1. Neither stations nor attitudes: are image measurements and control valid?
+1. Adjust without stations and attitudes. Are image measurements and control valid?
 
-2. Stations, with shift and drift of every strip, and no attitudes: is the GNSS trajectory valid?
+2. Add stations, with shift and drift of every strip, but no attitudes. Is the GNSS trajectory valid?
 
-3. Stations and attitudes, free boresight: the misalignment.
+3. Add attitudes with free boresight. The result is the misalignment.
 
-4. The same without control, which becomes check points: does control distort the misalignment?
+4. Repeat step 3 without control, which becomes check points. Does control distort the misalignment?
 
-A shift or drift that is significant but not major in step 2 is kept: free in step 3, fixed at that value in step 4,
+A shift or drift that is significant but not major in step 2 is retained: free in step 3, fixed at that value in step 4,
 where without control nothing else determines the position of the block. Thresholds and their reasons:
 docs/boresight.md. Source: paper 003, section 2.3.
 """
@@ -47,11 +47,11 @@ Biases = tuple[tuple[str, str], ...]
 """Shifts and drifts: (strip, "shift" or "drift")."""
 
 SIGNIFICANT = 3.0
-"""Standard deviations from which a shift, a drift, a misalignment or a difference of two is significant."""
+"""Ratio of a shift, drift, misalignment or difference to its standard deviation above which it is significant."""
 MAJOR = 10.0
-"""Multiple of the stations' sigma from which a significant shift, or drift over half a strip, is major."""
+"""Ratio of a significant shift, or of a drift over half a strip, to the stations' sigma above which it is major."""
 HIGH = 0.9
-"""|rho| from which two unknowns are hardly separable."""
+"""Value of |rho| above which two unknowns are hardly separable."""
 _SHOWN = 4
 TITLES = {
     1: "neither stations nor attitudes: image measurements and control",
@@ -77,8 +77,9 @@ class BoresightEstimate(NamedTuple):
 class Step(eqx.Module):
     """Step of a boresight calibration: its adjustment and conclusions.
 
-    `go_on` is True if continuing makes sense, after step 4 if the misalignment is usable. `biases` are the shifts and
-    drifts that later steps must keep. `estimates` are all shared unknowns and, in step 4, the differences from step 3.
+    `go_on` is True if further steps are useful; after step 4, if the misalignment is usable. `biases` are the shifts
+    and drifts retained in later steps. `estimates` contains all shared unknowns and, in step 4, the differences from
+    step 3.
     """
 
     number: int = eqx.field(static=True)
@@ -103,7 +104,7 @@ class _SharedParameters(NamedTuple):
 
 
 def judge(number: int, adjusted: Adjustment, last: Step | None = None) -> Step:
-    """Judge step `number`, whose block was adjusted; `last` is the previous step (step 4 needs step 3)."""
+    """Evaluate step `number`, whose block was adjusted; `last` is the previous step (step 4 needs step 3)."""
     cov = covariance(adjusted)
     parameters = _shared_parameters(adjusted, cov)
     estimates = [_estimate(label, parameters.value[label], parameters.sigma[label]) for label in parameters.value]
@@ -153,7 +154,7 @@ def _estimate(label: str, value: float, sigma: float) -> BoresightEstimate:
 
 
 def _shifts(adjusted: Adjustment, cov: Covariance, parameters: _SharedParameters) -> tuple[list[str], Biases, bool]:
-    """Return messages about significant and major shifts and drifts; which to keep; and True if one is major."""
+    """Return messages about significant and major shifts and drifts, the biases to retain, and True if one is major."""
     labels = [label for label in parameters.value if label.startswith("strips[")]
     owners = [_owner(label) for label in labels]
     note = [] if any(what == "drift" for _, what in owners) else ["no drift is tested: the images have no times"]
@@ -177,11 +178,12 @@ def _shifts(adjusted: Adjustment, cov: Covariance, parameters: _SharedParameters
 def _significant(
     labels: list[str], owners: list[tuple[str, str]], cov: Covariance, parameters: _SharedParameters
 ) -> tuple[Biases, np.ndarray, np.ndarray, float]:
-    """Return the nonzero shifts and drifts, their values and sigmas with the others zero, and the smallest p of a test.
+    """Return the significant shifts and drifts, values and sigmas given that all others are zero, and the smallest
+    p-value.
 
     Forward selection: the shift or drift (three axes) that reduces v'Pv / sigma0^2 most is added while the reduction is
-    significant. Tested individually they would mask one another, and be masked by a free principal point, which one
-    strip cannot separate from its shift.
+    significant. Individual tests would fail: biases mask each other, and a free principal point masks them, because one
+    strip cannot separate it from its shift.
     """
     place = [cov.labels.index(label) for label in labels]
     q = np.asarray(cov.matrix)[np.ix_(place, place)] * float(cov.variance_factor)
@@ -209,13 +211,13 @@ def _significant(
 
 
 def _owner(label: str) -> tuple[str, str]:
-    """Return (strip, "shift" or "drift") of the label of a strip's unknown."""
+    """Return (strip, "shift" or "drift") of a strip unknown's label."""
     strip, parameter = label.removeprefix("strips[").rsplit("].", 1)
     return strip, parameter.split("_")[0]
 
 
 def _size(adjusted: Adjustment, strip: str, what: str, axis: str) -> float:
-    """Return a shift of 1 m, or a drift of 1 m/s over half a strip, relative to the stations' sigma."""
+    """Return the ratio of a shift of 1 m, or of a drift of 1 m/s over half a strip, to the stations' sigma."""
     block, stations = adjusted.block, adjusted.block.stations
     rows = (np.array(block.image_strip)[stations.who] == strip) & (stations.axis == AXES.index(axis))
     span = 1.0 if what == "shift" else float(np.ptp(np.asarray(block.image_time)[stations.who[rows]])) / 2
@@ -223,7 +225,7 @@ def _size(adjusted: Adjustment, strip: str, what: str, axis: str) -> float:
 
 
 def _inseparable(cov: Covariance) -> list[str]:
-    """Return messages about shifts that an interior orientation may have absorbed."""
+    """Return messages about shifts that are correlated with an interior orientation."""
     plan = "a shift of every strip along its heading is equivalent; relief helps, or a fixed principal point"
     height = "fix c, or fly at two heights"
     messages = []
@@ -257,7 +259,7 @@ def _misalignment(adjusted: Adjustment, cov: Covariance, parameters: _SharedPara
 
 
 def _strongest(cov: Covariance, first, second) -> tuple[float, str, str]:
-    """Return the largest correlation of an unknown of `first` with one of `second`; empty names if none."""
+    """Return the largest correlation between unknowns of `first` and `second`, with names; empty names if none."""
     rho = correlation_matrix(cov)
     one = [k for k, label in enumerate(cov.labels) if first(label)]
     two = [k for k, label in enumerate(cov.labels) if second(label)]
@@ -273,12 +275,12 @@ def _differences(
 ) -> tuple[list[BoresightEstimate], str, bool]:
     """Return step 4 minus step 3 of every boresight angle.
 
-    Step 3 has all observations of step 4, so the difference has the variance Q4 - Q3. Where step 4 fixes shifts that
-    step 3 estimated, it is Q4 - C Q3 C' with C = [1, d boresight / d shift]: at most Q4, which is used. sigma0 is that
-    of step 4, which control errors do not increase.
+    Step 3 contains all observations of step 4, so the difference has the variance Q4 - Q3. Where step 4 fixes shifts
+    that step 3 estimated, it is Q4 - C Q3 C' with C = [1, d boresight / d shift]. Q4 is used as an upper bound. sigma0
+    is taken from step 4, because control errors do not increase it.
     """
     if last is None or last.number != 3:
-        raise ValueError("step 4 is judged against step 3: give it as `last`")
+        raise ValueError("step 4 needs the result of step 3; pass it as `last`")
     before, s0 = _shared_parameters(last.adjusted, last.covariance), float(adjusted.sigma0)
     q4, q3 = (dict(zip(c.labels, np.diagonal(c.matrix).tolist(), strict=True)) for c in (cov, last.covariance))
     estimates, worst = [], (0.0, "")
@@ -328,11 +330,11 @@ def boresight(
     max_steps: int = MAX_STEPS,
     report: Callable[[str], object] = lambda text: None,
 ) -> tuple[Step, ...]:
-    """Determine the boresight misalignment of `block` in four steps; returns the steps made.
+    """Determine the boresight misalignment of `block` in four steps; return the steps computed.
 
-    Stops after a step whose judgement is that continuing is pointless, unless `go_on`, and after one that does not
-    converge; `report` receives progress. Interior orientation is estimated according to the block's priors. Raises
-    BlockError if the block lacks what one of the steps needs, and what `jaxphoto.adjust` raises.
+    Stops after a step that fails its tests, unless `go_on`, and after a step that does not converge. `report` receives
+    progress. Interior orientation is estimated according to the block's priors. Raises BlockError if the block lacks
+    observations for a step, and the errors of `jaxphoto.adjust`.
     """
     for number in STEPS:
         _require(block, number)
@@ -351,11 +353,11 @@ def boresight(
 
 
 def step_block(block: Block, number: int, biases: Biases = (), before: Unknowns | None = None) -> Block:
-    """Return `block` as adjusted in step `number` (1 to 4).
+    """Return the block adjusted in step `number` (1 to 4), derived from `block`.
 
-    `biases` are the shifts and drifts kept from step 2 (`Step.biases`); `before` the unknowns of the previous step,
-    used as start values and, in step 4, as the fixed values of those shifts and drifts. If None, the block's own start
-    values are used. Raises BlockError if the block lacks what the step needs.
+    `biases` are the shifts and drifts retained from step 2 (`Step.biases`). `before` contains the unknowns of the
+    previous step: initial values and, in step 4, the fixed values of those shifts and drifts. If None, the initial
+    values of the block are used. Raises BlockError if the block lacks observations for the step.
     """
     _require(block, number)
     free = strip_biases(block) if number == 2 else biases if number == 3 else ()
@@ -379,9 +381,7 @@ def step_block(block: Block, number: int, biases: Biases = (), before: Unknowns 
 
 
 def strip_biases(block: Block) -> Biases:
-    """Return the shifts and drifts that stations determine: of strips with one station, and with two at different
-    times.
-    """
+    """Return the biases that stations determine: shifts need one station per strip, drifts two at different times."""
     whole = np.bincount(block.stations.who, minlength=len(block.images)) == 3
     biases: list[tuple[str, str]] = []
     for name in dict.fromkeys(block.image_strip):
@@ -394,14 +394,16 @@ def strip_biases(block: Block) -> Biases:
 
 
 def _mount_prior(prior: Mount, number: int) -> Mount:
-    """Prior of a mount: lever arm and shifts are hardly separable without attitudes, so free from step 3 on."""
+    """Return the prior of a mount. The lever arm is free from step 3 on: without attitudes it is inseparable from
+    shifts.
+    """
     if number < 3:
         return dataclasses.replace(prior, lever_arm=FIXED, boresight=FIXED, time_offset=FIXED)  # type: ignore[arg-type]
     return dataclasses.replace(prior, boresight=FREE)  # type: ignore[arg-type]
 
 
 def _require(block: Block, number: int) -> None:
-    """Raise BlockError, with the cure, if `block` lacks what step `number` needs."""
+    """Raise BlockError, with the cure, if `block` lacks observations for step `number`."""
     if number not in STEPS:
         raise ValueError(f"the steps of the boresight are 1, 2, 3 and 4, got {number!r}")
     what = f"step {number} of the boresight needs"
@@ -443,12 +445,12 @@ def _require(block: Block, number: int) -> None:
 
 
 LARGE_SIGMA0 = 1.5
-"""A rejected sigma0 is a contradiction only above this: below, a priori sigmas are merely optimistic."""
+"""Value of sigma0 above which a rejected test indicates contradictions; below, a priori sigmas are too small."""
 _SHOWN = 4
 
 
 def check_fit(adjusted: Adjustment, cov: Covariance) -> tuple[list[str], bool]:
-    """Return messages about sigma0, blunders and residuals of control; and True if all is consistent."""
+    """Return messages about sigma0, blunders and control residuals; and True if all are consistent."""
     sigma0, redundancy = float(adjusted.sigma0), adjusted.redundancy
     p = chi_square_p(float(adjusted.sum_of_squares), redundancy)
     sigma0_message = f"sigma0 {sigma0:.3f} with redundancy {redundancy}"

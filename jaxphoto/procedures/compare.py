@@ -1,13 +1,13 @@
 """Compare calibrations: two adjustments, or random halves of a block.
 
-`compare` tests for a camera change between two adjustments. `halves` tests if two calibrations are as close as their
-covariances predict. The block is repeatedly divided in two; what belongs together (an image, a strip, a flight) stays
-together. Both halves are adjusted, and their bundles of rays compared over the format (`stability`). Differences in
-excess of the covariances are due to model error (`stability.band`).
+`compare` tests for a camera change between two adjustments. `halves` tests if two calibrations agree within
+their covariances. The block is repeatedly divided in two; units (images, strips, flights) are not divided. Both
+halves are adjusted, and their bundles of rays compared over the format (`stability`). Differences in excess of the
+covariances are due to model error (`stability.band`).
 
-Observations in both halves, such as control, are identical: the covariance of the difference is less than the sum of
-both by their common effect (`statistics.common_covariance`). Errors common to both halves, such as those of fixed
-points, appear in no difference.
+Observations in both halves, such as control, are identical: the covariance of the difference is the sum of both
+covariances minus their common effect (`statistics.common_covariance`). Errors common to both halves, such as errors of
+fixed points, cancel in every difference.
 """
 
 import dataclasses
@@ -57,10 +57,11 @@ def compare(
 ) -> Change:
     """Compare a camera in two adjustments of different photographs: by parameters, and by its bundle of rays.
 
-    `camera` and `camera_b` name it in each if a block has several. `points` (mm from the centre) are the places of the
-    format at which rays are compared, 15 x 11 from edge to edge by default; `method` defines which orientation is
-    estimated between the bundles (docs/stability.md). `jaxphoto.report.stability` has its tables and messages.
-    Raises InputError for adjustments that did not converge, formats that differ, and bundles that cannot be compared.
+    `camera` and `camera_b` name it in each adjustment if a block has several. `points` (mm from the centre) are the
+    image points where rays are compared, by default 15 x 11 from edge to edge. `method` defines which orientation is
+    estimated between the bundles (docs/stability.md). `jaxphoto.report.stability` has tables and messages for the
+    result. Raises InputError for adjustments that did not converge, formats that differ, and bundles that cannot be
+    compared.
     """
     for adjusted in (first, second):
         if not bool(adjusted.converged):
@@ -80,7 +81,7 @@ def compare(
 
 CUTS = 64
 _TRIES = 50
-# Minimum image points to orient an image: three determine it without redundancy.
+# Minimum number of image points to orient an image: three determine it without redundancy.
 _LEAST_POINTS = 4
 
 
@@ -91,9 +92,9 @@ class Cut(NamedTuple):
     """True if an image is in the first half."""
     problem: str = ""
     cameras: tuple[InteriorOrientation, ...] = ()
-    """Of both halves."""
+    """Camera of each half."""
     covariance: Float[np.ndarray, "parameters parameters"] = np.zeros((0, 0))
-    """A posteriori, joint of both cameras."""
+    """Joint a posteriori covariance of both cameras."""
     sigma0: tuple[float, ...] = ()
     offsets_px: Float[np.ndarray, "cells 2"] = np.zeros((0, 2))
     """First minus second bundle in the measured image, aligned."""
@@ -105,30 +106,30 @@ class Halves(NamedTuple):
     """Calibration by the whole block and by its halves, and the reliability of its standard deviations."""
 
     adjusted: Adjustment
-    """Of the whole block."""
+    """Adjustment of the whole block."""
     camera: str
     by: str
     method: Method
     cells_mm: Float[np.ndarray, "cells 2"]
-    """Places of the format, from its centre."""
+    """Image points relative to the centre of the format."""
     covariance: Float[np.ndarray, "parameters parameters"]
-    """A posteriori, of the camera by the whole block."""
+    """A posteriori covariance of the camera, from the whole block."""
     promised_px: Float[np.ndarray, "cells"]
     """RMS length (both axes) of the error according to the covariance of the whole block."""
     cuts: tuple[Cut, ...]
-    """Compared divisions."""
+    """Divisions that were compared."""
     failed: tuple[Cut, ...]
     """Divisions that could not be compared."""
     band: ErrorBand
 
     @property
     def widened(self) -> Float[np.ndarray, "parameters parameters"]:
-        """Covariance with model error: times the square of the factor, if that exceeds 1."""
+        """Return the covariance with model error: multiplied by the square of the factor, if that exceeds 1."""
         return self.covariance * max(self.band.factor, 1.0) ** 2
 
     @property
     def leading(self) -> tuple[str, float]:
-        """Unit that dominates the differences, and the fraction of their sum of squares it explains."""
+        """Return the unit that dominates the differences, and the fraction of their sum of squares it explains."""
         names, unit = _units(self.adjusted.block, self.by)
         of_units = [np.flatnonzero(unit == k)[0] for k in range(len(names))]
         first = np.stack([cut.first[of_units] for cut in self.cuts])
@@ -137,7 +138,9 @@ class Halves(NamedTuple):
 
     @property
     def inside(self) -> tuple[float, float]:
-        """Fraction of cells whose difference is within the band estimated without it, and its standard error."""
+        """Return the fraction of cells whose difference is within the band estimated without it, and its standard
+        error.
+        """
         v = self.band.inside
         return float(v.mean()), float(v.std(ddof=1) / np.sqrt(len(v))) if len(v) > 1 else float("nan")
 
@@ -157,11 +160,11 @@ def halves(
     """Adjust `block` and random halves of it, and compare `camera` at `cells_mm` (`image_grid`).
 
     `by` is the unit that is never divided: "image", "strip", or a partition of the block such as "day". `n_cuts`
-    divisions are drawn with `seed`, fewer if there are not as many. `method` defines what the orientation of the images
-    absorbs (`stability.alignment`).
+    divisions are drawn with `seed`, or all if fewer exist. `method` defines which systematic effects the orientation of
+    the images absorbs (`stability.alignment`).
 
     Raises InputError if the block cannot be divided, no parameter of the camera is estimated or no two halves can be
-    compared, and what `adjust` raises for the whole block.
+    compared, and the errors of `adjust` for the whole block.
     """
     name = camera_of(block, camera)
     size, first = _cuts(block, by, name, n_cuts, seed)
@@ -211,7 +214,7 @@ def camera_of(block: Block, camera: str | None) -> str:
 
 
 def _units(block: Block, by: str) -> tuple[list[str], np.ndarray]:
-    """Names of the units, and the unit of each image."""
+    """Return the names of the units, and the unit of each image."""
     owners = block.owners(by)
     if "" in owners:
         raise InputError(f"image {block.images[owners.index('')]} has no {by}; add it, or divide by image")
@@ -222,7 +225,7 @@ def _units(block: Block, by: str) -> tuple[list[str], np.ndarray]:
 def _cuts(block: Block, by: str, camera: str, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the number of image points of each unit, and the units in the first half of each division (cuts, units).
 
-    The camera is in both halves of each.
+    Both halves of every division contain the camera.
     """
     names, unit = _units(block, by)
     has_camera = np.array([c == camera for c in block.image_camera])
@@ -243,11 +246,11 @@ def _cuts(block: Block, by: str, camera: str, n: int, seed: int) -> tuple[np.nda
 
 
 def _balanced(units: int, rng: np.random.Generator) -> Bool[np.ndarray, "cuts units"]:
-    """Random balanced divisions: any two units are together in half of them.
+    """Draw balanced divisions: any two units are together in half of them.
 
-    Jointly they estimate the scatter of halves as all divisions would, to first order. Rows of a Hadamard matrix with
-    random columns and signs, except those with less than a third of the units in one half. Source: McCarthy (1969),
-    balanced half-samples.
+    Jointly they estimate the scatter of halves to first order as all divisions would. The rows are taken from a
+    Hadamard matrix with random columns and signs, except rows with less than a third of the units in one half. Source:
+    McCarthy (1969), balanced half-samples.
     """
     order = 1 << (units - 1).bit_length()
     rows = scipy.linalg.hadamard(order)[rng.permutation(order)]
@@ -261,7 +264,7 @@ def halved(
     """Adjust the images `first` and the others separately, and compare them at `cells_mm`."""
     block = adjusted.block
     start = dataclasses.replace(block.start, unknowns=adjusted.unknowns)
-    # The position of a half in space is irrelevant for its camera: its stations or control may not determine the datum.
+    # The datum of a half is irrelevant for its camera and may be undetermined by its stations and control.
     datum = dataclasses.replace(block.datum, kind="inner") if block.datum.kind == "control" else block.datum
     try:
         both = []
@@ -290,7 +293,7 @@ def halved(
 
 
 def _oriented(block: Block, chosen: Bool[np.ndarray, "images"]) -> Block:
-    """Select the images `chosen`, except those with too few remaining points to orient them."""
+    """Select the images `chosen`, except images with too few remaining points for orientation."""
     while True:
         part = some_images(block, chosen)
         few = np.bincount(part.image_points.image, minlength=len(part.images)) < _LEAST_POINTS
@@ -312,6 +315,6 @@ def _joint_covariance(adjusted: Adjustment, both: list[Adjustment], camera: str,
 
 
 def _by_cell(jacobian: np.ndarray, covariance: np.ndarray) -> Float[np.ndarray, "cells 2 2"]:
-    """J Q J' of each cell."""
+    """Compute J Q J' of each cell."""
     rows = jacobian.reshape(-1, 2, jacobian.shape[1])
     return np.einsum("cip,pq,cjq->cij", rows, covariance, rows)

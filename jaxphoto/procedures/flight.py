@@ -26,9 +26,9 @@ from jaxphoto.procedures.orientation.orient_photographs import CAMERA, Report
 from jaxphoto.procedures.rolling_shutter import NEIGHBOUR_M, Moment, with_rolling_shutter
 from jaxphoto.statistics import VarianceComponents, variance_components
 
-# Random vectors of the trace estimate: each is expensive with 1e5 image points, and there are few variance components.
+# Number of random vectors of the trace estimate. Each is expensive with 1e5 image points; variance components are few.
 _PROBES = 16
-# Minimum number of unoriented photographs that form a part of their own; two would have no redundancy.
+# Minimum number of unoriented photographs that form a separate part; two would have no redundancy.
 _PART_OF_ITS_OWN = 3
 _NO_PAIR = "no relative orientation to any other photograph"
 
@@ -39,30 +39,30 @@ class KnownOfFlight(NamedTuple):
     positions: Mapping[str, Gps | None] = {}
     attitudes: Mapping[str, CameraAttitude | None] = {}
     code: int | None = None
-    """EPSG code of the map system; None: UTM."""
+    """EPSG code of the map system; None for UTM."""
     control: FlightControl | None = None
     lens: KnownLens | None = None
     taken: Mapping[str, Moment] | None = None
     """Exposure times, if a rolling shutter is to be estimated."""
     vertical: int | None = None
-    """EPSG code of the heights; None: ellipsoidal."""
+    """EPSG code of the heights; None for ellipsoidal heights."""
     order: Sequence[str] = ()
-    """Photographs in the order of exposures; default: by name."""
+    """Photographs in exposure order; by default sorted by name."""
 
 
 class FlightPart(NamedTuple):
-    """Connected photographs, oriented, georeferenced if they have positions, and adjusted."""
+    """Connected photographs, oriented, adjusted, and georeferenced if they have positions."""
 
     oriented: Oriented
     matched: MatchedPart
     placed: GeoreferencedPhotographs | None
     why_not: str
-    """Reason for missing stations, or "". With `placed` the positions were used to georeference only."""
+    """Reason for missing stations, or "". If also `placed`, the positions were used for georeferencing only."""
     components: VarianceComponents | None
-    """Of image points, stations and marks, if the adjustment converged."""
+    """Variance components of image points, stations and marks, if the adjustment converged."""
     adjusted: Adjustment
     controlled: ControlledBlock | None = None
-    """With the given control."""
+    """Block adjusted with the given control."""
     no_control: str = ""
     """Reason for unused control."""
     lens: tuple[str, ...] = ()
@@ -87,7 +87,7 @@ def calibrate_flight(
 ) -> CalibratedFlight:
     """Orient, georeference and adjust every connected part of the photographs of one camera, starting at `interior`.
 
-    Photographs that a part cannot orient, but that see enough of one another, form a part of their own. Photographs and
+    Photographs that a part cannot orient, but that are sufficiently connected, form a separate part. Photographs and
     parts that cannot be oriented are returned with the reason. A part is adjusted without `prior` information that
     contradicts it, also with the reason. Raises InputError if no part can be oriented.
     """
@@ -141,7 +141,7 @@ def _calibrated(
     if prior.control is not None:
         controlled, no_control = adjust_with_control(block, prior.control, prior.code, prior.vertical, report)
     try:
-        # Without positions it is the network of the orientation, which reuses its compiled code.
+        # Without positions, adjust the network of the orientation, to reuse its compiled code.
         sizes = MINIMAL_SIZES if placed else oriented.sizes
         adjusted = controlled.adjusted if controlled else adjust_for_tables(block, sizes=sizes)
     except (InputError, BlockError, DatumError, RankError) as error:
@@ -151,12 +151,12 @@ def _calibrated(
     metric = bool(controlled or (placed and not why_not))
     adjusted, why_no_shutter = _rolling(adjusted, prior.taken, metric)
     components = None
-    # Prior information about the lens needs the relative weight of image points, with or without stations.
+    # Estimate components also for prior information about the lens, which needs the weight of image points.
     if (placed or controlled or lens) and bool(adjusted.converged):
         report("estimating variance components")
         marked = {controlled.ids[p] for p in controlled.marks.point} if controlled else ()
         components = variance_components(adjusted, parts_with_marks(adjusted, marked), probes=_PROBES)
-        # Without convergence they are no weights; the report says so.
+        # Variance components are not used unless their estimation converged; the report states this.
         adjusted = components.adjusted if bool(components.adjusted.converged) else adjusted
     return FlightPart(
         oriented, matched, placed, why_not, components, adjusted,

@@ -4,8 +4,8 @@
     found = georeference(read_block("block"))
     found.exterior_sigma, found.point_sigma, found.discrepancies.value
 
-Nothing is adjusted: control serves as check points. The points are those of an adjustment of `variants.direct` without
-control.
+Exterior orientation is not adjusted, and control serves as check points. The points are identical to an adjustment of
+`variants.direct` without control.
 """
 
 from functools import partial
@@ -39,7 +39,7 @@ from jaxphoto.short_repr import pretty_repr
 from jaxphoto.tracing import outside_transformations
 from jaxphoto.unknowns import Weighted
 
-# Gauss-Newton iterations from the intersection: the first leaves micrometres, the second nothing.
+# Number of Gauss-Newton steps after the intersection: the first leaves micrometres, the second rounding errors.
 _STEPS = 4
 
 
@@ -50,14 +50,14 @@ class Georeferenced(eqx.Module):
     images: tuple[str, ...] = eqx.field(static=True)
     """Images with both a complete station and an attitude."""
     points: tuple[str, ...] = eqx.field(static=True)
-    """Points intersected by two or more of these."""
+    """Points with rays in two or more of these images."""
     exterior: ExteriorOrientation
     exterior_covariance: Float[ArrayLike, "images 6 6"]
-    """Of X, Y, Z (m) and a small rotation in the camera frame (rad)."""
+    """Covariance of X, Y, Z (m) and a small rotation in the camera frame (rad)."""
     positions: Float[np.ndarray, "points 3"]
-    """Of `points`, m."""
+    """Positions of `points`, m."""
     covariance: Float[np.ndarray, "points 3 3"]
-    """Of `positions` (m^2), including errors common to images of a mount or a camera."""
+    """Covariance of `positions` (m^2), including errors common to images of a mount or a camera."""
     discrepancies: ControlCoordinates
     """Surveyed minus computed (m) at control, fixed and check points, with the survey's sigmas; `who` refers to
     `points`.
@@ -76,11 +76,12 @@ class Georeferenced(eqx.Module):
 
 @outside_transformations
 def georeference(block: Block) -> Georeferenced:
-    """Exterior orientation of the images of `block` from stations, attitudes and mounts, and its points from these.
+    """Compute the exterior orientation of the images of `block` from stations, attitudes and mounts, and then its
+    points.
 
-    Mounts, cameras and strips are those of `block.start`. Weighted parameters in `block.priors` (except strips) have an
-    error of that sigma; all others are error-free. Raises BlockError if no image has both a complete station and an
-    attitude.
+    Mounts, cameras and strips are taken from `block.start`. Weighted parameters in `block.priors` (except strips) have
+    an error with their sigma; all others are error-free. Raises BlockError if no image has both a complete station and
+    an attitude.
     """
     sensors = sensor_rows(block, block.start.unknowns)
     if not len(sensors.image):
@@ -138,13 +139,13 @@ class _Rays(NamedTuple):
     sigma: Float[np.ndarray, "rows 2"]
     exterior: Float[np.ndarray, "rows 2 6"]
     interior: dict[str, tuple[np.ndarray, np.ndarray]]
-    """By camera: its rows and their derivatives by its parameters."""
+    """By camera: the indices of its rows and their derivatives by its parameters."""
 
 
 def _intersected(
     block: Block, oriented: Int[np.ndarray, "images"], exterior: ExteriorOrientation
 ) -> tuple[_Rays, Float[np.ndarray, "points 3"], Int[np.ndarray, "points"]]:
-    """Rays of the `oriented` images, the points (m) they determine, and their indices in the block."""
+    """Return rays of the `oriented` images, the points (m) they determine, and their indices in the block."""
     observed = block.image_points
     place = np.full(len(block.images), -1)
     place[oriented] = np.arange(len(oriented))
@@ -174,7 +175,7 @@ def _intersected(
     by_interior: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for _ in range(_STEPS):
         for name, r in rows_of.items():
-            # Padded with repeated rows, so that cameras of one model share compiled code.
+            # Pad with repeated rows, so cameras of one model share compiled code.
             rows = np.resize(r, padded_length(len(r)))
             of_rows = ExteriorOrientation(position[image[rows]], matrix[image[rows]])  # type: ignore[arg-type]
             by = _ray_partials(_numbers(interior[name]), of_rows, points[point[rows]], xy[rows], block.corrections)
@@ -190,12 +191,12 @@ def _propagated(by: Float[np.ndarray, "n 6 m"], sigma: Float[ArrayLike, "n m"]) 
 
 
 def _sigmas(priors: list) -> np.ndarray:
-    """Sigma of each prior, zero if it has none."""
+    """Return the sigma of each prior, zero if it has none."""
     return np.array([float(p.sigma) if isinstance(p, Weighted) else 0.0 for p in priors])
 
 
 def _numbers(interior: InteriorOrientation) -> InteriorOrientation:
-    """Convert floats to arrays: a float would be compiled in, for every camera again."""
+    """Convert floats to arrays; a Python float would be compiled in as a constant, separately for every camera."""
     return jax.tree.map(partial(np.asarray, dtype=float), interior)
 
 

@@ -1,7 +1,7 @@
 """Georeference oriented photographs by recorded positions, which become observed camera stations.
 
-A free network has its own frame and scale. The similarity from its projection centres to the recorded positions is
-estimated robustly, from positions that agree. Contradicting positions are rejected and reported.
+A free network has an arbitrary frame and scale. The similarity from its projection centres to the recorded positions is
+estimated robustly from consistent positions. Contradicting positions are rejected and reported.
 """
 
 import dataclasses
@@ -33,22 +33,22 @@ from jaxphoto.rotation import small_angles, small_rotation
 from jaxphoto.variants import without_stations
 
 SIGMA_M = (2.0, 2.0, 4.0)
-"""Standard deviations of single-point GNSS positions (east, north, up), if the file has none and they scatter less.
-Most GPS errors are common over the minutes of a flight (SPS Performance Standard, 2020: 95 % within 8 m in plan and
-13 m in height). Variance components refine them.
+"""Default standard deviations (m) of single-point GNSS positions (east, north, up), if the file has none. Larger
+scatter replaces them. Most GPS errors are common over the minutes of a flight (SPS Performance Standard, 2020: 95 %
+within 8 m in plan and 13 m in height). Variance components refine them.
 """
-# Samples of three positions: with 40 % outliers, one in five samples is valid; 200 almost surely contain one.
+# Number of samples of three positions: with 40 % outliers, one sample in five is valid.
 _SAMPLES = 200
-# Maximum ratio of a distance to the median distance: six standard deviations of a normal error in space.
+# Maximum ratio of a distance to the median distance: six standard deviations of a 3-D normal error.
 _BEYOND = 4.0
 # Maximum distance in standard deviations: exceeded by one position in a thousand.
 _BEYOND_OWN = 4.0
 _LEAST = 3
-# With attitudes, which determine the rotation.
+# Minimum number of positions with attitudes, which determine the rotation.
 _LEAST_TURNED = 2
-# Maximum standard deviation of the rotation from positions; above it a local frame is better.
+# Maximum standard deviation (rad) of the rotation from positions; above it a local frame is better.
 _FIXED_RAD = 0.3
-# Minimum number of positions for their scatter to be estimated, and its minimum (m).
+# Minimum number of positions for an estimate of their scatter; minimum of the estimate (m).
 _SCATTER, _FINEST_M = 6, 0.05
 # Minimum upward component of the mean viewing direction of an inverted block.
 _LOOK_UP = 0.5
@@ -59,9 +59,9 @@ class GeoreferencedPhotographs(NamedTuple):
 
     block: Block
     images: tuple[str, ...]
-    """Images with a position; rows of the following."""
+    """Images with a position, in the order of the rows of the following arrays."""
     offsets_m: Float[np.ndarray, "images 3"]
-    """Recorded minus network position after the similarity: east, north, up, without the shifts of parts."""
+    """Recorded minus network position after the similarity: east, north, up; shifts of parts removed."""
     used: Bool[np.ndarray, "images"]
     sentences: tuple[str, ...]
     steps: tuple[str, ...] = ()
@@ -82,11 +82,11 @@ def georeference_photographs(
 ) -> GeoreferencedPhotographs:
     """Transform `block`, a free network, to the EPSG system `code` (default UTM) by the `positions` of its images.
 
-    `vertical` is the EPSG code of the block's heights in files; None: ellipsoidal. Positions are transformed from WGS
-    84 to the datum of the system, as are ellipsoidal heights; other heights are used as recorded. Standard deviations
-    are those of the file, otherwise `SIGMA_M`. If `attitudes` determine the rotation better than the positions (a
-    single strip), they are observed, too. Positions with steps, in the `order` of exposures (default: of the block),
-    have one shift per part (`position_steps`).
+    `vertical` is the EPSG code of the block's heights in files; None: ellipsoidal. Positions and ellipsoidal heights
+    are transformed from WGS 84 to the datum of the system; other heights are used as recorded. Standard deviations come
+    from the file, otherwise from `SIGMA_M`. If `attitudes` determine the rotation better than the positions (a single
+    strip), they are also observed. Positions with jumps in the `order` of exposures (default: order of the block) get
+    one shift per part (`position_steps`).
 
     Raises InputError if fewer than three positions agree or all lie on a line without attitudes, and for unknown codes
     and unavailable geoids.
@@ -102,7 +102,7 @@ def georeference_photographs(
     longitude, latitude, _ = np.median(received, axis=0).tolist()
     code = utm_of(round(longitude, 4), round(latitude, 4)) if code is None else code
     change = datum_change(code, longitude, latitude)
-    # Heights of a geoid, above take-off or of unknown reference do not change with the ellipsoid.
+    # Heights above a geoid, take-off or unknown reference do not change with the ellipsoid.
     ellipsoidal = np.array([g.heights == "ellipsoid" for g in usable.values()])
     places = change.places(received, ellipsoidal)
     middle = np.median(places, axis=0)
@@ -114,10 +114,10 @@ def georeference_photographs(
     sigmas = np.array([gps.stated_sigma_m or SIGMA_M for gps in usable.values()])
     at, sigma_of = (dict(zip(usable, v, strict=True)) for v in (places, sigmas))
     rotation = recorded_rotation(block, attitudes or {}, at, sigma_of, frame)
-    # Without stated standard deviations, positions are judged by one another alone.
+    # Without stated standard deviations, test positions only by their median distance.
     own_sigmas = sigmas if any(gps.stated_sigma_m for gps in usable.values()) else np.zeros_like(sigmas)
     fitted = _fit(block, image, here, sigmas, own_sigmas, rotation)
-    # Single-point GNSS drifts by a fraction of its standard deviation within minutes; that is no step.
+    # Drift of single-point GNSS within minutes is smaller than its standard deviation, and not a jump.
     parts = position_parts(list(usable), order, here - fitted.similarity.of(there), here, np.median(sigmas, axis=0))
     raw, here = here, here - parts.off_m
     if parts.sentences:
@@ -152,8 +152,8 @@ def with_observed_scatter(
 ) -> GeoreferencedPhotographs | None:
     """Replace assumed standard deviations of positions by their scatter, if that is smaller.
 
-    Of the similarity's seven parameters, four concern plan and three height. None if a file states standard deviations,
-    positions are too few, or their scatter is not smaller.
+    Four of the similarity's seven parameters concern plan, three height. Return None if a file states standard
+    deviations, positions are too few, or their scatter is not smaller.
     """
     names = [name for name, used in zip(placed.images, placed.used, strict=True) if used]
     offset, n = placed.offsets_m[placed.used], len(names)
@@ -176,7 +176,7 @@ def with_observed_scatter(
 def with_fixed_datum(placed: GeoreferencedPhotographs, datum: Datum) -> GeoreferencedPhotographs | None:
     """Define the datum of the georeferenced block by `datum` instead of stations.
 
-    None if positions determine the rotation worse than 17 degrees, unless the strip is assumed level.
+    Return None if positions determine the rotation worse than 17 degrees, unless the strip is assumed level.
     """
     stations = placed.block.stations
     here, sigma = (np.asarray(v, float).reshape(-1, 3) for v in (stations.value, stations.sigma))
@@ -221,7 +221,7 @@ def _fit(
 def _check_upright(block: Block, similarity: Similarity) -> None:
     """Raise InputError if the photographs would look upwards.
 
-    Stations of a flight are nearly coplanar: mirrored positions fit an inverted block as well.
+    Stations of a flight are nearly coplanar: mirrored positions also fit an inverted block.
     """
     ahead = -np.asarray(block.start.unknowns.exterior.camera_from_object, float)[:, 2] @ similarity.turn.T
     if float(np.median(ahead[:, 2])) > _LOOK_UP:
@@ -238,7 +238,7 @@ def _rotation_sigma(here: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, "n 
     It follows from their extent across that direction.
     """
     across = np.linalg.svd(here - np.median(here, axis=0), compute_uv=False)
-    # The extent includes the scatter of the positions.
+    # The extent includes the scatter of the positions: remove it.
     noise = float(np.sqrt(np.mean(np.median(sigma, axis=0) ** 2)))
     apart = np.sqrt(max(across[1] ** 2 - len(here) * noise**2, 0.0)) if len(across) > 1 else 0.0
     return noise / apart if apart > 0 else np.inf
@@ -250,7 +250,7 @@ def _fit_with_rotation(
     turn: Float[np.ndarray, "3 3"],
     own_sigmas: Float[np.ndarray, "n 3"],
 ) -> tuple[Similarity, np.ndarray]:
-    """Scale and shift for a known rotation by the positions that agree, and their mask."""
+    """Estimate scale and shift for a known rotation by consistent positions; return them and the mask of these."""
     a = there @ turn.T
     one, other = np.triu_indices(len(here), 1)
     length = np.linalg.norm(a[one] - a[other], axis=1)
@@ -268,7 +268,7 @@ def _fit_with_rotation(
 
 
 def utm_of(longitude_deg: float, latitude_deg: float) -> int:
-    """Return the EPSG code of the UTM zone (WGS 84) of a place."""
+    """Return the EPSG code of the UTM zone (WGS 84) of a position."""
     area = AreaOfInterest(longitude_deg, latitude_deg, longitude_deg, latitude_deg)
     zones = query_utm_crs_info(datum_name="WGS 84", area_of_interest=area)
     if not zones:
@@ -279,7 +279,7 @@ def utm_of(longitude_deg: float, latitude_deg: float) -> int:
 
 
 def _inliers(offsets: Float[np.ndarray, "n 3"], sigmas: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-    """Mark offsets no larger than most, or within their own standard deviations (zero: unknown)."""
+    """Mark offsets within a multiple of the median, or of their standard deviations (zero: unknown)."""
     distance = np.linalg.norm(offsets, axis=1)
     allowed = np.linalg.norm(offsets / np.maximum(sigmas, 1e-9), axis=1) <= _BEYOND_OWN
     return (distance <= max(_BEYOND * float(np.median(distance)), 1e-9)) | allowed
@@ -288,7 +288,9 @@ def _inliers(offsets: Float[np.ndarray, "n 3"], sigmas: Float[np.ndarray, "n 3"]
 def _fit_by_positions(
     there: Float[np.ndarray, "n 3"], here: Float[np.ndarray, "n 3"], own_sigmas: Float[np.ndarray, "n 3"]
 ) -> tuple[Similarity, np.ndarray]:
-    """Robust similarity (least median of distances, then least squares) and the mask of positions that agree."""
+    """Estimate a robust similarity (least median of distances, then least squares); return it and the consistent
+    positions.
+    """
     n = len(here)
     distance = lambda s: np.linalg.norm(here - s.of(there), axis=1)  # noqa: E731
     whole = similarity_between(there, here)
@@ -312,7 +314,7 @@ def _fit_by_positions(
 
 
 def _sigmas(positions: list[Gps], offsets: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """Stated standard deviations; otherwise `SIGMA_M`, or the scatter if larger."""
+    """Return stated standard deviations; otherwise `SIGMA_M`, or the scatter if larger."""
     plan = max(SIGMA_M[0], float(np.sqrt(np.mean(offsets[:, :2] ** 2))))
     height = max(SIGMA_M[2], float(np.sqrt(np.mean(offsets[:, 2] ** 2))))
     return np.array([gps.stated_sigma_m or (plan, plan, height) for gps in positions])
@@ -325,12 +327,12 @@ def _least_squares_similarity(
     sigma: Float[np.ndarray, "n 3"],
     recorded: RecordedRotation | None = None,
 ) -> Similarity:
-    """Weighted least-squares similarity, with the rotation from attitudes as an observation.
+    """Estimate the similarity by weighted least squares, with the rotation from attitudes as an observation.
 
-    An adjustment from a worse start would rotate the whole block, in hundreds of steps.
+    Without it, the adjustment would have to rotate the whole block, in hundreds of steps.
     """
 
-    # Shift of the centroid, which a rotation leaves fixed.
+    # Estimate the shift of the centroid, which is independent of the rotation.
     middle = there.mean(axis=0)
     n = padded_length(len(here))
     weight = padded(1 / sigma, n) * (np.arange(n) < len(here))[:, None]
@@ -345,7 +347,7 @@ def _least_squares_similarity(
 
 @eqx.filter_jit
 def _optimise_similarity(shift, matrix, scale, there, here, weight, turn, turn_weight):
-    """Estimate shift, rotation and scale from the offsets, and the angles to the rotation `turn`."""
+    """Estimate shift, rotation and scale from the offsets, and from the angles to the rotation `turn`."""
 
     def at(x):
         return shift + x[:3], small_rotation(x[3:6]) @ matrix, scale * jnp.exp(x[6])
@@ -359,7 +361,7 @@ def _optimise_similarity(shift, matrix, scale, there, here, weight, turn, turn_w
 
 
 LEVEL_DEG = 5.0
-"""Assumed standard deviation of the mean roll of a nadir strip."""
+"""Standard deviation (degrees) of the mean roll of a nadir strip (assumed)."""
 # Maximum ratio of width to length of a line.
 _NARROW = 0.1
 
@@ -373,30 +375,31 @@ def is_line(centres: Float[np.ndarray, "n 3"]) -> bool:
 def level_rotation(
     centres: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"], backwards: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, "3 3"]:
-    """Rotation of a network to a level frame: its line to that of the `positions`, as upright as possible on average.
+    """Return the rotation of a network to a level frame: its line is mapped to the line of the `positions`.
 
-    `backwards` are the camera axes of the network opposite to the viewing directions.
+    The rotation about the line makes the images as vertical as possible on average. `backwards` are the camera axes of
+    the network opposite to the viewing directions.
     """
     one, other = _axes(_line(centres), backwards.mean(axis=0)), _axes(_line(positions), np.array([0.0, 0.0, 1.0]))
     return other @ one.T
 
 
 def _line(places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
-    """Direction from the first to the last places, by medians (robust to single outliers)."""
+    """Return the direction from the first to the last positions, by medians (robust to single outliers)."""
     half = len(places) // 2
     apart = places[half:] - places[: len(places) - half]
     return np.median(apart, axis=0)
 
 
 def _axes(along: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Axes along, across and up, as columns."""
+    """Return the axes along, across and up, as columns."""
     x = along / np.linalg.norm(along)
     y = np.cross(up, x)
     y /= np.linalg.norm(y)
     return np.stack([x, y, np.cross(x, y)], axis=1)
 
 
-# Relative tolerance of equal height offsets, and minimum of such an offset (m).
+# Maximum relative difference of equal height offsets; minimum of such an offset (m).
 _EQUAL, _ZERO_M = 0.1, 10.0
 # Minimum ratio of the height offset to the offset in plan.
 _HEIGHT_RATIO = 4.0
@@ -446,7 +449,7 @@ def position_messages(
 
 
 def _other_height_datum(offsets: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Mark rejected positions, two or more, that differ in height alone, all by the same amount."""
+    """Mark rejected positions, two or more, that have the same height offset and no offset in plan."""
     plan = np.hypot(*offsets[:, :2].T)
     level = ~used & (np.abs(offsets[:, 2]) > np.maximum(_ZERO_M, _HEIGHT_RATIO * plan))
     if level.sum() < 2:
@@ -459,7 +462,9 @@ def _other_height_datum(offsets: np.ndarray, used: np.ndarray) -> np.ndarray:
 def attitude_messages(
     recorded: RecordedRotation | str | None, used: bool, turn: Float[np.ndarray, "3 3"]
 ) -> Iterator[str]:
-    """Yield messages about the agreement of recorded attitudes with the network's `turn` to the map, and their use."""
+    """Yield messages about the agreement of recorded attitudes with the network's rotation `turn` to the map, and their
+    use.
+    """
     if isinstance(recorded, str):
         yield recorded
     if not isinstance(recorded, RecordedRotation):

@@ -1,4 +1,4 @@
-"""Prior information about a lens as observations of a camera without earlier calibration."""
+"""Prior information about a lens, for a camera without earlier calibration."""
 
 import dataclasses
 import math
@@ -10,20 +10,20 @@ from jaxphoto.camera.lens_prior import LensPrior, prior_sigmas
 from jaxphoto.observations import KnownParameters
 from jaxphoto.unknowns import FIXED, Weighted
 
-# Temperature difference between flights of different seasons.
+# Temperature difference (K) between flights of different seasons.
 _KELVIN = 10.0
 
 
 class KnownLens(NamedTuple):
-    """Nominal lens by EXIF, and the deviations of such lenses from it."""
+    """Nominal lens from EXIF, and typical deviations of real lenses from it."""
 
     nominal: InteriorOrientation
     prior: LensPrior
     c_rounding: float
-    """Relative standard deviation of the nominal c by the rounding in EXIF."""
+    """Relative standard deviation of the nominal c due to rounding in EXIF."""
 
     def sentences(self, block: Block, camera: str) -> tuple[str, ...]:
-        """Messages for a report."""
+        """Return messages for a report."""
         sigma, c = prior_sigmas(self.prior, self.nominal, block.sensors[camera], self.c_rounding), float(self.nominal.c)
         p = self.prior
         sensor = block.sensors[camera]
@@ -46,7 +46,7 @@ def has_prior(block: Block, camera: str) -> bool:
 
 
 def with_known_lens(block: Block, camera: str, lens: KnownLens) -> Block:
-    """Observe all free parameters of the camera by the prior information about its lens.
+    """Observe all free parameters of the camera with the prior information about its lens.
 
     Fixed parameters, and cameras with an earlier calibration, are unchanged.
     """

@@ -10,24 +10,24 @@ from jaxphoto.initial.matches import PairMatches, connected_images
 
 
 class MatchedPart(NamedTuple):
-    """Features of photographs and their matches, as input of `orient`."""
+    """Features of photographs and their matches, input of `orient`."""
 
     names: list[str]
     xy_mm: list[Float[np.ndarray, "n 2"]]
     sigma_mm: list[Float[np.ndarray, "n"]]
     pairs: list[PairMatches]
     gross: Int[np.ndarray, "compared 3"]
-    """By compared pair: first, second, number of rejected matches."""
+    """Per compared pair: first, second, number of rejected matches."""
     sigma_factor: float
-    """Ratio of the scatter of the accepted matches to that expected of coplanar features."""
+    """Ratio of the scatter of the accepted matches to its expectation for coplanar features."""
 
     @property
     def n_gross(self) -> int:
-        """Number of rejected matches of all pairs."""
+        """Return the number of rejected matches of all pairs."""
         return int(self.gross[:, 2].sum())
 
     def groups(self, least: int = 2) -> list["MatchedPart"]:
-        """Return the connected groups, the largest first, of `least` photographs or more."""
+        """Return the connected groups with at least `least` photographs, the largest first."""
         together = connected_images(len(self.names), self.pairs)
         return [self._of(group) for group in together if len(group) >= least]
 
@@ -36,7 +36,7 @@ class MatchedPart(NamedTuple):
         return self._of(np.array([k for k, name in enumerate(self.names) if name in names], int))
 
     def _of(self, photographs: Int[np.ndarray, "photographs"]) -> "MatchedPart":
-        """Select photographs and renumber."""
+        """Select photographs by index and renumber them."""
         new = np.full(len(self.names), -1)
         new[photographs] = np.arange(len(photographs))
         ends = new[self.gross[:, :2]]

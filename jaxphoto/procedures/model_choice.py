@@ -1,15 +1,15 @@
 """Choose the distortion model of a block: cross-validation, information criteria and significance.
 
 Every candidate (a model with some coefficients estimated, others fixed at 0) is adjusted to all observations and to the
-block without each of k folds; all by residuals of *measured* image coordinates. Image points are omitted such that
-every object point keeps two rays or more, and predicted by the cameras, orientations and points of the others.
+block without each of k folds. All use residuals of *measured* image coordinates. Every object point keeps at least two
+rays when a fold is omitted. Omitted image points are predicted from the other observations.
 
-Orientations and points are estimated with every candidate and increase with the block: they are not chosen. For the
-camera remain
+Orientations and points are estimated with every candidate and increase with the block: they are not part of the choice.
+For the camera there remain
 
     N = observations + constraints - unknowns other than interior ones = redundancy + p
 
-numbers, of which a candidate with p interior unknowns and the variance factor explains all but S = v'Pv:
+degrees of freedom. A candidate with p interior unknowns and the variance factor leaves S = v'Pv unexplained:
 
     AIC = N ln(S / N) + 2 (p + 1),    AICc = AIC + 2 (p + 1)(p + 2) / (N - p - 2),    BIC = N ln(S / N) + (p + 1) ln N
     F   = (S_smaller - S) / (p - p_smaller) / (S / redundancy)    of a candidate and one that it contains
@@ -51,7 +51,7 @@ class Candidate(NamedTuple):
     free: tuple[str, ...]
 
     def within(self, other: "Candidate") -> bool:
-        """Return True if `other` is this candidate with more coefficients."""
+        """Return True if `other` is the same model with additional coefficients."""
         return self.distortion is other.distortion and set(self.free) < set(other.free)
 
 
@@ -76,9 +76,9 @@ def with_candidate(block: Block, candidate: Candidate, unknowns: Unknowns | None
     """Return the block with the candidate for all cameras, starting at `known` orientations and points if given.
 
     c, x_p and y_p keep their priors: a weighted value is transformed if the conversion to another model changes it, as
-    SMAC's c with R0. All coefficients of the candidate are free, even weighted ones: otherwise models with a prior
-    would explain an additional observation. They start from the block's distortion, converted if its model differs.
-    Residuals are of measured coordinates, for every model.
+    for c of SMAC with R0. All coefficients of the candidate are free, even weighted ones: otherwise models with a prior
+    would explain an additional observation. Their initial values come from the block's distortion, converted if its
+    model differs. Residuals are of measured coordinates, for every model.
     """
     interior, priors = {}, {}
     for name, camera in block.start.unknowns.interior.items():
@@ -98,10 +98,10 @@ def _start(camera: InteriorOrientation, candidate: Candidate, sensor: Sensor) ->
     fixed = tuple(name for name in kind.coefficients if name not in candidate.free)
     try:
         same = exact(camera, kind)
-        # A fit must know the fixed coefficients: rational terms are meaningless without each other.
+        # The fit needs the fixed coefficients: rational terms depend on each other.
         interior = same if same is not None else fitted(camera, kind, sensor, fixed).interior
     except ValueError:
-        # A candidate that does not fit the given distortion starts without distortion.
+        # A candidate that cannot approximate the given distortion starts at zero distortion.
         interior = dataclasses.replace(camera, distortion=kind.plain(sensor))
     interior = dataclasses.replace(interior, residuals="measured")
     for name in fixed:
@@ -116,7 +116,7 @@ def _priors(camera: InteriorOrientation, priors, interior: InteriorOrientation, 
     for name, factor in (("c_mm", scale), ("xp_mm", 1.0), ("yp_mm", 1.0)):
         prior = get_parameter(priors, name)
         if isinstance(prior, Weighted):
-            # At the same distance from the start, in the unit that c now has.
+            # Retain the distance of the prior from the initial value, in the converted unit of c.
             start, before = (float(get_parameter(one, name)) for one in (interior, camera))
             prior = Weighted(start + factor * (float(prior.value) - before), factor * float(prior.sigma))
         new = set_parameter(new, name, prior)
@@ -129,10 +129,10 @@ _LEAST_RAYS = 2
 
 
 def folds(block: Block, k: int, seed: int = 0) -> Int[np.ndarray, "rows"]:
-    """Return the fold (0 ... k - 1) in which each image row is omitted; -1 for rows that never are.
+    """Return the fold (0 ... k - 1) in which each image row is omitted; -1 for rows that are never omitted.
 
-    Rows of a point are assigned to the folds in turn and at random, leaving the point two rays in each. Raises
-    BlockError if no point was measured in three images.
+    The rows of each point are distributed over the folds in random order. Each point keeps at least two rays when a
+    fold is omitted. Raises BlockError if no point was measured in three images.
     """
     point = np.asarray(block.image_points.point)
     rng = np.random.default_rng(seed)
@@ -143,7 +143,7 @@ def folds(block: Block, k: int, seed: int = 0) -> Int[np.ndarray, "rows"]:
     place = np.arange(len(order)) - first[point[order]]
     turn = rng.integers(0, k, len(block.points))
     fold = np.full(len(point), -1)
-    # The place // k-th of its fold: the point keeps the others.
+    # Row number place // k of its fold: at least `_LEAST_RAYS` rows are outside the fold.
     allowed = place // k < rays[point[order]] - _LEAST_RAYS
     fold[order] = np.where(allowed, (place + turn[point[order]]) % k, -1)
     if not (fold >= 0).any():
@@ -165,9 +165,9 @@ def fold_blocks(block: Block, fold: Int[np.ndarray, "rows"]) -> tuple[list[Block
 
 
 def measured_discrepancies(block: Block, unknowns: Unknowns) -> Float[np.ndarray, "rows 2"]:
-    """Return measured minus predicted image coordinate (mm) of every image row, whatever the domain of the distortion.
+    """Return measured minus predicted image coordinates (mm) of every image row, whatever the domain of the distortion.
 
-    It is the residual "measured" of `InteriorOrientation`, so that all models are compared by the same numbers.
+    These are the "measured" residuals of `InteriorOrientation`, so all models are compared by the same quantity.
     """
     p = block.image_points
     discrepancies = np.zeros((len(p.image), 2))
@@ -204,11 +204,11 @@ _NAN = float("nan")
 
 
 class Judged(NamedTuple):
-    """Result of a candidate; NaN, and the reason in `problem`, if it could not be adjusted.
+    """Result of a candidate; values are NaN and `problem` is the reason if it could not be adjusted.
 
     `rms_px` and `cv_rms_px` are the RMS length of the image discrepancy (both axes) of adjusted and of omitted image
-    points. `cv_excess` is the excess of the mean square of the latter over that of the best candidate, in standard
-    errors of the differences by image point.
+    points. `cv_excess` is the mean square discrepancy of omitted image points minus the smallest one of all candidates,
+    in standard errors of the differences by image point.
     """
 
     candidate: Candidate
@@ -231,12 +231,12 @@ class Judged(NamedTuple):
 
     @property
     def sigma0(self) -> float:
-        """Sigma0 of residuals of measured coordinates."""
+        """Return sigma0 of residuals of measured coordinates."""
         return float(np.sqrt(self.sum_of_squares / self.redundancy)) if self.redundancy > 0 else _NAN
 
     @property
     def weakest(self) -> Significance | None:
-        """Estimated distortion coefficient with the smallest ratio to its standard deviation."""
+        """Return the estimated distortion coefficient with the smallest ratio to its standard deviation."""
         coefficients = [s for s in self.parameters if s.parameter in self.candidate.free]
         return min(coefficients, key=lambda s: s.ratio, default=None)
 
@@ -244,8 +244,8 @@ class Judged(NamedTuple):
 class ModelChoice(NamedTuple):
     """Results of all candidates, in the order given; `by_bic` and `by_prediction` are names, "" if none converged.
 
-    `by_prediction` is the candidate with fewest parameters whose prediction error is within one standard error of the
-    best.
+    `by_prediction` is the candidate with the fewest parameters whose prediction error is within one standard error of
+    the smallest.
     """
 
     judged: tuple[Judged, ...]
@@ -264,8 +264,8 @@ def model_choice(
 ) -> ModelChoice:
     """Compare candidates (`candidate_of`) for all cameras of `block`; `k` = 0 omits cross-validation.
 
-    c, x_p and y_p keep their priors (`with_candidate`); the coefficients of a candidate are free. Candidates that
-    cannot be adjusted have the reason as `problem`. `report` receives progress.
+    c, x_p and y_p keep their priors (`with_candidate`); the coefficients of a candidate are free. `problem` is the
+    reason if a candidate cannot be adjusted. `report` receives progress.
 
     Raises InputError for unknown or repeated candidates or fewer than two folds, BlockError if no image point can be
     omitted.
@@ -317,7 +317,7 @@ def _judge(candidate: Candidate, adjusted: Adjustment) -> Judged:
 
 
 def _squares_px(block: Block, apart_mm: Float[np.ndarray, "rows 2"]) -> Float[np.ndarray, "rows"]:
-    """Squared lengths of image discrepancies in pixels."""
+    """Return squared lengths of image discrepancies in pixels."""
     pixel = np.array([block.sensors[camera].pixel_mm for camera in block.image_camera])[block.image_points.image]
     return (apart_mm**2).sum(1) / pixel**2
 
@@ -325,7 +325,7 @@ def _squares_px(block: Block, apart_mm: Float[np.ndarray, "rows 2"]) -> Float[np
 def _predicted(
     block: Block, adjusted: Adjustment, fold: np.ndarray, sizes: PaddedSizes, counted: Callable[[int], object]
 ) -> Float[np.ndarray, "left_out"] | None:
-    """Squared prediction errors (px) of all rows that are ever omitted; None if a fold does not converge."""
+    """Return squared prediction errors (px) of all rows that are ever omitted; None if a fold does not converge."""
     if not bool(adjusted.converged):
         return None
     squares = np.full(len(fold), _NAN)
@@ -341,7 +341,7 @@ def _predicted(
 
 
 def _compared(judged: list[Judged], squares: list[np.ndarray | None], n_left_out: int) -> ModelChoice:
-    """Add the results that need all candidates: excess over the best prediction, F tests, and the choice."""
+    """Add the results that need all candidates: excess over the smallest prediction error, F tests, and the choice."""
     means = [float(v.mean()) if v is not None else np.inf for v in squares]
     best = squares[int(np.argmin(means))]
     done = []
@@ -365,7 +365,7 @@ def _compared(judged: list[Judged], squares: list[np.ndarray | None], n_left_out
 
 
 def _f_test(smaller: Judged, larger: Judged) -> tuple[float, float]:
-    """F of the additional coefficients of `larger`, and its p-value if they were all 0."""
+    """Return F of the additional coefficients of `larger`, and its p-value under the hypothesis that all are 0."""
     more = larger.n_parameters - smaller.n_parameters
     if larger.redundancy <= 0 or more <= 0:
         return _NAN, _NAN

@@ -1,10 +1,10 @@
 """Detect steps (jumps) in recorded positions, after a lost fix or a change of base station.
 
-Differences of successive offsets (recorded minus network), in the order of exposures, are tested: a step is an outlier,
+Tests are applied to differences of successive offsets (recorded minus network) in exposure order. A step is an outlier,
 by axis, among all differences. Its test statistic is the deleted residual (Student's t), at a level divided by the
-number of places and axes (Bonferroni). Differences suit white noise and random walk of the receiver: either has
-constant variance. The model has everything else that changes offsets: the similarity of the network to the positions,
-which would absorb a step, a bend of the network in height, and a delay or lever arm, which rotates with the flight.
+number of candidates and axes (Bonferroni). Differences have constant variance for white noise and for a random walk of
+the receiver. The model contains all other changes of offsets: the similarity of the network to the positions, which
+would absorb a step, a bend of the network in height, and a delay or lever arm, which rotates with the flight.
 """
 
 import dataclasses
@@ -20,15 +20,16 @@ from jaxphoto.georeferencing import StripBias
 from jaxphoto.unknowns import FIXED, FREE
 
 _STEP_LEVEL = 0.03
-# More indicate another systematic effect.
+# Maximum number of steps; more indicate another systematic effect.
 _MOST = 3
-# Minimum number of photographs on either side; fewer are single outliers.
+# Minimum number of photographs on either side of a step; fewer are single outliers.
 _LEAST = 3
 # Minimum degrees of freedom per axis.
 _LEAST_FREE = 5
-# Maximum ratio of a deviation from the local median to the scatter; scale of the median absolute deviation.
+# Maximum ratio of a deviation from the local median to the scatter; ratio of the standard deviation of a normal
+# distribution to its median absolute deviation.
 _ISOLATED, _MAD = 6.0, 1.4826
-# Columns of the bend in the model.
+# Indices of the model columns that describe the bend.
 _BEND = (4, 5, 6)
 
 
@@ -45,8 +46,8 @@ def detect_steps(
 ) -> list[PositionStep]:
     """Detect steps of `offsets_m` (recorded minus network: east, north, up) of ordered photographs at positions `at_m`.
 
-    Steps of at most `least_m` on every axis are ignored: the positions' standard deviations allow them. Returns none if
-    there are more than three.
+    Steps of at most `least_m` on every axis are ignored: they are within the standard deviations of the positions.
+    Returns no steps if there are more than three.
     """
     valid = np.flatnonzero(~_isolated(offsets_m))
     y, model = offsets_m[valid], _model(at_m[valid])
@@ -61,7 +62,7 @@ def detect_steps(
 
 
 def _model(at: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 u"]:
-    """Design matrix of offsets without steps; no shift, which differences do not contain."""
+    """Return the design matrix of offsets without steps. It has no shift, which cancels in differences."""
     p = at - at.mean(axis=0)
     x, y, z = (p / max(float(np.abs(p).max()), 1e-9)).T
     o = np.zeros(len(p))
@@ -78,10 +79,10 @@ def _model(at: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 u"]:
 def _most_significant(
     y: np.ndarray, model: np.ndarray, apart: np.ndarray, places: list[int], least_m: np.ndarray
 ) -> int | None:
-    """Return the most significant place other than `known`; None if none is significant."""
-    # Place k is the difference between photographs k - 1 and k; known steps are excluded.
+    """Return the index of the most significant step not yet in `places`; None if none is significant."""
+    # Index k is the difference between photographs k - 1 and k; exclude known steps.
     place = np.setdiff1d(np.arange(1, len(y)), places)
-    # The standard deviation of a random walk increases with the number of omitted photographs.
+    # The standard deviation of a random walk increases with the number of skipped photographs.
     wide = np.sqrt(apart[place - 1])[:, None]
     d, u = np.diff(y, axis=0)[place - 1] / wide, np.diff(model, axis=0)[place - 1] / wide[..., None]
     n, free = len(place), len(place) - u.shape[2] / 3 - 1
@@ -94,7 +95,7 @@ def _most_significant(
         left = ((d / scale).ravel() - basis @ (basis.T @ (d / scale).ravel())).reshape(n, 3)
         lever = 1 - np.sum(basis**2, axis=1).reshape(n, 3)
         scale = scale * np.maximum(np.sqrt(np.sum(left**2, axis=0) / np.sum(lever, axis=0)), 1e-9)
-    # These scales standardise each axis; the deleted variance is smaller.
+    # The scales standardise each axis; the deleted variance is smaller.
     known_well = lever > 0.1
     jump = np.where(known_well, left / np.maximum(lever, 0.1), 0.0)
     squares = np.sum(left**2, axis=0) - left * jump
@@ -106,10 +107,11 @@ def _most_significant(
 
 
 def _step_sizes(y: np.ndarray, model: np.ndarray, places: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate the steps at `places` and their standard deviations, from the mean offsets before and after them.
+    """Estimate the steps at indices `places` and their standard deviations, from the mean offsets before and after
+    them.
 
-    First-order autoregressive errors are allowed for. The bend is omitted: few strips determine it as poorly as the
-    steps.
+    Errors are modelled as a first-order autoregressive process. The bend is omitted: with few strips it is as poorly
+    determined as the steps.
     """
     n, k = len(y), len(places)
     model = np.delete(model, _BEND, axis=2)
@@ -141,7 +143,7 @@ def _isolated(offsets: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
 
 
 class PositionParts(NamedTuple):
-    """Part of each photograph with a position."""
+    """Assignment of each photograph with a position to a part."""
 
     part: Int[np.ndarray, "n"]
     shift_m: Float[np.ndarray, "parts 3"]
@@ -152,7 +154,7 @@ class PositionParts(NamedTuple):
 
     @property
     def off_m(self) -> Float[np.ndarray, "n 3"]:
-        """Shift of each position."""
+        """Return the shift of each position."""
         return self.shift_m[self.part]
 
 
@@ -163,7 +165,7 @@ def position_parts(
     at_m: Float[np.ndarray, "n 3"],
     least_m: Float[np.ndarray, "3"],
 ) -> PositionParts:
-    """Divide photographs `names` at steps of their positions; `order` contains these names; see `detect_steps`."""
+    """Divide photographs `names` at steps of their positions (`detect_steps`); `order` contains these names."""
     rank = {name: k for k, name in enumerate(order)}
     turn = np.array(sorted(range(len(names)), key=lambda k: rank.get(names[k], k)), int)
     steps = detect_steps(offsets_m[turn], at_m[turn], least_m)
@@ -184,7 +186,7 @@ def position_parts(
 
 
 def with_part_shifts(block: Block, parts: PositionParts, image: Int[np.ndarray, "n"]) -> Block:
-    """Estimate one shift per part, as a strip, except for the reference part; `image` are the images of `parts`."""
+    """Estimate one shift per part except the reference part, as for strips; `image` contains the images of `parts`."""
     if not parts.sentences:
         return block
     shifts = {f"from_{parts.first[k]}": v for k, v in enumerate(parts.shift_m) if v.any()}

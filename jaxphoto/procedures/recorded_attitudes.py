@@ -1,11 +1,12 @@
 """Rotation of a network by recorded attitudes, and attitudes as observations.
 
 Each photograph gives the rotation from network to map: the product of its recorded and its oriented attitude. The
-average determines what the positions of a single strip do not: the rotation about its line. It contains the common
-error of all attitudes (zero of a gimbal, mounting); as observations they have a boresight with a prior of that size.
+average determines the rotation about the line of a single strip, which positions do not determine. It contains the
+common error of all attitudes (zero of a gimbal, mounting). As observations, attitudes therefore have a boresight with a
+prior of that size.
 
-Pictures turned by software in steps of 90 degrees do not agree with the attitudes, which are those of the sensor.
-Positions reveal it: with unchanged attitudes, the network would run across its own flight line, or backwards.
+Recorded attitudes refer to the sensor and contradict pictures that software rotated in steps of 90 degrees. Positions
+reveal such rotations: with unchanged attitudes, the network would be perpendicular or opposite to its flight line.
 """
 
 import dataclasses
@@ -28,22 +29,22 @@ from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 from jaxphoto.unknowns import FIXED, Weighted
 
 BORESIGHT_DEG = (2.0, 2.0, 2.0)
-"""Standard deviation of the common error of the attitudes of a flight, about the camera's axes: gimbal or mounting, and
-declination of a compass.
+"""Standard deviations (degrees) of the common error of the attitudes of a flight, about the camera's axes: gimbal or
+mounting, and declination of a compass.
 """
-# Maximum ratio of a deviation to the median, and minimum of that limit.
+# Maximum ratio of a deviation to the median deviation; minimum of this limit (degrees).
 _BEYOND, _LEAST_DEG = 4.0, 5.0
-# Median deviation above which attitudes are contradictory.
+# Median deviation (degrees) above which attitudes are contradictory.
 _CONTRADICT_DEG = 15.0
-# Cosine between directions in the rotated network and those of positions: on one line, to 20 degrees; not on it, beyond
-# 60.
+# Minimum cosine between directions in the rotated network and of positions: after a quarter turn of the pictures (20
+# degrees), without it (60 degrees).
 _SAME_LINE, _OTHER_LINE = 0.94, 0.5
-# Maximum median relative error of distances for positions to determine directions; for fewer positions than the second,
-# only pairs apart by this number of standard deviations count.
+# Maximum median relative error of distances for positions to determine directions; number of positions below which only
+# distant pairs are used; minimum distance of these in standard deviations.
 _TELLING, _FEW, _APART = 0.1, 6, 3.0
-# Maximum number of photographs compared with one another, as memory increases with its square.
+# Maximum number of photographs compared pairwise, as memory increases with its square.
 _MOST = 500
-# Name of a mount that a block folder applies to all cameras.
+# Name of the mount that a block folder applies to all cameras.
 _MOUNT = "default"
 
 
@@ -54,16 +55,18 @@ class RecordedRotation(NamedTuple):
     """Images of the block whose attitudes agree."""
     local_from_camera: Float[np.ndarray, "n 3 3"]
     sigma_rad: Float[np.ndarray, "n 3"]
-    """Of roll, pitch, yaw."""
+    """Standard deviations of roll, pitch, yaw."""
     turn: Float[np.ndarray, "3 3"]
-    """Rotation from the network's to the local frame."""
+    """Rotation from the network frame to the local frame."""
     turn_sigma_rad: float
-    """Standard deviation about a level axis, including the boresight."""
+    """Standard deviation of the rotation about a horizontal axis, including the boresight."""
     scatter_rad: float
     """RMS deviation of single attitudes from `turn`."""
     left_out: tuple[str, ...]
     quarters: int = 0
-    """Clockwise quarter turns of the pictures relative to the attitudes of their files; applied to those here."""
+    """Clockwise quarter turns of the pictures relative to the attitudes in their files; already applied to
+    `local_from_camera`.
+    """
 
 
 def recorded_rotation(
@@ -73,9 +76,10 @@ def recorded_rotation(
     sigma_m: Mapping[str, Float[np.ndarray, "3"]],
     frame: MapFrame,
 ) -> RecordedRotation | str | None:
-    """Rotation by the `attitudes` of images that also have `places` (longitude, latitude, height, +- `sigma_m`).
+    """Estimate the rotation from the `attitudes` of images that also have `places` (longitude, latitude, height, +-
+    `sigma_m`).
 
-    None without attitudes; a message if they contradict one another or the positions.
+    Return None without attitudes, and a message if they contradict each other or the positions.
     """
     usable = [(k, name, a) for k, name in enumerate(block.images) if name in places and (a := attitudes.get(name))]
     if not usable:
@@ -101,12 +105,12 @@ def recorded_rotation(
 def _rotation_of(
     block: Block, usable: list[tuple[int, str, CameraAttitude]], attitude: Float[np.ndarray, "n 3 3"]
 ) -> RecordedRotation | str:
-    """Rotation by attitudes `own` (local from camera) of the images `known`; a message if they are contradictory."""
+    """Return the rotation by attitudes (local from camera) of the `usable` images; a message if they contradict."""
     image = np.array([k for k, _, _ in usable])
     rotations = attitude @ np.asarray(block.start.unknowns.exterior.camera_from_object, float)[image]
     sigma = np.deg2rad([a.sigma_deg for _, _, a in usable])
     inlier, deviation = np.ones(len(rotations), bool), np.zeros(len(rotations))
-    # The attitude nearest to most, then the average of those near it.
+    # Start at the rotation with the smallest median distance to all others, then average the rotations near it.
     some = rotations[_subset(len(rotations))]
     apart = _angles(np.einsum("nji,mjk->nmik", some, some))
     turn = some[np.argmin(np.median(apart, axis=1))]
@@ -124,12 +128,12 @@ def _rotation_of(
 
 
 def _subset(n: int) -> Int[np.ndarray, "m"]:
-    """Evenly spaced indices of the photographs that are compared."""
+    """Return evenly spaced indices of at most `_MOST` photographs."""
     return np.linspace(0, n - 1, min(n, _MOST)).astype(int)
 
 
 def _clockwise(quarters: int) -> Float[np.ndarray, "3 3"]:
-    """Rotation from the axes of a picture turned clockwise to those of the sensor."""
+    """Return the rotation from the axes of a picture turned clockwise to the sensor axes."""
     return np.linalg.matrix_power(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), quarters)
 
 
@@ -139,7 +143,7 @@ def _cosine(
     sigma: Float[np.ndarray, "n"],
     recorded: RecordedRotation | str,
 ) -> float | None:
-    """Median cosine between directions in the rotated network and on the ground; None if they are undetermined."""
+    """Return the median cosine between directions in the rotated network and on the ground; None if undetermined."""
     some = _subset(len(local))
     one, other = (some[k] for k in np.triu_indices(len(some), 1))
     if isinstance(recorded, str) or not len(one):
@@ -175,7 +179,7 @@ def with_attitudes(block: Block, recorded: RecordedRotation) -> Block:
 
 
 def _angles(matrices: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
-    """Rotation angles (rad), from the chord, which is precise for small ones."""
+    """Return rotation angles (rad), from the chord, which is accurate for small angles."""
     chord = np.linalg.norm(matrices - np.eye(3), axis=(-2, -1))
     return 2 * np.arcsin(np.clip(chord / np.sqrt(8), 0, 1))
 

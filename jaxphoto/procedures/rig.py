@@ -1,4 +1,4 @@
-"""Observe a rig of cameras by photographs of one event."""
+"""Add a rig of cameras to a block with synchronous photographs."""
 
 import dataclasses
 import warnings
@@ -21,14 +21,14 @@ EVENT = "event"
 def with_rig(block: Block, reference: str, place_m: float, turn_rad: float) -> Block:
     """Add a rig of the block's cameras relative to the camera `reference`.
 
-    `Block.partitions["event"]` (a column of images.csv) groups the photographs. The rig is rigid to `place_m` and
-    `turn_rad` between events. Relative orientations start at the medians of the approximate ones, and are free:
-    `block.fix("place")`, `block.weigh("place", 0.005)`. Exposures are assumed simultaneous; `block.free("delay")`
-    estimates delays if the motion is known. The start then contains the distance flown during the delay: weigh a
-    measured position by its value.
+    `Block.partitions["event"]` (a column of images.csv) groups the photographs. The rig is constant between events to
+    `place_m` and `turn_rad` (standard deviations). Relative orientations start at the medians of the approximate
+    values, and are free: `block.fix("place")`, `block.weigh("place", 0.005)`. Exposures are assumed simultaneous;
+    `block.free("delay")` estimates delays if the motion is known. The initial relative position then contains the
+    distance flown during the delay: for a measured position, pass its value to `weigh`.
 
-    Raises InputError without events, if none has an image of `reference`, or a camera has no approximate orientation
-    relative to it. Issues a UserWarning about photographs without event.
+    Raises InputError without events, if no event has an image of `reference`, or if a camera has no approximate
+    orientation relative to it. Issues a UserWarning about photographs without event.
     """
     if EVENT not in block.partitions:
         raise InputError(
@@ -78,9 +78,9 @@ def with_rig(block: Block, reference: str, place_m: float, turn_rad: float) -> B
 def _median_pose(
     block: Block, reference: Int[np.ndarray, "n"], image: Int[np.ndarray, "n"]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Median position (m) and rotation vector (rad) of images relative to their reference, from approximate values.
+    """Return the median position (m) and rotation vector (rad) of images relative to their reference image.
 
-    Rotations are median matrices made orthogonal: rotation vectors near pi may have either sign.
+    Rotations are median matrices, orthogonalised: rotation vectors near pi may have either sign.
     """
     exterior = block.start.unknowns.exterior
     position, rotation = to_numpy(exterior.position), to_numpy(exterior.camera_from_object)

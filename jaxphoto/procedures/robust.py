@@ -1,13 +1,13 @@
 """Robust adjustment, and robust initial solutions of the search for blunders.
 
-`robust` minimises a robust loss in one solution, without rejecting rows. The scale of each group is estimated with the
-unknowns, iteratively: large at first, so the result does not depend on the start, then from the residuals. For
-Student's distribution the degrees of freedom are estimated, too.
+`robust` minimises a robust loss in one solution, without rejecting rows. The scale of each group is re-estimated from
+the residuals in every iteration. It is large at first, so the result does not depend on the initial values. For
+Student's distribution the degrees of freedom are also estimated.
 
-`initial_solutions` yields solutions robust to blunders, the most likely first. Many blunders mask one another in tests
-of single observations but hardly affect a Huber estimate. If no observation set fits (very large errors in an image of
-few points), Tukey's loss ignores them; or control and stations serve as little more than the datum; or all control, or
-all stations, are ignored, as if their file had other units or permuted rows.
+`initial_solutions` yields solutions robust to blunders, the most likely first. Many blunders mask each other in tests
+of single observations but hardly affect a Huber estimate. If the result does not fit (very large errors in an image of
+few points), the next solutions are: Tukey's loss, which ignores such errors; weights of control and stations just
+sufficient for the datum; all control, or all stations, ignored, for files with other units or permuted rows.
 
 Sources: Huber (1981), Robust statistics, chapters 6 and 7; Lange, Little and Taylor (1989), JASA 84.
 """
@@ -44,28 +44,28 @@ from jaxphoto.variants import without_observations
 RowMasks = dict[str, Bool[np.ndarray, "_"]]
 """Mask of rows by observation group."""
 RedundancyBlocks = dict[str, Float[np.ndarray, "_ _ _"]]
-"""By observation group: the redundancy matrix of each row (rows, components, components)."""
-# Median of |N(0, 1)|; minimum number of residuals for a scale of a group of its own.
+"""Redundancy matrices (rows, components, components) by observation group."""
+# Median of |N(0, 1)|; minimum number of residuals for a separate scale of a group.
 _MEDIAN, _ENOUGH = 0.6745, 30
-# Initial scale; largest decrease of a scale in one iteration; relative change at convergence.
+# Initial scale; minimum ratio of a scale to the previous one; maximum relative change at convergence.
 _WIDE, _FALL, _CONVERGED = 1e3, 0.1, 0.02
 _ROUNDS = 20
 
 
 @pretty_repr
 class Robust(NamedTuple):
-    """Result of a robust adjustment: the minimum of the sum of its losses."""
+    """Result of a robust adjustment: the minimum of the sum of the losses."""
 
     unknowns: Unknowns
     converged: bool
     losses: dict[str, AbstractLoss]
-    """By observation group, with the estimated scales."""
+    """Losses by observation group, with the estimated scales."""
     weights: dict[str, Float[np.ndarray, "_"]]
-    """By observation group, one per row: 1 full weight, 0 none."""
+    """Weights by observation group, one per row: 1 full weight, 0 none."""
     at: Adjustment
-    """The block linearised there; residuals and normal equations are those of least squares."""
+    """Block linearised at the result; residuals and normal equations are least-squares quantities."""
     diverged_points: RowMasks
-    """Image points of points that these rows do not determine; not used."""
+    """Image points of points that the observations do not determine; not used."""
 
 
 @outside_transformations
@@ -80,14 +80,14 @@ def robust(
 ) -> Robust:
     """Adjust `block` with `loss` (default Huber) for all observation groups, or one loss per named group.
 
-    The result has no standard deviations: `jaxphoto.snoop(block, loss)` continues from it to an adjustment that has.
-    Raises what `adjust` raises, and BlockError for a group that the block does not have.
+    The result has no standard deviations: `jaxphoto.snoop(block, loss)` continues from it to an adjustment with them.
+    Raises the errors of `adjust`, and BlockError for a group that the block does not have.
     """
     rows = block.named_observations
     loss = Huber() if loss is None else loss
     losses = dict(loss) if isinstance(loss, Mapping) else dict.fromkeys(rows, loss)
     if unknown := [name for name in losses if name not in rows]:
-        raise BlockError(f"the block has no observations {unknown[0]}, only {', '.join(rows)}")
+        raise BlockError(f"unknown observation group {unknown[0]}; use one of {', '.join(rows)}")
     unknowns = start_of(block, report) if start is None else start
     left = {name: np.zeros(len(group), bool) for name, group in rows.items()}
     estimated: dict[str, AbstractLoss] = {name: dataclasses.replace(loss, scale=_WIDE) for name, loss in losses.items()}
@@ -123,9 +123,9 @@ def solve_without_diverged(
 ) -> tuple[Adjustment, Int[np.ndarray, "points"], RowMasks]:
     """Adjust `block` from `unknowns` without the rows `left` and without points that the others do not determine.
 
-    Also returns the numbers of the points kept, and `left` with the image points of the others: blunders may leave a
-    point anywhere along its rays. Raises what `solve` raises, and BlockError if points keep diverging or the adjustment
-    diverges.
+    Also returns the indices of the remaining points, and `left` with the image points of the removed points: a point
+    with blunders may converge anywhere along its rays. Raises the errors of `solve`, and BlockError if points keep
+    diverging or the adjustment diverges.
     """
     rows, left = block.image_points, dict(left)
     for _ in range(_ROUNDS):
@@ -142,7 +142,7 @@ def solve_without_diverged(
             lost = np.flatnonzero(solved.diverged_points)
         if not len(lost):
             return solved, point, left
-        # Restart from `unknowns`: a diverged point has distorted the others.
+        # Restart from `unknowns`: a diverged point has distorted the other unknowns.
         left[rows.group] = left[rows.group] | np.isin(rows.point, point[lost])
     raise BlockError(f"too many object points diverge: {Outcome.ASTRAY.value}")
 
@@ -156,7 +156,7 @@ def _rescale(losses: dict[str, AbstractLoss], at: Adjustment, r: RedundancyBlock
         r_rows = r[name]
         checked = np.linalg.eigvalsh(r_rows)[:, 0] > LEAST_CHECKED
         if isinstance(loss, StudentT) and int(checked.sum()) >= _ENOUGH:
-            # v' R^-1 v has the expectation of the squared error. If the scale was free, too, some residuals would
+            # v' R^-1 v has the expectation of the squared error. Fix the scale: if it was free, some residuals would
             # become zero and the likelihood infinite.
             v, r_rows = np.atleast_2d(at.residuals[name]).T[checked, :, None], r_rows[checked]
             square = (v * np.linalg.solve(r_rows, v)).sum((1, 2)) / float(rescaled[name].scale) ** 2
@@ -167,7 +167,7 @@ def _rescale(losses: dict[str, AbstractLoss], at: Adjustment, r: RedundancyBlock
 
 
 def residual_scales(at: Adjustment, r: RedundancyBlocks) -> dict[str, float]:
-    """Return by group a robust standard deviation of the whitened residuals."""
+    """Return a robust standard deviation of the whitened residuals, by group."""
     scales = {}
     for name, r_rows in r.items():
         diagonal = np.diagonal(r_rows, axis1=1, axis2=2).T
@@ -191,29 +191,29 @@ def select_points(unknowns: Unknowns, point: np.ndarray) -> Unknowns:
 
 
 def restore_points(unknowns: Unknowns, before: Unknowns, point: np.ndarray) -> Unknowns:
-    """Restore all points; dropped ones keep the values they had `before`."""
+    """Restore all points; removed points get their values from `before`."""
     points = np.array(before.points)
     points[point] = to_numpy(unknowns.points)
     return dataclasses.replace(unknowns, points=points)
 
 
-# Huber's constant: residuals up to this number of standard deviations have full weight (95 % efficiency).
+# Maximum residual with full weight, in standard deviations (Huber; 95 % efficiency).
 _HUBER = 1.345
 _ROBUST_STEPS = 10
-# Sigma factors for control and stations that serve as little more than the datum, or are ignored unless nothing else
-# determines the block.
+# Weight factor of control and stations just sufficient for the datum; weight factor that ignores them unless nothing
+# else determines the block.
 _LOOSE, _NOTHING = 1e-4, 1e-12
 _CONVERGED = 0.02
 
 
 class InitialSolution(NamedTuple):
-    """Initial solution of a search."""
+    """Initial solution of the search for blunders."""
 
     at: Adjustment
-    """Whole block, linearised."""
+    """Whole block, linearised at the solution."""
     redundancy: RedundancyBlocks
     left: RowMasks
-    """Initially rejected: image points of diverged points, and ignored groups."""
+    """Initially rejected rows: image points of diverged points, and ignored groups."""
 
 
 def initial_solutions(
@@ -224,7 +224,7 @@ def initial_solutions(
     sizes: PaddedSizes,
     report: Callable[[str], object],
 ) -> Iterator[Callable[[], InitialSolution]]:
-    """Yield initial solutions, to be tried until one fits; with a `loss` only that one. Raises what `adjust` raises."""
+    """Yield initial solutions to try until one fits; with a `loss` only one. Raises the errors of `adjust`."""
 
     def robustly(loss: AbstractLoss) -> InitialSolution:
         begun = robust(block, loss, from_all(), max_steps=max_steps, sizes=sizes, report=report)
@@ -254,9 +254,9 @@ def without_common_errors(
     sizes: PaddedSizes,
     report: Callable[[str], object],
 ) -> Iterator[tuple[RowMasks, Callable[[], InitialSolution]]]:
-    """Return an initial solution without rows that share an error along an axis of their group.
+    """Yield initial solutions without rows that share an error along an axis of their group.
 
-    Other unknowns absorb most of such an error, and then valid rows contradict plausible ones.
+    Other unknowns absorb most of such an error, so valid rows contradict plausible ones.
     """
     tested = systematic_effect_tests(adjusted, np.asarray(covariance(adjusted).shared_sigma))
     for trend in tested:
@@ -290,7 +290,7 @@ def _huber_solution(
     report: Callable[[str], object],
     least: Mapping[str, float | np.ndarray],
 ) -> InitialSolution:
-    """Adjust with weights that decrease with the residual, from `least` on by group, or from 1."""
+    """Adjust with Huber weights. Initial weights are `least` by group; the default is 1."""
     rows, unknowns = block.named_observations, start
     weight = {name: np.broadcast_to(least.get(name, 1.0), len(group)) for name, group in rows.items()}
     least = weight
@@ -323,7 +323,7 @@ def scale_weights(rows: AbstractObservations, weight: Float[np.ndarray, "_"]) ->
 
 
 def _largest_normalised(at: Adjustment, name: str, r: RedundancyBlocks) -> Float[np.ndarray, "_"]:
-    """Return the largest |v| / sqrt(r) of each row; very small if hardly anything checks it."""
+    """Return the largest |v| / sqrt(r) of each row; 0 if its redundancy is negligible."""
     diagonal = np.diagonal(r[name], axis1=1, axis2=2).T
     checked = diagonal > LEAST_CHECKED
     size = np.abs(np.atleast_2d(at.residuals[name])) / np.sqrt(np.where(checked, diagonal, 1.0))

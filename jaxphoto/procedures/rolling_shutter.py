@@ -1,7 +1,8 @@
 """Rolling shutter of a block with exposure times: velocities from neighbouring photographs.
 
-Velocities are slopes of straight lines through the positions of a photograph and its neighbours in the same straight
-run; errors of positions and times give their standard deviations. Rotation rates are unknowns with expectation zero.
+Velocities are slopes of straight lines through the positions of a photograph and its neighbours on the same straight
+flight line. Errors of positions and times give their standard deviations. Rotation rates are unknowns with expectation
+zero.
 """
 
 import dataclasses
@@ -19,21 +20,21 @@ from jaxphoto.unknowns import FREE, Prior, Unknowns, Weighted
 Moment = tuple[float, float]
 """Exposure time (s, any origin) and its resolution (s)."""
 RATE_DEG_PER_S = 0.5
-"""Standard deviation of rotation rates of a camera in a gimbal (assumed)."""
-# Maximum number of neighbours on either side in a line, which turns by less and has no gap.
+"""Standard deviation (degrees/s) of rotation rates of a camera in a gimbal (assumed)."""
+# Maximum number of neighbours per side on a straight flight line; maximum change of direction (degrees).
 _NEIGHBOURS, _STRAIGHT_DEG = 2, 20.0
 GAP = 3.0
-"""Ratio to the usual interval between photographs above which an interval is a gap."""
+"""Ratio of an interval to the usual interval between photographs above which it is a gap."""
 NEIGHBOUR_M = 0.05
-"""Relative standard deviation of adjusted positions of neighbours (m, assumed)."""
-# Relative change of a drone's speed between photographs, and minimum standard deviation of a velocity.
+"""Standard deviation (m) of adjusted positions relative to neighbours (assumed)."""
+# Relative standard deviation of a drone's speed between photographs; minimum standard deviation of a velocity (m/s).
 _UNSTEADY, _LEAST_M_PER_S = 0.03, 0.1
 # Minimum fraction of photographs with a velocity.
 _ENOUGH = 0.5
 
 
 def usual_interval(time: Float[np.ndarray, "images"]) -> float:
-    """Median interval (s) between ordered times, infinite without any.
+    """Return the median interval (s) between ordered times, infinite without any.
 
     Zeros are excluded: exposures within the resolution of the clock have the same time.
     """
@@ -47,7 +48,7 @@ class Velocities(NamedTuple):
     velocity: Float[np.ndarray, "images 3"]
     sigma: Float[np.ndarray, "images 3"]
     known: Bool[np.ndarray, "images"]
-    """False without neighbours; then the velocity is zero and its standard deviation the usual speed."""
+    """False without neighbours; the velocity is then zero and its standard deviation the usual speed."""
 
 
 def velocities(
@@ -56,7 +57,7 @@ def velocities(
     step: Float[np.ndarray, "images"],
     sigma_m: float,
 ) -> Velocities:
-    """Velocities (m/s) from positions (m, with `sigma_m`) and times (s, with resolution `step`; NaN: unknown)."""
+    """Compute velocities (m/s) from positions (m, with `sigma_m`) and times (s, resolution `step`; NaN: unknown)."""
     n = len(time)
     velocity, sigma, has_velocity = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, bool)
     order = [int(k) for k in np.argsort(time, kind="stable") if np.isfinite(time[k])]
@@ -64,7 +65,7 @@ def velocities(
     for rank, k in enumerate(order):
         before, after = (_run(order, rank, side, position, time, GAP * usual) for side in (-1, 1))
         if before and after and not _straight(position[k] - position[before[0]], position[after[0]] - position[k]):
-            # End of a strip: it belongs to the side whose next photograph is nearer in time.
+            # At the end of a strip, use only the side whose next photograph is nearer in time.
             nearer = time[k] - time[before[0]] <= time[after[0]] - time[k]
             before, after = (before, []) if nearer else ([], after)
         run = [k, *before, *after]
@@ -74,7 +75,7 @@ def velocities(
             continue
         velocity[k] = t @ position[run] / spread
         speed = float(np.linalg.norm(velocity[k]))
-        # The uniform error of a time within its resolution is a position error.
+        # Time quantisation (uniform within the resolution) acts as a position error.
         noise = np.hypot(sigma_m, velocity[k] * float(step[run].mean()) / np.sqrt(12))
         sigma[k] = np.sqrt(noise**2 / spread + (_UNSTEADY * speed) ** 2 + _LEAST_M_PER_S**2)
         has_velocity[k] = True
@@ -84,7 +85,7 @@ def velocities(
 
 
 def _run(order: list[int], rank: int, side: int, position: np.ndarray, time: np.ndarray, gap: float) -> list[int]:
-    """Neighbours on one side within the straight run, the nearest first."""
+    """Return the neighbours on one side on the same straight flight line, the nearest first."""
     run, last, ahead = [], order[rank], None
     for k in order[rank + 1 : rank + 1 + _NEIGHBOURS] if side > 0 else order[:rank][::-1][:_NEIGHBOURS]:
         way = position[k] - position[last]
@@ -96,7 +97,7 @@ def _run(order: list[int], rank: int, side: int, position: np.ndarray, time: np.
 
 
 def _straight(one: np.ndarray, other: np.ndarray) -> bool:
-    """Return True if two steps have the same direction in plan."""
+    """Return True if two displacements have nearly the same horizontal direction."""
     a, b = one[:2], other[:2]
     return bool(a @ b > np.cos(np.radians(_STRAIGHT_DEG)) * np.hypot(*a) * np.hypot(*b))
 
@@ -110,8 +111,9 @@ def with_rolling_shutter(
 ) -> Block:
     """Add a rolling shutter to every camera, with a readout time that starts at zero.
 
-    `known` are the positions (with `sigma_m` relative to neighbours) and orientations that define the motions and the
-    start; None: those of the block. `taken` is by image. Raises InputError if too few photographs have a velocity.
+    `known` contains the positions (with `sigma_m` relative to neighbours) and orientations that define the motions and
+    the initial values; None: taken from the block. `taken` is by image. Raises InputError if too few photographs have a
+    velocity.
     """
     exterior = (block.start.unknowns if known is None else known).exterior
     moments = np.array([taken.get(name, (np.nan, 1.0)) for name in block.images]).reshape(-1, 2)

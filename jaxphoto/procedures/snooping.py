@@ -1,17 +1,17 @@
-"""Detect and reject blunders: robust start, then iterated data snooping.
+"""Detect and reject blunders: robust initial solution, then iterated data snooping.
 
-1. The block is adjusted with Huber weights, iteratively: many blunders mask one another in tests of single observations
-but hardly affect a robust estimate. If the result does not fit (very large errors in an image of few points, a file in
-other units), the search restarts from another solution (`robust.initial_solutions`).
+1. Adjust the block with Huber weights, iteratively: many blunders mask each other in tests of single observations but
+hardly affect a robust estimate. If the result does not fit (very large errors in an image of few points, a file in
+other units), restart from another solution (`robust.initial_solutions`).
 
-2. Contradicting rows are rejected and the block is adjusted without them. Then, iteratively: each rejected row is
-predicted by the others and reinstated if it agrees; of the others, the worst of each point is rejected if it
-contradicts (Baarda's data snooping), until nothing changes.
+2. Reject contradicting rows and adjust without them. Then, iteratively: each rejected row is predicted by the others
+and reinstated if it agrees; the most significant row of each point is rejected if it contradicts (Baarda's data
+snooping). Stop when no row changes.
 
-3. Control points or stations with exchanged coordinates, and image points of one image with exchanged names, are
-corrected (`exchanges`).
+3. Correct exchanged coordinates of control points or stations, and exchanged names of image points in one image
+(`exchanges`).
 
-4. Finally, points rejected while blunders still distorted the images are reinstated if their rays intersect.
+4. Reinstate points that were rejected while blunders distorted the images, if their rays intersect.
 
 Sources: Baarda (1968), A testing procedure for use in geodetic networks; Huber (1981), Robust statistics.
 """
@@ -60,15 +60,15 @@ from jaxphoto.tracing import outside_transformations
 from jaxphoto.unknowns import Unknowns
 
 _MAX_ITERATIONS = 20
-# Maximum sigma0 of a solution that fits: a larger one is not a matter of weights (docs/trust.md).
+# Maximum sigma0 of a solution that fits; larger values are not explained by weights (docs/trust.md).
 _FITS = 3.0
-# Minimum fraction of image points kept.
+# Minimum fraction of image points that remain.
 _LEAST_LEFT = 0.5
 SEVERAL = 4
-"""Minimum number of rejected rows, and `_SINGLE` minimum fraction of a group, that single errors do not explain."""
+"""Minimum number of rejected rows of a group that single errors do not explain. `_SINGLE` is the minimum fraction."""
 _SINGLE = 1 / 3
-# A blunder inflates neighbouring residuals: rows below this fraction of the largest are not rejected in the same
-# iteration.
+# Ratio to the largest normalised residual below which a row is not rejected in the same iteration: blunders inflate
+# neighbouring residuals.
 _BESIDE_THE_WORST = 0.5
 
 
@@ -76,8 +76,8 @@ _BESIDE_THE_WORST = 0.5
 class Snooped(NamedTuple):
     """Block adjusted without its blunders.
 
-    `left_out` are rejected rows of the original block, worst first: the others contradict them by `error` +- `sigma`.
-    `exchanged` are the exchanges that were corrected.
+    `left_out` contains the rejected rows of the original block, worst first: they differ by `error` +- `sigma` from the
+    prediction by the others. `exchanged` contains the corrected exchanges.
     """
 
     adjusted: Adjustment
@@ -99,8 +99,8 @@ def snoop(
     """Adjust `block` and reject observations that contradict the others.
 
     All observations are tested (image points, control, stations and further kinds), but not priors. A row is rejected
-    as a whole: both coordinates of an image point, one coordinate of a control point. With `loss` the search starts
-    from that robust adjustment (`jaxphoto.robust`). Raises what `adjust` raises.
+    completely: both coordinates of an image point, one coordinate of a control point. With `loss` the search starts
+    from that robust adjustment (`jaxphoto.robust`). Raises the errors of `adjust`.
     """
     sizes = common_sizes([block])
     best: Snooped | None = None
@@ -123,7 +123,7 @@ def snoop(
         if best is not None and _fits(best) and not mostly_rejected(best, block) and not rejected_images(best, block):
             break
     if best is None:
-        # What all observations together cannot determine is reported as in an adjustment.
+        # Unknowns that all observations together cannot determine are reported as in an adjustment.
         solve(block, start_of(block, report) if start is None else start, block.priors, max_steps, sizes)
         raise BlockError(
             "too many observations contradict the others: check names, units, axes and the order of rows, and adjust "
@@ -137,9 +137,7 @@ def snoop(
 
 
 def mostly_rejected(snooped: Snooped, block: Block) -> dict[str, dict[str, tuple[int, int]]]:
-    """Return (rejected, all) by group (except image points) and axis, where more are rejected than single errors
-    explain.
-    """
+    """Count (rejected, all) rows by group (except image points) and axis, if single errors do not explain them."""
     groups: dict[str, dict[str, tuple[int, int]]] = {}
     for name, rows in block.named_observations.items():
         left = [s for s in snooped.left_out if s.group == name]
@@ -154,7 +152,7 @@ def mostly_rejected(snooped: Snooped, block: Block) -> dict[str, dict[str, tuple
 
 
 def rejected_images(snooped: Snooped, block: Block) -> dict[int, tuple[int, int]]:
-    """Return (rejected, all) image points of images of which more are rejected than single errors explain."""
+    """Count (rejected, all) image points of images if single errors do not explain the number."""
     rows = block.image_points
     out = np.isin(np.array(block.points, object)[rows.point], snooped.points)
     out[[s.row for s in snooped.left_out if s.group == rows.group]] = True
@@ -169,13 +167,13 @@ def _fits(snooped: Snooped) -> bool:
 
 
 def _improves(one: Snooped, other: Snooped, out: RowMasks) -> bool:
-    """Return True if `one` fits, with smaller sigma0, and rejects no more rows outside of `out`."""
+    """Return True if `one` fits, has smaller sigma0, and does not reject more rows outside of `out`."""
     of_one, of_other = (sum(not (s.group in out and out[s.group][s.row]) for s in s.left_out) for s in (one, other))
     return _fits(one) and bool(one.adjusted.sigma0 < other.adjusted.sigma0) and of_one <= of_other
 
 
 def _better(one: Snooped, other: Snooped) -> bool:
-    """Return True if only `one` fits or it rejects fewer rows; if neither fits, if its sigma0 is smaller."""
+    """Return True if `one` is better: fewer rejected rows if both fit, otherwise smaller sigma0."""
     if _fits(one) and _fits(other):
         return len(one.left_out) < len(other.left_out)
     return bool(one.adjusted.sigma0 < other.adjusted.sigma0)
@@ -184,7 +182,7 @@ def _better(one: Snooped, other: Snooped) -> bool:
 def _snooped(
     block: Block, begun: InitialSolution, max_steps: int, sizes: PaddedSizes, report: Callable[[str], object]
 ) -> Snooped:
-    """Search from a robust solution."""
+    """Search for blunders from a robust initial solution."""
     at, r, flown = begun
     scale = residual_scales(at, r)
     worst = _largest_per_point(
@@ -192,12 +190,12 @@ def _snooped(
     )
     left = {name: flown[name] | worst[name] for name in worst}
     tried: list[RowMasks] = []
-    # Before any rejection: wrong coordinates distort images, and valid rows would be rejected with them.
+    # Correct exchanges before any rejection: wrong coordinates distort images, so valid rows would be rejected.
     lost = np.unique(block.image_points.point[flown[block.image_points.group]])
     done, at = coordinate_exchanges(at, left, lost, sizes)
     for exchange in done:
         block, left = exchanged(block, left, exchange)
-    # A repeated exchange is undone, and would be undone again.
+    # Exclude repeated exchanges: they would be undone in each iteration.
     tried_exchanges = {(e.group, e.rows) for e in done}
     returned, again = set[int](), set[tuple]()
     while True:
@@ -212,14 +210,14 @@ def _snooped(
             (block, left), at = exchanged(block, left, exchange), placed
             done.append(exchange)
         if new:
-            # The block has changed: rejections that led nowhere may succeed now.
+            # The block has changed: earlier sets of rejections may succeed now.
             tried.clear()
             continue
         rejections = _next_rejections(adjusted, at, left, point, sigma0, r)
         still_there = _equal_masks(rejections, left)
         if still_there or len(tried) == _MAX_ITERATIONS or any(_equal_masks(rejections, old) for old in tried):
-            # Exchanges that do not fit, or are unnecessary, are undone. If nothing fits, all are undone and may be
-            # tried once more.
+            # Undo exchanges that do not fit or are unnecessary. If the solution does not fit, undo all and allow one
+            # more attempt.
             fits = bool(adjusted.converged) and sigma0 <= _FITS
             wrong = [not fits or not _is_necessary(at, left, e, sigma0) for e in done]
             if undone := with_dependants(done, wrong):
@@ -230,7 +228,7 @@ def _snooped(
                 tried_exchanges, again = tried_exchanges - (went - again), again | went
                 tried.clear()
                 continue
-            # Points rejected while blunders still distorted the images.
+            # Points rejected while blunders distorted the images.
             back = {p: place for p, place in intersecting_points(at, left, lost, sigma0).items() if p not in returned}
             if not still_there or not back:
                 break
@@ -247,9 +245,9 @@ def _snooped(
 def _new_exchanges(
     at: Adjustment, left: RowMasks, lost: np.ndarray, sigma0: float, r: RedundancyBlocks, sizes: PaddedSizes, tried: set
 ) -> tuple[list[Exchange], Adjustment]:
-    """Return exchanges that are not `known`, which is extended, and `at` with the corrected positions.
+    """Return exchanges that are not in `tried`, which is extended, and `at` with the corrected positions.
 
-    Coordinates first: wrong ones distort images, in which names then seem exchanged.
+    Coordinates are tested first: wrong ones distort images, so names appear to be exchanged.
     """
     for find in (
         lambda: coordinate_exchanges(at, left, lost, sizes),
@@ -263,7 +261,7 @@ def _new_exchanges(
 
 
 def _is_necessary(at: Adjustment, left: RowMasks, exchange: Exchange, sigma0: float) -> bool:
-    """Return True if the exchanged rows fit, and would not without the exchange."""
+    """Return True if the exchanged rows fit, and would not fit without the exchange."""
     p, rows = at.block.image_points, np.setdiff1d(np.ravel(exchange.rows), exchange.out)
     if left[exchange.group][rows].mean() >= 0.5:
         return False
@@ -278,11 +276,11 @@ def _is_necessary(at: Adjustment, left: RowMasks, exchange: Exchange, sigma0: fl
 def _next_rejections(
     adjusted: Adjustment, at: Adjustment, left: RowMasks, point: np.ndarray, sigma0: float, r: RedundancyBlocks
 ) -> RowMasks:
-    """Return the next rejections; `adjusted` excludes `left`, `at` is the whole block linearised there."""
+    """Return the next rejections. `adjusted` excludes `left`; `at` is the whole block linearised at its solution."""
     stays = _rows_of_points(at.block, point)
     wrong = {name: size > sigma0 for name, size in blunder_statistics(at, r, predicted=True).items()}
     reconsidered = {name: out & (wrong[name] | ~stays[name]) for name, out in left.items()}
-    # `adjusted` has no rows of a group that is rejected entirely.
+    # `adjusted` has no rows of a group that is rejected completely.
     sizes = {name: np.zeros(len(out)) for name, out in left.items()}
     for name, size in blunder_statistics(adjusted, redundancy_blocks(adjusted)).items():
         sizes[name][~left[name] & stays[name]] = size / sigma0
@@ -291,7 +289,7 @@ def _next_rejections(
 
 
 def _largest_per_point(block: Block, sizes: dict[str, np.ndarray], limit: float) -> RowMasks:
-    """Mark the row with the largest size above `limit` of each point; of rows without point, of each image."""
+    """Mark the row with the largest size above `limit` of each point; for rows without point, of each image."""
     groups = block.named_observations
     worst: dict[object, tuple[float, str, int]] = {}
     for name, rows in groups.items():
@@ -307,7 +305,7 @@ def _largest_per_point(block: Block, sizes: dict[str, np.ndarray], limit: float)
 
 
 def _rows_of_points(block: Block, point: np.ndarray) -> RowMasks:
-    """Mark the rows all of whose points are kept."""
+    """Mark the rows whose points are all in `point`."""
     masks = {}
     for name, rows in block.named_observations.items():
         masks[name] = np.ones(len(rows), bool)
@@ -324,11 +322,11 @@ def _equal_masks(one: RowMasks, other: RowMasks) -> bool:
 def _suspects(
     at: Adjustment, left: RowMasks, stays: RowMasks, r: RedundancyBlocks, sigma0: float
 ) -> tuple[Suspect, ...]:
-    """Return the rejected rows of kept points, each with its most contradicting component."""
+    """Return the rejected rows of adjusted points, each with its most significant component."""
     block, suspects = at.block, []
     for name, rows in block.named_observations.items():
         v = np.atleast_2d(at.residuals[name])
-        # Unchecked components have redundancy zero, or less by rounding.
+        # The redundancy of unchecked components is zero, or negative by rounding.
         root = np.sqrt(np.maximum(np.diagonal(r[name], axis1=1, axis2=2).T, UNCHECKED))
         error, sigma = np.atleast_2d(rows.physical(v)), np.atleast_2d(np.asarray(rows.sigmas).T)
         out = np.flatnonzero(left[name] & stays[name])
@@ -348,11 +346,12 @@ _WEAK = 1000.0
 def blunder_statistics(
     at: Adjustment, r: RedundancyBlocks, predicted: bool = False
 ) -> dict[str, Float[np.ndarray, "_"]]:
-    """Return, for each row, sqrt(v' R^-1 v) over the root of its chi-square quantile: above 1 it is a blunder.
+    """Return the test statistic of each row: sqrt(v' R^-1 v) over the root of its chi-square quantile; blunders exceed
+    1.
 
-    Or sqrt(v' R v), for rejected rows, which the others `predict`. Only directions that the others check count: a point
-    of two rays is checked across their epipolar plane, not along it. A prediction hardly checks what is hardly
-    determined, but rounding does not enter.
+    For rejected rows, `predicted` by the others, it uses sqrt(v' R v). Only directions that the other observations
+    check are tested: a two-ray point is checked across the epipolar plane, not along it. The limit on the redundancy
+    excludes rounding errors.
     """
     axes = {name: np.linalg.eigh(matrix) for name, matrix in r.items()}
     least = UNCHECKED if predicted else LEAST_CHECKED
@@ -369,14 +368,15 @@ def blunder_statistics(
 
 
 def predicted_redundancy(at: Adjustment, left: RowMasks, sizes: PaddedSizes) -> RedundancyBlocks:
-    """Return `redundancy_blocks`, of rejected rows as if each was added to the others, which then predict it."""
+    """Return `redundancy_blocks`; for rejected rows, of the block to which that row alone is added."""
     rows = at.block.named_observations
     weak = {name: scale_weights(group, np.where(left[name], _WEAK**-2, 1.0)) for name, group in rows.items()}
     r = redundancy_blocks(linearise(at.block.with_observations(weak), at.unknowns, at.block.priors, sizes))
     for name, out in left.items():
         if out.any():
             values, vectors = np.linalg.eigh(r[name][out])
-            # 1 / r = 1 + q, for a prediction of the variance q, relative to the row's own of 1; here that is _WEAK^2.
+            # 1 / r = 1 + q, with q = variance of the prediction / variance of the row. The row's variance is _WEAK^2
+            # here, normally 1.
             values = np.clip(values, 0.0, 1.0)
             values = values / (values + _WEAK**2 * (1 - values))
             r[name] = r[name].copy()

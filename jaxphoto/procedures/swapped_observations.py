@@ -1,12 +1,13 @@
 """Detect exchanged observations: names of two image points of an image, coordinates of control points or stations.
 
-Names: the other rays of a point predict its image. A point with two rays, one of which is wrong, is lost; with the
-measurement of the other its rays must intersect, in front of the cameras and at the distance of other points. If both
-points have their two rays in the same two images, the image of the exchange is ambiguous; the points are the same.
+Names: the other rays of a point predict its image. A point with two rays, one of which is wrong, is lost. With the
+measurement of the other point its rays must intersect, in front of the cameras and at the distance of other points. If
+both points have their two rays in the same two images, the image of the exchange is ambiguous; the points are the same.
 
 Coordinates (two, or a file shifted by a row): the images determine the position of each object, a point from its rays,
-an image from its points. An object at another's stated position has that other's coordinates. Alternatively, the names
-of the points were exchanged in all images: no measurement distinguishes these, and the camera is the same.
+an image from its points. If an object is at the stated position of another, the coordinates are exchanged.
+Alternatively, the names of the points were exchanged in all images: no measurement distinguishes these cases, and the
+camera is the same.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -38,22 +39,24 @@ class Exchange(NamedTuple):
 
     group: str
     rows: tuple[tuple[int, ...], ...]
-    """Two or more each: the first receives the observation of the second, and so on; the last that of the first."""
+    """Cycles of two or more rows: the first receives the observation of the second, and so on; the last that of the
+    first.
+    """
     words: str
     """Message such as "points 12 and 31 of image A2 had each other's name"."""
     back: dict[str, tuple[int, ...]]
-    """Rows that are accepted again after the exchange, by group."""
+    """Rows that are accepted after the exchange, by group."""
     out: tuple[int, ...] = ()
-    """Rows of the group that belong to none of them, and are removed."""
+    """Rows of the group whose observations belong to no object, and are removed."""
 
     @property
     def undone(self) -> "Exchange":
-        """Return the exchange of nothing."""
+        """Return the inverse exchange."""
         return self._replace(rows=tuple(rows[::-1] for rows in self.rows), back={}, out=())
 
 
 def exchanged(block: Block, left: RowMasks, exchange: Exchange) -> tuple[Block, RowMasks]:
-    """Exchange these rows, and accept rows again."""
+    """Exchange the observations of these rows, and reinstate rows."""
     rows = block.named_observations[exchange.group]
     order = np.arange(len(rows))
     for cycle in exchange.rows:
@@ -78,7 +81,7 @@ def with_dependants(done: Sequence[Exchange], wrong: Sequence[bool]) -> list[Exc
 
 
 def with_positions(at: Adjustment, places: Mapping[int, Float[np.ndarray, "3"]]) -> Adjustment:
-    """Return `at` with points at these places (m)."""
+    """Return `at` with points at these positions (m)."""
     points = np.array(to_numpy(at.unknowns.points))
     for point, place in places.items():
         points[point] = place
@@ -88,7 +91,7 @@ def with_positions(at: Adjustment, places: Mapping[int, Float[np.ndarray, "3"]])
 def rays_of(
     at: Adjustment,
 ) -> tuple[Float[np.ndarray, "rows 3"], Float[np.ndarray, "rows 3"], Float[np.ndarray, "rows"]]:
-    """Origin (m) and direction in the object frame of the ray of each image point, and c (mm) of its camera."""
+    """Return origin (m) and direction in the object frame of the ray of each image point, and c (mm) of its camera."""
     block, exterior = at.block, at.unknowns.exterior
     p, measured = block.image_points, to_numpy(block.image_points.xy)
     camera, rays, c = np.array(block.image_camera, object)[p.image], np.zeros((len(p), 3)), np.ones(len(p))
@@ -105,33 +108,34 @@ def _set_rows(left: np.ndarray, rows: tuple[int, ...], out: bool) -> np.ndarray:
     return changed
 
 
-# Maximum ratio of the distance from the other's prediction to the distance of the two image points.
+# Maximum ratio of the distance from the other point's prediction to the distance of the two image points.
 _NEAR = 0.2
-# Maximum ratio of a point's distance to the nearest or farthest other point of the image.
+# Maximum factor by which a point may be nearer than the nearest, or farther than the farthest, other point of the
+# image.
 _DEPTH = 1.5
 
 
 class _Rays(NamedTuple):
-    """Data to judge whether a measurement matches a point."""
+    """Data to test if a measurement matches a point."""
 
     block: Block
     measured: Float[np.ndarray, "rows 2"]
     predicted: Float[np.ndarray, "rows 2"]
-    """Predicted image coordinates of the points of the rows, except lost ones."""
+    """Predicted image coordinates of the points of the rows, except lost points."""
     gone: Bool[np.ndarray, "points"]
     left: Bool[np.ndarray, "rows"]
     origins: Float[np.ndarray, "rows 3"]
     directions: Float[np.ndarray, "rows 3"]
     """Ray directions in the object frame."""
     sigma: Float[np.ndarray, "rows"]
-    """Standard deviation of a ray's direction (rad)."""
+    """Standard deviation of each ray's direction (rad)."""
     depths: Float[np.ndarray, "images 2"]
     """Distances of the nearest and the farthest point of each image (m)."""
     limit: float
-    """Limit of a squared number over its variance."""
+    """Maximum ratio of a squared discrepancy to its variance."""
 
     def partners(self, row: int) -> Int[np.ndarray, "others"]:
-        """Return the other rays of the point of a row: accepted ones, or else all."""
+        """Return the other rays of the point of a row: accepted ones, otherwise all."""
         p = self.block.image_points
         others = np.flatnonzero((p.point == p.point[row]) & (np.arange(len(p)) != row))
         return others[~self.left[others]] if not self.left[others].all() else others
@@ -168,7 +172,7 @@ def name_exchanges(
 def intersecting_points(
     at: Adjustment, left: RowMasks, gone: Int[np.ndarray, "points"], sigma0: float
 ) -> dict[int, Float[np.ndarray, "3"]]:
-    """Positions (m) of lost points all of whose rays intersect after all."""
+    """Return positions (m) of lost points whose rays all intersect."""
     rays, p = _ray_data(at, left, gone, sigma0), at.block.image_points
     rays_of_point = {point: np.flatnonzero(p.point == point) for point in gone.tolist()}
     places = {point: _intersection(rays, rows) for point, rows in rays_of_point.items() if len(rows) > 1}
@@ -176,7 +180,7 @@ def intersecting_points(
 
 
 def reinstate_points(block: Block, left: RowMasks, points: Iterable[int]) -> RowMasks:
-    """Return `left` without the image points of these."""
+    """Return `left` without the image points of the points `back`."""
     p = block.image_points
     return left | {p.group: left[p.group] & ~np.isin(p.point, list(points))}
 
@@ -234,23 +238,21 @@ def _epipolar_distance(rays: _Rays, one: int, other: int) -> float:
     length = np.linalg.norm(normal) * np.linalg.norm(base)
     if length == 0:
         return np.inf
-    # Angle between a ray and the plane of the base and the other one, both rays of equal uncertainty.
+    # Angle between a ray and the plane of the base and the other ray; both rays have equal uncertainty.
     plane = np.cross(base, rays.directions[one])
     distance = abs(float(rays.directions[other] @ plane)) / max(float(np.linalg.norm(plane)), 1e-300)
     return distance / float(np.hypot(rays.sigma[one], rays.sigma[other]))
 
 
 def _intersect_with(rays: _Rays, row: int, other: int) -> tuple[int, Float[np.ndarray, "3"], list[int]] | None:
-    """Return the point of `row` if it was measured in `other`, and its rays; None if they do not intersect."""
+    """Return the point of `row` if measured at `other`, and its rays; None if they do not intersect."""
     partners = rays.partners(row)
     place = _intersection(rays, np.array([other, *partners])) if len(partners) else None
     return None if place is None else (int(rays.block.image_points.point[row]), place, partners.tolist())
 
 
 def _intersection(data: _Rays, rays: Int[np.ndarray, "rays"]) -> Float[np.ndarray, "3"] | None:
-    """Return the intersection of these rows, at least two; None if there is none, or not at the distance of other
-    points.
-    """
+    """Intersect these rows, at least two; None if that fails, or far from the distance of other points."""
     origins, directions = data.origins[rays], data.directions[rays]
     places, determined = intersect_points(origins, directions, np.zeros(len(rays), int), 1)
     if not determined[0]:
@@ -268,26 +270,26 @@ def _intersection(data: _Rays, rays: Int[np.ndarray, "rays"]) -> Float[np.ndarra
 def _agrees_with_prediction(
     at: Adjustment, rays: _Rays, pair: tuple[int, int], r: RedundancyBlocks, sigma0: float
 ) -> bool:
-    """Return True if the points of the pair that are not lost agree with their predictions after the exchange."""
+    """Return True if those points of the pair that are not lost agree with their predictions after the exchange."""
     p = at.block.image_points
     staying = [k for k in pair if not rays.gone[p.point[k]]]
     if not staying:
         return True
-    # Far from the prediction a difference is not a measure: repeat with exchanged names.
+    # Repeat the prediction with exchanged names: linearisation is not valid far from it.
     block, _ = exchanged(at.block, {}, Exchange(p.group, (pair,), "", {}))
     discrepancy = (measured_discrepancies(block, at.unknowns) / to_numpy(p.sigma))[staying]
-    # Both coordinates of a point are tested; like all others, against all others.
+    # Test both coordinates of a point, with the same limit as all observations.
     limit = sigma0**2 * float(chi_square_limit(np.array(2), LEVEL / len(p)))
     return bool(np.all(np.einsum("ni,nij,nj->n", discrepancy, r[p.group][staying], discrepancy) < limit))
 
 
-# Maximum ratio of the distance from another's coordinates to that from the next nearest.
+# Maximum ratio of the distance from another object's coordinates to the distance from the next nearest.
 _NEAR = 0.2
-# The same if all of a group is rejected: it then distorts nothing, and the positions are accurate.
+# Maximum of the same ratio if all of a group is rejected: the positions are then accurate.
 _NEARER = 0.05
-# Number of points required for a resection.
+# Minimum number of points for a resection.
 _LEAST_POINTS = 4
-# Fraction of contradicting points from which an image may have another's station.
+# Minimum fraction of contradicting points of an image that may have exchanged stations.
 _CONTRADICTING = 0.25
 
 
@@ -307,7 +309,7 @@ def coordinate_exchanges(
         if len(suspects) < 2:
             continue
         if what == "point":
-            # However large the misclosure of their rays: an image distorted by these still gives a close position.
+            # Include points with any misclosure: distorted images still give a close position.
             places = intersecting_points(at, left, suspects, np.inf)
             by_images, placed = with_positions(at, places), list(places)
         else:
@@ -323,9 +325,9 @@ def coordinate_exchanges(
 
 
 def merge_exchanges(block: Block, done: Sequence[Exchange], left: RowMasks) -> list[Exchange]:
-    """Merge exchanges of coordinates found successively; all others unchanged.
+    """Merge successive exchanges of coordinates; return all other exchanges unchanged.
 
-    Objects all of whose rows are rejected in the end have no coordinates of their own.
+    Objects whose rows are all rejected in the end have no coordinates.
     """
     merged = []
     for group, rows in block.named_observations.items():
@@ -383,7 +385,7 @@ def _exchange(
     else:
         stood = [f"{a}'s at {b}" for a, b in zip(names, names[1:] + names[:1], strict=True)]
         stood = stood[: -1 if lacks else None]
-        # In the order of the block, except for the closing link.
+        # Report links in the order of the block, except for the closing link.
         shifted_by_one = int((np.abs(np.diff([*ids, ids[0]])) == 1).sum()) >= len(ids) - 1
         words = (
             f"{len(ids)} {many} had one another's {has}, {few(stood)}"
@@ -409,7 +411,7 @@ def _placed_images(
 ) -> tuple[Adjustment, list[int]]:
     """Return `at` with these images resected from their points, and the images with enough points.
 
-    Points are intersected from other images, if these suffice: an image with a wrong station has distorted them.
+    Points are intersected from other images, if these are sufficient: an image with a wrong station has distorted them.
     """
     block, exterior = at.block, at.unknowns.exterior
     p, points = block.image_points, to_numpy(at.unknowns.points)
@@ -430,7 +432,7 @@ def _placed_images(
         placed.append(image)
     new = ExteriorOrientation(jnp.asarray(positions), jnp.asarray(matrices))
     at = eqx.tree_at(lambda a: a.unknowns.exterior, at, new)
-    # Its points move along: they were distorted by wrong stations, and would pull it back.
+    # Re-intersect the points of these images: wrong stations distorted them, and they would bias the images.
     ids = np.unique(p.point[np.isin(p.image, placed)])
     intersections, valid = _intersect_rows(at, ids, np.isin(p.point, ids))
     return with_positions(at, dict(zip(ids[valid].tolist(), intersections[valid], strict=True))), placed
@@ -439,7 +441,7 @@ def _placed_images(
 def _intersect_rows(
     at: Adjustment, points: Int[np.ndarray, "n"], rows: Bool[np.ndarray, "rows"]
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
-    """Return the intersections of the rays of these rows (m), by point, and True where they are valid."""
+    """Return the intersections of the rays of these rows (m), by point, and a mask of valid ones."""
     origins, directions, _ = rays_of(at)
     which = np.searchsorted(points, at.block.image_points.point[rows])
     return intersect_points(origins[rows], directions[rows], which, len(points))
@@ -448,11 +450,11 @@ def _intersect_rows(
 def _cycles(
     rows: AbstractCoordinates, who, suspects, discrepancy: Float[np.ndarray, "rows"], near: float
 ) -> Iterator[tuple]:
-    """Return cycles in which each lies where the next is said to be, and their rows, axis by axis.
+    """Return cycles of objects, each at the stated position of the next, and their rows, axis by axis.
 
-    `off` is observed minus determined (m), NaN if undetermined by the images. The last lies where the first is said to
-    be; or is not determined, and coordinates are then not of a single axis; or lies elsewhere, and its observation is
-    removed: a file shifted by a row lacks one row, and may contain one twice.
+    `off` is observed minus determined (m), NaN if undetermined by the images. The last object is at the stated position
+    of the first; or is not determined, and the exchange must concern more than one axis; or is elsewhere, and its
+    observation is removed: a file shifted by a row lacks one row, and may contain one twice.
     """
     rows_of = {int(k): np.flatnonzero(who == k) for k in suspects}
     rows_of = {k: own_rows[np.argsort(rows.axis[own_rows])] for k, own_rows in rows_of.items()}
@@ -475,7 +477,7 @@ def _coincidences(
     discrepancy: Float[np.ndarray, "rows"],
     near: float,
 ) -> dict[int, int]:
-    """Return the pairs of positions and stated coordinates that coincide."""
+    """Return pairs of objects: the determined position of the first is the stated position of the second."""
     pairs: list[tuple[float, int, int]] = []
     for axes in {tuple(rows.axis[own_rows].tolist()) for own_rows in rows_of.values()}:
         ids = [k for k, own_rows in rows_of.items() if tuple(rows.axis[own_rows].tolist()) == axes]
@@ -485,7 +487,7 @@ def _coincidences(
         for k in usable.tolist() if len(ids) > 1 else ():
             miss = np.abs(stated - determined[k]).max(axis=1)
             nearest, second = np.argsort(miss)[:2].tolist()
-            # Correct ones have their own; and some of many lie close to another's by chance.
+            # Exclude objects near their stated position, and pairs that may be close by chance.
             if nearest != k and miss[nearest] < near * miss[second]:
                 pairs.append((float(miss[nearest]), ids[k], ids[nearest]))
     after: dict[int, int] = {}

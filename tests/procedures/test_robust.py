@@ -79,7 +79,7 @@ def test_snooping_gives_the_same_result_from_any_loss(block):
 
 
 def test_an_unknown_group_is_refused(block):
-    with pytest.raises(BlockError, match="no observations gnss"):
+    with pytest.raises(BlockError, match="unknown observation group gnss"):
         robust(block, {"gnss": Huber()})
 
 

@@ -1,4 +1,4 @@
-"""Calibration of a camera from photographs of a board with known targets."""
+"""Camera calibration from photographs of a board with known targets."""
 
 from jaxphoto.procedures.calibration.start import distortion_model, free_parameters
 from jaxphoto.procedures.calibration.target_block import (

@@ -1,14 +1,15 @@
 """Distortion model, free parameters and initial values of a calibration: distortion from straightness, c from
 perspective.
 
-1. Radial distortion, `ideal = measured (1 - k1 r^2 - k2 r^4)` about the image centre, for which the photographs of a
-flat board are best approximated by homographies (straight lines stay straight). Errors are measured in the plane of the
-board, so that a smaller image does not have smaller errors.
+1. Estimate the radial distortion, `ideal = measured (1 - k1 r^2 - k2 r^4)` about the image centre, for which
+homographies approximate the photographs of a flat board best (straight lines stay straight). Errors are measured in the
+plane of the board; otherwise a smaller image would have smaller errors.
 
-2. The principal distance from the homographies (Zhang, 2000): the images of the axes of the board are orthogonal and of
-equal length, `h1' W h2 = 0`, `h1' W h1 = h2' W h2` with W = diag(1, 1, c^2), by least squares over all photographs.
+2. Compute the principal distance from the homographies (Zhang, 2000): the images of the axes of the board are
+orthogonal and of equal length, `h1' W h2 = 0`, `h1' W h1 = h2' W h2` with W = diag(1, 1, c^2), by least squares over
+all photographs.
 
-3. The coefficients of any distortion model nearest to this radial distortion over the format.
+3. Fit the coefficients of any distortion model to this radial distortion over the format.
 """
 
 from collections.abc import Sequence
@@ -39,7 +40,7 @@ _CENTRAL = ("c_mm", "xp_mm", "yp_mm")
 
 
 def distortion_model(name: str, sensor: Sensor, r0_mm: float = 0.0) -> AbstractDistortion:
-    """Return the distortion model `name` of block.toml without distortion, with constants that fit the sensor
+    """Return the distortion model `name` of block.toml with zero distortion and constants that suit the sensor
     (`plain`).
 
     Raises InputError for an unknown name, for R0 of another model than SMAC, and for R0 beyond the format.
@@ -55,11 +56,11 @@ def distortion_model(name: str, sensor: Sensor, r0_mm: float = 0.0) -> AbstractD
 
 
 def free_parameters(name: str, distortion: AbstractDistortion, wanted: Sequence[str] | None = None) -> tuple[str, ...]:
-    """Return the parameters to estimate, in the order of the model: `wanted` (c, xp, yp stand for c_mm, ...), or the
-    default.
+    """Return the parameters to estimate, in the order of the model.
 
-    The default is c, the principal point, and the coefficients that a board determines (`AbstractDistortion.usual`):
-    for SMAC and Brown K1-K3, P1, P2. Raises InputError for unknown names, and for a scale coefficient together with c.
+    `wanted` lists names (c, xp, yp for c_mm, ...). The default is c, the principal point, and the coefficients that a
+    board determines (`AbstractDistortion.usual`): for SMAC and Brown K1-K3, P1, P2. Raises InputError for unknown
+    names, and for a scale coefficient together with c.
     """
     names = parameter_names(InteriorOrientation(1.0, distortion=distortion))
     if wanted is None:
@@ -74,13 +75,13 @@ def free_parameters(name: str, distortion: AbstractDistortion, wanted: Sequence[
     return tuple(n for n in names if n in asked)
 
 
-# Points along each side of the format at which two distortions are compared.
+# Number of grid points along each side of the format for the comparison of two distortions.
 _SIDE = 15
-# Bounds of the principal distance over the diagonal of the format.
+# Minimum and maximum ratio of the principal distance to the diagonal of the format.
 _SHORTEST, _LONGEST = 0.15, 15.0
-# Limit of the mean square error of a homography over the median: beyond, a view is not a plane seen by this camera.
+# Ratio of the mean square error of a homography to the median above which the view is not a plane seen by this camera.
 _MISFIT = 25.0
-# Mean square errors of homographies over the size of the board: for an invalid lens, and the minimum.
+# Relative mean square errors of homographies (unit: size of the board): value for a non-invertible lens; minimum.
 _FOLDED, _EXACT = 1e6, 1e-16
 # Minimum tilt of a view (from h1 and h2) that determines c.
 _TILT = 1e-3
@@ -91,10 +92,11 @@ _DETERMINED = 1e-3
 def rough_interior(
     board: Board, rows: TargetRows, sensor: Sensor, known: InteriorOrientation | None = None
 ) -> InteriorOrientation:
-    """Estimate the initial camera from a flat board, else `known`, else from resections with several c.
+    """Estimate the initial camera from a flat board, else `known`, else from resections with several values of c.
 
-    Homographies determine nothing for a board that is not flat, and no c for views without tilt: c is then that of
-    `known`, or that of seven between half and three times the longer side with the smallest resection errors.
+    Homographies determine nothing for a board that is not flat, and not c for views without tilt. In these cases c is
+    taken from `known`, or from seven values between half and three times the longer side, by the smallest resection
+    errors.
     """
     plane = board.plane
     if plane is not None:
@@ -113,7 +115,7 @@ def rough_interior(
 
 
 def _resection_error(board: Board, rows: TargetRows, interior: InteriorOrientation) -> float:
-    """Median error (mm) of the resections of all photographs."""
+    """Return the median resection error (mm) of all photographs."""
     exterior, why = resected(board, rows, interior)
     rows = rows.take(np.array([rows.images[k] not in why for k in rows.image], bool))
     if not len(rows.image):
@@ -129,13 +131,13 @@ def flat_start(
     """Estimate c, K1 and K2 (`Brown`) from views of flat boards: board coordinates (m) and image coordinates (mm).
 
     Views with collinear points, except for one, are skipped. The second value is False if no view has enough tilt to
-    determine c, which is then 1.2 times the longer side.
+    determine c; c is then 1.2 times the longer side.
     """
     half = np.hypot(sensor.width_mm, sensor.height_mm) / 2
     views = [view for view in views if _determines(view[0])]
     if not views:
         return InteriorOrientation(1.2 * max(sensor.width_mm, sensor.height_mm)), False
-    # The mean of logarithms is robust: a view of something else adds a constant.
+    # The mean of logarithms is robust: a view of another object adds only a constant.
     bend = lambda k: float(np.mean(np.log(_bends(views, k, half))))  # noqa: E731
     lens = scipy.optimize.minimize(bend, np.zeros(2), method="Nelder-Mead", options={"maxiter": 120}).x
     distortion_misfit = _bends(views, lens, half)
@@ -164,9 +166,9 @@ def flat_start(
 def nearest_distortion(
     known: InteriorOrientation, model: AbstractDistortion, free: Sequence[str], sensor: Sensor
 ) -> InteriorOrientation:
-    """Return `known` with the distortion `model`, its coefficients `free` fitted to that of `known`.
+    """Fit the coefficients `free` of the distortion `model` to the distortion of `known`; return the resulting camera.
 
-    The fit is to 15 x 15 points of the format, by least squares of the residuals of an adjustment.
+    Least squares of the image residuals at 15 x 15 points of the format.
     """
     x, y = (np.linspace(-0.48, 0.48, _SIDE) * side for side in (sensor.width_mm, sensor.height_mm))
     measured = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
@@ -198,14 +200,14 @@ def _with(interior: InteriorOrientation, names: tuple[str, ...], values) -> Inte
 
 
 def _straight(xy, lens, half):
-    """Ideal coordinates over half the diagonal."""
+    """Return ideal coordinates divided by half the diagonal."""
     reduced = xy / half
     r2 = np.sum(reduced**2, axis=1, keepdims=True)
     return reduced * (1 - lens[0] * r2 - lens[1] * r2**2)
 
 
 def _bends(views, lens, half) -> Float[np.ndarray, "views"]:
-    """Mean square error of the best homography of each view, in the board and over its size."""
+    """Return the relative mean square error of the best homography of each view, in the plane of the board."""
     r = np.linspace(0, 1, 20)
     if np.any(1 - 3 * lens[0] * r**2 - 5 * lens[1] * r**4 <= 0.05):
         return np.full(len(views), _FOLDED)  # the lens is not invertible inside the format
@@ -220,28 +222,28 @@ def _bends(views, lens, half) -> Float[np.ndarray, "views"]:
 
 
 def _homography(board, image) -> Float[np.ndarray, "3 3"]:
-    """Homography image ~ H board by the direct linear transformation, in conditioned coordinates."""
+    """Estimate the homography image ~ H board by the direct linear transformation, in conditioned coordinates."""
     (a, to_a), (b, to_b) = _conditioned(board), _conditioned(image)
     h = np.linalg.svd(_linear(a, b))[2][-1].reshape(3, 3)
     return np.linalg.solve(to_b, h @ to_a)
 
 
 def _determines(board) -> bool:
-    """Return True if points of a plane determine a homography: the map to themselves is unique."""
+    """Return True if points of a plane determine a homography: the only map onto themselves is the identity."""
     same, _ = _conditioned(board)
     size = np.linalg.svd(_linear(same, same), compute_uv=False)
     return bool(len(size) > 7 and size[7] > _DETERMINED * size[0])
 
 
 def _linear(board, image) -> Float[np.ndarray, "rows 9"]:
-    """Equations of the direct linear transformation: their product with the nine elements of H is zero."""
+    """Return the design matrix of the direct linear transformation; its product with the nine elements of H is zero."""
     one, zero = np.ones((len(board), 1)), np.zeros((len(board), 3))
     point = np.hstack([board, one])
     return np.vstack([np.hstack([point, zero, -image[:, :1] * point]), np.hstack([zero, point, -image[:, 1:] * point])])
 
 
 def _conditioned(xy):
-    """Conditioned points, about their mean and of size 1, and the matrix of the conditioning."""
+    """Return conditioned points (zero mean, unit size) and the matrix of the conditioning."""
     middle = xy.mean(axis=0)
     size = max(float(np.sqrt(np.mean(np.sum((xy - middle) ** 2, axis=1)))), 1e-300)
     matrix = np.array([[1 / size, 0, -middle[0] / size], [0, 1 / size, -middle[1] / size], [0, 0, 1]])

@@ -1,6 +1,6 @@
-"""Calibration boards, their targets as measured in photographs, and the block of a calibration.
+"""Calibration boards, image points of their targets, and the block of a calibration.
 
-Residuals are in the measured image, in pixels; their RMS is that of OpenCV.
+Residuals are in the measured image, in pixels; their RMS is defined as in OpenCV.
 """
 
 from collections.abc import Sequence
@@ -23,25 +23,25 @@ from jaxphoto.initial.rays import padded_length
 from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
 from jaxphoto.unknowns import FREE, Unknowns, default_priors
 
-# Maximum distance from a plane over the largest extent of a flat board; beyond, views are no homographies.
+# Maximum ratio of the deviation from a plane to the extent of a flat board; beyond, views are not homographies.
 _FLAT = 1e-2
 
 
 class Board(NamedTuple):
-    """Targets with known coordinates in a frame of their own; for a flat board Z points to the observer."""
+    """Targets with known coordinates in the frame of the board; the Z axis of a flat board points to the observer."""
 
     name: str
     points: tuple[str, ...]
     """Ids of the targets."""
     xyz_m: Float[np.ndarray, "points 3"]
     diameter_m: Float[np.ndarray, "points"]
-    """Of circles; 0 for corners of squares."""
+    """Diameter of circles; 0 for corners of squares."""
 
     @property
     def plane(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]] | None:
-        """Centre of a flat board and its axes (columns; right-handed, the third is the normal), or None.
+        """Return the centre of a flat board and its axes (columns; right-handed, the third is the normal), or None.
 
-        The normal is arbitrary for a vertical board, otherwise that with Z > 0.
+        The normal is arbitrary for a vertical board, otherwise it has Z > 0.
         """
         middle = self.xyz_m.mean(axis=0)
         _, size, axes = np.linalg.svd(self.xyz_m - middle, full_matrices=False)
@@ -53,13 +53,13 @@ class Board(NamedTuple):
 
 
 class Detection(NamedTuple):
-    """Targets of a board in one photograph."""
+    """Targets of a board detected in one photograph."""
 
     image: str
     point: Int[np.ndarray, "n"]
     """Index of the points of the board."""
     column_row: Float[np.ndarray, "n 2"]
-    """In pixels; the centre of the upper-left pixel is (0.5, 0.5)."""
+    """Pixel coordinates; the centre of the upper-left pixel is (0.5, 0.5)."""
     sigma_px: Float[np.ndarray, "n 2"]
     """Standard deviations of column and row."""
 
@@ -84,7 +84,7 @@ class TargetRows(NamedTuple):
 
     @staticmethod
     def of(detections: Sequence[Detection], sensor: Sensor) -> "TargetRows":
-        """Image points of all `detections`, in millimetres."""
+        """Convert all `detections` to image points in millimetres."""
         image = np.repeat(np.arange(len(detections)), [len(d.point) for d in detections])
         point = np.concatenate([d.point for d in detections])
         order = np.lexsort((image, point))
@@ -93,7 +93,7 @@ class TargetRows(NamedTuple):
         return TargetRows(tuple(d.image for d in detections), image[order], point[order], xy_mm[order], sigma_mm[order])
 
     def take(self, chosen: np.ndarray) -> "TargetRows":
-        """Select rows by a mask, and the images that keep one."""
+        """Select rows by a mask, and the images that still have rows."""
         kept, image = np.unique(self.image[chosen], return_inverse=True)
         images = tuple(self.images[k] for k in kept)
         return TargetRows(images, image, self.point[chosen], self.xy_mm[chosen], self.sigma_mm[chosen])
@@ -146,10 +146,10 @@ def calibration_block(
 
 
 def reprojection_residuals(adjusted: Adjustment) -> Float[np.ndarray, "rows 2"]:
-    """Measured minus projected (column, row) in pixels, in the order of the image points of the block.
+    """Return measured minus projected (column, row) in pixels, in the order of the image points of the block.
 
-    They are those of the measured image, also for distortions of measured coordinates, whose residuals of the ideal
-    image are stretched where the lens compresses.
+    Residuals are in the measured image, even for distortions of measured coordinates. Residuals of the ideal image
+    would be stretched where the lens compresses.
     """
     block, unknowns = adjusted.block, adjusted.unknowns
     rows = block.image_points
@@ -169,7 +169,7 @@ def projections(
     camera_from_object: Float[np.ndarray, "rows 3 3"],
     point: Float[np.ndarray, "rows 3"],
 ) -> Float[np.ndarray, "rows 2"]:
-    """Projected image coordinates (mm) of one point (m) in one image per row, with distortion."""
+    """Project one point (m) per row into one image per row, with distortion; return image coordinates (mm)."""
     n = len(point)
     some = np.arange(padded_length(n)) % n
     numbers = jax.tree.map(lambda v: np.asarray(v, float), interior)
@@ -177,7 +177,7 @@ def projections(
 
 
 def rms_px(residuals: Float[np.ndarray, "rows 2"]) -> float:
-    """Root mean square over image points, both axes together: sqrt(sum(dx^2 + dy^2) / n), as in OpenCV."""
+    """Return the RMS of all image points, both axes together: sqrt(sum(dx^2 + dy^2) / n), as in OpenCV."""
     return float(np.sqrt(np.mean(np.sum(np.asarray(residuals) ** 2, axis=1)))) if len(residuals) else 0.0
 
 
@@ -190,7 +190,7 @@ def _projected(interior, position, camera_from_object, point):
 def resected(
     board: Board, rows: TargetRows, interior: InteriorOrientation
 ) -> tuple[ExteriorOrientation, dict[str, str]]:
-    """Exterior orientations of the images that can be resected, in their order; reasons for the others by name."""
+    """Resect the images; return exterior orientations in the order of the images, and reasons for failures by name."""
     positions, matrices, why = [], [], {}
     for k, name in enumerate(rows.images):
         of_image = rows.image == k
@@ -210,8 +210,8 @@ def resected(
 
 
 def _exterior(interior: InteriorOrientation, xy_mm, points, sigma_mm: float, image: str) -> ExteriorOrientation:
-    """Resection by quaternions (paper 002); from three points with robust weights if that is undetermined or does not
-    fit.
+    """Resect an image by quaternions (paper 002); if undetermined or inconsistent, from three points with robust
+    weights.
     """
     try:
         resection = resect_by_quaternions(interior, xy_mm, points, sigma_mm, image)

@@ -1,29 +1,29 @@
-"""Calibration of a camera from the targets of a board in photographs.
+"""Camera calibration from the targets of a board in photographs.
 
-1. Initial values: distortion and principal distance from homographies of a flat board (`start`), resection.
+1. Compute initial values: distortion and principal distance from homographies of a flat board (`start`), resection.
 
-2. Self-calibrating adjustment; the points of the board are fixed, or weighted.
+2. Adjust with self-calibration; the points of the board are fixed, or weighted.
 
-3. Photographs that do not fit and blunders among the image points are rejected; image points get the standard deviation
-of their measurement and that of board and model (`added_sigma`); centres of circles are corrected for their
-eccentricity. Steps 2 and 3 repeat until nothing changes (`Calibration.settled`), at most twenty times.
+3. Reject photographs that do not fit and blunders among the image points. Image points get the standard deviation of
+measurement, board and model (`added_sigma`). Centres of circles are corrected for their eccentricity. Steps 2 and 3
+repeat to convergence (`Calibration.settled`), at most twenty times.
 
-Residuals are those of the measured image, whatever the direction of the distortion.
+Residuals are in the measured image, whatever the direction of the distortion.
 
-Eccentricity: a circle is seen as an ellipse (bent by the lens); measured is the centre of the ellipse nearest to its
-edge, which is not the image of its centre. Both follow from the adjusted orientation, the plane and the radius of the
-circle. With the boundary b(t), 0 <= t < 2 pi, projected through the camera, Green's theorem gives area, centroid and
-second moments of the image,
+Eccentricity: the image of a circle is an ellipse (bent by the lens). The measurement is the centre of the ellipse
+nearest to its edge, which is not the image of the circle's centre. Both follow from the adjusted orientation, the plane
+and the radius of the circle. With the boundary b(t), 0 <= t < 2 pi, projected through the camera, Green's theorem gives
+area, centroid and second moments of the image,
 
-    A = 1/2 int (b x b') dt,   m = 1/(3 A) int b (b x b') dt,   M = 1/(4 A) int (b - m) (b - m)' ((b - m) x b') dt,
+    A = 1/2 int (b x b') dt,   m = 1/(3 A) int b (b x b') dt,   M = 1/(4 A) int (b - m) (b - m)' ((b - m) x b') dt.
 
-and from the ellipse of these, Q = (4 M)^-1 = L L', Gauss-Newton steps lead to the nearest one,
+From their ellipse, Q = (4 M)^-1 = L L', Gauss-Newton steps lead to the nearest one,
 
     int e^2 |b'| dt -> min,   e = rho (rho - 1) / |L L' d|,   rho = |L' d|,   d = b - centre.
 
-The trapezoidal rule converges exponentially on a smooth closed curve: 32 points give every digit. Without distortion
-the centres of area, of the nearest ellipse and of the conic coincide; with it the first two differ by up to some
-hundredths of a pixel, for circles of a hundred pixels at a steep angle in the corner.
+The trapezoidal rule converges exponentially on a smooth closed curve: 32 points reach machine precision. Without
+distortion the centres of area, of the nearest ellipse and of the conic coincide. With distortion the first two differ
+by up to a few hundredths of a pixel, for circles of a hundred pixels at a steep angle in the corner.
 """
 
 import dataclasses
@@ -62,7 +62,7 @@ from jaxphoto.statistics import covariance
 from jaxphoto.unknowns import FIXED
 
 _POINTS = 32
-# From the ellipse of the moments, which differs by the distortion only.
+# Number of Gauss-Newton steps from the ellipse of the moments, which differs by the distortion only.
 _STEPS = 3
 
 
@@ -73,9 +73,9 @@ def eccentricity(
     axes: Float[Array, "3 2"],
     radius_m: Float[Array, ""],
 ) -> Float[Array, "2"]:
-    """Centre of the ellipse nearest to a circle's image minus the image of its centre (mm, measured image).
+    """Return the centre of the ellipse nearest to a circle's image minus the image of its centre (mm, measured image).
 
-    `centre` (m) and `axes`, two orthogonal unit vectors in its plane, are in the object frame.
+    `centre` (m) and `axes`, two orthogonal unit vectors in the plane of the circle, are in the object frame.
     """
 
     def boundary(t):
@@ -85,8 +85,7 @@ def eccentricity(
     about = project(interior, exterior, centre)
     t = jnp.arange(_POINTS) * (2 * jnp.pi / _POINTS)
     b, slope = jax.vmap(lambda t: jax.jvp(boundary, (t,), (1.0,)))(t)
-    # Relative to the image of the centre, to preserve digits of the small difference, and in units of the circle's
-    # size.
+    # Subtract the image of the centre, to preserve digits of the small difference, and divide by the circle's size.
     b = b - about
     cross = b[:, 0] * slope[:, 1] - b[:, 1] * slope[:, 0]
     size = jnp.sqrt(jnp.abs(jnp.sum(cross)))
@@ -105,7 +104,7 @@ def eccentricity(
 
 
 def _distances(ellipse: Float[Array, "5"], b: Float[Array, "points 2"]) -> Float[Array, "points"]:
-    """Distances of points from an ellipse (column, row and three elements of L) to first order."""
+    """Return distances of points from an ellipse (column, row and three elements of L) to first order."""
     x, y = b[:, 0] - ellipse[0], b[:, 1] - ellipse[1]
     u, v = ellipse[2] * x + ellipse[3] * y, ellipse[4] * y
     # XLA without optimisation differentiates jnp.hypot wrongly (jax 0.10.2).
@@ -121,10 +120,12 @@ def eccentricities(
     axes: Float[np.ndarray, "3 2"],
     radius_m: Float[np.ndarray, "rows"],
 ) -> Float[np.ndarray, "rows 2"]:
-    """`eccentricity` (mm) of one circle in one image per row, all in planes parallel to `axes`; 0 for a radius of 0."""
+    """Return `eccentricity` (mm) of one circle in one image per row, all in planes parallel to `axes`; 0 for a radius
+    of 0.
+    """
     n = len(centre)
     some = np.arange(padded_length(n)) % n
-    # A point has no area: the result for this radius is discarded.
+    # Replace a radius of 0, which has no area; its result is discarded.
     radius = np.where(radius_m > 0, radius_m, max(float(np.max(radius_m)), 1e-12))
     numbers = jax.tree.map(lambda v: np.asarray(v, float), interior)
     arguments = (numbers, position[some], camera_from_object[some], centre[some], axes, radius[some])
@@ -138,22 +139,23 @@ def _eccentricities(interior, position, camera_from_object, centre, axes, radius
     return jax.vmap(one)(position, camera_from_object, centre, radius)
 
 
-# Limit of a normalised residual: one valid image point of 270,000 exceeds it.
+# Maximum normalised residual: one valid image point of 270,000 exceeds it.
 _LIMIT = 5.0
-# Blunders of at least this fraction of the largest one of an image are rejected together.
+# Minimum ratio of a blunder to the largest one of its image for both to be rejected together.
 _NEARLY = 0.5
-# Limits of the median residual of a photograph: over that of the typical one, and in pixels.
+# Maximum median residual of a photograph: ratio to the typical one, and in pixels.
 _IMAGE_LIMIT, _IMAGE_PX = 5.0, 2.0
-# Median length of a vector with two normal components of sigma 1.
+# Median length of a vector with two standard normal components.
 _MEDIAN = float(np.sqrt(2 * np.log(2)))
 
 
 def blunders(
     residuals: Float[np.ndarray, "n 2"], sigma: Float[np.ndarray, "n 2"], image: Int[np.ndarray, "n"], n_images: int
 ) -> Bool[np.ndarray, "n"]:
-    """Image points with residuals of more than five times their sigma, scaled by the median of all.
+    """Mark image points with residuals of more than five sigma, scaled by the median of all.
 
-    Of each image only those of at least half its largest one: a blunder distorts the orientation, and valid residuals.
+    Per image, only residuals of at least half the largest are marked: a blunder distorts the orientation and the
+    residuals of valid points.
     """
     size = np.linalg.norm(residuals / sigma, axis=1)
     largest = np.zeros(n_images)
@@ -164,7 +166,7 @@ def blunders(
 def misfits(
     residuals: Float[np.ndarray, "n 2"], image: Int[np.ndarray, "n"], n_images: int
 ) -> Bool[np.ndarray, "images"]:
-    """Images whose median residual exceeds that of the others five times, and two pixels."""
+    """Mark images whose median residual exceeds two pixels and five times the typical one."""
     size = np.linalg.norm(residuals, axis=1)
     typical = np.array([np.median(size[image == k]) for k in range(n_images)])
     return (typical > _IMAGE_LIMIT * np.median(typical)) & (typical > _IMAGE_PX)
@@ -173,7 +175,7 @@ def misfits(
 def added_sigma(residuals: Float[np.ndarray, "n 2"], sigma: Float[np.ndarray, "n 2"], redundancy: int) -> float:
     """Estimate the sigma a (px) that explains the residuals together with `sigma`: sum v^2 / (sigma^2 + a^2) = r.
 
-    Zero if `sigma` alone explains them. It accounts for an uneven board, a rolling shutter, or a distortion model with
+    Return zero if `sigma` alone explains them. It models an uneven board, a rolling shutter, or a distortion model with
     too few coefficients; without it the most accurate points would have too much weight.
     """
     square, variance = residuals**2, sigma**2
@@ -190,17 +192,17 @@ def added_sigma(residuals: Float[np.ndarray, "n 2"], sigma: Float[np.ndarray, "n
 MIN_IMAGES = 3
 _MIN_POINTS = 6
 _ROUNDS = 20
-# Final change (px) of the added standard deviation and of the centres of circles.
+# Maximum change (px) of the added standard deviation and of the centres of circles at convergence.
 _STILL_PX = 1e-4
-# Common standard deviation (px) of image points in the first iteration.
+# Standard deviation (px) of all image points in the first iteration.
 _FIRST_SIGMA_PX = 1.0
-# First-order parameters of a lens: estimated first if the adjustment of all does not converge.
+# First-order parameters of a lens, estimated first if the adjustment of all parameters does not converge.
 _FIRST = ("c_mm", "k1", "k2", "a1", "a2", "a14")
 
 
 @pretty_repr
 class Calibration(NamedTuple):
-    """Calibrated camera, and what was rejected."""
+    """Calibrated camera and rejected observations."""
 
     adjusted: Adjustment
     board: Board
@@ -211,7 +213,7 @@ class Calibration(NamedTuple):
     eccentricity_px: Float[np.ndarray, "rows 2"]
     """Correction (column, row) of the measured centres of circles, in the same order."""
     added_sigma_px: float
-    """Standard deviation of board, shutter and model, added to that of the measurement."""
+    """Standard deviation of board, shutter and model, in addition to the measurement error."""
     left_out: dict[str, str]
     """Rejected photographs, with the reason."""
     removed: tuple[tuple[str, str], ...]
@@ -258,8 +260,8 @@ def calibrate(
     distortion in block.toml, `r0_mm` the balance radius of SMAC, `free` the parameters to estimate (`free_parameters`).
     The points of the board are fixed, or have the standard deviation `board_sigma_m` (m) on each axis.
 
-    Raises InputError for an unknown model or parameter, for fewer than three usable photographs, and what `adjust`
-    raises.
+    Raises InputError for an unknown model or parameter and for fewer than three usable photographs, and the errors of
+    `adjust`.
     """
     distortion = distortion_model(model, sensor, r0_mm)
     names = free_parameters(model, distortion, free)
@@ -269,7 +271,7 @@ def calibrate(
     rows = TargetRows.of(used, sensor)
     rough = rough_interior(board, rows, sensor, start)
     if start is not None:
-        # Parameters that are not estimated keep their given values.
+        # Parameters that are not estimated stay at their given values.
         for name in {"c_mm", "xp_mm", "yp_mm"}.difference(names):
             rough = set_parameter(rough, name, float(get_parameter(start, name)))
     exterior, why = resected(board, rows, rough)
@@ -294,7 +296,7 @@ def calibrate(
         turned = float(np.max(np.linalg.norm(correction - before, axis=1), initial=0.0)) / sensor.pixel_mm
         misfit = misfits(residuals, rows.image, len(rows.images))
         large = blunders(residuals, sigma / sensor.pixel_mm, rows.image, len(rows.images))
-        # A residual within the last change of the eccentricity is no blunder.
+        # A residual smaller than the last change of the eccentricity is not a blunder.
         good = ~misfit[rows.image] & ~(large & (np.linalg.norm(residuals, axis=1) > turned))
         redundancy = adjusted.redundancy - 2 * int((~good).sum())
         last, added = added, added_sigma(residuals[good], rows.sigma_mm[good] / sensor.pixel_mm, redundancy)
@@ -333,7 +335,7 @@ def _check_enough(images: int, total: int) -> None:
 
 
 def _adjusted(block: Block, max_steps: int) -> Adjustment:
-    """Adjust; if that does not converge, first with c and the first radial coefficients only."""
+    """Adjust; if that does not converge, first estimate c and the first radial coefficients only."""
     adjusted = adjust(block, max_steps=max_steps)
     if bool(adjusted.converged):
         return adjusted
@@ -351,7 +353,7 @@ def _still(exterior: ExteriorOrientation) -> ExteriorOrientation:
 
 
 def _image_eccentricities(board, rows, interior, exterior) -> Float[np.ndarray, "rows 2"]:
-    """In mm of the image; zero for corners and for a board that is not flat."""
+    """Return eccentricities (mm in the image); zero for corners and for a board that is not flat."""
     if not board.diameter_m.any() or board.plane is None:
         return np.zeros_like(rows.xy_mm)
     return eccentricities(

@@ -1,4 +1,4 @@
-"""Control of a block: surveyed points and their marks, transformation to their frame, adjustment and tests."""
+"""Control of a block: surveyed points and their marks, transformation to the control frame, adjustment and tests."""
 
 from jaxphoto.procedures.control.control_block import ControlledBlock, at_optimum, control_block, retest
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints

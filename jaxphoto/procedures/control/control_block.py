@@ -1,14 +1,14 @@
-"""Adjust an oriented block with control, and reject control that contradicts the rest.
+"""Adjust an oriented block with control, and reject control that contradicts the other observations.
 
 1. Rays of marks are intersected; a mark that contradicts the others of its point is rejected.
 
-2. Three or more consistent control points transform the block to their frame. With fewer it stays where it is.
+2. Three or more consistent control points transform the block to their frame. With fewer the block is not transformed.
 
-3. The block is adjusted with them. Iteratively, the observation of control with the largest normalised residual is
-rejected, and rejected points that agree return. Check points never enter.
+3. The block is adjusted with control. Iteratively, the control observation with the largest normalised residual is
+rejected, and rejected points that agree are reinstated. Check points are never adjusted.
 
-Normalised residuals test observations (Baarda); check points and rejected points are tested by their difference over
-its standard deviation, of survey and adjustment together.
+Normalised residuals test observations (Baarda). Check points and rejected points are tested by their difference divided
+by its standard deviation, which includes survey and adjustment.
 """
 
 import dataclasses
@@ -28,37 +28,37 @@ from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, SIGMA_M, GivenCo
 from jaxphoto.statistics import LEAST_CHECKED, covariance, normalised_residuals, redundancy_numbers
 
 CRITICAL = 4.0
-"""Limit of normalised residuals: one valid observation of 16,000 exceeds it."""
+"""Maximum normalised residual: one valid observation of 16,000 exceeds it."""
 
-# Minimum number of residuals of a scatter estimate, and the median of the larger of two normal errors.
+# Minimum number of residuals for a scatter estimate; median of the larger of two standard normal errors.
 _ENOUGH, _LARGER = 8, 1.05
-# Minimum number of surveyed points of a scatter estimate, the median of a normal error, and the ratio of scatters that
-# rejects a default: the median of twelve exceeds 1.9 in one valid block of a hundred.
+# Minimum number of surveyed points for a scatter estimate; median of |N(0, 1)|; ratio of scatters above which a default
+# is rejected (the median of twelve exceeds 1.9 in one valid block of a hundred).
 _POINTS, _MEDIAN, _MORE = 6, 0.6745, 2.0
-# Change (of the logarithm) that is not worth another adjustment.
+# Maximum change of log(sigma) that does not require another adjustment.
 _STILL = 0.15
 
 
 class TestedControl(NamedTuple):
-    """The last `points` of a block and the marks of them."""
+    """Test of the last `points` of a block and of their marks."""
 
     adjusted_m: Float[np.ndarray, "points 3"]
     off_m: Float[np.ndarray, "points 3"]
     """Surveyed minus adjusted; NaN without survey."""
     sigma_m: Float[np.ndarray, "points 3"]
-    """Of the adjusted coordinates, a posteriori."""
+    """Standard deviation of the adjusted coordinates, a posteriori."""
     w: Float[np.ndarray, "points 3"]
     """Normalised residuals; NaN if not tested."""
     marks_px: Float[np.ndarray, "rows 2"]
-    """Measured minus computed, column and row, of the marks in the order of the block."""
+    """Measured minus computed column and row of the marks, in the order of the block."""
     marks_w: Float[np.ndarray, "rows"]
-    """Normalised residuals, the larger of both axes; NaN if not tested."""
+    """Normalised residuals, maximum of both axes; NaN if not tested."""
 
 
 def test_control(
     adjusted: Adjustment, n: int, xyz: Float[np.ndarray, "points 3"], sigma: Float[np.ndarray, "points 3"]
 ) -> TestedControl:
-    """Test the last `n` points, surveyed at `xyz` with `sigma` (m), in any role."""
+    """Test the last `n` points, surveyed at `xyz` with `sigma` (m), whether control, check or rejected points."""
     block = adjusted.block
     first = len(block.points) - n
     cov = covariance(adjusted, rows=True)
@@ -85,15 +85,15 @@ def test_control(
 
 
 def _largest(w: Float[np.ndarray, "2 rows"]) -> Float[np.ndarray, "rows"]:
-    """Largest over the first axis; NaN if all are."""
+    """Return the maximum along the first axis, ignoring NaN; NaN if all are NaN."""
     largest = np.max(np.nan_to_num(w, nan=-1.0), axis=0, initial=-1.0)
     return np.where(largest < 0, np.nan, largest)
 
 
 def scatter(marks_w: Float[np.ndarray, "rows"]) -> float:
-    """Robust scatter of the normalised residuals of marks; at least 1, and 1 for few marks.
+    """Estimate the robust scatter of the normalised residuals of marks; at least 1, and 1 for few marks.
 
-    Manual marks are often less accurate than stated, which makes no blunders of them.
+    Manual marks are often less accurate than stated. Such marks are not blunders.
     """
     finite = marks_w[np.isfinite(marks_w)]
     return max(1.0, float(np.median(finite)) / _LARGER) if len(finite) >= _ENOUGH else 1.0
@@ -105,11 +105,12 @@ def poorer_survey(
     assumed: Bool[np.ndarray, "points 3"],
     guess_m: tuple[float, float, float],
 ) -> Float[np.ndarray, "3"] | None:
-    """Estimate sigmas (m) of the coordinates `assumed` that explain most of them; None if `sigma_m` does.
+    """Estimate sigmas (m) of the coordinates `assumed` that explain most of them; return None if `sigma_m` does.
 
-    They follow from the medians of the normalised residuals of plan and height; up to half of the points may be
-    blunders. A block is deformed by control with too much weight, so that several adjustments are needed: after the
-    default `guess_m` is rejected, standard deviations may decrease, too. Heights are at first as poor as the plan.
+    They follow from the medians of the normalised residuals of plan and height, so up to half of the points may be
+    blunders. Control with too much weight deforms the block, so several adjustments are needed: after the default
+    `guess_m` is rejected, standard deviations may also decrease. In the first estimate heights are as inaccurate as the
+    plan.
     """
     now, given_up = np.array(guess_m), bool((sigma_m[assumed] > max(guess_m)).any())
     factor = np.ones(3)
@@ -133,33 +134,33 @@ def beyond(w: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
 
 
 _ROUNDS = 8
-# Maximum number of sentences about marks in an error message.
+# Maximum number of messages about marks in an error message.
 _SAID = 2
-# Fraction of the largest normalised residual below which no other observation is rejected with it.
+# Ratio to the largest normalised residual below which no other observation is rejected in the same iteration.
 _BESIDE_THE_WORST = 0.7
 
 
 class ControlledBlock(NamedTuple):
-    """A block adjusted with control, and the result of each surveyed point. Arrays are over the surveyed points."""
+    """Block adjusted with control, and the result of each surveyed point. Arrays are over the surveyed points."""
 
     adjusted: Adjustment
     ids: tuple[str, ...]
     check: Bool[np.ndarray, "points"]
     state: tuple[str, ...]
-    """control, check, left out (it contradicts the rest), not marked (in too few photographs)."""
+    """One of: control, check, left out (rejected), not marked (in too few photographs)."""
     n_marks: tuple[int, ...]
     xyz_m: Float[np.ndarray, "points 3"]
-    """Surveyed, in the local frame of the block; NaN if unknown."""
+    """Surveyed coordinates in the local frame of the block; NaN if unknown."""
     off_m: Float[np.ndarray, "points 3"]
     """Surveyed minus adjusted, in the local frame of the block; NaN if undefined."""
     survey_sigma_m: Float[np.ndarray, "points 3"]
     sigma_m: Float[np.ndarray, "points 3"]
-    """Of the adjusted coordinates, a posteriori."""
+    """Standard deviation of the adjusted coordinates, a posteriori."""
     w: Float[np.ndarray, "points 3"]
     marks: Marked
     """Accepted marks; `point` is the index of the surveyed points."""
     marks_px: Float[np.ndarray, "rows 2"]
-    """Residuals of the marks, column and row."""
+    """Residuals of the marks (column, row)."""
     sentences: tuple[str, ...]
 
 
@@ -176,9 +177,9 @@ def control_block(
 ) -> ControlledBlock:
     """Adjust `block`, whose images and points have initial values, with `control`.
 
-    `system` names that of the points if their file does not, `code` the EPSG code of a block that has none yet,
-    `vertical` that of the heights of files. `elsewhere` are photographs of other blocks. Raises InputError for unusable
-    control (`in_frame`, `onto_control`), and if no mark is in a photograph of the block.
+    `system` is the coordinate system of the points if their file does not specify one, `code` the EPSG code of a block
+    without a system, `vertical` the EPSG code of heights in files. `elsewhere` lists photographs of other blocks.
+    Raises InputError for unusable control (`in_frame`, `onto_control`), and if no mark is in a photograph of the block.
     """
     points, ids = control.points, control.points.ids
     frame = in_frame(block, points, system, code, vertical)
@@ -192,12 +193,12 @@ def control_block(
     try:
         block, start, agree, sigma, seen_sigma = _placed(block, frame, met.points, met.covariance, sigma, points)
     except InputError as error:
-        # Contradicting marks explain why too few points are left.
+        # Rejected marks explain why too few points remain.
         raise InputError("; ".join([str(error), *_one_height(points), *met.sentences[:_SAID]])) from error
     messages += seen_sigma
     count = np.bincount(rows.point, minlength=len(ids))
     known = np.where(np.isnan(points.coordinates), np.nan, frame.xyz)
-    # One ray and a known point are an observation, one ray alone is not.
+    # One ray of a known point is an observation; one ray of an unknown point is not.
     seen = (count > 1) & np.isfinite(start).all(axis=1) | (count == 1) & ~points.check & np.isfinite(known).all(axis=1)
     start = np.where(np.isfinite(start), start, frame.xyz)
     base = without_names(block, ids)
@@ -213,21 +214,21 @@ def control_block(
         place = np.cumsum(seen) - 1
         of_seen = now._replace(point=place[now.point])
         names = tuple(ids[k] for k in which)
-        # A default standard deviation of check points must not enter the stated accuracy.
+        # A default standard deviation of check points must not affect the reported accuracy.
         seen_sigma = np.where(points.check[:, None] & np.isnan(points.sigma_m), 0.0, sigma)[which]
         roles = used[which], points.check[which]
         controlled = into_block(base, names, known[which], seen_sigma, start[which], of_seen, *roles)
         try:
             adjusted = adjust(controlled)
         except DatumError as error:
-            # The default standard deviations may be why control does not determine the datum.
+            # The default standard deviations may be the reason why control does not determine the datum.
             raise DatumError("; ".join([str(error), *_assumed(control, sigma)])) from error
         if not bool(adjusted.converged):
             messages.append("the adjustment with control did not converge; it is not tested")
         tested = _spread(test_control(adjusted, len(which), known[which], sigma[which]), seen)
         poorer = poorer_survey(tested.w[used], sigma[used], np.isnan(points.sigma_m[used]), SIGMA_M)
         if poorer is not None and number + 1 < _ROUNDS and bool(adjusted.converged):
-            # Before any point is tested with a default that most contradict.
+            # Estimate standard deviations before testing points: most may contradict the default.
             sigma = np.where(np.isnan(points.sigma_m), poorer, sigma)
             continue
         new, rejected, text = _tested(tested, now, used, seen & ~points.check, ids, block.images)
@@ -274,7 +275,7 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
     spread = np.sqrt(np.trace(covariance[known], axis1=1, axis2=2))
     assumed, surveyed = np.isnan(points.sigma_m[known]).any(axis=1), np.linalg.norm(sigma[known], axis=1)
     if not frame.at_place:
-        # In the unit of the block, until a similarity determines the scale.
+        # `spread` is in the unit of the block: convert it by the scale of a first similarity.
         first = onto_control(met[known], frame.xyz[known], surveyed, points.file, assumed)
         spread = spread * first.similarity.scale
     onto = onto_control(met[known], frame.xyz[known], np.hypot(surveyed, spread), points.file, assumed)
@@ -318,7 +319,7 @@ def _one_height(points: SurveyedPoints) -> list[str]:
 
 
 def _tested(tested: TestedControl, now: Marked, used, able, ids, images):
-    """Return accepted control points, marks to reject, and a sentence for each; no sentence if all agree."""
+    """Return accepted control points, marks to reject, and a message per change (may be empty); none if all agree."""
     new, rejected, messages = used.copy(), np.zeros(len(now.image), bool), []
     of_points, of_marks = np.where(used, np.nan_to_num(tested.w).max(axis=1), 0.0), np.nan_to_num(tested.marks_w)
     wide = scatter(tested.marks_w)
@@ -326,7 +327,7 @@ def _tested(tested: TestedControl, now: Marked, used, able, ids, images):
     if not worst > CRITICAL:
         back = able & ~used & ~beyond(tested.w) & np.isfinite(tested.w).any(axis=1)
         return new | back, rejected, [""] * bool(back.any())
-    # Smaller residuals near a blunder are often caused by it.
+    # A blunder often causes smaller residuals nearby.
     limit = max(CRITICAL, _BESIDE_THE_WORST * worst)
     for p in np.unique(now.point).tolist():
         row = max(np.flatnonzero(now.point == p), key=lambda k: of_marks[k])
@@ -356,7 +357,7 @@ def _left_out(ids, left, tested: TestedControl, frame: InFrame):
 
 
 def _spread(tested: TestedControl, seen) -> TestedControl:
-    """Expand to all surveyed points, with NaN for those that are not in the block."""
+    """Expand to all surveyed points, with NaN for points that are not in the block."""
     wide = lambda v: np.where(seen[:, None], v[np.cumsum(seen) - 1], np.nan)  # noqa: E731
     return tested._replace(
         adjusted_m=wide(tested.adjusted_m), off_m=wide(tested.off_m), sigma_m=wide(tested.sigma_m), w=wide(tested.w)
@@ -364,7 +365,7 @@ def _spread(tested: TestedControl, seen) -> TestedControl:
 
 
 def retest(controlled: ControlledBlock, adjusted: Adjustment) -> ControlledBlock:
-    """Test again after another adjustment of the block, such as with other weights."""
+    """Repeat the tests after another adjustment of the block, for example with other weights."""
     seen = np.array(controlled.state, object) != "not marked"
     xyz, sigma = controlled.xyz_m[seen], controlled.survey_sigma_m[seen]
     new = _spread(test_control(adjusted, int(seen.sum()), xyz, sigma), seen)
@@ -372,13 +373,13 @@ def retest(controlled: ControlledBlock, adjusted: Adjustment) -> ControlledBlock
 
 
 def at_optimum(adjusted: Adjustment) -> Block:
-    """Return the adjusted block, with initial values at the optimum."""
+    """Return the adjusted block with initial values at the optimum."""
     block = adjusted.block
     known = (np.ones(len(names), bool) for names in (block.images, block.points))
     return dataclasses.replace(block, start=Start(adjusted.unknowns, *known))
 
 
 def _from(base: Block, adjusted: Adjustment) -> Block:
-    """Return `base` with initial values at the optimum of the same block with control."""
+    """Return `base` with initial values from the optimum of the same block with control."""
     unknowns = dataclasses.replace(adjusted.unknowns, points=np.asarray(adjusted.unknowns.points)[: len(base.points)])
     return dataclasses.replace(base, start=dataclasses.replace(base.start, unknowns=unknowns))

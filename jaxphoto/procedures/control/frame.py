@@ -1,12 +1,12 @@
-"""The frame of control: coordinate systems, and the robust similarity that transforms a block to control points.
+"""Coordinate systems of control, and the robust similarity that transforms a block to control points.
 
-Every three points (or 300 samples of three) give a similarity; the one with the most consistent points is refined by
-least squares of these. The tolerance leaves room for deformations that the adjustment removes: distortion, or weak
-positions. Inconsistent points are omitted from the first adjustment, which tests them.
+Every three points (or 300 samples of three) determine a similarity. The one with the most consistent points is refined
+by least squares of these. The tolerance allows for deformations that the adjustment removes: distortion, or weakly
+determined positions. The first adjustment, which tests all points, starts without inconsistent ones.
 
 If standard deviations are defaults and most points are inconsistent, the survey may be less accurate (a hand-held
-receiver: metres). The similarity of the least median of squares (P. J. Rousseeuw, JASA 79, 1984) estimates the
-accuracy, as long as more than half of the points are valid.
+receiver: metres). The similarity of the least median of squares (P. J. Rousseeuw, JASA 79, 1984) estimates the accuracy
+if more than half of the points are valid.
 """
 
 import dataclasses
@@ -33,15 +33,15 @@ from jaxphoto.procedures.georeference_photographs import utm_of
 from jaxphoto.procedures.orientation.known_frame import Similarity, similarity_between
 
 _SAMPLES = 300
-# Tolerance of a point: standard deviations, and fraction of the size of the control.
+# Tolerance of a point: number of standard deviations plus fraction of the extent of the control.
 _BEYOND, _BENT = 5.0, 0.01
 MIN_POINTS = 3
-# Below this fraction of consistent points, of at least so many, the survey may be less accurate than assumed.
+# Fraction of consistent points below which the survey may be less accurate than assumed; minimum number of points.
 _MOST, _ENOUGH = 2 / 3, 6
-# Ratio of the median length of normal errors in space to their sigma, and parameters of a similarity.
+# Ratio of the median length of 3-D normal errors to their sigma; number of parameters of a similarity.
 _MEDIAN, _PARAMETERS = 1.54, 7
-# Limit (standard deviations) of the refined estimate; maximum standard deviation over the size of the control: beyond,
-# points or the order of coordinates are wrong.
+# Maximum residual (standard deviations) in the refined estimate; maximum ratio of the standard deviation to the extent
+# of the control: above it, points or the order of coordinates are wrong.
 _WITHIN, _POOREST = 3.5, 0.05
 
 
@@ -63,11 +63,11 @@ def onto_control(
 ) -> OntoControl:
     """Estimate the similarity from `there`, in the frame of a block, to surveyed points `here`.
 
-    `sigma_m` are those of the differences; those of `assumed` points are defaults, which most of the points may
-    correct.
+    `sigma_m`: standard deviations of the differences. The standard deviations of `assumed` points are defaults, which
+    are re-estimated if most of the points contradict them.
 
-    Raises InputError for fewer than three points, for collinear points, and if no three and a fourth are consistent,
-    with the cure if exchanged coordinates would be.
+    Raises InputError for fewer than three points, for collinear points, and if no four points are consistent, with the
+    cure if exchanging coordinates would help.
     """
     if len(here) < MIN_POINTS:
         raise InputError(
@@ -99,17 +99,17 @@ def onto_control(
 
 
 def on_a_line(there: Float[np.ndarray, "points 3"], here: Float[np.ndarray, "points 3"]) -> bool:
-    """Return True if all points are collinear, which leaves a rotation about their line undetermined."""
+    """Return True if all points are collinear, which leaves the rotation about their line undetermined."""
     return next(_of_threes(there, here), None) is None
 
 
 def _poor(there, here, sigma_m, assumed) -> OntoControl | None:
-    """Estimate with poor accuracy of the `assumed` points; None if most points are not consistent then either."""
+    """Estimate similarity and accuracy of inaccurate `assumed` points; None if most points remain inconsistent."""
     n = len(here)
     if n < _ENOUGH:
         return None
     similarity = min(_of_threes(there, here), key=lambda s: np.median(_off(s, there, here)))
-    # Rousseeuw's factor for small samples.
+    # Rousseeuw's correction factor for small samples.
     scatter = (1 + 5 / (n - MIN_POINTS)) * float(np.median(_off(similarity, there, here))) / _MEDIAN
     for _ in range(5):
         near = _off(similarity, there, here) < _WITHIN * scatter
@@ -172,9 +172,9 @@ class InFrame(NamedTuple):
 
     frame: Frame
     xyz: Float[np.ndarray, "points 3"]
-    """m; unknown heights are the median of the others."""
+    """Coordinates in m; unknown heights are replaced by the median of the others."""
     at_place: bool
-    """True if the block has that frame already."""
+    """True if the block is already in this frame."""
 
 
 def in_frame(
@@ -182,9 +182,10 @@ def in_frame(
 ) -> InFrame:
     """Transform the points to the frame of `block`, or to a new frame.
 
-    `words` name their system if the file does not. `code` is the EPSG code of a new frame, by default that of the
-    points or UTM, `vertical` that of its heights, by default that of the points. Raises InputError for a missing,
-    contradictory or unusable system, and for points far from the block, with a system that would fit.
+    `words` is the coordinate system if the file does not specify one. `code` is the EPSG code of a new frame, by
+    default the system of the points or UTM; `vertical` is the EPSG code of its heights, by default as in the points.
+    Raises InputError for a missing, contradictory or unusable system, and for points far from the block, with a system
+    that would fit.
     """
     at = block.frame.origin
     system = stated_system(points, words, lambda: fitting(points, None, *at[:2]) if at is not None else "")
@@ -201,7 +202,7 @@ def in_frame(
         there = places(points, system, block.frame.code)
         heights = block.frame.vertical if vertical is None else vertical
         if heights is None and block.frame.code == system.code:
-            # The transformed block has heights of the points.
+            # The transformed block uses the vertical system of the points.
             heights = system.vertical
         return InFrame(
             dataclasses.replace(block.frame, vertical=heights), block.frame.map.local_from_place(there), True
@@ -222,7 +223,10 @@ def in_frame(
 
 
 def stated_system(points: SurveyedPoints, words: str | None, guess: Callable[[], str]) -> ControlSystem:
-    """Return the system in the file of `points`, or `words`. Raises InputError for none, with a `guess`, or two."""
+    """Return the system in the file of `points`, or `words`.
+
+    Raises InputError if neither is given, with a `guess`, or if they differ.
+    """
     stated = system_of(points.system, points.file) if points.system else None
     given = system_of(words, "the EPSG code of the control") if words else None
     if stated and given and stated.crs != given.crs:
@@ -240,7 +244,7 @@ def stated_system(points: SurveyedPoints, words: str | None, guess: Callable[[],
 
 
 def new_code(points: SurveyedPoints, system: ControlSystem) -> int:
-    """EPSG code for a block that has none: that of the map system of the points, or the UTM zone."""
+    """Return the EPSG code for a block without one: the map system of the points, or the UTM zone."""
     if system.code is not None and system.crs is not None and system.crs.is_projected:
         return system.code
     longitude, latitude, _ = np.median(places(points, system, 4326), axis=0)

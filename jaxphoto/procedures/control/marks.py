@@ -1,7 +1,8 @@
-"""Marks of surveyed points in the images of a block: usable marks, their intersection, and their rows of a block.
+"""Marks of surveyed points in the images of a block: selection, intersection, and conversion to image points.
 
-Each two rays of a point give a position; the one that most rays pass within the limit is refined by least squares. A
-mark at the wrong target misses by far more than the limit, which leaves room for an orientation before adjustment.
+Every two rays of a point determine a position. The position with the most rays within the limit is refined by least
+squares. A mark at the wrong target exceeds the limit by far. The limit allows for errors of an orientation before
+adjustment.
 """
 
 import dataclasses
@@ -47,9 +48,9 @@ class Marked(NamedTuple):
 def marked(
     block: Block, points: SurveyedPoints, marks: Marks, elsewhere: Collection[str] = ()
 ) -> tuple[Marked, list[str]]:
-    """Return the marks of `points` in the images of `block`, and a sentence for those that are unusable.
+    """Return the marks of `points` in the images of `block`, and messages about unusable marks.
 
-    Images are found by file name, whatever folder, extension and case. Marks in `elsewhere`, images of other blocks,
+    Images are matched by file name, ignoring folder, extension and case. Marks in `elsewhere`, images of other blocks,
     are ignored.
     """
     image = images_of(marks.image, block.images)
@@ -64,7 +65,7 @@ def marked(
     _say(messages, marks, outside, marks.image, "outside of the picture")
     kept = np.flatnonzero((image >= 0) & (point >= 0) & ~outside)
     kept = kept[np.lexsort((image[kept], point[kept]))]
-    # The same photograph under two names.
+    # The same photograph may have marks under two names.
     twice = np.r_[False, (np.diff(image[kept]) == 0) & (np.diff(point[kept]) == 0)] if len(kept) else np.zeros(0, bool)
     _say(messages, marks, np.isin(np.arange(len(image)), kept[twice]), marks.point, "there twice for one photograph")
     kept = kept[~twice]
@@ -78,7 +79,7 @@ def marked(
 
 
 def images_of(names: Sequence[str], images: Sequence[str]) -> Int[np.ndarray, "names"]:
-    """Index of the image that each name means; -1 for none, or for more than one."""
+    """Return the index of the image that each name refers to; -1 for none, or for more than one."""
     exact = {name: k for k, name in enumerate(images)}
     loose: dict[str, int] = {}
     for k, name in enumerate(images):
@@ -93,7 +94,7 @@ def images_of(names: Sequence[str], images: Sequence[str]) -> Int[np.ndarray, "n
 
 
 def _say(messages: list[str], marks: Marks, wrong: np.ndarray, names: Sequence[str], what: str) -> None:
-    """Add a sentence on the marks that are `wrong`, with the first of them."""
+    """Append a message about the marks that are `wrong`, with the first of them."""
     which = np.flatnonzero(wrong)
     if len(which):
         listed = few(list(dict.fromkeys(names[int(k)] for k in which)))
@@ -101,9 +102,9 @@ def _say(messages: list[str], marks: Marks, wrong: np.ndarray, names: Sequence[s
 
 
 _BEYOND, _ROOM_PX = 4.0, 3.0
-# Maximum number of pairs of rays of one point.
+# Maximum number of ray pairs tested per point.
 _PAIRS = 300
-# Minimum angle (rad) of two rays.
+# Minimum angle (rad) between two rays.
 _PARALLEL = np.deg2rad(0.5)
 
 
@@ -111,10 +112,10 @@ class Intersected(NamedTuple):
     """Intersections of the rays of marks, in the frame of the block."""
 
     points: Float[np.ndarray, "points 3"]
-    """NaN for fewer than two rays."""
+    """Positions; NaN for fewer than two rays."""
     covariance: Float[np.ndarray, "points 3 3"]
     good: Bool[np.ndarray, "rows"]
-    """True for marks whose rays pass their point, and for single marks."""
+    """True for marks whose rays pass their point within the limit, and for single marks."""
     sentences: tuple[str, ...]
 
 
@@ -129,7 +130,7 @@ def rays_of(block: Block, unknowns: Unknowns, rows: Marked) -> Float[np.ndarray,
 
 
 def intersected(block: Block, unknowns: Unknowns, rows: Marked, ids: tuple[str, ...]) -> Intersected:
-    """Intersect the points of `rows` with the orientation `unknowns`; `ids` name them."""
+    """Intersect the points of `rows` with the orientation `unknowns`; `ids` are their names."""
     n, good = len(ids), np.ones(len(rows.image), bool)
     positions = np.asarray(unknowns.exterior.position, float)
     matrices = np.asarray(unknowns.exterior.camera_from_object, float)
@@ -168,7 +169,7 @@ def intersected(block: Block, unknowns: Unknowns, rows: Marked, ids: tuple[str, 
 
 
 def _passing(origins, directions, limit) -> Bool[np.ndarray, "rays"]:
-    """Return True for the rays of one point that pass the position of most of them; all False if no two rays meet."""
+    """Mark the rays of one point that pass the position of most of them; all False if no two rays meet."""
     n = len(origins)
     pairs = list(combinations(range(n), 2))
     pairs = [pairs[k] for k in np.linspace(0, len(pairs) - 1, min(len(pairs), _PAIRS)).astype(int)]
@@ -186,7 +187,7 @@ def _passing(origins, directions, limit) -> Bool[np.ndarray, "rays"]:
 
 
 def misses(places, origins, directions) -> Float[np.ndarray, "places rays"]:
-    """Angles (rad) by which rays miss positions; infinite behind the camera."""
+    """Return angles (rad) between rays and the directions to positions; infinite behind the camera."""
     towards = places[:, None] - origins
     along = np.sum(towards * directions, axis=2)
     across = np.linalg.norm(np.cross(directions[None], towards), axis=2)
@@ -206,7 +207,7 @@ def into_block(
     """Append the points `ids`, whose names are new, to `block`; `rows` are their marks.
 
     `xyz` (m, NaN if unknown) are observed with `sigma` for `control` points, and are check coordinates for `check`
-    points, with a sigma of 0 if not stated. `start` are initial values in the frame of the block.
+    points, with a sigma of 0 if not stated. `start` contains initial values in the frame of the block.
     """
     n = len(block.points)
     new = ImagePoints(
@@ -234,7 +235,7 @@ def _coordinates(xyz, sigma, chosen, first: int) -> ControlCoordinates:
 def without_names(block: Block, ids: tuple[str, ...]) -> Block:
     """Remove the names `ids` from the points of `block`.
 
-    Surveyed points of these names are removed with their image points; tie points are renamed.
+    Surveyed points with these names are removed together with their image points; tie points are renamed.
     """
     surveyed = {int(p) for rows in (block.control, block.fixed, block.check) for p in np.asarray(rows.who)}
     taken = set(ids)
@@ -265,7 +266,7 @@ def without_names(block: Block, ids: tuple[str, ...]) -> Block:
 
 
 def with_gnss_bias(block: Block) -> Block:
-    """Add a common shift of the stations of `block`, which control determines: height reference or datum."""
+    """Add a common shift of the stations of `block`, determined by control: an offset of height reference or datum."""
     unknowns, zero = block.start.unknowns, np.zeros(3)
     # Parts of a flight without a shift are the reference of the others.
     if "flight_bias" in unknowns.more or (unknowns.strips and unknowns.strips.keys() >= set(block.image_strip)):

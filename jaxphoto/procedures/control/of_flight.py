@@ -1,4 +1,4 @@
-"""Control of a flight: checked before matching, then used for every part; a part may be adjusted without it."""
+"""Control of a flight: checked before matching, then used for every part; a part can be adjusted without it."""
 
 from collections.abc import Callable, Collection, Iterable
 from functools import partial
@@ -20,16 +20,16 @@ from jaxphoto.statistics import Selection
 
 
 class FlightControl(NamedTuple):
-    """Control, and the system of its points if the file does not state it."""
+    """Control, and the coordinate system of its points if the file does not specify one."""
 
     control: GivenControl
     system: str | None
     images: tuple[str, ...]
     """All valid photographs of the flight."""
     target_search: TargetSearch | None
-    """Search for targets in the photographs."""
+    """Search function for targets in the photographs."""
     local: bool
-    """True for points in local Cartesian metres, to which positions of photographs have no relation."""
+    """True for points in local Cartesian metres, which are unrelated to the positions of photographs."""
 
 
 def flight_control(
@@ -40,7 +40,7 @@ def flight_control(
     target_search: TargetSearch | None = None,
     code: int | None = None,
 ) -> tuple[FlightControl, int | None]:
-    """Check control against photographs, and return the EPSG code of the flight: `code`, else that of the points.
+    """Check control against photographs, and return the EPSG code of the flight: `code`, or the code of the points.
 
     Raises InputError if no mark is in one of the `images`, for a missing or invalid system, for a local one together
     with `code`, and for points far from the `positions`, with a system that would fit.
@@ -71,7 +71,7 @@ def flight_control(
 def adjust_with_control(
     block: Block, control: FlightControl, code: int | None, vertical: int | None, report: Report
 ) -> tuple[ControlledBlock | None, str]:
-    """Adjust `block` with the control of the flight, or return why that is impossible."""
+    """Adjust `block` with the control of the flight, or return the reason why that is impossible."""
     how: dict[str, Any] = {"system": control.system, "code": code, "vertical": vertical, "report": report}
     of: Callable[..., ControlledBlock] = control_block
     if control.target_search is not None:
@@ -83,7 +83,7 @@ def adjust_with_control(
 
 
 def parts_with_marks(adjusted: Adjustment, marked: Collection[str]) -> dict[str, Selection]:
-    """Return groups of observations with a variance component each: features, marks, stations in plan and height."""
+    """Return observation groups with a variance component each: features, marks, stations in plan and height."""
     parts = {"image points": Selection("image_points")}
     if marked:
         ties = [name for name in adjusted.block.points if name not in marked]

@@ -1,6 +1,6 @@
 """Surveyed points, their marks in photographs, and their coordinate system.
 
-A system is an EPSG code, with one of heights (25832+7837) or without, "WGS84 UTM 32N" and PROJ strings as in
+A system is an EPSG code, with or without a code for heights (25832+7837), "WGS84 UTM 32N" and PROJ strings as in
 OpenDroneMap, WKT as in Metashape, or "local" for Cartesian metres without a map.
 """
 
@@ -21,9 +21,9 @@ from jaxphoto.errors import InputError, quoted
 from jaxphoto.georeferencing.map_frame import MapFrame, map_name, map_system
 
 SIGMA_M = (0.02, 0.02, 0.03)
-"""Default standard deviations of a surveyed point, east, north and up: RTK, one occupation."""
+"""Default standard deviations (m) of a surveyed point, east, north and up: RTK, one occupation."""
 MARK_SIGMA_PX = 1.0
-"""Default standard deviation of a manual mark."""
+"""Default standard deviation (px) of a manual mark."""
 
 
 class SurveyedPoints(NamedTuple):
@@ -32,13 +32,13 @@ class SurveyedPoints(NamedTuple):
     file: str
     ids: tuple[str, ...]
     coordinates: Float[np.ndarray, "points 3"]
-    """Easting, northing, height (m), or longitude, latitude (degrees), height; NaN for an unknown height."""
+    """Easting, northing, height (m), or longitude, latitude (degrees), height (m); NaN for an unknown height."""
     sigma_m: Float[np.ndarray, "points 3"]
-    """East, north, up; NaN if not stated."""
+    """Standard deviations east, north, up; NaN if not stated."""
     check: Bool[np.ndarray, "points"]
-    """True for check points, which never enter the adjustment."""
+    """True for check points, which are never adjusted."""
     places: tuple[str, ...]
-    """File and row of each."""
+    """File and row of each point."""
     system: str = ""
     """Coordinate system in the file: EPSG code, PROJ string, WKT, "local"; "" if not stated."""
     own_axes: bool = False
@@ -49,16 +49,16 @@ class Marks(NamedTuple):
     """Image coordinates of points in photographs (px); the centre of the upper-left pixel is (0.5, 0.5)."""
 
     image: tuple[str, ...]
-    """Name of the file or of the image."""
+    """File name or image name."""
     point: tuple[str, ...]
     column_row: Float[np.ndarray, "marks 2"]
     sigma_px: Float[np.ndarray, "marks"]
-    """NaN if not stated."""
+    """Standard deviation of each mark; NaN if not stated."""
     places: tuple[str, ...]
 
     @staticmethod
     def none() -> "Marks":
-        """No marks."""
+        """Return no marks."""
         return Marks((), (), np.zeros((0, 2)), np.zeros(0), ())
 
     def take(self, chosen: np.ndarray) -> "Marks":
@@ -78,7 +78,7 @@ class Marks(NamedTuple):
 
 
 class GivenControl(NamedTuple):
-    """Surveyed points and their marks, which may be empty if targets are to be found."""
+    """Surveyed points and their marks, which may be empty if targets are searched for."""
 
     points: SurveyedPoints
     marks: Marks
@@ -95,7 +95,7 @@ _KEYS = {
     "over",
 }  # fmt: skip
 _LONGEST = 20_000
-# Maximum distance of control from a flight.
+# Maximum distance (m) of control from a flight.
 NEAR_M = 20_000.0
 
 
@@ -104,7 +104,7 @@ class ControlSystem(NamedTuple):
 
     crs: CRS | None
     code: int | None
-    """EPSG code of the horizontal system, if any."""
+    """EPSG code of the horizontal system; None if there is none."""
     vertical: int | None
     """EPSG code of the heights; None for ellipsoidal heights, or if unknown."""
 
@@ -119,7 +119,7 @@ class ControlSystem(NamedTuple):
 
 @functools.lru_cache(maxsize=64)
 def system_of(words: str, place: str) -> ControlSystem:
-    """Parse the system `words`, read at `place`. Raises InputError if they name none."""
+    """Parse the system `words`, read at `place`. Raises InputError if the text is not a coordinate system."""
     words = words.strip()
     if words.lower() == LOCAL or words.startswith("LOCAL_CS["):
         return ControlSystem(None, None, None)
@@ -151,10 +151,10 @@ def system_of(words: str, place: str) -> ControlSystem:
 
 
 def places(points: SurveyedPoints, system: ControlSystem, code: int) -> Float[np.ndarray, "points 3"]:
-    """Longitude, latitude (degrees) and height (m) of the points, on the ellipsoid of the EPSG system `code`.
+    """Return longitude, latitude (degrees) and height (m) of the points, on the ellipsoid of the EPSG system `code`.
 
-    Unknown heights are the median of the others. Raises InputError for coordinates outside the system, for a missing
-    geoid model, and if no point has a height.
+    Unknown heights are replaced by the median of the others. Raises InputError for coordinates outside the system, for
+    a missing geoid model, and if no point has a height.
     """
     crs = system.crs
     assert crs is not None
@@ -184,7 +184,7 @@ def places(points: SurveyedPoints, system: ControlSystem, code: int) -> Float[np
 
 
 def filled(points: SurveyedPoints) -> Float[np.ndarray, "points 3"]:
-    """Coordinates with the median height for unknown ones. Raises InputError if no point has one."""
+    """Replace unknown heights by the median height. Raises InputError if no point has one."""
     xyz = points.coordinates.copy()
     if np.isnan(xyz[:, 2]).all():
         raise InputError(f"{points.file}: no point has a height; add them")
@@ -209,7 +209,7 @@ def check_near(points: SurveyedPoints, system: ControlSystem, longitude: float, 
 
 
 def fitting(points: SurveyedPoints, system: ControlSystem | None, longitude: float, latitude: float) -> str:
-    """Describe the system in which the points are near the photographs; "" if there is none."""
+    """Describe the system in which the points are near the photographs; return "" if there is none."""
     exchanged = points._replace(coordinates=points.coordinates[:, [1, 0, 2]])
     if system is not None and system.crs is not None and _near(exchanged, system, longitude, latitude):
         return f"with the first two coordinates exchanged, in {system.name}"
@@ -229,7 +229,7 @@ def _near(points: SurveyedPoints, system: ControlSystem, longitude: float, latit
 
 
 def _systems_at(longitude: float, latitude: float) -> list[int]:
-    """Projected systems in metres of the place: UTM first, then the national ones."""
+    """Return projected systems in metres that cover a position: UTM first, then national systems."""
     area = AreaOfInterest(longitude, latitude, longitude, latitude)
     listed = query_crs_info("EPSG", [PJType.PROJECTED_CRS], area, contains=True)
     codes = sorted(listed, key=lambda info: (not info.name.startswith("WGS 84 / UTM"), int(info.code)))
@@ -244,7 +244,7 @@ def _systems_at(longitude: float, latitude: float) -> list[int]:
 
 
 def distance_m(places: Float[np.ndarray, "n 3"], longitude: float, latitude: float) -> float:
-    """Distance of the median of `places` (degrees) from a place, on a sphere."""
+    """Return the distance between the median of `places` (degrees) and a position, on a sphere."""
     there = np.deg2rad(np.median(places[:, :2], axis=0))
     here = np.deg2rad([longitude, latitude])
     half = np.sin((there - here) / 2) ** 2

@@ -1,16 +1,17 @@
-"""Targets of surveyed points: predicted in photographs, searched for, verified, and adjusted with, iteratively.
+"""Targets of surveyed points: predict them in photographs, search, verify, and adjust, iteratively.
 
     C = J_i C_i J_i' + J_X C_X J_X'
 
-is the covariance of a predicted image point: J_i are the derivatives by exterior and interior orientation with their
-joint covariance from the adjustment, J_X those by the point with the covariance of the survey and of its offset.
+is the covariance of a predicted image point. J_i: derivatives by exterior and interior orientation, whose joint
+covariance C_i comes from the adjustment. J_X: derivatives by the point; C_X: covariance of the survey and its offset.
 
-A search returns candidates. Those of a point in several photographs belong to one target if their rays meet, near
-enough to the point. Of positions with similar numbers of photographs, the one with the sharpest edges is the target; if
-that is ambiguous none is accepted, nor candidates far less sharp than the targets of other points (stones).
+A search returns candidates. Candidates of a point in several photographs belong to one target if their rays meet, near
+enough to the point. Among positions with similar numbers of photographs, the one with the sharpest edges is the target.
+If that is ambiguous none is accepted, and neither are candidates far less sharp than the targets of other points
+(stones).
 
-The first search covers the uncertainty of the given block, the next ones that of the block with the accepted targets,
-which resolves similar targets. Targets far from the position that the other points predict are searched for again.
+The first search covers the uncertainty of the given block. Later searches use the block adjusted with the accepted
+targets, which resolves similar targets. Targets far from the position that the other points predict are re-searched.
 """
 
 from collections.abc import Callable, Collection
@@ -49,9 +50,9 @@ class Predicted(NamedTuple):
     point: Int[np.ndarray, "n"]
     column_row: Float[np.ndarray, "n 2"]
     covariance: Float[np.ndarray, "n 2 2"]
-    """px^2."""
+    """Covariance of the image coordinates (px^2)."""
     px_per_m: Float[np.ndarray, "n 2 3"]
-    """Derivative of the image coordinates by X, Y, Z of the point."""
+    """Derivatives of the image coordinates by X, Y, Z of the point."""
 
     def take(self, chosen: np.ndarray) -> "Predicted":
         """Select rows by mask or index."""
@@ -61,7 +62,7 @@ class Predicted(NamedTuple):
 def predicted(
     adjusted: Adjustment, xyz: Float[np.ndarray, "points 3"], of_points: Float[np.ndarray, "points 3 3"]
 ) -> Predicted:
-    """Predict `xyz` (m, in the frame of the block, with covariance `of_points`) in all photographs that show them."""
+    """Predict `xyz` (m, in the frame of the block, with covariance `of_points`) in all photographs containing them."""
     block, unknowns = adjusted.block, adjusted.unknowns
     joint = covariance(adjusted)
     n, factor = len(block.images), float(joint.variance_factor)
@@ -114,19 +115,20 @@ def _projected(interior, exterior, points, corrections):
     return jax.vmap(one)(exterior, points)
 
 
-# Search radius: standard deviations, and minimum in pixels.
+# Search radius: number of standard deviations, and minimum in pixels.
 _WITHIN, _MIN_PX = 3.5, 5.0
 # Standard deviation (m, plan) of the common offset of a block without control: receivers without corrections.
 COMMON_M = 3.0
-# Number of tie points that give the height of the ground at a point.
+# Number of tie points for the estimate of the ground height at a point.
 _NEAR_TIES = 8
 # Maximum distance (px) of a candidate from the intersection of the rays of its point.
 _MISS_PX = 2.0
 _MIN_IMAGES, _MIN_UNNAMED = 2, 3
-# Fraction of the photographs of a target above which another position competes.
+# Minimum ratio of photographs (another position / target) at which the target is ambiguous.
 _ALIKE = 0.6
 _PARALLEL = np.deg2rad(0.5)
-# Ratio of fits above which a target is sharper than another candidate, and above which it is duller than other targets.
+# Ratio of fits above which a target is sharper than another candidate; ratio above which it is duller than other
+# targets.
 _SHARPER, _DULL = 1.5, 3.0
 _MAX_PAIRS = 2000
 
@@ -142,11 +144,11 @@ class Candidates(NamedTuple):
 
 
 class TargetSearch(NamedTuple):
-    """Search for targets in photographs."""
+    """Function that searches for targets in photographs."""
 
     look: Callable[[Predicted, Float[np.ndarray, "n"], tuple[str, ...], tuple[str, ...]], Candidates]
-    """Return candidates within the radius (px) of each prediction; arguments include the names of all images and
-    points.
+    """Function that returns candidates within the radius (px) of each prediction; arguments include the names of all
+    images and points.
     """
     named: bool
     """True if a target identifies its point."""
@@ -159,7 +161,7 @@ class FoundTargets(NamedTuple):
     looked: dict[str, tuple[str, ...]]
     """Photographs that were searched."""
     why_not: dict[str, str]
-    """Reasons of points without a target."""
+    """Reasons for points without a target."""
 
 
 def found_marks(
@@ -174,8 +176,8 @@ def found_marks(
     """Find targets of the points `ids` at `xyz` (m, +- `sigma`) in the images of `adjusted`, except (image, point)
     `known`.
 
-    `placed`: control determines the frame of the block; otherwise its plan is that of receivers, its heights those of
-    the ground.
+    `placed`: control determines the frame of the block. Otherwise its plan is determined by receivers, and the ground
+    determines the heights of the points.
     """
     of_points = np.einsum("ni,ij->nij", sigma**2, np.eye(3))
     if not placed:
@@ -191,7 +193,7 @@ def found_marks(
 
 
 def _on_own_ground(adjusted: Adjustment, xyz) -> tuple[Float[np.ndarray, "points 3"], float]:
-    """Shift the heights of `xyz` to the ground of the block, and estimate the scatter of single ones."""
+    """Shift the heights of `xyz` to the ground of the block, and estimate the scatter of single heights."""
     ties = np.asarray(adjusted.unknowns.points, float)
     above = []
     for point in xyz:
@@ -259,14 +261,14 @@ def _believed(adjusted, ids, xyz, of_points, at: Predicted, seen: Candidates, na
 
 
 def _fit_of_others(taken: dict[int, list[int]], fit_px: Float[np.ndarray, "n"]) -> dict[int, float]:
-    """Median fit of the targets of the other points; infinite for too few."""
+    """Return the median fit of the targets of the other points; infinite for too few."""
     fits_of = {p: float(np.median(fit_px[rows])) for p, rows in taken.items()}
     others = {p: [fit for q, fit in fits_of.items() if q != p] for p in fits_of}
     return {p: float(np.median(fits)) if len(fits) >= _MIN_IMAGES else np.inf for p, fits in others.items()}
 
 
 def _meeting(origins, directions, image, limit, fit, near, of_point) -> tuple[np.ndarray, str]:
-    """Return the candidates, one per image, whose rays meet near a point; or why there are none."""
+    """Return the candidates, one per image, whose rays meet near a point; or the reason for failure."""
     one, other = np.triu_indices(len(image), 1)
     apart = image[one] != image[other]
     one, other = one[apart], other[apart]
@@ -281,7 +283,7 @@ def _meeting(origins, directions, image, limit, fit, near, of_point) -> tuple[np
         origins[ray], directions[ray], np.arange(len(one)).repeat(2), len(one), min_angle=_PARALLEL
     )
     off = met - near
-    # Two rays may differ by more than the survey: their own accuracy is in the limit.
+    # Two rays may differ by more than the survey: include their accuracy in the limit.
     room = np.linalg.norm(near - origins[one], axis=1) * limit[one] * 5
     distance = np.sqrt(np.einsum("ni,ij,nj->n", off, np.linalg.inv(of_point + 1e-12 * np.eye(3)), off))
     sure &= (distance < _WITHIN * 1.5) | (np.linalg.norm(off, axis=1) < room)
@@ -292,7 +294,7 @@ def _meeting(origins, directions, image, limit, fit, near, of_point) -> tuple[np
     score = np.stack([(inside & (image == i)).any(axis=1) for i in images]).sum(axis=0)
     likely = np.flatnonzero(score >= min(score.max(), max(_MIN_UNNAMED, _ALIKE * score.max())))
     sharp = np.array([np.median(fit[inside[k]]) for k in likely])
-    # Of the positions about as sharp as the sharpest, that of most photographs.
+    # Among positions nearly as sharp as the sharpest, take the one in most photographs.
     miss = misses(met[sure], origins, directions).min(axis=1)
     alike = likely[sharp <= _SHARPER * sharp.min()]
     best = int(alike[np.argmax(score[alike] - 1e-3 * miss[alike])])
@@ -309,7 +311,7 @@ def _meeting(origins, directions, image, limit, fit, near, of_point) -> tuple[np
 
 
 _ROUNDS = 3
-# Distance over the median of the other points beyond which a target may be something else.
+# Ratio of a distance to the median of the other points above which a target may be another object.
 _FAR = 10.0
 
 
@@ -325,9 +327,9 @@ def control_block_with_targets(
     adjust: Callable[[Block], Adjustment] = adjust_for_tables,
     report: Callable[[str], object] = lambda text: None,
 ) -> ControlledBlock:
-    """Adjust with the marks of `control` and those that `target_search` finds; see `control_block`.
+    """Adjust with the marks of `control` and with targets that `target_search` finds; see `control_block`.
 
-    Raises InputError as it does, and for a block in an arbitrary frame without marks of three control points.
+    Raises the same InputErrors, and InputError for a block in an arbitrary frame without marks of three control points.
     """
     points, ids = control.points, control.points.ids
     sigma = np.where(np.isnan(points.sigma_m), SIGMA_M, points.sigma_m)
@@ -351,9 +353,9 @@ def control_block_with_targets(
     for _ in range(_ROUNDS):
         report("looking for targets")
         frame = in_frame(adjusted.block, points, system, code, vertical)
-        # By marks, by targets of an earlier iteration, or by control of the block.
+        # The frame is determined by marks, by targets of an earlier iteration, or by control of the block.
         placed = len(adjusted.block.control) > 0
-        # Each only once.
+        # Replace the target of each point at most once.
         far = {p: off for p, off in _far(now, by_hand).items() if p not in replaced} if now else {}
         rows = (by_hand, now.marks.take(~np.isin(now.marks.point, list(far)))) if now else (by_hand,)
         known = {pair for of in rows for pair in zip(of.image.tolist(), of.point.tolist(), strict=True)}
@@ -368,7 +370,7 @@ def control_block_with_targets(
         why_not |= found.why_not
         if not len(found.marks.image):
             break
-        # After a rejection another target may be found; distant ones are replaced as a whole.
+        # Replace re-detected marks, and all marks of distant targets.
         again = set(zip(found.marks.image, found.marks.point, strict=True))
         names = {ids[p] for p in distant_points}
         kept = [(i, p) not in again and p not in names for i, p in zip(every.image, every.point, strict=True)]
@@ -394,9 +396,9 @@ def control_block_with_targets(
 
 
 def _far(now: ControlledBlock, by_hand: Marked) -> dict[int, float]:
-    """Distance (m) of found targets, not marked by hand nor adjusted with, that are far from their points.
+    """Return the distance (m) of found targets far from their points, except marks and targets used in the adjustment.
 
-    They remain unless another target is found: the block may be deformed there, which check points show.
+    They are retained unless another target is found: the block may be deformed there, as check points would show.
     """
     state, off = np.array(now.state, object), np.linalg.norm(np.nan_to_num(now.off_m), axis=1)
     if (state == "control").sum() < MIN_POINTS:
@@ -409,7 +411,7 @@ def _far(now: ControlledBlock, by_hand: Marked) -> dict[int, float]:
 def _told(
     ids: tuple[str, ...], seen: dict[str, set[str]], looked: dict[str, set[str]], why_not: dict[str, str]
 ) -> list[str]:
-    """One sentence on the targets of all iterations, and one for each point without any."""
+    """Return one message about the targets of all iterations, and one for each point without any."""
     counts = [f"{name} in {len(seen[name])} of {len(looked[name])}" for name in ids if seen[name]]
     count = f"{counted(len(counts), 'target')} found in the photographs that should show them"
     return [f"{count}: {', '.join(counts)}"] * bool(counts) + [why_not[p] for p in ids if p in why_not and not seen[p]]

@@ -1,10 +1,10 @@
 """Simultaneous adjustment of images and a point cloud (paper 001): the cloud constrains the images, the images correct
-it.
+the cloud.
 
-In one step: every tie point is observed to lie on the surface of each lidar strip that covers it, and the boresight of
-the scanner and the shifts of its strips are unknowns in addition to the orientations. The surface at a point depends on
-its position, so this step is iterated to convergence. Then the trajectory is corrected by the shifts of the strips, and
-the cloud is recomputed from it.
+Every tie point is observed to lie on the surface of each lidar strip that covers it. Unknowns are the orientations, the
+boresight of the scanner and the shifts of its strips. The surface at a point depends on its position, so the adjustment
+is iterated to convergence. Then the trajectory is corrected by the shifts of the strips, and the cloud is recomputed
+from it.
 """
 
 import dataclasses
@@ -58,8 +58,8 @@ SURFACES = get_args(Method)
 """Names of the surface interpolation methods."""
 SHIFT_SIGMA = 0.3
 """Default standard deviation (m) of a lidar strip's shift."""
-# Number of laser points of a strip around a tie point that its surface can depend on; multiple of the number that a
-# height is interpolated from.
+# Number of laser points of a strip near a tie point that can affect its surface; minimum ratio to the number used for
+# interpolation.
 _NEAR, _TIMES = 400, 8
 
 
@@ -73,17 +73,17 @@ class Simultaneous(eqx.Module):
     cloud: Cloud
     """Corrected cloud."""
     trajectory: Trajectory | None
-    """Corrected by the shifts of the strips flown along it."""
+    """Trajectory corrected by the shifts of its strips."""
     scanner: Scanner
     points: Int[np.ndarray, "rows"]
     """Point of the block, for each observation of a surface."""
     strip: Int[np.ndarray, "rows"]
     apart_before: Float[np.ndarray, "rows"]
-    """Height of points above the surface of the original cloud, before (m); NaN if undetermined."""
+    """Height of points above the surface of the original cloud, before adjustment (m); NaN if undetermined."""
     apart: Float[np.ndarray, "rows"]
-    """Height above the surface of the corrected cloud (m); NaN likewise."""
+    """Height of points above the surface of the corrected cloud (m); NaN if undetermined."""
     moved_cloud: Float[np.ndarray, "3"]
-    """Root mean square motion (m) of the laser points along X, Y and Z."""
+    """Root mean square correction (m) of the laser points along X, Y and Z."""
     rounds: tuple[Round, ...]
     converged: bool
     """True if the iteration converged."""
@@ -111,12 +111,12 @@ def simultaneous(
 ) -> Simultaneous:
     """Adjust `block` with its tie points on the surface of `cloud`, which is in the block's object frame.
 
-    `priors` are those of the scanner; by default its boresight is FREE if `trajectory` (of the scanner, on the cloud's
-    clock) gives the scanner position of each point, and FIXED without one; shifts are weighted at zero with
-    `SHIFT_SIGMA`. `points` are those on the surface; all tie points if None.
+    `priors` are the priors of the scanner. By default its boresight is FREE if `trajectory` (of the scanner, on the
+    cloud's clock) gives the scanner position of each point, and FIXED without one; shifts are weighted at zero with
+    `SHIFT_SIGMA`. `points` are the names of points on the surface; None selects all tie points.
 
     Raises BlockError if cloud and block, or cloud and trajectory, do not match; InputError for a boresight without
-    trajectory or times; and what `jaxphoto.adjust` raises.
+    trajectory or times; and the errors of `jaxphoto.adjust`.
     """
     settings = HeightSettings() if settings is None else settings
     names = cloud.strips or ("cloud",)
@@ -129,7 +129,7 @@ def simultaneous(
             f"the scanner's priors are of the strips {', '.join(priors.shifts)}, and the cloud's are "
             f"{', '.join(names)}: give one for each of these"
         )
-    # In the order of the cloud's strips.
+    # Sort by the cloud's strips.
     priors = Scanner(priors.boresight, {name: priors.shifts[name] for name in names})
     if priors.boresight != FIXED and not timed:
         raise InputError(
@@ -219,7 +219,7 @@ def _near(
     shift: Float[ArrayLike, "3"],
     settings: HeightSettings,
 ) -> tuple[Cloud, ScannerPoses | None]:
-    """Return the corrected laser points that the surface at some places can depend on, and their scanner poses."""
+    """Return the corrected laser points that can affect the surface at some positions, and their scanner poses."""
 
     def corrected(index: Int[np.ndarray, "m"]) -> tuple[Cloud, ScannerPoses | None]:
         returns = strip.cloud.take(index)
@@ -228,7 +228,7 @@ def _near(
         return dataclasses.replace(returns, xyz=corrected_xyz(returns.xyz, poses, boresight, shift)), poses
 
     order = np.asarray(strip.grid.order)
-    # Places in the measured cloud: displaced like the laser points there.
+    # Positions in the measured cloud: remove the correction of the nearest laser point.
     one = order[nearest(strip.grid, xy, 1).index[:, 0]]
     offset = strip.cloud.xyz[one, :2] - corrected(one)[0].xyz[:, :2]
     enough = min(max(_NEAR, _TIMES * settings.points), len(strip.cloud))
@@ -238,7 +238,7 @@ def _near(
 def _turns(
     surface: SurfaceAtPoints, strip: Int[np.ndarray, "rows"], poses: list[ScannerPoses | None]
 ) -> Float[np.ndarray, "rows 3"]:
-    """Return `SurfaceRows.turn` of every row, used or not: an equal number in every iteration."""
+    """Return `SurfaceRows.turn` of all rows, used or rejected: the shape is the same in every iteration."""
     turn = np.zeros_like(surface.foot)
     for k, one in enumerate(poses):
         if one is not None:
@@ -255,7 +255,7 @@ def _surface_rows(
     turn: Float[np.ndarray, "rows 3"],
     scanner: Scanner,
 ) -> SurfaceRows:
-    """Return observations by the measured cloud: linear in shift and boresight about those of `scanner`."""
+    """Return the observations of the measured cloud, linearised in shift and boresight at `scanner`."""
     of, turn, foot, normal = strip[used], turn[used], surface.foot[used], surface.normal[used]
     shift = np.stack([np.asarray(v) for v in scanner.shifts.values()])[of]
     raised = turn @ np.asarray(scanner.boresight)

@@ -1,4 +1,4 @@
-"""Outer iterations: adjustments with lidar observations that depend on the result, to convergence."""
+"""Iterated adjustment with lidar observations that depend on its result."""
 
 import dataclasses
 import warnings
@@ -19,28 +19,31 @@ from jaxphoto.unknowns import FIXED, Unknowns
 
 MAX_ROUNDS = 20
 CHANGE_LIMIT = 0.1
-"""Converged if no unknown moves by more than this fraction of its standard deviation.
+"""Maximum change of an unknown at convergence, in standard deviations.
 
-Smaller limits may never be reached: with each motion some laser point becomes a neighbour, and another ceases to be.
+Smaller limits may never be reached: any motion may change the set of neighbouring laser points.
 """
-# A point farther from the surface, in standard deviations, is rejected; it is tried again in the next iteration.
+# Maximum distance of a point from the surface, in standard deviations; rejected points are tested again in the next
+# iteration.
 _OUTLIER = 4.0
-# Per iteration only those are rejected that are this close to the largest.
+# Ratio to the largest normalised residual below which an observation is not rejected in the same iteration.
 _LARGEST = 0.5
-# First iteration with rejection, because the orientation may be inaccurate before; last one that may reject.
+# First iteration with rejection, because the orientation may be inaccurate before; iteration after which rejections are
+# final.
 _JUDGED, _SETTLED = 2, 5
-# Observations that differ by less, in standard deviations, are equal; iterations after which they are kept.
+# Maximum difference of equal observations, in standard deviations; iteration after which observations are constant.
 _SAME, _LAST_LOOK = 0.5, 8
-# Fraction of the height over the cloud by which points may miss it initially: error of the principal distance.
+# Maximum ratio of the initial distance of points from the cloud to the height above it: error of the principal
+# distance.
 _FAR = 0.1
-# Fraction of the observations that must fit in the end.
+# Minimum fraction of observations that must be accepted in the final iteration.
 _BORNE_OUT = 0.7
-# Fraction by which a principal distance rarely differs from its laboratory value.
+# Relative change of a principal distance above which it is unusual for a laboratory value.
 _UNUSUAL = 0.02
 
 
 class Round(NamedTuple):
-    """One iteration."""
+    """Record of one iteration."""
 
     number: int
     observed: int
@@ -50,19 +53,19 @@ class Round(NamedTuple):
     moved_m: float
     """Root mean square motion of the object points since the previous adjustment."""
     largest_change: float
-    """Of interior and exterior orientation since then, in standard deviations."""
+    """Maximum change of interior and exterior orientation since then, in standard deviations."""
     rmse_m: float
-    """Of the distances between the observed points and the surface, after the adjustment."""
+    """RMS distance of the observed points from the surface, after the adjustment."""
 
 
 class SurfaceAtPoints(NamedTuple):
-    """Surface at points: one row per candidate, in an order that stays from iteration to iteration."""
+    """Surface at points: one row per candidate, in the same order in every iteration."""
 
     point: Int[np.ndarray, "rows"]
     foot: Float[np.ndarray, "rows 3"]
     normal: Float[np.ndarray, "rows 3"]
     sigma: Float[np.ndarray, "rows"]
-    """Of the surface along its normal (m)."""
+    """Standard deviation of the surface along its normal (m)."""
     usable: Bool[np.ndarray, "rows"]
 
     def apart(self, adjusted: Adjustment) -> Float[np.ndarray, "rows"]:
@@ -82,7 +85,7 @@ class Observed(NamedTuple):
     used: Bool[np.ndarray, "rows"]
     rounds: tuple[Round, ...]
     converged: bool
-    """True if converged."""
+    """True if the iteration converged."""
 
 
 Look = Callable[[Adjustment], SurfaceAtPoints]
@@ -93,9 +96,9 @@ Build = Callable[[Adjustment, Covariance, SurfaceAtPoints, Bool[np.ndarray, "row
 def adjust_with_fixed_interior(block: Block) -> Adjustment:
     """Adjust `block` with fixed interior orientation, for the positions of its points.
 
-    If its datum is open or nearly so, as that of a strip with collinear stations, exterior orientation is fixed at its
-    start values from direct georeferencing: the cloud may close the datum. Raises what `adjust` raises, and BlockError
-    if it does not converge.
+    If its datum is undetermined or nearly so, as for a strip with collinear stations, exterior orientation is fixed at
+    its initial values from direct georeferencing: the cloud may determine the datum. Raises the errors of `adjust`, and
+    BlockError if it does not converge.
     """
     held = fix_interior(block).priors
     try:
@@ -118,7 +121,7 @@ def fix_interior(block: Block) -> Block:
 
 
 def check_without_surfaces(block: Block) -> None:
-    """Raise BlockError for a block with observations that are about to be made."""
+    """Raise BlockError if the block already has surface observations, which this procedure creates."""
     if len(block.surfaces.point) or block.start.unknowns.scanner is not None:
         raise BlockError(
             "the block has points on the surfaces of a laser scanner already: take the block as it was before, without "
@@ -129,9 +132,9 @@ def check_without_surfaces(block: Block) -> None:
 def with_common_error(
     sigma: Float[np.ndarray, "rows"], usable: Bool[np.ndarray, "rows"], common_m: float
 ) -> Float[np.ndarray, "rows"]:
-    """Return standard deviations whose mean over n rows keeps a common error: sigma^2 + (n - 1) common^2.
+    """Return standard deviations whose mean over n rows preserves a common error: sigma^2 + (n - 1) common^2.
 
-    `sigma` contains the common error once. An adjustment treats its observations as independent, and would average it.
+    `sigma` contains the common error once. Adjustment treats its observations as independent, which would average it.
     """
     return np.sqrt(sigma**2 + max(int(usable.sum()) - 1, 0) * common_m**2)
 
@@ -145,14 +148,14 @@ def iterate_to_convergence(
     group: Literal["control_points", "surfaces"],
     carry: Carry = lambda surface, before, now: surface,
 ) -> Observed:
-    """Iterate `look` at the cloud, `build` a block with the result, adjust; from `first` on, to convergence.
+    """Iterate from `first` to convergence: `look` up the surface, `build` a block with it, adjust.
 
-    Each block is adjusted from the unknowns of `build`. In later iterations an observation stays unchanged if the new
-    one is nearly equal, and finally in any case: otherwise a laser point could alternate between being a neighbour and
-    not. `carry` transforms an earlier observation from the cloud as corrected before to the current one. The
-    observations are the last rows of their `group`.
+    Each block is adjusted from the unknowns of `build`. In later iterations an observation is unchanged if the new one
+    is nearly equal, and finally in any case: otherwise the set of neighbouring laser points could alternate. `carry`
+    transforms an earlier observation from the previous corrected cloud to the current one. The observations are the
+    last rows of their `group`.
 
-    Raises BlockError if the cloud does not lie where the points are.
+    Raises BlockError if cloud and points are too far apart.
     """
     adjusted, cov, fits = first, covariance(first), np.array(True)
     before, at_first = first, look(first)
@@ -185,7 +188,7 @@ def iterate_to_convergence(
             _warn_of_scale(first, new)
             return Observed(at_first, adjusted, cov, surface, used, tuple(rounds), converged)
         if len(rounds) >= _JUDGED:
-            # In later iterations rejected observations stay rejected, to avoid alternation.
+            # In later iterations rejections are final, to avoid alternation.
             fits = _fit(surface, adjusted, cov, used, group) & (fits if len(rounds) >= _SETTLED else True)
         if len(rounds) < _SETTLED:
             surface = look(adjusted)
@@ -196,21 +199,20 @@ def iterate_to_convergence(
 
 
 def at_result(block: Block, unknowns: Unknowns) -> Block:
-    """Return `block` with an adjustment's unknowns as start values."""
+    """Return `block` with an adjustment's unknowns as initial values."""
     start = Start(unknowns, np.ones(len(block.images), bool), np.ones(len(block.points), bool))
     return dataclasses.replace(block, start=start)
 
 
 def _check_heights(first: Adjustment, surface: SurfaceAtPoints) -> None:
-    """Raise BlockError if the distance of the cloud from the points exceeds any error of the principal distance."""
+    """Raise BlockError if the distance of cloud and points is too large for an error of the principal distance."""
     apart = surface.apart(first)[surface.usable]
     camera = float(np.mean(np.asarray(first.unknowns.exterior.position)[:, 2]))
     offset, height = (float(np.median(v)) for v in (apart, camera - surface.foot[surface.usable, 2]))
     if abs(offset) > _FAR * abs(height):
         raise BlockError(
-            f"the cloud lies {abs(offset):.0f} m {'below' if offset > 0 else 'above'} where the block puts its points, "
-            f"with the cameras {height:.0f} m over the cloud: its heights may count in feet or belong to another "
-            "vertical system, or the principal distance that the block begins with is wrong"
+            f"the cloud is {abs(offset):.0f} m {'below' if offset > 0 else 'above'} the block's points (flying height "
+            f"{height:.0f} m); check the cloud's height unit and vertical datum, and the initial principal distance"
         )
 
 
@@ -225,7 +227,7 @@ def _check_used(surface: SurfaceAtPoints, used: Bool[np.ndarray, "rows"]) -> Non
 
 
 def _warn_of_scale(first: Adjustment, adjusted: Adjustment) -> None:
-    """Warn if the heights imply a principal distance that differs from any laboratory value."""
+    """Warn if the heights change a principal distance more than is plausible."""
     for name, interior in adjusted.unknowns.interior.items():
         before, after = float(first.unknowns.interior[name].c), float(interior.c)
         if abs(after - before) > _UNUSUAL * abs(before):
@@ -238,7 +240,7 @@ def _warn_of_scale(first: Adjustment, adjusted: Adjustment) -> None:
 
 
 def _keep_similar(old: SurfaceAtPoints, new: SurfaceAtPoints, adjusted: Adjustment) -> SurfaceAtPoints:
-    """Keep old observations that hardly differ from the new ones."""
+    """Retain old observations that are nearly equal to the new ones."""
     same = np.abs(old.apart(adjusted) - new.apart(adjusted)) < _SAME * new.sigma
     chosen = (np.where(same[:, None] if v.ndim > 1 else same, u, v) for u, v in zip(old[1:], new[1:], strict=True))
     return SurfaceAtPoints(new.point, *chosen)
@@ -247,18 +249,18 @@ def _keep_similar(old: SurfaceAtPoints, new: SurfaceAtPoints, adjusted: Adjustme
 def _fit(
     surface: SurfaceAtPoints, adjusted: Adjustment, cov: Covariance, used: Bool[np.ndarray, "rows"], group: str
 ) -> Bool[np.ndarray, "rows"]:
-    """Return which observations are consistent with the others."""
-    # Used ones, by their normalised residuals: those of the lidar are the last of their group.
+    """Mark observations that are consistent with the others."""
+    # Used observations: normalised residuals. The lidar observations are the last of their group.
     numbers, residuals = redundancy_numbers(adjusted, cov), adjusted.residuals
     # A group without rows has no residuals.
     none = np.zeros(0)
     v, r = (np.asarray(of.named.get(group, none)) for of in (residuals, numbers))
     v, r = (of_group[len(of_group) - int(used.sum()) :] for of_group in (v, r))
-    # Others, relative to the adjusted positions.
+    # Other observations: relative to the adjusted positions.
     points = np.einsum("ni,nij,nj->n", surface.normal, np.asarray(cov.points)[surface.point], surface.normal)
     w = np.where(surface.usable, np.abs(surface.apart(adjusted)) / np.sqrt(surface.sigma**2 + points), 0.0)
     w[used] = np.abs(v) / np.sqrt(np.maximum(r, LEAST_CHECKED))
-    # The largest first: they affect the others.
+    # Reject the largest first: they affect the others.
     limit = _OUTLIER * max(1.0, float(adjusted.sigma0))
     return w <= max(limit, _LARGEST * w.max(initial=0.0))
 

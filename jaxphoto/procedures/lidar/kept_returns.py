@@ -1,8 +1,8 @@
-"""Selection of returns for a strip adjustment of a cloud larger than memory: those at places that strips share.
+"""Selection of returns for a strip adjustment of a cloud larger than memory: returns in areas that strips share.
 
-The cloud is read twice, in parts. First its cells are accumulated; then the returns of cells with planes of two strips
-are kept, as many as fit, and those about control and tie points of photographs. The search then finds in them what it
-would find in the whole cloud.
+The cloud is read twice, in parts. First its cells are accumulated. Then the returns of cells with planes of two strips
+are selected up to the limit, and returns near control and tie points of photographs. The selection contains the planes
+that a search in the whole cloud would find.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,8 +18,8 @@ from jaxphoto.lidar.strip_planes import CellReturns, CellTally, StripSettings, c
 from jaxphoto.procedures.lidar.strip_model import Look, looks_of, thinned
 
 KEPT = 10_000_000
-"""Returns in memory: about a gigabyte with the search, and far more than 4,000 planes need."""
-# Maximum fraction about tie points; each attempt takes this factor less than the one before.
+"""Maximum number of returns in memory: about a gigabyte with the search, and far more than 4,000 planes need."""
+# Maximum fraction of returns near tie points; factor by which each attempt reduces the number of tie points.
 _ABOUT_POINTS, _LESS = 0.5, 0.8
 _LEAST = 1e-4
 # Minimum number of planes per pair of strips.
@@ -35,10 +35,11 @@ def kept_returns(
     surveyed: Float[np.ndarray, "k 3"] | None = None,
     most: int = KEPT,
 ) -> Cloud:
-    """Return the returns of a cloud for `adjust_strips`; all of them for at most `most` returns.
+    """Select the returns of a cloud for `adjust_strips`; all of them if there are at most `most`.
 
-    `parts` yields the cloud each time it is called, in parts of bounded size whose strips are those met so far;
-    `places` (m) are approximate tie points of photographs; `surveyed` (m) is control, all of whose returns are kept.
+    `parts` yields the cloud each time it is called, in parts of bounded size; the strips of a part are all strips read
+    so far. `places` (m) are approximate tie points of photographs. `surveyed` (m) is control; all returns near it are
+    selected.
     """
     small: list[Cloud] = []
     passed, number = _Passed(settings, path, pattern), 0
@@ -76,11 +77,11 @@ class _Passed:
 
     @property
     def cells(self) -> dict[str, CellReturns]:
-        """Cells by surface."""
+        """Return the cells of each look."""
         return self._tally.strips
 
     def returns(self, part: Cloud, cells: dict[str, Int[np.ndarray, "cells"]]) -> Bool[np.ndarray, "n"]:
-        """Return the returns of a part in `cells`; and of each strip the first and last, the ends of its splines."""
+        """Mark the returns of a part in `cells`, and the first and last return of each strip (ends of its splines)."""
         selected = np.zeros(len(part), bool)
         for look in self._looks(part):
             own_returns = look.returns
@@ -104,7 +105,7 @@ def _chosen(
     places: Float[np.ndarray, "n 3"],
     always: dict[str, Int[np.ndarray, "kept"]],
 ) -> dict[str, Int[np.ndarray, "cells"]]:
-    """Return the cells of each look whose returns are kept, at most `most`; those in `always`, and others."""
+    """Choose the cells of each look whose returns are selected, at most `most` returns in addition to `always`."""
     most -= _number(looks, always)
     part, room = 1.0, _ABOUT_POINTS * most
     while (n_about := _number(looks, about := _about(looks, places, part, settings))) > room and part > _LEAST:
@@ -129,7 +130,7 @@ def _chosen(
 def _about(
     looks: dict[str, CellReturns], places: Float[np.ndarray, "n 3"], part: float, settings: StripSettings
 ) -> dict[str, Int[np.ndarray, "cells"]]:
-    """Return the cells in and around which some of the places lie."""
+    """Return the cells that contain or adjoin a fraction `part` of the positions `places`."""
     number = max(1, round(part * len(places)))
     some = places[np.linspace(0, len(places) - 1, number).astype(int)] if len(places) else places
     beside = [np.array([x, y, 0.0]) * settings.cell_m for x in (-1, 0, 1) for y in (-1, 0, 1)]
@@ -138,7 +139,7 @@ def _about(
 
 
 def _number(looks: dict[str, CellReturns], cells: dict[str, Int[np.ndarray, "cells"]]) -> int:
-    """Return the number of returns in cells of the looks."""
+    """Return the number of returns in `cells` of the looks."""
     return sum(
         int(look_cells.returns[np.isin(look_cells.cell, cells[name], assume_unique=True)].sum())
         for name, look_cells in looks.items()

@@ -17,7 +17,7 @@ from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.observations import Attitudes, CameraPositions, StripPlanes, TrajectoryAttitudes, TrajectoryStations
 from jaxphoto.procedures.lidar.iterate_to_convergence import check_without_surfaces
 
-# Stations farther from the trajectory (m) belong to another one, or to another time.
+# Maximum distance (m) of stations from the trajectory; larger ones belong to another trajectory or time.
 _FAR_M = 10.0
 
 
@@ -25,11 +25,11 @@ class Photographs(NamedTuple):
     """Block of images, and the exposure times on the clock of the cloud and its trajectory."""
 
     block: Block
-    """Its stations and attitudes are those of the trajectory."""
+    """Block whose stations and attitudes come from the trajectory."""
     time: Float[np.ndarray, "images"]
-    """Seconds."""
+    """Exposure times in seconds."""
     on_breaklines: tuple[str, ...] = ()
-    """Tie points on breaklines; by default those of the block."""
+    """Names of tie points on breaklines; by default `block.breaklines`."""
 
     @property
     def breaklines(self) -> tuple[str, ...]:
@@ -94,7 +94,7 @@ def check_photographs(photographs: Photographs, trajectory: Trajectory | None) -
 def spans_with(
     time: Float[np.ndarray, "images"], spans: Float[np.ndarray, "strips 2"]
 ) -> Float[np.ndarray, "strips 2"]:
-    """Return first and last times of strips (s) including the exposures on their trajectories."""
+    """Return first and last times of strips (s), extended to the exposures on their trajectories."""
     strip = _strip_of(time, spans)
     times_of_strip = [np.append(time[strip == k], span) for k, span in enumerate(spans)]
     return np.array([(t.min(), t.max()) for t in times_of_strip])
@@ -108,7 +108,7 @@ def on_trajectory(
 ) -> Block:
     """Return the block with stations and attitudes of a trajectory with errors `splines` over `spans`.
 
-    They replace its own: the same instruments count once.
+    They replace the block's observations, which come from the same instruments and would be used twice.
     """
     block, time = photographs.block, photographs.time
     strip, knots, weights = _strip_of(time, spans), np.zeros((len(time), 4), int), np.zeros((len(time), 4))
@@ -127,6 +127,6 @@ def on_trajectory(
 
 
 def _strip_of(time: Float[np.ndarray, "images"], spans: Float[np.ndarray, "strips 2"]) -> Int[np.ndarray, "images"]:
-    """Return the laser strip whose trajectory holds each exposure: the nearest in time."""
+    """Return the laser strip of each exposure: the nearest in time."""
     away = np.maximum(spans[:, :1] - time, time - spans[:, 1:])
     return np.argmin(np.maximum(away, 0.0), axis=0)

@@ -1,4 +1,4 @@
-"""Search for common planes of two strips, in the cloud as corrected so far."""
+"""Search for common planes of two strips in the corrected cloud."""
 
 import dataclasses
 import itertools
@@ -29,14 +29,14 @@ from jaxphoto.lidar.strip_planes import (
 from jaxphoto.observations import StripPlanes, StripPoints
 from jaxphoto.procedures.lidar.strip_model import Look, looks_of, plane_rows, side_of, thinned
 
-# Fewer planes of a pair of strips occur by chance.
+# Minimum number of common planes of two strips; fewer may match by chance.
 _FEWEST = 10
-# Larger distances between strips (m) are not due to a trajectory; usually heights in two systems, or in feet.
+# Maximum distance (m) of two strips due to trajectory errors; larger ones indicate heights in two systems, or in feet.
 _APART_M = 10.0
 
 
 class CommonPlanes(NamedTuple):
-    """Planes of two strips, and which of them fit."""
+    """Planes of two strips, and a mask of accepted ones."""
 
     one: Look
     other: Look
@@ -46,10 +46,10 @@ class CommonPlanes(NamedTuple):
 
 
 class StripSearch:
-    """Successive searches: once `settled`, returns stay in their cells.
+    """Repeated search for common planes. Once `settled`, returns stay in their cells.
 
-    Otherwise with each correction some return would leave its cell, and another enter: scatter within the unknowns'
-    standard deviations, but without convergence.
+    Otherwise each correction would move some returns between cells: the results would vary within the standard
+    deviations of the unknowns, and not converge.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class StripSearch:
         """Returns of each look as corrected in the last search."""
 
     def look(self, errors: StripErrors, settled: bool) -> list[CommonPlanes]:
-        """Return the planes of every pair of strips; for a strip with two looks, those of both."""
+        """Return the planes of every pair of looks, including two looks of one strip."""
         patches, cells, corrected = [], [], []
         for k, strip_look in enumerate(self.looks):
             measured, time = self.cloud.xyz[strip_look.returns], times_of(self.cloud)[strip_look.returns]
@@ -76,7 +76,7 @@ class StripSearch:
 
     @property
     def corrected_cloud(self) -> Cloud:
-        """Return the cloud as corrected in the last search; all its other fields are kept."""
+        """Return the cloud as corrected in the last search, with all other fields unchanged."""
         xyz = np.empty_like(self.cloud.xyz)
         for look, corrected in zip(self.looks, self.corrected, strict=True):
             xyz[look.returns] = corrected
@@ -90,7 +90,7 @@ class StripSearch:
         return CommonPlanes(self.looks[one], self.looks[other], (patches[one], patches[other]), pairs, fits)
 
     def rows(self, planes: Sequence[CommonPlanes], errors: StripErrors) -> StripPlanes:
-        """Return the fitting planes as observations, at most `most`, distributed over the pairs of strips."""
+        """Return the accepted planes as observations, at most `most`, distributed over the pairs of strips."""
         total, parts = sum(int(f.fits.sum()) for f in planes), []
         for f in planes:
             chosen = np.flatnonzero(f.fits)
@@ -110,8 +110,8 @@ def check_joined(names: Sequence[str], planes: Sequence[CommonPlanes]) -> None:
     alone = [name for k, name in enumerate(names) if k not in joined]
     if alone and len(names) > 1:
         raise BlockError(
-            f"strip {alone[0]} has fewer than {_FEWEST} planes in common with any other: leave it out, take larger "
-            "cells (--cell-m) or rougher planes (--roughness-m), or check that all strips overlap and are in one system"
+            f"strip {alone[0]} has fewer than {_FEWEST} planes in common with any other; check overlap and coordinate "
+            "system, increase --cell-m or --roughness-m, or remove the strip"
         )
     for common in apart:
         up = float(np.median(common.pairs.gap / common.pairs.normal[:, 2]))
@@ -124,21 +124,21 @@ def check_joined(names: Sequence[str], planes: Sequence[CommonPlanes]) -> None:
 
 
 class PointPlanes(NamedTuple):
-    """Points above planes of one strip, and which of them fit."""
+    """Points above planes of one strip, and a mask of accepted ones."""
 
     look: Look
     patches: StripPatches
     found: PointsOnPlanes
-    """Its points are indices of `PointSearch.points`."""
+    """Gaps of points and planes; point indices refer to `PointSearch.points`."""
     sigma: Float[np.ndarray, "n"]
     """Standard deviation of the gaps, from plane and point (m)."""
     fits: Bool[np.ndarray, "n"]
 
 
 class PointSearch:
-    """Successive searches: once `settled`, returns stay with their points, as in `StripSearch`.
+    """Repeated search for planes at points. Once `settled`, returns stay with their points, as in `StripSearch`.
 
-    `points` are block indices: of the points `on_planes`, and twice of those `on_breaklines`, for both faces.
+    `points` contains block indices: `on_planes` once, and `on_breaklines` twice, for both faces.
     """
 
     def __init__(
@@ -155,9 +155,7 @@ class PointSearch:
     def look(
         self, place: Float[np.ndarray, "points 3"], spread: Float[np.ndarray, "points 3 3"], settled: bool
     ) -> list[PointPlanes]:
-        """Return the planes about points (m) with these covariances, in the strips as last corrected by the other
-        search.
-        """
+        """Return the planes at points (m) with covariances `spread`, in the strips last corrected by `StripSearch`."""
         search, about, seen = self.search, [], []
         for k, (strip_look, xyz) in enumerate(zip(search.looks, search.corrected, strict=True)):
             about.append(self.about[k] if settled else self._about(xyz, place))
@@ -175,13 +173,15 @@ class PointSearch:
         return seen
 
     def _about(self, xyz: Float[np.ndarray, "n 3"], place: Float[np.ndarray, "points 3"]) -> tuple[np.ndarray, ...]:
-        """Return the returns about each point, or of its face, and the point of each."""
+        """Return the returns near each point, or on its face, and the index of the point for each."""
         index, point = returns_about(xyz, place[: self._plain], self.search.settings)
         of_faces, face = faces_about(xyz, place[self._plain :: 2], self.search.settings)
         return np.concatenate([index, of_faces]), np.concatenate([point, self._plain + face])
 
     def unseen(self, planes: Sequence[PointPlanes], names: Sequence[str]) -> list[str]:
-        """Return a message if points on breaklines have no faces in any strip; `names` are those of the block."""
+        """Return a message if points on breaklines have no faces in any strip; `names` are the names of the block's
+        points.
+        """
         lines = self.points[self._plain :: 2]
         number = np.concatenate([f.found.point[f.found.point >= self._plain] for f in planes])
         out = np.setdiff1d(np.arange(len(lines)), (number - self._plain) // 2)
@@ -194,7 +194,7 @@ class PointSearch:
         ]
 
     def rows(self, planes: Sequence[PointPlanes], errors: StripErrors) -> tuple[StripPoints, ...]:
-        """Return the fitting points as observations: one group, if there are any."""
+        """Return the accepted points as observations: one group, or none."""
         of_strips = []
         for f in (f for f in planes if f.fits.any()):
             found = PointsOnPlanes(*(v[f.fits] for v in f.found))

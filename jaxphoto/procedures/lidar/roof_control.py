@@ -1,9 +1,9 @@
 """Roofs as additional control: tie points on planes of roof faces, and measured centroids as control points.
 
-A roof face is a plane of many laser points: it constrains a tie point along its normal better than any single height,
+A roof face is a plane of many laser points. It constrains a tie point along its normal better than any single height,
 and roof normals have many directions. The centroid of a roof constrains a point in X, Y and Z, if it was measured in
-the images. Both are methods that paper 004 cites. Elsewhere heights are control as in `vertical_control`: they also
-give the points' positions first, well enough to identify roofs.
+the images. Paper 004 cites both methods. Other tie points have heights as control as in `vertical_control`. These also
+give the initial positions of the points, accurate enough to identify roofs.
 """
 
 import dataclasses
@@ -34,11 +34,11 @@ from jaxphoto.statistics import Covariance
 
 BUILDING = 6
 """LAS class of buildings."""
-# Laser points farther from all requested points (m) belong to none of their roofs.
+# Maximum distance (m) of laser points from the requested points for a search of their roofs.
 _NEAR = 40.0
 # Minimum number of laser points of a roof.
 _LEAST = 20
-# Maximum distance of a point from its plane (m), with heights as control.
+# Maximum distance (m) of a point from its plane, for positions adjusted with heights as control.
 _STOREY = 2.0
 
 
@@ -46,12 +46,14 @@ class RoofControl(eqx.Module):
     """Adjustment with roofs as control; arrays are over the tie points on roof faces."""
 
     block: Block
-    """With the planes as `surfaces`, heights and centroids as control, starting from the adjusted unknowns."""
+    """Block with the planes as `surfaces`, heights and centroids as control, and the adjusted unknowns as initial
+    values.
+    """
     adjusted: Adjustment
     points: Int[np.ndarray, "n"]
-    """Index in the block."""
+    """Index of each point in the block."""
     apart: Float[np.ndarray, "n"]
-    """Height above the plane (m)."""
+    """Height of each point above its plane (m)."""
     faces: int
     """Number of roof faces with a tie point."""
     rounds: tuple[Round, ...]
@@ -71,13 +73,13 @@ def roof_control(
 ) -> RoofControl:
     """Adjust `block` with its tie points (or the named `points`) on roof faces of `cloud` constrained to their planes.
 
-    All others have control heights (`lidar_control`, by planes). Roofs are laser points of class 6; in a cloud without
-    classes (or with 0 and 1 only) all points are searched, including level ground. Points named in `centroids` were
-    measured at the centre of a roof face, and become control in X, Y and Z. The standard deviation of n points on one
-    plane is sqrt(n) times that of the plane there, which they share.
+    All other tie points have control heights (`lidar_control`, by planes). Roofs are laser points of class 6; in a
+    cloud without classes (or with 0 and 1 only) all points are searched, including level ground. Points named in
+    `centroids` were measured at the centre of a roof face, and become control in X, Y and Z. The standard deviation of
+    n points on one plane is sqrt(n) times the standard deviation of the plane there, which is common to them.
 
-    Raises BlockError if no tie point lies on a roof, or a centroid on none; InputError for names that are not points;
-    and what `jaxphoto.adjust` raises.
+    Raises BlockError if no tie point lies on a roof, or a centroid is outside all roofs; InputError for names that are
+    not points; and the errors of `jaxphoto.adjust`.
     """
     settings = HeightSettings() if settings is None else settings
     check_without_surfaces(block)
@@ -89,7 +91,7 @@ def roof_control(
     patches = _patches(cloud, places[np.concatenate([which, middles])], settings)
     margin = 2 * settings.sigma_xy_m
     centres = _centroid_rows(block, middles, places, patches, cloud)
-    # Those of the block come first.
+    # Remove the block's control, which comes first.
     of_heights = heights.block.control.take(np.arange(len(block.control.who), len(heights.block.control.who)))
     chosen = np.full(len(which), -1)
 
@@ -107,7 +109,7 @@ def roof_control(
             foot[members], normal[members], of_plane = plane_feet(patches[k].plane, xyz[members])
             # The error of a plane is common to its points.
             sigma[members] = of_plane * np.sqrt(members.sum())
-        # A yard between wings of a house lies within the outline of its roof, too.
+        # Exclude points in yards between the wings of a house, inside the outline of its roof.
         distance = np.einsum("nk,nk->n", normal, xyz - foot)
         chosen[~(np.abs(distance) < _STOREY)] = -1
         return SurfaceAtPoints(which, foot, normal, sigma, chosen >= 0)
@@ -135,7 +137,7 @@ def roof_control(
 
 
 def _patches(cloud: Cloud, places: Float[np.ndarray, "n 3"], settings: HeightSettings) -> list[Patch]:
-    """Return roof faces near places; `Patch.index` refers to the points of `cloud`."""
+    """Return roof faces near the positions `places`; `Patch.index` refers to the points of `cloud`."""
     classified = cloud.classification is not None and bool(np.any(cloud.classification > 1))
     roofs = np.flatnonzero(cloud.classification == BUILDING) if classified else np.arange(len(cloud))
     if len(roofs):
@@ -151,7 +153,7 @@ def _patches(cloud: Cloud, places: Float[np.ndarray, "n 3"], settings: HeightSet
 
 
 def _faces(xy: Float[np.ndarray, "n 2"], patches: list[Patch], margin: float) -> Int[np.ndarray, "n"]:
-    """Return the patch of each place, at least `margin` (m) inside its outline; -1 for none."""
+    """Return the patch that contains each position, at least `margin` (m) inside its outline; -1 for none."""
     face = np.full(len(xy), -1)
     for k, patch in reversed(list(enumerate(patches))):
         corners = patch.outline[:, :2]

@@ -1,7 +1,7 @@
 """Consistency of a cloud and a trajectory: positions of the points relative to the scanner.
 
-In the body frame, a scanner's points occupy the same region along the whole flight. With a trajectory in another
-system, in feet, on another clock or with another yaw they do not, and an adjustment is meaningless.
+In the body frame, a scanner's points are in the same region along the whole flight. If the trajectory is in another
+system, in feet, on another clock or has another yaw, they are not, and an adjustment is meaningless.
 """
 
 import dataclasses
@@ -21,39 +21,39 @@ from jaxphoto.procedures.lidar.strip_model import aside
 
 # Maximum range of an airborne laser scanner (m).
 _FARTHEST_M = 10_000.0
-# Number of points examined, second by second.
+# Number of points examined; time window (s); minimum number of points per window.
 _PROBED, _WINDOW_S, _FEWEST = 50_000, 1.0, 20
-# Allowed motion of the mean of a second's points, in half widths of the swath, as over water without returns; and its
-# maximum across track, as a tangent.
+# Maximum drift of the one-second median, in half swath widths (allows gaps over water); maximum of its median over the
+# flight, as a tangent.
 _WANDERS, _ASIDE = 1.5, 3.0
-# Line patterns spread less than this fraction ahead than across; circular patterns spread more. Swaths narrower than
-# this fraction of the height are not judged.
+# Ratio of the spreads ahead and across above which the pattern is circular, below which it consists of lines; minimum
+# half swath width, relative to the height, for this test.
 _ALIKE, _NARROW = 0.5, 0.02
-# Cosine of the angle between yaw and course: crab angles leave more.
+# Minimum median cosine of the angle between yaw and course; crab angles give a larger one.
 _FOLLOWS = 0.7
-# At lower speeds (m/s) the course is undetermined.
+# Minimum speed (m/s) for which the course is determined.
 _SLOW = 1.0
-# Minimum size of a jump, absolute and relative to the usual scatter of records.
+# Minimum size of a jump (m); minimum ratio to the median of all records.
 _JUMP_M, _TIMES = 0.3, 20.0
-# Largest mean look-ahead (tangent) of a scanner; a time shift that brings the points under the trajectory leaves at
-# most this fraction of it. Number of points examined.
+# Median tangent of the angle ahead below which clocks are not compared; maximum ratio to this tangent after a correct
+# time shift; number of points examined.
 _OBLIQUE, _UNDER, _SOME = 0.8, 0.25, 1000
 
 
 class _FromBody(NamedTuple):
-    """Tangents of the angles of points to the right and ahead, from the body's nadir."""
+    """Tangents of the angles of points to the right and ahead, relative to the body's nadir."""
 
     middle: Float[np.ndarray, "seconds 2"]
-    """Mean by second."""
+    """Median of each second."""
     half_width: Float[np.ndarray, "2"]
-    """Median half width of the points of a second."""
+    """Half width of the points of a second, median of all seconds."""
 
 
 def check_measured_from(cloud: Cloud, path: ScannerPath, pattern: Pattern | None = None) -> list[str]:
-    """Return messages about odd positions of the points of `cloud` relative to the scanner.
+    """Return messages about unusual positions of the points of `cloud` relative to the scanner.
 
-    Raises BlockError if they cannot have been measured from this trajectory, or correspond to another `pattern` where
-    it matters.
+    Raises BlockError if the points cannot have been measured from this trajectory, or correspond to another `pattern`
+    than the given one.
     """
     some = _probed(cloud)
     away = np.linalg.norm(cloud.xyz[some] - scanner_poses(path, cloud.time[some]).position, axis=1)  # type: ignore[index]
@@ -88,7 +88,7 @@ def check_measured_from(cloud: Cloud, path: ScannerPath, pattern: Pattern | None
 
 
 def _distant_strips(cloud: Cloud, path: ScannerPath, most: float) -> list[str]:
-    """Return strips whose mean lies farther across than `most` (a tangent); none if all do."""
+    """Return strips whose median lies farther from the nadir than `most` (a tangent); none if all do."""
     some = _probed(cloud)
     if cloud.strip is None:
         return []
@@ -104,8 +104,8 @@ def _check_pattern(positions: _FromBody, pattern: Pattern) -> None:
     spread = f"to the side by {right:.2f} of the height and ahead by {ahead:.2f}"
     if right < _ALIKE * ahead:
         raise BlockError(
-            f"the laser points of a second spread {spread}, as those of no scanner that was flown along its x axis: "
-            "correct the yaw of the trajectory, or turn it to the axes of the scanner"
+            f"laser points of one second spread {spread}: the scan is not across the x axis. Correct the trajectory's "
+            "yaw, or rotate it to the scanner axes"
         )
     around = ahead > _ALIKE * right
     if around and pattern == "line":
@@ -121,9 +121,7 @@ def _check_pattern(positions: _FromBody, pattern: Pattern) -> None:
 
 
 def _check_leap_seconds(cloud: Cloud, path: ScannerPath) -> None:
-    """Raise BlockError if the returns lie under the trajectory at a shift of some leap seconds, but not at their own
-    times.
-    """
+    """Raise BlockError if the returns are below the trajectory after a shift of leap seconds, but not before."""
     some = cloud.take(np.linspace(0, len(cloud) - 1, _SOME).astype(int))
     times = np.asarray(some.time)
     covered = CoveredTimes(path.trajectory)
@@ -172,13 +170,13 @@ def _odd_yaw(trajectory: Trajectory) -> list[str]:
 
 
 def _jumps(trajectory: Trajectory) -> list[str]:
-    """Return a message about jumps of the positions between records, as after a re-initialisation of GNSS."""
+    """Return a message about jumps of the positions between records, for example after a re-initialisation of GNSS."""
     time, position = np.asarray(trajectory.time), np.asarray(trajectory.position)
     between = np.diff(time)[:, None]
     speed = np.diff(position, axis=0) / between
-    # Relative to extrapolation from the steps before and after.
+    # Compare with the mean velocity of the intervals before and after.
     jump = np.linalg.norm((speed[1:-1] - (speed[:-2] + speed[2:]) / 2) * between[1:-1], axis=1)
-    # Nothing is expected across a gap, as in the turn between strips.
+    # Ignore gaps, for example turns between strips.
     gap = between[:, 0] > longest_interval(trajectory)
     jump[gap[1:-1] | gap[:-2] | gap[2:]] = 0.0
     k = int(np.argmax(jump))
@@ -201,7 +199,7 @@ def _probed(cloud: Cloud) -> Int[np.ndarray, "n"]:
 
 
 def _positions_in_body(cloud: Cloud, path: ScannerPath) -> _FromBody | None:
-    """Return the positions; None for a narrow swath, or for few points."""
+    """Return the positions of the points by second; None for a narrow swath, or for few points."""
     some = _probed(cloud)
     time = cloud.time[some]  # type: ignore[index]
     tangents = aside(cloud, some, path)
@@ -211,7 +209,7 @@ def _positions_in_body(cloud: Cloud, path: ScannerPath) -> _FromBody | None:
     parts = [tangents[order[k : k + n]] for k, n in zip(first, number, strict=True) if n >= _FEWEST]
     if not parts:
         return None
-    # From the first decile to the last: a return above the scanner may be arbitrarily far across.
+    # Use the first and last decile: a return above the scanner may be arbitrarily far across.
     low, middle, high = np.stack([np.quantile(part, (0.1, 0.5, 0.9), axis=0) for part in parts], axis=1)
     half_width = np.median((high - low) / 2, axis=0)
     return None if max(half_width) < _NARROW else _FromBody(middle, half_width)

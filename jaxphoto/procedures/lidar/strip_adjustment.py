@@ -1,8 +1,8 @@
-"""Strip adjustment: laser strips fitted to each other in their overlap, by scanner and trajectory corrections.
+"""Strip adjustment: fit overlapping laser strips to each other by scanner and trajectory corrections.
 
-Planes common to two strips are found by cells, and observed to coincide (`observations.StripPlanes`); scanner and
-trajectory are corrected, the cloud is recomputed from range, angle and trajectory, and planes are found in it again,
-until convergence.
+Planes common to two strips are found by cells, and observed to coincide (`observations.StripPlanes`). Scanner and
+trajectory are corrected, and the cloud is recomputed from range, angle and trajectory. Search and adjustment are
+iterated to convergence.
 """
 
 import dataclasses
@@ -47,34 +47,36 @@ from jaxphoto.unknowns import FIXED
 MAX_STRIP_ROUNDS = 10
 PHOTOGRAPHS = "photographs"
 """Name of the tie points of photographs in tables of differences."""
-# From this iteration on returns stay in their cells: strips fit to their noise by then.
+# Number of iterations after which returns stay in their cells: strips then fit to their noise.
 _SETTLED = 2
-# Their matrix has 29 GB.
+# Maximum number of spline knots; their normal matrix has 29 GB.
 _MOST_KNOTS = 10_000
 
 
 class StripRound(NamedTuple):
-    """One iteration."""
+    """Record of one iteration."""
 
     number: int
     planes: int
-    """Number observed; at most `StripSettings.most` of those that fit."""
+    """Number of planes observed; at most `StripSettings.most` of the fitting ones."""
     points: int
-    """Tie points of photographs observed to lie on a plane; one on planes of two strips counts twice."""
+    """Number of observations that tie points of photographs lie on a plane; a point on planes of two strips counts
+    twice.
+    """
     control: int
-    """Surveyed points observed likewise."""
+    """Number of observations that surveyed points lie on a plane."""
     left_out: int
-    """Rejected planes and points."""
+    """Number of rejected planes and points."""
     rms_m: float
-    """Of the gaps of all fitting planes, before this adjustment; NaN for one strip."""
+    """RMS gap of all fitting planes, before this adjustment; NaN for one strip."""
     largest_change: float
-    """Of the unknowns of scanner, trajectory and cameras, in standard deviations."""
+    """Largest change of the unknowns of scanner, trajectory and cameras, in standard deviations."""
 
 
 class StripDifference(NamedTuple):
-    """Difference of two strips in their overlap, or of points and the planes of a strip, before and after.
+    """Difference of two strips in their overlap, or of points and the planes of a strip, before and after adjustment.
 
-    Points are tie points of photographs, control or check points: named in `one`.
+    Points are tie points of photographs, control or check points, as named in `one`.
     """
 
     one: str
@@ -82,7 +84,7 @@ class StripDifference(NamedTuple):
     planes_before: int
     planes: int
     mean_before_m: float
-    """Mean gap along the normals of fitting planes: the first above the other."""
+    """Mean gap along the normals of fitting planes: the first above the second."""
     rms_before_m: float
     mean_m: float
     rms_m: float
@@ -98,9 +100,9 @@ class StripAdjustment(eqx.Module):
     adjusted: Adjustment
     covariance: Covariance
     cloud: Cloud
-    """Corrected, with all fields."""
+    """Corrected cloud, with all fields."""
     trajectory: Trajectory | None
-    """Corrected."""
+    """Corrected trajectory."""
     errors: StripErrors
     """Errors that were removed."""
     differences: tuple[StripDifference, ...]
@@ -110,7 +112,7 @@ class StripAdjustment(eqx.Module):
     warnings: tuple[str, ...] = ()
     """Messages about inconsistencies of cloud and trajectory."""
     surveyed: tuple[SurveyedGap, ...] = ()
-    """Control and check points, each above the plane of each strip that has one."""
+    """Control and check points above the planes of strips: one item per point and plane."""
 
 
 def adjust_strips(
@@ -125,26 +127,26 @@ def adjust_strips(
     max_rounds: int = MAX_STRIP_ROUNDS,
     report: Callable[[StripRound], None] = lambda made: None,
 ) -> StripAdjustment:
-    """Adjust the strips of `cloud`; `trajectory` is that of its scanner, on the cloud's clock.
+    """Adjust the strips of `cloud`; `trajectory` is the path of its scanner, on the cloud's clock.
 
-    Standard deviations stated by the trajectory replace those of `settings`; zero states none.
+    Standard deviations in the trajectory replace the values of `settings`; zero means unknown.
 
-    `photographs` taken on it are adjusted as well: their exposures have the trajectory's errors, and their tie points
-    lie on the planes of the strips, those on breaklines on both faces. Their block defines the unknowns of cameras and
-    mounts; its stations and attitudes are taken to be the trajectory's.
+    `photographs` of the same flight are also adjusted: their exposures have the trajectory's errors, and their tie
+    points lie on the planes of the strips, points on breaklines on both faces. Their block defines the unknowns of
+    cameras and mounts; its stations and attitudes are assumed to come from the trajectory.
 
-    `control` are surveyed points on smooth surfaces, in the cloud's system (m): strips with planes about them pass
-    through them. Its check points are only compared. Without a trajectory it is the datum, too.
+    `control` contains surveyed points on smooth surfaces, in the cloud's system (m): planes near them are observed to
+    pass through them. Its check points are only compared. Without a trajectory control also defines the datum.
 
-    `priors` are those of the scanner and include its pattern; by default lines, its boresight FREE and all else FIXED.
-    For circular patterns, forward and backward looks of a strip are compared, too. `fixed` are strips whose trajectory
-    is not corrected, or "all". Without a trajectory each strip has only a shift, and the first is fixed if none is
-    named, in the directions that control does not determine.
+    `priors` are the priors of the scanner and include its pattern; by default lines, its boresight FREE and all else
+    FIXED. For circular patterns, forward and backward looks of a strip are also compared. `fixed` are strips whose
+    trajectory is not corrected, or "all". Without a trajectory each strip has only a shift, and by default the first is
+    fixed in the directions that control does not determine.
 
-    Raises InputError for a cloud of one strip without control, of strips without points or without the times that a
+    Raises InputError for a cloud of one strip without control, for strips without points or without the times that a
     trajectory needs, for a time offset of a circular scanner and for control without heights or standard deviations;
     BlockError for strips without common planes, for control away from them and for a trajectory that does not cover the
-    cloud or the exposures; and what `jaxphoto.adjust` raises.
+    cloud or the exposures; and the errors of `jaxphoto.adjust`.
     """
     settings = StripSettings() if settings is None else settings
     if trajectory is None and priors is not None:
@@ -176,7 +178,7 @@ def adjust_strips(
     if control is not None:
         block, number = with_control(empty_block("strips and control") if images is None else images, control)
     if trajectory is None:
-        # With control, its datum below replaces that of a strip.
+        # With control, `with_datum` below replaces the fixed strip.
         right = fixed if fixed or control is not None else names[:1]
         block = strip_block(names, splines, right, sigmas, None, block)
     else:
@@ -207,7 +209,7 @@ def adjust_strips(
         point_rows = (StripPoints.joined(*points, *control_rows),) if points or control_rows else ()
         observed = dataclasses.replace(block, more=(*block.more, planes, *point_rows, *steps))
         adjusted = adjust(observed, observed.start.unknowns)
-        # With rows, because any iteration may be the last: its covariance also serves the tables of the result.
+        # Include rows, because any iteration may be the last: its covariance also serves the tables of the result.
         cov = covariance(adjusted, rows=True)
         now = np.asarray(adjusted.values.shared)[adjusted.structure.free]
         counted = len(planes), sum(map(len, points)), sum(map(len, control_rows))
@@ -240,7 +242,7 @@ def adjust_strips(
                 (*messages, *(() if ties is None else ties.unseen(on_ties, adjusted.block.points))),
                 () if control is None else surveyed_gaps(control, on_surveyed, errors, path, adjusted, cov),
             )
-        # For a large flight gigabytes, which the next iteration needs.
+        # Free gigabytes for large flights before the next iteration.
         del adjusted, cov
 
 

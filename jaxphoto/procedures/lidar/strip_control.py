@@ -1,7 +1,7 @@
-"""Surveyed points on smooth surfaces of strips: the datum that strips cannot provide themselves.
+"""Surveyed points on smooth surfaces of strips: the datum that strips do not determine.
 
 A point belongs to the block, with its coordinates observed once for any number of strips: its survey error is common to
-all of them.
+all strips.
 """
 
 import dataclasses
@@ -32,30 +32,31 @@ from jaxphoto.unknowns import FIXED, Weighted
 
 CONTROL, CHECK = "control", "check points"
 """Names of surveyed points in tables of differences."""
-# Maximum distance (m) of a strip from control in its system; usually exceeded by heights of another system, or feet.
+# Maximum distance (m) of a strip from control in the same system; larger ones indicate another height system, or feet.
 _FAR_M = 10.0
-# Distances are given in kilometres from here on (m).
+# Minimum distance (m) that messages state in kilometres.
 _KILOMETRES = 10_000.0
-# Prior sigmas of a strip, fixed in some directions and free in the others (m): small and large compared with control.
+# Prior sigmas (m) of a strip: in fixed directions, small compared with control; in free directions, large.
 _RIGHT_M, _FREE_M = 1e-3, 100.0
-# Of the common shift of most control: iterations of reweighting, standard deviations below which gaps have equal
-# weight, and fraction of the best-determined direction that is undetermined.
+# Number of reweighting iterations for the common shift of control; number of standard deviations below which gaps have
+# equal weight; ratio of singular values below which a direction is undetermined.
 _TURNS, _SMALL, _UNTOLD = 30, 0.1, 0.01
-# In standard deviations of the survey: two surveys within this limit belong to one point.
+# Maximum difference, in standard deviations of the survey, of two surveys of one point.
 _SAME = 4.0
 _NO_MARKS = Marked(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
 
 
 class OnStrips(NamedTuple):
-    """Surveyed points above planes of each look; check points all fit, because nothing follows from them."""
+    """Surveyed points above planes of each look; all check points are accepted, because nothing depends on them."""
 
     control: list[PointPlanes]
     check: list[PointPlanes]
 
 
 class ControlSearch:
-    """Searches about surveyed places, which stay; `number` is the index of each point in the block, -1 for check
-    points.
+    """Search for strip planes at surveyed points (constant coordinates).
+
+    `number`: index of each point in the block, -1 for check points.
     """
 
     def __init__(self, search: StripSearch, control: SurveyedPoints, number: Int[np.ndarray, "points"]) -> None:
@@ -65,10 +66,10 @@ class ControlSearch:
         self._spread = variances[:, :, None] * np.eye(3)
 
     def look(self, settled: bool) -> OnStrips:
-        """Return the planes about the points, in the strips as last corrected by the other search."""
+        """Return the planes at the points, in the strips last corrected by `StripSearch`."""
         seen = self._points.look(self.control.coordinates, self._spread, settled)
         control = [_select_planes(f, ~self.control.check[f.found.point]) for f in seen]
-        # All strips together: a few points of one strip do not show which of them is a blunder.
+        # Test all strips together: a few points of one strip do not show which of them is a blunder.
         found = [(f.patches.normal[f.found.patch], f.found.gap, f.sigma) for f in control]
         normal, gap, sigma = (np.concatenate(v) for v in zip(*found, strict=True))
         fit = fitting(_remove_common_shift(normal, gap, sigma), sigma, self.search.settings.outlier)
@@ -80,12 +81,12 @@ class ControlSearch:
         )
 
     def rows(self, seen: OnStrips, errors: StripErrors) -> tuple[StripPoints, ...]:
-        """Return the fitting control as observations: one group, if there are any."""
+        """Return the accepted control as observations: one group, or none."""
         return self._points.rows(seen.control, errors)
 
 
 def with_control(block: Block, control: SurveyedPoints) -> tuple[Block, Int[np.ndarray, "points"]]:
-    """Return `block` with the control observed, and the index of each; -1 for check points, which it does not need.
+    """Return `block` with the control observed, and the index of each point; -1 for check points, which are not added.
 
     Control of the block with the same name is the same point, surveyed once. Raises InputError for points without a
     height or a standard deviation, and for other points of the block with the same name.
@@ -144,14 +145,15 @@ def check_seen(control: SurveyedPoints, surveyed: OnStrips, search: StripSearch)
 def with_datum(block: Block, strip: str, surveyed: OnStrips, settings: StripSettings) -> Block:
     """Return `block` of shifts alone, with `strip` fixed in the directions that control does not determine.
 
-    These are determined worse than by a trajectory: control on level ground says nothing about X and Y.
+    A direction is undetermined if a trajectory would determine it better: control on level ground does not determine X
+    and Y.
     """
     planes = [(f.patches.normal[f.found.patch[f.fits]], f.sigma[f.fits]) for f in surveyed.control]
     normal, sigma = (np.concatenate(v) for v in zip(*planes, strict=True))
     weighed = normal / sigma[:, None]
     eigenvalues, axes = np.linalg.eigh(weighed.T @ weighed)
     determined = eigenvalues > settings.sigma_position_m**-2
-    # At least the direction that control determines best, if there is any.
+    # The direction that control determines best is always free, if there is control.
     determined[-1] = len(sigma) > 0
     if determined.all():
         return block
@@ -171,14 +173,14 @@ def _far(metres: float) -> str:
 def _remove_common_shift(
     normal: Float[np.ndarray, "n 3"], gap: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n"]:
-    """Return gaps without their most common shift (of least absolute deviations).
+    """Remove the common shift (least absolute deviations) from the gaps.
 
-    It includes the effect of a blunder among few points on the strips.
+    A blunder among few points affects the shifts of strips, hence many gaps: the common shift removes this effect.
     """
     remaining = gap
     for k in range(_TURNS):
         weight = 1 / np.sqrt(sigma * (np.maximum(np.abs(remaining), _SMALL * sigma) if k else sigma))
-        # Directions that are hardly determined stay unchanged.
+        # The shift is zero in directions that are hardly determined.
         shift = np.linalg.lstsq(normal * weight[:, None], gap * weight, rcond=_UNTOLD)[0]
         remaining = gap - normal @ shift
     return remaining
@@ -190,7 +192,7 @@ def _select_planes(planes: PointPlanes, chosen: Bool[np.ndarray, "n"]) -> PointP
 
 
 def _also_in_block(block: Block, control: SurveyedPoints) -> Bool[np.ndarray, "points"]:
-    """Return which control also belongs to the block. Raises InputError for names of other points there."""
+    """Mark control that also belongs to the block. Raises InputError for names of other points there."""
     place, again = {name: k for k, name in enumerate(block.points)}, np.zeros(len(control.ids), bool)
     surveyed = [(rows.who, rows.axis, np.asarray(rows.value)) for rows in (block.control, block.fixed)]
     who, axis, value = (np.concatenate(v) for v in zip(*surveyed, strict=True))
@@ -211,15 +213,15 @@ def _also_in_block(block: Block, control: SurveyedPoints) -> Bool[np.ndarray, "p
 
 # Gap between each surveyed point and each strip after the adjustment, with its expected scatter.
 #
-# A gap g = n . (X - F') of a surveyed place X above the foot F' on the plane of a strip has the variance s^2 of plane
-# and survey, and F' depends on the unknowns x, of covariance C, by a = d(n . F')/dx. Adjusted observations have
-# absorbed part of their errors, others have not:
+# The gap g = n . (X - F') of a surveyed point X above its foot F' on the plane of a strip has the variance s^2 of plane
+# and survey. F' depends on the unknowns x with covariance C: a = d(n . F')/dx. The unknowns have absorbed part of the
+# errors of adjusted control:
 #
 #     var(g) = s^2 - a C a'    for adjusted control,        s^2 + a C a'    for check points, and rejected control
 #
-# and g over its standard deviation is the test value w (Baarda 1968), standard normal without errors.
+# The test statistic w is g divided by its standard deviation (Baarda 1968), standard normal without blunders.
 
-# Fractions of its noise below which an adjusted gap is uninformative: nothing else checks it.
+# Ratio sigma of the adjusted gap / sigma of its noise below which the gap is uncontrolled (redundancy near zero).
 _UNTESTED = 1e-3
 
 
@@ -230,19 +232,19 @@ class SurveyedGap(NamedTuple):
     role: Literal["control", "check"]
     strip: str
     dX_m: float
-    """Surveyed minus the nearest place on the plane of the strip, corrected."""
+    """Surveyed point minus its foot on the corrected plane of the strip."""
     dY_m: float
     dZ_m: float
     gap_m: float
-    """Their length, positive if the point lies above."""
+    """Length of (dX, dY, dZ), positive if the point lies above the plane."""
     noise_m: float
-    """Of plane and survey."""
+    """Standard deviation of plane and survey."""
     sigma_m: float
-    """Of `gap_m`, a priori."""
+    """Standard deviation of `gap_m`, a priori."""
     w: float
-    """gap / sigma; NaN if nothing checks it."""
+    """gap / sigma; NaN if uncontrolled."""
     used: bool
-    """True if it is in the adjustment."""
+    """True if the point is in the adjustment."""
 
 
 def surveyed_gaps(
@@ -253,7 +255,7 @@ def surveyed_gaps(
     adjusted: Adjustment,
     cov: Covariance,
 ) -> tuple[SurveyedGap, ...]:
-    """Return the gaps of surveyed points for each strip with a plane about them; `errors` are the adjusted ones."""
+    """Return the gaps of surveyed points for each strip with a plane near them; `errors`: adjusted strip errors."""
     gaps: list[SurveyedGap] = []
     roles: tuple[tuple[Literal["control", "check"], list[PointPlanes]], ...]
     roles = (("control", surveyed.control), ("check", surveyed.check))
@@ -275,14 +277,14 @@ def surveyed_gaps(
 def _variance_of_foot(
     f: PointPlanes, errors: StripErrors, path: ScannerPath | None, adjusted: Adjustment, cov: Covariance
 ) -> Float[np.ndarray, "n"]:
-    """Return a C a', a priori."""
+    """Return the a priori variance a C a'."""
     side = side_of(f.patches, f.found.patch, f.found.foot, f.look.strip, errors, path)
     errors_at = np.concatenate([errors.position, errors.attitude], axis=1)[side.knots]
     errors_at = np.einsum("nk,nkc->nc", side.weights, errors_at)
     normal = f.patches.normal[f.found.patch]
     by_knots, *by_scanner = call_compiled(_slopes, side, normal, errors_at, errors.boresight, errors.calibration)
     place = {label: k for k, label in enumerate(adjusted.structure.labels)}
-    # Fixed unknowns have no place, and contribute nothing.
+    # Fixed unknowns have index -1: collect them in an extra column, which is removed.
     a = np.zeros((len(normal), len(place) + 1))
     knot = TrajectoryKnot(np.zeros(3), np.zeros(3))  # type: ignore[arg-type]
     owners, rows = list(adjusted.unknowns.more[TrajectoryKnot.kind]), np.arange(len(normal))
@@ -304,7 +306,7 @@ def _slopes(
     boresight: Float[Array, "3"],
     calibration: ScannerCalibration,
 ) -> tuple[Float[Array, "n 6"], Float[Array, "n 3"], Float[Array, "n calibrated"]]:
-    """Differentiate the height of the foot along the normal by the trajectory's error, the boresight and the rest."""
+    """Differentiate the foot's height along the normal by trajectory error, boresight and scanner calibration."""
     numbers, back = ravel_pytree(calibration)
 
     def height(offset, boresight, numbers, normal, point, position, angles, velocity, rate):

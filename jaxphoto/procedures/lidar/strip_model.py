@@ -1,7 +1,8 @@
 """Looks of a scanner: forward and backward returns of a strip.
 
-A line scanner sees a place once per strip. A circular scanner sees it ahead and, seconds later, behind: at other
-angles, at another time of the trajectory. Planes from the two looks of one strip are compared like those of two strips.
+A line scanner measures an area once per strip. A circular scanner measures it ahead and, seconds later, behind: at
+other angles, at another time of the trajectory. Planes from the two looks of one strip are compared like planes of two
+strips.
 """
 
 import dataclasses
@@ -35,7 +36,7 @@ from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
 
 
 class Look(NamedTuple):
-    """Returns of one strip."""
+    """Forward, backward or all returns of one strip."""
 
     strip: int
     name: str
@@ -58,7 +59,7 @@ def looks_of(cloud: Cloud, path: ScannerPath | None, pattern: Pattern) -> list[L
 
 
 def aside(cloud: Cloud, which: Int[np.ndarray, "n"], path: ScannerPath) -> Float[np.ndarray, "n 2"]:
-    """Return tangents of the angles of returns to the right and ahead, from the body's nadir."""
+    """Return tangents of the angles of returns to the right and ahead, relative to the body's nadir."""
     parts = [np.zeros((0, 2))]
     for first in range(0, len(which), PORTION):
         portion = which[first : first + PORTION]
@@ -77,19 +78,19 @@ class KnotSigmas(NamedTuple):
     """Standard deviations of the trajectory errors at each knot of all strips."""
 
     position: Float[np.ndarray, "knots 3"]
-    """Along X, Y and Z (m)."""
+    """Standard deviations along X, Y and Z (m)."""
     attitude: Float[np.ndarray, "knots 3"]
-    """About right, forward and up (rad)."""
+    """Standard deviations about right, forward and up (rad)."""
 
 
 def knot_sigmas(splines: Sequence[StripSpline], trajectory: Trajectory | None, settings: StripSettings) -> KnotSigmas:
-    """Return those stated by the trajectory, or those of the settings where it states none (zero)."""
+    """Return the trajectory's standard deviations at the knots, or the values of the settings if it has none (zero)."""
     times = np.concatenate([spline.times for spline in splines])
     position = np.full((len(times), 3), settings.sigma_position_m)
     attitude = np.tile(settings.sigma_attitude, (len(times), 1))
     if trajectory is None:
         return KnotSigmas(position, attitude)
-    # Of roll, pitch and yaw, which are rotations about forward, right and up.
+    # Order roll, pitch and yaw as rotations about right, forward and up.
     stated = np.asarray(trajectory.sigma_position), np.asarray(trajectory.sigma_attitude)[:, [1, 0, 2]]
     for sigma_of_knots, sigmas in zip((position, attitude), stated, strict=True):
         for axis, column in enumerate(sigmas.T):
@@ -99,14 +100,14 @@ def knot_sigmas(splines: Sequence[StripSpline], trajectory: Trajectory | None, s
 
 
 class ScannerPriors(NamedTuple):
-    """Priors of the scanner: FREE, FIXED or Weighted, each."""
+    """Priors of the scanner, each FREE, FIXED or Weighted."""
 
     boresight: Any = FREE
     calibration: ScannerCalibration = ScannerCalibration(*[FIXED] * len(dynamic_fields(ScannerCalibration)))  # type: ignore[arg-type]
 
     @property
     def right(self) -> bool:
-        """Return True if nothing of the scanner is estimated."""
+        """Return True if no parameter of the scanner is estimated."""
         calibration = (getattr(self.calibration, name) for name in dynamic_fields(ScannerCalibration))
         return all(prior == FIXED for prior in (self.boresight, *calibration))
 
@@ -119,11 +120,10 @@ def strip_block(
     priors: ScannerPriors | None,
     photographs: Block | None = None,
 ) -> Block:
-    """Create a block of these unknowns, all zero, added to `photographs` if given.
+    """Create a block with the unknowns of strips, all zero, added to `photographs` if given.
 
-    The first knot of each strip has the trajectory's sigma as prior.
-
-    Without `priors` strips have only a shift, which is free. The trajectory of strips in `held` is fixed.
+    The first knot of each strip has the trajectory's sigma as prior. Without `priors` strips have only a shift, which
+    is free. The trajectory of strips in `held` is fixed.
     """
     knots: dict[str, AbstractParameters] = {}
     knot_priors: dict[str, AbstractParameters] = {}
@@ -159,14 +159,15 @@ def errors_of(unknowns: Unknowns, splines: tuple[StripSpline, ...]) -> StripErro
     return StripErrors(splines, position, attitude, boresight, calibration)
 
 
-# Iterations from a corrected point to the measured one: each reduces the error by a factor of the corrections' size.
+# Number of iterations from a corrected point to the measured one: each multiplies the error by the relative size of the
+# corrections.
 _STEPS = 2
 # Odd multiplier (Knuth) that scatters neighbouring integers over 64 bits.
 _SCATTER = np.uint64(0x9E3779B97F4A7C15)
 
 
 class Side(NamedTuple):
-    """One strip's part of rows: knots (n, 4), weights (n, 4), all others (n, 3)."""
+    """Observations of one strip: knots (n, 4), weights (n, 4), all others (n, 3)."""
 
     knots: np.ndarray
     weights: np.ndarray
@@ -185,14 +186,14 @@ def side_of(
     errors: StripErrors,
     path: ScannerPath | None,
 ) -> Side:
-    """Return the places `foot` (m, corrected by `errors`) of patches as measured, and the scanner poses."""
+    """Return the measured positions of the corrected points `foot` (m) on patches, and the scanner poses."""
     time = patches.time[which]
     knots, weights = errors.splines[strip].weights(time)
     point = foot + patches.measured[which] - patches.mean[which]
     for _ in range(_STEPS):
         point = point - (corrected_strip(point, time, strip, errors, path) - foot)
     if path is None or not len(time):
-        # From vertically above: nothing that rotates the shot is estimated.
+        # Assume vertical shots: nothing that rotates the shot is estimated.
         none = np.zeros_like(point)
         return Side(knots, weights, point, point + np.array([0.0, 0.0, 1.0]), none, none, none)
     poses = scanner_poses(path, time)
@@ -208,9 +209,9 @@ def plane_rows(pairs: PlanePairs, a: Side, b: Side) -> StripPlanes:
 
 
 def thinned(normal: Float[np.ndarray, "n 3"], cell: Int[np.ndarray, "n"], most: int) -> np.ndarray:
-    """Select at most `most` planes: half of them steep ones if possible, otherwise at random.
+    """Select at most `most` planes: half of them steep if possible, otherwise at random.
 
-    Randomness depends on the cell, so that nearly equal planes give the same selection.
+    Randomness depends on the cell, so nearly equal planes give the same selection.
     """
     tells = steep(normal)
     order = np.argsort(cell.astype(np.uint64) * _SCATTER, kind="stable")
@@ -222,14 +223,14 @@ def thinned(normal: Float[np.ndarray, "n 3"], cell: Int[np.ndarray, "n"], most: 
 def step_rows(
     splines: tuple[StripSpline, ...], sigmas: KnotSigmas, settings: StripSettings
 ) -> tuple[PositionSteps, AttitudeSteps]:
-    """Return steps from knot to knot of every strip, so that every knot has its a priori standard deviation."""
+    """Return the difference observations of successive knots, which give every knot its a priori standard deviation."""
     start = np.concatenate([s.first + np.arange(s.size - 1) for s in splines])
     interval = np.concatenate([np.full(s.size - 1, s.interval) for s in splines])
     decay = np.exp(-interval / settings.correlation_s)
     part, none = decay[:, None] ** 2, np.zeros((len(start), 3))
 
     def new(sigma: Float[np.ndarray, "knots 3"]) -> Float[np.ndarray, "steps 3"]:
-        # If errors decrease faster than their correlation decays, new variance still enters.
+        # Limit from below: if errors decrease faster than their correlation decays, new variance is still added.
         before, after = sigma[start] ** 2, sigma[start + 1] ** 2
         return np.sqrt(np.maximum(after - part * before, (1 - part) * np.minimum(before, after)))
 

@@ -1,8 +1,8 @@
 """Vertical control from a cloud: the height of the laser points below each tie point.
 
-The images give the position of a tie point, the cloud the height there, and the images are re-adjusted with this
-height: iterated to convergence (paper 001). With `method` "image" the height is that of the pseudo control point of
-paper 001, interpolated in the image; otherwise it is `lidar.heights_at`. Control is vertical only; the reason is in
+The images determine the position of a tie point, the cloud its height there. The images are re-adjusted with this
+height, iteratively, to convergence (paper 001). With `method` "image" the height comes from the pseudo control point of
+paper 001, interpolated in the image; otherwise from `lidar.heights_at`. Control is vertical only; the reason is in
 docs/lidar_heights.md.
 """
 
@@ -41,18 +41,18 @@ class LidarControl(eqx.Module):
     """Vertical control from a cloud, and the adjustment with it; arrays are over the candidate `points`."""
 
     block: Block
-    """With the control, and the adjusted unknowns as start values."""
+    """Block with the control, and the adjusted unknowns as initial values."""
     adjusted: Adjustment
     points: Int[np.ndarray, "points"]
-    """Index in the block."""
+    """Index of each point in the block."""
     height: Float[np.ndarray, "points"]
-    """Z (m) of the cloud at the point; NaN if refused."""
+    """Z (m) of the cloud at the point; NaN if undetermined."""
     sigma: Float[np.ndarray, "points"]
-    """Of the height as control (m): of the cloud's height, and of the uncertain position of the point on a slope."""
+    """Standard deviation of the control height (m): from the cloud's height and the point's position on a slope."""
     flag: Integer[np.ndarray, "points"]
-    """Sums of `lidar.HeightFlag`."""
+    """Sum of `lidar.HeightFlag` values."""
     used: Bool[np.ndarray, "points"]
-    """True if the height is control: neither refused nor an outlier."""
+    """True if the height is used as control: determined and not an outlier."""
     rounds: tuple[Round, ...]
     converged: bool
     """True if the iteration converged."""
@@ -73,8 +73,8 @@ def lidar_control(
     A tie point has no control, fixed or check coordinates. The block needs a datum without the cloud: camera stations
     or control. `report` is called after each iteration.
 
-    Raises BlockError if cloud and points are in different places, or no height is determined; InputError for names that
-    are not points; and what `jaxphoto.adjust` raises.
+    Raises BlockError if cloud and points do not overlap, or no height is determined; InputError for names that are not
+    points; and the errors of `jaxphoto.adjust`.
     """
     settings = HeightSettings() if settings is None else settings
     grid = cloud if isinstance(cloud, Grid) else index_cloud(cloud)
@@ -112,8 +112,7 @@ def lidar_control(
 def tie_points(block: Block, names: Collection[str] | None = None) -> Int[np.ndarray, "points"]:
     """Return the named points, or all without control, fixed or check coordinates.
 
-    Raises InputError for a name that is not a point and for one whose height is control already, BlockError without tie
-    points.
+    Raises InputError for a name that is not a point or whose height is already control, BlockError without tie points.
     """
     observed = [rows.who for rows in (block.control, block.fixed, block.check)]
     if names is None:
@@ -136,7 +135,9 @@ def tie_points(block: Block, names: Collection[str] | None = None) -> Int[np.nda
 
 
 def no_surface_error(points: np.ndarray, cloud: np.ndarray, flag: np.ndarray) -> BlockError:
-    """Return the reason why no point has a height: the cloud lies elsewhere, or all heights were refused."""
+    """Return the reason why no point has a height: the cloud does not overlap the block, or all heights are
+    undetermined.
+    """
     (low, high), (least, most) = ((v[:, :2].min(axis=0), v[:, :2].max(axis=0)) for v in (points, cloud))
     if np.any(low > most) or np.any(high < least):
         block, other = (
@@ -162,7 +163,7 @@ def flag_counts(flag: Integer[np.ndarray, "points"]) -> dict[str, int]:
 def _heights(adjusted: Adjustment, which: np.ndarray, grid: Grid, method: Method, settings: HeightSettings):
     """Return height, standard deviation, gradient of the surface and flag, at each of some points."""
     if method == "image":
-        # In the order of `which`, which is sorted, too.
+        # Results are in the order of `which`, because it is sorted.
         pseudo = pseudo_control_of_block(adjusted.block, adjusted.unknowns, grid, which, settings).control
         return np.asarray(pseudo.xyz)[:, 2], *map(np.asarray, (pseudo.sigma_z, pseudo.gradient, pseudo.flag))
     heights = heights_at(grid, np.asarray(adjusted.unknowns.points)[which, :2], method, settings)
@@ -170,7 +171,7 @@ def _heights(adjusted: Adjustment, which: np.ndarray, grid: Grid, method: Method
 
 
 def _sigma(cov: Covariance, surface: SurfaceAtPoints) -> Float[np.ndarray, "points"]:
-    """Return the sigma of control heights: of the surface, and of the point's uncertain position on a slope."""
+    """Return the sigma of control heights, from the surface and from the point's position covariance on a slope."""
     of_place = np.asarray(cov.points)[surface.point][:, :2, :2]
     upright = surface.normal[:, 2]
     gradient = -surface.normal[:, :2] / upright[:, None]

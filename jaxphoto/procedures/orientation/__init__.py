@@ -1,4 +1,4 @@
-"""Orientation of images from their common points alone: photographs, or a block without initial values."""
+"""Image orientation from common points alone: for photographs, or for a block without initial values."""
 
 from jaxphoto.procedures.orientation.blocks import orient_block
 from jaxphoto.procedures.orientation.orient_photographs import GrossErrors, OrientationReport, Oriented, orient

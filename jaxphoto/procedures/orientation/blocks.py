@@ -1,6 +1,6 @@
-"""Orient a block without initial values by COLMAP; its points give the matches.
+"""Orient a block without initial values by COLMAP, with matches derived from its points.
 
-Gross errors stay in the block; COLMAP prevents their influence on initial values.
+Gross errors remain in the block; COLMAP excludes them from the initial values.
 """
 
 import dataclasses
@@ -20,16 +20,16 @@ from jaxphoto.procedures.orientation.known_frame import in_known_frame
 from jaxphoto.procedures.orientation.orient_photographs import Report
 from jaxphoto.unknowns import FIXED
 
-# Manual image points are few, and mostly correct.
+# Minimum number of matches of a pair, and of points of an image: manual image points are few and mostly correct.
 _MIN_MATCHES, _MIN_POINTS = 8, 6
 
 
 def orient_block(block: Block, report: Report = lambda text: None) -> Block:
     """Add initial values for images and points of `block`, from its image points alone.
 
-    The frame is that of three or more known points and camera stations that are not collinear, else that of known
-    images, else arbitrary. A principal distance that is not fixed starts at COLMAP's estimate. Known values are
-    unchanged; images and points that cannot be oriented stay unknown.
+    The frame is defined by three or more known points and camera stations that are not collinear, else by known images;
+    else it is arbitrary. A principal distance that is not fixed starts at COLMAP's estimate. Known values are
+    unchanged; images and points that cannot be oriented remain unknown.
 
     Raises BlockError for cameras that are not perspective, if no two images can be oriented, for unconnected groups of
     images, and for too few known points and stations.
@@ -53,7 +53,7 @@ def orient_block(block: Block, report: Report = lambda text: None) -> Block:
         _MIN_MATCHES,
         _MIN_POINTS,
     )
-    # Of several points that COLMAP made of one, that with most rays.
+    # If COLMAP split a point, use the part with most rays.
     points = np.full((len(block.points), 3), np.nan)
     number = np.array([point_of[i][f] for i, f in zip(network.image, network.feature, strict=True)], int)
     order = np.argsort(np.bincount(network.point)[network.point], kind="stable")

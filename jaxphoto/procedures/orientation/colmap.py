@@ -1,9 +1,9 @@
 """Incremental mapping by COLMAP: features and their matches -> exterior orientation, object points and tracks.
 
 COLMAP (Schönberger and Frahm 2016, "Structure-from-Motion Revisited") verifies every pair by its essential or
-fundamental matrix or homography, and adds images by resection, triangulation and local bundle adjustment. Here its
-input is ideal image coordinates of the initial camera, and it may estimate the principal distance and one radial term.
-Its result are initial values: `jaxphoto.procedures.orientation.orient` adjusts them.
+fundamental matrix or homography, and adds images by resection, triangulation and local bundle adjustment. Its input
+here is ideal image coordinates of the initial camera, and it may estimate the principal distance and one radial term.
+`jaxphoto.procedures.orientation.orient` adjusts its result, which are initial values.
 """
 
 import tempfile
@@ -19,13 +19,13 @@ from jaxphoto.initial.matches import PairMatches, connected_images
 
 # Minimum angles (deg) between rays of a point; the smaller one is tried if images are missing.
 _ANGLES_DEG = (1.5, 0.4)
-# Maximum factor of the estimated principal distance over its initial value.
+# Maximum ratio of the estimated principal distance to its initial value.
 _PLAUSIBLE = 1.5
 # Minimum inlier ratio of a pair: fewer matches agree by chance.
 _MIN_INLIER_RATIO = 0.25
 
 
-# Misclosure (px) up to which two images differ by a rotation only.
+# Maximum misclosure (px) of two images that differ by a rotation only.
 _ROTATED_PX = 2.0
 _ONE_PLACE = "they were taken from one place, or see too few points at a wide enough angle"
 
@@ -53,15 +53,15 @@ class Network(NamedTuple):
     feature: Int[np.ndarray, " rows"]
     point: Int[np.ndarray, " rows"]
     c_px: tuple[float, ...]
-    """By camera."""
+    """Principal distance of each camera."""
     verified: tuple[PairMatches, ...]
     """Inlier matches of each pair."""
 
 
 def import_pycolmap() -> Any:
-    """Return the module pycolmap, silenced. Raises BlockError if it is not installed."""
+    """Import pycolmap and disable its log output. Raises BlockError if it is not installed."""
     try:
-        # Loaded after pycolmap 4.2.1, OpenCV 5.0 ends the process where it writes a PNG.
+        # If OpenCV 5.0 is loaded after pycolmap 4.2.1, it terminates the process when it writes a PNG.
         import cv2  # noqa: F401
         import pycolmap
     except ImportError:
@@ -81,7 +81,7 @@ def map_images(
     min_matches: int,
     min_points: int,
 ) -> Network:
-    """Orient the images `names` from `matches` of their features, gross errors among them.
+    """Orient the images `names` from `matches` of their features, which may include gross errors.
 
     `features_px` are ideal coordinates in pixels (column, row), `image_camera` the camera of each image. A pair needs
     `min_matches` inliers, an image `min_points`.
@@ -130,7 +130,7 @@ def map_images(
 
 
 def _verified_matches(pycolmap: Any, database: str) -> tuple[PairMatches, ...]:
-    """Inlier matches of all pairs in a COLMAP `database`."""
+    """Read the inlier matches of all pairs from a COLMAP `database`."""
     verified = []
     with pycolmap.Database.open(database) as stored:
         for pair, geometry in zip(*stored.read_two_view_geometries(), strict=True):
@@ -149,7 +149,7 @@ def _rays(camera: MappedCamera, xy_px: Float[np.ndarray, "n 2"]) -> Float[np.nda
 
 
 def _only_rotated(rays: list[np.ndarray], match: PairMatches, c_px: float) -> bool:
-    """Return True if a rotation maps the rays of one image to those of the other: both have one projection centre."""
+    """Return True if a rotation maps the rays of one image to the other: both images have one projection centre."""
     one, other = rays[match.first][match.features[:, 0]], rays[match.second][match.features[:, 1]]
     u, _, vt = np.linalg.svd(one.T @ other)
     turned = one @ (u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
@@ -222,7 +222,7 @@ def _options(pycolmap: Any, cameras, angle: float, free: bool, min_matches: int,
 
 
 def _score(model: Any, cameras: Sequence[MappedCamera]) -> tuple[bool, int, int]:
-    """Return True if all principal distances are plausible; number of images; number of image points."""
+    """Return (True if all principal distances are plausible, number of images, number of image points)."""
     ratios = [c.focal_length / cameras[k - 1].c_px for k, c in model.cameras.items()]
     plausible = all(1 / _PLAUSIBLE < ratio < _PLAUSIBLE for ratio in ratios)
     return plausible, model.num_reg_images(), model.compute_num_observations()
@@ -238,7 +238,7 @@ def _network(model: Any, n_images: int, n_cameras: int, verified: tuple[PairMatc
         matrices[k] = np.diag([1.0, -1, -1]) @ image.cam_from_world().rotation.matrix()
     tracks = [point.track.elements for point in model.points3D.values()]
     rows = np.array([(e.image_id - 1, e.point2D_idx, p) for p, track in enumerate(tracks) for e in track], int)
-    # COLMAP may join two features of an image to one point: the first is kept.
+    # COLMAP may join two features of an image to one point: use the first.
     rows = rows.reshape(-1, 3)[np.unique(rows.reshape(-1, 3)[:, [2, 0]], axis=0, return_index=True)[1]]
     return Network(
         positions,

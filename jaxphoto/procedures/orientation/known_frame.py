@@ -1,4 +1,4 @@
-"""Similarity from an arbitrary frame of a network to known points, stations and images."""
+"""Similarity from the arbitrary frame of a network to known points, stations and images."""
 
 import dataclasses
 from typing import NamedTuple
@@ -11,9 +11,11 @@ from jaxphoto.errors import BlockError
 from jaxphoto.initial.averaging import average_rotation
 from jaxphoto.procedures.orientation.colmap import Network
 
-# Minimum spread of known points across their line over that along it: otherwise a rotation is undetermined.
+# Minimum ratio of the spread of known points across their line to the spread along it; below, a rotation is
+# undetermined.
 _LINE = 1e-3
-# The same if known images can give the rotation: approximate positions of a strip scatter by more than `_LINE`.
+# Minimum of the same ratio if known images can determine the rotation: approximate positions of a strip scatter by more
+# than `_LINE`.
 _NEARLY_A_LINE = 0.05
 
 
@@ -68,9 +70,9 @@ def similarity_between(
 def in_known_frame(block: Block, network: Network, known: Start) -> Network:
     """Transform `network` to the frame of known points and stations of `block`, then of the images of `known`.
 
-    If known points are few or nearly collinear, images and points of `known` join them; if these are, too, known images
-    give the rotation, and for a single point, scale bars give the scale. Without information, frame and scale of the
-    network remain.
+    If known points are few or nearly collinear, images and points of `known` are added. If all are nearly collinear,
+    known images determine the rotation, and for a single point, scale bars determine the scale. Without information,
+    frame and scale of the network are unchanged.
 
     Raises BlockError for one or two known points, or collinear ones, without a known image.
     """
@@ -95,7 +97,7 @@ def in_known_frame(block: Block, network: Network, known: Start) -> Network:
 
 
 def _surveyed(block: Block, network: Network) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Known points and stations of oriented images: in the network, and as surveyed."""
+    """Return known points and stations of oriented images: network coordinates and surveyed coordinates."""
     points = np.flatnonzero(np.asarray(block.start.point_known) & _met(network))
     station = np.full((len(block.images), 3), np.nan)
     station[np.asarray(block.stations.who), np.asarray(block.stations.axis)] = np.asarray(block.stations.value, float)
@@ -105,7 +107,9 @@ def _surveyed(block: Block, network: Network) -> tuple[Float[np.ndarray, "n 3"],
 
 
 def _by_images(block: Block, network: Network, known: Start, images, there, here) -> Similarity:
-    """From `images` and points of `known` and surveyed points, and from rotations if all are nearly collinear."""
+    """Estimate the similarity with `images` and points of `known` added, and with rotations if all are nearly
+    collinear.
+    """
     exterior = known.unknowns.exterior
     points = np.flatnonzero(np.asarray(known.point_known) & ~np.asarray(block.start.point_known) & _met(network))
     there = np.concatenate([there, network.points[points], network.positions[images]])
@@ -125,7 +129,7 @@ def _by_images(block: Block, network: Network, known: Start, images, there, here
 
 
 def _scale_of_bars(block: Block, network: Network) -> float:
-    """Median scale of the scale bars with both ends; 1 if there is none."""
+    """Return the median scale of the scale bars with both ends; 1 if there are none."""
     ends = np.asarray(block.distances.points)
     met = _met(network)[ends].all(axis=1)
     if not met.any():

@@ -1,4 +1,4 @@
-"""From matched features to an oriented block, for a calibration of the camera that took them.
+"""Orient a block from matched features, for a calibration of the camera that took them.
 
 1. COLMAP orients the images and joins matches to points (`colmap`).
 2. The network is adjusted iteratively, all parameters of the camera observed; gross errors are rejected (`rejection`).
@@ -41,9 +41,9 @@ MIN_MATCHES = 15
 MIN_POINTS = 10
 """Minimum number of points of an oriented photograph."""
 ITERATIONS = 20
-# The iteration ends if at most this fraction of the image points, or so many of them, are rejected.
+# Maximum fraction of image points, or number if larger, rejected in the last iteration.
 _CONVERGED, _FEW = 1e-3, 2
-# Over flat ground a weakly determined principal distance converges slowly.
+# Maximum number of steps: over flat ground a weakly determined principal distance converges slowly.
 _MAX_STEPS = 200
 
 Report = Callable[[str], object]
@@ -53,17 +53,17 @@ class GrossErrors(NamedTuple):
     """Rejected matches and image points, counted by reason."""
 
     unoriented: int
-    """Matches of pairs in which an image is not oriented."""
+    """Matches of pairs with an unoriented image."""
     off_epipolar: int
-    """Matches that do not agree with a relative orientation of their pair."""
+    """Matches that contradict the relative orientation of their pair."""
     untriangulated: int
-    """Other matches whose features are not of one point."""
+    """Other matches whose features were not triangulated to one point."""
     beyond: int
     """Image points whose residual exceeds the limit."""
     too_few: int
-    """Image points of points and images that are left with too few of them."""
+    """Image points of points and images with too few remaining image points."""
     unsupported: int
-    """Image points of two rays at a depth that neighbouring points contradict."""
+    """Image points of two-ray points whose depth contradicts neighbouring points."""
 
 
 class OrientationReport(NamedTuple):
@@ -72,31 +72,31 @@ class OrientationReport(NamedTuple):
     n_images: int
     n_matches: int
     n_pairs: int
-    """Pairs with a relative orientation."""
+    """Number of pairs with a relative orientation."""
     order: tuple[str, ...]
-    """Oriented images."""
+    """Oriented images, in the order of their orientation."""
     unoriented: dict[str, str]
-    """Images that are not oriented, and why."""
+    """Reasons for images that are not oriented."""
     gross_errors: GrossErrors
     n_points: int
     n_image_points: int
     rounds: int
-    """Iterations of adjustment and rejection."""
+    """Number of iterations of adjustment and rejection."""
     settled: bool
-    """True if the last iteration rejected hardly any image point."""
+    """True if the last iteration rejected hardly any image points."""
     converged: bool
-    """True if the last adjustment converged, and the iteration settled."""
+    """True if the last adjustment converged and the iteration settled."""
     limit_px: float
-    """Image points with larger residuals were rejected."""
+    """Maximum residual of accepted image points."""
     mean_px: float
     """Mean length of the residuals."""
     sigma0: float
     estimated: tuple[str, ...]
     """Parameters of the interior orientation that are free in the block."""
     observed: tuple[str, ...]
-    """Why others stay observed at their initial values, a sentence each."""
+    """Reasons why other parameters remain observed at their initial values, one message each."""
     alike: float
-    """Factor of the standard deviations of the camera for the correlation of neighbouring residuals."""
+    """Factor of the camera's standard deviations due to the correlation of neighbouring residuals."""
 
 
 @pretty_repr
@@ -104,12 +104,12 @@ class Oriented(NamedTuple):
     """Block of photographs, oriented as a free network of arbitrary scale, and the report."""
 
     block: Block
-    """Initial values are those of the last adjustment; `jaxphoto.adjust` gives statistics."""
+    """Block with initial values from the last adjustment; `jaxphoto.adjust` gives statistics."""
     residuals_mm: Float[np.ndarray, "rows 2"]
-    """Residuals of its image points, observed minus computed."""
+    """Residuals of the block's image points, observed minus computed."""
     report: OrientationReport
     sizes: PaddedSizes
-    """Sizes of the compiled adjustments: with them that of `block` runs the same program."""
+    """Padded sizes of the compiled adjustments; `block` can reuse their program with these sizes."""
 
 
 def orient(
@@ -122,7 +122,7 @@ def orient(
     title: str = "photographs",
     report: Report = lambda text: None,
 ) -> Oriented:
-    """Orient the images `names` of one camera from matches of their features, gross errors among them.
+    """Orient the images `names` of one camera from matches of their features, which may include gross errors.
 
     `features` are measured image coordinates (mm, from the image centre) by image, `sigmas_mm` their standard
     deviations (half a pixel by default), `matches` index them. `interior` is the initial camera; parameters that the
@@ -187,16 +187,16 @@ class _Iterated(NamedTuple):
     block: Block
     adjusted: Adjustment
     limit: float
-    """Limit of residuals over a priori standard deviations."""
+    """Maximum residual in a priori standard deviations."""
     iterations: int
     settled: bool
     rejected: dict[str, int]
     lost: dict[str, str]
-    """Images with too few points without gross errors."""
+    """Images with too few points after rejection of gross errors."""
 
 
 def _iterated(block: Block, calibration: SelfCalibration, free: tuple[str, ...], report: Report) -> _Iterated:
-    """Adjust `block` with the parameters `free`, the others observed, until hardly any image point is rejected."""
+    """Adjust `block` with the parameters `free` and observed others, until hardly any image points are rejected."""
     rejected, lost = {"beyond": 0, "too_few": 0, "unsupported": 0}, dict[str, str]()
     for iteration in range(1, ITERATIONS + 1):
         report(f"adjusting {len(block.images)} images, iteration {iteration}")
@@ -248,7 +248,7 @@ def _match_errors(matches: Sequence[PairMatches], network: Network) -> tuple[int
 
 
 def _unoriented(names, network: Network, block: Block, lost: dict[str, str]) -> dict[str, str]:
-    """Reasons of unoriented images."""
+    """Return the reasons why images are not oriented."""
     paired = {names[k] for m in network.verified for k in (m.first, m.second)}
     few = f"it shares too few points with the others that fit one orientation; {MIN_POINTS} are needed"
     alone = "no other image has a relative orientation to it"
@@ -256,7 +256,7 @@ def _unoriented(names, network: Network, block: Block, lost: dict[str, str]) -> 
 
 
 def network_block(title, names, sensor, interior, features, sigmas_mm, network: Network) -> Block:
-    """Block of the oriented images and points of `network`; the usual parameters of the camera are free."""
+    """Build the block of the oriented images and points of `network`; the usual parameters of the camera are free."""
     for name in parameter_names(interior):
         interior = set_parameter(interior, name, np.asarray(get_parameter(interior, name), float))
     priors = freed(interior, ("c_mm", "xp_mm", "yp_mm", *interior.distortion.usual()))
@@ -284,9 +284,7 @@ def photographs_block(
     start: tuple[ExteriorOrientation, Float[np.ndarray, "points 3"]],
     rows: ImagePoints,
 ) -> Block:
-    """Block of photographs of one `camera` (interior orientation and its priors), a free network with initial values
-    `start`.
-    """
+    """Build a free network of photographs of one `camera` (interior orientation, priors), initial values `start`."""
     interior, priors = (dataclasses.replace(part, residuals="measured") for part in camera)
     unknowns = Unknowns({CAMERA: interior}, *start, {}, {})
     n, n_points = len(names), len(points)

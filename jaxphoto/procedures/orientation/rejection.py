@@ -1,9 +1,9 @@
-"""Gross errors of an oriented network: image points by their residuals, and points of two rays by their depth.
+"""Gross errors of an oriented network: image points by their residuals, and two-ray points by their depth.
 
-A false match along an epipolar line gives a point of two rays at a wrong depth without residuals. Its neighbours in the
-image contradict it: over an image the inverse depth of a surface varies little, and that of a plane is linear. A point
-of two rays is rejected if its inverse depth is far from the median of its neighbours in both images, by their robust
-spread and its own standard deviation. At depth discontinuities neighbours spread widely, and nothing is rejected.
+A false match along an epipolar line gives a two-ray point at a wrong depth without residuals. Its neighbours in the
+image contradict it: over an image the inverse depth of a surface varies slowly; for a plane it is linear. A two-ray
+point is rejected if its inverse depth is far from the median of its neighbours in both images, relative to their robust
+spread and its standard deviation. At depth discontinuities neighbours spread widely, and nothing is rejected.
 """
 
 import numpy as np
@@ -12,19 +12,20 @@ from jaxtyping import Bool, Float
 
 from jaxphoto.block import Block
 
-# Limit in robust standard deviations, and its minimum in a priori ones.
+# Maximum residual in robust standard deviations; minimum of this limit in a priori standard deviations.
 _LIMIT, _MIN_LIMIT = 4.0, 1.0
-# Number of nearest points in the image, and the limit of a depth in their robust spreads.
+# Number of nearest points in the image; maximum deviation of a depth in their robust spreads.
 _NEIGHBOURS, _DEPTH_LIMIT = 12, 8.0
-# Ratios of the standard deviation of a normal distribution to its median absolute deviation, and of errors in two axes
-# to the median of their length (Rayleigh).
+# Ratio of the standard deviation of a normal distribution to its median absolute deviation; ratio of the standard
+# deviation per axis to the median length of 2-D errors (Rayleigh).
 _MAD, _RAYLEIGH = 1.4826, 1 / 1.1774
 
 
 def beyond_limit(block: Block, residuals: Float[np.ndarray, "2 rows"]) -> tuple[Bool[np.ndarray, " rows"], float]:
-    """Image rows whose `residuals`, over their sigmas, exceed the limit, at most one per point; and the limit.
+    """Mark image rows whose `residuals`, over their sigmas, exceed the limit, at most one per point; also return the
+    limit.
 
-    Residuals are divided by the square root of the redundancy of a ray of n, (2 n - 3) / (2 n).
+    Residuals are divided by the square root of the redundancy of one of n rays, (2 n - 3) / (2 n).
     """
     point = np.asarray(block.image_points.point)
     rays = np.bincount(point, minlength=len(block.points))[point]
@@ -36,7 +37,7 @@ def beyond_limit(block: Block, residuals: Float[np.ndarray, "2 rows"]) -> tuple[
 
 
 def unsupported(block: Block) -> Bool[np.ndarray, " rows"]:
-    """Image rows of points of two rays whose depths their neighbours in both images contradict."""
+    """Mark image rows of two-ray points whose depths contradict their neighbours in both images."""
     rows, start = block.image_points, block.start.unknowns
     image, point = np.asarray(rows.image), np.asarray(rows.point)
     ray = np.asarray(start.points)[point] - np.asarray(start.exterior.position)[image]
@@ -54,7 +55,7 @@ def unsupported(block: Block) -> Bool[np.ndarray, " rows"]:
 
 
 def _far(xy, inverse, sigma, tested: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " tested"]:
-    """Return True for the `tested` points of an image whose `inverse` depths their neighbours contradict."""
+    """Mark the `tested` points of an image whose `inverse` depths contradict their neighbours."""
     # The nearest point is the point itself.
     around = inverse[scipy.spatial.cKDTree(xy).query(xy[tested], _NEIGHBOURS + 1)[1][:, 1:]]
     median = np.median(around, axis=1)
@@ -63,7 +64,7 @@ def _far(xy, inverse, sigma, tested: Bool[np.ndarray, " n"]) -> Bool[np.ndarray,
 
 
 def _relative_depth_sigma(ray, point, sigma_rad) -> Float[np.ndarray, " rows"]:
-    """Relative standard deviation of the depths of points of two rays: errors of both over their angle."""
+    """Return the relative standard deviation of the depths of two-ray points: errors of both rays over their angle."""
     direction = ray / np.linalg.norm(ray, axis=1, keepdims=True)
     total = np.stack([np.bincount(point, v) for v in direction.T], axis=1)
     # The sum of two unit vectors at an angle g has the length 2 cos(g / 2).

@@ -1,16 +1,16 @@
-"""Self-calibration of a network without control: parameters of the camera that the images determine.
+"""Self-calibration of a network without control: select the camera parameters that the images determine.
 
 During the iteration every parameter is observed at its initial value with a standard deviation of 3 % of the image
-radius in the corner of the format, the principal distance with 10 %: real lenses are within a few of these. The
-parameters that the images determine follow from the covariance of the adjustment without these observations. The
-others, the weakest first, stay observed in the block.
+radius in the corner of the format, the principal distance with 10 %: real lenses deviate by a few times these values.
+The parameters that the images determine follow from the covariance of the adjustment without these observations. The
+others, the weakest first, remain observed in the block.
 
-Residuals of neighbouring rays are correlated if lens, rolling shutter or features have errors that no model describes.
-Standard deviations of independent rays are then too small by the square root of the design effect (Kish),
+Residuals of neighbouring rays are correlated if lens, rolling shutter or features have unmodelled errors. Standard
+deviations of independent rays are then too small by the square root of the design effect (Kish),
 
     d = sum over cells (sum over the rays of a cell v)^2 / sum over all rays v^2,
 
-1 for independent residuals v, and the number of rays of a cell for residuals that are equal in it.
+which is 1 for independent residuals v, and the number of rays per cell for residuals that are equal within cells.
 """
 
 import dataclasses
@@ -29,12 +29,12 @@ from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words
 from jaxphoto.unknowns import FIXED, FREE, Weighted
 
-# Prior standard deviations: of distortion parameters and principal point, by the image shift in the corner of the
-# format over its radius; of c over c; and of a free parameter.
+# Prior standard deviations: distortion parameters and principal point (image shift in the corner of the format divided
+# by its radius); c (divided by c); a free parameter (as the first).
 _LENS, _C, _FREE = 0.03, 0.1, 0.3
-# Maximum standard deviation of a determined parameter over its prior one.
+# Maximum ratio of the standard deviation of a determined parameter to its prior one.
 _DETERMINED = 0.5
-# Cells along the longer side of an image.
+# Number of cells along the longer side of an image.
 _CELLS = 8
 
 
@@ -47,15 +47,15 @@ class SelfCalibration(NamedTuple):
     """Change of each parameter that shifts the corner of the format by its radius."""
     start: dict[str, float]
     sizes: PaddedSizes
-    """Padded sizes of the whole block: parts of it run the same compiled program."""
+    """Padded sizes of the whole block, so parts of it run the same compiled program."""
 
     def observation(self, name: str) -> Weighted:
-        """Prior information of a parameter: its start."""
+        """Return the prior information of a parameter: its initial value with a standard deviation."""
         sigma = (_C if name == "c_mm" else _LENS) * self.unit[name]
         return Weighted(np.asarray(self.start[name]), np.asarray(sigma))
 
     def with_priors(self, block: Block, free: tuple[str, ...]) -> Block:
-        """`block` with the parameters `free` observed loosely at their current values, the others at initial values."""
+        """Return `block` with parameters `free` weakly observed at current values, others at initial values."""
         interior, priors = block.start.unknowns.interior[self.camera], block.priors.interior[self.camera]
         for name in self.names:
             prior = self.observation(name)
@@ -66,7 +66,7 @@ class SelfCalibration(NamedTuple):
         return _with_camera_priors(block, self.camera, priors)
 
     def final_priors(self, block: Block, free: tuple[str, ...]) -> Block:
-        """`block` with the parameters `free` free, the others observed at initial values."""
+        """Return `block` with the parameters `free` free, and the others observed at initial values."""
         priors = freed(block.priors.interior[self.camera], free)
         for name in self.names:
             if name not in free:
@@ -79,13 +79,13 @@ class Determined(NamedTuple):
 
     names: tuple[str, ...]
     observed: list[str]
-    """Why others stay observed, a sentence each."""
+    """Reasons why other parameters remain observed, one message each."""
     correlation_factor: float
-    """Factor of their standard deviations for the correlation of neighbouring residuals."""
+    """Factor of their standard deviations due to the correlation of neighbouring residuals."""
 
 
 def self_calibration(block: Block, camera: str) -> SelfCalibration:
-    """Parameters of `camera` that a free network of the images of `block` estimates: all that are not fixed."""
+    """Set up the parameters of `camera` that a free network of images estimates: all that are not fixed."""
     priors, sensor = block.priors.interior[camera], block.sensors[camera]
     interior = block.start.unknowns.interior[camera]
     names = tuple(n for n in parameter_names(priors) if get_parameter(priors, n) != FIXED)
@@ -97,9 +97,10 @@ def self_calibration(block: Block, camera: str) -> SelfCalibration:
 
 
 def corner_shift(interior: InteriorOrientation, name: str, corner: np.ndarray) -> float:
-    """Image shift (mm) in the corner of the format, or its maximum along the radius, per unit of a parameter.
+    """Return the image shift (mm) per unit of a parameter: in the corner of the format, or its maximum along the
+    radius.
 
-    Radial terms vanish in the corner if that is their balance radius.
+    The maximum is used because radial terms vanish in the corner if that is their balance radius.
     """
     if name == "c_mm":
         return float(np.linalg.norm(corner) / np.asarray(interior.c))
@@ -137,7 +138,7 @@ def determined(adjusted: Adjustment, calibration: SelfCalibration) -> Determined
 
 
 def correlation_factor(block: Block, residuals: Float[np.ndarray, "2 rows"]) -> float:
-    """Square root of the design effect of the `residuals` of image rows, both axes together; at least 1."""
+    """Return the square root of the design effect of the `residuals` of image rows, both axes together; at least 1."""
     rows, sensors = block.image_points, [block.sensors[camera] for camera in block.image_camera]
     half = np.array([(s.width_mm, s.height_mm) for s in sensors])[rows.image] / 2
     side = 2 * half.max(axis=1, keepdims=True) / _CELLS
@@ -157,17 +158,18 @@ def shared_covariance(adjusted: Adjustment) -> np.ndarray:
 
 @eqx.filter_jit
 def _inverse(equations: NormalEquations) -> Float[Array, "reduced reduced"]:
-    # statistics.covariance, with all points, would compile several times longer.
+    # Avoid statistics.covariance: with all points its compilation takes several times longer.
     return equations.inverse_of_reduced()
 
 
 def undetermined(
     names: tuple[str, ...], normal: np.ndarray, observed: np.ndarray, loose: np.ndarray
 ) -> dict[str, float]:
-    """Parameters that the images do not determine, and their standard deviations from the images.
+    """Return the parameters that the images do not determine, and their standard deviations from the images.
 
-    `normal` are the normal equations of the images. Undetermined parameters are added as observations, the weakest
-    first, with the standard deviations `observed`; the others with `loose`, which keep the equations regular.
+    `normal` contains the normal equations of the images. Undetermined parameters are added as observations with the
+    standard deviations `observed`, the weakest first. The others are observed with `loose`, to keep the equations
+    regular.
     """
     weak = np.zeros(len(names), bool)
     sigmas: dict[str, float] = {}
@@ -182,7 +184,7 @@ def undetermined(
 
 
 def freed(priors: InteriorOrientation, names: tuple[str, ...]) -> InteriorOrientation:
-    """Priors of a camera with the parameters `names` FREE and all others FIXED."""
+    """Return priors of a camera with the parameters `names` FREE and all others FIXED."""
     for name in parameter_names(priors):
         priors = set_parameter(priors, name, FREE if name in names else FIXED)
     return priors
