@@ -1,10 +1,11 @@
 """Geometry of an adjusted block: ground coverage, format coverage, links between images, intersection angles.
 
 Ground coverage: a ground cell, at the height of the nearest object points, is covered if it projects into the format of
-an image, a polygon of directions. Occlusions by trees and buildings between points are ignored.
+an image (a polygon of directions). Occlusions by trees and buildings between points are ignored.
 
-Links: images are nodes, and the number of their common points is the strength of an edge. In the maximum spanning tree
-the path between any two images maximises the weakest edge on it. Its weakest edges are where the block breaks first.
+Links: images are nodes, and the number of common points is the weight of an edge. In the maximum spanning tree the path
+between any two images has the largest possible minimum weight. Its edges of smallest weight are the weakest links of
+the block.
 """
 
 import itertools
@@ -83,8 +84,9 @@ def coverage(adjusted: Adjustment) -> Coverage:
 
 
 def _cells(points: np.ndarray, position: np.ndarray, margin: float):
-    """Return X and Y of the cell centres, the cells as object points and their side (m). The grid covers the stations
-    and the points without outliers.
+    """Return X and Y of the cell centres, the cells as object points and their side (m).
+
+    The grid covers the stations and the points without outliers.
     """
     low, high = np.percentile(points, [1, 99], axis=0)
     low = np.minimum(low[:2], position[:, :2].min(axis=0)) - margin

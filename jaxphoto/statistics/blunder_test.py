@@ -1,16 +1,16 @@
-"""Blunder test: normalised residuals against the critical value of their maximum, for one and for several outliers.
+"""Blunder test: compare normalised residuals with the critical value of their maximum, for one or several outliers.
 
-An error e in observation i alone is estimated by (P v)_i / (P Q_vv P)_ii with the standard deviation
+An error in observation i alone is estimated by (P v)_i / (P Q_vv P)_ii with the standard deviation
 sigma0 / sqrt((P Q_vv P)_ii), and w_i is their ratio. If sigma naught is estimated from the same residuals, w follows
 the tau distribution; the largest of n is compared with its quantile of level alpha / n (Bonferroni).
 
-Several outliers: a blunder inflates the residuals around it. The suspects are therefore selected one after another,
-largest first, each as an unknown error of its row. For another suspect i beside the selected ones, S, and with
-C = P Q_vv P of whitened observations and u = v,
+Several outliers: a blunder inflates the residuals around it. The suspects are therefore selected iteratively, largest
+first, each as an unknown error of its row. With S the selected suspects, i any other suspect, C = P Q_vv P of whitened
+observations and u = v,
 
     u_i|S = u_i - C_iS C_SS^-1 u_S,     c_i|S = C_ii - C_iS C_SS^-1 C_Si,     w_i|S = u_i|S / (s_S sqrt(c_i|S))
 
-where s_S^2 = (v'v - u_S' C_SS^-1 u_S) / (r - f_S) is the variance factor without them.
+where s_S^2 = (v'v - u_S' C_SS^-1 u_S) / (r - f_S) is the variance factor without the selected suspects.
 
 Sources: Baarda (1968), A testing procedure for use in geodetic networks; Pope (1976), The statistics of residuals and
 the detection of outliers, NOAA Technical Report NOS 65 NGS 1; Kok (1984), On data snooping and multiple outlier
@@ -64,8 +64,9 @@ class Suspect(eqx.Module):
 
 @pretty_repr
 class BlunderTest(eqx.Module):
-    """Blunder test of `n` normalised residuals. `suspects`: rows with a component beyond `limit`, largest normalised
-    residual first.
+    """Blunder test of `n` normalised residuals.
+
+    `suspects`: rows with a component beyond `limit`, largest normalised residual first.
     """
 
     suspects: tuple[Suspect, ...]

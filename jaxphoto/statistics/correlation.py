@@ -1,17 +1,17 @@
-"""Correlations: of interior and exterior orientation, and of the camera with the ground as a whole.
+"""Correlations of interior with exterior orientation, and of the camera with deformations of the ground.
 
 Source of the image-wise correlations: paper 000, Table 4 (mean absolute correlation over the images, per angle or
 coordinate and IOP).
 
-Over flat ground imaged from one height, a longer c is equivalent to a greater flying height, and radial distortion to
-a dome of the ground: neither leaves residuals. Correlations with the exterior orientation of single images do not show
-this, because all images and points move together. Each of the forms below is a linear function f = g' x of the
-coordinates of points and stations, so
+Over flat ground imaged from one height, a longer c is equivalent to a greater flying height, and radial distortion to a
+dome of the ground: neither changes the residuals. Correlations with the exterior orientation of single images do not
+show this, because all images and points move jointly. Each form below is a linear function f = g' x of the coordinates
+of points and stations, so
 
     cov(f, u) = sigma0^2 g' N^-1 e_u,   var(f) = sigma0^2 g' N^-1 g.
 
     height          mean Z of the points
-    flying_height   mean Z of the projection centres minus that of the points
+    flying_height   mean Z of the projection centres minus mean Z of the points
     dome            height of the centre of the ground over its edge: of Z = a + b X + c Y + d (X^2 + Y^2),
                     fitted to the points, -d R^2 with the distance R from the centre to the farthest point
 

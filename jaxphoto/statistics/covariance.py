@@ -1,9 +1,9 @@
 """Covariances of all unknowns, in their own units, from the cofactors of the normal equations.
 
-Covariance of two adjustments that share observations: two halves of a block have no image in common, but both use
-control, distances and prior information. To first order an estimate has the error -w'e, with e the errors of the
-observations over their standard deviations and w = J N^-1 e_p its weights. Two estimates therefore have the covariance
-w1'w2, summed over the rows in both.
+Covariance of two adjustments with common observations: two halves of a block have no common images, but both use
+control, distances and prior information. To first order an estimate has the error -w'e, with e the observation errors
+over their standard deviations and w = J N^-1 e_p the weights of the estimate. The covariance of two estimates is
+therefore w1'w2, summed over the common rows.
 """
 
 from collections.abc import Sequence
@@ -35,9 +35,9 @@ EOP_NAMES: dict[str, tuple[str, ...]] = {
 class Covariance(eqx.Module):
     """A priori covariances (sigma naught 1), in metres, radians, mm and the coefficients' own units.
 
-    `matrix` is the covariance of the exterior orientations, followed by the shared unknowns. Each image has six rows:
-    X, Y, Z and three rotations of the kind `rotations`. Fixed unknowns have zero rows. Multiply by `variance_factor`
-    for a posteriori values.
+    `matrix` is the covariance of the exterior orientations, followed by the shared unknowns. Each image, in the
+    block's order, has six rows: X, Y, Z and three rotations of the kind `rotations`. Fixed unknowns have zero rows.
+    Multiply by `variance_factor` for a posteriori values.
     """
 
     matrix: Float[ArrayLike, "reduced reduced"]

@@ -6,10 +6,11 @@ Positional accuracy by check points follows ASPRS Edition 2 and includes the err
 
     RMSE_H = sqrt(RMSE_x^2 + RMSE_y^2 + s_H^2),  RMSE_V = sqrt(RMSE_z^2 + s_V^2),  RMSE_3D = sqrt(RMSE_H^2 + RMSE_V^2)
 
-RMSE_x, RMSE_y, RMSE_z are root mean squares of the discrepancies at check points, s_H and s_V those of the survey's
-standard deviations. An accuracy class is any number of centimetres. A claim requires at least thirty check points, and
-a mean error beyond a quarter of the RMSE requires an investigation. With few check points such a mean occurs by chance
-(with three points in three of four cases), so it must also exceed the limit of Student's t.
+RMSE_x, RMSE_y, RMSE_z are root mean squares of the discrepancies at check points, s_H and s_V root mean squares of the
+survey's standard deviations. An accuracy class is an RMSE limit in centimetres. A claim requires at least 30 check
+points, and a mean error above 25 % of the RMSE requires an investigation. With few check points such a mean occurs by
+chance (with three points in 75 % of cases), so it must also exceed the limit of Student's t.
+
 Source: ASPRS Positional Accuracy Standards for Digital Geospatial Data, Edition 2, Version 1.0 (August 2023).
 """
 

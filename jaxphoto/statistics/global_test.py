@@ -1,8 +1,8 @@
-"""Global test of the variance factor: of the whole adjustment, and of each group of observations.
+"""Global test of the variance factor, for the whole adjustment and for each group of observations.
 
-With true weights v'Pv follows chi-square of the redundancy nu, and v'Pv of a group has the mean nu_g, the sum of its
-redundancy numbers (Förstner 1979). Its variance is at most that of chi-square of nu_g, so the group test is
-conservative.
+With correct weights v'Pv follows chi-square with nu degrees of freedom (the redundancy), and v'Pv of a group has the
+mean nu_g, the sum of its redundancy numbers (Förstner 1979). Its variance is at most the variance of chi-square with
+nu_g degrees of freedom, so the group test is conservative.
 """
 
 import equinox as eqx

@@ -1,8 +1,8 @@
-"""Products with the hat matrix H = J N^-1 J' and with N^-1 J', for a few directions at a time.
+"""Products with the hat matrix H = J N^-1 J' and with N^-1 J', in batches of directions.
 
 With J the derivatives of whitened residuals (observed minus computed), an error z of the observations moves the
-unknowns by -N^-1 J' z and the adjusted observations by H z = J N^-1 J' z; unknown k moves by -(J N^-1 e_k)_i with
-observation i. Products z' H z of many errors need no J x: they are those of J' z with N^-1 J' z.
+unknowns by -N^-1 J' z and the adjusted observations by H z = J N^-1 J' z. A unit error of observation i moves unknown k
+by -(J N^-1 e_k)_i. Products z' H z of many errors do not need J x: they are inner products of J' z and N^-1 J' z.
 """
 
 import math

@@ -5,7 +5,7 @@ normalised residual is w = v / (sigma0 sigma sqrt(r)), to be compared with the c
 
 The minimal detectable bias (MDB) of an observation is nabla_i = delta0 / sqrt((P Q_vv P)_ii): the smallest error that
 the test of its normalised residual detects with the stated power (internal reliability). An error of this size moves
-unknown k by -(J N^-1 e_k)_i nabla_i / sigma_i, and any function of the unknowns by at most
+unknown k by -(J N^-1 e_k)_i nabla_i / sigma_i. It moves any function of the unknowns by at most
 delta0 sqrt((P - P Q_vv P)_ii / (P Q_vv P)_ii) of its standard deviations (external reliability). Without correlations
 between observations this bound is delta0 sqrt((1 - r) / r).
 

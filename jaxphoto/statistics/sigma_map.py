@@ -2,16 +2,16 @@
 
 A point P is imaged at q = f(b, R (P - X0)) by the interior orientation b and the exterior orientation (X0, R). Both are
 estimated in one adjustment, and their errors are correlated: a rotation of the images compensates an error of the
-principal point. P is therefore fixed in the object frame as it appears in each image i of the camera, transformed back
-by the adjusted exterior orientation of that image, and the mean over the images is projected:
+principal point. P is therefore fixed in the object frame as observed in each image i of the camera, transformed back by
+the exterior orientation of image i, and the mean over the images is projected:
 
     p = d u                        d: distance, u: direction of q
     dp = mean_i (dtheta_i x p - R_i dX0_i)
     dq = df/db db + df/dp dp
 
-with small rotations dtheta_i about the axes of the camera. At an infinite distance the positions drop out. All this is
-linear in the unknowns, so the covariance of q is exact to first order. It needs only the covariance of b and of six
-means (`linear_forms`), whatever the number of images.
+with small rotations dtheta_i about the axes of the camera. At infinite distance the positions have no effect. dq is
+linear in the unknowns, so the covariance of q is exact to first order. For any number of images it needs only the
+covariance of b and of six means (`linear_forms`).
 
 Source: D. Kogan, mrcal, projection uncertainty (https://mrcal.secretsauce.net/uncertainty.html), method of version 2.
 """
