@@ -1,22 +1,23 @@
 """Exact sensitivity of an adjustment, by adjoint vectors for its estimates or along one direction of change.
 
-At the optimum the gradient of half the weighted square sum vanishes for any observations v. By the implicit function
+At the optimum the gradient of half the weighted sum of squares is zero for any observations v. By the implicit function
 theorem an estimate e, a function of the unknowns x, has the derivative
 
     de/dv = -lambda' B,   H lambda = de/dx
 
-with H and B of `hessian`: with the curvature of the residuals this is exact; without, it is the classical first-order
+with H and B of `hessian`. With the curvature of the residuals this is exact; without, it is the classical first-order
 matrix -N^-1 J'P. One adjoint vector lambda per estimate serves all observations (`sensitivity`), and B is sparse: an
-image row involves its image, camera and point. With M, C and F of `hessian`, the gain K = -V^-1 [W; Ws; D]' = -L^-T F,
-b the derivative of an estimate by the unknowns of M and b_p that by the points, the points are eliminated by
+image row involves only its image, camera and point. With M, C and F of `hessian`, the gain
+K = -V^-1 [W; Ws; D]' = -L^-T F, and the derivatives b and b_p of an estimate by the unknowns of M and by the points,
+the points are eliminated by
 
     lambda = M^-1 [b + K_x' b_p; C K_mu' b_p]       for images and shared unknowns, and for mu
     lambda_p = V^-1 b_p + K lambda
 
-These are a few products of concrete arrays with the sparse matrix K.
+This takes a few products of NumPy arrays with the sparse matrix K.
 
-`response` is the change of all unknowns along one direction dv of change of all values of a block (observations,
-standard deviations, weights of priors, fixed parameters): dy = -H^-1 B dv.
+`response` computes the change of all unknowns, dy = -H^-1 B dv, for one direction dv of change of all values of a block
+(observations, standard deviations, weights of priors, fixed parameters).
 """
 
 import dataclasses

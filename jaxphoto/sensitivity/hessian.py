@@ -1,18 +1,18 @@
-"""Second derivatives of half the weighted square sum at an optimum, with the points eliminated.
+"""Second derivatives of half the weighted sum of squares at an optimum, with the points eliminated.
 
-With r the weighted residuals, y the increments and v any value that r depends on, half the square sum has
+With r the weighted residuals, y the increments and v any value that r depends on, half the sum of squares has
 
     H = J'J + sum_r r d2r/dy2           the normal matrix and the curvature of the residuals
     B = J' dr/dv + sum_r r d2r/dy dv    the change of the gradient J'r with v
 
 and the optimum changes with dv by dy = -H^-1 B dv. Without the terms in r (`curved` 0 instead of 1), this is the
 classical first-order matrix -N^-1 J' dr/dv. Derivatives are exact, by automatic differentiation, and stored by the
-unknowns of each row, never as dense second derivatives.
+unknowns of each row, not as dense matrices.
 
 Every image row involves one image, one point and one camera, so H has the blocks of the normal matrix (see
-adjustment/solver/normal.py) and its points are eliminated likewise, by V = L L' and F = [W; Ws'; D_p] L^-T. Some rows,
-and the datum, couple points: D (the variables of such a row, then the constraints) has the weight C, and mu = C D x are
-additional unknowns. With S, G, K the parts of H, D and 0 without the points,
+adjustment/solver/normal.py). Its points are eliminated in the same way, by V = L L' and F = [W; Ws'; D_p] L^-T. Some
+rows, and the datum, couple points: D (the variables of such a row, then the constraints) has the weight C, and
+mu = C D x are additional unknowns. With S, G, K the parts of H, D and 0 without the points,
 
     M = [ S     G'      ]
         [ C G   C K - I ]

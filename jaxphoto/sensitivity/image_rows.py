@@ -1,18 +1,18 @@
-"""Second derivatives of half the weighted square sum of image rows, as a list without empty slots.
+"""Second derivatives of half the weighted sum of squares of image rows, listed without padding slots.
 
-A row depends on its image and its point through u alone, the point in the camera frame; further on the parameters t of
-its camera and on the measurement m. With J the derivatives of its two weighted residuals r by z = (u, t, m), and U
-those of u by the unknowns y of the image and of the point,
+A row depends on its image and its point only through u, the point in the camera frame. It also depends on the
+parameters t of its camera and on the measurement m. With J the derivatives of its two weighted residuals r by
+z = (u, t, m), and U the derivatives of u by the unknowns y of the image and of the point,
 
     G = J'J + sum_r r d2r/dz2       H_yy = U' G_uu U + sum_k g_k d2u_k/dy2,   g = J_u' r
                                     H_ty = G_tu U,   B_ym = U' G_um,   B_tm = G_tm
 
-G is computed by automatic differentiation, in three and a few directions. A small rotation theta of the image takes u
-to u + u x theta + (u x theta) x theta / 2, so that
+G is computed by automatic differentiation along u (three directions) and a few more. A small rotation theta of the
+image maps u to u + u x theta + (u x theta) x theta / 2, so
 
-    sum_k g_k d2u_k / dtheta dy = g . (du/dy x dtheta)        for y = theta the mean of that and its transpose
+    sum_k g_k d2u_k / dtheta dy = g . (du/dy x dtheta)        for y = theta: mean of this and its transpose
 
-The last axis of all arrays is the rows.
+The last axis of all arrays is the row axis.
 """
 
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,7 @@
 """Influence of observations on estimates: station bias, variance fractions, external reliability.
 
-Each function takes the derivatives A (one row per estimate, one column per observation) of `sensitivity`, exact or of
-first order, and the a priori standard deviations of the observations.
+Each function uses the derivatives A of `sensitivity` (one row per estimate, one column per observation; exact or first
+order) and the a priori standard deviations of the observations.
 """
 
 from typing import Literal

@@ -1,8 +1,8 @@
-"""Monte Carlo of an adjustment: thousands of re-adjustments of a block with other values, each to convergence.
+"""Monte Carlo simulation of an adjustment: thousands of re-adjustments of a block, each iterated to convergence.
 
-All draws share the factor of the nominal normal matrix (`chords`); draws for which these steps do not contract are
-adjusted individually and counted. The batch size follows from the block and the number of devices, so a draw does not
-depend on the draws before or after it.
+All draws share the factor of the nominal normal matrix (`chords`). Draws for which this iteration does not contract are
+adjusted individually and counted. The batch size depends only on the block and the number of devices, so a draw does
+not depend on other draws.
 """
 
 import dataclasses

@@ -8,10 +8,10 @@ scalars to record:
         heights = block.stations.value + rise * (block.stations.axis == 2)
         return eqx.tree_at(lambda b: b.stations.value, block, heights), {"rise_m": rise}
 
-`bias` and `noise` make the usual ones.
+`bias` and `noise` return common perturbations.
 
-A trajectory with the constant error b shifts laser returns and exposures. Because the weights of the knots sum to 1,
-this equals knots c' = c - b instead of the knots c: the prior of the first knot of a strip becomes -b, and
+A constant error b of a trajectory shifts laser returns and exposures. Because the weights of the knots sum to 1, this
+is equivalent to knots c' = c - b instead of c: the prior of the first knot of a strip becomes -b, and
 
     c[k + 1] - f c[k] = 0    becomes    c'[k + 1] - f c'[k] = -(1 - f) b
 

@@ -2,19 +2,19 @@
 
 Least squares reports the optimum and the inverse of the normal matrix: the Laplace approximation of the density
 
-    p(x) ~ exp(-1/2 sum of squared residuals over their a priori sigmas)
+    p(x) ~ exp(-1/2 sum of (residual / a priori sigma)^2)
 
-It equals the posterior if residuals are linear in the unknowns; where c, flying height and heights of points are
-strongly correlated, it may not. Here the whole posterior is sampled, in coordinates z in which the Laplace
-approximation is a standard normal distribution. With V = L L' of the points, A = M M' of the reduced unknowns and F as
-in adjustment/solver/normal.py,
+It equals the posterior if residuals are linear in the unknowns. It may differ if c, flying height and heights of points
+are strongly correlated. This module samples the whole posterior, in coordinates z in which the Laplace approximation is
+a standard normal distribution. With V = L L' of the points, A = M M' of the reduced unknowns and F as in
+adjustment/solver/normal.py,
 
     x_r = M'^-1 z_r,   x_p = L'^-1 (z_p - F' x_r)
 
-so one step length suits all unknowns, from k2 to positions, and no metric is adapted. (Distances and datum constraints,
-which couple points, are not in L: with them the coordinates are standard normal only approximately.)
+so one step length suits all unknowns, from k2 to positions, and the metric is not adapted. Distances and datum
+constraints couple points and are not in L: with them the coordinates are only approximately standard normal.
 
-Source: Hoffman and Gelman 2014 (NUTS, algorithm 6); Vehtari et al. 2021 (R-hat, effective sample size).
+Sources: Hoffman and Gelman 2014 (NUTS, algorithm 6); Vehtari et al. 2021 (R-hat, effective sample size).
 """
 
 import difflib

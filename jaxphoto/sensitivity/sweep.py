@@ -1,9 +1,8 @@
 """Sweep over designs: many simulated blocks, adjusted and evaluated by one compiled program.
 
-A design is a simulated block with known observations and true points. Strips, overlap, heights, control and standard
-deviations may differ from design to design, and with them the numbers of images and points: blocks are padded to common
-sizes. The program runs over the designs with `jax.lax.map` on all devices and returns the statistics of each; normal
-matrices are not kept.
+A design is a simulated block with observations and true points. Strips, overlap, heights, control, standard deviations
+and the numbers of images and points may differ between designs: blocks are padded to common sizes. The program runs
+over the designs with `jax.lax.map` on all devices and returns the statistics of each; normal matrices are not stored.
 """
 
 import time

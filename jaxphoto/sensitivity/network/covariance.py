@@ -1,21 +1,21 @@
-"""Covariance of a planned network, differentiable in every number of its layout, and criteria of it to minimise.
+"""Covariance of a planned network, differentiable in its layout, and criteria for network design.
 
-No residual is needed: the normal matrix is that of the layout itself, in the notation of adjustment/solver/normal.py,
+The normal matrix is computed from the layout without residuals. In the notation of adjustment/solver/normal.py,
 
     S = U - sum_p Y_p Y_p',    Y_p = W_p L_p^-T,    V_p = L_p L_p'
     Q = S^-1,    Q_pp = L_p^-T (I + Y_p' Q Y_p) L_p^-1
 
-and dense, for layouts of some tens of images and hundreds of points. Every pair of image and point contributes. Its
-weight is that of the image times a window that decreases from one to zero across the edge of the format
-(`Layout.edge_mm`), so a point enters an image without a discontinuity. If no point lies in the edge, this is the
-covariance of `jaxphoto.covariance` with sigma naught 1.
+S is dense, for layouts of some tens of images and hundreds of points. Every pair of image and point contributes. Its
+weight is the weight of the image times a window that decreases from one to zero across the edge of the format
+(`Layout.edge_mm`), so a point enters an image without a discontinuity. If no point lies in the edge, the result equals
+`jaxphoto.covariance` with sigma naught 1.
 
-A criterion is a plain function of it; `functools.partial(sigma_of, name="c_mm")` makes one, and so does any
-differentiable function from a `NetworkCovariance` to a number. A maximum has kinks; with `power` p it is replaced by
-the p-norm, which is smooth and larger by at most the p-th root of the number of values: use it in the search, and
-report the value without.
+A criterion is any differentiable function from a `NetworkCovariance` to a scalar, such as
+`functools.partial(sigma_of, name="c_mm")`. A maximum has kinks; `power` p replaces it by the p-norm, which is smooth and
+larger by at most the factor n^(1/p) for n values. Use `power` in the search, and report the value without it.
 
-Source of A, D and E: Pukelsheim, Optimal Design of Experiments (1993); for networks, Grafarend and Sanso (1985).
+Source of the criteria A, D and E: Pukelsheim, Optimal Design of Experiments (1993); for networks, Grafarend and Sanso
+(1985).
 """
 
 from collections.abc import Sequence

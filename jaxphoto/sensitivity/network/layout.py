@@ -1,9 +1,9 @@
 """Layouts of planned networks: positions of cameras and ground points, with weights.
 
-A `Layout` contains what a covariance needs, without measurements. A design is any tree of numbers (headings, heights,
-the position of a control point, fractions of a budget), and a pure function of the user maps it to a `Layout`. For
-straight strips and control points, `StripDesign` holds the design variables and `StripPlan` the constants.
-`block_from_layout` verifies a layout independently: a block with observations for `jaxphoto.adjust` and
+A `Layout` contains the input of a covariance, without measurements. A design is any tree of numeric values (headings,
+heights, the position of a control point, fractions of a budget), which a pure function of the user maps to a `Layout`.
+For straight strips and control points, `StripDesign` contains the design variables and `StripPlan` the constants. To
+verify a layout independently, `block_from_layout` builds a block with observations for `jaxphoto.adjust` and
 `jaxphoto.covariance`. Headings are clockwise from north, lengths in metres, the object frame east-north-up
 (docs/conventions.md).
 """

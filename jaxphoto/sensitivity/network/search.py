@@ -1,13 +1,13 @@
 """Gradient-based network design: minimise a criterion of the covariance over bounded design variables.
 
-A design is a tree of numbers; the user's pure function maps it to a `Layout`, and the criterion maps the covariance of
-that to a number. The composition is differentiated, so a search needs some tens of covariances, while a grid needs a
-number exponential in the number of variables. Bounds are enforced by the sine,
+A design is a tree of numeric values. The user's pure function maps it to a `Layout`, and the criterion maps the
+covariance of the layout to a scalar. The composition is differentiated, so a search needs some tens of covariances. A
+grid search needs a number of covariances that is exponential in the number of variables. Bounds are enforced by
 
     x = (low + high) / 2 + (high - low) / 2 sin u
 
-with u free, and BFGS minimises the logarithm of the criterion: neither has a unit. The objective has many local minima,
-so a search uses several starts.
+with unbounded u. BFGS minimises the logarithm of the criterion, so variables and objective are dimensionless. The
+objective has many local minima, so a search uses several starts.
 """
 
 from collections.abc import Callable
