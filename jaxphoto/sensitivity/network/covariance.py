@@ -11,8 +11,8 @@ weight is the weight of the image times a window that decreases from one to zero
 `jaxphoto.covariance` with sigma naught 1.
 
 A criterion is any differentiable function from a `NetworkCovariance` to a scalar, such as
-`functools.partial(sigma_of, name="c_mm")`. A maximum has kinks; `power` p replaces it by the p-norm, which is smooth and
-larger by at most the factor n^(1/p) for n values. Use `power` in the search, and report the value without it.
+`functools.partial(sigma_of, name="c_mm")`. A maximum has kinks; `power` p replaces it by the p-norm, which is
+smooth and larger by at most the factor n^(1/p) for n values. Use `power` in the search, and report the value without it.
 
 Source of the criteria A, D and E: Pukelsheim, Optimal Design of Experiments (1993); for networks, Grafarend and Sanso
 (1985).
