@@ -137,7 +137,7 @@ def run_experiment(
 
 
 def simulated(experiment: Experiment, folder: Path, variant: str, layout: int = 0) -> Simulation:
-    """Return the block of one variant, before `Variant.change`, with its truth."""
+    """Simulate one variant without `Variant.change`; return block and true parameters."""
     return simulate(_recipe(experiment.variants[variant], folder), layout)
 
 

@@ -59,7 +59,7 @@ class MonteCarlo:
         parts = min(_PART, _PART_NUMBERS // widest, _PART_ROWS // rows) // run.batch_size
         settings = {
             "block": digest_of(block), "errors": _errors_line(drawn), "sigma": _sigma_line(drawn), "seed": seed,
-            # The distribution has no name: its first draws identify it.
+            # Identify the distribution, which has no name, by its first draws.
             "first_draws": _digest(np.asarray(self.keys(np.arange(4)))),
             "exterior": run.exterior, "points": run.points, "batch": run.batch_size, "devices": run.devices,
             "thorough": run.many, "versions": versions(),
@@ -174,7 +174,7 @@ class MonteCarlo:
         return summary, table
 
     def _sigmas(self) -> dict[str, float]:
-        """Return the standard deviations by name of the error, angles in degrees."""
+        """Return the standard deviation of each error by name, angles in degrees."""
         pairs = zip(self.drawn.names, self.drawn.sigma, strict=True)
         return {name: float(np.degrees(v) if name.endswith("_rad") else v) for name, v in pairs}
 

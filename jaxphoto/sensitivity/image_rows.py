@@ -57,7 +57,7 @@ class RowProducts(NamedTuple):
     """Sums of H over the rows, and B by the measured x and y (mm)."""
 
     eop: Float[Array, "images 6 6"]
-    """Sums by image; to be symmetrised with the transpose."""
+    """Sums by image, not yet symmetrised."""
     shared_eop: Float[Array, "images colours 6"]
     shared: Float[Array, "images colours colours"]
     by_point: Float[Array, "touched 3 rows"]

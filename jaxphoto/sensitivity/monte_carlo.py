@@ -157,7 +157,7 @@ class Readjustment:
         self.seconds["compile"] = time.perf_counter() - began
 
     def batches(self, entries: Any) -> Iterator[Draws]:
-        """Yield the re-adjustments, batch by batch."""
+        """Yield the re-adjustments of `entries` in batches."""
         running = None
         for batch in self._split(entries):
             # Start the next batch before fetching the last one, so that host and device work in parallel.
@@ -198,7 +198,7 @@ class Readjustment:
         return shared, self._exterior(state) if self.exterior else None, points
 
     def _finish(self, entries: Any, running: tuple[Found, Recorded]) -> Draws:
-        """Fetch a batch and adjust individually the draws that did not contract."""
+        """Fetch a batch, and adjust draws individually if their iteration did not contract."""
         draws = self._fetch(*running, _count(entries))
         for k in map(int, np.flatnonzero(~draws.converged)):
             draws = _with_row(draws, k, self._adjust_one(jax.tree.map(lambda v, k=k: v[k], entries)))

@@ -215,7 +215,7 @@ class Bias(eqx.Module):
 
 
 def in_order_of(block: Block, changed: Block) -> Block:
-    """Return `changed` with its unknowns in the order of `block`."""
+    """Reorder the unknowns of `changed` as in `block`."""
     start = dataclasses.replace(changed.start, unknowns=changed.start.unknowns.in_order_of(block.start.unknowns))
     return dataclasses.replace(changed, start=start, priors=changed.priors.in_order_of(block.priors))
 
@@ -387,7 +387,7 @@ def _follow(tree: Any, path: tuple[Any, ...]) -> Any:
 
 
 def _leaf(tree: Any, name: str) -> Any:
-    """Return a field, or a parameter of a camera by its name."""
+    """Return a field, or an interior parameter of a camera, by name."""
     named = isinstance(tree, InteriorOrientation) and not hasattr(tree, name)
     return get_parameter(tree, name) if named else getattr(tree, name)
 

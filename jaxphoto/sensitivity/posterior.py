@@ -205,7 +205,7 @@ class _White(NamedTuple):
 
     equations: NormalEquations
     triangle: Float[Array, "reduced reduced"]
-    """M of A = M M'."""
+    """Factor M of A = M M'."""
     free: Int[Array, "free"]
     """Indices of the free unknowns in the padded vector."""
     datum: Float[Array, "constraints free"]
@@ -232,7 +232,7 @@ class _White(NamedTuple):
         return z - self.datum.T @ (self.datum @ z)
 
     def whitened(self, row: Increments) -> Float[Array, "free"]:
-        """Return the derivative by z of a function with the derivative `row` by x."""
+        """Convert a derivative `row` by x to the derivative by z."""
         right, d = self.equations.reduce(row)
         reduced = self.equations.factored.reduced
         if len(d):
@@ -285,7 +285,7 @@ def _laplace(
     rows = jax.jacrev(parameters)(at.increments)
     solved = jax.vmap(equations.solve)(rows)
     flat = jax.vmap(partial(_flat, xp=jnp))
-    # The datum constraints remove the free motions (see adjustment/solver/inverse.py).
+    # Subtract the free motions, which the datum constraints determine (see adjustment/solver/inverse.py).
     along = flat(solved) @ flat(equations.constraints()).T
     return parameters(at.increments), flat(rows) @ flat(solved).T - along @ along.T
 

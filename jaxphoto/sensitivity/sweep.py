@@ -2,7 +2,8 @@
 
 A design is a simulated block with observations and true points. Strips, overlap, heights, control, standard deviations
 and the numbers of images and points may differ between designs: blocks are padded to common sizes. The program runs
-over the designs with `jax.lax.map` on all devices and returns the statistics of each; normal matrices are not stored.
+over the designs with `jax.lax.map` on all devices and returns the statistics of each design. Normal matrices are not
+stored.
 """
 
 import time

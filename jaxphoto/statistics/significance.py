@@ -1,4 +1,4 @@
-"""Significance of parameters: single interior parameters, several parameters being zero, changes of a camera in flight.
+"""Significance of parameters: tests of single interior parameters, of zero parameters, of camera changes in flight.
 
 The parameters d have the cofactors Q. If all are truly zero,
 

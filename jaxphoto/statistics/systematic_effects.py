@@ -72,7 +72,7 @@ class EffectTerm(NamedTuple):
     name: str
     coefficients: Float[np.ndarray, "columns"]
     cure: str
-    """Advice in messages."""
+    """Advice for messages."""
     report_amount: bool = True
     """True if messages report the size of the term, in the unit of the observations."""
 
@@ -240,7 +240,7 @@ def _camera_over_time(
     x, y = (np.asarray(adjusted.values.xy)[:, rows] - np.asarray(interior.principal_point)[:, None]) / float(interior.c)
     zero = np.zeros_like(t)
     columns = (np.stack([x * t, t, zero]), np.stack([y * t, zero, t]))
-    # x and y share the same columns, so they form one part.
+    # x and y have the same columns, so they form one part.
     (at_x, x_values, x_weight), (at_y, y_values, y_weight) = _parts_of_image(adjusted, rows, places, columns)
     joint = Part(np.append(at_x, at_y), np.hstack([x_values, y_values]), np.append(x_weight, y_weight))
     names = ("c", "x_p", "y_p")
@@ -354,7 +354,7 @@ def _slopes(interior: InteriorOrientation, names: tuple[str, ...], values: Array
 
 
 def _is_affine(field: Float[np.ndarray, "2 n"], centred: Float[np.ndarray, "2 n"]) -> bool:
-    """Return True if the field stretches or shears the image, as the sequential exposure of rows does."""
+    """Return True if the field stretches or shears the image, as a rolling shutter does."""
     matrix = field @ np.linalg.pinv(centred)
     stretched = np.abs(matrix - np.eye(2) * np.trace(matrix) / 2).max() > _MAX_MISFIT * np.abs(matrix).max()
     return bool(stretched and np.abs(matrix @ centred - field).max() < _MAX_MISFIT * np.abs(field).max())
@@ -371,7 +371,7 @@ MIN_FRACTION = 1e-3
 """Minimum fraction of an error in one observation that estimated parameters must leave for it to be tested."""
 SIGNIFICANT_RATIO = 3.3
 """Ratio of a term to its standard deviation above which it is reported (error probability 0.1 %)."""
-# Maximum number of blunders estimated along with an effect; more blunders are a symptom of the effect itself.
+# Maximum number of blunders estimated along with an effect; more blunders are caused by the effect itself.
 _MAX_BLUNDERS = 16
 # Maximum relative difference between a blunder and the value of a term for the two to match.
 _MATCH = 0.5

@@ -11,8 +11,8 @@ weight is the weight of the image times a window that decreases from one to zero
 `jaxphoto.covariance` with sigma naught 1.
 
 A criterion is any differentiable function from a `NetworkCovariance` to a scalar, such as
-`functools.partial(sigma_of, name="c_mm")`. A maximum has kinks; `power` p replaces it by the p-norm, which is
-smooth and larger by at most the factor n^(1/p) for n values. Use `power` in the search, and report the value without it.
+`functools.partial(sigma_of, name="c_mm")`. A maximum has kinks; `power` p replaces it by the p-norm, which is smooth
+and larger by at most the factor n^(1/p) for n values. Use `power` in the search, and report the value without it.
 
 Source of the criteria A, D and E: Pukelsheim, Optimal Design of Experiments (1993); for networks, Grafarend and Sanso
 (1985).
@@ -115,13 +115,13 @@ def _design_covariance(layout: Layout) -> NetworkCovariance:
     image_weight, station, attitude = layout.by_image
     n, k, m = len(station), len(layout.free), len(layout.points)
     weighted = weight[:, :, None, None]
-    # (images, 6, 6), (images, 6, free), (free, free)
+    # Shapes (images, 6, 6), (images, 6, free), (free, free).
     u = jnp.einsum("ipca,ipcb->iab", weighted * eop, eop)
     u = u + jax.vmap(jnp.diag)(jnp.concatenate([station, attitude], axis=1))
     us = jnp.einsum("ipca,ipcb->iab", weighted * eop, shared).reshape(6 * n, k)
     uss = jnp.einsum("ipca,ipcb->ab", weighted * shared, shared)
     normal = jnp.block([[_block_diagonal(u), us], [us.T, uss]])
-    # (3, unknowns, points): sums of two products each; a batch of small matrices would be slow.
+    # Shape (3, unknowns, points). Sum two products each: a batch of small matrices would be slow.
     products = lambda a: sum(  # noqa: E731
         (weighted * a)[:, :, c, :, None] * point[:, :, c, None, :] for c in range(2)
     )

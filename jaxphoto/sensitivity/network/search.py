@@ -143,7 +143,7 @@ def best_designs(criterion: Criterion, layout_of: LayoutOf, designs: Design, n: 
 
 
 def stack_designs(*designs: Design) -> Design:
-    """Stack single designs along a leading axis."""
+    """Stack single designs along a new leading axis."""
     return jax.tree.map(lambda *v: np.stack([np.asarray(x, float) for x in v]), *designs)
 
 
