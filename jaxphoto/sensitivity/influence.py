@@ -32,10 +32,9 @@ class StationBias(eqx.Module):
 
 @pretty_repr
 class VarianceShares(eqx.Module):
-    """Fraction of each estimate's variance due to each observation. Over all groups the fractions of an estimate sum to
-    1.
+    """Fraction of each estimate's variance due to each observation.
 
-    Shaped like `Sensitivity.groups`. Rows of fixed parameters are zero. `variance` is the a priori variance A
+    Over all groups the fractions of an estimate sum to 1. Shaped like `Sensitivity.groups`. Rows of fixed parameters are zero. `variance` is the a priori variance A
     diag(sigma^2) A' of each estimate, in its unit squared.
     """
 

@@ -216,9 +216,7 @@ class Readjustment:
         return Draws({}, *self._estimates(state), np.array([converged]), np.array([steps]), np.array([True]), ())
 
     def _exterior(self, state: UnknownArrays) -> Float[np.ndarray, "draws images 6"]:
-        """Return X, Y, Z, omega, phi, kappa. Angles are continuous with the nominal ones, without a jump at 180
-        degrees.
-        """
+        """Return X, Y, Z, omega, phi, kappa. Angles are continuous with the nominal ones."""
         angles = np.asarray(call_compiled(_angles, _by_object(state.rotation)))
         nominal = np.asarray(call_compiled(_angles, np.asarray(self.adjusted.values.rotation).transpose(2, 0, 1)[None]))
         angles = nominal + (angles - nominal + np.pi) % (2 * np.pi) - np.pi

@@ -78,9 +78,7 @@ def residual_spread(adjusted: Adjustment) -> list[Spread]:
 
 
 def check_discrepancies(adjusted: Adjustment) -> ControlCoordinates:
-    """Compute surveyed minus computed coordinates (m) of the check points, with the survey's sigmas (paper 000, Table
-    5).
-    """
+    """Compute surveyed minus computed coordinates (m) of check points, and the survey's sigmas (paper 000, Table 5)."""
     check = adjusted.block.check
     points = np.asarray(adjusted.unknowns.points)
     return ControlCoordinates(
