@@ -34,8 +34,8 @@ class StationBias(eqx.Module):
 class VarianceShares(eqx.Module):
     """Fraction of each estimate's variance due to each observation.
 
-    Over all groups the fractions of an estimate sum to 1. Shaped like `Sensitivity.groups`. Rows of fixed parameters are zero. `variance` is the a priori variance A
-    diag(sigma^2) A' of each estimate, in its unit squared.
+    Over all groups the fractions of an estimate sum to 1. Shaped like `Sensitivity.groups`. Rows of fixed parameters
+    are zero. `variance` is the a priori variance of each estimate, diag(A diag(sigma^2) A'), in its unit squared.
     """
 
     groups: dict[str, Float[np.ndarray, "estimates _"]]

@@ -145,8 +145,8 @@ def linear_forms(
 
 
 FORMS = ("height", "flying_height", "dome")
-# Minimum number of rays per point, used if at least the minimum number of points have it: two-ray points would dominate
-# the variance of a mean.
+# Minimum number of rays per point (two-ray points would dominate the variance of a mean), and minimum number of points
+# with that many rays for the limit to apply.
 _MIN_RAYS, _MIN_POINTS = 3, 10
 # Minimum mean cosine of the tilt of near-vertical photographs.
 _MIN_COSINE = 0.7
