@@ -1,4 +1,4 @@
-"""Experiments: variants of simulated blocks whose tables stand beside what papers print."""
+"""Experiments: variants of simulated blocks whose results are compared with the tables of published papers."""
 
 from jaxphoto.experiment.experiment import (
     Cells,

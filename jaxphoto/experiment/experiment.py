@@ -1,4 +1,4 @@
-"""Experiments: variants of simulated blocks, adjusted layout by layout, and their tables compared with a paper's."""
+"""Experiments: variants of simulated blocks, adjusted for several layouts and compared with the tables of a paper."""
 
 import dataclasses
 import importlib.util
@@ -22,7 +22,7 @@ from jaxphoto.simulation import Recipe, Simulation, simulate
 FILE = "experiment.py"
 Progress = Callable[[str], None]
 MEAN_DIFFERENCE = "mean_abs_difference"
-"""The column whose cell is the mean of |ours - published| over its table."""
+"""Name of the column whose cell is the mean of |ours - published| over its table."""
 _KEY = ["table", "row", "column"]
 PUBLISHED = [*_KEY, "published", "unit", "tolerance", "note"]
 COLUMNS = [
@@ -32,7 +32,7 @@ COLUMNS = [
 
 @dataclasses.dataclass(frozen=True)
 class Results(Mapping[str, Tables]):
-    """The adjusted variants of one layout, by name; `simulations` are their blocks before `Variant.change`."""
+    """Adjusted variants of one layout, by name. `simulations` contains their blocks before `Variant.change`."""
 
     adjusted: Mapping[str, Tables]
     simulations: Mapping[str, Simulation]
@@ -48,13 +48,13 @@ class Results(Mapping[str, Tables]):
 
 
 Cells = dict[tuple[str, str], float]
-"""The cells of one table, by row and column."""
+"""Values of one table, by row and column name."""
 Measure = Callable[[Results], Cells]
 
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """One adjustment: `change` applied to the block of the recipe, in which `recipe` replaces keys.
+    """One adjustment: `change` applied to the block of the recipe, with the keys of `recipe` replaced.
 
     `recipe` is nested like the TOML file: `{"cameras": {"kodak": {"truth": {"c_mm": 35.5}}}}`.
     """
@@ -62,15 +62,16 @@ class Variant:
     change: Callable[[Block], Block] = lambda block: block
     recipe: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     file: str = "recipe.toml"
-    """The recipe, beside experiment.py."""
+    """Name of the recipe file, in the folder of experiment.py."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """Variants of simulated blocks and the tables printed of them.
+    """Variants of simulated blocks, and the tables computed from them.
 
-    `layouts` blocks are drawn (seeds 0, 1, ...), every variant of each is adjusted, and every table's cells are the
-    means over them. `published.csv` beside experiment.py holds what a paper prints, if there is one.
+    For each of `layouts` random layouts (seeds 0, 1, ...) every variant is simulated and adjusted. The cells of every
+    table are means over the layouts. `published.csv`, in the folder of experiment.py, contains the values of a paper,
+    if there is one.
     """
 
     title: str
@@ -82,7 +83,7 @@ class Experiment:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """The results of an experiment: the cells of every layout, the adjustments of the first, and failures.
+    """Results of an experiment: the cells of every layout, the adjustments of the first layout, and failures.
 
     `cells` has the columns table, row, column, layout, value.
     """
@@ -96,10 +97,10 @@ class Run:
 def run_experiment(
     experiment: Experiment, folder: Path, layouts: int | None = None, progress: Progress = lambda _: None
 ) -> Run:
-    """Run `experiment`, whose recipes lie in `folder`. `progress` is called with every step.
+    """Run `experiment` with the recipes in `folder`. `progress` is called with a message for every step.
 
     A layout in which a variant cannot be simulated or adjusted is rejected and listed in `failures`. Raises InputError
-    where no layout is left, and for recipes that cannot be read.
+    if all layouts are rejected, and for recipes that cannot be read.
     """
     recipes = {name: _recipe(variant, folder) for name, variant in experiment.variants.items()}
     failures: list[str] = []
@@ -136,12 +137,12 @@ def run_experiment(
 
 
 def simulated(experiment: Experiment, folder: Path, variant: str, layout: int = 0) -> Simulation:
-    """Return the block of one variant, before `Variant.change`, with its truth."""
+    """Simulate one variant without `Variant.change`; return block and true parameters."""
     return simulate(_recipe(experiment.variants[variant], folder), layout)
 
 
 def _simulated(experiment: Experiment, recipes: Mapping[str, Recipe], layout: int) -> dict[str, Simulation]:
-    """Return the simulation of each variant; variants of one recipe share it."""
+    """Simulate each variant; variants of one recipe share the simulation."""
     simulations: dict[tuple[str, str], Simulation] = {}
     variants = {}
     for name, variant in experiment.variants.items():
@@ -153,7 +154,7 @@ def _simulated(experiment: Experiment, recipes: Mapping[str, Recipe], layout: in
 
 
 def _sizes(layouts: list[dict[str, Block]]) -> dict[str, PaddedSizes]:
-    """Return the padded sizes by variant: variants and layouts with as many images share compiled programs."""
+    """Return the padded sizes by variant: variants and layouts with equal numbers of images share compiled programs."""
     of_images: dict[int, list[Block]] = {}
     for block in (b for variants in layouts for b in variants.values()):
         of_images.setdefault(len(block.images), []).append(block)
@@ -177,16 +178,19 @@ def _recipe(variant: Variant, folder: Path) -> Recipe:
 
 
 def _merged(values: Any, changes: Any) -> Any:
-    """Nested tables with `changes` applied."""
+    """Merge `changes` into nested tables."""
     if not isinstance(values, Mapping) or not isinstance(changes, Mapping):
         return changes
     return {**values, **{key: _merged(values.get(key, {}), change) for key, change in changes.items()}}
 
 
 def summary(cells: pd.DataFrame) -> pd.DataFrame:
-    """Mean and standard deviation of every cell over the layouts: table, row, column, ours, spread, n_layouts."""
+    """Compute mean and standard deviation of every cell over the layouts.
+
+    Columns: table, row, column, ours, spread, n_layouts.
+    """
     groups = cells.groupby(["table", "row", "column"], sort=False)["value"]
-    # Relative to the first layout: equal cells have exactly their value and no spread.
+    # Subtract the first layout: equal cells then give exactly their value and zero spread.
     table = groups.agg(
         ours=lambda v: v.iloc[0] + np.mean(v - v.iloc[0]),
         spread=lambda v: np.std(v - v.iloc[0], ddof=1) if len(v) > 1 else np.nan,
@@ -196,7 +200,7 @@ def summary(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def read_published(folder: Path) -> pd.DataFrame:
-    """Read the cells that a paper prints; empty without published.csv. Raises InputError for a missing column."""
+    """Read the published cells; empty without published.csv. Raises InputError for a missing column."""
     path = folder / "published.csv"
     if not path.is_file():
         return pd.DataFrame(columns=PUBLISHED)
@@ -210,9 +214,9 @@ def read_published(folder: Path) -> pd.DataFrame:
 
 
 def compare(run: Run, folder: Path) -> pd.DataFrame:
-    """Return the table tables.csv: every printed or computed cell; `within` is yes or no where there is a tolerance.
+    """Return the table tables.csv: every published or computed cell. `within` is yes or no if there is a tolerance.
 
-    `ours` is the mean over `n_layouts` layouts, `spread` its standard deviation from layout to layout.
+    `ours` is the mean over `n_layouts` layouts, `spread` the standard deviation over the layouts.
     """
     published = read_published(folder)
     table = published.merge(summary(run.cells), on=_KEY, how="left")
@@ -229,9 +233,9 @@ def compare(run: Run, folder: Path) -> pd.DataFrame:
 
 
 def side_by_side(comparison: pd.DataFrame, table: str) -> pd.DataFrame:
-    """One table of `compare` as it is printed: rows and columns as there, `each with `published` and `ours`.
+    """Return one table of `compare` in the layout of the paper, each column split into `published` and `ours`.
 
-    Cells that are neither are left out. Raises ValueError for an unknown table.
+    Columns without values are omitted. Raises ValueError for an unknown table.
     """
     cells = comparison[comparison["table"] == table]
     if cells.empty:
@@ -246,7 +250,7 @@ def side_by_side(comparison: pd.DataFrame, table: str) -> pd.DataFrame:
 
 
 def _with_mean_differences(table: pd.DataFrame) -> pd.DataFrame:
-    """Cells of MEAN_DIFFERENCE filled in."""
+    """Fill in the cells of MEAN_DIFFERENCE."""
     table = table.copy()
     for k in table.index[table["column"] == MEAN_DIFFERENCE]:
         cells = table[(table["table"] == table.loc[k, "table"]) & (table.index != k)]
@@ -255,7 +259,7 @@ def _with_mean_differences(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def find_experiments(directory: Path, name: str) -> list[Path]:
-    """Return the folder of the experiment `name`, or of `all`, in `directory`. Raises InputError if there is none."""
+    """Find the folder of the experiment `name`, or of `all`, in `directory`. Raises InputError if there is none."""
     known = sorted(path.parent for path in directory.glob(f"*/{FILE}"))
     if not known:
         raise InputError(
@@ -270,7 +274,7 @@ def find_experiments(directory: Path, name: str) -> list[Path]:
 
 
 def load_experiment(folder: Path) -> Experiment:
-    """Return the EXPERIMENT that experiment.py in `folder` declares. Raises InputError where it does not."""
+    """Import EXPERIMENT from experiment.py in `folder`. Raises InputError if it is not defined."""
     path = folder / FILE
     spec = importlib.util.spec_from_file_location(f"jaxphoto_experiment_{folder.name}", path)
     if spec is None or spec.loader is None or not path.is_file():

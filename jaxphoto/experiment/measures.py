@@ -1,7 +1,7 @@
-"""Measures: functions of the adjusted variants of one layout that give the cells of one printed table.
+"""Measures: functions that compute the cells of one table from the adjusted variants of one layout.
 
-Rows are named by variant, columns as the papers' tables name them. A measure takes the names of its variants,
-and may give them other names: `{"4": "system 4"}` prints the variant `system 4` in row `4`.
+Row names are variant names, column names are taken from the tables of the papers. A measure takes the names of its
+variants. A mapping assigns other row names: `{"4": "system 4"}` shows the variant `system 4` in row `4`.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -20,23 +20,23 @@ _UNITS = {"k1": "_mm-2", "k2": "_mm-4", "k3": "_mm-6", "p1": "_mm-1", "p2": "_mm
 _ANGLES = ("omega", "phi", "kappa")
 _OFF = [f"d{axis}_m" for axis in AXES]
 Rows = Mapping[str, str]
-"""Row of a table -> variant."""
+"""Mapping from row name to variant name."""
 
 
 def named(variants: Iterable[str]) -> dict[str, str]:
-    """Rows named as their variants."""
+    """Map each name to the variant of the same name."""
     return {name: name for name in variants}
 
 
 def _by_row(rows: Rows, columns: Callable[[Tables], Mapping[str, float]]) -> Measure:
-    """Return the measure whose rows are the `columns` of one variant each."""
+    """Return a measure with one row per variant and the given columns."""
     return lambda results: {
         (row, column): value for row, variant in rows.items() for column, value in columns(results[variant]).items()
     }
 
 
 def _by_pair(pairs: Iterable[tuple[str, str]], columns: Callable[[Tables, Tables], Mapping[str, float]]) -> Measure:
-    """Return the measure whose rows `first-second` are the `columns` of two variants each."""
+    """Return a measure with one row `first-second` per pair of variants and the given columns."""
     pairs = list(pairs)
     return lambda results: {
         (f"{first}-{second}", column): value
@@ -46,19 +46,22 @@ def _by_pair(pairs: Iterable[tuple[str, str]], columns: Callable[[Tables, Tables
 
 
 def iops(rows: Rows) -> Measure:
-    """Estimated interior orientation and its a posteriori sigmas: c_mm, sigma_c_mm, ..., k1_mm-2 (000 T2, 004 T3)."""
+    """Return the estimated interior orientation and its a posteriori sigmas.
+
+    Columns: c_mm, sigma_c_mm, ..., k1_mm-2 (000 T2, 004 T3).
+    """
     return _by_row(rows, lambda tables: _interior(tables) | {f"sigma_{c}": s for c, s in _interior(tables, 1).items()})
 
 
 def _interior(tables: Tables, place: int = 0) -> dict[str, float]:
-    """Estimated parameters, or with `place` 1 their sigmas."""
+    """Return the estimated parameters; with `place` 1, their sigmas."""
     return {s.parameter + _UNITS.get(s.parameter, ""): (s.value, s.sigma)[place] for s in tables.significance}
 
 
 def residuals(rows: Rows, *, image: str = "mm", ground: str = "m") -> Measure:
-    """RMSE of residuals of image points, control and stations, and the a posteriori variance factor (000 T3, 004 T4).
+    """Compute the RMSE of the residuals of image points, control and stations, and the a posteriori variance factor.
 
-    The papers print the variance factor under the name sigma0. `image` is mm or px, `ground` m or mm.
+    Tables 000 T3 and 004 T4. The papers call the variance factor sigma0. `image` is mm or px, `ground` m or mm.
     """
     names = {"image_points": "rmse_{}_" + image, "control_points": "rmse_{}_" + ground}
     names["stations"] = "rmse_{}s_" + ground
@@ -78,7 +81,7 @@ def residuals(rows: Rows, *, image: str = "mm", ground: str = "m") -> Measure:
 
 
 def mean_correlations(rows: Rows, columns: Mapping[str, str]) -> Measure:
-    """Mean absolute correlation of omega, phi, kappa with the IOP over the images, row `variant/angle` (000 T4)."""
+    """Compute the mean |rho| of omega, phi, kappa with the IOP over the images, row `variant/angle` (000 T4)."""
     return lambda results: {
         (f"{row}/{name}", columns[parameter]): float(camera.mean_abs[i, j])
         for row, variant in rows.items()
@@ -90,7 +93,7 @@ def mean_correlations(rows: Rows, columns: Mapping[str, str]) -> Measure:
 
 
 def check_points(rows: Rows) -> Measure:
-    """Mean and RMSE of surveyed minus computed at check points (000 T5, 004 T5)."""
+    """Compute mean and RMSE of surveyed minus computed at check points (000 T5, 004 T5)."""
     return _by_row(rows, lambda tables: _discrepancies(tables) | {"n_check_points": len(tables.check_points)})
 
 
@@ -99,7 +102,7 @@ def _discrepancies(tables: Tables) -> dict[str, float]:
 
 
 def tie_point_differences(pairs: Iterable[tuple[str, str]]) -> Measure:
-    """First minus second: coordinates of the tie points that both hold, row `first-second` (000 T6)."""
+    """Compute the coordinate differences first - second of common tie points, row `first-second` (000 T6)."""
 
     def columns(first: Tables, second: Tables) -> dict[str, float]:
         points, differences = point_differences(first.adjusted, second.adjusted)
@@ -109,7 +112,7 @@ def tie_point_differences(pairs: Iterable[tuple[str, str]]) -> Measure:
 
 
 def orientation_differences(pairs: Iterable[tuple[str, str]]) -> Measure:
-    """First minus second: omega, phi, kappa in arc seconds, row `first-second` (000 T7)."""
+    """Compute the differences first - second of omega, phi, kappa in arc seconds, row `first-second` (000 T7)."""
 
     def columns(first: Tables, second: Tables) -> dict[str, float]:
         _, differences = angle_differences(first.adjusted, second.adjusted)
@@ -119,7 +122,7 @@ def orientation_differences(pairs: Iterable[tuple[str, str]]) -> Measure:
 
 
 def principal_point(rows: Rows) -> Measure:
-    """Principal point (mm) and sigma naught in um on the image (003 T1)."""
+    """Return the principal point (mm) and sigma naught in um on the image (003 T1)."""
 
     def columns(tables: Tables) -> dict[str, float]:
         value = tables.interior.set_index("parameter")["value"]
@@ -129,7 +132,7 @@ def principal_point(rows: Rows) -> Measure:
 
 
 def misalignment(rows: Rows) -> Measure:
-    """Boresight (deg), with its sigma, and sigma naught in um on the image (003 T2, T3)."""
+    """Return the boresight (deg) with its sigma, and sigma naught in um on the image (003 T2, T3)."""
 
     def columns(tables: Tables) -> dict[str, float]:
         values = boresight(tables)
@@ -140,7 +143,10 @@ def misalignment(rows: Rows) -> Measure:
 
 
 def misalignment_agreement(pairs: Mapping[str, tuple[str, str]]) -> Measure:
-    """|first - second| of the boresight over the sigma of the difference, for independent estimates; row -> pair."""
+    """Compute |first - second| of the boresight over the sigma of the difference, for independent estimates.
+
+    Maps each row to its pair of variants.
+    """
 
     def measure(results: Results) -> Cells:
         cells: Cells = {}
@@ -154,7 +160,7 @@ def misalignment_agreement(pairs: Mapping[str, tuple[str, str]]) -> Measure:
 
 
 def boresight_correlation(rows: Rows) -> Measure:
-    """Correlation of the boresight's d omega with y_p (what cross strips are flown for)."""
+    """Return the correlation of the boresight's d omega with y_p, which cross strips reduce."""
 
     def columns(tables: Tables) -> dict[str, float]:
         names = [label.split("].")[1] for label in tables.covariance.labels]
@@ -166,9 +172,9 @@ def boresight_correlation(rows: Rows) -> Measure:
 
 
 def recovered(rows: Rows, truths: Mapping[str, str] = MappingProxyType({})) -> Measure:
-    """Estimated mounts and strips compared with their truth, row `row/parameter`; `ratio` is |error| / sigma.
+    """Compare estimated mounts and strips with their true values, row `row/parameter`; `ratio` is |error| / sigma.
 
-    `truths` names the true parameter of the truth's tables where the estimated one has another name there.
+    `truths` maps estimated parameters to true parameters where their names differ.
     """
 
     def measure(results: Results) -> Cells:
@@ -186,7 +192,7 @@ def recovered(rows: Rows, truths: Mapping[str, str] = MappingProxyType({})) -> M
 
 
 def effects(rows: Rows, reference: str) -> Measure:
-    """Estimated interior orientation minus that of the variant `reference`, RMSE at check points, sigma naught."""
+    """Compute the interior orientation relative to the variant `reference`, RMSE at check points and sigma naught."""
 
     def measure(results: Results) -> Cells:
         cells: Cells = {}
@@ -202,7 +208,7 @@ def effects(rows: Rows, reference: str) -> Measure:
 
 
 def boresight(tables: Tables) -> dict[str, tuple[float, float]]:
-    """Value and sigma (deg) of domega, dphi and dkappa."""
+    """Return value and sigma (deg) of domega, dphi and dkappa."""
     table: pd.DataFrame = tables.georeferencing
     rows = table[table["parameter"].str.contains("boresight")]
     return dict(zip(("domega", "dphi", "dkappa"), zip(rows["value"], rows["sigma"], strict=True), strict=True))

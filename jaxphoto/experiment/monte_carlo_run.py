@@ -1,4 +1,4 @@
-"""A Monte Carlo on disk: draws streamed to Parquet, resumed where they stopped, and compared with the prediction."""
+"""Monte Carlo on disk: stream draws to Parquet, resume after an interruption, compare with the prediction."""
 
 import dataclasses
 import hashlib
@@ -30,25 +30,25 @@ from jaxphoto.report.page import versions
 from jaxphoto.sensitivity import Bias, Readjustment, join_draws
 from jaxphoto.writing import whole_file
 
-# Largest part, which is what an interrupted run loses: draws, numbers, image rows (some seconds).
+# Maximum size of a part in draws, components and image rows: an interrupted run loses one part (some seconds).
 _PART, _PART_NUMBERS, _PART_ROWS = 1000, 5_000_000, 12_000_000
-# An intermediate summary is written from so many draws on, after so many seconds of drawing, or so many times the
-# duration of the last summary.
+# Minimum number of draws for an intermediate summary. Minimum drawing time (s) between summaries, and minimum ratio of
+# the drawing time to the duration of the last summary.
 _FIRST_DRAWS, _SECONDS, _TIMES = 100, 10.0, 20
-# Columns of the draws that are read at a time.
+# Number of columns of the draws that are read at a time.
 _AT_ONCE = 200
-# Keys of a summary and columns of its table.
+# Required keys of a summary, required columns of its table, and columns of the draws that are not quantities.
 _NUMBERS = ("draws", "converged", "fallbacks", "draws_per_second")
 _COLUMNS = {"quantity", "unit", "nominal", "mean", "sd", "predicted_sigma", "ratio"}
 _OF_DRAWS = ("draw", "converged", "iterations", "fallback")
-# Most errors whose individual effects are predicted, and drawn in a figure.
+# Maximum number of errors whose individual effects are predicted; maximum number of errors in a figure.
 _PREDICTED, _PICTURED = 20_000, 60
 
 
 class MonteCarlo:
     """Draws of `drawn` in the folder `directory`; `run` applies given errors.
 
-    Raises InputError where the folder holds another run, or something else.
+    Raises InputError if the folder contains a different run or other files.
     """
 
     def __init__(self, block: Block, run: Readjustment, drawn: Bias, draws: int, seed: int, directory: Path):
@@ -59,7 +59,7 @@ class MonteCarlo:
         parts = min(_PART, _PART_NUMBERS // widest, _PART_ROWS // rows) // run.batch_size
         settings = {
             "block": digest_of(block), "errors": _errors_line(drawn), "sigma": _sigma_line(drawn), "seed": seed,
-            # The distribution has no name: its first draws identify it.
+            # Identify the distribution, which has no name, by its first draws.
             "first_draws": _digest(np.asarray(self.keys(np.arange(4)))),
             "exterior": run.exterior, "points": run.points, "batch": run.batch_size, "devices": run.devices,
             "thorough": run.many, "versions": versions(),
@@ -68,9 +68,9 @@ class MonteCarlo:
         self.computed, self.seconds = 0, 0.0
 
     def draw(self, progress: Callable[[int], object] = lambda done: None) -> None:
-        """Draw what is missing; `progress` is called with the number of draws.
+        """Draw the missing draws. `progress` is called with the number of draws.
 
-        Raises InputError where another process draws into the folder.
+        Raises InputError if another process draws into the folder.
         """
         with self.folder.alone():
             self._draw(progress)
@@ -97,7 +97,7 @@ class MonteCarlo:
         folder.tidy()
 
     def _draw_part(self, part: int, numbers: np.ndarray, progress: Callable[[int], object]) -> None:
-        """Draw the requested ones of `numbers`, whose length is constant to compile once."""
+        """Compute the requested draws of `numbers`. Its length is constant, so one program is compiled."""
         errors, batches, done = np.asarray(self.keys(numbers))[numbers < self.folder.draws], [], int(numbers[0])
         for batch in self.run.batches(errors):
             batches.append(batch)
@@ -111,7 +111,7 @@ class MonteCarlo:
     def write(self) -> tuple[dict, pd.DataFrame]:
         """Write summary.csv, effects.csv, figures and, last, summary.json; return the summary and its table.
 
-        They are only read if nothing was drawn since they were written.
+        Existing files are read if nothing was drawn since they were written.
         """
         if self.computed == 0 and (written := self._written()) is not None:
             return written
@@ -125,7 +125,7 @@ class MonteCarlo:
             table = table.fillna({"unit": ""})
         except (ValueError, OSError):
             return None
-        # Not an intermediate summary.
+        # Reject an intermediate summary.
         numbers = all(isinstance(summary.get(key), int | float) for key in _NUMBERS)
         columns = {"quantity", "unit", *table.select_dtypes("number").columns} & set(table.columns)
         whole = numbers and summary["draws"] == self.folder.draws and columns >= _COLUMNS
@@ -133,12 +133,12 @@ class MonteCarlo:
 
     @property
     def _shared_columns(self) -> list[str]:
-        """Errors and shared parameters: the columns of an intermediate summary."""
+        """Return the columns of errors and shared parameters, which an intermediate summary uses."""
         errors = [in_degrees(f"bias.{name}") for name in self.drawn.names] if self.drawn.recorded else []
         return errors + [column_of(label) for label in self.run.adjusted.structure.labels]
 
     def _sum_up(self, names: list[str]) -> tuple[dict, pd.DataFrame]:
-        """Write summary, effects and figures of these columns."""
+        """Write summary, effects and figures of the given columns."""
         directory, folder = self.folder.directory, self.folder
         nominal, effects, predicted = self._prediction
         flags = folder.read(["converged", "fallback"])
@@ -174,13 +174,13 @@ class MonteCarlo:
         return summary, table
 
     def _sigmas(self) -> dict[str, float]:
-        """Return the standard deviations by name of the error, angles in degrees."""
+        """Return the standard deviation of each error by name, angles in degrees."""
         pairs = zip(self.drawn.names, self.drawn.sigma, strict=True)
         return {name: float(np.degrees(v) if name.endswith("_rad") else v) for name, v in pairs}
 
     @cached_property
     def _prediction(self) -> tuple[dict[str, float], pd.DataFrame, dict[str, float]]:
-        """The nominal estimates, the effect of one sigma of each error on each, and the standard deviations of these.
+        """Return the nominal estimates, the effect of one sigma of each error on each, and their standard deviations.
 
         First order, for independent errors; empty if there are too many errors.
         """
@@ -208,7 +208,7 @@ class MonteCarlo:
 
 
 def _errors_line(drawn: Bias) -> str:
-    """Return the errors in a line: their number, the quantities, and a digest of the assignment."""
+    """Describe the errors in one line: their number, the quantities, and a digest of the assignment."""
     where = sorted({path[0] if path[0] != "start" else path[2] for path in drawn.targets})
     paths = (".".join(map(str, path)).encode() for path in drawn.targets)
     digest = _digest(*drawn.index, *(np.frombuffer(path, np.uint8) for path in paths))

@@ -1,4 +1,4 @@
-"""The page of an experiment: agreement, then each table as printed, ours in the same cells; its figures and files."""
+"""HTML page of an experiment: agreement, each table with published and computed values, figures and files."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _TABLE = Environment(loader=PackageLoader("jaxphoto.experiment"), autoescape=Tru
 
 
 def index_page(experiments: Mapping[str, tuple[str, pd.DataFrame]]) -> str:
-    """Return a page with links to those of several experiments: name -> title and comparison."""
+    """Return a page with links to the pages of several experiments. Input: title and comparison by name."""
     parts: list[Part] = []
     for name, (title, t) in experiments.items():
         good, judged = int((t["within"] == "yes").sum()), int((t["within"] != "").sum())
@@ -60,7 +60,7 @@ def index_page(experiments: Mapping[str, tuple[str, pd.DataFrame]]) -> str:
 
 
 def experiment_page(run: Run, comparison: pd.DataFrame, record: CommandRecord | None = None) -> str:
-    """Return the page as HTML: agreement, the block of the first layout, each table as printed, check points."""
+    """Return the HTML page: agreement, the block of the first layout, each table, check points."""
     tables = [table_texts(str(name), cells) for name, cells in comparison.groupby("table", sort=False)]
     judged, good = (sum(table[name] for table in tables) for name in ("judged", "good"))
     verdict = f"{good} of {judged} printed values with a tolerance are within it"
@@ -96,10 +96,10 @@ def _parts(run: Run, comparison: pd.DataFrame, tables: list[dict]) -> Iterator[P
 
 
 def table_texts(name: str, cells: pd.DataFrame) -> dict:
-    """Format a printed table: title, columns, rows, notes, and the number of cells within their tolerance."""
+    """Format a table: title, columns, rows, notes, and the number of cells within their tolerance."""
     overall = cells["column"] == MEAN_DIFFERENCE
     shown = cells[~overall]
-    # A note of a whole column is put at its heading, others at their cells; they are numbered in order.
+    # Put notes of a whole column at its heading, other notes at their cells; number them in order.
     numbers: dict[str, int] = {}
     columns: list[dict] = []
     texts: dict[tuple, dict] = {}
@@ -125,7 +125,7 @@ def table_texts(name: str, cells: pd.DataFrame) -> dict:
 
 
 def _column(of: pd.DataFrame, power: int, marks: dict[str, int]) -> list[tuple[pd.Series, dict]]:
-    """Every cell of one column with its texts, in the digits of the column."""
+    """Format every cell of one column with the decimals of the column."""
     scale = 10.0**-power
     printed = printed_decimals(of["published"].dropna(), power)
     size = scale * float(of["ours"].abs().max())
@@ -156,8 +156,8 @@ def write_runs(
 ) -> None:
     """Write tables.csv, cells.csv (every layout) and report.html of the `runs` of experiment folders into `out`.
 
-    Several experiments have a page each and report.html as index; `record` is the provenance of each run. Raises what
-    `whole_folder` raises.
+    Several experiments get one page each, with report.html as index. `record` is the provenance of each run. Raises the
+    errors of `whole_folder`.
     """
     tables = {folder: compare(run, folder) for folder, run in runs.items()}
     only = len(runs) == 1
@@ -183,7 +183,7 @@ _WORDS = {
 }  # fmt: skip
 _UNITS = {"mm", "m", "px", "um", "deg", "arcsec", "mm-1", "mm-2", "mm-4", "mm-6"}
 _SMALL = 1e-3
-"""Columns of smaller numbers are given in a power of ten."""
+"""Columns whose values are all smaller are scaled by a power of ten."""
 
 
 def table_title(name: str) -> str:
@@ -195,7 +195,7 @@ def table_title(name: str) -> str:
 
 
 def heading(column: str, unit: str, power: int) -> str:
-    """Return the label of a column, with the unit of its name, else `unit`; its numbers are times 10**`power`."""
+    """Return the label of a column, with the unit of its name, else `unit`; values are scaled by 10**`power`."""
     stem, _, last = column.rpartition("_")
     named = last in _UNITS and bool(stem)
     of = (last if named else unit).replace("um", "µm")
@@ -206,21 +206,22 @@ def heading(column: str, unit: str, power: int) -> str:
 
 
 def power_of(values: Iterable[float]) -> int:
-    """Return the power of ten of a column of small numbers, 0 for others."""
+    """Return the power of ten of a column of small values, 0 for other columns."""
     largest = max((abs(v) for v in values), default=0.0)
     return math.floor(math.log10(largest)) if 0 < largest < _SMALL else 0
 
 
 def printed_decimals(values: Iterable[float], power: int) -> int | None:
-    """Decimals that give all `values` (in 10**`power`) exactly; None if all are zero."""
+    """Return the number of decimals that represents all `values` (in 10**`power`) exactly; None if all are zero."""
     places = [-int(Decimal(repr(float(v))).normalize().as_tuple().exponent) + power for v in values if v]
     return max([0, *places]) if places else None
 
 
 def own_decimals(value: float, spread: float, printed: int | None, size: float) -> int:
-    """Decimals of a value of ours: two digits of its spread, but at least `printed` and at most one more.
+    """Return the number of decimals of a computed value: two significant digits of its spread.
 
-    Without printed value and spread: three digits of `size`. Counts have none.
+    It is at least `printed` and at most one more. Without published value and spread: three significant digits of
+    `size`. Counts have none.
     """
     if value == round(value) and not spread > 0:
         return 0
@@ -245,10 +246,10 @@ _ACROSS = 5
 
 
 def plot_comparison(comparison: pd.DataFrame, table: str, column: str, ax: Axes | None = None) -> Axes:
-    """Plot one printed column of `table`, a line for each row: printed and ours.
+    """Plot one published column of `table` with the computed values, one line per row.
 
-    `comparison` is from `compare`. Bars are the tolerance of the printed value and the standard deviation of ours
-    from layout to layout. Raises ValueError if no cell of the column is both printed and ours.
+    `comparison` is the result of `compare`. Bars show the tolerance of the published value and the standard deviation
+    of the computed value over the layouts. Raises ValueError if no cell of the column is both published and computed.
     """
     cells = _both(comparison, table)
     of = cells[cells["column"] == column]
@@ -264,9 +265,9 @@ def plot_comparison(comparison: pd.DataFrame, table: str, column: str, ax: Axes 
 
 
 def comparison_figure(comparison: pd.DataFrame, table: str) -> Figure:
-    """One panel for each printed column of `table`, as in `plot_comparison`.
+    """Plot each published column of `table` in one panel, as in `plot_comparison`.
 
-    Raises ValueError if no cell of the table is both printed and ours.
+    Raises ValueError if no cell of the table is both published and computed.
     """
     cells = _both(comparison, table)
     rows = list(dict.fromkeys(cells["row"]))
@@ -285,7 +286,7 @@ def comparison_figure(comparison: pd.DataFrame, table: str) -> Figure:
 
 
 def _both(comparison: pd.DataFrame, table: str) -> pd.DataFrame:
-    """Return the cells of a table that are both printed and ours."""
+    """Return the cells of a table that are both published and computed."""
     cells = comparison[(comparison["table"] == table) & (comparison["column"] != MEAN_DIFFERENCE)]
     cells = cells[cells["published"].notna() & cells["ours"].notna()]
     if cells.empty:
@@ -319,9 +320,9 @@ def _name_rows(axes: Axes, rows: list[str]) -> None:
 
 
 def plot_agreement(comparison: pd.DataFrame, ax: Axes | None = None) -> Axes:
-    """Plot ours minus printed over the tolerance, by table; `comparison` is from `compare`.
+    """Plot (computed - published) / tolerance by table; `comparison` is the result of `compare`.
 
-    Raises ValueError if no value of ours has a tolerance.
+    Raises ValueError if no computed value has a tolerance.
     """
     if not comparison["within"].ne("").any():
         raise ValueError("no value that is printed and ours has a tolerance")
@@ -331,12 +332,12 @@ def plot_agreement(comparison: pd.DataFrame, ax: Axes | None = None) -> Axes:
 
 
 def draw_agreement(axes: Axes, comparison: pd.DataFrame) -> None:
-    """`plot_agreement` in a panel."""
+    """Draw `plot_agreement` in a panel."""
     cells = comparison[comparison["within"] != ""]
     off = ((cells["ours"] - cells["published"]) / cells["tolerance"]).to_numpy(float)
     tables = list(dict.fromkeys(cells["table"]))
     place, number = pd.factorize(cells["table"])[0], cells.groupby("table").cumcount().to_numpy()
-    # Values of a table one below the other, in the order of the print.
+    # Arrange the values of a table from top to bottom, in the order of the paper.
     at = place + 0.7 * (number / np.maximum(cells.groupby("table")["table"].transform("size") - 1, 1) - 0.5)
     within = (cells["within"] == "yes").to_numpy()
     axes.axvspan(-1, 1, color="0.93", lw=0)

@@ -1,4 +1,4 @@
-"""An adjustment as a function of its observations, priors and design: derivatives, Monte Carlo, network design."""
+"""Sensitivity of an adjustment to observations, priors and design: derivatives, Monte Carlo, network design."""
 
 from jaxphoto.sensitivity.exact import Response, Sensitivity, response, sensitivity
 from jaxphoto.sensitivity.influence import DELTA0, external_reliability, station_bias, variance_shares

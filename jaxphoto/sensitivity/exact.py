@@ -1,22 +1,23 @@
 """Exact sensitivity of an adjustment, by adjoint vectors for its estimates or along one direction of change.
 
-At the optimum the gradient of half the weighted square sum vanishes for any observations v. By the implicit function
+At the optimum the gradient of half the weighted sum of squares is zero for any observations v. By the implicit function
 theorem an estimate e, a function of the unknowns x, has the derivative
 
     de/dv = -lambda' B,   H lambda = de/dx
 
-with H and B of `hessian`: with the curvature of the residuals this is exact; without, it is the classical first-order
+with H and B of `hessian`. With the curvature of the residuals this is exact; without, it is the classical first-order
 matrix -N^-1 J'P. One adjoint vector lambda per estimate serves all observations (`sensitivity`), and B is sparse: an
-image row involves its image, camera and point. With M, C and F of `hessian`, the gain K = -V^-1 [W; Ws; D]' = -L^-T F,
-b the derivative of an estimate by the unknowns of M and b_p that by the points, the points are eliminated by
+image row involves only its image, camera and point. With M, C and F of `hessian`, the gain
+K = -V^-1 [W; Ws; D]' = -L^-T F, and the derivatives b and b_p of an estimate by the unknowns of M and by the points,
+the points are eliminated by
 
     lambda = M^-1 [b + K_x' b_p; C K_mu' b_p]       for images and shared unknowns, and for mu
     lambda_p = V^-1 b_p + K lambda
 
-These are a few products of concrete arrays with the sparse matrix K.
+This takes a few products of NumPy arrays with the sparse matrix K.
 
-`response` is the change of all unknowns along one direction dv of change of all values of a block (observations,
-standard deviations, weights of priors, fixed parameters): dy = -H^-1 B dv.
+`response` computes the change of all unknowns, dy = -H^-1 B dv, for one direction dv of change of all values of a block
+(observations, standard deviations, weights of priors, fixed parameters).
 """
 
 import dataclasses
@@ -61,27 +62,28 @@ from jaxphoto.unknowns import Unknowns
 
 
 class Estimates(NamedTuple):
-    """Estimates whose adjoint vectors are requested; steps are those of the scaled increments."""
+    """Estimates whose adjoint vectors are requested. `step`, `point_step`: units of the scaled increments."""
 
     unknowns: Int[np.ndarray, "n"]
-    """Index in M of exterior orientations and shared unknowns, in the block's order."""
+    """Indices in M of exterior orientations and shared unknowns, in the block's order."""
     step: Float[np.ndarray, "n"]
     rotations: Float[np.ndarray, "images 3 3"]
-    """Derivatives of the reported angles of an image by its small rotation (rad)."""
+    """Derivatives of the reported angles of each image by its small rotation (rad)."""
     points: Int[np.ndarray, "requested"]
-    """Points whose coordinates are requested, in padded order."""
+    """Indices of the requested points, in padded order."""
     point_step: Float[np.ndarray, "requested 3"]
 
 
 def adjoint_vectors(h: Any, estimates: Estimates) -> Float[np.ndarray, "unknowns estimates"]:
-    """lambda of each estimate: at exterior orientations and shared unknowns in the block's order, mu, all points.
+    """Compute the adjoint vector lambda of each estimate.
 
-    `h` is a `ReducedHessian` of concrete arrays.
+    Rows: exterior orientations and shared unknowns in the block's order, mu, all points. `h` is a `ReducedHessian` of
+    concrete arrays.
     """
     n, k, points = len(estimates.unknowns), len(h.c), estimates.points
     n_points = h.l.shape[1]
     index = np.append(estimates.unknowns, len(h.m) - k + np.arange(k))
-    # Padding has F = 0, so its place is arbitrary.
+    # Padding has F = 0, so its index is arbitrary.
     place = np.zeros(int(max(h.ray_index.max(initial=0), h.border_index.max(initial=0), len(h.m))) + 1, int)
     place[index] = np.arange(n + k)
     inverse = _inverse(h.m.take(index, axis=0).take(index, axis=1), positive=not k)
@@ -89,7 +91,7 @@ def adjoint_vectors(h: Any, estimates: Estimates) -> Float[np.ndarray, "unknowns
     reduced = adjoint[: n + k]
 
     np.multiply(inverse[:, :n], estimates.step, out=reduced[:, :n])
-    # By component: a batch of products of 3 x 3 matrices is several times slower.
+    # Multiply by component: a batch of 3 x 3 matrix products is several times slower.
     images = 6 * len(estimates.rotations)
     angles = [reduced[:, j:images:6] for j in (3, 4, 5)]
     rotated = [sum(a * factor for a, factor in zip(angles, estimates.rotations[:, i].T, strict=True)) for i in range(3)]
@@ -108,7 +110,7 @@ def adjoint_vectors(h: Any, estimates: Estimates) -> Float[np.ndarray, "unknowns
 
 
 def _gain(h: Any, place: Int[np.ndarray, "unknowns"], size: int) -> "scipy.sparse.csr_array":
-    """K = -L^-T F, three rows a point."""
+    """Return K = -L^-T F, three rows per point."""
     rows, values, columns = [], [], []
     for point, f, index in ((h.point, h.rays, h.ray_index), (np.arange(h.l.shape[1]), h.border, h.border_index)):
         gain = -np.stack(unwhiten(np.moveaxis(f, 0, -1), h.l[:, point]))
@@ -120,11 +122,11 @@ def _gain(h: Any, place: Int[np.ndarray, "unknowns"], size: int) -> "scipy.spars
 
 
 def _inverse(m: Float[np.ndarray, "n n"], positive: bool) -> Float[np.ndarray, "n n"]:
-    """Inverse of a symmetric matrix, by Cholesky if it is positive definite."""
+    """Return the inverse of a symmetric matrix, by Cholesky if it is positive definite."""
     lower, failed = scipy.linalg.lapack.dpotrf(m.T, lower=True) if positive else (m, True)
     if failed:
         return np.linalg.inv(m)
-    # dpotri fills the lower triangle only; the upper one is zero.
+    # dpotri fills only the lower triangle; the upper one is zero.
     half = scipy.linalg.lapack.dpotri(lower, lower=True, overwrite_c=True)[0]
     inverse = half + half.T
     np.fill_diagonal(inverse, half.diagonal())
@@ -132,41 +134,41 @@ def _inverse(m: Float[np.ndarray, "n n"], positive: bool) -> Float[np.ndarray, "
 
 
 def _inverses(l: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "n 3 3"]:  # noqa: E741
-    """V^-1 of V = L L'."""
+    """Return V^-1 of V = L L'."""
     lower = np.zeros((len(l), 3, 3))
     lower[:, [0, 1, 1, 2, 2, 2], [0, 0, 1, 0, 1, 2]] = l
     inverse = np.linalg.inv(lower)
     return inverse.swapaxes(1, 2) @ inverse
 
 
-# Maximum number of derivatives by image points: 1.6 GB.
+# Maximum number of derivatives by image points (1.6 GB).
 _MAX_ELEMENTS = 2e8
 
 
 @pretty_repr
 class Sensitivity(eqx.Module):
-    """Derivatives of the estimates named by `labels`, one row each, by observations in the block's order.
+    """Derivatives of the estimates `labels`, one row per estimate, by observations in the block's order.
 
-    `named` holds them by group, as the residuals of an adjustment: (estimates, rows), or (estimates, rows, axes). Units
-    are those of the estimate (m, rad, mm, the coefficient's own) over those of the observation (mm on the image, m,
-    rad). Surfaces are observed along their normals (m). Derivatives of and by fixed parameters are zero in the rows and
-    in the groups of observations.
+    `named` contains them by group, in the shape of the residuals: (estimates, rows) or (estimates, rows, axes). Units
+    are the unit of the estimate (m, rad, mm, the coefficient's own) over the unit of the observation (mm on the image,
+    m, rad). Surfaces are observed along their normals (m). Fixed parameters have zero rows, and derivatives by the
+    observations of fixed parameters are zero.
     """
 
     named: dict[str, Float[np.ndarray, "estimates ..."]]
     labels: tuple[str, ...] = eqx.field(static=True)
-    """As in `Covariance`; then `points[name].X` and so on for the requested points."""
+    """Labels as in `Covariance`, then `points[name].X` etc. of the requested points."""
     curvature: bool = eqx.field(static=True)
     """True if the curvature of the residuals is included; otherwise this is the classical first-order matrix."""
     by_fixed: Callable[[], tuple[np.ndarray, tuple[str, ...]]] = eqx.field(static=True, repr=False)
-    """Computes `fixed` and `fixed_labels` on request: they take as long as everything else."""
+    """Computes `fixed` and `fixed_labels` on request, which takes as long as the rest."""
 
     def __getitem__(self, name: str) -> Float[np.ndarray, "estimates ..."]:
         return self.named[name]
 
     @property
     def groups(self) -> dict[str, Float[np.ndarray, "estimates _"]]:
-        """Derivatives by group of observations, each as one matrix with the components of a row in turn."""
+        """Derivatives by group of observations, one matrix per group; the components of a row are consecutive."""
         return {name: v.reshape(len(self.labels), -1) for name, v in self.named.items()}
 
     @property
@@ -176,11 +178,11 @@ class Sensitivity(eqx.Module):
 
     @property
     def fixed_labels(self) -> tuple[str, ...]:
-        """Paths of all fixed parameters, then `points[name].X` and so on."""
+        """Paths of all fixed parameters, then `points[name].X` etc. of the fixed coordinates."""
         return self.by_fixed()[1]
 
     def row(self, label: str) -> int:
-        """Index of the estimate `label`. Raises InputError if there is none."""
+        """Return the index of the estimate `label`. Raises InputError if there is none."""
         if label not in self.labels:
             raise InputError(f"no estimate {label}: there are {', '.join(self.labels[-8:])} and others")
         return self.labels.index(label)
@@ -188,14 +190,14 @@ class Sensitivity(eqx.Module):
 
 @outside_transformations
 def sensitivity(adjusted: Adjustment, *, curvature: bool = True, points: Sequence[str] = ()) -> Sensitivity:
-    """Return d(estimate) / d(observation, prior, fixed parameter) at the optimum of `adjusted`.
+    """Compute d(estimate) / d(observation, prior, fixed parameter) at the optimum of `adjusted`.
 
-    Estimates are all exterior orientations (X, Y, Z in m; omega, phi, kappa in rad), shared unknowns (interior
-    orientation, mounts, strips), and the coordinates (m) of the named `points`. With `curvature` the derivative is
-    exact; without, it is the classical matrix -N^-1 J'P dr/dv.
+    Estimates are all exterior orientations (X, Y, Z in m; omega, phi, kappa in rad), all shared unknowns (interior
+    orientation, mounts, strips) and the coordinates (m) of the named `points`. With `curvature` the derivative is
+    exact; without, it is the classical first-order matrix -N^-1 J'P dr/dv.
 
     Raises InputError for an unknown point, for an adjustment that has not converged, and for a block whose matrix is
-    too large; use `response` there.
+    too large; use `response` for such a block.
     """
     _check_points(adjusted, points)
     check_optimum(adjusted)
@@ -216,7 +218,7 @@ def sensitivity(adjusted: Adjustment, *, curvature: bool = True, points: Sequenc
     shapes = {name: b.shape[:-1] for name, (b, _) in rows.items()}
     ends = np.cumsum([math.prod(shape) for shape in shapes.values()])[:-1]
     matrices = zip(shapes.items(), np.split(derivatives, ends), strict=True)
-    # Estimates last in memory: the derivatives by one observation are contiguous.
+    # Put the estimates on the last axis: the derivatives by one observation are contiguous in memory.
     groups = {name: np.moveaxis(matrix.reshape(*shape, estimates), -1, 0) for (name, shape), matrix in matrices}
     names = [f"exterior[{i}].{e}" for i in adjusted.block.images for e in EOP_NAMES["omega_phi_kappa"]]
     labels = (*names, *structure.labels, *(f"points[{name}].{axis}" for name in points for axis in AXES))
@@ -240,7 +242,7 @@ def _check_size(structure: Structure, estimates: int) -> None:
 
 
 class _Derivatives(NamedTuple):
-    """Reduced Hessian of a padded block, and B of all but the image rows (z, observed, ...)."""
+    """Reduced Hessian of a padded block, and B (z, observed, ...) of all rows except image rows."""
 
     h: ReducedHessian
     rotations: Float[Array, "images 3 3"]
@@ -256,11 +258,11 @@ def _derivatives(equations: NormalEquations, rows: ListedRows, curved: Array) ->
 
 
 Rows = tuple[np.ndarray, np.ndarray]
-"""-B of some observations, variables last, and the unknowns of these variables."""
+"""-B of some observations (last axis: their variables), and the indices of these variables among the unknowns."""
 
 
 def _observations(parts: _Derivatives, padded: PaddedBlock, first: int) -> dict[str, Rows]:
-    """-B of all observations by group name; points start at index `first`."""
+    """Return -B of all observations by group name; points start at index `first`."""
     structure, places = padded.own, padded.places
     n, q, axes = 6 * structure.n_images, structure.n_image_colours, np.arange(3)
     first_of_point = first + 3 * places.point
@@ -271,7 +273,7 @@ def _observations(parts: _Derivatives, padded: PaddedBlock, first: int) -> dict[
     rows: dict[str, tuple[Any, np.ndarray]] = {IMAGE_POINTS: (parts.h.measured[: len(unknowns)], unknowns[:, None])}
     for g, b in zip(structure.observed, parts.others, strict=True):
         z, o = b.shape[:2]
-        # (z o, rows), then rows first and z last.
+        # Reshape (z o, rows) to rows first and z last.
         flat = padded.crop_rows(dataclasses.replace(g, scalar=False), np.reshape(b, (z * o, *b.shape[2:])))
         flat = -np.moveaxis(flat.reshape(z, o, -1), 0, -1).swapaxes(0, 1)
         by_point = (first_of_point[g.point][:, None] + axes[:, None]).reshape(-1, g.n_rows)
@@ -281,7 +283,7 @@ def _observations(parts: _Derivatives, padded: PaddedBlock, first: int) -> dict[
 
 
 def _sparse(rows: Sequence[Rows], unknowns: int) -> "scipy.sparse.csr_array":
-    """-B as a sparse matrix, one row per observation."""
+    """Return -B as a sparse matrix, one row per observation."""
     lengths = np.repeat([b.shape[-1] for b, _ in rows], [math.prod(b.shape[:-1]) for b, _ in rows])
     data, columns = (np.concatenate([part[k].ravel() for part in rows]) for k in range(2))
     starts = np.append(0, np.cumsum(lengths)).astype(np.int32)
@@ -289,7 +291,7 @@ def _sparse(rows: Sequence[Rows], unknowns: int) -> "scipy.sparse.csr_array":
 
 
 class _Fixed(NamedTuple):
-    """Fixed unknowns: shared parameters by index, then coordinates by place of the point and axis."""
+    """Fixed unknowns: indices of shared parameters, then point index and axis of coordinates."""
 
     shared: Int[np.ndarray, "n"]
     point: Int[np.ndarray, "m"]
@@ -299,7 +301,7 @@ class _Fixed(NamedTuple):
 def _by_fixed(
     adjusted: Adjustment, curvature: bool, labels: Sequence[str], adjoint: np.ndarray, unknowns: np.ndarray
 ) -> tuple[Float[np.ndarray, "estimates fixed"], tuple[str, ...]]:
-    """-lambda' B of the fixed unknowns, and their labels: parameter paths, then coordinates."""
+    """Compute -lambda' B of the fixed unknowns. Return it with the labels: parameter paths, then coordinates."""
     block, fixed = adjusted.block, adjusted.block.fixed
     equations = adjusted.equations.on_one_device
     s, places, values = equations.structure, adjusted.padded.places, equations.values
@@ -313,14 +315,14 @@ def _by_fixed(
 
     coordinates = (f"points[{block.points[p]}].{AXES[a]}" for p, a in zip(fixed.who, fixed.axis, strict=True))
     fixed_labels = (*(parameters[k] for k in shared), *coordinates)
-    # A fixed estimate has the derivative 1 by itself.
+    # The derivative of a fixed estimate by itself is 1.
     same = np.array(labels)[:, None] == np.array(fixed_labels, dtype=str)
     return same - products.T, fixed_labels
 
 
 @eqx.filter_jit
 def _fixed_rows(equations: NormalEquations, curved: Array, fixed: _Fixed) -> Float[Array, "fixed n"]:
-    """B of the fixed unknowns, one after the other, dense: by images, shared unknowns and points."""
+    """Compute B of each fixed unknown as a dense row: by images, shared unknowns and points."""
     at, values = equations.at, equations.values
     shared, coordinates = jnp.zeros_like(values.shared), jnp.zeros_like(values.points)
     unchanged: Any = jax.tree.map(lambda _: None, values)
@@ -339,10 +341,10 @@ def _fixed_rows(equations: NormalEquations, curved: Array, fixed: _Fixed) -> Flo
 
 @pretty_repr
 class Response(eqx.Module):
-    """Change of every unknown in its own unit; images, points and parameters in the block's order."""
+    """Change of every unknown in its own unit. Images, points and parameters are in the block's order."""
 
     unknowns: Unknowns
-    """Changes in the tree of unknowns; of `exterior.camera_from_object`, those of the matrices."""
+    """Changes as a tree of unknowns; `exterior.camera_from_object` contains the changes of the rotation matrices."""
     omega_phi_kappa: Float[np.ndarray, "images 3"]
     """Changes of the angles (rad)."""
 
@@ -355,15 +357,15 @@ def response(
     *,
     curvature: bool = True,
 ) -> Response:
-    """First-order approximation of `adjust(block, start, priors)` minus `adjusted`, if only values have changed.
+    """Predict `adjust(block, start, priors)` minus `adjusted` to first order, if only values have changed.
 
-    `block` is the adjusted one with other observations or standard deviations; `start` has other values of the fixed
-    parameters (None: unchanged; free parameters do not matter); `priors` other weighted priors (None: unchanged). With
-    `curvature` it is the exact derivative along that change; without, the classical first-order change -N^-1 J'P dr.
-    The error for a finite change is of second order.
+    `block`: the adjusted block with other observations or standard deviations. `start`: other values of the fixed
+    parameters (None: unchanged; free parameters are ignored). `priors`: other weighted priors (None: unchanged). With
+    `curvature` this is the exact derivative along the change; without, it is the classical first-order change -N^-1 J'P
+    dr. The error for a finite change is of second order.
 
     Raises InputError for a block with other rows, for an adjustment that has not converged, and for more than a
-    thousand images; use `jax.jvp` through `adjust` there.
+    thousand images; use `jax.jvp` through `adjust` for such a block.
     """
     check_optimum(adjusted)
     s, equations = adjusted.structure, adjusted.equations.on_one_device
@@ -393,13 +395,13 @@ def response(
 
 
 def _difference(changed: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Difference where both are finite: padding has infinite standard deviations."""
+    """Subtract where both are finite: padding has infinite standard deviations."""
     finite = np.isfinite(changed) & np.isfinite(values)
     return np.where(finite, np.where(finite, changed, 0.0) - np.where(finite, values, 0.0), 0.0)
 
 
 def _without_free(direction: PaddedValues, s: PaddedStructure) -> PaddedValues:
-    """Set the free parameters of a direction to zero: their start values do not matter."""
+    """Set the free parameters of a direction to zero: their initial values have no effect."""
     shared = np.array(direction.shared)
     shared[s.free] = 0.0
     return eqx.tree_at(

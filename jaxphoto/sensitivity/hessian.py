@@ -1,18 +1,18 @@
-"""Second derivatives of half the weighted square sum at an optimum, with the points eliminated.
+"""Second derivatives of half the weighted sum of squares at an optimum, with the points eliminated.
 
-With r the weighted residuals, y the increments and v any value that r depends on, half the square sum has
+With r the weighted residuals, y the increments and v any value that r depends on, half the sum of squares has
 
     H = J'J + sum_r r d2r/dy2           the normal matrix and the curvature of the residuals
     B = J' dr/dv + sum_r r d2r/dy dv    the change of the gradient J'r with v
 
 and the optimum changes with dv by dy = -H^-1 B dv. Without the terms in r (`curved` 0 instead of 1), this is the
 classical first-order matrix -N^-1 J' dr/dv. Derivatives are exact, by automatic differentiation, and stored by the
-unknowns of each row, never as dense second derivatives.
+unknowns of each row, not as dense matrices.
 
 Every image row involves one image, one point and one camera, so H has the blocks of the normal matrix (see
-adjustment/solver/normal.py) and its points are eliminated likewise, by V = L L' and F = [W; Ws'; D_p] L^-T. Some rows,
-and the datum, couple points: D (the variables of such a row, then the constraints) has the weight C, and mu = C D x are
-additional unknowns. With S, G, K the parts of H, D and 0 without the points,
+adjustment/solver/normal.py). Its points are eliminated in the same way, by V = L L' and F = [W; Ws'; D_p] L^-T. Some
+rows, and the datum, couple points: D (the variables of such a row, then the constraints) has the weight C, and
+mu = C D x are additional unknowns. With S, G, K the parts of H, D and 0 without the points,
 
     M = [ S     G'      ]
         [ C G   C K - I ]
@@ -47,18 +47,18 @@ from jaxphoto.small_matrices import cholesky_3x3, unwhiten, whiten
 
 
 class RowSecond(NamedTuple):
-    """Second derivatives of half the square of each row of a group, rows last.
+    """Second derivatives of half the squared residuals of each row of a group; the row axis is last.
 
-    By its variables z: the increments of its images, its shared unknowns and the increments of its points.
+    The variables z of a row are the increments of its images, its shared unknowns and the increments of its points.
     """
 
     h: Float[Array, "z z rows"]
     b: Float[Array, "z o rows"]
-    """By z and by the observations."""
+    """Second derivatives by z and by the observations."""
 
 
 def mixed_second(at: Linearised, direction: PaddedValues, curved: Float[ArrayLike, ""]) -> Increments:
-    """B dv over all rows, for a direction dv of the values; leaves that are None do not change."""
+    """Compute B dv over all rows, for a direction dv of the values; leaves that are None do not change."""
 
     def gradient(changed):
         values = eqx.combine(changed, at.values)
@@ -71,7 +71,7 @@ def mixed_second(at: Linearised, direction: PaddedValues, curved: Float[ArrayLik
 
 
 def row_second(group: ObservedGroup, numbers: Any, at: Linearised, curved: Float[ArrayLike, ""]) -> RowSecond:
-    """H and B of every row of a group."""
+    """Compute H and B of every row of a group."""
     function = row_function(group, at.structure)
 
     def second(z: RowVariables, inputs: RowInputs) -> RowSecond:
@@ -80,7 +80,7 @@ def row_second(group: ObservedGroup, numbers: Any, at: Linearised, curved: Float
 
         def half_square(flat: Array, observed: Array) -> Float[Array, ""]:
             r = function(unravel(flat), inputs._replace(row=inputs.row.with_observation(observed)))
-            # Its second derivative is J'J + curved r d2r.
+            # The second derivative of this is J'J + curved r d2r.
             return jnp.sum(0.5 * r * r - (1 - curved) * jax.lax.stop_gradient(r) * r)
 
         slope = jax.grad(half_square)
@@ -92,21 +92,21 @@ def row_second(group: ObservedGroup, numbers: Any, at: Linearised, curved: Float
 
 
 def rows_second(at: Linearised, curved: Float[ArrayLike, ""]) -> tuple[RowSecond, ...]:
-    """`row_second` of all groups."""
+    """Apply `row_second` to all groups."""
     s = at.structure
     return tuple(row_second(g, numbers, at, curved) for g, numbers in zip(s.observed, at.values.groups, strict=True))
 
 
 class AtPointsSecond(NamedTuple):
-    """Sums over the rows at points (see `NonImageRows`)."""
+    """Sums over the rows that are eliminated with their points (see `NonImageRows`)."""
 
     v: Float[Array, "3 3 points"]
     w: Float[Array, "b 3 points"]
-    """By the other unknowns of the groups at points, `RayLists.met`."""
+    """Mixed derivatives by the other unknowns of these groups, `RayLists.met`."""
 
 
 def points_second(second: tuple[RowSecond, ...], at: Linearised) -> AtPointsSecond:
-    """H of rows at points: by the points, and by the points and shared unknowns."""
+    """Compute H of these rows: by the points, and by the points and shared unknowns."""
     s, n = at.structure, at.increments.points.shape[1]
     v, w = jnp.zeros((3, 3, n)), jnp.zeros((s.rays.met.shape[1], n, 3))
     for g, of_group in zip(s.observed, second, strict=True):
@@ -118,9 +118,9 @@ def points_second(second: tuple[RowSecond, ...], at: Linearised) -> AtPointsSeco
 
 
 def coupling_rows(second: tuple[RowSecond, ...], at: Linearised) -> tuple[Array, Array, Array]:
-    """D, by the reduced unknowns (k, n) and by the points (k, 3, points), and its weight C.
+    """Return D by the reduced unknowns (k, n) and by the points (k, 3, points), and its weight C.
 
-    For a row that couples points, D selects its variables one after the other, and C is its H.
+    For a row that couples points, the rows of D select its variables one by one, and C is its H.
     """
     values, scale, s = at.values, at.scale, at.structure
     n, n_points, fixed = 6 * s.n_images + s.n_shared, scale.points.shape[1], values.datum_eop.shape[0]
@@ -155,7 +155,7 @@ def _block_diagonal(blocks: list[Array]) -> Array:
 
 
 def other_second(second: tuple[RowSecond, ...], s: PaddedStructure) -> Float[Array, "n n"]:
-    """H of all rows but image rows in the reduced unknowns, without the rows that couple points."""
+    """Compute H of the non-image rows in the reduced unknowns, except rows that couple points."""
     n = 6 * s.n_images + s.n_shared
     h = jnp.zeros((n, n))
     for g, of_group in zip(s.observed, second, strict=True):
@@ -172,35 +172,35 @@ def other_second(second: tuple[RowSecond, ...], s: PaddedStructure) -> Float[Arr
     return h
 
 
-# An index outside every array: additions there are dropped.
+# Index outside every array: additions with this index are dropped.
 NOWHERE = int(np.iinfo(np.int32).max)
-# Maximum number of reduced unknowns: a dense matrix of this size is inverted within seconds.
+# Maximum number of reduced unknowns; a dense matrix of this size is inverted within seconds.
 _MAX_UNKNOWNS = 6000
 
 
 class ReducedHessian(NamedTuple):
-    """M, and the factors that eliminate and restore the points."""
+    """M, and the factors for elimination and back substitution of the points."""
 
     m: Float[Array, "n_and_k n_and_k"]
     c: Float[Array, "k k"]
     l: Float[Array, "6 points"]  # noqa: E741
     """Cholesky factors of V."""
     rays: Float[Array, "rays 3 e"]
-    """F of each ray, by the unknowns of its image."""
+    """F of each ray by the unknowns of its image."""
     border: Float[Array, "points 3 c"]
-    """F of each point, by its other unknowns."""
+    """F of each point by its other unknowns."""
     point: Int[Array, "rays"]
-    """Point of each ray."""
+    """Point index of each ray."""
     ray_index: Int[Array, "rays e"]
-    """Unknowns of M of the columns of `rays`; beyond the last for padding."""
+    """Indices in M of the columns of `rays`; beyond the last unknown for padding."""
     border_index: Int[Array, "points c"]
-    """Unknowns of M of the columns of `border`."""
+    """Indices in M of the columns of `border`; beyond the last unknown for padding."""
     measured: Float[Array, "rows 2 touched"]
-    """-B of each image row by its measured x and y (mm): for eop (6), point (3), colours."""
+    """-B of each image row by its measured x and y (mm): exterior orientation (6), point (3), camera unknowns."""
 
 
 def check_optimum(adjusted: Adjustment) -> None:
-    """Raise InputError without an optimum, and if M is too large."""
+    """Raise InputError if the adjustment has not converged or M is too large."""
     if not bool(adjusted.converged):
         raise InputError("sensitivity needs a converged adjustment: adjust until it converges")
     s = adjusted.padded.structure
@@ -226,7 +226,7 @@ def reduce_hessian(at: Linearised, rows: ListedRows, curved: Float[ArrayLike, ""
     v = v + at_points.v
     unit = jnp.where(jnp.einsum("iip->ip", v) == 0, 1.0, 0.0)
     l = cholesky_3x3(v + unit[:, None] * jnp.eye(3)[:, :, None])  # noqa: E741
-    # The column of the right-hand side is zero.
+    # Drop the column of the right-hand side: it is zero.
     met = jnp.concatenate([interior, d_p, jnp.zeros((1, *d_p.shape[1:])), at_points.w])
     border = jnp.stack(whiten(met.transpose(1, 0, 2), l)).transpose(2, 0, 1)
     w, point = h.by_point[:6], jnp.asarray(rows.point)
@@ -250,7 +250,7 @@ def _by_point(
     i: int,
     s: PaddedStructure,
 ) -> tuple[Float[Array, "3 3 points"], Float[Array, "interior 3 points"]]:
-    """Return the sums over the rows of each point: by the point, and by the point and interior unknowns."""
+    """Sum over the rows of each point: by the point, and by the point and camera unknowns."""
     n = s.n_points
     v = jax.ops.segment_sum(met[:3].reshape(9, -1).T, jnp.asarray(point), n).T.reshape(3, 3, n)
     at = jnp.asarray(point)[:, None], jnp.minimum(column, i)
@@ -259,7 +259,7 @@ def _by_point(
 
 
 def _by_unknown(h: RowProducts, s: PaddedStructure) -> Float[Array, "n n"]:
-    """Return the sums by image, at the unknowns of the image and of its colours."""
+    """Assemble the sums by image into a matrix of the exterior orientations and camera unknowns."""
     n_eop, columns = 6 * s.n_images, image_columns(s)
     images, n = jnp.arange(s.n_images), n_eop + s.n_shared
     eop = 0.5 * (h.eop + h.eop.transpose(0, 2, 1))
@@ -272,7 +272,7 @@ def _by_unknown(h: RowProducts, s: PaddedStructure) -> Float[Array, "n n"]:
 
 
 def image_columns(s: PaddedStructure) -> Int[Array, "images e_and_colours"]:
-    """Reduced unknowns of each image: exterior orientation, then the colours of its camera."""
+    """Return the reduced unknowns of each image: exterior orientation, then the camera unknowns of its camera."""
     column = jnp.asarray(s.column)[:, : s.n_image_colours]
     shared = jnp.where(column < s.n_shared, 6 * s.n_images + column, NOWHERE)
     return jnp.concatenate([6 * jnp.arange(s.n_images)[:, None] + jnp.arange(6), shared], axis=1)

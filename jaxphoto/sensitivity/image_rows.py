@@ -1,18 +1,18 @@
-"""Second derivatives of half the weighted square sum of image rows, as a list without empty slots.
+"""Second derivatives of half the weighted sum of squares of image rows, listed without padding slots.
 
-A row depends on its image and its point through u alone, the point in the camera frame; further on the parameters t of
-its camera and on the measurement m. With J the derivatives of its two weighted residuals r by z = (u, t, m), and U
-those of u by the unknowns y of the image and of the point,
+A row depends on its image and its point only through u, the point in the camera frame. It also depends on the
+parameters t of its camera and on the measurement m. With J the derivatives of its two weighted residuals r by
+z = (u, t, m), and U the derivatives of u by the unknowns y of the image and of the point,
 
     G = J'J + sum_r r d2r/dz2       H_yy = U' G_uu U + sum_k g_k d2u_k/dy2,   g = J_u' r
                                     H_ty = G_tu U,   B_ym = U' G_um,   B_tm = G_tm
 
-G is computed by automatic differentiation, in three and a few directions. A small rotation theta of the image takes u
-to u + u x theta + (u x theta) x theta / 2, so that
+G is computed by automatic differentiation along u (three directions) and a few more. A small rotation theta of the
+image maps u to u + u x theta + (u x theta) x theta / 2, so
 
-    sum_k g_k d2u_k / dtheta dy = g . (du/dy x dtheta)        for y = theta the mean of that and its transpose
+    sum_k g_k d2u_k / dtheta dy = g . (du/dy x dtheta)        for y = theta: mean of this and its transpose
 
-The last axis of all arrays is the rows.
+The last axis of all arrays is the row axis.
 """
 
 from collections.abc import Iterable, Sequence
@@ -35,35 +35,35 @@ from jaxphoto.georeferencing import Corrections, apparent_point
 from jaxphoto.georeferencing.corrections import NO_CORRECTIONS
 
 Scalars = tuple[Array, ...]
-"""One component of every row each; separate arrays, so that XLA vectorises over the rows."""
+"""One component of every row in each array; separate arrays let XLA vectorise over the rows."""
 
-# Rows per batch.
+# Number of rows per batch.
 _BATCH = 8192
 
 
 class ListedRows(NamedTuple):
-    """Image rows in the block's order, then at least one row of zero weight; indices of a padded structure."""
+    """Image rows in the block's order, then at least one row of zero weight. Indices refer to the padded structure."""
 
     image: Int[ArrayLike, "rows"]
     point: Int[ArrayLike, "rows"]
     xy: Float[ArrayLike, "2 rows"]
     weight: Float[ArrayLike, "2 rows"]
-    """1 / sigma (1/mm)."""
+    """1 / standard deviation (1/mm)."""
     of_slot: Int[np.ndarray, "batches chunks p"]
-    """Row of each ray; the last row for padding."""
+    """Row index of each ray; the last row for padding."""
 
 
 class RowProducts(NamedTuple):
     """Sums of H over the rows, and B by the measured x and y (mm)."""
 
     eop: Float[Array, "images 6 6"]
-    """Sums by image; to be symmetrised with the transpose."""
+    """Sums by image, not yet symmetrised."""
     shared_eop: Float[Array, "images colours 6"]
     shared: Float[Array, "images colours colours"]
     by_point: Float[Array, "touched 3 rows"]
-    """H of each row's eop (6), point (3) and colours with its point."""
+    """H of each row by its exterior orientation (6), point (3) and camera unknowns, and by its point."""
     measured: Float[Array, "rows 2 touched"]
-    """-B of each row's eop (6), point (3) and colours."""
+    """-B of each row by its exterior orientation (6), point (3) and camera unknowns."""
 
 
 def image_rows(adjusted: Adjustment) -> ListedRows:
@@ -72,7 +72,7 @@ def image_rows(adjusted: Adjustment) -> ListedRows:
     n, size = len(s.image), _size(len(s.image) + 1)
 
     def pad(values: np.ndarray) -> np.ndarray:
-        # Rows of zero weight repeat the first, so all their values are finite.
+        # Rows of zero weight repeat the first row, so all their values are finite.
         return np.concatenate([values, np.repeat(values[..., :1], size - n, axis=-1)], axis=-1)
 
     weight = pad(1 / to_numpy(adjusted.values.sigma_xy))
@@ -84,7 +84,7 @@ def image_rows(adjusted: Adjustment) -> ListedRows:
 
 
 def _size(rows: int) -> int:
-    """Return the padded number of rows: classes at most an eighth apart, then multiples of the batch."""
+    """Return the padded number of rows: size classes at most 1/8 apart, then multiples of the batch size."""
     step = min(1 << max((rows - 1).bit_length() - 4, 0), _BATCH) if rows <= _BATCH else _BATCH
     return -(-rows // step) * step
 
@@ -92,7 +92,7 @@ def _size(rows: int) -> int:
 def row_products(
     values: PaddedValues, scale: Increments, rows: ListedRows, curved: Float[ArrayLike, ""], s: PaddedStructure
 ) -> RowProducts:
-    """H and B of all rows at the values, in scaled increments; without the terms in r if `curved` is 0."""
+    """Compute H and B of all rows in scaled increments; without the terms in r if `curved` is 0."""
     count = -(-len(rows.image) // _BATCH)
     if count == 1:
         return _batch_products(values, scale, rows, curved, s)
@@ -139,7 +139,7 @@ def _batch_products(
     rotated = curved * image_step[3:, None] * jnp.stack(_cross(g_u, du))
     eop = sum_terms(d[:6, None] * cross[k, None, :6] for k, d in enumerate(du))
     by_point = sum_terms(d[:, None] * cross[k, None, 6:] for k, d in enumerate(du))
-    # Twice the lower triangle: symmetrised with the transpose later.
+    # Twice the lower triangle; it is symmetrised with the transpose later.
     eop = eop.at[3:].add(rotated[:, :6]).at[3:, :3].add(rotated[:, :3])
     by_point = by_point.at[3:6].add(rotated[:, 6:])
     if s.corrections != NO_CORRECTIONS:
@@ -175,7 +175,7 @@ def _camera_points(
     image_step: Float[Array, "6 rows"],
     point_step: Float[Array, "3 rows"],
 ) -> tuple[Scalars, Scalars]:
-    """u of every row, and its derivatives (9, rows) by scaled increments of image and point."""
+    """Return u of every row, and its derivatives (9, rows) by scaled increments of image and point."""
     ray = _rays(corrections, ends)
     u = tuple(_dot(row, ray) for row in rotation)
     by_rotation = _cross(u, jnp.eye(3)[:, :, None])
@@ -193,14 +193,14 @@ def _camera_points(
 
 
 def _rays(corrections: Corrections, ends: Float[Array, "6 rows"]) -> Float[Array, "3 rows"]:
-    """Vectors from the projection centres to the apparent points, in the object frame."""
+    """Return the vectors from the projection centres to the apparent points, in the object frame."""
     return apparent_point(ends[:3], ends[3:], corrections) - ends[:3]
 
 
 def _ray_second(
     corrections: Corrections, ends: Float[Array, "6 rows"], g_ray: Float[Array, "3 rows"], step: Float[Array, "6 rows"]
 ) -> Float[Array, "6 6 rows"]:
-    """Second derivatives of the components of the rays, summed with weights, by scaled increments of both ends."""
+    """Compute the weighted sum of second derivatives of the ray components, by scaled increments of both ends."""
     weighted = lambda ends: _dot(g_ray, _rays(corrections, ends))  # noqa: E731
 
     def second(seed: Array, other: Array) -> Array:
@@ -219,7 +219,7 @@ def _camera_second(
     weight: Scalars,
     curved: Float[ArrayLike, ""],
 ) -> tuple[Float[Array, "u_and_colours directions rows"], Scalars]:
-    """G of every row, (u, t) by (u, t, m), and J_u' r."""
+    """Return G of every row, (u, t) by (u, t, m), and J_u' r."""
     q = len(slope)
     z = (*u, *(jnp.zeros_like(u[0]),) * q, *xy)
     seeds = tuple(jnp.broadcast_to(unit[:, None], (len(z), *u[0].shape)) for unit in jnp.eye(len(z)))
@@ -228,7 +228,7 @@ def _camera_second(
         leaves = list(camera)
         for k, leaf in enumerate(group.free_leaves):
             leaves[leaf] = leaves[leaf] + _dot(z[3 : 3 + q], slope[:, k])
-        # vmap over rows: camera models are written for one image point.
+        # Vectorise over the rows: camera models are defined for a single image point.
         by_row = jax.vmap(
             lambda parameters, u, xy: camera_residual(interior_of(group, parameters), u, xy),
             ([0 if jnp.ndim(leaf) else None for leaf in leaves], 0, -1),
@@ -243,7 +243,7 @@ def _camera_second(
     def second(seed: Scalars, other: Scalars) -> Array:
         return jax.jvp(lambda z: jax.jvp(weighted, (z,), (seed,))[1], (z,), (other,))[1]
 
-    # G is symmetric: every pair once.
+    # G is symmetric: compute every pair once.
     row, column = np.triu_indices(3 + q, m=len(z))
     index = np.zeros((len(z), len(z)), int)
     index[row, column] = index[column, row] = np.arange(len(row))

@@ -1,7 +1,7 @@
 """Influence of observations on estimates: station bias, variance fractions, external reliability.
 
-Each function takes the derivatives A (one row per estimate, one column per observation) of `sensitivity`, exact or of
-first order, and the a priori standard deviations of the observations.
+Each function uses the derivatives A of `sensitivity` (one row per estimate, one column per observation; exact or first
+order) and the a priori standard deviations of the observations.
 """
 
 from typing import Literal
@@ -23,7 +23,7 @@ Per = Literal["block", "strip", "image"]
 
 @pretty_repr
 class StationBias(eqx.Module):
-    """Change of every estimate (`Sensitivity.labels`) for a bias of all stations of a unit along one axis."""
+    """Change of every estimate (`Sensitivity.labels`) due to a bias of all stations of a unit along one axis."""
 
     change: Float[np.ndarray, "estimates units 3"]
     units: tuple[str, ...] = eqx.field(static=True)
@@ -32,10 +32,10 @@ class StationBias(eqx.Module):
 
 @pretty_repr
 class VarianceShares(eqx.Module):
-    """Fraction of each estimate's variance due to each observation; over all groups a row sums to 1.
+    """Fraction of each estimate's variance due to each observation.
 
-    Shaped like `Sensitivity.groups`; rows of fixed parameters are zero. `variance` is the a priori variance
-    A diag(sigma^2) A' of each estimate, in its unit squared.
+    Over all groups the fractions of an estimate sum to 1. Shaped like `Sensitivity.groups`. Rows of fixed parameters
+    are zero. `variance` is the a priori variance of each estimate, diag(A diag(sigma^2) A'), in its unit squared.
     """
 
     groups: dict[str, Float[np.ndarray, "estimates _"]]
@@ -43,13 +43,13 @@ class VarianceShares(eqx.Module):
 
     @property
     def by_group(self) -> dict[str, Float[np.ndarray, "estimates"]]:
-        """Fractions of whole groups of observations."""
+        """Sum of the fractions of each group of observations."""
         return {name: fraction.sum(axis=1) for name, fraction in self.groups.items()}
 
 
 @pretty_repr
 class ExternalReliability(eqx.Module):
-    """Minimal detectable biases (MDB), and the effect of each on every estimate if it is not detected.
+    """Minimal detectable biases (MDB), and the effect of each on every estimate if it is undetected.
 
     Shaped like `Sensitivity.groups`, in the units of observations and estimates. Infinite for observations with
     redundancy number zero, whose errors are undetectable.
@@ -63,13 +63,13 @@ class ExternalReliability(eqx.Module):
 def station_bias(
     adjusted: Adjustment, derivatives: Sensitivity, per: Per = "strip", bias_m: float = 0.10
 ) -> StationBias:
-    """Change of the estimates due to a bias (m) of all observed stations of the block, of each strip, or of each image.
-
-    Stations include exposures on the trajectory of a scanner; its laser returns are not affected.
+    """Compute the change of the estimates due to a bias (m) of all observed stations.
 
         change = bias sum_k A_k     over the station rows k of the unit along one axis, X, Y or Z
 
-    Raises InputError for another `per`, without observed stations, and without strips.
+    The unit is the block, each strip or each image. Stations include exposures on the trajectory of a scanner; its
+    laser returns are not affected. Raises InputError for an invalid `per`, without observed stations, and without
+    strips.
     """
     block = adjusted.block
     unit_of = {"block": ("block",) * len(block.images), "strip": block.image_strip, "image": block.images}
@@ -92,7 +92,7 @@ def station_bias(
 
 
 def variance_shares(adjusted: Adjustment, derivatives: Sensitivity) -> VarianceShares:
-    """Fraction A_k^2 sigma_k^2 of each observation in the variance of every estimate."""
+    """Compute the fraction A_k^2 sigma_k^2 / variance of each observation for every estimate."""
     rows = observation_groups(adjusted)
     parts = {name: _shares(a, rows[name]) for name, a in derivatives.groups.items()}
     variance = np.sum([part.sum(axis=1) for part in parts.values()], axis=0)
@@ -101,7 +101,7 @@ def variance_shares(adjusted: Adjustment, derivatives: Sensitivity) -> VarianceS
 
 
 def _shares(a: Float[np.ndarray, "estimates n"], rows: AbstractObservations) -> Float[np.ndarray, "estimates n"]:
-    """Contribution of each observation to A C A'; they sum to it."""
+    """Return the contribution of each observation to A C A'."""
     if isinstance(rows, Correlated):
         by_set = a.reshape(len(a), len(rows), -1)
         return (by_set * np.einsum("esn,snm->esm", by_set, np.asarray(rows.covariance))).reshape(a.shape)
@@ -113,17 +113,15 @@ def external_reliability(adjusted: Adjustment, derivatives: Sensitivity, delta0:
 
         MDB_k = delta0 sigma_k / sqrt(r_k),   effect_k = A_k MDB_k
 
-    with the redundancy number r_k of the observation. `delta0` is the noncentrality of the test: 4.13 for a level of
-    0.1 % and a power of 80 %.
-
-    Raises InputError for a delta0 that is not positive.
+    r_k is the redundancy number of the observation. `delta0` is the noncentrality of the test: 4.13 for a level of 0.1
+    % and a power of 80 %. Raises InputError for a delta0 that is not positive.
     """
     if not delta0 > 0:
         raise InputError(f"delta0, the noncentrality of the test, must be positive, got {delta0}")
     numbers = redundancy_numbers(adjusted, covariance(adjusted, rows=True))
     mdb, effect = {}, {}
     for name, values in minimal_detectable_biases(adjusted, numbers, delta0).items():
-        # Components of a row in turn.
+        # The components of a row are consecutive.
         mdb[name] = values.T.ravel()
         a = derivatives.groups[name]
         effect[name] = np.multiply(a, mdb[name], out=np.zeros_like(a), where=a != 0)

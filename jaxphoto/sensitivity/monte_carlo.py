@@ -1,8 +1,8 @@
-"""Monte Carlo of an adjustment: thousands of re-adjustments of a block with other values, each to convergence.
+"""Monte Carlo simulation of an adjustment: thousands of re-adjustments of a block, each iterated to convergence.
 
-All draws share the factor of the nominal normal matrix (`chords`); draws for which these steps do not contract are
-adjusted individually and counted. The batch size follows from the block and the number of devices, so a draw does not
-depend on the draws before or after it.
+All draws share the factor of the nominal normal matrix (`chords`). Draws for which this iteration does not contract are
+adjusted individually and counted. The batch size depends only on the block and the number of devices, so a draw does
+not depend on other draws.
 """
 
 import dataclasses
@@ -32,19 +32,19 @@ from jaxphoto.sensitivity.perturbation import Perturbation, Recorded, in_order_o
 from jaxphoto.short_repr import pretty_repr
 from jaxphoto.tracing import outside_transformations
 
-# Number of draws from which optimised compilation pays off.
+# Minimum number of draws for optimised compilation.
 _MANY = 500
-# Upper bound of the number of devices.
+# Maximum number of devices.
 _MAX_DEVICES = 1024
 
 
 @pretty_repr
 class Draws(eqx.Module):
-    """Re-adjustments of a block, one a draw along the first axis.
+    """Re-adjustments of a block, one per draw along the first axis.
 
-    `recorded` holds the values that the perturbation drew; `shared` the estimated interior, mount and strip parameters
-    of `labels` (own units); `exterior` X, Y, Z (m) and omega, phi, kappa (rad) of all images; `points` all object
-    points (m). The latter two are None unless requested.
+    `recorded`: values drawn by the perturbation. `shared`: estimated interior, mount and strip parameters `labels` (own
+    units). `exterior`: X, Y, Z (m) and omega, phi, kappa (rad) of all images. `points`: all object points (m).
+    `exterior` and `points` are None unless requested.
     """
 
     recorded: dict[str, Float[np.ndarray, "draws"]]
@@ -54,7 +54,7 @@ class Draws(eqx.Module):
     converged: Bool[np.ndarray, "draws"]
     steps: Int[np.ndarray, "draws"]
     fallback: Bool[np.ndarray, "draws"]
-    """True if the draw was adjusted individually because steps with the nominal factor did not contract."""
+    """True if the draw was adjusted individually because iterations with the nominal factor did not contract."""
     labels: tuple[str, ...] = eqx.field(static=True)
 
 
@@ -71,9 +71,9 @@ def monte_carlo(
     """Re-adjust the block of `adjusted` `draws` times, each with values drawn by `perturb`.
 
     `perturb(key, block)` returns the block with other values, alone or with a dict of scalars to record; see
-    `jaxphoto.bias` for the usual ones. It is mapped over keys by `jax.vmap`: draw k has
-    `jax.random.fold_in(jax.random.key(seed), k)`. Its block starts at the adjusted unknowns. Ids, indices and shapes
-    must not change.
+    `jaxphoto.bias` for common perturbations. It is mapped over keys by `jax.vmap`: the key of draw k is
+    `jax.random.fold_in(jax.random.key(seed), k)`. The initial values of its block are the adjusted unknowns. Ids,
+    indices and shapes must not change.
 
     Raises InputError for less than one draw.
     """
@@ -90,9 +90,9 @@ def readjust(
     exterior: bool = False,
     points: bool = False,
 ) -> Draws:
-    """Re-adjust the block of `adjusted` once for each of `entries`, a tree of arrays along their first axis.
+    """Re-adjust the block of `adjusted` for each of `entries`, a tree of arrays along their first axis.
 
-    `change(entry, block)` returns the block with other values, as `perturb` of `monte_carlo` does.
+    `change(entry, block)` returns the block with other values, in the same form as `perturb` of `monte_carlo`.
     """
     run = Readjustment(adjusted, change, entries, exterior=exterior, points=points)
     return join_draws(list(run.batches(entries)))
@@ -105,20 +105,20 @@ def check_draws(draws: int) -> None:
 
 
 class DrawnChange(eqx.Module):
-    """A perturbation as a change that depends on the index of a draw."""
+    """Perturbation as a change that depends on the index of a draw."""
 
     perturb: Perturbation
     seed: int = eqx.field(static=True)
 
     def __call__(self, draw: Int[Array, ""], block: Block) -> Block | tuple[Block, Recorded]:
-        """Return the block of a draw."""
+        """Return the block of draw `draw`."""
         return self.perturb(jax.random.fold_in(jax.random.key(self.seed), draw), block)
 
 
 class Readjustment:
-    """Re-adjustment of a block with other values, compiled once; `seconds` is the time of compilation.
+    """Re-adjustment of a block with other values, compiled once. `seconds`: time of compilation.
 
-    `example` has the structure and the length of the entries of `batches`: many draws get better optimised code.
+    `example` has the structure and length of the entries of `batches`; compilation is optimised for many draws.
     """
 
     def __init__(
@@ -138,7 +138,7 @@ class Readjustment:
             adjusted.unknowns, *(np.ones(len(n), bool) for n in (adjusted.block.images, adjusted.block.points))
         )
         self.nominal = dataclasses.replace(adjusted.block, start=start, priors=adjusted.priors)
-        # With several processes each draws on its first device.
+        # With several processes, each one draws on its first device.
         self.devices = usable(_MAX_DEVICES) if jax.process_count() == 1 else 1
         self.common = common_of(self.adjusted)
         self.names = self._varying_fields(jax.tree.map(lambda v: v[:1], example))
@@ -157,10 +157,10 @@ class Readjustment:
         self.seconds["compile"] = time.perf_counter() - began
 
     def batches(self, entries: Any) -> Iterator[Draws]:
-        """Yield the re-adjustments, batch by batch."""
+        """Yield the re-adjustments of `entries` in batches."""
         running = None
         for batch in self._split(entries):
-            # The next batch is started before the last one is fetched, so that neither waits.
+            # Start the next batch before fetching the last one, so that host and device work in parallel.
             following = batch, self._start(batch, first_only=False)
             if running is not None:
                 yield self._finish(*running)
@@ -169,7 +169,7 @@ class Readjustment:
             yield self._finish(*running)
 
     def first_order(self, entries: Any) -> Draws:
-        """First-order re-adjustment by one step with the nominal factor: exact in the limit of small changes."""
+        """Re-adjust to first order by one step with the nominal factor: exact in the limit of small changes."""
         return join_draws([self._fetch(*self._start(b, first_only=True), _count(b)) for b in self._split(entries)])
 
     def _split(self, entries: Any) -> Iterator[Any]:
@@ -192,20 +192,20 @@ class Readjustment:
         return Draws(scalars, *self._estimates(state), converged, steps, np.zeros(n, bool), labels)
 
     def _estimates(self, state: UnknownArrays) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-        """`shared`, `exterior` and `points` of `Draws`."""
+        """Return `shared`, `exterior` and `points` of `Draws`."""
         shared = to_numpy(state.shared)[:, self.adjusted.structure.free]
         points = _by_object(state.points) if self.points else None
         return shared, self._exterior(state) if self.exterior else None, points
 
     def _finish(self, entries: Any, running: tuple[Found, Recorded]) -> Draws:
-        """Fetch a batch and adjust individually the draws that did not contract."""
+        """Fetch a batch, and adjust draws individually if their iteration did not contract."""
         draws = self._fetch(*running, _count(entries))
         for k in map(int, np.flatnonzero(~draws.converged)):
             draws = _with_row(draws, k, self._adjust_one(jax.tree.map(lambda v, k=k: v[k], entries)))
         return draws
 
     def _adjust_one(self, entry: Any) -> Draws:
-        """One draw by a full adjustment; NaN if it fails."""
+        """Compute one draw by a full adjustment; NaN if it fails."""
         block, _ = self._changed(entry)
         try:
             adjusted = solve(block, block.start.unknowns, block.priors)
@@ -216,7 +216,7 @@ class Readjustment:
         return Draws({}, *self._estimates(state), np.array([converged]), np.array([steps]), np.array([True]), ())
 
     def _exterior(self, state: UnknownArrays) -> Float[np.ndarray, "draws images 6"]:
-        """X, Y, Z, omega, phi, kappa; angles continuous with the nominal ones, without a jump at 180 degrees."""
+        """Return X, Y, Z, omega, phi, kappa. Angles are continuous with the nominal ones."""
         angles = np.asarray(call_compiled(_angles, _by_object(state.rotation)))
         nominal = np.asarray(call_compiled(_angles, np.asarray(self.adjusted.values.rotation).transpose(2, 0, 1)[None]))
         angles = nominal + (angles - nominal + np.pi) % (2 * np.pi) - np.pi
@@ -241,14 +241,14 @@ class Readjustment:
         structure, nominal = self.common.structure, self.common.values
         padded = self.adjusted.padded.pad(changed)
         values = {path_name(path): v for path, v in jax.tree_util.tree_leaves_with_path(padded)}
-        # Free unknowns start at the optimum, whatever the start of the block.
+        # Start free unknowns at the optimum, whatever the initial values of the block.
         for name, mask in held_in(structure, len(v.shared)).items():
             if isinstance(values[name], jax.core.Tracer):
                 values[name] = jnp.where(mask, values[name], getattr(nominal, name))
         return values | {"xy": changed.xy, "sigma_xy": changed.sigma_xy}, recorded
 
     def _varying_fields(self, entries: Any) -> tuple[str, ...]:
-        """Leaves of `Values` that differ between draws."""
+        """Return the names of the leaves of `Values` that differ between draws."""
         varying: list[str] = []
 
         def trace(entry):
@@ -256,7 +256,7 @@ class Readjustment:
             varying.extend(name for name, v in values.items() if isinstance(v, jax.core.Tracer))
             return 0
 
-        # vmap without jit: only leaves that depend on the entry are traced.
+        # Use vmap without jit: only leaves that depend on the entry are traced.
         jax.vmap(trace, out_axes=None)(entries)
         if not varying:
             raise InputError("the perturbation changes no value of the block: return the block with other values")
@@ -264,14 +264,14 @@ class Readjustment:
 
 
 def common_of(adjusted: Adjustment, batch: int | None = None) -> Common:
-    """Return the nominal adjustment, from whose optimum all draws start, with image rows in batches of `batch`."""
+    """Return the nominal adjustment, which all draws start from, with image rows in batches of `batch`."""
     equations, values = adjusted.equations.weighed, adjusted.values
     lists = row_lists(adjusted.structure, adjusted.padded.places, batch)
     return Common(equations.at, equations.factored, np.asarray(values.xy), np.asarray(values.sigma_xy), lists)
 
 
 def join_draws(parts: Iterable[Draws]) -> Draws:
-    """Concatenate `parts`."""
+    """Concatenate the draws of `parts`."""
     return jax.tree.map(lambda *v: np.concatenate(v), *parts)
 
 
@@ -280,7 +280,7 @@ def _draws_first(values: Array) -> Any:
 
 
 def _by_object(values: Any) -> np.ndarray:
-    """Draws first, then images or points, then components."""
+    """Move the axes: draws first, then images or points, then components."""
     return np.moveaxis(to_numpy(values), -1, 1)
 
 
@@ -289,7 +289,7 @@ def _count(entries: Any) -> int:
 
 
 def _check_same(block: Any, nominal: Block) -> None:
-    """Raise InputError if `block` differs from the nominal one in more than floating-point values."""
+    """Raise InputError if `block` differs from the nominal block in anything except floating-point values."""
     kind: Any = jax.tree.structure(nominal)
     same = isinstance(block, Block) and kind == jax.tree.structure(block)
     if not same or not all(map(_is_number_or_same, jax.tree.leaves(block), jax.tree.leaves(nominal))):
@@ -300,7 +300,7 @@ def _check_same(block: Any, nominal: Block) -> None:
 
 
 def _is_number_or_same(new: Any, old: Any) -> bool:
-    """Return True if a leaf is unchanged, or floating-point values of the same shape."""
+    """Return True if a leaf is unchanged, or contains floating-point values of the same shape."""
     if np.asarray(old).dtype.kind not in "f":
         return new is old or (not isinstance(new, jax.core.Tracer) and np.array_equal(new, old))
     return np.shape(new) == np.shape(old)

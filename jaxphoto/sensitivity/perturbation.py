@@ -8,10 +8,10 @@ scalars to record:
         heights = block.stations.value + rise * (block.stations.axis == 2)
         return eqx.tree_at(lambda b: b.stations.value, block, heights), {"rise_m": rise}
 
-`bias` and `noise` make the usual ones.
+`bias` and `noise` return common perturbations.
 
-A trajectory with the constant error b shifts laser returns and exposures. Because the weights of the knots sum to 1,
-this equals knots c' = c - b instead of the knots c: the prior of the first knot of a strip becomes -b, and
+A constant error b of a trajectory shifts laser returns and exposures. Because the weights of the knots sum to 1, this
+is equivalent to knots c' = c - b instead of c: the prior of the first knot of a strip becomes -b, and
 
     c[k + 1] - f c[k] = 0    becomes    c'[k + 1] - f c'[k] = -(1 - f) b
 
@@ -53,12 +53,12 @@ OBSERVED = {
     "station": (CameraPositions, TrajectoryStations),
     "attitude": (Attitudes, TrajectoryAttitudes),
 }
-"""Kinds of bias of GNSS and IMU, and the observations they apply to."""
+"""Kinds of bias of GNSS and IMU, and the observations that they change."""
 TRAJECTORY: dict[str, tuple[str, Steps]] = {
     "trajectory": ("position", PositionSteps),
     "trajectory-attitude": ("attitude", AttitudeSteps),
 }
-"""Kinds of bias of a scanner's trajectory: the field of its knots, and the changes from knot to knot."""
+"""Kinds of bias of a scanner's trajectory: field of its knots, and observed differences between knots."""
 LABELS = {
     "station": tuple(f"{a}_m" for a in AXES),
     "attitude": tuple(f"{a}_rad" for a in ATTITUDE_AXES),
@@ -66,22 +66,22 @@ LABELS = {
     "image-points": ("x_mm", "y_mm"),
     **{kind: TrajectoryKnot.names[field] for kind, (field, _) in TRAJECTORY.items()},
 }
-"""Labels of the errors of one owner."""
+"""Labels of the error components of one owner."""
 
 
 class BiasedArray(NamedTuple):
-    """An array of a block, with the owner and the axis of the error of each element."""
+    """Array of a block, with the owner and the axis of the error of each element."""
 
     path: tuple[Any, ...]
-    """From the block."""
+    """Path of the array in the block."""
     owner: list[str]
     axis: Int[np.ndarray, "numbers"]
     factor: Float[np.ndarray, "sets 3 3"] | None = None
-    """Multiplies the errors of each three elements."""
+    """Matrix multiplied with the errors of each set of three elements; None for the identity."""
 
 
 def observed_arrays(block: Block, kind: str, per: str) -> list[BiasedArray]:
-    """Arrays of stations, attitudes, control or image points."""
+    """Return the arrays of stations, attitudes, control or image points."""
     kinds = OBSERVED.get(kind, ())
     if not kinds:
         name = kind.replace("-", "_")
@@ -109,7 +109,7 @@ def _observed_array(block: Block, rows: Any, path: tuple[Any, ...], kind: str, p
 
 
 def trajectory_arrays(block: Block, kind: str, per: str) -> list[BiasedArray]:
-    """Arrays that an error of the trajectory of each strip of a laser scanner changes.
+    """Return the arrays that an error of the trajectory of a laser scanner changes, for each strip.
 
     Raises InputError for a block without a trajectory, and for a scalar prior of three axes.
     """
@@ -123,7 +123,7 @@ def trajectory_arrays(block: Block, kind: str, per: str) -> list[BiasedArray]:
 
 
 def _knots(block: Block, field: str, per: str) -> Iterator[BiasedArray]:
-    """Knots that are fixed or have priors."""
+    """Yield the arrays of knots that are fixed or have priors."""
     kind = TrajectoryKnot.kind
     for owner, knot in block.priors.more[kind].items():
         prior = getattr(knot, field)
@@ -153,7 +153,7 @@ def _owner(knot: str, per: str) -> str:
 Recorded = dict[str, Array]
 Perturbation = Callable[[Any, Block], Block | tuple[Block, Recorded]]
 Distribution = Callable[[Any, tuple[int, ...]], Array]
-"""Variates of mean 0 and standard deviation 1 from a key and a shape."""
+"""Random variates of mean 0 and standard deviation 1, from a key and a shape."""
 
 PER = {
     "station": ("block", "strip", "image"),
@@ -174,34 +174,36 @@ _AXES = {"lever-arm": ("right_m", "forward_m", "up_m"), "boresight": ("x_rad", "
 class Bias(eqx.Module):
     """Errors added to values of a block: `sigma` times independent variates of `distribution`.
 
-    Called with a key and a block it is a perturbation; `applied` adds prescribed errors.
+    Calling it with a key and a block applies random errors; `applied` adds given errors.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
     """Names of the errors, such as `E1.X_m`; angles in rad."""
     sigma: Float[np.ndarray, "errors"]
-    """In the units of the names."""
+    """Standard deviations of the errors, in the units of the names."""
     targets: tuple[tuple[Any, ...], ...] = eqx.field(static=True)
-    """Paths, from the block, of the arrays that the errors are added to."""
+    """Paths in the block of the arrays to which the errors are added."""
     index: tuple[Int[np.ndarray, "..."], ...]
-    """Index of the error of each element of these arrays; the number of errors for none."""
+    """Index of the error of each element of these arrays; the number of errors for elements without an error."""
     distribution: Distribution = eqx.field(static=True, default=jax.random.normal)
     recorded: bool = eqx.field(static=True, default=True)
     """True if each error is recorded."""
     mixed: tuple[Float[np.ndarray, "_ _ _"] | None, ...] = ()
-    """Factors L (sets, n, n) of the errors of each array, None for one; L L' is the covariance of correlated errors."""
+    """Factors L (sets, n, n) of the errors of each array, None for the identity. Correlated errors have the covariance
+    L L'.
+    """
 
     def __call__(self, key, block: Block) -> tuple[Block, Recorded]:
-        """`block` with random errors, and the errors by name."""
+        """Return `block` with random errors, and the errors by name."""
         errors = self.drawn(key)
         return self.applied(errors, block), dict(zip(self.names, errors, strict=True)) if self.recorded else {}
 
     def drawn(self, key) -> Float[Array, "errors"]:
-        """Errors of a key."""
+        """Draw the errors of a key."""
         return jnp.asarray(self.sigma) * self.distribution(key, self.sigma.shape)
 
     def applied(self, errors: Float[Array, "errors"], block: Block) -> Block:
-        """`block` with prescribed errors, in the order of `names`."""
+        """Return `block` with given errors, in the order of `names`."""
         padded = jnp.append(errors, 0.0)
         targets = lambda b: [_follow(b, path) for path in self.targets]  # noqa: E731
         factors = self.mixed or (None,) * len(self.targets)
@@ -213,13 +215,13 @@ class Bias(eqx.Module):
 
 
 def in_order_of(block: Block, changed: Block) -> Block:
-    """Return `changed` with its unknowns in the order of `block`."""
+    """Reorder the unknowns of `changed` as in `block`."""
     start = dataclasses.replace(changed.start, unknowns=changed.start.unknowns.in_order_of(block.start.unknowns))
     return dataclasses.replace(changed, start=start, priors=changed.priors.in_order_of(block.priors))
 
 
 def _with_errors(values: Any, errors: Array) -> Array:
-    """Values plus errors; rotation matrices are multiplied by small rotations."""
+    """Add errors to values; rotation matrices are multiplied by small rotations."""
     if errors.size == np.size(values):
         return jnp.asarray(values) + errors.reshape(np.shape(values))
     turn = jax.vmap(small_rotation)(errors.reshape(-1, 3))
@@ -236,16 +238,16 @@ def bias(
     parameter: str = "",
     distribution: Distribution = jax.random.normal,
 ) -> Bias:
-    """Errors of one kind, independent for each axis and each strip, image, point, mount or camera.
+    """Define errors of one kind, independent for each axis and each strip, image, point, mount or camera.
 
-    `kind` is one of `PER`, `per` one of its entries there (by default the first). `sigma`: m for stations, control
-    and lever arms; rad for attitudes and boresights; mm for image points; own units for the interior `parameter`
-    (`c_mm`, `k1` ...); one value, or one per axis. `of` names the units that get errors, by default all. Lever arms,
-    boresights and interior parameters must be FIXED (the fixed value changes) or Weighted (the prior value changes).
+    `kind` is a key of `PER`, `per` one of its entries (default: the first). `sigma`: m for stations, control and lever
+    arms; rad for attitudes and boresights; mm for image points; own units for the interior `parameter` (`c_mm`, `k1`
+    ...); one value, or one per axis. `of` names the units that get errors (default: all). Lever arms, boresights and
+    interior parameters must be FIXED (the fixed value changes) or Weighted (the prior value changes).
 
     Errors of `station` and `attitude` apply to exposures only. `trajectory` (m) and `trajectory-attitude` (rad, about
-    right, forward and up) are errors of the trajectory of a laser scanner, of the whole flight or of each laser strip:
-    they apply to its returns and to the exposures on it (`BiasedArray`).
+    right, forward and up) are errors of the trajectory of a laser scanner, for the whole flight or for each laser
+    strip. They apply to its returns and to the exposures on the trajectory (`BiasedArray`).
 
     Raises InputError for an invalid kind, name or sigma.
     """
@@ -279,7 +281,7 @@ def bias(
 
 
 class _Noisy(NamedTuple):
-    """Path of observed values, their standard deviations, and the Cholesky factor of correlated ones."""
+    """Path of observed values, their standard deviations, and the Cholesky factor of their covariance if correlated."""
 
     path: tuple[Any, ...]
     sigma: np.ndarray
@@ -287,9 +289,9 @@ class _Noisy(NamedTuple):
 
 
 def noise(block: Block) -> Bias:
-    """Errors of all observations and of all prior values, each with its own standard deviation.
+    """Define errors of all observations and prior values, with the a priori covariance of the block.
 
-    They are consistent with the covariance of the block. Raises InputError for a scalar prior of several values.
+    Raises InputError for a scalar prior of several values.
     """
     parts = [part for part in (*_observed(block), *_weighted(block)) if np.size(part.sigma)]
     starts = np.cumsum([0, *(np.size(part.sigma) for part in parts)])
@@ -304,7 +306,7 @@ def noise(block: Block) -> Bias:
 
 
 def _observed(block: Block) -> Iterator[_Noisy]:
-    """Observations of all groups of the block."""
+    """Yield the observations of all groups of the block."""
     groups = (block.image_points, *block.observations)
     fields: list[tuple[tuple[Any, ...], Any]] = [((f.name,), getattr(block, f.name)) for f in dataclasses.fields(block)]
     fields += [(("more", k), rows) for k, rows in enumerate(block.more)]
@@ -323,7 +325,7 @@ def _correlated(path: tuple[Any, ...], covariance: Any) -> _Noisy:
 
 
 def _weighted(block: Block) -> Iterator[_Noisy]:
-    """Prior values."""
+    """Yield the prior values."""
     paths = jax.tree_util.tree_leaves_with_path(block.priors, is_leaf=is_prior)
     unknowns = block.start.unknowns
     for keys, prior in paths:
@@ -344,7 +346,7 @@ def _weighted(block: Block) -> Iterator[_Noisy]:
 
 
 def _label(path: tuple[Any, ...]) -> str:
-    """Label for messages, such as "shift of a" and "exterior.position"."""
+    """Return a label for messages, such as "shift of a" or "exterior.position"."""
     return (
         f"{path[-1]} of {path[-2]}" if path[0] in ("mounts", "strips", "scanner", "more") else ".".join(map(str, path))
     )
@@ -378,14 +380,14 @@ def _parameters(block: Block, kind: str, sigma, of: Collection[str], parameter: 
 
 
 def _follow(tree: Any, path: tuple[Any, ...]) -> Any:
-    """Leaf at a path of fields, keys, indices and names of interior parameters."""
+    """Return the leaf at a path of fields, keys, indices and names of interior parameters."""
     for step in path:
         tree = tree[step] if isinstance(tree, dict | tuple) else _leaf(tree, step)
     return tree
 
 
 def _leaf(tree: Any, name: str) -> Any:
-    """Return a field, or a parameter of a camera by its name."""
+    """Return a field, or an interior parameter of a camera, by name."""
     named = isinstance(tree, InteriorOrientation) and not hasattr(tree, name)
     return get_parameter(tree, name) if named else getattr(tree, name)
 

@@ -2,19 +2,19 @@
 
 Least squares reports the optimum and the inverse of the normal matrix: the Laplace approximation of the density
 
-    p(x) ~ exp(-1/2 sum of squared residuals over their a priori sigmas)
+    p(x) ~ exp(-1/2 sum of (residual / a priori sigma)^2)
 
-It equals the posterior if residuals are linear in the unknowns; where c, flying height and heights of points are
-strongly correlated, it may not. Here the whole posterior is sampled, in coordinates z in which the Laplace
-approximation is a standard normal distribution. With V = L L' of the points, A = M M' of the reduced unknowns and F as
-in adjustment/solver/normal.py,
+It equals the posterior if residuals are linear in the unknowns. It may differ if c, flying height and heights of points
+are strongly correlated. This module samples the whole posterior, in coordinates z in which the Laplace approximation is
+a standard normal distribution. With V = L L' of the points, A = M M' of the reduced unknowns and F as in
+adjustment/solver/normal.py,
 
     x_r = M'^-1 z_r,   x_p = L'^-1 (z_p - F' x_r)
 
-so one step length suits all unknowns, from k2 to positions, and no metric is adapted. (Distances and datum constraints,
-which couple points, are not in L: with them the coordinates are standard normal only approximately.)
+so one step length suits all unknowns, from k2 to positions, and the metric is not adapted. Distances and datum
+constraints couple points and are not in L: with them the coordinates are only approximately standard normal.
 
-Source: Hoffman and Gelman 2014 (NUTS, algorithm 6); Vehtari et al. 2021 (R-hat, effective sample size).
+Sources: Hoffman and Gelman 2014 (NUTS, algorithm 6); Vehtari et al. 2021 (R-hat, effective sample size).
 """
 
 import difflib
@@ -48,7 +48,7 @@ except ImportError as error:
         "the posterior is sampled by blackjax: install it with pip install 'jaxphoto[posterior]'"
     ) from error
 
-# R-hat compares the halves of every chain, and each half needs a variance.
+# Minimum number of draws per chain: R-hat compares the halves of every chain, and each half needs a variance.
 MIN_DRAWS = 4
 _ACCEPTANCE = 0.9
 # Squared radius of the 95 % ellipse of a bivariate standard normal distribution.
@@ -58,28 +58,28 @@ _SQUARE_RADIUS = -2 * np.log(0.05)
 class Posterior(eqx.Module):
     """Sample of the posterior of some parameters, and its Laplace approximation.
 
-    Both are a priori: sigma naught is 1. Values are in metres, radians, mm and the coefficients' own units; rotations
-    are omega, phi, kappa.
+    Both are a priori (sigma naught 1). Values are in metres, radians, mm and the coefficients' own units; rotations are
+    omega, phi, kappa.
     """
 
     parameters: tuple[str, ...] = eqx.field(static=True)
     samples: Float[np.ndarray, "chains draws parameters"]
     optimum: Float[np.ndarray, " parameters"]
-    """Adjusted values: the mean of the Laplace approximation."""
+    """Adjusted values, the mean of the Laplace approximation."""
     laplace: Float[np.ndarray, "parameters parameters"]
     """Covariance of the Laplace approximation."""
     rhat: Float[np.ndarray, " parameters"]
-    """Rank-normalised split R-hat: above 1.01 the chains have not converged, and the sample must not be used."""
+    """Rank-normalised split R-hat. Above 1.01 the chains have not converged, and the sample must not be used."""
     ess: Float[np.ndarray, " parameters"]
-    """Effective sample size: the standard error of a mean is its sigma over the square root of this."""
+    """Effective sample size. The standard error of a mean is its sigma divided by the square root of this."""
     divergences: Int[np.ndarray, " chains"]
-    """Number of divergent transitions: if there are many, the sample misses parts of the posterior."""
+    """Number of divergent transitions. With many of them the sample misses parts of the posterior."""
     gradients: int
-    """Number of gradients of the density after warm-up."""
+    """Number of gradient evaluations of the density after warm-up."""
 
     @property
     def draws(self) -> Float[np.ndarray, "draws parameters"]:
-        """All chains as one sample."""
+        """Samples of all chains, concatenated."""
         return self.samples.reshape(-1, len(self.parameters))
 
     @property
@@ -95,7 +95,7 @@ class Posterior(eqx.Module):
 
     @property
     def skewness(self) -> Float[np.ndarray, " parameters"]:
-        """E (x - mean)^3 / sigma^3 of the posterior: 0 for a symmetric one."""
+        """Skewness E (x - mean)^3 / sigma^3 of the posterior; 0 for a symmetric one."""
         centred = self.draws - self.mean
         return (centred**3).mean(axis=0) / (centred**2).mean(axis=0) ** 1.5
 
@@ -103,7 +103,7 @@ class Posterior(eqx.Module):
     def outside(self) -> Float[np.ndarray, "parameters parameters"]:
         """Fraction of the sample outside the 95 % ellipse of the Laplace approximation, by pair of parameters.
 
-        0.05 for a Gaussian posterior. The diagonal, of single parameters, is zero.
+        It is 0.05 for a Gaussian posterior. The diagonal is zero.
         """
         error = self.draws - self.optimum
         result = np.zeros(self.laplace.shape)
@@ -126,14 +126,15 @@ def posterior(
 ) -> Posterior:
     """Sample the posterior of `parameters` by NUTS, and compute its Laplace approximation.
 
-    All unknowns are sampled: the other ones are marginalised. The density is exp(-1/2 v'Pv) with the a priori sigmas,
-    and uniform in every unknown without a `Weighted` prior: in positions, points, parameters of interior orientation,
-    mounts and strips, and in the small rotation of each image from its optimum. In a free network it is the density on
-    the plane of the datum constraints.
+    All unknowns are sampled, so the other ones are marginalised. The density is exp(-1/2 v'Pv) with the a priori
+    sigmas. It is uniform in every unknown without a `Weighted` prior: positions, points, parameters of interior
+    orientation, mounts and strips, and the small rotation of each image from its optimum. For a free network it is
+    restricted to the plane of the datum constraints.
 
-    `parameters` are labels as in `Covariance.labels`, `interior[kodak].c_mm` or `exterior[8936].omega`, or coordinates
-    of points, `points[12].Z`. Each of `chains` starts at its own draw of the Laplace approximation, adapts its step
-    length in `warmup` draws, and then keeps `draws`. The same `seed` gives the same sample.
+    `parameters` are labels as in `Covariance.labels`, such as `interior[kodak].c_mm` or `exterior[8936].omega`, or
+    coordinates of points, such as `points[12].Z`. Each of `chains` starts at a random draw of the Laplace
+    approximation, adapts its step length in `warmup` draws, and then stores `draws` samples. The same `seed` gives the
+    same sample.
 
     Raises InputError for an unknown or fixed parameter, for fewer draws than R-hat needs, and for an adjustment that
     has not converged.
@@ -164,7 +165,7 @@ def posterior(
 
 
 def _indices(adjusted: Adjustment, parameters: Sequence[str]) -> Int[np.ndarray, " parameters"]:
-    """Return indices of `parameters` in the vector of `_physical`."""
+    """Return the indices of `parameters` in the vector of `_physical`."""
     block, s, padded = adjusted.block, adjusted.structure, adjusted.padded
     n, q, image, point = padded.structure.n_images, s.n_shared, padded.places.image, padded.places.point
     names = EOP_NAMES["omega_phi_kappa"]
@@ -186,7 +187,7 @@ def _indices(adjusted: Adjustment, parameters: Sequence[str]) -> Int[np.ndarray,
 
 
 def _unknown_parameter(name: str, unknowns: list[str], adjusted: Adjustment) -> str:
-    """Error message for a parameter that is not among the unknowns."""
+    """Return the error for a parameter that is not an unknown."""
     block = adjusted.block
     parameters = [
         *(f"exterior[{i}].{angle}" for i in block.images for angle in EOP_NAMES["omega_phi_kappa"]),
@@ -204,9 +205,9 @@ class _White(NamedTuple):
 
     equations: NormalEquations
     triangle: Float[Array, "reduced reduced"]
-    """M of A = M M'."""
+    """Factor M of A = M M'."""
     free: Int[Array, "free"]
-    """Indices of the free unknowns among the padded ones."""
+    """Indices of the free unknowns in the padded vector."""
     datum: Float[Array, "constraints free"]
     """Orthonormal rows that span the datum constraints in z."""
 
@@ -218,7 +219,7 @@ class _White(NamedTuple):
         return white._replace(datum=jnp.linalg.qr(rows.T)[0].T)
 
     def increments(self, z: Float[Array, "free"]) -> Increments:
-        """x of z."""
+        """Return the increments x at z."""
         reduced = self.equations.factored.reduced
         r, (l11, l21, l22, l31, l32, l33) = len(self.triangle), reduced.l
         full = jnp.zeros(r + 3 * len(l11)).at[self.free].set(self.project(z))
@@ -231,7 +232,7 @@ class _White(NamedTuple):
         return z - self.datum.T @ (self.datum @ z)
 
     def whitened(self, row: Increments) -> Float[Array, "free"]:
-        """Return the derivative by z of a function with the derivative `row` by x."""
+        """Convert a derivative `row` by x to the derivative by z."""
         right, d = self.equations.reduce(row)
         reduced = self.equations.factored.reduced
         if len(d):
@@ -241,31 +242,34 @@ class _White(NamedTuple):
         return self.project(jnp.concatenate([half, points.reshape(-1)])[self.free])
 
     def slope(self, z: Float[Array, "free"]) -> tuple[Scalar, Float[Array, "free"]]:
-        """Half the sum of squares and its derivative; standard normal in the directions of the datum constraints."""
+        """Return half the sum of squares and its derivative by z.
+
+        The density is standard normal in the directions of the datum constraints.
+        """
         constrained = self.datum @ z
         b, square = self.equations.gradient(self.increments(z))
         return 0.5 * (square + constrained @ constrained), self.whitened(b) + self.datum.T @ constrained
 
     def log_density(self, z: Float[Array, "free"]) -> Scalar:
-        """Minus half the sum of squares."""
+        """Return minus half the sum of squares."""
         at = jax.lax.stop_gradient(z)
         half, slope = self.slope(at)
-        # Linear in z around `at`, so that differentiation returns the analytic slope.
+        # Linear in z around `at`: differentiation returns the analytic derivative.
         return -half - slope @ (z - at)
 
 
 def _flat(x: Increments, xp) -> Array:
-    """Reduced unknowns, then points."""
+    """Concatenate the reduced unknowns and the points."""
     return xp.concatenate([x.eop.T.reshape(-1), x.shared, x.points.reshape(-1)])
 
 
 def _physical(x: Increments, at: Linearised) -> Float[Array, "numbers"]:
-    """All unknowns in their own units: X, Y, Z, omega, phi, kappa of the images, shared unknowns, points."""
+    """Return all unknowns in their own units: X, Y, Z, omega, phi, kappa of the images, shared unknowns, points."""
     _, scale, values, s = at
     angles_of = jax.vmap(omega_phi_kappa_from_matrix, in_axes=2)
     state, optimum = state_at(x, scale, values, s), angles_of(values.rotation)
     change = angles_of(state.rotation) - optimum
-    # Continuous with the angles of the optimum.
+    # Angles are continuous with the angles of the optimum.
     angles = optimum + change - 2 * jnp.pi * jnp.round(change / (2 * jnp.pi))
     eop = jnp.concatenate([state.position.T, angles], axis=1)
     return jnp.concatenate([eop.reshape(-1), state.shared[s.free], state.points.reshape(-1)])
@@ -275,13 +279,13 @@ def _physical(x: Increments, at: Linearised) -> Float[Array, "numbers"]:
 def _laplace(
     equations: NormalEquations, index: Int[Array, " parameters"]
 ) -> tuple[Float[Array, " parameters"], Float[Array, "parameters parameters"]]:
-    """Parameters at the optimum, and their covariance."""
+    """Return the parameters at the optimum, and their covariance."""
     at = equations.at
     parameters = lambda x: _physical(x, at)[index]  # noqa: E731
     rows = jax.jacrev(parameters)(at.increments)
     solved = jax.vmap(equations.solve)(rows)
     flat = jax.vmap(partial(_flat, xp=jnp))
-    # The datum constraints remove the free motions (see adjustment/solver/inverse.py).
+    # Subtract the free motions, which the datum constraints determine (see adjustment/solver/inverse.py).
     along = flat(solved) @ flat(equations.constraints()).T
     return parameters(at.increments), flat(rows) @ flat(solved).T - along @ along.T
 
@@ -291,7 +295,7 @@ def _sample(
     equations: NormalEquations, index: Int[Array, " parameters"], free: Int[Array, " free"], seed: Int[Array, ""],
     chains: int, draws: int, warmup: int,
 ) -> tuple[Float[Array, "chains draws parameters"], Int[Array, " chains"], Int[Array, " chains"]]:  # fmt: skip
-    """Return samples of the parameters; divergent transitions and gradients of each chain."""
+    """Return samples of the parameters, and the number of divergent transitions and gradients of each chain."""
     white, at = _White.at_optimum(equations, free), equations.at
     metric, transition = jnp.ones(len(free)), blackjax.nuts.build_kernel()
     begin, update, final = blackjax.adaptation.step_size.dual_averaging_adaptation(_ACCEPTANCE)
@@ -316,11 +320,11 @@ def _sample(
         _, (samples, divergent, steps) = jax.lax.scan(draw, state, jax.random.split(draws_key, draws))
         return samples, jnp.sum(divergent), jnp.sum(steps)
 
-    # Sequentially: vmapped, every chain would wait for the longest trajectory.
+    # Run sequentially: vmapped, every chain would wait for the longest trajectory.
     return jax.lax.map(chain, jax.random.split(jax.random.key(seed), chains))
 
 
 @eqx.filter_jit
 def _diagnostics(samples: Float[Array, "chains draws parameters"]) -> tuple[Array, Array]:
-    """R-hat and effective sample size of every parameter."""
+    """Compute R-hat and effective sample size of every parameter."""
     return blackjax.diagnostics.rhat(samples), blackjax.diagnostics.ess_bulk(samples)

@@ -1,9 +1,9 @@
 """Sweep over designs: many simulated blocks, adjusted and evaluated by one compiled program.
 
-A design is a simulated block with known observations and true points. Strips, overlap, heights, control and standard
-deviations may differ from design to design, and with them the numbers of images and points: blocks are padded to common
-sizes. The program runs over the designs with `jax.lax.map` on all devices and returns the statistics of each; normal
-matrices are not kept.
+A design is a simulated block with observations and true points. Strips, overlap, heights, control, standard deviations
+and the numbers of images and points may differ between designs: blocks are padded to common sizes. The program runs
+over the designs with `jax.lax.map` on all devices and returns the statistics of each design. Normal matrices are not
+stored.
 """
 
 import time
@@ -42,14 +42,14 @@ from jaxphoto.initial import approximate
 from jaxphoto.statistics.covariance import EOP_NAMES, Rotations, physical_covariance
 from jaxphoto.unknowns import Unknowns
 
-# Designs per call of the program, at least one per device.
+# Number of designs per call of the program, at least one per device.
 _BATCH = 32
 
 
 class CheckPoints(NamedTuple):
     """Indices of check points in the padded arrays, and their true coordinates (m), NaN if unknown.
 
-    `weight` is 1, and 0 for padding.
+    `weight` is 1 for check points and 0 for padding.
     """
 
     point: Int[ArrayLike, "check"]
@@ -64,36 +64,36 @@ class PreparedDesign(NamedTuple):
     structure: PaddedStructure
     check: CheckPoints
     labels: tuple[str, ...]
-    """Of the shared unknowns."""
+    """Labels of the shared unknowns."""
     redundancy: int
 
 
 class DesignStatistics(NamedTuple):
-    """Statistics of one design; in metres, radians and the unknowns' own units, a priori."""
+    """A priori statistics of one design, in metres, radians and the unknowns' own units."""
 
     converged: Bool[ArrayLike, ""]
     least_pivot: Float[ArrayLike, ""]
-    """Smallest pivot relative to its diagonal element: 1 for independent unknowns, 0 for a rank defect."""
+    """Smallest ratio of a pivot to its diagonal element: 1 for independent unknowns, 0 for a rank defect."""
     steps: Int[ArrayLike, ""]
     sum_of_squares: Float[ArrayLike, ""]
-    """v'Pv."""
+    """Weighted sum of squares v'Pv."""
     covariance: Float[ArrayLike, "shared shared"]
     exterior_variance: Float[ArrayLike, "6"]
-    """X, Y, Z and three rotations, mean over the images."""
+    """Variances of X, Y, Z and three rotations, mean over the images."""
     mean_abs: Float[ArrayLike, "6 shared"]
-    """|rho| of X, Y, Z and three rotations with each shared unknown, mean over its images."""
+    """Mean |rho| of X, Y, Z and three rotations with each shared unknown, over the images that the unknown affects."""
     max_abs: Float[ArrayLike, "6 shared"]
     check_variance: Float[ArrayLike, "3"]
-    """Mean over the check points of the variance of computed coordinates."""
+    """Variance of computed coordinates, mean over the check points."""
     check_square: Float[ArrayLike, "3"]
-    """Mean over the check points of (true - computed) squared."""
+    """Squared difference true - computed, mean over the check points."""
 
 
 def prepare_design(block: Block, truth: Unknowns | None, sizes: PaddedSizes, n_check: int) -> PreparedDesign:
     """Add approximate values, datum and padding to `block`, as `jaxphoto.adjust` does.
 
-    `sizes` and `n_check`, the length of the list of check points, are common to all designs. Raises the errors of
-    `jaxphoto.adjust`: BlockError, DatumError, RankError.
+    `sizes` and `n_check`, the padded number of check points, are common to all designs. Raises BlockError, DatumError
+    and RankError as `jaxphoto.adjust` does.
     """
     problem = build_problem(block, approximate(block), block.priors, sizes, alone=True)
     s, constraints = problem.padded.own, len(problem.values.datum_eop)
@@ -108,7 +108,7 @@ def prepare_design(block: Block, truth: Unknowns | None, sizes: PaddedSizes, n_c
 
 
 def group_by_program(designs: Sequence[PreparedDesign]) -> list[list[int]]:
-    """Return indices of the designs that share one compiled program, by program."""
+    """Group the indices of designs by compiled program."""
     groups: dict[object, list[int]] = {}
     for k, design in enumerate(designs):
         arrays, rest = eqx.partition((design.values, design.structure), eqx.is_array)
@@ -121,11 +121,11 @@ def group_by_program(designs: Sequence[PreparedDesign]) -> list[list[int]]:
 def evaluate(
     designs: Sequence[PreparedDesign], rotations: Rotations, max_steps: int, seconds: dict[str, float]
 ) -> DesignStatistics:
-    """Statistics of designs of one program, as NumPy arrays with a leading axis over them."""
+    """Compute the statistics of designs of one program, as NumPy arrays with a leading axis over the designs."""
     devices = usable(_BATCH)
     per_device = -(-_BATCH // devices)
     size = per_device * devices
-    # Interleaved over the devices: a last batch of few designs keeps all devices busy.
+    # Interleave the designs over the devices: a last batch of few designs then uses all devices.
     order = np.arange(size).reshape(per_device, devices).T.ravel()
     parts = []
     for begin in range(0, len(designs), size):
@@ -150,7 +150,7 @@ def _evaluate(
 ) -> DesignStatistics:
     arrays, rest = eqx.partition((values, s, check), eqx.is_array)
 
-    # jit within jit: traced once, for its shapes and for its values.
+    # Nest jit in jit: traced once, for its shapes and for its values.
     @jax.jit
     def evaluate_one(arrays):
         values, s, check = eqx.combine(arrays, rest)
@@ -177,7 +177,7 @@ def _statistics(
         optimum = optimise(with_start(values, start), s, task)
         return optimum.state, optimum
 
-    # To the optimum, then once more for the undamped factor: a loop, so the code is compiled once.
+    # Solve to the optimum, then once more for the undamped factor; in a loop, so the code is compiled once.
     tasks = jax.tree.map(lambda *each: np.stack(each), to_optimum(max_steps), to_factor())
     start = UnknownArrays(values.position, values.rotation, values.shared, values.points)
     state, optima = jax.lax.scan(solve, start, tasks)
@@ -210,9 +210,9 @@ def _statistics(
 
 
 class Design(NamedTuple):
-    """A block with the parameters that distinguish it in its sweep, by name (`{"station_m": 0.1, "cross": True}`).
+    """Block with the parameters that distinguish it in its sweep, by name (`{"station_m": 0.1, "cross": True}`).
 
-    `truth` has the check points' true coordinates (`simulation.Simulation.truth`); None if unknown.
+    `truth` contains the true coordinates of the check points (`simulation.Simulation.truth`); None if unknown.
     """
 
     parameters: Mapping[str, Any]
@@ -223,19 +223,19 @@ class Design(NamedTuple):
 class Sweep(eqx.Module):
     """Standard deviations, correlations and check points of every design, with a leading axis over the designs.
 
-    Standard deviations are a priori (sigma naught 1), as for any design; in metres, radians, mm and the coefficients'
-    own units. Quantities that a design lacks (a fixed unknown, check points) are NaN, and so is everything of a design
-    that did not converge or has a rank defect.
+    Standard deviations are a priori (sigma naught 1), in metres, radians, mm and the coefficients' own units.
+    Quantities that a design lacks (a fixed unknown, check points) are NaN. All statistics of a design that did not
+    converge or has a rank defect are NaN.
     """
 
     parameters: tuple[Mapping[str, Any], ...] = eqx.field(static=True)
     labels: tuple[str, ...] = eqx.field(static=True)
     """Parameter path of each shared unknown of any design, such as `interior[kodak].c_mm`."""
     eop_names: tuple[str, ...] = eqx.field(static=True)
-    """X, Y, Z and three rotations."""
+    """Names of the exterior orientation elements: X, Y, Z and three rotations."""
     converged: Bool[np.ndarray, "designs"]
     determined: Bool[np.ndarray, "designs"]
-    """True without rank defect."""
+    """True for designs without a rank defect."""
     steps: Int[np.ndarray, "designs"]
     redundancy: Int[np.ndarray, "designs"]
     sigma0: Float[np.ndarray, "designs"]
@@ -243,18 +243,20 @@ class Sweep(eqx.Module):
     sigma: Float[np.ndarray, "designs shared"]
     correlation: Float[np.ndarray, "designs shared shared"]
     exterior_sigma: Float[np.ndarray, "designs 6"]
-    """Root mean square over the images."""
+    """Standard deviations of the exterior orientation elements, root mean square over the images."""
     mean_abs: Float[np.ndarray, "designs 6 shared"]
-    """|rho| of exterior orientation and shared unknown: mean over the images of its camera, mount or strip."""
+    """Mean |rho| of each exterior orientation element with each shared unknown, over the images of its camera, mount or
+    strip.
+    """
     max_abs: Float[np.ndarray, "designs 6 shared"]
     check_sigma: Float[np.ndarray, "designs 3"]
-    """Predicted standard deviation of X, Y, Z (m): root mean square over the check points."""
+    """Predicted standard deviation of X, Y, Z (m), root mean square over the check points."""
     check_rmse: Float[np.ndarray, "designs 3"]
-    """Root mean square of true minus computed X, Y, Z (m) of the check points, with the simulated observations."""
+    """Root mean square of true - computed X, Y, Z (m) of the check points, with the simulated observations."""
     programs: int = eqx.field(static=True)
     """Number of compiled programs."""
     seconds: dict[str, float] = eqx.field(static=True)
-    """Time of prepare (approximate values, padding), compile (or load) and designs (computation)."""
+    """Time (s) of prepare (approximate values, padding), compile (or load) and designs (computation)."""
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -265,11 +267,11 @@ def sweep(designs: Sequence[Design], rotations: Rotations = "omega_phi_kappa", *
 
     `rotations` selects the rotations of the correlations (see `jaxphoto.covariance`). One program serves all designs
     with the same unknowns shared by images (cameras, mounts, strips with shifts) and the same kinds of observations;
-    others are compiled as needed. A design that does not converge is no error: see `Sweep.converged`.
+    further programs are compiled as needed. A design that does not converge is not an error: see `Sweep.converged`.
 
-    Raises InputError without designs, for parameter names or camera unknowns that differ from design to design, and for
-    a truth of another block; and the errors of `jaxphoto.adjust`, naming the design, for one without datum, with an
-    undetermined free unknown, or without approximate values.
+    Raises InputError without designs, for parameter names or camera unknowns that differ between designs, and for a
+    truth of another block. Raises the errors of `jaxphoto.adjust`, with the name of the design, for a design without
+    datum, with an undetermined free unknown, or without approximate values.
     """
     _check(designs, rotations)
     seconds: dict[str, float] = {}
@@ -321,7 +323,7 @@ def _prepared(designs: Sequence[Design], seconds: dict[str, float]) -> list[Prep
 
 
 def _check_cameras(designs: Sequence[Design], prepared: Sequence[PreparedDesign]) -> None:
-    """Raise InputError unless all designs have the camera unknowns of the first."""
+    """Raise InputError unless all designs have the same camera unknowns as the first."""
     parameters = [[label for label in design.labels if label.startswith("interior[")] for design in prepared]
     for k, labels in enumerate(parameters):
         if labels != parameters[0]:
@@ -334,11 +336,11 @@ def _check_cameras(designs: Sequence[Design], prepared: Sequence[PreparedDesign]
 def _with_labels(
     statistics: DesignStatistics, designs: Sequence[PreparedDesign], labels: tuple[str, ...]
 ) -> DesignStatistics:
-    """Statistics with axes over all `labels`, NaN for those that a design lacks."""
+    """Expand the statistics to all `labels`; NaN for labels that a design lacks."""
     n, q = len(designs), len(labels)
     covariance, mean_abs, max_abs = (np.full((n, rows, q), np.nan) for rows in (q, 6, 6))
     for k, design in enumerate(designs):
-        # Designs of one program share shapes, not labels: their strips may have other names.
+        # Designs of one program have equal shapes but may have different labels, such as names of strips.
         index = np.array([labels.index(label) for label in design.labels], int)
         covariance[k][np.ix_(index, index)] = statistics.covariance[k]
         mean_abs[k][:, index], max_abs[k][:, index] = statistics.mean_abs[k], statistics.max_abs[k]

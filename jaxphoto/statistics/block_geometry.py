@@ -1,10 +1,11 @@
 """Geometry of an adjusted block: ground coverage, format coverage, links between images, intersection angles.
 
 Ground coverage: a ground cell, at the height of the nearest object points, is covered if it projects into the format of
-an image, a polygon of directions. Occlusions by trees and buildings between points are ignored.
+an image (a polygon of directions). Occlusions by trees and buildings between points are ignored.
 
-Links: images are nodes, and the number of their common points is the strength of an edge. In the maximum spanning tree
-the path between any two images maximises the weakest edge on it. Its weakest edges are where the block breaks first.
+Links: images are nodes, and the number of common points is the weight of an edge. In the maximum spanning tree the path
+between any two images has the largest possible minimum weight. Its edges of smallest weight are the weakest links of
+the block.
 """
 
 import itertools
@@ -22,39 +23,39 @@ from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.compiling import call_compiled
 from jaxphoto.stability import as_arrays
 
-# Vertices per side of the polygon of the format.
+# Number of vertices per side of the format polygon.
 _SIDE = 8
-# Cells along the longer side of the block.
+# Number of ground cells along the longer side of the block.
 _CELLS = 120
-# Number of nearest points whose median is the height of a cell.
+# Number of nearest object points whose median height is the height of a cell.
 _NEIGHBOURS = 5
-# Margin of the map around points and stations, as a fraction of the flying height.
+# Margin of the coverage map around points and stations, as a fraction of the flying height.
 _MARGIN = 0.5
 
 
 class Coverage(NamedTuple):
-    """Ground coverage of a block; metres."""
+    """Ground coverage of a block."""
 
     height_m: Float[np.ndarray, "images"]
-    """Height of each projection centre over its object points (median)."""
+    """Height of each projection centre above its object points (median, m)."""
     gsd_m: Float[np.ndarray, "images"]
-    """Ground sample distance along the optical axis."""
+    """Ground sample distance along the optical axis (m)."""
     x: Float[np.ndarray, "columns"]
-    """X of cell centres."""
+    """X of the cell centres (m)."""
     y: Float[np.ndarray, "rows"]
-    """Y of cell centres."""
+    """Y of the cell centres (m)."""
     seen_by: Int[np.ndarray, "rows columns"]
     """Number of images that cover each cell."""
     step_m: float
-    """Side of a cell."""
+    """Side of a cell (m)."""
 
     def area_m2(self, least: int) -> float:
-        """Area covered by at least `least` images."""
+        """Return the area covered by at least `least` images (m^2)."""
         return float((self.seen_by >= least).sum() * self.step_m**2)
 
 
 def coverage(adjusted: Adjustment) -> Coverage:
-    """Compute the ground coverage of an adjusted block whose Z is up."""
+    """Compute the ground coverage of an adjusted block. Z of the object frame must be up."""
     s, block = adjusted.structure, adjusted.block
     position = np.asarray(adjusted.unknowns.exterior.position)
     rotation = np.asarray(adjusted.unknowns.exterior.camera_from_object)
@@ -83,7 +84,10 @@ def coverage(adjusted: Adjustment) -> Coverage:
 
 
 def _cells(points: np.ndarray, position: np.ndarray, margin: float):
-    """X and Y of cell centres over points (without outliers) and stations, their positions and the side of a cell."""
+    """Return X and Y of the cell centres, the cells as object points and their side (m).
+
+    The grid covers the stations and the points without outliers.
+    """
     low, high = np.percentile(points, [1, 99], axis=0)
     low = np.minimum(low[:2], position[:, :2].min(axis=0)) - margin
     high = np.maximum(high[:2], position[:, :2].max(axis=0)) + margin
@@ -96,7 +100,7 @@ def _cells(points: np.ndarray, position: np.ndarray, margin: float):
 
 
 def _format(interior: InteriorOrientation, sensor: Sensor) -> Float[np.ndarray, "corners 2"]:
-    """Outline of the format as tangents of angles from the axis, to the right and up."""
+    """Return the outline of the format as tangents of the angles from the optical axis, to the right and up."""
     side = np.arange(_SIDE) / _SIDE * 2 - 1
     ones = np.ones(_SIDE)
     edge = np.concatenate([np.stack(v, axis=1) for v in ((side, -ones), (ones, side), (-side, ones), (-ones, -side))])
@@ -114,7 +118,7 @@ def _tangents(interior: InteriorOrientation, xy: Float[Array, "n 2"]) -> Float[A
 
 
 def _inside(at: Float[np.ndarray, "rows columns 2"], polygon: Float[np.ndarray, "corners 2"]) -> np.ndarray:
-    """Return True for points inside a polygon (even-odd rule)."""
+    """Return a mask, True for points inside a polygon (even-odd rule)."""
     x, y = at[..., 0], at[..., 1]
     odd = np.zeros(x.shape, bool)
     for (x1, y1), (x2, y2) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
@@ -127,13 +131,13 @@ class FormatCoverage(NamedTuple):
     """Fraction of the format covered by the convex hull of image points."""
 
     whole: float
-    """Points of all images."""
+    """Fraction covered by the points of all images together."""
     images: Float[np.ndarray, "images"]
-    """Points of each image that has any."""
+    """Fraction covered by the points of each image; images without points are omitted."""
 
 
 def format_coverage(adjusted: Adjustment, camera: str) -> FormatCoverage:
-    """Compute the format coverage of one camera; collinear or fewer than three points cover nothing."""
+    """Compute the format coverage of one camera: zero for collinear points and for fewer than three points."""
     s, sensor = adjusted.structure, adjusted.block.sensors[camera]
     rows = np.array([c == camera for c in adjusted.block.image_camera])[s.image]
     xy, image = np.asarray(adjusted.values.xy).T[rows], s.image[rows]
@@ -145,37 +149,37 @@ def format_coverage(adjusted: Adjustment, camera: str) -> FormatCoverage:
 
 def _hull_area(xy: Float[np.ndarray, "n 2"]) -> float:
     try:
-        # In two dimensions the volume of qhull is an area.
+        # Qhull's `volume` of a two-dimensional hull is its area.
         return float(scipy.spatial.ConvexHull(xy).volume) if len(xy) > 2 else 0.0
     except scipy.spatial.QhullError:
         return 0.0
 
 
 class ImageLinks(NamedTuple):
-    """Pairs of images with common points."""
+    """Pairs of images with common object points."""
 
     first: Int[np.ndarray, "pairs"]
     second: Int[np.ndarray, "pairs"]
-    """Indices of images; first < second."""
+    """Image indices of each pair, first < second."""
     common: Int[np.ndarray, "pairs"]
-    """Number of common object points."""
+    """Number of common object points of each pair."""
 
 
 class WeakLink(NamedTuple):
-    """An edge of the maximum spanning tree; without it two parts of the block are linked more weakly."""
+    """Edge of the maximum spanning tree. Without it the two parts of the block have only weaker links."""
 
     first: int
     second: int
     common: int
-    """Number of points common to these two images."""
+    """Number of object points common to the two images."""
     across: int
-    """Number of points measured on both sides of the edge."""
+    """Number of object points measured on both sides of the edge."""
     side: Int[np.ndarray, "images"]
-    """Images of the smaller side."""
+    """Indices of the images on the smaller side of the edge."""
 
 
 def image_links(adjusted: Adjustment) -> ImageLinks:
-    """All pairs of images with at least one common point."""
+    """List all pairs of images with at least one common object point."""
     measured = _measured(adjusted)
     common = scipy.sparse.triu(measured @ measured.T, k=1, format="coo")
     first, second = common.coords
@@ -185,7 +189,7 @@ def image_links(adjusted: Adjustment) -> ImageLinks:
 def weak_links(adjusted: Adjustment, links: ImageLinks, most: int) -> list[WeakLink]:
     """Return the `most` weakest edges of the maximum spanning tree, weakest first."""
     n, measured = len(adjusted.block.images), _measured(adjusted)
-    # The maximum spanning tree of strengths is the minimum spanning tree of their inverses.
+    # The maximum spanning tree of the common-point counts is the minimum spanning tree of their inverses.
     ends = links.first.astype(np.int32), links.second.astype(np.int32)
     length = scipy.sparse.coo_array((1.0 / links.common, ends), shape=(n, n))
     tree = scipy.sparse.csgraph.minimum_spanning_tree(length.tocsr()).tocoo()
@@ -204,17 +208,17 @@ def weak_links(adjusted: Adjustment, links: ImageLinks, most: int) -> list[WeakL
 
 
 def _measured(adjusted: Adjustment) -> "scipy.sparse.csr_array":
-    """Incidence matrix, images by points: one where an image measured a point."""
+    """Return the incidence matrix (images, points): one where the image measured the point."""
     s = adjusted.structure
     shape = len(adjusted.block.images), len(adjusted.block.points)
     incidence = scipy.sparse.csr_array((np.ones(len(s.image), int), (s.image, s.point)), shape=shape)
-    # Repeated measurements in one image count once.
+    # Count repeated measurements of a point in one image once.
     incidence.data[:] = 1
     return incidence
 
 
 def intersection_angles(adjusted: Adjustment) -> Float[np.ndarray, "points"]:
-    """Largest angle (rad) between two rays of each point; NaN with fewer than two images.
+    """Compute the largest intersection angle (rad) between two rays of each point; NaN with fewer than two images.
 
     cos = d_i' d_j of the unit vectors d from the point to the projection centres of its images.
     """
@@ -225,7 +229,7 @@ def intersection_angles(adjusted: Adjustment) -> Float[np.ndarray, "points"]:
     rays = np.bincount(s.point, minlength=len(adjusted.block.points))
     first = np.cumsum(rays) - rays
     angle = np.full(len(rays), np.nan)
-    # Batches of points with the same number of rays.
+    # Process points with the same number of rays in one batch.
     for n in np.unique(rays[rays > 1]):
         points = np.flatnonzero(rays == n)
         d = ray[first[points, None] + np.arange(n)]

@@ -1,16 +1,16 @@
-"""Blunder test: normalised residuals against the critical value of their maximum, for one and for several outliers.
+"""Blunder test: compare normalised residuals with the critical value of their maximum, for one or several outliers.
 
-An error e in observation i alone is estimated by (P v)_i / (P Q_vv P)_ii with the standard deviation
+An error in observation i alone is estimated by (P v)_i / (P Q_vv P)_ii with the standard deviation
 sigma0 / sqrt((P Q_vv P)_ii), and w_i is their ratio. If sigma naught is estimated from the same residuals, w follows
 the tau distribution; the largest of n is compared with its quantile of level alpha / n (Bonferroni).
 
-Several outliers: a blunder inflates the residuals around it. The suspects are therefore selected one after another,
-largest first, each as an unknown error of its row. For another suspect i beside the selected ones, S, and with
-C = P Q_vv P of whitened observations and u = v,
+Several outliers: a blunder inflates the residuals around it. The suspects are therefore selected iteratively, largest
+first, each as an unknown error of its row. With S the selected suspects, i any other suspect, C = P Q_vv P of whitened
+observations and u = v,
 
     u_i|S = u_i - C_iS C_SS^-1 u_S,     c_i|S = C_ii - C_iS C_SS^-1 C_Si,     w_i|S = u_i|S / (s_S sqrt(c_i|S))
 
-where s_S^2 = (v'v - u_S' C_SS^-1 u_S) / (r - f_S) is the variance factor without them.
+where s_S^2 = (v'v - u_S' C_SS^-1 u_S) / (r - f_S) is the variance factor without the selected suspects.
 
 Sources: Baarda (1968), A testing procedure for use in geodetic networks; Pope (1976), The statistics of residuals and
 the detection of outliers, NOAA Technical Report NOS 65 NGS 1; Kok (1984), On data snooping and multiple outlier
@@ -39,18 +39,18 @@ from jaxphoto.statistics.systematic_effects import (
 )
 
 LEVEL = 1e-3
-"""Error probability of a test of the whole adjustment: of sigma naught, and of all normalised residuals jointly."""
+"""Significance level of a test of the whole adjustment: of the global test, and of all normalised residuals jointly."""
 LEAST_SIGMA0 = 1e-3
-"""Sigma naught below which residuals are the rounding of exact values; no blunder test is made."""
+"""Sigma naught below which residuals are only rounding errors; no blunder test is made."""
 
 
 @pretty_repr
 class Suspect(eqx.Module):
-    """An observation whose normalised residual exceeds the critical value, and its error if it is the only outlier."""
+    """Observation whose normalised residual exceeds the critical value. `error`: its estimate as the only outlier."""
 
     group: str
     row: int
-    """Index in its group of the block."""
+    """Index in the observation group."""
     number: int
     """Component of the row with the largest normalised residual."""
     words: str
@@ -58,13 +58,16 @@ class Suspect(eqx.Module):
     w: float
     error: float
     sigma: float
-    """A posteriori standard deviation of `error`; both in `unit`."""
+    """A posteriori standard deviation of `error`; both are in `unit`."""
     unit: str
 
 
 @pretty_repr
 class BlunderTest(eqx.Module):
-    """`suspects`: rows with a component beyond `limit`, largest first; `n` normalised residuals were tested."""
+    """Blunder test of `n` normalised residuals.
+
+    `suspects`: rows with a component beyond `limit`, largest normalised residual first.
+    """
 
     suspects: tuple[Suspect, ...]
     limit: float
@@ -89,7 +92,7 @@ def blunder_test(adjusted: Adjustment, redundancy: Redundancy, level: float = LE
         rejected = np.flatnonzero(absolute_w.max(axis=0, initial=0.0) > limit)
         if not len(rejected):
             continue
-        # One suspect per row: both coordinates of an image point belong to the same blunder.
+        # One suspect per row: both coordinates of an image point have the same blunder.
         worst = absolute_w[:, rejected].argmax(axis=0)
         labels = rows.words_of(worst, rejected, block.images, block.points)
         values = (np.atleast_2d(v)[worst, rejected] for v in (w[name], precision[name]))
@@ -100,10 +103,10 @@ def blunder_test(adjusted: Adjustment, redundancy: Redundancy, level: float = LE
 
 
 def critical_w(n: int, redundancy: int, level: float = LEVEL) -> float:
-    """Critical value of the largest of `n` normalised residuals at error probability `level` (Pope's tau).
+    """Return the critical value of the largest of `n` normalised residuals at significance `level` (Pope's tau).
 
-    With nu the redundancy and t the quantile of Student's distribution of nu - 1 degrees of freedom,
-    tau = t sqrt(nu) / sqrt(nu - 1 + t^2); infinite below a redundancy of 2, where all |w| are 1.
+    With nu the redundancy and t the quantile of Student's distribution with nu - 1 degrees of freedom, tau = t sqrt(nu)
+    / sqrt(nu - 1 + t^2). It is infinite for a redundancy below 2, where all |w| are 1.
     """
     if redundancy < 2 or n == 0:
         return float("inf")
@@ -111,17 +114,17 @@ def critical_w(n: int, redundancy: int, level: float = LEVEL) -> float:
     return t * redundancy**0.5 / (redundancy - 1 + t * t) ** 0.5
 
 
-# Maximum number of suspects in the multiple outlier test; of larger sets, iterative data snooping decides.
+# Maximum number of suspects in the multiple outlier test; iterative data snooping tests larger sets.
 _MAX_SUSPECTS = 24
 
 
 def multiple_outlier_test(
     adjusted: Adjustment, test: BlunderTest, effects: Sequence[tuple[SystematicEffect, EffectTerm]] = ()
 ) -> tuple[Suspect, ...]:
-    """Return the suspects that stay beyond the critical value when larger ones are modelled as unknown errors.
+    """Return the suspects that exceed the critical value when all larger ones are modelled as unknown errors.
 
-    Largest first. Terms of systematic `effects` are unknowns from the start, so what they explain is no blunder.
-    Suspects beyond the first 24 are returned untested.
+    The largest is first. Terms of systematic `effects` are additional unknowns from the start, so deviations that they
+    explain are not blunders. Suspects beyond the first 24 are returned untested.
     """
     tested, others = test.suspects[:_MAX_SUSPECTS], test.suspects[_MAX_SUSPECTS:]
     if len(tested) + len(effects) < 2 or not tested:
@@ -171,7 +174,7 @@ def multiple_outlier_test(
 def _columns(
     hat_matrix: HatMatrix, effects: Sequence[tuple[SystematicEffect, EffectTerm]]
 ) -> Float[np.ndarray, "terms count"]:
-    """Terms of systematic effects as whitened errors of all observations; `effects` may come without their columns."""
+    """Return each term as whitened errors of all observations. The columns of `effects` are recomputed."""
     columns, labels = np.zeros((len(effects), hat_matrix.count)), [(e.what, e.camera) for e, _ in effects]
     for effect in candidate_effects(hat_matrix.adjusted, hat_matrix.places) if effects else ():
         for row, (label, (_, term)) in enumerate(zip(labels, effects, strict=True)):

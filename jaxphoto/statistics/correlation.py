@@ -1,17 +1,17 @@
-"""Correlations: of interior and exterior orientation, and of the camera with the ground as a whole.
+"""Correlations of interior with exterior orientation, and of the camera with deformations of the ground.
 
 Source of the image-wise correlations: paper 000, Table 4 (mean absolute correlation over the images, per angle or
 coordinate and IOP).
 
-Over flat ground imaged from one height, a longer c is equivalent to a greater flying height, and radial distortion to
-a dome of the ground: neither leaves residuals. Correlations with the exterior orientation of single images do not show
-this, because all images and points move together. Each of the forms below is a linear function f = g' x of the
-coordinates of points and stations, so
+Over flat ground imaged from one height, a longer c is equivalent to a greater flying height, and radial distortion to a
+dome of the ground: neither changes the residuals. Correlations with the exterior orientation of single images do not
+show this, because all images and points move jointly. Each form below is a linear function f = g' x of the coordinates
+of points and stations, so
 
     cov(f, u) = sigma0^2 g' N^-1 e_u,   var(f) = sigma0^2 g' N^-1 g.
 
     height          mean Z of the points
-    flying_height   mean Z of the projection centres minus that of the points
+    flying_height   mean Z of the projection centres minus mean Z of the points
     dome            height of the centre of the ground over its edge: of Z = a + b X + c Y + d (X^2 + Y^2),
                     fitted to the points, -d R^2 with the distance R from the centre to the farthest point
 
@@ -49,7 +49,7 @@ class Correlations(eqx.Module):
     interior: Float[Any, "iop iop"]
     exterior: Float[Any, "images 6 iop"]
     within_image: Float[Any, "images 6 6"]
-    """Correlations within each image's exterior orientation."""
+    """Correlations among the exterior orientation elements of each image."""
 
     @property
     def mean_abs(self) -> Float[Any, "6 iop"]:
@@ -63,7 +63,7 @@ class Correlations(eqx.Module):
 
 
 def correlation_matrix(covariance: Covariance) -> Float[Any, "reduced reduced"]:
-    """Correlation matrix of `covariance.labels`; zero for fixed unknowns."""
+    """Compute the correlation matrix of `covariance.labels`; zero for fixed unknowns."""
     matrix = to_numpy(covariance.matrix)
     xp, variance = namespace(matrix), matrix.diagonal()
     inverse = xp.where(variance > 0, 1 / xp.sqrt(xp.where(variance > 0, variance, 1.0)), 0.0)
@@ -71,7 +71,7 @@ def correlation_matrix(covariance: Covariance) -> Float[Any, "reduced reduced"]:
 
 
 def correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, Correlations]:
-    """Correlations by camera: IOP x IOP, and EOP x IOP of each of its images."""
+    """Compute the correlations of each camera: IOP with IOP, and EOP of each image with IOP."""
     rho, n = correlation_matrix(covariance), 6 * covariance.n_images
     names = EOP_NAMES[covariance.rotations]
     result = {}
@@ -94,7 +94,7 @@ def correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, Corr
 
 
 def high_pairs(names: Sequence[str], rho: Float[np.ndarray, "n n"], above: float) -> list[tuple[str, str, float]]:
-    """Pairs of parameters with |correlation| larger than `above`, and the correlation; the largest first."""
+    """List the pairs of parameters with |rho| > `above` and their correlation, largest first."""
     lower = [(i, j) for i in range(len(names)) for j in range(i)]
     pairs = [(names[i], names[j], float(rho[i, j])) for i, j in lower if abs(rho[i, j]) > above]
     return sorted(pairs, key=lambda pair: -abs(pair[2]))
@@ -102,7 +102,7 @@ def high_pairs(names: Sequence[str], rho: Float[np.ndarray, "n n"], above: float
 
 @pretty_repr
 class LinearForms(NamedTuple):
-    """Covariances of linear functions of unknowns, with one another and with the shared unknowns."""
+    """Covariances of linear functions of the unknowns: among themselves and with the shared unknowns."""
 
     variance: Float[Any, "forms forms"]
     with_shared: Float[Any, "forms shared"]
@@ -116,11 +116,12 @@ def linear_forms(
     exterior: Float[ArrayLike, "forms images 6"] | None = None,
     shared: Float[ArrayLike, "forms shared"] | None = None,
 ) -> LinearForms:
-    """Return the a posteriori covariances of `n_forms` functions f = g' x of the unknowns; omitted weights are zero.
+    """Compute the a posteriori covariances of `n_forms` functions f = g' x of the unknowns.
 
-    cov(f, h) = sigma0^2 g' N^-1 h with the normal matrix N. Unknowns are the coordinates of points (m), of each image
-    its position (m) and small rotations about the axes of its camera (rad), and the shared unknowns in the order of
-    `Structure.labels`, in their own units.
+        cov(f, h) = sigma0^2 g' N^-1 h    with the normal matrix N
+
+    Omitted weights are zero. Unknowns are the coordinates of the points (m), the position (m) and small rotations about
+    the camera axes (rad) of each image, and the shared unknowns in the order and units of `Structure.labels`.
     """
     equations, places = adjusted.equations.on_one_device.weighed, adjusted.padded.places
     scale = jax.tree.map(to_numpy, equations.scale)
@@ -144,31 +145,31 @@ def linear_forms(
 
 
 FORMS = ("height", "flying_height", "dome")
-# Minimum number of rays of the points used, if there are enough of these: points of two rays would dominate the
-# variance of a mean.
+# Minimum number of rays per point (two-ray points would dominate the variance of a mean), and minimum number of points
+# with that many rays for the limit to apply.
 _MIN_RAYS, _MIN_POINTS = 3, 10
 # Minimum mean cosine of the tilt of near-vertical photographs.
 _MIN_COSINE = 0.7
-# Fraction of the largest point variance below which the variance of a form is rounding: the datum fixes it.
+# Ratio to the largest point variance below which the variance of a form is rounding: the datum fixes the form.
 _ROUNDING = 1e-9
 
 
 @pretty_repr
 class GroundCorrelations(eqx.Module):
-    """Correlations of the `FORMS` of the ground with the interior orientation of a camera."""
+    """Correlations of the ground deformations `FORMS` with the interior orientation of a camera."""
 
     camera: str = eqx.field(static=True)
     parameters: tuple[str, ...] = eqx.field(static=True)
     """The camera's estimated interior parameters (c_mm ...)."""
     sigma_m: Float[np.ndarray, "forms"]
-    """Standard deviation of each of `FORMS`; zero where the datum fixes it."""
+    """Standard deviation (m) of each of `FORMS`; zero if the datum fixes it."""
     rho: Float[np.ndarray, "forms iop"]
     together: Float[np.ndarray, "forms"]
-    """Multiple correlation with all interior parameters of the camera."""
+    """Multiple correlation of each form with all interior parameters of the camera."""
 
 
 def ground_correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, GroundCorrelations]:
-    """Correlations by camera; empty for oblique blocks and for fewer than five points."""
+    """Compute the ground correlations of each camera; empty for oblique blocks and for fewer than five points."""
     rays = np.bincount(adjusted.structure.point, minlength=len(adjusted.block.points))
     chosen = rays >= _MIN_RAYS if (rays >= _MIN_RAYS).sum() >= _MIN_POINTS else rays > 0
     cosine = np.mean(np.asarray(adjusted.unknowns.exterior.camera_from_object)[:, 2, 2])
@@ -205,7 +206,7 @@ def ground_correlations(adjusted: Adjustment, covariance: Covariance) -> dict[st
 def _weights(
     xyz: Float[np.ndarray, "points 3"], chosen: np.ndarray, n_images: int
 ) -> tuple[Float[np.ndarray, "3 points 3"], Float[np.ndarray, "3 images 3"]]:
-    """Weights of the coordinates of points and of projection centres in each of `FORMS`."""
+    """Return the weights of the point coordinates and of the projection centres in each of `FORMS`."""
     points, positions = np.zeros((3, *xyz.shape)), np.zeros((3, n_images, 3))
     points[0, chosen, 2] = 1 / chosen.sum()
     points[1], positions[1, :, 2] = -points[0], 1 / n_images

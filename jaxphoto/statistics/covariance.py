@@ -1,9 +1,9 @@
 """Covariances of all unknowns, in their own units, from the cofactors of the normal equations.
 
-Covariance of two adjustments that share observations: two halves of a block have no image in common, but both use
-control, distances and prior information. To first order an estimate has the error -w'e, with e the errors of the
-observations over their standard deviations and w = J N^-1 e_p its weights. Two estimates therefore have the covariance
-w1'w2, summed over the rows in both.
+Covariance of two adjustments with common observations: two halves of a block have no common images, but both use
+control, distances and prior information. To first order an estimate has the error -w'e, with e the observation errors
+over their standard deviations and w = J N^-1 e_p the weights of the estimate. The covariance of two estimates is
+therefore w1'w2, summed over the common rows.
 """
 
 from collections.abc import Sequence
@@ -35,26 +35,26 @@ EOP_NAMES: dict[str, tuple[str, ...]] = {
 class Covariance(eqx.Module):
     """A priori covariances (sigma naught 1), in metres, radians, mm and the coefficients' own units.
 
-    `matrix` is of the exterior orientations (6 an image, in the block's order: X, Y, Z, then three rotations of the
-    kind `rotations`) followed by the shared unknowns. Fixed unknowns have zero rows. Multiply by `variance_factor`
-    for a posteriori values.
+    `matrix` is the covariance of the exterior orientations, followed by the shared unknowns. Each image, in the
+    block's order, has six rows: X, Y, Z and three rotations of the kind `rotations`. Fixed unknowns have zero rows.
+    Multiply by `variance_factor` for a posteriori values.
     """
 
     matrix: Float[ArrayLike, "reduced reduced"]
     points: Float[ArrayLike, "points 3 3"]
     variance_factor: Float[ArrayLike, ""] | float
     cofactors: Cofactors
-    """In padded sizes; see `Adjustment.padded`."""
+    """Cofactors in padded sizes; see `Adjustment.padded`."""
     rows: RowCofactors | None
-    """j Q j' of the observations, in padded sizes, if requested."""
+    """J Q J' of the observations in padded sizes, if requested."""
     labels: tuple[str, ...] = eqx.field(static=True)
     n_images: int = eqx.field(static=True)
     rotations: Rotations = eqx.field(static=True)
     converged: Bool[ArrayLike, ""]
-    """False: the covariance is evaluated where the adjustment stopped and is no measure of accuracy."""
+    """False: the adjustment stopped before convergence, and the covariance is not a measure of accuracy."""
 
     def __repr__(self) -> str:
-        # Inside a transformation of JAX the fields are tracers.
+        # Inside a JAX transformation the fields are tracers.
         if np.ndim(self.converged) or not isinstance(self.converged, bool | np.generic | np.ndarray):
             return "Covariance inside a transformation of JAX: its numbers are arrays"
         of = f"{counted(self.n_images, 'image')}, {counted(len(self.points), 'point')}"
@@ -102,18 +102,18 @@ class Covariance(eqx.Module):
 
     def _sigma(self, variance: ArrayLike) -> Any:
         xp = jnp if isinstance(variance * self.variance_factor, jax.Array) else np
-        # The variance of a fixed unknown is zero or, by rounding, slightly negative. NaN stays NaN.
-        # `where` twice: the square root has no derivative at zero.
+        # Clip the variance of fixed unknowns, which is zero or slightly negative by rounding. NaN stays NaN.
+        # Apply `where` twice: the square root has no derivative at zero.
         fixed = variance <= 0
         return xp.where(fixed, 0.0, xp.sqrt(xp.where(fixed, 1.0, variance) * self.variance_factor))
 
 
 def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa", *, rows: bool = False) -> Covariance:
-    """Covariance of exterior orientations, shared unknowns and points.
+    """Compute the covariance of exterior orientations, shared unknowns and points.
 
     `rotations` selects the rotations of the exterior rows: omega, phi, kappa; small rotations about the axes of the
-    object frame; or about those of the camera. `rows` stores the row cofactors, which saves `redundancy_numbers` from
-    computing them again.
+    object frame; or small rotations about the camera axes. `rows` stores the row cofactors for `redundancy_numbers`,
+    which otherwise recomputes them.
     """
     if rotations not in EOP_NAMES:
         raise ValueError(f"rotations must be one of {', '.join(EOP_NAMES)}, got {rotations!r}")
@@ -138,7 +138,7 @@ def prepare_covariance(equations: NormalEquations, seconds: dict[str, float]) ->
 
 
 def row_cofactors(adjusted: Adjustment, rotations: Rotations) -> RowCofactors:
-    """j Q j' of the rows that are computed with their points, by the compiled program of `covariance`."""
+    """Compute J Q J' of the rows that are eliminated with their points, by the compiled program of `covariance`."""
     return _run(adjusted, rotations, with_rows=True)[3]
 
 
@@ -151,13 +151,13 @@ def _run(adjusted: Adjustment, rotations: Rotations, with_rows: bool):
 def _covariance(
     equations: NormalEquations, rotations: Rotations, with_rows: bool
 ) -> tuple[Cofactors, Array, Array, RowCofactors | None]:
-    """Cofactors, covariances in the units of the unknowns and, if requested, j Q j' of the rows."""
+    """Compute cofactors, covariances in the units of the unknowns and, if requested, J Q J' of the rows."""
     q, rows = equations.cofactors(with_rows)
     return q, *physical_covariance(q, equations.scale, equations.values.rotation, rotations), rows
 
 
 def physical_covariance(q: Cofactors, scale: Increments, rotation: Float[Array, "3 3 images"], rotations: Rotations):
-    """Covariances of reduced unknowns and of points (3 x 3 each), in m, rad and the coefficients' own units."""
+    """Return the covariances of the reduced unknowns and of the points (3 x 3 each), in m, rad, mm and own units."""
     n = rotation.shape[2]
     factors = jnp.concatenate([scale.eop.T.reshape(-1), scale.shared])
     matrix = q.reduced * factors[:, None] * factors[None, :]
@@ -188,16 +188,16 @@ def rotation_jacobians(rotation: Float[Array, "3 3 images"], rotations: Rotation
 
 
 Weights = dict[tuple[str, str, int], Float[np.ndarray, "parameters"]]
-"""By group, label of the row, and a count for repeated labels."""
+"""Weights w of the parameters by group, row label and count of repeated labels."""
 
 
 def common_covariance(
     first: Adjustment, second: Adjustment, camera: str, parameters: Sequence[str]
 ) -> Float[np.ndarray, "parameters parameters"]:
-    """Return the a priori covariance of the interior orientations of `camera` in adjustments without common images.
+    """Compute the a priori covariance of the interior orientations of `camera` in adjustments without common images.
 
-    Rows are `parameters` of the first, columns those of the second, in their own units; zero for fixed parameters and
-    for adjustments that share no observation.
+    Rows are `parameters` of the first adjustment, columns `parameters` of the second, in their own units. Elements are
+    zero for fixed parameters and for adjustments without common observations.
     """
     first_weights, second_weights = (_weights(adjusted, camera, parameters) for adjusted in (first, second))
     covariance = np.zeros((len(parameters), len(parameters)))
@@ -207,7 +207,7 @@ def common_covariance(
 
 
 def _weights(adjusted: Adjustment, camera: str, parameters: Sequence[str]) -> Weights:
-    """w of the parameters, for every observation that involves no image."""
+    """Return the weights w of the parameters for every observation that involves no image."""
     labels = _labels(adjusted)
     if not labels:
         return {}
@@ -229,7 +229,7 @@ def _weights(adjusted: Adjustment, camera: str, parameters: Sequence[str]) -> We
 
 
 def _labels(adjusted: Adjustment) -> dict[str, list[str]]:
-    """Labels of the observations of every group that involves no image; the same in every part of a block."""
+    """Return the labels of all observations that involve no image; they are equal in all parts of a block."""
     block = adjusted.block
     observed, labels = observed_in(block, adjusted.priors), {}
     parameters = [entry.label for entry in observed.entries]
@@ -247,7 +247,7 @@ def _labels(adjusted: Adjustment) -> dict[str, list[str]]:
 
 @eqx.filter_jit
 def _influences(equations: NormalEquations, shared: Int[Array, "parameters"]) -> PaddedResiduals:
-    """J N^-1 e of some shared unknowns, in their own units, along a leading axis."""
+    """Compute J N^-1 e of some shared unknowns, in their own units, along a leading axis."""
     at = equations.at
     _, j_product = jax.linearize(lambda y: at._replace(increments=y).residuals(), at.increments)
     zero = jax.tree.map(jnp.zeros_like, at.increments)

@@ -6,10 +6,11 @@ Positional accuracy by check points follows ASPRS Edition 2 and includes the err
 
     RMSE_H = sqrt(RMSE_x^2 + RMSE_y^2 + s_H^2),  RMSE_V = sqrt(RMSE_z^2 + s_V^2),  RMSE_3D = sqrt(RMSE_H^2 + RMSE_V^2)
 
-RMSE_x, RMSE_y, RMSE_z are root mean squares of the discrepancies at check points, s_H and s_V those of the survey's
-standard deviations. An accuracy class is any number of centimetres. A claim requires at least thirty check points, and
-a mean error beyond a quarter of the RMSE requires an investigation. With few check points such a mean occurs by chance
-(with three points in three of four cases), so it must also exceed the limit of Student's t.
+RMSE_x, RMSE_y, RMSE_z are root mean squares of the discrepancies at check points, s_H and s_V root mean squares of the
+survey's standard deviations. An accuracy class is an RMSE limit in centimetres. A claim requires at least 30 check
+points, and a mean error above 25 % of the RMSE requires an investigation. With few check points such a mean occurs by
+chance (with three points in 75 % of cases), so it must also exceed the limit of Student's t.
+
 Source: ASPRS Positional Accuracy Standards for Digital Geospatial Data, Edition 2, Version 1.0 (August 2023).
 """
 
@@ -44,7 +45,7 @@ class Spread(eqx.Module):
 
 
 def observation_groups(adjusted: Adjustment) -> dict[str, AbstractObservations]:
-    """Rows of every group of `adjusted.residuals`, image points first, with the values used in the adjustment."""
+    """Return the observations of every group of `adjusted.residuals`, image points first, as used in the adjustment."""
     s, block = adjusted.structure, adjusted.block
     groups = zip(s.observed, adjusted.values.groups, strict=True)
     first_last = lambda v: np.moveaxis(np.asarray(v), -1, 0)  # noqa: E731
@@ -53,7 +54,7 @@ def observation_groups(adjusted: Adjustment) -> dict[str, AbstractObservations]:
 
 
 def physical_residuals(adjusted: Adjustment) -> dict[str, Float[np.ndarray, "..."]]:
-    """Observed minus computed by group, in mm (image), m and rad; shaped like `adjusted.residuals`."""
+    """Compute observed minus computed by group, in mm (image), m and rad; shaped like `adjusted.residuals`."""
     rows = observation_groups(adjusted)
     return {name: rows[name].physical(v) for name, v in adjusted.residuals.named.items()}
 
@@ -64,7 +65,7 @@ def a_priori_sigmas(adjusted: Adjustment) -> dict[str, Float[np.ndarray, "..."]]
 
 
 def residual_spread(adjusted: Adjustment) -> list[Spread]:
-    """Statistics of the residuals per group and axis (paper 000, Table 3); RMSE divides by n."""
+    """Compute the statistics of the residuals per group and axis (paper 000, Table 3). RMSE divides by n."""
     spreads = []
     groups = observation_groups(adjusted)
     for group, v in physical_residuals(adjusted).items():
@@ -77,7 +78,7 @@ def residual_spread(adjusted: Adjustment) -> list[Spread]:
 
 
 def check_discrepancies(adjusted: Adjustment) -> ControlCoordinates:
-    """Surveyed minus computed coordinates (m) of the check points, with the survey's sigmas (paper 000, Table 5)."""
+    """Compute surveyed minus computed coordinates (m) of check points, and the survey's sigmas (paper 000, Table 5)."""
     check = adjusted.block.check
     points = np.asarray(adjusted.unknowns.points)
     return ControlCoordinates(
@@ -86,13 +87,16 @@ def check_discrepancies(adjusted: Adjustment) -> ControlCoordinates:
 
 
 def point_differences(first: Adjustment, second: Adjustment) -> tuple[tuple[str, ...], Float[np.ndarray, "n 3"]]:
-    """First minus second: coordinates (m) of the common points (paper 000, Table 6)."""
+    """Compute the difference first - second of the coordinates (m) of common points (paper 000, Table 6)."""
     common, a, b = _common(first.block.points, second.block.points)
     return common, np.asarray(first.unknowns.points)[a] - np.asarray(second.unknowns.points)[b]
 
 
 def angle_differences(first: Adjustment, second: Adjustment) -> tuple[tuple[str, ...], Float[np.ndarray, "n 3"]]:
-    """First minus second: omega, phi, kappa (rad, in (-pi, pi]) of the common images (paper 000, Table 7)."""
+    """Compute the difference first - second of omega, phi, kappa of common images (paper 000, Table 7).
+
+    Angles are in rad, in (-pi, pi].
+    """
     common, a, b = _common(first.block.images, second.block.images)
     angles = jax.vmap(omega_phi_kappa_from_matrix)
     one, two = (np.asarray(angles(x.unknowns.exterior.camera_from_object)) for x in (first, second))
@@ -100,7 +104,7 @@ def angle_differences(first: Adjustment, second: Adjustment) -> tuple[tuple[str,
 
 
 def spread_of(group: str, axis: str, values: np.ndarray, unit: str) -> Spread:
-    """Return the number, mean, RMSE (over n) and maximum of values that are not empty."""
+    """Return number, mean, RMSE (over n) and maximum absolute value; `values` must not be empty."""
     rmse, max_abs = float(np.sqrt((values**2).mean())), float(np.abs(values).max())
     return Spread(group, axis, len(values), float(values.mean()), rmse, max_abs, unit)
 
@@ -112,47 +116,47 @@ def _common(first: tuple[str, ...], second: tuple[str, ...]) -> tuple[tuple[str,
 
 
 LEAST_CHECK_POINTS = 30
-"""Minimum number of check points for a claim of accuracy."""
+"""Minimum number of check points for an accuracy claim (ASPRS)."""
 SUSPECT_MEAN = 0.25
-"""Fraction of the RMSE of an axis beyond which a mean error requires an investigation."""
-# Error probability of Student's t-test of the mean.
+"""Ratio of a mean error to the RMSE of its axis above which it requires an investigation (ASPRS)."""
+# Significance level of Student's t-test of the mean.
 _LEVEL = 0.05
-# Significant digits of a class in centimetres; the tested value is rounded up.
+# Number of significant digits of an accuracy class in centimetres; the class is rounded up.
 _DIGITS = 2
 
 
 @pretty_repr
 class ComponentAccuracy(NamedTuple):
-    """Tested accuracy of one component; metres."""
+    """Tested accuracy of one component; lengths in metres."""
 
     name: str
-    """horizontal, vertical or three-dimensional."""
+    """Component: horizontal, vertical or three-dimensional."""
     symbol: str
     n: int
-    """Number of check points surveyed in all its axes."""
+    """Number of check points surveyed along all axes of the component."""
     fit_m: float
     """Root mean square of surveyed minus computed, summed over the axes."""
     survey_m: float
-    """Root mean square of the standard deviations of the survey, summed likewise; NaN if one of them is unknown."""
+    """Root mean square of the survey's standard deviations, summed over the axes; NaN if one of them is unknown."""
 
     @property
     def rmse_m(self) -> float:
-        """RMSE including the survey's standard deviations, if these are complete."""
+        """RMSE including the survey's standard deviations, if all of these are known."""
         return math.hypot(self.fit_m, 0.0 if math.isnan(self.survey_m) else self.survey_m)
 
     @property
     def class_cm(self) -> float:
-        """Accuracy class: `rmse_m` in centimetres, rounded up to two digits."""
+        """Accuracy class: `rmse_m` in centimetres, rounded up to two significant digits."""
         cm = 100 * self.rmse_m
         if cm == 0:
             return 0.0
         step = 10.0 ** (math.floor(math.log10(cm)) + 1 - _DIGITS)
-        # Rounding to nine digits first: the rounding error of the root must not raise the class.
+        # Round to nine digits first: the rounding error of the root must not raise the class.
         return float(f"{math.ceil(round(cm / step, 9)) * step:.10g}")
 
     @property
     def claimed(self) -> bool:
-        """True with enough check points and all sigmas of their survey."""
+        """True with at least `LEAST_CHECK_POINTS` check points and all sigmas of their survey."""
         return self.n >= LEAST_CHECK_POINTS and not math.isnan(self.survey_m)
 
 
@@ -167,7 +171,7 @@ class AxisErrors(NamedTuple):
 
     @property
     def biased(self) -> bool:
-        """True if the mean exceeds both the limit of the standard and that of Student's t."""
+        """True if the mean exceeds both the limit of the ASPRS standard and the limit of Student's t."""
         if self.n < 2 or abs(self.mean_m) <= SUSPECT_MEAN * self.rmse_m:
             return False
         scatter = math.sqrt(max(self.rmse_m**2 - self.mean_m**2, 0.0) / (self.n - 1))
@@ -179,14 +183,14 @@ class PositionalAccuracy(NamedTuple):
     """Accuracy of an adjusted block at its check points."""
 
     tested: tuple[ComponentAccuracy, ...]
-    """Horizontal, vertical and three-dimensional, if check points have the axes."""
+    """Horizontal, vertical and three-dimensional accuracy, if check points have these axes."""
     axes: tuple[AxisErrors, ...]
 
 
 def positional_accuracy(discrepancies: ControlCoordinates) -> PositionalAccuracy:
-    """Positional accuracy from `discrepancies`, surveyed minus computed with the survey's sigmas.
+    """Compute positional accuracy from `discrepancies`: surveyed minus computed, with the survey's sigmas.
 
-    See `check_discrepancies`. A sigma of zero is unknown.
+    See `check_discrepancies`. A sigma of zero means unknown.
     """
     points, row = np.unique(discrepancies.who, return_inverse=True)
     error, sigma = np.full((2, len(points), 3), np.nan)

@@ -1,8 +1,8 @@
-"""Global test of the variance factor: of the whole adjustment, and of each group of observations.
+"""Global test of the variance factor, for the whole adjustment and for each group of observations.
 
-With true weights v'Pv follows chi-square of the redundancy nu, and v'Pv of a group has the mean nu_g, the sum of its
-redundancy numbers (Förstner 1979). Its variance is at most that of chi-square of nu_g, so the group test is
-conservative.
+With correct weights v'Pv follows chi-square with nu degrees of freedom (the redundancy), and v'Pv of a group has the
+mean nu_g, the sum of its redundancy numbers (Förstner 1979). Its variance is at most the variance of chi-square with
+nu_g degrees of freedom, so the group test is conservative.
 """
 
 import equinox as eqx
@@ -22,7 +22,7 @@ from jaxphoto.statistics.reliability import Redundancy
 
 @pretty_repr
 class VarianceFactor(eqx.Module):
-    """v'Pv over the redundancy of a group of observations, with its two-sided p-value."""
+    """Variance factor v'Pv / redundancy of a group of observations, with its two-sided p-value."""
 
     group: str
     n: int
@@ -30,17 +30,20 @@ class VarianceFactor(eqx.Module):
     factor: float
     p_value: float
     expected: float = 1.0
-    """Expected factor if the a priori standard deviations are true."""
+    """Expected factor if the a priori standard deviations are correct."""
 
     @property
     def sigma(self) -> float:
-        """Factor of the a priori standard deviations of the group that fits the residuals."""
+        """Factor by which the a priori standard deviations of the group must be multiplied to fit the residuals."""
         return (self.factor / self.expected) ** 0.5
 
 
 def global_test(adjusted: Adjustment, redundancy: Redundancy | None = None) -> VarianceFactor:
-    """Test sigma naught of all observations against 1; with redundancy numbers, against its expectation for residuals
-    of distorted coordinates (`expected_residual_scale`)."""
+    """Test the variance factor of all observations against 1.
+
+    With redundancy numbers, test it against its expectation for residuals of corrected coordinates
+    (`expected_residual_scale`).
+    """
     n, sum_of_squares = sum(adjusted.n_observations.values()), float(adjusted.sum_of_squares)
     expected = 1.0
     if redundancy is not None and adjusted.redundancy > 0:
@@ -61,21 +64,21 @@ def group_factors(adjusted: Adjustment, redundancy: Redundancy) -> list[Variance
 
 
 def expected_residual_scale(adjusted: Adjustment) -> dict[str, float]:
-    """Return the expected root mean square of the image residuals over their standard deviations, by camera.
+    """Return the expected RMS of the image residuals over their standard deviations, by camera.
 
-    1 for residuals of measured coordinates. For residuals of corrected coordinates (docs/adjustment.md, residuals of
-    wide-angle cameras), the distortion scales the noise with the image.
+    It is 1 for residuals of measured coordinates. For residuals of corrected coordinates (docs/adjustment.md, residuals
+    of wide-angle cameras), the distortion scales the noise with the image.
     """
     cameras, expected = np.array(adjusted.block.image_camera)[adjusted.structure.image], _expected(adjusted)
     return {name: float(expected[cameras == name].mean()) ** 0.5 for name in dict.fromkeys(cameras.tolist())}
 
 
-# Points along a side of the grid on which the scale of a distortion is computed; constant, for one compilation.
+# Number of points along each side of the grid of distortion scales; constant, so one program is compiled.
 _GRID = 33
 
 
 def _expected(adjusted: Adjustment) -> Float[np.ndarray, "rows"]:
-    """Return the expected v'v / 2 of each image row's whitened residuals before adjustment, with the a priori noise."""
+    """Return the expected v'v / 2 of the whitened residuals of each image row before adjustment."""
     rows = adjusted.structure.image
     cameras, expected = np.array(adjusted.block.image_camera)[rows], np.ones(len(rows))
     for name, interior in adjusted.unknowns.interior.items():

@@ -1,8 +1,8 @@
-"""Products with the hat matrix H = J N^-1 J' and with N^-1 J', for a few directions at a time.
+"""Products with the hat matrix H = J N^-1 J' and with N^-1 J', in batches of directions.
 
 With J the derivatives of whitened residuals (observed minus computed), an error z of the observations moves the
-unknowns by -N^-1 J' z and the adjusted observations by H z = J N^-1 J' z; unknown k moves by -(J N^-1 e_k)_i with
-observation i. Products z' H z of many errors need no J x: they are those of J' z with N^-1 J' z.
+unknowns by -N^-1 J' z and the adjusted observations by H z = J N^-1 J' z. A unit error of observation i moves unknown k
+by -(J N^-1 e_k)_i. Products z' H z of many errors do not need J x: they are inner products of J' z and N^-1 J' z.
 """
 
 import math
@@ -23,25 +23,24 @@ from jaxphoto.adjustment.right_hand_sides import at_once, blank, in_batches, joi
 from jaxphoto.arrays import ArrayLike, to_numpy
 from jaxphoto.compiling import prepare, run_compiled
 
-# Maximum number of directions per batch, and of array elements in a batch: several arrays of this size coexist.
+# Maximum number of directions per batch; maximum number of elements of an array, of which several coexist.
 _MAX_BATCH, _MAX_ELEMENTS = 16, 20_000_000
 Column = Callable[[int], Float[np.ndarray, "n"]]
 
 
 class HatMatrix(eqx.Module):
-    """Effects of errors of the observations, computed in batches."""
+    """Products of the hat matrix with errors of the observations, computed in batches."""
 
     adjusted: Adjustment
     equations: NormalEquations
-    """On one device, with weights applied."""
+    """Normal equations on one device, with weights applied."""
     laid: Int32[np.ndarray, "places"]
     """Observation index of every element of the padded arrays; `count` for padding."""
     count: int
     places: dict[str, Int[np.ndarray, "..."]]
     """Index of each observation by group name, shaped like the residuals."""
     image_rows: bool = eqx.field(static=True, default=True)
-    """False if no error is in image points: H z is then not computed for image rows, which saves most of the time;
-    they are zero."""
+    """False if no error is in image points. H z is then zero for image rows: skipping them saves most of the time."""
 
     @classmethod
     def of(cls, adjusted: Adjustment, *, image_rows: bool = True) -> "HatMatrix":
@@ -60,7 +59,7 @@ class HatMatrix(eqx.Module):
 
     @property
     def residuals(self) -> Float[np.ndarray, "count"]:
-        """Whitened residuals in the order of `places`; zero for datum constraints."""
+        """Whitened residuals in the order of the observation indices; zero for datum constraints."""
         residuals = np.zeros(self.count)
         for name, place in self.places.items():
             residuals[place] = np.asarray(self.adjusted.residuals[name])
@@ -69,7 +68,7 @@ class HatMatrix(eqx.Module):
     def apply(self, column: Column, count: int) -> Iterator[tuple[Float[np.ndarray, "shared"], np.ndarray]]:
         """Yield the changes of the shared unknowns (own units) and H z for each error z = `column(k)`.
 
-        Errors are whitened and in the order of `places`.
+        Errors are whitened, in the order of the observation indices.
         """
         size = at_once(self.equations.scale)
         for first in range(0, count, size):
@@ -77,18 +76,20 @@ class HatMatrix(eqx.Module):
             yield from zip(self._shared_changes(x), self._j_products(x), strict=True)
 
     def influence_on(self, shared: Sequence[int]) -> Iterator[Float[np.ndarray, "n"]]:
-        """Yield the change of each `shared` unknown (index in `Structure.labels`, own unit) per standard deviation of
-        error in each observation."""
+        """Yield the sensitivity of each `shared` unknown (index in `Structure.labels`) to every observation.
+
+        It is the change of the unknown (own unit) for an error of one standard deviation.
+        """
         b = jax.tree.map(lambda v: np.zeros((len(shared), *v.shape)), self.equations.scale)
         b.shared[np.arange(len(shared)), np.array(shared, int)] = 1.0
         for k, influence in zip(shared, self._j_products(self.solve(b)), strict=True):
             yield -influence * self._scale[k]
 
     def products(self, column: Column, count: int) -> tuple[Float[np.ndarray, "count count"], Float[np.ndarray, "m s"]]:
-        """Return z' H z of all pairs of errors z = `column(k)`, and the changes of the shared unknowns as `apply`."""
+        """Return z' H z of all pairs of errors z = `column(k)`, and the changes of the shared unknowns."""
         jt_z = self._jt_products(column, range(count))
         products, changes = np.zeros((count, count)), np.zeros((count, len(self._scale)))
-        # In a large block one set of all directions takes hundreds of MB, so solutions are discarded batch by batch.
+        # The solutions of all directions take hundreds of MB in a large block: discard them batch by batch.
         for first in range(0, count, size := at_once(self.equations.scale)):
             batch = slice(first, first + size)
             x = self.solve(jax.tree.map(itemgetter(batch), jt_z))
@@ -103,7 +104,7 @@ class HatMatrix(eqx.Module):
         return -to_numpy(x.shared) * self._scale
 
     def _jt_products(self, column: Column, directions: range) -> Increments:
-        """J' z of each direction."""
+        """Compute J' z of each direction."""
 
         def batches() -> Iterator[Float[np.ndarray, "batch places"]]:
             batch = _batch(len(self.laid))
@@ -115,7 +116,7 @@ class HatMatrix(eqx.Module):
 
         program = _pull if self.image_rows else _pull_others
         parts = [jax.tree.map(to_numpy, self._run(program, z)) for z in batches()]
-        # There may be no direction: all parameters fixed, or no candidate effects.
+        # The number of directions is zero if all parameters are fixed or there are no candidate effects.
         return joined(parts, self.equations.scale, len(directions))
 
     def solve(self, b: Increments) -> Increments:
@@ -123,7 +124,7 @@ class HatMatrix(eqx.Module):
         return solve_many(self.equations, b, self.adjusted.seconds)
 
     def _j_products(self, x: Increments) -> Iterator[Float[np.ndarray, "n"]]:
-        """J x of each direction, in the order of `places`."""
+        """Yield J x of each direction, in the order of the observation indices."""
         valid, count, program = self.laid < self.count, len(x.shared), _push if self.image_rows else _push_others
         for first, batch in zip(range(0, count, size := _batch(len(self.laid))), in_batches(x, size), strict=True):
             for row in to_numpy(self._run(program, batch))[: count - first]:
@@ -136,9 +137,9 @@ class HatMatrix(eqx.Module):
 
 
 def inner_products(a: Increments, b: Increments) -> Float[ArrayLike, "m n"]:
-    """Return a' b of each of `a` with each of `b`, along leading axes.
+    """Return the inner products a' b of all increments in `a` and `b`, along leading axes.
 
-    Summed kind by kind: in a large block a copy of all increments takes 100 MB.
+    Sum by kind of unknown: concatenating all increments of a large block takes 100 MB.
     """
     products: Any = np.zeros((len(a.shared), len(b.shared)))
     for pair in zip(a, b, strict=True):
@@ -150,7 +151,7 @@ def inner_products(a: Increments, b: Increments) -> Float[ArrayLike, "m n"]:
 def prepare_hat_matrix(equations: NormalEquations, seconds: dict[str, float]) -> None:
     """Compile the programs of `HatMatrix` in the background."""
     if jax.process_count() > 1:
-        # Arrays from several processes have types that cannot be predicted here.
+        # Argument types of arrays sharded over several processes cannot be predicted here.
         return
     equations = equations.on_one_device.weighed
     shapes = jax.tree.leaves(jax.eval_shape(lambda e: e.at.residuals(), equations))
@@ -161,7 +162,7 @@ def prepare_hat_matrix(equations: NormalEquations, seconds: dict[str, float]) ->
 
 
 def _batch(n_elements: int) -> int:
-    """Batch size for directions of `n_elements` each: a power of two."""
+    """Return the batch size for directions of `n_elements` each: a power of two."""
     most = int(np.clip(_MAX_ELEMENTS // max(n_elements, 1), 1, _MAX_BATCH))
     return 1 << most.bit_length() - 1
 

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 
 
 def chi_square_tails(sum_of_squares: float, freedom: float) -> tuple[float, float]:
-    """Lower and upper tail probabilities of a square sum."""
+    """Return the lower and upper tail probabilities of a sum of squares under chi-square."""
     special = _special()
     return float(special.gammainc(freedom / 2, sum_of_squares / 2)), float(
         special.gammaincc(freedom / 2, sum_of_squares / 2)
@@ -15,30 +15,31 @@ def chi_square_tails(sum_of_squares: float, freedom: float) -> tuple[float, floa
 
 
 def chi_square_limit(freedom: Int[np.ndarray, "*n"], level: float) -> Float[np.ndarray, "*n"]:
-    """Quantile of chi-square that is exceeded with probability `level`."""
+    """Return the quantile of chi-square with upper tail probability `level`."""
     return np.asarray(2 * _special().gammainccinv(freedom / 2, level))
 
 
 def chi_square_shift(freedom: int, level: float, power: float) -> float:
-    """Noncentrality with which a square sum exceeds its limit of `level` with the probability `power`."""
+    """Return the noncentrality for which chi-square exceeds its limit of `level` with probability `power`."""
     special = _special()
     return float(special.chndtrinc(chi_square_limit(np.array(freedom), level), freedom, 1 - power))
 
 
 def student_limit(freedom: int, level: float) -> float:
-    """Quantile of |t| (Student) that is exceeded with probability `level`."""
+    """Return the quantile of Student's |t| with upper tail probability `level`."""
     return float(-_special().stdtrit(freedom, level / 2))
 
 
 def beta_tail(fraction: float, a: float, b: float) -> float:
-    """Probability of a larger fraction under the beta distribution of `a` and `b`."""
+    """Return the upper tail probability of `fraction` under the beta distribution of `a` and `b`."""
     return float(_special().betainc(b, a, np.clip(1 - fraction, 0.0, 1.0)))
 
 
 def student_freedom(square: Float[np.ndarray, "n"], dimension: int) -> float:
-    """Maximum likelihood degrees of freedom (1 to 100) of Student's distribution of rows of a `dimension`.
+    """Estimate the degrees of freedom (1 to 100) of multivariate Student residuals by maximum likelihood.
 
-    `square` is v'v over the squared scale of the distribution. 100 stands for the normal distribution.
+    `square` is v'v over the squared scale of the distribution, by row of `dimension` components. 100 stands for the
+    normal distribution.
     """
     from scipy.optimize import minimize_scalar
 

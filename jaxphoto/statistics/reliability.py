@@ -5,7 +5,7 @@ normalised residual is w = v / (sigma0 sigma sqrt(r)), to be compared with the c
 
 The minimal detectable bias (MDB) of an observation is nabla_i = delta0 / sqrt((P Q_vv P)_ii): the smallest error that
 the test of its normalised residual detects with the stated power (internal reliability). An error of this size moves
-unknown k by -(J N^-1 e_k)_i nabla_i / sigma_i, and any function of the unknowns by at most
+unknown k by -(J N^-1 e_k)_i nabla_i / sigma_i. It moves any function of the unknowns by at most
 delta0 sqrt((P - P Q_vv P)_ii / (P Q_vv P)_ii) of its standard deviations (external reliability). Without correlations
 between observations this bound is delta0 sqrt((1 - r) / r).
 
@@ -43,9 +43,9 @@ REPORTED_PARAMETERS = ("c_mm", "xp_mm", "yp_mm")
 
 
 def prepare_statistics(equations: NormalEquations, seconds: dict[str, float]) -> None:
-    """Compile the programs of `covariance` and `redundancy_numbers` in the background; see `solve`."""
+    """Compile the programs of `covariance` and `redundancy_numbers` in the background."""
     if jax.process_count() > 1:
-        # Arrays from several processes have types that cannot be predicted here.
+        # Argument types of arrays sharded over several processes cannot be predicted here.
         return
     prepare_covariance(equations, seconds)
     s, v = equations.structure, equations.values
@@ -60,11 +60,11 @@ def prepare_statistics(equations: NormalEquations, seconds: dict[str, float]) ->
 
 @pretty_repr
 class Redundancy(eqx.Module):
-    """Redundancy numbers, shaped like `Adjustment.residuals`; they sum to the redundancy."""
+    """Redundancy numbers, shaped like `Adjustment.residuals`. Their sum is the redundancy."""
 
     numbers: Residuals
     blocks: dict[str, Float[np.ndarray, "_ _ _"]]
-    """I - J Q J' (rows, c, c) of the whitened numbers of each row, by group."""
+    """I - J Q J' (rows, c, c) of the c whitened components of each row, by group."""
 
     @property
     def image(self) -> Float[ArrayLike, "2 rows"]:
@@ -81,9 +81,9 @@ class Redundancy(eqx.Module):
 
 
 def redundancy_numbers(adjusted: Adjustment, covariance: Covariance) -> Redundancy:
-    """Redundancy number of every observation.
+    """Compute the redundancy number of every observation.
 
-    For correlated observations these are the diagonal elements of Q_vv P, which also sum to the redundancy.
+    For correlated observations these are the diagonal elements of Q_vv P, whose sum is also the redundancy.
     """
     rows_cofactors = row_cofactors(adjusted, covariance.rotations) if covariance.rows is None else covariance.rows
     arguments = (adjusted.equations, covariance.cofactors, rows_cofactors)
@@ -110,9 +110,9 @@ def redundancy_numbers(adjusted: Adjustment, covariance: Covariance) -> Redundan
 
 
 def normalised_residuals(adjusted: Adjustment, redundancy: Redundancy) -> Residuals:
-    """w = v / (sigma0 sigma sqrt(r)) of every observation; NaN where the redundancy number is zero.
+    """Compute w = v / (sigma0 sigma sqrt(r)) of every observation; NaN if the redundancy number is zero.
 
-    For correlated observations w = (P v) / (sigma0 sqrt(diag P Q_vv P)), the test of an error in one of them.
+    For correlated observations w = (P v) / (sigma0 sqrt(diag P Q_vv P)), the test statistic of an error in one of them.
     """
     sigma0, precision = float(adjusted.sigma0), error_precision(adjusted, redundancy)
 
@@ -127,9 +127,9 @@ def normalised_residuals(adjusted: Adjustment, redundancy: Redundancy) -> Residu
 
 
 def error_precision(adjusted: Adjustment, redundancy: Redundancy) -> dict[str, Float[np.ndarray, "..."]]:
-    """diag P Q_vv P by group: the a priori weight with which an error in one observation is estimated.
+    """Compute diag P Q_vv P by group: the a priori weight of the estimated error in one observation.
 
-    r / sigma^2 without correlations, in one over the unit of the observation squared.
+    Without correlations it equals r / sigma^2. Unit: 1 / (unit of the observation)^2.
     """
     precision = {}
     for name, rows in observation_groups(adjusted).items():
@@ -150,9 +150,9 @@ def _row_variances(equations: NormalEquations, q: Cofactors, of_rows: RowCofacto
 def minimal_detectable_biases(
     adjusted: Adjustment, redundancy: Redundancy, delta0: float = DELTA0
 ) -> dict[str, Float[np.ndarray, "..."]]:
-    """Minimal detectable bias delta0 / sqrt(diag P Q_vv P) of every observation, by group.
+    """Compute the minimal detectable bias delta0 / sqrt(diag P Q_vv P) of every observation, by group.
 
-    In the unit of each observation; infinite where the redundancy number is zero.
+    In the unit of the observation; infinite if the redundancy number is zero.
     """
     mdbs = {}
     for name, p in error_precision(adjusted, redundancy).items():
@@ -163,19 +163,19 @@ def minimal_detectable_biases(
 
 @pretty_repr
 class LargestMdb(NamedTuple):
-    """The observation of a group with the largest MDB in standard deviations."""
+    """Observation of a group with the largest ratio MDB / standard deviation."""
 
     group: str
     words: str
     mdb: float
-    """Infinite where no error is detectable."""
+    """Minimal detectable bias; infinite for undetectable errors."""
     sigma: float
-    """A priori; both in `unit`."""
+    """A priori standard deviation; both are in `unit`."""
     unit: str
 
 
 def largest_mdbs(adjusted: Adjustment, redundancy: Redundancy) -> list[LargestMdb]:
-    """Return the largest MDB in standard deviations of each group of observations."""
+    """Find the observation with the largest ratio MDB / standard deviation in each group."""
     largest, block = [], adjusted.block
     mdbs = minimal_detectable_biases(adjusted, redundancy)
     for name, rows in observation_groups(adjusted).items():
@@ -192,24 +192,26 @@ def largest_mdbs(adjusted: Adjustment, redundancy: Redundancy) -> list[LargestMd
 class MdbEffects(eqx.Module):
     """External reliability: effect of the MDB of every observation, in standard deviations of the affected quantity.
 
-    By group, shaped like its residuals; NaN where the redundancy number is zero.
+    Arrays are shaped like the residuals of the group; NaN if the redundancy number is zero.
     """
 
     interior: dict[str, dict[str, Float[np.ndarray, "..."]]]
-    """By parameter of `REPORTED_PARAMETERS`: of the camera of an image row; of other rows, of the most affected one."""
+    """Effect on each of `REPORTED_PARAMETERS`, by group. Image rows affect their own camera; for other rows this is the
+    effect on the most affected camera.
+    """
     most: dict[str, Float[np.ndarray, "..."]]
-    """Upper bound for any function of the unknowns."""
+    """Upper bound of the effect on any function of the unknowns, by group."""
 
 
 @pretty_repr
 class LargestEffect(NamedTuple):
-    """The observation whose MDB has the largest effect on an interior parameter."""
+    """Observation whose MDB has the largest effect on an interior parameter."""
 
     parameter: str
-    """Of the camera of the image; of other rows, of the most affected camera."""
+    """Parameter of the camera of the image; for other rows, of the most affected camera."""
     words: str
     moved: float
-    """In standard deviations of the parameter."""
+    """Effect in standard deviations of the parameter."""
 
 
 def mdb_effects(adjusted: Adjustment, covariance: Covariance, redundancy: Redundancy) -> MdbEffects:
@@ -239,7 +241,7 @@ def mdb_effects(adjusted: Adjustment, covariance: Covariance, redundancy: Redund
         requested, hat_matrix.influence_on([k for *_, k in requested]), strict=True
     ):
         for name, index in hat_matrix.places.items():
-            # The MDB of an uncontrolled observation is infinite.
+            # Skip uncontrolled observations: their MDB is infinite.
             mdb = np.where(checked[name], mdbs[name], np.nan)
             moved = np.abs(_per_observation(groups[name], influence[index]) * mdb) / a_priori[k]
             if name == adjusted.block.image_points.group:
@@ -249,7 +251,7 @@ def mdb_effects(adjusted: Adjustment, covariance: Covariance, redundancy: Redund
 
 
 def largest_interior_effects(adjusted: Adjustment, external: MdbEffects) -> list[LargestEffect]:
-    """Return the largest effect on each of `REPORTED_PARAMETERS` that some camera estimates."""
+    """Find the largest effect on each of `REPORTED_PARAMETERS` that at least one camera estimates."""
     effects, block = [], adjusted.block
     for parameter, moved in external.interior.items():
         largest: LargestEffect | None = None
@@ -266,14 +268,17 @@ def largest_interior_effects(adjusted: Adjustment, external: MdbEffects) -> list
 
 
 def _weights(rows: AbstractObservations, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
-    """diag P, shaped like the residuals."""
+    """Return diag P, shaped like the residuals."""
     if isinstance(rows, Correlated):
         return np.einsum("nji,nji->in", np.asarray(rows.whitener), np.asarray(rows.whitener)).reshape(shape)
     return 1 / np.broadcast_to(np.asarray(rows.sigmas).T, shape) ** 2
 
 
 def _per_observation(rows: AbstractObservations, whitened: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """L'^-1 u of whitened quantities u (P = L'^-1 L^-1): from one over whitened to one over the observation's unit."""
+    """Return L'^-1 u of whitened quantities u (P = L'^-1 L^-1).
+
+    It converts u per whitened unit to u per unit of the observation.
+    """
     if isinstance(rows, Correlated):
         w = np.asarray(rows.whitener)
         return np.einsum("nji,jn->in", w, whitened.reshape(w.shape[1], -1)).reshape(whitened.shape)

@@ -2,16 +2,16 @@
 
 A point P is imaged at q = f(b, R (P - X0)) by the interior orientation b and the exterior orientation (X0, R). Both are
 estimated in one adjustment, and their errors are correlated: a rotation of the images compensates an error of the
-principal point. P is therefore fixed in the object frame as it appears in each image i of the camera, transformed back
-by the adjusted exterior orientation of that image, and the mean over the images is projected:
+principal point. P is therefore fixed in the object frame as observed in each image i of the camera, transformed back by
+the exterior orientation of image i, and the mean over the images is projected:
 
     p = d u                        d: distance, u: direction of q
     dp = mean_i (dtheta_i x p - R_i dX0_i)
     dq = df/db db + df/dp dp
 
-with small rotations dtheta_i about the axes of the camera. At an infinite distance the positions drop out. All this is
-linear in the unknowns, so the covariance of q is exact to first order. It needs only the covariance of b and of six
-means (`linear_forms`), whatever the number of images.
+with small rotations dtheta_i about the axes of the camera. At infinite distance the positions have no effect. dq is
+linear in the unknowns, so the covariance of q is exact to first order. For any number of images it needs only the
+covariance of b and of six means (`linear_forms`).
 
 Source: D. Kogan, mrcal, projection uncertainty (https://mrcal.secretsauce.net/uncertainty.html), method of version 2.
 """
@@ -36,7 +36,7 @@ from jaxphoto.short_repr import pretty_repr
 from jaxphoto.stability import as_arrays, image_grid, parameter_vector, regular_rays, with_parameters
 from jaxphoto.statistics.correlation import linear_forms
 
-# Cells along the longer and the shorter side of the format.
+# Number of cells along the longer and the shorter side of the format.
 _LONG, _SHORT = 60, 40
 
 
@@ -46,15 +46,15 @@ class SigmaMap(eqx.Module):
 
     camera: str = eqx.field(static=True)
     distance_m: float
-    """Distance of the point from the projection centre; infinite for a direction."""
+    """Distance of the projected point from the projection centre; infinite for a direction."""
     points: Float[ArrayLike, "cells 2"]
-    """Measured image coordinates (mm from the centre of the image)."""
+    """Measured image coordinates (mm from the centre of the format)."""
     covariance: Float[Any, "cells 2 2"]
-    """Of x and y (mm^2); NaN where the distortion is not invertible or the ray points backwards."""
+    """Covariance of x and y (mm^2); NaN if the distortion is not invertible or the ray points backwards."""
 
     @property
     def worst(self) -> Float[Any, "cells"]:
-        """Standard deviation (mm) in the direction of its maximum: the semi-major axis of the error ellipse."""
+        """Largest standard deviation over all directions (mm): the semi-major axis of the error ellipse."""
         q = self.covariance
         mean, half = (q[:, 0, 0] + q[:, 1, 1]) / 2, (q[:, 0, 0] - q[:, 1, 1]) / 2
         xp = namespace(q)
@@ -68,11 +68,12 @@ def sigma_map(
     distance_m: float = float("inf"),
     points: Float[ArrayLike, "cells 2"] | None = None,
 ) -> SigmaMap:
-    """Covariance of the image of a point at `distance_m` due to errors of interior and exterior orientation.
+    """Compute the covariance of the image of a point at `distance_m` due to errors of the camera orientation.
 
-    `points` are measured image coordinates (mm from the centre), by default 60 x 40 cells over the whole format.
-    `camera` is required for a block of several cameras. Effects beyond the interior orientation, such as a rolling
-    shutter, count as known. Raises InputError for an unknown camera and a distance that is not positive.
+    The covariance includes interior and exterior orientation. `points` are measured image coordinates (mm from the
+    centre), by default 60 x 40 cells over the format. `camera` is required for a block of several cameras. Other
+    effects, such as a rolling shutter, are treated as known. Raises InputError for an unknown camera and for a distance
+    that is not positive.
     """
     name = one_camera(adjusted.block, camera)
     if not distance_m > 0:
@@ -87,7 +88,7 @@ def _sigma_map(
     points: Float[ArrayLike, "cells 2"] | None,
     joint: tuple[list[str], Float[Any, "n n"]],
 ) -> SigmaMap:
-    """Return the map of a camera with the `_joint_covariance` `joint`."""
+    """Compute the uncertainty map of a camera from its `_joint_covariance`."""
     interior, sensor = adjusted.unknowns.interior[name], adjusted.block.sensors[name]
     xy = _cells(sensor) if points is None else np.asarray(points, float)
     parameters, covariance = joint
@@ -104,7 +105,7 @@ def _sigma_map(
 
 
 def seen_distance_m(adjusted: Adjustment, camera: str | None = None) -> float:
-    """Median distance (m) of the points measured by a camera."""
+    """Return the median distance (m) of the points measured by a camera."""
     s, name = adjusted.structure, one_camera(adjusted.block, camera)
     rows = np.array([c == name for c in adjusted.block.image_camera], bool)[s.image]
     rays = np.asarray(adjusted.unknowns.points)[s.point] - np.asarray(adjusted.unknowns.exterior.position)[s.image]
@@ -112,7 +113,7 @@ def seen_distance_m(adjusted: Adjustment, camera: str | None = None) -> float:
 
 
 def sigma_maps(adjusted: Adjustment) -> dict[str, tuple[SigmaMap, SigmaMap]]:
-    """Return the maps by camera with estimated parameters: at infinity, and at the median distance of its points."""
+    """Compute the maps of all cameras with estimated parameters: at infinity and at the median point distance."""
     s = adjusted.structure
     used = {adjusted.block.image_camera[i] for i in np.unique(s.image)}
     maps: dict[str, tuple[SigmaMap, SigmaMap]] = {}
@@ -130,7 +131,7 @@ def _cells(sensor: Sensor) -> Float[ArrayLike, "cells 2"]:
 
 
 def _joint_covariance(adjusted: Adjustment, camera: str) -> tuple[list[str], Float[Any, "n n"]]:
-    """Estimated parameters of the camera, and the covariance of them, of mean dtheta and of mean -R dX0."""
+    """Return the camera's estimated parameters, and their joint covariance with mean dtheta and mean -R dX0."""
     prefix, labels = f"interior[{camera}].", adjusted.structure.labels
     places = [k for k, label in enumerate(labels) if label.startswith(prefix)]
     n = len(places) + 6
@@ -152,7 +153,7 @@ def _joint_covariance(adjusted: Adjustment, camera: str) -> tuple[list[str], Flo
 def _derivatives(
     interior: InteriorOrientation, points: Float[Array, "cells 2"], nearness: Float[Array, ""]
 ) -> Float[Array, "cells 2 unknowns"]:
-    """dq by the camera parameters, dtheta (rad) and the shift of the point (m); `nearness` is 1 / distance."""
+    """Compute dq by the camera parameters, dtheta (rad) and the shift of the point (m); `nearness` is 1 / distance."""
     vector = parameter_vector(interior)
 
     def jacobian(xy):
@@ -160,7 +161,10 @@ def _derivatives(
         u = u / jnp.linalg.norm(u)
 
         def difference(change):
-            """Ideal coordinate of the point minus that of the measured one: zero for all changes that q follows."""
+            """Return the ideal coordinate of the point minus the ideal coordinate of its image.
+
+            By the implicit function theorem, dq keeps this difference zero.
+            """
             camera = with_parameters(interior, change[:-6])
             ray = small_rotation(change[-6:-3]) @ u + nearness * change[-3:]
             return camera.ideal_from_direction(*ray) - camera.ideal_from_measured(xy)

@@ -1,17 +1,18 @@
-"""Significance of parameters: single interior parameters, several parameters being zero, changes of a camera in flight.
+"""Significance of parameters: tests of single interior parameters, of zero parameters, of camera changes in flight.
 
 The parameters d have the cofactors Q. If all are truly zero,
 
     F = d' Q^-1 d / (f sigma0^2)
 
-of f parameters follows Fisher's distribution with f and r degrees of freedom, r the redundancy. A single parameter k
-with the true value D gives f F the noncentrality D^2 (Q^-1)_kk / sigma0^2. With lambda(f) the noncentrality for which
-the chi-square of f degrees of freedom exceeds its limit of 5 % with a power of 80 %, the minimal detectable value is
+follows Fisher's distribution with f and r degrees of freedom, f the number of parameters and r the redundancy. If a
+single parameter k has the true value D, the noncentrality of f F is D^2 (Q^-1)_kk / sigma0^2. With lambda(f) the
+noncentrality for a test of level 5 % with a power of 80 % by chi-square of f degrees of freedom, the minimal detectable
+value is
 
     D_k = sigma0 sqrt(lambda(f) / (Q^-1)_kk)
 
 which is (1.96 + 0.84) sigma for one parameter. Priors of the parameters (with their covariances) are removed from Q and
-d. Directions that then no observation determines, such as a change common to all strips, do not count in f.
+d. Directions that are then undetermined, such as a change common to all strips, are not counted in f.
 
 Sources: Baarda (1968), A testing procedure for use in geodetic networks; Teunissen (2000), Testing theory.
 """
@@ -45,12 +46,12 @@ from jaxphoto.tracing import outside_transformations
 from jaxphoto.unknowns import Weighted
 
 SIGNIFICANCE_LEVEL = 0.05
-"""Error probability of the tests of zero parameters."""
+"""Significance level of the tests of zero parameters."""
 
 
 @pretty_repr
 class Significance(eqx.Module):
-    """One estimated interior parameter: value, a posteriori sigma, |value| / sigma, and two-sided p of value = 0.
+    """One estimated interior parameter: value, a posteriori sigma, ratio |value| / sigma, two-sided p-value (H0: value = 0).
 
     Value and sigma are in `unit`: mm, 1/mm^2, "1" if dimensionless (`jaxphoto.camera.parameter_unit`).
     """
@@ -67,7 +68,7 @@ class Significance(eqx.Module):
     def significant(self) -> bool:
         """True if the p-value is below `SIGNIFICANCE_LEVEL`.
 
-        Paper 000 requires a `ratio` of 10, which is far stricter.
+        Paper 000 uses the stricter criterion `ratio` > 10.
         """
         return self.p_value < SIGNIFICANCE_LEVEL
 
@@ -92,16 +93,19 @@ def significance(adjusted: Adjustment, covariance: Covariance) -> list[Significa
 
 @pretty_repr
 class FixedAtZero(NamedTuple):
-    """First-order change of a camera if one interior parameter is fixed at zero."""
+    """First-order change of a camera when one interior parameter is fixed at zero."""
 
     in_sigmas: dict[str, float]
     """Change of every estimated parameter of the camera, in its standard deviations."""
     corner_mm: float
-    """Displacement of the image of a direction at the corner of the format."""
+    """Displacement (mm) of the image of a direction at the corner of the format."""
 
 
 def fix_at_zero(adjusted: Adjustment, covariance: Covariance, parameter: Significance) -> FixedAtZero:
-    """Predict the change of all interior parameters of the camera by their covariance: d = -Q[:, k] / q_kk value."""
+    """Predict the change of all interior parameters of a camera when `parameter` is fixed at zero.
+
+    d = -Q[:, k] / q_kk value, with the covariance Q of the interior parameters.
+    """
     interior, sensor = adjusted.unknowns.interior[parameter.camera], adjusted.block.sensors[parameter.camera]
     prefix = f"interior[{parameter.camera}]."
     names = [label.removeprefix(prefix) for label in covariance.labels if label.startswith(prefix)]
@@ -118,13 +122,13 @@ def fix_at_zero(adjusted: Adjustment, covariance: Covariance, parameter: Signifi
 
 @eqx.filter_jit
 def _reproject(interior: InteriorOrientation, changed: InteriorOrientation, xy: Array) -> Array:
-    """Image coordinates in `changed` of the direction imaged at `xy` by `interior`."""
+    """Project into `changed` the direction that `interior` images at `xy`; return its image coordinates."""
     direction = interior.direction_from_ideal(interior.ideal_from_measured(xy))
     return changed.measured_from_ideal(changed.ideal_from_direction(*direction))
 
 
 def student_p(t: float, degrees_of_freedom: int) -> float:
-    """Two-sided p-value of Student's t; 1 without redundancy, NaN for NaN."""
+    """Return the two-sided p-value of Student's t; 1 without redundancy, NaN for NaN."""
     if np.isnan(t):
         return np.nan
     if degrees_of_freedom <= 0:
@@ -136,27 +140,27 @@ def student_p(t: float, degrees_of_freedom: int) -> float:
 
 
 def chi_square_p(sum_of_squares: float, redundancy: int) -> float:
-    """Probability of a larger v'Pv if the a priori sigmas are true; 1 without redundancy."""
+    """Return the probability of a larger v'Pv if the a priori sigmas are correct; 1 without redundancy."""
     return float(gammaincc(redundancy / 2, sum_of_squares / 2)) if redundancy > 0 else 1.0
 
 
 @eqx.filter_jit
 def _beta(a, x):
-    """Regularised incomplete beta function of a and 1/2."""
+    """Return the regularised incomplete beta function of a and 1/2."""
     return betainc(a, 0.5, x)
 
 
 POWER = 0.80
-"""Probability with which a parameter of `detectable` size is detected."""
-# Fraction of the information about a parameter below which the contribution of the observations is rounding.
+"""Power of the test for a parameter of size `detectable`."""
+# Fraction of the total information about a parameter below which the contribution of the observations is rounding.
 _MIN_INFORMATION = 1e-6
 
 
 @pretty_repr
 class ZeroTest(NamedTuple):
-    """Test of zero parameters, one entry a parameter.
+    """Test of zero parameters. Arrays have one element per parameter.
 
-    `value` and `sigma` (a posteriori) are those of the adjustment; `p_values` (each parameter zero), `p_value` (all
+    `value` and `sigma` (a posteriori) are results of the adjustment. `p_values` (each parameter zero), `p_value` (all
     zero) and `detectable` (minimal detectable value) exclude the priors.
     """
 
@@ -175,7 +179,8 @@ class ZeroTest(NamedTuple):
 def zero_test(adjusted: Adjustment, covariance: Covariance, labels: Sequence[str], scale: float = 1.0) -> ZeroTest:
     """Test whether estimated shared parameters, each multiplied by `scale`, are zero.
 
-    KnownParameters and all other observations take part; only their own priors do not.
+    The priors of the tested parameters (with their covariances) are excluded. All other observations are used,
+    including `KnownParameters` of other parameters.
     """
     places = [covariance.labels.index(label) for label in labels]
     s, free_index = adjusted.structure, {label: k for k, label in enumerate(adjusted.structure.labels)}
@@ -184,7 +189,7 @@ def zero_test(adjusted: Adjustment, covariance: Covariance, labels: Sequence[str
     q = scale**2 * np.asarray(covariance.matrix)[np.ix_(places, places)]
     weight, prior = _priors(adjusted, index)
     weight, prior = weight / scale**2, scale * prior
-    # In units of the standard deviations the information matrix is the inverse of the correlation matrix.
+    # In units of the standard deviations, the information matrix is the inverse of the correlation matrix.
     sigma = np.sqrt(np.diagonal(q))
     information = np.linalg.inv(q / np.outer(sigma, sigma))
     without_priors = information - weight * np.outer(sigma, sigma)
@@ -207,7 +212,7 @@ def zero_test(adjusted: Adjustment, covariance: Covariance, labels: Sequence[str
 def _priors(
     adjusted: Adjustment, index: Int[np.ndarray, "k"]
 ) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k"]]:
-    """Weights and values of the priors of some parameters; `index` are their places among all shared ones."""
+    """Return weights and values of the priors of some parameters. `index`: indices among all shared parameters."""
     observed, place_of = observed_in(adjusted.block, adjusted.priors), {int(place): k for k, place in enumerate(index)}
     weight, value = np.zeros((len(index), len(index))), np.zeros(len(index))
     for k, place in enumerate(index):
@@ -224,7 +229,7 @@ def _priors(
 def _solved(
     matrix: Float[np.ndarray, "k k"], right: Float[np.ndarray, "k"]
 ) -> tuple[float, int, Float[np.ndarray, "k k"]]:
-    """right' inverse right, rank and inverse over the eigenvalues that are not rounding."""
+    """Return right' inverse right, rank and pseudoinverse of `matrix`, without eigenvalues that are rounding errors."""
     values, vectors = np.linalg.eigh(matrix)
     determined = values > _MIN_INFORMATION
     half = vectors[:, determined] / np.sqrt(values[determined])
@@ -232,7 +237,7 @@ def _solved(
 
 
 def _tail(sum_of_squares: float, freedom: int, redundancy: int) -> float:
-    """Probability of a larger square sum over the a posteriori variance factor; 1 without redundancy."""
+    """Return the probability of a larger sum of squares / a posteriori variance factor; 1 without redundancy."""
     if freedom == 0 or redundancy <= 0:
         return 1.0
     return beta_tail(sum_of_squares / (sum_of_squares + redundancy), freedom / 2, redundancy / 2)
@@ -240,35 +245,36 @@ def _tail(sum_of_squares: float, freedom: int, redundancy: int) -> float:
 
 @pretty_repr
 class CameraDrift(NamedTuple):
-    """Change of one camera from its first exposure to its last, or from the lowest to the highest temperature.
+    """Change of one camera over the flight or over the temperature range; one element per rate.
 
-    In mm (K1 in its unit); one entry a rate.
+    The change is in mm (K1 in its unit), from the first to the last exposure or from the lowest to the highest
+    temperature.
     """
 
     camera: str
     rates: type[AbstractCameraRates]
     span: float
-    """Range, in the unit of `rates.along`."""
+    """Range of the exposures, in the unit of `rates.along`."""
     parameters: tuple[str, ...]
-    """Names of `AbstractCameraRates` without suffix: c, xp, yp, k1."""
+    """Names of the `AbstractCameraRates` parameters without suffix: c, xp, yp, k1."""
     change: ZeroTest
 
 
 @pretty_repr
 class CameraDifferences(NamedTuple):
-    """Differences from the camera of the block (mm), by strip or by knot; one entry an estimated parameter."""
+    """Differences from the camera of the block (mm), by strip or by knot; one element per estimated parameter."""
 
     camera: str
     """Camera of the knots; "" for strips."""
     at: tuple[str, ...]
-    """The strip, or the time of the knot from the middle of the flight in minutes."""
+    """Strip name, or time of the knot in minutes from the middle of the flight."""
     parameters: tuple[str, ...]
-    """Names of `StripCamera` and `CameraSpline` without suffix: c, xp, yp."""
+    """Names of the `StripCamera` or `CameraSpline` parameters without suffix: c, xp, yp."""
     more: ZeroTest
 
 
 def camera_drifts(adjusted: Adjustment, covariance: Covariance) -> list[CameraDrift]:
-    """Test every camera with estimated rates, those of time first."""
+    """Test every camera with estimated rates; rates of time are first."""
     drifts, cameras = [], np.array(adjusted.block.image_camera)
     for rates in RATES:
         along = np.asarray(rates.argument(exposures(adjusted.block)))
@@ -282,7 +288,10 @@ def camera_drifts(adjusted: Adjustment, covariance: Covariance) -> list[CameraDr
 
 
 def strip_differences(adjusted: Adjustment, covariance: Covariance) -> CameraDifferences | None:
-    """Test all strips with estimated cameras; None without any. Changes from strip to strip are observations."""
+    """Test all strips with estimated cameras; None without any.
+
+    Differences between consecutive strips take part as observations.
+    """
     strips, names, labels = [], [], []
     for strip in adjusted.unknowns.more.get(StripCamera.kind, {}):
         for label, name in _estimated(adjusted, StripCamera.kind, strip).items():
@@ -307,6 +316,6 @@ def camera_spline_differences(adjusted: Adjustment, covariance: Covariance) -> l
 
 
 def _estimated(adjusted: Adjustment, kind: str, owner: str) -> dict[str, str]:
-    """Names of the estimated parameters of an owner, by their labels."""
+    """Return the estimated parameters of an owner: label to name."""
     prefix = f"{kind}[{owner}]."
     return {label: label.removeprefix(prefix) for label in adjusted.structure.labels if label.startswith(prefix)}

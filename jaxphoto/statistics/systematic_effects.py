@@ -1,14 +1,14 @@
-"""Tests of residuals for systematic effects: over the image format, over time, from strip to strip.
+"""Tests of residuals for systematic effects over the image format, over time, and between strips.
 
 Candidate effects. Over the format: polynomials of x and y up to the fifth degree (third in huge blocks); they contain
-the usual lens terms (k1, k2, p1, p2, affinity, shear) exactly and most smooth fields approximately. Over time: a camera
-that changes linearly. For every group observed per image: a common mean, a mean per strip and a linear drift.
+the usual lens terms (k1, k2, p1, p2, affinity, shear) exactly and most smooth fields approximately. Over time: a linear
+change of the camera. For every group observed per image: a common mean, a mean per strip and a linear drift.
 
-Test. An effect G (one column a direction, in the unit of the observations, whitened like them) that the model lacks
-shows in u = G'v with the cofactors C = G' Q_vv P G of whitened observations; as an unknown, G b would be estimated by
-b = C^-1 u. If the model is complete, u' C^-1 u / v'v follows the beta distribution of f / 2 and (r - f) / 2, with f the
-rank of C and r the redundancy; this is exact with sigma naught estimated from the same residuals. Effects absorbed by
-estimated parameters do not appear in C.
+Test. An effect G (one column per direction, whitened like the observations) that the model lacks changes u = G'v, which
+has the cofactors C = G' Q_vv P G of whitened observations. As an unknown, G b would be estimated by b = C^-1 u. If the
+model is complete, u' C^-1 u / v'v follows the beta distribution of f / 2 and (r - f) / 2, with f the rank of C and r
+the redundancy; this is exact with sigma naught estimated from the same residuals. Effects absorbed by estimated
+parameters do not appear in C.
 
 Sources: Kok (1984), On data snooping and multiple outlier testing, NOAA Technical Report NOS NGS 30; Teunissen (2000),
 Testing theory, 2.
@@ -43,18 +43,19 @@ from jaxphoto.statistics.hat_matrix import HatMatrix
 from jaxphoto.statistics.quantiles import beta_tail
 
 Places = Mapping[str, Int[np.ndarray, "..."]]
-# Maximum number of elements of all polynomials over a format of fifth degree; larger blocks use the third.
+# Maximum number of matrix elements for fifth-degree polynomials over the format; larger blocks use third degree.
 _MAX_ELEMENTS = 100_000_000
-# Observations per batch of weighted copies.
+# Maximum number of observations per batch of weighted copies.
 _BATCH = 50_000
 MAX_GROUPS = 40
-"""Maximum number of cameras, or of strips, tested one by one: more tests reduce the power of each."""
-# Points along a side of the grid on which terms are written as polynomials.
+"""Maximum number of cameras, or of strips, that are tested individually: more tests reduce the power of each."""
+# Number of points along each side of the grid on which terms are expanded in polynomials.
 _GRID = 9
-# Largest misfit of a term's polynomials, relative to its largest value.
+# Maximum misfit of a term's polynomial expansion, relative to the largest value of the term.
 _MAX_MISFIT = 0.02
 
-# A shift common to all stations is mostly absorbed by c and the ground; the small remainder is still significant.
+# Minimum fraction of a common shift of all stations that must remain. c and the ground absorb most of the shift, but
+# the small remainder is significant.
 _MIN_FRACTION_OF_SHIFT = 1e-6
 _CURE_OF_SHIFT = {
     "m": "on the average: another datum or kind of height, or a wrong lever arm; compare with control, or let the "
@@ -66,14 +67,14 @@ _CURE_OF_STRIP = "on the average: let that strip shift, or check its recording a
 
 @pretty_repr
 class EffectTerm(NamedTuple):
-    """A named combination of the columns of a systematic effect."""
+    """Named linear combination of the columns of a systematic effect."""
 
     name: str
     coefficients: Float[np.ndarray, "columns"]
     cure: str
-    """Advice in messages."""
+    """Advice for messages."""
     report_amount: bool = True
-    """True if messages report its size, in the unit of the observations."""
+    """True if messages report the size of the term, in the unit of the observations."""
 
 
 class Part(NamedTuple):
@@ -82,14 +83,14 @@ class Part(NamedTuple):
     at: Int[np.ndarray, "m"]
     """Indices of the observations."""
     values: Float[np.ndarray, "k m"]
-    """In the unit of the observations."""
+    """Values in the unit of the observations."""
     weight: Float[np.ndarray, "m"]
-    """One over their standard deviations."""
+    """One over the standard deviations of the observations."""
 
 
 @pretty_repr
 class SystematicEffect(NamedTuple):
-    """Candidate columns that residuals may follow, in parts."""
+    """Candidate columns of a systematic effect in the residuals, in parts."""
 
     what: str
     """Label for messages: "image points of camera A over the format"."""
@@ -99,12 +100,13 @@ class SystematicEffect(NamedTuple):
     parts: tuple[Part, ...]
     terms: tuple[EffectTerm, ...]
     begins: str = ""
-    """First words of the message, if not "residuals of `what` follow a pattern"."""
+    """Beginning of the message; default "residuals of `what` follow a pattern"."""
     group: str = ""
-    """Group whose rows all share the effect axis by axis; "" for other effects."""
+    """Group in which all rows share the effect axis by axis; "" for other effects."""
     min_fraction: float = 1e-3
-    """Fraction that estimated parameters must leave of a direction for it to be tested: smaller remainders are
-    dominated by the curvature of the model."""
+    """Minimum fraction of a direction that estimated parameters must leave for it to be tested. Smaller remainders are
+    dominated by the curvature of the model.
+    """
 
     @property
     def n_columns(self) -> int:
@@ -122,19 +124,23 @@ class SystematicEffect(NamedTuple):
         return float(1 / np.median(np.concatenate([p.weight for p in self.parts])))
 
     def products(self, whitened: bool) -> Float[np.ndarray, "columns columns"]:
-        """Products of all columns with one another, in the unit or whitened; parts share no observation."""
+        """Return the products of all pairs of columns, in the unit of the observations or whitened.
+
+        No observation is in two parts.
+        """
         products, first = np.zeros((self.n_columns, self.n_columns)), 0
         for p in self.parts:
             last = first + len(p.values)
             for k in range(0, len(p.at), _BATCH):
                 values = p.values[:, k : k + _BATCH] * (p.weight[k : k + _BATCH] if whitened else 1.0)
-                # einsum, not BLAS: its threads block each other on a busy machine (seconds instead of milliseconds).
+                # Use einsum instead of BLAS, whose threads block each other on a busy machine (seconds instead of
+                # milliseconds).
                 products[first:last, first:last] += np.einsum("in,jn->ij", values, values)
             first = last
         return products
 
     def column(self, k: int, count: int) -> Float[np.ndarray, "count"]:
-        """Column `k` of `count` observations, whitened."""
+        """Return column `k` for `count` observations, whitened."""
         column = np.zeros(count)
         for p in self.parts:
             if 0 <= k < len(p.values):
@@ -143,12 +149,12 @@ class SystematicEffect(NamedTuple):
         return column
 
     def times(self, whitened: Float[np.ndarray, "count"]) -> Float[np.ndarray, "columns"]:
-        """Products of all columns with whitened numbers of all observations."""
+        """Return the products of all columns with whitened values of all observations."""
         return np.concatenate([np.einsum("in,n->i", p.values, p.weight * whitened[p.at]) for p in self.parts])
 
 
 def candidate_effects(adjusted: Adjustment, places: Places) -> Iterator[SystematicEffect]:
-    """Yield all systematic effects to test in an adjustment; `places` numbers the observations.
+    """Yield all systematic effects to test in an adjustment. `places`: index of each observation by group.
 
     Correlated observations are not tested.
     """
@@ -169,7 +175,7 @@ def candidate_effects(adjusted: Adjustment, places: Places) -> Iterator[Systemat
 def _prior_contradictions(
     adjusted: Adjustment, groups: Mapping[str, AbstractObservations], places: Places
 ) -> Iterator[SystematicEffect]:
-    """Deviations of the parameters of each camera from their prior information."""
+    """Yield the deviations of the parameters of each camera from their prior information."""
     by_camera: dict[str, list[tuple[str, np.ndarray, np.ndarray]]] = {}
     interior_parameters = {
         f"interior[{camera}].{name}": (camera, name)
@@ -179,7 +185,7 @@ def _prior_contradictions(
     labels = adjusted.parameters
     for name, rows in groups.items():
         if name.startswith(PRIORS):
-            # A whitened unit change of each parameter: the columns of L^-1.
+            # Columns of L^-1: a whitened unit change of each parameter.
             sigma = np.asarray(rows.sigmas).ravel()
             whitener = np.asarray(rows.whitener)[0] if isinstance(rows, Correlated) else np.diag(1 / sigma)
             (_, parameters), *_ = rows.indices()
@@ -215,7 +221,7 @@ def _over_format(adjusted: Adjustment, camera: str, rows: np.ndarray, places: Pl
     terms, basis = [], np.linalg.pinv(inverse)
     for name, field in _fields(interior, grid):
         coefficients = np.stack([inverse @ f for f in field])
-        # A term that polynomials of this degree cannot represent is not named.
+        # Omit terms that polynomials of this degree cannot represent.
         if np.abs(coefficients @ basis.T - field).max() < _MAX_MISFIT * np.abs(field).max():
             cure = _cure(adjusted, camera, name)
             if cure and _is_affine(field, grid - np.asarray(interior.principal_point)[:, None]):
@@ -229,12 +235,12 @@ def _over_format(adjusted: Adjustment, camera: str, rows: np.ndarray, places: Pl
 def _camera_over_time(
     adjusted: Adjustment, camera: str, rows: np.ndarray, places: Places, time: np.ndarray
 ) -> SystematicEffect:
-    """Linear change of c and the principal point, in mm from the first to the last image."""
+    """Return a linear change of c and the principal point over time, in mm from the first to the last image."""
     interior, t = adjusted.unknowns.interior[camera], time[rows]
     x, y = (np.asarray(adjusted.values.xy)[:, rows] - np.asarray(interior.principal_point)[:, None]) / float(interior.c)
     zero = np.zeros_like(t)
     columns = (np.stack([x * t, t, zero]), np.stack([y * t, zero, t]))
-    # x and y share the same columns, so they form one part.
+    # x and y have the same columns, so they form one part.
     (at_x, x_values, x_weight), (at_y, y_values, y_weight) = _parts_of_image(adjusted, rows, places, columns)
     joint = Part(np.append(at_x, at_y), np.hstack([x_values, y_values]), np.append(x_weight, y_weight))
     names = ("c", "x_p", "y_p")
@@ -246,7 +252,7 @@ def _camera_over_time(
 def _parts_of_image(
     adjusted: Adjustment, rows: np.ndarray, places: Places, values: tuple[np.ndarray, ...]
 ) -> tuple[Part, ...]:
-    """Parts of the x and of the y coordinates of some image rows."""
+    """Return the parts of the x and of the y coordinates of some image rows."""
     sigma, at = np.asarray(adjusted.values.sigma_xy)[:, rows], places[IMAGE_POINTS][:, rows]
     return tuple(Part(places_xy, v, 1 / s) for places_xy, v, s in zip(at, values, sigma, strict=True))
 
@@ -254,7 +260,10 @@ def _parts_of_image(
 def _by_strip(
     adjusted: Adjustment, name: str, rows: AbstractObservations, places: Places
 ) -> Iterator[SystematicEffect]:
-    """Return the common mean, mean per strip and linear drift of each axis of rows that each belong to one image."""
+    """Yield common mean, mean per strip and linear drift of each axis.
+
+    Only for groups in which every row belongs to one image.
+    """
     block, at = adjusted.block, np.atleast_2d(places[name])
     image_number = rows.names_of("image", [str(k) for k in range(len(block.images))])
     if not len(image_number) or not all(n.isdigit() for n in image_number):
@@ -286,7 +295,7 @@ def _by_strip(
 
 
 def _time(adjusted: Adjustment) -> Float[np.ndarray, "images"] | None:
-    """Time of each image, scaled to -0.5 at the first and 0.5 at the last; None without times."""
+    """Return the time of each image, scaled to -0.5 at the first and 0.5 at the last; None without times."""
     block = adjusted.block
     time = np.asarray(block.image_time if block.flight_time is None else block.flight_time)
     span = np.ptp(time)
@@ -298,13 +307,13 @@ def _in_format(sensor: Sensor, xy: Float[np.ndarray, "2 n"]) -> Float[np.ndarray
 
 
 def _polynomials(xy: Float[np.ndarray, "2 n"], degree: int) -> Float[np.ndarray, "k n"]:
-    """Products of Legendre polynomials of x and y, up to a total degree."""
+    """Evaluate the products of Legendre polynomials of x and y up to a total degree."""
     x, y = (legendre.legvander(v, degree).T for v in xy)
     return np.stack([x[i] * y[j] for i in range(degree + 1) for j in range(degree + 1 - i)])
 
 
 _CURE_ROLLING = ", or estimate a rolling shutter, which stretches the image likewise (docs/time_dependent_cameras.md)"
-# Terms of Brown's model (docs/models.md), for cameras whose model lacks them.
+# Terms of Brown's model (docs/models.md), tested if the camera model lacks them.
 _BROWN_TERMS = {
     "k1": lambda x, y: (x * (x * x + y * y), y * (x * x + y * y)),
     "k2": lambda x, y: (x * (x * x + y * y) ** 2, y * (x * x + y * y) ** 2),
@@ -318,13 +327,13 @@ _BROWN_TERMS = {
 def _fields(
     interior: InteriorOrientation, grid: Float[np.ndarray, "2 n"]
 ) -> list[tuple[str, Float[np.ndarray, "2 n"]]]:
-    """Displacement field of each parameter of the camera and of the Brown terms that its model lacks."""
+    """Return the displacement field of each camera parameter and of the Brown terms that the model lacks."""
     centred = grid - np.asarray(interior.principal_point)[:, None]
     names = parameter_names(interior)
     values = np.array([float(get_parameter(interior, name)) for name in names])
     slopes = np.asarray(call_compiled(_slopes, interior, names, values, centred.T))
     unit, zero = np.ones(grid.shape[1]), np.zeros(grid.shape[1])
-    # Scale and shifts of the model without distortion, whose contribution to them is negligible.
+    # Use scale and shifts of the model without distortion: the contribution of the distortion to them is negligible.
     fields = {"c_mm": centred / float(interior.c), "xp_mm": np.stack([unit, zero]), "yp_mm": np.stack([zero, unit])}
     fields = {name: slopes[..., k].T for k, name in enumerate(names)} | fields
     brown = {name: np.stack(field(*centred)) for name, field in _BROWN_TERMS.items() if name.split()[0] not in names}
@@ -345,7 +354,7 @@ def _slopes(interior: InteriorOrientation, names: tuple[str, ...], values: Array
 
 
 def _is_affine(field: Float[np.ndarray, "2 n"], centred: Float[np.ndarray, "2 n"]) -> bool:
-    """Return True if the field stretches or shears the image, as the sequential exposure of rows does."""
+    """Return True if the field stretches or shears the image, as a rolling shutter does."""
     matrix = field @ np.linalg.pinv(centred)
     stretched = np.abs(matrix - np.eye(2) * np.trace(matrix) / 2).max() > _MAX_MISFIT * np.abs(matrix).max()
     return bool(stretched and np.abs(matrix @ centred - field).max() < _MAX_MISFIT * np.abs(field).max())
@@ -359,27 +368,27 @@ def _cure(adjusted: Adjustment, camera: str, name: str) -> str:
 
 
 MIN_FRACTION = 1e-3
-"""Fraction that estimated parameters must leave of an error in one observation for it to be tested."""
+"""Minimum fraction of an error in one observation that estimated parameters must leave for it to be tested."""
 SIGNIFICANT_RATIO = 3.3
-"""Ratio of a term to its standard deviation from which it is reported (error probability 0.1 %)."""
-# Maximum number of blunders estimated along with an effect; more blunders are a symptom of the effect itself.
+"""Ratio of a term to its standard deviation above which it is reported (error probability 0.1 %)."""
+# Maximum number of blunders estimated along with an effect; more blunders are caused by the effect itself.
 _MAX_BLUNDERS = 16
-# Largest relative difference between a blunder and the value of a term for the two to match.
+# Maximum relative difference between a blunder and the value of a term for the two to match.
 _MATCH = 0.5
 
 
 @pretty_repr
 class TermEstimate(NamedTuple):
-    """One term of a systematic effect, estimated alone."""
+    """Estimate of one term of a systematic effect, without the other terms."""
 
     term: EffectTerm
     share: float
-    """Fraction of the square sum of the whole effect, 0 to 1."""
+    """Fraction of the sum of squares of the whole effect, 0 to 1."""
     amount: float
     sigma: float
-    """A posteriori; both in the unit of the term."""
+    """A posteriori standard deviation; `amount` and `sigma` are in the unit of the term."""
     moves: dict[str, float]
-    """Change of the interior parameters with it, in their standard deviations, by path."""
+    """Change of the interior parameters due to the term, in their standard deviations, by path."""
 
 
 @pretty_repr
@@ -387,21 +396,21 @@ class EffectTest(NamedTuple):
     """Test of one systematic effect."""
 
     pattern: SystematicEffect
-    """Without its columns (hundreds of MB in a large block); `candidate_effects` builds them again."""
+    """Tested effect without its columns (hundreds of MB in a large block); `candidate_effects` recomputes them."""
     sigma: float
-    """Median standard deviation of its observations."""
+    """Median standard deviation of the observations of the effect."""
     freedom: int
     p_value: float
     size: float
     """Root mean square of the effect in the residuals, corrected for noise, in the unit of the observations."""
     hints: tuple[TermEstimate, ...]
-    """Named terms, largest fraction first."""
+    """Estimated named terms, largest fraction first."""
     matching_blunders: int = 0
     """Number of estimated blunders that match the value of the first term at their observations."""
 
     @property
     def significant_terms(self) -> list[TermEstimate]:
-        """Significant axes of an effect common to all rows of a group."""
+        """Significant terms of an effect common to all rows of a group; empty for other effects."""
         significant = [h for h in self.hints if abs(h.amount) > SIGNIFICANT_RATIO * h.sigma]
         return significant if self.pattern.group else []
 
@@ -409,10 +418,10 @@ class EffectTest(NamedTuple):
 def systematic_effect_tests(
     adjusted: Adjustment, shared_sigma: Float[np.ndarray, "shared"], blunders: Sequence[tuple[str, int]] = ()
 ) -> list[EffectTest]:
-    """Test all candidate effects of `adjusted`; those beyond chance have a small `p_value`.
+    """Test all candidate effects of `adjusted`. Significant effects have a small `p_value`.
 
-    `shared_sigma` are the a posteriori standard deviations of the shared unknowns. The first of the `blunders` (rows as
-    group name and index) are estimated as unknown errors along with each effect.
+    `shared_sigma`: a posteriori standard deviations of the shared unknowns. `blunders`: rows as group name and index;
+    up to 16 of them, the first, are estimated as unknown errors along with each effect.
     """
     if adjusted.redundancy < 2 or not bool(adjusted.converged):
         return []
@@ -433,7 +442,7 @@ def systematic_effect_tests(
 
 
 class _Directions(NamedTuple):
-    """Directions solved for together: an error in each of some observations, then the columns of each effect."""
+    """Right-hand sides solved together: a unit error in each of some observations, then the columns of each effect."""
 
     at: Int[np.ndarray, "m"]
     patterns: tuple[SystematicEffect, ...]
@@ -441,26 +450,26 @@ class _Directions(NamedTuple):
 
     @property
     def ends(self) -> list[int]:
-        """Index after the observations and after each effect."""
+        """End index of the observations, then of each effect."""
         return np.cumsum([len(self.at), *(p.n_columns for p in self.patterns)]).tolist()
 
     def column(self, k: int) -> Float[np.ndarray, "n"]:
-        """Direction `k`, whitened."""
+        """Return direction `k`, whitened."""
         effect = bisect.bisect_right(self.ends, k)
         if effect == 0:
             return self.unit(k)
         return self.patterns[effect - 1].column(k - self.ends[effect - 1], self.n_observations)
 
     def unit(self, k: int) -> Float[np.ndarray, "n"]:
-        """Error of one in observation `at[k]`."""
+        """Return a whitened unit error in observation `at[k]`."""
         return np.bincount(self.at[k : k + 1], minlength=self.n_observations).astype(float)
 
 
 class _Blunders(NamedTuple):
-    """Observations with unknown errors."""
+    """Observations with errors estimated as unknowns."""
 
     errors: Float[np.ndarray, "m"]
-    """Estimates, whitened."""
+    """Estimated errors, whitened."""
     changes: Float[np.ndarray, "m shared"]
     inverse: Float[np.ndarray, "m m"]
     explained: float
@@ -474,7 +483,7 @@ class _Blunders(NamedTuple):
         adjusted_products: Float[np.ndarray, "k k"],
         changes: Float[np.ndarray, "k shared"],
     ) -> "_Blunders":
-        """Estimate errors of the observations `at`, the first directions."""
+        """Estimate the errors of the observations `at`, the first directions."""
         m = len(at)
         inverse, freedom = truncated_inverse(np.eye(m) - adjusted_products[:m, :m], np.eye(m), MIN_FRACTION)
         errors = inverse @ v[at]
@@ -525,7 +534,10 @@ def _hints(
     changes: Float[np.ndarray, "k shared"],
     sigma0: float,
 ) -> list[TermEstimate]:
-    """Each term alone, with its square sum for `share`; terms absorbed by estimated parameters are omitted."""
+    """Estimate each term without the others, with its sum of squares as `share`.
+
+    Terms absorbed by estimated parameters are omitted.
+    """
     estimates = []
     paths = [(k, label) for k, label in enumerate(adjusted.structure.labels) if label.startswith("interior[")]
     for term in pattern.terms:
@@ -542,9 +554,9 @@ def _hints(
 def truncated_inverse(
     c: Float[np.ndarray, "k k"], unadjusted: Float[np.ndarray, "k k"], min_fraction: float
 ) -> tuple[Float[np.ndarray, "k k"], int]:
-    """Inverse of `c` over the directions that estimated parameters do not absorb, and their number.
+    """Return the pseudoinverse of `c` over the directions that estimated parameters do not absorb, and its rank.
 
-    `unadjusted` is `c` without any unknowns.
+    `unadjusted` is `c` without estimated parameters.
     """
     if not np.isfinite(c).all():
         # Overflow: no direction is testable.

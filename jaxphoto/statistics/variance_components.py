@@ -1,12 +1,11 @@
 """Variance components of parts of the observations, by restricted maximum likelihood (REML).
 
-Partition. The parts are declared by splits of the groups of observations, or by a selection of observations for each
-label:
+Partition. Parts are defined by splitting the groups of observations, or by selecting observations for each label:
 
     variance_components(adjusted, ("xy-z", "camera"))
     variance_components(adjusted, {"height": Selection("control_points", axes="Z"), "GNSS": Selection("stations")})
 
-Prior information (`Weighted`, `KnownParameters`) is no sample and keeps its weight.
+Prior information (`Weighted`, `KnownParameters`) is not a sample and retains its weight.
 
 Partial redundancy. With R = I - H, H = J Q J' of whitened observations, and R_kl the block of the rows of part k and
 the columns of part l,
@@ -14,25 +13,25 @@ the columns of part l,
     S_kl = tr(R_k R_l) = |R_kl|^2 (sum of squares),    r_k = tr R_kk = sum_l S_kl,    E[v_k' P_k v_k] = sum_l S_kl s_l
 
 where s_l is the variance factor of part l; the second follows because R is idempotent. Off the diagonal |R_kl| = |H_kl|
-is computed from products H z (`HatMatrix`): exactly, with z each unit vector of part k in turn; or, for a large part,
-as the mean of |H_l z|^2 over vectors z of random signs in part k (Hutchinson). Its standard deviation is below
-sqrt(S_kl / (2 p)) for p vectors, because no singular value of an off-diagonal block of a projector exceeds 1/2. The
-diagonal follows from the redundancy numbers, which are exact; so does the largest part, for which no vector is spent.
-If that part holds all image points, their rows are skipped: |H z|^2 = z'H z gives their sum.
+is computed from products H z (`HatMatrix`). For a small part it is exact, with every unit vector of part k as z. For a
+large part it is the mean of |H_l z|^2 over vectors z of random signs in part k (Hutchinson). Its standard deviation is
+below sqrt(S_kl / (2 p)) for p vectors, because no singular value of an off-diagonal block of a projector exceeds 1/2.
+The diagonal follows from the redundancy numbers, which are exact, and so does the largest part, which needs no vectors.
+If that part contains all image points, their rows are skipped: |H z|^2 = z'H z gives their sum.
 
 Variance components. With v_k' P_k v_k and S at the current weights, Helmert's step is
 
     s = S^-1 q,    q_k = v_k' P_k v_k,    covariance 2 S^-1.
 
 The sigmas of part k are multiplied by sqrt(s_k) and the block is readjusted (half the step after an overshoot), until
-all s_k are one: then q_k = r_k for every part, the equation of restricted maximum likelihood. As r_k is exact, so are
-the components; only their standard deviations depend on random vectors, through S. A step that leads to a variance that
-is not positive is replaced by Förstner's: s_k = q_k / r_k.
+all s_k are one: then q_k = r_k for every part, the equation of restricted maximum likelihood. The components are exact,
+because r_k is; only their standard deviations depend on random vectors, through S. If a step gives a variance that is
+not positive, Förstner's step s_k = q_k / r_k is used.
 
 Sources: F. R. Helmert, Die Ausgleichungsrechnung (1907); W. Förstner, Ein Verfahren zur Schätzung von Varianz- und
-Kovarianzkomponenten (1979); K. R. Koch, Parameter Estimation and Hypothesis Testing in Linear Models (1999), 3.6;
-H. D. Patterson and R. Thompson, Recovery of inter-block information when block sizes are unequal, Biometrika 58 (1971);
-M. F. Hutchinson (1989), A stochastic estimator of the trace of the influence matrix.
+Kovarianzkomponenten (1979); K. R. Koch, Parameter Estimation and Hypothesis Testing in Linear Models (1999), 3.6; H. D.
+Patterson and R. Thompson, Recovery of inter-block information when block sizes are unequal, Biometrika 58 (1971); M. F.
+Hutchinson (1989), A stochastic estimator of the trace of the influence matrix.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -57,7 +56,7 @@ from jaxphoto.tracing import outside_transformations
 
 @pretty_repr
 class Selection(NamedTuple):
-    """Observations of one group: all of them, or those of some axes, cameras, images or points."""
+    """Observations of one group: all of them, or only some axes, cameras, images or points."""
 
     group: str
     axes: Collection[str] = ()
@@ -67,21 +66,22 @@ class Selection(NamedTuple):
 
 
 Partition = Sequence[str] | Mapping[str, Selection | Sequence[Selection]]
-"""Splits of `SPLITS` (none: one part a group), or the selections of each label."""
+"""Names of splits (`SPLITS`), or the selections of each label. Without splits, each group is one part."""
 
 
 @pretty_repr
 class Parts(NamedTuple):
-    """A partition of the observations of one adjustment."""
+    """Partition of the observations of one adjustment."""
 
     labels: tuple[str, ...]
     part_of: dict[str, Int[np.ndarray, "..."]]
-    """Part of every observation by group name, shaped like the residuals; the number of parts for observations in
-    none."""
+    """Part of every observation by group name, shaped like the residuals. Observations without a part have the index
+    `len(labels)`.
+    """
 
     @property
     def counts(self) -> Int[np.ndarray, "parts"]:
-        """Number of observations of each part."""
+        """Number of observations in each part."""
         parts = np.concatenate([np.ravel(v) for v in self.part_of.values()])
         return np.bincount(parts, minlength=len(self.labels) + 1)[: len(self.labels)]
 
@@ -110,17 +110,17 @@ def _by_image(rows: AbstractObservations, block: Block) -> Names | None:
 
 
 SPLITS: dict[str, _Split] = {"xy-z": _plan_and_height, "axis": _by_axis, "camera": _by_camera, "image": _by_image}
-"""X and Y versus Z; every axis; image points by camera; image points by image."""
+"""Splits by name: X and Y versus Z; every axis; image points by camera; image points by image."""
 
 
 def observed_rows(adjusted: Adjustment) -> dict[str, AbstractObservations]:
-    """Return the groups of observations that may have variance components: all but prior information."""
+    """Return the groups of observations that can have variance components: all except prior information."""
     groups = observation_groups(adjusted)
     return {name: groups[name] for name in adjusted.block.named_observations}
 
 
 def partition_observations(adjusted: Adjustment, partition: Partition) -> Parts:
-    """Return the parts of an adjustment's observations, in the order of the partition.
+    """Assign the observations of an adjustment to parts, in the order of the partition.
 
     Raises InputError for an unknown split, group or name, a label without observations, observations with two labels,
     and correlated rows in different parts.
@@ -179,7 +179,7 @@ def _selected(
 def _mask(
     label: str, selection: Selection, rows: AbstractObservations, block: Block, shape: tuple[int, ...]
 ) -> np.ndarray:
-    """Mask of the selected observations of a group. Raises InputError for names that no row has."""
+    """Return the mask of the selected observations of a group. Raises InputError for names that no row has."""
     names_by_kind = {
         "axes": rows.axis_names(),
         "cameras": rows.names_of("image", block.image_camera),
@@ -198,31 +198,32 @@ def _mask(
 
 
 PROBES = 64
-"""Random vectors per part; parts of no more observations are exact. Only the standard deviations of the components
-depend on them: their error is below one per cent for parts with a redundancy of some tens."""
+"""Number of random vectors per part; parts with at most this many observations are computed exactly. Only the standard
+deviations of the components depend on it: their error is below 1 % for parts with a redundancy of some tens.
+"""
 
 
 @pretty_repr
 class PartialRedundancy(eqx.Module):
-    """Redundancy by parts of a partition; the last entry is all observations in none."""
+    """Redundancy by parts of a partition. The last element is for all observations without a part."""
 
     square_sums: Float[np.ndarray, "parts"]
-    """v_k' P_k v_k."""
+    """Sums of squares v_k' P_k v_k."""
     redundancy: Float[np.ndarray, "parts"]
-    """r_k; they sum to the redundancy."""
+    """Redundancy r_k of each part; the sum is the total redundancy."""
     matrix: Float[np.ndarray, "parts parts"]
-    """S."""
+    """Matrix S of the module's docstring."""
     uncertainty: Float[np.ndarray, "parts parts"]
-    """Upper bound of the standard deviation of each element of `matrix`; zero where exact."""
+    """Upper bound of the standard deviation of each element of `matrix`; zero for exact elements."""
 
 
 def partial_redundancy(adjusted: Adjustment, parts: Parts, probes: int = PROBES) -> PartialRedundancy:
-    """Compute S, r and v'Pv by part, with `probes` random vectors for each part with more observations than that."""
+    """Compute S, r and v'Pv by part, with `probes` random vectors for parts with more than `probes` observations."""
     n = len(parts.labels) + 1
     numbers = {k: np.asarray(v) for k, v in redundancy_numbers(adjusted, covariance(adjusted, rows=True)).named.items()}
     squares = {name: np.asarray(v) ** 2 for name, v in adjusted.residuals.named.items()}
     estimate, weight = _products(adjusted, parts, probes)
-    # The better of two estimates; the mean of equally good ones.
+    # Use the better of two estimates, or the mean of two equally good ones.
     share = np.where(weight[:, None] == weight, 0.5, weight[:, None] > weight)
     off_diagonal = share * estimate + share.T * estimate.T
     np.fill_diagonal(off_diagonal, 0.0)
@@ -246,20 +247,23 @@ def _by_part(numbers: dict[str, np.ndarray], parts: Parts, n: int) -> Float[np.n
 
 
 def _products(adjusted: Adjustment, parts: Parts, probes: int) -> tuple[np.ndarray, np.ndarray]:
-    """|H_kl|^2 off the diagonal, row by row, and the weight of each row: infinite if exact, zero for the largest."""
+    """Estimate |H_kl|^2 off the diagonal by row, and the weight of each row.
+
+    The weight is infinite for exact rows and zero for the largest part.
+    """
     n = len(parts.labels) + 1
     largest = int(np.argmax(sum(np.bincount(np.ravel(index), minlength=n) for index in parts.part_of.values())))
-    # The largest part gets no vectors. If it holds all image points, their share is the rest of z'Hz = |Hz|^2.
+    # The largest part gets no vectors. If it contains all image points, its |Hz|^2 is z'Hz minus the other parts.
     skip_images = all((index == largest).all() for name, index in parts.part_of.items() if name == ImagePoints.group)
     hat_matrix = HatMatrix.of(adjusted, image_rows=not skip_images)
-    # Datum constraints count as one more part.
+    # Index n: datum constraints.
     part = np.full(hat_matrix.count, n)
     for name, place in hat_matrix.places.items():
         part[place] = parts.part_of[name]
     at = [np.flatnonzero(part == k) for k in range(n)]
     weight = np.array([np.inf if len(places) <= probes else 1.0 for places in at])
     weight[largest] = 0.0
-    # Index of each unit vector of a part, or -1 for random signs.
+    # Index of each unit vector of a part; -1 for random signs.
     units = [places if w == np.inf else np.full((w > 0) * probes, -1) for places, w in zip(at, weight, strict=True)]
     part_of_unit, unit = np.repeat(np.arange(n), [len(u) for u in units]), np.concatenate(units)
 
@@ -272,7 +276,8 @@ def _products(adjusted: Adjustment, parts: Parts, probes: int) -> tuple[np.ndarr
     for j, (_, h) in enumerate(hat_matrix.apply(vector, len(part_of_unit))):
         by_part = np.bincount(part, h**2, minlength=n + 1)
         if skip_images:
-            # Rounding may leave a negative rest for a part that is nearly independent of the largest.
+            # Clip at zero: rounding may make the difference negative for a part that is nearly independent of the
+            # largest.
             by_part[largest] = max(0.0, vector(j) @ h - by_part.sum() + by_part[largest])
         squares[part_of_unit[j]] += by_part[:n]
     return squares / np.where(weight == 1.0, probes, 1.0)[:, None], weight
@@ -280,17 +285,19 @@ def _products(adjusted: Adjustment, parts: Parts, probes: int) -> tuple[np.ndarr
 
 MAX_ITERATIONS = 60
 MIN_DEGREES = 2.0
-"""Degrees of freedom at which the standard deviation of a component equals the component. With no more than these, it
-does not differ significantly from zero, and its weight 1 / s has no mean."""
-# Largest factor of a variance per iteration: further away S changes.
+"""Degrees of freedom at which the standard deviation of a component equals the component. With at most this many
+degrees of freedom it does not differ significantly from zero, and its weight 1 / s has no mean.
+"""
+# Maximum factor of a variance per iteration: S changes with larger factors.
 _MAX_FACTOR = 4.0
-# Convergence: largest change of a component in its standard deviations.
+# Convergence limit: maximum change of a component in its standard deviations.
 _TOLERANCE = 1e-3
-# Iterations with too few degrees of freedom and a decreasing variance after which a component is diagnosed as zero.
+# Number of iterations with too few degrees of freedom and a decreasing variance after which a component is diagnosed as
+# zero.
 _MAX_DECREASES = 3
-# Redundancy below which a part is uncontrolled: the rest is rounding.
+# Redundancy below which a part is uncontrolled: smaller values are rounding errors.
 _UNCHECKED = 1e-6
-# Smallest eigenvalue of S, scaled to a unit diagonal, that is not rounding.
+# Minimum eigenvalue of S, scaled to a unit diagonal; smaller values are rounding errors.
 _SINGULAR = 1e-10
 
 
@@ -298,8 +305,8 @@ _SINGULAR = 1e-10
 class VarianceComponents(eqx.Module):
     """Variance components of the parts of a partition, and the adjustment with them.
 
-    `factor` multiplies the a priori variances, sqrt(factor) the standard deviations. A part that cannot support a
-    component keeps the a priori ones (factor 1, no sigma); `warnings` say why.
+    `factor` multiplies the a priori variances, sqrt(factor) the standard deviations. A part that does not support a
+    component keeps its a priori standard deviations (factor 1, sigma NaN); `warnings` gives the reason.
     """
 
     labels: tuple[str, ...] = eqx.field(static=True)
@@ -307,23 +314,23 @@ class VarianceComponents(eqx.Module):
     sigma: Float[np.ndarray, "parts"]
     """Standard deviations of the factors; NaN for unsupported parts."""
     correlation: Float[np.ndarray, "parts parts"]
-    """Of the factors; NaN for unsupported parts."""
+    """Correlation matrix of the factors; NaN for unsupported parts."""
     observations: Int[np.ndarray, "parts"]
     redundancy: Float[np.ndarray, "parts"]
-    """After the adjustment with the components."""
+    """Redundancy of each part in the adjustment with the components."""
     sigma_uncertainty: Float[np.ndarray, "parts"]
     """Relative standard deviations of `sigma` due to random vectors; zero for exact traces."""
     supported: Bool[np.ndarray, "parts"]
     warnings: dict[str, str] = eqx.field(static=True)
-    """Reason and cure for each part that cannot support a component."""
+    """Reason and advice for each part that does not support a component."""
     adjusted: Adjustment
-    """Converged with standard deviations times sqrt(factor); its block has them."""
+    """Converged adjustment of the block with standard deviations multiplied by sqrt(factor)."""
     iterations: int = eqx.field(static=True)
     converged: bool = eqx.field(static=True)
 
     @property
     def degrees(self) -> Float[np.ndarray, "parts"]:
-        """Degrees of freedom of the factors: each has the variance 2 / degrees, as chi-square over its degrees."""
+        """Degrees of freedom of the factors: 2 / variance, as for chi-square divided by its degrees of freedom."""
         return 2 * (self.factor / self.sigma) ** 2
 
 
@@ -331,18 +338,18 @@ class _Step(NamedTuple):
     """Helmert's step of the estimated parts at the current weights, where every factor is one."""
 
     change: Float[np.ndarray, "free"]
-    """s - 1."""
+    """Change s - 1 of the factors."""
     covariance: Float[np.ndarray, "free free"]
-    """2 S^-1."""
+    """Covariance 2 S^-1 of the factors."""
 
     @property
     def sigma(self) -> Float[np.ndarray, "free"]:
-        """Standard deviations."""
+        """Standard deviations of the factors."""
         return np.sqrt(np.diagonal(self.covariance))
 
     @property
     def is_weak(self) -> Bool[np.ndarray, "free"]:
-        """True with at most `MIN_DEGREES` degrees of freedom."""
+        """True for parts with at most `MIN_DEGREES` degrees of freedom."""
         return self.sigma**2 >= 2 / MIN_DEGREES
 
     @property
@@ -363,17 +370,20 @@ def variance_components(
 ) -> VarianceComponents:
     """Estimate a variance component for every part of the observations, and adjust with them.
 
-    `partition` is a sequence of splits (`SPLITS`; none: one part a group), or observations by label (`Selection`).
-    Observations without a label and prior information keep their weight. A component that does not differ from zero
-    (at most `MIN_DEGREES` degrees of freedom) is not estimated. Traces use `probes` random vectors for parts with more
-    observations.
+    `partition`: names of splits (`SPLITS`; without splits, each group is one part), or observations by label
+    (`Selection`). Prior information and observations without a label retain their weight. A component that does not
+    differ from zero (at most `MIN_DEGREES` degrees of freedom) is not estimated. Traces use `probes` random vectors for
+    parts with more than `probes` observations.
 
-    Raises InputError for an adjustment that has not converged, an invalid partition, and no iteration.
+    Raises InputError for an adjustment that has not converged, an invalid partition, and a number of iterations or
+    random vectors below one.
     """
     if max_iterations < 1 or probes < 1:
         raise InputError(f"max_iterations and probes must be positive, got {max_iterations} and {probes}")
     if not bool(adjusted.converged):
-        raise InputError(f"variance components need a converged adjustment, but the block is {adjusted.outcome.value}")
+        raise InputError(
+            f"adjustment is {adjusted.outcome.value}; adjust to convergence before estimating variance components"
+        )
     block, priors, sizes = adjusted.block, adjusted.priors, adjusted.sizes
     parts = partition_observations(adjusted, partition)
     factor, free = np.ones(len(parts.labels)), np.ones(len(parts.labels), bool)
@@ -399,7 +409,7 @@ def variance_components(
             last[free] = step.change
         converged = False
         if (factor != before).any():
-            # An adjustment of a large block takes hundreds of MB: discard the last one before the next.
+            # Release the last adjustment (hundreds of MB for a large block) before the next one.
             unknowns, adjusted = adjusted.unknowns, None  # type: ignore[assignment]
             adjusted = solve(_reweighted(block, parts, factor), unknowns, priors, max_steps, sizes)
         if not bool(adjusted.converged):
@@ -408,7 +418,7 @@ def variance_components(
 
 
 def _helmert(current: PartialRedundancy, free: np.ndarray) -> _Step:
-    """Helmert's step of the `free` parts; parts that S cannot separate get a large standard deviation."""
+    """Compute Helmert's step of the `free` parts. Parts that S cannot separate get a large standard deviation."""
     s = current.matrix[:-1, :-1][np.ix_(free, free)]
     unit = 1 / np.sqrt(np.maximum(np.diagonal(s), _UNCHECKED**2))
     value, vector = np.linalg.eigh(s * unit[:, None] * unit)
@@ -427,8 +437,8 @@ def _unsupported(
 ) -> tuple[int, str] | None:
     """Return the part with the weakest unsupported component, if any, and the warning.
 
-    One at a time: without it, others may become separable. Before convergence the standard deviation is no criterion:
-    a part with far too small a priori sigmas has little redundancy at first.
+    Only one part is removed at a time: without it, others may become separable. Before convergence the standard
+    deviation is not a criterion: a part with far too small a priori sigmas has little redundancy at first.
     """
     candidates = np.flatnonzero(free).tolist()
     if not candidates:
@@ -453,13 +463,13 @@ def _warning(parts: Parts, k: int, reason: str) -> str:
 
 
 def _positive(change: np.ndarray, current: PartialRedundancy, free: np.ndarray) -> np.ndarray:
-    """Factors of the variances: Helmert's components, or Förstner's where these are not positive."""
+    """Return the factors of the variances: Helmert's components, or Förstner's if these are not positive."""
     foerstner = current.square_sums[:-1][free] / current.redundancy[:-1][free]
     return np.clip(np.where(change > -1, 1 + change, foerstner), 1 / _MAX_FACTOR, _MAX_FACTOR)
 
 
 def _reweighted(block: Block, parts: Parts, factor: np.ndarray) -> Block:
-    """Return the block with its variances times `factor`."""
+    """Return the block with its variances multiplied by `factor`."""
     scale = np.sqrt(np.append(factor, 1.0))
 
     def scaled(name: str, rows: AbstractObservations) -> AbstractObservations:

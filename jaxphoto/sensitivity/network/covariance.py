@@ -1,21 +1,21 @@
-"""Covariance of a planned network, differentiable in every number of its layout, and criteria of it to minimise.
+"""Covariance of a planned network, differentiable in its layout, and criteria for network design.
 
-No residual is needed: the normal matrix is that of the layout itself, in the notation of adjustment/solver/normal.py,
+The normal matrix is computed from the layout without residuals. In the notation of adjustment/solver/normal.py,
 
     S = U - sum_p Y_p Y_p',    Y_p = W_p L_p^-T,    V_p = L_p L_p'
     Q = S^-1,    Q_pp = L_p^-T (I + Y_p' Q Y_p) L_p^-1
 
-and dense, for layouts of some tens of images and hundreds of points. Every pair of image and point contributes. Its
-weight is that of the image times a window that decreases from one to zero across the edge of the format
-(`Layout.edge_mm`), so a point enters an image without a discontinuity. If no point lies in the edge, this is the
-covariance of `jaxphoto.covariance` with sigma naught 1.
+S is dense, for layouts of some tens of images and hundreds of points. Every pair of image and point contributes. Its
+weight is the weight of the image times a window that decreases from one to zero across the edge of the format
+(`Layout.edge_mm`), so a point enters an image without a discontinuity. If no point lies in the edge, the result equals
+`jaxphoto.covariance` with sigma naught 1.
 
-A criterion is a plain function of it; `functools.partial(sigma_of, name="c_mm")` makes one, and so does any
-differentiable function from a `NetworkCovariance` to a number. A maximum has kinks; with `power` p it is replaced by
-the p-norm, which is smooth and larger by at most the p-th root of the number of values: use it in the search, and
-report the value without.
+A criterion is any differentiable function from a `NetworkCovariance` to a scalar, such as
+`functools.partial(sigma_of, name="c_mm")`. A maximum has kinks; `power` p replaces it by the p-norm, which is smooth
+and larger by at most the factor n^(1/p) for n values. Use `power` in the search, and report the value without it.
 
-Source of A, D and E: Pukelsheim, Optimal Design of Experiments (1993); for networks, Grafarend and Sanso (1985).
+Source of the criteria A, D and E: Pukelsheim, Optimal Design of Experiments (1993); for networks, Grafarend and Sanso
+(1985).
 """
 
 from collections.abc import Sequence
@@ -38,8 +38,8 @@ from jaxphoto.sensitivity.network.layout import Layout
 from jaxphoto.small_matrices import cholesky_3x3, unwhiten, whiten
 from jaxphoto.statistics import EOP_NAMES
 
-# Prior weight of every point, relative to that of the best point (a million times its sigma): V of a point with fewer
-# than two rays is then invertible. Sigmas of all others change by less than 1e-7.
+# Prior weight of every point, relative to the weight of the best-determined point (10^6 times its sigma). It makes V
+# invertible for points with fewer than two rays. Sigmas of all other points change by less than 1e-7.
 _POINT_PRIOR = 1e-12
 EXTERIOR = EOP_NAMES["omega_phi_kappa"]
 
@@ -47,15 +47,15 @@ EXTERIOR = EOP_NAMES["omega_phi_kappa"]
 class NetworkCovariance(eqx.Module):
     """A priori covariances of a layout (sigma naught 1), in metres, radians, mm and the coefficients' own units.
 
-    `matrix` is of X, Y, Z, omega, phi, kappa of every image, followed by the free interior parameters.
+    `matrix` is the covariance of X, Y, Z, omega, phi, kappa of every image, followed by the free interior parameters.
     """
 
     matrix: Float[Array, "unknowns unknowns"]
     points: Float[Array, "points 3 3"]
     rays: Float[Array, "points"]
-    """Number of images of each point; an image with the point in the edge of its format counts by its weight."""
+    """Number of images of each point. An image with the point in the edge of its format counts by its weight."""
     corner: Float[Array, "free"]
-    """Displacement (mm) of an image point at the corner of the format by one unit of each interior parameter."""
+    """Displacement (mm) of an image point at the corner of the format per unit of each interior parameter."""
     free: tuple[str, ...] = eqx.field(static=True)
 
     @property
@@ -65,7 +65,7 @@ class NetworkCovariance(eqx.Module):
 
     @property
     def sigma(self) -> Float[Array, "unknowns"]:
-        """Standard deviations in the order of `matrix`."""
+        """Standard deviations of the unknowns, in the order of `matrix`."""
         return jnp.sqrt(jnp.diagonal(self.matrix))
 
     @property
@@ -76,7 +76,10 @@ class NetworkCovariance(eqx.Module):
 
     @property
     def interior_at_corner(self) -> Float[Array, "free free"]:
-        """Covariance in mm^2 at the corner of the format: one unit for all parameters, as sums need."""
+        """Covariance of the free interior parameters, scaled to displacements at the corner of the format (mm^2).
+
+        All parameters then have the same unit, as a trace requires.
+        """
         return self.interior * self.corner[:, None] * self.corner[None, :]
 
     @property
@@ -87,7 +90,7 @@ class NetworkCovariance(eqx.Module):
         return rho.reshape(-1, 6, len(self.free))
 
     def column(self, name: str) -> int:
-        """Index of the interior parameter `name` in `free`. Raises InputError if it is fixed."""
+        """Return the index of the interior parameter `name` in `free`. Raises InputError if it is fixed."""
         if name not in self.free:
             free = ", ".join(self.free) or "none"
             raise InputError(
@@ -98,11 +101,11 @@ class NetworkCovariance(eqx.Module):
 
 
 def design_covariance(layout: Layout) -> NetworkCovariance:
-    """Covariance of `layout`, differentiable; NaN with a rank defect.
+    """Compute the covariance of `layout`, differentiable; NaN with a rank defect.
 
-    `check_layout` reports the reason of a defect.
+    `check_layout` reports the reason of a rank defect.
     """
-    # A plain number would be part of the program, and each value compiled separately.
+    # Pass an array: a Python number would be a compile-time constant, and each value would be compiled separately.
     return call_compiled(_design_covariance, jax.tree.map(to_numpy, layout))
 
 
@@ -112,13 +115,13 @@ def _design_covariance(layout: Layout) -> NetworkCovariance:
     image_weight, station, attitude = layout.by_image
     n, k, m = len(station), len(layout.free), len(layout.points)
     weighted = weight[:, :, None, None]
-    # (images, 6, 6), (images, 6, free), (free, free)
+    # Shapes (images, 6, 6), (images, 6, free), (free, free).
     u = jnp.einsum("ipca,ipcb->iab", weighted * eop, eop)
     u = u + jax.vmap(jnp.diag)(jnp.concatenate([station, attitude], axis=1))
     us = jnp.einsum("ipca,ipcb->iab", weighted * eop, shared).reshape(6 * n, k)
     uss = jnp.einsum("ipca,ipcb->ab", weighted * shared, shared)
     normal = jnp.block([[_block_diagonal(u), us], [us.T, uss]])
-    # (3, unknowns, points): sums of two products each; a batch of small matrices would be slow.
+    # Shape (3, unknowns, points). Sum two products each: a batch of small matrices would be slow.
     products = lambda a: sum(  # noqa: E731
         (weighted * a)[:, :, c, :, None] * point[:, :, c, None, :] for c in range(2)
     )
@@ -132,7 +135,7 @@ def _design_covariance(layout: Layout) -> NetworkCovariance:
     l = cholesky_3x3(v)  # noqa: E741
     y = jnp.stack(whiten(w, l), axis=1)
     flat = y.reshape(len(normal), -1)
-    # Scaled to a unit diagonal before elimination.
+    # Scale to a unit diagonal before elimination.
     scale = jax.lax.stop_gradient(1 / jnp.sqrt(jnp.diagonal(normal)))
     q = _inverse((normal - flat @ flat.T) * scale[:, None] * scale) * scale[:, None] * scale
     inner = jnp.eye(3)[:, :, None] + jnp.einsum("acp,adp->cdp", y, (q @ flat).reshape(y.shape))
@@ -147,10 +150,10 @@ def _design_covariance(layout: Layout) -> NetworkCovariance:
 
 
 class _Pairs(NamedTuple):
-    """Derivatives of the image residual (mm) of every image and point, and its weight."""
+    """Derivatives of the image residual (mm) of every pair of image and point, and the weight of the pair."""
 
     eop: Float[Array, "images points 2 6"]
-    """By X, Y, Z and a small rotation about the camera's axes."""
+    """Derivatives by X, Y, Z and a small rotation about the camera axes."""
     shared: Float[Array, "images points 2 free"]
     point: Float[Array, "images points 2 3"]
     weight: Float[Array, "images points"]
@@ -165,7 +168,7 @@ def _pairs(layout: Layout) -> _Pairs:
         depth = jnp.where(z < 0, -z, 1.0)
         ideal = interior.c * jnp.stack([x, y]) / depth
         visible = (z < 0) & jnp.all(jnp.abs(ideal) < reach)
-        # `where` twice: far outside the format use a point on the axis instead, so that no derivative becomes NaN.
+        # Apply `where` twice: far outside the format use a point on the axis, so that no derivative is NaN.
         axis = image.position + rotate(image.camera_from_object.T, jnp.array([0.0, 0.0, -1.0]))
         aim = jnp.where(visible, point, axis)
         xy = project(interior, image, aim)
@@ -195,28 +198,28 @@ def _half(layout: Layout) -> Float[np.ndarray, "2"]:
 
 
 def _reach(layout: Layout) -> Float[Array, "2"]:
-    """Bounds of |ideal coordinates| on the format and its edge: pairs outside have no weight."""
+    """Return the bounds of |ideal coordinates| on the format and its edge: pairs outside have zero weight."""
     signs = np.array([[a, b] for a in (-1, 0, 1) for b in (-1, 0, 1)])
     ideal = jax.vmap(layout.interior.ideal_from_measured)(jnp.asarray(signs * (_half(layout) + layout.edge_mm / 2)))
     return 1.02 * jnp.max(jnp.abs(jax.lax.stop_gradient(ideal)), axis=0)
 
 
 def _smooth_step(t: Float[Array, "2"]) -> Float[Array, "2"]:
-    """0 below zero, 1 above one, and in between the polynomial with two continuous derivatives."""
+    """Return 0 below zero, 1 above one, and the quintic smoothstep (two continuous derivatives) in between."""
     t = jnp.clip(t, 0.0, 1.0)
     return t**3 * (10 - 15 * t + 6 * t**2)
 
 
 @jax.custom_jvp
 def _inverse(s: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """S^-1 by Cholesky."""
+    """Return S^-1 by Cholesky."""
     lower = cholesky(s)
     return solve_lower_transposed(lower, solve_lower(lower, jnp.eye(len(s))))
 
 
 @_inverse.defjvp
 def _inverse_jvp(primals, tangents):
-    """-S^-1 dS S^-1: matrix products, several times faster than the triangular solves that JAX would differentiate."""
+    """Differentiate by -S^-1 dS S^-1: several times faster than JAX's derivatives of the triangular solves."""
     q = _inverse(*primals)
     return q, -q @ tangents[0] @ q
 
@@ -227,7 +230,7 @@ def _block_diagonal(blocks: Float[Array, "n c c"]) -> Float[Array, "nc nc"]:
 
 
 def _angle_jacobian(camera_from_object: Float[Array, "3 3"]) -> Float[Array, "6 6"]:
-    """Return the derivative of X, Y, Z, omega, phi, kappa by X, Y, Z and a small rotation about the camera's axes."""
+    """Return the derivatives of X, Y, Z, omega, phi, kappa by X, Y, Z and a small rotation about the camera axes."""
     angles = lambda theta: omega_phi_kappa_from_matrix(small_rotation(theta) @ camera_from_object)  # noqa: E731
     return jnp.eye(6).at[3:, 3:].set(jax.jacfwd(angles)(jnp.zeros(3)))
 
@@ -241,19 +244,22 @@ def _corner(layout: Layout) -> Float[Array, "free"]:
 
 
 def a_criterion(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
-    """A-criterion: mean variance trace(Q) / n of a covariance matrix of unknowns of one unit."""
+    """Return the A-criterion: mean variance trace(Q) / n of the covariance matrix of unknowns of one unit."""
     return jnp.trace(matrix) / len(matrix)
 
 
 def d_criterion(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
-    """D-criterion: det(Q)^(1/n), mean size of the error ellipsoid; other units of the unknowns scale it only."""
+    """Return the D-criterion det(Q)^(1/n): mean size of the error ellipsoid. Units of the unknowns only scale it."""
     scale = jnp.sqrt(jnp.diagonal(matrix))
     log = 2 * jnp.sum(jnp.log(jnp.diagonal(cholesky(matrix / scale[:, None] / scale))))
     return jnp.exp((log + 2 * jnp.sum(jnp.log(scale))) / len(matrix))
 
 
 def e_criterion(matrix: Float[Array, "n n"], power: float | None = None) -> Float[Array, ""]:
-    """E-criterion: largest eigenvalue, the variance of the worst determined direction, of unknowns of one unit."""
+    """Return the E-criterion: largest eigenvalue of Q, the variance of the worst-determined direction.
+
+    The unknowns must have one unit.
+    """
     return _largest(eigh(matrix)[0], power)
 
 
@@ -264,7 +270,7 @@ def sigma_of(covariance: NetworkCovariance, name: str) -> Float[Array, ""]:
 
 
 def point_rmse(covariance: NetworkCovariance, points: Sequence[int] | slice = slice(None)) -> Float[Array, ""]:
-    """Return the expected RMSE (m) of a coordinate of `points`: sqrt of the mean variance over points and axes.
+    """Return the expected RMSE (m) of a coordinate of `points`: square root of the mean variance over points and axes.
 
     It predicts the RMSE at error-free check points. A point with fewer than two images makes it very large.
     """
@@ -275,7 +281,7 @@ def point_rmse(covariance: NetworkCovariance, points: Sequence[int] | slice = sl
 def largest_correlation(
     covariance: NetworkCovariance, exterior: Sequence[str], interior: Sequence[str], power: float | None = None
 ) -> Float[Array, ""]:
-    """Maximum |rho| over all images of `exterior` (X, Y, Z, omega, phi, kappa) with `interior` (c_mm ...) parameters.
+    """Return the maximum |rho| over all images of `exterior` (X, Y, Z, omega, phi, kappa) with `interior` parameters.
 
     Raises InputError for a parameter that is fixed or does not exist.
     """
@@ -285,7 +291,7 @@ def largest_correlation(
 def mean_correlation(
     covariance: NetworkCovariance, exterior: Sequence[str], interior: Sequence[str]
 ) -> Float[Array, ""]:
-    """Mean |rho| over all images of `exterior` with `interior` parameters (paper 000, Table 4)."""
+    """Return the mean |rho| over all images of `exterior` with `interior` parameters (paper 000, Table 4)."""
     return jnp.mean(jnp.abs(_chosen(covariance, exterior, interior)))
 
 
@@ -300,5 +306,5 @@ def _largest(values: Float[Array, "n"], power: float | None) -> Float[Array, ""]
     largest = jnp.max(values)
     if power is None:
         return largest
-    # Relative to the largest, so that no power overflows.
+    # Divide by the largest value, so that no power overflows.
     return largest * jnp.sum((values / largest) ** power) ** (1 / power)

@@ -1,9 +1,9 @@
 """Layouts of planned networks: positions of cameras and ground points, with weights.
 
-A `Layout` contains what a covariance needs, without measurements. A design is any tree of numbers (headings, heights,
-the position of a control point, fractions of a budget), and a pure function of the user maps it to a `Layout`. For
-straight strips and control points, `StripDesign` holds the design variables and `StripPlan` the constants.
-`block_from_layout` verifies a layout independently: a block with observations for `jaxphoto.adjust` and
+A `Layout` contains the input of a covariance, without measurements. A design is any tree of numeric values (headings,
+heights, the position of a control point, fractions of a budget), which a pure function of the user maps to a `Layout`.
+For straight strips and control points, `StripDesign` contains the design variables and `StripPlan` the constants. To
+verify a layout independently, `block_from_layout` builds a block with observations for `jaxphoto.adjust` and
 `jaxphoto.covariance`. Headings are clockwise from north, lengths in metres, the object frame east-north-up
 (docs/conventions.md).
 """
@@ -36,9 +36,9 @@ from jaxphoto.unknowns import FREE, Unknowns, default_priors
 class Layout(eqx.Module):
     """Images of one camera over ground points, with the weights of all planned observations.
 
-    A weight is 1 / sigma^2, zero for no observation, and may be traced: a budget can be optimised. Weights with fewer
-    axes are broadcast. The interior parameters in `free` (names as in block.toml) are unknown, the others fixed; all
-    exterior orientations and points are unknown.
+    A weight is 1 / sigma^2, zero for no observation. It may be traced, so that a budget can be optimised. Weights with
+    fewer axes are broadcast. The interior parameters in `free` (names as in block.toml) are unknown, the others fixed.
+    All exterior orientations and points are unknown.
     """
 
     interior: InteriorOrientation
@@ -46,18 +46,19 @@ class Layout(eqx.Module):
     points: Float[Array, "points 3"]
     """Ground points (m), including control points."""
     image_weight: Float[ArrayLike, "..."] | float
-    """Weight of both image coordinates, by image; 1 / mm^2."""
+    """Weight of both image coordinates, by image (1 / mm^2)."""
     control_weight: Float[ArrayLike, "..."] | float = 0.0
-    """Weight of X, Y, Z by point; 1 / m^2."""
+    """Weight of X, Y, Z by point (1 / m^2)."""
     station_weight: Float[ArrayLike, "..."] | float = 0.0
-    """Weight of X, Y, Z of the projection centre by image; 1 / m^2."""
+    """Weight of X, Y, Z of the projection centre by image (1 / m^2)."""
     attitude_weight: Float[ArrayLike, "..."] | float = 0.0
-    """Weight of roll, pitch, yaw by image, the camera's x axis pointing forward; 1 / rad^2."""
+    """Weight of roll, pitch, yaw by image (1 / rad^2). The camera's x axis points forward."""
     sensor: Sensor = eqx.field(static=True, kw_only=True)
     free: tuple[str, ...] = eqx.field(static=True, default=("c_mm", "xp_mm", "yp_mm"))
     edge_mm: float = eqx.field(static=True, default=1.0)
-    """Width of the edge of the format, half of it inside, in which the weight of an image point decreases smoothly to
-    zero: a layout is differentiable where points enter an image."""
+    """Width of the edge of the format, half of it inside the format. The weight of an image point decreases smoothly to
+    zero across the edge, so a layout is differentiable where points enter an image.
+    """
 
     def __check_init__(self) -> None:
         names = parameter_names(self.interior)
@@ -68,7 +69,7 @@ class Layout(eqx.Module):
 
     @property
     def by_image(self) -> tuple[Float[Array, "images"], Float[Array, "images 3"], Float[Array, "images 3"]]:
-        """Weights of image coordinates, of stations and of attitudes, for every image."""
+        """Return the weights of image coordinates, stations and attitudes for every image."""
         n = len(self.exterior.position)
         weights = (self.image_weight, (n,)), (self.station_weight, (n, 3)), (self.attitude_weight, (n, 3))
         image, station, attitude = (jnp.broadcast_to(jnp.asarray(w, float), shape) for w, shape in weights)
@@ -76,16 +77,16 @@ class Layout(eqx.Module):
 
     @property
     def by_point(self) -> Float[Array, "points 3"]:
-        """Weights of control coordinates, for every point."""
+        """Return the weights of control coordinates for every point."""
         return jnp.broadcast_to(jnp.asarray(self.control_weight, float), self.points.shape)
 
 
 class StripDesign(eqx.Module):
-    """Variables of a flight of straight strips over some control points; two of them are its bounds.
+    """Design variables of a flight of straight strips over control points. Two designs are the bounds of a search.
 
-    `heading` (rad) and `height` (m, Z of the strip); the centre of the strip is `along` ahead and `across` to the right
-    of the origin (m), in flight direction; `roll` and `pitch` (rad) tilt all its images. `control` is X, Y (m) of each
-    control point.
+    `heading` (rad); `height` (m): Z of the strip. The centre of the strip is `along` ahead and `across` to the right of
+    the origin (m), in flight direction. `roll` and `pitch` (rad) tilt all images of a strip. `control`: X, Y (m) of
+    each control point.
     """
 
     heading: Float[ArrayLike, "strips"]
@@ -98,12 +99,12 @@ class StripDesign(eqx.Module):
 
 
 class StripPlan(eqx.Module):
-    """Constants of a flight of strips; called with a `StripDesign` it returns the `Layout`.
+    """Constants of a flight of strips. Calling it with a `StripDesign` returns the `Layout`.
 
-    `images` is the number of images of each strip, `base` (m) the distance between them. `turn` (roll, pitch, yaw in
-    rad) and `shift` (m) are the deviations of each image from the plan. Sigmas in mm on the image and in m, infinite
-    for no observation. Control points are placed on the ground between its `points` (`smooth_height` with `reach`) and
-    follow these in the layout.
+    `images`: number of images per strip; `base` (m): distance between them. `turn` (roll, pitch, yaw in rad) and
+    `shift` (m): deviations of each image from the plan. Sigmas are in mm on the image and in m, infinite for no
+    observation. The ground through `points` (`smooth_height` with `reach`) gives the heights of the control points,
+    which follow `points` in the layout.
     """
 
     interior: InteriorOrientation
@@ -141,7 +142,7 @@ class StripPlan(eqx.Module):
 
 
 def design_from_plan(plan: FlightPlan, control: Float[ArrayLike, "control 2"]) -> StripDesign:
-    """Return strips of a flight plan over ground of mean height zero, without tilts, and control points at X, Y (m)."""
+    """Return the design of a flight plan: strips without tilts over ground of mean height zero, and control points."""
     numbers = [(np.deg2rad(s.heading_deg), s.height_m, s.across_m, s.along_m, 0.0, 0.0) for s in plan.strips]
     heading, height, across, along, roll, pitch = np.array(numbers).T
     return StripDesign(heading, height, across, along, roll, pitch, np.asarray(control, float))
@@ -159,12 +160,12 @@ def strip_images(
     turn: Float[ArrayLike, "images 3"] | float = 0.0,
     shift: Float[ArrayLike, "images 3"] | float = 0.0,
 ) -> ExteriorOrientation:
-    """Exterior orientations of straight strips with `images` images each, the camera's x axis forward.
+    """Return the exterior orientations of straight strips with `images` images each, the camera's x axis forward.
 
-    `base` (m) is the distance between exposures, `heading` (rad) clockwise from north, `height` (m) the Z of the strip;
-    its centre is `along` ahead and `across` to the right of the origin (m), in flight direction. `roll` and `pitch`
-    (rad) tilt every image of a strip. `turn` (roll, pitch, yaw in rad) and `shift` (m) are added image by image. As
-    `simulation.Strip`, and differentiable.
+    `base` (m): distance between exposures. `heading` (rad): clockwise from north. `height` (m): Z of the strip. The
+    centre of the strip is `along` ahead and `across` to the right of the origin (m), in flight direction. `roll` and
+    `pitch` (rad) tilt every image of a strip. `turn` (roll, pitch, yaw in rad) and `shift` (m) are added image by
+    image. Differentiable version of `simulation.Strip`.
     """
     n = len(images)
     strip = np.repeat(np.arange(n), images)
@@ -181,9 +182,9 @@ def strip_images(
 
 
 def smooth_height(points: Float[Array, "points 3"], xy: Float[Array, "n 2"], reach: float) -> Float[Array, "n"]:
-    """Z (m) of the ground at `xy` (m): mean of `points`, weighted by exp(-d^2 / (2 reach^2)).
+    """Interpolate Z (m) of the ground at `xy` (m): mean of `points`, weighted by exp(-d^2 / (2 reach^2)).
 
-    `reach` (m) is about the distance between points. It places points whose X, Y are design variables on the ground.
+    Choose `reach` (m) close to the distance between points. Use it for points whose X, Y are design variables.
     """
     square = jnp.sum((xy[:, None] - points[None, :, :2]) ** 2, axis=2)
     return jax.nn.softmax(-square / (2 * reach**2), axis=1) @ points[:, 2]
@@ -193,19 +194,19 @@ CAMERA, MOUNT = "camera", "body"
 
 
 class LayoutBlock(NamedTuple):
-    """A block with noise-free observations (`simulation.remeasure` adds noise), and its truth."""
+    """Block with noise-free observations (`simulation.remeasure` adds noise), and its true parameters."""
 
     block: Block
     truth: Unknowns
     point: np.ndarray
-    """Indices of the layout's points in the block: those in two images, and control in one."""
+    """Layout indices of the points in the block: points in at least two images, and control points in at least one."""
 
 
 def block_from_layout(layout: Layout) -> LayoutBlock:
     """Build the block of `layout`: every image measures the true position of the points inside its format.
 
-    Weights become standard deviations; zero weights are not observed. Raises BlockError for an image with fewer than
-    three points.
+    Weights become standard deviations; coordinates of zero weight are not observed. Raises BlockError for an image with
+    fewer than three points.
     """
     layout = jax.tree.map(to_numpy, layout)
     n = len(layout.exterior.position)
@@ -258,7 +259,7 @@ def block_from_layout(layout: Layout) -> LayoutBlock:
 
 
 def check_layout(layout: Layout) -> None:
-    """Raise DatumError if position, orientation or scale of `layout` is undetermined (the check of `jaxphoto.adjust`).
+    """Raise DatumError if position, orientation or scale of `layout` is undetermined, as in `jaxphoto.adjust`.
 
     Raises BlockError for an image with too few points, and for a fisheye camera.
     """
@@ -273,13 +274,13 @@ def check_layout(layout: Layout) -> None:
 
 
 def _rows(weight: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Index, axis, value and sigma of every coordinate with a weight."""
+    """Return index, axis, value and sigma of every coordinate with a nonzero weight."""
     index, axis = np.nonzero(weight > 0)
     return index, axis, np.asarray(value)[index, axis], 1 / np.sqrt(weight[index, axis])
 
 
 @eqx.filter_jit
 def _roll_pitch_yaw(camera_from_object: Float[Array, "images 3 3"]) -> Float[Array, "images 3"]:
-    """Angles of the body in which the camera's x axis points forward."""
+    """Return roll, pitch, yaw of the body frame in which the camera's x axis points forward."""
     level = body_from_camera(jnp.zeros(3), jnp.asarray(NOMINAL["forward"]))
     return jax.vmap(lambda matrix: roll_pitch_yaw_from_matrix(matrix.T @ level.T))(camera_from_object)

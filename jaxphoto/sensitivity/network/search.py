@@ -1,13 +1,13 @@
 """Gradient-based network design: minimise a criterion of the covariance over bounded design variables.
 
-A design is a tree of numbers; the user's pure function maps it to a `Layout`, and the criterion maps the covariance of
-that to a number. The composition is differentiated, so a search needs some tens of covariances, while a grid needs a
-number exponential in the number of variables. Bounds are enforced by the sine,
+A design is a tree of numeric values. The user's pure function maps it to a `Layout`, and the criterion maps the
+covariance of the layout to a scalar. The composition is differentiated, so a search needs some tens of covariances. A
+grid search needs a number of covariances that is exponential in the number of variables. Bounds are enforced by
 
     x = (low + high) / 2 + (high - low) / 2 sin u
 
-with u free, and BFGS minimises the logarithm of the criterion: neither has a unit. The objective has many local minima,
-so a search uses several starts.
+with unbounded u. BFGS minimises the logarithm of the criterion, so variables and objective are dimensionless. The
+objective has many local minima, so a search uses several starts.
 """
 
 from collections.abc import Callable
@@ -29,16 +29,16 @@ Design = TypeVar("Design")
 LayoutOf = Callable[[Any], Layout]
 Criterion = Callable[[NetworkCovariance], Float[Array, ""]]
 MAX_STEPS = 200
-# Convergence: change of ln(criterion) and of the variables (in units of their range).
+# Convergence limit: maximum change of ln(criterion) and of the variables (in units of their range).
 _TOLERANCE = 1e-6
-# Maximum distance of a start from the centre in units of the half range: at a bound the derivative by u is zero.
+# Maximum distance of initial values from the centre, in half ranges: the derivative by u is zero at a bound.
 _MAX_START = 0.99
-# Designs per batch of covariances.
+# Maximum number of designs per batch of covariances.
 _BATCH = 16
 
 
 class DesignSearch(eqx.Module, Generic[Design]):
-    """Result of `optimise_design`. Designs have a leading axis over the starts; values are those of the criterion."""
+    """Result of `optimise_design`. Designs have a leading axis over the starts; values are criterion values."""
 
     starts: Design
     start_values: Float[np.ndarray, "starts"]
@@ -54,7 +54,7 @@ class DesignSearch(eqx.Module, Generic[Design]):
 
     @property
     def value(self) -> float:
-        """Smallest criterion."""
+        """Smallest criterion value."""
         return float(np.min(self.values))
 
 
@@ -69,13 +69,13 @@ def optimise_design(
 ) -> DesignSearch[Design]:
     """Minimise `criterion` over designs between `low` and `high`, once from each of `starts`.
 
-    `layout_of` maps one design to its `Layout` and is differentiable; `low`, `high` and each start are designs of equal
-    structure. A variable with equal bounds is fixed. `starts` has a leading axis (`random_designs`, `stack_designs`).
-    `smooth` replaces a `criterion` with kinks in the search; values and the best design are by `criterion`, and no
-    result is worse than its start.
+    `layout_of` maps one design to its `Layout` and must be differentiable. `low`, `high` and each start are designs of
+    equal structure. A variable with equal bounds is fixed. `starts` has a leading axis (`random_designs`,
+    `stack_designs`). For a `criterion` with kinks, give a differentiable `smooth` for the search. Values and the best
+    design refer to `criterion`, and no result is worse than its start.
 
-    Raises InputError for reversed bounds, a start outside, or a criterion of a fixed parameter; DatumError or
-    BlockError for a start whose block has no datum, or images without points.
+    Raises InputError for reversed bounds, a start outside the bounds, or a criterion of a fixed parameter; DatumError
+    or BlockError for a start whose block has no datum, or images without points.
     """
     low, high = _checked(low, high)
     starts = _checked_starts(starts, low, high)
@@ -100,20 +100,20 @@ def optimise_design(
 
 
 def evaluate_designs(criterion: Criterion, layout_of: LayoutOf, designs: Design) -> Float[np.ndarray, "designs"]:
-    """Criterion of every one of `designs` (a leading axis), for a grid search; NaN with a rank defect."""
+    """Compute the criterion of each of `designs` (a leading axis), for a grid search; NaN with a rank defect."""
     arrays = jax.tree.map(lambda v: np.asarray(v, float), designs)
     return np.asarray(call_compiled(_evaluate, criterion, layout_of, arrays))
 
 
 def random_designs(low: Design, high: Design, n: int, seed: int = 0) -> Design:
-    """`n` designs drawn uniformly between the bounds, with a leading axis."""
+    """Draw `n` designs uniformly between the bounds; they have a leading axis."""
     low, high = _checked(low, high)
     rng = np.random.default_rng(seed)
     return jax.tree.map(lambda a, b: a + (b - a) * rng.uniform(size=(n, *a.shape)), low, high)
 
 
 def grid_designs(low: Design, high: Design, n: int) -> Design:
-    """Every combination of `n` equidistant values of each variable from `low` to `high`, with a leading axis.
+    """Return every combination of `n` equidistant values of each variable from `low` to `high`, with a leading axis.
 
     A variable with equal bounds has one value.
     """
@@ -130,7 +130,7 @@ def grid_designs(low: Design, high: Design, n: int) -> Design:
 def best_designs(criterion: Criterion, layout_of: LayoutOf, designs: Design, n: int) -> Design:
     """Return the `n` of `designs` (a leading axis) with the smallest criterion, as starts of a search.
 
-    Raises InputError if fewer have a finite criterion.
+    Raises InputError if fewer than `n` designs have a finite criterion.
     """
     values = evaluate_designs(criterion, layout_of, designs)
     if np.isfinite(values).sum() < n:
@@ -143,7 +143,7 @@ def best_designs(criterion: Criterion, layout_of: LayoutOf, designs: Design, n: 
 
 
 def stack_designs(*designs: Design) -> Design:
-    """Stack single designs along a leading axis."""
+    """Stack single designs along a new leading axis."""
     return jax.tree.map(lambda *v: np.stack([np.asarray(x, float) for x in v]), *designs)
 
 
@@ -174,12 +174,12 @@ def _search(objective: Criterion, layout_of: LayoutOf, low, high, starts, max_st
         solution: optx.Solution = optx.minimise(logarithm, solver, u, max_steps=max_steps, throw=False)
         return design(solution.value), solution.stats["num_steps"], solution.result == optx.RESULTS.successful
 
-    # Sequentially: vmapped, each would wait for the slowest, and on a CPU batches gain nothing.
+    # Run sequentially: vmapped, each search would wait for the slowest, and batches save no time on a CPU.
     return jax.lax.map(minimise, starts)
 
 
 def _checked(low: Design, high: Design) -> tuple[Design, Design]:
-    """Bounds as arrays. Raises InputError unless every low bound is at most its high one."""
+    """Return the bounds as arrays. Raises InputError unless every low bound is at most its high one."""
     low, high = (jax.tree.map(lambda v: np.asarray(v, float), tree) for tree in (low, high))
     if not _same_structure(low, high):
         raise InputError("low and high are designs of different structure: give both the same variables")
@@ -222,7 +222,7 @@ def _checked_starts(starts: Design, low: Design, high: Design) -> Design:
 
 
 def _check(layout: Layout, name: str) -> None:
-    """`check_layout`, with the name of the design in the error."""
+    """Apply `check_layout` and add the name of the design to its error."""
     try:
         check_layout(layout)
     except DatumError as error:
