@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 _SAMPLES = 16
 _QUANTILES = 0.1, 0.9
-_FACTOR = 3.0  # maximum ratio to the expected increase, or its inverse; the mean square of normalised errors is still correct below it
+_FACTOR = 3.0  # maximum ratio of the increase to the expected one, and of its inverse
 
 
 def typical_errors(normal: Float[np.ndarray, "u u"], sigma: float) -> Float[np.ndarray, "steps u"]:
