@@ -333,8 +333,8 @@ def _left_by_plane(sums: Float[Array, "2 lines 4 4"]) -> Float[Array, "2 lines"]
 
 # Error of an interpolated height: noise and interpolation bias.
 #
-# A height is a weighted sum of the heights of the points, H = sum w_i Z_i. With the local surface Z(x) (`LocalFit`), the
-# noise variance v of a height and A = `rows`,
+# A height is a weighted sum of the heights of the points, H = sum w_i Z_i. With the local surface Z(x) (`LocalFit`),
+# the noise variance v of a height and A = `rows`,
 #
 #     v = sigma_Z^2 + |g|^2 sigma_XY^2    (plus the excess in the residuals)
 #     b = sum w_i Z(x_i) - Z(0) + sigma_XY^2 (h_xx + h_yy) / 2

@@ -179,8 +179,8 @@ class CellTally:
 #     (v0 s0^2 + v s^2) / (v0 + v)
 #
 # v0 and s0^2 are estimated from mean and variance of log s^2; if it scatters no more than by chance, v0 is infinite,
-# and all variances are equal. Source: Smyth (2004), Linear models and empirical Bayes methods for assessing differential
-# expression in microarray experiments.
+# and all variances are equal. Source: Smyth (2004), Linear models and empirical Bayes methods for assessing
+# differential expression in microarray experiments.
 
 _ROUNDS = 50
 
