@@ -139,9 +139,8 @@ def relative_orientations(
     orientations = _adjusted(rotations, bases, pairs, robust) if len(rotations) else []
     if not orientations:
         raise BlockError(
-            f"no five of the {n} points that {images} have in common give a relative orientation with the points in "
-            "front of both cameras, as points on a line and false matches do not: check the matches, the axes of the "
-            "image coordinates and c_mm, and measure points that spread over the images"
+            f"relative orientation of {images} failed: no five of {n} common points are in front of both cameras. "
+            "Check for false matches, collinear points, image axes and c_mm; measure well-distributed points"
         )
     best = orientations[0]
     used = pairs.take(best.agrees)

@@ -44,7 +44,7 @@ class Raster(eqx.Module):
 
     @property
     def extent(self) -> Float[np.ndarray, "2 2"]:
-        """Minimum and maximum X, Y (m) of the outer edges."""
+        """Return the minimum and maximum X, Y (m) of the outer edges."""
         rows, columns = self.heights.shape
         east, south = self.west + columns * self.cell_m, self.north - rows * self.cell_m
         return np.array([[self.west, south], [east, self.north]])
