@@ -41,9 +41,9 @@ class Tracks(NamedTuple):
 def tracks(n_features: list[int], pairs: list[PairMatches]) -> Tracks:
     """Build tracks from matches; each point appears at most once in a photograph.
 
-    `n_features` is the number of features of every photograph. Matches are added in the order of their support, the
-    number of third features matched to both of the two; ties keep their order. A match whose two components share a
-    photograph is rejected and counted. Points are numbered in the order of their first feature.
+    `n_features` is the number of features of every photograph. Matches are added by decreasing support: the number of
+    third features matched to both ends; the order of ties is retained. A match whose two components share a photograph
+    is rejected and counted. Points are numbered in the order of their first feature.
 
     Raises ValueError for an index of a photograph or feature out of range.
     """

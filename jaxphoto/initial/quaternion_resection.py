@@ -39,7 +39,7 @@ _ITERATIONS = 50
 _CONVERGED = 1e-3  # maximum change of the rotations at convergence
 _POINTS = 60  # maximum number of points to pair
 _INCLINED = np.deg2rad(40.0)
-_FEW = 8  # maximum number of points that may be far from a plane: also start from cameras rotated by quarter turns
+_FEW = 8  # maximum number of points for starts rotated by quarter turns: few points may be far from a plane
 _APART = 0.05  # minimum chord between rotations with different results
 _ASIDE = np.array([-0.3, -0.03, 0.03, 0.3])  # fractions of the distance, and rad
 # Maximum standard deviation, as a fraction of the distance or in rad, of a usable orientation.
