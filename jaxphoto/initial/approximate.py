@@ -1,11 +1,11 @@
-"""Approximate values of a whole block: images from points, points from images, until everything is known.
+"""Approximate values of a whole block by alternating resection and intersection.
 
-1. An image with an observed position and attitude is oriented directly.
-2. Points with enough rays from known images are intersected.
-3. Unknown images that see at least four known points are resected, those with the most known points first, and back to
-   2. First only points whose rays meet at 1 degree or more serve; where nothing is left to orient, narrower ones do.
+1. Orient images with observed position and attitude directly.
+2. Intersect points that have enough rays from oriented images.
+3. Resect images that see at least four known points, those with the most first; then repeat from 2. Use points with an
+   intersection angle of at least 1 degree first, then smaller angles.
 
-If all approximate values are given, only the check that every point lies in front of its cameras runs.
+If all approximate values are given, only check that every point lies in front of its cameras.
 """
 
 import dataclasses
@@ -26,9 +26,9 @@ from jaxphoto.initial.resection import resect_ideal
 from jaxphoto.small_matrices import cholesky_3x3, unwhiten, whiten
 from jaxphoto.unknowns import Unknowns
 
-_RESECTED = 4  # known points
-_ANGLES = np.deg2rad([1.0, 0.02])  # between rays that make a point: wanted, and just acceptable
-# Part of the points that may be where no camera could see them: blunders. Of more, the frame is wrong.
+_RESECTED = 4  # minimum number of known points
+_ANGLES = np.deg2rad([1.0, 0.02])  # minimum intersection angles: desired, acceptable
+# Maximum fraction of points behind a camera that are treated as blunders; above it, the frame is wrong.
 _BLUNDERS = 0.05
 # Weight of a surveyed coordinate relative to a ray.
 _SURVEYED = 100.0
@@ -42,11 +42,11 @@ class PointsBehind(BlockError):
 def approximate(block: Block) -> Unknowns:
     """Complete `block.start`: orient every unknown image and intersect every unknown point.
 
-    Images are resected from known points or taken from observed positions and attitudes, points are intersected.
-    Known values of `block.start` stay.
+    Images are oriented by their observed positions and attitudes, or resected from known points. Known values of
+    `block.start` are not changed.
 
-    Raises BlockError, naming the first few and the cure, for images that never see four known points, points whose
-    rays are nearly parallel, and points behind a camera that measured them.
+    Raises BlockError for images that see fewer than four known points, points with nearly parallel rays, and points
+    behind a camera that measured them.
     """
     state = _State(block)
     state.complete()
@@ -55,17 +55,17 @@ def approximate(block: Block) -> Unknowns:
 
 
 def completed(block: Block) -> Start:
-    """`approximate` as far as possible: images and points that cannot be computed stay unknown."""
+    """Complete `block.start` as far as possible: images and points that cannot be computed stay unknown."""
     state = _State(block)
     state.complete()
     return state.start()
 
 
 def intersected(block: Block) -> Unknowns:
-    """`approximate` of a block that a JAX transformation traces: without resection, and without checks of values.
+    """Complete `block.start` inside a JAX transformation, without resection and checks of values.
 
-    A point lies where the squares of its distances from its rays, and from its control coordinates, are least. Raises
-    InputError for an image with neither an orientation nor an observed position and attitude.
+    Points minimise the weighted sum of squared distances from their rays and control coordinates. Raises InputError for
+    an image without orientation and without observed position and attitude.
     """
     start, image, point = block.start.unknowns, *map(np.asarray, (block.image_points.image, block.image_points.point))
     sensors, known = sensor_rows(block, start), np.array(block.start.image_known)
@@ -99,22 +99,23 @@ def intersected(block: Block) -> Unknowns:
 
 
 def in_front(block: Block, unknowns: Unknowns) -> Bool[np.ndarray, "rows"]:
-    """Return True for rows of `block.image_points` whose point lies, by `unknowns`, where its camera could see it."""
+    """Return True for rows of `block.image_points` whose point is in front of its camera under `unknowns`."""
     u = unknowns
     return _in_front(block, u.interior, *map(to_numpy, (u.exterior.position, u.exterior.camera_from_object, u.points)))
 
 
 def looking_away(block: Block, seen: Bool[np.ndarray, "rows"]) -> Int[np.ndarray, "some_images"]:
-    """Images with more than half of their points behind them: not `seen` (`in_front`).
+    """Return the images with more than half of their points behind them; `seen` is the result of `in_front`.
 
-    Collinearity does not distinguish front from back: an image that is turned over fits, seen from the other side.
+    Collinearity does not distinguish front from back: an image that views the scene from the opposite side fits as
+    well.
     """
     image, n = np.asarray(block.image_points.image), len(block.images)
     return np.flatnonzero(np.bincount(image[~seen], minlength=n) > np.bincount(image, minlength=n) / 2)
 
 
 class _State:
-    """Known values so far, filled in place."""
+    """Values known so far, updated in place."""
 
     def __init__(self, block: Block) -> None:
         start = block.start.unknowns
@@ -140,7 +141,7 @@ class _State:
                 if not self._resect_best():
                     break
         if self.resected:
-            # Once more with all rays: the points of the beginning come from few.
+            # Re-intersect with all rays: the first points were intersected from few images.
             self._intersect(~given, _ANGLES[-1])
         self._bring_in_front(given)
 
@@ -188,7 +189,7 @@ class _State:
             )
 
     def _orient_directly(self) -> None:
-        """Step 1: X = GNSS - R l - shift - drift t, and the attitude through the boresight."""
+        """Orient images by step 1: X = GNSS - R l - shift - drift t, attitude through the boresight."""
         rows = sensor_rows(self.block, self.block.start.unknowns)
         new = ~self.image_known[rows.image]
         if new.any():
@@ -198,7 +199,7 @@ class _State:
             self.image_known[images] = True
 
     def _compute_rays(self) -> None:
-        """Ideal coordinates and camera rays of all rows."""
+        """Compute ideal coordinates and camera rays of all rows."""
         xy = np.asarray(self.block.image_points.xy, float)
         self.ideal, self.rays = np.zeros_like(xy), np.zeros((len(xy), 3))
         for name, interior in self.block.start.unknowns.interior.items():
@@ -207,7 +208,7 @@ class _State:
                 self.ideal[rows], self.rays[rows] = (f(interior, xy[rows]) for f in (ideal_coordinates, camera_rays))
 
     def _intersect(self, wanted, min_angle: float) -> None:
-        """Step 2, of the points `wanted`."""
+        """Intersect the `wanted` points (step 2)."""
         if not wanted.any():
             return
         rows = np.flatnonzero(self.image_known[self.image] & wanted[self.point])
@@ -227,8 +228,8 @@ class _State:
         self.points[good], self.point_known[good] = points[good], True
 
     def _resect_best(self) -> bool:
-        """Step 3, of the images with at least half as many known points as the best; False where none could be."""
-        # A fisheye is resected by those of its rays that meet the perspective plane.
+        """Resect images with at least half as many known points as the best (step 3); return True if any succeeded."""
+        # For a fisheye use only rays that intersect the perspective plane.
         useful = self.point_known[self.point] & ~self.image_known[self.image] & np.isfinite(self.ideal).all(axis=1)
         count = np.bincount(self.image[useful], minlength=len(self.image_known))
         progress = False
@@ -247,9 +248,9 @@ class _State:
         return progress
 
     def _bring_in_front(self, given) -> None:
-        """Move points behind a camera that measured them, as blunders make it, to the depth of others.
+        """Move points behind a camera that measured them (blunders) to the typical depth of its other points.
 
-        Adjusted there, their residuals tell which ray is wrong.
+        After adjustment from there, the residuals identify the erroneous ray.
         """
         known = self.image_known[self.image] & self.point_known[self.point]
         interior = self.block.start.unknowns.interior
@@ -279,7 +280,7 @@ def _in_front(
     in_front = np.einsum("ni,ni->n", matrices[:, 2].take(image, 0), to_point) < 0
     for name, camera in interior.items():
         if camera.projection.widest_deg > 90:
-            # Points of such a camera may lie behind its image plane, but not opposite to where they were measured.
+            # Points of a wide-angle camera may lie behind its image plane, but not opposite to their measured rays.
             rows = _of_camera(block, name)[image]
             rays = camera_rays(camera, np.asarray(block.image_points.xy, float)[rows])
             in_front[rows] = np.einsum("ni,ni->n", turn_to_object(matrices, image[rows], rays), to_point[rows]) > 0

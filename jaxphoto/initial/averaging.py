@@ -1,10 +1,10 @@
-"""Orientation of one more image, and the first three images, from relative orientations of pairs.
+"""Initial image triplet and orientation of further images from relative orientations of pairs.
 
-Step one: each oriented image i that forms a pair with the new image k gives `R_ik M_i` for k's rotation; the
-quaternions are averaged. Step two: each gives a line through its centre to the new one; the lines are intersected.
+Rotation: each oriented image i that forms a pair with the new image k gives `R_ik M_i`; the unit quaternions are
+averaged. Position: each such image gives a line through its projection centre; the lines are intersected.
 
 Source: He and Habib (2014), "Linear approach for initial recovery of the exterior orientation parameters of randomly
-captured images by low-cost mobile mapping systems", ISPRS Archives XL-1. The criteria of the best triplet are ours.
+captured images by low-cost mobile mapping systems", ISPRS Archives XL-1. The criteria for the triplet are ours.
 """
 
 from collections import defaultdict
@@ -17,30 +17,30 @@ from jaxtyping import Float
 
 from jaxphoto.initial.quaternions import best_rotations
 
-_PARALLEL = np.deg2rad(3.0)  # lines at less than this do not meet in a point
-_CLOSED = np.deg2rad(2.0)  # of a triplet: by more its rotations are not those of three images
-_SPREAD = np.deg2rad(10.0)  # bases at more than this span a triangle
-_WIDE = np.deg2rad(5.0)  # rays at less than this count in proportion
+_PARALLEL = np.deg2rad(3.0)  # lines at a smaller angle are parallel
+_CLOSED = np.deg2rad(2.0)  # maximum misclosure of the rotations of a triplet
+_SPREAD = np.deg2rad(10.0)  # minimum angle between the bases of a triplet
+_WIDE = np.deg2rad(5.0)  # median ray angle below which a pair's points are downweighted
 
 
 class DirectedPoint(NamedTuple):
-    """A projection centre where lines meet."""
+    """Projection centre intersected from directions."""
 
     position: Float[np.ndarray, "3"]
     covariance: Float[np.ndarray, "3 3"]
-    """In the square of the position's unit, where the weights are rad^-2."""
+    """In squared units of the position if the weights are rad^-2."""
 
 
 def average_rotation(
     rotations: Float[np.ndarray, "n 3 3"], weights: Float[np.ndarray, " n"] | None = None
 ) -> tuple[Float[np.ndarray, "3 3"], float]:
-    """Return the average of rotations, and the weighted root mean square (rad) of the angles to it.
+    """Return the average rotation, and the weighted root mean square (rad) of the angles to it.
 
-    The eigenvector of the largest eigenvalue of sum w q q', with the unit quaternions q: their signs do not count.
+    The average is the eigenvector of the largest eigenvalue of sum w q q', with unit quaternions q of any sign.
     """
     w = np.ones(len(rotations)) if weights is None else np.asarray(weights, float)
     average = best_rotations(np.einsum("n,nij->ij", w, rotations))
-    # From the chord, which has all digits where the arc cosine of the trace has half of them.
+    # Compute angles from the chord: the arc cosine of the trace loses half of the digits.
     chord = np.linalg.norm(rotations - average, axis=(1, 2))
     angles = 2 * np.arcsin(np.clip(chord / np.sqrt(8), 0, 1))
     return average, float(np.sqrt(np.sum(w * angles**2) / np.sum(w)))
@@ -55,9 +55,9 @@ def intersect_directions(
 
         sum w / D^2 (I - d d') (X - position) = 0,   D = |X - position|
 
-    `weights` are those of the directions, 1 over the square of their standard deviation (rad) or in proportion. Lines
-    are parallel where the centres and X lie on a line: then only the direction of X is known, and its distance must
-    come from points in common. None, too, where X lies behind most of the positions.
+    `weights` of the directions are the inverse of their variance (rad^-2) or proportional to it. The lines are parallel
+    if X and all positions are collinear: then only the direction to X is determined. Returns None if X lies behind most
+    of the positions.
     """
     w = np.ones(len(positions)) if weights is None else np.asarray(weights, float)
     sine = np.linalg.norm(np.cross(directions[:, None], directions[None]), axis=2)
@@ -70,7 +70,7 @@ def intersect_directions(
         normal = np.einsum("n,nij->ij", w * scale, across)
         point = np.linalg.solve(normal, np.einsum("n,nij,nj->i", w * scale, across, local))
         distance = np.linalg.norm(point - local, axis=1)
-        # The noise of directions is a distance across the line in proportion to the distance along it.
+        # The error across a line grows in proportion to the distance along it.
         scale = 1 / np.maximum(distance, 1e-3 * distance.max()) ** 2
     ahead = np.sum(directions * (point - local), axis=1) > 0
     if w[ahead].sum() < 0.5 * w.sum():
@@ -79,14 +79,16 @@ def intersect_directions(
 
 
 def best_triplet(pairs: Sequence[Any]) -> tuple[int, int, int] | None:
-    """Return the three images to begin with; None where no three form three pairs that close.
+    """Return the best three images to start from; None if no three pairs have consistent rotations.
 
     A pair has the indices `first` and `second` of its images, the rotation `second_from_first` between the camera
-    frames, the `base` (unit vector to the second centre in the first camera's frame), the number `n` of points that
-    agree and the median `angle` (rad) between their rays. Three images close where |R_ki R_jk R_ij - I| is small; their
-    bases should not be parallel. Of those that do, the one whose weakest pair has the most points, those of rays at a
-    narrow angle counted in proportion, is the best. Triplets with parallel bases only serve where there is no other. A
-    pair may be given several times, with orientations that fit equally well.
+    frames, the `base` (unit vector to the second centre in the first camera's frame), the number `n` of consistent
+    points and the median `angle` (rad) between their rays. It may be given several times, with orientations that fit
+    equally well.
+
+    Three pairs are consistent if the rotation |R_ki R_jk R_ij - I| is small. The best triplet has the most points in
+    its weakest pair; points with narrow ray angles are downweighted. Triplets with parallel bases are used only if
+    there are no others.
     """
     by_ends: dict[tuple[int, int], list[Any]] = defaultdict(list)
     for pair in pairs:
@@ -108,20 +110,20 @@ def best_triplet(pairs: Sequence[Any]) -> tuple[int, int, int] | None:
 
 
 def _of(pair):
-    """Rotation and base of a pair from the lower index to the higher."""
+    """Return rotation and base of a pair from the lower index to the higher."""
     if pair.first < pair.second:
         return pair.second_from_first, pair.base
     return pair.second_from_first.T, -pair.second_from_first @ pair.base
 
 
 def _closes(ij, jk, ik) -> bool:
-    """Return True if the three rotations are those of three images."""
+    """Return True if the three rotations are consistent."""
     chord = np.linalg.norm(_of(jk)[0] @ _of(ij)[0] - _of(ik)[0])
     return bool(2 * np.arcsin(min(chord / np.sqrt(8), 1.0)) < _CLOSED)
 
 
 def _spans(ij, jk, ik) -> bool:
-    """Return True if the three bases, in the frame of image i, lie in a plane and span it."""
+    """Return True if the three bases, in the frame of image i, are coplanar and not parallel."""
     turn, first = _of(ij)
     second, third = turn.T @ _of(jk)[1], _of(ik)[1]
     products = [np.cross(first, second), np.cross(second, third), np.cross(first, third)]

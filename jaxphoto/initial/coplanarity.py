@@ -1,11 +1,11 @@
-"""The coplanarity condition of two images, and its least-squares solution.
+"""Coplanarity condition of two images, and its least-squares solution.
 
     e = x_2' R (B x x_1) = det[B, x_1, R' x_2] = 0
 
-with unit rays x_1 and x_2 in the camera frames, R = `camera_2_from_camera_1` and the base B, a unit vector in the
+x_1 and x_2 are unit rays in the camera frames, R = `camera_2_from_camera_1`, and the base B is a unit vector in the
 frame of camera 1. E = R [B]x is the essential matrix. The five unknowns are a small rotation in the frame of camera 2
-and a shift of B in its tangent plane. Every condition has one residual, its misclosure e over the standard deviation
-of e by the errors of both rays (Gauss-Helmert: `de = (E' x_2)' dx_1 + (E x_1)' dx_2`).
+and a shift of B in its tangent plane. Each condition has one residual: its misclosure e divided by the standard
+deviation of e, propagated from both rays (Gauss-Helmert: `de = (E' x_2)' dx_1 + (E x_1)' dx_2`).
 """
 
 from typing import NamedTuple
@@ -22,17 +22,17 @@ from jaxphoto.initial.rays import padded, padded_length, ray_noise
 from jaxphoto.least_squares import least_squares
 from jaxphoto.rotation import CROSS
 
-# First lambda: with less, few points of a flat scene leap over the nearest orientation.
+# Initial lambda. With smaller values, few points of a flat scene overshoot the nearest orientation.
 _DAMPING = 1e-2
-# Within a few sigmas of the epipole the condition is all noise, and the first order says nothing of that: there the
-# epipole would be drawn to the point. The variance of second order counts with this factor.
+# Factor of the second-order variance. Within a few sigmas of the epipole the condition is pure noise, which the
+# first-order variance ignores: the adjustment would move the epipole towards the point.
 _EPIPOLE = 50.0
-# Numbers of orientations that programs are compiled for; the first only where there are many points.
+# Batch sizes of orientations for which programs are compiled; the first only for more than `_MANY_POINTS` points.
 _STARTS, _MANY_POINTS = (2, 8, 40), 512
 
 
 class RayPairs(NamedTuple):
-    """Rays of the same points in two images, a row for each point."""
+    """Rays of corresponding points in two images, one row per point."""
 
     rays_1: Float[np.ndarray, "n 3"]
     rays_2: Float[np.ndarray, "n 3"]
@@ -40,11 +40,11 @@ class RayPairs(NamedTuple):
     """See `ray_noise`."""
     noise_2: Float[np.ndarray, "n 3 2"]
     floor: Float[np.ndarray, " n"]
-    """Least variance of the condition (rad^2)."""
+    """Minimum variance of the condition (rad^2)."""
 
     @staticmethod
     def of(rays_1: Float[np.ndarray, "n 3"], rays_2: Float[np.ndarray, "n 3"], sigma_rad: float) -> "RayPairs":
-        """From unit rays in the camera frames and the sigma of image coordinates as a fraction of c."""
+        """Create from unit rays in the camera frames and the sigma of image coordinates as a fraction of c."""
         noise = ray_noise(rays_1, sigma_rad), ray_noise(rays_2, sigma_rad)
         square_1, square_2 = (np.sum(one**2, axis=(1, 2)) for one in noise)
         return RayPairs(rays_1, rays_2, *noise, 0.5 * _EPIPOLE * square_1 * square_2)
@@ -60,15 +60,19 @@ class RelativeFits(NamedTuple):
     rotations: Float[np.ndarray, "m 3 3"]
     bases: Float[np.ndarray, "m 3"]
     values: Float[np.ndarray, "m n"]
-    """Misclosures of all points over their standard deviations."""
+    """Misclosures of all points divided by their standard deviations."""
     slopes: Float[np.ndarray, "m n 5"]
-    """Derivatives of `values` by the small rotation in camera 2 and the shift of the base in its tangent plane."""
+    """Derivatives of `values` with respect to the small rotation in camera 2 and the shift of the base in its tangent
+    plane.
+    """
     normals: Float[np.ndarray, "m 5 5"]
     """J'J of the points used."""
 
 
 def tangent_plane(base: Float[np.ndarray, "*m 3"]) -> Float[np.ndarray, "*m 3 2"]:
-    """Two unit vectors, as columns, across a unit vector and each other: the axes of small shifts of a base."""
+    """Return two orthogonal unit vectors, as columns, perpendicular to a unit vector: the axes of small shifts of a
+    base.
+    """
     across = cross_matrices(base)
     least = np.argmin(np.abs(base), axis=-1)[..., None, None]
     first = np.take_along_axis(across, least, axis=-1)
@@ -79,18 +83,18 @@ def tangent_plane(base: Float[np.ndarray, "*m 3"]) -> Float[np.ndarray, "*m 3 2"
 def moved(
     rotations: Float[np.ndarray, "#m 3 3"], bases: Float[np.ndarray, "#m 3"], step: Float[np.ndarray, "#m 5"]
 ) -> tuple[Float[np.ndarray, "#m 3 3"], Float[np.ndarray, "#m 3"]]:
-    """Orientations moved by a small rotation in camera 2 and a shift of the base in its tangent plane (rad)."""
+    """Apply a small rotation in camera 2 and a shift of the base in its tangent plane (rad) to orientations."""
     there = bases + (tangent_plane(bases) @ step[:, 3:, None])[..., 0]
     return rotated(rotations, step[:, :3]), there / np.linalg.norm(there, axis=1, keepdims=True)
 
 
 def essential(rotation: Float[np.ndarray, "*n 3 3"], base: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
-    """Return the essential matrix `E = R [B]x`, of which `x_2' E x_1 = 0`."""
+    """Return the essential matrix `E = R [B]x`, with `x_2' E x_1 = 0`."""
     return rotation @ cross_matrices(base)
 
 
 def misclosures(essentials: Float[np.ndarray, "m 3 3"], pairs: RayPairs) -> Float[np.ndarray, "m n"]:
-    """Return the coplanarity misclosures over their standard deviations, of many essential matrices."""
+    """Return the standardised coplanarity misclosures of many essential matrices."""
     by_1 = np.swapaxes(essentials, 1, 2) @ pairs.rays_2.T  # (m, 3, n)
     by_2 = essentials @ pairs.rays_1.T
     variance = np.broadcast_to(pairs.floor, (len(essentials), len(pairs.floor))).copy()
@@ -120,9 +124,9 @@ def fit(
     used: Bool[np.ndarray, "m n"],
     tolerance: float = 1e-9,
 ) -> RelativeFits:
-    """Least squares in the five unknowns from approximate orientations, each with the points that it uses.
+    """Adjust the five unknowns of each approximate orientation by least squares, each with its own set of points.
 
-    The iteration ends with a step of less than `tolerance` standard deviations.
+    Iterates until a step is below `tolerance` standard deviations.
     """
     m, n = len(rotations), len(pairs.rays_1)
     rows = padded_length(n)
@@ -145,7 +149,7 @@ def _moved(step, rotation, base, tangent):
 
 
 def _misclosures(step, rotation, base, tangent, pairs: RayPairs):
-    """Misclosures over their standard deviations after a step of the five unknowns, of one orientation."""
+    """Return the standardised misclosures of one orientation after a step of the five unknowns."""
     rotation, base = _moved(step, rotation, base, tangent)
     matrix = rotation @ (CROSS @ base)
     by_1, by_2 = pairs.rays_2 @ matrix, pairs.rays_1 @ matrix.T
@@ -176,9 +180,10 @@ def _linearised(rotations, bases, tangents, pairs):
 def error_directions(
     rotation: Float[np.ndarray, "3 3"], base: Float[np.ndarray, "3"], pairs: RayPairs
 ) -> Float[np.ndarray, "n 4"]:
-    """Return the derivatives of the standardised misclosures by the four image coordinates, in their sigmas.
+    """Return the derivatives of the standardised misclosures with respect to the four image coordinates, in their
+    sigmas.
 
-    The product of two such rows is the correlation of the misclosures of one point in two orientations.
+    The product of two such rows is the correlation of one point's misclosures in two orientations.
     """
     matrix = essential(rotation, base)
     sides = ((pairs.rays_2 @ matrix, pairs.noise_1), (pairs.rays_1 @ matrix.T, pairs.noise_2))

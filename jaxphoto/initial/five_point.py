@@ -1,10 +1,9 @@
-"""The five-point relative orientation: all essential matrices of five pairs of rays, for many fives at once.
+"""Five-point relative orientation: all essential matrices of five ray pairs, vectorised over many samples.
 
-The four right singular vectors of the five coplanarity conditions span the essential matrices
-`E = x E_1 + y E_2 + z E_3 + E_4`. `det E = 0` and `2 E E' E - tr(E E') E = 0` are ten cubic equations in x, y, z.
-Solved for the ten monomials of third degree, they give x times each of the other ten: a 10 x 10 matrix whose real
-eigenvalues are x, and whose eigenvectors hold y and z. Unlike the linear solution of eight points this also serves
-where the scene is flat.
+The four right singular vectors of the five coplanarity conditions span the essential matrices `E = x E_1 + y E_2 + z
+E_3 + E_4`. `det E = 0` and `2 E E' E - tr(E E') E = 0` are ten cubic equations in x, y, z. Solving them for the ten
+monomials of third degree gives a 10 x 10 matrix, the multiplication by x of the other ten: its real eigenvalues are x,
+and its eigenvectors contain y and z. Unlike the linear eight-point solution this is valid for flat scenes.
 
 Sources: Nister (2004), "An efficient solution to the five-point relative pose problem", IEEE PAMI 26(6); Stewenius,
 Engels and Nister (2006), "Recent developments on direct relative orientation", ISPRS Journal 60(4).
@@ -15,7 +14,7 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float
 
-# Exponents of x, y, z; first those of third degree, then those that are left, 1 last.
+# Exponents of x, y, z: first the monomials of third degree, then the others, 1 last.
 _MONOMIALS = (
     (3, 0, 0), (2, 1, 0), (1, 2, 0), (0, 3, 0), (2, 0, 1), (1, 1, 1), (0, 2, 1), (1, 0, 2), (0, 1, 2), (0, 0, 3),
     (2, 0, 0), (1, 1, 0), (0, 2, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0),
@@ -24,7 +23,7 @@ _LEFT = _MONOMIALS[10:]
 
 
 def _collected() -> Float[np.ndarray, "64 20"]:
-    """Monomials (columns) of the products of three of (x, y, z, 1)."""
+    """Collect products of three of (x, y, z, 1) by monomial (columns)."""
     factors = ((1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0))
     table = np.zeros((64, 20))
     for row, three in enumerate(product(factors, repeat=3)):
@@ -40,11 +39,11 @@ _LINEAR = [_LEFT.index(e) for e in ((1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0))]
 def five_point_essentials(
     rays_1: Float[np.ndarray, "fives 5 3"], rays_2: Float[np.ndarray, "fives 5 3"], imaginary: float = 1e-9
 ) -> Float[np.ndarray, "solutions 3 3"]:
-    """Every real essential matrix E, `x_2' E x_1 = 0`, of every five pairs of rays; of norm sqrt 2.
+    """Return every real essential matrix E, `x_2' E x_1 = 0`, of each sample of five ray pairs; norm sqrt 2.
 
-    Fives whose conditions depend on one another, such as points on a line, are skipped. With measuring errors a pair of
-    real solutions may turn complex, so a five may have none. `imaginary` is the imaginary part, relative to the size,
-    that is ignored; the matrix is then only nearly an essential one.
+    Samples with linearly dependent conditions, such as collinear points, are skipped. Measurement errors may turn a
+    pair of real solutions into a complex pair, so a sample may have no solution. A relative imaginary part of at most
+    `imaginary` is ignored; the matrix is then only approximately essential.
     """
     conditions = np.einsum("fni,fnj->fnij", rays_2, rays_1).reshape(-1, 5, 9)
     _, size, vectors = np.linalg.svd(conditions)
@@ -68,8 +67,8 @@ def five_point_essentials(
 
 
 def _cubics(basis: Float[np.ndarray, "fives 4 3 3"]) -> Float[np.ndarray, "fives 10 20"]:
-    """Coefficients of the ten equations in the monomials."""
-    e = basis.transpose(0, 2, 3, 1)  # (five, row, column, factor)
+    """Return the coefficients of the ten equations in the monomials."""
+    e = basis.transpose(0, 2, 3, 1)  # axes: (sample, row, column, factor)
     square = np.einsum("frka,fckb->frcab", e, e)  # E E'
     trace = np.einsum("frrab->fab", square)
     cubic = 2 * np.einsum("frkab,fkcd->frcabd", square, e) - np.einsum("fab,frcd->frcabd", trace, e)
@@ -86,8 +85,8 @@ def orientations(
 ) -> tuple[Float[np.ndarray, "m 4 3 3"], Float[np.ndarray, "m 4 3"]]:
     """Return the four orientations of each essential matrix: `camera_2_from_camera_1` and the base in camera 1's frame.
 
-    Both rotations U W V', U W' V' with both directions of the base, the vector that E maps to zero. Points lie in
-    front of both cameras in one of the four only.
+    They combine the rotations U W V' and U W' V' with both directions of the base, the null vector of E. Only one of
+    them has the points in front of both cameras.
     """
     u, _, vt = np.linalg.svd(essentials)
     u = u * np.linalg.det(u)[:, None, None]

@@ -1,4 +1,4 @@
-"""Forward intersection of all points of a block at once."""
+"""Forward intersection of all points of a block, vectorised."""
 
 from typing import NamedTuple
 
@@ -12,19 +12,20 @@ from jaxphoto.compiling import call_compiled
 from jaxphoto.initial.rays import padded, padded_length
 from jaxphoto.least_squares import least_squares
 
-# Standard deviation, over the distance, beyond which errors along the rays are no longer symmetrical.
+# Ratio of standard deviation to distance above which errors along the rays are asymmetric.
 _OPEN = 0.2
 
 
 class IntersectedPoints(NamedTuple):
-    """Points from the rays of images without errors; NaN where they are not determined."""
+    """Points intersected from error-free images; NaN where undetermined."""
 
     points: Float[np.ndarray, "points 3"]
-    """In m."""
+    """Coordinates (m)."""
     covariance: Float[np.ndarray, "points 3 3"]
-    """A priori, m^2."""
+    """A priori covariance (m^2)."""
     determined: Bool[np.ndarray, " points"]
-    """True if rays meet at an angle that their errors leave certain, in front of the cameras."""
+    """True if the rays intersect in front of the cameras, at an angle that is significant with respect to their errors.
+    """
 
 
 def intersect_points(
@@ -35,16 +36,16 @@ def intersect_points(
     coordinates: tuple[Int[np.ndarray, " known"], Int[np.ndarray, " known"], Float[np.ndarray, " known"]] | None = None,
     min_angle: float = np.deg2rad(0.02),
 ) -> tuple[Float[np.ndarray, "points 3"], Bool[np.ndarray, " points"]]:
-    """Return the point (m) nearest to its rays, for every point, and True if its rays determine it.
+    """Return the point (m) nearest to its rays, for every point, and True where the rays determine it.
 
         sum over rays (I - d d') (X - origin) = 0
 
-    `origins` (m) and unit `directions` are of the ray of each row, `point` is the point it belongs to. `coordinates`
-    (point, axis, value in m) are single known coordinates, such as a height: each is one more plane of the weight of
-    a ray. Where all rays of a point are within `min_angle` (rad) of each other, or there is only one, the point is not
-    determined and its coordinates are NaN. `jaxphoto.collinearity.intersect` is for one point, differentiable.
+    `origins` (m) and unit `directions` have one row per ray, `point` is the index of the ray's point. `coordinates`
+    (point, axis, value in m) are known single coordinates, such as a height: each is an additional plane with the
+    weight of a ray. A point with a single ray, or with all rays within `min_angle` (rad), is undetermined: its
+    coordinates are NaN. For one point and derivatives use `jaxphoto.collinearity.intersect`.
     """
-    # About the centre of the cameras, so that map coordinates lose no digits.
+    # Reduce to the centre of the cameras: large map coordinates would lose digits.
     centre = origins.mean(axis=0) if len(origins) else np.zeros(3)
     local = origins - centre
     along = np.sum(directions * local, axis=1)
@@ -60,7 +61,7 @@ def intersect_points(
         who, axis, value = coordinates
         np.add.at(normal, (who, axis, axis), 1.0)
         np.add.at(right, (who, axis), value - centre[axis])
-    # Two rays at the angle a have the smallest eigenvalue a^2 / 2.
+    # For two rays at the angle a the smallest eigenvalue is a^2 / 2.
     some = np.flatnonzero(np.trace(normal, axis1=1, axis2=2) > 0)
     some = some[np.linalg.eigvalsh(normal[some])[:, 0] > 0.5 * min_angle**2]
     result, determined = np.full((n_points, 3), np.nan), np.zeros(n_points, bool)
@@ -79,15 +80,15 @@ def intersect_with_covariance(
     sigma_rad: float,
     min_angle: float = np.deg2rad(0.02),
 ) -> IntersectedPoints:
-    """Return the points with the least squared errors of image coordinates, and their covariances.
+    """Intersect points by least squares of image coordinates; return them with their covariances.
 
         sum J' (u - u(X)) = 0,   u = (x, y) / -z,   Q = sigma_rad^2 (sum J' J)^-1,   J = du / dX
 
-    `rays` are unit directions in the camera frame of the `image` of each row, `point` is the point it belongs to;
-    `sigma_rad` is the standard deviation of image coordinates as a fraction of c. Starts from `intersect_points`, with
-    its `min_angle` (rad). A point behind one of its cameras is not determined either, nor one with a standard deviation
-    of more than a fifth of its distance: the errors of so weak an intersection are no longer symmetrical. Raises
-    ValueError where `sigma_rad` is not positive.
+    `rays` are unit directions in the camera frame of the `image` of each row, `point` is the index of the row's point;
+    `sigma_rad` is the standard deviation of image coordinates as a fraction of c. The approximate values are from
+    `intersect_points` with `min_angle` (rad). A point is undetermined if it lies behind one of its cameras, or if its
+    standard deviation exceeds a fifth of its distance: such errors are asymmetric. Raises ValueError if `sigma_rad` is
+    not positive.
     """
     if not sigma_rad > 0:
         raise ValueError(f"the standard deviation of image coordinates is positive, but sigma_rad is {sigma_rad}")
@@ -96,7 +97,7 @@ def intersect_with_covariance(
     covariance = np.full((n_points, 3, 3), np.nan)
     rows, count = np.argsort(point, kind="stable"), np.bincount(point, minlength=n_points)
     begin = np.cumsum(count) - count
-    # A program takes as many rays of each point: points with about as many are adjusted together.
+    # Programs have a fixed number of rays per point: group points by similar ray counts.
     sizes = 4 ** np.ceil(np.log(np.maximum(count, 2)) / np.log(4)).astype(int)
     for size in np.unique(sizes[determined]):
         some = np.flatnonzero(determined & (sizes == size))
@@ -118,7 +119,9 @@ def intersect_with_covariance(
 
 @eqx.filter_jit
 def _adjusted(offsets, camera_from_object, rays, used):
-    """Shifts (m) of points, normal matrices, and True if converged; `offsets` are from the images to the points."""
+    """Return shifts (m) of points, normal matrices, and True if converged; `offsets` are the vectors from image to
+    point.
+    """
 
     def adjusted(offsets, camera_from_object, rays, used):
         def residuals(shift, _):
@@ -134,7 +137,7 @@ def _adjusted(offsets, camera_from_object, rays, used):
 
 
 def _inverses(normal: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
-    """NaN where a matrix is singular or no number."""
+    """Invert matrices; NaN where one is singular or not finite."""
     result = np.full_like(normal, np.nan)
     regular = np.isfinite(normal).all(axis=(1, 2))
     values = np.linalg.eigvalsh(normal[regular])

@@ -1,9 +1,9 @@
 """Tracks: object points from feature matches between photographs.
 
 A track is a connected component of the graph of features (nodes) and matches (edges). A single false match joins two
-tracks into one that appears twice in some photographs. Dropping such a component would lose the long tracks first,
-which are worth most. `tracks` therefore grows components match by match, in order of confirmation by other matches, and
-rejects a match that would add a photograph twice.
+tracks into one that appears twice in some photographs. Rejecting such components would mainly remove the long tracks,
+which are the most valuable. Therefore `tracks` adds matches one by one, the best supported first, and rejects a match
+that would add a photograph twice.
 """
 
 import itertools
@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-# Matches processed together.
+# Number of matches processed at a time.
 _AT_ONCE = 200_000
 
 
@@ -41,9 +41,9 @@ class Tracks(NamedTuple):
 def tracks(n_features: list[int], pairs: list[PairMatches]) -> Tracks:
     """Build tracks from matches; each point appears at most once in a photograph.
 
-    `n_features` is the number of features of every photograph. Matches are added in the order of their support, the
-    number of third features matched to both of the two; ties keep their order. A match whose two components share a
-    photograph is rejected and counted. Points are numbered in the order of their first feature.
+    `n_features` is the number of features of every photograph. Matches are added by decreasing support: the number of
+    third features matched to both ends; the order of ties is retained. A match whose two components share a photograph
+    is rejected and counted. Points are numbered in the order of their first feature.
 
     Raises ValueError for an index of a photograph or feature out of range.
     """
@@ -54,7 +54,7 @@ def tracks(n_features: list[int], pairs: list[PairMatches]) -> Tracks:
     photograph = np.repeat(np.arange(len(number)), number).tolist()
     edges = edges[np.argsort(-support, kind="stable")]
     parent = list(range(int(first[-1])))
-    # The photographs of a component, a bit each.
+    # Photographs of a component, as a bit mask.
     shown: dict[int, int] = {}
     n_conflicting = 0
     for a, b in itertools.chain.from_iterable(map(np.ndarray.tolist, _portions(edges))):
@@ -73,7 +73,7 @@ def tracks(n_features: list[int], pairs: list[PairMatches]) -> Tracks:
     rows = np.unique(edges)
     roots = np.fromiter((_root(parent, k) for k in rows.tolist()), int, len(rows))
     _, begins, point, times = np.unique(roots, return_index=True, return_inverse=True, return_counts=True)
-    # A feature without accepted matches is no point.
+    # Features without accepted matches do not form points.
     kept = times[point] >= 2
     rows, point = rows[kept], begins[point][kept]
     image = np.searchsorted(first, rows, side="right") - 1
@@ -94,7 +94,7 @@ def connected_images(n_images: int, pairs: list[PairMatches]) -> list[Int[np.nda
 
 
 def _edges(first: np.ndarray, pairs: list[PairMatches]) -> Int[np.ndarray, "edges 2"]:
-    """Return the matches of all pairs, with features numbered across photographs."""
+    """Return the matches of all pairs, with features numbered consecutively across photographs."""
     edges = [np.zeros((0, 2), int)]
     for one, other, features in pairs:
         if not 0 <= one < other < len(first) - 1:
@@ -107,8 +107,8 @@ def _edges(first: np.ndarray, pairs: list[PairMatches]) -> Int[np.ndarray, "edge
 
 
 def _support(edges: np.ndarray, n: int) -> Int[np.ndarray, "edges"]:
-    """Return the number of third features matched to both ends of each match: the triangles of the graph over it."""
-    # SciPy takes a quarter of a second to import, and few orient photographs.
+    """Return the number of third features matched to both ends of each match: its triangles in the graph."""
+    # Import here: SciPy takes 0.25 s to import, and few sessions orient photographs.
     from scipy.sparse import csr_matrix
 
     both = np.concatenate([edges, edges[:, ::-1]])
@@ -123,7 +123,7 @@ def _support(edges: np.ndarray, n: int) -> Int[np.ndarray, "edges"]:
 
 
 def _portions(edges: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield some at a time, to limit memory."""
+    """Yield matches in portions, to limit memory."""
     for begin in range(0, len(edges), _AT_ONCE):
         yield edges[begin : begin + _AT_ONCE]
 

@@ -1,15 +1,15 @@
 """Single photo resection by quaternions, without approximate values, with the covariance of its result.
 
-1. The rays of two points j, k and the line between the points lie in one plane: `V . M' n = 0`, with the plane's normal
-   n = x_j x x_k in the camera frame, V = X_k - X_j and M = `camera_from_object`. Alternately, each M' n is projected
-   onto the plane across its V, and M is the rotation, by Horn's unit quaternion, that takes the projections nearest to
-   their n. Starts: cameras above and below the plane nearest to the points, upright and inclined; at most 50
-   iterations, because near-vertical photographs of flat ground take thousands to converge.
-2. The position is that nearest to the rays back from the points: linear.
-3. Least squares from the best few (`resection.refine`), and tests for other solutions.
+1. The rays of two points j, k and the line between the points are coplanar: `V . M' n = 0`, with the normal n = x_j x
+   x_k of the two rays in the camera frame, V = X_k - X_j and M = `camera_from_object`. Alternate: project each M' n
+   onto the plane perpendicular to its V; estimate M as the rotation (Horn's unit quaternion) that best maps the
+   projections to their n. Start from cameras above and below the best-fitting plane of the points, vertical and
+   inclined; stop after 50 iterations, because near-vertical photographs of flat ground take thousands to converge.
+2. Intersect the rays from the points back to the camera for the position (linear).
+3. Refine the best few by least squares (`resection.refine`), and test for other solutions.
 
-It uses all points with equal weights and needs no minimal solution: for targets and surveyed points without gross
-errors. For points with gross errors use `resect`, which starts from three points at a time.
+All points have equal weights; no minimal solution is needed. Suitable for targets and surveyed points without gross
+errors. For points with gross errors use `resect`, which starts from samples of three points.
 
 Source: Mazaheri and Habib (2015), "Quaternion-based solutions for the single photo resection problem", PE&RS 81(3).
 """
@@ -36,36 +36,38 @@ from jaxphoto.initial.resection import (
 )
 
 _ITERATIONS = 50
-_CONVERGED = 1e-3  # change of the rotations that ends the iteration
-_POINTS = 60  # at most that are paired
+_CONVERGED = 1e-3  # maximum change of the rotations at convergence
+_POINTS = 60  # maximum number of points to pair
 _INCLINED = np.deg2rad(40.0)
-_FEW = 8  # so few points may be far from a plane: cameras rotated by quarters about its normal, too
-_APART = 0.05  # chord of rotations that lead to different results
-_ASIDE = np.array([-0.3, -0.03, 0.03, 0.3])  # of the distance and in rad together
-# A standard deviation, of the distance or in rad, beyond which an orientation is no start for anything.
+_FEW = 8  # maximum number of points for starts rotated by quarter turns: few points may be far from a plane
+_APART = 0.05  # minimum chord between rotations with different results
+_ASIDE = np.array([-0.3, -0.03, 0.03, 0.3])  # fractions of the distance, and rad
+# Maximum standard deviation, as a fraction of the distance or in rad, of a usable orientation.
 _OPEN = 0.1
-_HOPELESS = 0.05  # root mean square residual as a fraction of c
-_AS_GOOD = 9.0  # squared residuals by which another orientation may be worse: three standard deviations
+_HOPELESS = 0.05  # maximum root mean square residual as a fraction of c
+_AS_GOOD = 9.0  # maximum difference of squared residuals (sigma^2) of equally good solutions: three sigmas
 
 
 class Resection(NamedTuple):
-    """An exterior orientation from known points."""
+    """Exterior orientation from known points, with quality measures."""
 
     position: Float[np.ndarray, "3"]
-    """Projection centre, m."""
+    """Projection centre (m)."""
     camera_from_object: Float[np.ndarray, "3 3"]
     covariance: Float[np.ndarray, "6 6"]
-    """A priori, of the position (m) and a small rotation in the camera frame (rad); times `sigma0`^2 a posteriori."""
+    """A priori covariance of the position (m) and a small rotation in the camera frame (rad); multiply by `sigma0`^2
+    for the a posteriori one.
+    """
     sigma0: float
-    """Square root of the weighted squares of residuals over the redundancy 2 n - 6."""
+    """Square root of the weighted sum of squared residuals over the redundancy 2 n - 6."""
     residuals: Float[np.ndarray, "n 2"]
-    """Measured minus computed ideal image coordinates, mm."""
+    """Measured minus computed ideal image coordinates (mm)."""
     iterations: int
-    """Of the quaternion solution, at most 50."""
+    """Number of iterations of the quaternion solution, at most 50."""
     converged: bool
-    """True if the rotation changed by less than 1e-3 before the fiftieth."""
+    """True if the rotation changed by less than 1e-3 before the 50th iteration."""
     steps: int
-    """Of least squares, at most 50."""
+    """Number of least-squares steps, at most 50."""
 
 
 def resect_by_quaternions(
@@ -75,17 +77,16 @@ def resect_by_quaternions(
     sigma_mm: float,
     image: str = "(unnamed)",
 ) -> Resection:
-    """Exterior orientation of one image by least squares from four or more known points, planar or not.
+    """Estimate the exterior orientation of one image by least squares from four or more known points, planar or not.
 
     `xy_mm` are measured coordinates from the image centre with the standard deviation `sigma_mm`, `points` (m) the
-    known points in the same order, without errors; `image` the name for messages.
+    error-free known points in the same order; `image` is the name for messages.
 
-    Raises BlockError for fewer than four distinct points (three leave up to four solutions), a coordinate that is not
-    a number, points on a line or in a plane with the projection centre, an orientation open by more than 0.1 of the
-    distance or 0.1 rad or by more than a covariance describes (the projection centre lies with the points on a
-    dangerous curve or cylinder), two orientations that fit equally well (small flat figures seen from afar), and
-    points that no orientation fits. ValueError where `sigma_mm` is not positive or there are not as many points as
-    coordinates.
+    Raises BlockError for: fewer than four distinct points (three have up to four solutions); a coordinate that is not a
+    number; points on a line or in a plane with the projection centre; a standard deviation above 0.1 of the distance or
+    0.1 rad; errors not described by a covariance (projection centre and points on a dangerous curve or cylinder); two
+    orientations that fit equally well (small flat figures seen from afar); points that no orientation fits. Raises
+    ValueError if `sigma_mm` is not positive or the numbers of points and coordinates differ.
     """
     c, ideal = float(interior.c), ideal_coordinates(interior, np.asarray(xy_mm, float))
     if not sigma_mm > 0:
@@ -128,7 +129,7 @@ def _check_unique(refined: RefinedResections, best: int, sigma: float, image: st
     """Raise BlockError if another orientation fits as well as the best."""
     near = refined.costs - refined.costs[best] < _AS_GOOD * sigma**2
     apart = np.linalg.norm(refined.matrices - refined.matrices[best], axis=(1, 2))
-    # Of the same minimum: closer than its own standard deviations.
+    # Solutions closer than their own standard deviations are the same minimum.
     same = np.sqrt(np.max(np.diagonal(np.linalg.inv(refined.normals[best]))[3:])) * sigma
     if np.any(near & (apart > np.maximum(5 * same, 1e-6))):
         angle = np.rad2deg(2 * np.arcsin(min(float(np.max(apart[near])) / np.sqrt(8), 1.0)))
@@ -140,14 +141,14 @@ def _check_unique(refined: RefinedResections, best: int, sigma: float, image: st
 
 
 def _starts(c, ideal, points):
-    """Up to `STARTS` positions and matrices, best first, with the iterations, and True if converged."""
+    """Return up to `STARTS` positions and matrices, best first, the number of iterations, and True if converged."""
     matrices = _from_plane(ideal, points)
     product = _condition(unit_rays(c, ideal), points)
     iterations, change = 0, np.inf
     while iterations < _ITERATIONS and change > _CONVERGED:
         new = best_rotations((matrices.reshape(-1, 9) @ product).reshape(-1, 3, 3))
         change, matrices, iterations = np.max(np.abs(new - matrices)), new, iterations + 1
-    # The rays back from the points: sum (I - d d') (S - X) = 0.
+    # Intersect the rays from the points back to the camera: sum (I - d d') (S - X) = 0.
     directions = unit_rays(c, ideal) @ matrices
     across = np.eye(3) - directions[..., :, None] * directions[..., None, :]
     right = np.einsum("snij,nj->si", across, points)
@@ -161,7 +162,9 @@ def _starts(c, ideal, points):
 
 
 def _condition(rays, points) -> Float[np.ndarray, "9 9"]:
-    """Map M, row by row, to the sum of n (|V|^2 M' n - V V' M' n)', of which the next M is the best rotation."""
+    """Return the linear map from M (row by row) to the sum of n (|V|^2 M' n - V V' M' n)', whose best rotation is the
+    next M.
+    """
     some = np.unique(np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(int))
     j, k = some[np.stack(np.triu_indices(len(some), 1))]
     normals, sides = np.cross(rays[j], rays[k]), points[k] - points[j]
@@ -171,12 +174,12 @@ def _condition(rays, points) -> Float[np.ndarray, "9 9"]:
     normals, sides = (normals / np.maximum(length, 1e-300))[useful], sides[useful]
     twice = (normals[:, :, None] * normals[:, None]).reshape(-1, 9)
     across = np.sum(sides**2, axis=1)[:, None, None] * np.eye(3) - sides[:, :, None] * sides[:, None]
-    result = (twice.T @ across.reshape(-1, 9)).reshape(3, 3, 3, 3)  # (row, row, column, column)
+    result = (twice.T @ across.reshape(-1, 9)).reshape(3, 3, 3, 3)  # axes: (row, row, column, column)
     return result.transpose(0, 2, 1, 3).reshape(9, 9)
 
 
 def _from_plane(ideal, points) -> Float[np.ndarray, "starts 3 3"]:
-    """Rotations of cameras above and below the plane nearest to the points, upright and inclined to four sides."""
+    """Return rotations of cameras above and below the best-fitting plane: vertical, and inclined to four sides."""
     axes = np.linalg.svd(points, full_matrices=False)[2]
     axes[2] *= np.linalg.det(axes)
     quarters = np.arange(4 if len(points) <= _FEW else 1) * np.pi / 2
@@ -185,7 +188,7 @@ def _from_plane(ideal, points) -> Float[np.ndarray, "starts 3 3"]:
     for side in (1.0, -1.0):
         upright = axes * np.array([1.0, side, side])[:, None]
         in_plane = points @ upright[:2].T
-        # The rotation about the normal that brings the figure nearest to its image.
+        # Rotation about the normal that best aligns the figure with its image.
         kappa = np.arctan2(
             np.sum(in_plane[:, 0] * image[:, 1] - in_plane[:, 1] * image[:, 0]), np.sum(in_plane * image)
         )
@@ -196,15 +199,15 @@ def _from_plane(ideal, points) -> Float[np.ndarray, "starts 3 3"]:
 
 
 def _moved(refined: RefinedResections, k: int, steps: Float[np.ndarray, "steps 6"]):
-    """Positions and matrices at steps from orientation `k`: shifts over the distance and small rotations (rad)."""
+    """Return positions and matrices after steps from orientation `k`: shifts over the distance, rotations (rad)."""
     return refined.positions[k] + refined.distances[k] * steps[:, :3], rotated(refined.matrices[k], steps[:, 3:])
 
 
 def _alternatives(c, ideal, points, refined: RefinedResections):
-    """Other orientations in which the points may look the same: positions and matrices.
+    """Return positions and matrices of other orientations in which the points may appear the same.
 
-    To both sides along the direction that is least determined, which leads over a dangerous cylinder to the orientation
-    beyond it. And of a distant flat figure half a turn about its normal, and another about the sight line.
+    Steps to both sides along the weakest direction reach the second orientation across a dangerous cylinder. For a
+    distant flat figure: half a turn about its normal, and another about the line of sight.
     """
     best = refined.best(len(points))
     position, matrix = refined.positions[best], refined.matrices[best]

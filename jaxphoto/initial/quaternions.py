@@ -1,4 +1,4 @@
-"""Rotations of many items at once, in NumPy, and the rotation that fits a sum of products of vectors best."""
+"""Vectorised rotations in NumPy, and the best rotation for a sum of vector products."""
 
 import numpy as np
 from jaxtyping import Float
@@ -7,28 +7,28 @@ from jaxphoto.rotation import CROSS
 
 
 def matrices_from_quaternions(quaternions: Float[np.ndarray, "*n 4"]) -> Float[np.ndarray, "*n 3 3"]:
-    """Rotation matrices `(w^2 - v'v) I + 2 v v' + 2 w [v]x` of unit quaternions (w, v)."""
+    """Return the rotation matrices `(w^2 - v'v) I + 2 v v' + 2 w [v]x` of unit quaternions (w, v)."""
     w, v = quaternions[..., 0, None, None], quaternions[..., 1:]
     square = w**2 - np.sum(v**2, axis=-1)[..., None, None]
     return square * np.eye(3) + 2 * v[..., :, None] * v[..., None, :] + 2 * w * cross_matrices(v)
 
 
 def cross_matrices(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
-    """`[v]x`, the matrices of the products v x a."""
+    """Return the matrices `[v]x` of the cross products v x a."""
     return (vectors @ CROSS.reshape(9, 3).T).reshape(*vectors.shape, 3)
 
 
 def rotated(matrix: Float[np.ndarray, "*#n 3 3"], theta: Float[np.ndarray, "*#n 3"]) -> Float[np.ndarray, "*#n 3 3"]:
-    """`small_rotation(theta) @ matrix` of `jaxphoto.rotation`, theta in rad."""
+    """Return `small_rotation(theta) @ matrix` (see `jaxphoto.rotation`), theta in rad."""
     half = 0.5 * np.linalg.norm(theta, axis=-1, keepdims=True)
     quaternion = np.concatenate([np.cos(half), -0.5 * np.sinc(half / np.pi) * theta], axis=-1)
     return matrices_from_quaternions(quaternion) @ matrix
 
 
 def cayley(theta):
-    """`small_rotation(theta)` to second order (rad), of one vector of NumPy or JAX: the quaternion (1, -theta / 2).
+    """Return `small_rotation(theta)` to second order (rad) of one NumPy or JAX vector: the quaternion (1, -theta / 2).
 
-    A rotation for any theta, and half the operations to compile.
+    The result is a rotation for any theta, with half as many operations to compile.
     """
     v = -0.5 * theta
     return ((1 - v @ v) * np.eye(3) + 2 * v[:, None] * v + 2 * (CROSS @ v)) / (1 + v @ v)
@@ -37,10 +37,10 @@ def cayley(theta):
 def best_rotations(products: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3 3"]:
     """Return the rotation R with the largest sum of b' R a, where `products` is the sum of b a'.
 
-    R belongs to the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix, linear in the products
-    (Horn 1987, "Closed-form solution of absolute orientation using unit quaternions", J. Opt. Soc. Am. A 4(4)). Of
-    several rotations R_i with weights w_i, `products` = sum w_i R_i gives the average: the same matrix is then
-    4 sum w_i q_i q_i' but for a multiple of the unit matrix.
+    R is the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix that is linear in the products (Horn
+    1987, "Closed-form solution of absolute orientation using unit quaternions", J. Opt. Soc. Am. A 4(4)). To average
+    rotations R_i with weights w_i, pass `products` = sum w_i R_i: the matrix is then 4 sum w_i q_i q_i' plus a multiple
+    of the identity.
     """
     m = products
     trace = np.trace(m, axis1=-2, axis2=-1)

@@ -1,4 +1,4 @@
-"""Rays and ideal coordinates of many image coordinates at once."""
+"""Rays and ideal coordinates from image coordinates, vectorised."""
 
 from functools import partial
 
@@ -10,24 +10,25 @@ from jaxtyping import Array, Float, Int
 from jaxphoto.camera import InteriorOrientation, Perspective
 from jaxphoto.compiling import jit_quickly
 
-# Cosine of the largest angle from the axis at which a fisheye ray is projected to the perspective plane: 80 degrees,
-# where a pixel is 30 times as large as in the centre.
+# Cosine of the maximum angle (80 degrees) from the axis at which a fisheye ray is projected to the perspective plane; a
+# pixel there is 30 times as large as in the centre.
 _FLATTEST = 0.17
 
 
 @jit_quickly
 def directions_of(interior: InteriorOrientation, xy: Float[Array, "rows 2"]) -> Float[Array, "rows 3"]:
-    """Directions in the camera frame of image coordinates (mm); traced numbers stay traced."""
+    """Return directions in the camera frame of image coordinates (mm); accepts traced values."""
     return jax.vmap(lambda one: jnp.stack(interior.direction_from_ideal(interior.ideal_from_measured(one))))(xy)
 
 
 def ideal_coordinates(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"]) -> Float[np.ndarray, "rows 2"]:
-    """Ideal coordinates (mm, from the principal point) on the perspective plane of the measured rows of one camera.
+    """Return the ideal coordinates (mm, from the principal point) of one camera's measured rows in the perspective
+    plane.
 
-    NaN for a ray of another projection that is farther than 80 degrees from the axis.
+    NaN for a fisheye ray farther than 80 degrees from the axis.
     """
     directions = _of_rows(interior, xy_mm)
-    # In this order the ideal coordinates of a perspective camera are unchanged.
+    # Compute the quotient first: it is exactly 1 for a perspective camera.
     ideal = directions[:, :2] * (-float(interior.c) / directions[:, 2:])
     if type(interior.projection) is not Perspective:
         ideal[~(-directions[:, 2] > _FLATTEST * np.linalg.norm(directions, axis=1))] = np.nan
@@ -35,7 +36,7 @@ def ideal_coordinates(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "r
 
 
 def camera_rays(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"]) -> Float[np.ndarray, "rows 3"]:
-    """Return unit directions in the camera frame of the measured rows of one camera of any projection."""
+    """Return unit directions in the camera frame for measured rows of one camera with any projection."""
     directions = _of_rows(interior, xy_mm)
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
@@ -44,7 +45,7 @@ def _of_rows(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"]) 
     n = len(xy_mm)
     xy = np.zeros((padded_length(n), 2))
     xy[:n] = xy_mm
-    # Numbers as arrays: a float in the tree would be a constant of the program, one for every camera.
+    # Convert floats to arrays: as constants each camera would need its own compiled program.
     numbers = jax.tree.map(partial(np.asarray, dtype=float), interior)
     return np.asarray(directions_of(numbers, xy))[:n]
 
@@ -58,7 +59,7 @@ def padded_length(n: int) -> int:
 
 
 def padded(values: np.ndarray, length: int) -> np.ndarray:
-    """`values` with the last row repeated to `length` rows."""
+    """Repeat the last row of `values` up to `length` rows."""
     return values[np.minimum(np.arange(length), len(values) - 1)]
 
 
@@ -71,13 +72,12 @@ def unit_rays(
 
 
 def ray_noise(rays: Float[np.ndarray, "rows 3"], sigma_rad: float) -> Float[np.ndarray, "rows 3 2"]:
-    """Errors of unit rays in the camera frame by one sigma in each of the two ideal image coordinates.
+    """Return the errors of unit rays in the camera frame due to one sigma in each of the two ideal image coordinates.
 
         d ray = (I - ray ray') (e_x, e_y) |z| sigma_rad
 
     `sigma_rad` is the standard deviation of an image coordinate as a fraction of c: the angle at the principal point.
-    Away from it the same error in the image is a smaller angle. Raises ValueError for a ray that does not point to
-    the front of the camera (z < 0).
+    Off axis the same image error is a smaller angle. Raises ValueError for a ray that does not point forward (z < 0).
     """
     if not np.all(rays[:, 2] < 0):
         raise ValueError("rays in the camera frame point to the front of the camera, so their z is negative")
@@ -90,5 +90,5 @@ def turn_to_object(
     image: Int[np.ndarray, " rows"],
     rays: Float[np.ndarray, "rows 3"],
 ) -> Float[np.ndarray, "rows 3"]:
-    """Directions in the object frame of rays in the camera frames of their images."""
+    """Rotate rays from the camera frames of their images to the object frame."""
     return np.einsum("nij,ni->nj", camera_from_object[image], rays)

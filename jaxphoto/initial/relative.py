@@ -1,11 +1,13 @@
 """Relative orientation of two images from their common points, with or without false matches.
 
-1. Essential matrices of random fives of points and both orientations of the best homography (`relative_search`).
-2. Least squares with the coplanarity condition from all of them, side by side. After each the gross errors are tested
-   for again, until none changes. Every start has its own set of points; starts that come to the same are dropped.
-3. The best is the result, with all that fit as well.
-4. Tests of what the rays do not determine: too few points, points on a line or on a critical surface, errors that no
-   covariance describes (`nonlinearity`), images from one place, agreement no better than chance.
+1. Generate essential matrices from random samples of five points, and both orientations of the best homography
+   (`relative_search`).
+2. Adjust the coplanarity condition by least squares from all of these starts. After each adjustment repeat the test for
+   gross errors, until the set of accepted points is constant. Each start has its own set; starts that converge to the
+   same orientation are merged.
+3. Return the best orientation and those that fit equally well.
+4. Test for undetermined results: too few points, points on a line or a critical surface, errors not described by a
+   covariance (`nonlinearity`), no base, agreement no better than chance.
 """
 
 from typing import NamedTuple
@@ -30,19 +32,19 @@ from jaxphoto.initial.quaternions import best_rotations
 from jaxphoto.initial.relative_search import candidates
 
 BLUNDER = 3.3
-"""Misclosures beyond so many standard deviations are gross errors."""
-_SAMPLE = 400  # points that choose among starts
-_FIRST = 10.0  # limit of gross errors while the orientation is still that of five points
+"""Number of standard deviations above which a misclosure is a gross error."""
+_SAMPLE = 400  # number of points for comparing starts
+_FIRST = 10.0  # limit of gross errors (sigmas) while the orientation is from five points only
 _ITERATIONS = 20
-_ROUGHLY = 0.03  # standard deviations, to test for blunders with
-_SAME_WAY = 0.1  # starts no further apart than so many standard deviations come to the same
-# With so many points, none need have a leverage beyond `_LEVERAGE` over their number, within these limits.
+_ROUGHLY = 0.03  # convergence limit (sigmas) before a test for blunders
+_SAME_WAY = 0.1  # maximum distance (sigmas) of starts that converge to the same orientation
+# With at least `_MANY` points, the maximum leverage of a point is `_LEVERAGE` over their number, within these limits.
 _MANY, _LEVERAGE, _UNCHECKED = 12, 25.0, (0.3, 0.9)
-_AS_GOOD = 9.0  # squared misclosures by which another orientation may be worse: three standard deviations
-_APART = 5.0  # standard deviations between different orientations
-_OPEN = 0.1  # rad: a standard deviation beyond which an orientation is no start for anything
-_SAME_PLACE = 3.0  # parallaxes below so many times their noise are none
-_QUANTILE = 0.8  # of the points; their parallax counts, so that a few near ones suffice and a few false ones do not
+_AS_GOOD = 9.0  # maximum difference of squared misclosures of equally good orientations: three standard deviations
+_APART = 5.0  # minimum difference (sigmas) of distinct orientations
+_OPEN = 0.1  # maximum standard deviation (rad) of a usable orientation
+_SAME_PLACE = 3.0  # minimum ratio of parallax to its noise
+_QUANTILE = 0.8  # quantile of the parallaxes to test: robust to a few near points and a few false ones
 _FALSE_ALARM = np.log(1e-2)
 
 
@@ -51,18 +53,19 @@ class RelativeOrientation(NamedTuple):
 
     camera_2_from_camera_1: Float[np.ndarray, "3 3"]
     base: Float[np.ndarray, "3"]
-    """Unit vector from projection centre 1 to 2 in the frame of camera 1."""
+    """Unit vector from projection centre 1 to 2, in the frame of camera 1."""
     covariance: Float[np.ndarray, "5 5"]
-    """A priori (rad^2), of a small rotation in the frame of camera 2 and a shift of the base along the two columns of
-    `tangent_plane(base)`; times `sigma0`^2 it is a posteriori."""
+    """A priori covariance (rad^2) of a small rotation in the frame of camera 2 and a shift of the base along the
+    columns of `tangent_plane(base)`; multiply by `sigma0`^2 for the a posteriori one.
+    """
     sigma0: float
-    """Square root of the squared misclosures over the redundancy; NaN without redundancy."""
+    """Square root of the sum of squared misclosures over the redundancy; NaN without redundancy."""
     agrees: Bool[np.ndarray, " n"]
-    """The points used: in front of both cameras, with a misclosure below `BLUNDER` sigmas, and checked by others."""
+    """True for the points used: in front of both cameras, misclosure below `BLUNDER` sigmas, checked by others."""
     parallactic_angle: float
-    """Median angle (rad) between the rays of the points that agree."""
+    """Median angle (rad) between the rays of the points used."""
     described: bool = True
-    """True if typical errors, drawn from the covariance, cost what it says."""
+    """True if the covariance describes the errors (see `nonlinearity`)."""
 
 
 def relative_orientation(
@@ -72,19 +75,18 @@ def relative_orientation(
     robust: bool = True,
     images: str = "the two images",
 ) -> RelativeOrientation:
-    """Relative orientation of two images from the unit rays of their common points, in the camera frames.
+    """Estimate the relative orientation of two images from unit rays of their common points, in the camera frames.
 
         x_2' R (B x x_1) = 0,   R = camera_2_from_camera_1,   |B| = 1
 
-    Rows of `rays_1` and `rays_2` belong together. `sigma_rad` is the standard deviation of an image coordinate as a
-    fraction of c (the angle at the principal point; see `ray_noise`). With `robust`, up to half of the pairs and more
-    may be false; without, all count. `images` names the two for messages.
+    Rows of `rays_1` and `rays_2` correspond. `sigma_rad` is the standard deviation of an image coordinate as a fraction
+    of c (the angle at the principal point; see `ray_noise`). With `robust`, half of the pairs and more may be false;
+    otherwise all are used. `images` names the two for messages.
 
-    Raises BlockError for fewer than five points, a ray that is not a number, points on a line, an orientation open by
-    more than 0.1 rad or by more than a covariance describes, images from one place as far as the points tell, no more
-    points that agree than by chance, and two orientations that fit equally well, such as of a flat scene (see
-    `relative_orientations`). ValueError where `sigma_rad` is not positive or there are not as many rays of the one as
-    of the other.
+    Raises BlockError for: fewer than five points; a ray that is not a number; points on a line; a standard deviation
+    above 0.1 rad, or errors not described by a covariance; no significant base; no more consistent points than by
+    chance; two orientations that fit equally well, as for a flat scene (see `relative_orientations`). Raises ValueError
+    if `sigma_rad` is not positive or the numbers of rays differ.
 
     Sources: docs/photographs.md; Mikhail, Bethel and McGlone (2001), "Introduction to Modern Photogrammetry".
     """
@@ -109,10 +111,10 @@ def relative_orientations(
     robust: bool = True,
     images: str = "the two images",
 ) -> list[RelativeOrientation]:
-    """Return the relative orientation, best first, and those that fit as well as the best.
+    """Return the relative orientation, best first, and all others that fit equally well.
 
-    One that is not `described` is a start of an adjustment, but its covariance says little. Arguments and other errors
-    are those of `relative_orientation`.
+    An orientation that is not `described` is suitable as approximate value, but its covariance is unreliable. For
+    arguments and other errors see `relative_orientation`.
     """
     rays_1, rays_2 = np.asarray(rays_1, float), np.asarray(rays_2, float)
     if len(rays_1) != len(rays_2):
@@ -137,9 +139,8 @@ def relative_orientations(
     orientations = _adjusted(rotations, bases, pairs, robust) if len(rotations) else []
     if not orientations:
         raise BlockError(
-            f"no five of the {n} points that {images} have in common give a relative orientation with the points in "
-            "front of both cameras, as points on a line and false matches do not: check the matches, the axes of the "
-            "image coordinates and c_mm, and measure points that spread over the images"
+            f"relative orientation of {images} failed: no five of {n} common points are in front of both cameras. "
+            "Check for false matches, collinear points, image axes and c_mm; measure well-distributed points"
         )
     best = orientations[0]
     used = pairs.take(best.agrees)
@@ -154,9 +155,9 @@ def relative_orientations(
 
 
 def _adjusted(rotations, bases, pairs: RayPairs, robust: bool) -> list[RelativeOrientation]:
-    """Return the orientations that the starts lead to, best first, without those that fit significantly worse.
+    """Return the distinct orientations adjusted from the starts, best first, without significantly worse ones.
 
-    With `robust`, gross errors take no part. Starts with fewer than five points that agree lead to none.
+    With `robust`, gross errors are rejected. Starts with fewer than five accepted points are discarded.
     """
     agrees = np.ones((len(rotations), len(pairs.rays_1)), bool)
     if robust:
@@ -183,16 +184,15 @@ def _adjusted(rotations, bases, pairs: RayPairs, robust: bool) -> list[RelativeO
 
 
 def _retested(fits: RelativeFits, pairs: RayPairs, agrees) -> Bool[np.ndarray, "m n"]:
-    """Return the points that agree, by each misclosure over its own standard deviation after the adjustment (Baarda).
+    """Return the accepted points: each misclosure is tested with its own standard deviation after adjustment (Baarda).
 
-    That of a point that took part is sqrt(1 - h) with its leverage h, so that one that drew the orientation to itself
-    is detected. A point that all others together cannot check, the usual end of a false match with an odd parallax,
-    does not agree either.
+    For a point that was used this is sqrt(1 - h), with its leverage h: a point that dominates the orientation is
+    detected. Points that all others cannot check, typically false matches with an exceptional parallax, are rejected.
     """
     covariances = _inverses(fits.normals)
     determined = np.isfinite(covariances).all(axis=(1, 2))
     leverage = np.sum(fits.slopes @ np.where(determined[:, None, None], covariances, 0.0) * fits.slopes, axis=2)
-    # The leverage of a point that took no part, if it had.
+    # Leverage if the point were used.
     as_part = np.where(agrees, leverage, leverage / (1 + leverage))
     variance = np.where(agrees, 1 - leverage, 1 + leverage)
     good = np.abs(fits.values) < BLUNDER * np.sqrt(np.maximum(variance, 1e-6))
@@ -204,12 +204,12 @@ def _retested(fits: RelativeFits, pairs: RayPairs, agrees) -> Bool[np.ndarray, "
 
 
 def _worthwhile(fits: RelativeFits, agrees, pairs: RayPairs) -> list[int]:
-    """Select starts that may still become as good as the best, one of each group converging to one orientation."""
+    """Select starts that may still become the best, one per group that converges to one orientation."""
     squares = fits.values**2
     costs = np.where(agrees, squares, BLUNDER**2).sum(axis=1)
     best = int(np.argmin(costs))
     scale = max(1.0, squares[best][agrees[best]].sum() / max(int(agrees[best].sum()) - 5, 1))
-    # A limit of `_allowance`; and as much again, for the gross errors that are still to be found.
+    # The limit of `_allowance`, doubled for gross errors not yet found.
     near = costs - costs[best] < 2 * scale * (_AS_GOOD + 6 * np.sqrt(len(pairs.rays_1)))
     places = np.concatenate([fits.rotations.reshape(-1, 9), fits.bases], axis=1)
     limits = _SAME_WAY * np.sqrt(np.trace(_inverses(fits.normals), axis1=1, axis2=2)) + 1e-9
@@ -222,9 +222,9 @@ def _worthwhile(fits: RelativeFits, agrees, pairs: RayPairs) -> list[int]:
 
 
 def _distinct(fits: RelativeFits, pairs: RayPairs, agrees, robust: bool) -> list[tuple[float, RelativeOrientation]]:
-    """Costs and orientations that differ from one another, best first."""
+    """Return costs and distinct orientations, best first."""
     wrong = np.any(behind(fits.rotations, fits.bases, pairs, BLUNDER) & agrees, axis=1)
-    # Squared misclosures, those of gross errors the square of the limit.
+    # Sum of squared misclosures; gross errors contribute the square of the limit.
     squares = fits.values**2
     costs = np.where(agrees, squares, BLUNDER**2 if robust else squares).sum(axis=1)
     covariances = _inverses(fits.normals)
@@ -242,7 +242,7 @@ def _distinct(fits: RelativeFits, pairs: RayPairs, agrees, robust: bool) -> list
 
 
 def _same(one: RelativeOrientation, other: RelativeOrientation) -> bool:
-    """Return True if two orientations differ by no more than a few standard deviations, or than rounding."""
+    """Return True if two orientations differ by no more than a few standard deviations, or by rounding."""
     rotation = one.camera_2_from_camera_1 @ other.camera_2_from_camera_1.T
     theta = np.array(
         [rotation[1, 2] - rotation[2, 1], rotation[2, 0] - rotation[0, 2], rotation[0, 1] - rotation[1, 0]]
@@ -254,9 +254,9 @@ def _same(one: RelativeOrientation, other: RelativeOrientation) -> bool:
 
 
 def _as_good(ends: list[tuple[float, RelativeOrientation]], pairs: RayPairs) -> list[RelativeOrientation]:
-    """Return the best, and those whose squared misclosures are no larger than noise may make them.
+    """Return the best orientation, and those whose squared misclosures exceed its own only by noise.
 
-    Where the best has few points, an orientation that fits five of them and calls the others gross errors is none.
+    If the best has few points, discard orientations that fit five of them and reject the others as gross errors.
     """
     if not ends:
         return []
@@ -276,10 +276,10 @@ def _as_good(ends: list[tuple[float, RelativeOrientation]], pairs: RayPairs) -> 
 
 
 def _allowance(best: RelativeOrientation, other: RelativeOrientation, pairs: RayPairs) -> float:
-    """Return the tolerance by which squared misclosures of an orientation as likely as the best may be larger.
+    """Return the maximum difference of squared misclosures between the best and an equally likely orientation.
 
-    Of two orientations that both fit but for noise, such as of a flat scene, each point's squared misclosures differ
-    with the variance 4 (1 - r^2), where r is their correlation.
+    If both orientations fit except for noise, as for a flat scene, the difference of a point's squared misclosures has
+    the variance 4 (1 - r^2), where r is the correlation of both misclosures.
     """
     rows = pairs.take(best.agrees & other.agrees)
     one, two = (error_directions(o.camera_2_from_camera_1, o.base, rows) for o in (best, other))
@@ -287,14 +287,14 @@ def _allowance(best: RelativeOrientation, other: RelativeOrientation, pairs: Ray
 
 
 def _inverses(normals: Float[np.ndarray, "m 5 5"]) -> Float[np.ndarray, "m 5 5"]:
-    """Covariances from normal matrices; infinite where one is singular."""
+    """Invert normal matrices; infinite where one is singular."""
     values, vectors = np.linalg.eigh(normals)
     result = vectors / np.maximum(values, 1e-300)[:, None] @ np.swapaxes(vectors, 1, 2)
     return np.where((values[:, 0] > 1e-13 * values[:, -1])[:, None, None], result, np.inf)
 
 
 def _is_described(one: RelativeOrientation, pairs: RayPairs) -> bool:
-    """Return True if errors are as the covariance says (see `nonlinearity`), by the points of `pairs` that agree."""
+    """Return True if the covariance describes the errors (see `nonlinearity`); uses the accepted points of `pairs`."""
     pairs = pairs.take(one.agrees)
     noise = max(1.0, np.nan_to_num(one.sigma0))
     steps = typical_errors(np.linalg.inv(one.covariance), noise)
@@ -325,7 +325,7 @@ def _open(one: RelativeOrientation, images: str) -> BlockError:
 
 
 def _check_not_a_line(pairs: RayPairs, images: str) -> None:
-    """Raise BlockError if the rays of an image lie in one plane, but for noise: its points are on a line."""
+    """Raise BlockError if the rays of an image are coplanar except for noise: its points are on a line."""
     for rays, noise in ((pairs.rays_1, pairs.noise_1), (pairs.rays_2, pairs.noise_2)):
         across = np.linalg.svd(rays, compute_uv=False)[2] / np.sqrt(len(rays))
         if across < _SAME_PLACE * np.sqrt(0.5 * np.mean(np.sum(noise**2, axis=(1, 2)))):
@@ -336,16 +336,16 @@ def _check_not_a_line(pairs: RayPairs, images: str) -> None:
 
 
 def _check_parallax(pairs: RayPairs, sigma0: float, images: str) -> None:
-    """Raise BlockError if a rotation alone explains the rays, as of images from one place or far scenes.
+    """Raise BlockError if a rotation alone explains the rays: images from one position, or distant scenes.
 
-    `pairs` are the points that agree, `sigma0` their noise over the a priori one.
+    `pairs` are the accepted points, `sigma0` is the ratio of their noise to the a priori one.
     """
     weights = np.ones(len(pairs.rays_1))
     for _ in range(10):
         rotation = best_rotations(np.einsum("n,ni,nj->ij", weights, pairs.rays_2, pairs.rays_1))
         parallax = np.linalg.norm(pairs.rays_2 - pairs.rays_1 @ rotation.T, axis=1)
         weights = 1 / np.maximum(parallax, 1e-3 * np.median(parallax) + 1e-15)
-    # Noise in two axes from two images: Rayleigh's distribution.
+    # Noise in two axes from two images has a Rayleigh distribution.
     variance = 0.5 * (np.sum(pairs.noise_1**2, axis=(1, 2)) + np.sum(pairs.noise_2**2, axis=(1, 2)))
     noise = np.sqrt(np.median(variance) * -2 * np.log(1 - _QUANTILE)) * (sigma0 if np.isfinite(sigma0) else 1.0)
     size = np.quantile(parallax, _QUANTILE)
@@ -357,11 +357,11 @@ def _check_parallax(pairs: RayPairs, sigma0: float, images: str) -> None:
 
 
 def _check_not_chance(best: RelativeOrientation, pairs: RayPairs, images: str) -> None:
-    """Raise BlockError if as many points would agree with the best of all orientations if all matches were false.
+    """Raise BlockError if equally many points would be accepted if all matches were false.
 
-    The fraction of false matches that agree is that of wrong partners, each point with those of others. Of the n
-    points, five fix an orientation; more than chance is what the binomial distribution, times the number of fives,
-    makes less probable than 1 % (a contrario: Moisan and Stival 2004, Int. J. Computer Vision 57(3)).
+    The probability that a false match is accepted is estimated by pairing each point with wrong partners. Five of the n
+    points determine an orientation. The result is better than chance if the binomial probability, multiplied by the
+    number of samples of five, is below 1 % (a contrario: Moisan and Stival 2004, Int. J. Computer Vision 57(3)).
     """
     n, agrees = len(pairs.rays_1), int(best.agrees.sum())
     if n <= 5:
@@ -371,11 +371,11 @@ def _check_not_chance(best: RelativeOrientation, pairs: RayPairs, images: str) -
     false = [pairs._replace(rays_2=np.roll(pairs.rays_2, s, 0), noise_2=np.roll(pairs.noise_2, s, 0)) for s in shifts]
     value = np.concatenate([np.abs(misclosures(matrix, wrong)[0]) for wrong in false])
     hits = np.sum(value < BLUNDER)
-    # Of few points no wrong partner may agree: then half of the median misclosure counts as evenly spread.
+    # If no wrong partner is accepted (few points), assume a uniform distribution up to twice the median misclosure.
     chance = (hits + 1) / (len(value) + 2) if hits else min(0.5, 0.5 * BLUNDER / np.median(value))
     chance = np.clip(chance, 1e-6, 0.999)
     fraction = min((agrees - 5) / (n - 5), 1 - 1e-12)
-    # Chernoff's bound of the binomial tail, and the logarithm of the number of fives.
+    # Chernoff bound of the binomial tail, and the logarithm of the number of samples of five.
     tail = 0.0
     if fraction > chance:
         tail = fraction * np.log(fraction / chance) + (1 - fraction) * np.log((1 - fraction) / (1 - chance))

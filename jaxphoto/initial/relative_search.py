@@ -1,7 +1,7 @@
-"""Starts of a relative orientation from random fives of points, judged by most other points.
+"""Initial relative orientations from random samples of five points, scored by the other points.
 
-The fives depend on the number of points alone, so results are reproducible. A few hundred points are judges; an
-orientation costs each judge its squared misclosure, a gross error no more than the limit.
+The samples depend only on the number of points, so results are reproducible. A few hundred points score each
+orientation by their squared misclosures, limited to the square of `_LIMIT` for gross errors.
 """
 
 from itertools import combinations
@@ -13,22 +13,22 @@ from jaxphoto.initial.coplanarity import RayPairs, behind, essential, misclosure
 from jaxphoto.initial.five_point import five_point_essentials, orientations
 from jaxphoto.initial.homography import homographies, homography_orientations, transfer_errors
 
-_FIVES = 60  # at a time
-_BATCHES = 40  # at most: three in four false matches still leave two fives of true ones
-_GOOD_FIVES = 12.0  # to be expected: one alone may be a poor one, of points close together
+_FIVES = 60  # samples of five points per batch
+_BATCHES = 40  # maximum number of batches: with 75 % false matches they still contain two samples without any
+_GOOD_FIVES = 12.0  # expected number of samples without false matches; more than one, as close points give poor results
 _JUDGES = 300
-_LIMIT = 6.0  # standard deviations; wider than a blunder, because five points leave errors of their own
-_FEW, _NEARLY = 8, 0.1  # of so few points, essential matrices with imaginary parts are starts, too
-_FOURS = 20  # of the fives, of which four points make a homography
-_OFF_PLANE = 8.0  # `_LIMIT` of points and a homography, which four have more errors of
-_PLANE, _LEAST_PLANE = 0.2, 6  # least fraction and number of the points that make a plane
-_BEST = 16  # essential matrices whose orientations are tested for the points in front
+_LIMIT = 6.0  # standard deviations; larger than for blunders, because a sample of five has errors of its own
+_FEW, _NEARLY = 8, 0.1  # for up to `_FEW` points, accept essential matrices with imaginary parts up to `_NEARLY`
+_FOURS = 20  # number of samples whose first four points define a homography
+_OFF_PLANE = 8.0  # standard deviations; larger than `_LIMIT`, as a homography of four points has larger errors
+_PLANE, _LEAST_PLANE = 0.2, 6  # minimum fraction and number of points in a plane
+_BEST = 16  # maximum number of essential matrices to decompose
 _STARTS, _STARTS_OF_FEW = 8, 40
-_APART = np.deg2rad(3.0)  # starts closer to one another than this in rotation and base lead to the same result
+_APART = np.deg2rad(3.0)  # minimum difference in rotation and base of two starts
 
 
 def candidates(pairs: RayPairs) -> tuple[Float[np.ndarray, "starts 3 3"], Float[np.ndarray, "starts 3"]]:
-    """Rotations `camera_2_from_camera_1` and bases (unit vectors) worth adjusting; possibly none."""
+    """Return rotations `camera_2_from_camera_1` and bases (unit vectors) to adjust; may be empty."""
     n = len(pairs.rays_1)
     rng = np.random.default_rng(0)
     judges = pairs if n <= _JUDGES else pairs.take(np.sort(rng.choice(n, _JUDGES, replace=False)))
@@ -59,7 +59,7 @@ def candidates(pairs: RayPairs) -> tuple[Float[np.ndarray, "starts 3 3"], Float[
     # A point behind a camera costs as much as a gross error.
     squares = np.minimum(misclosures(essential(rotations, bases), judges) ** 2, _LIMIT**2)
     costs = np.where(behind(rotations, bases, judges, _LIMIT), _LIMIT**2, squares).sum(axis=1)
-    # Both orientations of a plane are adjusted, whatever they cost before.
+    # Always adjust both orientations of a plane, whatever their cost.
     costs[: len(of_plane)] = -1
     chosen: list[int] = []
     angles = 0.5 * (rotations.reshape(-1, 9) @ rotations.reshape(-1, 9).T - 1)
@@ -71,7 +71,7 @@ def candidates(pairs: RayPairs) -> tuple[Float[np.ndarray, "starts 3 3"], Float[
 
 
 def _of_plane(plane, pairs: RayPairs):
-    """Return the orientations of the homography of the points that agree with it; none where these are few."""
+    """Return the orientations of the homography estimated from its inliers; empty if these are few."""
     for _ in range(3):
         agrees = transfer_errors(plane, pairs)[0] < _OFF_PLANE
         if agrees.sum() < max(_LEAST_PLANE, _PLANE * len(agrees)):
@@ -81,7 +81,7 @@ def _of_plane(plane, pairs: RayPairs):
 
 
 def _fives(rng: np.random.Generator, n: int):
-    """Return indices (fives, 5) of different points: all, of a few points."""
+    """Return indices (samples, 5) of distinct points; all combinations if there are few points."""
     if n <= _FEW:
         return np.array(list(combinations(range(n), 5)))
     if n < 50:

@@ -1,9 +1,9 @@
 """Resection of one image from known points, without approximate values.
 
-1. Three-point resections of some thirty triangles: the largest in the image, and random ones in case the outermost
-   points are wrong.
-2. The solutions with the smallest robust reprojection error over all points.
-3. Least squares from each of them, in ideal image coordinates over c, with Cauchy's loss. The best is the result.
+1. Compute three-point resections of about thirty triangles: the largest in the image, and random ones in case the
+   outermost points are wrong.
+2. Select the solutions with the smallest robust reprojection error over all points.
+3. Refine them by least squares in ideal image coordinates over c, with Cauchy's loss, and return the best.
 """
 
 from itertools import combinations
@@ -25,16 +25,16 @@ from jaxphoto.initial.three_points import three_point_resections
 from jaxphoto.least_squares import least_squares
 
 STARTS = 4
-"""Orientations to refine, at most."""
-_STARTS = 8  # that a program refines side by side
-_TRIANGLES = 16  # largest, and as many at random
-_JUDGES = 60  # points at most that choose among the solutions
-# Ideal image errors, as fractions of c: those that count as small when solutions are compared, and the typical one
-# beyond which a resection is no solution. Lenient, because the distortion may still be unknown.
+"""Maximum number of orientations to refine."""
+_STARTS = 8  # batch size of the refinement
+_TRIANGLES = 16  # number of the largest triangles; maximum number of random ones
+_JUDGES = 60  # maximum number of points for scoring the solutions
+# Scale of small errors when solutions are compared, and maximum median error of a valid resection, as fractions of c.
+# Lenient, because the distortion may still be unknown.
 _SMALL, _HOPELESS = 2e-3, 0.2
-# A standard deviation, of the distance or in rad, that makes a resection useless; by noise of `_LEAST` of c at least.
+# Maximum standard deviation, as a fraction of the distance or in rad; minimum noise as a fraction of c.
 _OPEN, _LEAST = 0.3, 1e-6
-# Relative and absolute difference of costs that is rounding.
+# Relative and absolute difference of costs due to rounding.
 _SAME_COST, _ROUNDING = 1e-10, 1e-28
 
 
@@ -44,16 +44,16 @@ class RefinedResections(NamedTuple):
     positions: Float[np.ndarray, "starts 3"]
     matrices: Float[np.ndarray, "starts 3 3"]
     costs: Float[np.ndarray, " starts"]
-    """Sum of robust squares of residuals over c."""
+    """Robust sums of squared residuals over c."""
     normals: Float[np.ndarray, "starts 6 6"]
-    """Of the shift over `distances` and the small rotation in the camera frame (rad)."""
+    """Normal matrices of the shift over `distances` and the small rotation in the camera frame (rad)."""
     distances: Float[np.ndarray, " starts"]
-    """In m, of each start from the origin."""
+    """Distance of each start from the origin (m)."""
     converged: Bool[np.ndarray, " starts"]
     steps: Int[np.ndarray, " starts"]
 
     def best(self, n_points: int) -> int:
-        """Return the index of the least cost; of costs equal but for rounding, that of a converged one."""
+        """Return the index of the minimum cost; among costs equal except for rounding, prefer a converged one."""
         equal = self.costs <= (1 + _SAME_COST) * np.min(self.costs) + _ROUNDING * n_points
         return int(np.lexsort((self.costs, ~self.converged, ~equal))[0])
 
@@ -64,15 +64,14 @@ def resect(
     points: Float[np.ndarray, "n 3"],
     image: str = "(unnamed)",
 ) -> ExteriorOrientation:
-    """Exterior orientation of one image from four or more known points, planar or not.
+    """Estimate the exterior orientation of one image from four or more known points, planar or not.
 
-    `xy_mm` are measured coordinates from the image centre, `points` (m) the known points in the same order, `image`
-    the name for the message. The interior orientation may be rough.
+    `xy_mm` are measured coordinates from the image centre, `points` (m) the known points in the same order, `image` is
+    the name for messages. The interior orientation may be approximate.
 
-    Raises BlockError for fewer than four distinct points (three leave up to four solutions), points on a line or in a
-    plane with the projection centre, an orientation open by more than 0.3 of the distance or 0.3 rad, a coordinate
-    that is not a number, and points that no orientation brings near their images. For the accuracy of the result see
-    `resect_by_quaternions`.
+    Raises BlockError for: fewer than four distinct points (three have up to four solutions); points on a line or in a
+    plane with the projection centre; a standard deviation above 0.3 of the distance or 0.3 rad; a coordinate that is
+    not a number; points that no orientation fits. For the accuracy of the result use `resect_by_quaternions`.
     """
     return resect_ideal(float(interior.c), ideal_coordinates(interior, np.asarray(xy_mm, float)), points, image)
 
@@ -80,13 +79,13 @@ def resect(
 def resect_ideal(
     c_mm: float, ideal: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"], image: str
 ) -> ExteriorOrientation:
-    """`resect` from ideal image coordinates (mm, from the principal point)."""
+    """Estimate the exterior orientation from ideal image coordinates (mm, from the principal point); see `resect`."""
     local, origin = checked_points(ideal, points, image)
     positions, matrices = _candidates(c_mm, ideal, local)
     if not len(positions):
         raise no_orientation(image)
     errors = reprojection_errors(c_mm, ideal, local, positions, matrices)
-    # Of a few points the triangle fits three exactly, so the others are no blunders for being worse.
+    # A triangle fits three points exactly: with few points, larger errors of the others do not indicate blunders.
     typical = np.median(errors[0]) if len(local) >= 8 else np.max(errors[0])
     refined = refine(c_mm, ideal, local, positions, matrices, max(3 * 1.4826 * float(typical) / c_mm, 0.5 * _SMALL))
     best = int(np.argmin(refined.costs))
@@ -94,7 +93,7 @@ def resect_ideal(
     error = float(np.median(reprojection_errors(c_mm, ideal, local, position[None], matrix[None])))
     if not error < _HOPELESS * c_mm:
         raise no_orientation(image)
-    # Six unknowns absorb part of the noise.
+    # Compensate for the noise absorbed by six unknowns.
     noise = error / c_mm * np.sqrt(len(local) / (len(local) - 3))
     check_determined(refined.normals[best], max(noise, _LEAST), image, _OPEN)
     return ExteriorOrientation(jnp.asarray(position + origin), jnp.asarray(matrix))
@@ -110,12 +109,12 @@ def refine(
 ) -> RefinedResections:
     """Refine orientations by least squares, with Cauchy's loss of scale `limit` (residuals over c).
 
-    `points` (m) are about the origin.
+    `points` (m) are relative to a local origin.
     """
     n, starts = padded_length(len(points)), _STARTS * -(-len(positions) // _STARTS)
     place = tuple(padded(v, starts) for v in (positions, matrices))
     rows = *(padded(v, n) for v in (ideal / c_mm, points)), np.arange(n) < len(points)
-    # From the solution once more: normal matrices are of small rotations from there.
+    # Repeat from the solution: normal matrices refer to small rotations from there.
     for _ in range(2):
         results = [np.asarray(v) for v in call_compiled(_refined, *place, *rows, np.asarray(limit, float))]
         place = results[0], results[1]
@@ -131,14 +130,14 @@ def _refined(positions, matrices, observed, points, used, limit):
             return position + distance * step[:3], cayley(step[3:]) @ matrix
 
         def residuals(step, _):
-            """Robust residuals over c after a shift over `distance` and a small rotation in the camera frame."""
+            """Return robust residuals over c after a shift over `distance` and a small rotation in the camera frame."""
             position, matrix = moved(step)
             in_camera = (points - position) @ matrix.T
             depth = -in_camera[:, 2:]
             residual = observed - in_camera[:, :2] / jnp.where(depth == 0, 1e-100, depth)
             # The squares of r sqrt(log(1 + q) / q) are Cauchy's loss.
             q = jnp.sum(residual**2, axis=1, keepdims=True) / limit**2 + 1e-30
-            # A blunder may lie behind the best candidate, but no step may take more points there.
+            # Blunders may lie behind the best candidate, but no step may increase the number of points there.
             behind = jnp.sqrt(jnp.sum(used) * jnp.sum(used * (depth[:, 0] <= 0)))
             return jnp.append(residual * used[:, None] * jnp.sqrt(jnp.log1p(q) / q), behind)
 
@@ -155,7 +154,7 @@ def reprojection_errors(
     positions: Float[np.ndarray, "orientations 3"],
     matrices: Float[np.ndarray, "orientations 3 3"],
 ) -> Float[np.ndarray, "orientations n"]:
-    """Errors (mm) of every point in every orientation, at most c; c for a point behind the camera."""
+    """Return the errors (mm) of every point in every orientation, at most c; c for a point behind the camera."""
     camera = (matrices.reshape(-1, 3) @ points.T).reshape(-1, 3, len(points)) - matrices @ positions[:, :, None]
     in_front = camera[:, 2] < 0
     error = ideal.T + c_mm * camera[:, :2] / np.where(in_front, camera[:, 2], -1.0)[:, None]
@@ -165,10 +164,10 @@ def reprojection_errors(
 def checked_points(
     ideal: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"], image: str
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "3"]]:
-    """Return the points about their mean, and the mean (m), of an image that they can orient.
+    """Check the known points of an image; return them relative to their mean, and the mean (m).
 
-    Raises BlockError for a coordinate that is not a number, fewer than four distinct points, and points on a line on
-    the ground or in the image; ValueError where there are not as many points as image coordinates.
+    Raises BlockError for a coordinate that is not a number, fewer than four distinct points, and points collinear on
+    the ground or in the image; ValueError if the numbers of points and image coordinates differ.
     """
     points = np.asarray(points, float)
     if points.shape != (len(ideal), 3):
@@ -204,7 +203,7 @@ def checked_points(
 
 
 def no_orientation(image: str) -> BlockError:
-    """Error for points that belong to other images."""
+    """Return the error for points that match no orientation of the image."""
     return BlockError(
         f"no position and attitude of image {image} brings its known points near their images: check their ids, "
         "the units and axes of the image coordinates, and c_mm"
@@ -222,7 +221,7 @@ def check_determined(normal: Float[np.ndarray, "6 6"], sigma: float, image: str,
 
 
 def open_orientation(image: str) -> BlockError:
-    """Error for points that do not determine the orientation."""
+    """Return the error for points that do not determine the orientation."""
     return BlockError(
         f"the known points of image {image} leave its orientation undetermined, as points close to a line do, few "
         "points in a small part of the image, or points on a dangerous cylinder or curve through the projection "
@@ -231,7 +230,7 @@ def open_orientation(image: str) -> BlockError:
 
 
 def _candidates(c_mm, ideal, points):
-    """Return the `STARTS` solutions of the triangles with the smallest robust reprojection error, best first."""
+    """Return the `STARTS` triangle solutions with the smallest robust reprojection error, best first."""
     triples = _triples(ideal, points)
     positions, matrices = three_point_resections(unit_rays(c_mm, ideal)[triples], points[triples])
     judges = np.linspace(0, len(ideal) - 1, min(len(ideal), _JUDGES)).astype(int)
@@ -255,7 +254,7 @@ def _triples(ideal, points):
 
 
 def _area(ideal, points, triples):
-    """Twice the area of triangles in the image; zero where they are lines in the object."""
+    """Return twice the area of triangles in the image; zero if they are collinear in the object."""
     a, b, c = (ideal[triples[:, k]] for k in range(3))
     sides = points[triples[:, [1, 2, 0]]] - points[triples]
     longest = np.max(np.sum(sides**2, axis=2), axis=1)

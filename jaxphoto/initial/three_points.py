@@ -1,27 +1,27 @@
-"""The three-point resection: all exterior orientations that image three known points where they were measured.
+"""Three-point resection: all exterior orientations that fit the rays to three known points.
 
-Grunert's (1841) solution as written by Haralick, Lee, Ottenberg and Noelle (1994), "Review and analysis of solutions
-of the three point perspective pose estimation problem", equations (2)-(9). With the sides a, b, c of the object
-triangle opposite points 1, 2, 3 and the cosines of the angles between the rays, the distances are s1, u s1, v s1, and
-v is a root of a quartic. The printed formula for u divides by zero for symmetric figures, such as a vertical
-photograph of a square. Here u is a root of the quadratic of side c; the caller rejects its false root by the
+Grunert's (1841) solution as written by Haralick, Lee, Ottenberg and Noelle (1994), "Review and analysis of solutions of
+the three point perspective pose estimation problem", equations (2)-(9). Let a, b, c be the sides of the object triangle
+opposite points 1, 2, 3. The distances are s1, u s1, v s1; v is a root of a quartic with coefficients from the sides and
+the cosines of the angles between the rays. The published formula for u divides by zero for symmetric figures, such as a
+vertical photograph of a square. Here u is a root of the quadratic of side c; the caller rejects its false root by the
 reprojection error.
 """
 
 import numpy as np
 from jaxtyping import Float
 
-# Relative difference of the sides of a solution: false roots are far off, but true double roots are only as good as the
-# square root of the rounding error and of the image errors.
+# Maximum relative difference of the sides of a solution. False roots have large differences, but true double roots are
+# only as accurate as the square root of the rounding and image errors.
 _MISFIT = 0.3
 
 
 def three_point_resections(
     rays: Float[np.ndarray, "triples 3 3"], points: Float[np.ndarray, "triples 3 3"]
 ) -> tuple[Float[np.ndarray, "solutions 3"], Float[np.ndarray, "solutions 3 3"]]:
-    """Positions (m) and `camera_from_object` of every solution of every triple.
+    """Return positions (m) and `camera_from_object` of every solution of every triple.
 
-    `rays` are unit directions in the camera frame, of the points in the same order (triple, point, axis).
+    `rays` are unit directions in the camera frame, in the order of the points (triple, point, axis).
     """
     d12, d13, d23 = (np.linalg.norm(points[:, i] - points[:, j], axis=1) for i, j in ((0, 1), (0, 2), (1, 2)))
     cos12, cos13, cos23 = (np.sum(rays[:, i] * rays[:, j], axis=1) for i, j in ((0, 1), (0, 2), (1, 2)))
@@ -46,7 +46,7 @@ def three_point_resections(
 
 
 def _quartic(a, b, c, cos_a, cos_b, cos_g):
-    """Coefficients, highest power first, of Haralick et al. (1994), equation (9)."""
+    """Return the coefficients, highest power first, of Haralick et al. (1994), equation (9)."""
     a2, b2, c2 = a * a, b * b, c * c
     minus, plus = (a2 - c2) / b2, (a2 + c2) / b2
     return np.stack(
@@ -66,20 +66,21 @@ def _quartic(a, b, c, cos_a, cos_b, cos_g):
 
 
 def _roots(coefficients):
-    """Real roots (NaN in place of complex ones), as eigenvalues of the companion matrices."""
+    """Return the real roots (NaN for complex ones), as eigenvalues of the companion matrices."""
     leading = coefficients[:, :1]
     tiny = np.abs(leading) < 1e-12 * np.max(np.abs(coefficients), axis=1, keepdims=True)
     companion = np.zeros((len(coefficients), 4, 4))
     companion[:, 0, :] = -coefficients[:, 1:] / np.where(tiny, 1.0, leading)
     companion[:, [1, 2, 3], [0, 1, 2]] = 1.0
     roots = np.linalg.eigvals(companion)
-    # A double root comes out as a pair with small imaginary parts, of the root of the measurement noise.
+    # Noise splits a double root into a complex pair; its imaginary part is of the order of the square root of the
+    # noise.
     real = (np.abs(roots.imag) < 0.1 * (0.1 + np.abs(roots.real))) & ~tiny
     return np.where(real, roots.real, np.nan)
 
 
 def _triad(triangles):
-    """Right-handed orthonormal axes of triangles, as columns."""
+    """Return right-handed orthonormal axes of triangles, as columns."""
     first = triangles[:, 1] - triangles[:, 0]
     normal = np.cross(first, triangles[:, 2] - triangles[:, 0])
     first = first / np.linalg.norm(first, axis=1, keepdims=True)

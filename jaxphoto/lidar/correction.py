@@ -1,4 +1,4 @@
-"""Correction of a cloud and its trajectory by the estimated scanner parameters."""
+"""Correction of a cloud and its trajectory with the estimated scanner parameters."""
 
 import dataclasses
 from collections.abc import Callable
@@ -26,8 +26,8 @@ from jaxphoto.lidar.coverage import longest_interval, not_covered
 from jaxphoto.rotation import matrix_from_quaternion, quaternion_from_matrix, small_rotation
 
 PORTION = 1 << 17
-"""Laser points processed at a time, within the processor's cache; fewer are padded to a power of two."""
-# Below this number computing costs nothing, and each size would compile programs of its own.
+"""Number of laser points processed at a time, fitting the CPU cache; smaller portions are padded to a power of two."""
+# Minimum portion size: smaller ones take no time to compute, but each size would be compiled separately.
 _FEW = 1 << 11
 
 
@@ -35,7 +35,7 @@ class ScannerPoses(eqx.Module):
     """Poses of the scanner at the times of laser points: one entry per point."""
 
     position: Float[np.ndarray, "n 3"]
-    """Metres, in the object frame."""
+    """Position (m) in the object frame."""
     object_from_body: Float[np.ndarray, "n 3 3"]
 
 
@@ -47,7 +47,7 @@ class ScannerPath(eqx.Module):
 
 
 def scanner_path(trajectory: Trajectory) -> ScannerPath:
-    """Prepare `trajectory`, which is on the clock of the laser points."""
+    """Fit a spline to `trajectory`, whose clock must be the clock of the laser points."""
     max_gap = np.array(longest_interval(trajectory))
     return ScannerPath(trajectory, call_compiled(_spline, trajectory, max_gap))
 
@@ -55,7 +55,7 @@ def scanner_path(trajectory: Trajectory) -> ScannerPath:
 def scanner_poses(path: ScannerPath, time: Float[np.ndarray, "n"]) -> ScannerPoses:
     """Interpolate poses at the times of laser points (s).
 
-    Raises BlockError for times that the trajectory does not cover.
+    Raises BlockError for times outside the trajectory.
     """
     if not len(time):
         return ScannerPoses(np.zeros((0, 3)), np.zeros((0, 3, 3)))
@@ -77,7 +77,7 @@ def corrected_xyz(
     boresight: Float[ArrayLike, "3"],
     shift: Float[ArrayLike, "3"],
 ) -> Float[np.ndarray, "n 3"]:
-    """Apply `georeferencing.corrected_point` to many points; without poses a boresight has no effect."""
+    """Apply `georeferencing.corrected_point` to many points; without poses the boresight is ignored."""
     shift = np.asarray(shift)
     if poses is None or not np.any(np.asarray(boresight)):
         return xyz - shift
@@ -87,7 +87,7 @@ def corrected_xyz(
 def correct_cloud(cloud: Cloud, scanner: Scanner, path: ScannerPath | None) -> Cloud:
     """Correct a cloud for the boresight of its scanner and the shifts of its strips.
 
-    A strip without a shift is corrected for boresight only. Raises what `scanner_poses` raises.
+    A strip without a shift is corrected for boresight only. Raises the errors of `scanner_poses`.
     """
     xyz = np.array(cloud.xyz)
     turned = path is not None and bool(np.any(np.asarray(scanner.boresight)))
@@ -100,7 +100,9 @@ def correct_cloud(cloud: Cloud, scanner: Scanner, path: ScannerPath | None) -> C
 
 
 def correct_trajectory(trajectory: Trajectory, cloud: Cloud, scanner: Scanner) -> Trajectory:
-    """Subtract from the trajectory the shift of the strip at that time; between strips, of the one closer in time."""
+    """Subtract from the trajectory the shift of the strip flown at that time; between strips, the shift of the closer
+    strip.
+    """
     if cloud.time is None:
         return trajectory
     time = np.asarray(trajectory.time)
@@ -117,7 +119,7 @@ def correct_trajectory(trajectory: Trajectory, cloud: Cloud, scanner: Scanner) -
 
 
 def _strips(cloud: Cloud, scanner: Scanner) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the points of each strip of a cloud, and the shift of that strip."""
+    """Return the points and the shift of each strip of a cloud."""
     names = cloud.strips or tuple(scanner.shifts)
     strip = cloud.strip if cloud.strip is not None else np.zeros(len(cloud), int)
     return [
@@ -128,7 +130,7 @@ def _strips(cloud: Cloud, scanner: Scanner) -> list[tuple[np.ndarray, np.ndarray
 def in_portions(
     function: Callable, points: tuple[Float[np.ndarray, "n ..."], ...], *common: Any
 ) -> Float[np.ndarray, "n 3"]:
-    """Apply `function`, made by `eqx.filter_jit`, to the rows of `points` in portions, and to `common` data."""
+    """Apply a jitted `function` to the rows of `points` in portions; `common` is passed unchanged."""
     result = np.empty((len(points[0]), 3))
     for first in range(0, len(result), PORTION):
         portion = slice(first, first + PORTION)
@@ -141,7 +143,7 @@ def in_portions(
 
 
 def _along(function: Callable, path: ScannerPath, time: Float[np.ndarray, "n"]) -> list[np.ndarray]:
-    """Evaluate `function`, made by `eqx.filter_jit`, of the spline at one or more times in portions."""
+    """Evaluate a jitted `function` of the spline at one or more times, in portions."""
     parts = []
     for first in range(0, len(time), PORTION):
         some = np.asarray(time[first : first + PORTION], float)
@@ -151,7 +153,7 @@ def _along(function: Callable, path: ScannerPath, time: Float[np.ndarray, "n"]) 
 
 
 def padded_size(n: int) -> int:
-    """Round up the number of laser points to the size of a program."""
+    """Round up the number of laser points to a compiled portion size."""
     return max(_FEW, min(1 << max(n - 1, 0).bit_length(), PORTION))
 
 
@@ -184,9 +186,9 @@ def corrected_strip(
     errors: StripErrors,
     path: ScannerPath | None,
 ) -> Float[np.ndarray, "n 3"]:
-    """Apply `georeferencing.corrected_return` to returns of one strip; without a path, its constant shift alone.
+    """Apply `georeferencing.corrected_return` to returns of one strip; without a path, only its constant shift.
 
-    Raises BlockError for times (s) that the trajectory does not cover.
+    Raises BlockError for times (s) outside the trajectory.
     """
     if path is None:
         return xyz - errors.at(strip, time)[0]
@@ -198,7 +200,7 @@ def corrected_strip(
 
 
 def correct_strips(cloud: Cloud, errors: StripErrors, path: ScannerPath | None) -> Cloud:
-    """Correct a cloud for these errors; all its other fields are kept."""
+    """Correct the coordinates of a cloud for strip errors; all other fields are unchanged."""
     xyz = np.array(cloud.xyz)
     for k in range(len(errors.splines)):
         of_strip = np.flatnonzero(cloud.strip == k) if cloud.strip is not None else np.arange(len(cloud))
@@ -208,7 +210,7 @@ def correct_strips(cloud: Cloud, errors: StripErrors, path: ScannerPath | None) 
 
 
 def correct_flight(trajectory: Trajectory, errors: StripErrors) -> Trajectory:
-    """Correct a trajectory; between two strips, by the errors of the strip end closer in time."""
+    """Correct a trajectory for strip errors; between strips, by the errors at the closer strip end."""
     time = np.asarray(trajectory.time)
     ends = np.array([(s.start, s.start + s.interval * max(s.size - 3, 0)) for s in errors.splines])
     away = np.maximum(ends[:, :1] - time, time - ends[:, 1:])
@@ -224,13 +226,13 @@ def correct_flight(trajectory: Trajectory, errors: StripErrors) -> Trajectory:
 
 
 def times_of(cloud: Cloud) -> Float[np.ndarray, "n"]:
-    """Return the times of the points (s); zero if the cloud has none, as a constant shift needs none."""
+    """Return the times of the points (s); zero if the cloud has no times (sufficient for a constant shift)."""
     return np.zeros(len(cloud)) if cloud.time is None else cloud.time
 
 
 @eqx.filter_jit
 def _corrected_returns(point, time, spline, errors, boresight, calibration) -> Float[Array, "n 3"]:
-    """NaN where the trajectory has no records."""
+    """Return corrected points; NaN where the trajectory has no records."""
     position, object_from_body, known = spline.poses(time)
     off, each = errors.at(time), (0, 0, 0, 0, 0, 0, 0, None, None)
     points = point, position, object_from_body, *spline.motions(time), off[:, :3], off[:, 3:], boresight, calibration

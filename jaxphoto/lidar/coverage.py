@@ -1,4 +1,4 @@
-"""Coverage of laser points by a trajectory; where incomplete, a message with the likely cause."""
+"""Coverage of laser points by a trajectory; error messages with the likely cause of gaps."""
 
 from collections.abc import Sequence
 
@@ -10,32 +10,32 @@ from jaxphoto.errors import BlockError, InputError, few
 from jaxphoto.georeferencing import Trajectory
 from jaxphoto.georeferencing.time_scales import DAY, LAS_OFFSET, LEAP_SECONDS, looks_like, shift_that_fits
 
-# An interval is a gap from this multiple of the usual interval on: one record may be lost.
+# Ratio of a record interval to the median interval above which it is a gap; one record may be missing.
 _GAP = 2.5
-# Below this speed (m/s) a clock jump cannot be distinguished from lost records.
+# Minimum speed (m/s) for distinguishing a clock jump from lost records.
 _FLYING = 1.0
-# Number of records on either side of a gap from which the speed is estimated.
+# Number of records on each side of a gap for estimating the speed.
 _BESIDE = 20
-# Cosine of half the angle (30 degrees) by which an aircraft may turn between records at a clock jump.
+# Cosine of half the maximum turn (30 degrees) of the aircraft between records at a clock jump.
 _STRAIGHT = 0.966
 _START = "a start of their own"
 
 
 def longest_interval(trajectory: Trajectory) -> float:
-    """Longest interval between two records (s) that is not a gap."""
+    """Return the longest interval between two records (s) that is not a gap."""
     return _GAP * float(np.median(np.diff(np.asarray(trajectory.time))))
 
 
 class CoveredTimes:
-    """Times of laser points, received in parts and by strip, relative to the contiguous pieces of a trajectory."""
+    """Times of laser points per strip, accumulated in parts, relative to the contiguous pieces of a trajectory."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         time = np.asarray(trajectory.time)
         self._trajectory = trajectory
         self._gaps = np.flatnonzero(np.diff(time) > longest_interval(trajectory))
         self._begins, self._ends = time[np.r_[0, self._gaps + 1]], time[np.r_[self._gaps, len(time) - 1]]
-        # For each strip, counts by place: 0 before the trajectory, odd in a piece, even in the gap after it or beyond
-        # the end.
+        # First and last time by strip and interval index: 0 before the trajectory, odd within a piece, even in the
+        # following gap or after the end.
         self._first: dict[str, np.ndarray] = {}
         self._last: dict[str, np.ndarray] = {}
         self._several: dict[str, bool] = {}
@@ -45,7 +45,7 @@ class CoveredTimes:
         return self._place(time) % 2 == 1
 
     def add(self, part: Cloud) -> None:
-        """Add laser points; those without times are ignored."""
+        """Add laser points; ignore points without times."""
         if part.time is None or not len(part):
             return
         if part.strip is None:
@@ -55,7 +55,7 @@ class CoveredTimes:
             self.add_times(part.time[part.strip == k], part.strips[k])
 
     def add_times(self, time: Float[np.ndarray, "n"], strip: str = "") -> None:
-        """Add times (s) of points of a strip, or of a cloud without strips."""
+        """Add times (s) of the points of a strip, or of a cloud without strips."""
         empty = np.full(2 * len(self._begins) + 1, np.inf)
         first = self._first.setdefault(strip, empty)
         last = self._last.setdefault(strip, -empty)
@@ -63,7 +63,7 @@ class CoveredTimes:
         ends = np.array([time.min(), time.max()])
         place = self._place(ends)
         if place[0] != place[1]:
-            # Only here every time must be examined.
+            # Examine every time only in this case.
             ends, place = time, self._place(time)
         np.minimum.at(first, place, ends)
         np.maximum.at(last, place, ends)
@@ -78,12 +78,12 @@ class CoveredTimes:
             raise error
 
     def uncovered(self, shift_s: float = 0.0) -> BlockError | None:
-        """Return an error about points before, after or in a gap of the trajectory; None if there are none."""
+        """Return an error if points lie before, after or in a gap of the trajectory; otherwise None."""
         return self._outside(shift_s) or self._in_a_gap()
 
     def _place(self, time: Float[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
         piece = np.searchsorted(self._begins, time, side="right")
-        # An isolated record between two gaps gives no information about its time.
+        # An isolated record between two gaps does not cover its time.
         within = (time <= self._ends[piece - 1]) & (self._begins[piece - 1] < self._ends[piece - 1])
         return 2 * piece - ((piece > 0) & within)
 
@@ -158,11 +158,11 @@ class CoveredTimes:
         return f"laser points{of and f' of {of}'} were measured where the trajectory has no records"
 
     def _jump(self, record: int) -> float | None:
-        """Return the clock jump (s) in the gap after a record; None if records are lost."""
+        """Return the clock jump (s) in the gap after a record; None if records were lost."""
         time, position = np.asarray(self._trajectory.time), np.asarray(self._trajectory.position)
         before, after = np.asarray(self._trajectory.quaternion)[record : record + 2]
         if abs(before @ after) < _STRAIGHT:
-            # The aircraft turned, and is back at the end of the last strip.
+            # The aircraft has turned, and is back at the end of the last strip.
             return None
         near = slice(max(record - _BESIDE, 0), record + _BESIDE + 2)
         lasts = np.diff(time[near])
@@ -196,7 +196,7 @@ def check_covered(cloud: Cloud, trajectory: Trajectory, shift_s: float = 0.0) ->
 
 
 def not_covered(trajectory: Trajectory, time: Float[np.ndarray, "n"]) -> BlockError:
-    """Return the error about times (s) of laser points that the trajectory does not cover."""
+    """Return the error for times (s) of laser points outside the trajectory."""
     coverage = CoveredTimes(trajectory)
     coverage.add_times(time)
     error = coverage.uncovered()
@@ -205,7 +205,7 @@ def not_covered(trajectory: Trajectory, time: Float[np.ndarray, "n"]) -> BlockEr
 
 
 def _strips(names: Sequence[str]) -> str:
-    """Return the names of strips; nothing for points of a cloud without strips."""
+    """Return the names of strips as text; empty for a cloud without strips."""
     if not any(names):
         return ""
     return f"strip {names[0]}" if len(names) == 1 else f"strips {few(names)}"

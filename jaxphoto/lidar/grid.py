@@ -1,8 +1,9 @@
 """Spatial index of a cloud: points sorted by square cells in plan.
 
-Cells are numbered row by row, so those of a window in one row hold one run of points: a window of (2 reach + 1)^2 cells
-is read as 2 reach + 1 runs. A point or place outside the grid belongs to the nearest border cell. That only brings them
-closer together, so no window misses a point, and a few distant points cannot make the grid large.
+Cells are numbered row by row, so the points of adjacent cells in a row are contiguous: a window of (2 reach + 1)^2
+cells is read as 2 reach + 1 runs. Points and query positions outside the grid are assigned to the nearest border cell.
+This only reduces their distances in cells, so no window misses a point, and a few distant points cannot enlarge the
+grid.
 """
 
 import equinox as eqx
@@ -17,58 +18,58 @@ from jaxphoto.errors import InputError
 
 # Mean number of points in a nonempty cell.
 _PER_CELL = 4
-# Number of points from which the cell size is determined.
+# Sample size for estimating the cell size.
 _SAMPLE = 200_000
-# Fraction of the points beyond each border if a few would otherwise make the grid too large.
+# Fraction of the points beyond each border, if isolated points would make the grid too large.
 _OUTSIDE = 1e-3
-# Places times candidates processed at a time.
+# Maximum number of query positions times candidates processed at a time.
 _AT_ONCE = 1_000_000
-# Low, medium and high vegetation (LAS classes).
+# LAS classes of low, medium and high vegetation.
 _VEGETATION = (3, 4, 5)
-# Ground, buildings, water and bridge decks.
+# LAS classes of ground, buildings, water and bridge decks.
 _SURFACES = (2, 6, 9, 17)
-# Larger windows are searched by a tree.
+# Maximum reach of a window; beyond it, a tree is searched.
 _REACH = 16
 
 
 class Grid(eqx.Module):
-    """Points of a cloud sorted by cells. Arrays are padded, so that clouds of similar size share programs."""
+    """Points of a cloud sorted by cells. Arrays are padded, so that clouds of similar size share compiled programs."""
 
     xyz: Float[ArrayLike, "padded 3"]
-    """Points in the order of the cells (m); padding repeats the last."""
+    """Points in the order of the cells (m); padded with copies of the last one."""
     order: Int[ArrayLike, "padded"]
-    """Index of each in the cloud; -1 for padding."""
+    """Index of each point in the cloud; -1 for padding."""
     start: Int[ArrayLike, "offsets"]
-    """First point of each cell; the last ones are the number of points."""
+    """Index of the first point of each cell, padded with the number of points."""
     corner: Float[ArrayLike, "2"]
-    """X, Y (m) of the lower left corner."""
+    """X, Y of the lower left corner (m)."""
     cell_m: Float[ArrayLike, ""]
-    """Side of a cell."""
+    """Side of a cell (m)."""
     shape: Int[ArrayLike, "2"]
-    """Rows and columns."""
+    """Number of rows and columns."""
     leafy: Bool[ArrayLike, "padded"]
-    """True for points classified as vegetation (LAS classes 3, 4, 5) or one of several returns of a pulse."""
+    """True for vegetation (LAS classes 3, 4, 5) and multiple returns of a pulse."""
     most: int = eqx.field(static=True)
-    """Capacity for the points of any three neighbouring cells in a row."""
+    """Maximum number of points in three adjacent cells of a row (capacity)."""
 
     def __len__(self) -> int:
         return int(self.start[-1])
 
 
 class Nearest(eqx.Module):
-    """Points nearest to places, nearest first; the distance is infinite if a cloud has too few."""
+    """Points nearest to query positions, nearest first; distances are infinite if the cloud has too few points."""
 
     index: Int[np.ndarray, "places k"]
-    """Index of the sorted points of the grid."""
+    """Index into the sorted points of the grid."""
     distance: Float[np.ndarray, "places k"]
-    """Horizontal (m)."""
+    """Horizontal distance (m)."""
 
 
 def index_cloud(cloud: Cloud | Float[np.ndarray, "n 3"], cell_m: float | None = None) -> Grid:
-    """Index a cloud, or bare points (m), in square cells of side `cell_m`.
+    """Index a cloud, or an array of points (m), in square cells of side `cell_m`.
 
-    By default a nonempty cell holds about 4 points. There are at most about twice as many cells as points: if the area
-    is too large for that, isolated points are assigned to the border of the grid, and cells are larger.
+    By default a nonempty cell contains about 4 points. The number of cells is at most about twice the number of points:
+    for larger areas, isolated points are assigned to the border of the grid, and cells are enlarged.
 
     Raises InputError for a cloud without points or with NaN coordinates, and for a cell size that is not positive.
     """
@@ -87,7 +88,7 @@ def index_cloud(cloud: Cloud | Float[np.ndarray, "n 3"], cell_m: float | None = 
     place = np.floor((xyz[:, :2] - low) / cell)
     place = np.clip(place, 0, shape[::-1] - 1).astype(np.int32)
     of_cell = place[:, 1] * np.int32(shape[1]) + place[:, 0]
-    # Sorting cell and point as one number is stable, and three times as fast as a stable sort.
+    # Sort cell and point as one integer: stable, and three times as fast as a stable sort.
     key = of_cell.astype(np.int64) << 32 | np.arange(len(xyz))
     key.sort()
     order = (key & 0xFFFFFFFF).astype(np.int32)
@@ -108,15 +109,15 @@ def index_cloud(cloud: Cloud | Float[np.ndarray, "n 3"], cell_m: float | None = 
 
 
 def around(grid: Grid, xy: Float[Array, "2"], reach: int = 1) -> tuple[Int[Array, "k"], Bool[Array, "k"]]:
-    """Return the points of the (2 reach + 1)^2 cells around one place (m), and which of these are valid.
+    """Return indices of the points in the (2 reach + 1)^2 cells around one position (m), and a mask of valid entries.
 
-    Indices are those of the sorted points: `grid.xyz[index]`, and `grid.order[index]` in the cloud. Their number is
-    always `(2 reach + 1) ceil((2 reach + 1) / 3) grid.most`, as compilation and `vmap` require. All points closer than
-    `reach` cells are among them.
+    Indices refer to the sorted points: `grid.xyz[index]`, or `grid.order[index]` in the cloud. The number of entries is
+    always `(2 reach + 1) ceil((2 reach + 1) / 3) grid.most`, as required for compilation and `vmap`. All points closer
+    than `reach` cells are included.
     """
     rows, columns = grid.shape[0], grid.shape[1]
     at = jnp.floor((xy - grid.corner) / grid.cell_m)
-    # In floating point until clipped: the cell of a distant place exceeds any integer.
+    # Clip as float: the cell of a distant position exceeds the integer range.
     column = jnp.clip(at[0], 0, columns - 1).astype(int)
     row = jnp.clip(at[1], 0, rows - 1).astype(int) + jnp.arange(-reach, reach + 1)
     inside = (row >= 0) & (row < rows)
@@ -131,10 +132,10 @@ def around(grid: Grid, xy: Float[Array, "2"], reach: int = 1) -> tuple[Int[Array
 
 
 def nearest(grid: Grid, xy: Float[np.ndarray, "places 2"], k: int) -> Nearest:
-    """Return the `k` points nearest to places (m) in plan, exactly, nearest first.
+    """Return the `k` points nearest to each position (m) in plan, exactly, nearest first.
 
-    A window is enlarged until the circle through the k-th point lies in it. Places far from all points are searched by
-    a SciPy tree.
+    Windows are enlarged until they contain the circle through the k-th point. Positions far from all points are
+    searched by a SciPy tree.
     """
     xy = np.asarray(xy, float).reshape(-1, 2)
     index, distance = np.zeros((len(xy), k), np.int32), np.full((len(xy), k), np.inf)
@@ -152,7 +153,7 @@ def nearest(grid: Grid, xy: Float[np.ndarray, "places 2"], k: int) -> Nearest:
             of = by_total[some]
             distance[left[of]], index[left[of]] = _nearest_of(grid, xy[left[of]], begin[of], end[of], k)
         last = distance[left, -1]
-        # Certain to hold the k-th: as many cells as the circle through the current k-th needs.
+        # Enlarge to contain the circle through the current k-th point.
         wanted = np.where(np.isfinite(last), np.ceil(last / float(grid.cell_m) + 1e-6), 2 * reach[left])
         reach[left] = np.minimum(np.maximum(wanted, reach[left] + 1), _REACH + 1)
         left = left[last > safe]
@@ -166,7 +167,7 @@ def _leafy(cloud: Cloud) -> np.ndarray:
     if cloud.returns is not None:
         several = cloud.returns[:, 1] > 1
         if cloud.classification is not None:
-            # Through an open crown the last return is the ground, and its class says so.
+            # Exclude classified ground: through an open crown the last return is the ground.
             several &= ~np.isin(cloud.classification, _SURFACES)
         leafy |= several
     return leafy
@@ -190,7 +191,9 @@ def _cells(low: np.ndarray, high: np.ndarray, cell: float) -> float:
 
 
 def _cell_side(some: np.ndarray, n: int) -> float:
-    """Return the side (m) at which nonempty cells hold `_PER_CELL` of `n` points, determined from some of them."""
+    """Return the cell side (m) for `_PER_CELL` points per nonempty cell, estimated from a sample; `n` is the number of
+    points.
+    """
     span = np.ptp(some, axis=0)
     area = max(float(np.prod(span)), float(span.max()) ** 2 / len(some))
     if area == 0:
@@ -205,25 +208,25 @@ def _cell_side(some: np.ndarray, n: int) -> float:
 
 
 def _fullest(start: np.ndarray, shape: np.ndarray) -> int:
-    """Return the largest number of points in three neighbouring cells of a row."""
+    """Return the maximum number of points in three adjacent cells of a row."""
     each = np.diff(start).reshape(shape)
     sums = np.convolve(each.ravel(), [1, 1, 1]) if shape[1] > 2 else each.sum(axis=1)
     return int(sums.max())
 
 
 def _room(n: int) -> int:
-    """Round up `n` to one of eight sizes between a power of two and the next."""
+    """Round up `n` to one of eight sizes between two powers of two."""
     step = 1 << max(n.bit_length() - 4, 2)
     return -(-n // step) * step
 
 
 def _first_reach(k: int) -> int:
-    """Return the window that most often holds `k` points for certain."""
+    """Return the window size that contains at least `k` points in most cases."""
     return max(1, int(np.ceil(np.sqrt(1.5 * k / (_PER_CELL * np.pi)))))
 
 
 def _window(grid: Grid, xy: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the runs of points of the window of each place, and the radius (m) within which it is complete."""
+    """Return the runs of points of each position's window, and the radius (m) within which it is complete."""
     rows, columns = (int(v) for v in grid.shape)
     place = np.clip((xy - grid.corner) / grid.cell_m, 0, [columns, rows])
     cell = np.minimum(np.floor(place).astype(int), [columns - 1, rows - 1])
@@ -235,14 +238,14 @@ def _window(grid: Grid, xy: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, 
     base = np.where(inside, row, 0) * columns
     begin = np.where(inside, grid.start[base + np.maximum(left, 0)], 0)
     end = np.where(inside, grid.start[base + np.minimum(right, columns - 1) + 1], 0)
-    # Beyond the border of the grid everything was moved into it.
+    # Points beyond the border are assigned to border cells.
     low, high = cell - reach[:, None], cell + reach[:, None] + 1
     sides = [np.where(low <= 0, np.inf, place - low), np.where(high >= [columns, rows], np.inf, high - place)]
     return begin, end, np.min(np.concatenate(sides, axis=1), axis=1) * float(grid.cell_m)
 
 
 def _portions(total: np.ndarray) -> list[slice]:
-    """Split places into portions whose tables of candidates are not too large; `total` is ascending."""
+    """Split positions into portions with a limited number of candidates; `total` is ascending."""
     portions, first = [], 0
     while first < len(total):
         many = max(1, int(np.searchsorted((np.arange(first, len(total)) - first + 1) * total[first:], _AT_ONCE)))
@@ -252,7 +255,7 @@ def _portions(total: np.ndarray) -> list[slice]:
 
 
 def _nearest_of(grid: Grid, xy: np.ndarray, begin: np.ndarray, end: np.ndarray, k: int):
-    """Return the distances of the nearest among the points of runs, and these points."""
+    """Return the distances of the nearest points among the runs, and their indices."""
     length = end - begin
     total = length.sum(axis=1)
     ends = np.cumsum(length.ravel())
@@ -272,7 +275,7 @@ def _nearest_of(grid: Grid, xy: np.ndarray, begin: np.ndarray, end: np.ndarray, 
 
 
 def _from_tree(grid: Grid, xy: np.ndarray, k: int):
-    # The points are sorted: an unbalanced tree is as good as a balanced one, and built faster.
+    # Points are sorted: an unbalanced tree is equally good, and faster to build.
     tree = scipy.spatial.KDTree(grid.xyz[: len(grid), :2], balanced_tree=False, compact_nodes=False)
     distance, index = tree.query(xy, k=np.arange(1, k + 1))
     return distance, np.where(np.isfinite(distance), index, 0)

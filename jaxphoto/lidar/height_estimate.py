@@ -1,4 +1,4 @@
-"""Height of one place from its nearest points: weights, standard deviation, flags."""
+"""Height at one position from its nearest points: weights, standard deviation, flags."""
 
 import enum
 from typing import NamedTuple
@@ -16,19 +16,19 @@ from jaxphoto.lidar.sight import empty_about, surrounded
 
 
 class HeightFlag(enum.IntFlag):
-    """Problems of a height; several may apply."""
+    """Quality flags of a height; several may apply."""
 
     OK = 0
     HOLE = 1
     """No point is close enough, given the density of the surrounding points."""
     EDGE = 2
-    """The nearest points do not surround the place: it would be extrapolated."""
+    """The nearest points do not surround the position: extrapolation."""
     VEGETATION = 4
-    """The nearest points are vegetation or of several returns, or too rough for a surface."""
+    """The nearest points are vegetation or multiple returns, or too rough for a surface."""
     BREAKLINE = 8
     """The nearest points lie on two surfaces: wall, ridge, kerb."""
     PLANE = 16
-    """`local` fitted a plane to the nearest points, which do not determine a quadratic; not refused."""
+    """`local` used a plane, because the nearest points do not determine a quadratic; not refused by default."""
 
 
 REFUSED = HeightFlag.HOLE | HeightFlag.EDGE | HeightFlag.VEGETATION | HeightFlag.BREAKLINE
@@ -37,10 +37,11 @@ REFUSED = HeightFlag.HOLE | HeightFlag.EDGE | HeightFlag.VEGETATION | HeightFlag
 class HeightSettings(eqx.Module):
     """Settings of height interpolation, and errors of the lidar.
 
-    `points` is the number of nearest points of `idw` and `plane`; if `radius_m` is given they use all points within it
-    instead. `local` uses three times `points`, at least 24. `power` is that of `idw`. Standard deviations are those of
-    a laser point in Z and in each of X and Y, and of the common error of all points. A place is flagged if the fraction
-    `leafy_share` of the points used is vegetation or of several returns; heights with a flag of `refuse` are NaN.
+    `points`: number of nearest points for `idw` and `plane`; with `radius_m` they use all points within it instead.
+    `local` uses three times `points`, at least 24. `power`: exponent of `idw`. `sigma_z_m`, `sigma_xy_m`: standard
+    deviations of a laser point in Z and in each of X and Y; `sigma_systematic_m`: common error of all points. A
+    position is flagged if at least the fraction `leafy_share` of the points used is vegetation or multiple returns;
+    heights with a flag of `refuse` are NaN.
     """
 
     points: int = 8
@@ -64,32 +65,32 @@ class HeightSettings(eqx.Module):
                 raise InputError(f"{name} is {getattr(self, name)}: give a number that is not negative")
 
 
-# Local least-squares surface through the points around a place.
+# Local least-squares surface through the points around a position.
 #
-# With x, y the offsets of a point from the place (m), and its height Z over some reference,
+# With x, y the offsets of a point from the position (m), and its height Z relative to a reference,
 #
 #     Z = h + g_x x + g_y y + (h_xx x^2 + 2 h_xy x y + h_yy y^2) / 2
 #
 # is a quadratic; without its last term, a plane. The fit is linear in the heights: `coefficients = rows @ z`, so every
 # standard deviation follows from `rows`.
 
-# Ratio of a pivot to its diagonal element: points collinear to 1e-4 of their distances.
+# Minimum ratio of a pivot to its diagonal element: points collinear to 1e-4 of their distances.
 _SINGULAR = 1e-8
 
 
 class Neighbours(NamedTuple):
-    """Points nearest to one place, nearest first; padded with points that are not `there`."""
+    """Points nearest to one position, nearest first; padding is marked False in `there`."""
 
     xy: Float[ArrayLike, "points 2"]
-    """Offsets from the place (m)."""
+    """Offsets from the position (m)."""
     z: Float[ArrayLike, "points"]
-    """Heights over that of the nearest point (m)."""
+    """Heights above the nearest point (m)."""
     distance: Float[ArrayLike, "points"]
     there: Bool[ArrayLike, "points"]
 
 
 class LocalFit(NamedTuple):
-    """Fitted surface."""
+    """Locally fitted surface."""
 
     coefficients: Float[Array, "6"]
     """h (m), g_x, g_y, h_xx, h_xy, h_yy (1/m)."""
@@ -99,29 +100,29 @@ class LocalFit(NamedTuple):
     freedom: Float[Array, ""]
     """Number of points minus number of coefficients."""
     determined: Bool[Array, ""]
-    """True if there are more points than coefficients, and they do not lie on a line or conic."""
+    """True if there are more points than coefficients, and they are not on a line or conic."""
 
     @property
     def interpolates(self) -> Bool[Array, ""]:
-        """Return True if the height at the place is better than a single point: otherwise it is extrapolated."""
+        """Return True if the height is more accurate than a single point; otherwise it is extrapolated."""
         return self.determined & (jnp.sum(self.rows[0] ** 2) <= 1)
 
 
 def terms(xy: Float[ArrayLike, "points 2"]) -> Float[Array, "points 6"]:
-    """Return the monomials of the coefficients."""
+    """Return the monomials of the coefficients, one row per point."""
     x, y = xy[:, 0], xy[:, 1]
     return jnp.stack([jnp.ones_like(x), x, y, x**2 / 2, x * y, y**2 / 2], axis=1)
 
 
 def fit_surface(near: Neighbours, weight: Float[ArrayLike, "points"], quadratic: bool) -> LocalFit:
-    """Fit by weighted least squares; the weights of missing points are zero.
+    """Fit the surface by weighted least squares; weights of missing points are zero.
 
-    The residual variance is that of the points of positive weight, each counted once.
+    The residual variance counts each point of positive weight once.
     """
     weight = jnp.where(near.there, weight, 0.0)
     used = weight > 0
     n_used = jnp.sum(used)
-    # Centred and in units of the farthest point, for the best condition of the normal matrix.
+    # Centre, and scale by the distance of the farthest point, for the condition of the normal matrix.
     middle = jnp.sum(jnp.where(used[:, None], near.xy, 0.0), axis=0) / jnp.maximum(n_used, 1)
     offset = jnp.where(used[:, None], near.xy - middle, 0.0)
     unit = jnp.sqrt(jnp.max(jnp.sum(offset**2, axis=1)))
@@ -139,7 +140,7 @@ def fit_surface(near: Neighbours, weight: Float[ArrayLike, "points"], quadratic:
 
 
 def _seen_from_place(at: Float[Array, "2"], unit: Float[Array, ""]) -> Float[Array, "6 6"]:
-    """Transform coefficients about the centre (per unit) to those about the place (per m), which is at `at`."""
+    """Transform coefficients about the centre (scaled) to coefficients about the position `at` (per m)."""
     x, y = at
     zero, one = jnp.zeros(()), jnp.ones(())
     by_x, by_y = jnp.stack([zero, one, zero, x, y, zero]), jnp.stack([zero, zero, one, zero, x, y])
@@ -150,9 +151,9 @@ def _seen_from_place(at: Float[Array, "2"], unit: Float[Array, ""]) -> Float[Arr
 def _solve(
     normal: Float[Array, "n n"], right: Float[Array, "n points"]
 ) -> tuple[Float[Array, "n points"], Bool[Array, ""]]:
-    """Solve by Cholesky factorisation; False if a pivot is close to zero.
+    """Solve by Cholesky factorisation; return False if a pivot is near zero.
 
-    Written out: for many places each step is one operation on long vectors, while LAPACK is called once per place.
+    Written out: vectorised over many positions, while LAPACK would be called for each.
     """
     n = len(normal)
     factor: list[list[Array]] = [[] for _ in range(n)]
@@ -176,54 +177,56 @@ def _solve(
 def inverse_distance_weights(
     squared: Float[ArrayLike, "m"], used: Bool[ArrayLike, "m"], power: Float[ArrayLike, ""]
 ) -> Float[Array, "m"]:
-    """Return w = d^-p over their sum, from squared distances d^2 in any unit; of the points `used`, zero for all
-    others.
+    """Return normalised weights d^-p of the points `used` from squared distances d^2 in any unit; zero for all others.
 
-    If points coincide with the place (d = 0), only these count; differentiable there, too. All are zero if no point is
-    used.
+    If points coincide with the position (d = 0), only they have weight; differentiable there, too. All weights are zero
+    if no point is used.
     """
     least = jnp.min(jnp.where(used, jax.lax.stop_gradient(squared), jnp.inf))
     least = jnp.where(jnp.any(used), least, 1.0)
     exact = squared == 0
-    # Two `where`: neither a distance nor a ratio of zero has a NaN derivative.
+    # Use `where` twice: neither a distance nor a ratio of zero may give a NaN derivative.
     ratio = jnp.where(exact, 1.0, least / jnp.where(exact, 1.0, squared))
     some = used & (ratio > 0)
     weight = jnp.where(some, jnp.where(some, ratio, 1.0) ** (power / 2), 0.0)
     return weight / jnp.maximum(jnp.sum(weight), 1e-300)
 
 
-# Delaunay triangle over one place, from the surrounding points only.
+# Delaunay triangle that contains one position, from the surrounding points only.
 #
 # Lift every point q to |q|^2: the triangulation is the lower hull of the lifted points (Edelsbrunner and Seidel 1986),
-# and the triangle over the place, taken as origin, is the facet that a vertical line pierces. It is the solution of
+# and the triangle that contains the position, taken as origin, is the facet that intersects a vertical line there. It
+# is the solution of
 #
 #     maximise b    subject to    a . q_i + b <= |q_i|^2    for all i
 #
-# in a (2) and b, found as in the dual simplex method: start with a triangle around the place; while a point lies in its
-# circumcircle, replace the corner that leaves a triangle around the place by the point deepest under the facet. Three
-# artificial distant points form the first triangle; if one of them remains, the place is outside all others. The
-# triangle is that of the whole cloud if its circumcircle lies in the circle within which all points are known.
+# in a (2) and b, by a dual simplex method: start with a triangle that contains the position; while a point lies in its
+# circumcircle, insert the point deepest below the facet in place of the corner whose removal leaves the position
+# inside. Three artificial distant points form the initial triangle; if one of them remains, the position is outside all
+# others. The triangle belongs to the triangulation of the whole cloud if its circumcircle lies in the circle within
+# which all points are given.
 
 _MOST_STEPS = 100
-# Corners of the first triangle, in units of the farthest point, and their lift: their facets are vertical.
+# Vertices of the initial triangle (unit: distance of the farthest point) and their lifted coordinate, large enough that
+# their facets are vertical.
 _FAR = 4 * np.stack([np.cos([0.5, 2.6, 4.7]), np.sin([0.5, 2.6, 4.7])], axis=1)
 _LIFT = 1e7
-# Relative to the largest lift of a corner: smaller differences are rounding.
+# Ratio of a depth to the largest lifted corner below which it is rounding.
 _ROUNDING = 1e-14
 
 
 class Triangle(NamedTuple):
-    """Influence of each point on the height of the place: barycentric coordinates of three, zero of the others."""
+    """Barycentric weights of the points: nonzero for the three corners only."""
 
     weight: Float[Array, "points"]
     inside: Bool[Array, ""]
-    """True if there is a triangle over the place."""
+    """True if a triangle contains the position."""
     safe: Bool[Array, ""]
-    """True if no point farther away than the last one given can lie in its circumcircle."""
+    """True if no point outside the given neighbours can lie in its circumcircle."""
 
 
 def delaunay_triangle(near: Neighbours) -> Triangle:
-    """Find the triangle over the place among the neighbours."""
+    """Find the triangle of the neighbours that contains the position."""
     unit = jnp.max(jnp.where(near.there, near.distance, 0.0))
     unit = jnp.where(unit > 0, unit, 1.0)
     points = jnp.concatenate([jnp.where(near.there[:, None], near.xy / unit, 0.0), _FAR])
@@ -266,7 +269,7 @@ def _slope(at: Float[Array, "3 2"], height: Float[Array, "3"]) -> Float[Array, "
 
 
 def _barycentric(at: Float[Array, "3 2"], place: Float[Array, "2"]) -> Float[Array, "3"]:
-    """Return barycentric coordinates of a place; their sum is 1."""
+    """Return barycentric coordinates of a position; their sum is 1."""
     (ax, ay), (bx, by), (px, py) = at[1] - at[0], at[2] - at[0], place - at[0]
     double = ax * by - bx * ay
     second, third = (px * by - bx * py) / double, (ax * py - px * ay) / double
@@ -274,23 +277,23 @@ def _barycentric(at: Float[Array, "3 2"], place: Float[Array, "2"]) -> Float[Arr
 
 
 _DIRECTIONS = np.pi * np.arange(12) / 12
-# Positions of the dividing line, in units of the farthest point.
+# Offsets of the dividing line, in units of the farthest point.
 _OFFSETS = np.array([-0.45, -0.3, -0.15, 0.0, 0.15, 0.3, 0.45])
-# Minimum number of points on each side: two more than a plane has coefficients.
+# Minimum number of points per side: two more than the coefficients of a plane.
 _FEWEST = 5
-# Determinant of a side's normal matrix relative to that of surrounding points: less is a line.
+# Minimum determinant of a side's normal matrix, relative to points all around: smaller ones are collinear.
 _LINE = 1e-4
-# Two planes must leave less than this fraction of the variance of one surface: divided by a line; and by height, which
-# leaves a quarter for any points.
+# Maximum ratio of the variance of two planes to the variance of one surface: divided by a line; divided by height
+# (random points reach a quarter).
 _BY_LINE, _BY_HEIGHT = 0.4, 0.1
 
 
 @eqx.filter_jit
 def lie_on_two_planes(near: Neighbours, variance: Float[Array, "places"]) -> Bool[Array, "places"]:
-    """Return True where two planes leave far less than the `variance` (m^2) of one surface.
+    """Return True where two planes reduce the `variance` (m^2) of one surface by far.
 
-    For a dividing line, of 12 directions and 7 distances from the place, less than 0.4 of it; for the points above and
-    below the largest gap between heights, as at a wall, less than 0.1.
+    Divided by a line (12 directions and 7 offsets from the position): to less than 0.4; divided at the largest gap
+    between heights, as at a wall: to less than 0.1.
     """
     return jax.vmap(_two_planes)(near, variance)
 
@@ -317,10 +320,7 @@ def _gap(near: Neighbours) -> Float[Array, ""]:
 
 
 def _left_by_plane(sums: Float[Array, "2 lines 4 4"]) -> Float[Array, "2 lines"]:
-    """Return residual sums of squares of planes; infinite for too few points, or collinear points.
-
-    About the mean, z'z - r' C^-1 r with C the sums of products of x and y, and r those with z.
-    """
+    """Return residual sums of squares of planes; infinite for too few or collinear points."""
     n = jnp.maximum(sums[..., 0, 0], 1.0)
     mean = sums[..., 0, 1:] / n[..., None]
     about = sums[..., 1:, 1:] - n[..., None, None] * mean[..., :, None] * mean[..., None, :]
@@ -333,19 +333,18 @@ def _left_by_plane(sums: Float[Array, "2 lines 4 4"]) -> Float[Array, "2 lines"]
 
 # Error of an interpolated height: noise and interpolation bias.
 #
-# A height is a weighted sum of those of the points, H = sum w_i Z_i. With the local surface Z(x) of `local_surface`,
-# the noise v of a height and A = `rows`,
+# A height is a weighted sum of the heights of the points, H = sum w_i Z_i. With the local surface Z(x) (`LocalFit`),
+# the noise variance v of a height and A = `rows`,
 #
-#     v = sigma_Z^2 + |g|^2 sigma_XY^2    (+ the excess that the residuals show)
+#     v = sigma_Z^2 + |g|^2 sigma_XY^2    (plus the excess in the residuals)
 #     b = sum w_i Z(x_i) - Z(0) + sigma_XY^2 (h_xx + h_yy) / 2
 #
-# where b is the bias: of weights that do not reproduce a slope or curvature, and of horizontal errors, over which the
-# cloud averages a curved surface. It has a variance itself, t^2, and counts as far as it exceeds that: the error is
-# assumed normal,
+# where b is the bias of weights that do not reproduce slope or curvature, and of horizontal errors, which smooth a
+# curved surface. The bias has a variance t^2 and is applied only as far as it exceeds it. The error is assumed normal,
 #
 #     N(k b, s^2),    k = max(0, 1 - 2 t^2 / b^2),    s^2 = |w - k c A|^2 v + k (1 - k) t^2 + roughness
 #
-# where c b is the bias per coefficient. The returned standard deviation is that of the zero-mean normal distribution
+# where c b is the bias per coefficient. The returned standard deviation belongs to the zero-mean normal distribution
 # with the same probability of 95 % within 1.96 sigma.
 
 
@@ -360,15 +359,15 @@ def noise_variance(fit: LocalFit, noise: LidarNoise) -> Float[ArrayLike, ""]:
     """Return the variance of a point's height over the surface (m^2): on a slope, horizontal errors contribute."""
     slope = jnp.sum(fit.coefficients[1:3] ** 2)
     on_slope = noise.sigma_z**2 + slope * noise.sigma_xy**2
-    # A slope that is not significant is none.
+    # Ignore slopes that are not significant.
     by_chance = on_slope * jnp.sum(fit.rows[1:3] ** 2)
     return noise.sigma_z**2 + jnp.maximum(slope - by_chance, 0.0) * noise.sigma_xy**2
 
 
 def excess(fit: LocalFit, variance: Float[ArrayLike, ""], quantile: float) -> Float[Array, ""]:
-    """Return the residual variance over the expected one, relative to the normal `quantile` of chance.
+    """Return the ratio of residual to expected variance, relative to its limit at the normal `quantile`.
 
-    The quantile of chi-square over its degrees of freedom is that of Wilson and Hilferty (1931).
+    The chi-square limit is the approximation of Wilson and Hilferty (1931).
     """
     part = 2 / (9 * jnp.maximum(fit.freedom, 1.0))
     return fit.variance / (variance * (1 - part + quantile * jnp.sqrt(part)) ** 3)
@@ -377,7 +376,7 @@ def excess(fit: LocalFit, variance: Float[ArrayLike, ""], quantile: float) -> Fl
 def height_sigma(
     near: Neighbours, weight: Float[ArrayLike, "points"], fit: LocalFit, noise: LidarNoise
 ) -> Float[Array, ""]:
-    """Return the standard deviation (m) of the height with these weights, as above."""
+    """Return the standard deviation (m) of a height with these weights (see the model above)."""
     expected = noise_variance(fit, noise)
     rough = excess(fit, expected, _ONE_IN_TWENTY) > 1
     variance = jnp.where(rough, fit.variance, expected)
@@ -393,18 +392,18 @@ def height_sigma(
 
 
 _ONE_IN_TWENTY = 1.645
-# Multiple of its variance that a squared bias must exceed.
+# Minimum ratio of a squared bias to its variance.
 _DOUBT = 2.0
 
 
 def normal_equivalent(mean: Float[Array, ""], sigma: Float[Array, ""]) -> Float[Array, ""]:
     """Return s for which |e| <= 1.96 s in 95 % of errors e of N(mean, sigma^2)."""
-    # Without noise only the bias counts.
+    # Without noise only the bias contributes.
     sigma = jnp.maximum(sigma, 1e-9 * jnp.abs(mean) + 1e-300)
     t = jnp.abs(mean) / sigma
     q = jnp.maximum(_BOUND, t + _ONE_IN_TWENTY)
     for _ in range(4):
-        # Newton's method; the probability is concave in q, so it converges from below.
+        # Newton's method converges from below, because the probability is concave in q.
         within = norm.cdf(q - t) - norm.cdf(-q - t)
         q = q + (0.95 - within) / (norm.pdf(q - t) + norm.pdf(q + t))
     return sigma * q / _BOUND
@@ -413,33 +412,33 @@ def normal_equivalent(mean: Float[Array, ""], sigma: Float[Array, ""]) -> Float[
 _BOUND = 1.959963984540054
 
 
-# Number of points that determine slope, curvature and roughness: a minimum, and a multiple of those used.
+# Number of points for slope, curvature and roughness: minimum, and multiple of the number of points used.
 WIDE, TIMES = 24, 3
-# Also all available points within this number of horizontal standard deviations.
+# Number of horizontal standard deviations within which all available points are used as well.
 APART = 4.75
-# Quantiles of the normal distribution: 1 in 20, and 1 in 1000.
+# Quantiles of the normal distribution: probabilities 1/20 and 1/1000.
 _SELDOM, _HARDLY = 1.645, 3.09
-# Residuals in units of the lidar's noise beyond which there is no surface.
+# Ratio of residuals to the lidar's noise above which there is no surface.
 _ROUGH = 3.0
-# Standard deviation of the weights of moving least squares, in units of the farthest point.
+# Standard deviation of the moving least-squares weights, in units of the farthest point.
 _WIDTH = 0.5
 
 
 class HeightNumbers(NamedTuple):
-    """Numerical settings, for which programs are not recompiled."""
+    """Numerical settings, passed as arrays: changes need no recompilation."""
 
     points: Int[ArrayLike, ""]
     power: Float[ArrayLike, ""]
     radius: Float[ArrayLike, ""]
-    """Zero: the nearest points (m)."""
+    """Search radius (m); zero: use the nearest points."""
     noise: LidarNoise
 
 
 class HeightEstimate(NamedTuple):
-    """Estimate for one place."""
+    """Estimate at one position."""
 
     height: Float[ArrayLike, ""]
-    """Over the nearest point (m); NaN if undetermined."""
+    """Height above the nearest point (m); NaN if undetermined."""
     sigma: Float[ArrayLike, ""]
     used: Int[ArrayLike, ""]
     density: Float[ArrayLike, ""]
@@ -454,9 +453,9 @@ class HeightEstimate(NamedTuple):
     misfit: Bool[ArrayLike, ""]
     """True if the points scatter about the surface more than the lidar's noise explains."""
     rough: Bool[ArrayLike, ""]
-    """True if they do so by far."""
+    """True if the scatter exceeds the noise by a factor of 3 (`_ROUGH`)."""
     wide: Int[ArrayLike, ""]
-    """Number of points that determined the surface."""
+    """Number of points used for the surface."""
     one_surface: Float[ArrayLike, ""]
     """Residual variance (m^2) of one smooth surface."""
     final: Bool[ArrayLike, ""]
@@ -467,7 +466,7 @@ class HeightEstimate(NamedTuple):
 def estimate_heights(
     near: Neighbours, leafy: Bool[Array, "places points"], numbers: HeightNumbers, method: str
 ) -> HeightEstimate:
-    """Estimate every place by `method`; arrays of `near` have a leading axis over the places."""
+    """Estimate the height at every position by `method`; arrays of `near` have a leading axis over the positions."""
     return jax.vmap(lambda n, of: _estimate(n, of, numbers, method))(near, leafy)
 
 
@@ -475,7 +474,7 @@ def _estimate(near: Neighbours, leafy: Bool[Array, "points"], numbers: HeightNum
     in_radius = near.there & (near.distance <= numbers.radius)
     n_used = jnp.where(numbers.radius > 0, jnp.sum(in_radius), numbers.points)
     n_around = jnp.maximum(WIDE, TIMES * n_used)
-    # Points whose horizontal errors equal their distances determine no curvature.
+    # Points closer than their horizontal errors do not determine curvature.
     n_wide = jnp.maximum(n_around, jnp.sum(near.there & (near.distance <= APART * numbers.noise.sigma_xy)))
     rank = jnp.arange(len(near.z))
     used, around = near.there & (rank < n_used), near.there & (rank < n_around)
@@ -488,7 +487,7 @@ def _estimate(near: Neighbours, leafy: Bool[Array, "points"], numbers: HeightNum
     def misfit(fit: LocalFit, quantile: float) -> Bool[Array, ""]:
         return excess(fit, noise_variance(fit, numbers.noise), quantile) > 1
 
-    # A local plane close to a break: points beyond it are irrelevant.
+    # Prefer a local plane near a breakline: points beyond it are irrelevant.
     take_flat = ~curved.interpolates | (misfit(curved, _HARDLY) & flat.interpolates & ~misfit(flat, _SELDOM))
     fit = jax.tree.map(lambda a, b: jnp.where(take_flat, a, b), flat, curved)
     final = interpolates = jnp.array(True)

@@ -1,13 +1,13 @@
 """Heights at X, Y from a cloud, with standard deviations; refused where the cloud does not determine them.
 
-Four interpolations of the heights of points around a place, H = sum w_i Z_i:
+Four interpolations of the heights of surrounding points, H = sum w_i Z_i:
 
-- `idw`: w ~ distance^-power over the nearest points (only the point at the place, if there is one), - `plane`: least
-squares through the nearest points, - `tin`: linear in the triangle of the Delaunay triangulation of the whole cloud
-(`tin`), - `local`: moving least squares, a quadratic with Gaussian weights; a plane if the points do not determine a
-quadratic.
+- `idw`: w ~ distance^-power over the nearest points (only the point at the position, if there is one),
+- `plane`: least squares through the nearest points,
+- `tin`: linear in the triangle of the Delaunay triangulation of the whole cloud (`tin`),
+- `local`: moving least squares, a quadratic with Gaussian weights; a plane if the points do not determine a quadratic.
 
-Error model: `height_error`; files and figures: docs/lidar_heights.md.
+Error model: `height_estimate`; files and figures: docs/lidar_heights.md.
 """
 
 from typing import Literal, get_args
@@ -36,40 +36,40 @@ from jaxphoto.lidar.height_estimate import (
 )
 
 Method = Literal["idw", "plane", "tin", "local"]
-# Places of a call are padded to one of these: few programs.
+# Batch sizes of positions; calls are padded to these, for few compiled programs.
 _PLACES = (64, 512, 4096)
-# Points among which the triangle over a place is searched: multiplied repeatedly, up to a limit.
+# Factor by which the number of points for a triangle is increased, and its maximum.
 _MORE, _MOST = 4, 384
-# Maximum number of points that determine the surface, if a cloud is much denser than its horizontal errors.
+# Maximum number of points for the surface, for clouds much denser than their horizontal errors.
 _MOST_WIDE = 4 * WIDE
 
 
 class Heights(eqx.Module):
-    """Heights of places (m) and their properties; NaN where refused or undetermined."""
+    """Heights (m) and their properties; NaN where refused or undetermined."""
 
     z: Float[ArrayLike, "places"]
     sigma: Float[ArrayLike, "places"]
     flag: Integer[ArrayLike, "places"]
-    """Sums of `HeightFlag`."""
+    """Bitwise sum of `HeightFlag`."""
     count: Int[ArrayLike, "places"]
     """Number of points used."""
     density: Float[ArrayLike, "places"]
-    """Points per m^2 around the place."""
+    """Points per m^2 around the position."""
     roughness: Float[ArrayLike, "places"]
     """Standard deviation (m) of the points about the local surface."""
     gradient: Float[ArrayLike, "places 2"]
-    """Gradient of the local surface by X and Y."""
+    """Gradient of the local surface (dZ/dX, dZ/dY)."""
 
     def __len__(self) -> int:
         return len(self.z)
 
     @property
     def slope(self) -> Float[ArrayLike, "places"]:
-        """Rise over run: 1 is 45 degrees."""
+        """Return the slope as rise over run: 1 is 45 degrees."""
         return np.hypot(*np.asarray(self.gradient).T)
 
     def flagged(self, flag: HeightFlag) -> Bool[np.ndarray, "places"]:
-        """Return True for places with any flag of `flag`."""
+        """Return True for positions with any flag of `flag`."""
         return (np.asarray(self.flag) & int(flag)) != 0
 
 
@@ -79,12 +79,12 @@ def heights_at(
     method: Method = "idw",
     settings: HeightSettings | None = None,
 ) -> Heights:
-    """Return heights of the cloud at places X, Y (m), by one of four methods, with standard deviations and flags.
+    """Interpolate heights of the cloud at X, Y (m) by one of four methods, with standard deviations and flags.
 
-    A `Grid` saves indexing the cloud again. Places with a flag of `settings.refuse` are NaN; `Heights.flag` gives the
-    reason. The standard deviation is such that 95 % of the errors are within 1.96 sigma.
+    Pass a `Grid` to avoid re-indexing the cloud. Positions with a flag of `settings.refuse` are NaN; `Heights.flag`
+    gives the reason. 95 % of the errors are within 1.96 standard deviations.
 
-    Raises InputError for an unknown method, places that are not pairs of numbers, and an empty cloud.
+    Raises InputError for an unknown method, positions that are not pairs of numbers, and an empty cloud.
     """
     settings = HeightSettings() if settings is None else settings
     if method not in get_args(Method):
@@ -101,14 +101,14 @@ def heights_at(
 
 
 def _points_of_noise(grid: Grid, sigma_xy_m: float) -> int:
-    """Return the mean number of points closer to a place than horizontal errors matter; a multiple of `WIDE`."""
+    """Return the mean number of points within the range of horizontal errors; a multiple of `WIDE`."""
     covered = np.count_nonzero(np.diff(grid.start)) * float(grid.cell_m) ** 2
     many = np.pi * (APART * sigma_xy_m) ** 2 * len(grid) / covered
     return min(WIDE * int(np.ceil(many / WIDE)), _MOST_WIDE)
 
 
 def _points_of_radius(grid: Grid, xy: np.ndarray, radius_m: float, wide: int) -> int:
-    """Return the number of nearest points that hold `TIMES` those of the radius, at every place."""
+    """Return a number of nearest points that is `TIMES` the number within the radius, at every position."""
     while wide < len(grid):
         within = (nearest(grid, xy, wide).distance <= radius_m).sum(axis=1).max(initial=0)
         if TIMES * within <= wide:
@@ -118,7 +118,7 @@ def _points_of_radius(grid: Grid, xy: np.ndarray, radius_m: float, wide: int) ->
 
 
 def _estimates(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSettings, k: int) -> HeightEstimate:
-    """Estimate all places, and with more points again those whose triangle might change."""
+    """Estimate all positions; repeat with more points where the triangle may change."""
     estimate = _with_points(grid, xy, method, settings, k)
     refused = estimate.hole * HeightFlag.HOLE | ~estimate.surrounded * HeightFlag.EDGE
     left = np.flatnonzero(~estimate.final & (refused & settings.refuse == 0))
@@ -134,13 +134,13 @@ def _estimates(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSetti
 
 
 def _with_points(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSettings, k: int) -> HeightEstimate:
-    """Estimate places from their `k` nearest points, in portions of few sizes."""
+    """Estimate positions from their `k` nearest points, in batches of few sizes."""
     most = max(1, _PLACES[-1] * WIDE // k)
     noise = LidarNoise(np.array(settings.sigma_z_m), np.array(settings.sigma_xy_m))
     numbers = HeightNumbers(
         np.array(settings.points), np.array(settings.power), np.array(settings.radius_m or 0.0), noise
     )
-    # No places are one portion, too.
+    # Process one portion even without positions.
     parts, sizes = [], [*(size for size in _PLACES if size < most), most]
     for first in range(0, max(len(xy), 1), most):
         some = xy[first : first + most]
@@ -154,7 +154,7 @@ def _with_points(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSet
 
 
 def _neighbours(grid: Grid, xy: np.ndarray, k: int) -> tuple[Neighbours, ArrayLike, ArrayLike]:
-    """Return the nearest points of places, the height of the nearest of all, and which of them are vegetation."""
+    """Return the neighbours of the positions, the height of the nearest neighbour, and a mask of vegetation."""
     neighbours = nearest(grid, xy, k)
     points = grid.xyz[neighbours.index]
     there = np.isfinite(neighbours.distance)
@@ -164,7 +164,7 @@ def _neighbours(grid: Grid, xy: np.ndarray, k: int) -> tuple[Neighbours, ArrayLi
 
 
 def _judged(estimate: HeightEstimate, broken: np.ndarray, settings: HeightSettings) -> Heights:
-    """Combine flags, and remove refused heights."""
+    """Combine flags, and set refused heights to NaN."""
     rough = estimate.misfit & estimate.rough & ~broken
     of_leaves = (estimate.leafy > 0) & (estimate.leafy >= settings.leafy_share)
     flag = estimate.hole * HeightFlag.HOLE | ~(estimate.surrounded & np.isfinite(estimate.height)) * HeightFlag.EDGE
@@ -183,7 +183,7 @@ def _judged(estimate: HeightEstimate, broken: np.ndarray, settings: HeightSettin
 
 
 def _broken(grid: Grid, xy: np.ndarray, estimate: HeightEstimate, k: int) -> np.ndarray:
-    """Return True for places at the border of two surfaces, among those where one smooth surface does not fit."""
+    """Return True for positions at a breakline, where one smooth surface does not fit."""
     broken = np.zeros(len(xy), bool)
     doubtful = np.flatnonzero(estimate.misfit)
     for first in range(0, len(doubtful), _PLACES[1]):
@@ -197,27 +197,27 @@ def _broken(grid: Grid, xy: np.ndarray, estimate: HeightEstimate, k: int) -> np.
 
 
 class TangentPlanes(eqx.Module):
-    """Planes at places; NaN where the cloud does not determine the surface (see `heights_at`)."""
+    """Tangent planes; NaN where the cloud does not determine the surface (see `heights_at`)."""
 
     foot: Float[np.ndarray, "places 3"]
-    """Point on the surface above or below the place (m)."""
+    """Point on the surface above or below the position (m)."""
     normal: Float[np.ndarray, "places 3"]
-    """Unit vectors, upwards."""
+    """Unit normals, upwards."""
     sigma: Float[np.ndarray, "places"]
     """Standard deviation of the surface along the normal (m)."""
     flag: Integer[np.ndarray, "places"]
-    """Sums of `HeightFlag`."""
+    """Bitwise sum of `HeightFlag`."""
     nearest: Int[np.ndarray, "places"]
-    """Laser point nearest to the place, in the order of the cloud."""
+    """Index in the cloud of the nearest laser point."""
 
 
 def tangent_planes(
     grid: Grid, xy: Float[np.ndarray, "places 2"], method: Method, settings: HeightSettings
 ) -> TangentPlanes:
-    """Return the tangent planes of the surface at places X, Y (m).
+    """Return the tangent planes of the surface at X, Y (m).
 
-    With the gradient g of the surface, the normal is (-g, 1) / sqrt(1 + g.g), and its height error is projected
-    accordingly. Raises what `heights_at` raises.
+    With the gradient g of the surface, the normal is (-g, 1) / sqrt(1 + g.g); the height error is projected onto it.
+    Raises the errors of `heights_at`.
     """
     heights = heights_at(grid, xy, method, settings)
     normal = np.column_stack([-heights.gradient, np.ones(len(xy))])

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxphoto.errors import InputError
 
-# All of 200 samples contain a blunder once in 10^11 cases at 50 % blunders, once in 230 at 70 %.
+# Number of samples: all contain a blunder once in 10^11 cases at 50 % blunders, once in 230 at 70 %.
 _DRAWS = 200
 _SCORED = 4000
 _CUT = 3.0
@@ -28,26 +28,25 @@ _ROUNDS = 30
 
 
 class Plane(eqx.Module):
-    """Plane `normal . (x - centroid) = 0` through laser points (m)."""
+    """Fitted plane `normal . (x - centroid) = 0` through laser points (m)."""
 
     normal: Float[np.ndarray, "3"]
-    """Unit vector, upwards."""
+    """Unit normal, upwards."""
     centroid: Float[np.ndarray, "3"]
     covariance: Float[np.ndarray, "4 4"]
-    """Of the normal and of the offset (m) at the centroid, a posteriori; singular along the normal, of length 1."""
+    """A posteriori covariance of the normal and the offset (m) at the centroid; singular along the normal."""
     sigma0: float
-    """Ratio of the points' spread to the stated standard deviations: 1 if these and the plane are correct."""
+    """Ratio of the points' scatter to the stated standard deviations: 1 if these and the plane are correct."""
     inliers: Bool[np.ndarray, "n"]
     """True for the points used."""
 
 
 def fit_plane(xyz: Float[np.ndarray, "n 3"], sigma_xy_m: float, sigma_z_m: float) -> Plane:
-    """Fit a plane to the majority of laser points `xyz` (m), by a robust start and total least squares.
+    """Fit a plane to the majority of laser points `xyz` (m), by RANSAC and total least squares.
 
-    `sigma_xy_m`, of X and of Y, and `sigma_z_m` are the standard deviations of a laser point. The points should be all
-    returns of a surface: a window cut by measured X and Y from a larger slope makes it slightly too steep. The samples
-    are the same each time. Raises InputError for fewer than four points, collinear points, or sigmas that are not
-    positive.
+    `sigma_xy_m` (of X and of Y) and `sigma_z_m` are the standard deviations of a laser point. Pass all returns of a
+    surface: a window cut by measured X and Y from a larger slope gives a slightly too steep plane. Random samples are
+    reproducible. Raises InputError for fewer than four points, collinear points, or sigmas that are not positive.
     """
     sigma = point_sigma(sigma_xy_m, sigma_z_m)
     if len(xyz) < 4:
@@ -69,7 +68,7 @@ def fit_plane(xyz: Float[np.ndarray, "n 3"], sigma_xy_m: float, sigma_z_m: float
             f"the {len(xyz)} laser points lie on a line within their standard deviations and determine no plane; take "
             "a larger patch"
         )
-    # Variances of the tilts about both long axes and of the offset, enlarged by errors along these axes.
+    # Variances of the tilts about both long axes and of the offset, scaled by the errors along these axes.
     variance = sigma0**2 * np.array([s / (s - noise) ** 2 for s in squares[1:]] + [1 / n])
     stretched = axes / sigma[:, None]
     length = np.linalg.norm(stretched[:, 0]) * (1 if stretched[2, 0] >= 0 else -1)
@@ -81,9 +80,10 @@ def fit_plane(xyz: Float[np.ndarray, "n 3"], sigma_xy_m: float, sigma_z_m: float
 
 
 def point_sigma(sigma_xy_m: float, sigma_z_m: float) -> Float[np.ndarray, "3"]:
-    """Return standard deviations (m) of a laser point in X, Y and Z; raises InputError for invalid ones.
+    """Return standard deviations (m) of a laser point in X, Y and Z. Raises InputError for invalid ones.
 
-    Zero in X and Y is replaced by a thousandth of that in Z: a plane is then regression on X and Y, to a millionth.
+    Zero in X and Y is replaced by a thousandth of the value in Z: the plane is then a regression of Z on X and Y, to a
+    millionth.
     """
     if not (sigma_z_m > 0 and sigma_xy_m >= 0):
         raise InputError(
@@ -96,7 +96,7 @@ def point_sigma(sigma_xy_m: float, sigma_z_m: float) -> Float[np.ndarray, "3"]:
 def plane_distance(
     plane: Plane, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Return the distance (m) of `points` (m) above the plane, along its normal, and its sigma (m) due to the plane."""
+    """Return the distance (m) of `points` (m) above the plane, along its normal, and the plane's sigma (m) there."""
     offset = points - plane.centroid
     by = np.column_stack([offset, -np.ones(len(offset))])
     return offset @ plane.normal, np.sqrt(np.einsum("ni,ij,nj->n", by, plane.covariance, by))
@@ -105,10 +105,11 @@ def plane_distance(
 def plane_feet(
     plane: Plane, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
-    """Return observations that `points` (m) lie on the plane: their feet on it (m), its normal and its sigma there (m).
+    """Return point-to-plane observations for `points` (m): foot points (m), unit normal, sigma of the plane at each
+    point (m).
 
-    A row of an adjustment is then `normal . (point - foot) = 0 +- sigma`. Its sigma is that of the plane alone, and
-    common to all points of one plane.
+    A row of an adjustment is then `normal . (point - foot) = 0 +- sigma`. The sigma contains the error of the plane
+    only, which all points of a plane share.
     """
     distance, sigma = plane_distance(plane, points)
     normal = np.broadcast_to(plane.normal, points.shape)
@@ -116,7 +117,7 @@ def plane_feet(
 
 
 def _start(scaled: np.ndarray) -> np.ndarray:
-    """Return distances of all points from the best of the planes through three of them."""
+    """Return distances of all points from the best plane through three random points."""
     rng = np.random.default_rng(0)
     corners = scaled[rng.integers(0, len(scaled), (_DRAWS, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -132,7 +133,7 @@ def _start(scaled: np.ndarray) -> np.ndarray:
 
 
 def _principal(scaled: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the mean, sums of squares along the principal axes, smallest first, and these axes as columns."""
+    """Return the mean, the sums of squares along the principal axes in ascending order, and the axes as columns."""
     mean = scaled.mean(axis=0)
     return mean, *np.linalg.eigh((scaled - mean).T @ (scaled - mean))
 
@@ -143,23 +144,23 @@ def _sigma0(sum_of_squares: float, inliers: np.ndarray) -> float:
 
 # Planar patches of a cloud, mainly roof faces, by region growing; planes, outlines and centroids.
 #
-# From a point whose neighbours are coplanar a patch grows: the plane through its points; all connected points within
-# three standard deviations of it; the plane through these, until they do not change. The largest patch from several
-# seeds is kept, and then the next of the remaining points. Along a ridge the first patch takes points of the other;
-# therefore each point is finally assigned to the nearest of the planes of its neighbours.
+# A patch grows from a point whose neighbours are coplanar. Fit a plane to its points, select all connected points
+# within three standard deviations, and repeat until the points do not change. Accept the largest patch of several
+# seeds, then continue with the remaining points. Along a ridge the first patch includes points of the other face;
+# therefore each point is finally assigned to the nearest plane of its neighbours.
 
-# Number of neighbours of a seed, and for connectivity.
+# Number of neighbours of a seed, and of the connectivity graph.
 _SEED, _GRAPH = 12, 8
-# Points are connected up to this multiple of the usual distance of the farthest neighbour.
+# Maximum length of a connection, as a multiple of the median distance of the farthest neighbour.
 _GAP = 2.0
-# Residual variance of a seed relative to that of the lidar: once in a thousand by chance.
+# Maximum ratio of the residual variance of a seed to the lidar's variance (exceeded by chance once in a thousand).
 _PLANAR = 2.7
 _RIDGE_ROUNDS, _SHARED = 12, 3
-# Number of seeds of which the largest patch is used: one on a ridge grows over parts of both faces.
+# Number of seeds from which the largest patch is selected: a seed on a ridge grows over parts of both faces.
 _TRIED = 6
-# Spread across a face, in horizontal standard deviations, that is more than noise: a width of about six of them.
+# Minimum spread across a face, in horizontal standard deviations: a width of about six of them.
 _WIDTH = 2.0
-# Largest sigma0 of a face; points uniformly between -3 and 3 standard deviations have 1.73.
+# Maximum sigma0 of a face; points uniformly distributed between -3 and 3 standard deviations have 1.73.
 _SPREAD = 1.35
 
 
@@ -167,11 +168,11 @@ class Patch(eqx.Module):
     """Connected coplanar laser points."""
 
     index: Int[np.ndarray, "n"]
-    """Indices of its points, in the given order."""
+    """Indices into the given points."""
     plane: Plane
-    """Through its points; `plane.inliers` are all of them."""
+    """Plane through the points of the patch; all are inliers."""
     outline: Float[np.ndarray, "corners 3"]
-    """Convex hull in X and Y, counterclockwise, on the plane (m): slightly enlarged by horizontal noise."""
+    """Convex hull in X and Y, counterclockwise, projected onto the plane (m); slightly enlarged by horizontal noise."""
 
 
 def planar_patches(
@@ -179,10 +180,10 @@ def planar_patches(
 ) -> list[Patch]:
     """Find the planar patches of at least `least_points` laser points `xyz` (m), largest first.
 
-    Standard deviations are those of a laser point and define planarity: they should be correct. Pass the points of
-    buildings (LAS class 6), or a window of all: level ground is a plane as well. A face narrower than six `sigma_xy_m`
-    cannot be distinguished from noise. Raises InputError for fewer points than a patch needs and, like `fit_plane`, for
-    invalid sigmas.
+    The standard deviations of a laser point define planarity: they should be realistic. Pass the points of buildings
+    (LAS class 6) or of a window: level ground is also planar. Faces narrower than six `sigma_xy_m` cannot be
+    distinguished from noise. Raises InputError for fewer points than a patch needs and, like `fit_plane`, for invalid
+    sigmas.
     """
     if len(xyz) < max(least_points, _SEED):
         raise InputError(
@@ -198,7 +199,7 @@ def planar_patches(
     )
     graph = (graph + graph.T).tocsr()
     even = _unevenness(xyz[near], sigma) < _PLANAR
-    # House by house: unconnected points have no face in common.
+    # Process connected points (houses) separately: unconnected points have no common face.
     _, house = scipy.sparse.csgraph.connected_components(graph, directed=False)
     by_house = np.split(np.argsort(house, kind="stable"), np.cumsum(np.bincount(house))[:-1])
     place = np.full(len(xyz), -1)
@@ -213,12 +214,11 @@ def planar_patches(
 
 
 def roof_centroid(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Return the centroid (m) of a roof face, or of a roof, from its laser points, and its covariance (m^2): scatter
-    over n.
+    """Return the centroid (m) of the laser points of a roof face or a roof, and its covariance (m^2): scatter over n.
 
-    It is that of the area in plan for uniformly distributed points, a sample of the area. If strips overlap over a part
-    of the roof, the mean is shifted there, and the covariance does not show it: use the points of one strip. Points
-    hidden from the lidar, behind a chimney, shift it, too.
+    For uniformly distributed points it is the centroid of the area in plan. Points of overlapping strips on a part of
+    the roof bias it without an effect on the covariance: use the points of one strip. Points hidden from the lidar, for
+    example behind a chimney, bias it as well.
     """
     if len(points) < 4:
         raise InputError(f"the centroid of a roof needs 4 laser points, got {len(points)}")
@@ -226,7 +226,7 @@ def roof_centroid(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "
 
 
 def ridge_line(first: Plane, second: Plane) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Return the intersection of two roof faces: a point (m) of it between them, and its unit direction.
+    """Return the intersection line of two roof faces: a point (m) on it between them, and its unit direction.
 
     Raises InputError for planes that are parallel within three standard deviations.
     """
@@ -249,7 +249,7 @@ def _plane(xyz: np.ndarray, sigma: np.ndarray) -> Plane:
 def _of_house(
     xyz: np.ndarray, near: np.ndarray, even: np.ndarray, graph: "scipy.sparse.csr_matrix", sigma: np.ndarray, least: int
 ) -> list[Patch]:
-    """Return the patches of connected points; `near` are the neighbours of each, -1 if not among them."""
+    """Find the patches of connected points; `near` are the neighbours of each point, -1 if not among them."""
     members: list[np.ndarray] = []
     free, scaled = np.ones(len(xyz), bool), xyz / sigma
     seeds = np.random.default_rng(0).permutation(np.flatnonzero(even))
@@ -272,10 +272,10 @@ def _of_house(
 def _faces(
     xyz: np.ndarray, members: list[np.ndarray], least: int, sigma: np.ndarray
 ) -> tuple[list[np.ndarray], list[Plane]]:
-    """Return those of `members` that are faces, with their planes.
+    """Select the `members` that are faces, and return them with their planes.
 
-    A face has enough points, exceeds what noise leaves in a strip along a ridge or the eaves, and its points scatter
-    about its plane as the lidar's noise does, without filling the band from which they were taken.
+    A face has enough points, is wider than a strip of noise along a ridge or eaves, and its points scatter about the
+    plane like the lidar's noise, not uniformly over the search band.
     """
     faces, planes = [], []
     for member in members:
@@ -297,7 +297,7 @@ def _patch(members: np.ndarray, plane: Plane, xyz: np.ndarray) -> Patch:
 
 
 def _unevenness(around: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Return the variance of each point's neighbours about their plane, relative to that of the lidar."""
+    """Return the ratio of the variance of each point's neighbours about their plane to the lidar's variance."""
     scaled = (around - around.mean(axis=1, keepdims=True)) / sigma
     return np.linalg.eigvalsh(np.swapaxes(scaled, 1, 2) @ scaled)[:, 0] / (around.shape[1] - 3)
 
@@ -305,7 +305,7 @@ def _unevenness(around: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 def _grown(
     scaled: np.ndarray, seed: np.ndarray, free: np.ndarray, graph: "scipy.sparse.csr_matrix"
 ) -> Int[np.ndarray, "n"]:
-    """Return the free points of a patch grown from `seed`; `scaled` are all, in standard deviations of X, Y and Z."""
+    """Grow a patch of free points from `seed`; `scaled`: all coordinates, divided by their standard deviations."""
     patch = seed
     for _ in range(_RIDGE_ROUNDS):
         if len(patch) < 4:
@@ -325,7 +325,7 @@ def _grown(
 def _shared(
     xyz: np.ndarray, members: list[np.ndarray], planes: list[Plane], graph: "scipy.sparse.csr_matrix", sigma: np.ndarray
 ) -> list[np.ndarray]:
-    """Assign each point to the nearest of the planes of its neighbours and its own."""
+    """Assign each point to the nearest plane among its own and its neighbours' planes."""
     distance = np.abs(np.stack([_scaled_distance(xyz, plane, sigma) for plane in planes]))
     for k, member in enumerate(members):
         mask = np.zeros(len(xyz))
@@ -337,5 +337,5 @@ def _shared(
 
 
 def _scaled_distance(xyz: np.ndarray, plane: Plane, sigma: np.ndarray) -> np.ndarray:
-    """Return distances from a plane in standard deviations of a laser point along its normal."""
+    """Return distances from a plane, divided by the standard deviation of a laser point along its normal."""
     return (xyz - plane.centroid) @ plane.normal / np.linalg.norm(sigma * plane.normal)

@@ -2,26 +2,24 @@
 
 For a feature at (x, y) in an image of known orientation (paper 001, equations (1)-(3); docs/lidar_heights.md):
 
-1. down the ray, cell by cell, to the first with a laser point as high as the ray: the visible surface (`sight`); 2.
-project the laser points around that place into the image; if they lie on two levels, as at a building, those of the
-level that the image shows; repeat both at the height found, until the place does not change; 3. with d_i the distances
-in the image of the nearest,
+1. Follow the ray downwards, cell by cell, to the first laser point at the height of the ray: the visible surface
+   (`sight`).
+2. Project the laser points around that position into the image. If they lie on two levels, as at a building, select the
+   visible level. Repeat both at the new height, `_ROUNDS` times.
+3. With d_i the distances in the image of the nearest points, compute Z = sum w_i Z_i, w_i = d_i^-p / sum d_j^-p.
+4. Compute X and Y from the ray at that Z.
 
-       Z = sum w_i Z_i,    w_i = d_i^-p / sum d_j^-p
-
-4. X and Y from the ray at that Z.
-
-The choice of the nearest points has no derivative; weights and ray have, by every parameter of interior and exterior
-orientation.
+The choice of the nearest points has no derivative. Weights and ray are differentiable with respect to every parameter
+of interior and exterior orientation.
 
 Standard deviation. Let t = d(X, Y)/dZ of the ray, q_i the horizontal offset of a laser point from the ray *at the
 height of the point*, and g the slope of the ground. Seen along the ray, the surface is
 
     Z = Z_0 + h . q,    h = g / (1 - g . t)
 
-and the error of a laser point is (1 + h . t) e_Z - h . e_XY: over q it is a surface of slope h, measured with errors (1
-+ h . t) sigma_Z and sigma_XY. `height_error` propagates these with the weights, and a slope that the weights do not
-reproduce. The result is the height of the surface where the ray meets it, without errors of the ray itself.
+and the error of a laser point is (1 + h . t) e_Z - h . e_XY: as a function of q it is a surface of slope h, measured
+with errors (1 + h . t) sigma_Z and sigma_XY. `height_estimate` propagates these errors, and the bias of weights that do
+not reproduce a slope. The result is the accuracy of the surface height at the intersection, without errors of the ray.
 """
 
 from typing import Literal, NamedTuple, get_args
@@ -60,27 +58,28 @@ from jaxphoto.unknowns import Unknowns
 
 Interpolation = Literal["weighted", "plane"]
 
-# Candidates per point: enough for a slope, and for neighbours if half of them are hidden.
+# Ratio of candidates to points used: enough for a slope, and if half of them are hidden.
 _CANDIDATES = 3
-# The first place has an error of half a cell, and each iteration leaves slope times run of it.
+# Number of iterations. The first position has an error of half a cell; each iteration multiplies it by slope times run.
 _ROUNDS = 5
-# Residuals beyond the lidar's noise: once in 1000 places by chance, and so large that there is no surface.
+# Ratio of residuals to the lidar's noise: quantile for one false alarm in 1000, and limit above which there is no
+# surface.
 _HARDLY, _ROUGH = 3.09, 3.0
-# Features processed at a time: what fits into a processor's cache; and for few features.
+# Number of features processed at a time (fits the CPU cache); minimum batch size.
 _AT_ONCE, _FEW = 512, 64
 
 
 class PseudoControl(eqx.Module):
-    """Intersections of the rays of features with a cloud, one per feature; NaN where refused or undetermined."""
+    """Intersections of feature rays with a cloud, one per feature; NaN where refused or undetermined."""
 
     xyz: Float[ArrayLike, "*n 3"]
     """X, Y, Z (m); X and Y are only as accurate as the orientation (docs/lidar_heights.md)."""
     sigma_z: Float[ArrayLike, "*n"]
     """Standard deviation of Z (m): 95 % of the errors are within 1.96 of it."""
     flag: Integer[ArrayLike, "*n"]
-    """Sums of `HeightFlag`: HOLE also where a ray does not meet the cloud."""
+    """Bitwise sum of `HeightFlag`; HOLE also if a ray does not intersect the cloud."""
     gradient: Float[ArrayLike, "*n 2"]
-    """Gradient of the surface by X and Y."""
+    """Gradient of the surface (dZ/dX, dZ/dY)."""
     roughness: Float[ArrayLike, "*n"]
     """Standard deviation (m) of the laser points about the plane through them."""
 
@@ -97,14 +96,14 @@ class _Numbers(NamedTuple):
 
 
 class _Ray(NamedTuple):
-    """Ray of a feature: X, Y = place + run (Z - origin's)."""
+    """Ray of a feature: (X, Y) = origin + run (Z - Z of the origin)."""
 
     origin: Float[Array, "3"]
     direction: Float[Array, "3"]
 
     @property
     def run(self) -> Float[Array, "2"]:
-        """d(X, Y)/dZ."""
+        """Return d(X, Y)/dZ."""
         return self.direction[:2] / jnp.where(self.direction[2] < 0, self.direction[2], -1.0)
 
     def at(self, z: Float[Array, "*n"]) -> Float[Array, "*n 2"]:
@@ -130,16 +129,16 @@ def pseudo_control_points(
     interpolation: Interpolation = "weighted",
     corrections: Corrections = NO_CORRECTIONS,
 ) -> PseudoControl:
-    """Return the pseudo control points of features measured at `xy` (mm) with one camera, in a cloud.
+    """Compute the pseudo control points of features measured at `xy` (mm) with one camera, in a cloud.
 
-    A `Grid` saves indexing the cloud again. `exterior` is that of one image, or has a leading axis over the features.
-    `settings.points` are the nearest, weighted by the paper's d^-`settings.power`; with `interpolation` "plane", three
-    times as many determine a plane in the image, which is better by half where the ground is planar. One compiled
-    program serves all features.
+    Pass a `Grid` to avoid re-indexing the cloud. `exterior`: one image, or a leading axis over the features. The
+    `settings.points` nearest laser points are weighted by d^-`settings.power` (paper 001). `interpolation="plane"` fits
+    a plane to three times as many points, which halves the error on planar ground. One compiled program is used for all
+    features.
 
-    `xyz` has derivatives by `interior`, `exterior` and `xy`, exact except where the set of nearest points changes; its
-    properties (`sigma_z` and the rest) have none. Raises InputError for an unknown interpolation, a radius in
-    `settings`, and no feature. Source: paper 001, section 3.1.
+    `xyz` is differentiable with respect to `interior`, `exterior` and `xy`, exactly except where the set of nearest
+    points changes; `sigma_z` and the other properties are not. Raises InputError for an unknown interpolation, a radius
+    in `settings`, and no feature. Source: paper 001, section 3.1.
     """
     settings = HeightSettings() if settings is None else settings
     if interpolation not in get_args(Interpolation):
@@ -208,7 +207,7 @@ def _choose(
     reach: int,
     corrections: Corrections,
 ) -> tuple[_Candidates, Bool[Array, ""]]:
-    """Return the candidates of a feature, and True if its ray meets the cloud."""
+    """Select the candidates of a feature; return them, and True if its ray intersects the cloud."""
     ideal = interior.ideal_from_measured(xy)
     ray = _Ray(*image_ray(interior, exterior, xy))
     place, intersected = first_met(ray.origin, ray.direction, sky, grid)
@@ -233,7 +232,7 @@ def _choose(
         new, z = candidates(place)
         near = new.seen & (jnp.cumsum(new.seen) <= points)
         mean = jnp.sum(jnp.where(near, z, 0)) / jnp.maximum(near.sum(), 1)
-        # The image may show a step that the ray passes on its way.
+        # Keep `broken` of earlier iterations: the image may show a step that the ray passes.
         new = _Candidates(new.index, new.seen, new.broken | previous.broken)
         return jnp.where(near.any(), ray.at(mean), place), new
 
@@ -306,7 +305,7 @@ def _described(
 
 
 def _room(n: int) -> int:
-    """Round up `n`: 64, or whole portions of `_AT_ONCE`, of four sizes between a power of two and the next."""
+    """Round up `n` to 64, or to multiples of `_AT_ONCE`: four sizes between two powers of two."""
     if n <= _FEW:
         return _FEW
     step = max(_AT_ONCE, 1 << n.bit_length() - 3)
@@ -315,22 +314,22 @@ def _room(n: int) -> int:
 
 # Pseudo control points of a whole block: heights for its measured image points.
 #
-# A point appears in several images, each of which gives it a height. These share laser points, so their mean is hardly
-# better than one; the image that sees the point most steeply is best, because an orientation error there changes the
-# place least, and occlusions are rare.
+# Each image that contains a point gives a height for it. These heights share laser points, so their mean is hardly more
+# accurate than one of them. The image with the steepest ray is the best: an orientation error has the smallest effect
+# on the position, and occlusions are rare.
 
 
 class BlockControl(eqx.Module):
-    """Pseudo control of the points of a block, one entry each."""
+    """Pseudo control of a block, one entry per point."""
 
     point: Int[np.ndarray, "n"]
     """Indices of the block's points."""
     image: Int[np.ndarray, "n"]
-    """Image used for each."""
+    """Index of the image used for each point."""
     control: PseudoControl
 
     def rows(self) -> ControlCoordinates:
-        """Return vertical control: Z of the determined points, with its standard deviation."""
+        """Return vertical control: Z and its standard deviation, for the determined points."""
         good = np.flatnonzero(np.isfinite(self.control.sigma_z))
         z, sigma = self.control.xyz[good, 2], self.control.sigma_z[good]
         return ControlCoordinates(self.point[good], np.full(len(good), 2), z, sigma)
@@ -345,11 +344,10 @@ def pseudo_control_of_block(
     *,
     interpolation: Interpolation = "weighted",
 ) -> BlockControl:
-    """Return heights from the cloud of `grid`, in the block's frame, for measured `points` (by index; all by default).
+    """Compute heights from the cloud of `grid`, in the block's frame, for measured `points` (indices; default: all).
 
-    Interior and exterior orientation are those of `unknowns`; the control changes with them. Of the images that
-    determine the height of a point, the one with the steepest ray is used. Raises BlockError if no image measured any
-    of the points.
+    Uses interior and exterior orientation of `unknowns`: repeat after they change. Of the images that determine the
+    height of a point, the one with the steepest ray is used. Raises BlockError if no image measured any of the points.
     """
     rows = block.image_points
     chosen = np.isin(rows.point, points) if points is not None else np.ones(len(rows.point), bool)
@@ -372,7 +370,7 @@ def pseudo_control_of_block(
     back = np.argsort(np.concatenate([of for of, _, _ in found]))
     control = jax.tree.map(lambda *parts: np.concatenate(parts)[back], *(part for _, part, _ in found))
     fall = np.concatenate([steep for _, _, steep in found])[back]
-    # By point, valid heights before refused ones, steepest first: the first row of each point.
+    # Sort by point, valid before refused heights, steepest ray first; then take the first row of each point.
     order = np.lexsort((fall, np.isnan(control.sigma_z), point))
     first = order[np.unique(point[order], return_index=True)[1]]
     return BlockControl(point[first], image[first], jax.tree.map(lambda v: v[first], control))
@@ -380,5 +378,5 @@ def pseudo_control_of_block(
 
 @eqx.filter_jit
 def _falls(interior, exterior: ExteriorOrientation, xy: Float[Array, "n 2"]) -> Float[Array, "n"]:
-    """Return the third components of the rays: -1 straight down."""
+    """Return the third components of the rays; -1 is vertically down."""
     return jax.vmap(lambda image, at: image_ray(interior, image, at)[1][2])(exterior, xy)

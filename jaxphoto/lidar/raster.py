@@ -1,6 +1,6 @@
-"""Surface models: heights in map cells from laser points; filling of small holes, hillshade.
+"""Surface models: raster heights from laser points, hole filling, hillshade, orthophotos.
 
-Cells are counted from the north-west corner: row 0 is in the north, column 0 in the west.
+Row 0 is in the north, column 0 in the west.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ from jaxphoto.lidar.strip_planes import (
 )
 
 Statistic = Literal["highest", "mean", "lowest"]
-"""Height of a cell from its points."""
+"""Statistic of the points' heights for a cell."""
 _MOST_CELLS = 500_000_000
 
 
@@ -44,13 +44,13 @@ class Raster(eqx.Module):
 
     @property
     def extent(self) -> Float[np.ndarray, "2 2"]:
-        """Minimum and maximum X, Y (m) of the outer edges."""
+        """Return the minimum and maximum X, Y (m) of the outer edges."""
         rows, columns = self.heights.shape
         east, south = self.west + columns * self.cell_m, self.north - rows * self.cell_m
         return np.array([[self.west, south], [east, self.north]])
 
     def centres(self, rows: slice = slice(None)) -> Float[np.ndarray, "n 3"]:
-        """Return X, Y (m) of the cell centres and their heights, row by row; `rows` selects some."""
+        """Return X, Y (m) of the cell centres and their heights, row by row; `rows` selects a part."""
         heights = self.heights[rows]
         x = self.west + (np.arange(heights.shape[1]) + 0.5) * self.cell_m
         y = self.north - (np.arange(len(self.heights))[rows] + 0.5) * self.cell_m
@@ -63,13 +63,13 @@ def surface_model(
     cell_m: float,
     statistic: Statistic = "highest",
 ) -> Raster:
-    """Return the highest, mean or lowest height of the points in every cell; NaN in cells without points.
+    """Compute the highest, mean or lowest height of the points in every cell; NaN in cells without points.
 
     `parts` are X, Y, Z (m) in portions of any size, so that a cloud need not fit in memory. `extent` is the minimum and
-    maximum X and Y: points outside are ignored, and empty rows and columns at its edges are removed. Edges of cells lie
-    at integer multiples of `cell_m`; a point on an edge belongs to the cell east or north of it.
+    maximum X and Y: points outside are ignored, and empty rows and columns at its edges are removed. Cell edges are at
+    integer multiples of `cell_m`; a point on an edge belongs to the cell east or north of it.
 
-    Raises InputError for a cell size that is not positive, or gives too many cells, and without points.
+    Raises InputError for a cell size that is not positive or gives too many cells, and if there are no points.
     """
     if statistic not in get_args(Statistic):
         raise InputError(f"the statistic {statistic!r} is unknown; choose one of {', '.join(get_args(Statistic))}")
@@ -99,7 +99,7 @@ def surface_model(
 
 
 def _span(there) -> tuple[int, int]:
-    """Return the range from the first to after the last nonempty place."""
+    """Return the start and stop index of the nonempty entries."""
     places = np.flatnonzero(there)
     if not len(places):
         raise InputError("no point lies in the extent of the surface model; take the extent of the cloud")
@@ -109,9 +109,9 @@ def _span(there) -> tuple[int, int]:
 def filled(raster: Raster, distance_m: float) -> Raster:
     """Fill small holes by the mean of surrounding heights, weighted by the inverse square of the distance.
 
-    A hole is a group of cells without height connected by edges. It is filled completely, from cells at most
-    `distance_m` away from each, or not at all: if one of its cells is farther from any height, and if it reaches the
-    edge of the raster, which is outside the cloud.
+    A hole is an edge-connected group of cells without height. It is filled completely, from cells within `distance_m`
+    of each cell, or not at all: if one of its cells is farther from any height, or if it touches the edge of the raster
+    (outside the cloud).
     """
     empty = np.isnan(raster.heights)
     holes, n = scipy.ndimage.label(empty)
@@ -145,8 +145,7 @@ def filled(raster: Raster, distance_m: float) -> Raster:
 def hillshade(
     raster: Raster, azimuth_deg: float = 315.0, altitude_deg: float = 45.0
 ) -> Float[np.ndarray, "rows columns"]:
-    """Return the illumination of the surface by a sun in `azimuth_deg` (from north, clockwise) at `altitude_deg`: 0 to
-    1.
+    """Compute the hillshade (0 to 1) for a sun in `azimuth_deg` (from north, clockwise) at `altitude_deg`.
 
         n . s,   n = (-dZ/dX, -dZ/dY, 1) normalised, s towards the sun
 
@@ -163,17 +162,17 @@ def hillshade(
 
 
 _CHUNK = 1 << 16
-# Clearance (m) of a line of sight above the surface: heights in files are rounded.
+# Clearance (m) of a line of sight above the surface, because heights in files are rounded.
 _GRAZING_M = 1e-3
 
 Frames = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
 
 
 class Picture(eqx.Module):
-    """Pixels of the cells of a raster, and the visibility of the cells; zero if not visible."""
+    """Pixels of raster cells, and the visibility of the cells; pixels are zero if not visible."""
 
     pixels: np.ndarray
-    """(bands, rows, columns), of the photograph's type."""
+    """Array (bands, rows, columns), of the photograph's dtype."""
     seen: Bool[np.ndarray, "rows columns"]
 
 
@@ -190,10 +189,10 @@ def orthophoto(
 ) -> Picture:
     """Resample the `photograph` (bands, height, width) of one image bilinearly to the cells of `raster`.
 
-    `object_from_map` converts coordinates (m) of the raster's system to the object frame, `map_from_object` back. A
-    cell is not visible if it has no height, lies behind the camera or beyond the centres of the outermost pixels, where
-    the distortion is not invertible (`InteriorOrientation.valid`), and where the surface hides it (`hidden`). The
-    collinearity equations are those of `jaxphoto.project`.
+    `object_from_map` transforms coordinates (m) of the raster's system to the object frame, `map_from_object` back. A
+    cell is not visible if it has no height, lies behind the camera or beyond the centres of the outermost pixels, if
+    the distortion there is not invertible (`InteriorOrientation.valid`), or if the surface occludes it (`hidden`). The
+    projection is `jaxphoto.project`.
     """
     rows, columns = raster.heights.shape
     bands = len(photograph)
@@ -212,7 +211,7 @@ def orthophoto(
         good &= ((px >= 0.5) & (px <= format_px - 0.5)).all(axis=1)
         good[good] = ~hidden(raster, on_map[good], camera)
         cells = begin * columns + place[good]
-        # The centre of the first pixel is (0.5, 0.5), its index 0.
+        # The centre of the first pixel is (0.5, 0.5); its index is 0.
         at = px[good][:, ::-1].T - 0.5
         for band in range(bands):
             values = scipy.ndimage.map_coordinates(photograph[band], at, float, order=1, mode="nearest")
@@ -222,16 +221,16 @@ def orthophoto(
 
 
 def hidden(raster: Raster, points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "n"]:
-    """Return True where the surface hides `points`, cell centres, from `camera`; X, Y, Z of the raster (m).
+    """Return True where the surface occludes `points` (cell centres) from `camera`; X, Y, Z of the raster (m).
 
-    The line of sight is followed from cell to cell. Wherever it crosses a line of centres, its height is compared with
-    that of the surface between the two nearest; a cell without height hides nothing.
+    The line of sight is followed from cell to cell. At each row or column of centres its height is compared with the
+    surface height interpolated between the two nearest. Cells without height occlude nothing.
     """
     row = (raster.north - points[:, 1]) / raster.cell_m - 0.5
     column = (points[:, 0] - raster.west) / raster.cell_m - 0.5
     down, across = (points[:, 1] - camera[1]) / raster.cell_m, (camera[0] - points[:, 0]) / raster.cell_m
     up, result = camera[2] - points[:, 2], np.zeros(len(points), bool)
-    # Steps go from line to line of the axis along which the distance is larger.
+    # Step along the axis with the larger distance.
     by_row = np.abs(down) >= np.abs(across)
     for chosen, heights, way in (
         (by_row, raster.heights, (row, down, column, across)),
@@ -250,11 +249,13 @@ def _blocked(
     z: np.ndarray,
     up: np.ndarray,
 ) -> np.ndarray:
-    """Apply `hidden` from a `place` in a `line` of `heights`, at `z`, of a camera `lines`, `places` and `up` away."""
+    """Test occlusion along lines of sight that start at (`line`, `place`) of `heights`, at `z`; `lines`, `places` and
+    `up` are the offsets of the camera.
+    """
     steps = np.maximum(np.abs(lines), 1e-12)
     forward, shift, rise = np.sign(lines).astype(int), places / steps, up / steps
     n, m = np.array(heights.shape) - 1
-    # At most to the camera, the edges, and where the line of sight is above everything.
+    # Stop at the camera, the edges, and where the line of sight is above all heights.
     with np.errstate(divide="ignore", invalid="ignore"):
         limits = [
             np.ceil(steps) - 1,
@@ -272,7 +273,7 @@ def _blocked(
         at, here = line[left] + k * forward[left], place[left] + k * shift[left]
         low = np.floor(np.maximum(here, 0)).astype(int)
         a, b = heights[at, low], heights[at, np.minimum(low + 1, m)]
-        # Next to a cell without height only the other one counts.
+        # Next to a cell without height use only the other one.
         a, b = np.where(np.isnan(a), b, a), np.where(np.isnan(b), a, b)
         blocked = a + (here - low) * (b - a) > z[left] + k * rise[left] + _GRAZING_M
         result[left[blocked]] = True
@@ -283,7 +284,7 @@ def _blocked(
 def _imaged(
     interior: InteriorOrientation, exterior: ExteriorOrientation, points: np.ndarray, corrections: Corrections
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return image coordinates (mm) of points, and their validity; in portions of one size, compiled once."""
+    """Return image coordinates (mm) of points, and a validity mask; in batches of one size, compiled once."""
     arrays = jax.tree.map(np.float64, interior)
     xy, good = np.empty((len(points), 2)), np.empty(len(points), bool)
     for begin in range(0, len(points), _CHUNK):
@@ -303,17 +304,17 @@ def _each_imaged(interior, exterior, points: Float[Array, "n 3"], corrections: C
     return jax.vmap(one)(points)
 
 
-# Map of the height differences between strips, by cell.
+# Height differences between strips, by cell.
 #
-# In a cell with planes of several strips, the gap is the height of the plane of the later strip above that of the
-# earlier one at their common place; of more than two strips that of the two that differ most. Rough ground and partly
-# covered cells have no plane and no gap, so slopes and trees cause none.
+# In a cell with planes of two strips, the gap is the height of the later plane above the earlier one at their mean
+# position; for more than two strips it is the gap of the two that differ most. Rough ground and partly covered cells
+# have no plane and no gap, so slopes and trees cause none.
 
 
 def strip_differences(strips: Cloud | Iterable[CellReturns], settings: StripSettings) -> Raster | None:
-    """Return the gaps (m) of strips in cells of `settings.cell_m`, NaN if there is none; None without any.
+    """Compute the gaps (m) of strips in cells of `settings.cell_m`, NaN without a gap; None if there are no gaps.
 
-    For a cloud larger than memory its accumulated cells suffice.
+    For a cloud larger than memory pass its accumulated cells.
     """
     cells = _cells(strips, settings) if isinstance(strips, Cloud) else strips
     patches = [planes_from(returns, settings) for returns in cells]
@@ -326,7 +327,7 @@ def strip_differences(strips: Cloud | Iterable[CellReturns], settings: StripSett
     for one, other in combinations(range(len(patches)), 2):
         pairs = corresponding(patches[one], patches[other], settings)
         column, up = columns_and_rows(pairs.cell)
-        # Along the normal, of the earlier over the later.
+        # The gap is along the normal, earlier above later strip.
         height = -pairs.gap / pairs.normal[:, 2]
         row, column = rows - 1 - (up - south), column - west
         larger = ~(np.abs(gaps[row, column]) >= np.abs(height))

@@ -1,7 +1,7 @@
-"""Intersection of image rays with a cloud: the visible surface, and its laser points.
+"""Intersection of image rays with a cloud: visible surface, and its laser points.
 
-Functions of one ray, to be mapped over many. `q` is the offset (m) of a laser point from the ray in X and Y, at the
-height of the point: at q = 0 the image shows the point at the place of the feature.
+Functions of one ray, for `vmap`. `q` is the horizontal offset (m) of a laser point from the ray, at the height of the
+point: a point with q = 0 has the image position of the feature.
 """
 
 from typing import NamedTuple
@@ -15,13 +15,13 @@ from jaxtyping import Array, Bool, Float
 from jaxphoto.arrays import ArrayLike
 from jaxphoto.lidar.grid import Grid
 
-# Gap between heights that separates two levels: in standard deviations of one point, and of the points of either level.
+# Minimum gap between the heights of two levels: in standard deviations of one point, and of the points of either level.
 _GAP_NOISE = 6.0
 _GAP_SPREAD = 3.0
-# The centroid of a half disc is 0.42 radii from the centre.
+# Maximum distance of the centroid from the centre, in radii; a half disc has 0.42.
 _BALANCED = 0.35
 _EMPTY = 1e-4
-# Window of cells around a place for a cloud of uneven density.
+# Maximum reach of the window for a cloud of uneven density (cells).
 _FARTHEST = 4
 
 
@@ -29,22 +29,22 @@ class Skyline(NamedTuple):
     """Highest point of every grid cell (m), and the range of heights."""
 
     tops: Float[np.ndarray, "cells"]
-    """In the order of `Grid.start`, with pits narrower than three cells filled; -inf without points."""
+    """Heights in the order of `Grid.start`; pits narrower than three cells are filled; -inf without points."""
     low: Float[np.ndarray, ""]
     high: Float[np.ndarray, ""]
 
 
 class Levels(NamedTuple):
-    """Laser points around a ray, where ground or roof has one level or two."""
+    """Visible laser points around a ray, on ground or roof with one level or two."""
 
     seen: Bool[Array, "m"]
-    """True for points of the level that the image shows at the place of the feature."""
+    """True for points of the level that the image shows at the feature."""
     broken: Bool[Array, ""]
-    """True if the feature is so close to a step that it may be on either level."""
+    """True if the feature is so close to a step that its level is ambiguous."""
 
 
 def skyline(grid: Grid) -> Skyline:
-    """Return the highest points of the cells of `grid`."""
+    """Compute the highest points of the cells of `grid`."""
     rows, columns = (int(v) for v in grid.shape)
     start, z = np.asarray(grid.start[: rows * columns + 1]), np.asarray(grid.xyz[: len(grid), 2])
     some = np.flatnonzero(np.diff(start))
@@ -56,7 +56,7 @@ def skyline(grid: Grid) -> Skyline:
 
 
 def window_reach(grid: Grid, wanted: int) -> int:
-    """Return how many cells around a place (`around`) hold `wanted` points, for nine of ten nonempty cells."""
+    """Return the reach of a window (see `around`) that contains `wanted` points around 90 % of the nonempty cells."""
     rows, columns = (int(v) for v in grid.shape)
     count = np.diff(np.asarray(grid.start[: rows * columns + 1])).reshape(rows, columns)
     for reach in range(1, _FARTHEST):
@@ -70,10 +70,9 @@ def window_reach(grid: Grid, wanted: int) -> int:
 def first_met(
     origin: Float[Array, "3"], direction: Float[Array, "3"], sky: Skyline, grid: Grid
 ) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
-    """Return X and Y (m) of the first place, from the camera downwards, where a cell is as high as the ray; True if
-    any.
+    """Return X and Y (m) where the ray, from the camera downwards, first meets a cell of its height; True if any.
 
-    In steps of half a cell in plan, so the mean error is a quarter. A ray that does not descend meets nothing.
+    The step is half a cell in plan, so the mean error is a quarter. A ray that does not descend has no intersection.
     """
     down = direction[2] < 0
     run = direction[:2] / jnp.where(down, direction[2], -1.0)
@@ -88,7 +87,7 @@ def first_met(
 
     high = jnp.minimum(sky.high, origin[2])
     z = jax.lax.while_loop(lambda z: (z > sky.low) & (top(z) < z), lambda z: z - step, jnp.where(down, high, sky.low))
-    # Overshoot of half a step, on average.
+    # Subtract the mean overshoot of half a step.
     return origin[:2] + run * (jnp.minimum(z + step / 2, high) - origin[2]), down & (top(z) >= z)
 
 
@@ -102,11 +101,11 @@ def levels(
 ) -> Levels:
     """Select the laser points nearest to a ray, at heights `z` (m), that the image shows; nearest first.
 
-    The heights are separated at the largest gap between two of them, if noise and slope cannot explain it. The upper
-    level hides the lower wherever it surrounds the feature. If neither does, or if the ray is too steep (`run` is d(X,
-    Y)/dZ) for the lower level to appear *behind* the upper, the feature is at the step between them.
+    The heights are divided at their largest gap, if noise and slope cannot explain it. The upper level hides the lower
+    one wherever it surrounds the feature. The feature is at the step between both if neither surrounds it, or if the
+    ray is so steep (`run` is d(X, Y)/dZ) that the lower level does not appear *behind* the upper one.
     """
-    # From each point to the next higher one; comparing all pairs compiles faster than a sort, and they are few.
+    # Gap from each point to the next higher one. Comparing all pairs (few) compiles faster than a sort.
     higher = jnp.min(jnp.where(there & (z > z[:, None]), z, jnp.inf), axis=1)
     gaps = jnp.where(there & jnp.isfinite(higher), higher - z, 0)
     widest = jnp.argmax(gaps)
@@ -125,9 +124,9 @@ def levels(
 
 
 def surrounded(q: Float[ArrayLike, "m 2"], which: Bool[ArrayLike, "m"]) -> Bool[Array, ""]:
-    """Return True if the points `which` surround q = 0: each has another less than half a turn on.
+    """Return True if the points `which` surround q = 0: each has another one within less than half a turn.
 
-    A point at q = 0 is on no side.
+    Points at q = 0 are ignored.
     """
     x, y = q[:, 0], q[:, 1]
     which = which & ((x != 0) | (y != 0))
@@ -136,10 +135,9 @@ def surrounded(q: Float[ArrayLike, "m 2"], which: Bool[ArrayLike, "m"]) -> Bool[
 
 
 def empty_about(distance: Float[ArrayLike, "m"], which: Bool[ArrayLike, "m"]) -> Bool[Array, ""]:
-    """Return True if no point is close enough: at uniform density such an empty circle occurs once in ten thousand
-    places.
+    """Return True if no point is close enough: at uniform density the probability of such an empty circle is 1e-4.
 
-    The nearest of n points in a circle, as a fraction of its area, is beyond x with probability (1 - x)^(n-1).
+    The nearest of n points in a circle is beyond a fraction x of its area with probability (1 - x)^(n-1).
     """
     near, far = jnp.min(jnp.where(which, distance, jnp.inf)), jnp.max(jnp.where(which, distance, 0))
     return (near / jnp.where(far > 0, far, 1)) ** 2 > 1 - _EMPTY ** (1 / jnp.maximum(which.sum() - 1, 1))

@@ -1,10 +1,10 @@
 """Corresponding planes of two laser strips: patches of both, in the cells of a common grid.
 
-The plane of a cell minimises the squared distances of its returns: through their mean, with the eigenvector of the
-smallest eigenvalue of their scatter as normal. A cell is used if its returns are numerous, cover the cell and are no
-rougher than a hard surface (no vegetation, no edge); planes of two strips correspond if their normals agree and their
-means are close. All sums are accumulated in one pass over the returns (`cell_returns`). Source: Glira, Pfeifer, Briese
-and Ressl (2015), A correspondence framework for ALS strip adjustments based on variants of the ICP algorithm;
+The plane of a cell minimises the squared distances of its returns: it contains their mean, and its normal is the
+eigenvector of the smallest eigenvalue of their scatter. A cell is used if it has enough returns that cover the cell and
+are no rougher than a hard surface (no vegetation, no edge). Planes of two strips correspond if their normals agree and
+their means are close. All sums are accumulated in one pass over the returns (`CellReturns`). Source: Glira, Pfeifer,
+Briese and Ressl (2015), A correspondence framework for ALS strip adjustments based on variants of the ICP algorithm;
 selection, matching and rejection apply to single points there, to cells here.
 """
 
@@ -26,13 +26,14 @@ _POSITIVE = (
 
 @dataclasses.dataclass(frozen=True)
 class StripSettings:
-    """Planes are fitted in cells of `cell_m` with at least `returns` returns, and a roughness of at most `roughness_m`.
+    """Settings of strip planes: cells of `cell_m` with at least `returns` returns, and a roughness of at most
+    `roughness_m`.
 
-    Normals of two strips agree to `normals_deg`; at most `most` planes of all pairs of strips together are observed. A
-    gap of more than `outlier` standard deviations is rejected. The trajectory's knots are `knots_s` apart; its errors
-    have `sigma_position_m`, `sigma_attitude_deg` (about right and forward) and `sigma_heading_deg`, and the correlation
-    time `correlation_s` (`observations.knot_steps`). Poses of exposures have these errors and, independently,
-    `sigma_exposure_m` and `sigma_exposure_deg`.
+    `normals_deg`: maximum angle between the normals of two strips. `most`: maximum number of observed planes of all
+    pairs of strips. `outlier`: number of standard deviations above which a gap is rejected. `knots_s`: knot spacing of
+    the trajectory errors; `sigma_position_m`, `sigma_attitude_deg` (about right and forward), `sigma_heading_deg` and
+    the correlation time `correlation_s` describe them (`observations.knot_steps`). Poses of exposures have these errors
+    and, independently, `sigma_exposure_m` and `sigma_exposure_deg`.
     """
 
     cell_m: float = 3.0
@@ -62,29 +63,29 @@ class StripSettings:
 
     @property
     def sigma_attitude(self) -> np.ndarray:
-        """About right, forward and up (rad)."""
+        """Return the standard deviations about right, forward and up (rad)."""
         return np.deg2rad([self.sigma_attitude_deg, self.sigma_attitude_deg, self.sigma_heading_deg])
 
 
-# Returns of a strip by grid cell: number, mean and scatter, which can be accumulated in parts.
+# Returns of a strip by grid cell: count, mean and scatter, accumulated in parts.
 #
-# For parts of a cell with numbers n, means m and scatters S about them, the total has the common mean, and S = sum (S_k
-# + n_k (m_k - m) (m_k - m)'): no digits are lost to squares of coordinates. Source: Chan, Golub and LeVeque (1979),
-# Updating formulae and a pairwise algorithm for computing sample variances.
+# For parts of a cell with counts n_k, means m_k and scatters S_k about them, the total has the common mean m, and
+# S = sum (S_k + n_k (m_k - m) (m_k - m)'), without loss of digits to squares of coordinates. Source: Chan, Golub and
+# LeVeque (1979), Updating formulae and a pairwise algorithm for computing sample variances.
 
-# Number of parts after which they are merged: a compromise between memory and time.
+# Number of parts after which they are merged: a trade-off between memory and time.
 _PARTS = 8
 
 
 class CellReturns(NamedTuple):
-    """Sums from which the planes of a strip follow, by cell in ascending order."""
+    """Sums for the planes of a strip, by cell in ascending order."""
 
     cell: Int[np.ndarray, "n"]
     returns: Int[np.ndarray, "n"]
     mean: Float[np.ndarray, "n 3"]
     """Mean of the returns (m)."""
     measured: Float[np.ndarray, "n 3"]
-    """Mean of the returns as measured."""
+    """Mean of the uncorrected returns (m)."""
     time: Float[np.ndarray, "n"]
     """Mean time of the returns (s)."""
     scatter: Float[np.ndarray, "n 3 3"]
@@ -92,7 +93,7 @@ class CellReturns(NamedTuple):
 
 
 def cells_of(xyz: Float[np.ndarray, "n 3"], settings: StripSettings) -> Int[np.ndarray, "n"]:
-    """Return the cell of each return in a grid through the origin, independent of the part of the cloud."""
+    """Return the cell of each return in a grid through the origin, independent of the cloud's extent."""
     column, up = np.floor(xyz[:, :2] / settings.cell_m).astype(np.int64).T
     return (column << 32) + up
 
@@ -109,7 +110,7 @@ def gathered(
     time: Float[np.ndarray, "n"],
     cell: Int[np.ndarray, "n"],
 ) -> CellReturns:
-    """Accumulate returns `xyz` (m), corrected, by cell; `measured` are the original ones, `time` (s) their times."""
+    """Accumulate returns by cell: `xyz` corrected, `measured` uncorrected coordinates (m), `time` (s)."""
     cells, of = np.unique(cell, return_inverse=True)
     return _together(cells, of, np.ones(len(of), int), xyz, measured, time, None)
 
@@ -131,7 +132,7 @@ def _together(
     time: Float[np.ndarray, "n"],
     scatter: Float[np.ndarray, "n 3 3"] | None,
 ) -> CellReturns:
-    """Merge means of `count` returns each, and their scatters (None: single returns), of the cells `cells[of]`."""
+    """Merge means of `count` returns each, and their scatters (None for single returns), by cell `cells[of]`."""
     total = np.bincount(of, count, len(cells))
 
     def average(values: np.ndarray) -> np.ndarray:
@@ -150,7 +151,7 @@ def _together(
 
 
 class CellTally:
-    """Accumulated cells of several strips; the returns themselves are not stored."""
+    """Accumulated cells of several strips; the returns are not stored."""
 
     def __init__(self, settings: StripSettings) -> None:
         self.settings = settings
@@ -171,14 +172,14 @@ class CellTally:
 
 # Moderated variances (empirical Bayes) from few values each.
 #
-# With v degrees of freedom a variance s^2 is too small as often as too large, and as weights the small ones count most.
+# A variance s^2 with v degrees of freedom is too small as often as too large, but too small ones get large weights.
 # If true variances follow a scaled inverse chi-squared distribution with v0 degrees of freedom about s0^2, the expected
-# one given s^2 is
+# variance given s^2 is
 #
 #     (v0 s0^2 + v s^2) / (v0 + v)
 #
-# v0 and s0^2 follow from mean and variance of log s^2 over all; if these scatter no more than by chance, v0 is
-# infinite, and all variances are equal. Source: Smyth (2004), Linear models and empirical Bayes methods for assessing
+# v0 and s0^2 are estimated from mean and variance of log s^2; if it scatters no more than by chance, v0 is infinite,
+# and all variances are equal. Source: Smyth (2004), Linear models and empirical Bayes methods for assessing
 # differential expression in microarray experiments.
 
 _ROUNDS = 50
@@ -199,7 +200,7 @@ def moderated_variances(variance: Float[np.ndarray, "n"], freedom: Int[np.ndarra
 
 
 def _inverse_trigamma(value: float) -> float:
-    """Newton's method on 1 / trigamma, which is nearly linear and convex: it converges from one side."""
+    """Invert trigamma by Newton's method on 1 / trigamma, which is nearly linear and convex: monotone convergence."""
     x = 0.5 + 1 / value
     for _ in range(_ROUNDS):
         slope = scipy.special.polygamma(1, x)
@@ -210,11 +211,11 @@ def _inverse_trigamma(value: float) -> float:
     return x
 
 
-# Minimum spread of a patch along the shorter of its axes, as a fraction of the cell; a full cell has 0.29.
+# Minimum spread of a patch along its shorter axis, as a fraction of the cell; a full cell has 0.29.
 _SPREAD = 0.15
 # Maximum distance of the means of two corresponding patches, as a fraction of the cell.
 _CLOSE = 0.3
-# Planes steeper than this (degrees) determine shifts in X and Y.
+# Minimum slope (degrees) of planes that determine shifts in X and Y.
 _STEEP_DEG = 5.0
 
 
@@ -226,13 +227,13 @@ class StripPatches(NamedTuple):
     mean: Float[np.ndarray, "n 3"]
     """Mean of the returns, corrected (m)."""
     measured: Float[np.ndarray, "n 3"]
-    """Mean of the returns as measured."""
+    """Mean of the uncorrected returns (m)."""
     time: Float[np.ndarray, "n"]
     """Mean time of the returns (s)."""
     normal: Float[np.ndarray, "n 3"]
-    """Unit vectors, upwards."""
+    """Unit normals, upwards."""
     roughness: Float[np.ndarray, "n"]
-    """Standard deviation of a return from the plane (m), moderated by that of other planes of similar slope."""
+    """Standard deviation of a return from the plane (m), moderated by planes of similar slope."""
     cofactor: Float[np.ndarray, "n 3 3"]
     """Inverse scatter within the plane (1/m^2): cofactor of the plane's tilt for returns of unit variance."""
 
@@ -241,7 +242,7 @@ class PlanePairs(NamedTuple):
     """Pairs of corresponding planes of two strips, and their gaps."""
 
     a: Int[np.ndarray, "n"]
-    """Indices of `StripPatches` of the first strip."""
+    """Index into `StripPatches` of the first strip."""
     b: Int[np.ndarray, "n"]
     cell: Int[np.ndarray, "n"]
     foot_a: Float[np.ndarray, "n 3"]
@@ -261,9 +262,7 @@ def planes_of(
     cell: Int[np.ndarray, "n"],
     settings: StripSettings,
 ) -> StripPatches:
-    """Fit the planes of a strip's returns `xyz` (m), corrected; `measured` are the original ones, `cell` from
-    `cells_of`.
-    """
+    """Fit the planes of a strip: `xyz` corrected, `measured` uncorrected returns (m), `cell` from `cells_of`."""
     return planes_from(gathered(xyz, measured, time, cell), settings)
 
 
@@ -279,7 +278,7 @@ def planes_from(cells: CellReturns, settings: StripSettings) -> StripPatches:
     )
     normal = axes[:, :, 0] * np.where(axes[:, 2, 0] < 0, -1.0, 1.0)[:, None]
     along = axes[usable][:, :, 1:]
-    # A patch smoother than any scanner is so by chance.
+    # A roughness below every scanner's noise is accidental: limit it.
     variance = np.maximum(roughness[usable], settings.least_roughness_m) ** 2
     return StripPatches(
         cells.cell[usable], count[usable], cells.mean[usable], cells.measured[usable], cells.time[usable],
@@ -296,7 +295,7 @@ def steep(normal: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
 def _moderated(
     variance: Float[np.ndarray, "n"], freedom: Int[np.ndarray, "n"], normal: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n"]:
-    """Moderate variances by planes of similar slope: errors in X and Y make steep ones rougher than flat ones."""
+    """Moderate variances by planes of similar slope: horizontal errors make steep planes rougher."""
     result, above = variance.copy(), steep(normal)
     for part in (above, ~above):
         result[part] = moderated_variances(variance[part], freedom[part])
@@ -304,7 +303,7 @@ def _moderated(
 
 
 def corresponding(one: StripPatches, other: StripPatches, settings: StripSettings) -> PlanePairs:
-    """Match the planes of both strips, and reject `outliers` robustly."""
+    """Match the planes of two strips in common cells."""
     cell, a, b = np.intersect1d(one.cell, other.cell, assume_unique=True, return_indices=True)
     cosine = np.einsum("ni,ni->n", one.normal[a], other.normal[b])
     apart = np.linalg.norm((one.mean[a] - other.mean[b])[:, :2], axis=1)
@@ -323,7 +322,7 @@ def corresponding(one: StripPatches, other: StripPatches, settings: StripSetting
 
 
 def fitting(gap: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"], limit: float) -> np.ndarray:
-    """Return True for gaps within `limit` standard deviations of their median, estimated from the middle half."""
+    """Return True for gaps within `limit` standard deviations of their median, with a robust standard deviation."""
     w = gap / sigma
     middle = np.median(w) if len(w) else 0.0
     # 1.4826 times the median absolute deviation is the standard deviation of normal errors.
@@ -332,13 +331,13 @@ def fitting(gap: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"], limit: f
 
 
 def up_to_plane(patches: StripPatches, which: np.ndarray, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Return the distance of the planes from places along the normal."""
+    """Return the distance of the planes from `place` along the normal."""
     normals = patches.normal[which]
     return np.einsum("ni,ni->n", normals, patches.mean[which] - place) / np.einsum("ni,ni->n", normals, normal)
 
 
 def variance_of_plane(patches: StripPatches, which: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return the variance of the heights of the planes at places (m^2)."""
+    """Return the variance (m^2) of the planes' heights at `place`."""
     offset = place - patches.mean[which]
     tilt = np.einsum("ni,nij,nj->n", offset, patches.cofactor[which], offset)
     return patches.roughness[which] ** 2 * (1 / patches.returns[which] + tilt)
@@ -346,35 +345,35 @@ def variance_of_plane(patches: StripPatches, which: np.ndarray, place: np.ndarra
 
 # Object points on planes fitted to one strip's surrounding returns.
 #
-# The plane of a point is that of the returns in a window of one cell about it (`planes_of`), so
-# the point is at its centre, where a plane is best determined and curvature has the least effect.
+# The plane is fitted to the returns in a window of one cell about the point (`planes_of`): in its centre a plane is
+# most accurate, and curvature has the smallest effect.
 
 
 class PointsOnPlanes(NamedTuple):
-    """Points with a plane of a strip, and their distances from it."""
+    """Points with a matching plane of a strip, and their distances from it."""
 
     patch: Int[np.ndarray, "n"]
-    """Index of `StripPatches`."""
+    """Index into `StripPatches`."""
     point: Int[np.ndarray, "n"]
-    """Index of the given points."""
+    """Index into the given points."""
     foot: Float[np.ndarray, "n 3"]
     """Point on the plane (m), corrected."""
     gap: Float[np.ndarray, "n"]
     """Height of the point above the plane, along its normal (m)."""
     sigma: Float[np.ndarray, "n"]
-    """Of the plane there (m), from its roughness."""
+    """Standard deviation (m) of the plane there, from its roughness."""
 
 
 def returns_about(
     xyz: Float[np.ndarray, "returns 3"], points: Float[np.ndarray, "points 3"], settings: StripSettings
 ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-    """Return the returns in the window of each point, one cell wide, and the point of each."""
+    """Return pairs (return, point): the returns in the window of each point, one cell wide."""
     half = settings.cell_m / 2
     cell = cells_of(xyz, settings)
     order = np.argsort(cell, kind="stable")
     ordered = cell[order]
     found: list[np.ndarray] = []
-    # A window is as wide as a cell: it overlaps the cells of its four corners, and no others.
+    # A window is as wide as a cell: it overlaps only the cells of its four corners.
     for corner in ((-half, -half, 0.0), (-half, half, 0.0), (half, -half, 0.0), (half, half, 0.0)):
         at = cells_of(points + np.array(corner), settings)
         first, last = np.searchsorted(ordered, at, "left"), np.searchsorted(ordered, at, "right")
@@ -388,48 +387,46 @@ def returns_about(
 
 
 def windows_of_returns(index: Int[np.ndarray, "n"], point: Int[np.ndarray, "n"]) -> Float[np.ndarray, "points"]:
-    """Return the mean number of windows, from `returns_about`, that a return about each point belongs to.
+    """Return the mean number of windows, from `returns_about`, that contain a return near each point.
 
-    Variances of planes times this number count the returns of close points once.
+    Multiply variances of planes by it, so that returns shared by close points are counted once.
     """
     often = np.bincount(index)[index]
     return np.bincount(point, often) / np.maximum(np.bincount(point), 1)
 
 
 def on_planes(patches: StripPatches, points: Float[np.ndarray, "points 3"]) -> PointsOnPlanes:
-    """Match points with planes of a strip; the cells of `patches` are the indices of the points."""
+    """Match points with planes of a strip; `patches.cell` is the index of the point."""
     patch, place = np.arange(len(patches.cell)), points[patches.cell]
     up = up_to_plane(patches, patch, place, patches.normal)
     sigma = np.sqrt(variance_of_plane(patches, patch, place))
     return PointsOnPlanes(patch, patches.cell, place + up[:, None] * patches.normal, -up, sigma)
 
 
-# Object points on breaklines: two smooth faces of a strip that intersect, such as those of a roof in its ridge.
+# Object points on breaklines: two smooth faces of a strip that intersect, such as the roof faces at a ridge.
 #
-# The returns in a window of two cells about a point are divided by a straight line, of any direction, that minimises
-# the residuals of two planes; then by the intersection of these planes, until it does not change. Each face is a plane
-# on which the point lies: both together leave it free only along the line. Source: Habib, Ghanma, Morgan and Al-Ruzouq
-# (2005), Photogrammetric and lidar data registration using linear features, where roofs give the lines of the lidar as
-# well.
+# The returns in a window of two cells about a point are divided by the straight line, of any direction, that minimises
+# the residuals of two planes; then by the intersection of these planes, until it does not change. The point lies on
+# both planes: it remains free only along the line. Source: Habib, Ghanma, Morgan and Al-Ruzouq (2005), Photogrammetric
+# and lidar data registration using linear features, which also derives lidar lines from roofs.
 
-# Number of directions of the line that are tried, and of iterations.
+# Trial directions of the dividing line; maximum number of iterations.
 _DIRECTIONS = np.pi * np.arange(12) / 12
 _TURNS = 10
-# Planes whose slopes differ by less (a tangent) form no breakline.
+# Minimum difference of slopes (tangent) of the two planes of a breakline.
 _BREAK = 0.15
-# As fractions of the cell: returns this close to the line may be of either face; a line farther from the point is
-# another one.
+# Fractions of the cell: half width of the ambiguous zone along the line; maximum distance of the line from the point.
 _NEAR, _FAR = 0.1, 0.5
-# Returns beyond this number of robust standard deviations from their face belong to another object, such as a chimney.
+# Number of robust standard deviations above which a return belongs to another object, such as a chimney.
 _OTHER = 4.0
 
 
 def faces_about(
     xyz: Float[np.ndarray, "returns 3"], points: Float[np.ndarray, "points 3"], settings: StripSettings
 ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-    """Return the returns of the two faces about each point, and their faces: 2 k and 2 k + 1 are those of point k.
+    """Return pairs (return, face) of the returns on the two faces of each point: point k has the faces 2 k and 2 k + 1.
 
-    A point without two such faces has none.
+    A point without two faces has no returns.
     """
     index, point = returns_about(xyz, points, dataclasses.replace(settings, cell_m=2 * settings.cell_m))
     parts = [np.zeros((2, 0), int)]
@@ -442,7 +439,7 @@ def faces_about(
 
 
 def _sides(offset: Float[np.ndarray, "n 3"], settings: StripSettings) -> Int[np.ndarray, "n"]:
-    """Return 0 and 1 for the returns of either face about the origin; -1 for neither."""
+    """Return 0 or 1 for the returns on either face about the origin; -1 for neither."""
     none = np.full(len(offset), -1)
     tried = [offset[:, :2] @ np.array([np.cos(a), np.sin(a)]) > 0 for a in _DIRECTIONS]
     tried = [first for first in tried if _enough(first, settings)]
@@ -457,7 +454,7 @@ def _sides(offset: Float[np.ndarray, "n 3"], settings: StripSettings) -> Int[np.
             return none
         beyond = (constant + offset[:, :2] @ slope) / size
         parted = beyond > 0
-        # A ridge is the lower of its planes on either side, a valley the higher.
+        # At a ridge each side has the lower of both planes, at a valley the higher.
         parted = parted if np.mean(parted == first) > 0.5 else ~parted
         if not _enough(parted, settings):
             return none
@@ -474,7 +471,7 @@ def _enough(first: np.ndarray, settings: StripSettings) -> bool:
 
 
 def _fitted(offset: Float[np.ndarray, "n 3"], first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return height at the origin and slopes of the planes of both sides, and the residual of each return."""
+    """Fit planes to both sides; return their heights at the origin and slopes, and the residual of each return."""
     rows, residual, planes = np.column_stack([np.ones(len(offset)), offset[:, :2]]), np.empty(len(offset)), []
     for side in (first, ~first):
         planes.append(np.linalg.lstsq(rows[side], offset[side, 2])[0])

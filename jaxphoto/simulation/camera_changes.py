@@ -1,7 +1,7 @@
 """Simulation of changing cameras: their image points, and the model of the block.
 
-A camera changes during the flight, with its temperature or from strip to strip; with a rolling shutter it moves while
-rows are exposed.
+A camera changes during the flight, with temperature or from strip to strip. With a rolling shutter it moves during
+readout.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ _WALKING = dynamic_fields(StripCamera)
 
 
 def draw_changes(recipe: Recipe, flight: Flight, clock: Float[np.ndarray, "images"], seed: int) -> Changes:
-    """Return the changes of the recipe with their truth: deviations of each owner, and the walk between strips."""
+    """Draw the true changes of the recipe: deviations of each owner, and the random walk between strips."""
     changes = {kind: draw_deviations(owners, seed) for kind, owners in recipe.changes.items()}
     if recipe.walk is not None:
         strips, hours = _strip_hours(flight, clock)
@@ -46,13 +46,13 @@ def draw_changes(recipe: Recipe, flight: Flight, clock: Float[np.ndarray, "image
 
 
 def draw_deviations(owners: Mapping[str, SimulatedChange], seed: int) -> dict[str, SimulatedChange]:
-    """Return the changes with the deviations of each owner in their truth."""
+    """Draw the deviations of each owner, and return the changes with their truth."""
     result = {}
     for name, change in owners.items():
         rng, moved = stream(seed, f"{type(change.truth).kind} of {name}"), {}
         for field in dynamic_fields(type(change.truth)):
             value, prior = np.asarray(getattr(change.truth, field)), getattr(change.spread, field)
-            # Every field draws, so that no other's deviation depends on it.
+            # Draw for every field, so that the deviations of a field do not depend on other fields.
             z = rng.standard_normal(value.shape)
             if isinstance(prior, Weighted):
                 joint = prior.covariance
@@ -76,13 +76,13 @@ def camera_steps(
 
 
 def _strip_hours(flight: Flight, clock: Float[np.ndarray, "images"]) -> tuple[list[str], Float[np.ndarray, "strips"]]:
-    """Return the strips in order, and their middles in hours."""
+    """Return the strips in order, and their mean times (h)."""
     strips, of = list(dict.fromkeys(flight.strips)), np.array(flight.strips)
     return strips, np.array([clock[of == strip].mean() for strip in strips]) / HOUR_S
 
 
 class Circumstances(eqx.Module):
-    """Time from the middle of the flight (s) of each image, and temperature above the reference (K)."""
+    """Time of each image from the middle of the flight (s), and temperature above the reference (K)."""
 
     time: Float[np.ndarray, "images"]
     above: Float[np.ndarray, "images"]
@@ -97,10 +97,10 @@ def reproject_changing(
     when: Circumstances,
     changes: Changes,
 ) -> Rays:
-    """Return the rays as seen by changing cameras; unchanged for all others.
+    """Reproject the rays of images whose camera changes; return all other rays unchanged.
 
-    `motions` are those of the images (`camera_motions`). A point at the edge of the format may end up slightly beyond
-    it.
+    `motions`: motion of the camera per image, from `camera_motions`. A point at the edge of the format may be moved
+    slightly beyond it.
     """
     xy, own_of = rays.xy.copy(), [_of_images(owners, flight) for owners in changes.values()]
     changing = np.any([mask for mask, _ in own_of], axis=0) if own_of else np.zeros(len(flight.images), bool)
@@ -130,7 +130,7 @@ def reproject_changing(
 
 
 def _of_images(owners: Mapping[str, SimulatedChange], flight: Flight) -> tuple[np.ndarray, AbstractParameters]:
-    """Return True for each image with a changing owner, and its change; zero where it has none."""
+    """Return a mask of the images with a changing owner, and the change of each image (zero without one)."""
     any_of = next(iter(owners.values())).truth
     names = {"camera": flight.cameras, "strip": flight.strips}[any_of.owner]
     none = jax.tree.map(np.zeros_like, any_of)
@@ -141,7 +141,7 @@ def _of_images(owners: Mapping[str, SimulatedChange], flight: Flight) -> tuple[n
 @jax.jit
 def _seen(interior, bending, time_per_mm, motion, in_flight, above, position, camera_from_object, point):
     def one(bending, time_per_mm, motion, in_flight, above, position, camera_from_object, point):
-        # Changes of a camera depend on nothing else of an exposure.
+        # Of the exposure, camera changes depend only on these quantities.
         exposure, changed = Exposure(in_flight, motion[:3], motion[3:], temperature=above), interior
         for change in bending:
             changed = change.interior(changed, exposure)
@@ -154,7 +154,7 @@ def _seen(interior, bending, time_per_mm, motion, in_flight, above, position, ca
 def with_changes(
     changes: Changes, start: Unknowns, priors: Unknowns, truth: Unknowns
 ) -> tuple[Unknowns, Unknowns, Unknowns]:
-    """Return start, priors and truth with the changes; the truth includes those that the block does not model."""
+    """Add the changes to start, priors and truth; the truth includes changes that the block does not model."""
 
     def more(unknowns: Unknowns, own_of: Mapping[str, dict[str, AbstractParameters]]) -> Unknowns:
         return dataclasses.replace(unknowns, more=unknowns.more | {kind: of for kind, of in own_of.items() if of})
@@ -172,7 +172,7 @@ def with_changes(
 def camera_motions(exterior: ExteriorOrientation, velocity, rate, mounts: list[Mount]) -> Float[np.ndarray, "images 6"]:
     """Return velocity (m/s) and rotation rate (rad/s) in the axes of the camera.
 
-    From a velocity in the object frame and a rate about the body's right, forward and up axes.
+    `velocity` is in the object frame, `rate` about the body's right, forward and up axes.
     """
     turned = np.einsum("nij,nj->ni", np.asarray(exterior.camera_from_object), velocity)
     camera = np.stack([np.asarray(body_from_camera(m.boresight, m.nominal)).T for m in mounts])
@@ -182,10 +182,9 @@ def camera_motions(exterior: ExteriorOrientation, velocity, rate, mounts: list[M
 def with_shutters(
     recipe: Recipe, flight: Flight, motions: np.ndarray, seed: int, start: Unknowns, priors: Unknowns, truth: Unknowns
 ) -> tuple[Unknowns, Unknowns, Unknowns]:
-    """Return start, priors and truth with the shutters and the motions of images whose camera the block models with
-    one.
+    """Add rolling shutters and image motions to start, priors and truth, for cameras whose block model has a shutter.
 
-    The block receives each motion with the error that it states, or exactly if it is fixed.
+    The block receives each motion with its stated error, or exactly if it is fixed.
     """
     if not recipe.shutters:
         return start, priors, truth

@@ -1,4 +1,4 @@
-"""Flight as flown: true camera positions, and error-free records of GNSS and IMU."""
+"""Simulated flight: true camera positions, and error-free GNSS and IMU records."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -40,9 +40,9 @@ _CHUNK = 64
 
 
 class Flight(NamedTuple):
-    """One entry per image, in order of flight; `time` in seconds from the mean time of the strip.
+    """Images in order of flight; `time` in seconds from the mean time of the strip.
 
-    Images that belong to no strip have the strip "".
+    The strip of an image outside all strips is "".
     """
 
     images: tuple[str, ...]
@@ -54,10 +54,10 @@ class Flight(NamedTuple):
 
 
 def fly(recipe: Recipe, plan: FlightPlan, mean_height: float, seed: int, purpose: str = "flight") -> Flight:
-    """Fly `plan` at `mean_height` (m) above zero, with the recipe's jitter, drawn for this `purpose` (`stream`).
+    """Fly `plan` at `mean_height` (m) above zero, with the recipe's jitter from the random stream `purpose`.
 
-    Every exposure deviates normally from its plan. The body's attitude is roll, pitch, yaw = heading + crab; the camera
-    follows it through the true mount.
+    Every exposure deviates normally from its plan. The body's attitude is roll, pitch, yaw = heading + crab; the true
+    mount gives the attitude of the camera.
     """
     strips = plan.strips
     of = np.repeat(np.arange(len(strips)), [s.images for s in strips])
@@ -85,10 +85,9 @@ def fly(recipe: Recipe, plan: FlightPlan, mean_height: float, seed: int, purpose
 
 
 def record(flight: Flight, mounts: list[Mount], biases: list[StripBias]) -> tuple[np.ndarray, np.ndarray]:
-    """Return GNSS position (images, 3) in m and roll, pitch, yaw (images, 3) in rad at the recorded times, without
-    noise.
+    """Return error-free GNSS positions (images, 3) in m and roll, pitch, yaw (images, 3) in rad at the recorded times.
 
-    `mounts` and `biases` are those of each image.
+    `mounts` and `biases` have one entry per image.
     """
     nominal = np.stack([m.nominal for m in mounts])
     exposure = Exposure(flight.time, flight.motion.velocity, flight.motion.rate, nominal)  # type: ignore[arg-type]
@@ -137,7 +136,7 @@ def _camera_from_object(roll_pitch_yaw, boresight, nominal):
 
 
 def take_images(plan: ConvergentPlan, jitter: Jitter, mean_height: float, seed: int) -> Flight:
-    """Take the images of `plan`, with jitter; the centre of the field is at the height `mean_height` (m)."""
+    """Take the images of a convergent `plan`, with jitter; the centre of the field has the height `mean_height` (m)."""
     stations, rng = plan.stations, stream(seed, "flight")
     n = len(stations)
     middle = np.array([0.0, 0.0, mean_height])
@@ -158,9 +157,10 @@ def take_images(plan: ConvergentPlan, jitter: Jitter, mean_height: float, seed: 
 def add_rig_images(
     recipe: Recipe, flight: Flight, cameras: Mapping[str, SimulatedChange], seed: int
 ) -> tuple[Flight, Int[np.ndarray, "images"]]:
-    """Add the photographs of the other cameras after each of the reference; returns the exposure of each image.
+    """Insert the images of the other rig cameras after each reference image; return also the exposure index of each
+    image.
 
-    The rig is deformed by the noise of the recipe, independently in every exposure.
+    The recipe's noise deforms the rig independently in every exposure.
     """
     if not cameras:
         return flight, np.arange(len(flight.images))
@@ -169,7 +169,7 @@ def add_rig_images(
     noise = np.array([triple(recipe.noise.rig_place_m), np.deg2rad(triple(recipe.noise.rig_turn_deg))])  # type: ignore[arg-type]
     truths: list[Any] = [own.truth for own in cameras.values()]
     place = np.array([own.place for own in truths]) + noise[0] * bent[:, :, 0]
-    # Rotated from its place in the rig.
+    # The rotation is about the camera's position in the rig.
     turn, flexure = np.broadcast_to([own.turn for own in truths], place.shape), noise[1] * bent[:, :, 1]
     at = np.repeat(np.arange(n), m - 1)
     reference = np.asarray(exterior.position)[at], np.asarray(exterior.camera_from_object)[at]
@@ -200,13 +200,13 @@ def add_rig_images(
 
 
 def _after_each(reference: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """Interleave the values of each exposure and those of the other cameras in it."""
+    """Interleave the values of the reference camera and of the other cameras, by exposure."""
     n, shape = len(reference), reference.shape[1:]
     return np.concatenate([reference[:, None], new.reshape(n, -1, *shape)], axis=1).reshape(-1, *shape)
 
 
 def rig_rows(recipe: Recipe, flight: Flight) -> tuple[RigPlaces | RigTurns, ...]:
-    """Return the block's rig observations of photographs whose cameras it models in the rig."""
+    """Return the rig observations for images of the cameras that the block models in the rig."""
     modelled = [name for name, own in recipe.rig.items() if own.model]
     m, image = len(recipe.rig) + 1, np.flatnonzero(np.isin(flight.cameras, modelled))
     if not len(image):
@@ -220,14 +220,14 @@ def rig_rows(recipe: Recipe, flight: Flight) -> tuple[RigPlaces | RigTurns, ...]
 
 
 def has_delay(cameras: Mapping[str, SimulatedChange]) -> bool:
-    """Return True if a camera of the rig may expose late: the block then needs its motion."""
+    """Return True if a rig camera may expose late: the block then needs the motion."""
     modelled: list[Any] = [own.model for own in cameras.values() if own.model]
     delays = [own.truth.delay for own in cameras.values()] + [start.delay for start, _ in modelled]  # type: ignore[attr-defined]
     return any(float(delay) != 0 for delay in delays) or any(prior.delay != FIXED for _, prior in modelled)
 
 
 def gnss_images(recipe: Recipe, flight: Flight) -> Int[np.ndarray, "n"]:
-    """Return the images with observed stations and attitudes: all, or those of the reference camera of a rig."""
+    """Return the images with observed stations and attitudes: all, or the images of a rig's reference camera."""
     return np.arange(0, len(flight.images), len(recipe.rig) + 1)
 
 
@@ -243,9 +243,9 @@ def _rig_exterior(position, camera_from_object, velocity, rate, arm, boresight, 
 def relative_rows(
     recipe: Recipe, flight: Flight, mounts: list[Mount], seed: int
 ) -> tuple[RelativePositions | RelativeAttitudes, ...]:
-    """Return relative observations by carrier phases and gyros of successive exposures of each strip.
+    """Return relative positions (carrier phases) and attitudes (gyros) of successive exposures of each strip.
 
-    Only their own noise: biases of a strip or trajectory errors do not enter.
+    They have only their own noise, not the biases of strips or trajectory errors.
     """
     stated, noise = recipe.stated, recipe.noise
     if stated.relative_position_m is None and stated.relative_attitude_deg is None:
@@ -274,5 +274,5 @@ def relative_rows(
 @jax.jit
 @jax.vmap
 def _relative_angles(first, second):
-    """Return roll, pitch and yaw of one body relative to another."""
+    """Return roll, pitch and yaw of the second body relative to the first."""
     return roll_pitch_yaw_from_matrix(matrix_from_roll_pitch_yaw(first).T @ matrix_from_roll_pitch_yaw(second))

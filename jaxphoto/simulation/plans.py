@@ -1,7 +1,7 @@
 """Plans of flights, convergent images and laser scans.
 
 Headings are in degrees clockwise from north, lengths in metres, object frame east-north-up (docs/conventions.md). The
-object frame of convergent images is that of a level field at close range: X and Y along its sides, Z towards the
+object frame of convergent images is defined by a level field at close range: X and Y along its sides, Z towards the
 cameras.
 """
 
@@ -15,7 +15,7 @@ from jaxphoto.camera import Sensor
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing.mount import ImageX
 
-# Number of attempts to draw n places from 4 n candidates: enough if strips cover a thousandth of the area.
+# Number of attempts to draw n positions from 4 n candidates; sufficient if strips cover a thousandth of the area.
 _TRIES = 1_000
 
 
@@ -28,10 +28,10 @@ class Footprint(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Strip:
-    """Straight run of `images` exposures, `base_m` apart, flown towards `heading_deg` at a constant height.
+    """Straight strip of `images` exposures, `base_m` apart, flown towards `heading_deg` at a constant height.
 
-    The centre of the run is `along_m` ahead and `across_m` to the right of the origin, in flight direction. `height_m`
-    is above the mean terrain, `footprint` is that of an exposure there.
+    The centre of the strip is `along_m` ahead and `across_m` to the right of the origin, in flight direction.
+    `height_m` is above the mean terrain; `footprint` is the ground coverage of an exposure there.
     """
 
     name: str
@@ -46,23 +46,23 @@ class Strip:
 
     @property
     def axes(self) -> Float[np.ndarray, "2 2"]:
-        """Unit vectors (east, north): ahead, and to the right."""
+        """Return unit vectors (east, north): ahead, and to the right."""
         heading = np.deg2rad(self.heading_deg)
         return np.array([[np.sin(heading), np.cos(heading)], [np.cos(heading), -np.sin(heading)]])
 
     @property
     def along(self) -> Float[np.ndarray, "images"]:
-        """Distance of each exposure ahead of the centre of the strip (m)."""
+        """Return the distance of each exposure ahead of the centre of the strip (m)."""
         return (np.arange(self.images) - (self.images - 1) / 2) * self.base_m
 
     @property
     def middle(self) -> Float[np.ndarray, "2"]:
-        """Centre of the run, (east, north) in m."""
+        """Return the centre of the strip, (east, north) in m."""
         return np.array([self.along_m, self.across_m]) @ self.axes
 
     @property
     def exposures(self) -> Float[np.ndarray, "images 2"]:
-        """(east, north) of the exposures, in m."""
+        """Return the positions (east, north) of the exposures in m."""
         return self.middle + self.along[:, None] * self.axes[0]
 
 
@@ -79,7 +79,7 @@ class FlightPlan:
 
     @property
     def clock(self) -> Float[np.ndarray, "images"]:
-        """Return the time of every exposure from the mean of all (s)."""
+        """Return the time of every exposure relative to the mean of all (s)."""
         times, begin = [], 0.0
         for strip in self.strips:
             at = strip.along / self.speed_m_per_s
@@ -90,20 +90,20 @@ class FlightPlan:
 
     @property
     def cameras(self) -> set[str]:
-        """Cameras used."""
+        """Return the names of the cameras."""
         return {strip.camera for strip in self.strips}
 
     @property
     def n_images(self) -> int:
-        """Number of images in all strips."""
+        """Return the number of images in all strips."""
         return sum(strip.images for strip in self.strips)
 
 
 @dataclasses.dataclass(frozen=True)
 class Swaths:
-    """Ground between the first and last exposure of each strip, over a fraction of its width.
+    """Ground area between the first and last exposure of each strip, over a fraction of its width.
 
-    `across` is that fraction; `ends` is the fraction of half a footprint added beyond the first and last exposure.
+    `across` is this fraction; `ends` is the fraction of half a footprint added beyond the first and last exposure.
     """
 
     strips: tuple[Strip, ...]
@@ -112,35 +112,35 @@ class Swaths:
 
     @property
     def axes(self) -> Float[np.ndarray, "2 2"]:
-        """Unit vectors (east, north): along the first strip's heading, and to its right."""
+        """Return unit vectors (east, north): along the first strip's heading, and to its right."""
         return self.strips[0].axes
 
     @property
     def directions(self) -> Float[np.ndarray, "directions 2"]:
-        """Unit vectors (east, north) along the strips, in one direction each."""
+        """Return unit vectors (east, north) along the strips, opposite headings merged."""
         headings = np.deg2rad(np.unique([round(s.heading_deg % 180, 3) for s in self.strips]))
         return np.column_stack([np.sin(headings), np.cos(headings)])
 
     def half(self, strip: Strip) -> Float[np.ndarray, "2"]:
-        """Half the length and half the width (m) of one swath."""
+        """Return half the length and half the width (m) of one swath."""
         length = strip.along[-1] + self.ends * strip.footprint.along / 2
         return np.array([length, self.across * strip.footprint.across / 2])
 
     def contain(self, xy: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
-        """Return True for places (east, north) in any of the swaths."""
+        """Return True for positions (east, north) in any of the swaths."""
         inside = np.zeros(len(xy), bool)
         for strip in self.strips:
             inside |= np.all(np.abs((xy - strip.middle) @ strip.axes.T) <= self.half(strip), axis=1)
         return inside
 
     def extent(self, axes: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
-        """Minimum and maximum coordinate of all swaths, (minimum or maximum, axis) in m along `axes`."""
+        """Return the minimum and maximum coordinates of all swaths, (minimum or maximum, axis) in m along `axes`."""
         signs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
         corners = np.vstack([s.middle + signs * self.half(s) @ s.axes for s in self.strips]) @ axes.T
         return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
     def draw(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n 2"]:
-        """Draw places (east, north) uniformly over the union of the swaths. Raises BlockError if that is empty."""
+        """Draw positions (east, north) uniformly over the union of the swaths. Raises BlockError if it is empty."""
         if not any(np.all(self.half(strip) > 0) for strip in self.strips):
             raise BlockError(
                 "strips of one image each leave no ground between their first and last exposure; "
@@ -180,7 +180,7 @@ class Station:
 
     @property
     def camera_from_object(self) -> Float[np.ndarray, "3 3"]:
-        """Rows: the camera's axes; `R3(roll) R1(tilt) R3(-azimuth)`."""
+        """Return the rotation matrix `R3(roll) R1(tilt) R3(-azimuth)`; its rows are the camera's axes."""
         angles = np.deg2rad([self.azimuth_deg, self.tilt_deg, self.roll_deg])
         (sa, st, sr), (ca, ct, cr) = np.sin(angles), np.cos(angles)
         level = np.array([[ca, -sa, 0.0], [ct * sa, ct * ca, st], [-st * sa, -st * ca, ct]])
@@ -188,33 +188,33 @@ class Station:
 
     @property
     def position(self) -> Float[np.ndarray, "3"]:
-        """Position relative to the centre of the field (m)."""
+        """Return the position relative to the centre of the field (m)."""
         return self.distance_m * self.camera_from_object[2]
 
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """Ground of a convergent set: a rectangle about the origin, in metres along X and Y."""
+    """Object area of a convergent set: a rectangle about the origin, in metres along X and Y."""
 
     size_m: tuple[float, float]
 
     @property
     def axes(self) -> Float[np.ndarray, "2 2"]:
-        """Unit vectors (X, Y) along the sides."""
+        """Return unit vectors (X, Y) along the sides."""
         return np.eye(2)
 
     @property
     def directions(self) -> Float[np.ndarray, "2 2"]:
-        """Unit vectors along the sides."""
+        """Return unit vectors along the sides."""
         return self.axes
 
     def extent(self, axes: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
-        """Minimum and maximum coordinate, (minimum or maximum, axis) in m along `axes`."""
+        """Return the minimum and maximum coordinates, (minimum or maximum, axis) in m along `axes`."""
         reach = np.abs(axes) @ np.array(self.size_m) / 2
         return np.stack([-reach, reach])
 
     def draw(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n 2"]:
-        """Draw places (X, Y) of uniform density."""
+        """Draw positions (X, Y) uniformly."""
         return rng.uniform(-0.5, 0.5, (n, 2)) * np.array(self.size_m)
 
 
@@ -227,12 +227,12 @@ class ConvergentPlan:
 
     @property
     def cameras(self) -> set[str]:
-        """Cameras used."""
+        """Return the names of the cameras."""
         return {station.camera for station in self.stations}
 
     @property
     def n_images(self) -> int:
-        """Number of images, one per station."""
+        """Return the number of images, one per station."""
         return len(self.stations)
 
 
@@ -242,18 +242,19 @@ _ZERO = (0.0, 0.0, 0.0)
 
 @dataclasses.dataclass(frozen=True)
 class ScanPlan:
-    """Scanner with lines across the track, up to `scan_angle_deg` on either side of the body's nadir.
+    """Laser scanner with lines across the track, up to `scan_angle_deg` on either side of the body's nadir.
 
     `pattern` is one of `georeferencing.PATTERN_OF`: "oscillating" scans back and forth; "circle" or "risley" has two
     counter-rotating prisms, "nutating" a constant nadir angle. `density_per_m2` is the pulse density of one strip on
-    level ground at the mean height of the terrain. It scans the strips of the flight, or `strips` of its own flight.
-    `boresight_deg` (about the body's right, forward and up axes) is the true misalignment. The true trajectory error of
-    a strip is its `shift_m` (by name or "default") plus a normal one of `shift_sigma_m`; that of its attitude is
+    level ground at the mean height of the terrain. The scanner flies with the cameras, or on its own `strips`.
+
+    `boresight_deg` (about the body's right, forward and up axes) is the true misalignment. The true position error of a
+    strip is `shift_m` (by name or "default") plus a normal error of `shift_sigma_m`; the attitude error is
     `attitude_deg` (about right, forward, up). Both drift linearly from the centre of the strip by `drift_m_per_s` and
     `attitude_drift_deg_per_s`, and randomly with `drift_sigma_m`, `drift_sigma_deg` and `correlation_s`, at knots
     `knots_s` apart. `lever_arm_m`, `range_offset_m`, the scales, `eccentricity_deg` (of cos and sin) and
-    `time_offset_s` are those of `georeferencing.ScannerCalibration`. With `same_trajectory` stations and attitudes of
-    the exposures have the errors of this trajectory, in addition to their noise.
+    `time_offset_s` are the parameters of `georeferencing.ScannerCalibration`. With `same_trajectory`, stations and
+    attitudes of the exposures contain the errors of this trajectory, in addition to their noise.
     """
 
     density_per_m2: float
@@ -280,10 +281,10 @@ class ScanPlan:
 
     @property
     def half_width(self) -> float:
-        """Half width of the swath relative to the height above ground: tangent of the scan angle."""
+        """Return the half width of the swath relative to the height above ground: tangent of the scan angle."""
         return float(np.tan(np.deg2rad(self.scan_angle_deg)))
 
 
 def strip_value(values: dict[str, Triple], strip: str) -> Float[np.ndarray, "3"]:
-    """Return the planned value of a strip, by its name or "default", without random parts."""
+    """Return the planned value of a strip (by its name or "default"), without random parts."""
     return np.array(values.get(strip, values.get("default", _ZERO)))

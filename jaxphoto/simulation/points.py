@@ -1,6 +1,6 @@
-"""Tie points and targets: places, names, roles, and visibility in the images.
+"""Simulated tie points and targets: positions, names, roles, and visibility in the images.
 
-Buildings hide points, trees and terrain do not.
+Buildings occlude points; trees and terrain do not.
 """
 
 import functools
@@ -21,16 +21,16 @@ from jaxphoto.simulation.sampling import in_chunks, stream
 from jaxphoto.simulation.scene import Building, Terrain, entry_distances, pairs_along, solids
 
 _CHUNK = 1024
-# Images times points processed at a time: bounds the memory.
+# Maximum number of image-point pairs processed at a time; limits memory.
 _PAIRS = 2_000_000
-# Grid of the format, per side, on which the range of ideal coordinates is determined; 31 x 31 fill a chunk.
+# Grid size per side for the range of ideal coordinates over the format; 31 x 31 points fill a chunk.
 _PLACES = 31
-# Obstacles closer than this (m) to a point do not hide it: a roof does not hide its own points.
+# Minimum distance (m) of an obstacle from a point it occludes: a roof does not occlude its own points.
 _ON_IT_M = 1e-3
 
 
 class Rays(NamedTuple):
-    """Measured coordinates (mm from the image centre) of points in images, sorted by point, then image."""
+    """Measured image coordinates (mm from the image centre), sorted by point, then image."""
 
     image: Int[np.ndarray, "rays"]
     point: Int[np.ndarray, "rays"]
@@ -41,7 +41,7 @@ class Rays(NamedTuple):
         return Rays(self.image[chosen], self.point[chosen], self.xy[chosen])
 
     def per_point(self, n: int) -> Int[np.ndarray, "points"]:
-        """Return the number of images of each of `n` points."""
+        """Return the number of images for each of `n` points."""
         return np.bincount(self.point, minlength=n)
 
 
@@ -57,7 +57,7 @@ def photograph(
 
     A point is visible if its direction has an image (`AbstractProjection.sees`; in front of a perspective camera), the
     distortion is invertible (`InteriorOrientation.invertible`), and it is inside the format by more than `margin_mm`.
-    Coordinates are those of `jaxphoto.collinearity.project`.
+    The projection is `jaxphoto.collinearity.project`.
     """
     at_once = max(1, _PAIRS // max(len(image_camera), 1))
     begins = range(0, max(len(points), 1), at_once)
@@ -76,9 +76,9 @@ def _photograph(
     points: Float[np.ndarray, "points 3"],
     margin_mm: float,
 ) -> Rays:
-    """Apply `photograph` to all points at once."""
+    """Apply `photograph` to all points without chunks."""
     position, matrix = np.asarray(exterior.position), np.asarray(exterior.camera_from_object)
-    # (images, points, 3), in the camera frame
+    # axes: (images, points, 3), in the camera frame
     in_camera = np.einsum("kij,knj->kni", matrix, points[None] - position[:, None])
     parts = []
     for name, interior in cameras.items():
@@ -102,7 +102,7 @@ def _photograph(
 
 
 def _reach(interior: InteriorOrientation, half: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-    """Return bounds of |ideal coordinates| on the format, so that the distortion is not evaluated for every pair."""
+    """Return the maximum of |ideal coordinates| over the format, to evaluate the distortion only for candidates."""
     grid = np.stack(np.meshgrid(*np.linspace(-half, half, _PLACES).T), axis=-1).reshape(-1, 2)
     ideal = np.abs(in_chunks(functools.partial(_ideal, interior), _CHUNK, grid))
     return 1.05 * np.max(ideal, axis=0, initial=0.0, where=np.isfinite(ideal))
@@ -122,7 +122,7 @@ def _measured(interior: InteriorOrientation, ideal):
 def remove_hidden(
     rays: Rays, exterior: ExteriorOrientation, points: Float[np.ndarray, "points 3"], buildings: tuple[Building, ...]
 ) -> Rays:
-    """Remove rays that a building blocks."""
+    """Remove rays occluded by a building."""
     if not buildings or not len(rays.point):
         return rays
     origin, end = np.asarray(exterior.position)[rays.image], points[rays.point]
@@ -137,7 +137,7 @@ def remove_hidden(
 
 
 def thin_rays(rays: Rays, n_points: int, min_images: int, mean_rays: float, rng: np.random.Generator) -> Rays:
-    """Remove rays at random until points have `mean_rays` on average; each keeps at least `min_images`."""
+    """Remove rays at random down to an average of `mean_rays` per point; each point retains at least `min_images`."""
     surplus = len(rays.point) - round(mean_rays * n_points)
     if surplus <= 0:
         return rays
@@ -149,7 +149,7 @@ def thin_rays(rays: Rays, n_points: int, min_images: int, mean_rays: float, rng:
     return rays.take(np.setdiff1d(np.arange(len(order)), spare[:surplus]))
 
 
-# Number of batches of places tried.
+# Maximum number of batches of positions.
 _TRIES = 20
 
 
@@ -208,7 +208,7 @@ def _seen_often(
     rng: np.random.Generator,
     draw: Callable[[int], np.ndarray],
 ) -> np.ndarray:
-    """Return the first `n` open places from `draw`, on ground or roofs, that enough images see."""
+    """Return the first `n` positions from `draw`, on open ground or roofs, that are visible in enough images."""
     result = np.zeros((0, 3))
     for _ in range(_TRIES):
         if len(result) >= n:
@@ -261,7 +261,7 @@ def _chosen(choice: Choice, xy: np.ndarray, ground: Swaths | Field) -> list[int]
     rankings = [(np.hypot(*xy.T), 1)] if choice.centre else []
     for ahead in ground.directions:
         rankings += [(xy @ ahead, choice.outermost), (-xy @ ahead, choice.outermost)]
-    # In turn, excluding points chosen before: every rule gets its number.
+    # Apply the rules in order, excluding points already chosen, so each rule yields its full count.
     for rank, count in rankings:
         chosen += [int(k) for k in np.argsort(rank, kind="stable") if k not in chosen][:count]
     return chosen

@@ -1,6 +1,6 @@
-"""Recipe of a simulation: everything but the seed.
+"""Recipe of a simulation: everything except the seed.
 
-The model of the block and the truth are separate: `Assumed` for parameters, `Sigmas` twice for noise.
+The recipe separates the model of the block from the truth: parameters by `Assumed`, noise by two `Sigmas`.
 """
 
 import dataclasses
@@ -18,14 +18,14 @@ from jaxphoto.simulation.plans import ConvergentPlan, Field, FlightPlan, ScanPla
 from jaxphoto.simulation.scene import Settlement, Terrain
 
 Role = Literal["control", "vertical", "check", "tie"]
-"""Role of a target: control in X, Y and Z, control in Z only, check point, or tie point of a target's precision."""
+"""Role of a target: control in X, Y and Z; control in Z only; check point; tie point with the precision of a target."""
 ROLES: tuple[Role, ...] = ("control", "vertical", "check", "tie")
 T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
 class Assumed(Generic[T]):
-    """Parameters: `truth`, `start` of the block, and its priors."""
+    """Parameters: `truth`, and the block's `start` and `prior`."""
 
     truth: T
     start: T
@@ -36,8 +36,8 @@ class Assumed(Generic[T]):
 class SimulatedBias:
     """Shift (m) and drift (m/s) of the GNSS positions of a strip.
 
-    Truth is `truth` plus normal shifts and drifts of `shift_sigma_m` and `drift_sigma_m_per_s` for each strip. `model`
-    is the block's start and prior, None if the block models no bias.
+    The true values are `truth` plus normal shifts and drifts of `shift_sigma_m` and `drift_sigma_m_per_s` for each
+    strip. `model` contains the block's start and prior; None if the block does not model the bias.
     """
 
     truth: StripBias
@@ -48,10 +48,10 @@ class SimulatedBias:
 
 @dataclasses.dataclass(frozen=True)
 class SimulatedShutter:
-    """Rolling shutter of a camera; `model` is the block's start and prior, None if the block models none.
+    """Rolling shutter of a camera; `model` contains the block's start and prior, None if the block does not model it.
 
-    The block receives motions of its images with normal errors of `velocity_m_per_s` and `rate_deg_per_s`, observed
-    with these standard deviations; exact and fixed if these are zero.
+    The motions of the images have normal errors of `velocity_m_per_s` and `rate_deg_per_s` in the block, and are
+    observed with these standard deviations; if zero, they are exact and fixed.
     """
 
     truth: RollingShutter
@@ -64,8 +64,8 @@ class SimulatedShutter:
 class SimulatedChange:
     """Change of a camera during the flight, or in a strip.
 
-    Truth is `truth`, plus a random part where the same field of `spread`, a tree of priors, is `Weighted`. `model` is
-    the block's start and prior, None if it models no change.
+    The true value is `truth`, plus a random part if the same field of `spread` (a tree of priors) is `Weighted`.
+    `model` contains the block's start and prior; None if the block does not model the change.
     """
 
     truth: AbstractParameters
@@ -75,9 +75,9 @@ class SimulatedChange:
 
 @dataclasses.dataclass(frozen=True)
 class CameraWalk:
-    """Random walk of c, x_p and y_p (mm) from strip to strip: standard deviations of a step of an hour.
+    """Random walk of c, x_p and y_p (mm) from strip to strip: standard deviations per step of one hour.
 
-    `truth` is the true walk, `stated` that of the block's `StripCameraSteps`; None if it has none.
+    `truth` generates the walk; `stated` is used in the block's `StripCameraSteps`, None to omit them.
     """
 
     truth: Triple
@@ -86,10 +86,10 @@ class CameraWalk:
 
 @dataclasses.dataclass(frozen=True)
 class Cooling:
-    """Camera temperature (degrees Celsius), approaching that of the air by Newton's law of cooling.
+    """Camera temperature (degrees Celsius), approaching the air temperature by Newton's law of cooling.
 
-    t after the first exposure it is air + (begin - air) exp(-t / time constant). The block knows it; its interior
-    orientation refers to `reference_c`.
+    At t after the first exposure it is air + (begin - air) exp(-t / time constant). The block contains these
+    temperatures; its interior orientation refers to `reference_c`.
     """
 
     begin_c: float
@@ -98,18 +98,18 @@ class Cooling:
     reference_c: float
 
     def at(self, time: Float[np.ndarray, "images"]) -> Float[np.ndarray, "images"]:
-        """Return temperatures at times (s) on any clock; the earliest is the first exposure."""
+        """Return temperatures at times (s) of any time scale; the earliest time is the first exposure."""
         gone = (time - np.min(time)) / self.time_constant_s
         return self.air_c + (self.begin_c - self.air_c) * np.exp(-gone)
 
 
 @dataclasses.dataclass(frozen=True)
 class Jitter:
-    """Standard deviations of a flight, or a convergent set, about its plan.
+    """Standard deviations of a flight, or a convergent set, from its plan.
 
-    `position_m` per axis X, Y, Z; `angle_deg` of roll and of pitch; `crab_deg` of yaw against the track (the track
-    stays); `rate_deg_per_s` of the rotation rates about right, forward and up. In a convergent set `angle_deg` is that
-    of the aim, about the camera's x and y axes, and `crab_deg` that of the roll.
+    `position_m`: per axis X, Y, Z; `angle_deg`: roll and pitch; `crab_deg`: yaw relative to the track (which is
+    unchanged); `rate_deg_per_s`: rotation rates about right, forward and up. In a convergent set `angle_deg` applies to
+    the aim, about the camera's x and y axes, and `crab_deg` to the roll.
     """
 
     position_m: Triple = (0.0, 0.0, 0.0)
@@ -123,9 +123,9 @@ class PointPlan:
     """Number, area and visibility of tie points.
 
     Points lie in the swaths (`Swaths`: `across`, `ends`) or the `Field`, and are visible in at least `min_images`
-    images, `margin_mm` from the edge of the format. Every such image measures the point, unless `mean_rays` sets the
-    average number of rays per point, to which rays are thinned at random. With buildings, the fraction `on_roofs` of
-    the tie points lies on them, the others on ground and roofs alike; none is close to a wall or crown.
+    images, `margin_mm` from the edge of the format. Each of these images measures the point, unless `mean_rays` sets
+    the average number of rays per point (random thinning). With buildings, the fraction `on_roofs` of the tie points
+    lies on roofs, the others on ground and roofs; none is close to a wall or crown.
     """
 
     ties: int
@@ -141,8 +141,8 @@ class PointPlan:
 class Choice:
     """Targets of a group with another role: the `outermost` of each arm, the one at the `centre`, the `first`.
 
-    Arms lead from the centre of the block in both directions of the strips, or along each side of a field. A target is
-    chosen once: a later rule takes its next one.
+    Arms extend from the centre of the block in both directions of the strips, or along each side of a field. Each rule
+    excludes targets chosen by earlier rules.
     """
 
     role: Role
@@ -153,10 +153,10 @@ class Choice:
 
 @dataclasses.dataclass(frozen=True)
 class TargetPlan:
-    """Signalised points of one role: `count` uniformly distributed, and those at given places.
+    """Signalised points of one role: `count` uniformly distributed, and points at given positions.
 
-    `at_m` gives (X, Y) or (X, Y, Z) in m; `at` gives places as fractions of half the block's length and width, along
-    and to the right of the first strip's heading, from the centre of the block; in a field along X and Y.
+    `at_m` contains (X, Y) or (X, Y, Z) in m. `at` contains positions relative to the centre of the block, as fractions
+    of half its length and width, along and to the right of the first strip's heading; in a field along X and Y.
     """
 
     role: Role
@@ -169,10 +169,10 @@ class TargetPlan:
 
 @dataclasses.dataclass(frozen=True)
 class Sigmas:
-    """Standard deviations of tie points and targets in the images, control, stations, attitudes, laser points,
-    positions and rotations of rig cameras, and relative positions and attitudes of successive exposures.
+    """Standard deviations of all observations; None if not observed.
 
-    None if not observed.
+    Tie points and targets in the images, control, stations, attitudes, laser points, positions and rotations of rig
+    cameras, relative positions and attitudes of successive exposures.
     """
 
     image_mm: float
@@ -189,7 +189,7 @@ class Sigmas:
 
 @dataclasses.dataclass(frozen=True)
 class Approximation:
-    """Standard deviations of the approximate values: of orientations, and of all points if given."""
+    """Standard deviations of the approximate values of orientations, and of all points if given."""
 
     position_m: float = 5.0
     angle_deg: float = 1.0
@@ -201,10 +201,10 @@ class Approximation:
 class Recipe:
     """Recipe of a simulation, without its seed.
 
-    `mounts` are by name, "default" or that of a camera, `shutters` by camera; `biases` by name, "default" or that of a
-    strip; `changes` of cameras by kind and owner; `rig` has the other cameras of a rig. `stated` sigmas are those of
-    the block's observations, `noise` those of their true errors. `datum_offset_m` is added to all observed stations and
-    is not modelled. `settlement` are buildings and trees on the terrain; `lidar` scans both, in strips.
+    Keys: `mounts` by name ("default" or a camera), `shutters` by camera, `biases` by name ("default" or a strip),
+    `changes` by kind and owner, `rig` by the other cameras of a rig. `stated`: sigmas of the block's observations;
+    `noise`: sigmas of their true errors. `datum_offset_m`: unmodelled offset of all observed stations. `settlement`:
+    buildings and trees on the terrain. `lidar`: scanner of terrain and settlement.
     """
 
     title: str
@@ -232,13 +232,13 @@ class Recipe:
 
     @property
     def ground(self) -> Swaths | Field:
-        """Area of the points."""
+        """Return the area of the points."""
         if isinstance(self.plan, ConvergentPlan):
             return self.plan.field
         return Swaths(self.plan.strips, self.points.across, self.points.ends)
 
     def mount_of(self, camera: str) -> str:
-        """Return the name of a camera's mount: its own, "default", or "" without any."""
+        """Return the name of a camera's mount: its own name, "default", or "" without a mount."""
         return camera if camera in self.mounts else "default" if "default" in self.mounts else ""
 
 

@@ -1,4 +1,6 @@
-"""Simulation of new observations of a block: the same rows, from known unknowns, with new noise of their sigmas."""
+"""Simulation of new observations of a block: the same rows, computed from true parameters, with new noise of their
+sigmas.
+"""
 
 import dataclasses
 from typing import Any
@@ -23,7 +25,7 @@ Rows = AbstractObservations | KnownParameters
 def remeasure_rows(rows: Rows, block: Block, truth: Unknowns, key: PRNGKeyArray) -> Rows:
     """Return the rows with their observations under `truth`, plus normal noise of their sigmas.
 
-    Rows with joint covariances, and those that touch parameters `truth` does not have, are not changed.
+    Rows with joint covariances, and rows with parameters missing from `truth`, are not changed.
     """
     if isinstance(rows, Correlated | KnownParameters) or rows.block_parameters or rows.uses_interior or not len(rows):
         return rows
@@ -52,7 +54,7 @@ def _touched(what: str, index: np.ndarray, block: Block, truth: Unknowns) -> Any
         parameters[kind] = jax.tree.map(lambda v: v[at], table)  # noqa: B023
     position, rotation = (jnp.asarray(v)[index] for v in (exterior.position, exterior.camera_from_object))
     states = ImageState
-    # One image each: a state is declared as that of one.
+    # Vectorise: `ImageState` is defined for a single image.
     for _ in range(index.ndim):
         states = jax.vmap(states)
     return states(position, rotation, taken, parameters)
@@ -65,9 +67,9 @@ def _numbers(parameters: Any) -> Any:
 def remeasure(block: Block, truth: Unknowns, key: PRNGKeyArray) -> Block:
     """Replace every observation of `block` by its true value under `truth` plus normal noise of its sigma.
 
-    Image points, stations, attitudes, control, surfaces, distances and further rows are drawn independently; check and
-    fixed coordinates become true ones; weighted priors and joint covariances stay. Pure and differentiable in `truth`;
-    `vmap` over keys gives many blocks at once. An adjustment should recover `truth`.
+    Image points, stations, attitudes, control, surfaces, distances and further rows are drawn independently. Check and
+    fixed coordinates are set to their true values; weighted priors and joint covariances are not changed. Pure and
+    differentiable in `truth`; use `vmap` over keys for many blocks at once. An adjustment should estimate `truth`.
     """
     keys = jax.random.split(key, 5)
     draw = lambda k, value, sigma: value + jnp.asarray(sigma) * jax.random.normal(k, value.shape)  # noqa: E731
@@ -95,7 +97,7 @@ def remeasure(block: Block, truth: Unknowns, key: PRNGKeyArray) -> Block:
 
 
 def _feet(surfaces: SurfaceRows, truth: Unknowns, key: PRNGKeyArray) -> Float[Array, "rows 3"]:
-    """Return laser points of the surfaces with shift and boresight of the scanner, and noise along the normal."""
+    """Return foot points on the surfaces with shift and boresight of the scanner, and noise along the normal."""
     foot = jnp.asarray(truth.points)[surfaces.point]
     rise = jnp.asarray(surfaces.sigma) * jax.random.normal(key, surfaces.sigma.shape)
     if truth.scanner is not None:

@@ -1,4 +1,4 @@
-"""Random streams of one seed, one per purpose, and evaluation of compiled functions in chunks."""
+"""Independent random streams of one seed, one per purpose, and chunked evaluation of compiled functions."""
 
 import zlib
 from collections.abc import Callable
@@ -8,19 +8,19 @@ import numpy as np
 
 
 def stream(seed: int, purpose: str) -> np.random.Generator:
-    """Return the generator of `purpose` ("terrain", "noise of stations", ...) under `seed`.
+    """Return the random generator of `purpose` ("terrain", "noise of stations", ...) under `seed`.
 
     Streams of different purposes are independent (NumPy's `SeedSequence` with the purpose as spawn key), and do not
-    depend on which others are used.
+    depend on which other streams are used.
     """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(zlib.crc32(purpose.encode()),)))
 
 
 def in_chunks(function: Callable, size: int, *rows):
-    """Apply `function(*rows)` to trees of arrays (or numbers) with a leading axis, `size` rows at a time.
+    """Apply `function(*rows)` to trees of arrays (or scalars) with a leading axis, `size` rows at a time.
 
-    `function` is compiled and takes `size` rows; the last chunk is padded with copies of its first row. The result is a
-    tree of NumPy arrays.
+    `function` is compiled for `size` rows; the last chunk is padded with copies of its first row. Returns a tree of
+    NumPy arrays.
     """
     n = len(jax.tree.leaves(rows)[0])
     parts = []

@@ -1,7 +1,7 @@
-"""Simulation of a laser scan of ground, buildings and trees, with its trajectory and truth.
+"""Simulated laser scan of ground, buildings and trees, with trajectory and true errors.
 
-Every pulse travels from the scanner along a ray fixed in the aircraft. It ends at a roof or on the ground, whichever
-comes first; a hit on a wall gives no return, so buildings cast shadows. On its way it may hit leaves.
+Every pulse travels from the scanner along a ray fixed in the body frame. It ends at a roof or on the ground, whichever
+comes first. A hit on a wall gives no return, so buildings cast shadows. Hits of leaves on the way give further returns.
 """
 
 from typing import Any, NamedTuple, cast
@@ -36,7 +36,7 @@ from jaxphoto.simulation.sampling import in_chunks, stream
 from jaxphoto.simulation.scene import Terrain, entry_distances, intersect_crowns, pairs_along, solids
 
 _CHUNK_EXPOSURES, _CHUNK_POINTS = 64, 65_536
-# From the end of a strip to the beginning of the next.
+# Time between the end of a strip and the beginning of the next.
 _GAP_S = 60.0
 
 
@@ -49,16 +49,16 @@ class Path(NamedTuple):
     length_m: float
     """Planned length over ground."""
     node: Float[np.ndarray, "nodes"]
-    """Times (s), from the beginning to the end of the strip."""
+    """Times from the beginning to the end of the strip (s)."""
     position: Float[np.ndarray, "nodes 3"]
     velocity: Float[np.ndarray, "nodes 3"]
-    """Metres and metres per second."""
+    """Position (m) and velocity (m/s)."""
     quaternion: Float[np.ndarray, "nodes 4"]
     turn: Float[np.ndarray, "nodes 4"]
-    """(w, x, y, z) of `object_from_body`, with continuous signs, and its derivative (1/s)."""
+    """`object_from_body` as quaternion (w, x, y, z) with continuous signs, and its derivative (1/s)."""
 
     def pose(self, time: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 4"]]:
-        """Return position (m) and unit quaternion of `object_from_body` at times (s)."""
+        """Return positions (m) and unit quaternions of `object_from_body` at times (s)."""
         quaternion = _hermite(self.node, self.quaternion, self.turn, time)
         length = np.linalg.norm(quaternion, axis=1, keepdims=True)
         return _hermite(self.node, self.position, self.velocity, time), quaternion / length
@@ -70,14 +70,13 @@ def matrices(quaternion: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]
 
 
 def paths(recipe: Recipe, plan: ScanPlan, flight: Flight, mean_height: float, seed: int) -> list[Path]:
-    """Return the path of every strip of `plan`, consecutively from time zero: of `flight` or of its own.
+    """Compute the path of every strip of `plan`, consecutively from time zero: strips of `flight`, or separate ones.
 
-    If exposures lie on the trajectory of the scanner, time zero is their mean.
+    If exposures lie on the scanner's trajectory, time zero is their mean.
 
     The scanner is at the reference point of GNSS and IMU, at their true positions. Positions and quaternions are cubic
-    Hermite splines through each exposure with its velocity and rotation rate. Over the ground of the first and last
-    image the path is extended straight beyond their exposures. Nodes of a separate flight deviate from the plan as
-    exposures do.
+    Hermite splines through each exposure with its velocity and rotation rate. The path is extended straight beyond the
+    first and last exposure by half their footprint. Nodes of a separate flight deviate from the plan like exposures.
     """
     flown = cast(FlightPlan, recipe.plan)
     if plan.strips:
@@ -85,7 +84,7 @@ def paths(recipe: Recipe, plan: ScanPlan, flight: Flight, mean_height: float, se
         flight = fly(recipe, flown, mean_height, seed, "flight of the scanner")
     names = [recipe.mount_of(camera) for camera in flight.cameras]
     true = [recipe.mounts[name].truth if name else NO_MOUNT for name in names]
-    # At the true time of the exposure, whatever the camera's clock.
+    # Use the true time of the exposure: time offsets of the camera do not apply.
     mounts = [Mount(m.lever_arm, m.boresight, 0.0, m.image_x) for m in true]
     position, attitude = record(flight, mounts, [NO_BIAS] * len(mounts))
     quaternion = in_chunks(_quaternions_from_angles, _CHUNK_EXPOSURES, attitude)
@@ -105,9 +104,9 @@ def paths(recipe: Recipe, plan: ScanPlan, flight: Flight, mean_height: float, se
 
 
 def _led(lead: float, time, position, velocity, quaternion, turn) -> tuple[np.ndarray, ...]:
-    """Return the nodes of one strip and two more, `lead` seconds before and after; signs of quaternions are continuous.
+    """Add a node `lead` seconds before and after the nodes of one strip; make the signs of quaternions continuous.
 
-    There the velocity and the attitude are those of the first and the last exposure, without rotation.
+    Velocity and attitude there are equal to the first and the last exposure, without rotation.
     """
     turned = np.einsum("ni,ni->n", quaternion[1:], quaternion[:-1]) < 0
     sign = np.concatenate([[1.0], np.cumprod(np.where(turned, -1.0, 1.0))])[:, None]
@@ -121,7 +120,7 @@ def _led(lead: float, time, position, velocity, quaternion, turn) -> tuple[np.nd
 
 
 def _turn(quaternion: Float[np.ndarray, "n 4"], rate: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4"]:
-    """Return the derivative of the quaternion: q (0, rate / 2), the rate about the body's axes (rad/s)."""
+    """Return the derivative of the quaternion, q (0, rate / 2); `rate` is about the body's axes (rad/s)."""
     (w, v), half = (quaternion[:, :1], quaternion[:, 1:]), rate / 2
     return np.hstack([-np.sum(v * half, axis=1, keepdims=True), w * half + np.cross(v, half)])
 
@@ -141,7 +140,7 @@ def _matrices_from_quaternions(quaternion):
 def _hermite(
     node: Float[np.ndarray, "k"], value: Float[np.ndarray, "k m"], slope: Float[np.ndarray, "k m"], at: np.ndarray
 ) -> Float[np.ndarray, "n m"]:
-    """Return the cubics with `value` and `slope` at every node."""
+    """Evaluate cubic Hermite splines with `value` and `slope` at every node."""
     i = np.clip(np.searchsorted(node, at, side="right") - 1, 0, len(node) - 2)
     step = (node[i + 1] - node[i])[:, None]
     u = (at - node[i])[:, None] / step
@@ -149,14 +148,14 @@ def _hermite(
     return ends + step * u * (1 - u) * (slope[i] * (1 - u) - slope[i + 1] * u)
 
 
-# Iterations from a corrected shot to the measured one: each reduces the error by a factor of the errors' size.
+# Iterations from a corrected to the measured shot; each multiplies the error by the order of the scanner's errors.
 _STEPS = 3
 
 
 def draw_errors(plan: ScanPlan, paths: list[Path], seed: int) -> StripErrors:
-    """Draw the errors of the scanner of `plan`, and those of its trajectory: shifts, and drifts about them.
+    """Draw the errors of the scanner of `plan`, and of its trajectory: shifts, and drifts about them.
 
-    Drifts are Gauss-Markov processes (`observations.knot_steps`) from knot to knot.
+    Random drifts are Gauss-Markov processes (`observations.knot_steps`) between knots.
     """
     splines: list[StripSpline] = []
     position, attitude = [], []
@@ -164,7 +163,7 @@ def draw_errors(plan: ScanPlan, paths: list[Path], seed: int) -> StripErrors:
         first = sum(s.size for s in splines)
         splines.append(StripSpline.over(first, float(path.node[0]), float(path.node[-1]), plan.knots_s))
         drift = _drift(splines[-1], plan.correlation_s, stream(seed, f"drift of lidar strip {path.strip}"))
-        # Linear in the times of the coefficients is linear in time.
+        # Coefficients linear in their times give a spline linear in time.
         gone = (splines[-1].times - np.mean(path.node[[0, -1]]))[:, None]
         shift = draw_shift(plan, path.strip, seed) + gone * strip_value(plan.drift_m_per_s, path.strip)
         turn = strip_value(plan.attitude_deg, path.strip) + gone * strip_value(
@@ -185,7 +184,7 @@ def draw_errors(plan: ScanPlan, paths: list[Path], seed: int) -> StripErrors:
 
 
 def draw_shift(plan: ScanPlan, strip: str, seed: int) -> Float[np.ndarray, "3"]:
-    """Draw the shift of a strip (m), about which it drifts."""
+    """Draw the shift of a strip (m); drifts are added to it."""
     drawn = stream(seed, f"shift of lidar strip {strip}").standard_normal(3)
     return strip_value(plan.shift_m, strip) + np.array(plan.shift_sigma_m) * drawn
 
@@ -193,9 +192,9 @@ def draw_shift(plan: ScanPlan, strip: str, seed: int) -> Float[np.ndarray, "3"]:
 def recorded_shot(
     in_body: Float[np.ndarray, "n 3"], boresight: Float[np.ndarray, "3"], calibration: ScannerCalibration
 ) -> Float[np.ndarray, "n 3"]:
-    """Return the shots (m) as georeferencing assumes them, from those between trajectory and hit.
+    """Return the recorded shots (m) for true vectors from trajectory to hit, in the body frame.
 
-    The inverse of `georeferencing.corrected_return` at a trajectory without error.
+    Inverse of `georeferencing.corrected_return` for an error-free trajectory.
     """
     true = (in_body + calibration.lever_arm) @ np.asarray(_rotation(boresight))
     shot = true
@@ -208,12 +207,12 @@ def recorded_shot(
 def rotate_body(
     object_from_body: Float[np.ndarray, "n 3 3"], attitude: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3 3"]:
-    """Return the attitudes of a trajectory with the error `attitude` (rad)."""
+    """Apply the attitude error `attitude` (rad) of a trajectory to its rotation matrices."""
     return object_from_body @ in_chunks(_rotations, _CHUNK_POINTS, -attitude) if np.any(attitude) else object_from_body
 
 
 def _drift(spline: StripSpline, correlation_s: float, rng: np.random.Generator) -> Float[np.ndarray, "knots 6"]:
-    """Draw six processes of standard deviation 1."""
+    """Draw six Gauss-Markov processes of standard deviation 1."""
     noise = rng.standard_normal((spline.size, 6))
     memory = np.exp(-spline.interval / correlation_s)
     for k in range(1, spline.size):
@@ -233,30 +232,30 @@ def _corrected(shot: Float[Array, "n 3"], calibration: ScannerCalibration) -> Fl
 GROUND, VEGETATION, ROOF = 2, 5, 6
 """LAS classes (ASPRS): ground, high vegetation, building."""
 _RATE_HZ = 100.0
-# Frequencies of the two prisms, whose pattern does not repeat within a strip; a nutating mirror has only the first.
+# Frequencies of the two prisms, whose pattern does not repeat within a strip; a nutating mirror uses only the first.
 _PRISMS_HZ = (121.7, -77.3)
-# Tolerance (m) of the intersection with the ground; steeper ground is not hit.
+# Tolerance (m) of the intersection with the ground; the iteration does not converge on steeper ground.
 _ENOUGH_M = 1e-7
 _ROUNDS = 60
-# Pulses processed at a time: bounds the memory.
+# Number of pulses processed at a time; limits memory.
 _PULSES_AT_ONCE = 500_000
-# Limits of the memory of a cloud, and of a trajectory.
+# Maximum number of pulses of a cloud, and of records of a trajectory; limits memory.
 _PULSES, _RECORDS = 1e8, 2e7
 
 
 class Scan(NamedTuple):
-    """Measured cloud, trajectory of GNSS and IMU, and the errors of both."""
+    """Measured cloud, recorded trajectory, and the true errors of both."""
 
     cloud: Cloud
     trajectory: Trajectory
     scanner: Scanner
-    """Boresight and the shifts of the strips, without their drifts."""
+    """True boresight and shifts of the strips, without their drifts."""
     errors: StripErrors
-    """All errors."""
+    """All true errors, drifts included."""
 
 
 class _Returns(NamedTuple):
-    """Reflections: index of the pulse, distance along the ray (m), class."""
+    """Returns: index of the pulse, distance along the ray (m), class."""
 
     pulse: Int[np.ndarray, "returns"]
     at: Float[np.ndarray, "returns"]
@@ -264,11 +263,11 @@ class _Returns(NamedTuple):
 
 
 def scan(plan: ScanPlan, paths: list[Path], terrain: Terrain, noise_m: Float[np.ndarray, "3"], seed: int) -> Scan:
-    """Scan `terrain`, which is drawn and settled, from the path of every strip; strips are called 1, 2 ... in turn.
+    """Scan `terrain` (drawn and settled) from the path of every strip; strips are named 1, 2, ... in order.
 
-    The trajectory has shift and drift errors by strip, the shots those of boresight and calibration: with these,
-    `corrected_return` of every point is the point that was hit plus normal noise of `noise_m` (X, Y, Z). Raises
-    BlockError without returns, and with more than memory can hold.
+    The trajectory has the shift and drift errors of its strip; the shots have boresight and calibration errors.
+    `corrected_return` with these errors gives the point that was hit plus normal noise of `noise_m` (X, Y, Z). Raises
+    BlockError without returns, and if the scan exceeds the memory limits.
     """
     errors = draw_errors(plan, paths, seed)
     leaves, noise = stream(seed, "laser returns from crowns"), stream(seed, "noise of laser points")
@@ -284,7 +283,7 @@ def scan(plan: ScanPlan, paths: list[Path], terrain: Terrain, noise_m: Float[np.
     if not sum(len(part["time"]) for part in parts):
         raise BlockError("no laser pulse reaches the ground; raise density_per_m2, or scan longer strips over it")
     of_points = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    # Integers, as cloud files require.
+    # Use integers, as required by cloud files.
     names = tuple(f"{number + 1}" for number in range(len(paths)))
     shifts = [draw_shift(plan, path.strip, seed) for path in paths]
     truth = Scanner(errors.boresight, dict(zip(names, shifts, strict=True)))  # type: ignore[arg-type]
@@ -292,7 +291,9 @@ def scan(plan: ScanPlan, paths: list[Path], terrain: Terrain, noise_m: Float[np.
 
 
 def _pulses(plan: ScanPlan, paths: list[Path]) -> list[float]:
-    """Return the number of pulses of every path. Raises BlockError for too many, and for a strip not flown."""
+    """Return the number of pulses of every path. Raises BlockError for too many pulses, and if the clock error exceeds
+    a strip.
+    """
     pulses_of = [plan.density_per_m2 * 2 * plan.half_width * path.height_m * path.length_m for path in paths]
     if not sum(pulses_of) <= _PULSES:
         raise BlockError(
@@ -315,27 +316,27 @@ def _pulses(plan: ScanPlan, paths: list[Path]) -> list[float]:
 def _pattern(
     plan: ScanPlan, path: Path, pulses: Int[np.ndarray, "n"], of: int
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 2"]]:
-    """Return the time (s) of pulses, and the tangents of their angles to the right and ahead."""
-    # Both the true time and the recorded one lie on the path.
+    """Return the times (s) of pulses, and the tangents of their angles to the right and ahead."""
+    # True and recorded time must both lie on the path.
     begin, end = path.node[[0, -1]] + np.clip(plan.time_offset_s, (0.0, -np.inf), (np.inf, 0.0))
     time = begin + (pulses + 0.5) / of * (end - begin)
     if PATTERN_OF[plan.pattern] == "circle":
         return time, _around(plan, time)
-    # On level ground, lines are as far apart as their pulses.
+    # On level ground, line spacing equals the pulse spacing.
     per_line = max(1, round(2 * plan.half_width * path.height_m * np.sqrt(plan.density_per_m2)))
     across = _across(plan, (pulses + 0.5) / per_line)
     return time, np.column_stack([across, np.zeros(len(across))])
 
 
 def _across(plan: ScanPlan, line: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Return lines: each from left to right at even steps, or oscillating as a sine."""
+    """Return the across-track tangents of scan lines: left to right at even steps, or a sine oscillation."""
     if plan.pattern == "oscillating":
         return -np.tan(np.deg2rad(plan.scan_angle_deg) * np.cos(np.pi * line))
     return plan.half_width * (2 * (line % 1) - 1)
 
 
 def _around(plan: ScanPlan, time: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
-    """Return circles: a rotating vector; two prisms add, to first order, one each."""
+    """Return the tangents of circular patterns: one rotating vector per prism, added to first order."""
     turning = _PRISMS_HZ[:1] if plan.pattern == "nutating" else _PRISMS_HZ
     angles = 2 * np.pi * np.outer(time, turning)
     return plan.half_width / len(turning) * np.column_stack([np.sin(angles).sum(1), np.cos(angles).sum(1)])
@@ -352,7 +353,7 @@ def _measured(
     leaves: np.random.Generator,
     noise: np.random.Generator,
 ) -> dict[str, np.ndarray]:
-    """Return the fields of the cloud of some pulses, sorted by time and return."""
+    """Return the cloud fields of some pulses, sorted by time and return."""
     position, quaternion = path.pose(time)
     object_from_body = believed_turn = matrices(quaternion)
     recorded, believed_position = time - errors.calibration.time_offset, position
@@ -361,7 +362,7 @@ def _measured(
         believed_turn = matrices(quaternion)
     origin = position - object_from_body @ errors.calibration.lever_arm
     body_from_scanner = np.asarray(_small_rotation(errors.boresight))
-    # The scanner assumes its axes are those of the body.
+    # The recorded ray assumes that the scanner axes are the body axes.
     believed = np.column_stack([aside, -np.ones(len(aside))])
     believed /= np.linalg.norm(believed, axis=1, keepdims=True)
     ray = _rotated(object_from_body, believed @ body_from_scanner.T)
@@ -370,7 +371,7 @@ def _measured(
     pulse, at, by = (a[order] for a in returns)
     _, first, of_pulse, count = np.unique(pulse, return_index=True, return_inverse=True, return_counts=True)
     number = np.arange(len(pulse)) - first[of_pulse] + 1
-    # Solve `corrected_return` for the recorded point; noise is that of the corrected point.
+    # Solve `corrected_return` for the recorded point; the noise applies to the corrected point.
     hit = ray[pulse] * at[:, None] + origin[pulse] - position[pulse] + noise.standard_normal((len(pulse), 3)) * noise_m
     shot = recorded_shot(
         _rotated(object_from_body[pulse].transpose(0, 2, 1), hit), errors.boresight, errors.calibration
@@ -401,7 +402,7 @@ def _returned(
 
 
 def _ground(origin: np.ndarray, ray: np.ndarray, terrain: Terrain) -> Float[np.ndarray, "n"]:
-    """Return the distance of the ground along each ray by fixed-point iteration; else infinity."""
+    """Return the distance of the ground along each ray by fixed-point iteration; infinity without convergence."""
     at = np.full(len(ray), np.nan)
     z = terrain.height(origin[:, :2])
     left, down = np.arange(len(ray)), -ray[:, 2]
@@ -419,7 +420,7 @@ def _ground(origin: np.ndarray, ray: np.ndarray, terrain: Terrain) -> Float[np.n
 def _built(
     origin: np.ndarray, ray: np.ndarray, ground: np.ndarray, terrain: Terrain
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Return the distance at which each ray first enters a building by its roof, and by a wall."""
+    """Return the distances at which each ray first enters a building through a roof, and through a wall."""
     planes = solids(terrain.buildings)
     hits = np.flatnonzero(np.isfinite(ground))
     hit = origin[hits] + ground[hits, None] * ray[hits]
@@ -455,10 +456,10 @@ _quaternions = jax.jit(jax.vmap(quaternion_from_matrix))
 
 
 def exposure_times(paths: list[Path], flight: Flight) -> Float[np.ndarray, "images"]:
-    """Return the times of all images, on the clock of the paths (s)."""
+    """Return the times (s) of all images, on the clock of the paths."""
     time, of = np.zeros(len(flight.images)), np.array(flight.strips)
     for path in paths:
-        # A path extends beyond its first and last exposure.
+        # The first and last node of a path are not exposures.
         time[of == path.strip] = path.node[1:-1]
     return time
 
@@ -471,7 +472,7 @@ def recorded_on_path(
     flight: Flight,
     errors: StripErrors,
 ) -> tuple[Float[np.ndarray, "images 3"], Float[np.ndarray, "images 3"]]:
-    """Return positions (m) and angles (rad) of the exposures with the trajectory errors at their times."""
+    """Add the trajectory errors at the exposure times to positions (m) and angles (rad)."""
     offset, turn, of = np.zeros_like(position), np.zeros_like(position), np.array(flight.strips)
     for k, path in enumerate(paths):
         on_path = of == path.strip

@@ -1,7 +1,7 @@
-"""Buildings: upright prisms over rectangles with flat, gable or monopitch roofs.
+"""Simulated scenes: buildings (upright prisms over rectangles with flat, gable or monopitch roofs), trees, terrain.
 
-Each is convex, the intersection of six half-spaces, `normal . X <= offset`: its walls, and one or two sides of the
-roof. Roof heights and intersections with rays follow from these.
+Each building is convex, the intersection of six half-spaces `normal . X <= offset`: walls, and one or two roof planes.
+Roof heights and ray intersections are computed from these.
 """
 
 import dataclasses
@@ -18,20 +18,20 @@ from jaxphoto.simulation.plans import Field, Swaths
 from jaxphoto.simulation.sampling import stream
 
 Pairs = tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]
-"""Index of the object, and of the place or ray."""
+"""Index of the object, and of the position or ray."""
 
 
 def pairs_near(
     xy: Float[np.ndarray, "n 2"], centre: Float[np.ndarray, "m 2"], radius: Float[np.ndarray, "m"], more_m: float = 0.0
 ) -> Pairs:
-    """Return all pairs of a circle and a place within its `radius` plus `more_m` (m); sorted by circle.
+    """Return all pairs of a circle and a position within its `radius` plus `more_m` (m); sorted by circle.
 
-    Places are sorted into square cells as wide as the largest circle, so that a circle meets only the cells around that
-    of its centre: three contiguous ones in each column.
+    Positions are sorted into square cells as wide as the largest circle: a circle overlaps only the cells around its
+    centre, three contiguous ones in each column.
     """
     if not len(xy) or not len(centre):
         return np.zeros(0, int), np.zeros(0, int)
-    # Slightly larger: the caller decides about the edge.
+    # Slightly enlarged: the caller decides about the boundary.
     reach = radius + more_m + 1e-6
     low, side = xy.min(axis=0), reach.max()
     cell = np.floor((xy - low) / side).astype(int) + 1
@@ -39,7 +39,7 @@ def pairs_near(
     key = cell[:, 0] * rows + cell[:, 1]
     order = np.argsort(key, kind="stable")
     key = key[order]
-    # Circles beyond the places on either side touch empty cells.
+    # Clip: circles beyond all positions overlap only empty cells.
     column, row = np.clip(np.floor((centre - low) / side) + 1, 0, cell.max(axis=0) + 1).astype(int).T
     first, last = np.maximum(row - 1, 0), np.minimum(row + 1, rows - 1)
     begin = np.stack([np.searchsorted(key, (column + c) * rows + first, side="left") for c in (-1, 0, 1)], axis=1)
@@ -58,9 +58,7 @@ def pairs_along(
     radius: Float[np.ndarray, "m"],
     top: Float[np.ndarray, "m"],
 ) -> Pairs:
-    """Return a superset of pairs of an upright cylinder up to Z = `top` (m) and a ray that passes it on its way to
-    `end`.
-    """
+    """Return pairs of an upright cylinder up to Z = `top` (m) and a ray that may pass it on its way to `end`."""
     if not len(end):
         return np.zeros(0, int), np.zeros(0, int)
     slant = np.max(np.hypot(*direction[:, :2].T) / -direction[:, 2])
@@ -68,7 +66,7 @@ def pairs_along(
 
 
 Roof = Literal["flat", "gable", "monopitch"]
-"""Level; two sides that meet in a ridge over the centre line; one side that rises to the right."""
+"""Roof shapes: level; two sides with a ridge over the centre line; one side that rises to the right."""
 ROOFS: tuple[Roof, ...] = ("flat", "gable", "monopitch")
 # The first faces of a building are its walls.
 _WALLS = 4
@@ -78,7 +76,7 @@ _WALLS = 4
 class Building:
     """Rectangle of `length_m` along `heading_deg` (from north) by `width_m` across, about `centre_m` (X, Y).
 
-    Its eaves, those on the left of a monopitch roof, are at Z = `eaves_m`; from there the roof rises by `slope_deg`.
+    The eaves (of a monopitch roof: on its left) are at Z = `eaves_m`; from there the roof rises by `slope_deg`.
     """
 
     centre_m: tuple[float, float]
@@ -91,30 +89,30 @@ class Building:
 
     @property
     def axes(self) -> Float[np.ndarray, "2 2"]:
-        """Unit vectors (east, north): along the building, and to its right."""
+        """Return unit vectors (east, north): along the building, and to its right."""
         heading = np.deg2rad(self.heading_deg)
         return np.array([[np.sin(heading), np.cos(heading)], [np.cos(heading), -np.sin(heading)]])
 
     @property
     def half(self) -> Float[np.ndarray, "2"]:
-        """Half the length and half the width (m)."""
+        """Return half the length and half the width (m)."""
         return np.array([self.length_m, self.width_m]) / 2
 
     @property
     def radius_m(self) -> float:
-        """Distance from the centre to a corner."""
+        """Return the distance from the centre to a corner (m)."""
         return float(np.hypot(*self.half))
 
 
 class Solids(NamedTuple):
-    """Buildings as planes."""
+    """Buildings as bounding planes."""
 
     centre: Float[np.ndarray, "buildings 2"]
     radius: Float[np.ndarray, "buildings"]
     top: Float[np.ndarray, "buildings"]
     """Z of the ridge (m)."""
     normal: Float[np.ndarray, "buildings 6 3"]
-    """Outward normals: four walls, of unit length; two sides of the roof, of Z component 1 (a single side twice)."""
+    """Outward normals: four walls (unit length); two roof sides with Z component 1 (a single side is repeated)."""
     offset: Float[np.ndarray, "buildings 6"]
 
 
@@ -132,7 +130,7 @@ def solids(buildings: tuple[Building, ...]) -> Solids:
 
 
 def roof_height(buildings: tuple[Building, ...], xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-    """Return Z (m) of the roofs above places (east, north), minus infinity if there is none."""
+    """Return Z (m) of the roofs above positions (east, north); minus infinity without a roof."""
     z = np.full(len(xy), -np.inf)
     if buildings:
         all_of_them = solids(buildings)
@@ -164,7 +162,7 @@ def wall_distance(
 def entry_distances(
     planes: Solids, which: Int[np.ndarray, "n"], origin: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Return the distance at which each ray enters building `which` by a roof, and by a wall; infinity if it does not.
+    """Return the distances at which rays enter building `which` through a roof, and through a wall; infinity if never.
 
     Source: Cyrus and Beck (1978), clipping of a line by a convex polyhedron.
     """
@@ -189,7 +187,7 @@ def _planes(b: Building) -> tuple[np.ndarray, np.ndarray]:
     walls = np.stack([along, -along, right, -right])
     reach = walls @ centre + np.repeat(half, 2)
     slope = np.tan(np.deg2rad(b.slope_deg))
-    # Decrease of Z along X and Y; at the centre line the planes are at `middle`.
+    # Downward gradient in X and Y; `middle` is the height at the centre line.
     falls = {"flat": (0 * right, 0 * right), "gable": (slope * right, -slope * right)}.get(
         b.roof, (-slope * right,) * 2
     )
@@ -203,9 +201,9 @@ def _planes(b: Building) -> tuple[np.ndarray, np.ndarray]:
 # A pulse hits leaves after exponentially distributed distances within crowns; each hit gives a return, and half of the
 # pulses continue.
 
-# Bare fraction of the height of a tree.
+# Height of the crown's base as a fraction of the tree's height.
 _BARE = 0.3
-# Mean distance between leaves (m), and maximum number of returns of a pulse from crowns.
+# Mean path between leaves (m); maximum number of returns of a pulse from crowns.
 _WAY_M = 2.5
 _RETURNS = 3
 
@@ -228,7 +226,7 @@ class Crowns(NamedTuple):
 
 
 class Leaves(NamedTuple):
-    """Hits of leaves: index of the pulse, distance along its ray (m); and the pulses that ended there."""
+    """Hits of leaves: index of the pulse, distance along its ray (m); mask of the pulses that ended there."""
 
     pulse: Int[np.ndarray, "returns"]
     at: Float[np.ndarray, "returns"]
@@ -244,7 +242,7 @@ def crowns(trees: Sequence[Tree]) -> Crowns:
 
 
 def under_crown(trees: Sequence[Tree], xy: Float[np.ndarray, "n 2"], margin_m: float) -> Bool[np.ndarray, "n"]:
-    """Return True if a place (east, north) lies under a crown or within `margin_m` of one."""
+    """Return True if a position (east, north) lies under a crown or within `margin_m` of one."""
     under = np.zeros(len(xy), bool)
     if trees:
         centre, half = crowns(trees)
@@ -259,14 +257,14 @@ def intersect_crowns(
     end: Float[np.ndarray, "pulses"],
     rng: np.random.Generator,
 ) -> Leaves:
-    """Return the hits of pulses along unit vectors in crowns before their `end` (m along each).
+    """Return the hits of pulses in crowns along unit vectors, before their `end` (distance in m).
 
-    Crowns may overlap: their path lengths add up, as if leaves were twice as dense.
+    Where crowns overlap, path lengths add up, as if leaves were twice as dense.
     """
     pulse, into, way = _chords(trees, origin, direction, end)
     order = np.lexsort((into, pulse))
     pulse, into, way = pulse[order], into[order], way[order]
-    # Concatenate the paths in crowns of all pulses on one line: place of a pulse after a distance within leaves.
+    # Concatenate the paths of all pulses within crowns to one line, for lookup by accumulated path length.
     line = np.concatenate([[0.0], np.cumsum(way)])
     which, first, count = np.unique(pulse, return_index=True, return_counts=True)
     begin, length = line[first], line[first + count] - line[first]
@@ -289,13 +287,13 @@ def intersect_crowns(
 def _chords(
     trees: Sequence[Tree], origin: np.ndarray, direction: np.ndarray, end: np.ndarray
 ) -> tuple[Int[np.ndarray, "chords"], Float[np.ndarray, "chords"], Float[np.ndarray, "chords"]]:
-    """Return the pulse, the distance along it at which a crown begins (m), and its path within (m)."""
+    """Return the pulse, the distance (m) at which it enters a crown, and its path length (m) within."""
     if not trees:
         return np.zeros(0, int), np.zeros(0), np.zeros(0)
     centre, half = crowns(trees)
     ends = origin + end[:, None] * direction
     tree, pulse = pairs_along(ends, direction, centre[:, :2], half[:, 0], centre[:, 2] + half[:, 2])
-    # On the unit sphere: |q + t e|^2 = 1.
+    # Intersection with the unit sphere: |q + t e|^2 = 1.
     q, e = (origin[pulse] - centre[tree]) / half[tree], direction[pulse] / half[tree]
     ee, qe, qq = (np.einsum("ni,ni->n", a, b) for a, b in ((e, e), (q, e), (q, q)))
     root = np.sqrt(np.maximum(qe**2 - ee * (qq - 1), 0))
@@ -304,7 +302,7 @@ def _chords(
     return pulse[within], into[within], (out_of - into)[within]
 
 
-# Distance of points from walls and crowns (m).
+# Minimum distance (m) of points from walls and crowns.
 _CLEARANCE_M = 1.0
 
 
@@ -320,9 +318,9 @@ class Wave:
 
 @dataclasses.dataclass(frozen=True)
 class RandomWaves:
-    """Random waves with a common root mean square height: random headings and phases.
+    """Random waves with a given total root mean square height: random headings, phases and lengths.
 
-    Lengths are evenly spaced, on a logarithmic scale, around `length_m` by a factor of two.
+    Lengths are log-uniformly distributed between half and twice `length_m`.
     """
 
     count: int
@@ -330,7 +328,7 @@ class RandomWaves:
     length_m: float
 
     def draw(self, rng: np.random.Generator) -> tuple[Wave, ...]:
-        """Draw the waves."""
+        """Draw headings, phases and lengths of the waves."""
         heading, phase = rng.uniform(0, 360, (2, self.count))
         length = self.length_m * 2.0 ** rng.uniform(-1, 1, self.count)
         amplitude = self.rms_m * np.sqrt(2 / self.count)
@@ -342,8 +340,8 @@ class RandomWaves:
 class Terrain:
     """Z = height + slope . (X, Y) + waves, with an independent uniform roughness of +- `roughness_m` at every point.
 
-    `slope` is in metres per metre to the east and to the north. `seed` keeps random waves, buildings and trees when the
-    simulation's seed changes.
+    `slope` is in metres per metre to the east and to the north. If `seed` is given, random waves, buildings and trees
+    do not depend on the simulation's seed.
     """
 
     height_m: float = 0.0
@@ -363,7 +361,7 @@ class Terrain:
         return dataclasses.replace(self, waves=self.waves + self.random.draw(rng), random=None)
 
     def height(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Return Z (m) of the smooth ground at (east, north); random waves must have been `drawn`."""
+        """Return Z (m) of the smooth ground at (east, north); draw random waves first (`drawn`)."""
         z = self.height_m + xy @ np.array(self.slope)
         for wave in self.waves:
             heading = np.deg2rad(wave.heading_deg)
@@ -372,21 +370,21 @@ class Terrain:
         return z
 
     def surface(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Return Z (m) of the smooth ground, or of the roof above it, at (east, north)."""
+        """Return Z (m) of the smooth ground or the roof above it, at (east, north)."""
         return np.maximum(self.height(xy), roof_height(self.buildings, xy))
 
     def open(self, xy: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
-        """Return True if a place (east, north) is at least 1 m from walls and crowns, on the ground or on a roof."""
+        """Return True for positions (east, north) at least 1 m from walls and crowns, on ground or roof."""
         near_wall = np.isfinite(wall_distance(self.buildings, xy, _CLEARANCE_M))
         return ~near_wall & ~under_crown(self.trees, xy, _CLEARANCE_M)
 
     def place(self, xy: Float[np.ndarray, "n 2"], rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
-        """Return points on the rough ground, or on smooth roofs, at (east, north), in m."""
+        """Return points (m) on the rough ground, or on smooth roofs, at (east, north)."""
         rough = rng.uniform(-1, 1, len(xy)) * self.roughness_m
         return np.column_stack([xy, np.maximum(self.height(xy) + rough, roof_height(self.buildings, xy))])
 
     def on_roofs(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n 2"]:
-        """Draw places (east, north) uniformly over the roofs, 1 m or more from their edges; requires a building."""
+        """Draw positions (east, north) uniformly over the roofs, at least 1 m from their edges; requires a building."""
         half = np.maximum(np.stack([b.half for b in self.buildings]) - 1.01 * _CLEARANCE_M, 0)
         area = half.prod(axis=1)
         which = rng.choice(len(half), n, p=area / area.sum() if area.any() else None)
@@ -402,18 +400,18 @@ ROLLING = Terrain(
 
 
 Range = tuple[float, float]
-"""Smallest and largest of uniformly drawn sizes."""
+"""Minimum and maximum of uniformly drawn sizes."""
 # Minimum distance between two buildings, or a building and a crown (m).
 _GAP_M = 2.0
-# Places drawn at a time, and number of attempts, before a building or tree is given up.
+# Number of positions per attempt, and maximum number of attempts for a building or tree.
 _PLACES, _TRIES = 64, 20
 
 
 @dataclasses.dataclass(frozen=True)
 class Buildings:
-    """Group of buildings with one kind of roof: `count` at random places, and those at `at_m` (X, Y).
+    """Group of buildings with one roof shape: `count` at random positions, and those at `at_m` (X, Y).
 
-    Each is level: `height_m` is that of the eaves above the ground at its centre.
+    The eaves are level: `height_m` is their height above the ground at the building's centre.
     """
 
     roof: Roof = "flat"
@@ -428,7 +426,7 @@ class Buildings:
 
 @dataclasses.dataclass(frozen=True)
 class Trees:
-    """Group of trees: `count` at random places, and those at `at_m` (X, Y)."""
+    """Group of trees: `count` at random positions, and those at `at_m` (X, Y)."""
 
     count: int = 0
     at_m: tuple[tuple[float, float], ...] = ()
@@ -438,16 +436,16 @@ class Trees:
 
 @dataclasses.dataclass(frozen=True)
 class Settlement:
-    """All groups of buildings and of trees."""
+    """Groups of buildings and of trees."""
 
     buildings: tuple[Buildings, ...] = ()
     trees: tuple[Trees, ...] = ()
 
     def settled(self, terrain: Terrain, ground: Swaths | Field, seed: int) -> Terrain:
-        """Return `terrain`, whose waves are `drawn`, with buildings and trees.
+        """Add buildings and trees to `terrain`, whose waves are `drawn`.
 
-        Random buildings keep clear of all others and random crowns of buildings; crowns may overlap. Raises BlockError
-        if there is no room.
+        Random buildings keep a distance from all buildings, and random crowns from buildings; crowns may overlap.
+        Raises BlockError if there is not enough room.
         """
         seed = seed if terrain.seed is None else terrain.seed
         for number, group in enumerate(self.buildings):
@@ -504,7 +502,7 @@ def _planted(row: Trees, terrain: Terrain, ground: Swaths | Field, rng: np.rando
 def _places(
     free: Callable[[np.ndarray], np.ndarray], ground: Swaths | Field, rng: np.random.Generator, n: int, what: str
 ) -> Float[np.ndarray, "n 2"]:
-    """Return the first `n` free places."""
+    """Return the first `n` free positions."""
     result = np.zeros((0, 2))
     for _ in range(_TRIES):
         if len(result) >= n:

@@ -1,4 +1,4 @@
-"""Simulate a block with known truth from a recipe and a seed."""
+"""Simulation of a block with known truth, from a recipe and a seed."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -49,29 +49,30 @@ from jaxphoto.simulation.scan import Path, Scan, exposure_times, paths, recorded
 from jaxphoto.simulation.scene import Terrain
 from jaxphoto.unknowns import FIXED, FREE, Unknowns
 
-# Control axes of each role, and number of places for the mean height of the ground.
+# Control axes of each role; number of sample positions for the mean ground height.
 _AXES = {"control": (0, 1, 2), "vertical": (2,), "check": (0, 1, 2)}
 _PLACES = 4096
 
 
 class Simulation(eqx.Module):
-    """Simulated block and its truth; with a lidar also cloud and trajectory. As a tuple: the first three.
+    """Simulated block and its true parameters; with a lidar also cloud and trajectory. Unpacks to (block, truth,
+    datum_offset_m).
 
-    `truth` has all mounts and strips of the recipe, modelled or not, and the scanner; the shifts of its strips contain
-    `datum_offset_m`. `remeasure(block, truth, key)` draws new observations with noise of the stated sigmas.
+    `truth` contains all mounts and strips of the recipe, modelled or not, and the scanner; the shifts of its strips
+    include `datum_offset_m`. Use `remeasure(block, truth, key)` for new observations with noise of the stated sigmas.
     """
 
     block: Block
     truth: Unknowns
     datum_offset_m: Float[np.ndarray, "3"]
     terrain: Terrain = eqx.field(static=True)
-    """With its random parts drawn."""
+    """Terrain, with its random parts drawn."""
     cloud: Cloud | None = None
-    """As measured; without drifts and calibration errors, `corrected_point` with `truth.scanner` corrects it."""
+    """Measured cloud. Without drifts and calibration errors, `corrected_point` with `truth.scanner` corrects it."""
     trajectory: Trajectory | None = None
     """Recorded trajectory of the scanner, on the clock of the cloud."""
     errors: StripErrors | None = None
-    """True errors of the cloud: `corrected_return` with these gives the hits, except for noise."""
+    """True errors of the cloud: `corrected_return` with these gives the hits plus noise."""
 
     def __iter__(self) -> Iterator[Any]:
         return iter((self.block, self.truth, self.datum_offset_m))
@@ -83,13 +84,13 @@ class Simulation(eqx.Module):
 
 
 def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
-    """Simulate the block of `recipe` for `seed`, reproducible bit by bit.
+    """Simulate the block of `recipe` for `seed`; results are bit-reproducible.
 
-    Ground, flight, points and each kind of noise have independent random streams: changing a sigma changes neither
-    geometry nor other noise, and scales its own. Raises BlockError if points or images have too few rays.
+    Ground, flight, points and each kind of noise have independent random streams: changing a sigma only scales its own
+    noise. Raises BlockError if points or images have too few rays.
     """
     terrain = recipe.settlement.settled(recipe.terrain.drawn(stream(seed, "terrain")), recipe.ground, seed)
-    # The same places for every seed: over unchanged ground, the flight keeps its height.
+    # Use the same positions for every seed: the flying height depends on the ground only.
     height = float(np.mean(terrain.height(recipe.ground.draw(stream(0, "ground"), _PLACES))))
     if isinstance(recipe.plan, ConvergentPlan):
         flight = take_images(recipe.plan, recipe.jitter, height, seed)
@@ -149,7 +150,7 @@ def _scanned(recipe: Recipe, flown: list[Path], terrain: Terrain, seed: int) -> 
 
 
 def _clock(recipe: Recipe, event: Int[np.ndarray, "images"]) -> Float[np.ndarray, "images"] | None:
-    """Return the time of every exposure from the middle of the flight (s); None if that of its strip suffices."""
+    """Return the time of every exposure from the middle of the flight (s); None if times per strip are sufficient."""
     changing = recipe.changes or recipe.temperature
     return recipe.plan.clock[event] if changing and isinstance(recipe.plan, FlightPlan) else None
 
@@ -160,7 +161,7 @@ def _temperatures(recipe: Recipe, times: Float[np.ndarray, "images"]) -> Tempera
 
 
 def _seen(recipe: Recipe, flight: Flight, scene: TruePoints, seed: int) -> TruePoints:
-    """Return the scene after thinning. Raises BlockError for an image that cannot be oriented."""
+    """Return the scene with thinned rays. Raises BlockError for an image with fewer than 3 points."""
     points, rays = recipe.points, scene.rays
     if points.mean_rays is not None:
         rays = thin_rays(rays, len(scene.ids), points.min_images, points.mean_rays, stream(seed, "thinning"))
@@ -183,7 +184,7 @@ def _image_points(recipe: Recipe, scene: TruePoints, seed: int) -> ImagePoints:
 
 
 def _control(recipe: Recipe, scene: TruePoints, seed: int) -> tuple[ControlCoordinates, ControlCoordinates]:
-    """Surveyed coordinates of control and check points; every point draws, so that roles do not change the noise."""
+    """Return surveyed coordinates of control and check points; noise is drawn for every point, independent of roles."""
     surveyed = scene.xyz + _sigma(recipe.noise.control_m) * _draw(seed, "noise of control", scene.xyz.shape)
     sigma = _sigma(recipe.stated.control_m)
 
@@ -202,7 +203,7 @@ def _georeferencing(
     of: Int[np.ndarray, "n"],
     seed: int,
 ) -> tuple[CameraPositions, Attitudes]:
-    """Return GNSS and IMU observations `of` some images, at `position` (m) and roll, pitch, yaw (rad)."""
+    """Return GNSS and IMU observations `of` the given images, from `position` (m) and roll, pitch, yaw (rad)."""
     n = len(of)
     stations, attitudes = CameraPositions.none(), Attitudes.none()
     if recipe.stated.station_m is not None:
@@ -217,7 +218,7 @@ def _georeferencing(
 
 
 def _true_biases(recipe: Recipe, flight: Flight, seed: int) -> dict[str, StripBias]:
-    """Shift and drift of every strip with any, including the datum offset."""
+    """Return shift and drift of every strip that has any, including the datum offset."""
     offset, biases = triple(recipe.datum_offset_m), {}
     for strip in dict.fromkeys(flight.strips):
         bias = _bias_of(recipe, strip)
@@ -235,7 +236,7 @@ def _true_biases(recipe: Recipe, flight: Flight, seed: int) -> dict[str, StripBi
 def _start(
     recipe: Recipe, flight: Flight, scene: TruePoints, control: ControlCoordinates, seed: int
 ) -> tuple[Start, Unknowns]:
-    """Start values and priors; control replaces approximate coordinates."""
+    """Return start values and priors; control coordinates replace approximate ones."""
     n, near = len(flight.images), recipe.start
     deviation = _draw(seed, "approximate orientation", (2, n, 3))
     position = np.asarray(flight.exterior.position) + near.position_m * deviation[0]
@@ -271,7 +272,7 @@ def _bias_of(recipe: Recipe, strip: str) -> SimulatedBias | None:
 
 
 def _has_time_offset(mount: Assumed[Mount]) -> bool:
-    """Return True if the block needs the motion of the sensor, because a time offset is nonzero or estimated."""
+    """Return True if a time offset is nonzero or estimated: the block then needs the motion of the sensor."""
     offsets = (mount.truth.time_offset, mount.start.time_offset)
     return any(float(offset) != 0 for offset in offsets) or mount.prior.time_offset != FIXED
 
