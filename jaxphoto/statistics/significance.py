@@ -51,7 +51,7 @@ SIGNIFICANCE_LEVEL = 0.05
 
 @pretty_repr
 class Significance(eqx.Module):
-    """One estimated interior parameter: value, a posteriori sigma, ratio |value| / sigma, two-sided p-value (H0: value = 0).
+    """One estimated interior parameter: value, sigma (a posteriori), |value| / sigma, two-sided p-value (H0: 0).
 
     Value and sigma are in `unit`: mm, 1/mm^2, "1" if dimensionless (`jaxphoto.camera.parameter_unit`).
     """
