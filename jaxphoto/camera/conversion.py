@@ -106,7 +106,7 @@ def fitted(
 
 
 def _sampled(interior: InteriorOrientation, sensor: Sensor) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the image points (mm) at which the camera is defined, their directions, and their fraction of all points."""
+    """Return the image points (mm) where the camera is defined, their directions, and their fraction of all points."""
     x, y = (np.linspace(-0.5, 0.5, _SIDE) * side for side in (sensor.width_mm, sensor.height_mm))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     rays, good = (np.asarray(v) for v in call_compiled(_rays, _arrays(interior), points))
@@ -166,7 +166,7 @@ def _fitted_values(start, free, first: InteriorOrientation, pixel_mm, points, ra
 
 
 def _displacements(values, first: InteriorOrientation, pixel_mm, points, rays):
-    """Return the displacements (px) of the image points of the given rays, to first order for measured-domain models."""
+    """Return the displacements (px) of the image points of given rays; first order for measured-domain models."""
     interior = _with(first, values)
 
     def of_one(xy, ray):

@@ -48,13 +48,11 @@ class InteriorOrientation(eqx.Module):
             )
 
     def ideal_from_measured(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Convert a measured image coordinate (mm, from the centre) to the ideal coordinate (mm, from the principal
-        point).
-        """
+        """Convert a measured (mm, from the centre) to an ideal image coordinate (mm, from the principal point)."""
         return self._in_mm(self.distortion.ideal_from_measured, single("xy", xy, 2) - self.principal_point)
 
     def measured_from_ideal(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Convert an ideal coordinate (mm, from the principal point) to the measured coordinate (mm, from the centre)."""
+        """Convert an ideal (mm, from the principal point) to a measured image coordinate (mm, from the centre)."""
         return self._in_mm(self.distortion.measured_from_ideal, single("xy", xy, 2)) + self.principal_point
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:

@@ -94,8 +94,7 @@ def _at(
 
 
 def _border(sensor: Sensor, interior: InteriorOrientation, less_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return x and y (mm, from the principal point) of points along the bottom, right, top and left border: (4,
-    points).
+    """Return x and y (mm, from the principal point) along the bottom, right, top and left border: (4, points).
 
     The points are on the perspective plane. The format is reduced by `less_px` in both directions.
     """

@@ -1,4 +1,4 @@
-"""Fisheye lenses of OpenCV and COLMAP: normalised, from ideal to measured coordinates, for the equidistant projection."""
+"""Fisheye lenses of OpenCV and COLMAP: normalised, from ideal to measured, for the equidistant projection."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Literal
