@@ -43,7 +43,7 @@ class AbstractCameraRates(AbstractParameters):
     @staticmethod
     @abc.abstractmethod
     def argument(exposure: Any) -> Any:
-        """Return the independent variable of one or more exposures; zero is the reference of the interior orientation."""
+        """Return the independent variable of one or more exposures, relative to the reference of the camera."""
 
     def interior(self, interior: Any, exposure: Any) -> Any:
         """Return the interior orientation at the exposure."""

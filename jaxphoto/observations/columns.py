@@ -60,8 +60,8 @@ def row_fields(cls: type) -> list[RowField]:
         axes, whole = annotated(hints[field.name]) or ([], False)
         if not all(axis.isdigit() for axis in axes[1:]):
             raise TypeError(
-                f"{cls.__name__}.{field.name}: {' '.join(axes)!r} does not say how many numbers a row has; write them "
-                'as in "n 3"'
+                f"{cls.__name__}.{field.name}: shape {' '.join(axes)!r} has no fixed number of components per row; "
+                'write it as in "n 3"'
             )
         found.append(RowField(field.name, touches, whole or bool(touches), tuple(map(int, axes[1:]))))
     return found

@@ -139,7 +139,7 @@ def correlated(
 def exponential_covariance(
     time: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"] | float, correlation_time: float
 ) -> Float[np.ndarray, "n n"]:
-    """Return sigma_i sigma_j exp(-|t_i - t_j| / T), the covariance of a first-order Gauss-Markov process at `time` (s)."""
+    """Return the covariance sigma_i sigma_j exp(-|t_i - t_j| / T) of a first-order Gauss-Markov process; t, T in s."""
     time, sigma = np.asarray(time, float), np.broadcast_to(np.asarray(sigma, float), np.shape(time))
     return sigma[:, None] * sigma * np.exp(-np.abs(time[:, None] - time) / correlation_time)
 

@@ -20,7 +20,7 @@ def station_of(image: ImageState) -> Float[Array, "3"]:
 
 
 class CameraPositions(AbstractCoordinates):
-    """Observed coordinates of the GNSS/IMU at the exposure of image `who`: `axis` (0, 1, 2), `value` and `sigma` (m)."""
+    """Observed GNSS/IMU coordinates at the exposure of image `who`: `axis` (0, 1, 2), `value` and `sigma` (m)."""
 
     group = "stations"
     unit = "m"

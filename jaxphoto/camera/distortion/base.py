@@ -26,7 +26,7 @@ _PROBES = 64
 
 
 class Term(NamedTuple):
-    """Coefficient of a model as one of the common terms (`AbstractDistortion.terms`): `sign * coefficient * c^power`."""
+    """Coefficient of a model as a common term, `sign * coefficient * c^power` (see `AbstractDistortion.terms`)."""
 
     field: str
     sign: float = 1.0
