@@ -87,8 +87,8 @@ def offset_uncertainty(
     if (second is not None and len(second) != p2) or p1 < 0:
         sizes = " and ".join(str(len(q)) for q in (first, second) if q is not None)
         raise ValueError(
-            f"covariances have {sizes} parameters, but the two sets have {jacobian.shape[1]} in total; give covariances of "
-            "matching size"
+            f"covariances have {sizes} parameters, but the two sets have {jacobian.shape[1]} in total; give covariances "
+            "of matching size"
         )
     covariance = np.zeros((p1 + p2, p1 + p2))
     covariance[:p1, :p1] = 0.0 if first is None else first
@@ -226,7 +226,7 @@ class Change(NamedTuple):
 
     @property
     def p_field(self) -> float:
-        """Return the probability of a larger bundle difference without a change of the camera; NaN without covariances."""
+        """Return the p-value of the bundle difference without a change of the camera; NaN without covariances."""
         uncertainty = self.field.uncertainty
         return float("nan") if uncertainty is None else float(uncertainty.p_value)
 
@@ -324,7 +324,7 @@ class Combination(NamedTuple):
     """p-value of the difference of each calibration from the combination of all others."""
 
     def disagreeing(self, level: float) -> list[int]:
-        """Return the indices of calibrations that differ from the others, with the overall significance level `level`."""
+        """Return indices of calibrations that differ from the others, at the overall significance level `level`."""
         n = len(self.against_others)
         return [k for k, p in enumerate(self.against_others) if p < level / n]
 
@@ -354,8 +354,8 @@ def combine(
             values = [float(get_parameter(i, parameter)) for i in (interiors[0], interior)]
             if not free_first and values[0] != values[1]:
                 raise InputError(
-                    f"{parameter} is fixed at {values[0]:g} in {names[0]} and at {values[1]:g} in {name}; readjust one of "
-                    "them to match"
+                    f"{parameter} is fixed at {values[0]:g} in {names[0]} and at {values[1]:g} in {name}; readjust "
+                    "one of them to match"
                 )
         if np.array_equal(covariance, covariances[0]) and all(
             float(get_parameter(interior, p)) == float(get_parameter(interiors[0], p)) for p in parameters
