@@ -22,9 +22,7 @@ from jaxphoto.camera.smac_balance_radius import rebalance
 
 
 def exact(interior: InteriorOrientation, target: type[AbstractDistortion]) -> InteriorOrientation | None:
-    """Convert to the model `target` with the same rays (SMAC: subtracted; R0 = 0); None if no exact conversion is
-    known.
-    """
+    """Convert to the model `target` with the same rays (SMAC: subtracted; R0 = 0); None if not exactly possible."""
     d = interior.distortion
     if type(d) is target:
         return interior

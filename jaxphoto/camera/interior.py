@@ -56,9 +56,7 @@ class InteriorOrientation(eqx.Module):
         return self._in_mm(self.distortion.measured_from_ideal, single("xy", xy, 2)) + self.principal_point
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Apply the distortion in its closed-form direction (see `domain`) to a coordinate in mm from the principal
-        point.
-        """
+        """Apply the distortion in its closed-form direction (`domain`) to a coordinate (mm, reduced to x_p, y_p)."""
         return self._in_mm(self.distortion.closed_form, xy)
 
     def valid(self, xy: Float[Array, "2"]) -> Bool[Array, ""]:
@@ -68,9 +66,7 @@ class InteriorOrientation(eqx.Module):
         return invert(self.distortion, xy / self.c if self.distortion.normalised else xy)[1]
 
     def invertible(self, xy: Float[Array, "2"]) -> Bool[Array, ""]:
-        """Return `valid`, evaluated also for distortions of the ideal coordinate, which are not invertible far off the
-        axis.
-        """
+        """Return `valid`, also for distortions of the ideal coordinate: they are not invertible far off the axis."""
         if self.distortion.domain == "measured":
             return self.valid(xy)
         there = xy / self.c if self.distortion.normalised else xy
@@ -139,9 +135,7 @@ def power_of_mm(power: int) -> str:
 
 
 def model_keys(interior: InteriorOrientation) -> dict[str, str]:
-    """Return the keys that identify the models of a camera in files: distortion, projection (if not perspective),
-    choices.
-    """
+    """Return the keys of the models of a camera in files: distortion, projection (if not perspective), choices."""
     keys = {"distortion": interior.distortion.name}
     if type(interior.projection) is not Perspective:
         keys["projection"] = interior.projection.name

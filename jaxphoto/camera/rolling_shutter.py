@@ -41,9 +41,7 @@ class RowMotion(eqx.Module):
     rate_z: Scalar = 0.0
 
     def at_row(self, y: Array, in_camera: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        """Transform a point from the camera frame of the middle row to the camera frame of the row with the measured
-        `y` (mm).
-        """
+        """Transform a point from the camera frame of the middle row to the frame of the row at measured `y` (mm)."""
         t = -self.time_per_mm * y
         velocity = jnp.stack([jnp.asarray(v) for v in (self.velocity_x, self.velocity_y, self.velocity_z)])
         rate = jnp.stack([jnp.asarray(w) for w in (self.rate_x, self.rate_y, self.rate_z)])
@@ -52,9 +50,7 @@ class RowMotion(eqx.Module):
 
 
 class RollingShutter(AbstractParameters):
-    """Readout time (ms) of one camera, from the first row of a photograph to the last; negative if the last is exposed
-    first.
-    """
+    """Readout time (ms) of one camera from first to last row of a photograph; negative if in reverse order."""
 
     kind = "shutters"
     owner = "camera"

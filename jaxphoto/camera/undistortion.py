@@ -127,7 +127,7 @@ def _plane(interior: InteriorOrientation, measured: Float[Array, "n 2"]):
 
 @eqx.filter_jit
 def _measured(interior: InteriorOrientation, new: InteriorOrientation, xy: Float[Array, "n 2"]):
-    """Convert coordinates (mm) in the new camera to measured ones (mm) in the given camera; NaN if none."""
+    """Convert coordinates (mm) in the new camera to measured coordinates (mm) in the given camera; NaN if none."""
 
     def of_one(one):
         x, y = one - new.principal_point

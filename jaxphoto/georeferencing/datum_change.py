@@ -15,7 +15,7 @@ from jaxphoto.georeferencing.map_frame import map_system
 _WGS84_3D = 4979
 # Half side length (degrees) of the area in which a transformation must be valid.
 _ABOUT = 0.1
-# Maximum accuracy value (m) of an identity transformation that is not reported.
+# Accuracy (m) above which a transformation is reported even if it has no effect.
 _SURE_M = 1.0
 
 

@@ -22,8 +22,7 @@ class StripBias(AbstractParameters):
 
 
 class FlightBias(AbstractParameters):
-    """Shift (m) and drift (m/s) of the GNSS positions of the whole block, such as an error of datum or reference
-    station.
+    """Shift (m) and drift (m/s) of the GNSS positions of the whole block: error of datum or reference station.
 
     Strips may have additional biases. Strip or flight biases then need prior information: weighted strip biases scatter
     about the flight bias, which control determines. Time counts from the middle of the flight (`Exposure.in_flight`).

@@ -43,9 +43,7 @@ class Gps(NamedTuple):
 
     @property
     def stated_sigma_m(self) -> tuple[float, float, float] | None:
-        """Return standard deviations (m) east, north and up from the file, else from the solution type; None without
-        either.
-        """
+        """Return standard deviations (m) east, north, up: from the file, else from the solution type, else None."""
         return self.sigma_m or FIX_SIGMA_M.get(self.fix)
 
 

@@ -54,8 +54,7 @@ def ground_point(
     ground: Ground,
     corrections: Corrections = NO_CORRECTIONS,
 ) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
-    """Intersect the ray of the measured image coordinate `xy` (mm) with the ground (m); the flag is False without
-    intersection.
+    """Intersect the ray of the measured image coordinate `xy` (mm) with the ground (m); False without intersection.
 
         X = X_s + s M' (x', y', -c)',    s = (Z - Z_s) / third component
 

@@ -1,7 +1,7 @@
 """Conversion of map or geographic coordinates to and from a local east-north-up frame, by PROJ.
 
 The local frame is Cartesian: Z is the normal of the ellipsoid at its origin, Y points to true north. The datum is not
-changed: longitudes, latitudes and ellipsoidal heights are those of the system's own datum.
+changed: longitudes, latitudes and ellipsoidal heights refer to the datum of the map system.
 """
 
 import functools
@@ -15,8 +15,8 @@ from pyproj.transformer import TransformerGroup
 
 from jaxphoto.errors import InputError
 
-# Half of the step along a grid line for its direction (m, degrees): the rounding error is 1e-11 rad, and the effect of
-# the line's curvature is smaller.
+# Half of the step along a grid line that determines its direction (m, degrees): rounding error 1e-11 rad, curvature
+# less.
 _STEP_M, _STEP_DEG = 50.0, 5e-4
 # Declaration of ellipsoidal heights in a block and in a flight, for messages.
 _ON_ELLIPSOID = 'vertical = "ellipsoidal" in block.toml, --heights ellipsoid of a flight'
@@ -77,9 +77,7 @@ class MapFrame:
         return np.arctan2(east, north)
 
     def geocentric_from_local(self) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-        """Return rotation and translation (m): X, Y, Z from the centre of the ellipsoid = rotation @ local +
-        translation.
-        """
+        """Return rotation and translation (m) to geocentric axes: geocentric = rotation @ local + translation."""
         origin = np.array([self.origin], float)
         return _geocentric_from_level(origin)[0], _transformed(_geocentric(map_system(self.code)), origin, "FORWARD")[0]
 
@@ -93,9 +91,7 @@ class MapFrame:
 
 
 def place_from_geocentric(code: int, xyz: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Convert geocentric X, Y, Z to longitude, latitude (degrees) and height (m) on the ellipsoid of the EPSG system
-    `code`.
-    """
+    """Convert geocentric X, Y, Z to longitude, latitude (degrees) and height (m) on the ellipsoid of EPSG `code`."""
     return _transformed(_geocentric(map_system(code)), xyz, "INVERSE")
 
 
@@ -195,7 +191,7 @@ def _transformed(transformer: Transformer, values: np.ndarray, direction: str) -
 
 
 def _geocentric_from_level(places: np.ndarray) -> np.ndarray:
-    """Return columns east, north and up at longitude and latitude, in geocentric axes."""
+    """Return the directions east, north and up at longitude and latitude as columns, in geocentric axes."""
     (sl, sp), (cl, cp) = np.sin(np.deg2rad(places[:, :2])).T, np.cos(np.deg2rad(places[:, :2])).T
     rows = [-sl, -sp * cl, cp * cl, cl, -sp * sl, cp * sl, 0 * sl, cp, sp]
     return np.stack(rows, axis=1).reshape(-1, 3, 3)

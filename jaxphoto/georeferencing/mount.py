@@ -63,8 +63,7 @@ class Mount(AbstractParameters):
 
 @pretty_repr
 class Exposure(eqx.Module):
-    """Properties of an exposure that are not observed. Arrays of exposures have a leading (in an adjustment: last)
-    axis.
+    """Unobserved properties of an exposure; arrays of exposures have a leading (in an adjustment: last) axis.
 
     `time` from the strip's reference time (s), `velocity` of the GNSS/IMU in the object frame (m/s), rotation `rate`
     about the body's right, forward and up axes (rad/s). Velocity and rate are needed for a time offset, and for a delay

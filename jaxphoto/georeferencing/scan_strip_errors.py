@@ -14,7 +14,7 @@ class StripErrors(eqx.Module):
     """Errors of a point cloud: scanner errors, and trajectory errors per strip."""
 
     splines: tuple[StripSpline, ...] = eqx.field(static=True)
-    """One for each strip of the cloud, in order."""
+    """Splines of the strips of the cloud, in order."""
     position: Float[np.ndarray, "knots 3"]
     """Position errors of all knots (m); `attitude` likewise (rad)."""
     attitude: Float[np.ndarray, "knots 3"]

@@ -31,9 +31,9 @@ class Trajectory(eqx.Module):
     """Records of a GNSS/IMU in the object frame; at least `SHORTEST`, in order of time."""
 
     time: Float[Array, "records"]
-    """Seconds."""
+    """Time (s)."""
     position: Float[Array, "records 3"]
-    """Metres."""
+    """Position (m)."""
     quaternion: Float[Array, "records 4"]
     """Quaternion (w, x, y, z) of `object_from_body`; body axes right, forward, up."""
     sigma_position: Float[Array, "records 3"]

@@ -74,9 +74,7 @@ class ImageState(eqx.Module):
 @pretty_repr
 @dataclass_transform(field_specifiers=(index_of, eqx.field))
 class AbstractObservations(eqx.Module):
-    """Base class of observations. Rows are along the first axis of every field; `sigma`, in the unit of the residual,
-    is required.
-    """
+    """Base class of observations: rows along the first axis of every field; requires `sigma` (unit of the residual)."""
 
     group: eqx.AbstractClassVar[str]
     """Name of the group in tables, files and results."""
@@ -172,9 +170,7 @@ class AbstractObservations(eqx.Module):
         return map_arrays(lambda v: to_numpy(v)[chosen], self)
 
     def renumbered(self, **new: np.ndarray) -> Self:
-        """Select rows whose images and points remain, and renumber them; `new` contains, by kind, the new indices or
-        -1.
-        """
+        """Select and renumber the rows whose images and points remain; `new`: new indices by kind, -1 if removed."""
         touched = {f.name: f.metadata["touches"] for f in dataclasses.fields(self) if "touches" in f.metadata}
         fields = {name: new[what] for name, what in touched.items() if what in new}
         kept = np.ones(len(self), bool)

@@ -107,7 +107,7 @@ class Correlated(AbstractObservations):
 def correlated(
     rows: AbstractObservations, sets: Sequence[Sequence[int]] | np.ndarray, covariance: Float[np.ndarray, "sets n n"]
 ) -> Correlated:
-    """Combine `rows` in sets of equal length (lists of row indices), each with its covariance matrix (m2, rad2 ...).
+    """Combine `rows` into sets of equal size (lists of row indices), each with a covariance matrix (m2, rad2 ...).
 
     The order within a covariance matrix is row by row, then component by component. Standard deviations of `rows` are
     ignored. Raises ValueError for invalid matrices.

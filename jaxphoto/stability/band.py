@@ -63,9 +63,7 @@ class ErrorBand(NamedTuple):
     """Standard deviation of `factor` over repeated measurements of the block."""
     cell_factor: Float[np.ndarray, "cells"]
     halves: Float[np.ndarray, "cells"]
-    """Radius that contains 95 % of the differences between halves of this block, for their mean covariance and any
-    distribution.
-    """
+    """Radius that contains 95 % of the differences between halves of this block, for any distribution."""
     calibration: Float[np.ndarray, "cells"]
     """Radius that contains 95 % of the errors of the calibration by the whole block, estimated from the halves."""
     of_cuts: Float[np.ndarray, "cuts"]
@@ -75,9 +73,7 @@ class ErrorBand(NamedTuple):
 
 
 def error_band(differences: Differences, covariance: Float[np.ndarray, "cells 2 2"]) -> ErrorBand:
-    """Compute factors and bands from `differences`; `covariance`: predicted for the calibration by the whole block
-    (px^2).
-    """
+    """Compute factors and bands from `differences`; `covariance` (px^2): of the calibration by the whole block."""
     squares, n = (differences.offsets**2).sum(axis=2), len(differences.offsets)
     ratio = squares / np.trace(differences.covariances, axis1=2, axis2=3)
     rho = float(differences.overlap.mean())

@@ -188,9 +188,7 @@ class BundleOffsets(eqx.Module):
 
     @property
     def rmse_measured_mm(self) -> Float[Array, ""]:
-        """Return RMSE_offset of `measured`, comparable with the noise of measured coordinates also for large
-        distortion.
-        """
+        """Return RMSE_offset of `measured`, comparable with the noise of measured coordinates at any distortion."""
         return ((self.measured**2).sum() / self.redundancy) ** 0.5
 
 
@@ -230,9 +228,7 @@ def bundle_offsets(
 
 
 def check_rays(interior: InteriorOrientation, points: Float[ArrayLike, "points 2"], name: str) -> None:
-    """Raise InputError if, at some of `points`, the distortion of `interior` is not invertible or the ray points
-    backward.
-    """
+    """Raise InputError if, at some of `points`, the distortion is not invertible or the ray points backward."""
     regular = regular_rays(interior, points)
     if not regular.all():
         radius = np.hypot(*np.asarray(points)[~regular].T).min()

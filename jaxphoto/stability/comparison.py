@@ -53,9 +53,9 @@ class OffsetUncertainty(NamedTuple):
     sigma_mm: float
     """Standard deviation of RMSE_offset over repeated calibrations of these two cameras."""
     low_mm: float
-    """2.5 % quantile over repeated calibrations."""
+    """2.5 % quantile of RMSE_offset over repeated calibrations."""
     high_mm: float
-    """97.5 % quantile over repeated calibrations."""
+    """97.5 % quantile of RMSE_offset over repeated calibrations."""
     expected_of_one_mm: float
     """Expected RMSE_offset of two such calibrations of one camera."""
     limit_of_one_mm: float
@@ -87,8 +87,8 @@ def offset_uncertainty(
     if (second is not None and len(second) != p2) or p1 < 0:
         sizes = " and ".join(str(len(q)) for q in (first, second) if q is not None)
         raise ValueError(
-            f"covariances have {sizes} parameters, but the two sets have {jacobian.shape[1]} in total; give covariances "
-            "of matching size"
+            f"covariances have {sizes} parameters, but the two sets have {jacobian.shape[1]} in total; give "
+            "covariances of matching size"
         )
     covariance = np.zeros((p1 + p2, p1 + p2))
     covariance[:p1, :p1] = 0.0 if first is None else first
@@ -196,7 +196,7 @@ class ParameterChange(NamedTuple):
     p_value: float
     """Probability of a larger difference without a change of the parameter; NaN if both are fixed."""
     unit: str
-    """mm, 1/mm^2, or "1" if dimensionless."""
+    """Unit of the parameter: mm, 1/mm^2, or "1" if dimensionless."""
 
 
 class Change(NamedTuple):
@@ -226,7 +226,7 @@ class Change(NamedTuple):
 
     @property
     def p_field(self) -> float:
-        """Return the p-value of the bundle difference without a change of the camera; NaN without covariances."""
+        """Return the p-value of the bundle difference for an unchanged camera; NaN without covariances."""
         uncertainty = self.field.uncertainty
         return float("nan") if uncertainty is None else float(uncertainty.p_value)
 

@@ -148,8 +148,7 @@ class QuadraticForm(eqx.Module):
         return float(height + np.log(abs(half.imag) / np.pi))
 
     def _path(self, x: float, saddle: float, bend: float, width: float) -> tuple[float, float]:
-        """Return the bend of a path with monotonically decreasing integrand, and its end, where the integrand is
-        negligible.
+        """Return the bend of a path with monotonically decreasing integrand, and its end (negligible integrand).
 
         With variances of very different size the integrand can increase along the osculating parabola; a straighter
         parabola is then used.

@@ -23,5 +23,5 @@ class AffineBrown(AbstractBrown):
     affinity: ClassVar[Affinity] = "before"
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Return the ideal coordinate (mm) of a measured coordinate, both reduced to the principal point."""
+        """Map a measured to the ideal coordinate (mm), both reduced to the principal point."""
         return self.undistorted(jnp.stack([xy[0] - self.b1 * xy[0] - self.b2 * xy[1], xy[1]]))

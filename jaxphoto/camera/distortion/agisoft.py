@@ -45,9 +45,7 @@ class Agisoft(AbstractDistortion):
     normalised: ClassVar[bool] = True
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Return the measured coordinate of an ideal coordinate, both reduced to the principal point and divided by c,
-        y up.
-        """
+        """Map an ideal to the measured coordinate, both reduced to the principal point and divided by c, y up."""
         x, y = xy[0], -xy[1]
         r2 = x * x + y * y
         q = 1 + radial(r2, self.k1, self.k2, self.k3, self.k4)

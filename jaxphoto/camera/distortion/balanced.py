@@ -43,7 +43,7 @@ class Balanced(AbstractDistortion):
     affinity: ClassVar[Affinity] = "added"
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Return the measured coordinate (mm) of an ideal coordinate, both reduced to the principal point."""
+        """Map an ideal to the measured coordinate (mm), both reduced to the principal point."""
         x, y = xy
         r2, s2 = x * x + y * y, self.r0 * self.r0
         dr = self.a1 * (r2 - s2) + self.a2 * (r2**2 - s2**2) + self.a3 * (r2**3 - s2**3)

@@ -73,7 +73,7 @@ class AbstractDistortion(Declared):
 
     @classmethod
     def plain(cls, sensor: Sensor) -> "AbstractDistortion":
-        """Return the model without distortion for a camera with the given sensor, with suitable required lengths."""
+        """Return the model without distortion for a camera with the given sensor, which sets the required lengths."""
         return cls()
 
     @classmethod
@@ -91,14 +91,14 @@ class AbstractDistortion(Declared):
         """Map one reduced coordinate in the closed-form direction, in the model's unit (mm unless `normalised`)."""
 
     def ideal_from_measured(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Return the ideal from the measured coordinate, both reduced to the principal point, in the model's unit.
+        """Map the measured to the ideal coordinate, both reduced to the principal point, in the model's unit.
 
         Undefined where the model is not invertible; see the flag of `invert`.
         """
         return self.closed_form(xy) if self.domain == "measured" else invert(self, xy)[0]
 
     def measured_from_ideal(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Return the measured from the ideal coordinate, both reduced to the principal point, in the model's unit.
+        """Map the ideal to the measured coordinate, both reduced to the principal point, in the model's unit.
 
         Undefined where the model is not invertible; see the flag of `invert`.
         """

@@ -23,6 +23,6 @@ class Brown(AbstractBrown):
     affinity: ClassVar[Affinity] = "added"
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Return the ideal coordinate (mm) of a measured coordinate, both reduced to the principal point."""
+        """Map a measured to the ideal coordinate (mm), both reduced to the principal point."""
         x, y = self.undistorted(xy)
         return jnp.stack([x - (self.b1 * xy[0] + self.b2 * xy[1]), y])

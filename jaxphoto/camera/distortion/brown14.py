@@ -52,16 +52,14 @@ class Brown14(AbstractDistortion):
 
     @classmethod
     def plain(cls, sensor: Sensor) -> "Brown14":
-        """Return the model with zero coefficients; F is the longer side of the format, close to most principal
-        distances.
-        """
+        """Return the model with zero coefficients; F is the longer side, close to most principal distances."""
         return cls(f=max(sensor.width_mm, sensor.height_mm))
 
     def __check_init__(self) -> None:
         check_positive(self, "f", "the scale of a13")
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Return the ideal coordinate (mm) of a measured coordinate, both reduced to the principal point."""
+        """Map a measured to the ideal coordinate (mm), both reduced to the principal point."""
         x, y = xy
         xx, x_y, yy = x * x, x * y, y * y
         in_x = self.a1 * x + self.a2 * y + self.a3 * x_y + self.a4 * yy

@@ -30,7 +30,7 @@ class BundlerRadial(AbstractDistortion):
     normalised: ClassVar[bool] = True
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Return the measured coordinate of an ideal one, both reduced to the principal point and divided by c."""
+        """Map an ideal to the measured coordinate, both reduced to the principal point and divided by c."""
         x, y = xy
         stretch = 1 + radial(x * x + y * y, self.k1, self.k2)
         return jnp.stack([x * stretch, y * stretch])

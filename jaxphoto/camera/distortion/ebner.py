@@ -51,14 +51,14 @@ class Ebner(AbstractDistortion):
 
     @classmethod
     def plain(cls, sensor: Sensor) -> "Ebner":
-        """Return the model with zero coefficients, for points that reach the ends of the longer side."""
+        """Return the model with zero coefficients; the 3 x 3 points span the longer side of the format."""
         return cls(b=max(sensor.width_mm, sensor.height_mm) / 2)
 
     def __check_init__(self) -> None:
         check_positive(self, "b", "the spacing of its points")
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Return the ideal coordinate (mm) of a measured coordinate, both reduced to the principal point."""
+        """Map a measured to the ideal coordinate (mm), both reduced to the principal point."""
         x, y = xy
         k, l = x * x - 2 * self.b**2 / 3, y * y - 2 * self.b**2 / 3  # noqa: E741
         linear = jnp.stack([self.b1 * x + self.b2 * y, self.b2 * x - self.b1 * y])

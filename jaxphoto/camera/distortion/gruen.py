@@ -101,14 +101,14 @@ class Gruen(AbstractDistortion):
 
     @classmethod
     def plain(cls, sensor: Sensor) -> "Gruen":
-        """Return the model with zero coefficients, for points that reach the ends of the longer side."""
+        """Return the model with zero coefficients; the 5 x 5 points span the longer side of the format."""
         return cls(b=max(sensor.width_mm, sensor.height_mm) / 2)
 
     def __check_init__(self) -> None:
         check_positive(self, "b", "twice the spacing of its points")
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Return the ideal coordinate (mm) of a measured coordinate, both reduced to the principal point."""
+        """Map a measured to the ideal coordinate (mm), both reduced to the principal point."""
         a = jnp.asarray(
             [
                 [0.0, self.a12, -10 / 7 * self.b22, self.a14, self.a15],

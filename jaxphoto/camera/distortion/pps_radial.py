@@ -40,9 +40,7 @@ class PpsRadial(AbstractDistortion):
         return jnp.stack([jnp.asarray(self.pps_x, float), jnp.asarray(self.pps_y, float)])
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Return the ideal coordinate (mm) of a measured coordinate, both reduced to the principal point of
-        autocollimation.
-        """
+        """Map a measured to the ideal coordinate (mm), both reduced to the principal point of autocollimation."""
         x, y = xy[0] - self.pps_x, xy[1] - self.pps_y
         dr = radial(x * x + y * y, self.k1, self.k2, self.k3)
         return jnp.stack([xy[0] - x * dr, xy[1] - y * dr])

@@ -32,7 +32,7 @@ class RadialPolynomial(AbstractDistortion):
     terms: ClassVar[Mapping[str, Term] | None] = {name: Term(name, -1.0) for name in ("k1", "k2", "k3")}
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Return the ideal coordinate (mm) of a measured coordinate, both reduced to the principal point."""
+        """Map a measured to the ideal coordinate (mm), both reduced to the principal point."""
         x, y = xy
         stretch = 1 + radial(x * x + y * y, self.k1, self.k2, self.k3)
         return jnp.stack([x * stretch, y * stretch])

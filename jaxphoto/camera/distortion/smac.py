@@ -52,7 +52,7 @@ class Smac(AbstractDistortion):
         return -1.0 if self.sign == "subtract" else 1.0
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Return the ideal coordinate (mm) of a measured coordinate, both reduced to the principal point."""
+        """Map a measured to the ideal coordinate (mm), both reduced to the principal point."""
         x, y = xy
         r2, s2 = x * x + y * y, self.r0 * self.r0
         k1, k2, k3, k4 = self.k1, self.k2, self.k3, self.k4

@@ -20,6 +20,6 @@ class StretchedBrown(AbstractBrown):
     affinity: ClassVar[Affinity] = "around"
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Return the ideal coordinate (mm) of a measured coordinate, both reduced to the principal point."""
+        """Map a measured to the ideal coordinate (mm), both reduced to the principal point."""
         x, y = self.undistorted(jnp.stack([xy[0] - self.b1 * xy[0], xy[1]]))
         return jnp.stack([x - self.b2 * y, y])

@@ -24,8 +24,7 @@ Component = Any
 
 @pretty_repr
 class AbstractProjection(Declared):
-    """Base class of projections. Name and parameters are declared as in `Declared`; most projections have no
-    parameters.
+    """Base class of projections, declared as in `Declared`; most projections have no parameters.
 
     Both mappings act on components and are differentiable wherever they are defined, including on the axis.
     """
@@ -36,8 +35,7 @@ class AbstractProjection(Declared):
 
     @abc.abstractmethod
     def ideal_from_direction(self, c, u: Component, v: Component, w: Component) -> tuple[Component, Component]:
-        """Convert a direction or point (u, v, w) of any length to the ideal image coordinate (mm, from the principal
-        point).
+        """Convert a direction or point (u, v, w) to the ideal image coordinate (mm, from the principal point).
 
         The value is meaningless where `sees` is False.
         """

@@ -6,9 +6,7 @@ from jaxphoto.camera.projection.base import AbstractProjection, Component
 
 
 class Perspective(AbstractProjection):
-    """f = tan theta: x = -c u / w, y = -c v / w. Straight lines remain straight; directions at 90 degrees are imaged at
-    infinity.
-    """
+    """f = tan theta: x = -c u / w, y = -c v / w. Straight lines remain straight; 90 degrees is at infinity."""
 
     name: ClassVar[str] = "perspective"
     widest_deg: ClassVar[float] = 90.0

@@ -8,7 +8,7 @@ from jaxphoto.camera.projection.base import AbstractProjection, Component
 
 
 class Stereographic(AbstractProjection):
-    """f = 2 tan(theta / 2): small figures retain their shape; the direction opposite to the axis is imaged at infinity.
+    """f = 2 tan(theta / 2): small figures retain their shape; the direction opposite to the axis is at infinity.
 
     Source: Kannala and Brandt (2006), equation (2).
     """
