@@ -3,8 +3,8 @@
     index_of("point"), one per row      start                           an id
     index_of("point"), m per row        points_1, points_2              ids
     integers                            axis
-    numbers, one per row                value_m                         unit of the class; rad are degrees in files
-    numbers, one per axis               value_X_m, value_Y_m, value_Z_m
+    values, one per row                 value_m                         unit of the class; rad are degrees in files
+    values, one per axis                value_X_m, value_Y_m, value_Z_m
 
 `columns` of the class renames the columns of a field; () means that the field is zero and has no column.
 """
