@@ -337,7 +337,7 @@ def test_incomplete_annotations_and_columns_are_refused():
         group = "short"
         columns = {"value": ("a", "b")}  # noqa: RUF012
 
-    with pytest.raises(TypeError, match=r"Open\.extra: 'n k' does not say how many numbers"):
+    with pytest.raises(TypeError, match=r"Open\.extra: shape 'n k' has no fixed number of components"):
         columns_of(Open)
     with pytest.raises(TypeError, match=r"Short\.columns: value has 1 numbers a row"):
         columns_of(Short)
