@@ -302,7 +302,7 @@ def test_models_that_cannot_be_written(tmp_path):
     block = read_source(write_text(tmp_path / "model"))
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.txt").write_text("years of work")
-    with pytest.raises(InputError, match="nothing in it says that jaxphoto wrote it"):
+    with pytest.raises(InputError, match="was not written by jaxphoto"):
         write_colmap_model(block, tmp_path / "other")
     with pytest.raises(InputError, match="is a file: name a folder"):
         write_colmap_model(block, tmp_path / "other" / "thesis.txt")
