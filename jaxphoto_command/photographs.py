@@ -470,7 +470,7 @@ def _orient_block(output: Output, folder: Path, out: Path) -> None:
     with output.progress("reading the block") as progress:
         block = read_block(folder)
         if not needs_orientation(block):
-            raise InputError(f"{folder} needs no orientation: resection reaches all its images; adjust it as it is")
+            raise InputError(f"{folder} needs no orientation: resection orients all images; adjust it directly")
         oriented = orient_block(block, progress.update)
         write_block(oriented, out)
     n_images, n_oriented = len(block.images), int(sum(oriented.start.image_known))

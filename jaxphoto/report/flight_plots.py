@@ -71,7 +71,7 @@ def plot_position_offsets(report: PartReport, ax: Axes | None = None, *, upright
     Raises InputError if the part has no recorded positions.
     """
     if not report.part.placed:
-        raise InputError(f"no recorded position of this part is used: {report.part.why_not or 'there are none'}")
+        raise InputError(f"no recorded position of this part is used: {report.part.why_not or 'none was read'}")
     ax, (d, has, used) = axes_or_new(ax), offsets_less_mean(report)
     if upright:
         ax.bar(np.flatnonzero(has), d[has, 2], color=np.where(used[has], "tab:blue", "tab:red"))

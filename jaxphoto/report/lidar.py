@@ -134,7 +134,7 @@ def plot_lidar_heights(control: LidarControl, ax: Axes | None = None, *, residua
     """
     points, used = np.asarray(control.adjusted.unknowns.points)[control.points], control.used
     if residuals and not used.any():
-        raise InputError("no height of the cloud is control: there are no residuals to be drawn")
+        raise InputError("no height of the cloud is used as control: no residuals to draw")
     ax = axes_or_new(ax)
     if residuals:
         difference = (control.height - points[:, 2])[used]

@@ -379,15 +379,15 @@ def halves_verdict(halves: Halves) -> list[str]:
     unit, fraction = halves.leading
     if n >= _ENOUGH_CUTS and fraction > _LEADS:
         sentences.append(
-            f"{100 * fraction:.0f} % of the squared differences follow {halves.by} {unit} alone: it contradicts the "
-            "others or determines what they cannot; compare with a calibration without it"
+            f"{100 * fraction:.0f} % of the squared differences are caused by {halves.by} {unit} alone: it contradicts "
+            "the others or determines more than they do; compare with a calibration without it"
         )
     if halves.failed:
         sentences.append(
             f"{len(halves.failed)} of {n + len(halves.failed)} splits could not be compared, the first: "
             f"{halves.failed[0].problem}"
         )
-    return [*sentences, "errors common to both halves, such as those of fixed points, show in no difference"]
+    return [*sentences, "errors common to both halves, such as those of fixed points, are undetectable"]
 
 
 def plot_halves(halves: Halves, ax: Axes | None = None, *, band: bool = False) -> Axes:

@@ -110,7 +110,7 @@ def test_heights_of_a_cloud_are_counted_and_coloured(axes):
     np.testing.assert_allclose(np.abs(right.collections[0].get_array()), 0.05)
     assert "RMSE 0.050 m" in right.get_title(loc="left")
     none = eqx.tree_at(lambda c: c.used, control, np.zeros_like(control.used))
-    with pytest.raises(InputError, match="no height of the cloud is control"):
+    with pytest.raises(InputError, match="no height of the cloud is used as control"):
         plot_lidar_heights(none, axes, residuals=True)
     assert [panel.has_data() for panel in heights_figure(none).axes] == [True, False]
 
