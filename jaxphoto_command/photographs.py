@@ -450,8 +450,8 @@ def orient(
             write_orientation(result, folder, n_gross=matched.n_gross, sigma_factor=matched.sigma_factor)
         checkpoint.remove()
     output.say(
-        f"{matched.n_gross} matches rejected before (off the epipolar line, or of pairs with too few); sigma factor of "
-        f"the others {matched.sigma_factor:.2g}"
+        f"{matched.n_gross} matches rejected before orientation (off the epipolar line, or in pairs with too few); "
+        f"sigma factor of the others {matched.sigma_factor:.2g}"
     )
     print_orientation(result.report, output.screen)
     output.wrote(out, f"wrote {out}: adjust it with jaxphoto adjust {out} --out DIR")

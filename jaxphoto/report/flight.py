@@ -119,7 +119,7 @@ def _findings(part: FlightPart) -> Iterator[Finding]:
         used = part.placed.used
         yield Finding("positions_rejected", "warning", value=int((~used).sum()), numbers={"n": len(used)})
     if report.alike > CORRELATED:
-        hint = "jaxphoto halves on the block determines the factor better"
+        hint = "Run jaxphoto halves on the block for a better factor"
         yield Finding("correlated_residuals", "warning", value=report.alike, limit=CORRELATED, hint=hint)
 
 

@@ -104,7 +104,7 @@ def test_heights_of_a_cloud_are_counted_and_coloured(axes):
     assert plot_lidar_heights(control, axes) is axes
     refused = ~np.isfinite(control.height)
     numbers = control.used.sum(), (~control.used & ~refused).sum(), refused.sum()
-    words = [f"{w} ({n})" for w, n in zip(("control", "left out", "refused"), numbers, strict=True)]
+    words = [f"{w} ({n})" for w, n in zip(("control", "rejected", "no height"), numbers, strict=True)]
     assert set(lines(axes)) == set(words) and len(lines(axes)[words[0]].get_xdata()) == control.used.sum()
     right = plot_lidar_heights(control, Figure().add_subplot(), residuals=True)
     np.testing.assert_allclose(np.abs(right.collections[0].get_array()), 0.05)
