@@ -158,7 +158,7 @@ def test_the_command_writes_adjusted_values(own, tmp_path, monkeypatch, capsys):
     for arguments, message in (
         ((own / "result", tmp_path / "no", "--to", "opk", "--adjust"), "--adjust applies to a block that is exported"),
         ((own / "block", tmp_path / "no", "--adjust"), "--adjust applies to a block that is exported"),
-        ((own / "block", tmp_path / "no", "--to", "opk", "--part", 2), "--block and --part apply to results"),
+        ((own / "block", tmp_path / "no", "--to", "opk", "--part", 2), "--block and --part apply to results only"),
         ((own / "result", tmp_path / "no.xml", "--to", "metashape"), "omit .xml"),
     ):
         code, _, wrong = run(monkeypatch, capsys, "convert", *arguments)
