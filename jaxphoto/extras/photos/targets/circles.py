@@ -328,8 +328,7 @@ class CircularTargets(Pattern):
         plane = self.board.plane
         if plane is None:
             raise InputError(
-                f"{path.name}: the targets are not coplanar (to 1 % of their extent); give the targets of one "
-                "plane"
+                f"{path.name}: the targets are not coplanar (to 1 % of their extent); give the targets of one plane"
             )
         middle, axes = plane
         self._flat = (xyz - middle) @ axes[:, :2]
