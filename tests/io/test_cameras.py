@@ -405,7 +405,7 @@ def test_a_block_may_get_another_model(tmp_path):
         (
             "1 RADIAL 100 100 80 50 50 0.1\n",
             "cameras.txt",
-            "camera 1 has 4 parameters, RADIAL has 5: f, cx, cy, k1, k2",
+            "camera 1 has 4 parameters instead of the 5 of RADIAL: f, cx, cy, k1, k2",
         ),
         (SMAC.replace("0.1558 × 10-6", "0.1558 × 10-"), "a.txt", "P2 is '0.1558e', not a finite number"),
         (SMAC_TORN[: SMAC_TORN.index("-0.3015")], "a.txt", "P1, P2, P3, P4 not found in this SMAC report"),
@@ -441,7 +441,7 @@ def test_wrong_use_is_refused(tmp_path):
     with pytest.raises(InputError, match="there is no camera '9' in it"):
         read_camera_file(written(tmp_path, COLMAP, "cameras.txt"), camera="9")
     interior = InteriorOrientation(35.0, 0.0, 0.0, Brown())
-    with pytest.raises(InputError, match="name one of opencv, ros, mrcal, colmap"):
+    with pytest.raises(InputError, match="give one of opencv, ros, mrcal, colmap"):
         write_camera_file(tmp_path / "a.dat", SENSOR, interior)
     folding = InteriorOrientation(10.0, 0.0, 0.0, Brown(k1=5e-3))
     with pytest.raises(InputError, match=r"a\.xml cannot be written: .* folds within"):
@@ -527,7 +527,7 @@ def test_command_converts_and_reports_the_misfit(tmp_path, monkeypatch, capsys):
         ("new.xml", ["--width-px", "100"], "both --width-px and --height-px"),
         ("new.xml", ["--distortion", "none"], "brown"),
         ("new.xml", ["--format", "none"], "not one of 'opencv'"),
-        ("new.xml", ["--distortion", "brown"], "the format agisoft has the distortion Agisoft, not Brown; leave"),
+        ("new.xml", ["--distortion", "brown"], "format agisoft has the distortion Agisoft, not Brown; omit"),
     ):
         monkeypatch.setattr("sys.argv", ["jaxphoto", *arguments[:2], str(tmp_path / out), *arguments[3:], *more])
         with pytest.raises(SystemExit) as stopped:

@@ -177,8 +177,8 @@ def spoil(file, row, text):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (spoil("cameras", 1, "5 FOV 640 480 1 1 1 1 0 0 0 0"), "FOV of camera 5 is not known"),
-        (spoil("cameras", 1, "5 OPENCV 640 480 800 800"), "camera 5 has 2 parameters, OPENCV has 8: fx"),
+        (spoil("cameras", 1, "5 FOV 640 480 1 1 1 1 0 0 0 0"), "FOV of camera 5 is not supported"),
+        (spoil("cameras", 1, "5 OPENCV 640 480 800 800"), "camera 5 has 2 parameters instead of the 8 of OPENCV: fx"),
         (spoil("cameras", 1, "5 OPENCV"), "camera 5 has 2 cells; write CAMERA_ID MODEL"),
         (spoil("cameras", 1, "6 SIMPLE_PINHOLE 640 480 800 320 240"), "camera 5 of image a.jpg is missing"),
         (spoil("images", 2, "1 0 0 0 0 0 0 0 5 b.jpg"), "the quaternion of image b.jpg has the length 0 instead of 1"),
@@ -347,7 +347,7 @@ def test_models_that_are_not_opencv_s_are_refused_by_name(tmp_path, model):
         read_source(write_text(tmp_path / "model", change), "colmap")
     path = write_binary(tmp_path / "binary") / "cameras.bin"
     path.write_bytes(struct.pack("<QIiQQ8d", 1, 5, NUMBERS.get(model, 13), 640, 480, *PARAMS))
-    with pytest.raises(InputError, match=f"the model {model if model in NUMBERS else 'number 13'} of camera 5"):
+    with pytest.raises(InputError, match=f"model {model if model in NUMBERS else 'number 13'} of camera 5"):
         read_camera_file(tmp_path / "binary")
 
 

@@ -124,7 +124,7 @@ def test_our_own_tables(tmp_path):
         (files.GCP_LIST + "1 2 3 4 5\n", None, "row 7: 5 cells"),
         (files.GCP_LIST.replace("30.5 512.5", "31.5 512.5"), None, "row 3: point 'G1' is also in a, row 2"),
         (files.MARKERS[:900], None, "a: damaged"),
-        (files.MARKERS.replace('camera_id="0"', 'camera_id="5"'), None, "the file has no such camera"),
+        (files.MARKERS.replace('camera_id="0"', 'camera_id="5"'), None, "unknown camera"),
         (files.MARKERS.replace('x="100.25"', 'x="nan"'), None, "x is 'nan', not a number"),
     ],
 )

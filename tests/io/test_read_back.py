@@ -259,7 +259,7 @@ def test_control_of_opensfm_is_a_gcp_list(tmp_path):
     assert given.points.system == "EPSG:32633" and set(given.points.ids) == set(names)
     # A list of control beside tracks makes no project of texts.
     assert recognise(tmp_path / "out") == ["opensfm"]
-    with pytest.warns(UserWarning, match="it needs a map system and the block is in a local frame"):
+    with pytest.warns(UserWarning, match="it needs a map system, but the block is in a local frame"):
         export(p._replace(frame=Frame("local")), tmp_path / "local", "opensfm")
     assert not (tmp_path / "local" / "gcp_list.txt").exists()
 

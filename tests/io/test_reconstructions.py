@@ -455,7 +455,7 @@ _KIND, _DATA = ("intrinsics", 0, "value", "polymorphic_name"), ("intrinsics", 0,
 _TURN = ("extrinsics", 1, "value", "rotation")
 REFUSED = {
     "kind": (_sfm((*_CAMERA, "projection_type"), "dual"), "'dual' is not supported"),
-    "camera": (_sfm((*_SHOT, "camera"), "two"), "shots.a.jpg.*no camera 'two'"),
+    "camera": (_sfm((*_SHOT, "camera"), "two"), "shots.a.jpg.*unknown camera 'two'"),
     "rotation": (_sfm((*_SHOT, "rotation"), [1, "x", 2]), "'a.jpg', rotation: .* is not 3 finite numbers"),
     "no tracks": (
         lambda f: (write_open_sfm(f) / "tracks.csv").unlink() or f / "reconstruction.json", "tracks.csv not found",
@@ -470,7 +470,7 @@ REFUSED = {
     "cut": (_blocks(lambda text: text[:-30]), "block.xml: damaged"),
     "unknown encoding": (_blocks(_replaced("utf-8", "utf-0")), "block.xml: damaged .*unknown encoding: utf-0"),
     "angles": (_blocks(_geographic), "is a geographic system"),
-    "axes": (_blocks(_replaced("XRightYUp", "XUpYLeft"), upwards=True), "one: CameraOrientation 'XUpYLeft'"),
+    "axes": (_blocks(_replaced("XRightYUp", "XUpYLeft"), upwards=True), "one: unknown CameraOrientation 'XUpYLeft'"),
     "end": (_bundle(lambda lines: lines[:-1]), "number of measurements of point 6"),
     # The last point but one says that it was measured ten times, which leaves two numbers for the last.
     "end amid a point": (

@@ -172,5 +172,5 @@ def row_numbers(path: Path, row: int, words: Sequence[str], many: int) -> list[f
     except ValueError:
         values = []
     if len(values) != many or not all(abs(value) <= LARGEST for value in values):
-        raise InputError(f"{path.name}, row {row}: {quoted(' '.join(words))} is not {many} numbers")
+        raise InputError(f"{path.name}, row {row}: {quoted(' '.join(words))} is not {many} numbers; correct it")
     return values

@@ -143,7 +143,7 @@ def _listed_names(path: Path, number: int) -> list[str]:
 def _count(path: Path, numbers: np.ndarray, at: int, what: str) -> int:
     value = numbers[at] if at < len(numbers) else np.nan
     if not 0 <= value <= len(numbers) or value != int(value):
-        raise InputError(f"{path.name}: invalid number of {what}, {value:g}. Export it again")
+        raise InputError(f"{path.name}: the number of {what} is {value:g}, not a valid count. Export it again")
     return int(value)
 
 

@@ -309,7 +309,9 @@ def _of_angles(path: Path, rows: list[_Row], places: dict[str, int], degrees: fl
     names, values, most = [], [], -min(places.values())
     for k, cells, line in rows:
         if len(cells) <= most:
-            raise InputError(f"{path.name}, row {k}: {quoted(line)} is not name, X, Y, Z, omega, phi, kappa")
+            raise InputError(
+                f"{path.name}, row {k}: {quoted(line)} is not name, X, Y, Z, omega, phi, kappa; correct it"
+            )
         values.append(row_numbers(path, k, [cells[places[name]] for name in _COLUMNS], len(_COLUMNS)))
         names.append(" ".join(cells[:-most]))
     numbers = np.array(values).reshape(-1, len(_COLUMNS))
@@ -352,7 +354,9 @@ def _of_bingo(path: Path, numbered: list[tuple[int, str]]) -> ExteriorText:
         words = line.split()
         begin = _oria(words)
         if words[0] == _ORIA and begin is None:
-            raise InputError(f"{path.name}, row {k}: {quoted(line)} is not ORIA, name, X, Y, Z, phi, omega, kappa")
+            raise InputError(
+                f"{path.name}, row {k}: {quoted(line)} is not ORIA, name, X, Y, Z, phi, omega, kappa; correct it"
+            )
         if begin is not None:
             names.append(" ".join(words[1:begin]))
             values.append(row_numbers(path, k, words[begin : begin + 6], 6))

@@ -47,7 +47,7 @@ def read_board(description: str) -> Pattern:
     make, names, least = _MADE[kind]
     counts = size.lower().split("x")
     if len(counts) != 2 or not all(n.isdecimal() and least <= int(n) <= 500 for n in counts):
-        raise _bad(description, kind, f"{size!r} is not COLUMNSxROWS, {least} to 500 each")
+        raise _bad(description, kind, f"{size!r} is not columns x rows, {least} to 500 each")
     texts: dict[str, str] = {}
     for setting in settings:
         name, sign, value = setting.partition("=")

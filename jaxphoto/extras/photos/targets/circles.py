@@ -209,7 +209,7 @@ class CircleGrid(Pattern):
         if rows < 3:
             raise ValueError("an asymmetric grid has at least 3 rows")
         if diameter_m >= np.sqrt(2) * spacing_m:
-            raise ValueError("the circles overlap: the diameter must be less than 1.41 times the spacing")
+            raise ValueError("the circles touch; the diameter must be less than 1.41 times the spacing")
         self.columns, self.rows, self.radius_m, self._spacing_m = columns, rows, diameter_m / 2, spacing_m
         row, column = np.divmod(np.arange(rows * columns), columns)
         ids = tuple(f"r{r + 1}c{c + 1}" for r, c in zip(row.tolist(), column.tolist(), strict=True))

@@ -79,7 +79,7 @@ class CharucoBoard(Pattern):
 
     def __init__(self, columns: int, rows: int, square_m: float, marker_m: float, dictionary: str) -> None:
         if marker_m >= square_m:
-            raise ValueError("the marker must be smaller than the square")
+            raise ValueError("the marker is not smaller than the square")
         self._dictionary = _dictionary(dictionary, columns * rows // 2)
         self.columns, self.rows, self.square_m, self.marker_m = columns, rows, square_m, marker_m
         self._drawn = cv2.aruco.CharucoBoard((columns, rows), square_m, marker_m, self._dictionary)
