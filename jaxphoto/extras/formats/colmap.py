@@ -142,7 +142,7 @@ def read(path: Path) -> Project:
     point = np.concatenate([np.zeros(0, int), *(i.point for i in images)])
     if len(missing := np.setdiff1d(point, ids)):
         raise InputError(
-            f"{path.parent}: {len(missing)} point(s) of the images are missing in points3D, for example {missing[0]}.  "
+            f"{path.parent}: {len(missing)} point(s) of the images are missing in points3D, for example {missing[0]}. "
             "Export the model from COLMAP again"
         )
     cameras = {str(k): _project_camera(path, model.cameras[k]) for k in sorted({i.camera for i in images})}

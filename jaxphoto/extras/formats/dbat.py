@@ -343,7 +343,7 @@ def _free(script: _Script) -> dict[str, str]:
         if element.tag in ("c", "all"):
             continue
         if element.tag not in groups:
-            raise script.error(f"unknown <{element.tag}> in <io>; use all,  {', '.join(groups)}")
+            raise script.error(f"unknown <{element.tag}> in <io>; use all, {', '.join(groups)}")
         value = (element.text or "").strip()
         if value not in ("true", "false"):
             raise script.error(f"<{element.tag}> in <io> is {value!r}; write true or false")

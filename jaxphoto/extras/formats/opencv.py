@@ -88,7 +88,7 @@ def _camera(source: CameraSource, storage: Any) -> CameraFile:
     if fisheye and n != len(FISHEYE_TERMS):
         raise source.error(f"{n} distortion_coefficients, but OpenCV's fisheye model has 4; give 4")
     if n not in _COUNTS:
-        raise source.error(f"{n} distortion_coefficients, but OpenCV has one of {', '.join(map(str, _COUNTS))}")
+        raise source.error(f"{n} distortion_coefficients, but OpenCV uses one of {', '.join(map(str, _COUNTS))}")
     _check_plane(source, coefficients)
     size = [_number(storage.getNode(key)) for key in ("image_width", "image_height")]
     if None in size and source.size_px is None:
@@ -127,7 +127,7 @@ def _matrix(source: CameraSource, storage: Any, key: str) -> np.ndarray:
         # One-dimensional list, as written by OpenCV 5.
         rows, columns = 1.0, sizes[0]
     if not rows or not columns or rows % 1 or columns % 1 or None in values or not rows * columns == len(values) > 0:
-        raise source.error(f"{key} is not a matrix of rows x cols numbers in data")
+        raise source.error(f"{key} is not a matrix of rows x cols numbers in data; export it again")
     matrix = np.array(values, float).reshape(-1, max(int(columns), 1))
     if not np.isfinite(matrix).all():
         raise source.error(f"{key} is not a matrix of finite numbers; calibrate again")

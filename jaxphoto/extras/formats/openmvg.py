@@ -73,7 +73,7 @@ def read(path: Path) -> Project:
             pose_of.append(pose_key)
     if not files:
         raise InputError(
-            f"{path}: none of {len(views)} views has a pose; give the file of the reconstruction:  "
+            f"{path}: none of {len(views)} views has a pose; give the file of the reconstruction: "
             f"openMVG_main_ConvertSfM_DataFormat binary -i sfm_data.bin -o {FILE} -V -I -E -S"
         )
     rotations, centres = (

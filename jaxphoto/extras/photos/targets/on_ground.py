@@ -131,7 +131,7 @@ def read_target(description: str) -> GroundTarget:
     if kind not in SYNTAX:
         raise InputError(f"--targets {description}: unknown target; write one of {', '.join(SYNTAX.values())}")
     if name != SYNTAX[kind].partition(":")[2].partition("=")[0]:
-        raise InputError(f"--targets {description}: unknown setting {name!r}; write it like {SYNTAX[kind]}")
+        raise InputError(f"--targets {description}: invalid setting {name!r}; write it like {SYNTAX[kind]}")
     if kind == "aruco":
         if value.upper() not in DICTIONARIES:
             there = ", ".join(DICTIONARIES)
