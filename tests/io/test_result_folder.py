@@ -129,7 +129,7 @@ def test_photographs_are_called_by_their_files(tmp_path):
         photograph_files(images, [tmp_path / "none"])
     (tmp_path / "photographs.csv").write_text("image,file\na,a.png\nc,c.png\n")
     assert photograph_files(images, [tmp_path / "right"], tmp_path) == {"a": "a.png", "b": "b.jpg", "c": "c.png"}
-    with pytest.raises(InputError, match="two images are of the photograph a"):
+    with pytest.raises(InputError, match="two images have the photograph a"):
         block = read_source(write_text(tmp_path / "model"))
         Project.of_block(block, block.start.unknowns, {"b": "a"})
 
