@@ -108,7 +108,7 @@ def test_cameras_of_different_sensors_are_refused(sets, monkeypatch, capsys):
     assert "give the true size with --pixel-mm" in error
     code, _, error = run(monkeypatch, capsys, "stability", sets / "one", other, "--pixel-mm", SENSOR["pixel_mm"])
     assert code == 2
-    assert "other.toml: its pixel size is 0.0015 mm, not 0.00155: remove --pixel-mm or" in error
+    assert "other.toml: its pixel size is 0.0015 mm, not 0.00155: remove --pixel-mm, or" in error
 
 
 @pytest.fixture(scope="module")

@@ -188,14 +188,14 @@ def read_camera_file(
                 result = reader.read(source)
             if pixel_mm is not None and not math.isclose(result.sensor.pixel_mm, pixel_mm, rel_tol=1e-6):
                 raise source.error(
-                    f"its pixel size is {result.sensor.pixel_mm:g} mm, not {pixel_mm:g}: remove --pixel-mm "
+                    f"its pixel size is {result.sensor.pixel_mm:g} mm, not {pixel_mm:g}: remove --pixel-mm, "
                     "or, if that size was assumed, convert the file to pixels first: jaxphoto camera "
                     f"{quoted(str(path))} --out pixels.yml"
                 )
             return result
     if not text.strip():
         raise source.error("the file is empty; re-export it")
-    raise source.error(f"unknown camera file format; use one of {CAMERAS_READ}")
+    raise source.error(f"unknown camera file format; supported are {CAMERAS_READ}")
 
 
 def results_in(folder: Path) -> Path:

@@ -18,7 +18,7 @@ from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.writing import check_room, clear_leftovers, is_place, locked, whole_file
 
 _MARKER, _SUFFIX = "kept.txt", ".piece"
-_SAYS = "What a run of jaxphoto has worked out so far. The same command goes on from here, and removes it at its end.\n"
+_SAYS = "Checkpoints of a run of jaxphoto. The same command continues from them, and removes them at its end.\n"
 # Maximum size of a checkpoint in bytes, sufficient for some million features.
 _MOST = 1_000_000_000
 

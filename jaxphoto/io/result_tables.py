@@ -68,7 +68,7 @@ def reservation(summary: Mapping[str, Any]) -> str:
         sigma0, expected = summary["sigma0"], test["expected_sigma0"]
         return (
             f"sigma naught of this adjustment is {sigma0:.3g}, expected {expected:.3g}, a significant difference: its "
-            "weights or its model are wrong, and its standard deviations with them"
+            "weights or its model are wrong, and so are its standard deviations"
         )
     if prior_warnings := summary.get("prior_warnings"):
         return f"this adjustment depends on an earlier one: {prior_warnings[0]}"

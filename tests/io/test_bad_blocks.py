@@ -169,7 +169,7 @@ def test_bad_input_is_refused(write_folder, name):
 
 
 def test_no_folder(tmp_path):
-    with pytest.raises(InputError, match=r"no folder .*nowhere; give the folder"):
+    with pytest.raises(InputError, match=r"folder not found: .*nowhere; give the folder"):
         read_block(tmp_path / "nowhere")
 
 

@@ -246,7 +246,7 @@ model = "ciddor"
         ),
         (
             [section("[unknowns.refractivity.default]")],
-            r"\[unknowns\.refractivity\]: their owner is a part of the images called hour; add the column hour",
+            r"\[unknowns\.refractivity\]: images have no partition hour; add the column hour",
         ),
         ([TOP], r"images\.csv, row 1: the column hour is missing"),
         ([("block.toml", 'title = "small"', 'partitions = ["strip"]')], r"partitions: strip is reserved"),

@@ -516,7 +516,7 @@ def test_numbers_are_not_used_if_an_invalid_row_may_hide_a_renumbering(tmp_path)
     file = read_exposures(written(tmp_path / "a.MRK", at_row(text, 4, lambda line: line.replace("55.", "x"))))
     blind = [steady.photograph(k, gps=None) for k in ALL]
     taken, said = with_exposures(blind, [file])
-    assert taken == blind and "not used" in said[0] and "1 of 9 rows is left out (4); row 4" in said[0]
+    assert taken == blind and "not used" in said[0] and "1 of 9 rows is skipped (4); row 4" in said[0]
 
 
 GPS, ZONE_S = 0x8825, 7200
@@ -617,5 +617,5 @@ def test_a_wrong_row_of_marks_is_one_sentence(clean, tmp_path):
     (wrong / "a.MRK").write_text((right / "a.MRK").read_text().replace("34\t", "34\tx"))
     (before, sound), (said, found) = said_of(right), said_of(wrong)
     mine = [s for s in said if s.startswith("a.MRK")]
-    assert len(mine) == 1 and mine[0] not in before and "1 of 10 rows is left out (4); row 4: " in mine[0], mine
+    assert len(mine) == 1 and mine[0] not in before and "1 of 10 rows is skipped (4); row 4: " in mine[0], mine
     assert [n for n, g in found.items() if g != sound[n]] == ["DJI_0004"] and found["DJI_0004"] is not None

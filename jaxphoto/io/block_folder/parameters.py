@@ -223,7 +223,7 @@ def _tables(kind: Kind, section: Section, block: Block) -> dict[str, Section]:
     if kind.owner not in (*_OWNERS, *block.partitions):
         raise section.error(
             "",
-            f"their owner is a part of the images called {kind.owner}; add the column {kind.owner} to images.csv and "
+            f"images have no partition {kind.owner}; add the column {kind.owner} to images.csv and "
             f'partitions = ["{kind.owner}"] to the top of {section.file}',
         )
     return by_owner(section, (name for name in dict.fromkeys(block.owners(kind.owner)) if name))

@@ -117,7 +117,7 @@ def open_source(path: str | Path, epsg: int | None = None, unit: str | None = No
     check_file(path)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise InputError(f"{path.name} is not a point cloud; give a file {', '.join(SUFFIXES)}")
+        raise InputError(f"{path.name} is not a point cloud; supported are {', '.join(SUFFIXES)}")
     system = None if epsg is None else epsg_system(epsg, path.name)
     if suffix in (".las", ".laz"):
         # Import here: laspy takes 0.2 s.

@@ -108,7 +108,7 @@ def open_csv(path: Path, system: CoordinateSystem | None) -> CloudSource:
     header = [cell.strip() for cell in lines[0].split(separator)]
     for name in COLUMNS:
         if header.count(name) > 1 or (name in XYZ and name not in header):
-            fault = "is there twice" if name in header else f"is missing (found {', '.join(header)})"
+            fault = "is given twice" if name in header else f"is missing (found {', '.join(header)})"
             raise InputError(f"{path.name}: the column {name} {fault}; correct the header")
     decimal = "," if separator == ";" and "," in "".join(lines[1:]) else "."
     layout = _Layout(header, separator, decimal)
