@@ -47,11 +47,11 @@ def test_without_a_name_they_are_listed_and_a_wrong_one_is_said(tmp_path, monkey
     _, screen, _ = run(monkeypatch, capsys, "example")
     assert [line.split()[0] for line in screen.splitlines()] == list(EXAMPLES)
     code, _, error = run(monkeypatch, capsys, "example", "crossblock")
-    assert code == 2 and "there is no example crossblock; there are cross_block, recipe" in error
+    assert code == 2 and "unknown example crossblock; choose one of cross_block, recipe" in error
     for flight in ("lidar", "strips"):
         assert read_recipe(shipped(flight)).lidar is not None
     monkeypatch.setattr("jaxphoto.io.shipped._PACKAGE", tmp_path / "jaxphoto")
-    with pytest.raises(InputError, match="came without its examples"):
+    with pytest.raises(InputError, match="has no examples"):
         shipped("recipe")
 
 

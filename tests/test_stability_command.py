@@ -108,7 +108,7 @@ def test_cameras_of_different_sensors_are_refused(sets, monkeypatch, capsys):
     assert "give the true size with --pixel-mm" in error
     code, _, error = run(monkeypatch, capsys, "stability", sets / "one", other, "--pixel-mm", SENSOR["pixel_mm"])
     assert code == 2
-    assert "other.toml: it says itself that a pixel is 0.0015 mm, not 0.00155: leave --pixel-mm out, or" in error
+    assert "other.toml: its pixel size is 0.0015 mm, not 0.00155: remove --pixel-mm, or" in error
 
 
 @pytest.fixture(scope="module")
@@ -154,5 +154,5 @@ def test_a_camera_may_have_another_name_in_b(sets, monkeypatch, capsys):
     other.write_text((sets / "bare.toml").read_text().replace("cameras.gopro", "cameras.hero"))
     arguments = ("stability", sets / "one", other, "--camera", "gopro")
     code, _, error = run(monkeypatch, capsys, *arguments)
-    assert (code, "there is no camera 'gopro' in it; name one of hero" in error) == (2, True)
+    assert (code, "unknown camera 'gopro'; choose one of hero" in error) == (2, True)
     assert run(monkeypatch, capsys, *arguments, "--camera-b", "hero")[0] == 0

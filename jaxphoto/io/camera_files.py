@@ -75,7 +75,7 @@ class CameraSource(NamedTuple):
         """Read the text, UTF-8 or else Windows-1252. Raise InputError for a binary file."""
         text = read_legacy_text(self.path)
         if "\0" in text:
-            raise self.error("the file is no text; give a camera file")
+            raise self.error("the file is not a text file; give a camera file")
         return text
 
     def number(self, name: str, text: Any) -> float:
@@ -92,11 +92,11 @@ class CameraSource(NamedTuple):
         """Return the requested camera of `names`, or the only one. Raise InputError otherwise."""
         listed = ", ".join(names)
         if not names:
-            raise self.error("there is no camera in it; give a file with one")
+            raise self.error("no camera in the file; give a file with one")
         if self.camera is None and len(names) > 1:
-            raise SeveralCamerasError(f"{self.path}: it holds {len(names)} cameras; name one of {listed}")
+            raise SeveralCamerasError(f"{self.path}: {len(names)} cameras in the file; choose one of {listed}")
         if self.camera not in (None, *names):
-            raise self.error(f"there is no camera {quoted(self.camera)} in it; name one of {listed}")
+            raise self.error(f"unknown camera {quoted(self.camera)}; choose one of {listed}")
         return self.camera or names[0]
 
     def sensor(self, width: float, height: float, pixel_mm: float | None = None) -> tuple[Sensor, str]:
@@ -105,13 +105,13 @@ class CameraSource(NamedTuple):
             size = "{} x {}".format(*self.size_px)
             raise self.error(f"image size is {width:g} x {height:g} px, not {size}; remove the size")
         if not all(0 < side <= _LARGEST_SIDE_PX and side == int(side) for side in (width, height)):
-            raise self.error(f"an image of {width:g} x {height:g} pixels cannot be; give whole positive numbers")
+            raise self.error(f"image size {width:g} x {height:g} px is invalid; give positive whole numbers")
         pixel = self.pixel_mm if self.pixel_mm is not None else pixel_mm
         if pixel is None:
-            note = f"the size of a pixel is not known; {ASSUMED_PIXEL_MM} mm was assumed, and c_mm scales with it"
+            note = f"the pixel size is unknown; {ASSUMED_PIXEL_MM} mm was assumed, and c_mm scales with it"
             return Sensor(int(width), int(height), ASSUMED_PIXEL_MM, pixel_assumed=True), note
         if not 0 < pixel < np.inf:
-            raise self.error(f"a pixel of {pixel:g} mm cannot be; give its size in millimetres")
+            raise self.error(f"pixel size {pixel:g} mm is invalid; give it in millimetres")
         return Sensor(int(width), int(height), float(pixel)), ""
 
 
@@ -124,7 +124,7 @@ def reading(path: Path, what: str) -> Iterator[None]:
         raise
     except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RecursionError, SyntaxError) as error:
         raise InputError(
-            f"{path.name}: damaged or no {what} ({type(error).__name__}: {error}). Export it again"
+            f"{path.name}: damaged, or not a {what} ({type(error).__name__}: {error}). Export it again"
         ) from error
 
 
@@ -176,7 +176,7 @@ def read_camera_file(
         path = results_in(path)
         inside = [path / name for name in _IN_FOLDER if (path / name).is_file()]
         if not inside:
-            raise InputError(f"{path} holds none of {', '.join(_IN_FOLDER)}; name the camera file")
+            raise InputError(f"{path} contains none of {', '.join(_IN_FOLDER)}; name the camera file")
         path = inside[0]
     if not path.is_file():
         raise InputError(f"there is no file {path}; correct the name")
@@ -188,14 +188,14 @@ def read_camera_file(
                 result = reader.read(source)
             if pixel_mm is not None and not math.isclose(result.sensor.pixel_mm, pixel_mm, rel_tol=1e-6):
                 raise source.error(
-                    f"it says itself that a pixel is {result.sensor.pixel_mm:g} mm, not {pixel_mm:g}: leave --pixel-mm "
-                    "out, or, if that was assumed, write it in pixels first: jaxphoto camera "
+                    f"its pixel size is {result.sensor.pixel_mm:g} mm, not {pixel_mm:g}: remove --pixel-mm, "
+                    "or, if that size was assumed, convert the file to pixels first: jaxphoto camera "
                     f"{quoted(str(path))} --out pixels.yml"
                 )
             return result
     if not text.strip():
-        raise source.error("the file is empty; write it again")
-    raise source.error(f"this is no camera file that is known; {CAMERAS_READ} are")
+        raise source.error("the file is empty; re-export it")
+    raise source.error(f"unknown camera file format; supported are {CAMERAS_READ}")
 
 
 def results_in(folder: Path) -> Path:
@@ -250,7 +250,7 @@ def read_results(source: CameraSource) -> CameraFile:
     parameters = table.ids("parameter").tolist()
     for row, parameter in enumerate(parameters):
         if parameter in parameters[:row]:
-            raise table.bad(row, f"{parameter} of camera {name} stands there twice; keep one of the two rows")
+            raise table.bad(row, f"{parameter} of camera {name} is given twice; keep one of the two rows")
     values = dict(zip(parameters, table.numbers("value").tolist(), strict=True))
     sigma = np.nan_to_num(table.numbers("sigma", empty=True))
     for line in np.flatnonzero(sigma < 0):
@@ -259,7 +259,7 @@ def read_results(source: CameraSource) -> CameraFile:
     names, constants = parameter_names(empty), constant_names(empty)
     if missing := [n for n in (*names, *constants) if n not in values]:
         model = type(empty.distortion).__name__
-        raise source.error(f"camera {name} has no {', '.join(missing)}, which {model} needs; give the block it is of")
+        raise source.error(f"camera {name} has no {', '.join(missing)}, which {model} needs; give its block")
     if not values["c_mm"] > 0:
         raise source.error(f"c_mm of camera {name} is {values['c_mm']:g}; a principal distance is positive")
     for constant in constants:
@@ -282,7 +282,9 @@ def _covariance(source: CameraSource, camera: str, names: tuple[str, ...], sigma
         table: pd.DataFrame = pd.read_csv(path, usecols=list(_CORRELATION), dtype=str)
     except ValueError:
         columns = ", ".join(_CORRELATION)
-        raise source.error(f"{path.name} beside it is no table of {columns}; adjust again or remove it") from None
+        raise source.error(
+            f"{path.name} in its folder is not a table of {columns}; adjust again or remove it"
+        ) from None
     labels = {f"interior[{camera}].{n}": k for k, n in enumerate(names) if n in free}
     rows = table[table.parameter_a.isin(labels) & table.parameter_b.isin(labels)]
     rho = np.full((len(names), len(names)), np.nan)
@@ -292,7 +294,7 @@ def _covariance(source: CameraSource, camera: str, names: tuple[str, ...], sigma
     part = rho[np.ix_(*2 * [[names.index(n) for n in free]])]
     symmetric = np.isfinite(part).all() and np.abs(part - part.T).max() < _ROUNDING
     if len(rows) != len(free) * (len(free) - 1) or not symmetric or np.linalg.eigvalsh(part).min() < -_ROUNDING:
-        raise source.error(f"{path.name} beside it is not of the same adjustment; adjust again or remove it")
+        raise source.error(f"{path.name} in its folder is of another adjustment; adjust again or remove it")
     return sigma[:, None] * np.nan_to_num(rho) * sigma
 
 
@@ -310,7 +312,7 @@ def _described(source: CameraSource, camera: str) -> tuple[Sensor, InteriorOrien
         return read_sensor(section), empty_camera(section.values)
     except (ValueError, KeyError, TypeError):
         raise source.error(
-            f"neither summary.json beside it nor a block says of which model camera {camera} is; give the block"
+            f"the model of camera {camera} is in neither summary.json nor a block; give the block"
         ) from None
 
 

@@ -127,7 +127,7 @@ def split_row(file: str, line: str, row: int, separator: str) -> list[str]:
             else csv.reader([line], delimiter=separator, skipinitialspace=True, strict=True)
         )
     except csv.Error:
-        raise RowError(f"{file}, row {row}: the quotation marks do not pair; close or remove them", [row]) from None
+        raise RowError(f"{file}, row {row}: unpaired quotation marks; close or remove them", [row]) from None
     return [cell.strip() for cell in cells]
 
 

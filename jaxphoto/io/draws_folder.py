@@ -48,8 +48,8 @@ class DrawsFolder:
         held, wanted = read_json(run), json.loads(json.dumps(settings))
         for name in [name for name in {**held, **wanted} if held.get(name) != wanted.get(name)][:1]:
             raise InputError(
-                f"{self.directory} holds a run with other settings ({name} {held.get(name)}, now {wanted.get(name)}): "
-                "name a new folder, or give the settings of that run to go on with it"
+                f"{self.directory} has a run with other settings ({name} {held.get(name)}, now {wanted.get(name)}): "
+                "name a new folder, or use the settings of that run to continue it"
             )
 
     @property
@@ -147,7 +147,7 @@ def check_place(directory: Path) -> None:
             raise InputError(f"{path} is a file: name a folder for the draws")
     known = not directory.is_dir() or (directory / _RUN).is_file()
     if not known and any(not is_place(path.name) for path in directory.iterdir()):
-        raise InputError(f"{directory} is not empty and holds no Monte Carlo run: name a new folder")
+        raise InputError(f"{directory} is not empty and has no Monte Carlo run: give a new folder")
     check_room(directory / _RUN)
 
 
@@ -158,4 +158,4 @@ def _reading(file: Path) -> Iterator[None]:
         yield
     # pyarrow raises KeyError or UnicodeDecodeError for damaged column names.
     except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError):
-        raise InputError(f"{file} is damaged: delete it, then its draws are repeated") from None
+        raise InputError(f"{file} is damaged: delete it to repeat its draws") from None

@@ -18,7 +18,7 @@ from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.writing import check_room, clear_leftovers, is_place, locked, whole_file
 
 _MARKER, _SUFFIX = "kept.txt", ".piece"
-_SAYS = "What a run of jaxphoto has worked out so far. The same command goes on from here, and removes it at its end.\n"
+_SAYS = "Checkpoints of a run of jaxphoto. The same command continues from them, and removes them at its end.\n"
 # Maximum size of a checkpoint in bytes, sufficient for some million features.
 _MOST = 1_000_000_000
 
@@ -71,12 +71,12 @@ class KeptPieces:
         """
         with locked(self.folder) as own:
             if own is False:
-                raise InputError(f"another run is at work in {self.folder}: wait for it, or name another folder --out")
+                raise InputError(f"another run uses {self.folder}: wait for it, or give another folder by --out")
             try:
                 yield self
             except JaxphotoError as error:
                 if self._any():
-                    error.add_note(f"what was worked out so far stays in {self.folder} for another try")
+                    error.add_note(f"checkpoints remain in {self.folder}; the same command continues from them")
                 raise
             finally:
                 if self.folder.is_dir() and not self._any():
@@ -108,12 +108,12 @@ def beside(out: Path) -> Path:
 def check_pieces(folder: Path) -> None:
     """Raise InputError if `folder` is a file or contains other files."""
     if os.path.lexists(folder) and not folder.is_dir():
-        raise InputError(f"{folder} is a file, where what is worked out is kept meanwhile: move it away")
+        raise InputError(f"{folder} is a file, but checkpoints need a folder of this name: move it away")
     known = not folder.is_dir() or (folder / _MARKER).is_file()
     if not known and any(not is_place(path.name) for path in folder.iterdir()):
         raise InputError(
-            f"{folder} is not empty and not jaxphoto's, and what is worked out would be kept there meanwhile: move it "
-            "away, or name another folder --out"
+            f"{folder} is not empty and not jaxphoto's, but needed for checkpoints: move it "
+            "away, or give another folder by --out"
         )
     check_room(folder / _MARKER)
 

@@ -89,7 +89,7 @@ def photographs(paths: Sequence[str | Path]) -> list[Photograph]:
         photograph = read_photograph(path)
         other = read.setdefault(path.stem, photograph)
         if other is not photograph:
-            raise InputError(f"{other.path} and {path} would both be the image {path.stem!r}; rename one, or omit it")
+            raise InputError(f"{other.path} and {path} both have the image name {path.stem!r}; rename or omit one")
     return list(read.values())
 
 
@@ -105,7 +105,7 @@ def read_photograph(path: Path) -> Photograph:
             return _photograph(path, *picture.size, read_exif(picture))
     # Pillow raises many kinds of exceptions for damaged bytes.
     except Exception as error:
-        raise InputError(f"{path}: this is no picture that can be read; give a TIFF, PNG or JPEG") from error
+        raise InputError(f"{path}: not a readable image; give a TIFF, PNG or JPEG") from error
 
 
 def _photograph(path: Path, width_px: int, height_px: int, exif: Exif) -> Photograph:
@@ -200,7 +200,7 @@ def sensor_and_interior(
         rounding = _rounding(f if first.sensor_width_mm or pixel_mm is not None else f35 or f)
     else:
         c = _USUAL_C * max(first.width_px, first.height_px) * pixel
-        c_origin, rounding = f"c a guess, {_USUAL_C:g} times the longer side (not in EXIF)", _USUAL_C_SIGMA
+        c_origin, rounding = f"c is a guess, {_USUAL_C:g} times the longer side (not in EXIF)", _USUAL_C_SIGMA
     sensor = Sensor(first.width_px, first.height_px, pixel, pixel_assumed=assumed)
     origin = f"c = {c:.6g} mm ({c / pixel:.5g} pixels of {pixel:.4g} mm): {c_origin}; {pixel_origin}."
     return CameraStart(sensor, InteriorOrientation(c), origin, rounding)
@@ -358,4 +358,4 @@ def _check_complete(file: Path) -> None:
             else:
                 picture.verify()
     except (OSError, SyntaxError) as error:
-        raise InputError(f"{file}: the picture is cut off or damaged ({error}); copy it again") from error
+        raise InputError(f"{file}: the image is cut off or damaged ({error}); copy it again") from error

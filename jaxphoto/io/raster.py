@@ -43,11 +43,11 @@ def read_dsm(path: str | Path, epsg: int | None = None) -> tuple[Raster, Coordin
         system = system_of(CRS.from_wkt(crs.to_wkt()), path.name) if crs else CoordinateSystem()
     valid = ~np.ma.getmaskarray(band) & np.isfinite(band.data)
     for invalid, problem in (
-        (place.is_identity, "has no georeferencing; write it with its place"),
+        (place.is_identity, "has no georeferencing; export it with georeferencing"),
         (place.b or place.d or place.a <= 0 or place.e >= 0, "is not north up; resample it"),
         (system.geographic, f"is in {system.name}, in degrees; resample it to a map system"),
         (not np.isclose(place.a, -place.e, rtol=1e-6), f"has cells of {place.a:g} x {-place.e:g}; resample to squares"),
-        (not valid.any(), "has no heights; name another surface model"),
+        (not valid.any(), "has no heights; give another surface model"),
     ):
         if invalid:
             raise InputError(f"{path.name} {problem}")

@@ -79,7 +79,7 @@ def photograph_files(images: Sequence[str], folders: Iterable[Path], flight: Pat
         for file in sorted(folder.iterdir()):
             if file.suffix.lower() in _PICTURES and file.stem in set(images):
                 if file.stem in pictures:
-                    raise InputError(f"{pictures[file.stem]} and {file} would both be the image {file.stem}; give one")
+                    raise InputError(f"{pictures[file.stem]} and {file} both have the image name {file.stem}; give one")
                 pictures[file.stem] = file
     listed = {} if flight is None else _listed(flight)
     return listed | {name: file.name for name, file in pictures.items()}
@@ -112,11 +112,11 @@ def _sources(folder: Path, block: Path | None, part: int) -> tuple[Path, Path]:
     parts = None if (folder / INTERIOR).is_file() else _parts(folder)
     if parts is not None:
         if not 1 <= part <= len(parts):
-            raise InputError(f"{folder} has {len(parts)} part(s), the largest being 1; there is no part {part}")
+            raise InputError(f"{folder} has {len(parts)} part(s); unknown part {part}")
         names = parts[part - 1] if isinstance(parts[part - 1], dict) else {}
         inside = [_below(folder, names.get(key)) for key in ("result", "block")]
         if inside[0] is None or inside[1] is None:
-            raise InputError(f"{folder / SUMMARY} does not say where part {part} is; fly again")
+            raise InputError(f"{folder / SUMMARY} has no folder for part {part}; fly again")
         result, block = inside[0], block or inside[1]
     elif not (folder / INTERIOR).is_file():
         raise InputError(f"{folder} has no {INTERIOR}; give a folder that jaxphoto adjust or jaxphoto fly wrote")
@@ -124,7 +124,9 @@ def _sources(folder: Path, block: Path | None, part: int) -> tuple[Path, Path]:
         raise InputError(f"{folder} is the result of one block; only the folder of a flight has a part {part}")
     block = block or _block_of(folder)
     if not (block / TOML).is_file():
-        raise InputError(f"the block of {result} should be {block}, where there is no {TOML}; name it by --block")
+        raise InputError(
+            f"the block of {result} should be {block}, but {TOML} is missing there; give the block by --block"
+        )
     return result, block
 
 
@@ -138,7 +140,7 @@ def _block_of(folder: Path) -> Path:
             block = _below(folder.parent, other.get("block"))
             if block is not None:
                 return block
-    raise InputError(f"{folder} does not say of which block it is the result; name the block folder by --block")
+    raise InputError(f"{folder} has no reference to its block; give the block folder by --block")
 
 
 def _below(folder: Path, name: Any) -> Path | None:
@@ -161,7 +163,7 @@ def _values(
     """Read numeric columns of a result table in the order of the block. Raise InputError for different ids."""
     path = result / file
     if not path.is_file():
-        raise InputError(f"{path} is missing, which results have; adjust again")
+        raise InputError(f"{path} is missing in the results; adjust again")
     table = read_csv(path, (column, *numbers), (*(f"sigma_{name}" for name in numbers), "n_images", "angle_deg"))
     if ANGLES[0] in numbers:
         check_angles(table, np.stack([table.numbers(name) for name in ANGLES], axis=1), ANGLES)

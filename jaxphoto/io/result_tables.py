@@ -34,7 +34,7 @@ def read_result_tables(folder: str | Path, names: Sequence[str] = ()) -> dict[st
     """
     files = {path.stem: path for path in sorted(Path(folder).glob("*.csv"))}
     if not files:
-        raise InputError(f"{folder} holds no tables (.csv): give a folder of results, as adjust writes it")
+        raise InputError(f"{folder} has no tables (.csv): give a result folder of jaxphoto adjust")
     if missing := [name for name in names if name not in files]:
         raise InputError(f"{folder} has no table {missing[0]}; it has {', '.join(files)}")
     return {name: read_table(files[name]) for name in names or files}
@@ -59,7 +59,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
 def reservation(summary: Mapping[str, Any]) -> str:
     """Return the most severe warning about an adjustment (convergence, verdict, global test, prior); "" if none."""
     if summary.get("converged") is False:
-        return f"this adjustment did not converge, so its numbers are no results: {summary.get('outcome')}"
+        return f"this adjustment did not converge, so its results are invalid: {summary.get('outcome')}"
     if summary.get("verdict") == "red":
         texts = [f["text"] for f in summary.get("findings", ()) if f.get("severity") == "error"]
         return f"the verdict on this adjustment is red: {texts[0] if texts else 'see its report'}"
@@ -68,10 +68,10 @@ def reservation(summary: Mapping[str, Any]) -> str:
         sigma0, expected = summary["sigma0"], test["expected_sigma0"]
         return (
             f"sigma naught of this adjustment is {sigma0:.3g}, expected {expected:.3g}, a significant difference: its "
-            "weights or its model are wrong, and its standard deviations with them"
+            "weights or its model are wrong, and so are its standard deviations"
         )
     if prior_warnings := summary.get("prior_warnings"):
-        return f"this adjustment rests on an earlier one: {prior_warnings[0]}"
+        return f"this adjustment depends on an earlier one: {prior_warnings[0]}"
     return ""
 
 

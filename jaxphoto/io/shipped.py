@@ -8,9 +8,9 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 EXAMPLES = {
     "cross_block": "a block to adjust: 31 images in two crossing pairs of strips, with control and check points",
     "recipe": "a recipe to simulate: two heights, a cross strip, boresight and shifts of strips",
-    "boresight": "a recipe to simulate: a flight to find the misalignment of a camera beside an IMU",
+    "boresight": "a recipe to simulate: a flight to estimate the misalignment between camera and IMU",
     "lidar": "a simulated flight of camera and lidar: block, cloud, trajectory, and the truth",
-    "strips": "a simulated flight of overlapping strips of a scanner and a camera on one trajectory, all of them wrong",
+    "strips": "a simulated flight of overlapping strips of a scanner and a camera on one trajectory, all with errors",
     "experiments": "the published experiments as runnable declarations",
 }
 """Examples and their descriptions."""
@@ -19,10 +19,10 @@ EXAMPLES = {
 def shipped(name: str) -> Path:
     """Return the path of an example, a file or folder. Raises InputError for an unknown name."""
     if name not in EXAMPLES:
-        raise InputError(f"there is no example {name}; there are {', '.join(EXAMPLES)}")
+        raise InputError(f"unknown example {name}; choose one of {', '.join(EXAMPLES)}")
     root = next((r for r in (_PACKAGE / "shipped", _PACKAGE.parent) if (r / "examples").is_dir()), None)
     if root is None:
-        raise InputError("this installation came without its examples: install jaxphoto from its wheel, or use a clone")
+        raise InputError("this installation has no examples: install jaxphoto from its wheel, or use a clone")
     if name == "experiments":
         return root / name
     folder = root / "examples"

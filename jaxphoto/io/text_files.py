@@ -55,9 +55,9 @@ def read_json(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path}: not a JSON file ({error}). Write it again") from None
+        raise InputError(f"{path}: not a JSON file ({error}). Rewrite it") from None
     if not isinstance(values, dict):
-        raise InputError(f"{path}: not a JSON object. Write it again")
+        raise InputError(f"{path}: not a JSON object. Rewrite it")
     return values
 
 

@@ -101,7 +101,7 @@ class Table:
         values = cells if cells.dtype == float else self._parsed(column, cells)
         self.check(
             np.abs(values) > LARGEST,
-            lambda line: f"{column} is {values[line]:g}, not a finite number that can be measured; correct it",
+            lambda line: f"{column} is {values[line]:g}, not a plausible finite number; correct it",
         )
         if not empty:
             self.check(np.isnan(values), lambda line: f"{column} is empty; give a number or delete the row")
@@ -167,13 +167,13 @@ def read_csv(path: Path, needed: Sequence[str], optional: Sequence[str] = (), te
     header = cells.iloc[0].str.strip().tolist()
     for name in filter(None, header):
         if header.count(name) > 1:
-            raise InputError(f"{path.name}, row {rows[0]}: the column {name} stands there twice; keep one of them")
+            raise InputError(f"{path.name}, row {rows[0]}: the column {name} is given twice; keep one of them")
     for name in needed:
         if name not in header:
             listed = ", ".join(filter(None, header))
             raise InputError(f"{path.name}, row {rows[0]}: the column {name} is missing (found {listed}); add it")
     if unknown := [name for name in header if name and name not in needed and name not in optional]:
-        message = f"{path.name}: columns that jaxphoto does not know are not used: {', '.join(unknown)}"
+        message = f"{path.name}: unknown columns are not used: {', '.join(unknown)}"
         warnings.warn(shown(message), UserWarning, stacklevel=2)
     columns: dict[str, Any] = {}
     for j, name in enumerate(header):
@@ -201,9 +201,9 @@ def _cells(path: Path, lines: list[str], rows: list[int], separator: str) -> pd.
         row, hint = rows[int(surplus[2]) - 1], ""
         if separator == ",":
             hint = " (decimal commas need semicolons between the columns)"
-        message = f"{surplus[3]} cells, but the header has {surplus[1]}; remove the surplus ones{hint}"
+        message = f"{surplus[3]} cells, but the header has {surplus[1]}; remove the extra cells{hint}"
     else:
-        row, message = rows[quotation], "the quotation marks do not pair; close or remove them in that row"
+        row, message = rows[quotation], "unpaired quotation marks; close or remove them in that row"
     raise RowError(f"{path.name}, row {row}: {message}", [row])
 
 

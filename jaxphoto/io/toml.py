@@ -61,7 +61,7 @@ class Keys(BaseModel):
     def _refuse_unknown_keys(cls, values: Any) -> Any:
         for key in values if isinstance(values, dict) else ():
             if key not in cls.model_fields:
-                raise KeyMistake(key, f"no such key is known; use {', '.join(cls.model_fields)} or remove it")
+                raise KeyMistake(key, f"unknown key; use {', '.join(cls.model_fields)} or remove it")
         return values
 
 
@@ -88,7 +88,7 @@ class Section:
         """Raise InputError for a key that is not in `keys`."""
         for key in self.values:
             if key not in keys:
-                raise self.error(key, f"no such key is known; use {', '.join(keys)} or remove it")
+                raise self.error(key, f"unknown key; use {', '.join(keys)} or remove it")
 
     def section(self, key: str) -> "Section":
         """Return the subtable `key`; empty if missing."""
@@ -131,7 +131,7 @@ class Section:
         given = {name.removesuffix(unit): value for name, value in status.items()} if isinstance(status, dict) else {}
         weights = {"sigma", "covariance"} if np.shape(start) else {"sigma"}
         if len(weights & set(given)) != 1 or set(given) - weights - {"value"}:
-            raise self.error(key, f'{quoted(status)} is no status; write "free", "fixed" or {{ sigma{unit} = ... }}')
+            raise self.error(key, f'{quoted(status)} is not a status; write "free", "fixed" or {{ sigma{unit} = ... }}')
         value = self._numbers(key, given["value"], np.shape(start)) * scale if "value" in given else np.asarray(start)
         if "covariance" in given:
             matrix = self.covariance(key, given["covariance"], len(start))
@@ -145,7 +145,7 @@ class Section:
         """Return the covariance matrix (`size` x `size`) with these rows."""
         if not isinstance(rows, list) or [len(r) if isinstance(r, list) else 0 for r in rows] != [size] * size:
             raise self.error(
-                key, f"the covariance is no matrix of {size} x {size}; write {size} lists of {size} numbers"
+                key, f"the covariance is not a {size} x {size} matrix; write {size} lists of {size} numbers"
             )
         matrix = np.array([self._numbers(key, row, (size,)) for row in rows])
         if not np.array_equal(matrix, matrix.T) or not is_covariance(matrix):
@@ -208,7 +208,7 @@ _SENTENCES = {
     "greater_than": "{input} is not positive; give the true value",
     "greater_than_equal": "{input} is less than {ge:g}; give the true value",
     "less_than": "{input} is not below {lt:g}; give the true value",
-    "less_than_equal": "{input} is too large, the most are {le:g}; give the true value",
+    "less_than_equal": "{input} exceeds the maximum {le:g}; give the true value",
     "too_short": "{input} has {actual_length} entries; give {min_length}",
     "too_long": "{input} has {actual_length} entries; give {max_length}",
     "bool_type": "{input} is neither true nor false; write one of them",

@@ -85,7 +85,7 @@ def read_flight_csv(path: Path) -> Records:
     systems = [names for names in (_MAP, _PLACE) if any(name in table for name in names)]
     if len(systems) != 1 or not all(name in table for name in systems[0]):
         raise InputError(
-            f"{path.name}: the positions are not given by one set of columns; use either {', '.join(_MAP)} or "
+            f"{path.name}: positions need exactly one set of columns; use either {', '.join(_MAP)} or "
             f"{', '.join(_PLACE)}"
         )
     sigma_m, sigma_deg = (np.stack([table.sigmas(n) for n in names], axis=1) for names in (_SIGMA_M, _SIGMA_DEG))
@@ -113,8 +113,8 @@ def _checked(records: Records, rows: np.ndarray, row: str) -> Records:
     file, time, angles = records.file, records.time, records.roll_pitch_yaw_deg
     if len(time) < SHORTEST:
         raise InputError(
-            f"{file}: there are {len(time)} records, but an interpolation that knows its uncertainty needs {SHORTEST}; "
-            "give the trajectory with more of them"
+            f"{file}: {len(time)} records, but interpolation with uncertainty needs {SHORTEST}; "
+            "give a longer trajectory"
         )
     for k in np.flatnonzero(np.diff(time) <= 0)[:1]:
         raise InputError(
@@ -202,12 +202,12 @@ def positions_in(records: Records, frame: Frame) -> Float[np.ndarray, "records 3
         position = frame.map.local_from_place(position) if records.geographic else frame.map.local(position)
     elif records.geographic:
         raise InputError(
-            f"{records.file}: the trajectory gives longitude and latitude, which a frame of kind "
-            f'"{frame.kind}" cannot place; write kind = "epsg" under [frame] in block.toml, or convert the file'
+            f"{records.file}: longitude and latitude cannot be converted to a frame of kind "
+            f'"{frame.kind}"; write kind = "epsg" under [frame] in block.toml, or convert the file'
         )
     for k in np.flatnonzero(~np.isfinite(position).all(axis=1))[:1]:
         raise InputError(
-            f"{records.file}: the coordinates at {records.time[k]:.3f} s lie where EPSG:{frame.code} does not reach; "
+            f"{records.file}: the coordinates at {records.time[k]:.3f} s are outside the area of EPSG:{frame.code}; "
             "correct them or the code"
         )
     return position

@@ -64,7 +64,7 @@ def write_undistorted(
                 _write(straight, exif, kept, photograph.path, work)
             progress(done, len(photographs))
         if len(left) == len(photographs):
-            raise InputError(f"no photograph is of camera {camera.name}: {next(iter(left.values()), 'there is none')}")
+            raise InputError(f"no photograph of camera {camera.name}: {next(iter(left.values()), 'none given')}")
         write_block_camera(work / CAMERA, camera.name, *new)
     return Undistorted(new, left)
 
@@ -76,10 +76,10 @@ def _read(path: Path, sensor: Sensor) -> tuple[np.ndarray, Image.Exif, dict[str,
     with Image.open(path) as picture:
         if picture.mode not in _MODES:
             known = ", ".join(_MODES)
-            raise InputError(f"its pixels are {picture.mode}, and undistorted are {known}; convert it to RGB")
+            raise InputError(f"its pixels are {picture.mode}, but undistorted images are {known}; convert it to RGB")
         # Reject 16-bit colours: Pillow reads them as 8-bit, and cannot write them.
         if bands.dtype != np.uint8 and picture.mode != "I;16":
-            raise InputError("its colours have 16 bits, and undistorted are those of 8; convert it to 8 bits")
+            raise InputError("16 bits per channel, but undistorted images have 8; convert it to 8 bits")
         kept: dict[str, Any] = {key: picture.info[key] for key in ("icc_profile", "xmp") if key in picture.info}
         if picture.format not in ("JPEG", "MPO"):
             kept.pop("xmp", None)

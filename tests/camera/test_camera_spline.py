@@ -120,7 +120,7 @@ def test_it_comes_back_from_a_block_folder(tmp_path):
         ("knots = 5", r"\[unknowns\.camera_splines\.one\]: knots = 5 is not an even number from 4 to 100; correct it"),
         ("interval_s = -1.0", r"interval_s = -1\.0 is not a positive number"),
         ("interval_s = 1e308", r"interval_s = 1e\+308 is not a positive number of seconds up to 1e\+09"),
-        ("yp_spline = { walk_mm = 1, sigma = 2 }", r"yp_spline\] sigma: no such key is known; use walk_mm"),
+        ("yp_spline = { walk_mm = 1, sigma = 2 }", r"yp_spline\] sigma: unknown key; use walk_mm"),
         ("c_spline_mm = [1.0]", r"c_spline_mm: \[1\.0\] has 1 entries; give 6"),
     ):
         key = wrong.split(" = ")[0]

@@ -102,7 +102,7 @@ def in_table(folder, change) -> None:
             "",
             "row 4: image i2 has no temperature_c, but in .*thermal_rates.* its camera one drifts; add the temperature",
         ),
-        ("293.15", r"row 4: temperature_c = 293\.15 is that of no camera; give it in degrees Celsius"),
+        ("293.15", r"row 4: temperature_c = 293\.15 is not a plausible camera temperature; give it in degrees Celsius"),
     ],
 )
 def test_what_is_missing_or_wrong_is_named(tmp_path, cell, words):

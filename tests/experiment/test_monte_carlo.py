@@ -163,7 +163,7 @@ def test_unreadable_settings_are_refused(tmp_path):
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
-    with pytest.raises(InputError, match="holds no Monte Carlo run"):
+    with pytest.raises(InputError, match="has no Monte Carlo run"):
         study(tmp_path)
     with pytest.raises(InputError, match="is a file"):
         study(tmp_path / "thesis.txt" / "run")

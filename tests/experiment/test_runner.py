@@ -189,7 +189,7 @@ def first_coordinate(folder) -> float:
         ({"small/experiment.py": "EXPERIMENT = 3"}, "declares no EXPERIMENT"),
         ({"small/experiment.py": "import nothing_of_the_kind"}, "cannot be run .ModuleNotFoundError"),
         ({"small/experiment.py": DECLARED}, "there is no recipe"),
-        ({"small/experiment.py": DECLARED, "small/recipe.toml": RECIPE.replace("ties", "tis")}, "tis: no such key"),
+        ({"small/experiment.py": DECLARED, "small/recipe.toml": RECIPE.replace("ties", "tis")}, "tis: unknown key"),
         ({"other/experiment.py": DECLARED}, "there is no experiment small.*choose other or all"),
     ],
 )

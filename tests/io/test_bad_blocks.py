@@ -78,7 +78,7 @@ CASES = {
     "control without coordinates": ([(C, "p2,,,4.0", "p2,,,")], ["control_points.csv, row 3", "at least one"]),
     "station without coordinates": ([(S, "b,10.0,0.0,100.0", "b,,,")], ["stations.csv, row 3", "at least one"]),
     "no time": ([(I, "one,12.0", "one,")], ["images.csv, row 3", "time_s", '"fixed"']),
-    "no strips": ([(I, "strip,time_s", "note,time_s")], ["block.toml", "strips", "add its column"]),
+    "no strips": ([(I, "strip,time_s", "note,time_s")], ["block.toml", "strips", "no column strip"]),
     # units that cannot be
     "c negative": ([(T, "c_mm = 5.0", "c_mm = -5.0")], ["block.toml", "c_mm", "positive"]),
     "c in pixels": ([(T, "c_mm = 5.0", "c_mm = 500.0")], ["block.toml", "[cameras.kodak.interior] c_mm", "pixels"]),
@@ -169,7 +169,7 @@ def test_bad_input_is_refused(write_folder, name):
 
 
 def test_no_folder(tmp_path):
-    with pytest.raises(InputError, match=r"no folder .*nowhere; give the folder"):
+    with pytest.raises(InputError, match=r"folder not found: .*nowhere; give the folder"):
         read_block(tmp_path / "nowhere")
 
 

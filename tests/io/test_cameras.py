@@ -396,7 +396,7 @@ def test_a_block_may_get_another_model(tmp_path):
         (AGISOFT.replace("frame", "spherical"), "a.xml", "projection 'spherical' is not supported; use one of frame"),
         (AGISOFT.replace("<f>3268.30117351641</f>", ""), "a.xml", "<f> is missing"),
         (AGISOFT.replace("-0.0123", "-0,0123"), "a.xml", "k3 is '-0,0123', not a finite number"),
-        (COLMAP, "cameras.txt", "it holds 6 cameras; name one of 1, 2, 3, 4, 5, 6"),
+        (COLMAP, "cameras.txt", "6 cameras in the file; choose one of 1, 2, 3, 4, 5, 6"),
         (
             "1 FOV 100 100 80 50 50 0.1\n",
             "cameras.txt",
@@ -409,9 +409,9 @@ def test_a_block_may_get_another_model(tmp_path):
         ),
         (SMAC.replace("0.1558 × 10-6", "0.1558 × 10-"), "a.txt", "P2 is '0.1558e', not a finite number"),
         (SMAC_TORN[: SMAC_TORN.index("-0.3015")], "a.txt", "P1, P2, P3, P4 not found in this SMAC report"),
-        (INTERIOR, "interior.csv", "nor a block says of which model camera nadir is; give the block"),
+        (INTERIOR, "interior.csv", "the model of camera nadir is in neither summary.json nor a block; give the block"),
         (COLMAP.replace("2 PINHOLE", "1 PINHOLE"), "cameras.txt", "duplicate camera 1"),
-        ("# Camera list\n", "cameras.txt", "there is no camera in it"),
+        ("# Camera list\n", "cameras.txt", "no camera in"),
         (OPENCV.replace("   cols: 1\n", ""), "a.yml", "distortion_coefficients is not a matrix of rows x cols"),
         ("", "a.txt", "the file is empty"),
     ],
@@ -428,17 +428,17 @@ def test_bad_files_are_refused_in_one_sentence(tmp_path, text, name, message):
 def test_wrong_use_is_refused(tmp_path):
     with pytest.raises(InputError, match="there is no file"):
         read_camera_file(tmp_path / "none.yml")
-    with pytest.raises(InputError, match=r"holds none of interior.csv, block.toml, camera.toml, cameras.txt"):
+    with pytest.raises(InputError, match=r"contains none of interior.csv, block.toml, camera.toml, cameras.txt"):
         read_camera_file(tmp_path)
     (tmp_path / "b.yml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError, match="the file is no text"):
+    with pytest.raises(InputError, match="the file is not a text file"):
         read_camera_file(tmp_path / "b.yml")
     path = written(tmp_path, OPENCV, "a.yml")
     with pytest.raises(InputError, match="image size is 1280 x 960 px, not 100 x 100"):
         read_camera_file(path, size_px=(100, 100))
-    with pytest.raises(InputError, match="a pixel of -1 mm cannot be"):
+    with pytest.raises(InputError, match="pixel size -1 mm is invalid"):
         read_camera_file(path, pixel_mm=-1.0)
-    with pytest.raises(InputError, match="there is no camera '9' in it"):
+    with pytest.raises(InputError, match="unknown camera '9'"):
         read_camera_file(written(tmp_path, COLMAP, "cameras.txt"), camera="9")
     interior = InteriorOrientation(35.0, 0.0, 0.0, Brown())
     with pytest.raises(InputError, match="give one of opencv, ros, mrcal, colmap"):
@@ -473,14 +473,14 @@ IMPOSSIBLE = [("c_mm", "xp_mm", 0.9), ("c_mm", "k1", -0.9), ("xp_mm", "k1", 0.9)
 def test_correlations_of_another_adjustment_are_refused(tmp_path, text):
     block, folder = written(tmp_path, TOML, "b.toml"), results_folder(tmp_path)
     written(tmp_path, text, "correlation.csv")
-    with pytest.raises(InputError, match=r"correlation.csv beside it is not of the same adjustment"):
+    with pytest.raises(InputError, match=r"correlation.csv in its folder is of another adjustment"):
         read_camera_file(folder, block=block)
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("nadir,yp_mm", "nadir,xp_mm", "row 4: xp_mm of camera nadir stands there twice"),
+        ("nadir,yp_mm", "nadir,xp_mm", "row 4: xp_mm of camera nadir is given twice"),
         ("0.002,True", "-0.002,True", "row 2: sigma is -0.002"),
         ("r0_mm,8.0", "r0_mm,-8.0", "r0_mm of camera nadir is -8"),
         ("35.5", "-35.5", "c_mm of camera nadir is -35.5"),
@@ -497,7 +497,9 @@ def test_results_that_are_incomplete_are_refused(tmp_path):
     folder = results_folder(tmp_path)
     block = written(tmp_path, TOML, "b.toml")
     written(tmp_path, "a,b\n1,2\n", "correlation.csv")
-    with pytest.raises(InputError, match=r"correlation.csv beside it is no table of parameter_a, parameter_b, rho"):
+    with pytest.raises(
+        InputError, match=r"correlation.csv in its folder is not a table of parameter_a, parameter_b, rho"
+    ):
         read_camera_file(folder, block=block)
     written(
         tmp_path, TOML.replace('"smac"\nsign = "add"', '"ebner"').replace("r0_mm", "b_mm").replace("k1", "b1"), "e.toml"

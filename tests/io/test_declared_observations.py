@@ -228,7 +228,7 @@ def test_defaults_of_user_classes(write_folder):
         ("-0.25,", ",", r"row 3: value_m is empty; give a number"),
         ("0.001", "0", r"row 2: sigma_m is 0; a standard deviation is positive"),
         ("start", "begin", r"row 1: the column start is missing"),
-        ("", "", r"row 3: there is no standard deviation; .* sigma_m, or add height_difference_m under \[sigmas\]"),
+        ("", "", r"row 3: missing standard deviation; .* sigma_m, or add height_difference_m under \[sigmas\]"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*not used:UserWarning")
@@ -244,7 +244,7 @@ def test_mistakes_are_named(write_folder, old, new, words):
     [
         ("who", "three", r"everything\.csv, row 2: strips three is none of the strips of this block \(one, two\)"),
         ("weather_code", "1.5", "row 2: weather_code is 1.5, not a whole number"),
-        ("value_u_deg", "400", "row 2: value_u_deg = 400 is more than a turn"),
+        ("value_u_deg", "400", "row 2: value_u_deg = 400 is more than a full rotation"),
         ("pair_2", "z", r"row 2: image z is not in images\.csv"),
     ],
 )
@@ -287,7 +287,7 @@ def test_observations_that_files_cannot_hold_are_refused(block, tmp_path):
     ):
         write_block(dataclasses.replace(block, more=(second,)), tmp_path / "copy")
     tilted = dataclasses.replace(rows_of(Everything, 1), offset=np.ones(1))
-    with pytest.raises(BlockError, match="everything: offset is in no file, which means zero"):
+    with pytest.raises(BlockError, match="everything: offset has no file format and must be zero"):
         write_block(dataclasses.replace(block, more=(tilted,)), tmp_path / "copy")
     assert not (tmp_path / "copy").exists()
 

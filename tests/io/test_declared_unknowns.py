@@ -225,7 +225,7 @@ model = "ciddor"
         ([section("[unknowns.tides]")], r"\[unknowns\] tides: jaxphoto has no class for these unknowns; give yours"),
         (
             [section("[unknowns.camera_rates.leica]")],
-            r"\[unknowns\.camera_rates\] leica: no such key is known; use default, kodak",
+            r"\[unknowns\.camera_rates\] leica: unknown key; use default, kodak",
         ),
         ([section("[unknowns.flight_bias]\nshift_m = [1, 2]")], r"shift_m: \[1, 2\] has 2 entries; give 3"),
         (
@@ -234,7 +234,7 @@ model = "ciddor"
         ),
         (
             [section('[unknowns.shutters.kodak]\nreadout_ms = 20000.0\nreadout = "free"')],
-            r"\[unknowns\.shutters\.kodak\] readout_ms: 20000 ms is no readout time; give milliseconds",
+            r"\[unknowns\.shutters\.kodak\] readout_ms: 20000 ms is not a plausible readout time; give milliseconds",
         ),
         (
             [section("[unknowns.shutters.default]\nreadout_ms = 30.0\n[unknowns.motions.a]\n[unknowns.motions.c]")],
@@ -246,10 +246,10 @@ model = "ciddor"
         ),
         (
             [section("[unknowns.refractivity.default]")],
-            r"\[unknowns\.refractivity\]: their owner is a part of the images called hour; add the column hour",
+            r"\[unknowns\.refractivity\]: images have no partition hour; add the column hour",
         ),
         ([TOP], r"images\.csv, row 1: the column hour is missing"),
-        ([("block.toml", 'title = "small"', 'partitions = ["strip"]')], r"partitions: strip has a meaning already"),
+        ([("block.toml", 'title = "small"', 'partitions = ["strip"]')], r"partitions: strip is reserved"),
         (
             [*HOURS[:3], ("images.csv", "c,kodak", "default,c,kodak"), TOP],
             r"images\.csv, row 4: the hour default means every hour in \[unknowns\]",
@@ -277,5 +277,7 @@ def test_fields_that_files_cannot_hold_are_refused(write_folder):
 
         both: Float[Array, "2"]
 
-    with pytest.raises(TypeError, match=r"Mixed\.both is no number or vector of one unit; make it several fields"):
+    with pytest.raises(
+        TypeError, match=r"Mixed\.both is not a number or vector of one unit; split it into several fields"
+    ):
         keys_of(Mixed)

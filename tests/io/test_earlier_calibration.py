@@ -92,9 +92,12 @@ def test_a_camera_file_keeps_the_covariance(years, results, monkeypatch, capsys)
 @pytest.mark.parametrize(
     ("table", "sentence"),
     [
-        ('calibration = "../this"', "has no covariance; name results of jaxphoto adjust, or a camera file of it"),
+        ('calibration = "../this"', "has no covariance; give a result folder of jaxphoto adjust, or a camera file"),
         ('calibration = "../nothing"', "there is no file"),
-        ('calibration = "../results"\nwidth_px = 3', "width_px: the calibration gives it; only residuals, unknowns"),
+        (
+            'calibration = "../results"\nwidth_px = 3',
+            "width_px: already given by the calibration, which permits only residuals, unknowns",
+        ),
         ('calibration = "../results"\n[cameras.one.unknowns]\nc_mm = "fixed"', "it has prior information in"),
     ],
 )

@@ -129,7 +129,7 @@ def test_renumbered_marks_are_matched_by_positions(tmp_path, lost):
     if lost:
         assert all(same(taken[k].gps, steady.camera[k]) for k in left)
     else:
-        assert taken == blind and "no position decides; not used" in said[0]
+        assert taken == blind and "no positions resolve this; not used" in said[0]
         # Numbers that begin with 2 were kept.
         kept = read_exposures(written(tmp_path / "b.MRK", "".join(steady.mark(k) for k in left)))
         taken, said = with_exposures(blind, [kept])
@@ -149,7 +149,7 @@ def test_marks_of_two_flights_that_both_count_from_one(tmp_path):
     assert all(same(p.gps, c) for p, c in zip(taken, both.camera, strict=True)), said
     blind = [p._replace(gps=None) for p in own]
     taken, said = with_exposures(blind, files)
-    assert taken == blind and all("no position decides" in s for s in said)
+    assert taken == blind and all("no positions resolve this" in s for s in said)
 
 
 def test_marks_of_another_day_need_positions_that_prove_the_clock(tmp_path):
@@ -167,9 +167,9 @@ def test_marks_of_another_flight_are_not_used(tmp_path):
     file = read_exposures(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k) for k in ALL)))
     away = [FLIGHT.photograph(k, gps=moved(FLIGHT.camera[k], np.array([900.0, 0, 0]))) for k in ALL]
     taken, said = with_exposures(away, [file])
-    assert taken == away and "as of another flight; not used" in said[0]
+    assert taken == away and "another flight?); not used" in said[0]
     unknown = [FLIGHT.photograph(k, taken=None, name=f"IMG{k}") for k in ALL]
-    assert "differ from its times by one constant; not used" in with_exposures(unknown, [file]).sentences[0]
+    assert "match its times with a common clock offset; not used" in with_exposures(unknown, [file]).sentences[0]
 
 
 def test_events_of_the_antenna_are_brought_to_the_camera_by_the_arms_of_the_marks(tmp_path):
@@ -214,7 +214,7 @@ def test_a_trajectory_without_exact_times_is_not_used(tmp_path):
         in with_exposures([FLIGHT.photograph(k) for k in ALL], [file]).sentences[0]
     )
     exact = [FLIGHT.photograph(k, taken=Taken(FLIGHT.time[k] - 18 + 9e6, 1e-6, 0.0)) for k in ALL]
-    assert "no photograph was taken while it lasts" in with_exposures(exact, [file]).sentences[0]
+    assert "no photograph within its time span" in with_exposures(exact, [file]).sentences[0]
 
 
 def test_a_lever_arm_that_is_given_turns_with_the_aircraft(tmp_path):
@@ -229,11 +229,11 @@ def test_a_lever_arm_that_is_given_turns_with_the_aircraft(tmp_path):
     fixed = [p._replace(aircraft_deg=None, attitude=CameraAttitude(turn)) for p in flown]
     assert all(same(p.gps, c) for p, c in zip(with_exposures(fixed, [events], arm)[0], FLIGHT.camera, strict=True))
     plain = [p._replace(aircraft_deg=None) for p in flown]
-    assert "no attitude of the aircraft turns it" in with_exposures(plain, [events], arm).sentences[0]
-    assert "--lever-arm gives it" in with_exposures(plain, [events]).sentences[0]
+    assert "no aircraft attitude to rotate it" in with_exposures(plain, [events], arm).sentences[0]
+    assert "give it by --lever-arm" in with_exposures(plain, [events]).sentences[0]
     own = [p._replace(gps=moved(c, turn @ np.array(arm))) for p, c in zip(flown, FLIGHT.camera, strict=True)]
     taken, said = with_exposures(own, [], arm)
-    assert all(same(p.gps, c) for p, c in zip(taken, FLIGHT.camera, strict=True)) and "taken off 10" in said[0]
+    assert all(same(p.gps, c) for p, c in zip(taken, FLIGHT.camera, strict=True)) and "applied to 10" in said[0]
 
 
 def test_an_sbet_gives_positions_and_attitudes(tmp_path):
@@ -250,7 +250,7 @@ def test_an_sbet_gives_positions_and_attitudes(tmp_path):
     expected = level_from_belly(np.degrees(1.1), 0.0, np.degrees(0.01))
     np.testing.assert_allclose(taken[0].attitude.level_from_camera, expected, atol=1e-9)
     assert any("flight.sbet: positions of 10 photographs by interpolation" in s for s in said)
-    assert any("10 are positions of the IMU, the lever arm is not known" in s for s in said)
+    assert any("10 are positions of the IMU, the lever arm is unknown" in s for s in said)
     assert taken[0].gps.stated_sigma_m == FIX_SIGMA_M["integrated"] and any("10 integrated" in s for s in said)
     # Events of the antenna, two of them lost, tell the times as well; their file comes after that of the trajectory.
     (tmp_path / "x.MRK").unlink()
@@ -295,7 +295,7 @@ def test_a_table_by_name(tmp_path):
 
 @pytest.mark.parametrize(
     ("exchanged", "east_m", "words"),
-    [(True, 0.0, "longitudes and latitudes have changed places"), (False, 5000.0, "as of another flight; not used")],
+    [(True, 0.0, "longitude and latitude are interchanged"), (False, 5000.0, "another flight?); not used")],
 )
 def test_a_table_far_from_the_photographs_is_not_used(tmp_path, exchanged, east_m, words):
     places = [moved(g, np.array([east_m, 0, 0])) for g in FLIGHT.camera]
@@ -396,11 +396,11 @@ def test_tables_of_other_programs(tmp_path, form):
 @pytest.mark.parametrize(
     "old, new, words",
     [
-        ("= 15.0", "= 9.0", "row 17: its easting and northing lie .* from its latitude and longitude in EPSG:32632"),
+        ("= 15.0", "= 9.0", "row 17: its easting and northing are .* from its latitude and longitude in EPSG:32632"),
         ("= 15.0", "= 14.0", "are map coordinates; give the EPSG code"),
-        ("the 'x' by", "the 'y' by", "its angles turn about y first"),
+        ("the 'x' by", "the 'y' by", "its first rotation is about y"),
         ("ID, # EVENT, TIME", "TIME, DISTANCE, TIME", "missing photograph columns"),
-        ("EASTING, NORTHING", "E, N", "its head names no columns"),
+        ("EASTING, NORTHING", "E, N", "no columns in the header"),
     ],
 )
 def test_inconsistent_pospac_texts_are_refused(tmp_path, old, new, words):
@@ -412,14 +412,14 @@ def test_inconsistent_pospac_texts_are_refused(tmp_path, old, new, words):
 
 def test_a_row_of_pospac_that_is_too_short_is_left_out(tmp_path):
     text = OTHERS["pospac"][0].replace("DJI_0002.JPG 7 1234.5", "DJI_0002.JPG 7")
-    assert "row 18: 10 cells, and the header has 11" in read_exposures(written(tmp_path / "eo.txt", text)).why
+    assert "row 18: 10 cells, but the header has 11" in read_exposures(written(tmp_path / "eo.txt", text)).why
 
 
 def test_ambiguous_tables_are_refused(tmp_path):
     for text, words in (
         (table_of("imageName,X,Y,Z", "{0},{4},{5},{3}"), "are map coordinates; give the EPSG code"),
         (table_of("#imagename,coordinate1,coordinate2,z", "{0},{1},{2},{3}"), "add a header"),
-        (table_of("imagename,latitude,longitude", "{0},{2},{1}"), "its header names no heights"),
+        (table_of("imagename,latitude,longitude", "{0},{2},{1}"), "no height column in the header"),
         (table_of("label,lon,lat,z,omega [gon],phi,kappa", "{0},{1},{2},{3},0,0,0"), "its angles are in gon"),
         (table_of("EPSG:4326", "{0},{1}", " "), "row 2: y is empty"),
         (table_of("EPSG:4326", "{0},{1},{2}", " "), "row 2: z is empty"),
@@ -505,7 +505,7 @@ def test_errors_of_a_whole_table_name_no_row(tmp_path):
     found = read_exposures(
         written(tmp_path / "a.csv", at_row(TABLE_ROWS, 5, lambda line: line.replace("0004", "0001")))
     )
-    assert found.without == (2, 5) and "it is there twice" in found.why and len(found.rows) == 8
+    assert found.without == (2, 5) and "it is given twice" in found.why and len(found.rows) == 8
 
 
 def test_numbers_are_not_used_if_an_invalid_row_may_hide_a_renumbering(tmp_path):
@@ -516,7 +516,7 @@ def test_numbers_are_not_used_if_an_invalid_row_may_hide_a_renumbering(tmp_path)
     file = read_exposures(written(tmp_path / "a.MRK", at_row(text, 4, lambda line: line.replace("55.", "x"))))
     blind = [steady.photograph(k, gps=None) for k in ALL]
     taken, said = with_exposures(blind, [file])
-    assert taken == blind and "not used" in said[0] and "1 of 9 rows is left out (4); row 4" in said[0]
+    assert taken == blind and "not used" in said[0] and "1 of 9 rows is skipped (4); row 4" in said[0]
 
 
 GPS, ZONE_S = 0x8825, 7200
@@ -567,8 +567,8 @@ def said_of(folder):
 
 FAR = (56.7, 13.2)
 SPOILT = {
-    "truncated": (cut, "cut.jpg: the picture is cut off or damaged", ()),
-    "no picture": (lambda f: (f / "x.jpg").write_text("none"), "x.jpg: this is no picture", ()),
+    "truncated": (cut, "cut.jpg: the image is cut off or damaged", ()),
+    "no picture": (lambda f: (f / "x.jpg").write_text("none"), "x.jpg: not a readable image", ()),
     "doubled": (lambda f: shutil.copy(f / "DJI_0002.jpg", f / "DJI_0002 (1).jpg"), "it is a copy of DJI_0002", ()),
     "screenshot": (lambda f: Image.new("RGB", (640, 480)).save(f / "s.png"), "s.png: its size is 640 x 480 px", ()),
     "other camera": (lambda f: picture(f, 4, model="Other"), "its camera is Maker Other", ("DJI_0005",)),
@@ -617,5 +617,5 @@ def test_a_wrong_row_of_marks_is_one_sentence(clean, tmp_path):
     (wrong / "a.MRK").write_text((right / "a.MRK").read_text().replace("34\t", "34\tx"))
     (before, sound), (said, found) = said_of(right), said_of(wrong)
     mine = [s for s in said if s.startswith("a.MRK")]
-    assert len(mine) == 1 and mine[0] not in before and "1 of 10 rows is left out (4); row 4: " in mine[0], mine
+    assert len(mine) == 1 and mine[0] not in before and "1 of 10 rows is skipped (4); row 4: " in mine[0], mine
     assert [n for n, g in found.items() if g != sound[n]] == ["DJI_0004"] and found["DJI_0004"] is not None

@@ -174,7 +174,7 @@ CLOCKS = {
     "LAS": (2200 * WEEK - 1_000_000_000, ["LAS", "shift_s = -330560000"]),
     "Unix": (2200 * WEEK + 315_964_800 - 18, ["Unix", f"shift_s = {-(2200 * WEEK + 315_964_800 - 18):d}"]),
     "leap seconds": (18.0, ["row 4", "image c", "shift_s = -18"]),
-    "another day": (3 * DAY + 5000, ["take a trajectory that covers it"]),
+    "another day": (3 * DAY + 5000, ["use a trajectory that covers it"]),
 }
 
 
@@ -231,7 +231,7 @@ REFUSED = {
     "gap": (lambda fly: fly(holed()), r"row 3: image b .* 350003\.330 s in a gap of flight\.csv.*max_gap_s"),
     "key": (
         lambda fly: fly(text="max_gap = 1.0"),
-        r"\[trajectory\] max_gap: no such key is known; use file, shift_s, max_gap_s",
+        r"\[trajectory\] max_gap: unknown key; use file, shift_s, max_gap_s",
     ),
     "stations": (
         lambda fly: _beside(fly(), "stations.csv", "image,X_m,Y_m,Z_m\na,1,2,3\n"),

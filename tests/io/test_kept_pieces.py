@@ -48,7 +48,7 @@ def test_folders_of_others_and_of_another_run_are_refused(tmp_path):
     with pytest.raises(InputError, match="not jaxphoto's"):
         KeptPieces(tmp_path)
     one, other = KeptPieces(tmp_path / "a"), KeptPieces(tmp_path / "a")
-    with one.alone(), pytest.raises(InputError, match="another run is at work"), other.alone():
+    with one.alone(), pytest.raises(InputError, match="another run uses"), other.alone():
         pass
     with other.alone() as own:
         assert own is other
@@ -61,4 +61,4 @@ def test_what_is_left_of_a_run_that_is_refused_is_told(tmp_path):
     with pytest.raises(InputError, match="no") as refused, pieces.alone():
         pieces.write("one", x=np.zeros(3))
         raise InputError("no")
-    assert refused.value.__notes__ == [f"what was worked out so far stays in {tmp_path / 'a'} for another try"]
+    assert refused.value.__notes__ == [f"checkpoints remain in {tmp_path / 'a'}; the same command continues from them"]

@@ -60,7 +60,7 @@ def test_heights_are_ellipsoidal_by_default_with_a_warning(write_folder, tmp_pat
     told = read_block(to_utm(write_folder()))
     (tmp_path / "block").rename(tmp_path / "first")
     silent = to_utm(write_folder(), EPSG.replace('\nvertical = "ellipsoidal"', ""))
-    with pytest.warns(UserWarning, match=r"block\.toml, \[frame\]: heights are taken as above the ellipsoid.*5773"):
+    with pytest.warns(UserWarning, match=r"block\.toml, \[frame\]: heights are assumed ellipsoidal.*5773"):
         assumed = read_block(silent)
     assert assumed.frame == told.frame
     np.testing.assert_array_equal(assumed.control.value, told.control.value)

@@ -256,7 +256,7 @@ def read_quietly(folder, name):
     """Image c has no station: direct georeferencing holds what images.csv says, and says so."""
     if name != "direct":
         return read_block(folder)
-    with pytest.warns(UserWarning, match=r"mode = .direct.: 1 image\(s\) have no station and attitude.*exact: c$"):
+    with pytest.warns(UserWarning, match=r"mode = .direct.: 1 image\(s\) have no station and attitude.*is fixed: c$"):
         return read_block(folder)
 
 

@@ -270,7 +270,7 @@ def test_a_sensor_in_millimetres_tells_the_pixel(tmp_path):
     assert block.sensors["one"].pixel_mm == pytest.approx(6.4 / WIDTH, rel=1e-15)
     assert float(block.start.unknowns.interior["one"].c) == pytest.approx(8.0, rel=1e-15)
     nothing = lambda text: text.replace("<SensorSize>6.4", "<SensorSize>0")  # noqa: E731
-    with pytest.raises(InputError, match="a pixel of 0 mm cannot be"):
+    with pytest.raises(InputError, match="pixel size 0 mm is invalid"):
         read_source(write_blocks_exchange(tmp_path / "none", pixels_of_focal=False, change=nothing))
 
 

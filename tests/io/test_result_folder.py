@@ -59,16 +59,16 @@ def test_the_block_of_a_result_in_a_flight_is_that_of_its_part(own):
     summary = json.loads((own / "result" / "summary.json").read_text())
     del summary["block"]
     (own / "result" / "summary.json").write_text(json.dumps(summary))
-    with pytest.raises(InputError, match="does not say of which block it is the result; name the block folder by"):
+    with pytest.raises(InputError, match="has no reference to its block; give the block folder by"):
         adjusted_block(own / "result")
     assert adjusted_block(own / "result", own / "block").images == adjusted("cross").block.images
     parts = [{"result": "result", "block": "block"}, {"result": "../result", "block": "block"}]
     (own / "summary.json").write_text(json.dumps({"parts": parts}))
     for folder in (own, own / "result"):
         same_unknowns(adjusted_block(folder).start.unknowns, adjusted("cross").unknowns)
-    with pytest.raises(InputError, match="does not say where part 2 is"):
+    with pytest.raises(InputError, match="has no folder for part 2"):
         adjusted_block(own, part=2)
-    with pytest.raises(InputError, match=r"has 2 part\(s\), the largest being 1; there is no part 3"):
+    with pytest.raises(InputError, match=r"has 2 part\(s\); unknown part 3"):
         adjusted_block(own, part=3)
     with pytest.raises(InputError, match="only the folder of a flight has a part 2"):
         adjusted_block(own / "result", part=2)
@@ -98,8 +98,8 @@ def diverged(folder):
         (renamed, r"exterior\.csv is not of the block .*: image i0; name the block that was adjusted by --block"),
         (shortened, r"object_points\.csv is not of the block .*: point p0"),
         (diverged, "the adjustment did not converge"),
-        (lambda f: shutil.rmtree(f / "block"), r"should be .*block, where there is no block\.toml"),
-        (lambda f: (f / "result" / "exterior.csv").unlink(), r"exterior\.csv is missing, which results have"),
+        (lambda f: shutil.rmtree(f / "block"), r"should be .*block, but block\.toml is missing"),
+        (lambda f: (f / "result" / "exterior.csv").unlink(), r"exterior\.csv is missing in the results"),
         (lambda f: (f / "result" / "interior.csv").unlink(), r"has no interior\.csv; give a folder that"),
     ],
 )  # fmt: skip
@@ -123,7 +123,7 @@ def test_photographs_are_called_by_their_files(tmp_path):
         (tmp_path / name).touch()
     images = ("a", "b", "c")
     assert photograph_files(images, [tmp_path / "left"]) == {"a": "a.JPG", "b": "b.tif"}
-    with pytest.raises(InputError, match=r"b\.tif and .*b\.jpg would both be the image b; give one"):
+    with pytest.raises(InputError, match=r"b\.tif and .*b\.jpg both have the image name b; give one"):
         photograph_files(images, [tmp_path / "left", tmp_path / "right"])
     with pytest.raises(InputError, match="folder not found: "):
         photograph_files(images, [tmp_path / "none"])

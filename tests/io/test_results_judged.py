@@ -25,7 +25,7 @@ RED = {"verdict": "red", "findings": [{"severity": "error", "text": "T1 is off"}
     [
         ({}, ""),
         ({"converged": True, "verdict": "green", "global_test": {"passed": True}}, ""),
-        ({"converged": False, "outcome": "too few steps"}, "no results: too few steps"),
+        ({"converged": False, "outcome": "too few steps"}, "results are invalid: too few steps"),
         (RED, "the verdict on .* is red: T1 is off"),
         ({"verdict": "red", "findings": []}, "is red: see its report"),
         (AMBER, r"sigma naught of this adjustment is 0\.53, expected 1, a significant difference"),
@@ -79,7 +79,7 @@ def test_a_failed_global_test_is_reported_and_kept_with_the_camera(results, monk
     findings = read_summary(rests)["findings"]
     assert any(f["severity"] == "warning" and f["text"].endswith(read.prior_warnings[0]) for f in findings), findings
     note = read_camera_file(rests).note
-    assert "this adjustment rests on an earlier one" in note and said in note
+    assert "this adjustment depends on an earlier one" in note and said in note
 
 
 def test_a_block_that_contradicts_itself_is_reported_before_simulation(results, monkeypatch, capsys, tmp_path):

@@ -58,7 +58,7 @@ def test_round_trip(folder, tmp_path, scanner):
     ("old", "new", "error", "said"),
     [
         ("p1,", "nobody,", BlockError, "surfaces.csv, row 2: point nobody is measured in no image"),
-        ("0.6,0.8", "0.6,0.9", InputError, "row 2: the normal has the length 1.08"),
+        ("0.6,0.8", "0.6,0.9", InputError, "row 2: the normal has length 1.08"),
         ("0.1,east", ",east", InputError, "row 2: sigma_m is empty"),
         ("0.2,west", "0.2,north", BlockError, r"row 3: strip 'north' has no table; add \[scanner.shifts.north\]"),
     ],
@@ -69,5 +69,5 @@ def test_bad_rows(folder, old, new, error, said):
 
 
 def test_bad_scanner(folder):
-    with pytest.raises(InputError, match=r"\[scanner\] tilt: no such key"):
+    with pytest.raises(InputError, match=r"\[scanner\] tilt: unknown key"):
         read_block(folder(scanner=SCANNER.replace("boresight_deg", "tilt")))

@@ -41,7 +41,7 @@ def test_numbers_round_trip_and_invalid_ones_name_their_row(tmp_path: Path):
         "1_000": "row 20010: v is '1_000', not a number",
         "": "row 20010: v is empty",
         "3,4": "row 20010: 3 cells, but the header has 2",
-        '"3': "row 20010: the quotation marks do not pair",
+        '"3': "row 20010: unpaired quotation marks",
     }.items():
         path.write_text("\n".join([*lines[:20_009], f"i,{cell}", *lines[20_010:]]))
         with pytest.raises(InputError, match=words):

@@ -81,7 +81,7 @@ def test_sbet_becomes_csv(tmp_path):
 
 
 CASES = {
-    "short": (lines(8), ["flight.csv", "8 records", "needs 9", "more"]),
+    "short": (lines(8), ["flight.csv", "8 records", "needs 9", "longer"]),
     "order": (lines(row4="2.5,8,0,100,0,0,90\n"), ["flight.csv, row 6", "2.5", "sort"]),
     "week": (lines(row4="-604796,8,0,100,0,0,90\n"), ["row 6", "add 604800"]),
     "turn": (lines(row3="3,6,0,100,0,0,400\n"), ["flight.csv, row 5", "yaw_deg = 400", "unit"]),

@@ -129,7 +129,7 @@ def test_the_command_leaves_out_what_is_not_of_the_camera(tmp_path, monkeypatch,
     code, said, wrong = run(monkeypatch, capsys, "undistort", tmp_path / "given", *given)
     assert code == 1 and "3 photographs of " in said
     assert "small.png: its size is 100 x 100 px" in wrong and "cut.png: " in wrong
-    assert f"skipped: {tmp_path / 'given' / 'deep.png'}: its colours have 16 bits" in wrong
+    assert f"skipped: {tmp_path / 'given' / 'deep.png'}: 16 bits per channel" in wrong
     assert {p.name for p in (tmp_path / "out").iterdir()} >= {"a.png", "b.png", "c.jpg", "camera.toml"}
     for arguments, message in (
         ((tmp_path / "given", *given[:3], tmp_path / "no", "--keep", "most"), "'most' is not one of 'crop', 'all'"),

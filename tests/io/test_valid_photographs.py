@@ -108,7 +108,7 @@ def test_spoilt_ones_are_left_out_each_with_a_sentence(folder):
     assert [p.name for p in kept] == ["0", "1", "2", "3"]
     for name, why in {
         "cut.jpg": "cut off or damaged",
-        "text.png": "no picture that can be read",
+        "text.png": "not a readable image",
         "copy.jpg": "a copy of 2.jpg",
         "3.jpg": "a copy of 3.jpeg",
         "screenshot.png": "its size is 640 x 480 px, that of most is 400 x 300 px",

@@ -147,7 +147,7 @@ def test_the_command_writes_those_that_are_asked_for(tmp_path, monkeypatch, caps
         code, _, error = run(monkeypatch, capsys, "tables", tmp_path / "results", *words, "--out", tmp_path / "no")
         assert code != 0 and message in " ".join(error.split()) and not (tmp_path / "no").exists()
     code, _, error = run(monkeypatch, capsys, "tables", tmp_path, "--to", "csv", "--out", tmp_path / "no")
-    assert code != 0 and "holds no tables" in " ".join(error.split())
+    assert code != 0 and "has no tables" in " ".join(error.split())
 
 
 def test_a_table_that_there_is_not_is_named():

@@ -157,19 +157,19 @@ def test_approximate_positions_are_near_as_distances_are():
     "changes, message",
     [
         ({"flight": {}}, r"\[flight\] strips: the key is missing"),
-        ({"convergent": None}, r"\[flight\] or a table \[convergent\]; give one of the two"),
+        ({"convergent": None}, r"\[flight\] or \[convergent\]; give one of the two"),
         ({"strips.default": {}}, "strips: a convergent set has no strips"),
-        ({"convergent.size_m": 1.0}, r"\[convergent\] size_m: no such key is known; use field_m"),
+        ({"convergent.size_m": 1.0}, r"\[convergent\] size_m: unknown key; use field_m"),
         ({"convergent.field_m": 1.2}, "field_m: 1.2 is not a list"),
         ({"convergent.field_m": [1.2, 0.0]}, "field_m: 0.0 is not positive"),
-        ({"convergent.stations": []}, "there are 0 images in all"),
+        ({"convergent.stations": []}, "0 images in total"),
         ({"convergent.stations.1.name": "front"}, "stations: two tables have the name front"),
         ({"convergent.stations.0.distance_m": [0.7, -1]}, "distance_m: -1 is not positive"),
-        ({"convergent.stations.0.tilt_deg": 90.0}, "tilt_deg: a field is seen from tilts of 0 or more"),
+        ({"convergent.stations.0.tilt_deg": 90.0}, "tilt_deg: tilts must be at least 0"),
         ({"convergent.stations.0.tilt_deg": None}, "tilt_deg: the key is missing"),
         ({"convergent.stations.0.roll_deg": []}, r"roll_deg: \[\] has 0 entries"),
         ({"convergent.stations.0.roll_deg": [0, "x"]}, "roll_deg: 'x' is not a finite number"),
-        ({"convergent.stations.0.camera": "leica"}, r"no table \[cameras.leica\]; use one of gopro"),
+        ({"convergent.stations.0.camera": "leica"}, r"unknown camera leica; use one of gopro"),
         ({"points.across": 0.9}, r"\[points\] across: only a flight has this key"),
         ({"targets.0.grid": [7]}, r"\[targets, number 1\] grid: \[7\] has 1 entries; give 2"),
         ({"targets.0.grid": [7, 1]}, "grid: 1 is less than 2"),
@@ -184,7 +184,7 @@ def test_mistakes_are_named_with_a_remedy(changes, message):
 def test_a_camera_that_takes_no_image_is_refused():
     values = changed({"convergent.stations.0.camera": "gopro", "convergent.stations.1.camera": "gopro"}, GOPRO)
     values["cameras"]["spare"] = values["cameras"]["gopro"]
-    with pytest.raises(InputError, match="spare: no image is taken with this camera"):
+    with pytest.raises(InputError, match="spare: no image uses this camera"):
         recipe_from(values)
 
 

@@ -123,8 +123,8 @@ STRIP = {"name": "A", "heading_deg": 0.0, "images": 3}
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"flihgt": {}}, "flihgt: no such key is known"),
-        ({"flight.strips.1.speed": 60}, r"\[flight.strips, number 2\] speed: no such key"),
+        ({"flihgt": {}}, "flihgt: unknown key"),
+        ({"flight.strips.1.speed": 60}, r"\[flight.strips, number 2\] speed: unknown key"),
         ({"flight.forward_overlap_percent": -5.0}, r"\[flight\] forward_overlap_percent: -5.0 is less than 0"),
         ({"flight.forward_overlap_percent": 100}, r"forward_overlap_percent: 100 is not below 100"),
         ({"flight.gsd_m": 0.1}, r"\[flight\] gsd_m: height_m gives the same; keep one"),
@@ -135,30 +135,30 @@ STRIP = {"name": "A", "heading_deg": 0.0, "images": 3}
         ({"flight.strips": {"name": "A"}}, r"strips: .* is not a list; .* as \[\[flight.strips\]\]"),
         ({"flight.strips.0.images": None}, r"number 1\] images: the key is missing"),
         ({"flight.strips.0.images": 2.5}, "images: 2.5 is not a whole number"),
-        ({"flight.strips.1.name": "A"}, r"number 2\] name: there is another strip A"),
+        ({"flight.strips.1.name": "A"}, r"number 2\] name: duplicate strip name A"),
         ({"flight.strips.1.name": "default"}, "cannot be called 'default'"),
-        ({"flight.strips.0.heading_deg": 400}, "heading_deg: 400 is too large, the most are 360"),
-        ({"flight.strips": [STRIP | {"images": 1}]}, "there are 1 images in all"),
-        ({"flight.strips.0.camera": "leica"}, r"there is no table \[cameras.leica\]; use one of kodak"),
-        ({"cameras": None}, "there is no camera"),
-        ({"cameras.kodak.truth.k9": 1.0}, r"\[cameras.kodak.truth\] k9: no such key is known; use c_mm"),
-        ({"cameras.kodak.truth.c_mm": 3425}, "c_mm: 3425 mm is no principal distance"),
+        ({"flight.strips.0.heading_deg": 400}, "heading_deg: 400 exceeds the maximum 360"),
+        ({"flight.strips": [STRIP | {"images": 1}]}, "1 images in total"),
+        ({"flight.strips.0.camera": "leica"}, r"unknown camera leica; use one of kodak"),
+        ({"cameras": None}, "no cameras"),
+        ({"cameras.kodak.truth.k9": 1.0}, r"\[cameras.kodak.truth\] k9: unknown key; use c_mm"),
+        ({"cameras.kodak.truth.c_mm": 3425}, "c_mm: 3425 mm is not a valid principal distance"),
         ({"mounts.default.image_x": "up"}, "image_x: 'up' is unknown; write forward"),
-        ({"strips.Z.truth.shift_m": [0, 0, 0]}, r"\[strips\] Z: no such key is known; use default, A, B, C"),
+        ({"strips.Z.truth.shift_m": [0, 0, 0]}, r"\[strips\] Z: unknown key; use default, A, B, C"),
         ({"terrain.kind": "moon"}, r"\[terrain\] kind: 'moon' is unknown; write .flat"),
-        ({"terrain.height_m": 3}, r"\[terrain\] height_m: no such key"),
-        ({"points.ties": 2, "targets": None}, "there are 2 points in all"),
+        ({"terrain.height_m": 3}, r"\[terrain\] height_m: unknown key"),
+        ({"points.ties": 2, "targets": None}, "2 points in total"),
         ({"points.min_images": 1}, "min_images: 1 is less than 2"),
         ({"points.mean_rays": 1.5}, "mean_rays: 1.5 is less than min_images = 2"),
         ({"targets.0.role": "contrl"}, r"\[targets, number 1\] role: 'contrl' is unknown; write .control"),
-        ({"targets.0.prefix": "T1"}, "prefix: 'T1' does not tell targets apart"),
+        ({"targets.0.prefix": "T1"}, "prefix: 'T1' is not a unique prefix of targets"),
         ({"targets.0.at_m": [[1.0, "x"]]}, "at_m: 'x' is not a finite number"),
-        ({"targets.0.choice": {"role": "check", "outer": 3}}, r"\[targets, number 1.choice\] outer: no such key"),
+        ({"targets.0.choice": {"role": "check", "outer": 3}}, r"\[targets, number 1.choice\] outer: unknown key"),
         ({"targets.0.choice": {"role": "check", "centre": 1}}, "centre: 1 is neither true nor false"),
         ({"sigmas.image_mm": 0.0}, "image_mm: 0.0 is not positive"),
         ({"sigmas.station_m": [0.1, 0.0, 0.1]}, "station_m: .* is not positive"),
-        ({"sigmas.control_m": None, "noise.control_m": None}, "control_m: the key is missing, but there are control"),
-        ({"sigmas.station_m": None}, r"\[noise\] station_m: this is not observed; add station_m under \[sigmas\]"),
+        ({"sigmas.control_m": None, "noise.control_m": None}, "control_m: the key is missing, but the recipe has"),
+        ({"sigmas.station_m": None}, r"\[noise\] station_m: this has no observation; add station_m under \[sigmas\]"),
         ({"start.angle_deg": "x"}, "angle_deg: 'x' is not a finite number"),
         ({"datum.kind": "free"}, r"\[datum\] kind: 'free' is unknown"),
     ],
@@ -174,7 +174,7 @@ def test_a_camera_that_does_not_fly_is_refused():
     values["cameras"]["spare"] = values["cameras"]["kodak"]
     for strip in values["flight"]["strips"]:
         strip["camera"] = "kodak"
-    with pytest.raises(InputError, match=re.escape("[cameras] spare: no image is taken with this camera")):
+    with pytest.raises(InputError, match=re.escape("[cameras] spare: no image uses this camera")):
         recipe_from(values)
 
 

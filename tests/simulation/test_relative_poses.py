@@ -98,7 +98,9 @@ def test_mistakes_are_named(tmp_path, table, old, new, words):
 
 
 def test_there_are_no_strips_without_a_flight():
-    with pytest.raises(InputError, match=r"relative_position_m.*: it is between exposures of a strip, .* remove it"):
+    with pytest.raises(
+        InputError, match=r"relative_position_m.*: it applies between exposures of a strip, .* remove it"
+    ):
         recipe_from(changed({"sigmas.relative_position_m": 0.005}, GOPRO))
 
 

@@ -257,7 +257,7 @@ def test_a_rig_without_rigidity_is_refused():
     ("changes", "words"),
     [
         ({"sigmas.rig_turn_deg": 0.0}, r"\[sigmas\] rig_turn_deg: 0\.0 is not positive"),
-        ({"cameras.third": OBLIQUE}, r"\[rig_cameras\]: all cameras but one sit in a rig beside that one"),
+        ({"cameras.third": OBLIQUE}, r"\[rig_cameras\]: all cameras but the reference camera need a rig table"),
         ({"rig_cameras.oblique.turn_deg": [1.0]}, r"turn_deg: \[1\.0\] has 1 entries; give 3"),
     ],
 )

@@ -94,11 +94,11 @@ def exposure_times(folder: str | Path) -> Float[np.ndarray, "images"]:
 def read_folder(folder: Path, more: Iterable[type] = ()) -> BlockTables:
     """Read the files of a block folder. Raises InputError for missing or invalid files."""
     if not folder.is_dir():
-        raise InputError(f"there is no folder {folder}; give the folder that holds {TOML}")
+        raise InputError(f"folder not found: {folder}; give the folder that contains {TOML}")
     required = (TOML, *(f"{name}.csv" for name, layout in LAYOUTS.items() if layout.required))
     for file in required:
         if not (folder / file).is_file():
-            raise InputError(f"{folder} has no file {file}; add it ({', '.join(required)} are needed)")
+            raise InputError(f"{folder}: missing file {file}; add it ({', '.join(required)} are needed)")
     settings = with_earlier_calibrations(read_toml(folder / TOML), TOML, folder)
     keys = Section(TOML, "", settings).model(BlockKeys)
     with warnings.catch_warnings(action="ignore"):
@@ -244,5 +244,5 @@ def _warn_of_fixed_orientations(block: Block, settings: Settings) -> None:
     if without and len(block.stations.who) + len(block.attitudes.image):
         _warn(
             f'{settings.file}, [georeferencing] mode = "direct": {len(without)} image(s) have no station and attitude, '
-            f"so their orientation in images.csv is fixed as if it were exact: {few(without)}"
+            f"so their orientation in images.csv is fixed: {few(without)}"
         )

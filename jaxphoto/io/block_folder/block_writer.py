@@ -90,7 +90,7 @@ def _write_files(block: Block, folder: Path) -> None:
 def _settings(block: Block) -> dict[str, Any]:
     start, priors = block.start.unknowns, block.priors
     if priors.points != FREE:
-        raise BlockError("block.toml can only say FREE of object points; reset their priors")
+        raise BlockError("block.toml cannot represent priors of object points; reset them to FREE")
     mount_of = mounts_of(start.interior, start.mounts)
     for image, camera, mount in zip(block.images, block.image_camera, block.image_mount, strict=True):
         if mount != mount_of[camera]:

@@ -114,7 +114,7 @@ def read_camera(section: Section) -> Camera:
     keys = section.model(_keys(distortion, projection))
     sensor = Sensor(keys.width_px, keys.height_px, keys.pixel_mm, keys.pixel_assumed)
     if not PIXEL_MM[0] <= sensor.pixel_mm <= PIXEL_MM[1]:
-        raise section.error("pixel_mm", f"{sensor.pixel_mm:g} mm is no size of a pixel; give it in millimetres")
+        raise section.error("pixel_mm", f"{sensor.pixel_mm:g} mm is not a valid pixel size; give it in millimetres")
     values = section.section("interior")
     parts = [
         kind(
@@ -139,13 +139,13 @@ def _check_interior(values: Section, sensor: Sensor) -> None:
     if not _SHORTEST * diagonal < c < _LONGEST * diagonal:
         raise values.error(
             "c_mm",
-            f"{c:g} mm is no principal distance of a format of {sensor.width_mm:g} x {sensor.height_mm:g} mm; give it "
-            "positive and in millimetres, not in pixels or metres",
+            f"{c:g} mm is not a valid principal distance for the format {sensor.width_mm:g} x {sensor.height_mm:g} mm; "
+            "give it positive and in millimetres, not in pixels or metres",
         )
     for name, side in (("xp_mm", sensor.width_mm), ("yp_mm", sensor.height_mm)):
         if abs(values.number(name, 0.0)) > side / 2:
             raise values.error(
-                name, "the principal point lies outside the format; give it in millimetres from the image centre"
+                name, "the principal point is outside the format; give it in millimetres from the image centre"
             )
 
 
@@ -222,7 +222,9 @@ def with_earlier_calibrations(settings: dict[str, Any], file: str, folder: Path)
         for key in section:
             if key not in _OTHER_KEYS:
                 only = ", ".join(_OTHER_KEYS[1:])
-                raise section.error(key, f"the calibration gives it; only {only} may be given, too: remove it")
+                raise section.error(
+                    key, f"already given by the calibration, which permits only {only} in addition; remove it"
+                )
         given = table[_CALIBRATION] if isinstance(table[_CALIBRATION], dict) else {"file": table[_CALIBRATION]}
         named = Section(file, f"cameras.{name}.{_CALIBRATION}", given)
         named.known("file", "camera")
@@ -231,7 +233,8 @@ def with_earlier_calibrations(settings: dict[str, Any], file: str, folder: Path)
         if read.covariance is None:
             raise section.error(
                 _CALIBRATION,
-                f"{named.text('file')} has no covariance; name results of jaxphoto adjust, or a camera file of it",
+                f"{named.text('file')} has no covariance; give a result folder of jaxphoto adjust, or a camera file "
+                "written from one",
             )
         known = known_together(read.interior, read.covariance)
         fixed = jax.tree.map(lambda _: FIXED, read.interior)

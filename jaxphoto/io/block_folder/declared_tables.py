@@ -203,7 +203,7 @@ def _sets(table: Table, matrices: Table, unit: str, scale: float, k: int) -> Ite
         if not is_covariance(matrix):
             raise InputError(
                 f"{matrices.file}: the covariance matrix of set {name} is not positive definite; give a variance "
-                f"of each of its {n} numbers (a = b), and covariances that go with them"
+                f"of each of its {n} numbers (a = b), and consistent covariances"
             )
         yield lines, matrix
 
@@ -245,7 +245,7 @@ def _table(rows: AbstractObservations, names: Names, sigmas: bool = True) -> pd.
     columns = columns_of(type(rows))
     for name, value in vars(rows).items():
         if name not in [c.field for c in columns] and np.any(np.asarray(value) != 0):
-            raise BlockError(f"{rows.group}: {name} is in no file, which means zero; only zero can be written")
+            raise BlockError(f"{rows.group}: {name} has no file format and must be zero; set it to zero")
     return pd.DataFrame({c.name: _cells(rows, c, names) for c in columns if sigmas or c.field != "sigma"})
 
 

@@ -173,7 +173,7 @@ def _check_yaw(yaw: np.ndarray, flown: np.ndarray, file: str) -> None:
     known = ~np.isnan(course) & ~np.isnan(yaw)
     if counts_in_radians(yaw[known], course[known]):
         raise InputError(
-            f"{file}: the yaw angles lie between {yaw[known].min():.2f} and {yaw[known].max():.2f} and follow the "
+            f"{file}: the yaw angles are between {yaw[known].min():.2f} and {yaw[known].max():.2f} and follow the "
             "direction of flight as radians, not as degrees; convert roll, pitch and yaw to degrees"
         )
 
@@ -198,8 +198,8 @@ def _interpolated(records: Records, images: Images, frame: Frame, settings: Sett
         sigmas.append(np.where(np.isnan(given), default_sigma(settings, key), given))
         if np.isnan(sigmas[-1]).any():
             raise InputError(
-                f"{records.file}: there is no standard deviation; add {key} under [sigmas] in {settings.file}, or the "
-                f"columns sigma_{column} and so on"
+                f"{records.file}: missing standard deviation; add {key} under [sigmas] in {settings.file}, or "
+                f"columns such as sigma_{column}"
             )
     trajectory = trajectory_in(near, frame, sigmas[0], np.deg2rad(sigmas[1]))
     _check_yaw(near.roll_pitch_yaw_deg[:-1, 2], np.diff(np.asarray(trajectory.position), axis=0), records.file)
@@ -255,7 +255,7 @@ def _check_inside(times: np.ndarray, image: np.ndarray, records: Records, images
             "shift_s under [trajectory]"
         )
     else:
-        cure = "take a trajectory that covers it, correct time_s, or leave time_s empty"
+        cure = "use a trajectory that covers it, correct time_s, or leave time_s empty"
     raise images.table.misfit(
         first,
         f"image {images.ids[first]} is exposed outside {records.file}: exposures at {looks_like(times)}, "

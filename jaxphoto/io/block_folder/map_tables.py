@@ -109,7 +109,7 @@ def with_origin(frame: Frame, tables: Mapping[str, Table], trajectory: Records |
     distance = float(np.linalg.norm(located.map.local_from_place(np.array([middle]))))
     if distance > _FAR_M:
         raise InputError(
-            f"{file}, [frame] origin: it is {distance / 1e3:.0f} km from the block, which lies about "
+            f"{file}, [frame] origin: it is {distance / 1e3:.0f} km from the block, which is near "
             f"({middle[0]:.4f}, {middle[1]:.4f}) degrees; correct it or remove the key"
         )
     return located
@@ -126,7 +126,7 @@ def _check_area(file: str, coordinates: np.ndarray, places: np.ndarray, frame: F
     if outside or not south - _BEYOND <= latitude <= north + _BEYOND or not np.isfinite(longitude):
         about = ", ".join(f"{value:.1f}" for value in np.median(coordinates, axis=0)[:2])
         raise InputError(
-            f"{file}: the coordinates, about ({about}), lie outside the area of EPSG:{frame.code} ({area.name}); "
+            f"{file}: the coordinates, about ({about}), are outside the area of EPSG:{frame.code} ({area.name}); "
             f"correct the code in {TOML}, or the coordinates ({names[0]} is east, {names[1]} north)"
         )
 
@@ -163,7 +163,7 @@ def _converted(tables: ArrayLike, frame: Frame, back: bool, refuse: Refuse) -> A
         to = given.copy()
         to[~partly] = system.map(whole[~partly]) if back else system.local(whole[~partly])
         for line in np.flatnonzero((~np.isfinite(to) & ~np.isnan(given)).any(axis=1)):
-            refuse(name, int(line), f"the coordinates lie where EPSG:{frame.code} does not reach; correct them")
+            refuse(name, int(line), f"the coordinates are outside the area of EPSG:{frame.code}; correct them")
         local[name] = whole if back else to
         columns = table.assign(**dict(zip(XYZ, np.where(np.isnan(given), np.nan, to).T, strict=True)))
         for vectors in (ANGLES,) if name == "images" else (VELOCITY,) if name == "stations" else ():

@@ -78,7 +78,7 @@ class Images(NamedTuple):
 def read_images(table: Table, settings: Settings) -> Images:
     """Read images.csv."""
     if not len(table):
-        raise BlockError(f"{table.file}: there are no images; list at least two")
+        raise BlockError(f"{table.file}: no images; list at least two")
     cameras, strips, times = table.text("camera"), table.text("strip"), table.numbers("time_s", empty=True)
     table.find(
         "camera",
@@ -154,7 +154,7 @@ def temperatures_of(images: Images, settings: Settings) -> Temperatures | None:
     celsius = images.table.numbers("temperature_c", empty=True)
     images.table.check(
         (celsius < _COLDEST_C) | (celsius > _WARMEST_C),
-        lambda k: f"temperature_c = {celsius[k]:g} is that of no camera; give it in degrees Celsius",
+        lambda k: f"temperature_c = {celsius[k]:g} is not a plausible camera temperature; give it in degrees Celsius",
     )
     known, reference = ~np.isnan(celsius), settings.keys.reference_temperature_c
     if not known.any():
@@ -223,7 +223,7 @@ def _coordinates(table: Table, pixel: np.ndarray, half: np.ndarray) -> np.ndarra
     pairs = [pair for pair in (("x_mm", "y_mm"), ("column_px", "row_px")) if any(name in table for name in pair)]
     if len(pairs) != 1 or not all(name in table for name in pairs[0]):
         raise InputError(
-            f"{table.file}: the coordinates are not given by one pair of columns; use either x_mm and y_mm or "
+            f"{table.file}: image coordinates need exactly one pair of columns; use either x_mm and y_mm or "
             "column_px and row_px"
         )
     xy = values = table.matrix(pairs[0])
@@ -232,7 +232,7 @@ def _coordinates(table: Table, pixel: np.ndarray, half: np.ndarray) -> np.ndarra
         hint = "give pixels from the upper left corner, and check the camera's width_px and height_px"
         xy = (values * pixel - half) * np.array([1.0, -1.0])
     for line, axis in np.argwhere(np.abs(xy) > _OUTSIDE * half)[:1]:
-        raise table.bad(line, f"{pairs[0][axis]} = {values[line, axis]:g} lies far outside the image; {hint}")
+        raise table.bad(line, f"{pairs[0][axis]} = {values[line, axis]:g} is far outside the image; {hint}")
     return xy
 
 
@@ -251,7 +251,7 @@ def _image_sigmas(table: Table, pixel: np.ndarray, settings: Settings) -> np.nda
     table.check(
         np.asarray(np.isnan(sigma).any(axis=1)),
         lambda _: (
-            "there is no standard deviation; add the column sigma_px, the columns sigma_x_mm and sigma_y_mm, or "
+            "missing standard deviation; add the column sigma_px, the columns sigma_x_mm and sigma_y_mm, or "
             f"image_mm (or image_px) under [sigmas] in {settings.file}"
         ),
     )
@@ -302,7 +302,7 @@ def sigmas_of(
     table.check(
         np.isnan(sigma) & needed,
         lambda _: (
-            f"there is no standard deviation; fill in the column {column}, or add {' or '.join(keys)} under [sigmas] "
+            f"missing standard deviation; fill in the column {column}, or add {' or '.join(keys)} under [sigmas] "
             f"in {settings.file}"
         ),
     )
@@ -349,7 +349,7 @@ def read_control(table: Table, approximations: Table, points: ObservedPoints, se
 def _given_coordinates(table: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return all coordinates (n, 3), and line and axis of each cell that is not empty. Every row needs at least one."""
     value = table.matrix(XYZ, empty=True)
-    table.check(np.isnan(value).all(axis=1), lambda _: "there is no coordinate; give at least one, or delete the row")
+    table.check(np.isnan(value).all(axis=1), lambda _: "no coordinates; give at least one, or delete the row")
     lines, axes = np.nonzero(~np.isnan(value))
     return value, lines, axes
 
@@ -400,7 +400,7 @@ def read_surfaces(table: Table, strips: tuple[str, ...], points: ObservedPoints,
     point = table.find("point", points.ids, lambda name: f"point {name} {message}")
     foot, normal, turn = (table.matrix(names) for names in (FOOT, NORMAL, TURN))
     sigma, length = table.numbers("sigma_m"), np.linalg.norm(normal, axis=1)
-    table.check(np.abs(length - 1) > _UNIT, lambda k: f"the normal has the length {length[k]:.4f}; give a unit vector")
+    table.check(np.abs(length - 1) > _UNIT, lambda k: f"the normal has length {length[k]:.4f}; give a unit vector")
     number = np.zeros(len(table), int)
     if strips:
         cure = f"to {settings.file}"

@@ -69,7 +69,9 @@ def keys_of(kind: Kind) -> tuple[Key, ...]:
         axes, _ = annotated(hints[field]) or (["n"] * (len(names) > 1), False)
         units = {unit_of(name) for name in names}
         if len(axes) > 1 or len(units) > 1:
-            raise TypeError(f"{kind.__name__}.{field} is no number or vector of one unit; make it several fields")
+            raise TypeError(
+                f"{kind.__name__}.{field} is not a number or vector of one unit; split it into several fields"
+            )
         (unit,) = units
         in_files = FILE_UNITS.get(unit, unit)
         end = f"_{in_files}" if in_files else ""
@@ -147,7 +149,7 @@ def read_mounts(section: Section, cameras: Iterable[str]) -> Pairs:
     for name, mount in mounts.items():
         if np.any(np.abs(mount.lever_arm) > 100):
             arm = np.asarray(mount.lever_arm).tolist()
-            raise section.section(name).error("lever_arm_m", f"{arm} m is no lever arm; give it in metres")
+            raise section.section(name).error("lever_arm_m", f"{arm} m is not a plausible lever arm; give it in metres")
     return mounts, priors
 
 
@@ -160,7 +162,7 @@ def read_strips(section: Section, strips: Iterable[str]) -> Pairs:
     """Read shift and drift, and their priors, of every strip that has a table or uses the default table."""
     strips = list(strips)
     if section.values and not strips:
-        raise section.error("", "images.csv names no strips; add its column strip or remove the tables")
+        raise section.error("", "images.csv has no column strip; add it or remove the tables")
     return _read_each(StripBias, by_owner(section, strips))
 
 
@@ -221,7 +223,7 @@ def _tables(kind: Kind, section: Section, block: Block) -> dict[str, Section]:
     if kind.owner not in (*_OWNERS, *block.partitions):
         raise section.error(
             "",
-            f"their owner is a part of the images called {kind.owner}; add the column {kind.owner} to images.csv and "
+            f"images have no partition {kind.owner}; add the column {kind.owner} to images.csv and "
             f'partitions = ["{kind.owner}"] to the top of {section.file}',
         )
     return by_owner(section, (name for name in dict.fromkeys(block.owners(kind.owner)) if name))
@@ -257,8 +259,8 @@ def check_shutters(images: Iterable[tuple[str, str]], starts: Unknowns, priors: 
         known = prior == FIXED or (isinstance(prior, Weighted) and float(prior.sigma) < _FASTEST_MS)
         if readout > _SLOWEST_MS or (known and 0 < readout < _FASTEST_MS):
             raise BlockError(
-                f"{place} readout_ms: {float(shutter.readout):g} ms is no readout time; give milliseconds, for most "
-                "cameras 5 to 100, or 0 for a global shutter"
+                f"{place} readout_ms: {float(shutter.readout):g} ms is not a plausible readout time; give "
+                "milliseconds, for most cameras 5 to 100, or 0 for a global shutter"
             )
         if missing := [image for image, its_camera in images if its_camera == camera and image not in motions]:
             raise BlockError(

@@ -49,7 +49,9 @@ class FrameKeys(Keys):
         except InputError as error:
             raise KeyMistake(key, str(error)) from None
         if self.origin is not None and (abs(self.origin[0]) > 360 or abs(self.origin[1]) > 90):
-            raise KeyMistake("origin", "this is no place; give [longitude, latitude, height] in degrees and metres")
+            raise KeyMistake(
+                "origin", "this is not a position; give [longitude, latitude, height] in degrees and metres"
+            )
         if self.yaw == "grid" and system.is_geographic:
             raise KeyMistake("yaw", f'EPSG:{self.code} has no grid; write yaw = "true"')
         return self
@@ -120,7 +122,7 @@ class BlockKeys(Keys):
         taken = [*(c.name for c in LAYOUTS["images"].columns), *PLACE, "mount", "block", "lidar", "knot"]
         for name in self.partitions:
             if name in taken or self.partitions.count(name) > 1:
-                raise KeyMistake("partitions", f"{name} has a meaning already; give the partition another name")
+                raise KeyMistake("partitions", f"{name} is reserved; give the partition another name")
         return self
 
 
@@ -151,7 +153,7 @@ def read_settings(values: dict[str, Any], file: str = TOML, sigma_keys: Sequence
     keys = top.model(BlockKeys)
     top.section("sigmas").known(*_SIGMAS, *sigma_keys)
     if not keys.cameras:
-        raise top.error("", "there is no camera; add a table [cameras.NAME] with its format and interior orientation")
+        raise top.error("", "no cameras; add a table [cameras.NAME] with its format and interior orientation")
     cameras = top.section("cameras")
     if "default" in cameras:
         raise cameras.error("default", "this name means every camera in [mounts]; give the camera another one")
@@ -166,7 +168,7 @@ def frame_of(keys: FrameKeys, file: str) -> Frame:
     """Return the frame; a frame of kind epsg may lack its origin."""
     if keys.kind == "epsg" and "vertical" not in keys.model_fields_set:
         warnings.warn(
-            f"{file}, [frame]: heights are taken as above the ellipsoid (GNSS); write "
+            f"{file}, [frame]: heights are assumed ellipsoidal (GNSS); write "
             'vertical = "ellipsoidal", or the EPSG code of their system (5773 for EGM96) if they are not',
             UserWarning,
             stacklevel=2,
@@ -186,7 +188,7 @@ def corrections_in(frame: Frame, settings: Settings) -> Corrections:
         )
     if frame.kind == "epsg":
         if keys.sea_level_m is not None:
-            raise section.error("sea_level_m", "a frame of kind epsg knows its heights; remove the key")
+            raise section.error("sea_level_m", "a frame of kind epsg defines its heights; remove the key")
         return Corrections(keys.refraction, False, frame.map.sea_level() if keys.refraction else 0.0)
     if keys.sea_level_m is not None and not keys.refraction:
         raise section.error("sea_level_m", "only refraction = true needs it; remove the key or switch refraction on")

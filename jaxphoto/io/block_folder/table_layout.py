@@ -132,7 +132,7 @@ def checked(table: Table, layout: TableLayout) -> Table:
 def check_angles(table: Table, degrees: np.ndarray, columns: Sequence[str]) -> None:
     """Raise RowError for an angle above 360 degrees."""
     for line, axis in np.argwhere(np.abs(degrees) > 360)[:1]:
-        message = f"{columns[axis]} = {degrees[line, axis]:g} is more than a turn; give the angle in degrees"
+        message = f"{columns[axis]} = {degrees[line, axis]:g} is more than a full rotation; give the angle in degrees"
         raise table.bad(line, message)
 
 

@@ -117,7 +117,7 @@ def open_source(path: str | Path, epsg: int | None = None, unit: str | None = No
     check_file(path)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise InputError(f"{path.name} is not a cloud; name a file {', '.join(SUFFIXES)}")
+        raise InputError(f"{path.name} is not a point cloud; supported are {', '.join(SUFFIXES)}")
     system = None if epsg is None else epsg_system(epsg, path.name)
     if suffix in (".las", ".laz"):
         # Import here: laspy takes 0.2 s.
@@ -137,7 +137,7 @@ def _selected_chunks(
     within: np.ndarray | None,
 ) -> Iterator[Cloud]:
     if returns not in get_args(Returns):
-        raise InputError(f"the returns {returns!r} are unknown; choose one of {', '.join(get_args(Returns))}")
+        raise InputError(f"unknown returns {returns!r}; choose one of {', '.join(get_args(Returns))}")
     placement = Placement(source.name, source.system, frame)
     if within is not None and source.extent is not None:
         placement.check_overlap(source.extent, within)
@@ -158,13 +158,13 @@ def selection(chunk: Cloud, classes: Collection[int] | None, returns: Returns, n
     mask = np.ones(len(chunk), bool) if chunk.withheld is None else ~chunk.withheld
     if classes is not None and classes != EVERY_CLASS:
         if chunk.classification is None:
-            raise InputError(f"{name} has no classification; leave out the selection of classes")
+            raise InputError(f"{name} has no classification; remove the selection of classes")
         mask &= np.isin(chunk.classification, list(classes))
     elif classes is None and chunk.classification is not None:
         mask &= ~np.isin(chunk.classification, NOISE)
     if returns != "all":
         if chunk.returns is None:
-            raise InputError(f"{name} has no numbers of returns; leave out the selection of returns")
+            raise InputError(f"{name} has no return numbers; remove the selection of returns")
         number, of = chunk.returns.T
         mask &= {"first": number == 1, "last": number == of, "only": (number == 1) & (of == 1)}[returns]
     return mask

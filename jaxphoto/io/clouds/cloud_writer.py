@@ -132,5 +132,5 @@ def _suffix(path: Path) -> str:
     if path.name.lower().endswith(".copc.laz"):
         raise InputError(f"{path.name}: COPC is read only; name a .laz file, and convert it (pdal translate, untwine)")
     if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"{path.name} is not a cloud; name a file {', '.join(SUFFIXES)}")
+        raise InputError(f"{path.name} is not a point cloud; supported are {', '.join(SUFFIXES)}")
     return path.suffix.lower()

@@ -251,7 +251,7 @@ class Placement:
         if "Ballpark" in best.description and not same:
             warnings.warn(
                 f"{self.name}: PROJ has no transformation between the datums of {source.name} and {target.name}; they "
-                "are taken as the same, with errors of some metres",
+                "are assumed identical, with errors of some metres",
                 UserWarning,
                 stacklevel=3,
             )

@@ -170,7 +170,7 @@ def _set_coordinates(points: laspy.ScaleAwarePointRecord, xyz: np.ndarray, heade
     """Set the coordinates of points. Raises InputError if they exceed 32 bits in the scale of the header."""
     if not (np.abs((xyz - header.offsets) / header.scales) < 2**31 - 1).all():
         raise InputError(
-            f"{name} counts in {header.scales[0]:g} from its offset, too finely for coordinates up to "
+            f"{name} has the resolution {header.scales[0]:g}, too fine for coordinates up to "
             f"{np.abs(xyz).max():g}; write the cloud as .csv or .ply"
         )
     points.x, points.y, points.z = xyz.T
@@ -188,7 +188,7 @@ def _system(header: laspy.LasHeader, name: str) -> CoordinateSystem:
     try:
         crs = header.parse_crs()
     except CRSError:
-        raise InputError(f"{name} has a coordinate system that PROJ does not know; give it (--cloud-epsg)") from None
+        raise InputError(f"{name} has a coordinate system unknown to PROJ; give it (--cloud-epsg)") from None
     if crs is not None:
         system = system_of(crs, name)
     else:

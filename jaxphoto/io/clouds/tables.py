@@ -87,7 +87,7 @@ def _first_error(
             if not _valid(name, np.array([value]))[0]:
                 kind = "whole number from 0 to 255" if name in _BYTES else "finite number"
                 return InputError(f"{file}, row {row}: {name} is {cell[:50]!r}; give a {kind}, or delete the row")
-    return InputError(f"{file} cannot be read as a table of numbers; write the cloud again")
+    return InputError(f"{file} cannot be read as a table of numbers; re-export the cloud")
 
 
 class _Layout(NamedTuple):
@@ -108,7 +108,7 @@ def open_csv(path: Path, system: CoordinateSystem | None) -> CloudSource:
     header = [cell.strip() for cell in lines[0].split(separator)]
     for name in COLUMNS:
         if header.count(name) > 1 or (name in XYZ and name not in header):
-            fault = "is there twice" if name in header else f"is missing (there are {', '.join(header)})"
+            fault = "is given twice" if name in header else f"is missing (found {', '.join(header)})"
             raise InputError(f"{path.name}: the column {name} {fault}; correct the header")
     decimal = "," if separator == ";" and "," in "".join(lines[1:]) else "."
     layout = _Layout(header, separator, decimal)
@@ -199,7 +199,7 @@ def _ply_header(path: Path) -> _Vertices:
     order, count, fields, element, before, row = "", -1, list[tuple[str, str]](), "", False, 1
     with path.open("rb") as file:
         if file.readline(8).strip() != b"ply":
-            raise InputError(f"{path.name} does not begin as a PLY file does; name a PLY file")
+            raise InputError(f"{path.name} does not begin with the PLY signature; give a PLY file")
         for row, line in enumerate(iter(lambda: file.readline(1000), b""), 2):
             match words := line.decode("ascii", "replace").split():
                 case ["format", name, _] if name in _ORDERS:
@@ -218,12 +218,14 @@ def _ply_header(path: Path) -> _Vertices:
                 case ["comment" | "obj_info", *_] | []:
                     pass
                 case _:
-                    raise InputError(f"{path.name}, row {row}: {' '.join(words)!r} is not in the header of a cloud")
+                    raise InputError(
+                        f"{path.name}, row {row}: {' '.join(words)!r} is not a valid PLY header entry; re-export it"
+                    )
         else:
-            raise InputError(f"{path.name}: the header does not end; write the cloud again")
+            raise InputError(f"{path.name}: the header has no end; re-export the cloud")
         begin = file.tell()
     if order not in _ORDERS or count < 0 or not {"x", "y", "z"} <= {name.lower() for name, _ in fields}:
-        raise InputError(f"{path.name}: the header has no format, or no vertices with x, y and z; write it again")
+        raise InputError(f"{path.name}: the header has no format, or no vertices with x, y and z; re-export it")
     if before:
         raise InputError(f"{path.name}: other elements precede the vertices; write the cloud with vertices first")
     return _Vertices(_ORDERS[order], count, fields, begin, row)

@@ -84,7 +84,9 @@ def _without_errors(exposures: Exposures, errors: dict[int, str]) -> Exposures:
     """Remove invalid rows. Raises InputError if at least half of the rows are invalid, or if there are none."""
     for k, axis in np.argwhere(np.abs(exposures.place[:, :2]) > [360.0, 90.0]):
         name, value = ("longitude", "latitude")[axis], exposures.place[k, axis]
-        errors.setdefault(int(exposures.rows[k]), f"the {name} {value:g} degrees is impossible; exchange the columns?")
+        errors.setdefault(
+            int(exposures.rows[k]), f"the {name} {value:g} degrees is out of range; check the order of the columns"
+        )
     total = len(set(exposures.rows.tolist()) | set(errors))
     if not total:
         raise InputError(f"{exposures.file}: the file has no positions; omit it, or copy it again")
@@ -95,7 +97,7 @@ def _without_errors(exposures: Exposures, errors: dict[int, str]) -> Exposures:
         raise InputError(f"{exposures.file}, row {first}: {errors[first]}")
     kept = ~np.isin(exposures.rows, rows)
     are = "is" if len(rows) == 1 else "are"
-    why = f"{len(rows)} of {total} rows {are} left out ({few(list(map(str, rows)))}); row {first}: {errors[first]}"
+    why = f"{len(rows)} of {total} rows {are} skipped ({few(list(map(str, rows)))}); row {first}: {errors[first]}"
     return exposures.take(kept)._replace(without=tuple(rows), why=why)
 
 
@@ -138,7 +140,7 @@ def _read_pos(file: str, lines: Lines, errors: dict[int, str]) -> Exposures:
             clock = words[0] if words and words[0] in _BEHIND_S else clock
             if "ecef" in line or "baseline" in line or "(d'\")" in line:
                 raise InputError(
-                    f"{file}: its positions are not latitudes and longitudes in degrees; write the solution again with "
+                    f"{file}: positions are not latitudes and longitudes in degrees; re-export the solution with "
                     "the format Lat/Lon/Height, ddd.ddddddd"
                 )
             if "lat/lon/height=" in line:

@@ -199,11 +199,11 @@ def match_message(
 def no_match_message(result: Ambiguous | None) -> str:
     """Report the reason why times match no photographs."""
     if result is None:
-        return "no two photographs have times that differ from its times by one constant; not used"
+        return "fewer than two photographs match its times with a common clock offset; not used"
     one, other = map(clock_words, result.offsets_s)
     return (
-        f"{result.fitted} photographs fit its times with clocks that differ by {one} or by {other}, and no position "
-        "decides; not used (a table with names does: --exposures)"
+        f"{result.fitted} photographs fit its times with clock offsets of both {one} and {other}, and no positions "
+        "resolve this; not used (give a table with names: --exposures)"
     )
 
 
@@ -338,7 +338,7 @@ class _Assignment:
         """Assign the rows of a table by name."""
         exposure = by_name(self.photographs, file)
         if not (exposure >= 0).any():
-            return f"none of its {len(file.names)} names is that of a photograph ({few(list(file.names))}); not used"
+            return f"none of its {len(file.names)} names matches a photograph ({few(list(file.names))}); not used"
         if problem := self._other_flight(file, exposure):
             return problem
         message = f"positions of {count_message(self.photographs, file, exposure)} by name{fix_counts(file, exposure)}"
@@ -387,7 +387,7 @@ class _Assignment:
         exposure = np.where(np.isfinite(at.place).all(axis=1), np.arange(len(times)), -1)
         if not (exposure >= 0).any():
             apart = np.nanmedian(times) - np.median(file.time_s)
-            return f"no photograph was taken while it lasts: it is {apart:+,.0f} s from them; not used"
+            return f"no photograph within its time span: it is {apart:+,.0f} s from them; not used"
         if problem := self._other_flight(at, exposure):
             return problem
         lost = [p.name for p, k in zip(self.photographs, exposure, strict=True) if k < 0]
@@ -407,8 +407,8 @@ class _Assignment:
             else:
                 self.photographs[i] = p._replace(gps=moved(p.gps, -rotation @ np.array(arm)))
                 moved_count += 1
-        without = f"; {left} have no attitude that turns it, and stay" if left else ""
-        return f"the lever arm is taken off {moved_count} positions of the photographs' own files{without}"
+        without = f"; {left} have no attitude to rotate it and are unchanged" if left else ""
+        return f"the lever arm is applied to {moved_count} positions of the photographs' own files{without}"
 
     def _set_camera(self, file: Exposures, exposure: Int[np.ndarray, "n"]) -> None:
         """Assign camera positions, times and lever arms."""
@@ -445,9 +445,9 @@ class _Assignment:
         parts = [f"lever arms of {marked} are those of the time marks{instead}"] if marked else []
         parts += [f"the lever arm of {given} is as given"] if given else []
         if none:
-            why = "--lever-arm gives it" if self.arm is None else "no attitude of the aircraft turns it"
+            why = "give it by --lever-arm" if self.arm is None else "no aircraft attitude to rotate it"
             sensor = "antenna" if file.aircraft_deg is None else "IMU"
-            parts.append(f"{none} are positions of the {sensor}, the lever arm is not known ({why})")
+            parts.append(f"{none} are positions of the {sensor}, the lever arm is unknown ({why})")
         return ", ".join(parts)
 
     def _other_flight(self, file: Exposures, exposure: Int[np.ndarray, "n"]) -> str:
@@ -458,10 +458,10 @@ class _Assignment:
         back = distance(self.photographs, file._replace(place=file.place[:, [1, 0, 2]]), exposure)
         if back is not None and back <= _FAR_M:
             return (
-                "its longitudes and latitudes have changed places, as the photographs' own positions show; not used: "
+                "longitude and latitude are interchanged compared with the photographs' own positions; not used: "
                 "exchange the two in the file"
             )
-        return f"its positions are {far:,.0f} m from those of the photographs, as of another flight; not used"
+        return f"its positions are {far:,.0f} m from those of the photographs (another flight?); not used"
 
     def _other_day(self, file: Exposures, match: Matched) -> str:
         """Return the reason to reject a file of another day; "" if its positions show that only the clock is wrong."""
@@ -472,7 +472,7 @@ class _Assignment:
             return ""
         when = "before" if match.offset_s > 0 else "after"
         return (
-            f"its times are {abs(match.offset_s) / DAY_S:.1f} days {when} those of the photographs, as of another day, "
+            f"its times are {abs(match.offset_s) / DAY_S:.1f} days {when} those of the photographs (another day?), "
             "and no positions prove that only the clock is wrong; not used"
         )
 

@@ -103,7 +103,7 @@ def read_table(file: str, lines: Lines, errors: dict[int, str], code: int | None
             check(numbers[name] <= 0, name, "a standard deviation is positive")
     ids = [PureWindowsPath(name).stem for name in cells["image"]]
     check(cells["image"] == "", "image", "give its name, or delete the row")
-    check(pd.Series(ids).duplicated(keep=False), "image", "it is there twice: keep one of the rows")
+    check(pd.Series(ids).duplicated(keep=False), "image", "it is given twice: keep one of the rows")
     fixes = cells["fix"] if "fix" in cells else pd.Series([""] * len(ids), cells.index)
     if "fix" in cells:
         check(~fixes.isin(["", *get_args(Fix)]), "fix", f"give one of {', '.join(get_args(Fix))}, or nothing")
@@ -154,7 +154,7 @@ def _table(file: str, lines: Lines, errors: dict[int, str]) -> _Table:
         try:
             records[row] = split_row(file, line, row, separator)
         except RowError:
-            errors[row] = "the quotation marks do not pair; close or remove them"
+            errors[row] = "unpaired quotation marks; close or remove them"
     first = records.get(content[0][0], [])
     comment_cells = [line.lstrip("# ").split(None if separator == " " else separator) for line in comments]
     for header in (first, *comment_cells):
@@ -164,7 +164,7 @@ def _table(file: str, lines: Lines, errors: dict[int, str]) -> _Table:
     else:
         raise InputError(f"{file}: missing column image or coordinate columns (X_m, Y_m, Z_m); add a header")
     if "z" not in columns:
-        raise InputError(f"{file}: its header names no heights (Z, altitude or height); add them")
+        raise InputError(f"{file}: no height column in the header (Z, altitude or height); add it")
     if set(columns) & {*_OPK, *_RPY} and _GON.search(" ".join([*comments, *header])):
         raise InputError(f"{file}: its angles are in gon; give degrees")
     if header is first:
@@ -220,7 +220,7 @@ def _pospac(file: str, content: Lines, errors: dict[int, str]) -> _Table:
     headers = [[cell.partition("(")[0].strip().upper() for cell in line.split(",")] for _, line in content[:100]]
     begin = next((k for k, header in enumerate(headers) if {"TIME", "EASTING", "NORTHING"} <= set(header)), None)
     if begin is None:
-        raise InputError(f"{file}: its head names no columns (TIME, EASTING, NORTHING ...); export it with its header")
+        raise InputError(f"{file}: no columns in the header (TIME, EASTING, NORTHING ...); export it with its header")
     header, head = headers[begin], " ".join(line for _, line in content[:begin])
     if not set(_POSPAC_COLUMNS.values()) <= set(header):
         raise InputError(
@@ -228,7 +228,7 @@ def _pospac(file: str, content: Lines, errors: dict[int, str]) -> _Table:
             "orientation at the camera events, or use the SBET trajectory"
         )
     if (first := re.search(r"first rotation is around the '(\w)'", head, re.IGNORECASE)) and first[1].lower() != "x":
-        raise InputError(f"{file}: its angles turn about {first[1]} first: export omega, phi, kappa")
+        raise InputError(f"{file}: its first rotation is about {first[1]}: export omega, phi, kappa")
     records = {}
     for row, line in content[begin + 1 :]:
         cells = line.replace(",", " ").split()
@@ -237,7 +237,7 @@ def _pospac(file: str, content: Lines, errors: dict[int, str]) -> _Table:
         if len(cells) == len(header):
             records[row] = cells
         else:
-            errors[row] = f"{len(cells)} cells, and the header has {len(header)}; complete the row"
+            errors[row] = f"{len(cells)} cells, but the header has {len(header)}; complete the row"
     system = _mapping_frame(file, head)
     if system is not None and {"LAT", "LONG"} <= set(header):
         assert system.crs is not None and system.crs.geodetic_crs is not None
@@ -249,8 +249,8 @@ def _pospac(file: str, content: Lines, errors: dict[int, str]) -> _Table:
         for row, metres in zip(records, off.tolist(), strict=True):
             if metres > 1.0:
                 errors[row] = (
-                    f"its easting and northing lie {metres:.3g} m from its latitude and longitude in {system.name}, "
-                    "the mapping frame of the head; export it again, or delete the columns LAT and LONG"
+                    f"its easting and northing are {metres:.3g} m from its latitude and longitude in {system.name}, "
+                    "the mapping frame of the header; export it again, or delete the columns LAT and LONG"
                 )
     table = _cells(records, {name: header.index(word) for name, word in _POSPAC_COLUMNS.items()}, errors)
     # POSPac solutions are integrated GNSS/IMU solutions.
@@ -275,7 +275,9 @@ def _mapping_frame(file: str, head: str) -> ControlSystem | None:
 def _system(file: str, words: str) -> ControlSystem:
     system = system_of(words, file)
     if system.code is None or system.crs is None or system.crs.is_geocentric:
-        raise InputError(f"{file}: its system ({system.name}) is not a map with an EPSG code; write EPSG:25832, say")
+        raise InputError(
+            f"{file}: its system ({system.name}) is not a map with an EPSG code; write for example EPSG:25832"
+        )
     return system
 
 

@@ -66,7 +66,7 @@ def _strip_name(name: str) -> str:
 
 def _prefix(prefix: str) -> str:
     if not prefix or prefix[-1].isdigit() or prefix[0] == "#":
-        raise ValueError(f'{prefix!r} does not tell targets apart; use letters, like "T"')
+        raise ValueError(f'{prefix!r} is not a unique prefix of targets; use letters, like "T"')
     return prefix
 
 
@@ -216,7 +216,7 @@ class TerrainKeys(Keys):
         if self.kind != "rolling":
             known += ["height_m", "roughness_m", *shapes.get(self.kind, ())]
         for key in sorted(self.model_fields_set - set(known)):
-            raise KeyMistake(key, f"no such key is known of {self.kind} terrain; use {', '.join(known)} or remove it")
+            raise KeyMistake(key, f"unknown key for {self.kind} terrain; use {', '.join(known)} or remove it")
         return self
 
     def terrain(self, section: Section) -> Terrain:
@@ -295,10 +295,10 @@ class StationKeys(Keys):
         if min(self.distance_m) <= 0:
             raise KeyMistake("distance_m", f"{min(self.distance_m):g} is not positive; give the true value")
         if min(self.tilt_deg) < 0 or max(self.tilt_deg) >= 90:
-            raise KeyMistake("tilt_deg", "a field is seen from tilts of 0 or more and less than 90; give one of these")
+            raise KeyMistake("tilt_deg", "tilts must be at least 0 and less than 90 degrees; correct them")
         n = len(self.distance_m) * len(self.azimuth_deg) * len(self.tilt_deg) * len(self.roll_deg)
         if n > IMAGES:
-            raise KeyMistake("", f"these are {n} images, the most are {IMAGES}; give fewer distances or angles")
+            raise KeyMistake("", f"{n} images exceed the maximum of {IMAGES}; give fewer distances or angles")
         return self
 
     def stations(self, camera: str) -> Iterator[Station]:
@@ -347,7 +347,7 @@ class LidarKeys(PlanKeys):
     @model_validator(mode="after")
     def _check(self) -> "LidarKeys":
         if self.same_trajectory and self.strips:
-            raise KeyMistake("same_trajectory", "[[lidar.strips]] are another flight; remove these, or this key")
+            raise KeyMistake("same_trajectory", "[[lidar.strips]] define another flight; remove them, or this key")
         names = [strip.name for strip in self.strips]
         if twice := [name for name in names if names.count(name) > 1]:
             raise KeyMistake("strips", f"two strips have the name {twice[0]}; give each its own name")

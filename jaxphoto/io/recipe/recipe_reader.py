@@ -115,7 +115,7 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
     ties = keys.points.ties or 0
     points = ties + sum(t.count + len(t.at) + len(t.at_m) for t in targets)
     if points < 3:
-        raise InputError(f"{file}, [points] ties: there are {points} points in all; ask for more than 2")
+        raise InputError(f"{file}, [points] ties: {points} points in total; ask for more than 2")
     if images * points > PAIRS:
         raise InputError(
             f"{file}, [points] ties: {images} images and {points} points make more than {PAIRS} pairs; ask for fewer"
@@ -219,7 +219,7 @@ def _change(kind: type[AbstractParameters], section: Section, owners: Iterable[s
         true, spread = _truth(kind, table, drawn=True)
         for field in dynamic_fields(kind):
             if getattr(spread, field) == FREE:
-                raise table.section("truth").error(field, "a truth is not free; give its value or a sigma")
+                raise table.section("truth").error(field, "a true value cannot be free; give its value or a sigma")
         stated = {key: value for key, value in table.values.items() if key != "truth"}
         model: Any = read_parameters(kind, Section(table.file, table.path, stated)) if stated else None
         changes[name] = SimulatedChange(true, spread, model)
@@ -243,11 +243,11 @@ def _walk(top: Section, keys: Any) -> CameraWalk | None:
     if keys is None:
         return None
     if not top.section(StripCamera.kind).values:
-        raise top.error("camera_walk", "there are no cameras of strips that could walk; add [strip_cameras.default]")
+        raise top.error("camera_walk", "no strip cameras for a random walk; add [strip_cameras.default]")
     stated = (keys.c_mm, keys.xp_mm, keys.yp_mm) if keys.model_fields_set - {"truth"} else None
     if stated and not all(stated):
         raise top.section("camera_walk").error(
-            "", "c, x_p and y_p all walk in the block; give c_mm, xp_mm and yp_mm above zero"
+            "", "c, x_p and y_p all have a random walk in the block; give c_mm, xp_mm and yp_mm above zero"
         )
     truth = keys.truth
     return CameraWalk((truth.c_mm, truth.xp_mm, truth.yp_mm) if truth else stated or _ZERO, stated)
@@ -259,13 +259,13 @@ def _sigmas(top: Section, keys: Any, targets: Sequence[Any]) -> tuple[Sigmas, Si
     stated = keys.sigmas.plan(target_mm=keys.sigmas.target_mm or image)
     for key in keys.noise.model_fields_set:
         if getattr(stated, key) is None:
-            raise top.section("noise").error(key, f"this is not observed; add {key} under [sigmas] too, or remove it")
+            raise top.section("noise").error(key, f"this has no observation; add {key} under [sigmas], or remove it")
     for key in ("relative_position_m", "relative_attitude_deg"):
         if key in section and keys.flight is None:
-            raise section.error(key, "it is between exposures of a strip, and there is no [flight]; remove it")
+            raise section.error(key, "it applies between exposures of a strip, but [flight] is missing; remove it")
     roles = {role for group in targets for role in (group.role, *([group.choice.role] if group.choice else []))}
     if stated.control_m is None and roles & {"control", "vertical"}:
-        raise section.error("control_m", "the key is missing, but there are control points; add it")
+        raise section.error("control_m", "the key is missing, but the recipe has control points; add it")
     noise = vars(stated) | {name: plain(getattr(keys.noise, name)) for name in keys.noise.model_fields_set}
     if "target_mm" not in section and "target_mm" not in keys.noise.model_fields_set:
         # Targets have the standard deviation of tie points by default.
@@ -281,9 +281,9 @@ def _flown_cameras(top: Section, rig: Section, cameras: list[str]) -> list[str]:
     rig.known(*cameras)
     flown = [name for name in cameras if name not in rig]
     if rig.values and len(flown) != 1:
-        raise rig.error("", "all cameras but one sit in a rig beside that one; give each of them a table")
+        raise rig.error("", "all cameras but the reference camera need a rig table; add one for each")
     if rig.values and "convergent" in top:
-        raise top.error("convergent", "a rig is flown; remove the table, or that of the rig")
+        raise top.error("convergent", "a rig requires a flight; remove this table, or that of the rig")
     return flown
 
 
@@ -294,16 +294,14 @@ Flown = Mapping[str, tuple[Sensor, InteriorOrientation, Any]]
 def _plan(top: Section, keys: Any, cameras: Flown) -> FlightPlan | ConvergentPlan:
     """Read the flight or the convergent stations; every camera must be used."""
     if ("flight" in top) == ("convergent" in top):
-        raise top.error("", "a recipe has a table [flight] or a table [convergent]; give one of the two")
+        raise top.error("", "a recipe needs either [flight] or [convergent]; give one of the two")
     plan = _flight(top, keys.flight, cameras) if keys.flight else _convergent(top, keys.convergent, list(cameras))
     if not 2 <= plan.n_images <= IMAGES:
         table, key = ("flight", "strips") if keys.flight else ("convergent", "stations")
-        raise top.section(table).error(
-            key, f"there are {plan.n_images} images in all; give from 2, which see a point twice, to {IMAGES}"
-        )
+        raise top.section(table).error(key, f"{plan.n_images} images in total; give from 2 to {IMAGES}")
     for name in cameras:
         if name not in plan.cameras:
-            raise top.section("cameras").error(name, "no image is taken with this camera; use it or remove it")
+            raise top.section("cameras").error(name, "no image uses this camera; use it or remove it")
     return plan
 
 
@@ -316,7 +314,7 @@ def _camera_of(section: Section, name: str | None, cameras: Iterable[str], numbe
     if name is None:
         raise place.error("camera", "the key is missing; add it")
     if name not in cameras:
-        raise place.error("camera", f"there is no table [cameras.{name}]; use one of {', '.join(cameras)}")
+        raise place.error("camera", f"unknown camera {name}; use one of {', '.join(cameras)}")
     return name
 
 
@@ -343,7 +341,7 @@ def _flight(top: Section, keys: Any, cameras: Flown) -> FlightPlan:
         for strip in _strips(table, keys, camera, cameras[camera], top.section("flight")):
             if strip.name in [other.name for other in strips]:
                 place = Section(top.file, f"flight.strips, number {number}", {})
-                raise place.error("name", f"there is another strip {strip.name}; give each its own name")
+                raise place.error("name", f"duplicate strip name {strip.name}; give each its own name")
             strips.append(strip)
     given = {name: value for name in ("speed_m_per_s", "turn_s") if (value := getattr(keys, name)) is not None}
     return FlightPlan(tuple(strips), **given)
@@ -398,18 +396,20 @@ def _lidar(
     sigmas = top.section("sigmas")
     if keys.lidar is None:
         if stated.lidar_m is not None:
-            raise sigmas.error("lidar_m", "there is no table [lidar]; add it, or remove this key")
+            raise sigmas.error("lidar_m", "missing table [lidar]; add it, or remove this key")
         return None
     if isinstance(plan, ConvergentPlan):
-        raise top.error("lidar", "a convergent set is not flown, so it has no lidar strips; remove the table")
+        raise top.error("lidar", "a convergent set has no lidar strips; remove the table")
     if terrain.roughness_m:
         raise top.section("terrain").error(
             "roughness_m",
-            f"points {terrain.roughness_m:g} m above or below the ground lie on no surface that a lidar could measure; "
-            'use 0, and in place of "rolling" give its waves',
+            f"points {terrain.roughness_m:g} m above or below the ground are not on a surface that lidar can measure; "
+            'use 0, and replace "rolling" by its waves',
         )
     if stated.lidar_m is None:
-        raise sigmas.error("lidar_m", "the key is missing, but there is a lidar; add its sigmas, like [0.5, 0.5, 0.15]")
+        raise sigmas.error(
+            "lidar_m", "the key is missing, but the recipe has lidar; add its sigmas, like [0.5, 0.5, 0.15]"
+        )
     strips = tuple(_lidar_strip(strip, plan.speed_m_per_s, top) for strip in keys.lidar.strips)
     truth, names = keys.lidar.truth.plan(density_per_m2=1.0), [strip.name for strip in strips or plan.strips]
     for key in ("shift_m", "drift_m_per_s", "attitude_deg", "attitude_drift_deg_per_s"):
