@@ -287,7 +287,7 @@ def test_a_set_without_covariance_is_taken_as_exact():
     zero = np.zeros_like(covariance())
     assert offset_uncertainty(v, covariance()) == pytest.approx(offset_uncertainty(v, covariance(), zero), rel=1e-9)
     assert offset_uncertainty(v, None, covariance()) == pytest.approx(offset_uncertainty(v, zero, covariance()))
-    with pytest.raises(ValueError, match="covariances of 3 and 12 parameters, but the two sets have 24"), unchecked():
+    with pytest.raises(ValueError, match="covariances have 3 and 12 parameters, but the two sets have 24"), unchecked():
         offset_uncertainty(v, np.eye(3), covariance())
 
 

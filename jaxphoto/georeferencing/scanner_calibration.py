@@ -80,7 +80,7 @@ class ScannerCalibration(AbstractParameters):
 
     def __check_init__(self) -> None:
         if self.pattern not in PATTERNS:
-            raise ValueError(f"pattern is one of {', '.join(PATTERNS)}, got {self.pattern!r}")
+            raise ValueError(f"unknown scan pattern {self.pattern!r}; use one of {', '.join(PATTERNS)}")
 
 
 def corrected_shot(shot: Float[Array, "3"], calibration: ScannerCalibration) -> Float[Array, "3"]:

@@ -60,8 +60,8 @@ def row_fields(cls: type) -> list[RowField]:
         axes, whole = annotated(hints[field.name]) or ([], False)
         if not all(axis.isdigit() for axis in axes[1:]):
             raise TypeError(
-                f"{cls.__name__}.{field.name}: {' '.join(axes)!r} does not say how many numbers a row has; write them "
-                'as in "n 3"'
+                f"{cls.__name__}.{field.name}: shape {' '.join(axes)!r} has no fixed number of components per row; "
+                'write it as in "n 3"'
             )
         found.append(RowField(field.name, touches, whole or bool(touches), tuple(map(int, axes[1:]))))
     return found
@@ -87,7 +87,7 @@ def columns_of(cls: Any) -> tuple[Column, ...]:
         names = (names,) if isinstance(names, str) else names
         if names and len(names) != math.prod(field.shape):
             raise TypeError(
-                f"{cls.__name__}.columns: {field.name} has {math.prod(field.shape)} numbers a row, but {names} are "
+                f"{cls.__name__}.columns: {field.name} has {math.prod(field.shape)} numbers per row, but {names} has "
                 f"{len(names)} names"
             )
         for place, name in zip(np.ndindex(*field.shape), names, strict=False):

@@ -84,7 +84,10 @@ def offset_uncertainty(
     p2 = jacobian.shape[1] - p1
     if (second is not None and len(second) != p2) or p1 < 0:
         sizes = " and ".join(str(len(q)) for q in (first, second) if q is not None)
-        raise ValueError(f"covariances of {sizes} parameters, but the two sets have {jacobian.shape[1]} together")
+        raise ValueError(
+            f"covariances have {sizes} parameters, but the two sets have {jacobian.shape[1]} in total; give "
+            "covariances of matching size"
+        )
     covariance = np.zeros((p1 + p2, p1 + p2))
     covariance[:p1, :p1] = 0.0 if first is None else first
     covariance[p1:, p1:] = 0.0 if second is None else second
@@ -347,7 +350,10 @@ def combine(
                 )
             values = [float(get_parameter(i, parameter)) for i in (interiors[0], interior)]
             if not free_first and values[0] != values[1]:
-                raise InputError(f"{parameter} is fixed at {values[0]:g} in {names[0]} and at {values[1]:g} in {name}")
+                raise InputError(
+                    f"{parameter} is fixed at {values[0]:g} in {names[0]} and at {values[1]:g} in {name}: readjust "
+                    "one of them to match"
+                )
         if np.array_equal(covariance, covariances[0]) and all(
             float(get_parameter(interior, p)) == float(get_parameter(interiors[0], p)) for p in parameters
         ):

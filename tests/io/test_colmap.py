@@ -324,7 +324,7 @@ def test_the_command_converts_there_and_back(tmp_path, monkeypatch, capsys):
     assert "camera 5: the conversion is exact" in said
     same_block(read_source(tmp_path / "back"), read_source(model))
     for out, to, message in (
-        (tmp_path / "block", "colmap", "is or holds the input"),
+        (tmp_path / "block", "colmap", "is or contains the input"),
         (tmp_path / "new", "colmop", "'colmop' is not one of"),
     ):
         code, _, error = run(monkeypatch, capsys, "convert", tmp_path / "block", out, "--to", to)
