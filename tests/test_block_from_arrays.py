@@ -177,7 +177,7 @@ def test_a_network_without_control_has_a_minimal_datum():
         ),
         (
             {"control": {"point": ["1"], **columns(XYZ, [[1.0, 2.0, 3.0]]), "role": ["chek"]}},
-            r"control, entry 0: the role 'chek' is unknown",
+            r"control, entry 0: unknown role 'chek'",
         ),
         ({"stations": STATION | {"image": ["c"]}}, r"stations, entry 0: unknown image c"),
         ({"free": ["k9"]}, r"free: camera kodak has no parameter 'k9'; it has c_mm"),
