@@ -98,7 +98,7 @@ def message(error: Exception) -> str | None:
         module = (error.name or "").partition(".")[0]
         return str(MissingExtra(module)) if module in EXTRAS else None
     if isinstance(error, OSError):
-        return f"{error.filename or 'a file'}: {error.strerror or error}. Name a path that can be read and written."
+        return f"{error.filename or 'a file'}: {error.strerror or error}. Give a path that can be read and written."
     # Match the text of the error: XLA has a single class for all its errors.
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
         return "not enough memory. Close other programs, or reduce the input (a part of the block, fewer points)."

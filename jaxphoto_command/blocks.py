@@ -171,7 +171,7 @@ def certificate(
     from jaxphoto_command.certificate import certificate_document, write_certificate
 
     if out.suffix.lower() not in (".html", ".pdf"):
-        raise typer.BadParameter(f"--out {out}: name a file that ends in .html or .pdf.")
+        raise typer.BadParameter(f"--out {out}: give a file that ends in .html or .pdf.")
     check_room(out)
     with output.progress(f"writing {out}"):
         write_certificate(certificate_document(results, camera, last, halves, photographs or []), out)
@@ -248,7 +248,7 @@ def monte_carlo(
     if seed >= 2**63:
         raise typer.BadParameter(f"--seed {seed}: give a number below 2^63.")
     if kind == "noise" and (per is not None or on or parameter):
-        raise typer.BadParameter("--bias noise concerns all observations: omit --per, --on and --parameter.")
+        raise typer.BadParameter("--bias noise applies to all observations: omit --per, --on and --parameter.")
     check_place(out)
     sigmas = _sigmas(kind, {"m": sigma_m, "deg": sigma_deg, "mm": sigma_mm, "own": sigma})
     with output.progress("reading the block") as progress:
@@ -287,7 +287,7 @@ def _sigmas(kind: str, values: dict[str, str | None]) -> list[float]:
     unit = "deg" if kind in _DEGREES else {"image-points": "mm", "interior": "own"}.get(kind, "m")
     option = _SIGMA_OPTIONS[unit]
     if units != [unit]:
-        raise typer.BadParameter(f"--bias {kind} takes {option}, and no other sigma.")
+        raise typer.BadParameter(f"--bias {kind}: give {option} and no other sigma.")
     try:
         numbers = [float(part) for part in str(values[unit]).split(",")]
     except ValueError:
@@ -313,7 +313,7 @@ def sensitivity(
     from jaxphoto.writing import check_folder
 
     if bias_m == 0 or not math.isfinite(bias_m):
-        raise typer.BadParameter(f"--bias-m {bias_m:g} is no bias: give its size in metres.")
+        raise typer.BadParameter(f"--bias-m {bias_m:g}: give a finite bias in metres, not 0.")
     check_folder(out, block)
     start = time.perf_counter()
     with output.progress("reading the block") as progress:
@@ -402,4 +402,4 @@ def warn_of_contradictions(adjusted: Any, output: Output) -> None:
     else:
         texts = [adjusted.outcome.value]
     if texts:
-        output.warn(f"the block itself: {texts[0]} (details: jaxphoto adjust)")
+        output.warn(f"input block: {texts[0]} (details: jaxphoto adjust)")

@@ -116,7 +116,7 @@ def combine(
     from jaxphoto_command.certificate import check_one_sensor
 
     if out.suffix != ".toml":
-        raise typer.BadParameter(f"--out {out}: only a .toml file can hold the covariance.")
+        raise typer.BadParameter(f"--out {out}: only a .toml file can contain the covariance.")
     check_file(out, *calibrations)
     files = {str(path): read_camera_file(path, camera=camera) for path in calibrations}
     first = files[str(calibrations[0])]

@@ -109,7 +109,7 @@ def _format_band(folder: Path) -> FormatBand:
     x, y, band = (table.numbers(name) for name in columns)
     factor, sigma = (summary.get(name) for name in ("factor", "sigma_factor"))
     if not all(isinstance(v, int | float) and math.isfinite(v) for v in (factor, sigma)) or len(band) < _MIN_CELLS:
-        raise InputError(f"{folder} is no result of jaxphoto halves: name the folder that it wrote")
+        raise InputError(f"{folder} is not a result folder of jaxphoto halves; give one")
     return FormatBand(np.stack([x, y], axis=1), band, float(factor), float(sigma), input_file(path, "halves/cells.csv"))  # type: ignore[arg-type]
 
 
@@ -136,8 +136,8 @@ def check_one_sensor(a: CameraFile, b: CameraFile, first: Path, second: Path) ->
     one, other = a.sensor, b.sensor
     if (one.width_px, one.height_px) != (other.width_px, other.height_px):
         raise InputError(
-            f"{first} is of {one.width_px} x {one.height_px} px, {second} of {other.width_px} x {other.height_px} px; "
-            "compare two sets of one camera"
+            f"image sizes differ: {first} {one.width_px} x {one.height_px} px, {second} {other.width_px} x "
+            f"{other.height_px} px; compare two calibrations of one camera"
         )
     if not math.isclose(one.pixel_mm, other.pixel_mm, rel_tol=1e-6):
         raise InputError(
@@ -150,7 +150,7 @@ def check_one_sensor(a: CameraFile, b: CameraFile, first: Path, second: Path) ->
 def check_two_calibrations(a: CameraFile, b: CameraFile, first: Path, second: Path) -> None:
     """Raise InputError if two camera files are identical."""
     if bool(eqx.tree_equal((a.interior, a.covariance), (b.interior, b.covariance))):
-        raise InputError(f"{first} and {second} are one calibration; name one by other photographs")
+        raise InputError(f"{first} and {second} are the same calibration; give one from other photographs")
 
 
 def share_measurements(first: Path, second: Path) -> bool:

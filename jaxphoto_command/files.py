@@ -34,7 +34,9 @@ def _one_of(table: str) -> Any:
 def _target(out: Path | None, second: Path | None) -> Path:
     """Return --out, or the second argument."""
     if (out is None) == (second is None):
-        raise typer.BadParameter("Missing option: --out" if out is None else f"--out {out} and {second}: name one.")
+        raise typer.BadParameter(
+            "Missing option: --out" if out is None else f"--out {out} and {second}: give one only."
+        )
     return out or second  # type: ignore[return-value]
 
 
@@ -73,7 +75,7 @@ def convert(
     if adjust and (result or to == "block"):
         raise typer.BadParameter("--adjust applies to a block that is exported, not to results or --to block.")
     if not result and (block is not None or part != 1):
-        raise typer.BadParameter(f"--block and --part apply to results, which {source} is not.")
+        raise typer.BadParameter(f"--block and --part apply to results only; {source} is not a result folder.")
     if out.suffix.lower() in {suffix for known in EXPORTS.values() for suffix in known.endings}:
         raise typer.BadParameter(f"--out {out}: {to} is a folder of files; omit {out.suffix}.")
     (check_block_target if to == "block" else check_export_target)(out, source)

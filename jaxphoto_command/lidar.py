@@ -439,7 +439,7 @@ def orthophoto(
         read = read_block(block)
         if image not in read.images:
             some = ", ".join(read.images[:5]) + (" ..." if len(read.images) > 5 else "")
-            raise InputError(f"--image {image}: the block has no such image; it has {some}")
+            raise InputError(f"--image {image}: unknown image; use one of {some}")
         index = read.images.index(image)
         camera = read.image_camera[index]
         surface, system = raster.read_dsm(dsm, dsm_epsg)
@@ -467,7 +467,7 @@ def orthophoto(
             raise InputError(
                 f"image {image}, from ({x:.1f}, {y:.1f}, {z:.1f}) m, does not see {dsm.name} (X {west:.1f} to "
                 f"{east:.1f}, Y {south:.1f} to {north:.1f} m, Z {np.nanmin(surface.heights):.1f} to "
-                f"{np.nanmax(surface.heights):.1f} m); name the surface model of this area"
+                f"{np.nanmax(surface.heights):.1f} m); give a surface model of this area"
             )
         raster.write_orthophoto(out, picture, surface, system)
     fraction = picture.seen.mean()

@@ -450,8 +450,8 @@ def orient(
             write_orientation(result, folder, n_gross=matched.n_gross, sigma_factor=matched.sigma_factor)
         checkpoint.remove()
     output.say(
-        f"{matched.n_gross} matches rejected before (off the epipolar line, or of pairs with too few); sigma factor of "
-        f"the others {matched.sigma_factor:.2g}"
+        f"{matched.n_gross} matches rejected before orientation (off the epipolar line, or in pairs with too few); "
+        f"sigma factor of the others {matched.sigma_factor:.2g}"
     )
     print_orientation(result.report, output.screen)
     output.wrote(out, f"wrote {out}: adjust it with jaxphoto adjust {out} --out DIR")
@@ -470,7 +470,7 @@ def _orient_block(output: Output, folder: Path, out: Path) -> None:
     with output.progress("reading the block") as progress:
         block = read_block(folder)
         if not needs_orientation(block):
-            raise InputError(f"{folder} needs no orientation: resection reaches all its images; adjust it as it is")
+            raise InputError(f"{folder} needs no orientation: resection orients all images; adjust it directly")
         oriented = orient_block(block, progress.update)
         write_block(oriented, out)
     n_images, n_oriented = len(block.images), int(sum(oriented.start.image_known))

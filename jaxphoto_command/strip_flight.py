@@ -97,7 +97,7 @@ def adjust_flight(output: Output, flight: StripFiles, choices: StripChoices, out
     """
     cloud, trajectory, block = flight.cloud, flight.trajectory, flight.block
     if flight.breaklines is not None and block is None:
-        raise InputError("--breaklines names points of photographs: add their block (--block), or omit it")
+        raise InputError("--breaklines needs points of photographs: add their block (--block), or omit it")
     settings, priors = choices.settings, choices.priors
     check_folder(out, cloud, *(path for path in (trajectory, block, flight.control) if path is not None))
     with output.progress("reading the cloud") as progress:
@@ -239,8 +239,8 @@ def _frame_at(records: Records, system: CoordinateSystem, cloud: Path) -> Frame:
     code = None if datum is None else datum.to_epsg()
     if code is None:
         raise InputError(
-            f"{records.file}: the trajectory is in longitude and latitude, and {cloud.name} states no EPSG code; name "
-            "it (--cloud-epsg)"
+            f"{records.file}: the trajectory is in longitude and latitude, and {cloud.name} has no EPSG code; give it "
+            "(--cloud-epsg)"
         )
     longitude, latitude, height = records.coordinates[len(records.time) // 2].tolist()
     return Frame("epsg", code, origin=(longitude, latitude, height))
@@ -267,7 +267,7 @@ def _check_strips(part: Cloud, result: StripAdjustment) -> None:
     assert part.strip is not None
     for k in part.strip[part.strip >= len(result.cloud.strips)][:1]:
         raise InputError(
-            f"strip {part.strips[k]} has no points of these classes and returns: choose others, or omit it"
+            f"strip {part.strips[k]} has no points of these classes and returns: choose others, or remove the strip"
         )
 
 

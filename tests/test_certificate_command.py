@@ -130,7 +130,7 @@ def test_against_itself_a_camera_has_not_changed(results, tmp_path, monkeypatch,
 
 def test_bad_input_is_one_sentence(results, tmp_path, monkeypatch, capsys):
     code, _, error = run(monkeypatch, capsys, "certificate", results, "--out", tmp_path / "a.doc")
-    assert code == 2 and "name a file that ends in .html or .pdf" in error
+    assert code == 2 and "give a file that ends in .html or .pdf" in error
     code, _, error = run(monkeypatch, capsys, "certificate", tmp_path, "--out", tmp_path / "a.pdf")
     assert code == 2 and "interior.csv not found" in error
     open_end = tmp_path / "open"

@@ -77,7 +77,7 @@ def test_the_command_compares_two_results(tmp_path, monkeypatch, capsys):
 def test_one_calibration_is_not_compared_with_itself_and_shared_image_points_are_said(tmp_path, monkeypatch, capsys):
     a, b = (written_set(tmp_path / name, "gopro", values) for name, values in (("one", TARGET_1), ("two", TARGET_2)))
     code, _, error = run(monkeypatch, capsys, "compare", a, a)
-    assert code == 2 and "are one calibration" in error
+    assert code == 2 and "are the same calibration" in error
     for folder, key, shared in ((a, "0", False), (b, "1", False), (b, "0", True)):
         rows = f"x/image_points.csv,9,{64 * key}\ny.csv,9,{63 * key}9\n"
         (folder / "inputs.csv").write_text(f"file,n_bytes,sha256\n{rows}")

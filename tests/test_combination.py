@@ -103,4 +103,4 @@ def test_what_cannot_be_combined_is_said(tmp_path, monkeypatch, capsys):
     code, _, error = run(monkeypatch, capsys, "combine", *sets, "--out", tmp_path / "camera.toml")
     assert (code, "two has no covariance" in error) == (2, True)
     code, _, error = run(monkeypatch, capsys, "combine", *sets, "--out", tmp_path / "camera.yml")
-    assert (code, "only a .toml file can hold the covariance" in error) == (2, True)
+    assert (code, "only a .toml file can contain the covariance" in error) == (2, True)

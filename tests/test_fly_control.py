@@ -70,7 +70,7 @@ def test_a_flight_is_brought_onto_targets_that_it_finds(flown, tmp_path, monkeyp
         (lambda t: t, (), "they would fit"),
         (lambda t: t.rename(columns={"X_m": "Y_m", "Y_m": "X_m"}), ("--control-epsg", CODE), "coordinates exchanged"),
         (lambda t: t, ("--control-epsg", CODE + 1), "would fit EPSG:32633"),
-        (lambda t: t.drop(columns="X_m"), ("--control-epsg", CODE), "this is no file of control"),
+        (lambda t: t.drop(columns="X_m"), ("--control-epsg", CODE), "not a control file"),
         (lambda t: t, ("--control-epsg", CODE, "--targets", "disc"), "write one of circle"),
     ],
 )

@@ -252,7 +252,7 @@ def test_in_space_each_image_has_its_frame():
     # Below the projection centre, as far as it looks down.
     z = np.array([np.asarray(line.get_data_3d())[2] for line in frames])
     assert (z[:, :4].max(axis=1) < np.asarray(result.unknowns.exterior.position)[:, 2]).all()
-    with pytest.raises(InputError, match="in_3d draws on axes in space"):
+    with pytest.raises(InputError, match="in_3d needs 3D axes"):
         result.plot(Figure().add_subplot(), in_3d=True)
 
 

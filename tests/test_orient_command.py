@@ -62,7 +62,7 @@ def test_photographs_become_a_block(taken, tmp_path, monkeypatch, capsys):
         (["--r0-mm", "nan"], "R0 belongs to the model smac"),
         (["--model", "smac", "--r0-mm", "-1"], "R0 = -1 mm does not lie on an image"),
         (["--model", "smac", "--r0-mm", "nan"], "R0 = nan mm does not lie on an image"),
-        (["--pairs", "nearest"], "the choice of pairs is 'nearest'"),
+        (["--pairs", "nearest"], "unknown choice of pairs 'nearest'"),
     ],
 )
 def test_options_that_mean_nothing(arguments, message, taken, tmp_path, monkeypatch, capsys):
@@ -116,14 +116,14 @@ def test_photographs_that_show_nothing_are_named(taken, tmp_path, monkeypatch, c
     more = matched._replace(
         xy_mm=[*matched.xy_mm, np.zeros((0, 2))],
         sigma_mm=[*matched.sigma_mm, np.zeros(0)],
-        left_out={"wall[red]": "it shows no features: it is blank or out of focus"},
+        left_out={"wall[red]": "no features: blank or out of focus"},
     )
     monkeypatch.setattr(matching, "match_photographs", lambda *arguments, **options: more)
     out = tmp_path / "block[1]"
     code, said, wrong = run(monkeypatch, capsys, "orient", *taken, blank, "--out", out)
     assert code == 0, wrong
     assert "7 of 8 images oriented" in said
-    assert "image wall[red] is not oriented: it shows no features: it is blank or out of focus" in said
+    assert "image wall[red] is not oriented: no features: blank or out of focus" in said
     assert f"wrote {out}" in said
     summary = json.loads((out / "orientation.json").read_text())
     assert list(summary["unoriented"]) == ["wall[red]"]

@@ -101,7 +101,7 @@ def test_cameras_of_different_sensors_are_refused(sets, monkeypatch, capsys):
     other.write_text((sets / "bare.toml").read_text().replace("3000", "4000"))
     code, _, error = run(monkeypatch, capsys, "stability", sets / "one", other)
     assert code == 2
-    assert "is of 3000 x 2250 px" in error
+    assert "3000 x 2250 px" in error
     other.write_text((sets / "bare.toml").read_text().replace("0.00155", "0.0015"))
     code, _, error = run(monkeypatch, capsys, "stability", sets / "one", other)
     assert code == 2

@@ -5,8 +5,8 @@ For time or temperature t of the camera, the interior orientation of an exposure
     c + dc t,    x_p + dx_p t,    y_p + dy_p t,    K1 + dK1 t
 
 Time is in hours from the middle of the flight, the mean time of all exposures; temperature in kelvins from the
-reference of the block (`Temperatures`), by default the mean of all exposures. The interior orientation estimated along
-with the rates is that of the middle of the flight, or at the reference temperature. A positive rate of c is an
+reference of the block (`Temperatures`), by default the mean of all exposures. The interior orientation estimated
+together with the rates refers to the middle of the flight or to the reference temperature. A positive rate of c is an
 increasing principal distance. Effects that rates may absorb: docs/time_dependent_cameras.md.
 """
 
@@ -25,13 +25,13 @@ HOUR_S = 3600.0
 
 
 class AbstractCameraRates(AbstractParameters):
-    """Rates of one camera: of c, x_p, y_p in mm, of K1 in its own unit (mm^-2 for `Brown`), per unit of `along`.
+    """Rates of change of one camera per unit of `along`: c, x_p, y_p in mm, K1 in its own unit (mm^-2 for `Brown`).
 
-    K1 must be fixed for a distortion without a coefficient k1.
+    K1 must be fixed if the distortion has no coefficient k1.
     """
 
     along: eqx.AbstractClassVar[str]
-    """Independent variable: a word, followed by its unit."""
+    """Name of the independent variable, followed by its unit."""
     owner = "camera"
     modifies_interior = ("c", "x_p", "y_p", "k1")
 
@@ -43,7 +43,7 @@ class AbstractCameraRates(AbstractParameters):
     @staticmethod
     @abc.abstractmethod
     def argument(exposure: Any) -> Any:
-        """Return the independent variable of an exposure (or of many), zero where the interior orientation holds."""
+        """Return the independent variable of one or more exposures, relative to the reference of the camera."""
 
     def interior(self, interior: Any, exposure: Any) -> Any:
         """Return the interior orientation at the exposure."""
@@ -60,7 +60,7 @@ class AbstractCameraRates(AbstractParameters):
 
 
 class CameraRates(AbstractCameraRates):
-    """Rates of one camera per hour."""
+    """Rates of change of one camera per hour."""
 
     kind = "camera_rates"
     along = "time_h"
@@ -73,12 +73,12 @@ class CameraRates(AbstractCameraRates):
 
     @staticmethod
     def argument(exposure: Any) -> Any:
-        """Return hours from the middle of the flight."""
+        """Return the time (h) from the middle of the flight."""
         return exposure.in_flight / HOUR_S
 
 
 class ThermalRates(AbstractCameraRates):
-    """Rates of one camera per kelvin of its temperature.
+    """Rates of change of one camera per kelvin of its temperature.
 
     Source: Smith and Cope (2010), The effects of temperature variation on single-lens-reflex digital camera calibration
     parameters, ISPRS Archives 38 (5).
@@ -95,9 +95,9 @@ class ThermalRates(AbstractCameraRates):
 
     @staticmethod
     def argument(exposure: Any) -> Any:
-        """Return kelvins above the reference of the block."""
+        """Return the temperature difference (K) from the reference of the block."""
         return exposure.temperature
 
 
 RATES: tuple[type[AbstractCameraRates], ...] = (CameraRates, ThermalRates)
-"""All kinds of linear change."""
+"""All classes of linear change."""

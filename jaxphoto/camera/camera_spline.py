@@ -1,17 +1,18 @@
-"""Camera that drifts during a flight: principal distance and principal point as cubic B-splines of time.
+"""Drift of a camera during a flight: principal distance and principal point as cubic B-splines of time.
 
-With n knots h apart, the middle of them in the middle of the flight, an exposure at time t from there sees through
+n knots with spacing h are centred on the middle of the flight. At time t from the middle of the flight, the principal
+distance is
 
     c + sum over k of c_k B(t / h - (k - (n + 1) / 2)),    k = 1 ... n
 
-and likewise x_p and y_p, where B is the cubic B-spline of unit steps:
+and analogously for x_p and y_p, where B is the cubic B-spline of unit knot spacing:
 
     B(d) = (4 - 6 d^2 + 3 |d|^3) / 6  for |d| < 1,    (2 - |d|)^3 / 6  for 1 <= |d| < 2,    0 beyond
 
-Before the first whole interval and after the last, n - 3 of them, the camera is as at their ends. What holds the
-coefficients together is a random walk of q (mm^2/h) that begins at nothing in the middle of the flight and goes both
-ways: coefficients at times s and t on one side have the covariance q min(|s|, |t|), those on two sides none. So the
-interior orientation beside the spline is that of the middle of the flight, but for sqrt(q h) / 2.
+The spline has n - 3 complete intervals; outside them, the camera is constant. The prior of the coefficients is a random
+walk of q (mm^2/h) in both directions from zero in the middle of the flight: coefficients at times s and t on the same
+side have the covariance q min(|s|, |t|), coefficients on opposite sides are uncorrelated. The constant interior
+orientation therefore refers to the middle of the flight, up to a standard deviation of sqrt(q h) / 2.
 Sources: de Boor (1978), A practical guide to splines; Gelb (1974), Applied optimal estimation.
 """
 
@@ -29,14 +30,14 @@ from jaxphoto.parameters import AbstractParameters, dynamic_fields
 
 MOST = 100
 """Maximum number of knots of a camera; each is a parameter of all its images."""
-# No flight takes thirty years; knot times remain finite.
+# Maximum time (s), about thirty years: knot times remain finite.
 _LONGEST_S = 1e9
 
 
 class CameraSpline(AbstractParameters):
-    """Coefficients added to one camera's interior orientation: of c, x_p and y_p (mm).
+    """Spline coefficients of one camera, added to c, x_p and y_p (mm).
 
-    `knots` is an even number of them, 4 or more, `interval_s` the time from one to the next.
+    `knots`: number of knots, even and at least 4. `interval_s`: knot spacing.
     """
 
     kind = "camera_splines"
@@ -60,7 +61,7 @@ class CameraSpline(AbstractParameters):
             )
 
     def labels(self, owner: str) -> tuple[str, ...]:
-        """Labels such as `camera_splines[kodak].c_3_mm`."""
+        """Return labels such as `camera_splines[kodak].c_3_mm`."""
         ends = [self.names[field][0].split("_") for field in dynamic_fields(type(self))]
         return tuple(f"{self.kind}[{owner}].{name}_{k + 1}_{unit}" for name, unit in ends for k in range(self.knots))
 
@@ -79,12 +80,12 @@ class CameraSpline(AbstractParameters):
 
     @property
     def times(self) -> Float[np.ndarray, "knots"]:
-        """Return the time of the largest weight of each knot, from the middle of the flight (s)."""
+        """Return the time (s) of the largest weight of each knot, from the middle of the flight."""
         return (np.arange(self.knots) - (self.knots - 1) / 2) * self.interval_s
 
     @property
     def walk(self) -> Float[np.ndarray, "knots knots"]:
-        """Return the covariance of the coefficients of a camera that drifts by 1 mm in an hour (mm^2)."""
+        """Return the prior covariance (mm^2) of the coefficients for a random walk of 1 mm^2/h."""
         hours = self.times / HOUR_S
         least = np.minimum(np.abs(hours)[:, None], np.abs(hours))
         return np.where(np.sign(hours)[:, None] == np.sign(hours), least, 0.0)

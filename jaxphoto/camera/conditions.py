@@ -1,23 +1,23 @@
-"""Conditions of a photograph, as recorded in its file: required in a calibration certificate."""
+"""Conditions of a photograph, as recorded in its file, for the calibration certificate."""
 
 from typing import NamedTuple
 
 
 class Conditions(NamedTuple):
-    """Conditions of one photograph; "" and None where its file does not record them."""
+    """Conditions of one photograph; "" or None if its file does not record them."""
 
     image: str
     file: str
-    """File name, without folders."""
+    """File name without folders."""
     sha256: str
     used: bool = True
-    """True if it is an image of the block."""
+    """True if the photograph is an image of the block."""
     time: str = ""
-    """By the camera's clock, such as 2016-10-11 10:23:45.50+02:00; offset only if the file has one."""
+    """Time of the camera's clock, such as 2016-10-11 10:23:45.50+02:00; UTC offset only if the file has one."""
     make: str = ""
     model: str = ""
     serial: str = ""
-    """Serial number of the body."""
+    """Serial number of the camera body."""
     lens: str = ""
     lens_serial: str = ""
     drone: str = ""
@@ -28,9 +28,9 @@ class Conditions(NamedTuple):
     exposure_s: float | None = None
     iso: float | None = None
     subject_distance_m: float | None = None
-    """Focus distance."""
+    """Focus distance (m)."""
     temperature_c: float | None = None
-    """Air temperature."""
+    """Air temperature (degrees Celsius)."""
     lens_temperature_c: float | None = None
     sensor_temperature_c: float | None = None
     humidity_percent: float | None = None
@@ -38,7 +38,7 @@ class Conditions(NamedTuple):
 
     @property
     def camera(self) -> str:
-        """Return maker and model. Some makers repeat their name in the model."""
+        """Return make and model. Some makes are repeated in the model name."""
         name = next(iter(self.make.split()), "")
         told = self.model.lower().startswith(name.lower())
         return self.model if told else f"{self.make} {self.model}".strip()

@@ -16,29 +16,29 @@ from jaxphoto.compiling import call_compiled
 from jaxphoto.least_squares import least_squares
 from jaxphoto.linear_algebra import solve
 
-# Image points along each side of the format, corners included, at which cameras are compared.
+# Number of image points along each side of the format, corners included, at which cameras are compared.
 _SIDE = 25
-# A fit without rarely needed terms is accepted if its error does not exceed this.
+# Maximum error (px) of a fit without rarely needed terms.
 _GOOD_PX = 0.01
-# Rational models lie in a flat valley and take many.
+# Maximum number of iterations. Rational models converge slowly along a flat valley.
 _MAX_STEPS = 300
 
 
 class Conversion(NamedTuple):
-    """Camera converted to another model, and the displacement of image points for the same rays (px)."""
+    """Camera converted to another model, and displacement (px) of the image points of the same rays."""
 
     interior: InteriorOrientation
     rms_px: float
     """RMS length of the displacement over the format; 0 for an exact conversion."""
     max_px: float
     covered: float
-    """Fraction of the format that was compared; below 1 where the given camera is not defined in its corners."""
+    """Fraction of the format that was compared; below 1 if the given camera is undefined in the corners."""
     worst_px: tuple[float, float] | None = None
     """Column and row of the image point with the largest displacement; None for an exact conversion."""
 
     @property
     def lost(self) -> str:
-        """Describe what the conversion loses."""
+        """Describe the loss of the conversion."""
         if self.worst_px is None:
             return "the conversion is exact"
         column, row = self.worst_px
@@ -55,9 +55,9 @@ def converted(
     held: tuple[str, ...] = (),
     projection: AbstractProjection | None = None,
 ) -> Conversion:
-    """Return `exact` where it exists, otherwise `fitted`; `held` names coefficients of `target` that must be 0.
+    """Convert by `exact` if possible, otherwise by `fitted`; `held` names coefficients of `target` that must be 0.
 
-    `projection` is that of the result; None keeps the camera's own. Raises what `fitted` raises.
+    `projection`: projection of the result; None retains the projection of the camera. Raises the errors of `fitted`.
     """
     own = projection is None or eqx.tree_equal(projection, interior.projection) is True
     same = exact(interior, target) if own else None
@@ -76,12 +76,12 @@ def fitted(
     """Fit the model `target` to the rays of `interior` by least squares in the image.
 
     c, x_p, y_p and the coefficients of `target` except `held` are fitted to 25 x 25 evenly spaced image points of the
-    format with equal weights; the camera is not rotated. Rare terms (affinity, rational and highest ones) are used only
-    if the others leave more than 0.01 px. R0 of SMAC and of the balanced model is 0. `projection` is that of the
-    result; None keeps the camera's own.
+    format with equal weights; the camera is not rotated. Rare terms (affinity, rational and highest-order terms) are
+    used only if the error without them exceeds 0.01 px. R0 of SMAC and of the balanced model is 0. `projection`:
+    projection of the result; None retains the projection of the camera.
 
-    Raises ValueError if `interior` is undefined in more than half of the format, if it sees directions there that
-    `projection` does not, or if the fitted model is not invertible there.
+    Raises ValueError if `interior` is undefined in more than half of the format, if `projection` does not cover the
+    directions of the format, or if the fitted model is not invertible in the format.
     """
     points, rays, covered = _sampled(interior, sensor)
     scales = (*held, *target.scales)
@@ -95,7 +95,7 @@ def fitted(
     found = _fit(first, sensor, points, rays, (*scales, *rare))
     if rare and not found.max_px <= _GOOD_PX:
         fuller = _fit(found.interior, sensor, points, rays, scales)
-        # A model that is not invertible has max_px NaN: any other is better.
+        # max_px is NaN for a model that is not invertible; prefer any other model.
         found = fuller if not found.rms_px <= fuller.rms_px else found
     if not np.isfinite(found.max_px):
         raise ValueError(
@@ -106,7 +106,7 @@ def fitted(
 
 
 def _sampled(interior: InteriorOrientation, sensor: Sensor) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return image points (mm) of the format that the camera maps, their directions, and their fraction of all."""
+    """Return the image points (mm) where the camera is defined, their directions, and their fraction of all points."""
     x, y = (np.linspace(-0.5, 0.5, _SIDE) * side for side in (sensor.width_mm, sensor.height_mm))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     rays, good = (np.asarray(v) for v in call_compiled(_rays, _arrays(interior), points))
@@ -120,7 +120,7 @@ def _sampled(interior: InteriorOrientation, sensor: Sensor) -> tuple[np.ndarray,
 
 @eqx.filter_jit
 def _rays(interior: InteriorOrientation, points):
-    """Return directions, over c, of image points, and True where the model is invertible."""
+    """Return the directions (divided by c) of image points, and True where the model is invertible."""
     d, c = interior.distortion, interior.c
 
     def of_one(xy):
@@ -129,7 +129,7 @@ def _rays(interior: InteriorOrientation, points):
         if d.domain == "ideal":
             good = invert(d, reduced / unit)[1]
         else:
-            # The inverse of an inverse returns the point only within the monotone range.
+            # Check by a round trip: the inverse returns the same point only within the monotone range.
             back, monotone = invert(d, ideal / unit)
             good = monotone & (jnp.max(jnp.abs(unit * back - reduced)) < 1e-6 * c)
         ray = jnp.stack(interior.direction_from_ideal(ideal)) / c
@@ -141,12 +141,12 @@ def _rays(interior: InteriorOrientation, points):
 def _fit(
     first: InteriorOrientation, sensor: Sensor, points: np.ndarray, rays: np.ndarray, held: tuple[str, ...]
 ) -> Conversion:
-    """Fit all parameters of `first` except `held`, from its values."""
+    """Fit all parameters of `first` except `held`; its values are the initial values."""
     names = parameter_names(first)
     free = np.array([name not in held for name in names])
     begin = np.array([float(get_parameter(first, name)) for name in names])
     data = (_arrays(first), np.array(sensor.pixel_mm), _padded(points), _padded(rays))
-    # All parameters are arguments, fixed ones too: one program serves a model.
+    # Pass all parameters as arguments, including fixed parameters, to compile one program per model.
     interior = _with(first, np.asarray(call_compiled(_fitted_values, begin, free, *data)))
     moved = np.asarray(call_compiled(_moved, _arrays(interior), *data[1:]))[: len(points)]
     column, row = sensor.px_from_mm(points[[np.argmax(moved)]])[0].tolist()
@@ -154,19 +154,19 @@ def _fit(
 
 
 def _padded(values: np.ndarray) -> np.ndarray:
-    """Replace the omitted points of a format by NaN: one program serves all."""
+    """Pad the points of the format by NaN to a common shape, to compile one program."""
     return np.concatenate([values, np.full((_SIDE**2 - len(values), values.shape[1]), np.nan)])
 
 
 @eqx.filter_jit
 def _fitted_values(start, free, first: InteriorOrientation, pixel_mm, points, rays):
-    """Parameters of least squares of the displacements, from `start`; only those that are `free` change."""
+    """Minimise the squared displacements over the `free` parameters, from `start`; return all parameters."""
     displacements = lambda v, _: _displacements(jnp.where(free, v, start), first, pixel_mm, points, rays)  # noqa: E731
     return least_squares(displacements, start, atol=1e-9, max_steps=_MAX_STEPS).unknowns
 
 
 def _displacements(values, first: InteriorOrientation, pixel_mm, points, rays):
-    """Return the displacements (px) of image points of the given rays, to first order for measured-domain models."""
+    """Return the displacements (px) of the image points of given rays; first order for measured-domain models."""
     interior = _with(first, values)
 
     def of_one(xy, ray):
@@ -176,7 +176,7 @@ def _displacements(values, first: InteriorOrientation, pixel_mm, points, rays):
         if interior.distortion.domain == "ideal":
             apart = interior.measured_from_ideal(aimed) - xy
         else:
-            # Ideal coordinates over c; the model's derivative transforms their difference to the image.
+            # Compare ideal coordinates divided by c; transform the difference to the image by the model's derivative.
             ideal = lambda m: interior.ideal_from_measured(m) / interior.c  # noqa: E731
             j = jax.lax.stop_gradient(jax.jacfwd(ideal)(xy))
             apart = solve(j, aimed / interior.c - ideal(xy))
@@ -187,7 +187,7 @@ def _displacements(values, first: InteriorOrientation, pixel_mm, points, rays):
 
 @eqx.filter_jit
 def _moved(interior: InteriorOrientation, pixel_mm, points, rays):
-    """Return the exact lengths of the displacements (px); NaN where the model is not invertible."""
+    """Return the exact lengths (px) of the displacements; NaN where the model is not invertible."""
 
     def of_one(xy, ray):
         ideal = interior.ideal_from_direction(*ray)
@@ -200,7 +200,7 @@ def _moved(interior: InteriorOrientation, pixel_mm, points, rays):
 def _plain(
     interior: InteriorOrientation, target: type[AbstractDistortion], sensor: Sensor, projection: AbstractProjection
 ) -> InteriorOrientation:
-    """Return the camera without distortion, as a `target`, and True if its projection differs."""
+    """Return the camera with the model `target` and the given projection, without distortion."""
     plain = target.plain(sensor)
     camera = InteriorOrientation(interior.c, interior.x_p, interior.y_p, plain, projection=projection)
     return jax.tree.map(lambda v: jnp.asarray(v, float), camera)

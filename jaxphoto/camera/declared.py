@@ -1,4 +1,4 @@
-"""Self-description of camera models, so that readers, writers and tables need no list of models."""
+"""Declarations of camera models, used by readers, writers and tables instead of a list of models."""
 
 import dataclasses
 import inspect
@@ -13,15 +13,15 @@ Kind = TypeVar("Kind", bound="Declared")
 
 
 class Declared(eqx.Module):
-    """Model of a kind (a distortion, a projection) that files identify by its name.
+    """Base class of distortions and projections that files identify by name.
 
-    `name` is its name in files and commands. `coefficients` names the fields that an adjustment may estimate;
-    `constants` those that it never does, by their names in files, which end in the unit (`{"r0_mm": "r0"}`); `choices`
-    names static fields, with their possible values. `powers` gives the power of mm of a coefficient: -2 for mm^-2, 0
-    for a number without unit; coefficients it does not name have an unknown unit in tables.
+    `name`: name in files and commands. `coefficients`: fields that an adjustment can estimate. `constants`: fields that
+    are never estimated, by their names in files, which end in the unit (`{"r0_mm": "r0"}`). `choices`: static fields
+    with their possible values. `powers`: unit of a coefficient as a power of mm: -2 for mm^-2, 0 if dimensionless; the
+    unit of any other coefficient is unknown in tables.
 
-    A class is known once defined, without registration; a notebook cell that is run again replaces its previous
-    definition.
+    Defining a class registers it; a second definition with the same name replaces the first, as when a notebook cell is
+    re-run.
     """
 
     name: eqx.AbstractClassVar[str]
@@ -32,7 +32,7 @@ class Declared(eqx.Module):
 
     def __init_subclass__(cls, **options) -> None:
         super().__init_subclass__(**options)
-        # Equinox makes temporary subclasses, which declare nothing.
+        # Skip the temporary subclasses of Equinox, which declare nothing.
         if "name" in cls.__dict__:
             _check(cls)
             of_kind = _KNOWN.setdefault(_kind(cls), {})
@@ -46,7 +46,7 @@ class Declared(eqx.Module):
 
     @classmethod
     def known(cls: type[Kind]) -> Mapping[str, type[Kind]]:
-        """Return every model of this kind by name: those of jaxphoto, then user-defined ones."""
+        """Return all models of this kind by name: models of jaxphoto first, then user-defined models."""
         return dict(_KNOWN.get(cls, {}))
 
     @classmethod
@@ -60,12 +60,12 @@ class Declared(eqx.Module):
 
     @classmethod
     def power(cls, coefficient: str) -> int | None:
-        """Return the power of mm that is the unit of a coefficient; None if undeclared."""
+        """Return the unit of a coefficient as a power of mm; None if undeclared."""
         return cls.powers.get(coefficient)
 
     @classmethod
     def needed(cls) -> dict[str, str]:
-        """Return the `constants` without default: positive lengths that the model needs."""
+        """Return the required `constants` (without default), all of them positive lengths."""
         without = {f.name for f in dataclasses.fields(cls) if f.default is dataclasses.MISSING}
         return {name: field for name, field in cls.constants.items() if field in without}
 
@@ -74,7 +74,7 @@ _KNOWN: dict[type, dict[str, type]] = {}
 
 
 def _kind(cls: type) -> type:
-    """Return the abstract class right below `Declared` that `cls` derives from."""
+    """Return the direct subclass of `Declared` from which `cls` derives."""
     return next(base for base in cls.__mro__ if Declared in base.__bases__)
 
 
@@ -101,7 +101,7 @@ def _check(cls: type[Declared]) -> None:
 
 
 def _annotated(cls: type) -> list[str]:
-    """Return the fields in the body of a class: annotations except class variables."""
+    """Return the annotated fields in the body of a class, class variables excluded."""
     hints = inspect.get_annotations(cls)
     return [name for name, hint in hints.items() if "ClassVar" not in str(hint)]
 

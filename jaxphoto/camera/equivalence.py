@@ -1,12 +1,13 @@
-"""Exact conversions between distortion models that are the same polynomial in other names, signs, units or scale.
+"""Exact conversions between distortion models that are the same polynomial with different names, signs, units or scale.
 
-Most models are one of two polynomials, with D Brown's decentring distortion and (x, y) with y up:
+Most models are one of two polynomials (D: Brown's decentring distortion, y up):
 
     measured    ideal = x - x q - t D(P1, P2) - affinity(b1, b2),             x measured, in mm
     ideal       measured = c (p + p q + t D(P1, P2) + affinity(b1, b2)),      p = ideal / c
 
-with q = K1 r^2 + K2 r^4 + ... and t = 1 + P3 r^2 + P4 r^4. A camera of one of them converts exactly to every model of
-the same direction that has the required terms, for any R0. Each model declares its terms (`AbstractDistortion.terms`).
+with q = K1 r^2 + K2 r^4 + ... and t = 1 + P3 r^2 + P4 r^4. A camera with one of these models converts exactly to every
+model of the same direction that has the required terms, for any R0. Each model declares its terms
+(`AbstractDistortion.terms`).
 """
 
 import dataclasses
@@ -21,9 +22,7 @@ from jaxphoto.camera.smac_balance_radius import rebalance
 
 
 def exact(interior: InteriorOrientation, target: type[AbstractDistortion]) -> InteriorOrientation | None:
-    """Convert to the model `target` with the same rays (SMAC: subtracted; R0 = 0); None if no exact conversion is
-    known.
-    """
+    """Convert to the model `target` with the same rays (SMAC: subtracted; R0 = 0); None if not exactly possible."""
     d = interior.distortion
     if type(d) is target:
         return interior
@@ -47,7 +46,7 @@ def exact(interior: InteriorOrientation, target: type[AbstractDistortion]) -> In
 def with_sign(interior: InteriorOrientation, sign: Literal["subtract", "add"]) -> InteriorOrientation:
     """Convert SMAC to the sign "subtract" (paper 002) or "add" (reports of the USGS).
 
-    K0 to K4, P1 and P2 change their sign. Raises ValueError for a distortion other than SMAC.
+    K0 to K4, P1 and P2 change sign. Raises ValueError for a distortion other than SMAC.
     """
     d = interior.distortion
     if not isinstance(d, Smac):

@@ -27,8 +27,8 @@ class InteriorOrientation(eqx.Module):
     distortion.ideal_from_measured(measured - (x_p, y_p))`; for a `normalised` distortion both are divided by c
     (docs/conventions.md).
 
-    `residuals` selects the image in which residuals are measured: that of the model, where the distortion has a closed
-    form, or always the measured image, where the noise is. They differ where a wide-angle lens stretches the image.
+    `residuals` selects the image to which residuals refer: the image in which the distortion has a closed form, or
+    always the measured image, which contains the noise. The two differ where a wide-angle lens stretches the image.
     """
 
     c: Float[Array, ""] | float
@@ -38,7 +38,7 @@ class InteriorOrientation(eqx.Module):
     residuals: Literal["model", "measured"] = eqx.field(static=True, default="model")
     projection: AbstractProjection = dataclasses.field(default_factory=Perspective)
     rows: RowMotion | None = None
-    """Motion of the camera while rows are exposed: only within an adjustment with `RollingShutter`."""
+    """Motion of the camera during the exposure of the rows; only set within an adjustment with `RollingShutter`."""
 
     def __check_init__(self) -> None:
         if both := set(self.projection.coefficients) & set(self.distortion.coefficients):
@@ -48,17 +48,15 @@ class InteriorOrientation(eqx.Module):
             )
 
     def ideal_from_measured(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Convert a measured image coordinate (mm, from the centre) to the ideal one (mm, from the principal point)."""
+        """Convert a measured (mm, from the centre) to an ideal image coordinate (mm, from the principal point)."""
         return self._in_mm(self.distortion.ideal_from_measured, single("xy", xy, 2) - self.principal_point)
 
     def measured_from_ideal(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Convert an ideal coordinate (mm, from the principal point) to the measured one (mm, from the centre)."""
+        """Convert an ideal (mm, from the principal point) to a measured image coordinate (mm, from the centre)."""
         return self._in_mm(self.distortion.measured_from_ideal, single("xy", xy, 2)) + self.principal_point
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Apply the distortion in its closed-form direction (see `domain`) to a coordinate in mm from the principal
-        point.
-        """
+        """Apply the distortion in its closed-form direction (`domain`) to a coordinate (mm, reduced to x_p, y_p)."""
         return self._in_mm(self.distortion.closed_form, xy)
 
     def valid(self, xy: Float[Array, "2"]) -> Bool[Array, ""]:
@@ -68,7 +66,7 @@ class InteriorOrientation(eqx.Module):
         return invert(self.distortion, xy / self.c if self.distortion.normalised else xy)[1]
 
     def invertible(self, xy: Float[Array, "2"]) -> Bool[Array, ""]:
-        """Return `valid`; also for distortions of the ideal coordinate, which are not invertible far outside either."""
+        """Return `valid`, also for distortions of the ideal coordinate: they are not invertible far off the axis."""
         if self.distortion.domain == "measured":
             return self.valid(xy)
         there = xy / self.c if self.distortion.normalised else xy
@@ -76,12 +74,12 @@ class InteriorOrientation(eqx.Module):
         return sure & (jnp.abs(back - there).max() < 1e-9 * (1 + jnp.abs(there).max()))
 
     def direction_from_ideal(self, xy: Float[Array, "2"]) -> tuple[Array, Array, Array]:
-        """Return the direction (u, v, w) in the camera frame, of any length, of an ideal coordinate (mm)."""
+        """Convert an ideal coordinate (mm) to a direction (u, v, w) of arbitrary length in the camera frame."""
         u, v, w = self.projection.direction_from_ideal(jnp.asarray(self.c, xy.dtype), xy[0], xy[1])
         return u, v, w
 
     def ideal_from_direction(self, u: Array, v: Array, w: Array) -> Float[Array, "2"]:
-        """Return the ideal coordinate (mm, from the principal point) of a direction or point in the camera frame."""
+        """Convert a direction or point in the camera frame to the ideal coordinate (mm, from the principal point)."""
         return jnp.stack(self.projection.ideal_from_direction(self.c, u, v, w))
 
     @property
@@ -97,11 +95,11 @@ class InteriorOrientation(eqx.Module):
 
     @property
     def principal_point(self) -> Float[Array, "2"]:
-        """(x_p, y_p) in mm."""
+        """Return (x_p, y_p) in mm."""
         return jnp.stack([jnp.asarray(self.x_p), jnp.asarray(self.y_p)])
 
     def _in_mm(self, of_model: Callable, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Convert a map of the distortion, in its own unit, to millimetres."""
+        """Convert a mapping of the distortion from its own unit to millimetres."""
         if not self.distortion.normalised:
             return of_model(xy)
         x, y = of_model(jnp.stack([xy[0] / self.c, xy[1] / self.c]))
@@ -109,20 +107,20 @@ class InteriorOrientation(eqx.Module):
 
 
 def parameter_names(interior: InteriorOrientation) -> tuple[str, ...]:
-    """Return the estimable parameters in the order of the model: c_mm, xp_mm, yp_mm and the coefficients.
+    """Return the names of the estimable parameters in the order of the model: c_mm, xp_mm, yp_mm and the coefficients.
 
-    These are the names of `block.toml` and of every table (docs/block_folder.md).
+    `block.toml` and all tables use these names (docs/block_folder.md).
     """
     return (*_FIELDS, *interior.distortion.coefficients, *interior.projection.coefficients)
 
 
 def constant_names(interior: InteriorOrientation) -> tuple[str, ...]:
-    """Return the constants of its models, by their names in files (`r0_mm`)."""
+    """Return the names of the constants of its models, as in files (`r0_mm`)."""
     return (*interior.distortion.constants, *interior.projection.constants)
 
 
 def parameter_unit(interior: InteriorOrientation, name: str) -> str:
-    """Return the unit of a parameter or constant: mm, 1/mm^2; "1" without unit, "" if unknown."""
+    """Return the unit of a parameter or constant: mm, 1/mm^2; "1" if dimensionless, "" if unknown."""
     for part in (interior.distortion, interior.projection):
         if name in part.coefficients:
             power = part.power(name)
@@ -137,9 +135,7 @@ def power_of_mm(power: int) -> str:
 
 
 def model_keys(interior: InteriorOrientation) -> dict[str, str]:
-    """Return the keys by which files identify the models of a camera: distortion, projection (if not perspective),
-    choices.
-    """
+    """Return the keys of the models of a camera in files: distortion, projection (if not perspective), choices."""
     keys = {"distortion": interior.distortion.name}
     if type(interior.projection) is not Perspective:
         keys["projection"] = interior.projection.name
@@ -149,9 +145,9 @@ def model_keys(interior: InteriorOrientation) -> dict[str, str]:
 
 
 def empty_camera(told: Mapping[str, Any], constant: float = 1.0) -> InteriorOrientation:
-    """Return a camera of the models in `model_keys`: parameters zero, all constants `constant`.
+    """Return a camera with the models in `model_keys`, zero parameters, and all constants equal to `constant`.
 
-    Raises InputError for unknown models, KeyError without a distortion.
+    Raises InputError for unknown models, KeyError if the distortion is missing.
     """
     distortion = _empty(AbstractDistortion.called(told["distortion"]), told, constant)
     projection = _empty(AbstractProjection.called(told.get("projection", Perspective.name)), told, constant)

@@ -1,8 +1,8 @@
-"""Prior information about a lens before any measurement: by make and model, or by class of camera.
+"""Prior information about lenses by make and model, or by class of camera.
 
-A flat block at one height determines neither the principal distance apart from its own height nor barrel distortion
-apart from a dome. The result then depends on how far lenses deviate from EXIF: table `lens_priors.toml`, with the
-source of each figure.
+In a flat block at one flying height, the principal distance is not separable from the flying height, nor barrel
+distortion from a doming error. The result then depends on the prior: the deviation of lenses from EXIF. The table
+`lens_priors.toml` contains the values with their sources.
 """
 
 import functools
@@ -19,40 +19,40 @@ from jaxtyping import Float
 from jaxphoto.camera.interior import InteriorOrientation, parameter_names, set_parameter
 from jaxphoto.camera.sensor import Sensor
 
-# Places on the edge of the format at which the effect of a coefficient is evaluated.
+# Number of points per edge of the format at which the effect of a coefficient is evaluated.
 _ON_AN_EDGE = 9
 
 
 class LensPrior(NamedTuple):
-    """Standard deviations of the lenses of a model, or of a class of cameras, about the values of EXIF."""
+    """Standard deviations of lens parameters relative to EXIF, for a camera model or a class of cameras."""
 
     name: str
     c_percent: float
-    """Of c about the focal length in EXIF."""
+    """Standard deviation of c relative to the focal length in EXIF (%)."""
     point_percent: float
-    """Of the principal point about the centre, in x and in y, relative to the longer side of the format."""
+    """Standard deviation of x_p and y_p in percent of the longer side of the format."""
     radial_percent: float
-    """Effect of each radial distortion term at the corner, relative to the distance of the corner."""
+    """Effect of each radial term at the corner of the format, in percent of the distance of the corner."""
     decentring_percent: float
-    """The same for all other terms."""
+    """Effect of each other term at the corner of the format, in percent of the distance of the corner."""
     drift_ppm_per_K: float
-    """Change of c with temperature."""
+    """Relative change of c with temperature (ppm/K)."""
     published: bool
-    """True if the figures rest on published ones."""
+    """True if the values are based on published values."""
     source: str
 
 
 @functools.cache
 def lens_priors() -> tuple[tuple[tuple[str, ...], tuple[str, ...], LensPrior], ...]:
-    """Return the table of models or beginnings of makes (and models) with their priors; the first match is used."""
+    """Return the table of priors by prefix of make and model; the first match applies."""
     table = tomllib.loads(resources.files(__package__).joinpath("lens_priors.toml").read_text("utf-8"))
     return tuple((tuple(row.pop("models", ())), tuple(row.pop("makes", ())), LensPrior(**row)) for row in table["lens"])
 
 
 def lens_prior(make: str | None, model: str | None) -> LensPrior:
-    """Return the prior of a camera by make and model in EXIF (None if EXIF lacks them)."""
+    """Return the prior of a camera by make and model in EXIF (None if missing)."""
     make, model = (make or "").strip(), (model or "").strip()
-    # Some makers repeat their name in the model.
+    # Some makes are repeated in the model name.
     told = {f"{make} {model}".lower(), f"{make.split(' ')[0]} {model}".lower(), model.lower()}
     for models, makes, prior in lens_priors():
         if model in models or any(name.startswith(own.lower()) for own in makes for name in told):
@@ -63,10 +63,10 @@ def lens_prior(make: str | None, model: str | None) -> LensPrior:
 def prior_sigmas(
     prior: LensPrior, interior: InteriorOrientation, sensor: Sensor, rounding: float = 0.0
 ) -> dict[str, float]:
-    """Return standard deviations of the parameters of `interior` about its values, by name (their own units).
+    """Return the prior standard deviations of the parameters of `interior`, by name, in their own units.
 
-    `rounding` is the relative standard deviation of c due to its rounding in EXIF. A coefficient has the standard
-    deviation whose largest displacement at the edge of the format is the percentage of the table.
+    `rounding`: relative standard deviation of c due to its rounding in EXIF. The standard deviation of a coefficient is
+    the value whose maximum displacement along the edge of the format equals the percentage in the table.
     """
     c = float(interior.c)
     point = prior.point_percent / 100 * max(sensor.width_mm, sensor.height_mm)
@@ -81,13 +81,13 @@ def prior_sigmas(
         most = np.hypot(*moved.T).max()
         radial = across < 1e-6 * corner * most
         percent = prior.radial_percent if radial else prior.decentring_percent
-        # Without effect: the centre of a distortion that is zero. Treat it as the principal point.
+        # The centre of a zero distortion has no effect: treat it like the principal point.
         found[name] = percent / 100 * corner / most if most > 0 else point
     return found
 
 
 def _edge(sensor: Sensor) -> Float[np.ndarray, "places 2"]:
-    """Return places along two edges of the format and its corner (mm, from the centre)."""
+    """Return points (mm, from the centre) along two edges of the format, including their common corner."""
     half, part = np.array([sensor.width_mm, sensor.height_mm]) / 2, np.linspace(0.0, 1.0, _ON_AN_EDGE)
     ones = np.ones_like(part)
     return half * np.concatenate([np.column_stack([part, ones]), np.column_stack([ones, part])])

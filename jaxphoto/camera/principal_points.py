@@ -1,13 +1,14 @@
 """Principal points of autocollimation (PPA) and of symmetry (PPS), and their equivalence to decentring distortion.
 
-The PPA is the foot of the perpendicular from the projection centre: (x_p, y_p) of every camera here. The PPS is the
-centre of the radial distortion, S from the PPA. With delta_i(x) = x |x|^2i, to first order in S,
+The PPA is the foot of the perpendicular from the projection centre, (x_p, y_p) of every camera in jaxphoto. The PPS is
+the centre of the radial distortion, with coordinates S relative to the PPA. With delta_i(x) = x |x|^2i, to first order
+in S,
 
     sum Ki delta_i(x - S) = sum Ki delta_i(x) - K1 (S r^2 + 2 x (x.S)) - K2 r^2 (S r^2 + 4 x (x.S)) - ...
 
-The K1 term is decentring distortion with P = -K1 S, so a lens may be described either way; the terms of K2, K3 and of
-S^2 do not have that form. A conversion omits them, and `conversion_error` gives their size. Source: derivation in
-docs/models.md; the two points in paper 003, section 2.4.
+The K1 term is decentring distortion with P = -K1 S, so both models describe the same lens to this order. The terms of
+K2, K3 and S^2 do not have this form. Conversions neglect them; `conversion_error` computes their size. Source:
+docs/models.md (derivation); paper 003, section 2.4 (the two points).
 """
 
 import dataclasses
@@ -26,13 +27,13 @@ from jaxphoto.least_squares import least_squares
 from jaxphoto.rotation import small_rotation
 from jaxphoto.short_repr import pretty_repr
 
-# Image points along each side of the format, corners included, at which two cameras are compared.
+# Number of image points along each side of the format, corners included, at which two cameras are compared.
 _SIDE = 25
 
 
 @pretty_repr
 class PrincipalPoints(NamedTuple):
-    """Both principal points in the image, in mm from the image centre."""
+    """Both principal points, in mm from the image centre."""
 
     autocollimation: Float[Array, "2"]
     symmetry: Float[Array, "2"]
@@ -40,9 +41,9 @@ class PrincipalPoints(NamedTuple):
 
 @pretty_repr
 class ConversionError(NamedTuple):
-    """Difference between two cameras: the largest and RMS image displacement over the format, in mm.
+    """Difference between two cameras: maximum and RMS image displacement over the format, in mm.
 
-    `interior` is the second camera, as compared.
+    `interior` is the second camera, after the fit if any.
     """
 
     largest_mm: Float[Array, ""]
@@ -53,7 +54,8 @@ class ConversionError(NamedTuple):
 def principal_points(interior: InteriorOrientation) -> PrincipalPoints:
     """Return PPA and PPS of a camera with `PpsRadial` (exact) or `Brown` (to first order: S = -P / K1).
 
-    Raises ValueError for other distortions, and an equinox error for decentring without K1, which has no PPS.
+    Raises ValueError for other distortions, and an Equinox error for decentring distortion with K1 = 0, which has no
+    PPS.
     """
     ppa = interior.principal_point
     d = interior.distortion
@@ -63,12 +65,11 @@ def principal_points(interior: InteriorOrientation) -> PrincipalPoints:
 
 
 def symmetry_from_decentring(interior: InteriorOrientation) -> InteriorOrientation:
-    """Convert `Brown` to `PpsRadial`: S = -P / K1; c, the PPA and K1 to K3 stay.
+    """Convert `Brown` to `PpsRadial`: S = -P / K1; c, the PPA and K1 to K3 are unchanged.
 
-    First order in S. Neglects the K2 and K3 terms, of which the K2 term -K2 r^2 (S r^2 + 4 x (x.S)) does not have
-    decentring form, and everything of order S^2; `conversion_error` gives their size. Raises ValueError for a
-    distortion other than Brown, and an equinox error for decentring without K1 and for affinity or shear, which
-    `PpsRadial` does not have.
+    First order in S. Neglects the K2 term -K2 r^2 (S r^2 + 4 x (x.S)), the K3 term, and all terms of order S^2;
+    `conversion_error` computes their size. Raises ValueError for a distortion other than Brown, and an Equinox error
+    for decentring distortion with K1 = 0 and for affinity or shear, which `PpsRadial` does not have.
     """
     d = _checked(interior, Brown)
     s = _symmetry_point(d)
@@ -78,9 +79,9 @@ def symmetry_from_decentring(interior: InteriorOrientation) -> InteriorOrientati
 
 
 def decentring_from_symmetry(interior: InteriorOrientation) -> InteriorOrientation:
-    """Convert `PpsRadial` to `Brown`: P = -K1 S; c, the PPA and K1 to K3 stay.
+    """Convert `PpsRadial` to `Brown`: P = -K1 S; c, the PPA and K1 to K3 are unchanged.
 
-    Neglects what `symmetry_from_decentring`, its inverse, neglects. Raises ValueError for a distortion other than
+    Inverse of `symmetry_from_decentring`; neglects the same terms. Raises ValueError for a distortion other than
     PpsRadial.
     """
     d = _checked(interior, PpsRadial)
@@ -91,11 +92,11 @@ def decentring_from_symmetry(interior: InteriorOrientation) -> InteriorOrientati
 def conversion_error(
     before: InteriorOrientation, after: InteriorOrientation, sensor: Sensor, refit: bool = False
 ) -> ConversionError:
-    """Return the largest and RMS displacement between the ideal coordinates of two cameras for the same image points.
+    """Return the maximum and RMS displacement between the ideal coordinates of two cameras for the same image points.
 
-    Taken over 25 x 25 points of the format, to its corners, at the scale of `before.c`; both cameras as they are. With
-    `refit`, c, x_p, y_p, every coefficient of `after` and a small rotation of the camera are first fitted to `before`
-    by least squares: the remainder is what self-calibration with the model of `after` cannot absorb.
+    Uses 25 x 25 points of the format, corners included, at the scale of `before.c`. With `refit`, c, x_p, y_p, all
+    coefficients of `after` and a small rotation of the camera are first fitted to `before` by least squares; the
+    remaining displacement cannot be absorbed by self-calibration with the model of `after`.
     """
     x, y = (np.linspace(-0.5, 0.5, _SIDE) * side for side in (sensor.width_mm, sensor.height_mm))
     points = jnp.asarray(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))

@@ -1,18 +1,18 @@
-"""Rolling shutter: rows of a photograph are exposed one after another while the camera moves and rotates.
+"""Rolling shutter: rows of a photograph are exposed sequentially while the camera moves and rotates.
 
-The exterior orientation is that of the middle row. A row with the image coordinate y (mm, up, from the centre of the
+The exterior orientation refers to the middle row. A row with the image coordinate y (mm, up, from the centre of the
 format of height h) is exposed
 
     t = -readout y / h = readout (row / rows - 1/2)
 
-after it: `readout` is the time from the first row of the file to the last, negative if the last comes first. The camera
-is then at C + R' v t with the rotation small_rotation(w t) R, so a point at p in the camera frame of the middle row is,
-for that row, at
+after the middle row. `readout` is the time from the first row of the file to the last, negative if the last row is
+exposed first. The camera then has the position C + R' v t and the rotation small_rotation(w t) R. A point p in the
+camera frame of the middle row has, in the camera frame of that row, the coordinates
 
     p(t) = small_rotation(w t) (p - v t)
 
-with the velocity v (m/s) and the rotation rate w (rad/s) in the camera axes. y is the measured coordinate, so nothing
-is iterated. v and w are those of the camera over the ground: object points are assumed not to move.
+with the velocity v (m/s) and the rotation rate w (rad/s) in the camera axes. y is the measured coordinate, so no
+iteration is needed. v and w are relative to the ground: object points are assumed static.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ Scalar = Float[Array, "*images"] | float
 
 
 class RowMotion(eqx.Module):
-    """Motion of the camera from row to row: added to the interior orientation of an image."""
+    """Motion of the camera between rows, added to the interior orientation of an image."""
 
     time_per_mm: Scalar = 0.0
     """Readout over the height of the format (s/mm)."""
@@ -41,7 +41,7 @@ class RowMotion(eqx.Module):
     rate_z: Scalar = 0.0
 
     def at_row(self, y: Array, in_camera: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        """Transform a point from the camera frame of the middle row to that of the row with the measured `y` (mm)."""
+        """Transform a point from the camera frame of the middle row to the frame of the row at measured `y` (mm)."""
         t = -self.time_per_mm * y
         velocity = jnp.stack([jnp.asarray(v) for v in (self.velocity_x, self.velocity_y, self.velocity_z)])
         rate = jnp.stack([jnp.asarray(w) for w in (self.rate_x, self.rate_y, self.rate_z)])
@@ -50,7 +50,7 @@ class RowMotion(eqx.Module):
 
 
 class RollingShutter(AbstractParameters):
-    """Time (ms) from the first row of a photograph to the last, of one camera; negative if the last comes first."""
+    """Readout time (ms) of one camera from first to last row of a photograph; negative if in reverse order."""
 
     kind = "shutters"
     owner = "camera"
@@ -69,7 +69,7 @@ class RollingShutter(AbstractParameters):
 class ImageMotion(AbstractParameters):
     """Velocity (m/s) and rotation rate (rad/s) of one image in its camera axes: x right, y up, z out of its back.
 
-    The rate is that of the camera: a positive one about z rotates it counter-clockwise as seen from behind.
+    A positive rate about z rotates the camera counter-clockwise as seen from behind.
     """
 
     kind = "motions"

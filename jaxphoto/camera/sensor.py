@@ -1,4 +1,4 @@
-"""Sensor: its format in pixels and millimetres, and image coordinates in either."""
+"""Sensor: format in pixels and millimetres, and conversion of image coordinates."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ class Sensor(eqx.Module):
     height_px: int
     pixel_mm: float
     pixel_assumed: bool = eqx.field(static=True, default=False)
-    """True if the pixel size is assumed, because no file states it: all millimetres of the camera scale with it."""
+    """True if the pixel size is assumed because no file contains it; all values in mm of the camera scale with it."""
 
     def __check_init__(self) -> None:
         if self.width_px <= 0 or self.height_px <= 0 or not self.pixel_mm > 0:
@@ -35,12 +35,12 @@ class Sensor(eqx.Module):
 
     @property
     def width_mm(self) -> float:
-        """Format along x, in millimetres."""
+        """Return the format along x (mm)."""
         return self.width_px * self.pixel_mm
 
     @property
     def height_mm(self) -> float:
-        """Format along y, in millimetres."""
+        """Return the format along y (mm)."""
         return self.height_px * self.pixel_mm
 
     def mm_from_px(self, column_row: Float[ArrayLike, "n 2"]) -> Float[np.ndarray, "n 2"]:
@@ -58,6 +58,6 @@ class Sensor(eqx.Module):
 
 
 def sensor_keys(sensor: Sensor) -> dict[str, Any]:
-    """Return the keys by which files describe a sensor; `pixel_assumed` only if true."""
+    """Return the keys and values that describe a sensor in files; `pixel_assumed` only if true."""
     size = {"width_px": sensor.width_px, "height_px": sensor.height_px, "pixel_mm": sensor.pixel_mm}
     return size | ({"pixel_assumed": True} if sensor.pixel_assumed else {})

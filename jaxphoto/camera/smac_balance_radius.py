@@ -1,4 +1,4 @@
-"""SMAC at another balance radius R0: exact conversion, its inverse, and covariance propagation."""
+"""Change of the balance radius R0 of SMAC: exact conversion, its inverse, and covariance propagation."""
 
 import dataclasses
 
@@ -14,12 +14,12 @@ from jaxphoto.camera.interior import InteriorOrientation, get_parameter, paramet
 def rebalance(interior: InteriorOrientation, r0_mm: Float[Array, ""] | float) -> InteriorOrientation:
     """Convert to the balance radius `r0_mm` and K0 = 0, with the same rays.
 
-    With `s = 1 -+ (K0 - sum Ki R0^2i)` (upper sign: subtracted), c, Ki, P1 and P2 divide by s to reach R0 = 0, and
-    multiply by `1 / (1 -+ sum Ki R0^2i)` to reach another R0; P3, P4 and the principal point stay. The image rays agree
-    to rounding. `rebalance(rebalance(x, a), x.distortion.r0)` returns x if K0 = 0.
+    With `s = 1 -+ (K0 - sum Ki R0^2i)` (upper sign: subtracted), c, Ki, P1 and P2 are divided by s to reach R0 = 0, and
+    are multiplied by `1 / (1 -+ sum Ki R0^2i)` to reach another R0; P3, P4 and the principal point are unchanged. The
+    image rays agree to rounding. `rebalance(rebalance(x, a), x.distortion.r0)` returns x if K0 = 0.
 
-    Raises ValueError for a distortion other than SMAC, and an equinox error where R0 makes the map singular. Source:
-    paper 002, section on the equivalence of R0; derivation in docs/models.md.
+    Raises ValueError for a distortion other than SMAC, and an Equinox error if the conversion is singular for this R0.
+    Source: paper 002, section on the equivalence of R0; derivation in docs/models.md.
     """
     d = interior.distortion
     if not isinstance(d, Smac):
@@ -42,7 +42,7 @@ def rebalance(interior: InteriorOrientation, r0_mm: Float[Array, ""] | float) ->
 def rebalance_covariance(
     interior: InteriorOrientation, r0_mm: Float[Array, ""] | float, covariance: Float[Array, "n n"]
 ) -> Float[Array, "n n"]:
-    """Propagate the covariance to `rebalance(interior, r0_mm)`: J Q J' with J the exact derivative of the map.
+    """Propagate the covariance to `rebalance(interior, r0_mm)`: J Q J' with the exact Jacobian J.
 
     `covariance` is ordered as `parameter_names(interior)`, with zero rows and columns for fixed parameters.
     """

@@ -1,9 +1,9 @@
 """Strip-variant principal distance and principal point.
 
-The interior orientation of the camera is common to all strips; each strip adds its own c, x_p and y_p. If all are free,
-only differences between strips are determined: observe them as zero, which makes the camera the mean of its strips, or
-constrain them from strip to strip (`observations.StripCameraSteps`). Source: Moniwa (1981), The concept of
-photo-variant self-calibration and its application in block adjustment with bundles, Photogrammetria 36.
+The interior orientation of the camera is common to all strips; each strip adds corrections to c, x_p and y_p. If all
+are free, only differences between strips are determined. Either observe the corrections as zero, which makes the camera
+the mean of its strips, or constrain them from strip to strip (`observations.StripCameraSteps`). Source: Moniwa (1981),
+The concept of photo-variant self-calibration and its application in block adjustment with bundles, Photogrammetria 36.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ Scalar = Float[Array, "*images"] | float
 
 
 class StripCamera(AbstractParameters):
-    """Additions of a strip to the camera of the block: to c, x_p and y_p (mm)."""
+    """Corrections of one strip to c, x_p and y_p (mm) of the camera of the block."""
 
     kind = "strip_cameras"
     owner = "strip"

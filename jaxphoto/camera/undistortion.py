@@ -1,4 +1,4 @@
-"""Distortion-free pinhole camera of a given camera, and the source position of each of its pixels."""
+"""Distortion-free pinhole camera derived from a given camera, and the source position of each of its pixels."""
 
 from typing import Literal, NamedTuple
 
@@ -15,11 +15,11 @@ from jaxphoto.camera.sensor import Sensor
 from jaxphoto.compiling import call_compiled
 
 Keep = Literal["crop", "all"]
-# Number of points along each side of the border.
+# Number of points along each side of the border of the format.
 _ALONG = 200
-# Largest ratio of new to given sides: anything larger is the horizon of a fisheye.
+# Maximum ratio of new to given side lengths; exceeded only near the horizon of a fisheye.
 _LARGEST = 4.0
-# Spacing (px) of exactly computed positions; between them a spline is more accurate than the rounding of the result.
+# Spacing (px) of exactly computed positions; the error of the spline between them is below the rounding of the result.
 _STEP = 16
 _NOWHERE = -1e6
 # Number of positions per call of the compiled program.
@@ -27,7 +27,7 @@ _CHUNK = 1 << 16
 
 
 class Pinhole(NamedTuple):
-    """Camera without distortion: c and pixel size of the given one, in another format."""
+    """Camera without distortion: c and pixel size of the given camera, with a different format."""
 
     sensor: Sensor
     interior: InteriorOrientation
@@ -36,11 +36,11 @@ class Pinhole(NamedTuple):
 def pinhole(sensor: Sensor, interior: InteriorOrientation, keep: Keep = "crop") -> Pinhole:
     """Return the camera of undistorted photographs.
 
-    `crop`: the largest format filled by the given one, `all`: the smallest that contains it. Raises ValueError if the
-    distortion is not invertible at the border of the given format, if the border is 90 degrees or more from the axis,
-    and if the new format would be more than four times as wide or high.
+    `crop`: the largest format inside the given format; `all`: the smallest format that contains it. Raises ValueError
+    if the distortion is not invertible at the border of the given format, if the border is 90 degrees or more from the
+    axis, and if the new format would be more than four times as wide or high.
     """
-    # Interpolation needs pixel centres on all sides.
+    # Shrink the format, because interpolation needs pixel centres on all sides.
     x, y = _border(sensor, interior, 1.0 if keep == "crop" else 0.0)
     if keep == "crop":
         low = np.array([x[3].max(), y[0].max()])
@@ -64,10 +64,9 @@ def pinhole(sensor: Sensor, interior: InteriorOrientation, keep: Keep = "crop") 
 def source_pixels(
     sensor: Sensor, interior: InteriorOrientation, new: Pinhole
 ) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
-    """Return column and row in the given photograph of every pixel of the new camera; the centre of the first pixel is
-    0.
+    """Return column and row in the given photograph for every pixel of the new camera; the first pixel centre is 0.
 
-    Far outside the format where the given camera has no image, or its distortion is not invertible.
+    Positions are far outside the format where the given camera has no image or its distortion is not invertible.
     """
     rows, columns = (np.arange(n) + 0.5 for n in (new.sensor.height_px, new.sensor.width_px))
     coarse = [np.linspace(v[0], v[-1], max(len(v) // _STEP, 4)) for v in (rows, columns)]
@@ -75,7 +74,7 @@ def source_pixels(
     if np.isfinite(found).all():
         column, row = (scipy.interpolate.RectBivariateSpline(*coarse, found[k])(rows, columns) for k in (0, 1))
     else:
-        # Pixels without an image cannot be interpolated.
+        # Mark pixels without an image, which cannot be interpolated.
         column, row = np.nan_to_num(_at(sensor, interior, new, rows, columns), nan=_NOWHERE)
     return column.astype(np.float32), row.astype(np.float32)
 
@@ -83,11 +82,11 @@ def source_pixels(
 def _at(
     sensor: Sensor, interior: InteriorOrientation, new: Pinhole, rows: np.ndarray, columns: np.ndarray
 ) -> Float[np.ndarray, "2 rows columns"]:
-    """Return column and row in the given photograph of the grid of `rows` and `columns` (px); NaN for none."""
+    """Return column and row (px) in the given photograph of the grid of `rows` and `columns`; NaN without an image."""
     px = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     parts = []
     for begin in range(0, len(px), _CHUNK):
-        # Equal size, for one program.
+        # Pad all batches to one size, so one compiled program serves all.
         part = px[np.minimum(np.arange(begin, begin + _CHUNK), len(px) - 1)]
         parts.append(call_compiled(_measured, interior, new.interior, new.sensor.mm_from_px(part)))
     xy = np.concatenate([np.asarray(part) for part in parts])[: len(px)]
@@ -95,10 +94,9 @@ def _at(
 
 
 def _border(sensor: Sensor, interior: InteriorOrientation, less_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return x and y (mm, from the principal point) on the perspective plane of bottom, right, top and left: (4,
-    points).
+    """Return x and y (mm, from the principal point) along the bottom, right, top and left border: (4, points).
 
-    For the border of a format that is `less_px` smaller in both directions.
+    The points are on the perspective plane. The format is reduced by `less_px` in both directions.
     """
     size = np.array([sensor.width_mm, sensor.height_mm]) - less_px * sensor.pixel_mm
     t = np.linspace(-0.5, 0.5, _ALONG)
@@ -115,7 +113,7 @@ def _border(sensor: Sensor, interior: InteriorOrientation, less_px: float) -> tu
 
 @eqx.filter_jit
 def _plane(interior: InteriorOrientation, measured: Float[Array, "n 2"]):
-    """Return coordinates on the perspective plane, and True where the camera sees them there."""
+    """Return coordinates on the perspective plane, and True where they have an image in the camera."""
 
     def of_one(xy):
         ideal = interior.ideal_from_measured(xy)
@@ -129,7 +127,7 @@ def _plane(interior: InteriorOrientation, measured: Float[Array, "n 2"]):
 
 @eqx.filter_jit
 def _measured(interior: InteriorOrientation, new: InteriorOrientation, xy: Float[Array, "n 2"]):
-    """Convert coordinates (mm) in the new camera to measured ones (mm) in the given camera; NaN if none."""
+    """Convert coordinates (mm) in the new camera to measured coordinates (mm) in the given camera; NaN if none."""
 
     def of_one(one):
         x, y = one - new.principal_point

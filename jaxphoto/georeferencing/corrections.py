@@ -1,7 +1,7 @@
 """Atmospheric refraction and earth curvature as displacements of the object point, for any tilt of the camera.
 
-For a vertical image both are, to first order, the textbook's radial image displacements (docs/conventions.md). A block
-enables them; curvature applies only to map-grid coordinates.
+For a vertical image both equal, to first order, the radial image displacements of textbooks (docs/conventions.md). A
+block enables them; curvature applies only to map-grid coordinates.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ EARTH_RADIUS_M = 6_371_000.0
 @pretty_repr
 @dataclasses.dataclass(frozen=True)
 class Corrections:
-    """Enabled corrections. `sea_level_m` is the Z of the sea: refraction needs heights above it."""
+    """Enabled corrections. `sea_level_m` is Z at sea level: refraction depends on heights above it."""
 
     refraction: bool = False
     curvature: bool = False
@@ -30,10 +30,10 @@ NO_CORRECTIONS = Corrections()
 def apparent_point(
     position: Float[Array, "3 *many"], point: Float[Array, "3 *many"], corrections: Corrections
 ) -> Float[Array, "3 *many"]:
-    """Return the point at which a straight ray must aim to meet the image of `point` (m); of many with a last axis.
+    """Return the apparent position of `point` (m), which a straight ray intersects; components first, points last.
 
-    Curvature lowers the point by d^2 / 2R, with d its horizontal distance. Refraction rotates the ray outward by K
-    tan(a), a its angle from the nadir: the point moves by K d (1 + tan(a)^2).
+    Curvature lowers the point by d^2 / 2R at the horizontal distance d. Refraction rotates the ray outward by K tan(a)
+    at the nadir angle a: the point moves by K d (1 + tan(a)^2).
     """
     if not (corrections.refraction or corrections.curvature):
         return point

@@ -1,4 +1,4 @@
-"""Conversion of WGS 84 positions of receivers to the datum of a map system and back, by PROJ."""
+"""Conversion between WGS 84 positions of receivers and the datum of a map system, by PROJ."""
 
 import warnings
 from typing import NamedTuple
@@ -13,32 +13,32 @@ from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import map_system
 
 _WGS84_3D = 4979
-# Half the side (degrees) of the area in which a transformation must be valid.
+# Half side length (degrees) of the area in which a transformation must be valid.
 _ABOUT = 0.1
-# A transformation of lower accuracy is reported even if it changes nothing.
+# Accuracy (m) above which a transformation is reported even if it has no effect.
 _SURE_M = 1.0
 
 
 class DatumChange(NamedTuple):
-    """Best installed PROJ transformation from WGS 84 to the datum of a map system, near a place."""
+    """Best installed PROJ transformation from WGS 84 to the datum of a map system, near a given position."""
 
     transformer: Transformer
     datum: str
     name: str
     """EPSG name of the operation."""
     accuracy_m: float | None
-    """None if unknown."""
+    """Accuracy (m); None if unknown."""
     meridian_deg: float
-    """Prime meridian of the datum, from Greenwich."""
+    """Longitude (degrees) of the prime meridian of the datum, from Greenwich."""
     better: tuple[str, float] | None
     """Grid of a better transformation that is not installed, and its accuracy (m)."""
 
     def places(
         self, wgs84: Float[np.ndarray, "n 3"], with_height: bool | Bool[np.ndarray, "n"] = True
     ) -> Float[np.ndarray, "n 3"]:
-        """Return longitude, latitude (degrees) and height (m) on the datum of the map system.
+        """Convert WGS 84 to longitude, latitude (degrees) and height (m) on the datum of the map system.
 
-        Heights that are not ellipsoidal (`with_height` False) are not changed.
+        Heights that are not ellipsoidal (`with_height` False) are unchanged.
         """
         return self._changed(wgs84, with_height, "FORWARD")
 
@@ -51,7 +51,7 @@ class DatumChange(NamedTuple):
     def sentences(
         self, wgs84: Float[np.ndarray, "n 3"], with_height: bool | Bool[np.ndarray, "n"] = True
     ) -> tuple[str, ...]:
-        """Describe the change and its accuracy; nothing if it is zero and known to a metre."""
+        """Describe the change and its accuracy; return nothing if it is zero with an accuracy of 1 m or better."""
         known = self.accuracy_m
         if known is None:
             return (
@@ -85,7 +85,7 @@ class DatumChange(NamedTuple):
 
 
 def datum_change(code: int, longitude_deg: float, latitude_deg: float) -> DatumChange:
-    """Return the transformation from WGS 84 to the datum of the EPSG system `code` near a place.
+    """Return the transformation from WGS 84 to the datum of the EPSG system `code` near a position.
 
     Raises InputError if PROJ has none.
     """
@@ -108,7 +108,7 @@ def datum_change(code: int, longitude_deg: float, latitude_deg: float) -> DatumC
         if not grid.available
     ]
     steps = [step for step in best.description.split(" + ") if not step.startswith("axis order change")]
-    # PROJ 9.6 and later report for each step the axis order of pyproj.
+    # Remove the axis order that PROJ 9.6 and later append to the name of each step.
     name = " + ".join(step.removeprefix("Inverse of ").split(" (with axis order")[0] for step in steps)
     better_one = min(better, key=lambda b: b[1], default=None)
     return DatumChange(best, geodetic.name, name, accuracy, _meridian_deg(geodetic), better_one)
@@ -117,9 +117,9 @@ def datum_change(code: int, longitude_deg: float, latitude_deg: float) -> DatumC
 def wgs84_places(
     code: int, places: Float[np.ndarray, "n 3"], with_height: bool | Bool[np.ndarray, "n"] = True
 ) -> Float[np.ndarray, "n 3"]:
-    """Return longitude, latitude (degrees) and height (m) of WGS 84 of `places` on the datum of the EPSG system `code`.
+    """Convert `places` on the datum of the EPSG system `code` to WGS 84: longitude, latitude (degrees), height (m).
 
-    Raises what `datum_change` raises.
+    Raises InputError like `datum_change`.
     """
     geodetic = map_system(code).geodetic_crs
     assert geodetic is not None
@@ -128,10 +128,10 @@ def wgs84_places(
 
 
 def ways(source: CRS, target: CRS, longitude_deg: float, latitude_deg: float) -> TransformerGroup:
-    """Return the PROJ transformations between two systems near a place, the best installed one first."""
+    """Return the PROJ transformations between two systems near a position, the best installed one first."""
     longitude = (longitude_deg + 180) % 360 - 180
     here = AreaOfInterest(longitude - _ABOUT, latitude_deg - _ABOUT, longitude + _ABOUT, latitude_deg + _ABOUT)
-    # pyproj warns of better ones whose grids are missing: reported where it matters.
+    # Suppress pyproj's warning about missing grids: better transformations are reported separately.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         return TransformerGroup(source, target, always_xy=True, area_of_interest=here)  # type: ignore[arg-type]

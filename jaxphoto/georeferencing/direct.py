@@ -1,6 +1,6 @@
 """Direct georeferencing: exterior orientation from GNSS/IMU and mount, with its covariance.
 
-Functions of one image. Frames and signs: docs/conventions.md; source: papers 000 and 004, equation (1).
+Functions take one image. Frames and signs: docs/conventions.md; source: papers 000 and 004, equation (1).
 """
 
 from typing import NamedTuple
@@ -20,11 +20,12 @@ class SensorCovariance(eqx.Module):
     """Covariances of the inputs of direct georeferencing, mutually independent."""
 
     station: Float[Array, "3 3"]
-    """Of the GNSS position (m)."""
+    """Covariance of the GNSS position (m^2)."""
     attitude: Float[Array, "3 3"]
-    """Of roll, pitch and yaw (rad)."""
+    """Covariance of roll, pitch and yaw (rad^2)."""
     mount: Float[Array, "7 7"]
-    """Of lever arm (m), boresight (rad) and time offset (s), in this order; zeros for a mount without errors."""
+    """Covariance of lever arm (m), boresight (rad) and time offset (s), in this order; zeros for an error-free mount.
+    """
 
 
 def direct_orientation(
@@ -47,12 +48,12 @@ def direct_orientation(
 
 
 class DirectPartials(NamedTuple):
-    """Derivatives of X, Y, Z (m) and of a small rotation in the camera frame (rad), by the inputs."""
+    """Derivatives of X, Y, Z (m) and of a small rotation in the camera frame (rad) with respect to the inputs."""
 
     station: Float[Array, "6 3"]
     attitude: Float[Array, "6 3"]
     mount: Float[Array, "6 7"]
-    """By lever arm (m), boresight (rad) and time offset (s), in this order."""
+    """Derivatives with respect to lever arm (m), boresight (rad) and time offset (s), in this order."""
 
 
 def direct_partials(
@@ -62,7 +63,7 @@ def direct_partials(
     bias: StripBias,
     exposure: Exposure,
 ) -> DirectPartials:
-    """Differentiate the result of `direct_orientation` by its arguments."""
+    """Differentiate the result of `direct_orientation` with respect to its arguments."""
     at = direct_orientation(station, roll_pitch_yaw, mount, bias, exposure)
 
     def moved(d_station, d_attitude, d_mount):
@@ -84,8 +85,8 @@ def direct_covariance(
 ) -> Float[Array, "6 6"]:
     """Return the covariance of `direct_orientation`: X, Y, Z (m) and a small rotation in the camera frame (rad).
 
-    First-order propagation. Images of one mount share its error, so they are correlated; `direct_partials` allows for
-    it.
+    First-order propagation. Images of one mount share its error and are correlated; use `direct_partials` for their
+    joint covariance.
     """
     by = direct_partials(station, roll_pitch_yaw, mount, bias, exposure)
     sensors = by.station @ covariance.station @ by.station.T + by.attitude @ covariance.attitude @ by.attitude.T

@@ -1,8 +1,8 @@
-"""Match photographs with exposures of a receiver by the times of two clocks that differ by a constant.
+"""Matching of photographs with exposures of a receiver by the times of two clocks with a constant offset.
 
-The clock of a camera is in some time zone and seconds off; a receiver counts GPS time. The difference of the clocks is
-the one that most photographs share: a gap, a missing or a surplus exposure does not change it. At equal intervals a
-shift by one exposure fits nearly as well: then the photographs' own positions decide.
+The clock of a camera runs in some time zone with an error of seconds; a receiver records GPS time. The clock offset
+with the most matches is selected: gaps, missing and surplus exposures do not change it. At equal intervals a shift by
+one exposure fits nearly as well; the positions of the photographs then resolve the ambiguity.
 """
 
 from datetime import datetime
@@ -12,48 +12,48 @@ import numpy as np
 from jaxtyping import Float, Int
 
 LEAP_SECONDS = 18.0
-"""GPS time minus UTC since 2017."""
+"""GPS time minus UTC since 2017 (s)."""
 WEEK_S = 604_800.0
 _HOUR_S, DAY_S = 3600.0, 86_400.0
 ZONES_S = 15 * _HOUR_S
-"""Largest difference of a clock to UTC: the farthest zone is 14 hours ahead."""
-# Error of a camera's clock besides zone and leap seconds.
+"""Maximum offset of a clock from UTC (s); time zones reach 14 hours ahead."""
+# Maximum error (s) of a camera's clock apart from time zone and leap seconds.
 _NEAR_ZONE_S = 300.0
-# Zones are quarters of an hour.
+# Step of time zones (s): a quarter of an hour.
 _ZONE_S = 900.0
-# Largest number of differences; of more photographs every n-th is used.
+# Maximum number of time differences; with more photographs every n-th is used.
 _MOST_PAIRS = 2_000_000
 WORSE = 1.5
-"""Offsets whose positions differ by this multiple of the best offset's are rejected."""
+"""Ratio of median position differences to the best offset's above which a clock offset is rejected."""
 
 
 def gps_seconds(at: datetime) -> float:
-    """Seconds since 1980-01-06, in the time zone of `at`, without leap seconds."""
+    """Return the seconds since 1980-01-06 in the time zone of `at`, without leap seconds."""
     return (at - datetime(1980, 1, 6)).total_seconds()
 
 
 class Taken(NamedTuple):
-    """Time of exposure in the file of a photograph."""
+    """Exposure time recorded in the file of a photograph."""
 
     clock_s: float
-    """Seconds since 1980-01-06 of the camera's clock, in its time zone."""
+    """Time of the camera's clock in its time zone, in seconds since 1980-01-06."""
     resolution_s: float
-    """1 for whole seconds."""
+    """Resolution of the time (s); 1 for whole seconds."""
     ahead_of_utc_s: float | None = None
-    """Offset of the clock to UTC; None if unknown."""
+    """Offset of the clock from UTC (s); None if unknown."""
 
 
 class Matched(NamedTuple):
-    """The exposure of every photograph, and the difference of the clocks."""
+    """Exposure of every photograph, and offset between the clocks."""
 
     exposure: Int[np.ndarray, "photographs"]
     """Index of the exposure; -1 for none."""
     offset_s: float
-    """Clock of the photographs minus that of the exposures; NaN if matched without times."""
+    """Clock of the photographs minus clock of the exposures; NaN if matched without times."""
 
 
 class Ambiguous(NamedTuple):
-    """Two differences of the clocks that fit equally many photographs."""
+    """Two clock offsets that match equally many photographs."""
 
     offsets_s: tuple[float, float]
     fitted: int
@@ -66,10 +66,10 @@ def match_times(
     photographs_at: Float[np.ndarray, "photographs 3"] | None = None,
     exposures_at: Float[np.ndarray, "exposures 3"] | None = None,
 ) -> Matched | Ambiguous | None:
-    """Match photographs and exposures whose times (NaN: unknown) differ by a constant.
+    """Match photographs and exposures whose times (NaN: unknown) differ by a constant offset.
 
-    `tolerance_s` is that of a single difference. `photographs_at` and `exposures_at` (m, NaN: unknown) decide between
-    constants that fit equally many. None if no two photographs share a constant.
+    `tolerance_s`: maximum deviation of a time difference from the offset. The positions `photographs_at` and
+    `exposures_at` (m, NaN: unknown) select between similar offsets. Returns None if no offset matches two photographs.
     """
     known = np.flatnonzero(np.isfinite(photographs_s))
     order = known[np.argsort(photographs_s[known], kind="stable")]
@@ -85,7 +85,7 @@ def match_times(
     if photographs_at is not None and exposures_at is not None:
         off = [_apart(photographs_at[order], exposures_at[rank], found) for found, _ in tried]
         if np.isfinite(off).any():
-            # Positions decide against a shift, even if it fits more times.
+            # Prefer the offset with the best positions, even if another offset matches more times.
             enough = [k for k, (found, _) in enumerate(tried) if (found >= 0).sum() >= 0.8 * most]
             best = min(enough, key=lambda k: off[k])
             near = [tried[k] for k in enough if off[k] <= WORSE * off[best]]
@@ -101,7 +101,7 @@ def match_times(
 
 
 def _offsets(times: np.ndarray, events: np.ndarray, tolerance_s: float, most: int = 12) -> list[float]:
-    """Constants by the number of pairs within the tolerance, the largest first: middles of windows."""
+    """Return candidate offsets (centres of windows), sorted by decreasing number of pairs within the tolerance."""
     times = times[:: 1 + len(times) * len(events) // _MOST_PAIRS]
     every = np.sort((times[:, None] - events[None, :]).ravel())
     count = np.searchsorted(every, every + 2 * tolerance_s, side="right") - np.arange(len(every))
@@ -116,9 +116,9 @@ def _offsets(times: np.ndarray, events: np.ndarray, tolerance_s: float, most: in
 
 
 def _joined(times: np.ndarray, events: np.ndarray, offset: float, tolerance_s: float) -> tuple[np.ndarray, float]:
-    """Return the exposure of each time, each used once and in order, and the refined constant."""
+    """Return the exposure of each time (in order, each used at most once), and the refined offset."""
     best, left = _in_order(times, events, offset, tolerance_s)
-    # Refine the window: its middle is the mean of fine times, and the midrange of truncated seconds.
+    # Refine the offset: try the mean (precise times) and the midrange (truncated seconds) of the residuals.
     for _ in range(2):
         for middle in (np.mean, lambda v: (np.min(v) + np.max(v)) / 2):
             if not len(left):
@@ -145,14 +145,14 @@ def _in_order(
 
 
 def _apart(at: np.ndarray, there: np.ndarray, found: np.ndarray) -> float:
-    """Median distance of matched positions, including a common shift; infinite if unknown."""
+    """Return the median distance of matched positions, including a common shift; infinite if unknown."""
     d = (at - there[found])[found >= 0]
     d = d[np.isfinite(d).all(axis=1)]
     return float(np.median(np.linalg.norm(d, axis=1))) if len(d) >= 3 else np.inf
 
 
 def clock_words(offset_s: float) -> str:
-    """Describe a difference to GPS time: hours of a time zone, leap seconds, remainder."""
+    """Describe an offset from GPS time: hours of a time zone, leap seconds, remainder."""
     best = min(
         ((zone, leap) for zone in _near_zones(offset_s) for leap in (-LEAP_SECONDS, 0.0, LEAP_SECONDS)),
         key=lambda parts: (round(abs(offset_s - sum(parts))), parts[1]),

@@ -1,4 +1,4 @@
-"""Shift and drift of the GNSS positions: of each strip, and of the whole flight."""
+"""Shift and drift of the GNSS positions per strip and of the whole flight."""
 
 from typing import Any
 
@@ -22,10 +22,10 @@ class StripBias(AbstractParameters):
 
 
 class FlightBias(AbstractParameters):
-    """Shift (m) and drift (m/s) of the GNSS positions of the whole block: a datum offset, a reference station.
+    """Shift (m) and drift (m/s) of the GNSS positions of the whole block: error of datum or reference station.
 
-    Strips may have biases in addition. One of the two then needs prior information: weighted strip biases scatter about
-    that of the flight, which control determines. Time is that of the flight (`Exposure.in_flight`).
+    Strips may have additional biases. Strip or flight biases then need prior information: weighted strip biases scatter
+    about the flight bias, which control determines. Time counts from the middle of the flight (`Exposure.in_flight`).
     """
 
     kind = "flight_bias"
@@ -39,5 +39,5 @@ class FlightBias(AbstractParameters):
     drift: Float[Array, "3 *images"]
 
     def station(self, position: Any, exposure: Any) -> Any:
-        """Return the sensor's position (m) with shift and drift."""
+        """Add shift and drift to the sensor's position (m)."""
         return position + self.shift + self.drift * exposure.in_flight

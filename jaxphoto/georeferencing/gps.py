@@ -6,49 +6,49 @@ import numpy as np
 from jaxtyping import Float
 
 Heights = Literal["ellipsoid", "geoid", "take-off", "unknown"]
-"""Reference of heights; a geoid is that of any model (mean sea level)."""
+"""Reference of heights; "geoid" is any geoid model (mean sea level)."""
 HEIGHTS: dict[Heights, str] = {
     "ellipsoid": "above the ellipsoid",
     "geoid": "above a geoid (mean sea level)",
     "take-off": "above take-off",
     "unknown": "of unknown reference",
 }
-"""Names in messages."""
+"""Names of the height references in messages."""
 Fix = Literal["fixed", "float", "single", "integrated", "unknown"]
-"""Kind of solution: integer ambiguities, real ambiguities, code only, or GNSS and IMU integrated in post-processing."""
+"""GNSS solution type: integer ambiguities, float ambiguities, code only, or GNSS/IMU integrated in post-processing."""
 FIX_SIGMA_M: dict[Fix, tuple[float, float, float]] = {
     "fixed": (0.02, 0.02, 0.04),
     "float": (0.3, 0.3, 0.6),
     "integrated": (0.05, 0.05, 0.1),
 }
-"""East, north and up, for files with the kind of solution but without standard deviations.
+"""Standard deviations (m) east, north and up by solution type, for files without standard deviations.
 
-A fixed solution has 1 cm + 1 ppm in plan and 1.5 cm + 1 ppm in height (DJI, specifications of the Phantom 4 RTK), a
-float one decimetres (DJI, manuals: RtkFlag); twice the former allows for base station and interpolation. An integrated
-one has 2 to 5 cm in plan and 5 to 10 in height (Applanix, specifications of APX-15 and POS AV, post-processed).
+Fixed: 1 cm + 1 ppm in plan and 1.5 cm + 1 ppm in height (DJI, specifications of the Phantom 4 RTK), doubled for errors
+of base station and interpolation. Float: decimetres (DJI, manuals: RtkFlag). Integrated: 2 to 5 cm in plan and 5 to 10
+cm in height (Applanix, specifications of APX-15 and POS AV, post-processed).
 """
 
 
 class Gps(NamedTuple):
-    """A recorded position of the projection centre."""
+    """Recorded position of the projection centre."""
 
     latitude_deg: float
     longitude_deg: float
     altitude_m: float | None
     sigma_m: tuple[float, float, float] | None = None
-    """East, north and up, if the file has them."""
+    """Standard deviations east, north and up; None if not in the file."""
     heights: Heights = "unknown"
     """Reference of `altitude_m`."""
     fix: Fix = "unknown"
 
     @property
     def stated_sigma_m(self) -> tuple[float, float, float] | None:
-        """East, north and up: those of the file, else those of the kind of solution; None without either."""
+        """Return standard deviations (m) east, north, up: from the file, else from the solution type, else None."""
         return self.sigma_m or FIX_SIGMA_M.get(self.fix)
 
 
 def moved(gps: Gps, east_north_up_m: Float[np.ndarray, "3"]) -> Gps:
-    """Return the position shifted by a lever arm (m, on WGS 84)."""
+    """Shift the position by a lever arm (m, on WGS 84)."""
     east, north, up = np.asarray(east_north_up_m, float).tolist()
     s = np.sin(np.deg2rad(gps.latitude_deg))
     w = 1 - _E2 * s * s

@@ -1,6 +1,6 @@
-"""Projection of image coordinates to the ground, a horizontal plane or a surface, with covariance.
+"""Projection of image coordinates to the ground (horizontal plane or surface), with covariance.
 
-Functions of one image and one point (monoplotting). Frames and units: docs/conventions.md, equations: docs/models.md.
+Functions take one image and one point (monoplotting). Frames and units: docs/conventions.md, equations: docs/models.md.
 """
 
 from collections.abc import Callable
@@ -16,14 +16,14 @@ from jaxphoto.georeferencing.corrections import NO_CORRECTIONS, Corrections, app
 from jaxphoto.rotation import small_rotation
 from jaxphoto.short_repr import pretty_repr
 
-# Refraction and curvature bend a ray by about 1e-4: each iteration gains four digits.
+# Number of iterations. Refraction and curvature bend a ray by about 1e-4: each iteration gains four digits.
 _ROUNDS = 4
 _MAX_STEPS = 60
 
 
 @pretty_repr
 class Surface(eqx.Module):
-    """Ground as a height Z (m) over X and Y (m), differentiable, between the heights `low` and `high`."""
+    """Ground as a differentiable height Z (m) over X and Y (m), between the heights `low` and `high`."""
 
     height: Callable[[Float[Array, ""], Float[Array, ""]], Float[Array, ""]]
     low: Float[Array, ""] | float
@@ -31,20 +31,20 @@ class Surface(eqx.Module):
 
 
 Ground = Surface | Float[Array, ""] | float
-"""A surface, or the Z (m) of a horizontal plane."""
+"""Surface, or Z (m) of a horizontal plane."""
 
 
 class RayCovariance(eqx.Module):
     """Covariances of the inputs of a ground point, mutually independent."""
 
     exterior: Float[Array, "6 6"]
-    """Of X, Y, Z (m) and a small rotation in the camera frame (rad), from `direct_covariance`."""
+    """Covariance of X, Y, Z (m) and a small rotation in the camera frame (rad), as from `direct_covariance`."""
     interior: Float[Array, "k k"]
-    """Of the interior orientation, in the order of `camera.parameter_names`; zeros if without errors."""
+    """Covariance of the interior orientation, in the order of `camera.parameter_names`; zeros if error-free."""
     image: Float[Array, "2 2"]
-    """Of the measured image coordinate (mm)."""
+    """Covariance of the measured image coordinate (mm^2)."""
     height: Float[Array, ""] | float
-    """Variance of the height of plane or surface (m^2)."""
+    """Variance of the height of the plane or surface (m^2)."""
 
 
 def ground_point(
@@ -54,18 +54,19 @@ def ground_point(
     ground: Ground,
     corrections: Corrections = NO_CORRECTIONS,
 ) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
-    """Intersect the ray of the measured image coordinate `xy` (mm) with the ground (m); False if it does not meet it.
+    """Intersect the ray of the measured image coordinate `xy` (mm) with the ground (m); False without intersection.
 
         X = X_s + s M' (x', y', -c)',    s = (Z - Z_s) / third component
 
-    On a surface, a safeguarded Newton iteration on the height finds Z = height(X, Y), and the implicit function theorem
-    its derivatives. The surface must be continuous along the ray; of several intersections, as behind a ridge, any one
-    is found. False, with a meaningless point, if the ray is parallel to the plane or meets the ground behind the camera
-    or nowhere between `low` and `high`. Source: paper 001, equation (1), inverted.
+    On a surface, Z = height(X, Y) is solved by safeguarded Newton iterations on the height and differentiated by the
+    implicit function theorem. The surface must be continuous along the ray; if there are several intersections, as
+    behind a ridge, any one of them is returned. The flag is False, and the point meaningless, if the ray is parallel to
+    the plane, or if it intersects the ground behind the camera or not between `low` and `high`. Source: paper 001,
+    equation (1), inverted.
     """
     origin, direction = image_ray(interior, exterior, xy)
     upright = direction[2] == 0
-    # Two `where`: a horizontal ray must not have NaN derivatives either.
+    # Use two `where`, because derivatives of a horizontal ray must not be NaN either.
     fall = jnp.where(upright, 1.0, direction[2])
 
     def at_height(height: Float[Array, ""]) -> Float[Array, "3"]:
@@ -77,7 +78,7 @@ def ground_point(
         return point
 
     if isinstance(ground, Surface):
-        # In front of the camera only.
+        # Restrict the search to the ray in front of the camera.
         low = jnp.where(fall > 0, jnp.maximum(ground.low, origin[2]), ground.low)
         high = jnp.where(fall < 0, jnp.minimum(ground.high, origin[2]), ground.high)
         height, met = _root(lambda z: z - ground.height(*at_height(z)[:2]), low, high)
@@ -96,7 +97,7 @@ def ground_covariance(
 ) -> Float[Array, "3 3"]:
     """Return the covariance (m^2) of `ground_point`, by first-order propagation.
 
-    On a surface, its height error shifts it as a whole: the point moves along the ray.
+    The height error shifts the whole surface: the point moves along the ray.
     """
 
     def moved(d_exterior, d_interior, d_xy, d_height):
@@ -116,21 +117,21 @@ def ground_covariance(
 
 
 def moved_exterior(exterior: ExteriorOrientation, step: Float[Array, "6"]) -> ExteriorOrientation:
-    """Return the orientation after a shift (m) and a small rotation in the camera frame (rad)."""
+    """Apply a shift (m) and a small rotation in the camera frame (rad) to the exterior orientation."""
     return ExteriorOrientation(
         exterior.position + step[:3], small_rotation(step[3:]) @ jnp.asarray(exterior.camera_from_object)
     )
 
 
 def moved_interior(interior: InteriorOrientation, step: Float[Array, "k"]) -> InteriorOrientation:
-    """Return the interior orientation with `step` added to its parameters, in the order of `camera.parameter_names`."""
+    """Add `step` to the parameters of the interior orientation, in the order of `camera.parameter_names`."""
     for k, name in enumerate(parameter_names(interior)):
         interior = set_parameter(interior, name, get_parameter(interior, name) + step[k])
     return interior
 
 
 def _root(f: Callable, low: Float[Array, ""], high: Float[Array, ""]) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """Return z in [low, high] with f(z) = 0, f(low) <= 0 <= f(high), and True if it exists; differentiable."""
+    """Return the root z of f in [low, high], f(low) <= 0 <= f(high), and True if it exists; differentiable."""
     low, high = jax.lax.stop_gradient((low, high))
     enough = 1e-12 * (1 + jnp.maximum(jnp.abs(low), jnp.abs(high)))
 

@@ -1,12 +1,13 @@
 """Forward intersection from fixed images with the covariance of the points, including common errors.
 
-The residual r (mm) of a ray depends on its point X, on its own errors e (image noise, orientation of its image) and on
-errors m common to many rays (a mount, a camera). Weighted by the image sigmas, as in an adjustment with fixed images,
+The residual r (mm) of a ray depends on its point X, on its individual errors e (image noise, orientation of its image)
+and on errors m common to many rays (mount, camera). With weights from the image sigmas, as in an adjustment with fixed
+images,
 
     dX = - sum J r,    J = (sum A' P A)^-1 A' P,    A = dr / dX
     Q  = sum J (dr/de Q_e dr/de') J' + (sum J dr/dm) Q_m (sum J dr/dm)'
 
-`ray_partials` takes one image and one point; the others take all rows, summed over the rows of each point.
+`ray_partials` takes one image and one point; the other functions take all rows and sum over the rows of each point.
 """
 
 from typing import NamedTuple
@@ -23,14 +24,14 @@ from jaxphoto.linear_algebra import inverse
 
 
 class RayPartials(NamedTuple):
-    """Residual (mm) of one ray, as in an adjustment, and its derivatives; of many rows with a leading axis."""
+    """Residual (mm) of one ray, as in an adjustment, and its derivatives; arrays of rays have a leading axis."""
 
     residual: Float[Array, "*rows 2"]
     point: Float[Array, "*rows 2 3"]
     exterior: Float[Array, "*rows 2 6"]
-    """By X, Y, Z (m) and a small rotation in the camera frame (rad)."""
+    """Derivatives with respect to X, Y, Z (m) and a small rotation in the camera frame (rad)."""
     interior: Float[Array, "*rows 2 k"]
-    """In the order of `camera.parameter_names`."""
+    """Derivatives with respect to the interior orientation, in the order of `camera.parameter_names`."""
 
 
 def ray_partials(
@@ -40,7 +41,7 @@ def ray_partials(
     xy: Float[Array, "2"],
     corrections: Corrections = NO_CORRECTIONS,
 ) -> RayPartials:
-    """Differentiate the residual of the measured image coordinate `xy` (mm) of `point` (m)."""
+    """Evaluate and differentiate the residual of the measured image coordinate `xy` (mm) of `point` (m)."""
 
     def residual(d_point, d_exterior, d_interior):
         image = moved_exterior(exterior, d_exterior)
@@ -56,13 +57,14 @@ def ray_partials(
 def intersection_gain(
     by_point: Float[Array, "rows 2 3"], sigma: Float[Array, "rows 2"], point: Int[Array, "rows"], n_points: int
 ) -> Float[Array, "rows 3 2"]:
-    """Return J of every row: a point moves by -sum J r. `sigma` (mm) of the image coordinates, `point` of each row.
+    """Return J of every row: a point moves by -sum J r.
 
-    NaN or very large if the rays of a point are parallel.
+    `sigma` (mm): standard deviations of the image coordinates. `point`: index of the point of each row. J is NaN or
+    very large if the rays of a point are parallel.
     """
     weighted = by_point.transpose(0, 2, 1) / sigma[:, None, :] ** 2
     normal = jax.ops.segment_sum(weighted @ by_point, point, n_points)
-    # A point without rows has no normal matrix, and no row that needs its inverse.
+    # The normal matrix of a point without rows is singular, but no row uses its inverse.
     return jax.vmap(inverse)(normal)[point] @ weighted
 
 
@@ -76,7 +78,7 @@ def intersection_step(
 def own_covariance(
     gain: Float[Array, "rows 3 2"], own: Float[Array, "rows 2 2"], point: Int[Array, "rows"], n_points: int
 ) -> Float[Array, "points 3 3"]:
-    """Propagate independent errors of each ray, of covariance `own` (mm^2) in its residual, to the points (m^2)."""
+    """Propagate independent errors of the rays to the points (m^2); `own` is the covariance of each residual (mm^2)."""
     return jax.ops.segment_sum(gain @ own @ gain.transpose(0, 2, 1), point, n_points)
 
 

@@ -1,7 +1,7 @@
 """Conversion of map or geographic coordinates to and from a local east-north-up frame, by PROJ.
 
 The local frame is Cartesian: Z is the normal of the ellipsoid at its origin, Y points to true north. The datum is not
-changed: longitudes, latitudes and ellipsoidal heights are those of the system's own datum.
+changed: longitudes, latitudes and ellipsoidal heights refer to the datum of the map system.
 """
 
 import functools
@@ -15,9 +15,10 @@ from pyproj.transformer import TransformerGroup
 
 from jaxphoto.errors import InputError
 
-# Half the step along a grid line that gives its direction: rounding is then 1e-11 rad, curvature of the line less.
+# Half of the step along a grid line that determines its direction (m, degrees): rounding error 1e-11 rad, curvature
+# less.
 _STEP_M, _STEP_DEG = 50.0, 5e-4
-# Where it is declared: in a block, in a flight.
+# Declaration of ellipsoidal heights in a block and in a flight, for messages.
 _ON_ELLIPSOID = 'vertical = "ellipsoidal" in block.toml, --heights ellipsoid of a flight'
 
 Place = tuple[float, float, float]
@@ -25,11 +26,11 @@ Place = tuple[float, float, float]
 
 
 class MapFrame:
-    """Local frame at `origin` of files in the EPSG system `code`, heights of the EPSG system `vertical`.
+    """Local frame at `origin` for coordinates in the EPSG system `code` with heights in the EPSG system `vertical`.
 
-    `vertical` None means heights above the ellipsoid. Map coordinates are (easting, northing, height) in m, or
-    (longitude, latitude, height) in degrees and m if `geographic`. Outside the area of a system, results are infinite.
-    Raises InputError for unknown or unsuitable codes, and for heights whose geoid is not installed.
+    `vertical` None: heights above the ellipsoid. Map coordinates are (easting, northing, height) in m, or (longitude,
+    latitude, height) in degrees and m if `geographic`. Outside the area of a system, results are infinite. Raises
+    InputError for unknown or unsuitable codes, and if the geoid of the heights is not installed.
     """
 
     def __init__(self, code: int, vertical: int | None, origin: Place):
@@ -40,19 +41,19 @@ class MapFrame:
         self._to_local = _topocentric(system, origin)
 
     def place(self, coordinates: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Return longitude, latitude (degrees) and ellipsoidal height (m) of map coordinates."""
+        """Convert map coordinates to longitude, latitude (degrees) and ellipsoidal height (m)."""
         return _transformed(self._to_place, coordinates, "FORWARD")
 
     def local_from_place(self, place: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Return local X, Y, Z (m) of longitude, latitude and ellipsoidal height."""
+        """Convert longitude, latitude and ellipsoidal height to local X, Y, Z (m)."""
         return _transformed(self._to_local, place, "FORWARD")
 
     def local(self, coordinates: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Return local X, Y, Z (m) of map coordinates."""
+        """Convert map coordinates to local X, Y, Z (m)."""
         return self.local_from_place(self.place(coordinates))
 
     def map(self, local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Return map coordinates of local X, Y, Z (m); the inverse of `local`."""
+        """Convert local X, Y, Z (m) to map coordinates; the inverse of `local`."""
         return _transformed(self._to_place, self._place_from_local(local), "INVERSE")
 
     def local_from_level(self, local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
@@ -61,7 +62,7 @@ class MapFrame:
         return here.T @ _geocentric_from_level(self._place_from_local(local))
 
     def local_from_grid(self, local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
-        """Return rotations from grid east, grid north, up to the local frame: includes meridian convergence."""
+        """Return rotations from grid east, grid north, up to the local frame; includes meridian convergence."""
         g = self.convergence(local)
         c, s, zero, one = np.cos(g), np.sin(g), np.zeros(len(g)), np.ones(len(g))
         level_from_grid = np.stack([c, s, zero, -s, c, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)
@@ -76,14 +77,12 @@ class MapFrame:
         return np.arctan2(east, north)
 
     def geocentric_from_local(self) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-        """Return rotation and translation (m): X, Y, Z from the centre of the ellipsoid = rotation @ local +
-        translation.
-        """
+        """Return rotation and translation (m) to geocentric axes: geocentric = rotation @ local + translation."""
         origin = np.array([self.origin], float)
         return _geocentric_from_level(origin)[0], _transformed(_geocentric(map_system(self.code)), origin, "FORWARD")[0]
 
     def sea_level(self) -> float:
-        """Return local Z (m) of height zero at the origin; of the ellipsoid if heights are ellipsoidal."""
+        """Return local Z (m) of height zero at the origin (of the ellipsoid if heights are ellipsoidal)."""
         easting, northing, _ = self.map(np.zeros((1, 3)))[0]
         return float(self.local(np.array([[easting, northing, 0.0]]))[0, 2])
 
@@ -92,9 +91,7 @@ class MapFrame:
 
 
 def place_from_geocentric(code: int, xyz: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Return longitude, latitude (degrees) and height (m) on the ellipsoid of the EPSG system `code` of geocentric X,
-    Y, Z.
-    """
+    """Convert geocentric X, Y, Z to longitude, latitude (degrees) and height (m) on the ellipsoid of EPSG `code`."""
     return _transformed(_geocentric(map_system(code)), xyz, "INVERSE")
 
 
@@ -129,13 +126,13 @@ def check_heights(code: int, vertical: int) -> None:
 
 
 def map_name(code: int, vertical: int | None) -> str:
-    """Return the name of a map system with its heights, as used by PROJ: EPSG:25832+7837."""
+    """Return the name of a map system and its vertical system, as in PROJ: EPSG:25832+7837."""
     return f"EPSG:{code}" + (f"+{vertical}" if vertical is not None else "")
 
 
 @functools.cache
 def _to_place(code: int, vertical: int | None) -> Transformer:
-    """Return the conversion of map coordinates to longitude, latitude and ellipsoidal height of the same datum."""
+    """Return the transformer from map coordinates to longitude, latitude and ellipsoidal height of the same datum."""
     system = map_system(code)
     geodetic = system.geodetic_crs
     assert geodetic is not None
@@ -150,7 +147,7 @@ def _to_place(code: int, vertical: int | None) -> Transformer:
             f"EPSG:{vertical} ({heights.name}) is not a vertical CRS; give the code of one (5773 is EGM96), or "
             "ellipsoidal heights"
         )
-    # pyproj warns where an error is raised below.
+    # Suppress the warnings of pyproj; an error is raised below.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         group = TransformerGroup(f"EPSG:{code}+{vertical}", geodetic.to_3d(), always_xy=True)
@@ -194,7 +191,7 @@ def _transformed(transformer: Transformer, values: np.ndarray, direction: str) -
 
 
 def _geocentric_from_level(places: np.ndarray) -> np.ndarray:
-    """Return columns east, north and up at longitude and latitude, in geocentric axes."""
+    """Return the directions east, north and up at longitude and latitude as columns, in geocentric axes."""
     (sl, sp), (cl, cp) = np.sin(np.deg2rad(places[:, :2])).T, np.cos(np.deg2rad(places[:, :2])).T
     rows = [-sl, -sp * cl, cp * cl, cl, -sp * sl, cp * sl, 0 * sl, cp, sp]
     return np.stack(rows, axis=1).reshape(-1, 3, 3)

@@ -1,6 +1,6 @@
 """Mount of a camera relative to the GNSS/IMU: lever arm, boresight, time offset; shift and drift of the positions.
 
-Functions of one image. Frames and signs: docs/conventions.md; source: paper 000, equations (1)-(4), paper 003.
+Functions take one image. Frames and signs: docs/conventions.md; source: paper 000, equations (1)-(4), paper 003.
 """
 
 from typing import Literal
@@ -19,8 +19,8 @@ from jaxphoto.rotation import rotate, small_angles, small_rotation
 from jaxphoto.short_repr import pretty_repr
 
 ImageX = Literal["forward", "left", "back", "right"]
-"""Direction of the camera's x axis in the aircraft."""
-# Columns: the camera's x, y and z axis in body axes right, forward, up; z is always up (docs/models.md).
+"""Direction of the camera's x axis in the body."""
+# Columns: camera axes x, y and z in the body axes right, forward, up; z is always up (docs/models.md).
 NOMINAL: dict[str, np.ndarray] = {
     "forward": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
     "left": np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]),
@@ -31,7 +31,7 @@ IMAGE_X = tuple(NOMINAL)
 
 
 class Mount(AbstractParameters):
-    """Position, orientation and clock of a camera relative to the GNSS/IMU.
+    """Position, orientation and time offset of a camera relative to the GNSS/IMU.
 
     `lever_arm` from the projection centre to the GNSS/IMU reference (m: right, forward, up), `boresight` as a small
     rotation in the camera frame (rad), `time_offset` of the true exposure after the recorded one (s). `image_x` is the
@@ -57,20 +57,20 @@ class Mount(AbstractParameters):
 
     @property
     def nominal(self) -> Float[np.ndarray, "3 3"]:
-        """`body_from_camera` without misalignment."""
+        """Return `body_from_camera` without misalignment."""
         return NOMINAL[self.image_x]
 
 
 @pretty_repr
 class Exposure(eqx.Module):
-    """Properties of an exposure that are not observed; of many with a leading (in an adjustment: last) axis.
+    """Unobserved properties of an exposure; arrays of exposures have a leading (in an adjustment: last) axis.
 
     `time` from the strip's reference time (s), `velocity` of the GNSS/IMU in the object frame (m/s), rotation `rate`
     about the body's right, forward and up axes (rad/s). Velocity and rate are needed for a time offset, and for a delay
-    in a rig. `nominal` is needed only if mounts of several kinds are stacked (`Mount.image_x` is one for all): the
-    `Mount.nominal` of each. `flight_time` is that from the middle of the flight (s), for changes from strip to strip;
-    None: equal to `time`. `height` is that of the camera's format (mm), for a rolling shutter. `temperature` is that of
-    the camera above the reference of its block (K).
+    in a rig. `nominal` is the `Mount.nominal` of each exposure, needed only if mounts with different `image_x` are
+    stacked. `flight_time` is the time from the middle of the flight (s), for changes between strips; None: equal to
+    `time`. `height` is the height of the camera's format (mm), for a rolling shutter. `temperature` is the temperature
+    of the camera above the reference of its block (K).
     """
 
     time: Float[Array, "*images"] | float
@@ -83,14 +83,14 @@ class Exposure(eqx.Module):
 
     @property
     def in_flight(self) -> Float[Array, "*images"] | float:
-        """Time from the middle of the flight (s)."""
+        """Return the time from the middle of the flight (s)."""
         return self.time if self.flight_time is None else self.flight_time
 
 
 def nominal_mount(mount: Mount, exposure: Exposure) -> Float[ArrayLike, "3 3"]:
     """Return `body_from_camera` without misalignment: from the exposure if given, else from the mount.
 
-    Raises InputError (under `jit` an error of Equinox) if a mount that is not "forward" contradicts the exposure.
+    Raises InputError (under `jit` an Equinox error) if a mount other than "forward" contradicts the exposure.
     """
     if exposure.nominal is None or mount.image_x == "forward":
         return mount.nominal if exposure.nominal is None else exposure.nominal
@@ -105,14 +105,14 @@ def nominal_mount(mount: Mount, exposure: Exposure) -> Float[ArrayLike, "3 3"]:
 
 
 def body_from_camera(boresight: Float[Array, "3"], nominal: Float[ArrayLike, "3 3"]) -> Float[Array, "3 3"]:
-    """Return the nominal mount times the misalignment (small rotation in the camera frame, rad)."""
+    """Multiply the nominal mount by the misalignment (small rotation in the camera frame, rad)."""
     return jnp.matmul(nominal, small_rotation(boresight))
 
 
 def object_from_body(
     camera_from_object: Float[Array, "3 3"], boresight: Float[Array, "3"], nominal: Float[ArrayLike, "3 3"]
 ) -> Float[Array, "3 3"]:
-    """Return the attitude of the body from the orientation of the camera and the boresight misalignment."""
+    """Compute the attitude of the body from the orientation of the camera and the boresight misalignment."""
     return camera_from_object.T @ body_from_camera(boresight, nominal).T
 
 
@@ -123,7 +123,7 @@ def sensor_position(
     bias: StripBias,
     exposure: Exposure,
 ) -> Float[Array, "3"]:
-    """Return what GNSS observes at the recorded time, in m: X + R l + shift + drift (t - t0) - v tau.
+    """Return the predicted GNSS observation (m) at the recorded time: X + R l + shift + drift (t - t0) - v tau.
 
     tau is the mount's time offset. Source: paper 000, equation (1).
     """
@@ -142,7 +142,7 @@ def attitude_residual(
 ) -> Float[Array, "3"]:
     """Return observed minus computed attitude as a small rotation about (forward, right, down), in rad.
 
-    These are the axes of roll, pitch and yaw, so near level flight each component is one angle's residual.
+    These are the axes of roll, pitch and yaw: near level flight, each component is the residual of one angle.
     """
     right, forward, up = -small_angles(computed_object_from_body.T @ observed_object_from_body)
     return jnp.stack([forward, right, -up])

@@ -1,8 +1,8 @@
-"""Checks and corrections of the positions that receivers record in photographs.
+"""Checks and corrections of GNSS positions recorded in photographs.
 
-The photographs of a flight lie within kilometres. A receiver without a position writes (0, 0); exchanged latitude and
-longitude lie elsewhere on the earth. Heights above take-off among heights above a datum equal the photograph's own
-height above take-off.
+The photographs of a flight lie within kilometres. Detected errors: the position (0, 0), written without a fix;
+exchanged latitude and longitude, far from the other positions; heights above take-off among heights above a datum,
+equal to the recorded height above take-off.
 """
 
 from collections.abc import Mapping
@@ -15,17 +15,17 @@ from jaxphoto.georeferencing.map_frame import MapFrame
 
 Positions = dict[str, Gps | None]
 WGS84 = 4326
-"""EPSG code of longitude and latitude of receivers."""
+"""EPSG code of the geographic coordinates of receivers."""
 _EARTH_M = 6_371_000.0
 _FAR_M = 50_000.0
-# Some hundred metres about (0, 0).
+# Maximum |latitude| and |longitude| (degrees) of positions treated as (0, 0): some hundred metres.
 _NOWHERE_DEG = 1e-3
-# Tolerance of equal heights above take-off; difference of zeros that are two.
+# Maximum difference (m) of equal heights above take-off; minimum difference (m) of two different zero heights.
 _SAME_M, _APART_M = 0.5, 5.0
 
 
 def plausible_positions(positions: Mapping[str, Gps | None]) -> tuple[Positions, list[str]]:
-    """Return plausible positions (exchanged latitudes and longitudes corrected) and a message per kind of change."""
+    """Return plausible positions, with exchanged latitudes and longitudes corrected, and one message per change."""
     result: Positions = dict(positions)
     absent = [name for name, gps in result.items() if gps is None]
     nowhere = [n for n, g in result.items() if g and max(abs(g.latitude_deg), abs(g.longitude_deg)) < _NOWHERE_DEG]
@@ -41,7 +41,7 @@ def plausible_positions(positions: Mapping[str, Gps | None]) -> tuple[Positions,
         back = [n for n in far if near(_exchanged(known[n]))]
         result |= {n: _exchanged(known[n]) for n in back}
         exchanged += back
-        # A majority decides which are far.
+        # Reject distant positions only if they are a minority.
         lost = [n for n in far if n not in back] if 2 * len(far) < len(known) else []
         result |= dict.fromkeys(lost, None)
     messages = []
@@ -63,10 +63,11 @@ def one_height(
     above_takeoff_m: Mapping[str, float | None],
     wanted: Heights | int | None = None,
 ) -> tuple[Positions, list[str]]:
-    """Return the positions with heights of one reference, and messages about it.
+    """Convert all positions to one height reference; return them with messages.
 
-    `wanted` "take-off" selects the heights above take-off; others are the reference of heights without one, an EPSG
-    code that of a geoid, which is added. If None, heights of two references are joined by those above take-off.
+    `wanted`: "take-off" selects the heights above take-off. Any other reference applies to heights of unknown
+    reference. An EPSG code is a vertical system whose geoid height is added. None: heights of several references are
+    reduced to the most frequent one by the heights above take-off.
     """
     result: Positions = dict(positions)
     above = {n: h for n in result if (h := above_takeoff_m.get(n)) is not None}
@@ -99,7 +100,7 @@ def one_height(
 
 
 def _joined(positions: Positions, zero: Mapping[str, float]) -> tuple[Positions, list[str]]:
-    """Heights of rare references reduced to the usual one, if the heights of take-off are known in both."""
+    """Reduce heights to the most frequent reference, if the take-off height is known in both references."""
     kinds: dict[Heights, list[str]] = {}
     for n, g in positions.items():
         if g and g.altitude_m is not None:
@@ -132,11 +133,12 @@ def _joined(positions: Positions, zero: Mapping[str, float]) -> tuple[Positions,
 
 
 def _above_ellipsoid(positions: Positions, vertical: int) -> tuple[Positions, list[str]]:
-    """Heights of the EPSG system `vertical` reduced to the ellipsoid: h = H + N, N the height of its geoid (m).
+    """Convert heights of the EPSG system `vertical` to ellipsoidal heights: h = H + N with the geoid height N (m).
 
-    Raises InputError for a code that is not one of heights, for a geoid that is not installed, and for a place outside.
+    Raises InputError if the code is not a vertical system, if its geoid is not installed, and for positions outside the
+    geoid.
     """
-    # A wrong code is an error even if no height needs it.
+    # Check the code even if no height needs it.
     system = MapFrame(WGS84, vertical, (0.0, 0.0, 0.0))
     places = {
         n: (g.longitude_deg, g.latitude_deg, g.altitude_m)
@@ -177,7 +179,7 @@ def _reference(positions: Positions) -> str:
 
 
 def _exchanged(gps: Gps) -> Gps | None:
-    """Latitude and longitude in each other's place; None if impossible."""
+    """Exchange latitude and longitude; None if impossible."""
     if abs(gps.longitude_deg) > 90:
         return None
     return gps._replace(latitude_deg=gps.longitude_deg, longitude_deg=gps.latitude_deg)

@@ -1,17 +1,18 @@
 """Rig: rigidly connected cameras with common exposures, such as a nadir camera with oblique heads.
 
-One of them is the reference. Every other camera has the position of its projection centre in the frame of the reference
-camera, l (m), and a rotation t (rad), the rotation vector of its orientation relative to the reference:
+One camera is the reference. Every other camera has a position l (m), its projection centre in the frame of the
+reference camera, and a rotation t (rad), the rotation vector of its orientation relative to the reference:
 
     X = X_ref + R_ref' l,    R = small_rotation(t) R_ref        (R takes the object frame to the camera)
 
-`small_rotation` is exact for any angle below a full turn, so heads may point anywhere. The deviation of a photograph is
+`small_rotation` is exact for angles below 360 degrees, so the direction of a camera is arbitrary. The deviation of a
+photograph is
 
     p = R_ref (X - X_ref) - l (m, in the axes of the reference),    r: small_rotation(r) = R R_ref' small_rotation(t)'
 
-which is zero for a rigid rig. A camera that exposes a delay tau after the reference refers to the pose of the reference
-at that time, by the velocity v of the GNSS/IMU, its lever arm a and the rotation rate w (both in body axes), and M,
-which takes the camera to the body:
+which is zero for a rigid rig. A camera that exposes with a delay tau after the reference refers to the pose of the
+reference at that time. It follows from the velocity v of the GNSS/IMU, its lever arm a and rotation rate w (both in
+body axes), and the rotation M from camera to body:
 
     X_ref(tau) = X_ref + (v - R_ref' M' (w x a)) tau,    R_ref(tau) = small_rotation(M' w tau) R_ref
 
@@ -28,11 +29,11 @@ from jaxphoto.rotation import rotate, small_angles, small_rotation
 
 
 class RigCamera(AbstractParameters):
-    """Position and orientation of a camera relative to the reference camera of its rig, which has none itself.
+    """Position and orientation of a camera relative to the reference camera of its rig. The reference camera has none.
 
-    `place` of its projection centre in the axes of the reference camera (m: x right, y up, z out of its back), `turn`
-    about these axes (rad), the rotation vector of `camera_from_reference = small_rotation(turn)`, `delay` of its
-    exposures after those of the reference camera (s).
+    `place`: projection centre in the axes of the reference camera (m: x right, y up, z out of its back). `turn`:
+    rotation vector (rad) about these axes, `camera_from_reference = small_rotation(turn)`. `delay`: exposure time minus
+    exposure time of the reference camera (s).
     """
 
     kind = "rig_cameras"
@@ -57,7 +58,7 @@ def reference_later(
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
     """Return position (m) and orientation of the reference camera `delay` seconds after its exposure."""
     body = body_from_camera(mount.boresight, nominal_mount(mount, exposure))
-    # Velocity of the camera; the GNSS/IMU is a lever arm away from it.
+    # Velocity of the camera from the velocity of the GNSS/IMU and the lever arm.
     velocity = exposure.velocity - rotate(camera_from_object.T @ body.T, jnp.cross(exposure.rate, mount.lever_arm))
     turn = small_rotation(rotate(body.T, exposure.rate) * delay)
     return position + velocity * delay, turn @ camera_from_object
@@ -66,8 +67,9 @@ def reference_later(
 def rig_place(
     reference: Float[Array, "3"], camera_from_object: Float[Array, "3 3"], position: Float[Array, "3"]
 ) -> Float[Array, "3"]:
-    """Return a projection centre in the frame of the reference camera (m); the first two arguments are of the
-    reference.
+    """Compute a projection centre in the frame of the reference camera (m).
+
+    The first two arguments refer to the reference camera.
     """
     return rotate(camera_from_object, position - reference)
 
@@ -80,7 +82,7 @@ def rig_turn(reference: Float[Array, "3 3"], camera_from_object: Float[Array, "3
 def in_rig(
     position: Float[Array, "3"], camera_from_object: Float[Array, "3 3"], camera: RigCamera
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Return position and orientation of a camera of a rig, given its reference."""
+    """Compute position and orientation of a camera of a rig from its reference camera."""
     there = position + rotate(camera_from_object.T, camera.place)
     return there, small_rotation(camera.turn) @ camera_from_object
 
@@ -88,5 +90,5 @@ def in_rig(
 def turn_off(
     reference: Float[Array, "3 3"], camera_from_object: Float[Array, "3 3"], turn: Float[Array, "3"]
 ) -> Float[ArrayLike, "3"]:
-    """Return the rotation of a camera relative to its place in the rig (rad, about its own axes)."""
+    """Return the deviation of a camera from its orientation in the rig (rotation vector in rad, about its own axes)."""
     return small_angles(camera_from_object @ reference.T @ small_rotation(turn).T)

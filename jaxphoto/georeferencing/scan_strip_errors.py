@@ -1,4 +1,4 @@
-"""Errors of the strips of a cloud, simulated or estimated."""
+"""Errors of the strips of a point cloud, simulated or estimated."""
 
 import equinox as eqx
 import numpy as np
@@ -11,12 +11,12 @@ from jaxphoto.short_repr import pretty_repr
 
 @pretty_repr
 class StripErrors(eqx.Module):
-    """Errors of a cloud: of its scanner, and of its trajectory strip by strip."""
+    """Errors of a point cloud: scanner errors, and trajectory errors per strip."""
 
     splines: tuple[StripSpline, ...] = eqx.field(static=True)
-    """One for each strip of the cloud, in order."""
+    """Splines of the strips of the cloud, in order."""
     position: Float[np.ndarray, "knots 3"]
-    """For all knots (m, rad)."""
+    """Position errors of all knots (m); `attitude` likewise (rad)."""
     attitude: Float[np.ndarray, "knots 3"]
     boresight: Float[np.ndarray, "3"]
     calibration: ScannerCalibration
@@ -27,6 +27,6 @@ class StripErrors(eqx.Module):
         return tuple(np.einsum("nk,nkc->nc", weights, of[knots]) for of in (self.position, self.attitude))  # type: ignore[return-value]
 
     def of_strip(self, strip: int) -> SplineKnots:
-        """Return position (m) and attitude (rad) errors together, six numbers, for compiled programs."""
+        """Return position (m) and attitude (rad) errors as one spline with six components, for compiled programs."""
         first, size, start, interval = (np.asarray(v) for v in self.splines[strip])
         return SplineKnots(first, size, start, interval, np.concatenate([self.position, self.attitude], axis=1))

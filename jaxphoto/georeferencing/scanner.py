@@ -1,6 +1,6 @@
 """Boresight of a laser scanner relative to the GNSS/IMU, and shifts of its strips.
 
-Functions of one laser point; frames and signs are those of a camera's mount (docs/conventions.md).
+Functions take one laser point; frames and signs as for a camera mount (docs/conventions.md).
 """
 
 import equinox as eqx
@@ -14,10 +14,10 @@ from jaxphoto.static_values import ordered
 
 
 class Scanner(AbstractParameters):
-    """Errors of a cloud georeferenced without boresight and shifts.
+    """Errors of a point cloud georeferenced without boresight and shifts.
 
-    `boresight` is the misalignment, a small rotation about the body's right, forward and up axes (rad); `shifts` holds,
-    for each lidar strip by name, the offset of its points from the object frame (m).
+    `boresight`: misalignment, a small rotation about the body's right, forward and up axes (rad). `shifts`: offset of
+    the points of each lidar strip from the object frame (m), by strip name.
     """
 
     kind = "scanner"
@@ -40,9 +40,9 @@ def corrected_point(
     boresight: Float[Array, "3"],
     shift: Float[Array, "3"],
 ) -> Float[Array, "3"]:
-    """Return a corrected laser point (m): `position + R small_rotation(boresight) R' (point - position) - shift`.
+    """Correct a laser point (m): `position + R small_rotation(boresight) R' (point - position) - shift`.
 
-    `position` and `object_from_body` (R) are those of the scanner at the time of the point, by the trajectory.
+    `position` and `object_from_body` (R): scanner pose at the time of the point, from the trajectory.
     """
     in_body = rotate(object_from_body.T, point - position)
     return position + rotate(object_from_body, rotate(small_rotation(boresight), in_body)) - shift

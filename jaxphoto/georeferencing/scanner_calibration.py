@@ -1,7 +1,7 @@
 """Correction of laser returns for errors of trajectory and scanner.
 
-A cloud holds X, and a trajectory the position p and attitude R of the scanner at the time of X. Range and angle of the
-pulse are those of s = R' (X - p), in the body axes (right, forward, up):
+A point cloud contains the return X; a trajectory contains the position p and attitude R of the scanner at the time of
+X. Range and angle of the pulse follow from s = R' (X - p) in the body axes (right, forward, up):
 
     rho = |s|,    theta = atan2(s_right, -s_up)        from the nadir, about the forward axis
 
@@ -18,9 +18,9 @@ b of `Scanner` and `ScannerCalibration`, the return lies at
         circular: rotated towards the nadir by k theta, and about it by -(e1 cos alpha + e2 sin alpha)
 
 An encoder offset is equivalent to a boresight about the forward axis (opposite sign), for circular patterns about the
-up axis, and is estimated as such. k of two prisms is the error of their deflection by wedge angle or refractive index.
-dt is the delay of the scanner's clock relative to that of the trajectory: its pose, to first order in dt, is that of a
-time later by dt, by the velocity v and the rotation rate w.
+up axis, and is absorbed by the boresight. For two prisms, k is the error of the deflection due to wedge angle or
+refractive index. dt is the delay of the scanner clock relative to the trajectory clock: the pose is extrapolated by dt
+to first order, with the velocity v and the rotation rate w.
 
 Sources: Skaloud and Lichti (2006), Rigorous approach to bore-sight self-calibration in airborne laser scanning; Glira,
 Pfeifer and Mandlburger (2016), Rigorous strip adjustment of UAV-based laserscanning data including time-dependent
@@ -46,17 +46,18 @@ PATTERN_OF: dict[str, Pattern] = {
     "risley": "circle",
     "nutating": "circle",
 }
-"""Kinds of scanners with the pattern whose angles are corrected; a pattern stands for any of its kinds."""
+"""Pattern of each scanner type; the pattern names themselves are also valid."""
 _PPM = 1e-6
 _AXES = ("right", "forward", "up")
 
 
 class ScannerCalibration(AbstractParameters):
-    """Errors of the scanner except its boresight, as they appear in its cloud.
+    """Scanner errors except the boresight, as contained in the point cloud.
 
-    `lever_arm` relative to the one used (m: right, forward, up); `range_offset` (m) and `range_scale` (ppm) of measured
-    ranges; `angle_scale` (ppm) of theta and `eccentricity` (rad, of cos and sin) of theta, for the pattern "circle" of
-    alpha; `time_offset` (s) of the true time of a return, on the clock of the trajectory, after the recorded one.
+    `lever_arm`: correction to the lever arm in use (m: right, forward, up). `range_offset` (m), `range_scale` (ppm):
+    errors of measured ranges. `angle_scale` (ppm): scale error of theta. `eccentricity` (rad): cosine and sine terms of
+    theta, for the pattern "circle" of alpha. `time_offset` (s): true time of a return on the trajectory clock minus
+    recorded time.
     """
 
     kind = "scanner_calibration"
@@ -84,14 +85,14 @@ class ScannerCalibration(AbstractParameters):
 
 
 def corrected_shot(shot: Float[Array, "3"], calibration: ScannerCalibration) -> Float[Array, "3"]:
-    """Return the vector from scanner to return (m, in body axes), with corrected range and angle."""
+    """Correct range and angle of the vector from scanner to return (m, in body axes)."""
     distance = jnp.sqrt(jnp.sum(shot**2))
     turned = _turned_across(shot, calibration) if calibration.pattern == "line" else _turned_around(shot, calibration)
     return turned * (1 - _PPM * calibration.range_scale - calibration.range_offset / distance)
 
 
 def _turned_across(shot: Float[Array, "3"], calibration: ScannerCalibration) -> Float[Array, "3"]:
-    """Rotate by the angle of a line pattern."""
+    """Correct the scan angle of a line pattern."""
     right, forward, up = shot
     angle = jnp.arctan2(right, -up)
     by_cos, by_sin = calibration.eccentricity
@@ -101,10 +102,10 @@ def _turned_across(shot: Float[Array, "3"], calibration: ScannerCalibration) -> 
 
 
 def _turned_around(shot: Float[Array, "3"], calibration: ScannerCalibration) -> Float[Array, "3"]:
-    """Rotate by both angles of a circular pattern."""
+    """Correct both angles of a circular pattern."""
     right, forward, up = shot
     square = right**2 + forward**2
-    # At the nadir the horizontal distance is zero, and the root has no derivative.
+    # Avoid the root at the nadir: it is not differentiable at the horizontal distance zero.
     aside = jnp.sqrt(jnp.where(square > 0, square, 1.0))
     by_cos, by_sin = calibration.eccentricity
     around = (by_cos * forward + by_sin * right) / aside
@@ -131,10 +132,10 @@ def corrected_return(
     boresight: Float[Array, "3"],
     calibration: ScannerCalibration,
 ) -> Float[Array, "3"]:
-    """Correct a laser point (m); `position` and `object_from_body` are those of the scanner by the trajectory.
+    """Correct a laser point (m); `position` and `object_from_body`: scanner pose from the trajectory.
 
-    `velocity` (m/s, in the object frame) and `rate` (rad/s, about the body's axes) are those of `georeferencing.Poses`;
-    `off_position` (m) and `off_attitude` (rad) are the trajectory errors at its time.
+    `velocity` (m/s, in the object frame) and `rate` (rad/s, about the body axes): as in `georeferencing.Poses`.
+    `off_position` (m) and `off_attitude` (rad): trajectory errors at the time of the point.
     """
     shot = corrected_shot(rotate(object_from_body.T, point - position), calibration)
     in_body = rotate(small_rotation(boresight), shot) - calibration.lever_arm

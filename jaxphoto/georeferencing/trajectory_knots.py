@@ -1,7 +1,7 @@
 """Trajectory errors by strip: cubic B-splines of time for position and attitude.
 
-With knots h apart from the start of a strip, the correction at time t in interval i, with u the elapsed fraction of the
-interval, is that of four coefficients c[i] to c[i + 3]:
+With knots of spacing h from the start of a strip, the correction at time t in interval i is the sum of the four
+coefficients c[i] to c[i + 3] with the weights (u: elapsed fraction of the interval)
 
     [(1 - u)^3, 3 u^3 - 6 u^2 + 4, -3 u^3 + 3 u^2 + 3 u + 1, u^3] / 6
 
@@ -18,15 +18,15 @@ from jaxtyping import Array, Float, Int
 from jaxphoto.arrays import ArrayLike
 from jaxphoto.parameters import AbstractParameters
 
-# Separates strip and time in the name of a knot.
+# Separator of strip and time in the name of a knot.
 _AT = " at "
 
 
 class TrajectoryKnot(AbstractParameters):
     """One spline coefficient of a strip.
 
-    `position` is the error of positions (m, in the object frame), `attitude` a small rotation about the body's right,
-    forward and up axes (rad): the true attitude is `object_from_body @ small_rotation(attitude)`.
+    `position`: position error (m, in the object frame). `attitude`: small rotation about the body's right, forward and
+    up axes (rad); the true attitude is `object_from_body @ small_rotation(attitude)`.
     """
 
     kind = "trajectory_knots"
@@ -46,28 +46,28 @@ def knot_name(strip: str, time: float) -> str:
 
 
 def strip_of_knot(name: str) -> str:
-    """Return the strip of a knot from its name."""
+    """Extract the strip from the name of a knot."""
     return name.rpartition(_AT)[0]
 
 
 class StripSpline(NamedTuple):
-    """Knots of a strip, numbered from `first` among those of all strips; a single knot is a constant."""
+    """Knots of a strip; `first` is the index of its first knot among all knots. A single knot is a constant."""
 
     first: int
     size: int
     start: float
-    """Seconds."""
+    """Start time (s)."""
     interval: float
 
     @classmethod
     def over(cls, first: int, start: float, end: float, apart: float) -> "StripSpline":
-        """Create knots about `apart` (s), evenly over a strip from `start` to `end`."""
+        """Create equidistant knots with a spacing of about `apart` (s) over a strip from `start` to `end`."""
         pieces = max(1, round((end - start) / apart))
         return cls(first, pieces + 3, start, max(end - start, 1e-9) / pieces)
 
     @classmethod
     def constant(cls, first: int) -> "StripSpline":
-        """Create a constant error."""
+        """Create a spline of one knot (constant error)."""
         return cls(first, 1, 0.0, 1.0)
 
     @property
@@ -76,7 +76,7 @@ class StripSpline(NamedTuple):
         return self.start + (np.arange(self.size) - (self.size > 1)) * self.interval
 
     def weights(self, time: Float[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "n 4"], Float[np.ndarray, "n 4"]]:
-        """Return knots and weights of the correction at each time; outside the strip those of its ends."""
+        """Return indices and weights of the knots at each time; outside the strip, of its nearest end."""
         n = len(time)
         if self.size == 1:
             return np.full((n, 4), self.first), np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
@@ -88,7 +88,7 @@ class StripSpline(NamedTuple):
     def all_weights(
         self, time: Float[np.ndarray, "n"]
     ) -> tuple[Int[np.ndarray, "n size"], Float[np.ndarray, "n size"]]:
-        """Return weights for all knots of the strip; most are zero."""
+        """Return all knots of the strip with their weights at each time; most weights are zero."""
         knots, weights = self.weights(time)
         every = np.zeros((len(knots), self.size))
         np.add.at(every, (np.arange(len(knots))[:, None], knots - self.first), weights)
@@ -96,31 +96,31 @@ class StripSpline(NamedTuple):
 
 
 class SplineKnots(NamedTuple):
-    """Spline of a strip with its coefficients, for compiled programs; more knots need no other program."""
+    """Spline of a strip with its coefficients as arrays: compiled programs are reused for other numbers of knots."""
 
     first: Int[ArrayLike, ""]
-    """Index of its first knot among those of all strips."""
+    """Index of its first knot among all knots."""
     size: Int[ArrayLike, ""]
     start: Float[ArrayLike, ""]
     interval: Float[ArrayLike, ""]
     knots: Float[ArrayLike, "knots k"]
 
     def at(self, time: Float[Array, "n"]) -> Float[Array, "n k"]:
-        """Return `StripSpline.weights` and the correction at each time (s)."""
+        """Evaluate the correction at each time (s), as by `StripSpline.weights`."""
         gone = jnp.clip((time - self.start) / self.interval, 0.0, jnp.maximum(self.size - 3, 0))
         piece = jnp.minimum(gone.astype(int), jnp.maximum(self.size - 4, 0))
-        # The weights add up to 1: for a single knot all four refer to it.
+        # For a single knot all four indices refer to it; the weights sum to 1.
         index = (self.first + jnp.minimum(piece + k, self.size - 1) for k in range(4))
         parts = zip(_cubic(gone - piece), index, strict=True)
         return sum(w[:, None] * self.knots[k] for w, k in parts)  # type: ignore[return-value, misc]
 
 
 def _cubic(u: Float[ArrayLike, "n"]) -> list[Float[ArrayLike, "n"]]:
-    """Return the weights of four coefficients at the fraction `u` of an interval."""
+    """Return the weights of the four coefficients at the fraction `u` of an interval."""
     weights = (1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3
     return [w / 6 for w in weights]
 
 
 def weighted_knot(knots: TrajectoryKnot, weights: Float[ArrayLike, "knots"]) -> TrajectoryKnot:
-    """Combine four knots (leading axis)."""
+    """Compute the weighted sum of knots (leading axis)."""
     return jax.tree.map(lambda v: sum(weights[k] * v[k] for k in range(len(weights))), knots)

@@ -1,17 +1,18 @@
-"""Detection of angles in radians read as degrees, by the direction of flight."""
+"""Detection of yaw angles in radians that were read as degrees, by comparison with the direction of flight."""
 
 import numpy as np
 from jaxtyping import Float
 
-# Mean cosine between yaw and course: the crab angle leaves more than the first; the readings differ below the second.
+# Minimum mean cosine between yaw and course for the correct unit (allows for the crab angle); maximum for the wrong
+# unit.
 _ALIKE, _UNLIKE = 0.8, 0.7
 _FEWEST = 4
 
 
 def counts_in_radians(yaw: Float[np.ndarray, "n"], course: Float[np.ndarray, "n"]) -> bool:
-    """Return True if the numbers `yaw` follow the `course` (rad) when read as radians, but not when read as degrees.
+    """Return True if `yaw` agrees with the `course` (rad) when interpreted in radians, but not in degrees.
 
-    Valid degrees are never misjudged: they follow the flight, whatever the wind, because no aircraft flies sideways.
+    Valid degrees are never misclassified: they agree with the course in any wind, because aircraft do not fly sideways.
     """
     if len(course) < _FEWEST or np.abs(yaw).max() > 2 * np.pi:
         return False

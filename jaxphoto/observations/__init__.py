@@ -1,6 +1,6 @@
-"""Observations: one file each declares its rows, what a row touches, and the residual of one row.
+"""Observations: each file declares one kind of rows, the unknowns of a row, and the residual of a row.
 
-A new kind is one file here and its line below.
+To add a kind, add its file to this folder and its import below.
 """
 
 import dataclasses
@@ -12,7 +12,7 @@ from jaxphoto.observations.base import AbstractObservations as AbstractObservati
 from jaxphoto.observations.base import ImageState as ImageState
 from jaxphoto.observations.base import index_of as index_of
 
-# Order of tables and files.
+# The order of imports is the order in tables and files.
 # ruff: isort: off
 from jaxphoto.observations.image_points import ImagePoints as ImagePoints
 from jaxphoto.observations.stations import CameraPositions as CameraPositions
@@ -46,17 +46,17 @@ from jaxphoto.observations.priors import ParameterRows as ParameterRows
 
 
 def _has_a_table(kind: object) -> bool:
-    """Return True for classes with files: they have a name and do not refer to parameters, which have no ids."""
+    """Return True for classes with a file: classes with a group that do not refer to parameters, which have no ids."""
     if not (isinstance(kind, type) and issubclass(kind, AbstractObservations) and kind.__dict__.get("group")):
         return False
     return all(f.metadata.get("touches") != "parameter" for f in dataclasses.fields(kind))
 
 
 OBSERVATIONS: tuple[type[AbstractObservations], ...] = tuple(filter(_has_a_table, list(globals().values())))
-"""Classes whose tables a block folder may hold; pass classes of your own to `read_block`."""
+"""Classes whose tables a block folder may contain; pass user-defined classes to `read_block`."""
 
 if not TYPE_CHECKING:
-    # Type checkers would take a computed list for an empty one; the aliases above serve them.
+    # Type checkers read a computed list as empty; the aliases above export the names.
     __all__ = sorted(
         name
         for name, what in globals().items()

@@ -13,7 +13,7 @@ ATTITUDE_AXES = ("roll", "pitch", "yaw")
 
 
 class Attitudes(AbstractObservations):
-    """Observed roll, pitch, yaw (rad, all three) of `image` with their sigmas (rad)."""
+    """Observed roll, pitch and yaw (rad) of `image` with their sigmas (rad)."""
 
     group = "attitudes"
     unit = "rad"
@@ -34,5 +34,5 @@ class Attitudes(AbstractObservations):
         return attitude_residual(matrix_from_roll_pitch_yaw(jnp.asarray(self.roll_pitch_yaw)), computed)
 
     def words(self, images, points) -> np.ndarray:
-        """Labels such as "roll of image 12"."""
+        """Return labels such as "roll of image 12"."""
         return np.array([[f"{axis} of image {images[i]}" for i in self.image] for axis in self.axes], object)

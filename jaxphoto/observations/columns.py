@@ -3,10 +3,10 @@
     index_of("point"), one per row      start                           an id
     index_of("point"), m per row        points_1, points_2              ids
     integers                            axis
-    numbers, one per row                value_m                         unit of the class; rad are degrees in files
-    numbers, one per axis               value_X_m, value_Y_m, value_Z_m
+    values, one per row                 value_m                         unit of the class; rad are degrees in files
+    values, one per axis                value_X_m, value_Y_m, value_Z_m
 
-`columns` of the class renames those of a field; () means that the field is zero and has no column.
+`columns` of the class renames the columns of a field; () means that the field is zero and has no column.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ import numpy as np
 from jaxphoto.arrays import annotated
 
 FILE_UNITS = {"rad": "deg", "rad_per_s": "deg_per_s"}
-"""Units of files in place of those of computations."""
+"""Units in files, by unit of the class."""
 
 
 class Column(NamedTuple):
@@ -29,21 +29,21 @@ class Column(NamedTuple):
     name: str
     field: str
     place: tuple[int, ...]
-    """Index of the number within a row of the field; () for a single one."""
+    """Index of the component within a row of the field; () for a scalar."""
     touches: str
-    """Kind of object that its ids name; "" for numbers."""
+    """Kind of object of an id column; "" for columns of values."""
     whole: bool
     scale: float
-    """Factor of its numbers."""
+    """Factor from file units to units of the class."""
 
     @property
     def of_rows(self) -> tuple[Any, ...]:
-        """Return the index of its numbers in the field of all rows."""
+        """Return the index of its values in the field of all rows."""
         return (slice(None), *self.place)
 
 
 class RowField(NamedTuple):
-    """Part of a field that belongs to one row."""
+    """Layout of a field within one row."""
 
     name: str
     touches: str
@@ -53,7 +53,7 @@ class RowField(NamedTuple):
 
 @functools.cache
 def row_fields(cls: type) -> list[RowField]:
-    """Return the annotated fields of an observation class: `Int[np.ndarray, "n 2"]` is two indices per row."""
+    """Return the layouts of the annotated fields of a class: `Int[np.ndarray, "n 2"]` is two indices per row."""
     hints, found = typing.get_type_hints(cls), []
     for field in dataclasses.fields(cls):
         touches = field.metadata.get("touches", "")
@@ -69,9 +69,9 @@ def row_fields(cls: type) -> list[RowField]:
 
 @functools.cache
 def whole_fields(cls: type) -> tuple[str, ...]:
-    """Return the fields that hold indices: those that touch something, and integers."""
+    """Return the names of the integer fields, including indices of objects."""
     fields = dataclasses.fields(cls)
-    # Names in the annotations of a class within a function may be out of scope.
+    # Annotations of a class defined in a function may contain names that are out of scope.
     hints = (
         typing.get_type_hints(cls) if any(isinstance(f.type, str) for f in fields) else {f.name: f.type for f in fields}
     )
@@ -97,13 +97,13 @@ def columns_of(cls: Any) -> tuple[Column, ...]:
 
 
 def file_unit(cls: Any) -> str:
-    """Return the unit of an observation class as in column names: _m, _deg; "" if it has none."""
+    """Return the unit suffix of column names of an observation class: _m, _deg; "" without a unit."""
     unit = FILE_UNITS.get(cls.unit, cls.unit)
     return f"_{unit}" if unit else ""
 
 
 def sigma_key(cls: Any) -> str:
-    """Return the key under [sigmas] of block.toml for omitted sigmas: distance_m."""
+    """Return the key of the default sigma in [sigmas] of block.toml, such as distance_m."""
     return cls.group.removesuffix("s") + file_unit(cls)
 
 

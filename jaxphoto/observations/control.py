@@ -10,7 +10,7 @@ from jaxphoto.observations.base import AXES, AbstractCoordinates, index_of
 class ControlCoordinates(AbstractCoordinates):
     """Surveyed coordinates of point `who`: `axis` (0, 1, 2), `value` and `sigma` (m).
 
-    Vertical control is rows with axis 2. Check coordinates, and fixed ones, use the same class.
+    Vertical control consists of rows with axis 2. Check coordinates and fixed coordinates use the same class.
     """
 
     group = "control_points"
@@ -27,6 +27,6 @@ class ControlCoordinates(AbstractCoordinates):
         return self.value - point[self.axis]
 
     def words(self, images, points) -> np.ndarray:
-        """Labels such as "control point T11 in Z"."""
+        """Return labels such as "control point T11 in Z"."""
         rows = zip(self.who, self.axis, strict=True)
         return np.array([f"control point {points[p]} in {AXES[a]}" for p, a in rows], object)

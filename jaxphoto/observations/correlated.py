@@ -1,8 +1,8 @@
 """Correlated observations: small sets of rows with a full covariance matrix.
 
-The three axes of a station from GNSS processing, a point from another adjustment, stations of a strip with exponential
-correlation in time: a set of m rows of any kind has the covariance matrix C = L L'. Its residuals are multiplied by
-L^-1, computed once, so the solver sees only rows of unit weight.
+A set of m rows of any kind has the covariance matrix C = L L'. Examples: the three axes of a station from GNSS
+processing, a point from another adjustment, stations of a strip with exponential correlation in time. The residuals are
+multiplied by L^-1, which is computed once; the solver processes only rows of unit weight.
 """
 
 from collections.abc import Sequence
@@ -19,15 +19,15 @@ from jaxphoto.static_values import map_arrays
 
 
 class Correlated(AbstractObservations):
-    """Sets of rows: fields of `rows` have the leading axes (sets, m); created by `correlated`.
+    """Sets of correlated rows, created by `correlated`; fields of `rows` have the leading axes (sets, m).
 
-    `covariance` (sets, m k, m k) covers the rows of a set, and the k numbers of each.
+    `covariance` (sets, m k, m k): covariance of the m rows of a set with k components each.
     """
 
     rows: AbstractObservations
     covariance: Float[ArrayLike, "sets n n"]
     whitener: Float[ArrayLike, "sets n n"]
-    """L^-1."""
+    """Inverse Cholesky factor L^-1 of each covariance."""
     group: str = eqx.field(static=True)  # type: ignore[misc]
     unit: str = eqx.field(static=True)  # type: ignore[misc]
     axes: tuple[str, ...] = eqx.field(static=True)  # type: ignore[misc]
@@ -42,60 +42,60 @@ class Correlated(AbstractObservations):
         return each.reshape(-1)
 
     def whitened(self, residual: Float[ArrayLike, "n"]) -> Float[ArrayLike, "n"]:
-        """Return L^-1 times the residuals."""
+        """Multiply the residuals by L^-1."""
         return self.whitener @ residual
 
     def with_sigmas_times(self, factor: Float[ArrayLike, "sets n"]) -> "Correlated":
-        """Replace the covariance C by D C D, with D the diagonal matrix of `factor`: correlations stay."""
+        """Replace the covariance C by D C D with the diagonal matrix D of `factor`; correlations are unchanged."""
         where = lambda sets: (sets.covariance, sets.whitener)  # noqa: E731
         new = self.covariance * factor[:, :, None] * factor[:, None], self.whitener / factor[:, None]
         return eqx.tree_at(where, self, new)
 
     def without_weight(self) -> "Correlated":
-        """Return sets of zero weight."""
+        """Return the sets with zero weight."""
         return eqx.tree_at(lambda sets: sets.whitener, self, np.zeros(np.shape(self.whitener)))
 
     def indices(self) -> list[tuple[str, Int[ArrayLike, "..."]]]:
-        """Return what the rows of a set touch, along the axes after the first."""
+        """Return kinds and indices of the objects of the rows; the rows of a set are along the second axis."""
         return self.rows.indices()
 
     @property
     def observation(self) -> ArrayLike:
-        """(sets, n)."""
+        """Return the observed values as an array (sets, n)."""
         return self.rows.observation.reshape(len(self), -1)
 
     def with_observation(self, value: ArrayLike) -> "Correlated":
-        """Replace the observed numbers."""
+        """Replace the observed values."""
         inner = self.rows.with_observation(value.reshape(self.rows.observation.shape))
         return eqx.tree_at(lambda sets: sets.rows, self, inner)
 
     @property
     def sigmas(self) -> ArrayLike:
-        """(sets, n)."""
+        """Return the standard deviations as an array (sets, n)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
     def physical(self, whitened: Float[ArrayLike, "n sets"]) -> Float[np.ndarray, "n sets"]:
-        """Return L times the whitened residuals."""
+        """Multiply the whitened residuals by L."""
         return np.linalg.solve(np.asarray(self.whitener), np.asarray(whitened).T[..., None])[..., 0].T
 
     def __len__(self) -> int:
         return len(self.covariance)
 
     def axis_names(self) -> np.ndarray:
-        """(n, sets)."""
+        """Return the axis names as an array (n, sets)."""
         return self._by_set(self.flat.axis_names())
 
     def names_of(self, what: str, names: Sequence[str] | np.ndarray) -> np.ndarray:
-        """(n, sets)."""
+        """Return the object names as an array (n, sets)."""
         return self._by_set(self.flat.names_of(what, names))
 
     def words(self, images: Sequence[str], points: Sequence[str]) -> np.ndarray:
-        """(n, sets)."""
+        """Return the labels as an array (n, sets)."""
         return self._by_set(self.flat.words(images, points))
 
     @property
     def flat(self) -> AbstractObservations:
-        """Return all rows, set after set."""
+        """Return the rows of all sets, concatenated."""
         return map_arrays(lambda v: np.asarray(v).reshape(-1, *np.shape(v)[2:]), self.rows)
 
     def _by_set(self, names: np.ndarray) -> np.ndarray:
@@ -107,10 +107,10 @@ class Correlated(AbstractObservations):
 def correlated(
     rows: AbstractObservations, sets: Sequence[Sequence[int]] | np.ndarray, covariance: Float[np.ndarray, "sets n n"]
 ) -> Correlated:
-    """Combine `rows` in sets of equal length (lists of row indices), each with its covariance matrix (m2, rad2 ...).
+    """Combine `rows` into sets of equal size (lists of row indices), each with a covariance matrix (m2, rad2 ...).
 
-    The covariance of a set covers its rows in their order, and the numbers of each row. Standard deviations of `rows`
-    are ignored. Raises ValueError for invalid matrices.
+    The order within a covariance matrix is row by row, then component by component. Standard deviations of `rows` are
+    ignored. Raises ValueError for invalid matrices.
     """
     index, covariance = np.asarray(sets, int), np.asarray(covariance, float)
     n = index.shape[1] * len(rows.axes) if index.ndim == 2 else 0
@@ -139,13 +139,13 @@ def correlated(
 def exponential_covariance(
     time: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"] | float, correlation_time: float
 ) -> Float[np.ndarray, "n n"]:
-    """Return sigma_i sigma_j exp(-|t_i - t_j| / T): a first-order Gauss-Markov process at `time` (s), T in s."""
+    """Return the covariance sigma_i sigma_j exp(-|t_i - t_j| / T) of a first-order Gauss-Markov process; t, T in s."""
     time, sigma = np.asarray(time, float), np.broadcast_to(np.asarray(sigma, float), np.shape(time))
     return sigma[:, None] * sigma * np.exp(-np.abs(time[:, None] - time) / correlation_time)
 
 
 def is_covariance(matrix: Float[np.ndarray, "n n"]) -> bool:
-    """Return True if a symmetric matrix is positive definite, judged by its correlations, for any units."""
+    """Return True if a symmetric matrix is positive definite; tests its correlation matrix, so units do not matter."""
     variance = matrix.diagonal()
     if not (variance > 0).all():
         return False

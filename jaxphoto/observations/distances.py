@@ -28,11 +28,11 @@ class Distances(AbstractObservations):
         return self.value - jnp.sqrt(jnp.sum((ends[0] - ends[1]) ** 2))
 
     def words(self, images, points) -> np.ndarray:
-        """Labels such as "distance A to B"."""
+        """Return labels such as "distance A to B"."""
         return np.array([f"distance {points[a]} to {points[b]}" for a, b in self.points], object)
 
     def validation_errors(self) -> Iterator[tuple[int, str]]:
-        """Yield distances from a point to itself, and those not positive."""
+        """Yield (row, message) for distances from a point to itself and distances that are not positive."""
         for row in np.flatnonzero(self.points[:, 0] == self.points[:, 1]):
             yield int(row), "the distance runs from a point to itself; correct point_a or point_b"
         for row in np.flatnonzero(np.asarray(self.value) <= 0):

@@ -30,6 +30,6 @@ class ImagePoints(AbstractObservations):
         return image_residual(image.interior, exterior, point, jnp.asarray(self.xy))
 
     def words(self, images, points) -> np.ndarray:
-        """Labels such as "point 7 in image 12", for both coordinates: a blunder affects both."""
+        """Return labels such as "point 7 in image 12", equal for both coordinates because a blunder affects both."""
         names = [f"point {points[p]} in image {images[i]}" for i, p in zip(self.image, self.point, strict=True)]
         return np.broadcast_to(np.array(names, object), (2, len(names)))

@@ -1,12 +1,13 @@
-"""Steps of the trajectory error from knot to knot: a drift model of GNSS and IMU that regularises it.
+"""Steps of the trajectory error from knot to knot: regularisation by a drift model of GNSS and IMU.
 
 A Gauss-Markov process with standard deviation s and correlation time T proceeds from c[k] to
 
     c[k + 1] = f c[k] + noise,    f = exp(-h / T),    noise with standard deviation s sqrt(1 - f^2)
 
-after h seconds. Infinite T is a constant; s and T that grow together, s^2 / T = q / 2, a random walk of q (m^2/s), as
-accelerometers and gyros produce. The first knot of a strip has a prior of zero with s. Source: Gelb (1974), Applied
-optimal estimation; Cucci, Rehak and Skaloud (2017) use raw inertial measurements instead.
+after h seconds. The process is constant for infinite T; for increasing s and T with s^2 / T = q / 2 it becomes a random
+walk of q (m^2/s), as of accelerometers and gyros. The first knot of a strip has the prior zero with standard deviation
+s. Source: Gelb (1974), Applied optimal estimation; Cucci, Rehak and Skaloud (2017) use raw inertial measurements
+instead.
 """
 
 from collections.abc import Iterator
@@ -21,7 +22,7 @@ from jaxphoto.observations.base import AXES, AbstractObservations, index_of
 
 
 class AbstractKnotSteps(AbstractObservations):
-    """Difference of the error at knot `end` from `kept` times that at `start`: zero, with `sigma`."""
+    """Error at knot `end` minus `kept` times the error at knot `start`, observed as zero with `sigma`."""
 
     _words: eqx.AbstractClassVar[tuple[str, str]]
     observed = "step"
@@ -34,7 +35,7 @@ class AbstractKnotSteps(AbstractObservations):
     step: Float[ArrayLike, "n 3"]
 
     def validation_errors(self) -> Iterator[tuple[int, str]]:
-        """Yield fractions that no process has."""
+        """Yield (row, message) for every `kept` outside [0, 1]."""
         kept = np.asarray(self.kept)
         for row in np.flatnonzero((kept < 0) | (kept > 1)):
             yield (
@@ -43,7 +44,7 @@ class AbstractKnotSteps(AbstractObservations):
             )
 
     def words(self, images, points) -> np.ndarray:
-        """Labels such as "step 12 of the trajectory in Z"."""
+        """Return labels such as "step 12 of the trajectory in Z"."""
         step, along = self._words
         return np.array(
             [[f"{step} {k + 1} of the trajectory {along} {a}" for k in range(len(self))] for a in self.axes], object

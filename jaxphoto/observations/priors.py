@@ -17,7 +17,7 @@ PRIORS = "priors"
 
 
 class ParameterRows(AbstractObservations):
-    """Parameters with prior `value` and `sigma`, in their own units."""
+    """Prior values and sigmas of parameters, in the units of the parameters."""
 
     group = PRIORS
     unit = ""
@@ -48,7 +48,7 @@ class PositionRows(AbstractObservations):
 
 
 class RotationRows(AbstractObservations):
-    """Prior rotations `camera_from_object` of `image`; sigma is of a small rotation in its frame (rad)."""
+    """Prior rotations `camera_from_object` of `image`; sigma refers to a small rotation in the camera frame (rad)."""
 
     group = "prior_rotations"
     unit = "rad"
@@ -60,10 +60,10 @@ class RotationRows(AbstractObservations):
     value: Float[ArrayLike, "n 3 3"]
     sigma: Float[ArrayLike, "n 3"]
     turn: Float[ArrayLike, "n 3"]
-    """Observed rotation in addition to `value`: zero, unless an error is simulated."""
+    """Observed rotation relative to `value` (rad): zero, unless an error is simulated."""
 
     def residual(self, image: ImageState) -> Float[ArrayLike, "3"]:
-        """Return prior minus estimated rotation, a small rotation in the camera frame (rad)."""
+        """Return prior minus estimated rotation as a small rotation in the camera frame (rad)."""
         return self.turn + small_angles(jnp.asarray(self.value) @ image.camera_from_object.T)
 
 
@@ -85,17 +85,18 @@ class PointRows(AbstractObservations):
 
 @pretty_repr
 class KnownParameters(eqx.Module):
-    """Joint prior of parameters: an earlier calibration, with its correlations.
+    """Joint prior of parameters with correlations, such as an earlier calibration.
 
     `labels` are paths such as `interior[kodak].c_mm` and `strips[a].shift_Z_m` (as in every table of parameters),
-    `value` and `covariance` in their own units. For `adjust(block, more=...)`; the parameters are FREE in `priors`.
+    `value` and `covariance` in the units of the parameters. Pass it as `adjust(block, more=...)` and set the parameters
+    to FREE in `priors`.
     """
 
     labels: tuple[str, ...] = eqx.field(static=True)
     value: Float[ArrayLike, "n"]
     covariance: Float[ArrayLike, "n n"]
     reservation: str = eqx.field(static=True)
-    """Reservation about their source, such as a calibration with a red verdict; "" for none."""
+    """Warning about the source of the values, such as a calibration with the verdict FAIL; "" for none."""
 
     def __init__(
         self,
@@ -114,7 +115,7 @@ class KnownParameters(eqx.Module):
 
     @property
     def doubt(self) -> str:
-        """Return the reservation with the parameters' source; "" for none."""
+        """Return the warning together with the source of the parameters; "" for none."""
         if not self.reservation:
             return ""
         own = [label.removeprefix("interior[") for label in self.labels if label.startswith("interior[")]

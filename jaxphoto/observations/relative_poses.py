@@ -1,14 +1,14 @@
 """Relative control: changes of position and attitude of the GNSS/IMU between exposures.
 
 Carrier phases determine the motion of an antenna between two exposures to millimetres, and gyros the rotation of the
-body, while positions and attitudes themselves drift. With the sensor's position P = X + R l - v tau
-(`georeferencing.sensor_position`) and the body's attitude B, which takes body to object,
+body, although positions and attitudes drift. With the sensor's position P = X + R l - v tau
+(`georeferencing.sensor_position`) and the attitude B of the body (from body to object),
 
     d = P_2 - P_1,    A = B_1' B_2
 
-Shift and drift of strips and flight are errors of the positions and do not enter d: what all positions of a strip have
-in common cancels. Sources: Skaloud, Rehak and Lichti (2014), Mapping with MAV: experimental study on the contribution
-of absolute and relative aerial position control; Cucci, Rehak and Skaloud (2017), Bundle adjustment with raw inertial
+Shift and drift of strips and flight are errors of the positions and do not affect d: errors common to all positions of
+a strip cancel. Sources: Skaloud, Rehak and Lichti (2014), Mapping with MAV: experimental study on the contribution of
+absolute and relative aerial position control; Cucci, Rehak and Skaloud (2017), Bundle adjustment with raw inertial
 observations in UAV applications.
 """
 
@@ -28,7 +28,7 @@ _NO_BIAS = StripBias(np.zeros(3), np.zeros(3))  # type: ignore[arg-type]
 
 
 class AbstractRelativeRows(AbstractObservations):
-    """Pose of the GNSS/IMU at `image_2` relative to that at `image_1`."""
+    """Pose of the GNSS/IMU at `image_2` relative to its pose at `image_1`."""
 
     unique = True
 
@@ -36,12 +36,12 @@ class AbstractRelativeRows(AbstractObservations):
     image_2: Int[np.ndarray, "n"] = index_of("image")
 
     def validation_errors(self) -> Iterator[tuple[int, str]]:
-        """Yield images paired with themselves."""
+        """Yield (row, message) for images paired with themselves."""
         for row in np.flatnonzero(self.image_1 == self.image_2):
             yield int(row), "image_1 and image_2 are the same; name two exposures"
 
     def words(self, images, points) -> np.ndarray:
-        """Labels such as "relative position of images 12 and 13 in Z"."""
+        """Return labels such as "relative position of images 12 and 13 in Z"."""
         thing, along = self.group.replace("_", " ").removesuffix("s"), "in" if self.axes == AXES else "about"
         pairs = [f"images {images[a]} and {images[b]}" for a, b in zip(self.image_1, self.image_2, strict=True)]
         return np.array([[f"{thing} of {pair} {along} {axis}" for pair in pairs] for axis in self.axes], object)
@@ -66,8 +66,8 @@ class RelativePositions(AbstractRelativeRows):
 class RelativeAttitudes(AbstractRelativeRows):
     """Rotation of the body from `image_1` to `image_2`: roll, pitch and yaw (rad) of body 2 relative to body 1.
 
-    The angles of B_1' B_2, as if right, forward and up of body 1 were east, north and up. The residual is a small
-    rotation about forward, right and down of body 2, and so are the sigmas.
+    The angles are roll, pitch and yaw of B_1' B_2, with right, forward and up of body 1 in place of east, north and up.
+    Residual and sigmas refer to a small rotation about forward, right and down of body 2.
     """
 
     group = "relative_attitudes"

@@ -1,8 +1,8 @@
-"""Rigid cameras of a rig: observations of each exposure that regularise it (`georeferencing.RigCamera`).
+"""Rigidity of a rig: observations that constrain the cameras at each exposure (`georeferencing.RigCamera`).
 
-A row refers to a photograph and to that of the reference camera at the same event. Both poses are unknown, and the
-camera's place in the rig may be: a rig without GNSS and IMU connects its photographs, and one with a trajectory of its
-reference camera needs none for the others.
+A row refers to a photograph and to the photograph of the reference camera at the same event. Both poses are unknown;
+the camera's pose in the rig can be unknown too. A rig connects its photographs without GNSS and IMU; if the reference
+camera has a trajectory, the other cameras do not need one.
 """
 
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ from jaxphoto.observations.base import AXES, AbstractObservations, ImageState, i
 
 
 class AbstractRigRows(AbstractObservations):
-    """Deviation of a photograph from its place in the rig: zero, with `sigma`."""
+    """Deviation of a photograph from its pose in the rig, observed as zero with `sigma`."""
 
     observed = "off"
     columns = {"off": ()}  # noqa: RUF012
@@ -28,13 +28,13 @@ class AbstractRigRows(AbstractObservations):
     sigma: Float[ArrayLike, "n 3"]
 
     def validation_errors(self) -> Iterator[tuple[int, str]]:
-        """Yield photographs paired with themselves."""
+        """Yield (row, message) for photographs paired with themselves."""
         for row in np.flatnonzero(self.reference == self.image):
             yield int(row), "the image is its own reference; name that of the reference camera of the same event"
 
 
 class RigPlaces(AbstractRigRows):
-    """Places of cameras in their rigs (m), in the axes of the reference camera."""
+    """Positions of cameras in their rigs (m), in the axes of the reference camera."""
 
     group = "rig_places"
     unit = "m"
@@ -62,7 +62,7 @@ class RigTurns(AbstractRigRows):
 
 
 def _reference_for(reference: ImageState, own: RigCamera) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Return position and orientation of the reference camera when the other one exposes."""
+    """Return position and orientation of the reference camera at the exposure of the other camera."""
     at = reference.position, reference.camera_from_object
     return reference_later(own.delay, *at, reference.mount, reference.exposure)
 

@@ -9,9 +9,9 @@ from jaxphoto.observations.base import AXES, AbstractCoordinates, ImageState, in
 
 
 def station_of(image: ImageState) -> Float[Array, "3"]:
-    """Return the error-free GNSS observation at the exposure of an image (m); see `georeferencing.sensor_position`."""
+    """Predict the GNSS observation (m) at the exposure of an image; see `georeferencing.sensor_position`."""
     if not image.parameters:
-        # Without mounts and strips a station is the projection centre.
+        # Without mounts and strips, the station is the projection centre.
         return image.position
     at = sensor_position(image.position, image.camera_from_object, image.mount, image.strip, image.exposure)
     for own in image.parameters.values():
@@ -20,7 +20,7 @@ def station_of(image: ImageState) -> Float[Array, "3"]:
 
 
 class CameraPositions(AbstractCoordinates):
-    """Coordinates of the GNSS/IMU at the exposure of image `who`: `axis` (0, 1, 2), `value` and `sigma` (m)."""
+    """Observed GNSS/IMU coordinates at the exposure of image `who`: `axis` (0, 1, 2), `value` and `sigma` (m)."""
 
     group = "stations"
     unit = "m"
@@ -36,6 +36,6 @@ class CameraPositions(AbstractCoordinates):
         return self.value - station_of(image)[self.axis]
 
     def words(self, images, points) -> np.ndarray:
-        """Labels such as "station of image 12 in Z"."""
+        """Return labels such as "station of image 12 in Z"."""
         rows = zip(self.who, self.axis, strict=True)
         return np.array([f"station of image {images[i]} in {AXES[a]}" for i, a in rows], object)

@@ -1,6 +1,6 @@
 """Constraints on the camera from strip to strip: a random walk of its interior orientation.
 
-A random walk of q (mm^2/h) changes in the time h between the middles of two strips by zero, with the standard deviation
+In the time h between the middles of two strips, a random walk of q (mm^2/h) changes by zero with the standard deviation
 sqrt(q h). Source: Gelb (1974), Applied optimal estimation.
 """
 
@@ -14,7 +14,7 @@ from jaxphoto.observations.base import AbstractObservations, index_of
 
 
 class StripCameraSteps(AbstractObservations):
-    """Differences of c, x_p and y_p of strip `end` from those of strip `start` (mm)."""
+    """Changes of c, x_p and y_p from strip `start` to strip `end` (mm)."""
 
     group = "strip_camera_steps"
     unit = "mm"

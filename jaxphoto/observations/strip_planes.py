@@ -24,7 +24,7 @@ def return_at(
     scanner: Scanner | None,
     calibration: ScannerCalibration | None,
 ) -> Float[Array, "3"]:
-    """Apply `georeferencing.corrected_return` to a point of a strip (m), for a scanner pose with the error `off`."""
+    """Apply `georeferencing.corrected_return` to a point of a strip (m), given the trajectory error `off`."""
     boresight = jnp.zeros(3) if scanner is None else scanner.boresight
     known = ScannerCalibration(jnp.zeros(3)) if calibration is None else calibration
     turn = matrix_from_roll_pitch_yaw(jnp.asarray(roll_pitch_yaw))
@@ -36,9 +36,9 @@ class StripPlanes(AbstractObservations):
 
         normal . (X'_a - X'_b) = gap
 
-    with standard deviation `sigma` (m). `point_a` (m) is the point on strip a's plane as measured, `scanner_a` and
-    `roll_pitch_yaw_a` the pose of the scanner at that time by the trajectory, `velocity_a` (m/s) and `rate_a` (rad/s,
-    about the body's axes) its motion; `knots_a` and `weights_a` define the trajectory error then
+    with standard deviation `sigma` (m). `point_a` (m) is the measured point on the plane of strip a; `scanner_a` and
+    `roll_pitch_yaw_a` the pose of the scanner at that time, from the trajectory; `velocity_a` (m/s) and `rate_a`
+    (rad/s, about the body axes) its motion. `knots_a` and `weights_a` define the trajectory error at that time
     (`georeferencing.StripSpline.weights`). X' is `georeferencing.corrected_return`. `gap` is the observation: zero,
     unless an error is simulated. Without a trajectory the scanner position above is arbitrary.
     """
@@ -82,7 +82,7 @@ class StripPlanes(AbstractObservations):
         scanner: Scanner | None,
         calibration: ScannerCalibration | None,
     ) -> Float[ArrayLike, ""]:
-        """Return the height of b's plane above a's (m), along the normal."""
+        """Return the distance of the plane of b above the plane of a (m), along the normal."""
         known = scanner, calibration
         off_a, off_b = weighted_knot(knots_a, self.weights_a), weighted_knot(knots_b, self.weights_b)
         motion_a, motion_b = (self.velocity_a, self.rate_a), (self.velocity_b, self.rate_b)
@@ -91,11 +91,11 @@ class StripPlanes(AbstractObservations):
         return self.gap - jnp.sum(self.normal * (a - b))
 
     def validation_errors(self) -> Iterator[tuple[int, str]]:
-        """Yield invalid weights and normals."""
+        """Yield (row, message) for invalid weights and normals."""
         yield from weight_flaws(self.weights_a)
         yield from weight_flaws(self.weights_b)
         yield from normal_flaws(self.normal)
 
     def words(self, images, points) -> np.ndarray:
-        """Labels such as "plane 12 of two strips"."""
+        """Return labels such as "plane 12 of two strips"."""
         return np.array([f"plane {k + 1} of two strips" for k in range(len(self))], object)

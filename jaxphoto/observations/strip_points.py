@@ -18,9 +18,9 @@ class StripPoints(AbstractObservations):
 
         normal . (X - F') = rise
 
-    with standard deviation `sigma` (m). `foot` F (m) is a point on the plane as measured by the strip, `scanner` and
-    `roll_pitch_yaw` the pose of the scanner at that time by the trajectory, `velocity` (m/s) and `rate` (rad/s, about
-    the body's axes) its motion; `knots` and `weights` define the trajectory error then
+    with standard deviation `sigma` (m). `foot` F (m) is a point on the plane as measured by the strip; `scanner` and
+    `roll_pitch_yaw` the pose of the scanner at that time, from the trajectory; `velocity` (m/s) and `rate` (rad/s,
+    about the body axes) its motion. `knots` and `weights` define the trajectory error at that time
     (`georeferencing.StripSpline.weights`), and F' is `georeferencing.corrected_return`. `rise` is the observation:
     zero, unless an error is simulated.
     """
@@ -51,17 +51,17 @@ class StripPoints(AbstractObservations):
         scanner: Scanner | None,
         calibration: ScannerCalibration | None,
     ) -> Float[ArrayLike, ""]:
-        """Return the height of the plane above the point (m), along its normal."""
+        """Return the distance of the plane above the point (m), along its normal."""
         off = weighted_knot(knots, self.weights)
         pose = self.scanner, self.roll_pitch_yaw, self.velocity, self.rate
         foot = return_at(self.foot, *pose, off, scanner, calibration)
         return self.rise - jnp.sum(self.normal * (point - foot))
 
     def validation_errors(self) -> Iterator[tuple[int, str]]:
-        """Yield invalid weights and normals."""
+        """Yield (row, message) for invalid weights and normals."""
         yield from weight_flaws(self.weights)
         yield from normal_flaws(self.normal)
 
     def words(self, images, points) -> np.ndarray:
-        """Labels such as "point 12 on its plane of a strip"."""
+        """Return labels such as "point 12 on its plane of a strip"."""
         return np.array([f"point {points[p]} on its plane of a strip" for p in self.point], object)

@@ -10,12 +10,12 @@ from jaxphoto.observations.base import AbstractObservations, index_of
 
 
 class SurfaceRows(AbstractObservations):
-    """Points observed to lie on a surface measured by a laser scanner: on the plane through `foot` (m).
+    """Points observed to lie on a surface measured by a laser scanner, on the tangent plane through `foot` (m).
 
         normal . (X - foot + shift) + turn . boresight = rise
 
-    with standard deviation `sigma` (m), and the shift of the lidar strip and the boresight of `Unknowns.scanner`, if
-    the block has one. `turn` (m/rad) is the rise of `foot` along `normal` per unit of boresight
+    with standard deviation `sigma` (m). Shift of the lidar strip and boresight are from `Unknowns.scanner`, if the
+    block has one. `turn` (m/rad) is the rise of `foot` along `normal` per unit of boresight
     (`georeferencing.raised_by_boresight`). `rise` is the observation: zero, unless an error is simulated.
     """
 
@@ -46,7 +46,7 @@ class SurfaceRows(AbstractObservations):
         self.rise = np.zeros(np.shape(sigma)) if rise is None else rise
 
     def residual(self, point: Float[Array, "3"], scanner: Scanner | None) -> Float[ArrayLike, ""]:
-        """Return the height of the surface above the point (m), along its normal."""
+        """Return the distance of the surface above the point (m), along its normal."""
         apart, rise = point - self.foot, jnp.zeros(())
         if scanner is not None:
             shifts = list(scanner.shifts.values())
@@ -55,5 +55,5 @@ class SurfaceRows(AbstractObservations):
         return self.rise - (jnp.sum(self.normal * apart) + rise)
 
     def words(self, images, points) -> np.ndarray:
-        """Labels such as "point 12 on its surface"."""
+        """Return labels such as "point 12 on its surface"."""
         return np.array([f"point {points[p]} on its surface" for p in self.point], object)

@@ -1,12 +1,12 @@
 """Poses of exposures on the trajectory of a laser scanner, with common errors.
 
-GNSS and IMU observations of an exposure share the errors of the trajectory at that time, dp and da
-(`georeferencing.TrajectoryKnot`, of the surrounding knots), and have little noise of their own:
+GNSS and IMU observations of an exposure contain the errors dp and da of the trajectory at that time (interpolated from
+`georeferencing.TrajectoryKnot`), plus small independent noise:
 
     p = X + R l + dp + noise,    R_p S(da) = R + noise
 
-with the projection centre X, the lever arm l and the attitude R of the body, which follows from that of the camera by
-its boresight (`georeferencing.sensor_position`, `recorded_attitude`). Laser returns of that time have the same dp and
+with the projection centre X, the lever arm l and the attitude R of the body, which follows from the camera attitude and
+the boresight (`georeferencing.sensor_position`, `recorded_attitude`). Laser returns at that time have the same dp and
 da (`observations.strip_planes`). Source: Glira, Pfeifer and Mandlburger (2019), Hybrid orientation of airborne lidar
 point clouds and aerial images.
 """
@@ -29,8 +29,8 @@ from jaxphoto.rotation import matrix_from_roll_pitch_yaw, small_rotation
 class TrajectoryStations(AbstractCoordinates):
     """Coordinates of the trajectory at the exposure of image `who`: `axis` (0, 1, 2), `value` and `sigma` (m).
 
-    `knots` and `weights` define the trajectory error then (`georeferencing.StripSpline.weights`); `sigma` is that of
-    the remaining noise.
+    `knots` and `weights` define the trajectory error at that time (`georeferencing.StripSpline.weights`); `sigma` is
+    the standard deviation of the remaining noise.
     """
 
     group = "trajectory_stations"
@@ -50,13 +50,13 @@ class TrajectoryStations(AbstractCoordinates):
         return self.value - (station_of(image) + off.position)[self.axis]
 
     def validation_errors(self) -> Iterator[tuple[int, str]]:
-        """Yield invalid weights and axes."""
+        """Yield (row, message) for invalid weights and axes."""
         yield from weight_flaws(self.weights)
         for row in np.flatnonzero(~np.isin(self.axis, (0, 1, 2))):
             yield int(row), f"axis is {self.axis[row]}; it is 0, 1 or 2, for X, Y or Z"
 
     def words(self, images, points) -> np.ndarray:
-        """Labels such as "trajectory at image 12 in Z"."""
+        """Return labels such as "trajectory at image 12 in Z"."""
         rows = zip(self.who, self.axis, strict=True)
         return np.array([f"trajectory at image {images[i]} in {AXES[a]}" for i, a in rows], object)
 
@@ -84,11 +84,11 @@ class TrajectoryAttitudes(AbstractObservations):
         return attitude_residual(jnp.matmul(observed, small_rotation(off.attitude)), computed)
 
     def validation_errors(self) -> Iterator[tuple[int, str]]:
-        """Yield invalid weights."""
+        """Yield (row, message) for invalid weights."""
         return weight_flaws(self.weights)
 
     def words(self, images, points) -> np.ndarray:
-        """Labels such as "roll of the trajectory at image 12"."""
+        """Return labels such as "roll of the trajectory at image 12"."""
         return np.array(
             [[f"{axis} of the trajectory at image {images[i]}" for i in self.image] for axis in self.axes], object
         )

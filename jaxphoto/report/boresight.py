@@ -38,11 +38,11 @@ def boresight_verdict(steps: Sequence[Step]) -> str:
     failed = [step.number for step in steps if not step.go_on]
     last = steps[-1].number
     if not failed:
-        return "the misalignment is usable: all four steps are passed"
+        return "the misalignment is usable: all four steps passed"
     names = ", ".join(map(str, failed))
     if last < 4:
-        return f"stopped at step {last}" + ("" if failed == [last] else f"; steps {names} are not passed")
-    return f"do not use the misalignment: step {names} is not passed"
+        return f"stopped at step {last}" + ("" if failed == [last] else f"; failed steps: {names}")
+    return f"do not use the misalignment; failed steps: {names}"
 
 
 def steps_table(steps: Sequence[Step]) -> pd.DataFrame:

@@ -136,14 +136,14 @@ def _statement(certified: Certified) -> tuple[str, str]:
     """Return the first sentence and its colour."""
     colour, severities = certified.summary.get("verdict"), [severity for severity, _ in certified.findings]
     if certified.covariance is None:
-        return "Not to be signed: nothing of this camera was estimated, or no correlations are kept.", "red"
+        return "Not to be signed: no parameter of this camera was estimated, or correlations are missing.", "red"
     if colour == "red":
         first = next((f" First error: {text}" for severity, text in certified.findings if severity == "error"), "")
         return f"Not to be signed: the verdict on the adjustment is red.{first}", "red"
     if colour == "amber":
         return f"Calibrated with {severities.count('warning')} warnings, which are listed under Findings.", "amber"
     if axes := ", ".join(certified.shifted_axes):
-        return f"Calibrated; check points are shifted in {axes}: look into this before signing.", "amber"
+        return f"Calibrated; check points are shifted in {axes}: check this before signing.", "amber"
     return "Calibrated; all tests of the adjustment are passed.", "green"
 
 
@@ -324,8 +324,8 @@ def _stability(certified: Certified) -> Iterator[Part]:
     yield Paragraph(f"Compared with {last.name} (first: that, second: this).")
     if last.shared:
         yield Paragraph(
-            "Both calibrations have images in common: their agreement does not show that nothing has changed. Compare "
-            "with a calibration by other images."
+            "Both calibrations have images in common: their agreement does not prove stability. Compare with a "
+            "calibration from other images."
         )
     yield from (Paragraph(as_sentence(sentence)) for sentence in change_verdict(changed, certified.sensor))
     yield [

@@ -151,7 +151,7 @@ def plot_draws(draws: pd.DataFrame, summary: pd.DataFrame, quantity: str, ax: Ax
     quantities = summary["quantity"].tolist()
     if quantity not in quantities or quantity not in draws:
         names = ", ".join(name for name in quantities if name in draws and not name.startswith(LONG))
-        raise InputError(f"the draws have no {quantity!r}; they have {names}, and those of images and points")
+        raise InputError(f"unknown quantity {quantity!r} of the draws; use one of {names}, or one of images or points")
     ax = axes_or_new(ax)
     _draw_histogram(ax, quantity, draws[quantity].to_numpy(float), summary)
     return ax
@@ -185,7 +185,7 @@ def plot_effects(
     names = list(quantities)
     available = [name for name in summary["quantity"] if name in effects]
     if missing := [name for name in names if name not in available]:
-        raise InputError(f"the effects have no {missing[0]!r}; they have {', '.join(available)}")
+        raise InputError(f"unknown quantity {missing[0]!r} of the effects; use one of {', '.join(available)}")
     ax, predicted = axes_or_new(ax), summary.set_index("quantity")["predicted_sigma"][names].to_numpy()
     fractions = effects[names].to_numpy() / np.where(predicted > 0, predicted, np.nan)
     image = ax.imshow(fractions, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")

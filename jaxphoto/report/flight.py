@@ -119,7 +119,7 @@ def _findings(part: FlightPart) -> Iterator[Finding]:
         used = part.placed.used
         yield Finding("positions_rejected", "warning", value=int((~used).sum()), numbers={"n": len(used)})
     if report.alike > CORRELATED:
-        hint = "jaxphoto halves on the block determines the factor better"
+        hint = "Run jaxphoto halves on the block for a better factor"
         yield Finding("correlated_residuals", "warning", value=report.alike, limit=CORRELATED, hint=hint)
 
 
@@ -259,7 +259,7 @@ def positions_section(report: PartReport, source: FlightSource) -> Iterator[Part
     yield Heading("Recorded positions")
     yield from (Paragraph(as_sentence(s)) for s in source.positions_from)
     if not part.placed:
-        yield Paragraph(f"No recorded position is used: {part.why_not or 'there are none'}.")
+        yield Paragraph(f"No recorded position is used: {part.why_not or 'none was read'}.")
         return
     if part.why_not:
         yield Paragraph(f"They place the block, but are not observed: {part.why_not}.")

@@ -71,7 +71,7 @@ def plot_position_offsets(report: PartReport, ax: Axes | None = None, *, upright
     Raises InputError if the part has no recorded positions.
     """
     if not report.part.placed:
-        raise InputError(f"no recorded position of this part is used: {report.part.why_not or 'there are none'}")
+        raise InputError(f"no recorded position of this part is used: {report.part.why_not or 'none was read'}")
     ax, (d, has, used) = axes_or_new(ax), offsets_less_mean(report)
     if upright:
         ax.bar(np.flatnonzero(has), d[has, 2], color=np.where(used[has], "tab:blue", "tab:red"))
@@ -89,7 +89,7 @@ def plot_position_offsets(report: PartReport, ax: Axes | None = None, *, upright
     if has.any():
         size = float(f"{max(np.median(np.hypot(*d[has].T)), 1e-3):.0e}")
         scale = 15 * size / max(np.ptp(station, axis=0).max(), 1e-9)
-        for rows, colour, name in ((has & ~used, "tab:red", "left out"), (used, "tab:blue", "used")):
+        for rows, colour, name in ((has & ~used, "tab:red", "rejected"), (used, "tab:blue", "used")):
             style = {"angles": "xy", "scale_units": "xy", "scale": scale, "color": colour, "width": 0.005}
             arrows = ax.quiver(*station[rows].T, *d[rows].T, label=name, **style)
         ax.quiverkey(arrows, 0.75, 1.04, size, f"{size:g} m", labelpos="E")

@@ -294,7 +294,7 @@ TABLE_FORMATS = tuple(_WRITERS)
 def check_table_format(kind: str) -> None:
     """Raise InputError for an unknown table format."""
     if kind not in _WRITERS:
-        raise InputError(f"there is no table format {kind}: give {', '.join(TABLE_FORMATS)}")
+        raise InputError(f"unknown table format {kind}; use one of {', '.join(TABLE_FORMATS)}")
 
 
 def write_table(table: pd.DataFrame, name: str, folder: Path, kind: str) -> Path:

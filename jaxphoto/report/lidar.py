@@ -134,7 +134,7 @@ def plot_lidar_heights(control: LidarControl, ax: Axes | None = None, *, residua
     """
     points, used = np.asarray(control.adjusted.unknowns.points)[control.points], control.used
     if residuals and not used.any():
-        raise InputError("no height of the cloud is control: there are no residuals to be drawn")
+        raise InputError("no height of the cloud is used as control: no residuals to draw")
     ax = axes_or_new(ax)
     if residuals:
         difference = (control.height - points[:, 2])[used]
@@ -142,8 +142,8 @@ def plot_lidar_heights(control: LidarControl, ax: Axes | None = None, *, residua
         _draw_heights(ax, points[used], difference, difference, "cloud minus adjusted height [m]", name)
         return ax
     missing = ~np.isfinite(control.height)
-    sets = ((missing, "refused", "0.6", "+"), (used, "control", "tab:blue", "o"))
-    for chosen, words, colour, marker in (*sets, (~used & ~missing, "left out", "#D55E00", "x")):
+    sets = ((missing, "no height", "0.6", "+"), (used, "control", "tab:blue", "o"))
+    for chosen, words, colour, marker in (*sets, (~used & ~missing, "rejected", "#D55E00", "x")):
         ax.plot(*points[chosen, :2].T, marker, ms=5, color=colour, ls="none", label=f"{words} ({chosen.sum()})")
     ax.legend(loc="best", fontsize=8)
     title(ax, "heights of the cloud")

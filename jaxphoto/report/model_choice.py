@@ -113,7 +113,7 @@ def plot_models(choice: ModelChoice, ax: Axes | None = None, *, rms: bool = Fals
     """
     judged = [j for j in choice.judged if math.isfinite(j.bic)]
     if not judged:
-        raise InputError("no model could be adjusted: there is nothing to be drawn")
+        raise InputError("no model could be adjusted; see the problems in choice.judged")
     ax, at = axes_or_new(ax), np.arange(len(judged))
     if rms:
         ax.plot([j.rms_px for j in judged], at, "o", color="0.5", label="adjusted")

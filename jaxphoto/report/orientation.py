@@ -40,8 +40,8 @@ def orientation_sentences(report: OrientationReport) -> list[str]:
     ]
     if not report.settled:
         sentences.append(
-            f"warning: the selection of image points did not converge in {report.rounds} iterations: false matches or "
-            "an unsuitable distortion model (--model)"
+            f"warning: the selection of image points did not converge in {report.rounds} iterations: check for "
+            "false matches or an unsuitable distortion model (--model)"
         )
     elif not report.converged:
         sentences.append("warning: the last adjustment did not converge; adjust with more iterations (--max-steps)")

@@ -54,7 +54,7 @@ def axes_or_new(axes: Axes | None, *, in_3d: bool = False) -> Axes:
         figure = pyplot.figure(figsize=(6.4, 5.6), layout="constrained")
         return figure.add_subplot(projection="3d" if in_3d else None)
     if in_3d and axes.name != "3d":
-        raise InputError('in_3d draws on axes in space: make them with subplot_kw={"projection": "3d"}')
+        raise InputError('in_3d needs 3D axes; create them with subplot_kw={"projection": "3d"}')
     return axes
 
 
@@ -237,7 +237,7 @@ def plot_station_residuals(tables: Tables, ax: Axes | None = None) -> Axes:
     """Draw residuals of camera stations in the order of the flight. Raises InputError without observed stations."""
     a = tables.adjusted
     if not len(a.block.stations.who):
-        raise InputError("the block has no observed stations to be drawn")
+        raise InputError("the block has no observed stations to draw")
     ax = axes_or_new(ax)
     time = np.asarray(a.block.image_time if a.block.flight_time is None else a.block.flight_time, float)
     # Use times only if they are unique; times relative to the middle of each strip are not.
@@ -267,7 +267,7 @@ def plot_check_points(
     Arrows are scaled for a length of `key` metres. Raises InputError without check points.
     """
     if not len(tables.check_points):
-        raise InputError("the block has no check points to be drawn")
+        raise InputError("the block has no check points to draw")
     ax, a, d = axes_or_new(ax), tables.adjusted, discrepancies(tables)
     key = round_key(d) if key is None else key
     number = {point: k for k, point in enumerate(a.block.points)}
@@ -350,7 +350,7 @@ def draw_sigma_map(axes: Axes, sensor: Sensor, one: SigmaMap) -> None:
     """Draw the standard deviation in the worst direction (px), with contours at round values."""
     x, y = (np.unique(v) for v in one.points.T)
     if len(x) * len(y) != len(one.points):
-        raise ValueError("a map is drawn of cells in rows and columns")
+        raise ValueError("the points of a map must form a grid of rows and columns")
     worst = np.ma.masked_invalid(one.worst.reshape(len(y), len(x)) / sensor.pixel_mm)
     levels = _levels(worst.compressed())
     if levels:

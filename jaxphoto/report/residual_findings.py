@@ -116,7 +116,7 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
                 numbers = p | {"factor": factor, "size": size}
                 yield Finding("group_sigma", "warning", f.group.replace("_", " "), f.sigma, 1.0, hint, numbers)
             elif f.sigma < 1 and not (f.group == PRIORS and _priors_of_lens_type(tables.adjusted.block)):
-                hint = "If it comes from the same images they count twice and sigmas are too small: remove it"
+                hint = "If it was estimated from the same images, remove it: sigmas are too small"
                 yield Finding("prior_counted_twice", "warning", value=f.sigma, limit=1.0, hint=hint, numbers=p)
         return
     groups = ", ".join(f"{f.group.replace('_', ' ')} {f.sigma:.3g}" for f in factors)
@@ -229,7 +229,7 @@ def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
                 matters, spoilt = True, moved > _SPOILT_BY_EFFECT
                 detail += f"; {path} would move by {moved:.1f} sigma"
         elif t.pattern.camera:
-            detail += ": no single usual term is most of it; try a distortion of more terms (docs/stability.md)"
+            detail += ": no single common term explains most of it; try a model with more terms (docs/stability.md)"
         elif several := [h for h in t.hints if abs(h.amount) > SIGNIFICANT_RATIO * h.sigma][:_SHOWN]:
             detail += f", each alone {_terms(t.pattern, several)}"
         # Count the suspects explained by the terms: these are not blunders.
@@ -373,7 +373,7 @@ def _too_many(snooped: Snooped, block: Block) -> Iterator[Finding]:
     mistakes = coordinate_mistakes(snooped, block)
     for name, counts in mostly_rejected(snooped, block).items():
         many = ", ".join(f"{n} of {of} in {axis}" for axis, (n, of) in counts.items())
-        hint = "Check their units, axes, names and signs, and what is held fixed"
+        hint = "Check their units, axes, names and signs, and the fixed values"
         if name in mistakes:
             hint = f"They fit if {mistakes[name]}: correct them at their source"
         yield Finding("rejected_group", "error", f"{name.replace('_', ' ')}, {many}", hint=hint)
@@ -403,7 +403,7 @@ def component_findings(components: VarianceComponents, blunders: Sequence[Inflat
     """Report components caused by blunders, missing convergence, and groups whose component is not estimable."""
     found = []
     for component in blunders:
-        hint = "Blunders are no measure of precision: adjust with --snoop as well"
+        hint = "Adjust with --snoop as well: blunders inflate variance components"
         numbers = {"words": few(list(component.words))}
         found.append(
             Finding("component_blunder", "error", component.label, component.factor, component.without, hint, numbers)

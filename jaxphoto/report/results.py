@@ -119,7 +119,7 @@ def write_tables(tables: Tables, directory: str | Path, kind: str = "csv", names
     check_table_format(kind)
     known = table_names(tables)
     if missing := [name for name in names if name not in known]:
-        raise InputError(f"there is no table {missing[0]}; there are {', '.join(known)}")
+        raise InputError(f"unknown table {missing[0]}; use one of {', '.join(known)}")
     with whole_folder(Path(directory)) as work:
         for name in names or known:
             write_table(getattr(tables, name), name, work, kind)
@@ -511,7 +511,7 @@ def convergence_words(adjusted: Adjustment) -> str:
         return f"{words}. Converged: the last moved no unknown by more than {last:.1e} of its standard deviation."
     if adjusted.outcome is Outcome.STEPS:
         moved = f"; the last would still move unknowns by up to {last:.2g} sigma" if np.isfinite(last) else ""
-        return f"{words}, which is the limit (--max-steps){moved}."
+        return f"{words}, the maximum (--max-steps){moved}."
     return f"{words}. {adjusted.outcome.value.partition(': ')[2]}."
 
 
@@ -533,8 +533,8 @@ def assumed_pixel_words(sensors: Mapping[str, Sensor]) -> str:
         return ""
     which = "of every camera" if len(cameras) == len(sensors) else f"of {', '.join(cameras)}"
     return (
-        f"The pixel size {which} is unknown: {sensors[cameras[0]].pixel_mm:g} mm is assumed. c, the principal point "
-        "and all else in mm or its powers scale with it; numbers in pixels and on the ground do not."
+        f"The pixel size {which} is unknown: {sensors[cameras[0]].pixel_mm:g} mm is assumed. All camera "
+        "parameters in mm or its powers scale with it; values in pixels and on the ground do not."
     )
 
 

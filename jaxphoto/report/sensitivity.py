@@ -184,7 +184,7 @@ def plot_sensitivity(tables: SensitivityTables, title: str, ax: Axes | None = No
     `title` is a key of `tables.panels`, such as `c_mm`. Raises InputError for an unknown title.
     """
     if title not in tables.panels:
-        raise InputError(f"there is no {title!r} to be drawn; there are {'; '.join(tables.panels)}")
+        raise InputError(f"unknown estimate {title!r}; use one of {'; '.join(tables.panels)}")
     ax = axes_or_new(ax)
     _draw_effects(ax, tables, title)
     ax.legend(fontsize=8)

@@ -48,7 +48,7 @@ class Compared(NamedTuple):
 def about_sets(sets: tuple[Compared, Compared]) -> list[str]:
     """Describe both calibrations, the source of the uncertainty, and assumed pixel sizes."""
     without = [one.name for one in sets if not one.known]
-    uncertainty = "Uncertainty by the covariances of both sets, which are assumed to be of different images."
+    uncertainty = "Uncertainty from the covariances of both sets, assuming different images."
     if len(without) == 1:
         uncertainty = f"{without[0]} has no covariance and is assumed exact: the uncertainty is that of the other set."
     elif without:
@@ -216,7 +216,7 @@ def change_verdict(change: Change, sensor: Sensor) -> list[str]:
             f"{p_words(change.p_parameters, 2)}: {change_meaning(change.p_parameters)}"
         )
     elif not change.parameters:
-        sentences.append("the calibrations are of different models, so their parameters are not compared")
+        sentences.append("parameters are not compared: the calibrations have different models")
     if held := [one.parameter for one in change.parameters if one.sigma == 0 and one.difference != 0]:
         sentences.append(f"fixed at different values and not tested: {', '.join(held)}")
     field = change.field.uncertainty
@@ -379,15 +379,15 @@ def halves_verdict(halves: Halves) -> list[str]:
     unit, fraction = halves.leading
     if n >= _ENOUGH_CUTS and fraction > _LEADS:
         sentences.append(
-            f"{100 * fraction:.0f} % of the squared differences follow {halves.by} {unit} alone: it contradicts the "
-            "others or determines what they cannot; compare with a calibration without it"
+            f"{100 * fraction:.0f} % of the squared differences are caused by {halves.by} {unit} alone: it contradicts "
+            "the others or determines more than they do; compare with a calibration without it"
         )
     if halves.failed:
         sentences.append(
             f"{len(halves.failed)} of {n + len(halves.failed)} splits could not be compared, the first: "
             f"{halves.failed[0].problem}"
         )
-    return [*sentences, "errors common to both halves, such as those of fixed points, show in no difference"]
+    return [*sentences, "errors common to both halves, such as those of fixed points, are undetectable"]
 
 
 def plot_halves(halves: Halves, ax: Axes | None = None, *, band: bool = False) -> Axes:

@@ -148,7 +148,7 @@ def strips_verdict(result: StripAdjustment, tables: Tables | None) -> Verdict:
 def _lookups(result: StripAdjustment) -> Iterator[Finding]:
     if not result.converged:
         n, change = len(result.rounds), result.rounds[-1].largest_change
-        hint = "Ask for more iterations"
+        hint = "Increase the maximum number of iterations"
         yield Finding("lookups_not_converged", "error", value=change, hint=hint, numbers={"n": n})
 
 
@@ -162,7 +162,7 @@ def _steps(result: StripAdjustment) -> Iterator[Finding]:
         if over_sigma > _CONTRADICTS:
             largest = [np.abs(errors[s.first : s.first + s.size]).max() for s in result.errors.splines]
             k = int(np.argmax(largest))
-            hint = "Check the heights and the system of this strip, and its trajectory"
+            hint = "Check the heights, coordinate system and trajectory of this strip"
             numbers = {"unit": unit, "change": over_sigma}
             yield Finding(
                 "strip_contradiction", "error", result.cloud.strips[k], float(largest[k]), hint=hint, numbers=numbers
@@ -212,10 +212,10 @@ def _sigma_naught(result: StripAdjustment) -> Iterator[Finding]:
         small = whole.factor < 1
         gaps = f"gaps of planes are {'smaller' if small else 'larger'} than expected by their roughness"
         if result.trajectory is None:
-            hint = "" if small else "Further errors than shifts need a trajectory (--trajectory)"
+            hint = "" if small else "Add a trajectory (--trajectory) to estimate more than shifts"
         else:
             gaps += " and the trajectory's standard deviations"
-            hint = "These are too large" if small else "These are too small, or knots too far apart"
+            hint = "Reduce these" if small else "Increase these, or reduce the knot spacing"
         # Without a trajectory, shifts cannot model all errors: report only a warning.
         absurd = result.trajectory is not None and whole.factor > _CONTRADICTS**2
         severity: Severity = "error" if absurd else "warning"
@@ -274,7 +274,7 @@ def plot_scanner_correlation(result: StripAdjustment, ax: Axes | None = None, *,
     rho, scanner, others = _scanner_and_others(result)
     columns = scanner if itself else others
     if not scanner or not columns:
-        raise InputError(f"nothing of {'the scanner' if not scanner else 'cameras and mounts'} is estimated here")
+        raise InputError(f"no parameters of {'the scanner' if not scanner else 'cameras and mounts'} are estimated")
     ax, name = axes_or_new(ax), f"scanner with {'itself' if itself else 'camera and mount'}"
     draw_matrix(ax, rho.loc[scanner, columns].to_numpy(), _short(scanner), _short(columns), name)
     return ax
@@ -314,7 +314,7 @@ def plot_trajectory_errors(
     Raises InputError for an unknown strip.
     """
     if strip not in result.cloud.strips:
-        raise InputError(f"there is no strip {strip!r}; there are {', '.join(result.cloud.strips)}")
+        raise InputError(f"unknown strip {strip!r}; use one of {', '.join(result.cloud.strips)}")
     ax, k, (unit, factor, names) = axes_or_new(ax), result.cloud.strips.index(strip), _COMPONENTS[attitude]
     spline = result.errors.splines[k]
     at = np.linspace(spline.times[0], spline.times[-1], _PLACES * spline.size)

@@ -55,7 +55,7 @@ def sweep_table(sweep: Sweep) -> pd.DataFrame:
     names = list(sweep.parameters[0])
     taken = [name for name in names if name in _COLUMNS]
     if taken:
-        raise InputError(f"a parameter of the designs is called {taken[0]}, like a column of the table: rename it")
+        raise InputError(f"design parameter {taken[0]} has the name of a table column; rename it")
     columns = list(_columns(sweep))
     design = np.repeat(np.arange(len(sweep)), len(columns))
     n = len(sweep)
@@ -143,8 +143,8 @@ def _chosen(table: pd.DataFrame, x: str, quantity: str, of: str, by: Sequence[st
         raise InputError(f"the table has no {quantity} of {of}: look at table[['quantity', 'of']].drop_duplicates()")
     if rows.duplicated([x, *by]).any():
         raise InputError(
-            f"several designs have the same {', '.join([x, *by])}: take a part of the table in which these "
-            "identify each design, or name more parameters in by"
+            f"several designs have the same {', '.join([x, *by])}: select rows in which these identify "
+            "each design, or add parameters to by"
         )
     return rows
 

@@ -81,7 +81,7 @@ class Tables:
         self.rotations: Rotations = rotations
         self.truth = truth
         if known is not None and known.rotations != "omega_phi_kappa":
-            raise ValueError(f"known is the covariance with omega, phi, kappa, not with {known.rotations!r}")
+            raise ValueError(f"known: rotations {known.rotations!r}; use the covariance with omega, phi, kappa")
         self._known = known
 
     def __repr__(self) -> str:

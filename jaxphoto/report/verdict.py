@@ -108,7 +108,7 @@ def _not_converged(adjusted: Adjustment) -> Iterator[Finding]:
     if sigma0 <= NOTHING_FITS:
         yield from (Finding("undetermined", "error", w.sentence) for w in weaknesses_of(adjusted))
     elif np.isfinite(sigma0):
-        hint = "jaxphoto adjust --snoop looks for observations that contradict the others, and for mistakes of files"
+        hint = "Run jaxphoto adjust --snoop to find contradicting observations and mistakes in files"
         yield Finding("nothing_fits", "error", value=sigma0, limit=NOTHING_FITS, hint=hint)
 
 
@@ -119,14 +119,14 @@ def behind_findings(adjusted: Adjustment) -> Iterator[Finding]:
     away = looking_away(block, seen)
     if names := [block.images[k] for k in away]:
         hint = (
-            "It is mirrored: x and y of its image points are exchanged or one of them has the wrong sign; if this "
-            "holds for all images, the vertical direction is wrong"
+            "The image is mirrored: x and y of its image points are exchanged or one has the wrong sign; if all images "
+            "are affected, the vertical direction is wrong"
         )
         yield Finding("mirrored_image", "error", few(names), len(names), hint=hint)
     behind = np.flatnonzero(~seen & ~np.isin(rows.image, away))
     if len(behind):
         names = [f"{block.points[rows.point[k]]} in {block.images[rows.image[k]]}" for k in behind]
-        hint = "Their rays are nearly parallel or wrong: remove them"
+        hint = "Remove them: their rays are nearly parallel or wrong"
         yield Finding("points_behind", "warning", few(names), len(names), hint=hint)
 
 
@@ -152,7 +152,7 @@ def duplicate_findings(block: Block) -> Iterator[Finding]:
     if pairs := duplicate_images(block):
         one, other, n = pairs[0]
         others = f"; {len(pairs) - 1} further pairs" if len(pairs) > 1 else ""
-        hint = "Delete one of each pair: counted twice, it makes standard deviations too small"
+        hint = "Delete one of each pair: standard deviations are too small if both are used"
         subject = f"{one} and {other}"
         yield Finding("duplicate_images", "warning", subject, n, hint=hint, numbers={"others": others})
 
@@ -194,14 +194,14 @@ def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
     if rho > WEAK_CORRELATION and corner["c_mm"] > FELT:
         why, cure = _stations(adjusted, images, (2,))
         percent = 100 * sigma["c_mm"] / float(adjusted.unknowns.interior[camera].c)
-        hint = f"{cure}, relief, a second flying height or oblique images, or hold c fixed"
+        hint = f"{cure}, relief, a second flying height or oblique images, or fix c"
         add("c_weak", _C, sigma["c_mm"], hint, {"percent": percent, "rho": rho, "why": why})
     tilt, shift = _strongest(c, _TILTS, _POINT), _strongest(c, _PLAN, _POINT)
     moved = max((corner[name] for name in _POINT if name in corner), default=0.0)
     if max(tilt, shift) > WEAK_CORRELATION and moved > FELT:
         why, cure = _stations(adjusted, images, (0, 1))
         sigmas = ", ".join(f"sigma of {symbol(name)} {sigma[name]:.3g} mm" for name in _POINT if name in sigma)
-        hint = f"{cure} with strips in both directions, relief or oblique images, or hold it fixed"
+        hint = f"{cure} with strips in both directions, relief or oblique images, or fix it"
         numbers = {"sigmas": sigmas, "tilts": " and ".join(c.eop_names[_TILTS]), "tilt": tilt, "shift": shift}
         add("principal_point_weak", _POINT, max(sigma.get(n, 0.0) for n in _POINT), hint, {**numbers, "why": why})
     return findings
@@ -246,8 +246,8 @@ def _stations(adjusted: Adjustment, images: np.ndarray, axes: tuple[int, ...]) -
     loose = {name for name, bias in priors.strips.items() if bias.shift != FIXED}
     swung = {name for name, mount in priors.mounts.items() if mount.lever_arm != FIXED}
     if all(block.image_strip[i] in loose or block.image_mount[i] in swung for i in observed):
-        why = "stations separate them only as well as their shifts and lever arms are known"
-        return why, "Hold these fixed, or add camera stations (GNSS) that do not shift"
+        why = "estimated shifts or lever arms of the stations hardly separate them"
+        return why, "Fix these, or add camera stations (GNSS) that do not shift"
     sigma = float(np.median(np.asarray(block.stations.sigma)[rows]))
     return f"stations of sigma {sigma:.2g} m hardly separate them", "Add better camera stations (GNSS)"
 
@@ -322,7 +322,7 @@ def _correlated(
         ]
         weak = [p for p in dict.fromkeys(c.parameters[j] for _, j in high) if p in felt]
         cures = [_FOR_FIELD] if field else list(dict.fromkeys(_CURES.get(p, _FOR_DISTORTION) for p in weak))
-        hint = f"Add {', or '.join(cures)}" if weak else f"Its uncertainty moves no image corner by {FELT:g} sigma"
+        hint = f"Add {', or '.join(cures)}" if weak else f"Its effect on the image corners is below {FELT:g} sigma"
         severity: Severity = "warning" if weak else "note"
         yield finding("correlation_exterior", severity, float(worst.max()), names, hint)
     within = np.abs(c.within_image).max(axis=0)

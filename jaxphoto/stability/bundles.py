@@ -1,4 +1,4 @@
-"""Bundles of rays of interior orientations: alignment, offsets and their RMSE, uncertainty over the format.
+"""Bundles of rays of interior orientations: alignment, offsets and RMSE, uncertainty over the format.
 
 With the rays (x1, -c1) and (x2, -c2) of the same measured image points, in mm, the offsets v on the virtual image plane
 of the first bundle are
@@ -8,8 +8,8 @@ of the first bundle are
     spr    v = -c1 q_xy / q_z - x2 c1 / c2,   q = R (P - X0)                second bundle resected, v'v minimal
 
 where P = d (x1, -c1) / c1 are object points on the first bundle's rays, at depths d. Bundles that differ only by the
-alignment are equivalent in use: none if position and attitude are observed and the camera is fixed to these sensors
-(zrot), the attitude if positions are observed (rot), both in indirect georeferencing (spr).
+alignment are equivalent in use. The alignment is none if position and attitude are observed and the camera is fixed to
+these sensors (zrot), the attitude if only positions are observed (rot), and both in indirect georeferencing (spr).
 Source: Habib, Pullivelli, Mitishita, Ghanma and Kim, Photogrammetric Record 21 (2006), 29-43.
 """
 
@@ -33,7 +33,7 @@ from jaxphoto.short_repr import pretty_repr
 def image_grid(
     sensor: Sensor, columns: int = 15, rows: int = 11, extent_mm: tuple[float, float] | None = None
 ) -> Float[np.ndarray, "points 2"]:
-    """Measured image points (mm from the image centre) of a regular grid, row by row from the lower left.
+    """Return a regular grid of measured image points (mm from the image centre), row by row from the lower left.
 
     `columns` x `rows` points cover the format, or a centred rectangle `extent_mm` (width and height), from edge to
     edge. Raises ValueError for fewer than 2 columns or rows, and for an extent that is not positive.
@@ -48,7 +48,7 @@ def image_grid(
 
 
 def image_rays(interior: InteriorOrientation, points: Float[ArrayLike, "points 2"]) -> Float[Array, "points 3"]:
-    """Bundle of rays (x', y', -c) in mm, in the camera frame, of measured image points (mm from the centre).
+    """Return the bundle of rays (x', y', -c) in mm, in the camera frame, of measured image points (mm from the centre).
 
     x' is the distortion-free coordinate from the principal point, on the virtual image plane at distance c, for any
     projection; rays must be within 90 degrees of the axis.
@@ -63,12 +63,12 @@ def image_rays(interior: InteriorOrientation, points: Float[ArrayLike, "points 2
 
 
 def parameter_vector(interior: InteriorOrientation) -> Float[Array, "parameters"]:
-    """Values of `jaxphoto.camera.parameter_names`, in their order and units."""
+    """Return the values of `jaxphoto.camera.parameter_names`, in their order and units."""
     return jnp.stack([jnp.asarray(get_parameter(interior, name), float) for name in parameter_names(interior)])
 
 
 def with_parameters(interior: InteriorOrientation, vector: Float[Array, "parameters"]) -> InteriorOrientation:
-    """`interior` with the values of a `parameter_vector`; constants of its model are kept."""
+    """Return `interior` with the values of a `parameter_vector`; constants of the model are unchanged."""
     for name, value in zip(parameter_names(interior), vector, strict=True):
         interior = set_parameter(interior, name, value)
     return interior
@@ -77,18 +77,18 @@ def with_parameters(interior: InteriorOrientation, vector: Float[Array, "paramet
 Method = Literal["zrot", "rot", "spr"]
 METHODS: tuple[Method, ...] = ("zrot", "rot", "spr")
 UNKNOWNS: dict[Method, int] = {"zrot": 0, "rot": 3, "spr": 6}
-"""Number of unknowns of the alignment: three angles (rad), then the position in units of the object distance."""
+"""Number of unknowns of the alignment: three angles (rad), then position in units of the object distance."""
 ALIGNED: dict[Method, str] = {
     "zrot": "not aligned",
     "rot": "aligned by rotation",
     "spr": "aligned by rotation and translation",
 }
-"""Labels of the alignments."""
+"""Labels of the alignment methods."""
 
 # Maximum number of Gauss-Newton steps; bundles of one camera need 3 to 6.
 _MAX_STEPS = 50
 _STEP_TOLERANCE = 1e-13
-# Largest cosine between the offsets and their derivatives at an optimum.
+# Maximum cosine between the offsets and their derivatives at an optimum.
 _GRADIENT_TOLERANCE = 1e-9
 
 
@@ -99,7 +99,7 @@ def offsets_of(
     depth: Float[Array, "points"],
     method: Method,
 ) -> Float[Array, "points 2"]:
-    """Offsets v (mm) of two bundles under an alignment of `UNKNOWNS` values; see the module's docstring."""
+    """Compute the offsets v (mm) of two bundles for an alignment of `UNKNOWNS` values; see the module's docstring."""
     c1, c2 = -first[0, 2], -second[0, 2]
     if method == "zrot":
         return first[:, :2] - second[:, :2] * (c1 / c2)
@@ -115,8 +115,8 @@ def align(
 ) -> tuple[Float[Array, "u"], Bool[Array, ""]]:
     """Minimise v'v over the alignment; the flag is True at convergence.
 
-    Gauss-Newton from the identity. Derivatives of any order are those of the optimum, by the implicit function theorem
-    applied to its gradient.
+    Uses Gauss-Newton iterations from the identity. Derivatives of any order follow from the implicit function theorem,
+    applied to the gradient at the optimum.
     """
     if not UNKNOWNS[method]:
         return jnp.zeros(0), jnp.array(True)
@@ -136,7 +136,7 @@ def align(
         def body(state):
             alignment, _, k = state
             columns = jax.jacfwd(offsets)(alignment)
-            # At most six well separated unknowns: normal equations suffice and compile three times faster.
+            # Use normal equations: sufficient for six well-conditioned unknowns, and three times faster to compile.
             step = solve(columns.T @ columns, columns.T @ offsets(alignment))
             return alignment - step, step, k + 1
 
@@ -153,42 +153,42 @@ def align(
 
 @pretty_repr
 class BundleOffsets(eqx.Module):
-    """Offsets of two bundles after alignment, on the first one's virtual image plane, in mm.
+    """Offsets (mm) of two bundles after alignment, on the virtual image plane of the first bundle.
 
-    `alignment` is (small rotation in rad, position in units of the object distance), the unknowns of the method.
-    `jacobian` is dv/dp of the offsets, point by point x then y, by `parameter_vector` of the first and then of the
-    second interior orientation, including the change of the optimal alignment; it propagates covariances.
+    `alignment`: unknowns of the method (small rotation in rad, position in units of the object distance). `jacobian`:
+    dv/dp of the offsets (x, then y, point by point) with respect to the `parameter_vector` of the first and then of the
+    second interior orientation, including the change of the optimal alignment; used to propagate covariances.
     """
 
     points: Float[Array, "points 2"]
     offsets: Float[Array, "points 2"]
     measured: Float[Array, "points 2"]
-    """Offsets in the measured image, by the first distortion; independent of R0."""
+    """Offsets converted to the measured image by the first distortion; independent of R0."""
     alignment: Float[Array, "u"]
     jacobian: Float[Array, "2*points parameters"]
     stretch: Float[Array, "points 2 2"]
-    """d(ideal) / d(measured) coordinate of the first camera: `offsets` are `stretch` times `measured`."""
+    """Derivative d(ideal) / d(measured) of the first camera: `offsets` = `stretch` times `measured`."""
     converged: Bool[Array, ""]
 
     @property
     def measured_jacobian(self) -> Float[Array, "coordinates parameters"]:
-        """dv/dp like `jacobian`, of the offsets in the measured image, to first order."""
+        """Return dv/dp like `jacobian`, for the offsets in the measured image, to first order."""
         by_point = self.jacobian.reshape(len(self.points), 2, -1)
         return jax.vmap(solve)(self.stretch, by_point).reshape(self.jacobian.shape)
 
     @property
     def redundancy(self) -> int:
-        """2 n - u: coordinates of the grid minus unknowns of the alignment."""
+        """Return 2 n - u: number of coordinates of the grid minus number of unknowns of the alignment."""
         return 2 * len(self.points) - len(self.alignment)
 
     @property
     def rmse_mm(self) -> Float[Array, ""]:
-        """RMSE_offset = sqrt(v'v / (2 n - u)), in mm (paper 002)."""
+        """Return RMSE_offset = sqrt(v'v / (2 n - u)) in mm (paper 002)."""
         return ((self.offsets**2).sum() / self.redundancy) ** 0.5
 
     @property
     def rmse_measured_mm(self) -> Float[Array, ""]:
-        """RMSE_offset of `measured`, comparable with the noise of measured coordinates for large distortion."""
+        """Return RMSE_offset of `measured`, comparable with the noise of measured coordinates at any distortion."""
         return ((self.measured**2).sum() / self.redundancy) ** 0.5
 
 
@@ -199,11 +199,11 @@ def rmse_offset(
     method: Method = "rot",
     depth: Float[ArrayLike, "points"] | None = None,
 ) -> Float[Array, ""]:
-    """RMSE_offset (mm) of two interior orientations over image points (mm, from the centre; see `image_grid`).
+    """Compute RMSE_offset (mm) of two interior orientations at image points (mm from the centre; see `image_grid`).
 
-    `sqrt(v'v / (2 n - u))`, for any distortion models. `depth` is that of the object points of the method spr, in units
-    of their mean distance; flat if None. A pure function for `jax.jit`, `jax.grad` and `jax.vmap`; for equal bundles it
-    is a norm at zero without derivative: differentiate `bundle_offsets` there.
+    RMSE_offset = `sqrt(v'v / (2 n - u))`, for any distortion models. `depth` is the depth of the object points for the
+    method spr, in units of their mean distance; flat if None. A pure function for `jax.jit`, `jax.grad` and `jax.vmap`.
+    For equal bundles the norm is not differentiable: differentiate `bundle_offsets` instead.
     Source: paper 002, section on stability analysis; Habib et al. (2006).
     """
     v = _aligned(first, second, points, method, _depths(points, depth))[0]
@@ -228,7 +228,7 @@ def bundle_offsets(
 
 
 def check_rays(interior: InteriorOrientation, points: Float[ArrayLike, "points 2"], name: str) -> None:
-    """Raise InputError if the distortion of `interior` is not invertible or has no ray ahead at some of `points`."""
+    """Raise InputError if, at some of `points`, the distortion is not invertible or the ray points backward."""
     regular = regular_rays(interior, points)
     if not regular.all():
         radius = np.hypot(*np.asarray(points)[~regular].T).min()
@@ -239,7 +239,7 @@ def check_rays(interior: InteriorOrientation, points: Float[ArrayLike, "points 2
 
 
 def regular_rays(interior: InteriorOrientation, points: Float[ArrayLike, "points 2"]) -> Bool[ArrayLike, "points"]:
-    """Return True for image points (mm) with an invertible distortion and a ray ahead."""
+    """Return True for image points (mm) with an invertible distortion and a forward ray."""
     return to_numpy(call_compiled(_regular, as_arrays(interior), jnp.asarray(points, float)))
 
 
@@ -258,7 +258,7 @@ def _bundle_offsets(first, second, points, method, depth) -> BundleOffsets:
 
 @eqx.filter_jit
 def _regular(interior, points):
-    """Return True where the map from measured to ideal coordinates keeps its orientation and the ray points ahead."""
+    """Return True where the mapping from measured to ideal coordinates is invertible and the ray points forward."""
 
     def regular(xy):
         _, _, w = interior.direction_from_ideal(interior.ideal_from_measured(xy))
@@ -284,7 +284,7 @@ def _depths(points, depth):
 
 
 def as_arrays(interior: InteriorOrientation) -> InteriorOrientation:
-    """Values as arrays: another value must not compile another program."""
+    """Convert values to arrays, so that other values do not require recompilation."""
     return jax.tree.map(lambda v: jnp.asarray(v, float), interior)
 
 
@@ -294,15 +294,15 @@ def frame_sigma(
     points: Float[np.ndarray, "points 2"],
     method: Method,
 ) -> Float[np.ndarray, "points"]:
-    """Root mean square error (mm, both axes) at image points (mm) from the covariance of `parameter_names`.
+    """Propagate the covariance of `parameter_names` to the root mean square error (mm, both axes) at image points (mm).
 
-    `method` is the alignment that the orientation of images can absorb. Raises InputError for points where the
-    distortion is not invertible.
+    `method`: alignment that the orientation of images can absorb. Raises InputError for points where the distortion is
+    not invertible.
     """
     check_rays(interior, points, "the camera")
     derivatives = call_compiled(_derivatives, as_arrays(interior), jnp.asarray(points, float))
     stretch, by_parameters, by_alignment = jax.tree.map(np.asarray, derivatives)
-    # At zero offsets the alignment is a projection: only the residual of the least squares fit remains.
+    # At zero offsets the alignment is an orthogonal projection: use the residuals of the least-squares fit.
     columns = by_alignment[method].reshape(2 * len(points), -1)
     absorbed = columns @ np.linalg.lstsq(columns, by_parameters, rcond=None)[0]
     rest = (by_parameters - absorbed).reshape(len(points), 2, -1)
@@ -314,9 +314,9 @@ def frame_sigma(
 def _derivatives(
     interior: InteriorOrientation, points: Float[Array, "points 2"]
 ) -> tuple[Float[Array, "points 2 2"], Float[Array, "coordinates p"], dict[Method, Float[Array, "points 2 u"]]]:
-    """d(ideal) / d(measured); d(offsets) / d(parameters) from the bundle itself; d(offsets) / d(alignment) by method.
+    """Return d(ideal) / d(measured), d(offsets) / d(parameters) without alignment, d(offsets) / d(alignment) by method.
 
-    One program for all methods: compiling each would take longer than running all.
+    Evaluates all methods in one program, because compiling one program per method takes longer.
     """
     rays, depth = image_rays(interior, points), jnp.ones(len(points))
 

@@ -1,17 +1,18 @@
-"""Comparison of calibrations: uncertainty of RMSE_offset, stability analysis, change of a camera, combination.
+"""Comparison of calibrations: uncertainty of RMSE_offset, stability analysis, change detection, combination.
 
-Uncertainty. The offsets are v = v0 + J e with the errors e of both parameter sets, e ~ N(0, Q), and J exact
-(`BundleOffsets.jacobian`). RMSE_offset is a norm: for nearly equal bundles it is not normal, and its first derivative
-is meaningless. v'v is therefore treated as a quadratic form in normal variables (`QuadraticForm`): about the estimated
-offsets (v0 = v) for the uncertainty, about zero (v0 = 0) for the hypothesis of one camera.
+Uncertainty. The offsets are v = v0 + J e with the errors e of both parameter sets, e ~ N(0, Q), and the exact Jacobian
+J (`BundleOffsets.jacobian`). RMSE_offset is a norm: for nearly equal bundles it is not normally distributed, and
+first-order propagation is invalid. v'v is therefore evaluated as a quadratic form in normal variables
+(`QuadraticForm`): about the estimated offsets (v0 = v) for the uncertainty, about zero (v0 = 0) for the hypothesis of
+one camera.
 
 Combination. With the parameters x_i and covariances Q_i of n independent calibrations
 
     Q = (sum Q_i^-1)^-1,   x = Q sum Q_i^-1 x_i,   T = sum (x_i - x)' Q_i^-1 (x_i - x)
 
-and T follows chi-square of (n - 1) p if they are from one camera. An inconsistent one is identified by its difference d
-from the combination of all others, which has the covariance Q_i + Q_others: d' (Q_i + Q_others)^-1 d follows chi-square
-of p.
+and T has the chi-square distribution with (n - 1) p degrees of freedom if all are from one camera. An inconsistent
+calibration is identified by its difference d from the combination of all others, with the covariance Q_i + Q_others: d'
+(Q_i + Q_others)^-1 d has the chi-square distribution with p degrees of freedom.
 """
 
 from collections.abc import Sequence
@@ -47,22 +48,23 @@ from jaxphoto.stability.quadratic_form import QuadraticForm
 
 @pretty_repr
 class OffsetUncertainty(NamedTuple):
-    """Distribution of RMSE_offset by the covariances of both sets; in mm, except the probability."""
+    """Distribution of RMSE_offset from the covariances of both sets; in mm, except the p-value."""
 
     sigma_mm: float
     """Standard deviation of RMSE_offset over repeated calibrations of these two cameras."""
     low_mm: float
-    """2.5 % quantile over repeated calibrations."""
+    """2.5 % quantile of RMSE_offset over repeated calibrations."""
     high_mm: float
-    """97.5 % quantile over repeated calibrations."""
+    """97.5 % quantile of RMSE_offset over repeated calibrations."""
     expected_of_one_mm: float
-    """Mean RMSE_offset of two such calibrations of one camera."""
+    """Expected RMSE_offset of two such calibrations of one camera."""
     limit_of_one_mm: float
     """95 % quantile of RMSE_offset of two such calibrations of one camera."""
     p_value: float
-    """Probability that two calibrations of one camera differ as much as these or more."""
+    """Probability that two calibrations of one camera differ by at least this much."""
     unexplained_mm: float
-    """Part of RMSE_offset that covariances do not explain: sqrt((v'v - E) / (2n - u)), E = tr(J Q J'); 0 if E > v'v."""
+    """Part of RMSE_offset not explained by the covariances: sqrt((v'v - E) / (2n - u)), E = tr(J Q J'); 0 if E > v'v.
+    """
 
 
 def offset_uncertainty(
@@ -73,13 +75,13 @@ def offset_uncertainty(
     """Compute the uncertainty of RMSE_offset from the covariances of the parameter sets; None if both are None.
 
     `first` and `second` are a posteriori covariances in the order of `jaxphoto.camera.parameter_names`, with zero rows
-    for fixed parameters; a set without one counts as exact. The sets must be independent: from different images. Raises
-    ValueError for a covariance of another size than its parameters.
+    for fixed parameters; a set without covariance is treated as error-free. The sets must be independent, from
+    different images. Raises ValueError if the size of a covariance does not match its parameters.
     """
     if first is None and second is None:
         return None
     jacobian = np.asarray(offsets.jacobian)
-    # If one is missing, its size follows from the other.
+    # Infer the size of a missing covariance from the other one.
     p1 = len(first) if first is not None else jacobian.shape[1] - len(second)  # type: ignore[arg-type]
     p2 = jacobian.shape[1] - p1
     if (second is not None and len(second) != p2) or p1 < 0:
@@ -111,26 +113,26 @@ def offset_uncertainty(
     )
 
 
-# p-value below which a change is significant.
+# Maximum p-value of a significant change.
 SIGNIFICANT_P = 0.05
-# Smallest p-value reported.
+# Minimum p-value reported.
 _MIN_P = 1e-300
 
 
 @pretty_repr
 class Analysis(NamedTuple):
-    """Two parameter sets compared by one method; `uncertainty` is None without covariances."""
+    """Comparison of two parameter sets by one method; `uncertainty` is None without covariances."""
 
     method: Method
     offsets: BundleOffsets
     uncertainty: OffsetUncertainty | None
 
     def similar(self, noise_mm: float) -> bool:
-        """Return True if RMSE_offset is within the noise of image coordinates (paper 002: about one pixel)."""
+        """Return True if RMSE_offset does not exceed the noise of image coordinates (paper 002: about one pixel)."""
         return bool(self.offsets.rmse_mm <= noise_mm)
 
     def verdict(self, noise_mm: float) -> str:
-        """Return the result of the comparison in one or two sentences."""
+        """Summarise the result of the comparison in one or two sentences."""
         rmse, uncertainty = float(self.offsets.rmse_mm), self.uncertainty
         result, side = ("similar", "within") if self.similar(noise_mm) else ("not similar", "beyond")
         text = f"{result}: RMSE_offset of {1e3 * rmse:.3g} um is {side} the noise of {1e3 * noise_mm:.3g} um"
@@ -145,7 +147,7 @@ class Analysis(NamedTuple):
 
 
 def change_meaning(p_value: float) -> str:
-    """Conclusion from the probability `p_value` that two calibrations of one camera differ as much."""
+    """Describe the conclusion from the probability `p_value` that two calibrations of one camera differ this much."""
     changed = "the camera has changed, or many image points of a calibration share errors (see jaxphoto halves)"
     return changed if p_value < SIGNIFICANT_P else "no significant change"
 
@@ -159,9 +161,9 @@ def analyse(
 ) -> dict[Method, Analysis]:
     """Compare two parameter sets by zrot, rot and spr over image points (mm from the centre; see `image_grid`).
 
-    `covariances` are a posteriori, in the order of `parameter_names` of either set. The object points of spr lie at
-    alternating distances, greater and smaller by the fraction `relief`. Raises InputError for points where a distortion
-    is not invertible and for bundles too different to be aligned, ValueError for a `relief` of 1 or more.
+    `covariances` are a posteriori, in the order of `parameter_names` of each set. The object points of spr have
+    distances alternately increased and decreased by the fraction `relief`. Raises InputError for points where a
+    distortion is not invertible and for bundles too different to align, ValueError for a `relief` of 1 or more.
     """
     if not 0 <= relief < 1:
         raise ValueError(f"relief, a fraction of the object distance, must be at least 0 and below 1, got {relief:g}")
@@ -177,13 +179,13 @@ def analyse(
     return analyses
 
 
-# Eigenvalues of a correlation matrix below this fraction of the largest are rounding.
+# Ratio to the largest eigenvalue of a correlation matrix below which an eigenvalue is treated as zero (rounding).
 _ROUNDING = 1e-12
 
 
 @pretty_repr
 class ParameterChange(NamedTuple):
-    """One parameter in two calibrations, in its own unit: second minus first, with its significance."""
+    """Change of one parameter between two calibrations, in its own unit: second minus first, with its significance."""
 
     parameter: str
     first: float
@@ -194,43 +196,43 @@ class ParameterChange(NamedTuple):
     p_value: float
     """Probability of a larger difference without a change of the parameter; NaN if both are fixed."""
     unit: str
-    """mm, 1/mm^2, or "1" if dimensionless."""
+    """Unit of the parameter: mm, 1/mm^2, or "1" if dimensionless."""
 
 
 class Change(NamedTuple):
     """Comparison of two calibrations of a camera."""
 
     parameters: tuple[ParameterChange, ...]
-    """None for different models."""
+    """Changes of the parameters; None for different models."""
     chi_square: float
-    """d' Q^-1 d of all differences, Q the sum of both covariances; NaN without parameters."""
+    """d' Q^-1 d of all differences, with the sum Q of both covariances; NaN without parameters."""
     degrees_of_freedom: int
     p_parameters: float
     """Probability of a larger chi-square without a change of the camera."""
     field: Analysis
-    """The two bundles of rays after alignment, with the same probability for their difference."""
+    """Comparison of the two bundles of rays after alignment, with the p-value of their difference."""
     limit_mm: Float[np.ndarray, "points"]
-    """95 % quantile of the offsets of two such calibrations of one camera at each point, in the measured image."""
+    """95 % quantile, at each point, of the offsets of two such calibrations of one camera, in the measured image."""
 
     @property
     def offset_mm(self) -> Float[np.ndarray, "points"]:
-        """Lengths of the offsets in the measured image."""
+        """Return the lengths (mm) of the offsets in the measured image."""
         return np.linalg.norm(np.asarray(self.field.offsets.measured), axis=1)
 
     @property
     def beyond(self) -> Bool[np.ndarray, "points"]:
-        """True where offsets exceed `limit_mm`: at one point in twenty without a change of the camera."""
+        """Return True where offsets exceed `limit_mm`; expected at 5 % of the points without a change of the camera."""
         return self.offset_mm > self.limit_mm
 
     @property
     def p_field(self) -> float:
-        """Probability of a larger difference of the bundles without a change of the camera; NaN without covariances."""
+        """Return the p-value of the bundle difference for an unchanged camera; NaN without covariances."""
         uncertainty = self.field.uncertainty
         return float("nan") if uncertainty is None else float(uncertainty.p_value)
 
     @property
     def changed(self) -> bool:
-        """True if a test, of parameters or of bundles, is significant."""
+        """Return True if the test of the parameters or of the bundles is significant."""
         return self.p_parameters < SIGNIFICANT_P or self.p_field < SIGNIFICANT_P
 
     def __repr__(self) -> str:
@@ -249,9 +251,9 @@ def change(
 ) -> Change:
     """Compare two calibrations from independent images: parameters, and bundles over image points (mm).
 
-    `covariances` are a posteriori, in the order of `parameter_names`; a set without one counts as exact. Raises
-    InputError if both are None, for points where a distortion is not invertible, and for bundles that cannot be
-    aligned.
+    `covariances` are a posteriori, in the order of `parameter_names`; a set without covariance is treated as
+    error-free. Raises InputError if both are None, for points where a distortion is not invertible, and for bundles
+    that cannot be aligned.
     """
     if covariances[0] is None and covariances[1] is None:
         raise InputError("neither calibration has a covariance: a change cannot be tested")
@@ -279,7 +281,7 @@ def change(
 
 
 def mahalanobis(difference: Float[np.ndarray, "n"], covariance: Float[np.ndarray, "n n"]) -> tuple[float, int]:
-    """d' Q^-1 d and its degrees of freedom, over the directions in which Q is not zero."""
+    """Return d' Q^-1 d and its degrees of freedom, restricted to the directions in which Q is not zero."""
     free = np.diagonal(covariance) > 0
     sigma = np.sqrt(np.diagonal(covariance)[free])
     values, axes = np.linalg.eigh(covariance[np.ix_(free, free)] / sigma[:, None] / sigma)
@@ -289,7 +291,7 @@ def mahalanobis(difference: Float[np.ndarray, "n"], covariance: Float[np.ndarray
 
 
 def same_model(first: InteriorOrientation, second: InteriorOrientation) -> bool:
-    """Return True if the parameters of both have the same meaning."""
+    """Return True if both cameras have the same models and constants."""
     constants = [{n: float(get_parameter(i, n)) for n in constant_names(i)} for i in (first, second)]
     return model_keys(first) == model_keys(second) and constants[0] == constants[1]
 
@@ -313,16 +315,16 @@ class Combination(NamedTuple):
 
     interior: InteriorOrientation
     covariance: Float[np.ndarray, "p p"]
-    """In the order of `parameter_names`; zero rows for fixed parameters."""
+    """Covariance in the order of `parameter_names`; zero rows for fixed parameters."""
     chi_square: float
     degrees_of_freedom: int
     p_value: float
-    """Probability of a larger chi-square if all are from one camera."""
+    """Probability of a larger chi-square if all calibrations are from one camera."""
     against_others: tuple[float, ...]
     """p-value of the difference of each calibration from the combination of all others."""
 
     def disagreeing(self, level: float) -> list[int]:
-        """Return indices of calibrations that differ from the others, with the overall error probability `level`."""
+        """Return indices of calibrations that differ from the others, at the overall significance level `level`."""
         n = len(self.against_others)
         return [k for k, p in enumerate(self.against_others) if p < level / n]
 
@@ -333,7 +335,8 @@ def combine(
     """Combine independent calibrations; `names` are their labels in messages.
 
     `covariances` are in the order of `parameter_names`, with zero rows for fixed parameters. Raises InputError for
-    fewer than two, a repeated one, different models, and different sets or values of fixed parameters.
+    fewer than two calibrations, a repeated calibration, different models, and different sets or values of fixed
+    parameters.
     """
     if len(interiors) < 2:
         raise InputError("a combination needs at least two calibrations: name another one")
@@ -351,7 +354,7 @@ def combine(
             values = [float(get_parameter(i, parameter)) for i in (interiors[0], interior)]
             if not free_first and values[0] != values[1]:
                 raise InputError(
-                    f"{parameter} is fixed at {values[0]:g} in {names[0]} and at {values[1]:g} in {name}: readjust "
+                    f"{parameter} is fixed at {values[0]:g} in {names[0]} and at {values[1]:g} in {name}; readjust "
                     "one of them to match"
                 )
         if np.array_equal(covariance, covariances[0]) and all(
@@ -385,7 +388,7 @@ def combine(
 
 
 def _mean(x: Float[np.ndarray, "n p"], q: Float[np.ndarray, "n p p"]) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted mean and its covariance, computed in units of standard deviations."""
+    """Compute the weighted mean and its covariance, in units of standard deviations."""
     unit = np.sqrt(np.diagonal(q[0]))
     weights = np.linalg.inv(q / unit[:, None] / unit)
     combined = np.linalg.inv(weights.sum(axis=0))

@@ -1,12 +1,12 @@
-"""Distortion of a camera as a function of the distance from its principal point, with its uncertainty.
+"""Distortion curve: distortion as a function of the distance from the principal point, with uncertainty.
 
 With K directions u_k at the measured distance r from the principal point,
 
     radial(r) = mean over k of u_k . d(r u_k),   d = measured - ideal
 
-is the rotationally symmetric radial distortion for the calibrated c (Brown 1971): another c would add a linear term.
-The asymmetric part (decentring and affinity) is reported as the root mean square of d - radial(r) u_k. The band of
-radial follows from the covariance of all parameters, by exact derivatives.
+is the rotationally symmetric radial distortion for the calibrated c (Brown 1971); a different c adds a linear term. The
+asymmetric part (decentring and affinity) is reported as the root mean square of d - radial(r) u_k. The standard
+deviation of radial is propagated from the covariance of all parameters by exact derivatives.
 """
 
 from typing import NamedTuple
@@ -30,7 +30,7 @@ NORMAL_95 = 1.959963984540054
 
 @pretty_repr
 class DistortionCurve(NamedTuple):
-    """Distortion by distance from the principal point; mm."""
+    """Distortion by distance from the principal point, in mm."""
 
     r: Float[np.ndarray, "steps"]
     radial: Float[np.ndarray, "steps"]
@@ -67,7 +67,7 @@ def _curve(
 
     def curves(vector):
         camera = with_parameters(interior, vector)
-        # From the principal point of the camera: its position is no distortion.
+        # Use coordinates from the fixed principal point of the camera: its error is not distortion.
         distortion = lambda xy: xy - camera.ideal_from_measured(xy + camera.principal_point)  # noqa: E731
         d = jax.vmap(jax.vmap(distortion))(r[:, None, None] * u)
         radial = (d * u).sum(axis=2).mean(axis=1)

@@ -1,14 +1,14 @@
-"""Distribution of S = v'v of a normal v: generalised chi-square, exactly.
+"""Exact distribution of S = v'v for a normal v (generalised chi-square).
 
-With the covariance of v written U diag(w) U' and b = U' mean(v), S is a constant plus the sum of squares
-(b_i + sqrt(w_i) z_i)^2 over independent standard normal z_i, and its cumulant function is
+With the covariance U diag(w) U' of v and b = U' mean(v), S is a constant plus the sum of squares (b_i + sqrt(w_i)
+z_i)^2 over independent standard normal z_i, and its cumulant function is
 
     K(t) = constant t + sum [ b_i^2 t / (1 - 2 w_i t) - log(1 - 2 w_i t) / 2 ],   t < 1 / (2 max w)
 
 P(S > x) is the integral of exp(K(t) - t x) / (2 pi i t) upwards across the real axis in 0 < t < 1 / (2 max w). The path
-crosses it at the saddle point of the integrand, which avoids cancellation far in the tail, and bends to the right,
-where exp(-t x) vanishes; crossing at t < 0 gives -P(S < x) in the same way.
-Source: contour integration of the saddle point, Rice (1980), SIAM J. Sci. Stat. Comput. 1, 438-448.
+crosses the real axis at the saddle point of the integrand, which avoids cancellation far in the tail, and bends to the
+right, where exp(-t x) vanishes. Crossing at t < 0 gives -P(S < x).
+Source: contour integration through the saddle point, Rice (1980), SIAM J. Sci. Stat. Comput. 1, 438-448.
 """
 
 import equinox as eqx
@@ -18,12 +18,12 @@ from jaxtyping import Float
 
 from jaxphoto.short_repr import pretty_repr
 
-# Variances below this fraction of the largest contribute their mean only.
+# Ratio to the largest variance below which a variance is replaced by its mean contribution.
 _NEGLIGIBLE = 1e-14
-# Squared ratio of standard deviation and mean of S below which sqrt(S) is normal.
+# Squared ratio of standard deviation to mean of S below which sqrt(S) is treated as normal.
 _CONCENTRATED = 1e-10
 _NODES = 800
-# Exponent at which the integrand is negligible.
+# Exponent at which the integrand is treated as zero.
 _NEGLIGIBLE_EXPONENT = 40.0
 
 
@@ -31,7 +31,8 @@ _NEGLIGIBLE_EXPONENT = 40.0
 class QuadraticForm(eqx.Module):
     """S = constant + sum (sqrt(shift_i) + sqrt(weight_i) z_i)^2, z_i independent standard normal.
 
-    `weights` are positive variances and `shifts` squared means along the same axes; all in one unit squared.
+    `weights` are positive variances, `shifts` squared means along the same axes, and `constant` the remainder; all in
+    the same squared unit.
     """
 
     weights: Float[np.ndarray, "axes"]
@@ -42,7 +43,7 @@ class QuadraticForm(eqx.Module):
     def of_normal(
         mean: Float[np.ndarray, "n"], jacobian: Float[np.ndarray, "n parameters"], covariance: Float[np.ndarray, "p p"]
     ) -> "QuadraticForm":
-        """Return the form v'v of a normal v with this mean and the covariance J Q J'; Q may be singular."""
+        """Return the form v'v for a normal v with this mean and the covariance J Q J'; Q may be singular."""
         root = covariance_root(covariance)
         axes, spread, _ = np.linalg.svd(np.asarray(jacobian) @ root, full_matrices=False)
         weights = spread**2
@@ -53,25 +54,26 @@ class QuadraticForm(eqx.Module):
 
     @property
     def mean(self) -> float:
-        """E[S] = constant + sum (weights + shifts)."""
+        """Return E[S] = constant + sum (weights + shifts)."""
         return self.constant + self._spread
 
     @property
     def _spread(self) -> float:
-        """E[S] - constant."""
+        """Return E[S] - constant."""
         return float((self.weights + self.shifts).sum())
 
     @property
     def variance(self) -> float:
-        """Var[S] = sum (2 weights^2 + 4 weights shifts)."""
+        """Return Var[S] = sum (2 weights^2 + 4 weights shifts)."""
         return float((2 * self.weights**2 + 4 * self.weights * self.shifts).sum())
 
     @property
     def mean_of_root(self) -> float:
-        """E[sqrt(S)]: 1 / (2 sqrt(pi)) times the integral of (1 - E[exp(-t S)]) t^(-3/2) over t > 0."""
+        """Return E[sqrt(S)] = 1 / (2 sqrt(pi)) times the integral of (1 - E[exp(-t S)]) t^(-3/2) over t > 0."""
         if not len(self.weights):
             return self.constant**0.5
-        # In log t the integrand is smooth and falls as exp(-|log t| / 2): the trapezoidal rule is exact to rounding.
+        # Integrate over log t, where the integrand is smooth and decays as exp(-|log t| / 2): the trapezoidal rule is
+        # exact to rounding.
         log_t, step = np.linspace(-80.0, 80.0, 1601, retstep=True)
         t = np.exp(log_t) / self.mean
         integrand = -np.expm1(self._cumulant(-t) - self.constant * t) * np.exp(-log_t / 2)
@@ -79,21 +81,21 @@ class QuadraticForm(eqx.Module):
 
     @property
     def sigma_of_root(self) -> float:
-        """Standard deviation of sqrt(S)."""
+        """Return the standard deviation of sqrt(S)."""
         if self.variance < _CONCENTRATED * self.mean**2:
-            # First order, which is exact here; the difference below would be rounding.
+            # Use first-order propagation: exact to rounding here, unlike the difference below.
             return (self.variance / self.mean) ** 0.5 / 2 if self.mean > 0 else 0.0
         return max(self.mean - self.mean_of_root**2, 0.0) ** 0.5
 
     def tail_probability(self, x: float) -> float:
-        """P(S > x)."""
+        """Return P(S > x)."""
         if x <= self.constant or not len(self.weights):
             return float(x < self.constant or len(self.weights) > 0)
         tail = float(np.exp(self._log_tail(x - self.constant)))
         return tail if x - self.constant > self._spread else 1 - tail
 
     def quantile(self, probability: float) -> float:
-        """x with P(S < x) = `probability`, strictly between 0 and 1."""
+        """Return x with P(S < x) = `probability`, which is strictly between 0 and 1."""
         if not len(self.weights):
             return self.constant
         spread, sigma = self._spread, self.variance**0.5
@@ -109,24 +111,24 @@ class QuadraticForm(eqx.Module):
         far = 1.0
         while difference(far) > 0:
             far *= 2
-        # Starts just beyond the mean, on the side of the tail.
+        # Start just beyond the mean, on the side of the tail.
         return float(self.constant + x_of(scipy.optimize.brentq(difference, 1e-9, far, xtol=1e-13)))
 
     def _cumulant(self, t):
-        """K(t) without the constant, for real or complex t."""
+        """Return K(t) without the constant term, for real or complex t."""
         t = np.asarray(t)[..., None]
         denominator = 1 - 2 * self.weights * t
         return (self.shifts * t / denominator - np.log1p(-2 * self.weights * t) / 2).sum(-1)
 
     def _slope(self, t: float, x: float) -> float:
-        """Return the derivative of K(t) - t x - log|t| at a real t."""
+        """Return the derivative of K(t) - t x - log|t| at real t."""
         denominator = 1 - 2 * self.weights * t
         return float((self.shifts / denominator**2 + self.weights / denominator).sum() - x - 1 / t)
 
     def _log_tail(self, x: float) -> float:
-        """Logarithm of P(S - constant > x) above the mean, of P(S - constant < x) at and below it."""
+        """Return the logarithm of P(S - constant > x) above the mean, of P(S - constant < x) at and below the mean."""
         pole = 1 / (2 * self.weights.max())
-        # Between their poles the exponents are convex; the root of the slope is found on a logarithmic scale of t.
+        # The exponent is convex between its poles: find the root of its slope on a logarithmic scale of t.
         if x > self._spread:
             t_of, ends = (lambda q: pole / (1 + np.exp(-q))), (-40.0, 34.0)
         else:
@@ -135,7 +137,8 @@ class QuadraticForm(eqx.Module):
         w, denominator = self.weights, 1 - 2 * self.weights * saddle
         second = (4 * w * self.shifts / denominator**3 + 2 * w**2 / denominator**2).sum()
         third = (24 * w**2 * self.shifts / denominator**4 + 8 * w**3 / denominator**3).sum()
-        # The parabola that osculates the steepest descent of exp(K(t) - t x); the pole at 0 would bend it too much.
+        # Use the osculating parabola of the steepest descent of exp(K(t) - t x), without 1 / t: the pole at 0 would
+        # bend it too much.
         bend, reach = self._path(x, saddle, third / (6 * second), (second + 1 / saddle**2) ** -0.5)
         y = np.linspace(0.0, reach, _NODES + 1)
         t = saddle + 1j * y + bend * y**2
@@ -145,9 +148,10 @@ class QuadraticForm(eqx.Module):
         return float(height + np.log(abs(half.imag) / np.pi))
 
     def _path(self, x: float, saddle: float, bend: float, width: float) -> tuple[float, float]:
-        """Bend of a path on which the integrand decreases monotonically, and where it is negligible.
+        """Return the bend of a path with monotonically decreasing integrand, and its end (negligible integrand).
 
-        With variances of very different size the osculating parabola may leave the descent: then a straighter one.
+        With variances of very different size the integrand can increase along the osculating parabola; a straighter
+        parabola is then used.
         """
         y = width * np.geomspace(0.05, 1e5, 300)
         for straighter in 0.25 ** np.arange(12.0):
@@ -160,7 +164,7 @@ class QuadraticForm(eqx.Module):
 
 
 def covariance_root(covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """B with B B' = Q of a covariance that may be singular, scaled for independence of units."""
+    """Return B with B B' = Q for a possibly singular covariance, scaled to be independent of units."""
     covariance = np.asarray(covariance, float)
     sigma = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
     scale = np.where(sigma > 0, sigma, 1.0)

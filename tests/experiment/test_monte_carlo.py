@@ -253,7 +253,7 @@ def test_the_command(folder, monkeypatch, capsys, tmp_path):
     [
         (("--bias", "station", "--sigma-m", "0.1", "--on", "S9", "--per", "strip"), "unknown strip 'S9'"),
         (("--bias", "station", "--sigma-m", "0.1", "--draws", "0"), "must be positive, got 0"),
-        (("--bias", "station", "--sigma-deg", "0.1"), "takes --sigma-m"),
+        (("--bias", "station", "--sigma-deg", "0.1"), "give --sigma-m"),
         (("--bias", "station", "--sigma-m", "much"), "--sigma-m much"),
         (("--bias", "station", "--sigma-m", "-1"), "above zero"),
         (("--bias", "wind", "--sigma-m", "1"), "'wind' is not one of 'station'"),

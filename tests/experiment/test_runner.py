@@ -139,7 +139,7 @@ def test_a_run_is_written_whole_and_read_back(folder, run, tmp_path):
     write_runs({folder: run}, out)  # an earlier run is replaced
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("x")
-    with pytest.raises(InputError, match="nothing in it says that jaxphoto wrote it"):
+    with pytest.raises(InputError, match="was not written by jaxphoto"):
         write_runs({folder: run}, tmp_path / "mine")
     assert (tmp_path / "mine" / "thesis.tex").read_text() == "x"
 

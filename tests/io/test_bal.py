@@ -129,7 +129,7 @@ def fewer_rays(lines):
 
 
 def test_points_of_fewer_than_two_images_are_left_out(write):
-    with pytest.warns(UserWarning, match=r"pre\.txt: .* 1 point\(s\) that fewer than two images show"):
+    with pytest.warns(UserWarning, match=r"pre\.txt: .* 1 point\(s\) in fewer than two images"):
         block = read_source(write(fewer_rays))
     assert block.points == ("0", "1", "2")
     assert len(block.image_points.point) == 9
@@ -153,11 +153,11 @@ def shortened(lines):
     [
         (replaced(1, "3 5"), "row 1"),
         (replaced(4, None), "row 15: .* is not 4 numbers"),
-        (replaced(1, "3 5 13"), "46 numbers follow .* have 42 .* row 1"),
-        (replaced(57, None), r"41 numbers follow .* have 42 \(9 a camera, 3 a point\)"),
+        (replaced(1, "3 5 13"), "46 numbers follow .* need 42 .* row 1"),
+        (replaced(57, None), r"41 numbers follow .* need 42 \(9 per camera, 3 per point\)"),
         (shortened, "ends after 9 of 14 observations"),
-        (replaced(3, "3 0 1.0 2.0"), "row 3: camera is 3; .* from 0 to 2"),
-        (replaced(3, "1 -1 1.0 2.0"), "row 3: point is -1; .* from 0 to 4"),
+        (replaced(3, "3 0 1.0 2.0"), "row 3: camera 3 is not .* from 0 to 2"),
+        (replaced(3, "1 -1 1.0 2.0"), "row 3: point -1 is not .* from 0 to 4"),
         (replaced(20, "1.0e"), "row 20"),
         (replaced(31, "-500.0"), "row 31: f of camera 1 is -500"),
         (replaced(3, "0 0 1.0 2.0"), "row 3: point 0 is measured twice in image 0"),
@@ -173,12 +173,12 @@ def test_an_image_of_two_points_is_skipped(write):
         lines[1:15] = [line for line in lines[1:15] if line[0] != "2" or line[2] in "01"]
         lines[0] = "3 5 12"
 
-    with pytest.warns(UserWarning, match=r"pre\.txt: 1 image\(s\) with fewer than 3 points are left out: '2'"):
+    with pytest.warns(UserWarning, match=r"pre\.txt: skipped 1 image\(s\) with fewer than 3 points: '2'"):
         assert read_source(write(two_left)).images == ("0", "1")
 
 
 def test_a_folder_of_two_problems_is_refused(write):
     path = write()
     (path.parent / "other.txt").write_text(path.read_text())
-    with pytest.raises(InputError, match=r"holds 2 files of bal .*; name one"):
+    with pytest.raises(InputError, match=r"2 files of bal .*; give one"):
         read_source(path.parent, "bal")

@@ -171,7 +171,7 @@ def test_older_agisoft_file_projects_by_the_equations_of_lens(tmp_path, p):
     u, v = distorted(POINTS[:, 0] / POINTS[:, 2], POINTS[:, 1] / POINTS[:, 2], (-0.118, 0.0936), *p)
     expected = np.column_stack([1971.4 + u * 3270.5 + v * -4.25, 1529.5 + v * 3268.3])
     np.testing.assert_allclose(columns_rows(camera), expected, rtol=0, atol=1e-9)
-    assert ("p1 and p2 were taken in OpenCV's order" in camera.note) == (p[0] != 0)
+    assert ("p1 and p2 are used in OpenCV's order" in camera.note) == (p[0] != 0)
 
 
 @pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
@@ -388,31 +388,31 @@ def test_a_block_may_get_another_model(tmp_path):
 @pytest.mark.parametrize(
     ("text", "name", "message"),
     [
-        (OPENCV[:300], "a.yml", "OpenCV cannot read it; it is cut off"),
+        (OPENCV[:300], "a.yml", "OpenCV cannot read it: it is truncated"),
         (OPENCV.replace("camera_matrix", "matrix"), "a.yml", "camera_matrix is missing"),
         (OPENCV.replace("image_width: 1280\n", ""), "a.yml", "image_width or image_height is missing"),
         (OPENCV.replace("912.25", "-912.25"), "a.yml", "-912.25 and 910.75 px are not positive"),
         (OPENCV + "fisheye_model: 1\n", "a.yml", "8 distortion_coefficients, but OpenCV's fisheye model has 4"),
-        (AGISOFT.replace("frame", "spherical"), "a.xml", "projection 'spherical' is not known here; known are frame"),
+        (AGISOFT.replace("frame", "spherical"), "a.xml", "projection 'spherical' is not supported; use one of frame"),
         (AGISOFT.replace("<f>3268.30117351641</f>", ""), "a.xml", "<f> is missing"),
         (AGISOFT.replace("-0.0123", "-0,0123"), "a.xml", "k3 is '-0,0123', not a finite number"),
         (COLMAP, "cameras.txt", "it holds 6 cameras; name one of 1, 2, 3, 4, 5, 6"),
         (
             "1 FOV 100 100 80 50 50 0.1\n",
             "cameras.txt",
-            "the model FOV of camera 1 is not known here; use one of SIMPLE",
+            "model FOV of camera 1 is not supported; use one of SIMPLE",
         ),
         (
             "1 RADIAL 100 100 80 50 50 0.1\n",
             "cameras.txt",
-            "camera 1 has 4 parameters, RADIAL has 5: f, cx, cy, k1, k2",
+            "camera 1 has 4 parameters instead of the 5 of RADIAL: f, cx, cy, k1, k2",
         ),
         (SMAC.replace("0.1558 × 10-6", "0.1558 × 10-"), "a.txt", "P2 is '0.1558e', not a finite number"),
-        (SMAC_TORN[: SMAC_TORN.index("-0.3015")], "a.txt", "P1, P2, P3, P4 cannot be found in this SMAC report"),
+        (SMAC_TORN[: SMAC_TORN.index("-0.3015")], "a.txt", "P1, P2, P3, P4 not found in this SMAC report"),
         (INTERIOR, "interior.csv", "nor a block says of which model camera nadir is; give the block"),
-        (COLMAP.replace("2 PINHOLE", "1 PINHOLE"), "cameras.txt", "camera 1 stands there twice"),
+        (COLMAP.replace("2 PINHOLE", "1 PINHOLE"), "cameras.txt", "duplicate camera 1"),
         ("# Camera list\n", "cameras.txt", "there is no camera in it"),
-        (OPENCV.replace("   cols: 1\n", ""), "a.yml", "distortion_coefficients is no matrix with rows, cols"),
+        (OPENCV.replace("   cols: 1\n", ""), "a.yml", "distortion_coefficients is not a matrix of rows x cols"),
         ("", "a.txt", "the file is empty"),
     ],
 )
@@ -441,10 +441,10 @@ def test_wrong_use_is_refused(tmp_path):
     with pytest.raises(InputError, match="there is no camera '9' in it"):
         read_camera_file(written(tmp_path, COLMAP, "cameras.txt"), camera="9")
     interior = InteriorOrientation(35.0, 0.0, 0.0, Brown())
-    with pytest.raises(InputError, match="name one of opencv, ros, mrcal, colmap"):
+    with pytest.raises(InputError, match="give one of opencv, ros, mrcal, colmap"):
         write_camera_file(tmp_path / "a.dat", SENSOR, interior)
     folding = InteriorOrientation(10.0, 0.0, 0.0, Brown(k1=5e-3))
-    with pytest.raises(InputError, match=r"a\.xml cannot be written: .* folds within"):
+    with pytest.raises(InputError, match=r"a\.xml cannot be written: .* is not invertible"):
         write_camera_file(tmp_path / "a.xml", SENSOR, folding)
     assert not (tmp_path / "a.xml").exists()
 
@@ -527,7 +527,7 @@ def test_command_converts_and_reports_the_misfit(tmp_path, monkeypatch, capsys):
         ("new.xml", ["--width-px", "100"], "both --width-px and --height-px"),
         ("new.xml", ["--distortion", "none"], "brown"),
         ("new.xml", ["--format", "none"], "not one of 'opencv'"),
-        ("new.xml", ["--distortion", "brown"], "the format agisoft has the distortion Agisoft, not Brown; leave"),
+        ("new.xml", ["--distortion", "brown"], "format agisoft has the distortion Agisoft, not Brown; omit"),
     ):
         monkeypatch.setattr("sys.argv", ["jaxphoto", *arguments[:2], str(tmp_path / out), *arguments[3:], *more])
         with pytest.raises(SystemExit) as stopped:

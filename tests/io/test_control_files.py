@@ -77,14 +77,14 @@ def test_the_reference_pane_of_metashape(tmp_path):
     ("wrong", "words"),
     [
         ("G1,10.0,2O.0,30.0,0.02,0.03", "a, row 1: Y is '2O.0', not a number"),
-        ("G1,10.0,20.0", "a, row 1: 3 cells, where most rows have 6"),
+        ("G1,10.0,20.0", "a, row 1: 3 cells, but most rows have 6"),
     ],
 )
 def test_one_bad_row_of_a_table_without_header_is_named(tmp_path, wrong, words):
     rows = [wrong, *(f"G{k},{k}.0,20.0,30.0,0.02,0.03" for k in range(2, 6))]
     with pytest.raises(InputError, match=words):
         read(tmp_path, "\n".join(rows))
-    with pytest.raises(InputError, match="this is no file of control"):
+    with pytest.raises(InputError, match="not a control file"):
         read(tmp_path, "\n".join(["who,knows,what,this,may,be", *rows[1:]]))
 
 
@@ -112,19 +112,19 @@ def test_our_own_tables(tmp_path):
     ("points", "marks", "words"),
     [
         ("", None, "the file is empty"),
-        ("hello\nworld\n", None, "this is no file of control"),
+        ("hello\nworld\n", None, "not a control file"),
         (files.OWN_MARKS, None, "has marks but no coordinates"),
         (files.OWN, files.OWN, "has coordinates but no marks"),
-        (files.OWN + "G1,1,2,3,,,,\n", None, "row 5: the point 'G1' stands in a, row 3, too with other coordinates"),
+        (files.OWN + "G1,1,2,3,,,,\n", None, "row 5: point 'G1' is also in a, row 3 with other coordinates"),
         (files.OWN.replace("386800.10", "east"), None, "row 3: X is 'east', not a number"),
-        (files.OWN.replace("control\n", "master\n"), None, "row 3: the role 'master' is unknown"),
+        (files.OWN.replace("control\n", "master\n"), None, "row 3: unknown role 'master'"),
         (files.OWN.replace("0.02", "-0.02"), None, "row 3: sigma of z is -0.02"),
-        (files.OWN, files.OWN_MARKS.replace("G1", "H1"), "no mark is of a point that a has (H1; there are G1, G2)"),
-        (files.OWN, files.OWN_MARKS.replace("DJI_0002", "DJI_0001"), "'G1' is marked in 'DJI_0001' in b, row 2, too"),
+        (files.OWN, files.OWN_MARKS.replace("G1", "H1"), "no marked point (H1) is in a (G1, G2)"),
+        (files.OWN, files.OWN_MARKS.replace("DJI_0002", "DJI_0001"), "'G1' in 'DJI_0001' is also marked in b, row 2"),
         (files.GCP_LIST + "1 2 3 4 5\n", None, "row 7: 5 cells"),
-        (files.GCP_LIST.replace("30.5 512.5", "31.5 512.5"), None, "row 3: the point 'G1' stands in a, row 2, too"),
+        (files.GCP_LIST.replace("30.5 512.5", "31.5 512.5"), None, "row 3: point 'G1' is also in a, row 2"),
         (files.MARKERS[:900], None, "a: damaged"),
-        (files.MARKERS.replace('camera_id="0"', 'camera_id="5"'), None, "the file has no such camera"),
+        (files.MARKERS.replace('camera_id="0"', 'camera_id="5"'), None, "unknown camera"),
         (files.MARKERS.replace('x="100.25"', 'x="nan"'), None, "x is 'nan', not a number"),
     ],
 )
@@ -175,7 +175,7 @@ def test_a_photograph_of_a_feature_is_no_image_of_a_mark(tmp_path):
     (tmp_path / "a").write_text(json.dumps({"type": "FeatureCollection", "features": [one]}))
     assert read_control(tmp_path / "a", None).points.ids == ("G1",)
     (tmp_path / "a").write_text(json.dumps({"type": "FeatureCollection", "features": []}))
-    with pytest.raises(InputError, match="there are no features"):
+    with pytest.raises(InputError, match="no features"):
         read_control(tmp_path / "a", None)
 
 
@@ -201,14 +201,14 @@ def _geo(old, new):
 
 
 GEO_REFUSED = {
-    "no point": (_geo('"Point"', '"LineString"'), "a, feature 1: the geometry is no point"),
-    "no number": (_geo("386800.1", '"x"'), "a, feature 1: the geometry is no point"),
-    "no name": (_geo('"name": "G', '"what": "G'), r"a: no attribute is the name of the points \(there are fid, what"),
-    "role": (_geo('"check"', '"both"'), "a, feature 2: the role 'both' is unknown"),
-    "twice": (_geo('"G2"', '"G1"'), "a, feature 2: the point 'G1' stands in a, feature 1, too"),
-    "system": (_geo("EPSG::32633", "ESRI::102100"), "the system 'urn:ogc:def:crs:ESRI::102100' is no EPSG code"),
+    "no point": (_geo('"Point"', '"LineString"'), "a, feature 1: the geometry is not a point"),
+    "no number": (_geo("386800.1", '"x"'), "a, feature 1: the geometry is not a point"),
+    "no name": (_geo('"name": "G', '"what": "G'), r"a: no attribute with point names \(found fid, what"),
+    "role": (_geo('"check"', '"both"'), "a, feature 2: unknown role 'both'"),
+    "twice": (_geo('"G2"', '"G1"'), "a, feature 2: point 'G1' is also in a, feature 1"),
+    "system": (_geo("EPSG::32633", "ESRI::102100"), "system 'urn:ogc:def:crs:ESRI::102100' is not an EPSG code"),
     "cut": (files.GEO_JSON[:-20], "JSON"),
-    "no feature": ('{"type": "FeatureCollection", "features": []}', "there are no features"),
+    "no feature": ('{"type": "FeatureCollection", "features": []}', "no features"),
 }  # fmt: skip
 
 
@@ -230,11 +230,11 @@ def _package(folder, *statements):
 
 PACKAGE_REFUSED = {
     "layers": (("ALTER TABLE object_points RENAME COLUMN point TO what",), "0 point layers with an attribute"),
-    "geometry": (("UPDATE object_points SET geom = x'4750' WHERE fid = 3",), "feature 3: the geometry is no point"),
+    "geometry": (("UPDATE object_points SET geom = x'4750' WHERE fid = 3",), "feature 3: the geometry is not a point"),
     "system": (("UPDATE gpkg_contents SET srs_id = 0",), "coordinate system has no EPSG code"),
-    "tables": (("DROP TABLE gpkg_geometry_columns",), "is no GeoPackage that can be read"),
+    "tables": (("DROP TABLE gpkg_geometry_columns",), "is not a readable GeoPackage"),
     "column": (("UPDATE gpkg_geometry_columns SET column_name = 'shape'",), "has no column 'shape'"),
-    "names": (("UPDATE object_points SET point = 'p7'",), "feature 2: the point 'p7' stands in photographs.gpkg, fe"),
+    "names": (("UPDATE object_points SET point = 'p7'",), "feature 2: point 'p7' is also in photographs.gpkg, fe"),
 }
 
 
@@ -248,7 +248,7 @@ def test_a_geo_package_that_is_no_control_is_told_in_a_sentence(tmp_path, name):
 def test_a_geo_package_whose_columns_have_no_names_in_text_is_told_in_a_sentence(tmp_path):
     path = _package(tmp_path, "ALTER TABLE object_points RENAME COLUMN point TO point_nr")
     path.write_bytes(path.read_bytes().replace(b"point_nr", b"point_\xff\xfe"))
-    with pytest.raises(InputError, match="is no GeoPackage that can be read"):
+    with pytest.raises(InputError, match="is not a readable GeoPackage"):
         read_control(path)
 
 
@@ -269,7 +269,7 @@ def test_control_of_bingo(tmp_path):
     assert points.ids == ("11", "12", "A-3") and points.check.tolist() == [False, True, False]
     np.testing.assert_array_equal(points.coordinates[:2], [[500.5, 600.5, 70.25], [510.5, 610.5, 71.25]])
     assert np.isnan(points.coordinates[2, 2])
-    for change, words in ((("620.5 nan", ""), "row 5: 3 cells; a row has CONT"), (("12 5", "11 5"), "'11' stands in")):
+    for change, words in ((("620.5 nan", ""), "row 5: 3 cells instead of CONT"), (("12 5", "11 5"), "'11' is also in")):
         path.write_text(files.GEOIN.replace(*change))
         with pytest.raises(InputError, match=words):
             read_control(path)

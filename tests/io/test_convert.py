@@ -186,7 +186,7 @@ def test_unknown_formats_list_the_known_ones(tmp_path):
         ("im,id,x,y,sxy", "im,label,x,y,sxy", ("project.xml", "image_pts", "no id")),
         ("camcal-fixed.txt", "camcal-free.txt", ("camcal-free.txt", "add it")),
         ("<ctrl_pts>", "<extra/><ctrl_pts>", ("project.xml", "<extra>", "remove it")),
-        ("<ctrl_pts>", "<prior_eo/><ctrl_pts>", ("project.xml", "<prior_eo> names 0 files")),
+        ("<ctrl_pts>", "<prior_eo/><ctrl_pts>", ("project.xml", "<prior_eo> has no file")),
         ('base_dir="$HERE"', 'base_dir="$DBAT"', ("project.xml", "$DBAT", "$HERE")),
         ("<project_unit>m<", "<project_unit>ft<", ("project.xml", "'ft'", "use one of m")),
     ],
@@ -218,7 +218,7 @@ def test_a_bad_row_of_an_aicon_file_is_named(data_dir, tmp_path):
     ("line", "old", "new", "message"),
     [
         (0, "-28.78507", "c", r"example\.ior, row 1: a cell is not a finite number; correct it"),
-        (4, "35.96800", "0", r"example\.ior, row 5: the format in mm and pixels is positive; correct it"),
+        (4, "35.96800", "0", r"example\.ior, row 5: the image format in mm or pixels is not positive; correct it"),
     ],
 )
 def test_a_bad_camera_of_an_aicon_project_is_named(data_dir, tmp_path, line, old, new, message):
@@ -244,7 +244,7 @@ def test_an_aicon_project_needs_its_files(data_dir, tmp_path):
     ("old", "new", "message"),
     [
         ("   0      333 2158.2500", "   9      333 2158.2500", r"pmexport\.txt, row \d+: image 9 is not among"),
-        ("0.000500 20 8858 12996", "0.000500 20 8858", "is of no format that is known"),
+        ("0.000500 20 8858 12996", "0.000500 20 8858", "has an unknown format"),
     ],
 )
 def test_a_bad_export_is_refused(data_dir, tmp_path, old, new, message):

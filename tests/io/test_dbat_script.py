@@ -119,8 +119,8 @@ def test_a_dependent_datum_is_a_minimal_one(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"units": "turns"}, "the units 'turns' of <prior_eo> are unknown; use one of degrees, radian, gon"),
-        ({"form": "id,x,y,z,omega,phi,skappa"}, "the column 'skappa', which is not read"),
+        ({"units": "turns"}, "unknown units 'turns' of <prior_eo>; use one of degrees, radian, gon"),
+        ({"form": "id,x,y,z,omega,phi,skappa"}, "the unsupported column 'skappa'"),
         ({"rows": "7,1,2,8,5,0,50\n"}, r"eo.txt, row 1: image 7 is not in images.txt"),
     ],
 )
@@ -131,5 +131,5 @@ def test_invalid_prior_orientations_are_refused(tmp_path, change, message):
 
 def test_a_camera_file_without_camera_is_refused(tmp_path):
     (eo_script(tmp_path) / "camera.txt").write_text("<document/>")
-    with pytest.raises(InputError, match=r"camera.txt has no <cameras><camera>; name a camera file of DBAT"):
+    with pytest.raises(InputError, match=r"camera.txt has no <cameras><camera>; give a camera file of DBAT"):
         _read(tmp_path)

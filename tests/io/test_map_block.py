@@ -145,7 +145,7 @@ REFUSED = {
     "no code": ([("code = 32722\n", "")], ["[frame] code", "missing", "add it"]),
     "feet": ([("32722", "2227")], ["[frame] code", "US survey foot", "convert"]),
     "unknown vertical": ([('"ellipsoidal"', "99999")], ["block.toml, [frame] vertical", "99999 is unknown"]),
-    "no heights": ([('"ellipsoidal"', "4326")], ["block.toml, [frame] vertical", "no system of heights"]),
+    "no heights": ([('"ellipsoidal"', "4326")], ["block.toml, [frame] vertical", "not a vertical CRS"]),
     "vertical": ([('"ellipsoidal"', '"geoid"')], ["[frame] vertical", "geoid", "give one"]),
     "yaw": ([(EPSG, EPSG + '\nyaw = "map"')], ["[frame] yaw", "'map'", '"grid"']),
     "grid of degrees": ([("32722", "4326"), (EPSG[-13:], EPSG[-13:] + '\nyaw = "grid"')], ["no grid", '"true"']),

@@ -86,10 +86,10 @@ def _changed(old, new):
 
 
 REFUSED = {
-    "size": (_changed(f"20 {WIDTH} {HEIGHT}", "20"), "row 2: it has no size of the photographs; write width"),
+    "size": (_changed(f"20 {WIDTH} {HEIGHT}", "20"), "row 2: no size of the photographs; write width"),
     "outer": (_changed("0 -0.6 -0.1", "0 -0.6 x"), "row 7: .* is not 7 numbers"),
-    "cells": (_changed("\n10 ", "\n10 1 "), r"row \d+: 7 numbers are expected here"),
-    "cut": ("\n".join(export_text().split("\n")[:8]), "row 6: '0 some folder/a 1.jpg' begins no photograph"),
+    "cells": (_changed("\n10 ", "\n10 1 "), r"row \d+: expected 7 numbers"),
+    "cut": ("\n".join(export_text().split("\n")[:8]), "row 6: '0 some folder/a 1.jpg' does not start a photograph"),
     "image": (_changed("2 18 ", "9 18 "), "image 9 is not among the export's images"),
 }
 

@@ -258,7 +258,7 @@ def test_the_command_lays_a_photograph_over_the_ground(tmp_path, monkeypatch, ca
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"--image": "nobody"}, "no such image; it has"),
+        ({"--image": "nobody"}, "unknown image; use one of"),
         ({"dsm": "away"}, r"does not see dsm\.tif"),
         ({"dsm": "utm"}, "frame is local"),
         ({"photo": "dsm"}, "its camera 450 x 300"),

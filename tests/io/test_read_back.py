@@ -95,10 +95,10 @@ def test_several_cameras_come_back_with_their_photographs_from_opk(tmp_path):
         np.testing.assert_allclose(at, own[back.images[i], back.points[k]], rtol=0, atol=1e-9)
     table = tmp_path / "out" / "images.csv"
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:-1]))
-    with pytest.raises(InputError, match=r"images.csv says no camera of 1 photographs \(f.tif\); add a row"):
+    with pytest.raises(InputError, match=r"images.csv has no camera for 1 photographs \(f.tif\); add a row"):
         read_source(tmp_path / "out")
     table.unlink()
-    with pytest.raises(InputError, match=r"camera.toml holds several cameras.*; write images.csv beside it"):
+    with pytest.raises(InputError, match=r"camera.toml has several cameras.*; write images.csv into"):
         read_source(tmp_path / "out")
 
 
@@ -228,12 +228,12 @@ def test_markers_in_another_system_are_refused_and_incomplete_ones_reported(tmp_
     p = inside("agisoft", "local")
     none = np.full((4, 3), np.nan)
     heights = with_control(p, np.array([[0.0, 0, 0]] * 3 + [[np.nan, np.nan, 0]]), none, np.zeros(4, bool))
-    with pytest.warns(UserWarning, match="markers.xml: 1 control or check points without X and Y are left out"):
+    with pytest.warns(UserWarning, match="markers.xml: skipped 1 control or check points without X and Y"):
         export(heights, tmp_path / "out", "metashape")
     assert len(read_source(tmp_path / "out").control.who) == 9
     path = tmp_path / "out" / "markers.xml"
     path.write_text(path.read_text().replace("LOCAL_CS[", "GEOGCS["))
-    with pytest.raises(InputError, match=r"markers.xml is in another coordinate system than cameras.xml"):
+    with pytest.raises(InputError, match=r"markers.xml and cameras.xml differ in coordinate system"):
         read_source(tmp_path / "out")
 
 
@@ -241,7 +241,7 @@ def test_control_of_opensfm_is_a_gcp_list(tmp_path):
     p = inside("opencv", "epsg")
     p = p._replace(files=tuple(name.replace(" ", "_") for name in p.files))
     p = with_control(p, np.full((5, 3), 0.25), np.full((5, 3), 0.02), np.arange(5) == 4)
-    with pytest.warns(UserWarning, match="gcp_list.txt is without 1 check points or points without X and Y"):
+    with pytest.warns(UserWarning, match="gcp_list.txt skips 1 check points or points without X and Y"):
         export(p, tmp_path / "out", "opensfm")
     lines = (tmp_path / "out" / "gcp_list.txt").read_text().splitlines()
     assert lines[0] == "EPSG:32633"
@@ -259,7 +259,7 @@ def test_control_of_opensfm_is_a_gcp_list(tmp_path):
     assert given.points.system == "EPSG:32633" and set(given.points.ids) == set(names)
     # A list of control beside tracks makes no project of texts.
     assert recognise(tmp_path / "out") == ["opensfm"]
-    with pytest.warns(UserWarning, match="it needs a map system and the block is in a local frame"):
+    with pytest.warns(UserWarning, match="it needs a map system, but the block is in a local frame"):
         export(p._replace(frame=Frame("local")), tmp_path / "local", "opensfm")
     assert not (tmp_path / "local" / "gcp_list.txt").exists()
 

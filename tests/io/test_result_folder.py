@@ -129,7 +129,7 @@ def test_photographs_are_called_by_their_files(tmp_path):
         photograph_files(images, [tmp_path / "none"])
     (tmp_path / "photographs.csv").write_text("image,file\na,a.png\nc,c.png\n")
     assert photograph_files(images, [tmp_path / "right"], tmp_path) == {"a": "a.png", "b": "b.jpg", "c": "c.png"}
-    with pytest.raises(InputError, match="two images are of the photograph a"):
+    with pytest.raises(InputError, match="two images have the photograph a"):
         block = read_source(write_text(tmp_path / "model"))
         Project.of_block(block, block.start.unknowns, {"b": "a"})
 
@@ -158,7 +158,7 @@ def test_the_command_writes_adjusted_values(own, tmp_path, monkeypatch, capsys):
     for arguments, message in (
         ((own / "result", tmp_path / "no", "--to", "opk", "--adjust"), "--adjust applies to a block that is exported"),
         ((own / "block", tmp_path / "no", "--adjust"), "--adjust applies to a block that is exported"),
-        ((own / "block", tmp_path / "no", "--to", "opk", "--part", 2), "--block and --part apply to results"),
+        ((own / "block", tmp_path / "no", "--to", "opk", "--part", 2), "--block and --part apply to results only"),
         ((own / "result", tmp_path / "no.xml", "--to", "metashape"), "omit .xml"),
     ):
         code, _, wrong = run(monkeypatch, capsys, "convert", *arguments)

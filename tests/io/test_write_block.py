@@ -129,7 +129,7 @@ def test_foreign_files_are_never_replaced(write_folder, tmp_path):
     """A block of the user's own, a table that was changed by hand, one that would be read with another block."""
     own = write_folder()
     block, before = read_block(own), {path: path.read_bytes() for path in own.iterdir()}
-    with pytest.raises(InputError, match="block is not empty, and nothing in it says"):
+    with pytest.raises(InputError, match="block is not empty and was not written"):
         write_block(block, own)
     assert {path: path.read_bytes() for path in own.iterdir()} == before
     write_block(block, tmp_path / "changed")
@@ -139,7 +139,7 @@ def test_foreign_files_are_never_replaced(write_folder, tmp_path):
         write_block(block, tmp_path / "changed")
     write_block(dataclasses.replace(block, distances=type(block.distances).none()), tmp_path / "added")
     (tmp_path / "added" / "distances.csv").write_bytes((own / "distances.csv").read_bytes())
-    with pytest.raises(InputError, match=r"distances\.csv is not jaxphoto's and would belong to what is written"):
+    with pytest.raises(InputError, match=r"distances\.csv was not written by jaxphoto and would be read"):
         write_block(block, tmp_path / "added")
 
 
@@ -147,7 +147,7 @@ def test_another_folder_is_left_alone(write_folder, tmp_path):
     block = read_block(write_folder())
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "1.jpg").write_text("")
-    with pytest.raises(InputError, match=r"photos is not empty, and nothing in it says that jaxphoto wrote it"):
+    with pytest.raises(InputError, match=r"photos is not empty and was not written by jaxphoto"):
         write_block(block, tmp_path / "photos")
     assert [path.name for path in (tmp_path / "photos").iterdir()] == ["1.jpg"]
     with pytest.raises(InputError, match=r"1\.jpg is a file: name a folder"):

@@ -109,7 +109,7 @@ def test_what_cannot_be_measured_is_told_in_a_sentence(tmp_path):
     with pytest.raises(InputError, match="this is no picture that can be read"):
         interest_points(tmp_path / "text.png", SENSOR, 10)
     cv2.imwrite(str(tmp_path / "blank.png"), np.full((480, 640), 90, np.uint8))
-    with pytest.raises(InputError, match="no interest point was found"):
+    with pytest.raises(InputError, match="no interest point found"):
         interest_points(tmp_path / "blank.png", SENSOR, 10)
     with pytest.raises(InputError, match="the picture has 640 x 480 pixels, the camera 320 x 240"):
         interest_points(tmp_path / "blank.png", Sensor(320, 240, 0.006), 10)

@@ -83,7 +83,7 @@ def test_another_size_or_number_is_another_target():
         ("disc", "write one of circle:diameter_mm=300"),
         ("circle", "write it like circle:diameter_mm=300"),
         ("circle:diameter_mm=-3", "diameter_mm is '-3', not a positive"),
-        ("aruco:dictionary=9X9", "there is no dictionary '9X9'"),
+        ("aruco:dictionary=9X9", "unknown dictionary '9X9'"),
     ],
 )
 def test_a_wrong_description_is_said_with_the_syntax(description, words):

@@ -203,7 +203,9 @@ def test_photographs_that_do_not_hang_together(taken, elsewhere):
     images, camera, _, _ = taken
     near = [p.path for p in images[:2]]
     groups = photographs([near[0], *elsewhere, near[1]])
-    with pytest.raises(InputError, match=r"2 groups without matches .*\(0.png, 1.png; far0.png, far1.png\)"):
+    with pytest.raises(
+        InputError, match=r"2 groups of photographs without matches .*\(0.png, 1.png; far0.png, far1.png\)"
+    ):
         match_photographs(groups, camera.sensor, camera.interior, photograph_pairs(groups), count=800)
     apart = photographs([near[0], elsewhere[0]])
     with pytest.raises(InputError, match=r"no two of the 2 photographs \(0.png, far0.png\) have 15 points in common"):
@@ -221,8 +223,8 @@ def test_photographs_that_match_no_other_one_are_left_out_by_name(taken, elsewhe
     assert found.counts[:, 3].astype(bool).tolist() == [False, True, False, False, False, False]
     assert len(found.xy_mm[1]) == len(found.sigma_mm[1]) == 0
     assert found.left_out == {
-        "blank": "it shows no features: it is blank or out of focus",
-        "far0": "it has 15 points in common with no other photograph it was compared with",
+        "blank": "no features: blank or out of focus",
+        "far0": "fewer than 15 points in common with each compared photograph",
     }
 
 
@@ -231,9 +233,9 @@ def test_too_few_photographs_with_features(taken, tmp_path):
     for k in range(2):
         cv2.imwrite(str(tmp_path / f"blank{k}.png"), np.full((480, 640), 90, np.uint8))
     one = photographs([tmp_path / "blank0.png", images[0].path, tmp_path / "blank1.png"])
-    with pytest.raises(InputError, match=r"in common; blank0.png, blank1.png show no features: blank or out of focus"):
+    with pytest.raises(InputError, match=r"in common; blank0.png, blank1.png have no features: blank or out of focus"):
         match_photographs(one, camera.sensor, camera.interior, photograph_pairs(one), count=800)
-    with pytest.raises(InputError, match="an orientation needs two photographs that overlap"):
+    with pytest.raises(InputError, match="an orientation needs at least two overlapping photographs"):
         match_photographs(images[:1], camera.sensor, camera.interior, [], count=800)
 
 

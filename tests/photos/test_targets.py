@@ -229,7 +229,7 @@ def test_no_board_anywhere_suggests_the_other_count(tmp_path):
     pattern = read_board("chessboard:8x5:square_mm=22")
     cv2.imwrite(str(tmp_path / "a.png"), rendered(pattern, SENSOR, LENS, view(pattern.board, 0), rays=4))
     taken = photographs([tmp_path / "a.png"])
-    with pytest.raises(InputError, match="8x5 corners are found"):
+    with pytest.raises(InputError, match="8x5 corners found"):
         find_targets(taken, read_board("chessboard:9x6:square_mm=22"))
 
 

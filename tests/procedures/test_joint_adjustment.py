@@ -76,7 +76,7 @@ def test_plots_show_names_literally():
     errors = plot_trajectory_errors(result, "2", Figure().add_subplot(), attitude=True)
     whole = trajectory_errors_figure(result).axes
     np.testing.assert_array_equal(errors.lines[0].get_ydata(), whole[4].lines[0].get_ydata())
-    with pytest.raises(InputError, match="there is no strip 'x'; there are 1, 2, 3"):
+    with pytest.raises(InputError, match="unknown strip 'x'; use one of 1, 2, 3"):
         plot_trajectory_errors(result, "x")
     own = plot_scanner_correlation(result, Figure().add_subplot(), itself=True)
     np.testing.assert_array_equal(own.images[0].get_array(), second.images[0].get_array())

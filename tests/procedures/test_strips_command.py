@@ -174,7 +174,7 @@ def test_a_cloud_on_the_map_and_a_trajectory_in_sbet(on_the_map, tmp_path, monke
     code, _, errors = run(
         monkeypatch, capsys, "strips", folder / "nowhere.laz", "--out", tmp_path / "no", *given, *OPTIONS
     )
-    assert code == 2 and "name it (--cloud-epsg)" in " ".join(errors.split()) and not (tmp_path / "no").exists()
+    assert code == 2 and "give it (--cloud-epsg)" in " ".join(errors.split()) and not (tmp_path / "no").exists()
 
 
 def test_withheld_points_that_nothing_says_anything_of_stay(cloud_file, tmp_path):
@@ -213,7 +213,7 @@ def test_withheld_points_that_nothing_says_anything_of_stay(cloud_file, tmp_path
         (("--sigma-heading-deg", "inf"), "'--sigma-heading-deg': inf is not a positive number"),
         (("--trajectory-shift-s", "nan"), "'--trajectory-shift-s': nan is not a finite number"),
         (("--exposure-shift-s", "inf"), "'--exposure-shift-s': inf is not a finite number"),
-        (("--breaklines", "R*"), "--breaklines names points of photographs: add their block (--block)"),
+        (("--breaklines", "R*"), "--breaklines needs points of photographs: add their block (--block)"),
         (("--cell-m", "0.3"), "strip 1 has fewer than 10 planes in common"),
     ],
 )

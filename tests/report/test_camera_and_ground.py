@@ -135,7 +135,7 @@ def test_sigma_naught_falls_from_that_of_the_start_to_that_of_the_optimum():
     one = jaxphoto.adjust(simulated("cross").block, max_steps=1)
     assert one.history.sum_of_squares[0] == pytest.approx(result.history.sum_of_squares[0])
     assert float(one.sum_of_squares) == pytest.approx(result.history.sum_of_squares[1], rel=1e-6)
-    assert "1 step, which is the limit (--max-steps)" in convergence_words(one) and one.outcome is Outcome.STEPS
+    assert "1 step, the maximum (--max-steps)" in convergence_words(one) and one.outcome is Outcome.STEPS
 
 
 def test_the_last_step_is_shorter_than_what_ends_an_adjustment():

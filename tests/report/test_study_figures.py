@@ -70,7 +70,7 @@ def test_a_sensitivity_is_drawn_as_its_table_says(axes):
     heights = [bar.get_height() for bar in axes.patches]
     np.testing.assert_allclose(heights, np.concatenate([own[n] for n in ("exact", "first_order", "difference")]))
     assert axes.get_legend_handles_labels()[1] == ["exact", "first order", "difference"]
-    with pytest.raises(InputError, match=r"no 'k9' to be drawn; there are c_mm; .*check points, X"):
+    with pytest.raises(InputError, match=r"unknown estimate 'k9'; use one of c_mm; .*check points, X"):
         plot_sensitivity(tables, "k9")
 
 
@@ -87,10 +87,10 @@ def test_draws_and_effects_are_those_of_their_files(axes):
     area = sum(bar.get_height() * bar.get_width() for bar in axes.patches)
     assert area == pytest.approx(1.0)
     assert max(axes.lines[1].get_ydata()) == pytest.approx(1 / 0.01 / np.sqrt(2 * np.pi), rel=1e-3)
-    with pytest.raises(InputError, match=r"the draws have no 'c'; they have one\.c_mm"):
+    with pytest.raises(InputError, match=r"unknown quantity 'c' of the draws; use one of one\.c_mm"):
         plot_draws(draws, summary, "c", axes)
     effects = pd.DataFrame({"error": ["A X", "A Y"], "one.c_mm": [0.005, -0.002]})
     shown = plot_effects(effects, summary, ["one.c_mm"], Figure().add_subplot()).images[0]
     np.testing.assert_allclose(np.asarray(shown.get_array()).ravel(), [0.5, -0.2])
-    with pytest.raises(InputError, match="the effects have no 'k1'"):
+    with pytest.raises(InputError, match="unknown quantity 'k1' of the effects"):
         plot_effects(effects, summary, ["k1"])

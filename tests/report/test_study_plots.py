@@ -104,13 +104,13 @@ def test_heights_of_a_cloud_are_counted_and_coloured(axes):
     assert plot_lidar_heights(control, axes) is axes
     refused = ~np.isfinite(control.height)
     numbers = control.used.sum(), (~control.used & ~refused).sum(), refused.sum()
-    words = [f"{w} ({n})" for w, n in zip(("control", "left out", "refused"), numbers, strict=True)]
+    words = [f"{w} ({n})" for w, n in zip(("control", "rejected", "no height"), numbers, strict=True)]
     assert set(lines(axes)) == set(words) and len(lines(axes)[words[0]].get_xdata()) == control.used.sum()
     right = plot_lidar_heights(control, Figure().add_subplot(), residuals=True)
     np.testing.assert_allclose(np.abs(right.collections[0].get_array()), 0.05)
     assert "RMSE 0.050 m" in right.get_title(loc="left")
     none = eqx.tree_at(lambda c: c.used, control, np.zeros_like(control.used))
-    with pytest.raises(InputError, match="no height of the cloud is control"):
+    with pytest.raises(InputError, match="no height of the cloud is used as control"):
         plot_lidar_heights(none, axes, residuals=True)
     assert [panel.has_data() for panel in heights_figure(none).axes] == [True, False]
 

@@ -151,7 +151,7 @@ def test_the_command_writes_those_that_are_asked_for(tmp_path, monkeypatch, caps
 
 
 def test_a_table_that_there_is_not_is_named():
-    with pytest.raises(InputError, match="there is no table inner; there are interior, exterior"):
+    with pytest.raises(InputError, match="unknown table inner; use one of interior, exterior"):
         write_tables(Tables(adjusted("cross")), "nowhere", names=["inner"])
 
 

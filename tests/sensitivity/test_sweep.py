@@ -278,5 +278,5 @@ def test_mistakes_are_told_in_one_sentence(designs, swept):
     with pytest.raises(ValueError, match="rotations must be one of"), unchecked():
         sweep([base], "euler")  # type: ignore[arg-type]
     renamed = dataclasses.replace(swept, parameters=tuple({"value": k} for k in range(len(swept))))
-    with pytest.raises(InputError, match="called value, like a column"):
+    with pytest.raises(InputError, match="design parameter value has the name of a table column"):
         sweep_table(renamed)

@@ -1,11 +1,11 @@
-"""Lens distortion: one final class per model with a common base, found by its name in files.
+"""Lens distortion: one final class per model, selected by its name in files.
 
-A new model is one file here and its line below.
+To add a model, add its file to this folder and its import below.
 """
 
 from typing import TYPE_CHECKING
 
-# Order of tables and messages.
+# The order of imports is the order in tables and messages.
 # ruff: isort: off
 from jaxphoto.camera.distortion.base import AbstractDistortion as AbstractDistortion
 from jaxphoto.camera.distortion.base import invert as invert
@@ -30,7 +30,7 @@ DISTORTIONS = AbstractDistortion.known()
 """Models of jaxphoto by name in files; `AbstractDistortion.known()` includes user-defined ones."""
 
 if not TYPE_CHECKING:
-    # Type checkers would take a computed list for an empty one; the aliases above serve them.
+    # Type checkers read a computed list as empty; the aliases above export the names.
     __all__ = sorted(
         ["DISTORTIONS", "AbstractDistortion", "invert", *(model.__name__ for model in DISTORTIONS.values())]
     )

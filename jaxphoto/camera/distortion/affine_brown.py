@@ -1,4 +1,4 @@
-"""Brown's distortion after an affinity of the image axes, in the measured coordinate, subtracted."""
+"""Brown's distortion applied after an affinity of the image axes; function of the measured coordinate, subtracted."""
 
 from typing import ClassVar
 
@@ -9,18 +9,19 @@ from jaxphoto.camera.distortion.base import AbstractBrown, Affinity
 
 
 class AffineBrown(AbstractBrown):
-    """Affinity and shear first, then radial and decentring distortion of the result.
+    """Affinity and shear, followed by radial and decentring distortion.
 
         m = (x - b1 x - b2 y, y),   ideal = m - delta(m)
         delta = m (K1 r^2 + K2 r^4 + K3 r^6) + (P1 (r^2 + 2 m_x^2) + 2 P2 m_x m_y, 2 P1 m_x m_y + P2 (r^2 + 2 m_y^2))
 
-    `Brown` evaluates all terms in the same coordinate; the two differ by products of affinity and distortion, which are
-    visible for close-range cameras. Units as there. Source: the "backward" model 3 of DBAT (Börlin and Grussenmeyer).
+    `Brown` evaluates all terms in the same coordinate; the models differ by products of affinity and distortion, which
+    matter for close-range cameras. Units: as in `Brown`. Source: the "backward" model 3 of DBAT (Börlin and
+    Grussenmeyer).
     """
 
     name: ClassVar[str] = "affine_brown"
     affinity: ClassVar[Affinity] = "before"
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""
+        """Map a measured to the ideal coordinate (mm), both reduced to the principal point."""
         return self.undistorted(jnp.stack([xy[0] - self.b1 * xy[0] - self.b2 * xy[1], xy[1]]))

@@ -1,4 +1,4 @@
-"""Agisoft's frame camera: polynomial from ideal to measured, normalised, with affinity and skew."""
+"""Agisoft's frame camera: normalised polynomial from ideal to measured coordinates, with affinity and skew."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Literal
@@ -15,10 +15,10 @@ class Agisoft(AbstractDistortion):
         u = x q + t (P1 (r^2 + 2 x^2) + 2 P2 x y),   v = y q + t (2 P1 x y + P2 (r^2 + 2 y^2))
         q = 1 + K1 r^2 + K2 r^4 + K3 r^6 + K4 r^8,   t = 1 + P3 r^2 + P4 r^4
 
-    (x, y) is the ideal coordinate divided by c, and in these formulas y runs *down*, as in Agisoft's; the coordinates
-    that `closed_form` takes and gives have y up, as everywhere here. c is its f; all coefficients are its own numbers,
-    without unit, but for b1 = B1 / f and b2 = B2 / f, as its B1 and B2 are in pixels. P3 and P4 are of PhotoScan
-    1.2 to 1.4; Metashape has none.
+    (x, y) is the ideal coordinate divided by c, and in these formulas y points *down*, as in Agisoft's; `closed_form`
+    converts coordinates with y up, as everywhere in jaxphoto. c is Agisoft's f; all coefficients have Agisoft's values,
+    without unit, except b1 = B1 / f and b2 = B2 / f, because B1 and B2 are in pixels. P3 and P4 exist only in PhotoScan
+    1.2 to 1.4.
     Source: Agisoft PhotoScan and Metashape, user manual, appendix "Camera models".
     """
 
@@ -37,7 +37,7 @@ class Agisoft(AbstractDistortion):
     domain: ClassVar[Literal["measured", "ideal"]] = "ideal"
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
     rare: ClassVar[tuple[str, ...]] = ("k4", "p3", "p4", "b1", "b2")
-    # y points down: odd terms in y change sign.
+    # y points down: terms odd in y change sign.
     terms: ClassVar[Mapping[str, Term] | None] = {
         **same_terms("k1", "k2", "k3", "k4", "p1", "p3", "p4", "b1"),
         **{"p2": Term("p2", -1.0), "b2": Term("b2", -1.0)},
@@ -45,7 +45,7 @@ class Agisoft(AbstractDistortion):
     normalised: ClassVar[bool] = True
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Measured coordinate of an ideal one, both reduced to the principal point and divided by c, y up."""
+        """Map an ideal to the measured coordinate, both reduced to the principal point and divided by c, y up."""
         x, y = xy[0], -xy[1]
         r2 = x * x + y * y
         q = 1 + radial(r2, self.k1, self.k2, self.k3, self.k4)

@@ -1,4 +1,4 @@
-"""The balanced radial model of close-range metrology, in the ideal coordinate, added."""
+"""Balanced radial model of close-range metrology: function of the ideal coordinate, added."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Literal
@@ -16,8 +16,8 @@ class Balanced(AbstractDistortion):
         delta_y = y dr + B2 (r^2 + 2 y^2) + 2 B1 x y
         dr = A1 (r^2 - R0^2) + A2 (r^4 - R0^4) + A3 (r^6 - R0^6)
 
-    Units: A1 mm^-2, A2 mm^-4, A3 mm^-6, B1 and B2 mm^-1, C1 and C2 none, R0 mm (a constant of the model).
-    Source: the AICON / JAG3D bundle adjustment, whose report the tests reproduce.
+    Units: A1 mm^-2, A2 mm^-4, A3 mm^-6, B1 and B2 mm^-1, C1 and C2 dimensionless, R0 mm (a constant of the model).
+    Source: AICON / JAG3D bundle adjustment; the tests reproduce its report.
     """
 
     a1: Float[Array, ""] | float = 0.0
@@ -43,7 +43,7 @@ class Balanced(AbstractDistortion):
     affinity: ClassVar[Affinity] = "added"
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Measured coordinate (mm) of an ideal one, both reduced to the principal point."""
+        """Map an ideal to the measured coordinate (mm), both reduced to the principal point."""
         x, y = xy
         r2, s2 = x * x + y * y, self.r0 * self.r0
         dr = self.a1 * (r2 - s2) + self.a2 * (r2**2 - s2**2) + self.a3 * (r2**3 - s2**3)

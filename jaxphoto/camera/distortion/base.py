@@ -1,9 +1,9 @@
 """Base class of lens distortions: one polynomial map between measured and ideal image coordinates.
 
 Coordinates are reduced to the principal point, in millimetres or, for a `normalised` model, in units of the principal
-distance. A model implements one direction in closed form and declares which (`domain`); `invert` computes the other.
-Direction, sign and units of a distortion are thus part of its type (docs/conventions.md); `InteriorOrientation`
-converts millimetres to any of them.
+distance. A model implements one direction in closed form and declares it by `domain`; `invert` computes the other
+direction. Direction, sign and units of a distortion are therefore part of its type (docs/conventions.md);
+`InteriorOrientation` converts from and to millimetres.
 """
 
 import abc
@@ -19,14 +19,14 @@ from jaxphoto.camera.declared import Declared
 from jaxphoto.camera.sensor import Sensor
 from jaxphoto.short_repr import pretty_repr
 
-# Maximum number of Newton iterations; within the monotone range a model needs 4 to 8.
+# Maximum number of Newton iterations; 4 to 8 suffice within the monotone range.
 _STEPS = 50
-# Number of places along the ray from the principal point at which the map must keep its orientation.
+# Number of points along the ray from the principal point at which the sign of the Jacobian determinant is checked.
 _PROBES = 64
 
 
 class Term(NamedTuple):
-    """Coefficient of a model as a common term (`AbstractDistortion.terms`): `sign * coefficient * c^power`."""
+    """Coefficient of a model as a common term, `sign * coefficient * c^power` (see `AbstractDistortion.terms`)."""
 
     field: str
     sign: float = 1.0
@@ -34,12 +34,12 @@ class Term(NamedTuple):
 
 
 def same_terms(*names: str) -> dict[str, Term]:
-    """Return terms for coefficients of the same name, sign and unit."""
+    """Return the terms of coefficients whose name, sign and unit equal the common term."""
     return {name: Term(name) for name in names}
 
 
 def radial_powers(letter: str, n: int) -> dict[str, int]:
-    """Return powers of mm of the first `n` coefficients of even powers of the radius: k1 in mm^-2, k2 in mm^-4 ..."""
+    """Return the units of the first `n` radial coefficients as powers of mm: k1 in mm^-2, k2 in mm^-4 ..."""
     return {f"{letter}{i}": -2 * i for i in range(1, n + 1)}
 
 
@@ -48,20 +48,20 @@ Affinity = Literal["added", "before", "after", "around"]
 
 @pretty_repr
 class AbstractDistortion(Declared):
-    """Lens distortion; its fields are scalars, its `domain` declares the direction of the polynomial.
+    """Base class of lens distortions; fields are scalars, `domain` declares the direction of the polynomial.
 
     `domain == "measured"`: `closed_form` maps measured to ideal coordinates (usual in photogrammetry). `domain ==
-    "ideal"`: it maps ideal to measured ones, and residuals are those of measured coordinates. `normalised`: coordinates
-    are those in mm divided by the principal distance (tangents of the field angle), as in computer vision, so that
-    coefficients have no unit.
+    "ideal"`: it maps ideal to measured coordinates, and residuals refer to measured coordinates. `normalised`:
+    coordinates are divided by the principal distance (tangents of the field angle), as in computer vision; coefficients
+    have no unit.
 
-    Name and coefficients of a model are declared only here (docs/extending.md): `name`, `coefficients`, `constants` and
-    `choices` as in `Declared`; `rare` names coefficients that most cameras do not need (affinity, rational and highest
-    terms); `scales` those that change the image scale as the principal distance does: both cannot be free.
+    The class is the only declaration of a model (docs/extending.md). `name`, `coefficients`, `constants` and `choices`:
+    see `Declared`. `rare`: coefficients that most cameras do not need (affinity, rational and highest-order terms).
+    `scales`: coefficients that change the image scale like the principal distance; they and c cannot both be free.
 
-    `terms` enables exact conversions (`camera.equivalence`): the coefficients as terms of one of its two polynomials;
-    None if the model is neither. `affinity` declares when it acts: "added" to the other terms, in the same coordinate;
-    or in a step of its own, "before" or "after" them, or one part "around" each side.
+    `terms`: the coefficients as terms of one of the two polynomials of `camera.equivalence`, for exact conversions;
+    None if the model is neither. `affinity`: order of the affinity; "added" to the other terms, in the same coordinate;
+    applied separately "before" or "after" them; or one part before and one after ("around").
     """
 
     domain: eqx.AbstractClassVar[Literal["measured", "ideal"]]
@@ -73,17 +73,17 @@ class AbstractDistortion(Declared):
 
     @classmethod
     def plain(cls, sensor: Sensor) -> "AbstractDistortion":
-        """Return the model without distortion for a camera with that sensor; chooses lengths that the model needs."""
+        """Return the model without distortion for a camera with the given sensor, which sets the required lengths."""
         return cls()
 
     @classmethod
     def power(cls, coefficient: str) -> int | None:
-        """Return the power of mm of a coefficient; 0 for normalised coordinates."""
+        """Return the unit of a coefficient as a power of mm; 0 for normalised coordinates."""
         return 0 if cls.normalised else super().power(coefficient)
 
     @classmethod
     def usual(cls) -> tuple[str, ...]:
-        """Return the coefficients that most cameras need: all except `rare` and `scales`."""
+        """Return the commonly needed coefficients: all except `rare` and `scales`."""
         return tuple(name for name in cls.coefficients if name not in (*cls.rare, *cls.scales))
 
     @abc.abstractmethod
@@ -91,16 +91,16 @@ class AbstractDistortion(Declared):
         """Map one reduced coordinate in the closed-form direction, in the model's unit (mm unless `normalised`)."""
 
     def ideal_from_measured(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Return the ideal from the measured coordinate, both reduced to the principal point, in the model's unit.
+        """Map the measured to the ideal coordinate, both reduced to the principal point, in the model's unit.
 
-        Meaningless where the model is not invertible; `invert` tells.
+        Undefined where the model is not invertible; see the flag of `invert`.
         """
         return self.closed_form(xy) if self.domain == "measured" else invert(self, xy)[0]
 
     def measured_from_ideal(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Return the measured from the ideal coordinate, both reduced to the principal point, in the model's unit.
+        """Map the ideal to the measured coordinate, both reduced to the principal point, in the model's unit.
 
-        Meaningless where the model is not invertible; `invert` tells.
+        Undefined where the model is not invertible; see the flag of `invert`.
         """
         return invert(self, xy)[0] if self.domain == "measured" else self.closed_form(xy)
 
@@ -108,9 +108,9 @@ class AbstractDistortion(Declared):
 def invert(distortion: AbstractDistortion, target: Float[Array, "2"]) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
     """Return the coordinate that `closed_form` maps to `target`, and True if it lies in the monotone range.
 
-    Newton's method from the linear part of the map, differentiable to any order by the implicit function theorem. The
-    second value is False if Newton's method does not converge or if the Jacobian determinant of the map changes sign
-    between the principal point and the result: the model is undefined there, whatever the first value is.
+    Uses Newton's method from the linear part of the map; differentiable to any order by the implicit function theorem.
+    The second value is False if Newton's method does not converge or if the Jacobian determinant of the map changes
+    sign between the principal point and the result; the first value is then undefined.
     """
 
     def error(xy: Float[Array, "2"]) -> Float[Array, "2"]:
@@ -138,7 +138,7 @@ def invert(distortion: AbstractDistortion, target: Float[Array, "2"]) -> tuple[F
 
 
 def _monotone(distortion: AbstractDistortion, xy: Float[Array, "2"]) -> Bool[Array, ""]:
-    """Return True if the map keeps its orientation along the ray from the principal point to `xy`."""
+    """Return True if the Jacobian determinant keeps its sign along the ray from the principal point to `xy`."""
 
     def determinant(fraction):
         j = jax.jacfwd(distortion.closed_form)(fraction * xy)
@@ -153,7 +153,7 @@ def _solve_2x2(a: Float[Array, "2 2"], b: Float[Array, "2"]) -> Float[Array, "2"
 
 
 def radial(r2: Float[Array, ""], *k) -> Float[Array, ""]:
-    """Return K1 r^2 + K2 r^4 + K3 r^6 + ..., from the squared radius and any number of coefficients."""
+    """Return K1 r^2 + K2 r^4 + K3 r^6 + ... for the squared radius r^2 and any number of coefficients."""
     if not k:
         return jnp.zeros_like(r2)
     first, *higher = k
@@ -161,23 +161,23 @@ def radial(r2: Float[Array, ""], *k) -> Float[Array, ""]:
 
 
 def decentring(p1, p2, xy: Float[Array, "2"] | tuple[Array, Array]) -> Float[Array, "2"]:
-    """Return decentring distortion P1 (r^2 + 2 x^2) + 2 P2 x y, 2 P1 x y + P2 (r^2 + 2 y^2)."""
+    """Return the decentring distortion P1 (r^2 + 2 x^2) + 2 P2 x y, 2 P1 x y + P2 (r^2 + 2 y^2)."""
     x, y = xy
     r2, along = x * x + y * y, 2 * (p1 * x + p2 * y)
     return jnp.stack([p1 * r2 + along * x, p2 * r2 + along * y])
 
 
 def check_positive(distortion: AbstractDistortion, field: str, meaning: str) -> None:
-    """Raise ValueError unless the constant `field` of a model is positive; traced values are not checked."""
+    """Raise ValueError if the constant `field` of a model is not positive; traced values are not checked."""
     value = getattr(distortion, field)
     if not isinstance(value, jax.core.Tracer) and not value > 0:
         raise ValueError(f"{field} of {type(distortion).__name__}, {meaning}, must be positive (mm), got {value}")
 
 
 class AbstractBrown(AbstractDistortion):
-    """Radial K1-K3, decentring P1, P2, affinity b1 and shear b2, of the measured coordinate, subtracted.
+    """Radial K1-K3, decentring P1, P2, affinity b1 and shear b2: functions of the measured coordinate, subtracted.
 
-    Brown's models differ in the order of affinity and shear.
+    Its subclasses differ in the order of affinity and shear.
     """
 
     k1: Float[Array, ""] | float = 0.0
@@ -196,7 +196,7 @@ class AbstractBrown(AbstractDistortion):
 
     def undistorted(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Remove radial and decentring distortion from a coordinate (mm)."""
-        # `decentring` and `radial` by their common factor: every program contains this several times.
+        # Combine `decentring` and `radial` by their common factor, because every program contains them several times.
         x, y = xy
         r2 = x * x + y * y
         left = 1 - radial(r2, self.k1, self.k2, self.k3) - 2 * (self.p1 * x + self.p2 * y)

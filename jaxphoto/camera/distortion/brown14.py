@@ -1,4 +1,4 @@
-"""Brown's fourteen additional parameters for aerial cameras, in the measured coordinate, subtracted."""
+"""Brown's fourteen additional parameters for aerial cameras: function of the measured coordinate, subtracted."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Literal
@@ -17,13 +17,13 @@ class Brown14(AbstractDistortion):
         delta_y = a8 x y + a9 x^2 + a10 x^2 y + a11 x y^2 + a12 x^2 y^2 + y q
         q = a13 x^2 y^2 / F + a14 r^2
 
-    Units: a1 and a2 none, a3, a4, a8, a9 mm^-1, a5, a6, a10, a11, a14 mm^-2, a7, a12, a13 mm^-3; F in mm, of the size
-    of the principal distance (a constant of the model that must be given; it only sets the unit of a13). a14 is K1 of
-    `Brown`. None of them acts as c, x_p, y_p or a rotation does: a1 and a2 move x alone (c takes the scale, kappa the
-    rotation), and x^2 in x and y^2 in y are left out because the two tilts take them.
+    Units: a1 and a2 dimensionless, a3, a4, a8, a9 mm^-1, a5, a6, a10, a11, a14 mm^-2, a7, a12, a13 mm^-3; F in mm,
+    about the principal distance (a required constant of the model that only sets the unit of a13). a14 is K1 of
+    `Brown`. No parameter is equivalent to c, x_p, y_p or a rotation: a1 and a2 affect only x (c absorbs the scale,
+    kappa the rotation), and x^2 in x and y^2 in y are omitted because the two tilts absorb them.
 
-    Source: Brown (1976), The bundle adjustment - progress and prospects; the formula as MicMac writes it (DCBrown),
-    there with the sign +.
+    Source: Brown (1976), The bundle adjustment - progress and prospects; formula of MicMac (DCBrown), which adds the
+    correction.
     """
 
     f: Float[Array, ""] | float
@@ -52,14 +52,14 @@ class Brown14(AbstractDistortion):
 
     @classmethod
     def plain(cls, sensor: Sensor) -> "Brown14":
-        """All coefficients 0, F being the longer side, which is of the size of most principal distances."""
+        """Return the model with zero coefficients; F is the longer side, close to most principal distances."""
         return cls(f=max(sensor.width_mm, sensor.height_mm))
 
     def __check_init__(self) -> None:
         check_positive(self, "f", "the scale of a13")
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""
+        """Map a measured to the ideal coordinate (mm), both reduced to the principal point."""
         x, y = xy
         xx, x_y, yy = x * x, x * y, y * y
         in_x = self.a1 * x + self.a2 * y + self.a3 * x_y + self.a4 * yy

@@ -1,4 +1,4 @@
-"""The radial distortion of Bundler, OpenCV and COLMAP: from ideal to measured, in units of the principal distance."""
+"""Radial distortion of Bundler, OpenCV and COLMAP: normalised polynomial from ideal to measured coordinates."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Literal
@@ -12,12 +12,12 @@ from jaxphoto.camera.distortion.base import AbstractDistortion, Term, radial, sa
 class BundlerRadial(AbstractDistortion):
     """Two radial terms of the normalised ideal coordinate p; `measured = c p (1 + k1 |p|^2 + k2 |p|^4)`.
 
-    p = ideal / c = -(U, V) / W. k1 and k2 have no unit; k1 < 0 is a barrel. With coefficients in mm they are those of
-    `Balanced` with R0 = 0, A1 = k1 / c^2 and A2 = k2 / c^4.
+    p = ideal / c = -(U, V) / W. k1 and k2 are dimensionless; k1 < 0 is barrel distortion. The model equals `Balanced`
+    with R0 = 0, A1 = k1 / c^2 and A2 = k2 / c^4.
 
     Source: Snavely, Seitz and Szeliski (2006), Photo tourism, the camera of Bundler, and Agarwal and others (2010),
-    Bundle adjustment in the large (BAL). The same numbers are k1 and k2 of OpenCV (fx = fy, all else 0) and of
-    COLMAP's RADIAL; their y runs down and their z forwards, which a radial term does not see.
+    Bundle adjustment in the large (BAL). k1 and k2 have the same values in OpenCV (fx = fy, all other coefficients 0)
+    and in COLMAP's RADIAL; their axes y down and z forward do not affect radial terms.
     """
 
     k1: Float[Array, ""] | float = 0.0
@@ -30,7 +30,7 @@ class BundlerRadial(AbstractDistortion):
     normalised: ClassVar[bool] = True
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Measured coordinate of an ideal one, both reduced to the principal point and divided by c."""
+        """Map an ideal to the measured coordinate, both reduced to the principal point and divided by c."""
         x, y = xy
         stretch = 1 + radial(x * x + y * y, self.k1, self.k2)
         return jnp.stack([x * stretch, y * stretch])

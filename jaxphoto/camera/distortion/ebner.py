@@ -1,4 +1,4 @@
-"""Ebner's twelve additional parameters, in the measured coordinate, subtracted."""
+"""Ebner's twelve additional parameters: function of the measured coordinate, subtracted."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Literal
@@ -17,14 +17,14 @@ class Ebner(AbstractDistortion):
         delta_y = -b1 y + b2 x + b3 x y - 2 b4 l + b6 k + b8 y k + b10 x l + b12 k l
         k = x^2 - 2 b^2 / 3,   l = y^2 - 2 b^2 / 3
 
-    Units: b1 and b2 none, b3 to b6 mm^-1, b7 to b10 mm^-2, b11 and b12 mm^-3; b, the spacing of the 3 x 3 points, in
-    mm (a constant of the model that must be given). On those points the twelve are also orthogonal to what c, x_p,
-    y_p and the three rotations of the image do: b1 and b2 are the affinity and shear that are left when c takes the
-    scale and kappa the rotation, b3 to b6 are the quadratic terms that the two tilts leave. So none of them acts as c
-    does and all may be free with c, x_p and y_p. They are for what is left of a calibrated camera: without x^3 and y^3
-    they cannot stand for the radial distortion of an ordinary lens.
+    Units: b1 and b2 dimensionless, b3 to b6 mm^-1, b7 to b10 mm^-2, b11 and b12 mm^-3; b, the spacing of the 3 x 3
+    points, in mm (a required constant of the model). On these points the parameters are also orthogonal to c, x_p, y_p
+    and the three rotations of the image: b1 and b2 are the affinity and shear that c (scale) and kappa (rotation) do
+    not absorb, b3 to b6 the quadratic terms that the two tilts do not absorb. All can therefore be free together with
+    c, x_p and y_p. They model the remaining distortion of a calibrated camera: without x^3 and y^3 they cannot
+    represent the radial distortion of an ordinary lens.
 
-    Source: Ebner (1976), Self calibrating block adjustment; the formula as MicMac writes it, there with the sign +.
+    Source: Ebner (1976), Self calibrating block adjustment; formula of MicMac, which adds the correction.
     """
 
     b: Float[Array, ""] | float
@@ -51,14 +51,14 @@ class Ebner(AbstractDistortion):
 
     @classmethod
     def plain(cls, sensor: Sensor) -> "Ebner":
-        """All coefficients 0, on points that reach the ends of the longer side."""
+        """Return the model with zero coefficients; the 3 x 3 points span the longer side of the format."""
         return cls(b=max(sensor.width_mm, sensor.height_mm) / 2)
 
     def __check_init__(self) -> None:
         check_positive(self, "b", "the spacing of its points")
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""
+        """Map a measured to the ideal coordinate (mm), both reduced to the principal point."""
         x, y = xy
         k, l = x * x - 2 * self.b**2 / 3, y * y - 2 * self.b**2 / 3  # noqa: E741
         linear = jnp.stack([self.b1 * x + self.b2 * y, self.b2 * x - self.b1 * y])

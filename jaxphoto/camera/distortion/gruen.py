@@ -1,4 +1,4 @@
-"""Gruen's forty-four additional parameters, in the measured coordinate, subtracted."""
+"""Gruen's forty-four additional parameters: function of the measured coordinate, subtracted."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Literal
@@ -22,14 +22,14 @@ class Gruen(AbstractDistortion):
             [ a41  a42     a43     a44  a45 ]        [    b41      b42  b43  b44  b45 ]
             [ a51  a52     a53     a54  a55 ]        [    b51      b52  b53  b54  b55 ]
 
-    f holds the orthogonal polynomials of five equidistant points. Units: mm^(3-i-j) for aij and bij; b in mm (a
-    constant of the model that must be given). The four places without a parameter of their own belong to x_p and y_p
-    (two shifts), and to c, kappa and the two tilts, to which all 44 are orthogonal on those points: none acts as c
-    does, and all may be free with c, x_p and y_p. They are for what is left of a calibrated camera.
+    f contains the orthogonal polynomials of five equidistant points. Units: mm^(3-i-j) for aij and bij; b in mm (a
+    required constant of the model). The remaining six terms correspond to x_p, y_p, c, kappa and the two tilts. All 44
+    parameters are orthogonal to them on these points and can therefore be free together with c, x_p and y_p. They model
+    the remaining distortion of a calibrated camera.
 
     Source: Gruen (1978), Progress in photogrammetric point determination by compensation of systematic errors and
-    detection of gross errors. Written down without the print at hand: the tests prove the orthogonality and that the
-    50 columns are complete, which fixes the functions, but not that the print numbers them in the same way.
+    detection of gross errors. The original was not available: the tests verify the orthogonality and the completeness
+    of the 50 functions, but the numbering of the parameters may differ from the original.
     """
 
     b: Float[Array, ""] | float
@@ -96,19 +96,19 @@ class Gruen(AbstractDistortion):
     # fmt: on
     powers: ClassVar[Mapping[str, int]] = {n: 3 - int(n[1]) - int(n[2]) for n in coefficients}
     constants: ClassVar[Mapping[str, str]] = {"b_mm": "b"}
-    # Beyond the third degree: with all 44, neighbouring targets would be fitted one by one.
+    # Terms beyond the third degree: with all 44 parameters, the model would fit individual targets.
     rare: ClassVar[tuple[str, ...]] = tuple(n for n in coefficients if int(n[1]) + int(n[2]) - 2 > 3)
 
     @classmethod
     def plain(cls, sensor: Sensor) -> "Gruen":
-        """All coefficients 0, on points that reach the ends of the longer side."""
+        """Return the model with zero coefficients; the 5 x 5 points span the longer side of the format."""
         return cls(b=max(sensor.width_mm, sensor.height_mm) / 2)
 
     def __check_init__(self) -> None:
         check_positive(self, "b", "twice the spacing of its points")
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""
+        """Map a measured to the ideal coordinate (mm), both reduced to the principal point."""
         a = jnp.asarray(
             [
                 [0.0, self.a12, -10 / 7 * self.b22, self.a14, self.a15],

@@ -1,4 +1,4 @@
-"""OpenCV's rational lens model with unequal focal lengths and skew: from ideal to measured, normalised."""
+"""OpenCV's rational lens model with unequal focal lengths and skew: normalised, from ideal to measured coordinates."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Literal
@@ -15,14 +15,14 @@ class OpenCv(AbstractDistortion):
         u = x q + 2 p1 x y + p2 (r^2 + 2 x^2),   v = y q + p1 (r^2 + 2 y^2) + 2 p2 x y
         q = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
 
-    (x, y) is the ideal coordinate divided by c, and in these formulas y runs *down*, as in OpenCV; the coordinates that
-    `closed_form` takes and gives have y up, as everywhere here. All coefficients are therefore OpenCV's own numbers,
-    without unit: its p1 and p2 are P2 (with the other sign) and P1 of the decentring of `Brown`. c is f_y, with
-    b1 = f_x / f_y - 1 and b2 = skew / f_y; OpenCV itself has no skew.
+    (x, y) is the ideal coordinate divided by c, and in these formulas y points *down*, as in OpenCV; `closed_form`
+    converts coordinates with y up, as everywhere in jaxphoto. All coefficients have OpenCV's values, without unit: p1
+    and p2 correspond to -P2 and P1 of the decentring distortion of `Brown`. c is f_y, with b1 = f_x / f_y - 1 and b2 =
+    skew / f_y; OpenCV itself has no skew.
 
-    Not all can be estimated together from every block: k4 to k6 do nearly what k1 to k3 do.
-    Source: OpenCV, calib3d, "Detailed description"; COLMAP's FULL_OPENCV is the same, and its SIMPLE_PINHOLE, PINHOLE,
-    SIMPLE_RADIAL, RADIAL and OPENCV are parts of it.
+    Most blocks do not determine all coefficients: k4 to k6 are strongly correlated with k1 to k3.
+    Source: OpenCV, calib3d, "Detailed description"; COLMAP's FULL_OPENCV is the same model; its SIMPLE_PINHOLE,
+    PINHOLE, SIMPLE_RADIAL, RADIAL and OPENCV are special cases.
     """
 
     k1: Float[Array, ""] | float = 0.0
@@ -40,7 +40,7 @@ class OpenCv(AbstractDistortion):
     domain: ClassVar[Literal["measured", "ideal"]] = "ideal"
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "b1", "b2")
     rare: ClassVar[tuple[str, ...]] = ("k4", "k5", "k6", "b1", "b2")
-    # y runs down: what is odd in y changes its sign.
+    # y points down: terms odd in y change sign.
     terms: ClassVar[Mapping[str, Term] | None] = {
         **same_terms("k1", "k2", "k3"),
         **{f"q{i}": Term(f"k{i + 3}") for i in (1, 2, 3)},
@@ -49,7 +49,7 @@ class OpenCv(AbstractDistortion):
     normalised: ClassVar[bool] = True
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Measured coordinate of an ideal one, both reduced to the principal point and divided by c, y up."""
+        """Map an ideal to the measured coordinate, both reduced to the principal point and divided by c, y up."""
         x, y = xy[0], -xy[1]
         r2 = x * x + y * y
         q = (1 + radial(r2, self.k1, self.k2, self.k3)) / (1 + radial(r2, self.k4, self.k5, self.k6))
@@ -58,5 +58,5 @@ class OpenCv(AbstractDistortion):
 
 
 def affine_up(u: Float[Array, ""], v: Float[Array, ""], b1, b2) -> Float[Array, "2"]:
-    """(u + b1 u + b2 v, v) of a coordinate (u, v) whose v runs down, given with y up."""
+    """Apply (u + b1 u + b2 v, v), with v down, to a coordinate with y up."""
     return jnp.stack([u + b1 * u + b2 * v, -v])

@@ -1,4 +1,4 @@
-"""Radial distortion about a principal point of symmetry that is not the principal point, subtracted."""
+"""Radial distortion about a principal point of symmetry that differs from the principal point, subtracted."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Literal
@@ -14,12 +14,11 @@ class PpsRadial(AbstractDistortion):
 
         delta = (x - S) (K1 |x - S|^2 + K2 |x - S|^4 + K3 |x - S|^6),   S = (pps_x, pps_y)
 
-    x is reduced, as everywhere, to (x_p, y_p), which is the principal point of autocollimation (PPA): S is the PPS
-    *from the PPA*, and the PPS lies at (x_p + pps_x, y_p + pps_y) in the image. Units: K1 mm^-2, K2 mm^-4, K3 mm^-6,
-    pps_x and pps_y mm.
+    x is reduced to (x_p, y_p), the principal point of autocollimation (PPA). S is the PPS *relative to the PPA*: its
+    image coordinates are (x_p + pps_x, y_p + pps_y). Units: K1 mm^-2, K2 mm^-4, K3 mm^-6, pps_x and pps_y mm.
 
-    A lens without radial distortion has its PPS anywhere: pps_x and pps_y are only determined with K1. To first order
-    they do what decentring distortion does with P = -K1 S (`jaxphoto.camera.principal_points`).
+    Without radial distortion the PPS is undefined: pps_x and pps_y are determined only if K1 is not zero. To first
+    order they are equivalent to decentring distortion with P = -K1 S (`jaxphoto.camera.principal_points`).
     Source: paper 003, section 2.4, for the two points; derivation in docs/models.md.
     """
 
@@ -37,11 +36,11 @@ class PpsRadial(AbstractDistortion):
 
     @property
     def symmetry_point(self) -> Float[Array, "2"]:
-        """The PPS from the PPA, in mm."""
+        """Return the PPS relative to the PPA (mm)."""
         return jnp.stack([jnp.asarray(self.pps_x, float), jnp.asarray(self.pps_y, float)])
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Ideal coordinate (mm) of a measured one, both reduced to the principal point of autocollimation."""
+        """Map a measured to the ideal coordinate (mm), both reduced to the principal point of autocollimation."""
         x, y = xy[0] - self.pps_x, xy[1] - self.pps_y
         dr = radial(x * x + y * y, self.k1, self.k2, self.k3)
         return jnp.stack([xy[0] - x * dr, xy[1] - y * dr])

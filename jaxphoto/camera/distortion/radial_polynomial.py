@@ -1,4 +1,4 @@
-"""The radial polynomial of odd degree, in the measured coordinate, added."""
+"""Radial polynomial of odd degree: function of the measured coordinate, added."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Literal
@@ -10,15 +10,15 @@ from jaxphoto.camera.distortion.base import AbstractDistortion, Term, radial, ra
 
 
 class RadialPolynomial(AbstractDistortion):
-    """Radial correction of odd powers of the radius; `ideal = measured (1 + dr / r)`.
+    """Radial correction with odd powers of the radius; `ideal = measured (1 + dr / r)`.
 
         dr = k1 r^3 + k2 r^5 (+ k3 r^7)
 
-    The correction is *added*: k1 > 0 is a barrel, and k1, k2, k3 are those of `Brown` with the opposite sign. At r = 0
-    the factor is 1. The fifth degree is k3 = 0, fixed. Units: k1 mm^-2, k2 mm^-4, k3 mm^-6.
+    The correction is *added*: k1 > 0 is barrel distortion, and k1, k2, k3 are K1, K2, K3 of `Brown` with opposite sign.
+    At r = 0 the factor is 1. For the fifth degree, fix k3 at 0. Units: k1 mm^-2, k2 mm^-4, k3 mm^-6.
 
-    Source: paper 001 (after Chikatsu), which says no more than "radial polynomial 5th degree": that the polynomial is
-    odd, that it is added and that it is one of the measured coordinate are the usual reading, not the paper's words.
+    Source: paper 001 (after Chikatsu), which specifies only "radial polynomial 5th degree". An odd polynomial of the
+    measured coordinate, added, is the usual interpretation.
     """
 
     k1: Float[Array, ""] | float = 0.0
@@ -32,7 +32,7 @@ class RadialPolynomial(AbstractDistortion):
     terms: ClassVar[Mapping[str, Term] | None] = {name: Term(name, -1.0) for name in ("k1", "k2", "k3")}
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""
+        """Map a measured to the ideal coordinate (mm), both reduced to the principal point."""
         x, y = xy
         stretch = 1 + radial(x * x + y * y, self.k1, self.k2, self.k3)
         return jnp.stack([x * stretch, y * stretch])

@@ -1,4 +1,4 @@
-"""SMAC, the USGS Simultaneous Multi-frame Analytical Calibration model, in the measured coordinate."""
+"""SMAC, the USGS Simultaneous Multi-frame Analytical Calibration model: function of the measured coordinate."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Literal
@@ -10,13 +10,13 @@ from jaxphoto.camera.distortion.base import AbstractDistortion, Term, decentring
 
 
 class Smac(AbstractDistortion):
-    """SMAC in full; `ideal = measured - delta` (sign "subtract", paper 002) or `+ delta` ("add", USGS).
+    """Complete SMAC model; `ideal = measured - delta` (sign "subtract", paper 002) or `+ delta` ("add", USGS).
 
         delta = (x, y) q + (1 + P3 r^2 + P4 r^4) (P1 (r^2 + 2 x^2) + 2 P2 x y, 2 P1 x y + P2 (r^2 + 2 y^2))
         q = K0 + K1 (r^2 - R0^2) + K2 (r^4 - R0^4) + K3 (r^6 - R0^6) + K4 (r^8 - R0^8)
 
-    Units: K0 none, Ki mm^-2i, P1 and P2 mm^-1, P3 mm^-2, P4 mm^-4, R0 mm (a constant of the model). R0, K0 and
-    the principal distance are one scale: K0 and c cannot be estimated together (docs/models.md).
+    Units: K0 dimensionless, Ki mm^-2i, P1 and P2 mm^-1, P3 mm^-2, P4 mm^-4, R0 mm (a constant of the model). K0, R0 and
+    the principal distance all change the image scale: K0 and c cannot be estimated together (docs/models.md).
     Source: paper 002, equations (1)-(3); K0, K4, P3, P4 and the sign "add" from USGS report OSL/2985.
     """
 
@@ -48,11 +48,11 @@ class Smac(AbstractDistortion):
 
     @property
     def signum(self) -> float:
-        """-1 where the distortion is subtracted, +1 where it is added."""
+        """Return -1 if the distortion is subtracted, +1 if it is added."""
         return -1.0 if self.sign == "subtract" else 1.0
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""
+        """Map a measured to the ideal coordinate (mm), both reduced to the principal point."""
         x, y = xy
         r2, s2 = x * x + y * y, self.r0 * self.r0
         k1, k2, k3, k4 = self.k1, self.k2, self.k3, self.k4

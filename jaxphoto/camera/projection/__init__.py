@@ -1,11 +1,11 @@
-"""Projections: one final class each with a common base, found by its name in files.
+"""Projections: one final class per projection, selected by its name in files.
 
-A new projection is one file here and its line below.
+To add a projection, add its file to this folder and its import below.
 """
 
 from typing import TYPE_CHECKING
 
-# Order of tables and messages.
+# The order of imports is the order in tables and messages.
 # ruff: isort: off
 from jaxphoto.camera.projection.base import AbstractProjection as AbstractProjection
 from jaxphoto.camera.projection.perspective import Perspective as Perspective
@@ -19,5 +19,5 @@ PROJECTIONS = AbstractProjection.known()
 """Projections of jaxphoto by name in files; `AbstractProjection.known()` includes user-defined ones."""
 
 if not TYPE_CHECKING:
-    # Type checkers would take a computed list for an empty one; the aliases above serve them.
+    # Type checkers read a computed list as empty; the aliases above export the names.
     __all__ = sorted(["PROJECTIONS", "AbstractProjection", *(model.__name__ for model in PROJECTIONS.values())])

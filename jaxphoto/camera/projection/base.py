@@ -1,11 +1,11 @@
-"""Base class of projections: maps from directions in the camera frame to the ideal image, and back.
+"""Base class of projections: mappings between directions in the camera frame and the ideal image.
 
 A camera looks along -w of its frame (u right, v up, w out of its back; docs/conventions.md); theta is the angle of a
-direction from that axis. A projection that is symmetric about the axis is a function of it,
+direction from that axis. A projection that is symmetric about the axis is
 
     (x, y) = c f(theta) (u, v) / |(u, v)|,    f(theta) = theta + ...
 
-so that c is the scale at the image centre, in mm per radian, for every projection. Distortions and principal points
+c is therefore the scale at the image centre, in mm per radian, for every projection. Distortions and principal points
 refer to this ideal image plane and do not depend on the projection.
 """
 
@@ -19,31 +19,30 @@ from jaxphoto.camera.declared import Declared
 from jaxphoto.short_repr import pretty_repr
 
 Component = Any
-"""Component of a direction or an image coordinate: a number, or a NumPy or JAX array of many."""
+"""Component of a direction or an image coordinate: a scalar, or a NumPy or JAX array."""
 
 
 @pretty_repr
 class AbstractProjection(Declared):
-    """Projection; its name and parameters are declared as in `Declared`. Most have no parameters.
+    """Base class of projections, declared as in `Declared`; most projections have no parameters.
 
-    Both maps are written by component and are differentiable wherever they are defined, including on the axis.
+    Both mappings act on components and are differentiable wherever they are defined, including on the axis.
     """
 
     widest_deg: eqx.AbstractClassVar[float]
-    """Directions farther from the axis have no image, whatever the format."""
+    """Maximum angle from the axis (degrees): directions beyond it have no image, for any format."""
     coefficients: ClassVar[tuple[str, ...]] = ()
 
     @abc.abstractmethod
     def ideal_from_direction(self, c, u: Component, v: Component, w: Component) -> tuple[Component, Component]:
-        """Return the ideal image coordinate (mm, from the principal point) of a direction or point (u, v, w) of any
-        length.
+        """Convert a direction or point (u, v, w) to the ideal image coordinate (mm, from the principal point).
 
         The value is meaningless where `sees` is False.
         """
 
     @abc.abstractmethod
     def direction_from_ideal(self, c, x: Component, y: Component) -> tuple[Component, Component, Component]:
-        """Return the direction (u, v, w), of any length, of an ideal image coordinate (mm); NaN if there is none."""
+        """Convert an ideal image coordinate (mm) to a direction (u, v, w) of arbitrary length; NaN if there is none."""
 
     def sees(self, u: Component, v: Component, w: Component) -> Any:
         """Return True if a direction (u, v, w) of any length has an image."""

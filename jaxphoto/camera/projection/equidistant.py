@@ -1,4 +1,4 @@
-"""Equidistant projection; most fisheye lenses are distorted forms of it."""
+"""Equidistant projection; most fisheye lenses approximate it."""
 
 import math
 from collections.abc import Callable
@@ -8,8 +8,8 @@ import jax.numpy as jnp
 
 from jaxphoto.camera.projection.base import AbstractProjection, Component
 
-# Below this, series in the square of an angle or its tangent: the closed forms are 0 / 0 on the axis, and their second
-# derivatives lose half of their digits near it. Ten terms leave an error of 1e-21.
+# Maximum square of an angle or its tangent for which series are used: on the axis the closed forms are 0 / 0, and close
+# to it their second derivatives lose half of their digits. Ten terms leave an error of 1e-21.
 _NEAR = 1e-2
 _TERMS = 10
 
@@ -17,7 +17,7 @@ _TERMS = 10
 class Equidistant(AbstractProjection):
     """f = theta: the distance from the principal point is c times the angle from the axis, up to 180 degrees.
 
-    The fisheye models of OpenCV (cv2.fisheye) and COLMAP are this projection with the distortion `OpenCvFisheye`.
+    With the distortion `OpenCvFisheye`, it is the fisheye model of OpenCV (cv2.fisheye) and COLMAP.
     Source: Kannala and Brandt (2006), A generic camera model and calibration method for conventional, wide-angle, and
     fish-eye lenses, equation (3).
     """
@@ -26,10 +26,10 @@ class Equidistant(AbstractProjection):
     widest_deg: ClassVar[float] = 180.0
 
     def ideal_from_direction(self, c, u: Component, v: Component, w: Component) -> tuple[Component, Component]:
-        """(x, y) = c theta (u, v) / rho,  rho = |(u, v)|,  theta = atan2(rho, -w)."""
+        """Return (x, y) = c theta (u, v) / rho, rho = |(u, v)|, theta = atan2(rho, -w)."""
         rho2 = u * u + v * v
         near = (rho2 < _NEAR * w * w) & (w < 0)
-        # Two `where`: derivatives of the branch not taken must be finite, too.
+        # Use two `where`, because derivatives of the branch not taken must be finite too.
         rho = jnp.sqrt(jnp.where(near, 1.0, rho2))
         far_away = jnp.arctan2(rho, -w) / rho
         depth = jnp.where(near, -w, 1.0)
@@ -39,7 +39,7 @@ class Equidistant(AbstractProjection):
         return u * scale, v * scale
 
     def direction_from_ideal(self, c, x: Component, y: Component) -> tuple[Component, Component, Component]:
-        """(x sin(theta) / theta, y sin(theta) / theta, -c cos(theta)),  theta = |(x, y)| / c."""
+        """Return (x sin(theta) / theta, y sin(theta) / theta, -c cos(theta)), theta = |(x, y)| / c."""
         theta2 = (x * x + y * y) / (c * c)
         near = theta2 < _NEAR
         theta = jnp.sqrt(jnp.where(near, 1.0, theta2))

@@ -1,4 +1,4 @@
-"""Orthographic projection: the hemisphere seen from infinity."""
+"""Orthographic projection: parallel projection of the hemisphere of directions."""
 
 from typing import ClassVar
 
@@ -17,10 +17,10 @@ class Orthographic(AbstractProjection):
     widest_deg: ClassVar[float] = 90.0
 
     def ideal_from_direction(self, c, u: Component, v: Component, w: Component) -> tuple[Component, Component]:
-        """(x, y) = c (u, v) / n,  n = |(u, v, w)|."""
+        """Return (x, y) = c (u, v) / n, n = |(u, v, w)|."""
         scale = c / jnp.sqrt(u * u + v * v + w * w)
         return u * scale, v * scale
 
     def direction_from_ideal(self, c, x: Component, y: Component) -> tuple[Component, Component, Component]:
-        """(x, y, -sqrt(c^2 - |(x, y)|^2))."""
+        """Return (x, y, -sqrt(c^2 - |(x, y)|^2))."""
         return x, y, -jnp.sqrt(c * c - (x * x + y * y))

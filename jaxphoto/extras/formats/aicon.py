@@ -80,7 +80,7 @@ def _camera(path: Path) -> tuple[str, dict[str, Any]]:
     """Read the camera's id and its [cameras.X] table from the five lines of .ior."""
     rows = [(row, line.split()) for row, line in content_rows(path)]
     if [len(cells) for _, cells in rows] != [8, 1, 2, 2, 4]:
-        raise InputError(f"{path.name}: the five lines of one camera (8, 1, 2, 2, 4 numbers) are expected")
+        raise InputError(f"{path.name}: not the five lines of one camera (8, 1, 2, 2, 4 numbers); export it again")
     values = []
     for row, cells in rows:
         numbers = [number for cell in cells if (number := finite(cell)) is not None]
@@ -88,7 +88,9 @@ def _camera(path: Path) -> tuple[str, dict[str, Any]]:
             raise InputError(f"{path.name}, row {row}: a cell is not a finite number; correct it")
         values.append(numbers)
     if min(values[-1]) <= 0:
-        raise InputError(f"{path.name}, row {rows[-1][0]}: the format in mm and pixels is positive; correct it")
+        raise InputError(
+            f"{path.name}, row {rows[-1][0]}: the image format in mm or pixels is not positive; correct it"
+        )
     (_, _, c, x, y, a1, a2, r0), (a3,), (b1, b2), (c1, c2), (width_mm, height_mm, width, height) = values
     # Use the mean pixel size of both axes: it affects only the format.
     pixel = (width_mm / width + height_mm / height) / 2

@@ -62,17 +62,17 @@ def read(path: Path) -> Project:
     root, ties, n_control = _parsed(path)
     blocks = root.findall("Block")
     if len(blocks) != 1:
-        raise InputError(f"{path.name} has {len(blocks)} blocks, and one is read; export that one by itself")
+        raise InputError(f"{path.name} has {len(blocks)} blocks, not 1; export one block")
     (block,) = blocks
     system = _system(path, root, block)
     cameras, photos, n_unposed = _photogroups(path, block)
     if skipped := [
         f"{n} {what}" for n, what in ((n_unposed, "photographs without pose"), (n_control, "control points")) if n
     ]:
-        warn(f"{path.name}: {' and '.join(skipped)} are not read")
+        warn(f"{path.name}: skipped {' and '.join(skipped)}")
     index = {photo.number: k for k, photo in enumerate(photos)}
     if len(index) < len(photos):
-        raise InputError(f"{path.name}: two photographs have one Id. Export the file again")
+        raise InputError(f"{path.name}: two photographs have the same Id. Export the file again")
     here = lambda what: lambda k: f"{path.name}, photo {photos[k].number}, {what}"  # noqa: E731
     matrices = [[photo.pose.findtext(f"Rotation/{name}") for name in _MATRIX] for photo in photos]
     rotations = number_rows(matrices, (9,), here("Rotation")).reshape(-1, 3, 3)
@@ -125,7 +125,7 @@ def _system(path: Path, root: ElementTree.Element, block: ElementTree.Element) -
         except (CRSError, UnicodeError, ValueError):
             geographic = False
         if geographic:
-            raise InputError(f"{path.name}: {quoted(words)} is longitude and latitude. Export it in a map system")
+            raise InputError(f"{path.name}: {quoted(words)} is a geographic system. Export it in a map system")
         return words
     return ""
 
@@ -140,7 +140,9 @@ def _photogroups(path: Path, block: ElementTree.Element) -> tuple[dict[str, Proj
         name = name if name not in cameras else f"{name} {count}"
         axes = (group.findtext("CameraOrientation") or "XRightYDown").strip()
         if axes not in _AXES:
-            raise InputError(f"{path.name}, {name}: CameraOrientation {quoted(axes)} is none of {', '.join(_AXES)}")
+            raise InputError(
+                f"{path.name}, {name}: unknown CameraOrientation {quoted(axes)}; use one of {', '.join(_AXES)}"
+            )
         posed = []
         for photo in group.iterfind("Photo"):
             position, file = photo.find("Pose"), (photo.findtext("ImagePath") or "").strip()
@@ -158,7 +160,7 @@ def _photogroups(path: Path, block: ElementTree.Element) -> tuple[dict[str, Proj
 def _camera(source: CameraSource, name: str, group: ElementTree.Element) -> ProjectCamera:
     kind = (group.findtext("CameraModelType") or "Perspective").strip()
     if kind != "Perspective":
-        raise source.error(f"camera {quoted(name)} is a {quoted(kind)}, and perspective ones are read; export those")
+        raise source.error(f"camera {quoted(name)} is a {quoted(kind)}, not perspective; export perspective cameras")
 
     def number(key: str, default: float | None = None) -> float:
         text = group.findtext(key)
@@ -175,7 +177,7 @@ def _camera(source: CameraSource, name: str, group: ElementTree.Element) -> Proj
     else:
         focal = number("FocalLength") / number("SensorSize") * longer
     if number("AspectRatio", 1.0) != 1.0 or number("Skew", 0.0) != 0.0:
-        warn(f"{source.path.name}: aspect ratio and skew of camera {name} are not read; free b1 and b2 to find them")
+        warn(f"{source.path.name}: skipped aspect ratio and skew of camera {name}; free b1 and b2 to estimate them")
     middle = zip("xy", (width / 2 - _FIRST_PX, height / 2 - _FIRST_PX), strict=True)
     column, row = (number(f"PrincipalPoint/{axis}", at) + _FIRST_PX for axis, at in middle)
     terms = {key: number(f"Distortion/{key.upper()}", 0.0) for key in BROWN_TERMS}

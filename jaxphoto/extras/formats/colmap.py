@@ -105,7 +105,7 @@ class _Binary:
             raise InputError(f"{self.path}: the file ends early. Copy it again") from None
         self.at += struct.calcsize("<" + layout)
         if not np.isfinite([v for v in values if isinstance(v, float)]).all():
-            raise InputError(f"{self.path}: a number is not finite. Let COLMAP write it again")
+            raise InputError(f"{self.path}: a number is not finite. Export it from COLMAP again")
         return values
 
     def count(self, size: int) -> int:
@@ -142,8 +142,8 @@ def read(path: Path) -> Project:
     point = np.concatenate([np.zeros(0, int), *(i.point for i in images)])
     if len(missing := np.setdiff1d(point, ids)):
         raise InputError(
-            f"{path.parent}: the images show {len(missing)} point(s) that points3D has not, for example {missing[0]}. "
-            "Let COLMAP write the model again"
+            f"{path.parent}: {len(missing)} point(s) of the images are missing in points3D, for example {missing[0]}. "
+            "Export the model from COLMAP again"
         )
     cameras = {str(k): _project_camera(path, model.cameras[k]) for k in sorted({i.camera for i in images})}
     quaternions = np.array([i.quaternion for i in images]).reshape(-1, 4)[:, [1, 2, 3, 0]]
@@ -173,22 +173,22 @@ def read_model(path: Path) -> ColmapModel:
         ids, xyz = _binary_points(points_path)
     for image in images:
         if image.camera not in cameras:
-            raise InputError(f"{path.parent}: image {image.name} is of camera {image.camera}, which is missing. Add it")
+            raise InputError(f"{path.parent}: camera {image.camera} of image {image.name} is missing. Add it")
         length = math.hypot(*image.quaternion)
         if not 1 / _LONGEST < length < _LONGEST:
             raise InputError(
-                f"{path.parent}: the quaternion of image {image.name} has the length {length:.3g} instead of 1. Let "
-                "COLMAP write the model again"
+                f"{path.parent}: the quaternion of image {image.name} has the length {length:.3g} instead of 1. "
+                "Export the model from COLMAP again"
             )
     for what, names in (("image", [i.name for i in images]), ("point", ids.tolist())):
         if twice := [name for name, times in Counter(names).items() if times > 1]:
-            raise InputError(f"{path.parent}: {what} {twice[0]} is there twice. Keep one of them")
+            raise InputError(f"{path.parent}: duplicate {what} {twice[0]}. Keep one of them")
     return ColmapModel(cameras, images, ids, xyz)
 
 
 def _cells_error(path: Path, row: int, count: int, expected: str) -> InputError:
     return InputError(
-        f"{path}, row {row}: {count} cells instead of {expected}. Correct it or let COLMAP write it again"
+        f"{path}, row {row}: {count} cells instead of {expected}. Correct it or export it from COLMAP again"
     )
 
 
@@ -220,7 +220,7 @@ def _text_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
             raise _cells_error(path, row, len(cells), "POINT3D_ID X Y Z and more")
         points.append(row_numbers(path, row, cells, 4))
         if points[-1][0] % 1 or abs(points[-1][0]) >= 2**53:
-            raise InputError(f"{path}, row {row}: {cells[0]} is no id. Write a whole number")
+            raise InputError(f"{path}, row {row}: {cells[0]} is not an id. Write a whole number")
     values = np.array(points).reshape(-1, 4)
     return values[:, 0].astype(np.int64), values[:, 1:]
 
@@ -281,7 +281,7 @@ def read_cameras(source: CameraSource) -> dict[int, ColmapCamera]:
         model = _NUMBERS[number] if 0 <= number < len(_NUMBERS) else f"number {number}"
         _check_known(source, model, str(identifier))
         if identifier in cameras:
-            raise source.error(f"camera {identifier} stands there twice; keep one of the two")
+            raise source.error(f"duplicate camera {identifier}; keep one of the two")
         cameras[identifier] = ColmapCamera(model, width, height, file.take(f"{len(MODELS[model])}d"))
     return cameras
 
@@ -292,9 +292,11 @@ def _lines_by_id(source: CameraSource) -> dict[int, list[str]]:
         cells = line.split()
         identifier = int(cells[0]) if cells[0].isdecimal() else None
         if identifier is None:
-            raise source.error(f"row {row} begins with {quoted(cells[0])}, which is no id")
+            raise source.error(
+                f"row {row} begins with {quoted(cells[0])}, not an id; write CAMERA_ID MODEL WIDTH HEIGHT PARAMS"
+            )
         if identifier in lines:
-            raise source.error(f"camera {identifier} stands there twice; keep one of the two lines")
+            raise source.error(f"duplicate camera {identifier}; keep one of the two lines")
         lines[identifier] = cells
     return lines
 
@@ -307,7 +309,9 @@ def _camera_of(source: CameraSource, name: str, cells: list[str]) -> ColmapCamer
     names = MODELS[model]
     if len(cells) != 4 + len(names):
         count = len(cells) - 4
-        raise source.error(f"camera {name} has {count} parameters, {model} has {len(names)}: {', '.join(names)}")
+        raise source.error(
+            f"camera {name} has {count} parameters instead of the {len(names)} of {model}: {', '.join(names)}"
+        )
     sensor, _ = source.sensor(*(source.number(f"the size of camera {name}", cell) for cell in cells[2:4]))
     values = (source.number(f"{key} of camera {name}", cell) for key, cell in zip(names, cells[4:], strict=True))
     return ColmapCamera(model, sensor.width_px, sensor.height_px, tuple(values))
@@ -315,7 +319,7 @@ def _camera_of(source: CameraSource, name: str, cells: list[str]) -> ColmapCamer
 
 def _check_known(source: CameraSource, model: str, name: str) -> None:
     if model not in MODELS:
-        raise source.error(f"the model {model} of camera {name} is not known here; use one of {', '.join(MODELS)}")
+        raise source.error(f"model {model} of camera {name} is not supported; use one of {', '.join(MODELS)}")
 
 
 def _sensor_and_interior(source: CameraSource, camera: ColmapCamera) -> tuple[Sensor, InteriorOrientation, str]:

@@ -101,12 +101,12 @@ class SurveyRows:
         same = np.array_equal(np.array(first[0]), np.array(xyz), equal_nan=True)
         if first is not row and (once or not same):
             other = "" if same else " with other coordinates"
-            raise InputError(f"{place}: the point {quoted(name)} stands in {first[3]}, too{other}")
+            raise InputError(f"{place}: point {quoted(name)} is also in {first[3]}{other}; keep one of them")
 
     def surveyed(self, system: str = "") -> SurveyedPoints:
         """Return all points. Raise InputError if there is none."""
         if not self._rows:
-            raise InputError(f"{self.file}: there is no point with coordinates; add some")
+            raise InputError(f"{self.file}: no point has coordinates; add some")
         xyz, sigma, check, place = zip(*self._rows.values(), strict=True)
         points = np.array(xyz, float).reshape(-1, 3), np.array(sigma, float).reshape(-1, 3), np.array(check, bool)
         return SurveyedPoints(self.file, tuple(self._rows), *points, place, system)
@@ -120,7 +120,7 @@ def read_marks(rows: Sequence[Mark]) -> Marks:
         check_name(point, "point", place)
         first = seen.setdefault((image, point), place)
         if first is not place:
-            raise InputError(f"{place}: {quoted(point)} is marked in {quoted(image)} in {first}, too; keep one of them")
+            raise InputError(f"{place}: {quoted(point)} in {quoted(image)} is also marked in {first}; keep one of them")
     images, points, at, sigma, places = zip(*rows, strict=True) if rows else ((),) * 5
     return Marks(images, points, np.array(at, float).reshape(-1, 2), np.array(sigma, float), places)
 
@@ -171,9 +171,9 @@ def read_table(path: Path, text: str) -> SurveyedPoints | Marks:
     usual = Counter(map(len, records)).most_common(1)[0][0]
     odd = [k for k, r in enumerate(records) if len(r) != usual]
     if 2 * len(odd) < len(records) and _without_header([r for r in records if len(r) == usual])[0]:
-        raise cells.bad(odd[0], f"{counted(len(records[odd[0]]), 'cell')}, where most rows have {usual}; complete it")
+        raise cells.bad(odd[0], f"{counted(len(records[odd[0]]), 'cell')}, but most rows have {usual}; complete it")
     raise cells.none(
-        f"this is no file of control (it begins with {quoted(' '.join(cells.records[0]))}): give points (point, X_m, "
+        f"not a control file (it begins with {quoted(' '.join(cells.records[0]))}): give points (point, X_m, "
         "Y_m, Z_m), marks (image, point, x_px, y_px), a gcp_list.txt, markers of Metashape, GeoJSON or a GeoPackage"
     )
 
@@ -215,12 +215,14 @@ def read_points(cells: Cells, columns: Columns, separator: str, system: str, deg
             row[columns[name]].lower() if columns.get(name, len(row)) < len(row) else "" for name in ("role", "enabled")
         )
         if role not in _ROLES:
-            raise cells.bad(k, f"the role {quoted(role)} is unknown; write control or check")
+            raise cells.bad(k, f"unknown role {quoted(role)}; write control or check")
         check = _ROLES[role] or enabled in ("0", "false", "no")
         points.add(row[columns["point"]], xyz, cells.place(k), sigma, check, once=True)
     surveyed = points.surveyed(system)
     if degrees and not (np.abs(surveyed.coordinates[:, 0]) <= 360).all():
-        raise cells.none("the header says longitude and latitude, but the numbers are no degrees; correct the header")
+        raise cells.none(
+            "the header contains longitude and latitude, but the numbers are not degrees; correct the header"
+        )
     return surveyed
 
 
@@ -241,7 +243,7 @@ def _marks(cells: Cells, columns: Columns, separator: str) -> Marks:
         sigma = cells.sigma(k, columns.get("sigma"), "the sigma of the mark")
         marks.append((row[columns["image"]], row[columns["point"]], column_row, sigma, cells.place(k)))
     if not marks:
-        raise cells.none("there is no mark; add rows")
+        raise cells.none("no marks; add rows")
     return read_marks(marks)
 
 
@@ -275,7 +277,7 @@ def read_gcp_list(path: Path, text: str) -> GivenControl:
     (_, system), *rows = _gcp_lines(text)
     cells = Cells(path.name, [line.split() for _, line in rows], [row for row, _ in rows])
     if not cells.records:
-        raise cells.none(f"there is no mark after {quoted(system.strip())}; add rows")
+        raise cells.none(f"no marks after {quoted(system.strip())}; add rows")
     points, marks = SurveyRows(path.name), list[Mark]()
     marked = _unmarked(cells.records[0]) is None
     for k, row in enumerate(cells.records):
@@ -302,11 +304,11 @@ def write_gcp_list(p: Project, folder: Path) -> None:
     names = [*p.files, *(p.points[j] for j in p.control.point[chosen])]
     message = ""
     if p.frame.kind != "epsg":
-        message = "is not written, because it needs a map system and the block is in a local frame"
+        message = "is not written: it needs a map system, but the block is in a local frame"
     elif blank := next((name for name in names if len(name.split()) != 1), None):
-        message = f"is not written, because it ends names at blanks and {blank!r} has one; rename it"
+        message = f"is not written: {blank!r} contains a blank; rename it"
     elif left := len(p.control.point) - len(chosen):
-        message = f"is without {left} check points or points without X and Y, which it cannot have"
+        message = f"skips {left} check points or points without X and Y: it has control points only"
     if message:
         warnings.warn(f"{GCP_LIST} {message}", UserWarning, stacklevel=4)
     if message.startswith("is not written"):
@@ -339,7 +341,7 @@ def read_geoin(path: Path, text: str) -> SurveyedPoints:
     cells, points = Cells(path.name, [line for _, line in rows], [row for row, _ in rows]), SurveyRows(path.name)
     for k, row in enumerate(cells.records):
         if len(row) < 5:
-            raise cells.bad(k, f"{len(row)} cells; a row has {row[0]}, the point, X, Y and Z, so complete it")
+            raise cells.bad(k, f"{len(row)} cells instead of {row[0]}, point, X, Y and Z; complete it")
         xyz = [cells.number(k, 2, "X"), cells.number(k, 3, "Y"), cells.height(k, 4)]
         points.add(row[1], xyz, cells.place(k), check=_BINGO_CHECK[row[0]], once=True)
     return points.surveyed()

@@ -87,7 +87,7 @@ def read_tables(source: str | Path, format: str | None = None) -> BlockTables:
     """Read the tables of a file or folder in one of `FORMATS`. The format is detected unless `format` names it."""
     source = Path(source)
     if not source.exists():
-        raise InputError(f"there is no file or folder {source}; correct the name")
+        raise InputError(f"file or folder not found: {source}; correct the name")
     name = _format_name(source, format)
     if name == "block":
         return read_folder(source if source.is_dir() else source.parent)
@@ -98,7 +98,7 @@ def read_tables(source: str | Path, format: str | None = None) -> BlockTables:
         files = [source]
     if len(files) != 1:
         names = f" ({few([path.name for path in files])})" if files else ""
-        raise InputError(f"{source} holds {len(files)} files of {name}{names}, {chosen.about}; name one")
+        raise InputError(f"{source}: {len(files)} files of {name}{names}, {chosen.about}; give one")
     with reading(files[0], chosen.about):
         content = chosen.read(files[0])
         return content.tables() if isinstance(content, Project) else content
@@ -133,7 +133,7 @@ def _format_name(source: Path, name: str | None) -> str:
     known = ", ".join(FORMATS)
     if name is not None:
         if name not in FORMATS:
-            raise InputError(f"the format {name!r} is unknown; choose one of {known}")
+            raise InputError(f"unknown format {name!r}; choose one of {known}")
         return name
     names = recognise(source)
     if len(names) == 1:
@@ -141,9 +141,9 @@ def _format_name(source: Path, name: str | None) -> str:
     if not names and source.is_file() and is_camera_file(source):
         raise InputError(f"{source} is a camera file, without photographs; jaxphoto camera converts it")
     if not names and source.is_file() and is_control_file(source):
-        raise InputError(f"{source} is control, without photographs; jaxphoto control takes it to a block")
-    what = f"is of several formats ({', '.join(names)})" if names else "is of no format that is known"
-    raise InputError(f"{source} {what}; name the format, one of {known}")
+        raise InputError(f"{source} is a control file, without photographs; jaxphoto control adds it to a block")
+    what = f"fits several formats ({', '.join(names)})" if names else "has an unknown format"
+    raise InputError(f"{source} {what}; give the format, one of {known}")
 
 
 class Misfit(NamedTuple):
@@ -171,14 +171,14 @@ def export(project: Project, folder: str | Path, format: str) -> Exported:
     with other content, and a camera or frame that the format cannot represent.
     """
     if format not in EXPORTS:
-        raise InputError(f"nothing can be exported as {format!r}; choose one of {', '.join(EXPORTS)}")
+        raise InputError(f"unknown export format {format!r}; choose one of {', '.join(EXPORTS)}")
     chosen, folder = EXPORTS[format], Path(folder)
     assert chosen.write is not None
     check_export_target(folder)
     cameras = {name: _converted(project, name, chosen) for name in project.cameras}
     if project.changes:
         corrections = ", ".join(project.changes)
-        warnings.warn(f"{format} knows no {corrections}: points will not fit the photographs by it", stacklevel=2)
+        warnings.warn(f"{format} does not support {corrections}: points will not fit the photographs", stacklevel=2)
     written = project._replace(
         cameras={name: c._replace(interior=cameras[name].interior) for name, c in project.cameras.items()}
     )
@@ -207,8 +207,8 @@ def _converted(project: Project, name: str, format: Format) -> Conversion:
         # Perspective polynomials misfit fisheye images by hundreds of pixels at the border.
         others = ", ".join(key for key, other in EXPORTS.items() if other.fisheye)
         raise InputError(
-            f"camera {name} cannot be written as {format.name}, whose cameras are perspective, because it is a "
-            f"fisheye; write one of {others}, or undistort its photographs"
+            f"camera {name} is a fisheye, but cameras of {format.name} are perspective; write one of {others}, "
+            "or undistort its photographs"
         )
     try:
         return converted(interior, model.distortion, sensor, model.lacks, model.projection)
@@ -272,7 +272,7 @@ def write_camera_file(
         by_suffix = [key for key, other in CAMERA_FORMATS.items() if path.suffix.lower() in other.suffixes]
         format = "colmap" if path.name == "cameras.txt" else by_suffix[0] if by_suffix else ""
     if format not in CAMERAS_WRITTEN:
-        raise InputError(f"{path}: the name does not tell the format; name one of {', '.join(CAMERAS_WRITTEN)}")
+        raise InputError(f"{path}: unknown camera format; give one of {', '.join(CAMERAS_WRITTEN)}")
     chosen = CAMERA_FORMATS[format]
     target = _target(path, chosen, interior, model, distortion)
     try:
@@ -281,7 +281,7 @@ def write_camera_file(
         raise InputError(f"{path} cannot be written: {error}") from None
     if not conversion.max_px <= loss_px:
         raise InputError(
-            f"{path} would not be this camera any more ({conversion.lost}): choose a model or format with more terms, "
+            f"{path} would change the camera ({conversion.lost}): choose a model or format with more terms, "
             f"or allow the loss (--loss-px {np.ceil(conversion.max_px):.0f})"
         )
     with whole_file(path) as work:
@@ -312,17 +312,19 @@ def _target(
     """Return the camera model to write."""
     if format.plane is not None and format.fisheye is None and type(interior.projection) is not Perspective:
         others = ", ".join(n for n in CAMERAS_WRITTEN if CAMERA_FORMATS[n].fisheye or not CAMERA_FORMATS[n].plane)
-        raise InputError(f"{path}: cameras of {format.name} are perspective, this is a fisheye; write one of {others}")
+        raise InputError(
+            f"{path}: the camera is a fisheye, but cameras of {format.name} are perspective; write one of {others}"
+        )
     if model is not None and model not in format.models:
-        there = f"it has {', '.join(format.models)}" if format.models else "leave the model out"
-        raise InputError(f"{path}: {model} is no model of the format {format.name}; {there}")
+        there = f"use one of {', '.join(format.models)}" if format.models else "omit the model"
+        raise InputError(f"{path}: unknown model {model} of format {format.name}; {there}")
     target = format.model_of(interior) if model is None else format.models[model]
     if target is None:
         return CameraModel(distortion or type(interior.distortion), (), interior.projection)
     if distortion not in (None, target.distortion):
         raise InputError(
-            f"{path}: the format {format.name} has the distortion {target.distortion.__name__}, not "
-            f"{distortion.__name__}; leave the distortion out, or write a .toml"
+            f"{path}: format {format.name} has the distortion {target.distortion.__name__}, not "
+            f"{distortion.__name__}; omit the distortion, or write a .toml"
         )
     return target
 
@@ -343,7 +345,7 @@ def read_control(control: str | Path, marks: str | Path | None = None) -> GivenC
     """
     content = _read_control(Path(control))
     if isinstance(content, Marks):
-        raise InputError(f"{Path(control).name} has marks but no coordinates; give it as the marks")
+        raise InputError(f"{Path(control).name} has marks but no coordinates; give it as marks")
     points, seen = content if isinstance(content, GivenControl) else (content, Marks.none())
     if marks is not None:
         other = _read_control(Path(marks))
@@ -356,8 +358,8 @@ def read_control(control: str | Path, marks: str | Path | None = None) -> GivenC
         seen = Marks.joined(seen.take(kept), other)
     if seen.point and not set(seen.point) & set(points.ids):
         raise InputError(
-            f"{seen.places[0]}: no mark is of a point that {points.file} has ({few(list(dict.fromkeys(seen.point)))}; "
-            f"there are {few(points.ids)}); use the same names in both"
+            f"{seen.places[0]}: no marked point ({few(list(dict.fromkeys(seen.point)))}) is in {points.file} "
+            f"({few(points.ids)}); use the same names in both"
         )
     return GivenControl(points, seen)
 

@@ -45,7 +45,7 @@ class _Script(NamedTuple):
     def find(self, place: str) -> ElementTree.Element:
         element = self.root.find(place)
         if element is None:
-            raise self.error(f"there is no <{place.replace('/', '><')}>; add it")
+            raise self.error(f"missing <{place.replace('/', '><')}>; add it")
         return element
 
     def text(self, place: str, default: str) -> str:
@@ -67,14 +67,14 @@ class _Script(NamedTuple):
         base = base.replace("$HOME", str(Path.home()))
         name = (element.text or "").strip()
         if "$" in base or "$" in name:
-            raise self.error(f"the folder of {name} ({base}) is not known here; write it with $HERE")
+            raise self.error(f"unknown folder {base} of {name}; write it with $HERE")
         return Path(base) / name
 
     def tables(self, tag: str, *columns: str) -> list[tuple[Table, ElementTree.Element]]:
         """Read the files of <input><tag>; the attribute `format` names their columns, `columns` are required."""
         elements = self.find(f"input/{tag}").findall("file")
         if not elements:
-            raise self.error(f"<{tag}> names 0 files; add <file format='{','.join(columns)}'>")
+            raise self.error(f"<{tag}> has no file; add <file format='{','.join(columns)}'>")
         tables = []
         for element in elements:
             names = [name.strip() for name in element.get("format", "").split(",")]
@@ -94,7 +94,7 @@ class _Script(NamedTuple):
     def metres(self) -> float:
         unit = self.text("meta/project_unit", "m")
         if unit not in _METRES:
-            raise self.error(f"the project_unit {unit!r} is unknown; use one of {', '.join(_METRES)}")
+            raise self.error(f"unknown project_unit {unit!r}; use one of {', '.join(_METRES)}")
         return _METRES[unit]
 
 
@@ -112,7 +112,9 @@ def read(path: Path) -> BlockTables:
     script = _open(path)
     for element in script.find("input"):
         if element.tag not in _INPUT:
-            raise script.error(f"<{element.tag}> in <input> cannot be read; remove it, or convert the project by hand")
+            raise script.error(
+                f"<{element.tag}> in <input> is not supported; remove it, or convert the project by hand"
+            )
     _include_cameras(script)
     images = concatenate([table for table, _ in script.tables("images", "id", "path")])
     stems = [Path(path.replace("\\", "/")).stem for path in images.text("path")]
@@ -147,7 +149,7 @@ def _include_cameras(script: _Script) -> None:
         path = script.file(element)
         included = _open(path).root.findall("cameras/camera")
         if not included:
-            raise script.error(f"{path.name} has no <cameras><camera>; name a camera file of DBAT")
+            raise script.error(f"{path.name} has no <cameras><camera>; give a camera file of DBAT")
         cameras.remove(element)
         cameras.extend(included)
 
@@ -165,9 +167,9 @@ def _prior_orientations(script: _Script, file: str, name_of: dict[str, str]) -> 
     """Return image, camera position and, if given, angles in degrees and standard deviations."""
     ((table, element), *more) = script.tables("prior_eo", "id", *_POSITION)
     if more:
-        raise script.error(f"<prior_eo> names {1 + len(more)} files, and one is read; put all orientations into it")
+        raise script.error(f"<prior_eo> has {1 + len(more)} files, not 1; put all orientations into one")
     if other := [name for name in table.columns if name not in ("id", "label", *_POSITION, *_ANGLES, *_SIGMAS)]:
-        raise script.error(f"<prior_eo> has the column {quoted(other[0])}, which is not read; remove it")
+        raise script.error(f"<prior_eo> has the unsupported column {quoted(other[0])}; remove it")
     metres, unit = script.metres, element.get("units", "")
     columns = {"image": _check_images(table, "id", name_of, file)}
     columns |= {name: table.numbers(axis) * metres for name, axis in zip(XYZ, _POSITION, strict=True)}
@@ -175,7 +177,7 @@ def _prior_orientations(script: _Script, file: str, name_of: dict[str, str]) -> 
         if not all(name in table for name in _ANGLES):
             raise script.error("<prior_eo> has some of omega, phi, kappa; give all three or none")
         if unit not in _DEGREES:
-            raise script.error(f"the units {quoted(unit)} of <prior_eo> are unknown; use one of {', '.join(_DEGREES)}")
+            raise script.error(f"unknown units {quoted(unit)} of <prior_eo>; use one of {', '.join(_DEGREES)}")
         columns |= {f"{name}_deg": table.numbers(name) * _DEGREES[unit] for name in _ANGLES}
     for name, axis in zip(SIGMA_XYZ, _POSITION, strict=True):
         if sigma := _first(table, "sxyz", f"s{axis}"):
@@ -235,7 +237,7 @@ def _control(script: _Script, tag: str, role: str) -> Table | None:
         ids = {part.strip() for part in element.get("id", "").split(",")}
         action = (element.text or "").strip()
         if action not in ("keep", "remove") or ids == {""}:
-            raise script.error(f"write <filter id='1,2'>keep or remove</filter> in <{tag}>")
+            raise script.error(f"invalid <filter> in <{tag}>; write <filter id='1,2'>keep or remove</filter>")
         chosen = np.array([point in ids for point in table.text("point")], bool)
         table = table.take(chosen if action == "keep" else ~chosen)
     return table
@@ -268,7 +270,7 @@ def _camera(script: _Script) -> dict[str, Any]:
     """Return the [cameras.X] table of the only camera."""
     c = _CAMERA_PLACE
     if len(script.find("input/cameras").findall("camera")) != 1:
-        raise script.error("there is not exactly one <camera>; this reader takes one, so convert the project by hand")
+        raise script.error("the number of <camera> is not 1; convert the project by hand")
     if (unit := script.text(f"{c}/unit", "mm")) != "mm":
         raise script.error(f"the camera's unit is {unit!r}; give the camera in mm")
     if (model := script.text(f"{c}/model", "3")) not in _MODELS:
@@ -289,7 +291,7 @@ def _camera(script: _Script) -> dict[str, Any]:
         interior |= _coefficients(script, "K", 3) | _coefficients(script, "P", 2)
         interior["b1"] = script.numbers(f"{c}/aspect", "1")[0] - 1.0
         if script.numbers(f"{c}/skew", "0")[0] != 0:
-            raise script.error("a <skew> other than 0 cannot be read; set it to 0")
+            raise script.error("<skew> is not 0; set it to 0")
     unknowns = _free(script)
     if model in "12" and (interior["b1"] != 0 or {"b1", "b2"} & set(unknowns)):
         raise script.error(f"lens model {model} has neither aspect nor skew; set aspect to 1 and estimate none")
@@ -316,7 +318,7 @@ def _pixel_mm(script: _Script, place: str, width: int, height: int) -> float:
 def _coefficients(script: _Script, tag: str, most: int) -> dict[str, float]:
     values = script.numbers(f"{_CAMERA_PLACE}/{tag}", "0")
     if any(value != 0 for value in values[most:]):
-        raise script.error(f"<{tag}> has more than {most} coefficients; remove the others")
+        raise script.error(f"<{tag}> has more than {most} coefficients; remove the rest")
     return {f"{tag.lower()}{i}": 0.0 - value for i, value in enumerate(values[:most], start=1)}
 
 
@@ -334,14 +336,14 @@ def _free(script: _Script) -> dict[str, str]:
     estimate = "set_bundle_estimate_params"
     for key in ("eo", "op"):
         if (value := script.setting(estimate, key)) not in ("true", "default"):
-            raise script.error(f"<{key}> {value!r} in <{estimate}> cannot be read; set it to true")
+            raise script.error(f"<{key}> {value!r} in <{estimate}> is not supported; set it to true")
     every = script.setting(estimate, "io") == "true"
     free = {name for names in groups.values() for name in names} if every else set()
     for element in script.root.findall(f"operations/operation/{estimate}/io/*"):
         if element.tag in ("c", "all"):
             continue
         if element.tag not in groups:
-            raise script.error(f"<{element.tag}> in <io> is unknown; use all, {', '.join(groups)}")
+            raise script.error(f"unknown <{element.tag}> in <io>; use all, {', '.join(groups)}")
         value = (element.text or "").strip()
         if value not in ("true", "false"):
             raise script.error(f"<{element.tag}> in <io> is {value!r}; write true or false")

@@ -162,7 +162,7 @@ def number_rows(
         if row.shape != shape or not (np.abs(row) <= LARGEST).all():
             many = " x ".join(map(str, shape))
             raise InputError(f"{place(k)}: {quoted(value)} is not {many} finite numbers. Correct it or export it again")
-    raise InputError(f"{place(0)}: numbers of one shape are expected. Export the file again")
+    raise InputError(f"{place(0)}: the numbers differ in shape. Export the file again")
 
 
 def row_numbers(path: Path, row: int, words: Sequence[str], many: int) -> list[float]:
@@ -172,5 +172,5 @@ def row_numbers(path: Path, row: int, words: Sequence[str], many: int) -> list[f
     except ValueError:
         values = []
     if len(values) != many or not all(abs(value) <= LARGEST for value in values):
-        raise InputError(f"{path.name}, row {row}: {quoted(' '.join(words))} is not {many} numbers")
+        raise InputError(f"{path.name}, row {row}: {quoted(' '.join(words))} is not {many} numbers; correct it")
     return values

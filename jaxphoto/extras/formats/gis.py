@@ -137,7 +137,7 @@ def write_geojson(p: Project, folder: Path) -> None:
     """Write stations.geojson and footprints.geojson."""
     frame = p.frame
     if frame.kind != "epsg" or frame.code is None:
-        raise InputError("GeoJSON is in longitude and latitude, and the block is in a local frame; write a GeoPackage")
+        raise InputError("GeoJSON needs a map system, but the block is in a local frame; write a GeoPackage")
     features = _features(p)
     places = lambda local: wgs84_places(frame.code, frame.map.place(frame.map.map(local)))  # type: ignore[arg-type]  # noqa: E731
     points = [{"type": "Point", "coordinates": at} for at in places(features.positions).tolist()]
@@ -221,8 +221,8 @@ def _surveyed(file: str, features: Sequence[tuple[Sequence[float], dict[str, Any
     header = [*("xyz" if solid else "xy"), *keys]
     columns = point_attributes(header)
     if columns is None:
-        names = f" (there are {few(keys)})" if keys else ""
-        raise InputError(f"{file}: no attribute is the name of the points{names}; call it point, name, label or id")
+        names = f" (found {few(keys)})" if keys else ""
+        raise InputError(f"{file}: no attribute with point names{names}; name it point, name, label or id")
     records = []
     for coordinates, attributes in features:
         place = [*map(repr, coordinates), ""][: len(header) - len(keys)]
@@ -238,7 +238,7 @@ def read_geojson(path: Path, text: str) -> SurveyedPoints:
     content = read_json(path)
     features = content.get("features")
     if not isinstance(features, list) or not features:
-        raise InputError(f"{path.name}: there are no features; export the layer of the control points")
+        raise InputError(f"{path.name}: no features; export the layer of the control points")
     points = [_point_feature(path, k, feature) for k, feature in enumerate(features, 1)]
     return _surveyed(path.name, points, _geojson_system(path, content))
 
@@ -249,7 +249,7 @@ def _point_feature(path: Path, k: int, feature: Any) -> tuple[list[float], dict[
     coordinates = place if isinstance(place, list) else []
     numbers = all(isinstance(v, int | float) and abs(v) <= LARGEST for v in coordinates)
     if not numbers or not 2 <= len(coordinates) <= 4:
-        raise InputError(f"{path.name}, feature {k}: the geometry is no point. Export a layer of points")
+        raise InputError(f"{path.name}, feature {k}: the geometry is not a point. Export a layer of points")
     attributes = feature.get("properties") or {}
     return [float(v) for v in coordinates[:3]], ({"id": feature["id"]} if "id" in feature else {}) | attributes
 
@@ -260,7 +260,9 @@ def _geojson_system(path: Path, content: dict[str, Any]) -> str:
     name = str(content["crs"]["properties"]["name"])
     code = _EPSG.search(name)
     if code is None and not _CRS84.search(name):
-        raise InputError(f"{path.name}: the system {quoted(name)} is no EPSG code")
+        raise InputError(
+            f"{path.name}: coordinate system {quoted(name)} is not an EPSG code; export it in an EPSG system"
+        )
     return f"EPSG:{code[1] if code else _WGS84}"
 
 
@@ -276,7 +278,7 @@ def read_geopackage(path: Path, text: str) -> SurveyedPoints:
     """Read the only point layer with an attribute for point names."""
     content, log = read_bytes(path), path.with_name(path.name + "-wal")
     if log.is_file() and log.stat().st_size:
-        raise InputError(f"{path.name} is open in another program, which has not written all of it; close it there")
+        raise InputError(f"{path.name} is open in another program and incomplete; close it there")
     try:
         # Open a copy in memory: SQLite would write files into a folder where the original may be open elsewhere.
         with contextlib.closing(sqlite3.connect(":memory:")) as file:
@@ -284,7 +286,7 @@ def read_geopackage(path: Path, text: str) -> SurveyedPoints:
             file.text_factory = lambda text: text.decode("utf-8", "replace")
             return _read_layer(path, file)
     except (sqlite3.Error, OverflowError, UnicodeDecodeError):
-        raise InputError(f"{path.name} is no GeoPackage that can be read; export the layer again") from None
+        raise InputError(f"{path.name} is not a readable GeoPackage; export the layer again") from None
 
 
 def _read_layer(path: Path, file: sqlite3.Connection) -> SurveyedPoints:
@@ -323,7 +325,7 @@ def _coordinates(path: Path, k: int, blob: Any) -> Sequence[float]:
             values = struct.unpack_from(f"{order}{many}d", blob, begin + 5)
             if all(abs(v) <= LARGEST for v in values):
                 return values
-    raise InputError(f"{path.name}, feature {k}: the geometry is no point; export a layer of points")
+    raise InputError(f"{path.name}, feature {k}: the geometry is not a point; export a layer of points")
 
 
 FORMATS = (

@@ -98,7 +98,7 @@ def _calibration(sensor: ElementTree.Element) -> tuple[ElementTree.Element | Non
 def _camera(source: CameraSource, name: str, calibration: ElementTree.Element, pixel: str | None) -> CameraFile:
     kind = (calibration.findtext("projection") or calibration.get("type") or "frame").strip()
     if kind not in _MODELS:
-        raise source.error(f"the projection {quoted(kind)} is not known here; known are {', '.join(_MODELS)}")
+        raise source.error(f"projection {quoted(kind)} is not supported; use one of {', '.join(_MODELS)}")
     resolution = calibration.find("resolution")
     sides = ("width", "height")
     size = [calibration.findtext(side) if resolution is None else resolution.get(side) for side in sides]
@@ -126,7 +126,7 @@ def _values(source: CameraSource, calibration: ElementTree.Element, sensor: Sens
         if key not in numbers:
             raise source.error(f"<{key}> is missing; add it")
         if not numbers[key] > 0:
-            raise source.error(f"{key} is {numbers[key]:g} pixels; a focal length is positive")
+            raise source.error(f"{key} is {numbers[key]:g} pixels; give a positive focal length")
     values = {key: numbers.get(key, 0.0) for key in ("f", "cx", "cy", *Agisoft.coefficients)}
     if not older:
         return values, ""
@@ -135,7 +135,7 @@ def _values(source: CameraSource, calibration: ElementTree.Element, sensor: Sens
         values[key] = numbers[key] - side / 2 if key in numbers else 0.0
     values |= {"p1": values["p2"], "p2": values["p1"]}
     tangential = values["p1"] != 0 or values["p2"] != 0
-    return values, "fx and fy are of an old version; its p1 and p2 were taken in OpenCV's order" * tangential
+    return values, "fx and fy are of an old version; p1 and p2 are used in OpenCV's order" * tangential
 
 
 def write_calibration(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
@@ -193,7 +193,7 @@ def read(path: Path) -> Project:
     sensors, names = _project_cameras(path, chunk), _sensor_names(chunk)
     for photo in photos:
         if photo.sensor not in sensors:
-            raise InputError(f"{path.name}, camera {quoted(photo.label)}: its sensor is not calibrated.")
+            raise InputError(f"{path.name}, camera {quoted(photo.label)}: its sensor is not calibrated. Calibrate it")
     labels = [photo.label for photo in photos]
     place = lambda k: f"{path.name}, camera {quoted(labels[k])}, transform"  # noqa: E731
     poses = number_rows([photo.transform.split() for photo in photos], (16,), place).reshape(-1, 4, 4)
@@ -205,7 +205,9 @@ def read(path: Path) -> Project:
     cameras = [sensors[photo.sensor] for photo in photos]
     shown = joined(points_beside(path, labels, cameras), marks_shown(marks, labels), path.name)
     if not len(shown.image):
-        raise InputError(f"{path.name} has no tie points and no marks; export tie points as BINGO or PATB beside it")
+        raise InputError(
+            f"{path.name} has no tie points and no marks; export tie points as BINGO or PATB into its folder"
+        )
     project = Project(
         chunk.get("label") or path.stem, {names[key]: camera for key, camera in sensors.items()}, (), labels,
         [names[photo.sensor] for photo in photos], pose(rotations, centres), shown.points, None, shown.image,
@@ -217,8 +219,8 @@ def read(path: Path) -> Project:
         return project
     if (georeferenced and system.crs is None) or system.code is not None:
         return project._replace(control=_control(rows, shown.points))
-    why = "is in no EPSG system" if georeferenced else "is not georeferenced"
-    warn(f"{path.name} {why}: {len(rows)} markers with coordinates are no control; give it to jaxphoto control, too")
+    why = "has no EPSG system" if georeferenced else "is not georeferenced"
+    warn(f"{path.name} {why}: skipped {len(rows)} markers with coordinates; add them by jaxphoto control")
     return project
 
 
@@ -305,8 +307,8 @@ def _datum_code(path: Path, system: ControlSystem) -> int:
     geodetic = None if system.crs is None else system.crs.geodetic_crs
     code = None if geodetic is None else geodetic.to_epsg()
     if code is None:
-        raise InputError(f"{path.name}: neither {system.name} nor its datum has an EPSG code")
-    warn(f"{path.name}: its system has no EPSG code; the block is in EPSG:{code}")
+        raise InputError(f"{path.name}: {system.name} and its datum have no EPSG code; export it in an EPSG system")
+    warn(f"{path.name}: its system has no EPSG code; converted to EPSG:{code}")
     return code
 
 
@@ -324,7 +326,7 @@ def _chunk(path: Path, text: str) -> ElementTree.Element:
     root = ElementTree.fromstring(text)
     chunk = root if root.tag == "chunk" else root.find("chunk")
     if chunk is None:
-        raise InputError(f"{path.name}: there is no <chunk>. Export markers or cameras of a chunk")
+        raise InputError(f"{path.name}: missing <chunk>. Export markers or cameras of a chunk")
     return chunk
 
 
@@ -340,7 +342,7 @@ def _markers(path: Path, chunk: ElementTree.Element) -> tuple[SurveyRows, list[M
         return _markers_of(path.name, chunk)
     other = _chunk(beside, read_legacy_text(beside))
     if _system_words(other) != _system_words(chunk):
-        raise InputError(f"{MARKERS_FILE} is in another coordinate system than {path.name}")
+        raise InputError(f"{MARKERS_FILE} and {path.name} differ in coordinate system; export both in one")
     return _markers_of(MARKERS_FILE, other)
 
 
@@ -367,7 +369,9 @@ def _markers_of(file: str, chunk: ElementTree.Element) -> tuple[SurveyRows, list
             camera = location.get("camera_id", "")
             place = f"{file}, marker {quoted(labels.get(number, number))}, camera {quoted(camera)}"
             if camera not in cameras or number not in labels:
-                raise InputError(f"{place}: the file has no such {'marker' if camera in cameras else 'camera'}")
+                raise InputError(
+                    f"{place}: unknown {'marker' if camera in cameras else 'camera'}. Export the markers again"
+                )
             column_row = [_number(location, key, place) for key in "xy"]
             marks.append((cameras[camera], labels[number], column_row, np.nan, place))
     return points, marks
@@ -388,7 +392,7 @@ def _sigma(reference: ElementTree.Element, key: str, place: str) -> float:
     key = key if reference.get(key) is not None else "sxyz"
     value = _number(reference, key, place) if reference.get(key) is not None else np.nan
     if value < 0:
-        raise InputError(f"{place}: {key} is {value:g}; a standard deviation is positive, so correct it")
+        raise InputError(f"{place}: standard deviation {key} is {value:g}, not positive; correct it")
     return value if value > 0 else np.nan
 
 
@@ -438,10 +442,7 @@ def _write_markers(p: Project, folder: Path) -> None:
     assert control is not None
     placed = np.flatnonzero(~np.isnan(control.xyz[:, :2]).any(axis=1))
     if left := len(control.xyz) - len(placed):
-        warn(
-            f"{MARKERS_FILE}: {left} control or check points without X and Y are left out, which markers of Metashape "
-            "need"
-        )
+        warn(f"{MARKERS_FILE}: skipped {left} control or check points without X and Y (markers of Metashape need both)")
     root, chunk = _document(p)
     _add_cameras(chunk, p)
     markers = add(chunk, "markers", next_id=str(len(placed)), next_group_id="0")

@@ -73,13 +73,13 @@ def _camera(path: Path, place: str, values: dict[str, Any]) -> ProjectCamera:
     # instant-ngp does not specify a camera model.
     kind = section.text("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") is True else "OPENCV")
     if kind not in _KINDS:
-        raise section.error("camera_model", f"{quoted(kind)} is not known here; known are {', '.join(_KINDS)}")
+        raise section.error("camera_model", f"{quoted(kind)} is not supported; use one of {', '.join(_KINDS)}")
     model, coefficients = _KINDS[kind]
     for name in _TERMS:
         if name not in coefficients and section.number(name, 0.0) != 0:
             raise section.error(name, f"unsupported term for camera model {kind}; recalibrate without it")
     if not ("w" in section and "h" in section):
-        raise InputError(f"{path.name} does not say how large its photographs are. Add w and h (pixels)")
+        raise InputError(f"{path.name} has no size of the photographs. Add w and h (pixels)")
     width, height = section.number("w"), section.number("h")
     sensor, _ = source.sensor(width, height)
     if "fl_x" not in section and "camera_angle_x" in section:
@@ -96,7 +96,9 @@ def write(p: Project, folder: Path) -> None:
     cameras = {name: _written(camera) for name, camera in p.cameras.items()}
     kinds = {camera.pop("camera_model") for camera in cameras.values()}
     if len(kinds) != 1:
-        raise InputError("transforms.json is of cameras of one kind, and the block has fisheyes beside others")
+        raise InputError(
+            "transforms.json has one camera model, but the block has fisheyes and others; export each kind separately"
+        )
     shared = next(iter(cameras.values())) if len(cameras) == 1 else {}
     frames = []
     for i, file in enumerate(p.files):

@@ -69,7 +69,7 @@ def read_opencv(source: CameraSource) -> CameraFile:
             raise cv2.error("not open")
         return _camera(source, storage)
     except cv2.error:
-        raise source.error("OpenCV cannot read it; it is cut off or was changed, so write it again") from None
+        raise source.error("OpenCV cannot read it: it is truncated or changed; write it again") from None
     finally:
         storage.release()
 
@@ -78,17 +78,17 @@ def _camera(source: CameraSource, storage: Any) -> CameraFile:
     kind = storage.getNode("distortion_model")
     if not kind.empty() and kind.string() not in ROS_MODELS:
         models = ", ".join(ROS_MODELS)
-        raise source.error(f"the distortion_model {quoted(kind.string())} is not known here; known are {models}")
+        raise source.error(f"distortion_model {quoted(kind.string())} is not supported; use one of {models}")
     fisheye = _number(storage.getNode("fisheye_model")) not in (None, 0.0) or kind.string() == _ROS_FISHEYE
     matrix = _matrix(source, storage, "camera_matrix")
     if matrix.shape != (3, 3):
-        raise source.error(f"camera_matrix is {' x '.join(map(str, matrix.shape))}; it has to be 3 x 3")
+        raise source.error(f"camera_matrix is {' x '.join(map(str, matrix.shape))}, not 3 x 3; export it again")
     coefficients = _matrix(source, storage, "distortion_coefficients").ravel()
     n = len(coefficients)
     if fisheye and n != len(FISHEYE_TERMS):
         raise source.error(f"{n} distortion_coefficients, but OpenCV's fisheye model has 4; give 4")
     if n not in _COUNTS:
-        raise source.error(f"there are {n} distortion_coefficients; OpenCV has one of {', '.join(map(str, _COUNTS))}")
+        raise source.error(f"{n} distortion_coefficients, but OpenCV uses one of {', '.join(map(str, _COUNTS))}")
     _check_plane(source, coefficients)
     size = [_number(storage.getNode(key)) for key in ("image_width", "image_height")]
     if None in size and source.size_px is None:
@@ -105,7 +105,7 @@ def _camera(source: CameraSource, storage: Any) -> CameraFile:
 
 def _check_plane(source: CameraSource, coefficients: np.ndarray) -> None:
     if np.any(coefficients[len(OPENCV_ORDER) :] != 0):
-        raise source.error("its terms of a thin prism or a tilted sensor are not known here; calibrate without them")
+        raise source.error("terms of a thin prism or a tilted sensor are not supported; calibrate without them")
 
 
 def _number(node: Any) -> float | None:
@@ -127,10 +127,10 @@ def _matrix(source: CameraSource, storage: Any, key: str) -> np.ndarray:
         # One-dimensional list, as written by OpenCV 5.
         rows, columns = 1.0, sizes[0]
     if not rows or not columns or rows % 1 or columns % 1 or None in values or not rows * columns == len(values) > 0:
-        raise source.error(f"{key} is no matrix with rows, cols and as many numbers in data")
+        raise source.error(f"{key} is not a matrix of rows x cols numbers in data; export it again")
     matrix = np.array(values, float).reshape(-1, max(int(columns), 1))
     if not np.isfinite(matrix).all():
-        raise source.error(f"{key} is no matrix of finite numbers; calibrate again")
+        raise source.error(f"{key} is not a matrix of finite numbers; calibrate again")
     return matrix
 
 
@@ -201,9 +201,9 @@ def read_kalibr(source: CameraSource) -> CameraFile:
     camera = chain[name]
     kind, distortion = camera.get("camera_model"), camera.get("distortion_model")
     if kind != "pinhole":
-        raise source.error(f"{name} is a {quoted(kind)}; cameras that are pinhole are known here")
+        raise source.error(f"{name} is a {quoted(kind)}, not pinhole; calibrate as pinhole")
     if not isinstance(distortion, str) or distortion not in _KALIBR:
-        raise source.error(f"the distortion {quoted(distortion)} of {name} is none of {', '.join(_KALIBR)}")
+        raise source.error(f"unknown distortion {quoted(distortion)} of {name}; use one of {', '.join(_KALIBR)}")
     model, order = _KALIBR[distortion]
     fu, fv, pu, pv = _list(source, camera, "intrinsics", 4, name)
     sensor, assumed = source.sensor(*_list(source, camera, "resolution", 2, name))
@@ -215,7 +215,7 @@ def read_kalibr(source: CameraSource) -> CameraFile:
 def _list(source: CameraSource, values: dict[str, Any], key: str, count: int, of: str) -> list[float]:
     numbers = values.get(key)
     if not isinstance(numbers, list | tuple) or len(numbers) != count:
-        raise source.error(f"{key} of {of} is {quoted(numbers)}, and {count} numbers are needed; export it again")
+        raise source.error(f"{key} of {of} is {quoted(numbers)}, not {count} numbers; export it again")
     return [source.number(f"{key} of {of}", None if isinstance(v, bool) else v) for v in numbers]
 
 
@@ -231,7 +231,7 @@ def read_mrcal(source: CameraSource) -> CameraFile:
     values = ast.literal_eval(source.text())
     model = values.get("lensmodel", values.get("lens_model"))
     if not isinstance(model, str) or model not in _MRCAL:
-        raise source.error(f"the lens model {quoted(model)} is not known here; known are {', '.join(_MRCAL)}")
+        raise source.error(f"lens model {quoted(model)} is not supported; use one of {', '.join(_MRCAL)}")
     fx, fy, cx, cy, *coefficients = _list(source, values, "intrinsics", 4 + _MRCAL[model], model)
     _check_plane(source, np.array(coefficients))
     sensor, assumed = source.sensor(*_list(source, values, "imagersize", 2, model))

@@ -73,7 +73,7 @@ def read(path: Path) -> Project:
             pose_of.append(pose_key)
     if not files:
         raise InputError(
-            f"{path} has {len(views)} views and none with a pose; give the file that the reconstruction wrote: "
+            f"{path}: none of {len(views)} views has a pose; give the file of the reconstruction: "
             f"openMVG_main_ConvertSfM_DataFormat binary -i sfm_data.bin -o {FILE} -V -I -E -S"
         )
     rotations, centres = (
@@ -112,7 +112,7 @@ def _by_key(path: Path, content: dict[str, Any], name: str) -> dict[str, dict[st
     for item in content[name]:
         key, value = str(item["key"]), item["value"]
         if key in values:
-            raise InputError(f"{path.name}, {name}: {key} is there twice; keep one of the two")
+            raise InputError(f"{path.name}, {name}: duplicate {key}; keep one of the two")
         values[key] = value
     return values
 
@@ -132,7 +132,7 @@ def _camera(path: Path, key: str, value: dict[str, Any], kinds: dict[int | None,
     section = Section(path.name, f"intrinsics {key}", _data(value))
     kind = value.get("polymorphic_name", kinds.get(_kind_number(value)))
     if kind not in _KINDS:
-        raise section.error("polymorphic_name", f"{quoted(kind)} is not known here; known are {', '.join(_KINDS)}")
+        raise section.error("polymorphic_name", f"{quoted(kind)} is not supported; use one of {', '.join(_KINDS)}")
     model, name, coefficients = _KINDS[kind]
     source = CameraSource(path)
     sensor, _ = source.sensor(section.count("width"), section.count("height"))

@@ -58,7 +58,7 @@ def read(path: Path) -> Project:
     """Read a reconstruction; cameras have free c, the coefficients of their model and, if given, xp, yp and b1."""
     folder = path.parent
     if not (folder / TRACKS).is_file():
-        raise InputError(f"{path} has no {TRACKS} beside it. Copy it from the project's folder (opensfm)")
+        raise InputError(f"{path}: {TRACKS} not found in its folder. Copy it from the project's folder (opensfm)")
     content = _largest(path, read_json(path))
     shots, points = content.section("shots").values, content.section("points").values
     cameras = {name: _camera(path, content.section("cameras").section(name)) for name in content.section("cameras")}
@@ -66,7 +66,7 @@ def read(path: Path) -> Project:
     camera_of = [shot.text("camera") for shot in sections]
     for shot, camera in zip(sections, camera_of, strict=True):
         if camera not in cameras:
-            raise shot.error("camera", f"there is no camera {quoted(camera)} in the file; correct it")
+            raise shot.error("camera", f"unknown camera {quoted(camera)}; correct it")
     files, ids = list(shots), list(points)
 
     def vectors(key: str) -> np.ndarray:
@@ -103,17 +103,17 @@ def _largest(path: Path, content: Any) -> Section:
     each = content if isinstance(content, list) else [content]
     shots = [len(r["shots"]) if isinstance(r, dict) and isinstance(r.get("shots"), dict) else 0 for r in each]
     if not any(shots):
-        raise InputError(f"{path}: there is no reconstruction with shots in it; run OpenSfM's reconstruct")
+        raise InputError(f"{path}: no reconstruction with shots; run OpenSfM's reconstruct")
     best = int(np.argmax(shots))
     if sum(shots) > shots[best]:
-        warn(f"{path}: of {len(each)} reconstructions the one of {shots[best]} shots is read, {sum(shots)} are in all")
+        warn(f"{path}: read the largest of {len(each)} reconstructions ({shots[best]} of {sum(shots)} shots)")
     return Section(path.name, "", each[best])
 
 
 def _camera(path: Path, camera: Section) -> ProjectCamera:
     kind = camera.text("projection_type", "perspective")
     if kind not in _KINDS:
-        raise camera.error("projection_type", f"{quoted(kind)} is not known here; known are {', '.join(_KINDS)}")
+        raise camera.error("projection_type", f"{quoted(kind)} is not supported; use one of {', '.join(_KINDS)}")
     model, names = _KINDS[kind]
     source = CameraSource(path)
     sensor, _ = source.sensor(camera.count("width"), camera.count("height"))
@@ -138,7 +138,9 @@ def _tracks(
     for row, line in enumerate(lines[begin:], begin + 1):
         cells = line.split("\t")
         if len(cells) < 5 and line.strip():
-            raise InputError(f"{path.name}, row {row}: {len(cells)} cells, not photograph, track, feature, x, y ...")
+            raise InputError(
+                f"{path.name}, row {row}: {len(cells)} cells; expected photograph, track, feature, x, y ..."
+            )
         if len(cells) >= 5 and cells[0] in shot_of and cells[1] in point_of:
             index.append((shot_of[cells[0]], point_of[cells[1]]))
             xy.append(cells[3:5])

@@ -75,7 +75,7 @@ def read(path: Path) -> Project:
     """Read parameters; cameras have free c, xp, yp and nonzero coefficients."""
     interiors = _interiors(path.parent)
     if len(interiors) != 1:
-        raise InputError(f"{path.parent} has {len(interiors)} files of interior parameters; leave one")
+        raise InputError(f"{path.parent} has {len(interiors)} files of interior parameters; keep one")
     files, names, positions, angles, system = _of_csv(path) if path.suffix.lower() == ".csv" else _of_json(path)
     source = CameraSource(interiors[0])
     cameras = {name: _camera(source, Section(source.path.name, name, v)) for name, v in yaml_cameras(source).items()}
@@ -84,8 +84,8 @@ def read(path: Path) -> Project:
     for k, name in enumerate(camera_of, 1):
         if name not in cameras:
             raise InputError(
-                f"{path.name}, photograph {k}: there is no camera {quoted(name)} in the interior parameters (there are "
-                f"{few(list(cameras))}); add it"
+                f"{path.name}, photograph {k}: unknown camera {quoted(name)}, not in the interior parameters "
+                f"({few(list(cameras))}); add it"
             )
     shown = points_beside(path, files, [cameras[name] for name in camera_of])
     exterior = ExteriorOrientation.from_angles(positions, angles)  # type: ignore[arg-type]
@@ -115,11 +115,11 @@ def _of_json(path: Path) -> _Exterior:
 def _camera(source: CameraSource, section: Section) -> ProjectCamera:
     kind = section.text("type")
     if kind not in _KINDS:
-        raise section.error("type", f"{quoted(kind)} is not known here; known are {', '.join(_KINDS)}")
+        raise section.error("type", f"{quoted(kind)} is not supported; use one of {', '.join(_KINDS)}")
     model, coefficients = _KINDS[kind]
     for name in _NOT_READ:
         if section.number(name, 0.0) != 0:
-            raise section.error(name, "terms of a thin prism or a tilted sensor are not known here; calibrate without")
+            raise section.error(name, "terms of a thin prism or a tilted sensor are not supported; calibrate without")
     width, height = section.vector("im_size", 2).tolist()
     longer, pixel_mm = max(width, height), None
     two = isinstance(section.values.get("focal_len"), list)
@@ -127,7 +127,7 @@ def _camera(source: CameraSource, section: Section) -> ProjectCamera:
     if "sensor_size" in section:
         size = section.vector("sensor_size", 2)
         if not (size > 0).all():
-            raise section.error("sensor_size", "this is not positive; give width and height in the unit of focal_len")
+            raise section.error("sensor_size", "size is not positive; give width and height in the unit of focal_len")
         pixel_mm = float(size[1] / height) if height else None
         focal = focal * [width, height] / size
     else:
@@ -143,7 +143,9 @@ def write(p: Project, folder: Path) -> None:
     """Write the interior and exterior parameters, a .prj if in a map system, and image_points.csv."""
     m = p.in_map()
     if m.geographic:
-        raise InputError(f"orthority counts metres, and the block is in {m.system}, in degrees")
+        raise InputError(
+            f"orthority needs metres, but {m.system} is in degrees; convert the block to a projected system"
+        )
     cameras = "".join(_written(name, camera) for name, camera in p.cameras.items())
     (folder / "int_param.yaml").write_text(cameras, encoding="utf-8")
     values = np.hstack([np.asarray(m.exterior.position), angles_deg(m.exterior)])

@@ -61,7 +61,7 @@ def read(path: Path) -> BlockTables:
     """
     lines = read_legacy_text(path).split("\n")
     if len(lines) < 6:
-        raise InputError(f"{path.name}: the export ends within its header. Export it again")
+        raise InputError(f"{path.name}: the file ends within its header. Export it again")
     camera = _camera(path, lines)
     name_of, images, at = _photographs(path, lines)
     control, points, marks = _sections(path, lines, at)
@@ -107,14 +107,14 @@ def read(path: Path) -> BlockTables:
 def _camera(path: Path, lines: list[str]) -> dict[str, Any]:
     """Return the [cameras.X] table of the camera."""
     if len(lines[1].split()) == 2:
-        raise InputError(f"{path.name}, row 2: it has no size of the photographs; write width, height at its end")
+        raise InputError(f"{path.name}, row 2: no size of the photographs; write width, height at its end")
     _, _, width, height = row_numbers(path, 2, lines[1].split(), 4)
     c, px, py, width_mm, height_mm, *coefficients = row_numbers(path, 4, lines[3].split(), 10)
     if min(width, height, width_mm, height_mm) <= 0:
         raise InputError(f"{path.name}: the format of the camera is not positive. Export it again")
     sides = width_mm / width, height_mm / height
     if not all(PIXEL_MM[0] <= side <= PIXEL_MM[1] for side in sides):
-        raise InputError(f"{path.name}: pixels of {sides[0]:g} x {sides[1]:g} mm cannot be. Export it again")
+        raise InputError(f"{path.name}: pixels of {sides[0]:g} x {sides[1]:g} mm are implausible. Export it again")
     square = abs(sides[0] / sides[1] - 1) < _SQUARE
     # Affinity is applied first: it makes the pixels square.
     pixel = sides[0] if square else sides[1]
@@ -135,15 +135,17 @@ def _photographs(path: Path, lines: list[str]) -> tuple[dict[str, str], Table, i
     while at < len(lines) and lines[at].strip():
         words = lines[at].split(maxsplit=1)
         if len(words) != 2 or len(lines) < at + _LINES_PER_PHOTOGRAPH:
-            raise InputError(f"{path.name}, row {at + 1}: {quoted(lines[at])} begins no photograph. Export it again")
+            raise InputError(
+                f"{path.name}, row {at + 1}: {quoted(lines[at])} does not start a photograph. Export it again"
+            )
         names[words[0]] = _stem(words[1].strip())
         poses.append(row_numbers(path, at + 2, lines[at + 1].split(), 7)[1:])
         rows.append(at + 2)
         at += _LINES_PER_PHOTOGRAPH
     if not names:
-        raise InputError(f"{path.name}, row 6: there is no photograph. Export it again")
+        raise InputError(f"{path.name}, row 6: no photograph. Export it again")
     if len(names) < len(poses):
-        raise InputError(f"{path.name}: two photographs have one number. Export it again")
+        raise InputError(f"{path.name}: two photographs have the same number. Export it again")
     x, y, z, kappa, phi, omega = np.array(poses).T
     columns = {"image": np.array(list(names.values()), object), "camera": np.full(len(names), CAMERA, object)}
     columns |= dict(zip((*XYZ, *ANGLES), (x, y, z, omega, phi, kappa), strict=True))
@@ -160,7 +162,7 @@ def _sections(path: Path, lines: list[str], at: int) -> list[Table]:
             at += 1
             rows.append(at)
             if len(cells[-1]) != len(columns):
-                raise InputError(f"{path.name}, row {at}: {len(columns)} numbers are expected here. Export it again")
+                raise InputError(f"{path.name}, row {at}: expected {len(columns)} numbers. Export it again")
         values = {name: np.array([row[j] for row in cells], object) for j, name in enumerate(columns)}
         tables.append(Table.of(path.name, values, np.array(rows, int)))
     return tables

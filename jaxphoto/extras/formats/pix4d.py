@@ -85,7 +85,7 @@ def _read_cameras(path: Path) -> tuple[list[str], list[tuple[int, int]], np.ndar
 def _camera(path: Path, values: list[float]) -> ProjectCamera:
     width, height, fx, skew, cx, _, fy, cy, *_, k1, k2, k3, p1, p2 = values
     if not (fx > 0 and fx == fy and skew == 0):
-        raise InputError(f"{path.name}: K is not that of one focal length without skew. Export it again")
+        raise InputError(f"{path.name}: K has two focal lengths or skew. Export it again")
     source = CameraSource(path)
     sensor, _ = source.sensor(int(width), int(height))
     interior = in_pixels(source, sensor, fx, fy, (cx, cy), OPENCV, k1=k1, k2=k2, k3=k3, p1=p1, p2=p2)

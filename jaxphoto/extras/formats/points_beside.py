@@ -61,7 +61,7 @@ def points_beside(path: Path, files: Sequence[str], cameras: Sequence[ProjectCam
     texts = measured_texts(path)
     if len(texts) > 1:
         names = few([other.name for other in texts])
-        raise InputError(f"{path.parent} holds {len(texts)} files of image points ({names}); leave one")
+        raise InputError(f"{path.parent}: {len(texts)} files of image points ({names}); keep one")
     if not texts:
         return named([], [], np.zeros((0, 2)))
     if texts[0].name == TABLE:
@@ -127,8 +127,8 @@ def joined(ties: Shown, marks: Shown, of: str) -> Shown:
     clash = set(names[0]) & set(names[1]) - same
     if clash:
         warn(
-            f"{of}: {len(clash)} tie points have the name of a marker but lie elsewhere ({few(sorted(clash))}); they "
-            f"get another, with {_RENAMED!r} behind"
+            f"{of}: {len(clash)} tie points have the name of a marker elsewhere ({few(sorted(clash))}); renamed by "
+            f"appending {_RENAMED!r}"
         )
     kept = np.array([key[1] not in same or key not in marked for key in where], bool)
     tie_names = [n + _RENAMED if n in clash else n for n, keep in zip(names[0], kept.tolist(), strict=True) if keep]
@@ -203,7 +203,7 @@ def _read_measured(path: Path) -> tuple[list[str], np.ndarray, list[str], np.nda
             heads.append(line.strip())
             within = True
         elif len(words) < 3:
-            raise InputError(f"{path.name}, row {k}: {quoted(line)} is not point, x, y. Complete the row")
+            raise InputError(f"{path.name}, row {k}: {quoted(line)} is not point, x, y. Complete it")
         else:
             photograph.append(len(heads) - 1)
             points.append(words[0])
@@ -249,6 +249,6 @@ def _scale(camera: ProjectCamera | None, rest: list[str], centred: bool) -> list
 def _warn_unknown(unknown: list[str], text: Path, of: str) -> None:
     if unknown:
         warn(
-            f"{text.name}: {len(unknown)} photographs are not in {of} and are left out: "
+            f"{text.name}: skipped {len(unknown)} photographs that are not in {of}: "
             f"{few([quoted(name) for name in unknown])}"
         )

@@ -122,7 +122,7 @@ class Project(NamedTuple):
         names = tuple((files or {}).get(name, name) for name in block.images)
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
-            raise InputError(f"two images are of the photograph {twice}; give each photograph one name")
+            raise InputError(f"two images have the photograph {twice}; give each photograph one name")
         rows = block.image_points
         xy, image = to_numpy(rows.xy), np.asarray(rows.image)
         column_row, sigma_px = np.zeros((len(image), 2)), to_numpy(rows.sigma).copy()
@@ -228,20 +228,20 @@ class Project(NamedTuple):
         """
         p = self.in_map()
         if not len(p.files):
-            raise InputError(f"{p.file}: no image is oriented; give one that has images")
+            raise InputError(f"{p.file}: no image is oriented; give a file with oriented images")
         _check_rotations(p)
         order = np.argsort(np.array(p.files, object), kind="stable")
         names = np.array(_image_names([p.files[k] for k in order]), object)
         if len(set(names)) < len(names):
             twice = next(name for name in names if list(names).count(name) > 1)
-            raise InputError(f"{p.file}: image {twice} is there twice; keep one of them")
+            raise InputError(f"{p.file}: duplicate image {twice}; keep one of them")
         control = p._control_table()
         image, point, column_row, sigma = p._measurements(np.argsort(order)[p.image], control)
         kept = np.flatnonzero(np.bincount(image, minlength=len(names)))
         if not len(kept):
-            raise InputError(f"{p.file}: no image shows {_LEAST} points that others show, too")
+            raise InputError(f"{p.file}: no image shares {_LEAST} points with others; add image points")
         if skipped := [quoted(name) for name in np.delete(names, kept).tolist()]:
-            _warn(f"{p.file}: {len(skipped)} image(s) with fewer than {_LEAST} points are left out: {few(skipped)}")
+            _warn(f"{p.file}: skipped {len(skipped)} image(s) with fewer than {_LEAST} points: {few(skipped)}")
         order, names, image = order[kept], names[kept], np.searchsorted(kept, image)
         seen, point_of = np.unique(point, return_inverse=True)
         ids = np.array(p.points, object)[seen]
@@ -283,8 +283,8 @@ class Project(NamedTuple):
         complete = int(np.sum(~check & np.isfinite(xyz).all(axis=1)))
         if complete < _LEAST:
             _warn(
-                f"{self.file}: images show {complete} control point(s) with all coordinates, and a block needs "
-                f"{_LEAST}; none is used"
+                f"{self.file}: skipped control: images show {complete} control point(s) with all coordinates; "
+                f"a block needs {_LEAST}"
             )
             return None
         columns = (*coordinate_names(self.frame), *SIGMA_XYZ)
@@ -316,8 +316,8 @@ class Project(NamedTuple):
         n_skipped = n_points - len(np.unique(point))
         if n_once < len(order) or n_skipped:
             _warn(
-                f"{self.file}: {len(order) - n_once} measurement(s) that are there twice are not used, nor are "
-                f"{n_skipped} point(s) that fewer than two images show"
+                f"{self.file}: skipped {len(order) - n_once} duplicate measurement(s) and {n_skipped} point(s) "
+                "in fewer than two images"
             )
         return image, point, xy, sigma
 
@@ -372,7 +372,7 @@ def _check_rotations(p: Project) -> None:
         off = np.abs(np.einsum("nij,nkj->nik", r, r) - np.eye(3)).max(axis=(1, 2))
         bad = ~(off < _ROTATION_TOLERANCE) | ~(np.linalg.det(np.where(off[:, None, None] < 1, r, 0.0)) > 0)
     for k in np.flatnonzero(bad).tolist():
-        raise InputError(f"{p.file}: the matrix of image {p.files[k]} is no rotation.")
+        raise InputError(f"{p.file}: the matrix of image {p.files[k]} is not a rotation. Export it again")
 
 
 def _image_names(files: list[str]) -> list[str]:
@@ -398,7 +398,7 @@ def geocentric(p: Project, code: int, vertical: int | None) -> Project:
     """Convert geocentric coordinates on the datum of the EPSG system `code` to a frame of this system."""
     centres = np.asarray(p.exterior.position)
     if not is_geocentric(centres):
-        raise InputError(f"{p.file}: its transform puts photographs not on the earth")
+        raise InputError(f"{p.file}: its transform places photographs off the Earth's surface; export it again")
     frame = _frame_amid(code, vertical, place_from_geocentric(code, centres))
     rotation, translation = frame.map.geocentric_from_local()
     exterior = ExteriorOrientation((centres - translation) @ rotation, p.exterior.camera_from_object @ rotation)  # type: ignore[arg-type]
@@ -412,7 +412,7 @@ def about_place(p: Project, place: Place) -> Project:
     """
     far = float(np.abs(np.asarray(p.exterior.position)).max(initial=0.0))
     if not (far < _NEAR_M and abs(place[0]) <= 180 and abs(place[1]) <= 90):
-        return _local(p, f"photographs lie {far / 1000:.0f} km from its origin")
+        return _local(p, f"photographs are {far / 1000:.0f} km from its origin")
     try:
         return p._replace(frame=Frame("epsg", utm_of(*place[:2]), None, "true", place))
     except InputError as error:
@@ -436,10 +436,10 @@ def with_system(p: Project, words: str) -> Project:
     if system.crs is None:
         return p
     if system.code is None:
-        raise InputError(f"{p.file}: its system ({system.name}) has no EPSG code; write EPSG:25832, say, in its place")
+        raise InputError(f"{p.file}: its system ({system.name}) has no EPSG code; write an EPSG code, e.g. EPSG:25832")
     places = MapFrame(system.code, system.vertical, (0.0, 0.0, 0.0)).place(np.asarray(p.exterior.position))
     if not np.isfinite(places).all():
-        raise InputError(f"{p.file}: positions are no places of {system.name}; correct the system")
+        raise InputError(f"{p.file}: positions are outside {system.name}; correct the system")
     return p._replace(frame=_frame_amid(system.code, system.vertical, places), on_map=True)
 
 
@@ -450,5 +450,5 @@ def _frame_amid(code: int, vertical: int | None, places: Float[np.ndarray, "n 3"
 
 
 def _local(p: Project, why: str) -> Project:
-    _warn(f"{p.file}: where the block lies is not read, and its coordinates are taken as Cartesian metres: {why}")
+    _warn(f"{p.file}: the georeference is skipped and coordinates are used as Cartesian metres: {why}")
     return p

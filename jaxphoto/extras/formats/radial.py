@@ -95,7 +95,9 @@ def read_bundler(path: Path) -> Project:
     n_cameras, n_points = (_count(path, numbers, k, what) for k, what in enumerate(("cameras", "points")))
     at = 2 + 15 * n_cameras
     if len(numbers) < at + 7 * n_points:
-        raise InputError(f"{path.name}: the file ends before its {n_cameras} cameras and {n_points} points do")
+        raise InputError(
+            f"{path.name}: the file ends within its {n_cameras} cameras and {n_points} points. Complete it"
+        )
     cameras, xyz = numbers[2:at].reshape(n_cameras, 5, 3), np.zeros((n_points, 3))
     rows, point = [np.zeros((0, 4))], [np.zeros(0, int)]
     for k in range(n_points):
@@ -108,7 +110,7 @@ def read_bundler(path: Path) -> Project:
         at += 4 * many
     measured = np.concatenate(rows)
     if not np.isin(measured[:, 0], np.arange(n_cameras)).all():
-        raise InputError(f"{path.name}: a point is measured in a camera that is none of 0 to {n_cameras - 1}")
+        raise InputError(f"{path.name}: a point has a camera outside 0 to {n_cameras - 1}. Export it again")
     oriented = np.flatnonzero(cameras[:, 0, 0] > 0)
     number = np.full(n_cameras, -1)
     number[oriented] = np.arange(len(oriented))
@@ -130,16 +132,18 @@ def _listed_names(path: Path, number: int) -> list[str]:
         if file != path and file.is_file():
             names = [line.split()[0] for line in read_legacy_text(file).split("\n") if line.strip()]
             if len(names) != number:
-                raise InputError(f"{file.name} names {len(names)} photographs and {path.name} has {number} cameras")
+                raise InputError(
+                    f"{file.name} has {len(names)} photographs, but {path.name} has {number} cameras; complete it"
+                )
             return names
-    warn(f"{path.name}: photographs have numbers, as no list.txt names them")
+    warn(f"{path.name}: list.txt not found; photographs are numbered")
     return [str(k) for k in range(number)]
 
 
 def _count(path: Path, numbers: np.ndarray, at: int, what: str) -> int:
     value = numbers[at] if at < len(numbers) else np.nan
     if not 0 <= value <= len(numbers) or value != int(value):
-        raise InputError(f"{path.name}: the number of {what} is {value:g}, which cannot be. Export it again")
+        raise InputError(f"{path.name}: the number of {what} is {value:g}, not a valid count. Export it again")
     return int(value)
 
 
@@ -147,7 +151,7 @@ def write_bundler(p: Project, folder: Path) -> None:
     """Write bundle.out and list.txt; object points without image points are omitted."""
     for file in p.files:
         if len(file.split()) != 1:
-            raise InputError(f"{LIST} ends names at blanks, and {quoted(file)} has one; rename the photograph")
+            raise InputError(f"{LIST} allows no blanks, but {quoted(file)} has one; rename the photograph")
     words = lambda values: " ".join(map(repr, values))  # noqa: E731
     rotations, values = np.asarray(p.exterior.camera_from_object), _radial_values(p).tolist()
     moved = translations(rotations, p.exterior.position).tolist()
@@ -191,19 +195,21 @@ def read_bal(path: Path) -> Project:
     for k, (what, count) in enumerate((("camera", n_cameras), ("point", n_points))):
         for wrong in np.flatnonzero(~np.isin(observed[:, k], np.arange(count))):
             raise InputError(
-                f"{path.name}, row {rows[wrong + 1][0]}: {what} is {observed[wrong, k]:g}; the {count} {what}s are "
-                f"counted from 0 to {count - 1}"
+                f"{path.name}, row {rows[wrong + 1][0]}: {what} {observed[wrong, k]:g} is not an integer from 0 "
+                f"to {count - 1}; correct it"
             )
     pairs, times = np.unique(observed[:, :2], axis=0, return_counts=True)
     for camera, point in pairs[times > 1].astype(int).tolist():
         last = np.flatnonzero((observed[:, :2] == (camera, point)).all(axis=1))[-1]
-        raise InputError(f"{path.name}, row {rows[last + 1][0]}: point {point} is measured twice in image {camera}.")
+        raise InputError(
+            f"{path.name}, row {rows[last + 1][0]}: point {point} is measured twice in image {camera}; keep one"
+        )
     words = [(row, word) for row, line in rows[n + 1 :] for word in line.split()]
     needed = 9 * n_cameras + 3 * n_points
     if len(words) != needed:
         raise InputError(
             f"{path.name}: {len(words)} numbers follow the observations, but {n_cameras} cameras and {n_points} points "
-            f"have {needed} (9 a camera, 3 a point). Complete the file or correct row {rows[0][0]}"
+            f"need {needed} (9 per camera, 3 per point). Complete the file or correct row {rows[0][0]}"
         )
     values = np.array([row_numbers(path, row, [word], 1)[0] for row, word in words])
     cameras = values[: 9 * n_cameras].reshape(-1, 9)
@@ -254,7 +260,7 @@ def on_same_rays(p: Project, cameras: Mapping[str, Conversion]) -> Float[np.ndar
         moved, good = (np.asarray(v)[: len(rows)] for v in call_compiled(_moved, interior, cameras[name].interior, xy))
         for k in rows[~good]:
             raise InputError(
-                f"point {p.points[p.point[k]]} in image {p.images[p.image[k]]} lies where the distortion of camera "
+                f"point {p.points[p.point[k]]} in image {p.images[p.image[k]]} is where the distortion of camera "
                 f"{name} is not invertible. Delete the image point, or correct the camera"
             )
         column_row[rows] = sensor.px_from_mm(moved)

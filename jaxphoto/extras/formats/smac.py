@@ -51,10 +51,10 @@ def read_smac_report(source: CameraSource) -> CameraFile:
     if focal is None:
         missing.insert(0, "the Calibrated Focal Length in mm")
     if focal is None or missing:
-        raise source.error(f"{', '.join(missing)} cannot be found in this SMAC report; write each as NAME = VALUE")
+        raise source.error(f"{', '.join(missing)} not found in this SMAC report; write each as NAME = VALUE")
     c = _number(source, "the Calibrated Focal Length", focal[1])
     if not c > 0:
-        raise source.error(f"a focal length of {c:g} mm cannot be; give a positive one")
+        raise source.error(f"focal length {c:g} mm is not positive; give a positive one")
     sensor, assumed = _sensor(source, text)
     coefficients = {name.lower(): value for name, value in values.items() if name[0] in "KP"}
     interior = InteriorOrientation(c, values["xp"], values["yp"], Smac(**coefficients, sign="add"))  # type: ignore[arg-type]

@@ -125,7 +125,7 @@ def oriented_project(
 ) -> Project:
     """Build a project from orientations, image points and the name of the coordinate system."""
     if not len(shown.image):
-        raise InputError(f"{path.name} has no image points; write BINGO, PATB or image_points.csv beside it")
+        raise InputError(f"{path.name} has no image points; write BINGO, PATB or image_points.csv into its folder")
     project = Project(
         path.resolve().parent.name, cameras, (), files, image_camera, exterior, shown.points, None, shown.image,
         shown.point, shown.column_row, sigma_px=shown.sigma_px, file=path.name,
@@ -138,20 +138,20 @@ def _cameras(path: Path, names: list[str]) -> tuple[dict[str, ProjectCamera], li
     near = (p for p in sorted(path.parent.iterdir()) if p.is_file() and not p.name.startswith("."))
     files = [p for p in near if p.suffix.lower() in _CAMERAS]
     if len(files) != 1:
-        raise InputError(f"{path.parent} holds {len(files)} camera files and needs one (docs/formats.md)")
+        raise InputError(f"{path.parent}: {len(files)} camera files, not 1; keep one (docs/formats.md)")
     file, beside = files[0], path.with_name(IMAGES)
     if not beside.is_file():
         try:
             camera = read_camera_file(file)
         except SeveralCamerasError:
-            raise InputError(f"{file.name} holds several cameras; write {IMAGES} beside it") from None
+            raise InputError(f"{file.name} has several cameras; write {IMAGES} into its folder") from None
         return {camera.name: ProjectCamera.estimated(camera.sensor, camera.interior)}, [camera.name] * len(names)
     table, places, camera_of = read_csv(beside, ("image", "camera")), places_by_name(names), dict[int, str]()
     for row, (image, name) in enumerate(zip(table.ids("image"), table.ids("camera"), strict=True)):
         if camera_of.setdefault(place := places.get(image, -1), name) != name and place >= 0:
             raise table.bad(row, f"photograph {quoted(image)} has another camera in a row above; keep one of the two")
     if missing := [name for k, name in enumerate(names) if k not in camera_of]:
-        raise InputError(f"{IMAGES} says no camera of {len(missing)} photographs ({few(missing)}); add a row for each")
+        raise InputError(f"{IMAGES} has no camera for {len(missing)} photographs ({few(missing)}); add a row for each")
     chosen = [camera_of[k] for k in range(len(names))]
     read_files = {name: read_camera_file(file, camera=name) for name in dict.fromkeys(chosen)}
     return {name: ProjectCamera.estimated(c.sensor, c.interior) for name, c in read_files.items()}, chosen
@@ -230,13 +230,13 @@ def read_exterior(path: Path) -> ExteriorText:
     if matrices:
         return _of_matrices(path, rows)._replace(system=_system(path, head))
     if _GRAD.search(head) and not _GON.search(head):
-        raise InputError(f"{path.name} has angles in grad, degrees to some and gon to others; write one")
+        raise InputError(f"{path.name} has angles in grad, which means degrees or gon; write one of them")
     row, above = numbered[first - 1] if first else (0, "")
     places = _places(above)
     if places is None and set(_COLUMNS[3:]) & set(_meanings(above)):
         raise InputError(
-            f"{path.name}, row {row}: {quoted(above)} does not name X, Y, Z, Omega, Phi and Kappa once each; call the "
-            "columns so"
+            f"{path.name}, row {row}: {quoted(above)} does not name X, Y, Z, Omega, Phi and Kappa once each; rename "
+            "the columns"
         )
     places = places or dict(zip(_COLUMNS, range(-len(_COLUMNS), 0), strict=True))
     exterior = _of_angles(path, rows, places, _GON_DEG if _GON.search(head) else 1.0)
@@ -309,7 +309,9 @@ def _of_angles(path: Path, rows: list[_Row], places: dict[str, int], degrees: fl
     names, values, most = [], [], -min(places.values())
     for k, cells, line in rows:
         if len(cells) <= most:
-            raise InputError(f"{path.name}, row {k}: {quoted(line)} is not name, X, Y, Z, omega, phi, kappa")
+            raise InputError(
+                f"{path.name}, row {k}: {quoted(line)} is not name, X, Y, Z, omega, phi, kappa; correct it"
+            )
         values.append(row_numbers(path, k, [cells[places[name]] for name in _COLUMNS], len(_COLUMNS)))
         names.append(" ".join(cells[:-most]))
     numbers = np.array(values).reshape(-1, len(_COLUMNS))
@@ -352,7 +354,9 @@ def _of_bingo(path: Path, numbered: list[tuple[int, str]]) -> ExteriorText:
         words = line.split()
         begin = _oria(words)
         if words[0] == _ORIA and begin is None:
-            raise InputError(f"{path.name}, row {k}: {quoted(line)} is not ORIA, name, X, Y, Z, phi, omega, kappa")
+            raise InputError(
+                f"{path.name}, row {k}: {quoted(line)} is not ORIA, name, X, Y, Z, phi, omega, kappa; correct it"
+            )
         if begin is not None:
             names.append(" ".join(words[1:begin]))
             values.append(row_numbers(path, k, words[begin : begin + 6], 6))

@@ -30,11 +30,11 @@ def read_grey(path: str | Path) -> UInt8[np.ndarray, "rows columns"]:
     except (OSError, cv2.error):  # cv2.error: empty files and pictures that are too large
         picture = None
     if picture is None:
-        raise InputError(f"{path}: this is no picture that OpenCV can read, or it is cut off; give a TIFF, PNG or JPEG")
+        raise InputError(f"{path}: OpenCV cannot read this picture, or it is truncated; give a TIFF, PNG or JPEG")
     if picture.dtype == np.uint8:
         return picture
     if picture.dtype.kind not in "iu" or picture.min() < 0:
-        raise InputError(f"{path}: its grey values are {picture.dtype}; give a picture of 8 or 16 bits, from 0 up")
+        raise InputError(f"{path}: its grey values are {picture.dtype}; give an unsigned picture of 8 or 16 bits")
     return np.right_shift(picture, max(0, int(picture.max()).bit_length() - 8)).astype(np.uint8)
 
 
@@ -96,7 +96,7 @@ def interest_points(photograph: Path, sensor: Sensor, count: int) -> Features:
     # Detect ten times as many candidates at half the distance of an even distribution.
     candidates = cv2.goodFeaturesToTrack(picture, 10 * count, _WEAKEST, min(apart, 20))
     if candidates is None:
-        raise InputError(f"{photograph}: no interest point was found; the picture is blank or out of focus")
+        raise InputError(f"{photograph}: no interest point found; the picture is blank or out of focus")
     corners = candidates.reshape(-1, 2)
     border = np.minimum(corners, [sensor.width_px - 1, sensor.height_px - 1] - corners).min(axis=1)
     corners = corners[border >= _BORDER_PX]
@@ -104,7 +104,7 @@ def interest_points(photograph: Path, sensor: Sensor, count: int) -> Features:
     chosen = _spread(corners, strength, sensor, count)
     corners, strength = corners[chosen], strength[chosen]
     if not len(corners):
-        raise InputError(f"{photograph}: no interest point was found but at the border; the picture is nearly blank")
+        raise InputError(f"{photograph}: interest points found only at the border; the picture is nearly blank")
     until = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
     fine = cv2.cornerSubPix(picture, corners.reshape(-1, 1, 2).copy(), (_HALF_WINDOW,) * 2, (-1, -1), until)
     fine = fine.reshape(-1, 2).astype(float)
@@ -173,7 +173,7 @@ def _read(photograph: Path, sensor: Sensor) -> np.ndarray:
     if (width, height) != (sensor.width_px, sensor.height_px):
         raise InputError(
             f"{photograph}: the picture has {width} x {height} pixels, the camera {sensor.width_px} x "
-            f"{sensor.height_px}; give the picture as it was taken, or the camera that took it"
+            f"{sensor.height_px}; give the original picture, or its camera"
         )
     return picture
 

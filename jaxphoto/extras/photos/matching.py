@@ -40,8 +40,8 @@ _OFF_LINE = 0.003
 # Quantile that defines the scatter, and the same quantile in standard deviations of a normal distribution. The median
 # ignores the long tails of the features; the sum of squares is sensitive to remaining false matches.
 _QUANTILE, _QUANTILE_SIGMA = 0.9, 1.6449
-_BLANK = "it shows no features: it is blank or out of focus"
-_ALONE = f"it has {MIN_MATCHES} points in common with no other photograph it was compared with"
+_BLANK = "no features: blank or out of focus"
+_ALONE = f"fewer than {MIN_MATCHES} points in common with each compared photograph"
 # Number of pairs matched and stored in one batch.
 _CHUNK = 200
 Progress = Callable[[str, int, int], None]
@@ -112,7 +112,7 @@ def match_photographs(
     BlockError if pycolmap is not installed.
     """
     if len(photographs) < 2:
-        raise InputError("an orientation needs two photographs that overlap, or more; give them all")
+        raise InputError("an orientation needs at least two overlapping photographs; give them all")
     paths = [p.path for p in photographs]
     matched = _matched(paths, sensor, interior, pairs, count, longest_px, keep, progress)
     blank = [len(xy) == 0 for xy in matched.xy_mm]
@@ -134,7 +134,7 @@ def tie_features(
     kept = np.bincount(point)[point] >= least_photographs
     if not kept.any():
         raise InputError(
-            f"the {len(paths)} photographs have no point in common; give such as overlap, in the same size"
+            f"the {len(paths)} photographs have no point in common; give overlapping photographs of the same size"
         )
     xy_mm = np.stack([matched.xy_mm[i][f] for i, f in zip(image[kept], feature[kept], strict=True)])
     return TieFeatures(image[kept], np.unique(point[kept], return_inverse=True)[1], xy_mm)
@@ -290,16 +290,16 @@ def _alone(names: list[str], blank: list[bool], pairs: list[PairMatches], in_par
     joined = [group for group in groups if len(group) > 1]
     if not joined:
         empty = [name for name, nothing in zip(names, blank, strict=True) if nothing]
-        beside = f"; {_listed(empty)} show no features: blank or out of focus" if empty else ""
+        beside = f"; {_listed(empty)} have no features: blank or out of focus" if empty else ""
         raise InputError(
             f"no two of the {len(names)} photographs ({_listed(names)}) have {MIN_MATCHES} points in "
-            f"common{beside}; give photographs that overlap by half at least, in sharp focus, or compare more pairs"
+            f"common{beside}; give sharp photographs that overlap by at least half, or compare more pairs"
         )
     if len(joined) > 1 and not in_parts:
         each = "; ".join(_listed([names[k] for k in group]) for group in joined)
         raise InputError(
-            f"the photographs fall into {len(joined)} groups without matches between them ({each}); add photographs "
-            "that see both, compare more pairs, or take each group by itself"
+            f"{len(joined)} groups of photographs without matches between them ({each}); add photographs "
+            "that overlap both, compare more pairs, or orient each group separately"
         )
     return [int(group[0]) for group in groups if len(group) == 1]
 

@@ -68,7 +68,7 @@ def photograph_pairs(
         return list(itertools.combinations(range(len(photographs)), 2))
     if name not in ("sequence", "position", "similar") or not number.isdecimal() or int(number) < 1:
         raise InputError(
-            f"the choice of pairs is {choice!r}; give exhaustive, sequence:K, position:K or similar:K with a "
+            f"unknown choice of pairs {choice!r}; give exhaustive, sequence:K, position:K or similar:K with a "
             "whole number K, for example sequence:10"
         )
     if name == "similar":

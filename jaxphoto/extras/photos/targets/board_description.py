@@ -38,9 +38,7 @@ def read_board(description: str) -> Pattern:
     """Create a board from a one-line description (mm). Raise InputError, with the syntax, for an invalid one."""
     kind, _, rest = description.partition(":")
     if kind not in SYNTAX:
-        raise InputError(
-            f"--board {description}: there is no board of the kind {kind!r}; write one of {', '.join(SYNTAX.values())}"
-        )
+        raise InputError(f"--board {description}: unknown board {kind!r}; write one of {', '.join(SYNTAX.values())}")
     if kind == "targets":
         if not rest:
             raise _bad(description, kind, "the file with the targets is missing")
@@ -49,7 +47,7 @@ def read_board(description: str) -> Pattern:
     make, names, least = _MADE[kind]
     counts = size.lower().split("x")
     if len(counts) != 2 or not all(n.isdecimal() and least <= int(n) <= 500 for n in counts):
-        raise _bad(description, kind, f"{size!r} is no count of columns x rows, {least} to 500 each")
+        raise _bad(description, kind, f"{size!r} is not columns x rows, {least} to 500 each")
     texts: dict[str, str] = {}
     for setting in settings:
         name, sign, value = setting.partition("=")
@@ -68,7 +66,7 @@ def read_board(description: str) -> Pattern:
 def _value(description: str, kind: str, name: str, text: str) -> float | str:
     if name == "dictionary":
         if text.upper() not in DICTIONARIES:
-            raise _bad(description, kind, f"there is no dictionary {text!r} (there are {', '.join(DICTIONARIES)})")
+            raise _bad(description, kind, f"unknown dictionary {text!r} (use one of {', '.join(DICTIONARIES)})")
         return text.upper()
     if not is_number(text) or not 0 < float(text) < 1e6:
         raise _bad(description, kind, f"{name} is {text!r}, not a positive number of millimetres")

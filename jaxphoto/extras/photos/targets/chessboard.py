@@ -52,8 +52,8 @@ class Chessboard(Pattern):
         fewer, more = max(counts, key=np.prod)
         if (fewer, more) == (min(self.columns, self.rows), max(self.columns, self.rows)):
             return None
-        hint = f"{more}x{fewer} corners are found"
-        return f"{hint}: count the inner ones, where four squares meet, or show all of the board"
+        hint = f"{more}x{fewer} corners found"
+        return f"{hint}: give the inner corners, where four squares meet, or show the whole board"
 
 
 def grid_points(columns: int, rows: int, apart_m: float) -> tuple[tuple[str, ...], Float[np.ndarray, "n 3"]]:

@@ -207,9 +207,9 @@ class CircleGrid(Pattern):
 
     def __init__(self, columns: int, rows: int, spacing_m: float, diameter_m: float) -> None:
         if rows < 3:
-            raise ValueError("an asymmetric grid has 3 rows at least")
+            raise ValueError("an asymmetric grid has at least 3 rows")
         if diameter_m >= np.sqrt(2) * spacing_m:
-            raise ValueError("circles so large touch each other: the diameter is less than 1.41 times the spacing")
+            raise ValueError("the circles touch; the diameter must be less than 1.41 times the spacing")
         self.columns, self.rows, self.radius_m, self._spacing_m = columns, rows, diameter_m / 2, spacing_m
         row, column = np.divmod(np.arange(rows * columns), columns)
         ids = tuple(f"r{r + 1}c{c + 1}" for r, c in zip(row.tolist(), column.tolist(), strict=True))
@@ -321,15 +321,14 @@ class CircularTargets(Pattern):
             raise table.bad(line, "diameter_mm is empty; give the diameter of the target")
         ids = tuple(table.ids("point").tolist())
         if len(set(ids)) < len(ids):
-            raise InputError(f"{path.name}: a point stands there twice; give each target an id of its own")
+            raise InputError(f"{path.name}: duplicate point; give each target a unique id")
         if len(ids) < _MIN_TARGETS:
-            raise InputError(f"{path.name}: {len(ids)} targets are too few; a photograph needs {_MIN_TARGETS} of them")
+            raise InputError(f"{path.name}: {len(ids)} targets, fewer than {_MIN_TARGETS}; add targets")
         self.board = Board(path.stem, ids, xyz, diameter / 1000)
         plane = self.board.plane
         if plane is None:
             raise InputError(
-                f"{path.name}: the targets are not coplanar (to 1 % of their extent), but only those of one plane can "
-                "be identified; give the targets of one wall"
+                f"{path.name}: the targets are not coplanar (to 1 % of their extent); give the targets of one plane"
             )
         middle, axes = plane
         self._flat = (xyz - middle) @ axes[:, :2]

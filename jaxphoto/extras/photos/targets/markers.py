@@ -125,7 +125,7 @@ class CharucoBoard(Pattern):
 def _dictionary(name: str, needed: int):
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
     if needed > len(dictionary.bytesList):
-        raise ValueError(f"the board has {needed} markers, the dictionary {name} {len(dictionary.bytesList)}")
+        raise ValueError(f"the board needs {needed} markers, but dictionary {name} has {len(dictionary.bytesList)}")
     return dictionary
 
 

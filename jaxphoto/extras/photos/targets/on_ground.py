@@ -129,13 +129,13 @@ def read_target(description: str) -> GroundTarget:
     kind, _, rest = description.partition(":")
     name, _, value = rest.partition("=")
     if kind not in SYNTAX:
-        raise InputError(f"--targets {description}: write one of {', '.join(SYNTAX.values())}")
+        raise InputError(f"--targets {description}: unknown target; write one of {', '.join(SYNTAX.values())}")
     if name != SYNTAX[kind].partition(":")[2].partition("=")[0]:
-        raise InputError(f"--targets {description}: write it like {SYNTAX[kind]}")
+        raise InputError(f"--targets {description}: invalid setting {name!r}; write it like {SYNTAX[kind]}")
     if kind == "aruco":
         if value.upper() not in DICTIONARIES:
             there = ", ".join(DICTIONARIES)
-            raise InputError(f"--targets {description}: there is no dictionary {value!r} (there are {there})")
+            raise InputError(f"--targets {description}: unknown dictionary {value!r}; use one of {there}")
         return Marker(value.upper())
     if not is_number(value) or not 0 < float(value) < 1e5:
         raise InputError(f"--targets {description}: {name} is {value!r}, not a positive number of millimetres")

@@ -72,7 +72,7 @@ def find_targets(
         picture = read_grey(photograph.path)
         seen = pattern.find(picture)
         if seen is None:
-            left_out[photograph.name] = "the board was not found"
+            left_out[photograph.name] = "board not found"
             continue
         good, places = seen.places.found, seen.places
         # OpenCV's origin is the centre of the upper left pixel, (0.5, 0.5) in our convention.
@@ -81,8 +81,8 @@ def find_targets(
     if not detections:
         hint = pattern.hint([read_grey(photograph.path) for photograph in photographs[:_LOOKED_AT]])
         raise InputError(
-            f"the board ({pattern.board.name}) was not found in any of the {len(photographs)} photographs; "
-            + (hint or "check its description, that all of it is seen in good light, and that it is in focus")
+            f"the board ({pattern.board.name}) was not found in any of {len(photographs)} photographs; "
+            + (hint or "check its description, lighting and focus, and show the whole board")
         )
     return Targets(detections, left_out)
 
