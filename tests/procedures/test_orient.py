@@ -203,7 +203,7 @@ def test_images_from_one_place_are_recognised(false):
     points = rng.normal(size=(600, 3))
     points *= (10 * rng.uniform(0.5, 3, 600) / np.linalg.norm(points, axis=1))[:, None]
     p = photographed(Scene(np.tile(centre, (6, 1)), matrices, points), Camera(8.0, 0.0, 0.0, 0.0, 0.0), false=false)
-    with pytest.raises(BlockError, match=r"no two of the 6 images .*the base of"):
+    with pytest.raises(BlockError, match=r"no two of the 6 images .*were taken from one place"):
         orient(p.names, SENSOR, InteriorOrientation(8.0), p.features, p.matches)
 
 
