@@ -94,7 +94,7 @@ class Block(BlockEdits):
         ):
             given = getattr(self, field)
             if isinstance(given, AbstractObservations) and not isinstance(given, kind):
-                raise BlockError(f"Block.{field} takes {kind.__name__}, got {type(given).__name__}")
+                raise BlockError(f"Block.{field} must be {kind.__name__}, got {type(given).__name__}")
 
     @property
     def observations(self) -> tuple[AbstractObservations, ...]:

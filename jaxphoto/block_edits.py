@@ -111,7 +111,7 @@ class BlockEdits(eqx.Module):
         priors = block.priors
         for name in names or ("",):
             if not isinstance(name, str) or not name:
-                asked = f"{name!r} is no parameter" if names else "no parameter is named"
+                asked = f"{name!r} is not a parameter name" if names else "no parameter given"
                 raise InputError(f"{asked}: give names separated by commas, such as c_mm, k1, lever_arm, position")
         for name in names:
             priors = with_prior(priors, name, prior_of, block.start.unknowns, of)
@@ -123,7 +123,7 @@ def one_camera(block: Any, camera: str | None) -> str:
     if camera is None and len(block.sensors) == 1:
         return next(iter(block.sensors))
     if camera is None or camera not in block.sensors:
-        asked = "say which camera" if camera is None else f"there is no camera {camera}"
+        asked = "name the camera" if camera is None else f"unknown camera {camera}"
         raise InputError(f"{asked}: the block has {', '.join(block.sensors) or 'none'}")
     return camera
 
@@ -169,7 +169,7 @@ def shifted_stations(block: Any, shift: Any, per: str) -> Any:
     names = [name for name in dict.fromkeys(owners) if name or per == "block"]
     if isinstance(shift, Mapping):
         if unknown := [name for name in shift if name not in names]:
-            raise InputError(f"shift_stations: there is no {per} {unknown[0]!r}; there are {', '.join(names)}")
+            raise InputError(f"shift_stations: unknown {per} {unknown[0]!r}; choose among {', '.join(names)}")
         shift = [shift.get(name, np.zeros(3)) for name in names]
     xp = namespace(shift, rows.value)
     own, expected = xp.asarray(shift, float), (3,) if per == "block" else (len(names), 3)

@@ -61,7 +61,7 @@ def block_fields(
     Raises InputError for a missing or invalid column, name or value, BlockError if they do not form a block.
     """
     if not cameras:
-        raise InputError('cameras: there is none; give {"name": (Sensor(...), InteriorOrientation(...))}')
+        raise InputError('cameras: empty; give {"name": (Sensor(...), InteriorOrientation(...))}')
     seen = CheckedColumns("image_points", image_points)
     listed = CheckedColumns("images", {"image": list(dict.fromkeys(seen.ids("image")))} if images is None else images)
     listed.refuse_twice("image")
@@ -69,9 +69,9 @@ def block_fields(
     ids, rows = _image_rows(seen, names, sigma_mm)
 
     given = CheckedColumns("control", control, "point", *_XYZ)
-    of_point = given.index("point", ids, "point {name} is measured in no image; measure it or leave it out")
+    of_point = given.index("point", ids, "point {name} is measured in no image; measure it or remove it")
     role = np.array(given.ids("role") if "role" in given else ["control"] * given.n, object)
-    given.find(list(role), _ROLES, "the role {name!r} is unknown; write control, fixed or check")
+    given.find(list(role), _ROLES, "unknown role {name!r}; use control, fixed or check")
     coordinates, entry = _scalars(given, of_point, role == "control")
     by_role = {r: coordinates.take(role[entry] == r) for r in _ROLES}
     flown, turned = (
@@ -80,7 +80,7 @@ def block_fields(
     )
     for table in (flown, turned):
         table.refuse_twice("image")
-    of_station, of_attitude = (t.index("image", names, "there is no image {name}") for t in (flown, turned))
+    of_station, of_attitude = (t.index("image", names, "unknown image {name}") for t in (flown, turned))
     bars = CheckedColumns("distances", distances, "point_a", "point_b", "distance_m")
     ends = [bars.index(end, ids, "point {name} is measured in no image") for end in ("point_a", "point_b")]
 
@@ -130,9 +130,9 @@ def _cameras(images: CheckedColumns, cameras: tuple[str, ...]) -> tuple[str, ...
     """Return the camera of every image."""
     if "camera" not in images:
         if len(cameras) > 1:
-            raise InputError(f"images: add the column camera, as there are {len(cameras)} ({', '.join(cameras)})")
+            raise InputError(f"images: no column camera for {len(cameras)} cameras; add it ({', '.join(cameras)})")
         return cameras * images.n
-    images.index("camera", cameras, f"there is no camera {{name}} ({', '.join(cameras)})")
+    images.index("camera", cameras, f"unknown camera {{name}} ({', '.join(cameras)})")
     return tuple(images.ids("camera"))
 
 

@@ -76,7 +76,7 @@ class Frame:
     def map(self) -> MapFrame:
         """Conversion to and from the map coordinates of the files; for kind `epsg` only."""
         if self.code is None or self.origin is None:
-            raise ValueError(f"only a frame of kind epsg with an origin has map coordinates, this is {self}")
+            raise ValueError(f"{self} has no map coordinates; use a frame of kind epsg with an origin")
         return MapFrame(self.code, self.vertical, self.origin)
 
 

@@ -100,5 +100,5 @@ class CheckedColumns:
     def _column(self, column: str) -> np.ndarray:
         if column not in self.columns:
             there = ", ".join(self.columns) or "none"
-            raise InputError(f"{self.name}: the column {column} is missing; there are {there}")
+            raise InputError(f"{self.name}: the column {column} is missing; its columns are {there}")
         return self.columns[column]

@@ -193,7 +193,7 @@ def adjustment_repr(adjusted: Any) -> str:
     of = f"Adjustment of {adjusted.block.title!r}"
     # Traced arrays have no value, and several blocks have no common one; `factored` is None in a JAX transformation.
     if adjusted.factored is None or np.ndim(adjusted.converged) != 0:
-        return f"{of} inside a transformation of JAX or of several blocks at once: its numbers are arrays"
+        return f"{of}: traced by JAX or batched, values are arrays"
     observations, unknowns = (sum(n.values()) for n in (adjusted.n_observations, adjusted.n_unknowns))
     return (
         f"{of}: {adjusted.outcome.value.partition(':')[0]} after {_counted(int(adjusted.steps), 'step')},\n"
@@ -249,7 +249,7 @@ def change_html(found: Any) -> str:
 
 
 def _change_words(found: Any) -> str:
-    return "a test says that the camera has changed" if found.changed else "nothing says that the camera has changed"
+    return "the camera has changed significantly" if found.changed else "no significant change of the camera"
 
 
 def _tests(found: Any) -> dict[str, str]:

@@ -86,7 +86,7 @@ class Weighted(eqx.Module):
 
     def __init__(self, value, sigma=None, *, covariance=None):
         if (sigma is None) == (covariance is None):
-            raise ValueError("Weighted takes a value and either its sigma or its covariance")
+            raise ValueError("Weighted needs a value and either its sigma or its covariance")
         self.value, self.covariance = value, covariance
         self.sigma = sigma if covariance is None else np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
 
@@ -243,7 +243,7 @@ def with_prior(
     it.
     """
     if name in _WHOLE and of is not None:
-        raise InputError(f"{name} has one prior for the whole block, not one of {of!r}: leave the owner out")
+        raise InputError(f"{name} has one prior for the whole block, not one of {of!r}: omit the owner")
     if name in _WHOLE:
         return eqx.tree_at(_WHOLE[name], priors, prior_of(_WHOLE[name](start)))
     known, label = [], _FIELDS.get(name, name)
@@ -270,6 +270,6 @@ def with_prior(
                 f"unknown parameter owner {of!r}; use one of {', '.join(dict.fromkeys(o for o, _ in known))}"
             )
         raise InputError(
-            f"there is no parameter {name!r}{whose}; there are {', '.join(dict.fromkeys([*there, *_WHOLE]))}"
+            f"unknown parameter {name!r}{whose}; choose among {', '.join(dict.fromkeys([*there, *_WHOLE]))}"
         )
     return dataclasses.replace(priors, interior=interior).with_tables(tables)

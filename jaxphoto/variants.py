@@ -61,7 +61,7 @@ def direct(block: Block) -> Block:
     known[rows.image] = True
     if not known.all():
         left = np.flatnonzero(~known)
-        so = "1 image is so" if len(left) == 1 else f"{len(left)} images are so"
+        so = "1 such image" if len(left) == 1 else f"{len(left)} such images"
         raise BlockError(
             f"image {block.images[left[0]]} has neither station and attitude nor an exterior orientation ({so}), "
             "which direct georeferencing needs: give them, or choose another mode"
@@ -102,7 +102,7 @@ def control_only(block: Block, points: Collection[str]) -> Block:
     of = np.array(block.points, object)
     given = set(of[block.control.who]) | set(of[block.fixed.who])
     if unknown := [point for point in points if point not in given]:
-        raise ValueError(f"{unknown[0]} is no control point of this block; name some of {', '.join(sorted(given))}")
+        raise ValueError(f"{unknown[0]} is not a control point of this block; choose among {', '.join(sorted(given))}")
     chosen = np.isin(np.arange(len(of)), [k for k, point in enumerate(of) if point in set(points)])
     stay, held = chosen[block.control.who], chosen[block.fixed.who]
     return dataclasses.replace(
@@ -121,7 +121,7 @@ def with_control(block: Block, points: Collection[str], sigma: float | Float[np.
     of, groups = np.array(block.points, object), (block.control, block.fixed, block.check)
     given = {name for rows in groups for name in of[rows.who]}
     if unknown := [point for point in points if point not in given]:
-        raise InputError(f"point {unknown[0]} has no surveyed coordinates; name some of {few(sorted(given))}")
+        raise InputError(f"point {unknown[0]} has no surveyed coordinates; choose among {few(sorted(given))}")
     named = np.isin(np.arange(len(of)), [k for k, point in enumerate(of) if point in set(points)])
     kept, gone = ([rows.take(named[rows.who] == own) for rows in groups] for own in (True, False))
     control = ControlCoordinates.joined(kept[0], _as_control(kept[2], block.control, sigma))
@@ -196,7 +196,7 @@ def strips(block: Block, names: Collection[str]) -> Block:
 def without_images(block: Block, names: Collection[str]) -> Block:
     """Remove the named images, as `some_images` does. Raises InputError for an unknown image name."""
     if unknown := [name for name in names if name not in block.images]:
-        raise InputError(f"there is no image {unknown[0]!r}; the block has {few(block.images)}")
+        raise InputError(f"unknown image {unknown[0]!r}; the block has {few(block.images)}")
     return some_images(block, np.array([image not in names for image in block.images]))
 
 

@@ -107,7 +107,7 @@ def check_folder(directory: Path, *inputs: Path, clashes: Clashes = lambda name:
     target = _real(directory)
     for given in inputs:
         if target in (real := _real(given), *real.parents):
-            raise InputError(f"{directory} is or holds the input {given}, which would be lost: name another folder")
+            raise InputError(f"{directory} is or contains the input {given}, which would be lost: name another folder")
     _check_parents(target, "name a folder")
     if os.path.ismount(target):
         raise InputError(f"{directory} is a mount point, which cannot be replaced: name a folder in it")
@@ -209,7 +209,7 @@ def _written(folder: Path, clashes: Clashes) -> set[str]:
     for name in _files(folder):
         if name not in listed and name != MARKER and Path(name).name not in _DEBRIS and clashes(name):
             raise InputError(
-                f"{folder / name} was not written by jaxphoto and would be read with what is written there: "
+                f"{folder / name} was not written by jaxphoto and would be read together with the new files: "
                 "move it away, or name a new folder"
             )
     return set(listed)

@@ -88,14 +88,14 @@ def test_without_images_leaves_the_others_as_they_were():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda b: b.with_distortion("sony", Smac()), "there is no camera sony"),
+        (lambda b: b.with_distortion("sony", Smac()), "unknown camera sony"),
         (lambda b: b.with_distortion("one", Smac(), free=("k9",)), "no parameter 'k9'; it has c_mm"),
         (lambda b: b.with_camera("one", InteriorOrientation(35.0), free=("a1",)), "no parameter 'a1'"),
         (lambda b: b.shift_stations(np.zeros((3, 3)), per="strip"), r"shape \(3, 3\); give"),
-        (lambda b: b.shift_stations({"z": np.zeros(3)}, per="image"), "there is no image 'z'"),
+        (lambda b: b.shift_stations({"z": np.zeros(3)}, per="image"), "unknown image 'z'"),
         (lambda b: b.shift_stations([0.1]), r"give X, Y, Z in metres"),
         (lambda b: b.with_control("T99"), "point T99 has no surveyed coordinates"),
-        (lambda b: b.without_images("B99"), "there is no image 'B99'"),
+        (lambda b: b.without_images("B99"), "unknown image 'B99'"),
     ],
 )
 def test_what_a_block_does_not_have_is_named(call, message):

@@ -144,12 +144,12 @@ def test_a_network_without_control_has_a_minimal_datum():
     [
         ({"sigma_mm": None}, r"image_points: no standard deviation; give sigma_x_mm and sigma_y_mm, or sigma"),
         ({"sigma_mm": -1.0}, r"image_points, entry 0: the standard deviation sigma_x_mm is -1.0; it must be positive"),
-        ({"cameras": {}}, r"cameras: there is none"),
-        ({"cameras": KODAK | {"d": KODAK["kodak"]}}, r"images: add the column camera, as there are 2 \(kodak, d\)"),
+        ({"cameras": {}}, r"cameras: empty"),
+        ({"cameras": KODAK | {"d": KODAK["kodak"]}}, r"images: no column camera for 2 cameras; add it \(kodak, d\)"),
         ({"images": {"image": ["a"]}}, r"image_points, entry 1: image b is not listed under images"),
         (
             {"images": {"image": ["a", "b"], "camera": ["kodak", "x"]}},
-            r"images, entry 1: there is no camera x \(kodak\)",
+            r"images, entry 1: unknown camera x \(kodak\)",
         ),
         ({"images": {"image": ["a", "b", "a"]}}, r"images, entry 2: image a is given twice"),
         (
@@ -177,9 +177,9 @@ def test_a_network_without_control_has_a_minimal_datum():
         ),
         (
             {"control": {"point": ["1"], **columns(XYZ, [[1.0, 2.0, 3.0]]), "role": ["chek"]}},
-            r"control, entry 0: the role 'chek' is unknown",
+            r"control, entry 0: unknown role 'chek'",
         ),
-        ({"stations": STATION | {"image": ["c"]}}, r"stations, entry 0: there is no image c"),
+        ({"stations": STATION | {"image": ["c"]}}, r"stations, entry 0: unknown image c"),
         ({"free": ["k9"]}, r"free: camera kodak has no parameter 'k9'; it has c_mm"),
     ],
 )

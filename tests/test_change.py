@@ -62,7 +62,7 @@ def test_the_command_compares_two_results(tmp_path, monkeypatch, capsys):
     difference = np.array([TARGET_2[n] - TARGET_1[n] for n in SIGMAS]) / np.array(list(SIGMAS.values()))
     chi_square = (difference**2).sum() / 2
     assert f"parameters: chi-square {chi_square:.1f} with {len(SIGMAS)} degrees" in text
-    assert "bundle of rays, turned onto one another" in text
+    assert "bundle of rays, aligned by rotation" in text
     parameters, cells = pd.read_csv(out / "parameters.csv"), pd.read_csv(out / "cells.csv")
     own = parameters.set_index("parameter").loc[list(SIGMAS), "ratio"]
     np.testing.assert_allclose(own, difference / np.sqrt(2), rtol=1e-9)

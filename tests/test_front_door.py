@@ -84,7 +84,7 @@ def test_a_block_and_an_adjustment_say_what_they_are_in_three_lines():
     # While JAX maps over a block its leaves may be anything.
     known = covariance(result)
     assert "not converged" not in repr(known)
-    assert repr(jax.tree.map(lambda _: None, known)).startswith("Covariance inside")
+    assert repr(jax.tree.map(lambda _: None, known)).startswith("Covariance: traced")
     assert "not converged" in repr(covariance(adjust(simulated("cross").block, max_steps=1)))
     assert repr(jax.tree.map(lambda _: None, result.block)).startswith("Block 'simulated': ")
 

@@ -156,17 +156,17 @@ def test_of_several_owners_one_is_named_or_all_are_meant():
     [
         (
             lambda b: b.fix("k9"),
-            r"there is no parameter 'k9'; there are c_mm, xp_mm, .*k1.* position, rotation",
+            r"unknown parameter 'k9'; choose among c_mm, xp_mm, .*k1.* position, rotation",
         ),
         (lambda b: b.free("k1", of="sony"), "unknown parameter owner 'sony'; use one of one"),
-        (lambda b: b.fix("a1", of="one"), "there is no parameter 'a1' of 'one'; there are c_mm"),
+        (lambda b: b.fix("a1", of="one"), "unknown parameter 'a1' of 'one'; choose among c_mm"),
         (lambda b: b.fix("points", of="one"), "points has one prior for the whole block, not one of 'one'"),
-        (lambda b: b.fix(), "no parameter is named: give names"),
-        (lambda b: b.free(""), "'' is no parameter: give names"),
-        (lambda b: b.fix(["k1", "k2"]), r"\['k1', 'k2'\] is no parameter: give names with commas between"),
-        (lambda b: b.weigh("points", 0.1), r"weigh\('points'\) needs a value beside its sigma"),
-        (lambda b: b.weigh("c", -1), r"c: its sigma is -1: give one above zero, or hold .* fix\('c'\)"),
-        (lambda b: b.weigh("c", 0), "c: its sigma is 0: give one above zero"),
+        (lambda b: b.fix(), "no parameter given: give names"),
+        (lambda b: b.free(""), "'' is not a parameter name: give names"),
+        (lambda b: b.fix(["k1", "k2"]), r"\['k1', 'k2'\] is not a parameter name: give names separated by commas"),
+        (lambda b: b.weigh("points", 0.1), r"weigh\('points'\) needs a value with its sigma"),
+        (lambda b: b.weigh("c", -1), r"c: its sigma is -1: give a positive one, or fix .* fix\('c'\)"),
+        (lambda b: b.weigh("c", 0), "c: its sigma is 0: give a positive one"),
         (lambda b: b.weigh("c", float("nan")), "c: its sigma is nan: give a finite number"),
         (lambda b: b.weigh("c", None), "c: its sigma is None: give a finite number"),
         (lambda b: b.weigh("c", 0.1, value=np.inf), "c: its value is inf: give a finite number"),
@@ -265,7 +265,7 @@ def test_two_adjustments_of_one_block_are_alike_and_of_another_camera_are_not():
     other = jaxphoto.compare(one, dataclasses.replace(one, unknowns=unknowns), method="zrot")
     (row,) = [p for p in other.parameters if p.parameter == "xp_mm"]
     assert row.difference == pytest.approx(0.2) and other.beyond.all() and other.p_parameters < 1e-6
-    with pytest.raises(InputError, match="there is no camera two"):
+    with pytest.raises(InputError, match="unknown camera two"):
         jaxphoto.compare(one, one, camera="two")
 
 
@@ -298,11 +298,11 @@ def test_a_comparison_and_a_simulation_say_what_they_are():
     one, made = adjusted("cross"), simulated("cross")
     same = jaxphoto.compare(one, one)
     for shown in (repr(same), same._repr_html_()):
-        assert "nothing says that the camera has changed" in shown and "at 0 of 165 points" in shown
+        assert "no significant change of the camera" in shown and "at 0 of 165 points" in shown
     moved = dataclasses.replace(one.unknowns.interior["one"], x_p=one.unknowns.interior["one"].x_p + 0.2)
     unknowns = dataclasses.replace(one.unknowns, interior={"one": moved})
     other = jaxphoto.compare(one, dataclasses.replace(one, unknowns=unknowns))
-    assert other.changed and "a test says that the camera has changed" in other._repr_html_()
+    assert other.changed and "the camera has changed significantly" in other._repr_html_()
     whole = Simulation(made.block, made.truth, np.zeros(3), Terrain())
     assert repr(whole) == f"Simulation with its truth, of {made.block!r}"
     assert "10 of 1 camera" in whole._repr_html_() and "true camera one" in whole._repr_html_()

@@ -118,7 +118,7 @@ def test_control_only_keeps_the_points_named():
     assert {kept.points[w] for w in kept.control.who} <= set(chosen)
     assert {kept.points[w] for w in kept.fixed.who} == {chosen[1]}
     assert not {kept.points[w] for w in kept.check.who} & set(chosen)
-    with pytest.raises(ValueError, match="p0 is no control point"):
+    with pytest.raises(ValueError, match="p0 is not a control point"):
         control_only(block, ["p0"])
 
 

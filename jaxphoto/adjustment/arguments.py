@@ -18,7 +18,7 @@ def check_arguments(block: Any, start: Any, priors: Any) -> None:
         raise InputError(f"adjust takes a Block first, got {type(block).__name__}")
     for name, tree, cure in (
         ("start", start, "adjusted.unknowns or block.start.unknowns"),
-        ("priors", priors, "block.priors, or what jaxphoto.default_priors makes of the start values"),
+        ("priors", priors, "block.priors, or jaxphoto.default_priors of the start values"),
     ):
         if not isinstance(tree, Unknowns):
             raise InputError(f"{name} is of the type {type(tree).__name__}: give Unknowns, such as {cure}")
@@ -35,12 +35,12 @@ def _check_owners(name: str, tree: Unknowns, known: Unknowns) -> None:
     for camera in known.interior:
         if camera not in tree.interior:
             raise InputError(
-                f"{name} has no camera {camera!r}, which the block has; it has {', '.join(tree.interior) or 'none'}"
+                f"{name} lacks camera {camera!r} of the block; it has {', '.join(tree.interior) or 'none'}"
             )
     for kind, owners in known.tables.items():
         for owner in owners:
             if owner not in tree.tables.get(kind, {}):
-                raise InputError(f"{name} lacks {kind}[{owner}]: take it from block.start.unknowns")
+                raise InputError(f"{name} lacks {kind}[{owner}]: copy it from block.start.unknowns")
 
 
 def _check_models(start: Unknowns, priors: Unknowns) -> None:
@@ -53,7 +53,7 @@ def _check_models(start: Unknowns, priors: Unknowns) -> None:
             if structure != jax.tree.structure(wanted):
                 found = f"another {type(given).__name__}" if type(given) is type(wanted) else type(given).__name__
                 raise InputError(
-                    f"interior[{camera}].{part}: priors have {found}, start has {type(wanted).__name__}; exchange both "
+                    f"interior[{camera}].{part}: priors have {found}, start has {type(wanted).__name__}; replace both "
                     f'together, as block.with_distortion("{camera}", ...) does'
                 )
 

@@ -52,8 +52,8 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
     scale_open = bool(len(null_motions)) and bool(np.abs(null_motions[:, 6]).max() > 1e-6)
     if scale_open and any(t.kind == RollingShutter.kind for t in structure.tables):
         raise DatumError(
-            "a rolling shutter needs the scale of the block, which is open: add stations, control or a distance, or "
-            "remove the shutter"
+            "a rolling shutter needs the scale of the block, which is undetermined: add stations, control or a "
+            "distance, or remove the shutter"
         )
     kind, over = block.datum.kind, block.datum.over
     if kind == "control":
@@ -64,10 +64,10 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
         return null
     if block.datum.scale is not None and scale_open != block.datum.scale:
         raise DatumError(
-            "[datum] scale = false, but nothing in the block gives it a scale: add a distance, stations or "
+            "[datum] scale = false, but the scale of the block is undetermined: add a distance, stations or "
             "control, or set scale = true"
             if scale_open
-            else "[datum] scale = true, but distances, stations or control give it already: set scale = false"
+            else "[datum] scale = true, but distances, stations or control determine it: set scale = false"
         )
     if not len(null_motions):
         return null
@@ -82,7 +82,7 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
     )
     if np.linalg.svd(product, compute_uv=False)[-1] < 1e-9 * np.abs(product).max():
         raise DatumError(
-            f'[datum] over = "{over}" cannot fix the datum (they lie on a line or in a point): take all points'
+            f'[datum] over = "{over}" cannot fix the datum (they lie on a line or in a point): use all points'
         )
     return _orthonormal(constraints)
 

@@ -48,15 +48,15 @@ def datum_sentence(null_motions: np.ndarray, block: Block, named: list[str], sig
     if not np.isfinite(sigma):
         mends += ', or set [datum] kind = "inner" (or "minimal") in block.toml'
     elif any("rotation" in name for name in names):
-        mends = "add control points or camera stations away from the line on which those there are lie"
+        mends = "add control points or camera stations off the line of the existing ones"
     if named:
         mends = "add control points, or fix " + ", ".join(named[:3]) + (" ..." if len(named) > 3 else "")
     from_what = " and ".join(observed) if observed else "image coordinates alone"
     if np.isfinite(sigma):
         known = f"{100 * sigma:.2g} %" if names == ["scale"] else f"{np.degrees(sigma):.2g} deg"
         return (
-            f"the datum of the block is as good as open: {', '.join(names)} cannot be determined from {from_what} "
-            f"better than to {known}, which is noise; {mends}"
+            f"the datum of the block is nearly undetermined: {', '.join(names)} cannot be determined from {from_what} "
+            f"better than to {known} (noise level); {mends}"
         )
     return (
         f"the datum of the block has a defect of {len(null_motions)}: {', '.join(names)} cannot be determined from "

@@ -27,6 +27,6 @@ def warn_of_precision_loss(block: Block, start: Unknowns, priors: Unknowns) -> N
                 largest = float(np.abs(np.asarray(leaf)).max(initial=0.0))
                 step = float(np.spacing(np.asarray(largest, dtype)))
                 label = f"{name}{jax.tree_util.keystr(path)}"
-                found.append(f"{label} is {dtype.name} and knows {largest:.7g} to {step:.1g} only")
+                found.append(f"{label} is {dtype.name} and resolves {largest:.7g} to {step:.1g} only")
     if found:
         warnings.warn(f"{'; '.join(found)}: give float64, such as np.asarray(x, float)", stacklevel=4)

@@ -35,18 +35,18 @@ class Outcome(enum.Enum):
     CONVERGED = "converged: every unknown is within a hundred-thousandth of its standard deviation of the optimum"
     STEPS = (
         "not converged: the step limit was reached; check the approximate values, look for blunders among the largest "
-        "residuals, or hold weakly determined unknowns fixed"
+        "residuals, or fix weakly determined unknowns"
     )
     FLAT = (
-        "not converged: steps as long as before hardly reduce the residuals any more, so the observations do not "
-        "determine some unknowns; fix them, give them weights, or add observations that do"
+        "not converged: long steps hardly reduce the residuals, so the observations do not determine some unknowns; "
+        "fix them, weight them, or add observations that determine them"
     )
     ASTRAY = (
-        "not converged: object points went so far away that their rays are parallel; look for blunders in what was "
-        "measured of them, leave them out, or give better approximate values"
+        "not converged: object points diverged (near-parallel rays); check their measurements for blunders, "
+        "remove the points, or give better approximate values"
     )
     DIVERGED = (
-        "not converged: the numbers became infinite; check units, approximate values, and whether points lie behind "
+        "not converged: values became infinite; check units, approximate values, and whether points lie behind "
         "their cameras"
     )
 

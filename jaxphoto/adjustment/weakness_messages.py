@@ -125,9 +125,9 @@ class _Words:
 
     def _points(self, d: WeakDirection) -> str:
         angle = max(self._angle(int(p)) for p in d.points)
-        cure = "measure them in an image from another place, or leave them out"
+        cure = "measure them in an image from another position, or remove them"
         if 2 * len(d.points) > len(self.block.points):
-            cure = "all images stand nearly at one place: take photographs from other places as well"
+            cure = "all images have nearly one position: add images from other positions"
         return (
             f"point {_those(self.block.points, d.points)}: {_hardly(d)} along the rays ({self._sigmas(d)}), which are "
             f"nearly parallel, {angle:.2g} deg apart at most: {cure}"
@@ -142,17 +142,17 @@ class _Words:
         return (
             f"image {self.block.images[image]}: its orientation is {_hardly(d)} ({self._sigmas(d)}) by its "
             f"{counted(int(mine.sum()), 'point')}{on_line}: measure more points in it"
-            f"{', beside that line' if on_line else ''}, give its station and attitude, or leave it out"
+            f"{', off that line' if on_line else ''}, give its station and attitude, or remove it"
         )
 
     def _shared(self, d: WeakDirection, labels: list[str]) -> str:
-        along = f" with the place of {len(d.points)} of {len(self.block.points)} points" if len(d.points) else ""
+        along = f" with the positions of {len(d.points)} of {len(self.block.points)} points" if len(d.points) else ""
         cures = [self._holding(d, labels)]
         if along:
             cures.append(f"add control points (point {self._farthest(d)} moves most)")
             if _turns_with_heading(labels):
                 cures.append(_HEADING)
-        return f"{few(labels)}{along}: {_hardly(d)} ({self._sigmas(d)}) and not told apart: {_or(cures)}"
+        return f"{few(labels)}{along}: {_hardly(d)} ({self._sigmas(d)}) and not separable: {_or(cures)}"
 
     def _part(self, d: WeakDirection, labels: list[str], names: list[str]) -> str:
         joint = f" together with {few(labels)}" if labels else ""
@@ -162,7 +162,7 @@ class _Words:
         return (
             f"image {_those(self.block.images, d.images)}, which share {none} with "
             f"the others: {_and(names)} of this part{joint} {_hardly(d)} ({self._sigmas(d)}): measure points that it "
-            "shares with the others, or give it control points of its own"
+            "shares with the others, or add control points in it"
         )
 
     def _block(self, d: WeakDirection, labels: list[str], names: list[str]) -> str:
@@ -170,7 +170,7 @@ class _Words:
         cures = [self._holding(d, labels)] if labels else []
         turns = any("rotation" in name for name in names)
         if len(d.points):
-            beside = ", away from the line on which those there are lie" if turns and len(self.block.control) else ""
+            beside = ", off the line of the existing ones" if turns and len(self.block.control) else ""
             cures.append(f"add control points{beside} (point {self._farthest(d)} moves most)")
         if _turns_with_heading(labels):
             cures.append(_HEADING)
@@ -196,7 +196,7 @@ class _Words:
             cures.append(_HEADING)
         elif not labels:
             cures.append("measure more points in these images, or give their stations and attitudes")
-        return f"{what}: {_hardly(d)} ({self._sigmas(d)}) and not told apart: {_or(cures)}"
+        return f"{what}: {_hardly(d)} ({self._sigmas(d)}) and not separable: {_or(cures)}"
 
     def _holding(self, d: WeakDirection, labels: list[str]) -> str:
         """Return the cure: fix one of several unknowns if one suffices, otherwise all."""
@@ -243,7 +243,7 @@ class _Words:
     def _sigmas(self, d: WeakDirection) -> str:
         """Format the motions of the unknowns that participate."""
         if d.sigma > OPEN:
-            return "nothing sees it"
+            return "no observation depends on it"
         moved, yard, found = d.moved, self.yard, []
         if len(d.points):
             found.append(f"points {yard.ground * np.abs(moved.points).max():.2g} m")

@@ -55,7 +55,7 @@ class Declared(eqx.Module):
         known = cls.known()
         if name not in known:
             kind = cls.__name__.removeprefix("Abstract").lower()
-            raise InputError(f"no {kind} model is called {name!r}; choose one of {', '.join(known)}")
+            raise InputError(f"unknown {kind} model {name!r}; choose one of {', '.join(known)}")
         return known[name]
 
     @classmethod

@@ -50,7 +50,7 @@ def with_sign(interior: InteriorOrientation, sign: Literal["subtract", "add"]) -
     """
     d = interior.distortion
     if not isinstance(d, Smac):
-        raise ValueError(f"only SMAC can be added or subtracted, this camera has {type(d).__name__}")
+        raise ValueError(f"only SMAC has a sign; this camera has {type(d).__name__}")
     if d.sign == sign:
         return interior
     turned = {name: -jnp.asarray(getattr(d, name)) for name in ("k0", "k1", "k2", "k3", "k4", "p1", "p2")}

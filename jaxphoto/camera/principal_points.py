@@ -131,7 +131,7 @@ def _symmetry_point(d: Brown) -> Float[Array, "2"]:
 
 def _checked(interior: InteriorOrientation, kind):
     if not isinstance(interior.distortion, kind):
-        raise ValueError(f"this is of {kind.__name__} cameras, this camera has {type(interior.distortion).__name__}")
+        raise ValueError(f"this conversion needs {kind.__name__}; this camera has {type(interior.distortion).__name__}")
     return interior.distortion
 
 

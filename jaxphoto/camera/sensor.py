@@ -22,7 +22,7 @@ class Sensor(eqx.Module):
     def __check_init__(self) -> None:
         if self.width_px <= 0 or self.height_px <= 0 or not self.pixel_mm > 0:
             raise ValueError(
-                f"a sensor has a positive width, height and pixel size, got {self.width_px} x "
+                f"a sensor needs a positive width, height and pixel size, got {self.width_px} x "
                 f"{self.height_px} px of {self.pixel_mm} mm"
             )
 

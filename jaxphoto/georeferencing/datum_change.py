@@ -55,21 +55,23 @@ class DatumChange(NamedTuple):
         known = self.accuracy_m
         if known is None:
             return (
-                f"PROJ has no transformation from WGS 84 to the datum {self.datum}: positions are not transformed, "
-                "which can be wrong by hundreds of metres; choose a CRS of another datum",
+                f"PROJ has no transformation from WGS 84 to the datum {self.datum}: positions are not transformed "
+                "and may have errors of hundreds of metres; choose a CRS of another datum",
             )
         moved = self.places(wgs84, with_height) - wgs84
         north, east = np.deg2rad(moved[:, 1]) * 6.371e6, np.deg2rad(moved[:, 0] + self.meridian_deg) * 6.371e6
         plan = float(np.median(np.hypot(north, east * np.cos(np.deg2rad(wgs84[:, 1])))))
         up = float(np.median(moved[:, 2]))
-        by = f'by PROJ\'s "{self.name}", known to {known:g} m'
+        by = f'by PROJ\'s "{self.name}", accuracy {known:g} m'
         if not moved.any():
             if known <= _SURE_M:
                 return ()
-            said = f"positions of WGS 84 are taken as of the datum {self.datum}, {by}"
+            said = f"positions of WGS 84 are used unchanged in the datum {self.datum}, {by}"
         else:
-            heights = f"{up:+.2f} m in height" if np.any(with_height) else "heights stay as they are"
-            said = f"positions are brought from WGS 84 to the datum {self.datum} {by}: {plan:.2f} m in plan, {heights}"
+            heights = f"{up:+.2f} m in height" if np.any(with_height) else "heights unchanged"
+            said = (
+                f"positions are transformed from WGS 84 to the datum {self.datum} {by}: {plan:.2f} m in plan, {heights}"
+            )
         if self.better:
             grid, accuracy = self.better
             said += f'; {grid}, which is not installed, gives {accuracy:g} m ("pyproj sync --file {grid}")'

@@ -160,9 +160,9 @@ def clock_words(offset_s: float) -> str:
     zone, leap = best
     rest = offset_s - zone - leap
     if abs(offset_s) > ZONES_S:
-        return f"{offset_s / DAY_S:+.2f} days, which no time zone explains"
+        return f"{offset_s / DAY_S:+.2f} days, more than any time zone"
     if abs(rest) > _NEAR_ZONE_S:
-        return f"{offset_s:+.1f} s, which is no time zone: it is counted from somewhere else"
+        return f"{offset_s:+.1f} s, which is not a time zone: the epochs differ"
     parts = [f"{zone / _HOUR_S:+g} h (time zone)"] if zone else []
     parts += [f"{leap:+g} s (leap seconds: GPS time against UTC)"] if leap else []
     parts += [f"{rest:+.2f} s"] if abs(rest) >= 0.005 or not parts else []

@@ -11,7 +11,7 @@ HEIGHTS: dict[Heights, str] = {
     "ellipsoid": "above the ellipsoid",
     "geoid": "above a geoid (mean sea level)",
     "take-off": "above take-off",
-    "unknown": "above what the files do not say",
+    "unknown": "of unknown reference",
 }
 """Names of the height references in messages."""
 Fix = Literal["fixed", "float", "single", "integrated", "unknown"]

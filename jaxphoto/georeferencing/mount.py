@@ -53,7 +53,7 @@ class Mount(AbstractParameters):
 
     def __check_init__(self) -> None:
         if self.image_x not in NOMINAL:
-            raise ValueError(f"image_x is one of {', '.join(IMAGE_X)}, got {self.image_x!r}")
+            raise ValueError(f"unknown image_x {self.image_x!r}; use one of {', '.join(IMAGE_X)}")
 
     @property
     def nominal(self) -> Float[np.ndarray, "3 3"]:
@@ -96,8 +96,8 @@ def nominal_mount(mount: Mount, exposure: Exposure) -> Float[ArrayLike, "3 3"]:
         return mount.nominal if exposure.nominal is None else exposure.nominal
     differ = jnp.any(jnp.asarray(exposure.nominal) != mount.nominal)
     message = (
-        f"the mount says image_x = {mount.image_x!r}, which is not the nominal mount of the exposure; leave "
-        "Exposure.nominal out, or give it Mount.nominal"
+        f"image_x = {mount.image_x!r} of the mount contradicts the nominal mount of the exposure; omit "
+        "Exposure.nominal, or set it to Mount.nominal"
     )
     if not isinstance(differ, jax.core.Tracer) and differ:
         raise InputError(message)

@@ -48,9 +48,9 @@ def plausible_positions(positions: Mapping[str, Gps | None]) -> tuple[Positions,
     if lost:
         messages.append(f"the positions of {_names(lost)} are more than {_FAR_M / 1000:g} km from the others: not used")
     if exchanged:
-        messages.append(f"latitude and longitude of {_names(exchanged)} have changed places; they are exchanged")
+        messages.append(f"latitude and longitude of {_names(exchanged)} are swapped in the files: corrected")
     if nowhere:
-        messages.append(f"the positions of {_names(nowhere)} are (0, 0), which means none: not used")
+        messages.append(f"the positions of {_names(nowhere)} are (0, 0): treated as missing")
     if absent:
         some = f"{len(absent)} of {len(positions)} photographs {'have' if len(absent) > 1 else 'has'} no position"
         every = f"all {len(positions)} photographs have no position"
@@ -84,15 +84,14 @@ def one_height(
         result |= {n: known[n][0]._replace(altitude_m=known[n][1] + shift) for n in relative}
         zero |= dict.fromkeys(relative, shift)
         messages.append(
-            f"the heights of {_names(relative)} are above take-off, those of the others {shift:+.1f} m from there, "
-            "which is added"
+            f"the heights of {_names(relative)} are above take-off: {shift:+.1f} m is added to match the others"
         )
     if isinstance(wanted, int):
         result, more = _above_ellipsoid(result, wanted)
         messages += more
     elif wanted is not None:
         if wanted == "take-off" and known:
-            messages.append("no photograph has a height above take-off: those of the files are taken as such")
+            messages.append("no photograph has a height above take-off: the heights of the files are used as such")
         result = {n: g and g._replace(heights=wanted) for n, g in result.items()}
     else:
         result, more = _joined(result, zero)
@@ -117,9 +116,11 @@ def _joined(positions: Positions, zero: Mapping[str, float]) -> tuple[Positions,
         here, there = ([zero[n] for n in kinds[k] if n in zero] for k in (kind, usual))
         shift = float(np.median(there) - np.median(here)) if here and there else None
         if shift is None:
-            messages.append(f"{both}, and their difference is unknown: the former are not used (--heights gives it)")
+            messages.append(
+                f"{both}, and their difference is unknown: the former are not used (set the reference by --heights)"
+            )
         elif abs(shift) > _APART_M:
-            messages.append(f"{both}; {shift:+.1f} m brings them together (by the heights above take-off)")
+            messages.append(f"{both}; {shift:+.1f} m is added (from the heights above take-off)")
         else:
             shift = 0.0
         for n in names:
@@ -146,7 +147,7 @@ def _above_ellipsoid(positions: Positions, vertical: int) -> tuple[Positions, li
     }
     if not places:
         any_height = any(g and g.altitude_m is not None for g in positions.values())
-        reason = "all are above the ellipsoid by their files" if any_height else "no photograph has one"
+        reason = "the files give all above the ellipsoid" if any_height else "no photograph has one"
         return positions, [f"no height needs the geoid of EPSG:{vertical}: {reason}"]
     given = np.array(list(places.values()), float)
     heights = system.place(given)[:, 2]
@@ -162,7 +163,7 @@ def _above_ellipsoid(positions: Positions, vertical: int) -> tuple[Positions, li
             result[name] = gps._replace(altitude_m=height, heights="ellipsoid")
     added = heights - given[:, 2]
     return result, [
-        f"the heights of {len(places)} photographs are taken as those of EPSG:{vertical}; its geoid, "
+        f"the heights of {len(places)} photographs are interpreted as EPSG:{vertical}; its geoid, "
         f"{added.min():+.2f} to {added.max():+.2f} m, is added"
     ]
 
@@ -173,7 +174,7 @@ def _reference(positions: Positions) -> str:
     if kind == "ellipsoid":
         return "heights are above the ellipsoid"
     if kind == "unknown":
-        return "heights are as in the files, which do not say above what (--heights says it)"
+        return "heights are as in the files, of unknown reference (set it by --heights)"
     return f"heights are {HEIGHTS[kind]}; nothing is added to bring them to the ellipsoid"
 
 

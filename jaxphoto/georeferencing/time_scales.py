@@ -11,7 +11,7 @@ DAY, WEEK = 86_400, 604_800
 LEAP_SECONDS = (18, 17, 16, 15, 14, 13)
 LAS_OFFSET = 1e9
 """Offset (s) subtracted from full GPS time in LAS files."""
-_OF_LAS = "full GPS time less 1e9 s, as in LAS files"
+_OF_LAS = "full GPS time minus 1e9 s, as in LAS files"
 
 
 def looks_like(times: Float[np.ndarray, "n"], origin: str = "the first exposure") -> str:
@@ -49,4 +49,4 @@ def _kind(first: float, last: float, origin: str = "") -> str:
     if first >= 6e8:
         return "full GPS or Unix time"
     # Negative before September 2011.
-    return _OF_LAS if abs(first) > 2 * WEEK else "seconds from some event"
+    return _OF_LAS if abs(first) > 2 * WEEK else "seconds from an unknown epoch"

@@ -43,7 +43,7 @@ class Trajectory(eqx.Module):
 
     def __check_init__(self) -> None:
         if len(self.time) < SHORTEST:
-            raise ValueError(f"a trajectory has at least {SHORTEST} records, got {len(self.time)}")
+            raise ValueError(f"a trajectory needs at least {SHORTEST} records, got {len(self.time)}")
 
 
 class Poses(NamedTuple):

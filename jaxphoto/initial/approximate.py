@@ -184,8 +184,8 @@ class _State:
             image, point = self.image[bad[0]], self.point[bad[0]]
             raise PointsBehind(
                 f"point {block.points[point]} lies behind image {block.images[image]}, which measured it ({len(bad)} "
-                f"of {len(self.image)} image points are so): check the approximate angles and their units, the "
-                "position of the image, the unit of its image coordinates, and that the point's are in the same frame"
+                f"of {len(self.image)} such image points): check the approximate angles and their units, the "
+                "position of the image, the unit of its image coordinates, and the frame of the point"
             )
 
     def _orient_directly(self) -> None:

@@ -91,7 +91,7 @@ def intersect_with_covariance(
     not positive.
     """
     if not sigma_rad > 0:
-        raise ValueError(f"the standard deviation of image coordinates is positive, but sigma_rad is {sigma_rad}")
+        raise ValueError(f"sigma_rad, the standard deviation of image coordinates, must be positive, got {sigma_rad}")
     directions = np.einsum("nij,ni->nj", camera_from_object[image], rays)
     points, determined = intersect_points(positions[image], directions, point, n_points, min_angle=min_angle)
     covariance = np.full((n_points, 3, 3), np.nan)

@@ -98,10 +98,10 @@ def _edges(first: np.ndarray, pairs: list[PairMatches]) -> Int[np.ndarray, "edge
     edges = [np.zeros((0, 2), int)]
     for one, other, features in pairs:
         if not 0 <= one < other < len(first) - 1:
-            raise ValueError(f"a pair of {len(first) - 1} photographs has first < second, got {one} and {other}")
+            raise ValueError(f"a pair of {len(first) - 1} photographs needs first < second, got {one} and {other}")
         number = first[[one + 1, other + 1]] - first[[one, other]]
         if (features < 0).any() or (features >= number).any():
-            raise ValueError(f"the pair {one}, {other} matches features that are not there; they have {number}")
+            raise ValueError(f"the pair {one}, {other} matches features out of range; the photographs have {number}")
         edges.append(np.asarray(features, int) + first[[one, other]])
     return np.concatenate(edges)
 

@@ -90,7 +90,7 @@ def resect_by_quaternions(
     """
     c, ideal = float(interior.c), ideal_coordinates(interior, np.asarray(xy_mm, float))
     if not sigma_mm > 0:
-        raise ValueError(f"the standard deviation of image coordinates is positive, but sigma_mm is {sigma_mm}")
+        raise ValueError(f"sigma_mm, the standard deviation of image coordinates, must be positive, got {sigma_mm}")
     local, origin = checked_points(ideal, points, image)
     positions, matrices, iterations, converged = _starts(c, ideal, local)
     refined = refine(c, ideal, local, positions, matrices)
@@ -134,8 +134,8 @@ def _check_unique(refined: RefinedResections, best: int, sigma: float, image: st
     if np.any(near & (apart > np.maximum(5 * same, 1e-6))):
         angle = np.rad2deg(2 * np.arcsin(min(float(np.max(apart[near])) / np.sqrt(8), 1.0)))
         raise BlockError(
-            f"two orientations of image {image}, turned by {angle:.3g} deg, fit its known points equally well, as few "
-            "points and flat figures seen from afar do: measure points off the plane or over more of the "
+            f"two orientations of image {image}, {angle:.3g} deg apart, fit its known points equally well (typical of "
+            "few points and of distant planes): measure points off the plane or over more of the "
             "image, or give omega_deg, phi_deg, kappa_deg in images.csv"
         )
 

@@ -80,7 +80,7 @@ def ray_noise(rays: Float[np.ndarray, "rows 3"], sigma_rad: float) -> Float[np.n
     Off axis the same image error is a smaller angle. Raises ValueError for a ray that does not point forward (z < 0).
     """
     if not np.all(rays[:, 2] < 0):
-        raise ValueError("rays in the camera frame point to the front of the camera, so their z is negative")
+        raise ValueError("rays in the camera frame must have a negative z (point to the front of the camera)")
     across = np.eye(3)[:, :2] - rays[:, :, None] * rays[:, None, :2]
     return across * (sigma_rad * np.abs(rays[:, 2]))[:, None, None]
 

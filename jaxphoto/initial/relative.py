@@ -98,7 +98,7 @@ def relative_orientation(
         angle = np.rad2deg(np.arccos(np.clip(0.5 * (trace - 1), -1, 1)))
         raise BlockError(
             f"{len(all_that_fit)} relative orientations of {images} fit their {len(rays_1)} common points equally well "
-            f"(the first two turned by {angle:.1f} deg), as points of a flat scene and few points may: measure points "
+            f"(the first two differ by {angle:.1f} deg), typical of a flat scene or few points: measure points "
             "off the plane, or decide with a third image (relative_orientations gives them all)"
         )
     return all_that_fit[0]
@@ -118,16 +118,16 @@ def relative_orientations(
     """
     rays_1, rays_2 = np.asarray(rays_1, float), np.asarray(rays_2, float)
     if len(rays_1) != len(rays_2):
-        raise ValueError(f"rays belong together in pairs, but there are {len(rays_1)} and {len(rays_2)}")
+        raise ValueError(f"rays must be pairs, got {len(rays_1)} and {len(rays_2)}")
     finite = np.isfinite(rays_1).all(axis=1) & np.isfinite(rays_2).all(axis=1)
     if not finite.all():
-        raise BlockError(f"{np.sum(~finite)} of the {len(finite)} rays of {images} are no numbers: leave them out")
+        raise BlockError(f"{np.sum(~finite)} of the {len(finite)} rays of {images} are NaN or infinite: remove them")
     if not sigma_rad > 0:
-        raise ValueError(f"the standard deviation of image coordinates is positive, but sigma_rad is {sigma_rad}")
+        raise ValueError(f"sigma_rad, the standard deviation of image coordinates, must be positive, got {sigma_rad}")
     n = len(np.unique(np.column_stack([rays_1, rays_2]), axis=0)) if len(rays_1) < 50 else len(rays_1)
     if n < 5:
         raise BlockError(
-            f"{images} have {counted(n, 'point')} in common and a relative orientation needs 5: match or measure more"
+            f"{images} have {counted(n, 'point')} in common, a relative orientation needs 5: match or measure more"
         )
     pairs = RayPairs.of(rays_1, rays_2, sigma_rad)
     rotations, bases = candidates(pairs)
@@ -318,9 +318,8 @@ def _open(one: RelativeOrientation, images: str) -> BlockError:
     sigma = _sigma(one)
     known = f"to {np.rad2deg(sigma):.2g} deg only" if sigma < 3 else "not at all"
     return BlockError(
-        f"the common points of {images} determine their relative orientation {known}, as few points, points on a "
-        "line, close together or on a critical surface do: measure points that spread over both images, near and "
-        "far"
+        f"the common points of {images} determine their relative orientation {known} (few points, or points on a "
+        "line, close together or on a critical surface): measure points that spread over both images, near and far"
     )
 
 
@@ -330,7 +329,7 @@ def _check_not_a_line(pairs: RayPairs, images: str) -> None:
         across = np.linalg.svd(rays, compute_uv=False)[2] / np.sqrt(len(rays))
         if across < _SAME_PLACE * np.sqrt(0.5 * np.mean(np.sum(noise**2, axis=(1, 2)))):
             raise BlockError(
-                f"the common points of {images} lie on a line, which leaves their relative orientation open: measure "
+                f"the common points of {images} lie on a line, their relative orientation is undetermined: measure "
                 "points that spread over both images"
             )
 
@@ -351,8 +350,8 @@ def _check_parallax(pairs: RayPairs, sigma0: float, images: str) -> None:
     size = np.quantile(parallax, _QUANTILE)
     if size < max(_SAME_PLACE * noise, 1e-12):
         raise BlockError(
-            f"{images} were taken from one place, as far as their common points tell (parallaxes {size:.1e} rad, of "
-            f"which {noise:.1e} rad are noise): use a pair with a longer base"
+            f"the base of {images} is zero within the noise of their common points (parallaxes {size:.1e} rad, "
+            f"noise {noise:.1e} rad): use a pair with a longer base"
         )
 
 
@@ -382,6 +381,6 @@ def _check_not_chance(best: RelativeOrientation, pairs: RayPairs, images: str) -
     fives = np.sum(np.log(n - np.arange(5))) - np.log(120)
     if fives - (n - 5) * tail > _FALSE_ALARM:
         raise BlockError(
-            f"{agrees} of {n} common points of {images} agree with the best relative orientation, and as many would if "
-            "all were false: match them with a stricter ratio, or leave the pair out"
+            f"{agrees} of {n} common points of {images} agree with the best relative orientation, no more than "
+            "random matches would: match them with a stricter ratio, or skip the pair"
         )

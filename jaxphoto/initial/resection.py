@@ -172,14 +172,14 @@ def checked_points(
     points = np.asarray(points, float)
     if points.shape != (len(ideal), 3):
         raise ValueError(
-            f"image coordinates and points belong together, but of image {image} there are {len(ideal)} coordinates "
-            f"and points of shape {points.shape}"
+            f"image {image} has {len(ideal)} image coordinates, but points of shape {points.shape}; "
+            "give one point for each"
         )
     finite = np.isfinite(points).all(axis=1) & np.isfinite(ideal).all(axis=1)
     if not finite.all():
         raise BlockError(
-            f"{np.sum(~finite)} of the {len(points)} known points of image {image} have a coordinate that is no "
-            "number (in the image, after the correction of its distortion, or on the ground): leave them out"
+            f"{np.sum(~finite)} of the {len(points)} known points of image {image} have a coordinate that is "
+            "NaN or infinite (in the image, after the correction of its distortion, or on the ground): remove them"
         )
     distinct = len(np.unique(points, axis=0))
     cure = "or give its approximate X_m, Y_m, Z_m, omega_deg, phi_deg, kappa_deg in images.csv"
@@ -223,9 +223,9 @@ def check_determined(normal: Float[np.ndarray, "6 6"], sigma: float, image: str,
 def open_orientation(image: str) -> BlockError:
     """Return the error for points that do not determine the orientation."""
     return BlockError(
-        f"the known points of image {image} leave its orientation undetermined, as points close to a line do, few "
-        "points in a small part of the image, or points on a dangerous cylinder or curve through the projection "
-        "centre: measure known points elsewhere in it"
+        f"the known points of image {image} leave its orientation undetermined (near a line, few in a small "
+        "part of the image, or on a dangerous cylinder or curve through the projection centre): "
+        "measure known points elsewhere in it"
     )
 
 

@@ -87,7 +87,7 @@ def columns_of(cls: Any) -> tuple[Column, ...]:
         names = (names,) if isinstance(names, str) else names
         if names and len(names) != math.prod(field.shape):
             raise TypeError(
-                f"{cls.__name__}.columns: {field.name} has {math.prod(field.shape)} numbers a row, but {names} are "
+                f"{cls.__name__}.columns: {field.name} has {math.prod(field.shape)} numbers per row, but {names} has "
                 f"{len(names)} names"
             )
         for place, name in zip(np.ndindex(*field.shape), names, strict=False):

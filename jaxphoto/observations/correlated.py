@@ -116,8 +116,8 @@ def correlated(
     n = index.shape[1] * len(rows.axes) if index.ndim == 2 else 0
     if index.ndim != 2 or covariance.shape != (len(index), n, n):
         raise ValueError(
-            f"sets are lists of equally many rows, each with a covariance matrix of all their numbers: {len(index)} "
-            f"sets need {(len(index), n, n)}, got {covariance.shape}"
+            f"covariances of {len(index)} sets, each with as many rows, must have the shape {(len(index), n, n)}, "
+            f"got {covariance.shape}"
         )
     try:
         whitener = np.linalg.inv(np.linalg.cholesky(covariance))

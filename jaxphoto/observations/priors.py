@@ -120,5 +120,5 @@ class KnownParameters(eqx.Module):
             return ""
         own = [label.removeprefix("interior[") for label in self.labels if label.startswith("interior[")]
         cameras = ", ".join(camera_words(name) for name in dict.fromkeys(label.rpartition("].")[0] for label in own))
-        said = f"the calibration that {cameras} is from" if cameras else f"what is known of {few(self.labels)}"
+        said = f"the calibration that {cameras} is from" if cameras else f"the prior information on {few(self.labels)}"
         return f"of {said}: {self.reservation}"

@@ -70,7 +70,7 @@ def _reference_for(reference: ImageState, own: RigCamera) -> tuple[Float[Array, 
 def _camera_of(image: ImageState) -> RigCamera:
     if RigCamera.kind not in image.parameters:
         raise BlockError(
-            "there are rows of a rig, but no camera of the block belongs to one: give "
+            "rig observations need a camera of the block that belongs to a rig: give "
             f"[unknowns.{RigCamera.kind}.CAMERA]"
         )
     found: RigCamera = image.parameters[RigCamera.kind]

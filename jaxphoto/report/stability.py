@@ -147,7 +147,7 @@ def write_stability(
     """
     chosen, figure = analyses[method], new_figure(7.2, 5.4)
     plot_ray_offsets(chosen, sensor, figure.subplots())
-    methods = "The bundles of rays are aligned " + "; ".join(f"{ALIGNED[name]} ({name})" for name in analyses) + "."
+    methods = "The bundles of rays are " + "; ".join(f"{ALIGNED[name]} ({name})" for name in analyses) + "."
     parts: list[Part] = [
         *map(Paragraph, about_sets(sets)),
         Heading("By method"),

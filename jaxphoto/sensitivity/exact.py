@@ -184,7 +184,7 @@ class Sensitivity(eqx.Module):
     def row(self, label: str) -> int:
         """Return the index of the estimate `label`. Raises InputError if there is none."""
         if label not in self.labels:
-            raise InputError(f"no estimate {label}: there are {', '.join(self.labels[-8:])} and others")
+            raise InputError(f"unknown estimate {label}: choose among {', '.join(self.labels[-8:])} and others")
         return self.labels.index(label)
 
 

@@ -74,7 +74,7 @@ def station_bias(
     block = adjusted.block
     unit_of = {"block": ("block",) * len(block.images), "strip": block.image_strip, "image": block.images}
     if per not in unit_of:
-        raise InputError(f"a station bias per {per} is unknown: choose among {', '.join(unit_of)}")
+        raise InputError(f"unknown unit {per} of a station bias: choose among {', '.join(unit_of)}")
     stations = {name: rows for name, rows in block.named_observations.items() if isinstance(rows, OBSERVED["station"])}
     if not stations:
         raise InputError("the block has no observed stations: add stations to compute a station bias")

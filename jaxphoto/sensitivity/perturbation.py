@@ -257,7 +257,7 @@ def bias(
     if per not in PER[kind]:
         raise InputError(f"a bias of kind {kind} is drawn per {' or '.join(PER[kind])}, not per {per}")
     if (parameter != "") != (kind == "interior"):
-        raise InputError("a parameter name, such as c_mm, is required by a bias of kind interior, and by no other")
+        raise InputError("a parameter name, such as c_mm, is required for a bias of kind interior only")
     if kind in ("lever-arm", "boresight", "interior"):
         return _parameters(block, kind, sigma, of, parameter, distribution)
     axes = LABELS[kind]
@@ -398,7 +398,7 @@ def _chosen(of: Collection[str], owners: list[str], kind: str, per: str) -> list
     for name in of:
         if name not in owners:
             examples = ", ".join(owners[:8]) + (" ..." if len(owners) > 8 else "")
-            raise InputError(f"unknown {per} {name!r} for a bias of kind {kind}: there are {examples}")
+            raise InputError(f"unknown {per} {name!r} for a bias of kind {kind}: choose among {examples}")
     return [name for name in owners if name != "" and (not of or name in of)]
 
 

@@ -79,9 +79,9 @@ METHODS: tuple[Method, ...] = ("zrot", "rot", "spr")
 UNKNOWNS: dict[Method, int] = {"zrot": 0, "rot": 3, "spr": 6}
 """Number of unknowns of the alignment: three angles (rad), then position in units of the object distance."""
 ALIGNED: dict[Method, str] = {
-    "zrot": "as they lie in the camera",
-    "rot": "turned onto one another",
-    "spr": "turned and moved onto one another",
+    "zrot": "not aligned",
+    "rot": "aligned by rotation",
+    "spr": "aligned by rotation and translation",
 }
 """Labels of the alignment methods."""
 

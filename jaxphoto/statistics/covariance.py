@@ -56,7 +56,7 @@ class Covariance(eqx.Module):
     def __repr__(self) -> str:
         # Inside a JAX transformation the fields are tracers.
         if np.ndim(self.converged) or not isinstance(self.converged, bool | np.generic | np.ndarray):
-            return "Covariance inside a transformation of JAX: its numbers are arrays"
+            return "Covariance: traced by JAX or batched, values are arrays"
         of = f"{counted(self.n_images, 'image')}, {counted(len(self.points), 'point')}"
         shared = counted(len(self.labels) - 6 * self.n_images, "shared unknown")
         where = "" if self.converged else ";\n  not converged: evaluated where the adjustment stopped, do not use"

@@ -58,11 +58,11 @@ _MAX_MISFIT = 0.02
 # the small remainder is significant.
 _MIN_FRACTION_OF_SHIFT = 1e-6
 _CURE_OF_SHIFT = {
-    "m": "on the average: another datum or kind of height, or a wrong lever arm; compare with control, or let the "
-    'flight shift ([unknowns.flight_bias], shift = "free")',
-    "rad": "on the average: another convention of angles, or a boresight, which can be free",
+    "m": "on the average: another datum or kind of height, or a wrong lever arm; compare with control, or "
+    'estimate a shift of the flight ([unknowns.flight_bias], shift = "free")',
+    "rad": "on the average: another convention of angles, or a boresight: set it free",
 }
-_CURE_OF_STRIP = "on the average: let that strip shift, or check its recording and its camera"
+_CURE_OF_STRIP = "on the average: estimate a shift of that strip, or check its recording and its camera"
 
 
 @pretty_repr
@@ -199,7 +199,7 @@ def _prior_contradictions(
         for k, (_, at, column) in enumerate(priors):
             values[k, np.searchsorted(places_of_camera, at)] = column
         cure = (
-            "the camera has changed since (focus, lens, temperature), or one of the two is less certain than it says: "
+            "the camera has changed since (focus, lens, temperature), or the standard deviations of one are too small: "
             "compare with a calibration of this block alone (jaxphoto compare)"
         )
         columns = np.eye(len(priors))
@@ -244,7 +244,7 @@ def _camera_over_time(
     (at_x, x_values, x_weight), (at_y, y_values, y_weight) = _parts_of_image(adjusted, rows, places, columns)
     joint = Part(np.append(at_x, at_y), np.hstack([x_values, y_values]), np.append(x_weight, y_weight))
     names = ("c", "x_p", "y_p")
-    cure = "from the first image to the last: the camera changes in flight, give it parameters of shorter times"
+    cure = "from the first image to the last: the camera changes in flight: estimate parameters of shorter periods"
     terms = tuple(EffectTerm(name, column, cure) for name, column in zip(names, np.eye(3), strict=True))
     return SystematicEffect(f"image points of {camera_words(camera)} over time", "mm", camera, (joint,), terms)
 
@@ -291,7 +291,7 @@ def _by_strip(
         yield effect("from strip to strip", columns, _CURE_OF_STRIP)
     if (time := _time(adjusted)) is not None:
         drifts = [(a, np.where(axis == a, time[image], 0.0)) for a in axes]
-        yield effect("over time", drifts, "from the first image to the last: let strips shift or drift")
+        yield effect("over time", drifts, "from the first image to the last: estimate shifts or drifts of the strips")
 
 
 def _time(adjusted: Adjustment) -> Float[np.ndarray, "images"] | None:
@@ -312,7 +312,7 @@ def _polynomials(xy: Float[np.ndarray, "2 n"], degree: int) -> Float[np.ndarray,
     return np.stack([x[i] * y[j] for i in range(degree + 1) for j in range(degree + 1 - i)])
 
 
-_CURE_ROLLING = ", or estimate a rolling shutter, which stretches the image likewise (docs/time_dependent_cameras.md)"
+_CURE_ROLLING = ", or estimate a rolling shutter, with a similar effect (docs/time_dependent_cameras.md)"
 # Terms of Brown's model (docs/models.md), tested if the camera model lacks them.
 _BROWN_TERMS = {
     "k1": lambda x, y: (x * (x * x + y * y), y * (x * x + y * y)),

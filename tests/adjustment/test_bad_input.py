@@ -227,7 +227,7 @@ def test_trees_of_another_kind_are_named():
     start = block.start.unknowns
     for wrong, message in (
         (block.start, "start is of the type Start: give Unknowns, such as adjusted.unknowns"),
-        (dataclasses.replace(start, interior={"two": start.interior["one"]}), "start has no camera 'one', .* two"),
+        (dataclasses.replace(start, interior={"two": start.interior["one"]}), "start lacks camera 'one' .* two"),
         (dataclasses.replace(start, points=start.points[:-1]), r"start.points has the shape \(\d+, 3\), the block"),
     ):
         with pytest.raises(InputError, match=message):

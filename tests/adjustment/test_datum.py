@@ -106,7 +106,7 @@ def test_stations_on_a_line_leave_a_rotation():
     count, named, _ = defect_of(stations_at(line))
     assert count == 1
     assert "rotation about X" in named
-    with pytest.raises(DatumError, match=r"as good as open: rotation about X cannot .* away from the line") as caught:
+    with pytest.raises(DatumError, match=r"nearly undetermined: rotation about X cannot .* off the line") as caught:
         with_constraints(stations_at(line + 0.1 * np.random.default_rng(3).standard_normal(line.shape)))
     # What it is said to be known to follows from how far the stations are off the line.
     assert 5 < float(re.search(r"than to (\S+) deg", str(caught.value))[1]) < 60

@@ -16,7 +16,7 @@ def test_float32_input_is_named_with_the_digits_it_has():
     block, start = simulated("cross").block, adjusted("cross").unknowns
     xy = np.asarray(block.image_points.xy, np.float32)
     narrow = eqx.tree_at(lambda b: b.image_points.xy, block, xy)
-    with pytest.warns(UserWarning, match=r"image_points\.xy is float32 and knows .* to 2e-06 only: give float64"):
+    with pytest.warns(UserWarning, match=r"image_points\.xy is float32 and resolves .* to 2e-06 only: give float64"):
         result = adjust(narrow, start)
     # It is adjusted all the same, in 64 bits.
     assert bool(result.converged)
@@ -26,7 +26,7 @@ def test_float32_input_is_named_with_the_digits_it_has():
 def test_large_coordinates_lose_decimetres():
     block, start = simulated("cross").block, adjusted("cross").unknowns
     far = eqx.tree_at(lambda u: u.points, start, np.asarray(start.points + 5_400_000, np.float32))
-    with pytest.warns(UserWarning, match=r"start\.points is float32 and knows 54\d+ to 0\.5 only"):
+    with pytest.warns(UserWarning, match=r"start\.points is float32 and resolves 54\d+ to 0\.5 only"):
         warn_of_precision_loss(block, far, block.priors)
 
 

@@ -110,7 +110,7 @@ def test_constants_must_be_given_and_positive(model):
     with pytest.raises(TypeError, match=f"'{name}'"):
         model()
     for wrong in (0.0, -3.0, np.nan):
-        with pytest.raises(ValueError, match=f"{name} of {model.__name__}, .* is positive and in mm, got {wrong}"):
+        with pytest.raises(ValueError, match=f"{name} of {model.__name__}, .* must be positive .mm., got {wrong}"):
             model(**{name: wrong})
 
 

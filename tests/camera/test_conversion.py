@@ -122,7 +122,7 @@ def test_sign_of_smac():
     assert subtracted.distortion.sign == "subtract"
     np.testing.assert_allclose(rays(subtracted), rays(added), rtol=0, atol=1e-15)
     assert with_sign(added, "add") is added
-    with pytest.raises(ValueError, match="only SMAC can be added or subtracted, this camera has Brown"):
+    with pytest.raises(ValueError, match="only SMAC has a sign; this camera has Brown"):
         with_sign(camera(Brown()), "add")
 
 

@@ -105,8 +105,8 @@ def test_block_toml_holds_it_and_gives_it_back():
     [
         ({"way": "up"}, 'way: \'up\' is unknown; write "out" or "in"'),
         ({"sign": "add"}, "unknown key; use width_px, .*, interior, unknowns, .*, way"),
-        ({"projection": "fish"}, "no projection model is called 'fish'; choose one of perspective, equidistant"),
-        ({"distortion": "tangend"}, "no distortion model is called 'tangend'; choose one of brown, affine_brown"),
+        ({"projection": "fish"}, "unknown projection model 'fish'; choose one of perspective, equidistant"),
+        ({"distortion": "tangend"}, "unknown distortion model 'tangend'; choose one of brown, affine_brown"),
         ({"interior": {"c_mm": 35.0, "a": 0.1}}, "s_mm: the key is missing"),
         (
             {"interior": {"c_mm": 35.0, "s_mm": 9.0, "aa": 0.1}},

@@ -154,10 +154,10 @@ def test_a_shift_of_the_ppa_at_a_fixed_pps_is_a_rotation_to_first_order():
 
 
 def test_other_distortions_are_refused():
-    with pytest.raises(ValueError, match="of PpsRadial cameras, this camera has Brown"):
+    with pytest.raises(ValueError, match="needs PpsRadial; this camera has Brown"):
         decentring_from_symmetry(InteriorOrientation(34.0))
     for function in (symmetry_from_decentring, principal_points):
-        with pytest.raises(ValueError, match="of Brown cameras, this camera has Smac"):
+        with pytest.raises(ValueError, match="needs Brown; this camera has Smac"):
             function(InteriorOrientation(34.0, distortion=Smac()))
 
 

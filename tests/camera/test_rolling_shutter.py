@@ -152,7 +152,7 @@ def test_what_it_cannot_do_is_refused(rolling):
         adjust(loose)
     rows = block.image_points.take(np.arange(4))
     joined = correlated(rows, [range(4)], np.eye(8)[None] * 0.004**2)
-    with pytest.raises(BlockError, match="leave out shutters, motions"):
+    with pytest.raises(BlockError, match="remove shutters, motions"):
         adjust(block, more=(joined,))
 
 

@@ -39,16 +39,19 @@ def test_what_a_change_does_and_how_sure_it_is_is_said():
 
     assert said(25832, 9.0, 50.0) == said(32633, 15.0, 47.0) == ()
     (austria,) = said(31287, 15.0, 47.0)
-    assert 'the datum MGI by PROJ\'s "MGI to WGS 84 (8)", known to 0.5 m: 83.92 m in plan, ' in austria
+    assert 'the datum MGI by PROJ\'s "MGI to WGS 84 (8)", accuracy 0.5 m: 83.92 m in plan, ' in austria
     (flat,) = said(31287, 15.0, 47.0, False)
-    assert flat.endswith("heights stay as they are")
+    assert flat.endswith("heights unchanged")
     (nad83,) = said(6339, -122.0, 45.0)
-    assert nad83.startswith("positions of WGS 84 are taken as of the datum NAD83(2011), by") and "known to 2 m" in nad83
+    assert (
+        nad83.startswith("positions of WGS 84 are used unchanged in the datum NAD83(2011), by")
+        and "accuracy 2 m" in nad83
+    )
     (britain,) = said(27700, -1.5, 52.0)
     # Where the grid is there, it is the way.
     assert "uk_os_OSTN15_NTv2_OSGBtoETRS.tif, which is not installed, gives 1 m" in britain or "(9)" in britain
     # A system of elsewhere.
-    assert "can be wrong by hundreds of metres" in said(31287, -60.0, -30.0)[0]
+    assert "errors of hundreds of metres" in said(31287, -60.0, -30.0)[0]
 
 
 def test_longitudes_from_another_meridian_than_greenwich():

@@ -62,7 +62,7 @@ def test_times_of_another_day_or_without_a_common_constant_join_nothing():
         (-3.5 * 3600, "-3.5 h (time zone)"),
         (0.27, "+0.27 s"),
         (18.0, "+18 s (leap seconds: GPS time against UTC)"),
-        (86400 * 300.0, "no time zone"),
+        (86400 * 300.0, "more than any time zone"),
     ],
 )
 def test_what_a_difference_of_clocks_is_made_of(offset, words):

@@ -46,10 +46,10 @@ def test_the_geoid_is_added_to_what_is_not_above_the_ellipsoid(geoid):
     assert [g and g.altitude_m for g in found.values()] == pytest.approx([100 + UNDULATION_M] * 2 + [100.0, None])
     assert {g.heights for g in found.values() if g} == {"ellipsoid"} and said[0] == "heights are above the ellipsoid"
     assert said[1:] == [
-        f"the heights of 2 photographs are taken as those of EPSG:5773; its geoid, {UNDULATION_M:+.2f} to "
+        f"the heights of 2 photographs are interpreted as EPSG:5773; its geoid, {UNDULATION_M:+.2f} to "
         f"{UNDULATION_M:+.2f} m, is added"
     ]
-    assert "all are above the ellipsoid by their files" in one_height({"c": given["c"]}, {}, EGM96)[1][1]
+    assert "the files give all above the ellipsoid" in one_height({"c": given["c"]}, {}, EGM96)[1][1]
 
 
 def test_heights_above_take_off_among_them_are_brought_to_them_first(geoid):

@@ -19,7 +19,7 @@ def test_what_cannot_be_is_named_and_what_changed_places_is_changed_back():
     assert [n for n, g in found.items() if g is None] == ["zero", "far", "none"]
     for words in (
         "the positions of far are more than 50 km from the others",
-        "latitude and longitude of swapped have changed places",
+        "latitude and longitude of swapped are swapped",
         "the positions of zero are (0, 0)",
         "1 of 12 photographs has no position (none)",
     ):
@@ -38,8 +38,8 @@ def test_heights_above_take_off_among_others_are_brought_to_them():
     given["d"] = HERE._replace(altitude_m=60.5)
     found, said = one_height(given, above)
     assert [g.altitude_m for g in found.values()] == pytest.approx([1100.0, 1101.0, 1102.0, 1100.5])
-    assert "the heights of d are above take-off, those of the others +1040.0 m from there" in said[1]
-    assert "do not say above what" in said[0]
+    assert "the heights of d are above take-off: +1040.0 m is added" in said[1]
+    assert "of unknown reference" in said[0]
     # All above take-off, or a flight from sea level: nothing to mend.
     for zero in (0.0, 2.0):
         plain = {n: HERE._replace(altitude_m=zero + h) for n, h in above.items()}
@@ -52,7 +52,7 @@ def test_heights_of_two_kinds_are_joined_where_something_tells_how_far_they_are_
     given["c"] = HERE._replace(altitude_m=1075.0 + 62, heights="geoid")
     found, said = one_height(given, above)
     assert found["c"].altitude_m == pytest.approx(1102.0) and found["c"].heights == "ellipsoid"
-    assert said[0] == "heights are above the ellipsoid" and "-35.0 m brings them together" in said[1]
+    assert said[0] == "heights are above the ellipsoid" and "-35.0 m is added" in said[1]
     found, said = one_height(given, {})
     assert found["c"].altitude_m is None and found["a"] == given["a"] and "not used" in said[1]
 

@@ -66,7 +66,7 @@ def test_errors_of_every_kind(errors, kind):
 def test_few_are_refused_and_each_for_a_reason(errors):
     assert len(errors.refused) <= 0.05 * N
     assert all(
-        "one place" in reason or "determine their relative orientation to" in reason for reason in errors.refused
+        "the base of" in reason or "determine their relative orientation to" in reason for reason in errors.refused
     )
 
 

@@ -165,11 +165,11 @@ def test_rays_that_are_no_numbers_or_in_no_order():
     scene = pair_scene(20, 0)
     spoilt = scene.rays_2.copy()
     spoilt[3] = np.nan
-    with pytest.raises(BlockError, match="1 of the 20 rays of the two images are no numbers"):
+    with pytest.raises(BlockError, match="1 of the 20 rays of the two images are NaN"):
         relative_orientation(scene.rays_1, spoilt, SIGMA)
     with pytest.raises(ValueError, match="there are 20 and 19"), unchecked():
         relative_orientation(scene.rays_1, scene.rays_2[:19], SIGMA)
-    with pytest.raises(ValueError, match="sigma_rad is 0"):
+    with pytest.raises(ValueError, match=r"sigma_rad, .* must be positive, got 0"):
         relative_orientation(scene.rays_1, scene.rays_2, 0.0)
 
 
@@ -178,7 +178,7 @@ def test_covariance_that_does_not_tell_the_errors():
     refused = 0
     for seed in range(6):
         scene = pair_scene(15, seed, 10 * SIGMA, flat=True, base=[1, 0, 0], length=1.0)
-        with pytest.raises(BlockError, match=r"determine their relative orientation|one place|fit their|as many would"):
+        with pytest.raises(BlockError, match=r"determine their relative orientation|base of|fit their|random matches"):
             relative_orientation(scene.rays_1, scene.rays_2, 10 * SIGMA)
         refused += 1
     assert refused == 6
@@ -186,11 +186,11 @@ def test_covariance_that_does_not_tell_the_errors():
 
 def test_images_from_one_place():
     scene = pair_scene(100, 0, SIGMA, length=0.0)
-    with pytest.raises(BlockError, match="images a and b were taken from one place"):
+    with pytest.raises(BlockError, match="the base of images a and b is zero"):
         relative_orientation(scene.rays_1, scene.rays_2, SIGMA, images="images a and b")
     # A far scene is no better, and false matches do not hide it.
     false = pair_scene(300, 1, SIGMA, length=1e-3, false=0.3)
-    with pytest.raises(BlockError, match="one place"):
+    with pytest.raises(BlockError, match="base of"):
         relative_orientation(false.rays_1, false.rays_2, SIGMA)
 
 
@@ -208,7 +208,7 @@ def test_points_on_a_line():
 def test_matches_that_are_all_false():
     for seed in range(5):
         xy = np.random.default_rng(seed).uniform(-0.6, 0.6, (2, 60, 2))
-        with pytest.raises(BlockError, match=r"as many would if all were false|one place|equally well"):
+        with pytest.raises(BlockError, match=r"random matches|base of|equally well"):
             relative_orientation(rays_of(xy[0]), rays_of(xy[1]), SIGMA)
 
 

@@ -308,7 +308,7 @@ def test_models_that_cannot_be_written(tmp_path):
         write_colmap_model(block, tmp_path / "other" / "thesis.txt")
     terms = lambda b: (b.start.unknowns.interior["5"].distortion.k1, b.start.unknowns.interior["5"].distortion.b2)  # noqa: E731
     folding = eqx.tree_at(terms, block, (np.array(-9.0), np.array(0.1)))
-    with pytest.raises(InputError, match="camera 5 cannot be written as colmap: the distortion of this camera folds"):
+    with pytest.raises(InputError, match=r"camera 5 cannot be written as colmap: .* is not invertible"):
         write_colmap_model(folding, tmp_path / "new")
     assert not (tmp_path / "new").exists()
     curved = dataclasses.replace(block, corrections=Corrections(curvature=True))
@@ -324,7 +324,7 @@ def test_the_command_converts_there_and_back(tmp_path, monkeypatch, capsys):
     assert "camera 5: the conversion is exact" in said
     same_block(read_source(tmp_path / "back"), read_source(model))
     for out, to, message in (
-        (tmp_path / "block", "colmap", "is or holds the input"),
+        (tmp_path / "block", "colmap", "is or contains the input"),
         (tmp_path / "new", "colmop", "'colmop' is not one of"),
     ):
         code, _, error = run(monkeypatch, capsys, "convert", tmp_path / "block", out, "--to", to)

@@ -178,7 +178,7 @@ def test_known_parameters_round_trip(block, tmp_path):
         KnownParameters(("strips[one].shift_X_m",), np.array([0.3]), np.array([[0.1]]), "it was foggy, and late"),
     )
     write_block(dataclasses.replace(block, more=known), tmp_path / "copy")
-    with pytest.warns(UserWarning, match="of what is known of strips.one..shift_X_m: it was foggy, and late"):
+    with pytest.warns(UserWarning, match="of the prior information on strips.one..shift_X_m: it was foggy, and late"):
         read = read_block(tmp_path / "copy")
     for got, want in zip(read.more, known, strict=True):
         assert isinstance(got, KnownParameters)
@@ -339,5 +339,5 @@ def test_incomplete_annotations_and_columns_are_refused():
 
     with pytest.raises(TypeError, match=r"Open\.extra: shape 'n k' has no fixed number of components"):
         columns_of(Open)
-    with pytest.raises(TypeError, match=r"Short\.columns: value has 1 numbers a row"):
+    with pytest.raises(TypeError, match=r"Short\.columns: value has 1 numbers per row"):
         columns_of(Short)

@@ -282,7 +282,7 @@ def test_unknown_modes_are_refused(write_folder):
 
 
 def test_direct_needs_an_orientation_of_every_image(write_folder):
-    with pytest.raises(BlockError, match=r"image c has neither station and attitude nor .*\(1 image is so\)"):
+    with pytest.raises(BlockError, match=r"image c has neither station and attitude nor .*\(1 such image\)"):
         read_block(write_folder(mode("direct")))
 
 

@@ -183,7 +183,7 @@ def test_tracks_of_little():
     np.testing.assert_array_equal([one.image, one.feature, one.point], [[0, 1, 2], [2, 0, 0], [0, 0, 0]])
     with pytest.raises(ValueError, match="first < second"):
         tracks([3, 3], [PairMatches(1, 0, np.array([[0, 0]]))])
-    with pytest.raises(ValueError, match="features that are not there"):
+    with pytest.raises(ValueError, match="features out of range"):
         tracks([3, 3], [PairMatches(0, 1, np.array([[0, 3]]))])
     joined = connected_images(5, [PairMatches(1, 3, np.array([[0, 0]])), PairMatches(3, 4, np.array([[0, 0]]))])
     assert [group.tolist() for group in joined] == [[1, 3, 4], [0], [2]]

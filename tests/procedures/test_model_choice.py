@@ -183,7 +183,7 @@ def test_candidates_by_name():
     assert not candidate_of("brown").within(candidate_of("brown"))
     assert not candidate_of("smac:k1").within(candidate_of("brown"))
     for name, message in (
-        ("braun", "no distortion model is called 'braun'; choose one of brown"),
+        ("braun", "unknown distortion model 'braun'; choose one of brown"),
         ("brown:k9", "brown has no coefficient 'k9' to estimate; it has k1"),
         ("smac:k0", "smac has no coefficient 'k0' to estimate"),
     ):
@@ -264,4 +264,4 @@ def test_command_writes_the_table_and_says_the_choice(block, perfect, tmp_path, 
     assert first["unit"] == "mm"
     code, _, errors = run(monkeypatch, capsys, "models", tmp_path / "block", "--models", "braun", "--out", out)
     assert code == 2
-    assert "no distortion model is called 'braun'" in errors
+    assert "unknown distortion model 'braun'" in errors

@@ -115,10 +115,13 @@ def test_external_reliability_is_an_undetected_error_adjusted_in() -> None:
 @pytest.mark.parametrize(
     ("call", "sentence"),
     [
-        (lambda a, d: station_bias(a, d, "camera"), "per camera is unknown: choose among block, strip, image"),  # type: ignore[arg-type]
+        (
+            lambda a, d: station_bias(a, d, "camera"),
+            "unknown unit camera of a station bias: choose among block, strip, image",
+        ),  # type: ignore[arg-type]
         (lambda a, d: station_bias(a, d, "strip"), "no image with an observed station has a strip"),
         (lambda a, d: external_reliability(a, d, 0.0), "must be positive, got 0.0"),
-        (lambda a, d: d.row("interior[one].k9"), "no estimate interior"),
+        (lambda a, d: d.row("interior[one].k9"), "unknown estimate interior"),
     ],
 )
 def test_mistakes_get_a_sentence(call, sentence: str) -> None:

@@ -92,7 +92,7 @@ def test_cells_go_from_edge_to_edge_and_are_60_by_40():
 
 def test_what_it_cannot_tell_is_said():
     result = adjusted("cross")
-    with pytest.raises(InputError, match="there is no camera two: the block has one"):
+    with pytest.raises(InputError, match="unknown camera two: the block has one"):
         sigma_map(result, "two")
     with pytest.raises(InputError, match="distance_m must be positive, got -3"):
         sigma_map(result, distance_m=-3.0)

@@ -127,7 +127,7 @@ def observations_of(
     place = {label: k for k, label in enumerate(labels)}
     for k in known:
         if missing := [label for label in k.labels if label not in place]:
-            raise BlockError(f"{missing[0]} is no parameter of this block, which has {', '.join(list(place)[:4])} ...")
+            raise BlockError(f"unknown parameter {missing[0]}; the block has {', '.join(list(place)[:4])} ...")
     sets = [JointPrior(np.array([place[x] for x in k.labels]), k.value, k.covariance) for k in known]
     for n, (parameters, value, covariance) in enumerate([*together, *sets]):
         size = len(parameters)
@@ -177,12 +177,14 @@ def _check(rows: AbstractObservations, block: Block) -> None:
         size = {"image": len(block.images), "point": len(block.points)}.get(what)
         index = np.asarray(index)
         if index.dtype.kind not in "iu":
-            raise BlockError(f"{rows.group}: a row refers to indices of {what}s, not by {index.dtype}")
+            raise BlockError(f"{rows.group}: indices of {what}s must be integers, got {index.dtype}")
         if size is None:
             continue
         bad = np.flatnonzero(((index < 0) | (index >= size)).reshape(len(index), -1).any(axis=1))
         if len(bad):
-            raise BlockError(f"{rows.group}, row {bad[0]}: there is no {what} {index[bad[0]]} among {size}")
+            raise BlockError(
+                f"{rows.group}, row {bad[0]}: {what} {index[bad[0]]} is out of range, the block has {size}"
+            )
 
 
 def group_of(

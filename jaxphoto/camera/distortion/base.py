@@ -171,7 +171,7 @@ def check_positive(distortion: AbstractDistortion, field: str, meaning: str) -> 
     """Raise ValueError if the constant `field` of a model is not positive; traced values are not checked."""
     value = getattr(distortion, field)
     if not isinstance(value, jax.core.Tracer) and not value > 0:
-        raise ValueError(f"{field} of {type(distortion).__name__}, {meaning}, is positive and in mm, got {value}")
+        raise ValueError(f"{field} of {type(distortion).__name__}, {meaning}, must be positive (mm), got {value}")
 
 
 class AbstractBrown(AbstractDistortion):

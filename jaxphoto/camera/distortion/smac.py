@@ -44,7 +44,7 @@ class Smac(AbstractDistortion):
 
     def __check_init__(self) -> None:
         if self.sign not in ("subtract", "add"):
-            raise ValueError(f'the sign of SMAC is "subtract" or "add", got {self.sign!r}')
+            raise ValueError(f'the sign of SMAC must be "subtract" or "add", got {self.sign!r}')
 
     @property
     def signum(self) -> float:
