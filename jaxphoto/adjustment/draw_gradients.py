@@ -43,7 +43,7 @@ Varying = dict[str, Array]
 
 
 class Common(eqx.Module):
-    """Data common to all draws, in padded sizes; image rows (2, rows) by row of the block."""
+    """Data common to all draws, padded. `xy` and `sigma_xy` have one column per image row of the block."""
 
     at: Linearised
     """Nominal optimum, the start of all draws."""

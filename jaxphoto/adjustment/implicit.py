@@ -55,8 +55,7 @@ def _derivative(values: PaddedValues, direction: Any, at: Increments, structure:
     moved, still = eqx.partition(values, jax.tree.map(lambda t: t is not None, direction, is_leaf=lambda t: t is None))
     _, change = jax.jvp(lambda m: gradient(at, eqx.combine(m, still)), (moved,), (direction,))
     right, unravel = ravel_pytree(jax.tree.map(lambda c, k: -c * k, change, scale))
-    # Use one flat vector: the transposed solution requires that its right-hand side depends on the direction as a
-    # whole.
+    # Use one flat vector: JAX can transpose the linear solve only if the entire right-hand side depends on the tangent.
     flat = lambda tree: ravel_pytree(tree)[0]  # noqa: E731
 
     # jit caches the trace for the product and for its inverse.

@@ -29,7 +29,7 @@ from jaxphoto.rotation import small_angles
 
 # Maximum number of factors tried before the remaining draws are adjusted individually.
 _FACTORS = 3
-# Leaves of the values with start values, and leaves derived from the start.
+# Leaves of `Values` that hold start values; leaves that define the datum and are computed from the start values.
 _STARTS, _DATUM = {"position", "rotation", "shared", "points"}, {"datum_eop", "datum_points"}
 
 

@@ -90,10 +90,10 @@ def program_of(plain: PlainProgram) -> jax.stages.Compiled:
 
 def _type(aval: Any) -> list:
     if type(aval) is not jax.core.ShapedArray:
-        raise TypeError(f"{type(aval)} cannot be kept")
+        raise TypeError(f"cannot serialise a program with arguments of {type(aval)}; compile it in each process")
     kind = np.dtype(aval.dtype)
     if np.dtype(kind.str) != kind:
-        raise TypeError(f"numbers of type {kind} cannot be kept")
+        raise TypeError(f"cannot serialise a program with arrays of type {kind}; compile it in each process")
     return [list(aval.shape), kind.str, bool(aval.weak_type)]
 
 
@@ -105,7 +105,8 @@ def _aval(text: list) -> Any:
 def _sharding(sharding: Any) -> dict[str, Any]:
     """Describe the placement of an array in JSON."""
     if sharding.memory_kind != "device":
-        raise TypeError(f"memory of kind {sharding.memory_kind} cannot be kept")
+        kind = sharding.memory_kind
+        raise TypeError(f"cannot serialise a program with arrays in memory of kind {kind}; compile it in each process")
     if isinstance(sharding, SingleDeviceSharding):
         (device,) = cast(Any, sharding.device_set)
         return {"device": device.id}
@@ -116,7 +117,7 @@ def _sharding(sharding: Any) -> dict[str, Any]:
         part is None or isinstance(part, str) or (type(part) is tuple and all(isinstance(n, str) for n in part))
         for part in sharding.spec
     ):
-        raise TypeError(f"{sharding} cannot be kept")
+        raise TypeError(f"cannot serialise a program with arrays of sharding {sharding}; compile it in each process")
     mesh = sharding.mesh
     return {
         "devices": [device.id for device in np.asarray(mesh.devices, object).ravel()],

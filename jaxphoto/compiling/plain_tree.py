@@ -26,7 +26,7 @@ def to_json(tree: Any) -> Any:
     names = _fields(type(tree))
     name = f"{type(tree).__module__}:{type(tree).__qualname__}"
     if names is None or _class(name) is not type(tree):
-        raise TypeError(f"{type(tree)} cannot be kept")
+        raise TypeError(f"cannot serialise {type(tree)}; use a NamedTuple or an equinox Module defined at module level")
     return {name: [to_json(getattr(tree, field)) for field in names]}
 
 

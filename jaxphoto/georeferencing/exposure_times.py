@@ -16,7 +16,7 @@ LEAP_SECONDS = 18.0
 WEEK_S = 604_800.0
 _HOUR_S, DAY_S = 3600.0, 86_400.0
 ZONES_S = 15 * _HOUR_S
-"""Maximum offset of a clock from UTC (s); time zones reach 14 hours ahead."""
+"""Maximum offset of a clock from UTC (s); time zones extend to UTC+14."""
 # Maximum error (s) of a camera's clock apart from time zone and leap seconds.
 _NEAR_ZONE_S = 300.0
 # Step of time zones (s): a quarter of an hour.
@@ -24,7 +24,7 @@ _ZONE_S = 900.0
 # Maximum number of time differences; with more photographs every n-th is used.
 _MOST_PAIRS = 2_000_000
 WORSE = 1.5
-"""Ratio of median position differences to the best offset's above which a clock offset is rejected."""
+"""Maximum ratio of the median position difference of a clock offset to that of the best clock offset."""
 
 
 def gps_seconds(at: datetime) -> float:

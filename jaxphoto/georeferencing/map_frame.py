@@ -15,8 +15,8 @@ from pyproj.transformer import TransformerGroup
 
 from jaxphoto.errors import InputError
 
-# Half of the step along a grid line that determines its direction (m, degrees): rounding error 1e-11 rad, curvature
-# less.
+# Half of the step along a grid line that determines its direction (m, degrees): the rounding error is 1e-11 rad, the
+# effect of curvature smaller.
 _STEP_M, _STEP_DEG = 50.0, 5e-4
 # Declaration of ellipsoidal heights in a block and in a flight, for messages.
 _ON_ELLIPSOID = 'vertical = "ellipsoidal" in block.toml, --heights ellipsoid of a flight'

@@ -20,7 +20,8 @@ _EARTH_M = 6_371_000.0
 _FAR_M = 50_000.0
 # Maximum |latitude| and |longitude| (degrees) of positions treated as (0, 0): some hundred metres.
 _NOWHERE_DEG = 1e-3
-# Maximum difference (m) of equal heights above take-off; minimum difference (m) of two different zero heights.
+# Maximum difference (m) of an altitude that equals the height above take-off; minimum difference (m) of two different
+# zero heights.
 _SAME_M, _APART_M = 0.5, 5.0
 
 

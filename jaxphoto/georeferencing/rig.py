@@ -29,9 +29,9 @@ from jaxphoto.rotation import rotate, small_angles, small_rotation
 
 
 class RigCamera(AbstractParameters):
-    """Position and orientation of a camera relative to the reference camera of its rig. The reference camera has none.
+    """Position and orientation of a camera relative to the reference camera of its rig, which has no `RigCamera`.
 
-    `place`: projection centre in the axes of the reference camera (m: x right, y up, z out of its back). `turn`:
+    `place`: projection centre in the axes of the reference camera (m: x right, y up, z backwards). `turn`:
     rotation vector (rad) about these axes, `camera_from_reference = small_rotation(turn)`. `delay`: exposure time minus
     exposure time of the reference camera (s).
     """

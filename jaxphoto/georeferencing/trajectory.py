@@ -207,9 +207,10 @@ def _interpolation_error(nodes, values, joined) -> Float[Array, "n 6"]:
 
 
 def _misfit(nodes, values, joined, every: int, start: int) -> tuple[Float[Array, "n 6"], Float[Array, "n"]]:
-    """Return squared errors of a spline through every `every`-th record at the records midway between, and 1 for these.
+    """Return squared errors and weights, by record, of a spline through every `every`-th record.
 
-    Both are zero at other records, and close to a gap.
+    The errors are those at the records midway between, which have the weight 1. Both are zero at other records and
+    close to a gap.
     """
     kept = jnp.arange(start, len(nodes), every)
     middle = kept[:-1] + every // 2

@@ -67,7 +67,7 @@ class StripSpline(NamedTuple):
 
     @classmethod
     def constant(cls, first: int) -> "StripSpline":
-        """Create a spline of one knot (constant error)."""
+        """Create a spline with a single knot: a constant trajectory error."""
         return cls(first, 1, 0.0, 1.0)
 
     @property

@@ -12,7 +12,7 @@ _FEWEST = 4
 def counts_in_radians(yaw: Float[np.ndarray, "n"], course: Float[np.ndarray, "n"]) -> bool:
     """Return True if `yaw` agrees with the `course` (rad) when interpreted in radians, but not in degrees.
 
-    Valid degrees are never misclassified: they agree with the course in any wind, because aircraft do not fly sideways.
+    Valid degrees are never misclassified: crab angles are far below 90 degrees in any wind.
     """
     if len(course) < _FEWEST or np.abs(yaw).max() > 2 * np.pi:
         return False

@@ -23,7 +23,7 @@ _LEFT = _MONOMIALS[10:]
 
 
 def _collected() -> Float[np.ndarray, "64 20"]:
-    """Collect products of three of (x, y, z, 1) by monomial (columns)."""
+    """Return the matrix that assigns each product of three factors of (x, y, z, 1) (row) to its monomial (column)."""
     factors = ((1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0))
     table = np.zeros((64, 20))
     for row, three in enumerate(product(factors, repeat=3)):

@@ -211,7 +211,7 @@ _MOST_STEPS = 100
 # their facets are vertical.
 _FAR = 4 * np.stack([np.cos([0.5, 2.6, 4.7]), np.sin([0.5, 2.6, 4.7])], axis=1)
 _LIFT = 1e7
-# Ratio of a depth to the largest lifted corner below which it is rounding.
+# Ratio of a depth to the largest lifted corner below which it is a rounding error.
 _ROUNDING = 1e-14
 
 
@@ -277,23 +277,24 @@ def _barycentric(at: Float[Array, "3 2"], place: Float[Array, "2"]) -> Float[Arr
 
 
 _DIRECTIONS = np.pi * np.arange(12) / 12
-# Offsets of the dividing line, in units of the farthest point.
+# Offsets of the dividing line, in units of the distance of the farthest point.
 _OFFSETS = np.array([-0.45, -0.3, -0.15, 0.0, 0.15, 0.3, 0.45])
 # Minimum number of points per side: two more than the coefficients of a plane.
 _FEWEST = 5
-# Minimum determinant of a side's normal matrix, relative to points all around: smaller ones are collinear.
+# Minimum determinant of the scatter matrix per n^2, in units of the distance of the farthest point to the power of 4:
+# below it, points are collinear.
 _LINE = 1e-4
-# Maximum ratio of the variance of two planes to the variance of one surface: divided by a line; divided by height
-# (random points reach a quarter).
+# Maximum ratio of the residual variance of two planes to that of one surface, for points divided by a line and by
+# height (random points reach 0.25).
 _BY_LINE, _BY_HEIGHT = 0.4, 0.1
 
 
 @eqx.filter_jit
 def lie_on_two_planes(near: Neighbours, variance: Float[Array, "places"]) -> Bool[Array, "places"]:
-    """Return True where two planes reduce the `variance` (m^2) of one surface by far.
+    """Return True where two planes have a much smaller residual variance than one surface, `variance` (m^2).
 
-    Divided by a line (12 directions and 7 offsets from the position): to less than 0.4; divided at the largest gap
-    between heights, as at a wall: to less than 0.1.
+    The ratio is less than 0.4 if a line divides the points (12 directions and 7 offsets from the position), or less
+    than 0.1 if the largest gap between heights divides them, as at a wall.
     """
     return jax.vmap(_two_planes)(near, variance)
 
@@ -414,13 +415,13 @@ _BOUND = 1.959963984540054
 
 # Number of points for slope, curvature and roughness: minimum, and multiple of the number of points used.
 WIDE, TIMES = 24, 3
-# Number of horizontal standard deviations within which all available points are used as well.
+# Number of horizontal standard deviations within which all available points are also used.
 APART = 4.75
 # Quantiles of the normal distribution: probabilities 1/20 and 1/1000.
 _SELDOM, _HARDLY = 1.645, 3.09
-# Ratio of residuals to the lidar's noise above which there is no surface.
+# Ratio of residuals to the lidar's noise above which the points do not define a surface.
 _ROUGH = 3.0
-# Standard deviation of the moving least-squares weights, in units of the farthest point.
+# Standard deviation of the moving least-squares weights, in units of the distance of the farthest point.
 _WIDTH = 0.5
 
 

@@ -108,7 +108,7 @@ def _points_of_noise(grid: Grid, sigma_xy_m: float) -> int:
 
 
 def _points_of_radius(grid: Grid, xy: np.ndarray, radius_m: float, wide: int) -> int:
-    """Return a number of nearest points that is `TIMES` the number within the radius, at every position."""
+    """Return a neighbour count of at least `TIMES` the maximum number of points within the radius of any position."""
     while wide < len(grid):
         within = (nearest(grid, xy, wide).distance <= radius_m).sum(axis=1).max(initial=0)
         if TIMES * within <= wide:

@@ -38,7 +38,7 @@ class Plane(eqx.Module):
     sigma0: float
     """Ratio of the points' scatter to the stated standard deviations: 1 if these and the plane are correct."""
     inliers: Bool[np.ndarray, "n"]
-    """True for the points used."""
+    """True for inliers."""
 
 
 def fit_plane(xyz: Float[np.ndarray, "n 3"], sigma_xy_m: float, sigma_z_m: float) -> Plane:
@@ -82,8 +82,8 @@ def fit_plane(xyz: Float[np.ndarray, "n 3"], sigma_xy_m: float, sigma_z_m: float
 def point_sigma(sigma_xy_m: float, sigma_z_m: float) -> Float[np.ndarray, "3"]:
     """Return standard deviations (m) of a laser point in X, Y and Z. Raises InputError for invalid ones.
 
-    Zero in X and Y is replaced by a thousandth of the value in Z: the plane is then a regression of Z on X and Y, to a
-    millionth.
+    Zero in X and Y is replaced by a thousandth of the value in Z: the plane then equals the regression of Z on X and Y
+    to 1e-6.
     """
     if not (sigma_z_m > 0 and sigma_xy_m >= 0):
         raise InputError(

@@ -58,12 +58,12 @@ from jaxphoto.unknowns import Unknowns
 
 Interpolation = Literal["weighted", "plane"]
 
-# Ratio of candidates to points used: enough for a slope, and if half of them are hidden.
+# Ratio of candidates to points used: sufficient for a slope, even if half of them are hidden.
 _CANDIDATES = 3
-# Number of iterations. The first position has an error of half a cell; each iteration multiplies it by slope times run.
+# Number of iterations. The first position has an error of half a cell; each iteration multiplies it by slope * run.
 _ROUNDS = 5
-# Ratio of residuals to the lidar's noise: quantile for one false alarm in 1000, and limit above which there is no
-# surface.
+# Ratio of residuals to the lidar's noise: quantile for one false alarm in 1000, and limit above which the points do not
+# define a surface.
 _HARDLY, _ROUGH = 3.09, 3.0
 # Number of features processed at a time (fits the CPU cache); minimum batch size.
 _AT_ONCE, _FEW = 512, 64
@@ -138,7 +138,7 @@ def pseudo_control_points(
 
     `xyz` is differentiable with respect to `interior`, `exterior` and `xy`, exactly except where the set of nearest
     points changes; `sigma_z` and the other properties are not. Raises InputError for an unknown interpolation, a radius
-    in `settings`, and no feature. Source: paper 001, section 3.1.
+    in `settings`, and an empty `xy`. Source: paper 001, section 3.1.
     """
     settings = HeightSettings() if settings is None else settings
     if interpolation not in get_args(Interpolation):

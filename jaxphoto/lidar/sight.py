@@ -72,7 +72,8 @@ def first_met(
 ) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
     """Return X and Y (m) where the ray, from the camera downwards, first meets a cell of its height; True if any.
 
-    The step is half a cell in plan, so the mean error is a quarter. A ray that does not descend has no intersection.
+    The step is half a cell in plan, so the mean error is a quarter of a cell. A ray that does not descend has no
+    intersection.
     """
     down = direction[2] < 0
     run = direction[:2] / jnp.where(down, direction[2], -1.0)
@@ -124,7 +125,7 @@ def levels(
 
 
 def surrounded(q: Float[ArrayLike, "m 2"], which: Bool[ArrayLike, "m"]) -> Bool[Array, ""]:
-    """Return True if the points `which` surround q = 0: each has another one within less than half a turn.
+    """Return True if the points `which` surround q = 0: adjacent directions differ by less than 180 degrees.
 
     Points at q = 0 are ignored.
     """

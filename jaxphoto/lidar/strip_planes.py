@@ -172,7 +172,7 @@ class CellTally:
 
 # Moderated variances (empirical Bayes) from few values each.
 #
-# A variance s^2 with v degrees of freedom is too small as often as too large, but too small ones get large weights.
+# A variance s^2 estimated with v degrees of freedom may be too small, and its observation then gets too large a weight.
 # If true variances follow a scaled inverse chi-squared distribution with v0 degrees of freedom about s0^2, the expected
 # variance given s^2 is
 #
@@ -345,8 +345,8 @@ def variance_of_plane(patches: StripPatches, which: np.ndarray, place: np.ndarra
 
 # Object points on planes fitted to one strip's surrounding returns.
 #
-# The plane is fitted to the returns in a window of one cell about the point (`planes_of`): in its centre a plane is
-# most accurate, and curvature has the smallest effect.
+# The plane is fitted to the returns in a window of one cell about the point (`planes_of`): at the window's centre
+# the plane is most accurate, and curvature has the smallest effect.
 
 
 class PointsOnPlanes(NamedTuple):
@@ -405,10 +405,11 @@ def on_planes(patches: StripPatches, points: Float[np.ndarray, "points 3"]) -> P
 
 # Object points on breaklines: two smooth faces of a strip that intersect, such as the roof faces at a ridge.
 #
-# The returns in a window of two cells about a point are divided by the straight line, of any direction, that minimises
-# the residuals of two planes; then by the intersection of these planes, until it does not change. The point lies on
-# both planes: it remains free only along the line. Source: Habib, Ghanma, Morgan and Al-Ruzouq (2005), Photogrammetric
-# and lidar data registration using linear features, which also derives lidar lines from roofs.
+# The returns in a window of two cells about a point are divided by a line, and a plane is fitted to each side. The
+# initial line passes through the point, in the trial direction with the smallest residuals. It is then replaced by the
+# intersection of the two planes, iterated to convergence. The point is constrained to both planes and is free only
+# along their intersection. Source: Habib, Ghanma, Morgan and Al-Ruzouq (2005), Photogrammetric and lidar data
+# registration using linear features, which also derives lidar lines from roofs.
 
 # Trial directions of the dividing line; maximum number of iterations.
 _DIRECTIONS = np.pi * np.arange(12) / 12

@@ -75,7 +75,7 @@ def moved_table(result: Simultaneous) -> pd.DataFrame:
     """
     after, before = result.adjusted, result.before
     sigma = np.asarray(Tables(after).covariance.shared_sigma)
-    # Missing values before the adjustment are the scanner parameters, which are zero.
+    # Only scanner parameters have no value before the adjustment; use zero.
     then, now = (dict(zip(a.parameters, np.asarray(a.values.shared).tolist(), strict=True)) for a in (before, after))
     rows: list[tuple] = []
     for path, s in zip(after.structure.labels, sigma, strict=True):

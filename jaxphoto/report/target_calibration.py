@@ -121,9 +121,9 @@ def write_calibration(
     """Write the results of the adjustment, photographs.csv, photographs.html and a picture of each image.
 
     summary.json also contains rms_px, n_images_used, n_image_points, added_sigma_px, settled, left_out, removed and
-    `start`, a sentence on the initial camera. `pictures`: functions by image that read the grey values, also of skipped
-    images, whose detected targets are in `detections`. `notes` become findings. `beside` writes additional files into
-    the folder. Raises InputError if `directory` contains anything but an earlier result.
+    `start`, a sentence on the initial camera. `pictures` maps images, including skipped ones, to functions that read
+    their grey values. `detections`: targets detected in skipped images. `notes` become findings. `beside` writes
+    additional files into the folder. Raises InputError if `directory` contains anything but an earlier result.
     """
     began = time.perf_counter()
     tables = Tables(calibration.adjusted)

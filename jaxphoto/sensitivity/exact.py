@@ -173,7 +173,7 @@ class Sensitivity(eqx.Module):
 
     @property
     def fixed(self) -> Float[np.ndarray, "estimates fixed"]:
-        """Derivatives by the fixed parameters and coordinates, in the order of `fixed_labels`."""
+        """Derivatives with respect to the fixed parameters and coordinates, in the order of `fixed_labels`."""
         return self.by_fixed()[0]
 
     @property

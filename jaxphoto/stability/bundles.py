@@ -156,8 +156,8 @@ class BundleOffsets(eqx.Module):
     """Offsets (mm) of two bundles after alignment, on the virtual image plane of the first bundle.
 
     `alignment`: unknowns of the method (small rotation in rad, position in units of the object distance). `jacobian`:
-    dv/dp of the offsets (x, then y, point by point) with respect to the `parameter_vector` of the first and then of the
-    second interior orientation, including the change of the optimal alignment; used to propagate covariances.
+    derivative of the offsets (x, y of each point) with respect to the `parameter_vector` of the first and then of the
+    second interior orientation. It includes the change of the optimal alignment and is used for covariance propagation.
     """
 
     points: Float[Array, "points 2"]

@@ -98,7 +98,7 @@ def _pairs(image: Int[np.ndarray, "k rows"], width: int) -> Int[np.ndarray, "pai
 
 
 def _row_places(g: ObservedGroup, places: Places, n_points: int) -> Int[np.ndarray, "rows"]:
-    """Return the position of each row of a group stored by point in (rows, points)."""
+    """Return the flat index of each row of a group in its padded (rows, points) array."""
     order = np.argsort(g.point[0], kind="stable")
     of_point = g.point[0][order]
     below = np.arange(len(order)) - np.searchsorted(of_point, of_point)

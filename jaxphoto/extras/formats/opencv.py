@@ -135,7 +135,7 @@ def _matrix(source: CameraSource, storage: Any, key: str) -> np.ndarray:
 
 
 def _parts(sensor: Sensor, interior: InteriorOrientation) -> tuple[bool, list[float], list[float]]:
-    """Return True for a fisheye, the camera matrix in row-major order, and the coefficients that OpenCV requires."""
+    """Return (is_fisheye, camera matrix in row-major order, distortion coefficients required by OpenCV)."""
     fx, fy, column, row = pixels_of(interior, sensor)
     fisheye = isinstance(interior.distortion, OpenCvFisheye)
     values = [float(getattr(interior.distortion, k)) for k in (FISHEYE_TERMS if fisheye else OPENCV_ORDER)]

@@ -238,7 +238,8 @@ def unknown_sections(block: Block) -> dict[str, Any]:
         }
         if any(type(parameters).owner in _ONE for parameters in owners.values()):
             if set(tables) != {""}:
-                raise BlockError(f"{kind} belongs to the whole block, whose name is '', not {', '.join(tables)}")
+                given = ", ".join(tables)
+                raise BlockError(f"{kind} applies to the whole block, but is given for {given}; use the single key ''")
             tables = tables[""]
         if tables:
             written[kind] = tables

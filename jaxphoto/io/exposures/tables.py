@@ -276,7 +276,8 @@ def _system(file: str, words: str) -> ControlSystem:
     system = system_of(words, file)
     if system.code is None or system.crs is None or system.crs.is_geocentric:
         raise InputError(
-            f"{file}: its system ({system.name}) is not a map with an EPSG code; write for example EPSG:25832"
+            f"{file}: coordinate reference system {system.name} is geocentric or has no EPSG code; give the EPSG code "
+            "of map coordinates, for example EPSG:25832"
         )
     return system
 
