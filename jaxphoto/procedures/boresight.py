@@ -405,7 +405,7 @@ def _mount_prior(prior: Mount, number: int) -> Mount:
 def _require(block: Block, number: int) -> None:
     """Raise BlockError, with the cure, if `block` lacks observations for step `number`."""
     if number not in STEPS:
-        raise ValueError(f"the steps of the boresight are 1, 2, 3 and 4, got {number!r}")
+        raise ValueError(f"unknown boresight step {number!r}; choose 1, 2, 3 or 4")
     what = f"step {number} of the boresight needs"
     if number < 4 and not len(block.control.who) + len(block.fixed.who):
         raise BlockError(f"{what} control points and the block has none: add control_points.csv")
@@ -415,7 +415,7 @@ def _require(block: Block, number: int) -> None:
         raise BlockError(f"{what} camera stations and the block has none: add stations.csv")
     strips = set(block.image_strip) - {""}
     if not strips:
-        raise BlockError(f"{what} strips and the images name none: add the column strip to images.csv")
+        raise BlockError(f"{what} strips and the images have none: add the column strip to images.csv")
     if len(strips) == 1:
         raise BlockError(
             f"{what} two strips or more and all images are of strip {strips.pop()}, in which a misalignment looks like "
@@ -439,7 +439,7 @@ def _require(block: Block, number: int) -> None:
         held = np.unique(np.concatenate([block.control.who, block.fixed.who]).astype(int))
         if len(lone := held[rays[held] < 2]):
             raise BlockError(
-                f"step 4 of the boresight takes the control away, but control point {block.points[lone[0]]} is seen by "
+                f"step 4 of the boresight removes the control, but control point {block.points[lone[0]]} is seen by "
                 f"fewer than two images ({len(lone)} such points): measure it in two or more, or remove it"
             )
 
@@ -457,7 +457,7 @@ def check_fit(adjusted: Adjustment, cov: Covariance) -> tuple[list[str], bool]:
     test = f"(chi-square test, p = {p:.2g})"
     large = p < LEVEL and sigma0 > LARGE_SIGMA0
     if large:
-        sigma0_message += f" contradicts the a priori standard deviations {test}: observations are worse than announced"
+        sigma0_message += f" contradicts the a priori standard deviations {test}: observations are worse than stated"
     elif p < LEVEL:
         sigma0_message += (
             f" is above what the a priori standard deviations announce {test}: enlarge them by that factor"
