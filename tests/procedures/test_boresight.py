@@ -205,7 +205,7 @@ def test_priors_of_each_step():
     np.testing.assert_array_equal(fourth.start.unknowns.strips["b"].drift, 0.01)
     # What is not kept falls back to the block's own start.
     np.testing.assert_array_equal(fourth.start.unknowns.strips["a"].shift, 0.0)
-    with pytest.raises(ValueError, match="1, 2, 3 and 4"):
+    with pytest.raises(ValueError, match="choose 1, 2, 3 or 4"):
         step_block(made, 5)
 
 

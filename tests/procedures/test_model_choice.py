@@ -185,7 +185,7 @@ def test_candidates_by_name():
     for name, message in (
         ("braun", "no distortion model is called 'braun'; choose one of brown"),
         ("brown:k9", "brown has no coefficient 'k9' to estimate; it has k1"),
-        ("smac:k0", "smac has no coefficient 'k0' to estimate"),
+        ("smac:k0", "unknown coefficient 'k0' of smac"),
     ):
         with pytest.raises(InputError, match=message):
             candidate_of(name)
