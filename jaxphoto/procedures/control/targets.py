@@ -387,8 +387,8 @@ def control_block_with_targets(
         if p not in distant
     ]
     texts += [
-        f"what was found for check point {ids[p]} lies {off:.2g} m from its position: check that it is its target, or "
-        "mark it by hand"
+        f"the detection of check point {ids[p]} is {off:.2g} m from its position: check that it is its target, or mark "
+        "it by hand"
         for p, off in distant.items()
         if points.check[p]
     ]
