@@ -85,8 +85,8 @@ def test_a_turn_that_ends_where_it_began_is_no_jump_of_a_clock():
 
 def test_a_trajectory_that_begins_late_or_ends_early():
     message = said(CLOUD, flown(TIME[1200:7200]))
-    assert "from 10.000 to 80.000 s, and the trajectory, from 12.000 to 71.990 s" in message
-    assert "begins 2.000 s later and ends 8.010 s earlier; give the trajectory of the whole flight" in message
+    assert "from 10.000 to 80.000 s, the trajectory from 12.000 to 71.990 s" in message
+    assert "begins 2.000 s later and ends 8.010 s earlier); give the trajectory of the whole flight" in message
     message = said(CLOUD, flown(TIME[:7200]))
     assert message.startswith("laser points of strip 2 were") and "begins" not in message and "UTC" not in message
     # A cloud in GPS time, a trajectory in UTC.
