@@ -164,7 +164,9 @@ def test_poorly_surveyed_points_of_a_small_site_still_bring_the_block(sigma_m):
 def test_heights_that_nobody_surveyed_cost_a_sentence(marked):
     xyz = marked.control.points.coordinates.copy()
     xyz[:, 2] = 0.0
-    with pytest.raises(InputError, match=r"do not fit their coordinates.*all 9 surveyed heights are 0 m; where nobody"):
+    with pytest.raises(
+        InputError, match=r"do not fit their coordinates.*all 9 surveyed heights are 0 m; if they were not surveyed"
+    ):
         found_in(marked, with_coordinates(marked.control, xyz))
 
 
