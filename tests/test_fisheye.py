@@ -154,7 +154,7 @@ def test_it_is_not_oriented_from_nothing(tmp_path):
     folder = folder_of(tmp_path / "dome", orientations=False)
     (folder / "control_points.csv").unlink()
     with pytest.raises(
-        BlockError, match=r"camera dome has the projection equidistant, .* perspective cameras only: give"
+        BlockError, match=r"camera dome has the projection equidistant, .* needs a perspective camera: give"
     ):
         jaxphoto.adjust(jaxphoto.read_block(folder))
 

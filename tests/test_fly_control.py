@@ -66,7 +66,7 @@ def test_a_flight_is_brought_onto_targets_that_it_finds(flown, tmp_path, monkeyp
 @pytest.mark.parametrize(
     ("change", "options", "message"),
     [
-        (lambda t: t, (), "does not say the coordinate system of its points"),
+        (lambda t: t, (), "does not state the coordinate system of its points"),
         (lambda t: t, (), "they would fit"),
         (lambda t: t.rename(columns={"X_m": "Y_m", "Y_m": "X_m"}), ("--control-epsg", CODE), "coordinates exchanged"),
         (lambda t: t, ("--control-epsg", CODE + 1), "would fit EPSG:32633"),

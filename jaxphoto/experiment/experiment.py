@@ -131,7 +131,7 @@ def run_experiment(
             for (row, column), value in measure(Results(adjusted, variants)).items()
         ]
     if not first:
-        raise InputError(f"{folder}: no layout could be adjusted; the first says: {failures[0]}")
+        raise InputError(f"{folder}: no layout could be adjusted; first error: {failures[0]}")
     cells = pd.DataFrame(rows, columns=["table", "row", "column", "layout", "value"])
     return Run(experiment, cells, first, tuple(failures))
 
@@ -172,7 +172,7 @@ def _adjusted(block: Block, sizes: PaddedSizes) -> Tables:
 def _recipe(variant: Variant, folder: Path) -> Recipe:
     path = folder / variant.file
     if not path.is_file():
-        raise InputError(f"there is no recipe {path}; add it, or correct the variant's file")
+        raise InputError(f"recipe not found: {path}; add it, or correct the variant's file")
     values = read_toml(path)
     return recipe_from(_merged(values, variant.recipe), f"{folder.name}/{variant.file}")
 
@@ -263,13 +263,13 @@ def find_experiments(directory: Path, name: str) -> list[Path]:
     known = sorted(path.parent for path in directory.glob(f"*/{FILE}"))
     if not known:
         raise InputError(
-            f"{directory} holds no experiments (folders with {FILE}); go to the folder that has experiments/, name it "
-            "with --experiments, or write those of the papers there first (jaxphoto example experiments)"
+            f"{directory} contains no experiments (folders with {FILE}); change to the folder that has experiments/, "
+            "name it with --experiments, or write those of the papers there first (jaxphoto example experiments)"
         )
     chosen = known if name == "all" else [path for path in known if path.name == name]
     if not chosen:
         names = ", ".join(path.name for path in known)
-        raise InputError(f"there is no experiment {name} in {directory}; choose {names} or all")
+        raise InputError(f"unknown experiment {name} in {directory}; choose {names} or all")
     return chosen
 
 
@@ -278,7 +278,7 @@ def load_experiment(folder: Path) -> Experiment:
     path = folder / FILE
     spec = importlib.util.spec_from_file_location(f"jaxphoto_experiment_{folder.name}", path)
     if spec is None or spec.loader is None or not path.is_file():
-        raise InputError(f"there is no file {path}; an experiment is a folder with {FILE}")
+        raise InputError(f"file not found: {path}; an experiment is a folder with {FILE}")
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)

@@ -255,7 +255,9 @@ def plot_comparison(comparison: pd.DataFrame, table: str, column: str, ax: Axes 
     of = cells[cells["column"] == column]
     if of.empty:
         known = ", ".join(dict.fromkeys(cells["column"]))
-        raise ValueError(f"no column {column!r} of {table!r} is both printed and ours; those that are: {known}")
+        raise ValueError(
+            f"{table!r}: column {column!r} has no printed value with a result of ours; choose among {known}"
+        )
     ax = axes_or_new(ax)
     rows = list(dict.fromkeys(of["row"]))
     _draw_column(ax, of, rows)
@@ -290,7 +292,7 @@ def _both(comparison: pd.DataFrame, table: str) -> pd.DataFrame:
     cells = comparison[(comparison["table"] == table) & (comparison["column"] != MEAN_DIFFERENCE)]
     cells = cells[cells["published"].notna() & cells["ours"].notna()]
     if cells.empty:
-        raise ValueError(f"nothing of {table!r} is both printed and ours")
+        raise ValueError(f"{table!r}: no printed value has a result of ours")
     return cells
 
 
@@ -325,7 +327,7 @@ def plot_agreement(comparison: pd.DataFrame, ax: Axes | None = None) -> Axes:
     Raises ValueError if no computed value has a tolerance.
     """
     if not comparison["within"].ne("").any():
-        raise ValueError("no value that is printed and ours has a tolerance")
+        raise ValueError("no printed value with a result of ours has a tolerance")
     ax = axes_or_new(ax)
     draw_agreement(ax, comparison)
     return ax

@@ -94,9 +94,8 @@ class CoveredTimes:
         every = len({float(first.min()) for first in self._first.values()}) == 1 and len(one) == len(self._first)
         of = "" if every else f" of strip {one[0]}"
         return InputError(
-            f"all laser points{of} have one time, {self._first[one[0]].min():.3f} s, so that nothing says where on "
-            "the trajectory they were measured: take a cloud with the GPS time of each point, or leave the trajectory "
-            "out"
+            f"all laser points{of} have one time, {self._first[one[0]].min():.3f} s, so their positions on the "
+            "trajectory are unknown: use a cloud with the GPS time of each point, or omit the trajectory"
         )
 
     def _outside(self, shift_s: float) -> BlockError | None:
@@ -111,9 +110,9 @@ class CoveredTimes:
         if last < start or first > end or (shift is not None and abs(shift - shift_s) > leap):
             advice = "give the trajectory of this flight, or the difference of the clocks (--trajectory-shift-s)"
             if start + shift_s <= first and last <= end + shift_s:
-                advice = "leave --trajectory-shift-s out, without which all of them lie in it"
+                advice = "omit --trajectory-shift-s: without it the trajectory covers all points"
             elif shift is not None:
-                advice = f"give {option}, which brings all of them into it"
+                advice = f"give {option}: the trajectory then covers all points"
                 if shift % DAY in (0.0, LAS_OFFSET % DAY, -LAS_OFFSET % DAY):
                     advice += f" ({leap} s more if the cloud's clock is UTC, {leap} s less if the trajectory's is)"
             cloud, trajectory = np.array([first, last]), np.array([start, end]) + shift_s
@@ -127,8 +126,8 @@ class CoveredTimes:
         if shift is not None:
             advice += f", or, if one clock is UTC and the other GPS time, {option}"
         return BlockError(
-            f"{self._measured(outside)}: the cloud goes from {first:.3f} to {last:.3f} s, and the trajectory, from "
-            f"{start:.3f} to {end:.3f} s, {' and '.join(gaps)}; {advice}"
+            f"{self._measured(outside)}: the cloud goes from {first:.3f} to {last:.3f} s, the trajectory from "
+            f"{start:.3f} to {end:.3f} s ({' and '.join(gaps)}); {advice}"
         )
 
     def _in_a_gap(self) -> BlockError | None:
@@ -148,8 +147,8 @@ class CoveredTimes:
                     "measured then"
                 )
             return BlockError(
-                f"{gap}, which the scanner crosses as quickly as from one record to the next, so that the trajectory's "
-                f"clock jumps: take {jump:.3f} s off its times from then on, or export it again"
+                f"{gap}, but the scanner moves only as far as between two records: the trajectory's clock jumps. "
+                f"Subtract {jump:.3f} s from its times after the gap, or re-export it"
             )
         return None
 
@@ -182,8 +181,8 @@ class CoveredTimes:
                 last, (a, b) = self._last[strip], there[:2]
                 return BlockError(
                     f"{_strips([strip]) or 'the cloud'} has laser points from {first[a]:.3f} to {last[a]:.3f} s and "
-                    f"from {first[b]:.3f} to {last[b]:.3f} s, and the trajectory has a gap between, as of two flight "
-                    "lines with one point source ID: give each line its own, or the trajectory without the gap"
+                    f"from {first[b]:.3f} to {last[b]:.3f} s, and the trajectory has a gap between, as for two flight "
+                    "lines with one point source ID: give each line its own ID, or use a trajectory without the gap"
                 )
         return None
 

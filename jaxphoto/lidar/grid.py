@@ -75,14 +75,14 @@ def index_cloud(cloud: Cloud | Float[np.ndarray, "n 3"], cell_m: float | None = 
     """
     xyz = np.asarray(cloud.xyz if isinstance(cloud, Cloud) else cloud, float)
     if not len(xyz):
-        raise InputError("the cloud has no points, and an index needs one: check the filters it was read with")
+        raise InputError("the cloud has no points; check the filters used for reading it")
     if not np.isfinite(xyz).all():
         wrong = int(np.argmin(np.isfinite(xyz).all(axis=1)))
         raise InputError(
-            f"point {wrong} of the cloud is {xyz[wrong].tolist()}: leave out coordinates that are no numbers"
+            f"point {wrong} of the cloud is {xyz[wrong].tolist()}: remove points with NaN or infinite coordinates"
         )
     if cell_m is not None and not (np.isfinite(cell_m) and cell_m > 0):
-        raise InputError(f"cell_m is {cell_m}, and a cell needs a positive side in metres")
+        raise InputError(f"cell_m is {cell_m}; give a positive cell size in metres")
     low, high, cell = _extent(xyz[:, :2], cell_m)
     shape = np.maximum(np.ceil((high - low)[::-1] / cell), 1).astype(int)
     place = np.floor((xyz[:, :2] - low) / cell)

@@ -55,14 +55,14 @@ class HeightSettings(eqx.Module):
 
     def __check_init__(self) -> None:
         if self.points < 4:
-            raise InputError(f"points is {self.points}, and heights need 4 points at least: give 4 or more")
+            raise InputError(f"points is {self.points}; heights need 4 or more")
         for name in ("power", "sigma_z_m", "radius_m"):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise InputError(f"{name} is {value}: give a positive number")
         for name in ("sigma_xy_m", "sigma_systematic_m", "leafy_share"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise InputError(f"{name} is {getattr(self, name)}: give a number that is not negative")
+                raise InputError(f"{name} is {getattr(self, name)}: give zero or a positive number")
 
 
 # Local least-squares surface through the points around a position.

@@ -88,10 +88,10 @@ def heights_at(
     """
     settings = HeightSettings() if settings is None else settings
     if method not in get_args(Method):
-        raise InputError(f"the method is {method!r}: choose one of {', '.join(get_args(Method))}")
+        raise InputError(f"unknown method {method!r}; choose one of {', '.join(get_args(Method))}")
     xy = np.asarray(xy, float)
     if xy.ndim != 2 or xy.shape[1] != 2 or not np.isfinite(xy).all():
-        raise InputError("places are rows of X_m and Y_m: give an array of two columns without NaN")
+        raise InputError("invalid places; give an array of two columns, X_m and Y_m, without NaN")
     grid = cloud if isinstance(cloud, Grid) else index_cloud(cloud)
     wide = max(WIDE, TIMES * settings.points, _points_of_noise(grid, settings.sigma_xy_m))
     if settings.radius_m is not None:

@@ -50,7 +50,7 @@ def fit_plane(xyz: Float[np.ndarray, "n 3"], sigma_xy_m: float, sigma_z_m: float
     """
     sigma = point_sigma(sigma_xy_m, sigma_z_m)
     if len(xyz) < 4:
-        raise InputError(f"a plane with a check on it needs 4 laser points, got {len(xyz)}; take a larger patch")
+        raise InputError(f"a plane with redundancy needs 4 laser points, got {len(xyz)}; use a larger patch")
     origin = np.median(xyz, axis=0)
     scaled = (xyz - origin) / sigma
     inliers = np.abs(_start(scaled)) < _CUT
@@ -65,8 +65,8 @@ def fit_plane(xyz: Float[np.ndarray, "n 3"], sigma_xy_m: float, sigma_z_m: float
     noise = n * sigma0**2
     if not squares[1] > 2 * noise + 1e-9 * squares[2]:
         raise InputError(
-            f"the {len(xyz)} laser points lie on a line within their standard deviations and determine no plane; take "
-            "a larger patch"
+            f"the {len(xyz)} laser points lie on a line within their standard deviations and do not determine a "
+            "plane; use a larger patch"
         )
     # Variances of the tilts about both long axes and of the offset, scaled by the errors along these axes.
     variance = sigma0**2 * np.array([s / (s - noise) ** 2 for s in squares[1:]] + [1 / n])
@@ -124,7 +124,9 @@ def _start(scaled: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(normals, axis=1)
     drawn = length > 0
     if not drawn.any():
-        raise InputError(f"the {len(scaled)} laser points lie on a line and determine no plane; take a larger patch")
+        raise InputError(
+            f"the {len(scaled)} laser points lie on a line and do not determine a plane; use a larger patch"
+        )
     normals, corners = normals[drawn] / length[drawn, None], corners[drawn, 0]
     some = scaled[rng.permutation(len(scaled))[:_SCORED]]
     distance = some @ normals.T - np.sum(corners * normals, axis=1)
@@ -187,8 +189,7 @@ def planar_patches(
     """
     if len(xyz) < max(least_points, _SEED):
         raise InputError(
-            f"planar patches of {least_points} points or more were asked of {len(xyz)} laser points; take a larger "
-            "window, or all classes"
+            f"{len(xyz)} laser points, but a planar patch needs {least_points}; use a larger window, or all classes"
         )
     sigma = point_sigma(sigma_xy_m, sigma_z_m)
     distance, near = scipy.spatial.KDTree(xyz).query(xyz, k=_SEED)
@@ -234,7 +235,10 @@ def ridge_line(first: Plane, second: Plane) -> tuple[Float[np.ndarray, "3"], Flo
     length = np.linalg.norm(direction)
     tilt = np.sqrt(np.trace(first.covariance[:3, :3]) + np.trace(second.covariance[:3, :3]))
     if length < _CUT * tilt:
-        raise InputError("the two planes are parallel within their standard deviations and meet in no ridge")
+        raise InputError(
+            "the two planes are parallel within their standard deviations and have no intersection line; choose two "
+            "faces of different slope"
+        )
     direction = direction / length
     middle = (first.centroid + second.centroid) / 2
     rows = np.stack([first.normal, second.normal, direction])

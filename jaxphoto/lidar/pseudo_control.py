@@ -142,9 +142,9 @@ def pseudo_control_points(
     """
     settings = HeightSettings() if settings is None else settings
     if interpolation not in get_args(Interpolation):
-        raise InputError(f"the interpolation is {interpolation!r}: choose one of {', '.join(get_args(Interpolation))}")
+        raise InputError(f"unknown interpolation {interpolation!r}; choose one of {', '.join(get_args(Interpolation))}")
     if settings.radius_m is not None:
-        raise InputError("pseudo control takes the laser points nearest in the image: give points, not radius_m")
+        raise InputError("pseudo control uses the nearest laser points in the image: give points, not radius_m")
     numbers = (
         settings.power,
         settings.sigma_z_m,
@@ -155,7 +155,7 @@ def pseudo_control_points(
     )
     grid, n = cloud if isinstance(cloud, Grid) else index_cloud(cloud), len(xy)
     if not n:
-        raise InputError("there is no feature to give a height to: give one image coordinate at least")
+        raise InputError("no features: give one or more image coordinates")
     rows = np.arange(_room(n)) % n
     one = exterior.position.ndim == 1
     found = call_compiled(
@@ -353,7 +353,7 @@ def pseudo_control_of_block(
     chosen = np.isin(rows.point, points) if points is not None else np.ones(len(rows.point), bool)
     measured = np.flatnonzero(chosen)
     if not len(measured):
-        raise BlockError("no image measured any of the points that are to take heights from the cloud; name others")
+        raise BlockError("none of the points for pseudo control is measured in an image; name others")
     image, point, xy = rows.image[measured], rows.point[measured], to_numpy(rows.xy)[measured]
     exterior = jax.tree.map(lambda v: to_numpy(v)[image], unknowns.exterior)
     camera = np.array(block.image_camera, object)[image]

@@ -72,13 +72,15 @@ def surface_model(
     Raises InputError for a cell size that is not positive or gives too many cells, and if there are no points.
     """
     if statistic not in get_args(Statistic):
-        raise InputError(f"the statistic {statistic!r} is unknown; choose one of {', '.join(get_args(Statistic))}")
+        raise InputError(f"unknown statistic {statistic!r}; choose one of {', '.join(get_args(Statistic))}")
     if not (np.isfinite(cell_m) and cell_m > 0):
-        raise InputError(f"a cell has a positive size, got {cell_m:g} m; 1 to 2 times the distance of points is usual")
+        raise InputError(f"cell size {cell_m:g} m is not positive; use 1 to 2 times the point spacing")
     first, last = np.floor(np.asarray(extent) / cell_m).astype(int)
     columns, rows = (last - first + 1).tolist()
     if rows * columns > _MOST_CELLS:
-        raise InputError(f"cells of {cell_m:g} m make {columns} x {rows} of them, which is too many; take larger ones")
+        raise InputError(
+            f"{columns} x {rows} cells of {cell_m:g} m are too many (limit {_MOST_CELLS}); use larger ones"
+        )
     start = {"highest": -np.inf, "mean": 0.0, "lowest": np.inf}[statistic]
     cells = np.full(rows * columns, start)
     counts = np.zeros(rows * columns, np.int32)
@@ -102,7 +104,7 @@ def _span(there) -> tuple[int, int]:
     """Return the start and stop index of the nonempty entries."""
     places = np.flatnonzero(there)
     if not len(places):
-        raise InputError("no point lies in the extent of the surface model; take the extent of the cloud")
+        raise InputError("no point lies in the extent of the surface model; use the extent of the cloud")
     return int(places[0]), int(places[-1]) + 1
 
 

@@ -405,41 +405,41 @@ def _mount_prior(prior: Mount, number: int) -> Mount:
 def _require(block: Block, number: int) -> None:
     """Raise BlockError, with the cure, if `block` lacks observations for step `number`."""
     if number not in STEPS:
-        raise ValueError(f"the steps of the boresight are 1, 2, 3 and 4, got {number!r}")
+        raise ValueError(f"unknown boresight step {number!r}; choose 1, 2, 3 or 4")
     what = f"step {number} of the boresight needs"
     if number < 4 and not len(block.control.who) + len(block.fixed.who):
-        raise BlockError(f"{what} control points and the block has none: add control_points.csv")
+        raise BlockError(f"{what} control points, but the block has none: add control_points.csv")
     if number == 1:
         return
     if not len(block.stations.who):
-        raise BlockError(f"{what} camera stations and the block has none: add stations.csv")
+        raise BlockError(f"{what} camera stations, but the block has none: add stations.csv")
     strips = set(block.image_strip) - {""}
     if not strips:
-        raise BlockError(f"{what} strips and the images name none: add the column strip to images.csv")
+        raise BlockError(f"{what} strips, but the images have none: add the column strip to images.csv")
     if len(strips) == 1:
         raise BlockError(
-            f"{what} two strips or more and all images are of strip {strips.pop()}, in which a misalignment looks like "
-            "a shift: add a strip flown in the opposite direction, better also one across"
+            f"{what} two strips or more, but all images are of strip {strips.pop()}, where a misalignment is "
+            "equivalent to a shift: add a strip flown in the opposite direction, better also one across"
         )
     if number == 2:
         return
     if not len(block.attitudes.image):
-        raise BlockError(f"{what} attitudes and the block has none: add attitudes.csv")
+        raise BlockError(f"{what} attitudes, but the block has none: add attitudes.csv")
     with_attitude = np.asarray(block.attitudes.image).tolist()
     turned = {block.image_mount[i] for i in with_attitude}
     if bare := sorted({block.image_camera[i] for i in with_attitude if not block.image_mount[i]}):
         raise BlockError(
-            f"{what} a mount and camera {bare[0]} has none: add [mounts.{bare[0]}] with its lever_arm_m and image_x to "
-            "block.toml"
+            f"{what} a mount, but camera {bare[0]} has none: add [mounts.{bare[0]}] with its lever_arm_m and image_x "
+            "to block.toml"
         )
     if blind := [name for name in block.priors.mounts if name not in turned]:
-        raise BlockError(f"{what} attitudes and no image of mount {blind[0]} has one: add them to attitudes.csv")
+        raise BlockError(f"{what} attitudes, but no image of mount {blind[0]} has one: add them to attitudes.csv")
     if number == 4:
         rays = np.bincount(block.image_points.point, minlength=len(block.points))
         held = np.unique(np.concatenate([block.control.who, block.fixed.who]).astype(int))
         if len(lone := held[rays[held] < 2]):
             raise BlockError(
-                f"step 4 of the boresight takes the control away, but control point {block.points[lone[0]]} is seen by "
+                f"step 4 of the boresight removes the control, but control point {block.points[lone[0]]} is seen by "
                 f"fewer than two images ({len(lone)} such points): measure it in two or more, or remove it"
             )
 
@@ -457,13 +457,11 @@ def check_fit(adjusted: Adjustment, cov: Covariance) -> tuple[list[str], bool]:
     test = f"(chi-square test, p = {p:.2g})"
     large = p < LEVEL and sigma0 > LARGE_SIGMA0
     if large:
-        sigma0_message += f" contradicts the a priori standard deviations {test}: observations are worse than announced"
+        sigma0_message += f" contradicts the a priori standard deviations {test}: observations are worse than stated"
     elif p < LEVEL:
-        sigma0_message += (
-            f" is above what the a priori standard deviations announce {test}: enlarge them by that factor"
-        )
+        sigma0_message += f" is above 1 {test}: enlarge the a priori standard deviations by that factor"
     elif p > 1 - LEVEL:
-        sigma0_message += f" is below what the a priori standard deviations announce {test}: they are too large"
+        sigma0_message += f" is below 1 {test}: the a priori standard deviations are too large"
     else:
         sigma0_message += f" agrees with the a priori standard deviations {test}"
     tested = blunder_test(adjusted, redundancy_numbers(adjusted, cov))

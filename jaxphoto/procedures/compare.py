@@ -209,7 +209,7 @@ def camera_of(block: Block, camera: str | None) -> str:
     if camera is None and len(block.sensors) > 1:
         raise InputError(f"the block has {len(block.sensors)} cameras; name one of {names}")
     if camera is not None and camera not in block.sensors:
-        raise InputError(f"the block has no camera {camera}; name one of {names}")
+        raise InputError(f"unknown camera {camera}; name one of {names}")
     return camera if camera is not None else names
 
 

@@ -68,7 +68,7 @@ def candidate_of(text: str) -> Candidate:
     names = () if listed == "none" else tuple(name.strip() for name in listed.split("+"))
     for name in names:
         if name not in estimable:
-            raise InputError(f"{text}: {model} has no coefficient {name!r} to estimate; it has {', '.join(estimable)}")
+            raise InputError(f"{text}: {name!r} is not estimable in {model}; choose among {', '.join(estimable)}")
     return Candidate(text.strip(), kind, tuple(name for name in estimable if name in names))
 
 

@@ -143,8 +143,8 @@ class Swaths:
         """Draw positions (east, north) uniformly over the union of the swaths. Raises BlockError if it is empty."""
         if not any(np.all(self.half(strip) > 0) for strip in self.strips):
             raise BlockError(
-                "strips of one image each leave no ground between their first and last exposure; "
-                "let the points lie beyond the ends too, or add images"
+                "strips of one image each have no ground between their first and last exposure; extend the points "
+                "beyond the ends, or add images"
             )
         low, high = self.extent(np.eye(2))
         result = np.zeros((0, 2))
@@ -153,7 +153,7 @@ class Swaths:
                 return result[:n]
             xy = rng.uniform(low, high, (4 * n, 2))
             result = np.vstack([result, xy[self.contain(xy)]])
-        raise BlockError("the strips lie so far apart that places are hardly ever in one; bring them together")
+        raise BlockError("the strips are so far apart that random places are hardly ever in one; reduce their distance")
 
 
 def footprint(sensor: Sensor, c_mm: float, height_m: float, image_x: ImageX) -> Footprint:

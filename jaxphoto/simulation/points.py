@@ -219,7 +219,7 @@ def _seen_often(
     if len(result) < n:
         raise BlockError(
             f"only {len(result)} of {n} points are seen in {recipe.points.min_images} images, of {_TRIES * n} tried; "
-            "raise the overlaps or the number of images, or ask less of the points"
+            "raise the overlaps or the number of images, or require fewer images per point"
         )
     return result[:n]
 

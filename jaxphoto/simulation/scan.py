@@ -297,7 +297,7 @@ def _pulses(plan: ScanPlan, paths: list[Path]) -> list[float]:
     pulses_of = [plan.density_per_m2 * 2 * plan.half_width * path.height_m * path.length_m for path in paths]
     if not sum(pulses_of) <= _PULSES:
         raise BlockError(
-            f"the scanner would send {sum(pulses_of):.3g} pulses, the most are {_PULSES:g}; lower density_per_m2"
+            f"the scanner would send {sum(pulses_of):.3g} pulses, the limit is {_PULSES:g}; lower density_per_m2"
         )
     seconds = sum(path.node[-1] - path.node[0] for path in paths)
     if not seconds * _RATE_HZ <= _RECORDS:

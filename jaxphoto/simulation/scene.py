@@ -509,4 +509,4 @@ def _places(
             return result[:n]
         xy = ground.draw(rng, max(_PLACES, 2 * n))
         result = np.vstack([result, xy[free(xy)]])
-    raise BlockError(f"there is no room for {what} beside the other buildings; ask for fewer or smaller ones")
+    raise BlockError(f"no room for {what} next to the other buildings; request fewer or smaller ones")

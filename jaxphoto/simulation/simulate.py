@@ -168,8 +168,8 @@ def _seen(recipe: Recipe, flight: Flight, scene: TruePoints, seed: int) -> TrueP
     per_image = np.bincount(rays.image, minlength=len(flight.images))
     for k in np.flatnonzero(per_image < 3):
         raise BlockError(
-            f"image {flight.images[k]} sees {per_image[k]} point(s), but an orientation needs 3; "
-            "ask for more points or rays, or let the swaths reach beyond the ends"
+            f"image {flight.images[k]} sees {per_image[k]} point(s), but an orientation needs 3; request more points "
+            "or rays, or extend the swaths beyond the ends"
         )
     return scene._replace(rays=rays)
 

@@ -185,12 +185,12 @@ def first_coordinate(folder) -> float:
 @pytest.mark.parametrize(
     ("files", "message"),
     [
-        ({}, "holds no experiments"),
+        ({}, "contains no experiments"),
         ({"small/experiment.py": "EXPERIMENT = 3"}, "declares no EXPERIMENT"),
         ({"small/experiment.py": "import nothing_of_the_kind"}, "cannot be run .ModuleNotFoundError"),
-        ({"small/experiment.py": DECLARED}, "there is no recipe"),
+        ({"small/experiment.py": DECLARED}, "recipe not found"),
         ({"small/experiment.py": DECLARED, "small/recipe.toml": RECIPE.replace("ties", "tis")}, "tis: unknown key"),
-        ({"other/experiment.py": DECLARED}, "there is no experiment small.*choose other or all"),
+        ({"other/experiment.py": DECLARED}, "unknown experiment small.*choose other or all"),
     ],
 )
 def test_what_is_no_experiment_is_refused(files, message, tmp_path):

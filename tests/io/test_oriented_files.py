@@ -262,7 +262,7 @@ REFUSED = {
         lambda f: appended(write_nerfstudio(f), "f,p1,x,2\n", "image_points.csv"), "points.csv, row [0-9]+: column_px",
     ),
     "opk": (_orthority('"opk": [', '"opk": ["x", '), "ext_param.geojson, feature 1: .* is not 3 finite numbers"),
-    "world": (_orthority("EPSG:32633", "nowhere"), "'nowhere' names no coordinate system"),
+    "world": (_orthority("EPSG:32633", "nowhere"), "'nowhere' is not a coordinate system"),
     "camera": (_orthority('"camera": "one"', '"camera": "two"'), "photograph 1: unknown camera 'two', not in the int"),
     "interior": (
         lambda f: changed(write_orthority(f), "int_param.yaml", ": brown", ": other"), r"\[one\] type: 'other' is",

@@ -325,7 +325,7 @@ def test_blocks_exchange_on_a_map_keeps_it(tmp_path, monkeypatch):
     assert block.frame.code == 32633
     found = block.frame.map.map(np.asarray(block.start.unknowns.exterior.position))
     np.testing.assert_allclose(found, CENTRES[[1, 0, 2]], atol=1e-6)
-    with pytest.warns(UserWarning, match="used as Cartesian metres: 'a plane' names no coordinate system"):
+    with pytest.warns(UserWarning, match="used as Cartesian metres: 'a plane' is not a coordinate system"):
         block = read_source(write_blocks_exchange(tmp_path / "in", system=SRS.format("a plane")))
     assert block.frame.kind == "local"
 

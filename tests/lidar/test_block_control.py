@@ -80,5 +80,5 @@ def test_a_point_is_taken_from_the_image_that_sees_it_from_nearest_above(flown):
         away = np.asarray(truth.exterior.position)[images] - truth.points[point]
         off_nadir = np.hypot(away[:, 0], away[:, 1]) / away[:, 2]
         assert found.image[k] == images[np.argmin(off_nadir)]
-    with pytest.raises(BlockError, match="no image measured any of the points"):
+    with pytest.raises(BlockError, match="none of the points for pseudo control"):
         pseudo_control_of_block(block, truth, grid, points=np.array([], int))

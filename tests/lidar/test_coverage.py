@@ -71,7 +71,7 @@ def test_a_gap_inside_a_strip():
 
 def test_a_clock_that_jumps_inside_a_strip():
     message = said(CLOUD, flown(np.where(TIME > 60, TIME + 1.0, TIME), TIME))
-    assert "a gap of 1.010 s, from 60.000 to 61.010 s" in message and "take 1.000 s off its times" in message
+    assert "a gap of 1.010 s, from 60.000 to 61.010 s" in message and "Subtract 1.000 s from its times" in message
 
 
 def test_a_turn_that_ends_where_it_began_is_no_jump_of_a_clock():
@@ -85,8 +85,8 @@ def test_a_turn_that_ends_where_it_began_is_no_jump_of_a_clock():
 
 def test_a_trajectory_that_begins_late_or_ends_early():
     message = said(CLOUD, flown(TIME[1200:7200]))
-    assert "from 10.000 to 80.000 s, and the trajectory, from 12.000 to 71.990 s" in message
-    assert "begins 2.000 s later and ends 8.010 s earlier; give the trajectory of the whole flight" in message
+    assert "from 10.000 to 80.000 s, the trajectory from 12.000 to 71.990 s" in message
+    assert "begins 2.000 s later and ends 8.010 s earlier); give the trajectory of the whole flight" in message
     message = said(CLOUD, flown(TIME[:7200]))
     assert message.startswith("laser points of strip 2 were") and "begins" not in message and "UTC" not in message
     # A cloud in GPS time, a trajectory in UTC.
@@ -110,14 +110,14 @@ def test_other_clocks_and_the_shift_that_joins_them(cloud_s, trajectory_s, shift
     # What has been given already was taken off the trajectory.
     message = said(cloud, flown(TIME + trajectory_s - given_s), given_s)
     assert message.startswith("laser points were measured where the trajectory has no records: the cloud's clock shows")
-    assert f"give --trajectory-shift-s {shift:.15g}, which brings all" in message, message
+    assert f"give --trajectory-shift-s {shift:.15g}: the trajectory then covers all" in message, message
     assert "18 s more if the cloud's clock is UTC" in message
     for word in (*words, f"{trajectory_s:.3f} to "):
         assert word in message
 
 
 def test_a_shift_that_is_none():
-    assert "leave --trajectory-shift-s out" in said(CLOUD, flown(TIME - 1000.0), 1000.0)
+    assert "omit --trajectory-shift-s" in said(CLOUD, flown(TIME - 1000.0), 1000.0)
 
 
 def test_in_a_long_flight_the_likely_difference_is_taken():
@@ -143,7 +143,7 @@ def test_two_flight_lines_of_one_name():
 
 def test_times_that_are_all_the_same():
     zero = dataclasses.replace(CLOUD, time=np.zeros(400))
-    with pytest.raises(InputError, match=r"^all laser points have one time, 0\.000 s.*take a cloud with the GPS time"):
+    with pytest.raises(InputError, match=r"^all laser points have one time, 0\.000 s.*use a cloud with the GPS time"):
         check_covered(zero, flown(TIME + 5))
     one = dataclasses.replace(CLOUD, time=np.where(CLOUD.strip == 1, 60.0, CLOUD.time))
     with pytest.raises(InputError, match=r"^all laser points of strip 2 have one time, 60\.000 s"):
@@ -170,5 +170,5 @@ def test_leap_seconds_inside_the_trajectory_are_found_by_where_the_points_lie(la
     if abs(late) != 18:
         check_measured_from(cloud, path)
         return
-    with pytest.raises(BlockError, match=rf"at \{late:+.0f} s, .*--trajectory-shift-s that is greater by {late:.0f} "):
+    with pytest.raises(BlockError, match=rf"by \{late:+.0f} s: .*Increase --trajectory-shift-s by {late:.0f} "):
         check_measured_from(cloud, path)

@@ -120,5 +120,5 @@ def test_what_cannot_be_indexed_is_said() -> None:
     xyz[4, 2] = np.nan
     with pytest.raises(InputError, match="point 4 "):
         index_cloud(xyz)
-    with pytest.raises(InputError, match="positive side"):
+    with pytest.raises(InputError, match="positive cell size"):
         index_cloud(uniform(10), cell_m=0.0)

@@ -222,7 +222,7 @@ def test_wrong_use_is_told_in_a_sentence():
     grid = indexed(scanned(slope(0, 0), 1, np.random.default_rng(7)))
     with pytest.raises(InputError, match="choose one of weighted, plane"), unchecked():
         pseudo_control_points(CAMERA, image(0), np.zeros((1, 2)), grid, interpolation="spline")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="give one image coordinate at least"):
+    with pytest.raises(InputError, match="give one or more image coordinates"):
         pseudo_control_points(CAMERA, image(0), np.zeros((0, 2)), grid)
     with pytest.raises(InputError, match="give points, not radius_m"):
         pseudo_control_points(CAMERA, image(0), np.zeros((1, 2)), grid, HeightSettings(radius_m=2.0))

@@ -47,7 +47,7 @@ def test_control_brings_the_block_to_its_place(marked):
     assert np.abs(off / sigma).max() < 4.5 and np.sqrt(np.mean((off / sigma) ** 2)) < 1.6
     check = np.array(found.state) == "check"
     assert np.nanmax(found.w[check]) < 3.5 and np.nanmax(found.w[~check]) < 3.5
-    assert not [s for s in found.sentences if "left out" in s]
+    assert not [s for s in found.sentences if "rejected" in s]
     # Once more: it lies by control now, and not by any positions.
     again = control_block(at_optimum(found.adjusted), marked.control, adjust=adjust)
     assert any("m (east, north, up) from where the block has it" in s for s in again.sentences)
@@ -111,7 +111,9 @@ def test_control_on_a_line_needs_positions_of_the_photographs(marked):
     found = control_block(placed, given, adjust=adjust)
     assert found.state == ("control",) * 3 + ("check",) * 3 and (found.w[3:] < 4).all()
     assert any("3 control points in two photographs or more lie on a line" in s for s in found.sentences)
-    with pytest.raises(InputError, match="lie on a line, which leaves a turn about it open; mark one beside it, or"):
+    with pytest.raises(
+        InputError, match="lie on a line, so the rotation about it is undetermined; mark one off the line"
+    ):
         control_block(marked.block, given, adjust=adjust)
 
 
@@ -140,7 +142,7 @@ def test_points_of_a_hand_held_receiver_are_taken_for_what_they_are(marked):
         assert found.state == tuple(left if k == 1 else "control" for k in range(len(points.ids)))
         (said,) = (s for s in found.sentences if "they scatter about the photographs" in s)
         east, _, up = found.survey_sigma_m[0]
-        assert 0.8 < east < 2.5 and f"{east:.2g} m east and north, {up:.2g} m up are taken" in said
+        assert 0.8 < east < 2.5 and f"{east:.2g} m east and north, {up:.2g} m up are assumed" in said
         off = in_true_frame(found) - marked.true_xyz
         assert np.abs(off / found.sigma_m).max() < 4.5 and np.sqrt(np.mean((off / found.sigma_m) ** 2)) < 1.8
 
@@ -162,7 +164,9 @@ def test_poorly_surveyed_points_of_a_small_site_still_bring_the_block(sigma_m):
 def test_heights_that_nobody_surveyed_cost_a_sentence(marked):
     xyz = marked.control.points.coordinates.copy()
     xyz[:, 2] = 0.0
-    with pytest.raises(InputError, match=r"do not fit their coordinates.*all 9 surveyed heights are 0 m; where nobody"):
+    with pytest.raises(
+        InputError, match=r"do not fit their coordinates.*all 9 surveyed heights are 0 m; if they were not surveyed"
+    ):
         found_in(marked, with_coordinates(marked.control, xyz))
 
 
@@ -190,16 +194,16 @@ def test_marks_that_cannot_be_used_cost_a_sentence(marked):
     image = ("nowhere.jpg", *control.marks.image[1:2], "I2.jpg", *control.marks.image[3:])
     spoilt = control._replace(marks=control.marks._replace(image=image))
     said = " ".join(found_in(marked, spoilt).sentences)
-    assert "left out: 1 mark of no photograph that is used: nowhere.jpg (marks.csv, row 2)" in said
+    assert "rejected: 1 mark of photographs that are not used: nowhere.jpg (marks.csv, row 2)" in said
     spoilt = control._replace(marks=control.marks._replace(column_row=pixels))
-    assert "left out: 1 mark outside of the picture" in " ".join(found_in(marked, spoilt).sentences)
+    assert "rejected: 1 mark outside of the picture" in " ".join(found_in(marked, spoilt).sentences)
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda c: with_coordinates(c, c.points.coordinates[:, [1, 0, 2]]), "with X and Y exchanged"),
-        (lambda c: c._replace(points=c.points._replace(system="")), "does not say the coordinate system"),
+        (lambda c: c._replace(points=c.points._replace(system="")), "does not state the coordinate system"),
         (lambda c: c._replace(marks=c.marks.take(np.arange(3))), "1 control point in two photographs or more"),
         (lambda c: c._replace(marks=c.marks._replace(image=("x",) * len(c.marks.image))), "no mark (x) is in"),
         (lambda c: with_coordinates(c, c.points.coordinates[[3, 0, 4, 1, 5, 2, 6, 7, 8]]), "do not fit"),

@@ -111,7 +111,7 @@ def test_another_thing_at_a_check_point_gives_way_to_its_target():
         by_hand = known_only(m.control, BY_HAND)
         found = control_block_with_targets(m.block, by_hand, TargetSearch(look, False), adjust=adjust)
         off = np.linalg.norm(found.off_m[found.ids.index("G21")])
-        said = "the target of G21 was found again, 0.8" if target else "what was found for check point G21 lies 0.8"
+        said = "the target of G21 was found again, 0.8" if target else "the detection of check point G21 is 0.8"
         assert (off < 0.5) == target and any(said in text for text in found.sentences)
 
 

@@ -66,5 +66,5 @@ def test_a_map_system_for_the_block_beside_it_is_refused(flown):
 
 def test_without_a_word_about_the_system_the_sentence_names_local(flown):
     _, control, positions = flown
-    with pytest.raises(InputError, match=r"site.csv does not say the coordinate system .* \(or local, for Cartesian"):
+    with pytest.raises(InputError, match=r"site.csv does not state the coordinate system .* \(or local, for Cartesian"):
         flight_control(control, None, positions, positions.values())

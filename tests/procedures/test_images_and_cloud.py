@@ -121,5 +121,5 @@ def test_a_boresight_needs_a_trajectory():
 
 def test_priors_go_by_the_names_of_strips():
     flight = misaligned()
-    with pytest.raises(InputError, match="priors are of the strips 1, 2, north, and the cloud's are 1, 2, 3"):
+    with pytest.raises(InputError, match="priors for the strips 1, 2, north, but the cloud has 1, 2, 3"):
         simultaneous(flight.block, flight.cloud, None, Scanner(FIXED, dict.fromkeys(("1", "2", "north"), FREE)))

@@ -103,7 +103,7 @@ def test_a_trajectory_of_another_day(folder, tmp_path, monkeypatch, capsys):
     for command in ((*together, *SIGMAS), (*together, *shift), ("strips", cloud, *shift)):
         code, _, error = run(monkeypatch, capsys, *command, *given)
         assert code == 2 and "where the trajectory has no records" in error
-        assert "give --trajectory-shift-s 86400, which brings all of them into it" in error
+        assert "give --trajectory-shift-s 86400: the trajectory then covers all points" in error
 
 
 def test_a_cloud_elsewhere(folder, tmp_path, monkeypatch, capsys):

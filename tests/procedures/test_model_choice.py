@@ -184,8 +184,8 @@ def test_candidates_by_name():
     assert not candidate_of("smac:k1").within(candidate_of("brown"))
     for name, message in (
         ("braun", "unknown distortion model 'braun'; choose one of brown"),
-        ("brown:k9", "brown has no coefficient 'k9' to estimate; it has k1"),
-        ("smac:k0", "smac has no coefficient 'k0' to estimate"),
+        ("brown:k9", "'k9' is not estimable in brown; choose among k1"),
+        ("smac:k0", "'k0' is not estimable in smac"),
     ):
         with pytest.raises(InputError, match=message):
             candidate_of(name)

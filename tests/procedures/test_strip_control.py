@@ -172,7 +172,7 @@ def test_with_a_trajectory_control_determines_the_height_of_a_flight():
 def test_control_of_a_block_is_the_same_point_and_counts_once():
     block = flown_with_photographs().block
     tie = surveyed(np.zeros((1, 3)))._replace(ids=(block.points[0],))
-    with pytest.raises(InputError, match="is a point of the block, too, without being control there"):
+    with pytest.raises(InputError, match="is also a point of the block, without being control there"):
         with_control(block, tie)
     given = surveyed(np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]))
     whole, number = with_control(block, given)
@@ -181,7 +181,7 @@ def test_control_of_a_block_is_the_same_point_and_counts_once():
     assert again.points == whole.points and len(again.control) == len(whole.control)
     np.testing.assert_array_equal(same, number)
     moved = given._replace(coordinates=given.coordinates + np.array([0.0, 0.0, 0.2]))
-    with pytest.raises(InputError, match=r"K0 is a point of the block, too, 0\.200 m away"):
+    with pytest.raises(InputError, match=r"K0 is also a point of the block, 0\.200 m away"):
         with_control(whole, moved)
 
 

@@ -191,7 +191,7 @@ def test_pulses_pass_a_crown_as_poisson_says():
 
 
 def test_no_room_is_said():
-    with pytest.raises(BlockError, match="there is no room for 4000 buildings"):
+    with pytest.raises(BlockError, match="no room for 4000 buildings"):
         made({"terrain.buildings": [{"count": 4000, "length_m": 300.0, "width_m": 100.0}]})
 
 

@@ -51,7 +51,7 @@ def distortion_model(name: str, sensor: Sensor, r0_mm: float = 0.0) -> AbstractD
             raise InputError(f"R0 = {r0_mm:g} mm does not lie on an image of {longer:.4g} mm; give 0 to {longer:.4g}")
         return Smac(r0=r0_mm)
     if r0_mm:
-        raise InputError(f"R0 belongs to the model smac; leave it out with {name}, or choose smac")
+        raise InputError(f"R0 belongs to the model smac; omit it with {name}, or choose smac")
     return kind.plain(sensor)
 
 
@@ -69,9 +69,9 @@ def free_parameters(name: str, distortion: AbstractDistortion, wanted: Sequence[
     asked = [f"{n}_mm" if n in ("c", "xp", "yp") else n for n in wanted]
     for parameter in asked:
         if parameter not in names:
-            raise InputError(f"the model {name} has no parameter {parameter!r}; it has {', '.join(names)}")
+            raise InputError(f"unknown parameter {parameter!r} of the model {name}; choose among {', '.join(names)}")
     if both := [scale for scale in distortion.scales if scale in asked and "c_mm" in asked]:
-        raise InputError(f"{both[0]} changes the scale as c does: leave {both[0]} or c out of what is free")
+        raise InputError(f"{both[0]} changes the scale as c does: fix one of them")
     return tuple(n for n in names if n in asked)
 
 

@@ -329,8 +329,8 @@ def calibrate(
 def _check_enough(images: int, total: int) -> None:
     if images < MIN_IMAGES:
         raise InputError(
-            f"{images} of {total} photographs show enough of the board, and a calibration needs "
-            f"{MIN_IMAGES}: take more of them, with the board tilted and turned"
+            f"{images} of {total} photographs show enough of the board, but a calibration needs {MIN_IMAGES}: take "
+            "more photographs, with the board tilted and rotated"
         )
 
 

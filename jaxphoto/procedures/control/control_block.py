@@ -205,7 +205,7 @@ def control_block(
     used = seen & ~points.check & agree
     if len(base.stations) and all(np.isfinite(known[used, axis]).any() for axis in range(3)):
         base = with_gnss_bias(base)
-        messages.append("positions of the receiver have a shift of their own, which control tells")
+        messages.append("positions of the receiver have a separate shift, estimated from the control")
     now = rows.take(seen[rows.point])
     tried: list[tuple] = []
     for number in range(_ROUNDS):
@@ -268,7 +268,7 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
     by_positions = len(block.stations) > 0 and not len(block.control)
     line = len(known) >= MIN_POINTS and on_a_line(met[known], frame.xyz[known])
     if frame.at_place and (line or len(known) < MIN_POINTS):
-        how = " lie on a line, which leaves a turn about it open" if line else ""
+        how = " lie on a line, so the rotation about it is undetermined" if line else ""
         stays = f"the block stays {'at its positions' if by_positions else 'where it lies'}"
         messages = [f"{counted(len(known), 'control point')} in two photographs or more{how}: {stays}"]
         return block, met, agree, sigma, messages
@@ -299,12 +299,12 @@ def _assumed(control: GivenControl, sigma: Float[np.ndarray, "points 3"]) -> lis
         why = "they scatter about the photographs: " if (taken > SIGMA_M).any() else ""
         east, north, up = np.where(none.any(axis=0), np.maximum(taken, SIGMA_M), SIGMA_M)
         messages.append(
-            f"{n} surveyed points have no standard deviations: {why}{max(east, north):.2g} m east and north, "
-            f"{up:.2g} m up are taken"
+            f"{n} surveyed points have no standard deviations: {why}{max(east, north):.2g} m east and north, {up:.2g} "
+            "m up are assumed"
         )
     messages += _one_height(control.points)
     if n := int(np.isnan(control.marks.sigma_px).sum()):
-        messages.append(f"{n} marks have no standard deviations: {MARK_SIGMA_PX:g} px is taken")
+        messages.append(f"{n} marks have no standard deviations: {MARK_SIGMA_PX:g} px is assumed")
     return messages
 
 
@@ -313,8 +313,8 @@ def _one_height(points: SurveyedPoints) -> list[str]:
     if len(height) < MIN_POINTS or np.ptp(height) != 0:
         return []
     return [
-        f"all {len(height)} surveyed heights are {height[0]:g} m; where nobody surveyed them, leave them empty and "
-        "give positions of the photographs, which tell how the block lies"
+        f"all {len(height)} surveyed heights are {height[0]:g} m; if they were not surveyed, leave them empty and "
+        "give positions of the photographs, which determine the tilt of the block"
     ]
 
 
@@ -340,7 +340,7 @@ def _tested(tested: TestedControl, now: Marked, used, able, ids, images):
         rejected[row] = True
         off, image = np.linalg.norm(tested.marks_px[row]), images[now.image[row]]
         messages.append(
-            f"the mark of {ids[p]} in {image} is {off:.3g} px off (w = {tested.marks_w[row]:.3g}) and left out"
+            f"the mark of {ids[p]} in {image} is {off:.3g} px off (w = {tested.marks_w[row]:.3g}) and rejected"
         )
     return new, rejected, messages
 
@@ -348,11 +348,11 @@ def _tested(tested: TestedControl, now: Marked, used, able, ids, images):
 def _left_out(ids, left, tested: TestedControl, frame: InFrame):
     for k in np.flatnonzero(left):
         offset = ", ".join(f"{v:.3g}" for v in tested.off_m[k])
-        text = f"control point {ids[k]} contradicts the rest by {offset} m (east, north, up) and is left out"
+        text = f"control point {ids[k]} contradicts the rest by {offset} m (east, north, up) and is rejected"
         near = np.linalg.norm(frame.xyz - tested.adjusted_m[k], axis=1)
         other = int(np.argmin(np.where(np.arange(len(ids)) == k, np.inf, near)))
         if near[other] < 0.1 * np.linalg.norm(tested.off_m[k]):
-            text += f": its marks show {ids[other]}, so look at the names"
+            text += f": its marks show {ids[other]}; check the names"
         yield text
 
 

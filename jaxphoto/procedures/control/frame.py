@@ -71,14 +71,14 @@ def onto_control(
     """
     if len(here) < MIN_POINTS:
         raise InputError(
-            f"{file}: {counted(len(here), 'control point')} in two photographs or more, where three tell place, scale "
-            "and attitude of a block; mark more"
+            f"{file}: {counted(len(here), 'control point')} in two photographs or more, but position, scale and "
+            "attitude of a block need three; mark more"
         )
     best = _best(there, here, sigma_m)
     if best is None:
         raise InputError(
-            f"{file}: the control points lie on a line, which leaves a turn about it open; mark one beside it, or "
-            "orient photographs that have positions"
+            f"{file}: the control points lie on a line, so the rotation about it is undetermined; mark one off the "
+            "line, or orient photographs with positions"
         )
     if best.agree.mean() < _MOST and assumed.any() and (poor := _poor(there, here, sigma_m, assumed)) is not None:
         return poor
@@ -94,7 +94,7 @@ def onto_control(
     off = _off(best.similarity, there, here)
     raise InputError(
         f"{file}: the marks of the control points do not fit their coordinates ({np.median(off):.3g} m off in the "
-        "median); look at names, system and order of coordinates"
+        "median); check names, system and order of coordinates"
     )
 
 
@@ -192,7 +192,7 @@ def in_frame(
     if block.frame.kind == "epsg":
         assert block.frame.code is not None and block.frame.origin is not None
         if code is not None and code != block.frame.code:
-            raise InputError(f"the block is in EPSG:{block.frame.code} already, and EPSG:{code} is given; leave it out")
+            raise InputError(f"the block is in EPSG:{block.frame.code} already, and EPSG:{code} is given; omit it")
         if system.crs is None:
             raise InputError(
                 f"{points.file} is in a local system and the block in EPSG:{block.frame.code}: give the control there, "
@@ -230,15 +230,13 @@ def stated_system(points: SurveyedPoints, words: str | None, guess: Callable[[],
     stated = system_of(points.system, points.file) if points.system else None
     given = system_of(words, "the EPSG code of the control") if words else None
     if stated and given and stated.crs != given.crs:
-        raise InputError(
-            f"{points.file} says {stated.name}, but {given.name} is given; leave out the one that is wrong"
-        )
+        raise InputError(f"{points.file} states {stated.name}, but {given.name} is given; omit the wrong one")
     system = stated or given
     if system is None:
         would = guess()
         raise InputError(
-            f"{points.file} does not say the coordinate system of its points; give its EPSG code (or local, for "
-            "Cartesian metres of no map)" + (f": they would fit {would}" if would else "")
+            f"{points.file} does not state the coordinate system of its points; give its EPSG code (or local, for "
+            "Cartesian metres without a map)" + (f": they would fit {would}" if would else "")
         )
     return system
 

@@ -58,7 +58,7 @@ def marked(
     place = {name: k for k, name in enumerate(points.ids)}
     point = np.array([place.get(name, -1) for name in marks.point], int)
     messages: list[str] = []
-    _say(messages, marks, (image < 0) & ~other, marks.image, "of no photograph that is used")
+    _say(messages, marks, (image < 0) & ~other, marks.image, "of photographs that are not used")
     _say(messages, marks, (point < 0), marks.point, f"of points without coordinates in {points.file}")
     size = np.array([(s.width_px, s.height_px) for s in (block.sensors[c] for c in block.image_camera)], float)
     outside = ((marks.column_row < 0) | (marks.column_row > size[image])).any(axis=1) & (image >= 0) & (point >= 0)
@@ -67,7 +67,7 @@ def marked(
     kept = kept[np.lexsort((image[kept], point[kept]))]
     # The same photograph may have marks under two names.
     twice = np.r_[False, (np.diff(image[kept]) == 0) & (np.diff(point[kept]) == 0)] if len(kept) else np.zeros(0, bool)
-    _say(messages, marks, np.isin(np.arange(len(image)), kept[twice]), marks.point, "there twice for one photograph")
+    _say(messages, marks, np.isin(np.arange(len(image)), kept[twice]), marks.point, "listed twice for one photograph")
     kept = kept[~twice]
     sigma = np.where(np.isnan(marks.sigma_px), MARK_SIGMA_PX, marks.sigma_px)[kept]
     xy = np.zeros((len(kept), 2))
@@ -98,7 +98,7 @@ def _say(messages: list[str], marks: Marks, wrong: np.ndarray, names: Sequence[s
     which = np.flatnonzero(wrong)
     if len(which):
         listed = few(list(dict.fromkeys(names[int(k)] for k in which)))
-        messages.append(f"left out: {counted(len(which), 'mark')} {what}: {listed} ({marks.places[which[0]]})")
+        messages.append(f"rejected: {counted(len(which), 'mark')} {what}: {listed} ({marks.places[which[0]]})")
 
 
 _BEYOND, _ROOM_PX = 4.0, 3.0
@@ -148,11 +148,11 @@ def intersected(block: Block, unknowns: Unknowns, rows: Marked, ids: tuple[str, 
         images = [block.images[i] for i in rows.image[of_point[~passing]]]
         if passing.sum() < 2:
             good[of_point] = False
-            messages.append(f"the marks of {ids[p]} in {few(images)} contradict one another, and none is used")
+            messages.append(f"the marks of {ids[p]} in {few(images)} contradict one another: all rejected")
         elif len(images):
             good[of_point[~passing]] = False
             messages.append(
-                f"the mark of {ids[p]} in {few(images)} contradicts those in {passing.sum()} others: left out"
+                f"the mark of {ids[p]} in {few(images)} contradicts those in {passing.sum()} others: rejected"
             )
     used = np.flatnonzero(good)
     intersection = intersect_with_covariance(

@@ -60,8 +60,8 @@ def flight_control(
     if stated.crs is None:
         if code is not None:
             raise InputError(
-                f"{control.points.file} is in a local system, and EPSG:{code} is given for the block; leave out the "
-                "code, or give the control in a map system"
+                f"{control.points.file} is in a local system, and EPSG:{code} is given for the block; omit the code, "
+                "or give the control in a map system"
             )
         return FlightControl(control, system, names, target_search, local=True), None
     flight_code = new_code(control.points, stated) if code is None else code

@@ -129,7 +129,7 @@ def system_of(words: str, place: str) -> ControlSystem:
         vertical = int(codes[2]) if codes[2] else None
         return ControlSystem(map_system(int(codes[1])), int(codes[1]), vertical)
     wrong = InputError(
-        f"{place}: {quoted(words)} names no coordinate system; write EPSG:25832, EPSG:25832+7837 with heights, or local"
+        f"{place}: {quoted(words)} is not a coordinate system; write EPSG:25832, EPSG:25832+7837 with heights, or local"
     )
     keys = {part.lstrip("+").split("=")[0] for part in words.split()}
     is_wkt = bool(_WKT.match(words)) and "EXTENSION" not in words and "GRID" not in words.upper()
@@ -146,7 +146,7 @@ def system_of(words: str, place: str) -> ControlSystem:
     if not (parts[0].is_projected or parts[0].is_geographic or parts[0].is_geocentric):
         raise wrong
     if len(parts) > 1 and None in codes_of:
-        raise InputError(f"{place}: the system of the heights has no EPSG code; write like EPSG:25832+7837")
+        raise InputError(f"{place}: the system of the heights has no EPSG code; write it as EPSG:25832+7837")
     return ControlSystem(parts[0], codes_of[0], codes_of[1] if len(parts) > 1 else None)
 
 
@@ -178,7 +178,8 @@ def places(points: SurveyedPoints, system: ControlSystem, code: int) -> Float[np
     for k in np.flatnonzero(~np.isfinite(there).all(axis=1)):
         text = ", ".join(f"{v:.10g}" for v in xyz[k])
         raise InputError(
-            f"{points.places[k]}: {text} is no place of {system.name}; correct coordinates, their order or the system"
+            f"{points.places[k]}: {text} is not a position in {system.name}; correct coordinates, their order or the "
+            "system"
         )
     return there
 

@@ -246,8 +246,8 @@ def _believed(adjusted, ids, xyz, of_points, at: Predicted, seen: Candidates, na
         if not named and np.median(seen.fit_px[rows_of]) > _DULL * usual[p]:
             del taken[p]
             why_not[ids[p]] = (
-                f"the target of {ids[p]} was looked for: what was seen in {len(rows_of)} photographs is far less sharp "
-                "than the other targets; mark it by hand"
+                f"the target of {ids[p]} was searched for: detections in {len(rows_of)} photographs are far less "
+                "sharp than the other targets; mark it by hand"
             )
     kept = [k for rows_of in taken.values() for k in rows_of]
     marks = Marks(
@@ -288,7 +288,7 @@ def _meeting(origins, directions, image, limit, fit, near, of_point) -> tuple[np
     distance = np.sqrt(np.einsum("ni,ij,nj->n", off, np.linalg.inv(of_point + 1e-12 * np.eye(3)), off))
     sure &= (distance < _WITHIN * 1.5) | (np.linalg.norm(off, axis=1) < room)
     if not sure.any():
-        return none, "nothing that was seen lies where it should"
+        return none, "no detection is at the expected position"
     inside = misses(met[sure], origins, directions) < limit
     images = np.unique(image)
     score = np.stack([(inside & (image == i)).any(axis=1) for i in images]).sum(axis=0)
@@ -300,7 +300,7 @@ def _meeting(origins, directions, image, limit, fit, near, of_point) -> tuple[np
     best = int(alike[np.argmax(score[alike] - 1e-3 * miss[alike])])
     chosen = inside[best]
     if not (inside[alike] & chosen).any(axis=1).all():
-        return none, f"two places or more look like it, one in {score[best]} photographs: mark it by hand"
+        return none, f"two or more candidates, one in {score[best]} photographs: mark it by hand"
     miss = misses(met[sure][best][None], origins, directions)[0]
     kept = [
         int(np.flatnonzero(chosen & (image == i))[np.argmin(miss[chosen & (image == i)])])
@@ -341,8 +341,8 @@ def control_block_with_targets(
         now = control_block(block, control, **how)
     elif block.frame.kind != "epsg":
         raise InputError(
-            f"{points.file}: the block has no place, so nobody knows where its photographs show the points; mark three "
-            "control points by hand, each in two photographs or more"
+            f"{points.file}: the block is not georeferenced, so the image positions of the points are unknown; mark "
+            "three control points by hand, each in two photographs or more"
         )
     adjusted = now.adjusted if now else adjust(block)
     looked: dict[str, set[str]] = {name: set() for name in ids}
@@ -387,8 +387,8 @@ def control_block_with_targets(
         if p not in distant
     ]
     texts += [
-        f"what was found for check point {ids[p]} lies {off:.2g} m from its place: see whether it is its target, or "
-        "mark it by hand"
+        f"the detection of check point {ids[p]} is {off:.2g} m from its position: check that it is its target, or mark "
+        "it by hand"
         for p, off in distant.items()
         if points.check[p]
     ]

@@ -126,15 +126,15 @@ def simultaneous(
         priors = Scanner(FREE if timed else FIXED, dict.fromkeys(names, shift))  # type: ignore[arg-type]
     if set(priors.shifts) != set(names):
         raise InputError(
-            f"the scanner's priors are of the strips {', '.join(priors.shifts)}, and the cloud's are "
-            f"{', '.join(names)}: give one for each of these"
+            f"the scanner has priors for the strips {', '.join(priors.shifts)}, but the cloud has {', '.join(names)}: "
+            "give one for each of these"
         )
     # Sort by the cloud's strips.
     priors = Scanner(priors.boresight, {name: priors.shifts[name] for name in names})
     if priors.boresight != FIXED and not timed:
         raise InputError(
-            "the boresight of the scanner needs its trajectory and the time of each laser point, from which "
-            "points were measured: give them, or fix the boresight"
+            "the boresight of the scanner needs its trajectory and the time of each laser point: give them, or fix "
+            "the boresight"
         )
     check_without_surfaces(block)
     if timed:

@@ -124,7 +124,7 @@ def check_without_surfaces(block: Block) -> None:
     """Raise BlockError if the block already has surface observations, which this procedure creates."""
     if len(block.surfaces.point) or block.start.unknowns.scanner is not None:
         raise BlockError(
-            "the block has points on the surfaces of a laser scanner already: take the block as it was before, without "
+            "the block already has points on the surfaces of a laser scanner: use the original block, without "
             "surfaces.csv and [scanner]"
         )
 
@@ -221,8 +221,8 @@ def _check_used(surface: SurfaceAtPoints, used: Bool[np.ndarray, "rows"]) -> Non
     n, most = int(used.sum()), int(surface.usable.sum())
     if n < max(1.0, _BORNE_OUT * most):
         raise BlockError(
-            f"the block bears out only {n} of {most} observations of the cloud: check that cloud and block are in one "
-            "system, that the stated standard deviations are true, and that the block adjusts well without the cloud"
+            f"only {n} of {most} observations of the cloud agree with the block: check that both are in one system, "
+            "the stated standard deviations, and the adjustment without the cloud"
         )
 
 
@@ -232,8 +232,8 @@ def _warn_of_scale(first: Adjustment, adjusted: Adjustment) -> None:
         before, after = float(first.unknowns.interior[name].c), float(interior.c)
         if abs(after - before) > _UNUSUAL * abs(before):
             warnings.warn(
-                f"the principal distance of {name} became {after:.3f} mm from {before:.3f} mm, an unusual change: "
-                "heights may be of another vertical system than the stations",
+                f"the principal distance of {name} changed from {before:.3f} to {after:.3f} mm: check that the cloud "
+                "and the stations have the same vertical datum",
                 UserWarning,
                 stacklevel=4,
             )

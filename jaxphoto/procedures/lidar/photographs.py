@@ -42,33 +42,29 @@ def check_photographs(photographs: Photographs, trajectory: Trajectory | None) -
     block, time = photographs.block, photographs.time
     if trajectory is None:
         raise InputError(
-            "photographs and strips are joined by the trajectory on which both were measured: give it (--trajectory), "
-            "or adjust the strips alone"
+            "photographs and strips need their common trajectory: give it (--trajectory), or adjust the strips alone"
         )
     if any(isinstance(rows, StripPlanes) for rows in block.more):
         raise BlockError(
-            "the block is that of a joint adjustment, with its planes in strip_planes.csv: adjust it by jaxphoto "
-            "adjust, or give the block as it was before"
+            "the block is the result of a joint adjustment (planes in strip_planes.csv): adjust it by jaxphoto "
+            "adjust, or give the original block"
         )
     check_without_surfaces(block)
     unknown = np.flatnonzero(~np.isfinite(time))
     if len(unknown):
         raise InputError(
-            f"image {block.images[unknown[0]]} has no time_s, so that nothing says where on the trajectory it was "
-            "exposed: give the times of all exposures in images.csv"
+            f"image {block.images[unknown[0]]} has no time_s, so its position on the trajectory is unknown: give the "
+            "times of all exposures in images.csv"
         )
     if not len(block.stations):
-        raise InputError(
-            "the block has no stations, which the trajectory gives the exposures: add [trajectory] to block.toml, or "
-            "stations.csv"
-        )
+        raise InputError("the block has no stations: add [trajectory] to block.toml, or stations.csv")
     times = np.asarray(trajectory.time)
     outside = np.flatnonzero((time < times[0]) | (time > times[-1]))
     if len(outside):
         shift = shift_that_fits(time, times[0], times[-1])
         on_its_clock = "on its clock (--exposure-shift-s)"
         if shift is not None:
-            on_its_clock = f"{shift:+.15g} s later, which brings all of them into it (--exposure-shift-s)"
+            on_its_clock = f"{shift:+.15g} s later, all within the trajectory (--exposure-shift-s)"
         raise BlockError(
             f"image {block.images[outside[0]]} was exposed at {time[outside[0]]:.3f} s, where the trajectory has no "
             f"records: the exposures are at {looks_like(time)}, the trajectory at {looks_like(times)}; give the "
@@ -86,8 +82,8 @@ def check_photographs(photographs: Photographs, trajectory: Trajectory | None) -
     apart = float(np.median(np.sqrt(np.bincount(rows.who, offset**2)[np.unique(rows.who)])))
     if apart > _FAR_M:
         raise BlockError(
-            f"the stations of the block lie {apart:.0f} m from where the trajectory is at their times: bring "
-            "both onto one clock (--exposure-shift-s) and into one coordinate system"
+            f"the stations of the block are {apart:.0f} m from the trajectory at their times: bring both onto one "
+            "clock (--exposure-shift-s) and into one coordinate system"
         )
 
 

@@ -117,9 +117,9 @@ def check_joined(names: Sequence[str], planes: Sequence[CommonPlanes]) -> None:
         up = float(np.median(common.pairs.gap / common.pairs.normal[:, 2]))
         if abs(up) > _APART_M:
             raise BlockError(
-                f"strip {common.one.name} lies {abs(up):.1f} m {'above' if up > 0 else 'below'} strip "
-                f"{common.other.name}: heights of one may count in feet or belong to another vertical system, as those "
-                "above an ellipsoid and a geoid; bring all strips and their trajectory into one"
+                f"strip {common.one.name} is {abs(up):.1f} m {'above' if up > 0 else 'below'} strip "
+                f"{common.other.name}: check the height unit and vertical datum (ellipsoid or geoid) of all strips "
+                "and their trajectory"
             )
 
 
@@ -188,9 +188,9 @@ class PointSearch:
         if not len(out):
             return []
         return [
-            f"{len(out)} of {len(lines)} points on breaklines have no two smooth faces about them in any strip, hence "
-            f"no observations: {few([names[p] for p in lines[out]])}; take cells (--cell-m) half as wide as "
-            "the roofs, or leave these points out"
+            f"{len(out)} of {len(lines)} points on breaklines lack two smooth faces in every strip and have no "
+            f"observations: {few([names[p] for p in lines[out]])}; use cells (--cell-m) half as wide as the roofs, or "
+            "omit these points"
         ]
 
     def rows(self, planes: Sequence[PointPlanes], errors: StripErrors) -> tuple[StripPoints, ...]:

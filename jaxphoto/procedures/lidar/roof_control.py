@@ -101,7 +101,7 @@ def roof_control(
         if not (chosen >= 0).any() and not len(middles):
             raise BlockError(
                 f"none of {len(which)} tie points lies on one of the cloud's {len(patches)} roof faces: measure "
-                "points on roofs, or take heights for control (lidar_control)"
+                "points on roofs, or use heights for control (lidar_control)"
             )
         foot, normal, sigma = np.full((len(which), 3), np.nan), np.full((len(which), 3), np.nan), np.ones(len(which))
         for k in np.unique(chosen[chosen >= 0]):
@@ -146,7 +146,7 @@ def _patches(cloud: Cloud, places: Float[np.ndarray, "n 3"], settings: HeightSet
     if len(roofs) < _LEAST:
         raise BlockError(
             f"within {_NEAR:g} m of the points the cloud has {len(roofs)} laser points of roofs (class {BUILDING}): "
-            "classify the cloud, or take heights for control (lidar_control)"
+            "classify the cloud, or use heights for control (lidar_control)"
         )
     patches = planar_patches(cloud.xyz[roofs], settings.sigma_xy_m, settings.sigma_z_m, _LEAST)
     return [eqx.tree_at(lambda p: p.index, patch, roofs[patch.index]) for patch in patches]
@@ -171,11 +171,11 @@ def _centroid_rows(
     parts = [ControlCoordinates.none()]
     for point, face in zip(points, _faces(places[points, :2], patches, 0.0), strict=True):
         if point in block.control.who:
-            raise InputError(f"point {block.points[point]} is control already: leave it out of the centroids")
+            raise InputError(f"point {block.points[point]} is control already: omit it from the centroids")
         if face < 0:
             raise BlockError(
                 f"point {block.points[point]} is to be the centroid of a roof, but the cloud has no roof face at X "
-                f"{places[point, 0]:.1f} m, Y {places[point, 1]:.1f} m: leave it out"
+                f"{places[point, 0]:.1f} m, Y {places[point, 1]:.1f} m: omit it"
             )
         centre, covariance = roof_centroid(cloud.xyz[patches[face].index])
         parts.append(ControlCoordinates(np.full(3, point), np.arange(3), centre, np.sqrt(np.diagonal(covariance))))

@@ -59,8 +59,8 @@ def check_measured_from(cloud: Cloud, path: ScannerPath, pattern: Pattern | None
     away = np.linalg.norm(cloud.xyz[some] - scanner_poses(path, cloud.time[some]).position, axis=1)  # type: ignore[index]
     if np.median(away) > _FARTHEST_M:
         raise BlockError(
-            f"the laser points lie {np.median(away) / 1000:.0f} km from where the trajectory says that the scanner "
-            "was: bring cloud and trajectory into one coordinate system, in metres, and onto one clock"
+            f"the laser points are {np.median(away) / 1000:.0f} km from the scanner's trajectory: bring cloud and "
+            "trajectory into one coordinate system, in metres, and onto one clock"
         )
     _check_leap_seconds(cloud, path)
     messages = [*_odd_yaw(path.trajectory), *_jumps(path.trajectory)]
@@ -73,14 +73,14 @@ def check_measured_from(cloud: Cloud, path: ScannerPath, pattern: Pattern | None
         furthest = np.abs(positions.middle).max()
         if elsewhere := _distant_strips(cloud, path, _WANDERS * max(positions.half_width)):
             raise BlockError(
-                f"the laser points of strip {few(elsewhere)} lie up to {furthest:.1f} of the scanner's height to one "
-                "side, and those of the other strips do not: bring all strips and their trajectory into one coordinate "
-                "system, in metres, and onto one clock"
+                f"the laser points of strip {few(elsewhere)} are up to {furthest:.1f} flying heights to one side, "
+                "unlike those of the other strips: bring all strips and their trajectory into one coordinate system, "
+                "in metres, and onto one clock"
             )
         raise BlockError(
-            f"the laser points of a second lie now here, now there about the scanner, up to {furthest:.1f} of its "
-            f"height to one side, while the swath is {2 * max(positions.half_width):.2f} of it wide: bring cloud and "
-            "trajectory into one coordinate system, both in metres, and onto one clock, with angles in degrees"
+            f"laser points of one second scatter about the scanner, up to {furthest:.1f} flying heights to one side, "
+            f"but the swath is {2 * max(positions.half_width):.2f} flying heights wide: bring cloud and trajectory "
+            "into one coordinate system, both in metres, and onto one clock, with angles in degrees"
         )
     if pattern is not None:
         _check_pattern(positions, pattern)
@@ -110,13 +110,13 @@ def _check_pattern(positions: _FromBody, pattern: Pattern) -> None:
     around = ahead > _ALIKE * right
     if around and pattern == "line":
         raise BlockError(
-            f"the laser points of a second spread {spread}, as those of a scanner that looks all around its nadir: "
-            'give its pattern as "circle" (--pattern circle)'
+            f'laser points of one second spread {spread}, as for a circular scan: give its pattern as "circle" '
+            "(--pattern circle)"
         )
     if not around and pattern == "circle":
         raise BlockError(
-            f"the laser points of a second spread {spread}, as those of a scanner that draws lines across the track: "
-            'give its pattern as "line" (--pattern line)'
+            f"laser points of one second spread {spread}, as for a line scan across the track: give its pattern as "
+            '"line" (--pattern line)'
         )
 
 
@@ -141,9 +141,9 @@ def _check_leap_seconds(cloud: Cloud, path: ScannerPath) -> None:
     best = min(far, key=lambda shift: far[shift])
     if far[best] < _UNDER * now:
         raise BlockError(
-            f"the laser points lie {np.rad2deg(np.arctan(now)):.0f} degrees ahead of the scanner or behind it at their "
-            f"times, but {np.rad2deg(np.arctan(far[best])):.0f} degrees at {best:+d} s, so one clock is UTC and the "
-            f"other GPS time: give a --trajectory-shift-s that is greater by {best} (0 where none is given)"
+            f"the laser points are {np.rad2deg(np.arctan(now)):.0f} degrees ahead of the scanner or behind it at "
+            f"their times, but {np.rad2deg(np.arctan(far[best])):.0f} degrees if their times are shifted by {best:+d} "
+            f"s: one clock is UTC and the other GPS time. Increase --trajectory-shift-s by {best} (default 0)"
         )
 
 
@@ -159,13 +159,13 @@ def _odd_yaw(trajectory: Trajectory) -> list[str]:
         return []
     if counts_in_radians(np.rad2deg(yaw), course):
         raise BlockError(
-            "the yaw of the trajectory follows its course as radians, not as degrees: convert roll, pitch and yaw to "
-            "degrees"
+            "the yaw of the trajectory agrees with its course in radians, not in degrees: convert roll, pitch and "
+            "yaw to degrees"
         )
     deviation = np.rad2deg(np.median(np.abs(np.arctan2(np.sin(yaw - course), np.cos(yaw - course)))))
     return [
-        f"the yaw of the trajectory is {deviation:.0f} degrees off its course in the median, as of an aircraft that "
-        "flies sideways or backwards: boresight and lever arm refer to these axes; correct yaw if it does not"
+        f"the yaw of the trajectory is {deviation:.0f} degrees off its course in the median, as in sideways or "
+        "backward flight: boresight and lever arm refer to these axes; correct the yaw if it is wrong"
     ]
 
 
@@ -183,8 +183,8 @@ def _jumps(trajectory: Trajectory) -> list[str]:
     if jump[k] < max(_JUMP_M, _TIMES * float(np.median(jump))):
         return []
     return [
-        f"the trajectory jumps by {jump[k]:.2g} m at {time[k + 2]:.3f} s from one record to the next, which no "
-        "aircraft does: splines go over it; process the trajectory again, or leave out the strip that was flown then"
+        f"the trajectory jumps by {jump[k]:.2g} m at {time[k + 2]:.3f} s from one record to the next: the splines do "
+        "not follow it. Reprocess the trajectory, or remove the strip flown then"
     ]
 
 

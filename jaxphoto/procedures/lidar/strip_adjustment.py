@@ -151,14 +151,14 @@ def adjust_strips(
     settings = StripSettings() if settings is None else settings
     if trajectory is None and priors is not None:
         raise InputError(
-            "without a trajectory strips have shifts alone, and nothing is estimated of their scanner: give the "
-            "trajectory (--trajectory), or say nothing of the scanner"
+            "without a trajectory only strip shifts are estimated, not the scanner: give the trajectory "
+            "(--trajectory), or omit the scanner"
         )
     priors = ScannerPriors() if priors is None else priors
     if priors.calibration.pattern == "circle" and priors.calibration.time_offset != FIXED:
         raise InputError(
-            "the time offset of a scanner that looks all around is not estimated, because what it sees of one plane is "
-            "seconds apart: leave out time-offset, and shift the trajectory (--trajectory-shift-s)"
+            "the time offset of a circular scanner is not estimated, because its returns of one plane are seconds "
+            "apart: omit time-offset, and shift the trajectory (--trajectory-shift-s)"
         )
     fixed = cloud.strips if fixed == "all" else fixed
     names = _check(cloud, trajectory, fixed, photographs is None and priors.right, control is not None)
@@ -252,15 +252,15 @@ def _check(
     names = cloud.strips
     if cloud.strip is None or len(names) < (1 if controlled else 2):
         raise InputError(
-            "the cloud has one strip, and nothing to compare it with: give each flight line its own point source ID, "
-            "or a column strip; or control (--control)"
+            "the cloud has one strip only: give each flight line its own point source ID, or a column strip; or "
+            "control (--control)"
         )
     for k, name in enumerate(names):
         if not np.any(cloud.strip == k):
             raise InputError(f"strip {name} of the cloud has no points: omit it, or read other classes and returns")
     for name in fixed:
         if name not in names:
-            raise InputError(f"{name} is no strip of the cloud, which has {', '.join(names)}: correct its name")
+            raise InputError(f"unknown strip {name}; choose among {', '.join(names)}")
     if set(names) <= set(fixed) and (strips_alone or trajectory is None):
         raise InputError("all strips are fixed: nothing is left to adjust; fix fewer")
     if trajectory is not None and cloud.time is None:
@@ -287,8 +287,8 @@ def _splines(
     wanted = 0 if trajectory is None else float(np.ptp(spans, axis=1).sum()) / settings.knots_s
     if wanted > _MOST_KNOTS:
         raise InputError(
-            f"with knots {settings.knots_s:g} s apart the trajectory has {wanted:.0f} of them, of six unknowns each, "
-            f"and {_MOST_KNOTS} fill a computer: take them farther apart (--knots-s)"
+            f"with knots {settings.knots_s:g} s apart the trajectory has {wanted:.0f} knots of six unknowns each "
+            f"(limit {_MOST_KNOTS}): increase --knots-s"
         )
     for start, end in spans.tolist():
         first = sum(s.size for s in splines)

@@ -107,12 +107,9 @@ def check_complete(control: SurveyedPoints) -> None:
     for k, (xyz, sigma) in enumerate(zip(control.coordinates, control.sigma_m, strict=True)):
         at = f"{control.places[k]}: point {control.ids[k]}"
         if not np.isfinite(xyz).all():
-            raise InputError(f"{at} has no height, without which nothing says how far it is from a plane: add Z_m")
+            raise InputError(f"{at} has no height: add Z_m")
         if not (sigma > 0).all():
-            raise InputError(
-                f"{at} has no standard deviations, which say how near to a plane it must be: add sigma_X_m, sigma_Y_m "
-                "and sigma_Z_m"
-            )
+            raise InputError(f"{at} has no standard deviations: add sigma_X_m, sigma_Y_m and sigma_Z_m")
 
 
 def check_seen(control: SurveyedPoints, surveyed: OnStrips, search: StripSearch) -> None:
@@ -129,16 +126,15 @@ def check_seen(control: SurveyedPoints, surveyed: OnStrips, search: StripSearch)
                 "system and in metres, easting first"
             )
         raise BlockError(
-            f"no point of {control.file} lies on a plane of a strip, which is {settings.returns} returns about it, in "
-            f"{settings.cell_m:g} m, that scatter by {settings.roughness_m:g} m at most: give points on smooth, open "
-            "surfaces, or take larger cells (--cell-m) or rougher planes (--roughness-m)"
+            f"no point of {control.file} lies on a plane of a strip ({settings.returns} returns within "
+            f"{settings.cell_m:g} m, scatter at most {settings.roughness_m:g} m): give points on smooth, open "
+            "surfaces, or increase --cell-m or --roughness-m"
         )
     offset = float(np.median(gap))
     if abs(offset) > _FAR_M:
         raise BlockError(
-            f"the points of {control.file} lie {abs(offset):.1f} m {'above' if offset > 0 else 'below'} the strips: "
-            "its heights may count in feet or belong to another vertical system than those of the cloud; bring both "
-            "into one"
+            f"the points of {control.file} are {abs(offset):.1f} m {'above' if offset > 0 else 'below'} the strips: "
+            "check the height unit and vertical datum of both"
         )
 
 
@@ -204,7 +200,7 @@ def _also_in_block(block: Block, control: SurveyedPoints) -> Bool[np.ndarray, "p
         if not of_point.any() or (difference > _SAME * control.sigma_m[k, axis[of_point]]).any():
             how = f"{difference.max():.3f} m away" if of_point.any() else "without being control there"
             raise InputError(
-                f"{control.places[k]}: {name} is a point of the block, too, {how}: give it the same coordinates in "
+                f"{control.places[k]}: {name} is also a point of the block, {how}: give it the same coordinates in "
                 "the control of both, or another name"
             )
         again[k] = True

@@ -118,18 +118,16 @@ def tie_points(block: Block, names: Collection[str] | None = None) -> Int[np.nda
     if names is None:
         free = np.setdiff1d(np.arange(len(block.points)), np.concatenate(observed).astype(int))
         if not len(free):
-            raise BlockError(
-                "the block has no tie point that a cloud could give a height: name points that should have one"
-            )
+            raise BlockError("the block has no tie point for a height from the cloud: name the points")
         return free
     place = {name: k for k, name in enumerate(block.points)}
     high = {int(p) for rows in (block.control, block.fixed) for p in np.asarray(rows.who)[rows.axis == 2]}
     for name in names:
         if name not in place:
-            raise InputError(f"{name} is no point of the block: name points of image_points.csv")
+            raise InputError(f"unknown point {name}; choose points of image_points.csv")
         if place[name] in high:
             raise InputError(
-                f"the height of point {name} is control already: leave it out, or take it out of the control"
+                f"the height of point {name} is control already: omit the point, or remove it from the control"
             )
     return np.array(sorted(place[name] for name in set(names)), int)
 
@@ -145,11 +143,11 @@ def no_surface_error(points: np.ndarray, cloud: np.ndarray, flag: np.ndarray) ->
         )
         return BlockError(
             f"the cloud does not cover the block: its points lie at {other}, those of the block at {block}; read the "
-            "cloud for the block's frame (its EPSG code and unit), or take another cloud"
+            "cloud for the block's frame (its EPSG code and unit), or use another cloud"
         )
     counts = ", ".join(f"{n} {name.lower()}" for name, n in flag_counts(flag).items())
     return BlockError(
-        f"the cloud tells the height of none of the {len(points)} points ({counts}): take a denser cloud, other "
+        f"the cloud determines the height of none of the {len(points)} points ({counts}): use a denser cloud, other "
         "classes or returns, or another method"
     )
 

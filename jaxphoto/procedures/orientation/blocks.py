@@ -94,9 +94,9 @@ def _check_perspective(block: Block) -> None:
     for name, interior in block.start.unknowns.interior.items():
         if type(interior.projection) is not Perspective:
             raise BlockError(
-                f"camera {name} has the projection {interior.projection.name}, and images are oriented from nothing "
-                "but their points for perspective cameras only: give approximate values in images.csv, stations and "
-                "attitudes, or four known points in each image"
+                f"camera {name} has the projection {interior.projection.name}, but orientation from image points "
+                "alone needs a perspective camera: give approximate values in images.csv, stations and attitudes, or "
+                "four known points in each image"
             )
 
 

@@ -84,7 +84,7 @@ def in_known_frame(block: Block, network: Network, known: Start) -> Network:
     elif similarity is None and len(here):
         raise BlockError(
             f"the images are oriented to one another, but the {len(here)} known points and stations that they see are "
-            "fewer than three or lie on a line, which leaves the frame open: measure more known points, or give "
+            "fewer than three or lie on a line, so the frame is undetermined: measure more known points, or give "
             "approximate X_m, Y_m, Z_m, omega_deg, phi_deg, kappa_deg in images.csv"
         )
     elif similarity is None:

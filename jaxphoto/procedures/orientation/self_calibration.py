@@ -128,7 +128,7 @@ def determined(adjusted: Adjustment, calibration: SelfCalibration) -> Determined
         tuple(name for name in names if name not in weak),
         [
             f"{name} of {camera_words(camera)} is observed where it starts, {float(prior.value):.6g} +- "
-            f"{float(prior.sigma):.2g}: the images leave the corner of the format open by "
+            f"{float(prior.sigma):.2g}: the images determine the corner of the format only to "
             f"{weak[name] / calibration.unit[name]:.1%} of its radius"
             for name, prior in zip(names, priors, strict=True)
             if name in weak
