@@ -26,8 +26,8 @@ def single(name: str, values: Any, *shape: int | None) -> Float[Array, "..."]:
     if values.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, values.shape, strict=True)):
         return values
     many = values.ndim == len(shape) + 1 and all(n in (None, m) for n, m in zip(shape, values.shape[1:], strict=True))
-    mend = "map the function over many with jax.vmap" if many else "give an array of that shape"
-    raise InputError(f"{name} has shape {_written(values.shape)} where {_written(shape)} is required: {mend}")
+    cure = "map the function over many with jax.vmap" if many else "give an array of that shape"
+    raise InputError(f"{name} has shape {_written(values.shape)} where {_written(shape)} is required: {cure}")
 
 
 def _written(shape: tuple[int | None, ...]) -> str:

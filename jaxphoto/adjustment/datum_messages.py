@@ -42,23 +42,23 @@ def datum_sentence(null_motions: np.ndarray, block: Block, named: list[str], sig
     order = ["control_points", *(name for name in counts if name != "control_points")]
     named_counts = [(counts[name], what.get(name, name.replace("_", " "))) for name in order if name in counts]
     observed = [f"{n} {noun[:-1] if n == 1 else noun}" for n, noun in named_counts]
-    mends = "add control points or camera stations"
+    cures = "add control points or camera stations"
     if names == ["scale"]:
-        mends += ", or a distance"
+        cures += ", or a distance"
     if not np.isfinite(sigma):
-        mends += ', or set [datum] kind = "inner" (or "minimal") in block.toml'
+        cures += ', or set [datum] kind = "inner" (or "minimal") in block.toml'
     elif any("rotation" in name for name in names):
-        mends = "add control points or camera stations off the line of the existing ones"
+        cures = "add control points or camera stations off the line of the existing ones"
     if named:
-        mends = "add control points, or fix " + ", ".join(named[:3]) + (" ..." if len(named) > 3 else "")
+        cures = "add control points, or fix " + ", ".join(named[:3]) + (" ..." if len(named) > 3 else "")
     from_what = " and ".join(observed) if observed else "image coordinates alone"
     if np.isfinite(sigma):
         known = f"{100 * sigma:.2g} %" if names == ["scale"] else f"{np.degrees(sigma):.2g} deg"
         return (
             f"the datum of the block is nearly undetermined: {', '.join(names)} cannot be determined from {from_what} "
-            f"better than to {known} (noise level); {mends}"
+            f"better than to {known} (noise level); {cures}"
         )
     return (
         f"the datum of the block has a defect of {len(null_motions)}: {', '.join(names)} cannot be determined from "
-        f"{from_what}; {mends}"
+        f"{from_what}; {cures}"
     )

@@ -41,7 +41,7 @@ class Outcome(enum.Enum):
         "not converged: long steps hardly reduce the residuals, so the observations do not determine some unknowns; "
         "fix them, weight them, or add observations that determine them"
     )
-    ASTRAY = (
+    DIVERGED_POINTS = (
         "not converged: object points diverged (near-parallel rays); check their measurements for blunders, "
         "remove the points, or give better approximate values"
     )
@@ -145,7 +145,7 @@ class Adjustment(eqx.Module):
         if not np.isfinite(float(self.sum_of_squares)):
             return Outcome.DIVERGED
         if self.diverged_points.any():
-            return Outcome.ASTRAY
+            return Outcome.DIVERGED_POINTS
         kept = 0 if self.history is None else len(self.history.length)
         flat = self.history is not None and 0 < kept == int(self.steps) and bool(self.history.is_flat(kept - 1))
         return Outcome.FLAT if flat else Outcome.STEPS

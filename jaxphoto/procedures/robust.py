@@ -144,7 +144,7 @@ def solve_without_diverged(
             return solved, point, left
         # Restart from `unknowns`: a diverged point has distorted the other unknowns.
         left[rows.group] = left[rows.group] | np.isin(rows.point, point[lost])
-    raise BlockError(f"too many object points diverge: {Outcome.ASTRAY.value}")
+    raise BlockError(f"too many object points diverge: {Outcome.DIVERGED_POINTS.value}")
 
 
 def _rescale(losses: dict[str, AbstractLoss], at: Adjustment, r: RedundancyBlocks) -> dict[str, AbstractLoss]:

@@ -73,7 +73,7 @@ NO_CONTROL = {"control": ControlCoordinates.none(), "fixed": ControlCoordinates.
 @pytest.mark.parametrize(
     ("make", "error", "words"),
     [
-        (lambda: lone({"shift": FREE, "drift": FREE}), RankError, ["strips[c].drift", "one image", "strip c fixed"]),
+        (lambda: lone({"shift": FREE, "drift": FREE}), RankError, ["strips[c].drift", "one image", "strip c"]),
         (lambda: lone({"shift": FIXED, "drift": FREE}), RankError, ["strips[c].drift", "one image"]),
         (
             lambda: at_one_time(with_strips(a=StripBias(FREE, FREE))),

@@ -93,7 +93,7 @@ def test_a_diverged_adjustment_has_no_sigmas_and_is_not_compared():
     block = simulated("cross").block
     short = adjust(block, max_steps=1)
     assert not bool(short.converged)
-    with pytest.raises(InputError, match="is no calibration: not converged"):
+    with pytest.raises(InputError, match="did not converge: not converged"):
         compare(short, adjusted("cross"))
     table = Tables(short).interior
     assert table["sigma"].isna().all() and table["significant"].isna().all()

@@ -144,7 +144,7 @@ def test_the_command_leaves_out_what_is_not_of_the_camera(tmp_path, monkeypatch,
 
 def test_there_is_not_always_a_pinhole(tmp_path):
     wide = InteriorOrientation(1.0, 0.0, 0.0, OpenCvFisheye(), projection=Equidistant())
-    with pytest.raises(ValueError, match="looks at 90 degrees from its axis or more"):
+    with pytest.raises(ValueError, match="sees directions 90 degrees or more from its axis"):
         pinhole(SENSOR, wide)
     with pytest.raises(ValueError, match=r"keep only what fills them \(crop\)"):
         pinhole(SENSOR, InteriorOrientation(1.5, 0.0, 0.0, OpenCvFisheye(), projection=Equidistant()), "all")

@@ -196,7 +196,7 @@ def test_a_delay_goes_through_files_and_needs_the_motion(tmp_path):
     table.to_csv(tmp_path / "block/attitudes.csv", index=False)
     with pytest.raises(BlockError, match=r"delay of \[unknowns\.rig_cameras\.oblique\] needs the motion of image A_03"):
         read_block(tmp_path / "block")
-    with pytest.raises(RankError, match=r"rig_cameras\[oblique\]\.delay acts with the motion of the rig"):
+    with pytest.raises(RankError, match=r"rig_cameras\[oblique\]\.delay needs the motion of the rig"):
         adjust(dataclasses.replace(late().block, motion=None))
     bare = indirect(late().block)
     assert bare.motion is not None and not len(bare.stations)

@@ -205,8 +205,8 @@ def check_near(points: SurveyedPoints, system: ControlSystem, longitude: float, 
     if off <= NEAR_M:
         return
     would = fitting(points, system, longitude, latitude)
-    mend = f"they would fit {would}" if would else "correct the coordinates, or the system"
-    raise InputError(f"{far}, if their system is {system.name}: {mend}")
+    cure = f"they would fit {would}" if would else "correct the coordinates, or the system"
+    raise InputError(f"{far}, if their system is {system.name}: {cure}")
 
 
 def fitting(points: SurveyedPoints, system: ControlSystem | None, longitude: float, latitude: float) -> str:
