@@ -92,7 +92,7 @@ def test_cameras_of_a_chain_of_kalibr_project_as_opencv(tmp_path):
     )
     found = columns_rows(second, equidistant)
     np.testing.assert_allclose(found, fisheye([-0.02, 0.01, -0.003, 0.001]), rtol=0, atol=1e-9)
-    with pytest.raises(InputError, match="name one of cam0, cam1"):
+    with pytest.raises(InputError, match="choose one of cam0, cam1"):
         read_camera_file(path)
 
 
