@@ -284,7 +284,7 @@ def test_untied_photographs_are_reported(tmp_path):
     (tmp_path / "in" / "ties.txt").write_text("a b camera\n1 0.5 0.5\n2 0.5 0.6\n3 0.5 0.7\n-99\nlost camera\n")
     with (
         pytest.raises(InputError, match="no image shares 3 points with others"),
-        pytest.warns(UserWarning, match="1 photographs are not in cameras.xml .*'lost camera'"),
+        pytest.warns(UserWarning, match="1 photographs that are not in cameras.xml: 'lost camera'"),
         pytest.warns(UserWarning, match=r"3 point\(s\) in fewer than two images"),
     ):
         read_source(tmp_path / "in")
