@@ -388,7 +388,7 @@ def test_a_block_keeps_its_source_and_assumed_pixel_size(tmp_path):
 
 
 def test_pix4d_photographs_without_camera_are_reported_and_points_intersected(tmp_path):
-    with pytest.warns(UserWarning, match="1 photographs are not in flight_calibrated.*: 'lost'"):
+    with pytest.warns(UserWarning, match="1 photographs that are not in flight_calibrated.*: 'lost'"):
         block = read_source(write_pix4d(tmp_path / "in", offset=(0.25, -1.0, 3.0)))
     assert free_of(block, "0") == {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2"}
     found = np.asarray(approximate(block).points)
@@ -468,7 +468,7 @@ REFUSED = {
     "mirror": (_mvg(_TURN, np.diag([1.0, 1, -1]).tolist()), "image a.jpg is not a rotation"),
     "model": (_mvg(_KIND, "spherical"), "'spherical' is not supported"),
     "cut": (_blocks(lambda text: text[:-30]), "block.xml: damaged"),
-    "unknown encoding": (_blocks(_replaced("utf-8", "utf-0")), "block.xml: damaged .*unknown encoding: utf-0"),
+    "unknown encoding": (_blocks(_replaced("utf-8", "utf-0")), "block.xml: damaged.*unknown encoding: utf-0"),
     "angles": (_blocks(_geographic), "is a geographic system"),
     "axes": (_blocks(_replaced("XRightYUp", "XUpYLeft"), upwards=True), "one: unknown CameraOrientation 'XUpYLeft'"),
     "end": (_bundle(lambda lines: lines[:-1]), "number of measurements of point 6"),

@@ -190,7 +190,7 @@ def test_control_of_a_block_is_the_same_point_and_counts_once():
     [
         (lambda c: c._replace(sigma_m=np.full_like(c.sigma_m, np.nan)), "point K0 has no standard deviations"),
         (lambda c: c._replace(coordinates=c.coordinates + np.array([5000.0, 0, 0])), r"lie 49\d\d m from the strips"),
-        (lambda c: c._replace(coordinates=c.coordinates + np.array([0, 0, 47.0])), r"lie 4\d\.\d m above the strips"),
+        (lambda c: c._replace(coordinates=c.coordinates + np.array([0, 0, 47.0])), r"are 4\d\.\d m above the strips"),
         (lambda c: c._replace(coordinates=c.coordinates * np.array([1, 1, np.nan])), "point K0 has no height"),
         (lambda c: c._replace(coordinates=0 * c.coordinates + [8.0, 20.0, 4.6]), "lies on a plane of a strip"),
     ],
