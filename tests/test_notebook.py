@@ -19,6 +19,11 @@ import jaxphoto
 from jaxphoto import FIXED, FREE, InputError, Tables, Weighted, report
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
 from jaxphoto.losses import AbstractLoss
+from jaxphoto.procedures.boresight import BoresightEstimate, Step
+from jaxphoto.procedures.georeference import Georeferenced
+from jaxphoto.procedures.robust import Robust
+from jaxphoto.procedures.snooping import Snooped
+from jaxphoto.procedures.swapped_observations import Exchange
 from jaxphoto.report.findings import Verdict
 from jaxphoto.sensitivity import Readjustment
 from jaxphoto.simulation import Simulation, Terrain
@@ -51,7 +56,8 @@ def test_things_show_themselves_in_a_few_lines():
     assert "&lt;script&gt;" in evil._repr_html_()
 
 
-ROOMS = (jaxphoto, jaxphoto.statistics, jaxphoto.stability, jaxphoto.sensitivity, jaxphoto.procedures)
+ROOMS = (jaxphoto, jaxphoto.statistics, jaxphoto.stability, jaxphoto.sensitivity)
+PROCEDURES = {BoresightEstimate, Exchange, Georeferenced, Robust, Snooped, Step}
 
 
 def classes_in(hint) -> set[type]:
@@ -63,7 +69,7 @@ def classes_in(hint) -> set[type]:
 
 def returned() -> set[type]:
     """What public functions return, public classes, and what blocks, adjustments and simulations consist of."""
-    found: set[type] = set()
+    found: set[type] = set(PROCEDURES)
     for thing in (getattr(room, name) for room in ROOMS for name in room.__all__):
         if inspect.isclass(thing):
             found.add(thing)
