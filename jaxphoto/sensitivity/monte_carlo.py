@@ -290,9 +290,14 @@ def _count(entries: Any) -> int:
 
 def _check_same(block: Any, nominal: Block) -> None:
     """Raise InputError if `block` differs from the nominal block in anything except floating-point values."""
-    kind: Any = jax.tree.structure(nominal)
-    same = isinstance(block, Block) and kind == jax.tree.structure(block)
-    if not same or not all(map(_is_number_or_same, jax.tree.leaves(block), jax.tree.leaves(nominal))):
+    # Priors replaced by `eqx.tree_at` may be in a plain dictionary, which JAX distinguishes from an ordered one.
+    one, other = (
+        dataclasses.replace(b, priors=dataclasses.replace(b.priors)) if isinstance(b, Block) else b
+        for b in (block, nominal)
+    )
+    kind: Any = jax.tree.structure(other)
+    same = isinstance(block, Block) and kind == jax.tree.structure(one)
+    if not same or not all(map(_is_number_or_same, jax.tree.leaves(one), jax.tree.leaves(other))):
         raise InputError(
             "a perturbation must return its block with other values of observations or parameters, alone or with a "
             "dict of scalars to record: ids, indices, shapes and free unknowns must not change"
