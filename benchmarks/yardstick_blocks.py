@@ -42,7 +42,7 @@ def case(build: Callable[[], Blocks]) -> Callable[[], Blocks]:
 def _resolved():
     """Blocks of procedures that look at a cloud from where an adjustment puts points: from the optimum itself."""
     stack = contextlib.ExitStack()
-    for module in ("until_still", "strip_adjustment"):
+    for module in ("iterate_to_convergence", "strip_adjustment"):
         stack.enter_context(mock.patch(f"jaxphoto.procedures.lidar.{module}.adjust", optimum))
     return stack
 
