@@ -72,7 +72,7 @@ def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], nam
         # A valid file may still fail on this machine: this appears only in the call, as various errors.
         if not program.loaded:
             raise
-        program = _program_of(function.__wrapped__, arguments, thorough, anew=True)()
+        program = _program_of(function.__wrapped__, arguments, thorough, recompile=True)()
         _keep(key, program)
         ready = time.perf_counter()
         result = program(arrays)
@@ -139,14 +139,14 @@ def _type(array: Any) -> tuple:
     return array.shape, array.dtype, array.weak_type, array.sharding if array.committed else None
 
 
-def _program_of(function: Any, arguments: tuple, thorough: bool, anew: bool = False) -> Callable[[], _Program]:
-    """Return a function that returns the program: loaded from disk, or compiled and stored (always with `anew`).
+def _program_of(function: Any, arguments: tuple, thorough: bool, recompile: bool = False) -> Callable[[], _Program]:
+    """Return a function that returns the program: loaded from disk, or compiled and stored (always with `recompile`).
 
     All steps that depend on the thread, such as `with jax.enable_x64(False)`, are completed before this returns.
     """
     options = options_here(thorough)
     key = store.key_of(function, arguments, options)
-    stored = store.load(key) if key and not anew else None
+    stored = store.load(key) if key and not recompile else None
     if stored is not None:
         program = _Program(stored.compiled, *jax.tree.flatten(stored.skeleton), loaded=True)
         return_freed_memory()

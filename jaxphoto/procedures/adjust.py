@@ -197,9 +197,9 @@ def _from_image_points(block: Block, from_start: _FromStart, report: Callable[[s
     for rows in (block.control, block.fixed):
         is_control[rows.who, rows.axis] = True
     images, points = np.zeros_like(np.asarray(s.image_known)), is_control.all(axis=1) & np.asarray(s.point_known)
-    try:
-        from jaxphoto.procedures.orientation import orient_block
+    from jaxphoto.procedures.orientation import orient_block
 
+    try:
         oriented = orient_block(
             dataclasses.replace(block, start=dataclasses.replace(s, image_known=images, point_known=points)), report
         )
@@ -251,9 +251,9 @@ def start_of(block: Block, report: Callable[[str], object] = lambda text: None) 
     reached, enough = _reached(block)
     if enough:
         return approximate(reached)
-    try:
-        from jaxphoto.procedures.orientation import orient_block
+    from jaxphoto.procedures.orientation import orient_block
 
+    try:
         oriented = orient_block(block, report)
     except (BlockError, DatumError, RankError) as error:
         if not reached.start.image_known.any():
