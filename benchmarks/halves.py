@@ -12,7 +12,7 @@ import numpy as np
 
 import jaxphoto
 from jaxphoto.adjustment import common_sizes
-from jaxphoto.procedures.halves import camera_of, halved, halves
+from jaxphoto.procedures.compare import camera_of, halved, halves
 from jaxphoto.stability import image_grid
 
 

@@ -66,7 +66,7 @@ def flown(seed: int, draws: int) -> dict:
     knots = np.column_stack([flight.errors.position, flight.errors.attitude]).ravel()
     known = [v for label, v in joint.items() if label.startswith("trajectory_knots")]
     record = {
-        "still": together.still,
+        "converged": together.converged,
         "sigma0": float(together.adjusted.sigma0),
         "joint": compared(joint, true),
         "two_steps": compared(scanner | estimates(images), true),
@@ -177,7 +177,7 @@ def table(records: list[dict]) -> str:
     joint, apart = (np.array([list(r[way].values()) for r in good]) for way in ("joint", "two_steps"))
     w = [np.abs(of[..., 0] / of[..., 1]) for of in (joint, apart)]
     knots = np.abs(np.concatenate([r["trajectory"] for r in good]))
-    restless = sum(not r["still"] for r in good)
+    restless = sum(not r["converged"] for r in good)
     inside = 100 * np.mean(np.concatenate([w[0].ravel(), knots]) < _WITHIN)
     rows = [
         ["flights, failed, not still", f"{len(records)}, {len(records) - len(good)}, {restless}"],

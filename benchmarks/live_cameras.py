@@ -24,7 +24,7 @@ from jaxphoto import adjust, covariance
 from jaxphoto.io import recipe_from
 from jaxphoto.parameters import numbers_of
 from jaxphoto.simulation import remeasure, simulate
-from jaxphoto.simulation.changing_cameras import drawn
+from jaxphoto.simulation.camera_changes import draw_changes
 from jaxphoto.simulation.flight import fly
 from jaxphoto.statistics import SIGNIFICANCE_LEVEL, camera_drifts, camera_spline_differences, strip_differences
 
@@ -71,7 +71,7 @@ def flights(case: str, n: int, first: int) -> Iterator[dict]:
     observed = lambda b: (b.image_points.xy, b.stations.value, b.attitudes.roll_pitch_yaw, b.control.value)  # noqa: E731
     measure = jax.jit(lambda truth, key: observed(remeasure(block, truth, key)))
     for seed in range(first, first + n):
-        changes = drawn(recipe, flight, block.flight_time, seed)
+        changes = draw_changes(recipe, flight, block.flight_time, seed)
         more = {kind: {name: own.truth for name, own in owners.items()} for kind, owners in changes.items()}
         more = jax.tree.map(np.asarray, more)
         true = dataclasses.replace(truth, more=more)

@@ -61,7 +61,7 @@ def adjusted(seed: int, pattern: str) -> dict:
     # Knots come one after the other, three numbers of position and three of attitude each.
     knots = np.column_stack([errors.position, errors.attitude]).ravel()
     return {
-        "still": found.still,
+        "converged": found.converged,
         "sigma0": float(found.adjusted.sigma0),
         "before_m": _rms([d.rms_before_m for d in found.differences]),
         "after_m": _rms([d.rms_m for d in found.differences]),
@@ -81,7 +81,7 @@ def table(records: list[dict]) -> str:
     good = [r for r in records if "failed" not in r]
     w = np.array([list(r["parameters"].values()) for r in good])
     all_w = np.concatenate([np.ravel(w), *(r["trajectory"] for r in good)])
-    chi2, restless = np.array([r["chi2"] for r in good]), sum(not r["still"] for r in good)
+    chi2, restless = np.array([r["chi2"] for r in good]), sum(not r["converged"] for r in good)
     rows = [
         ["flights, failed, not still", f"{len(records)}, {len(records) - len(good)}, {restless}"],
         ["gaps before, after, of noise alone (mm)", ", ".join(f"{1000 * _rms([r[k] for r in good]):.1f}" for k in

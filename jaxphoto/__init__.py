@@ -1,6 +1,6 @@
 """jaxphoto: differentiable photogrammetry on JAX.
 
-Importing it switches JAX to float64 (docs/precision.md) and, unless you chose otherwise, keeps compiled code in a
+Importing it switches JAX to float64 (docs/statistics.md) and, unless you chose otherwise, keeps compiled code in a
 cache on disk.
 """
 
@@ -17,7 +17,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import jax
 
 jax.config.update("jax_enable_x64", True)
-# One JAX device per core: large blocks are sharded over them (docs/scaling.md).
+# One JAX device per core: large blocks are sharded over them (docs/solver.md).
 _chosen = "host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
 if jax.config.values["jax_num_cpu_devices"] <= 0 and not _chosen:
     # Too late if JAX has already computed: its devices then stay as they are.
@@ -80,8 +80,7 @@ if TYPE_CHECKING:
     from jaxphoto.extras.formats import convert, read_source
     from jaxphoto.io import read_block, read_recipe, write_block, write_simulation
     from jaxphoto.procedures.calibration import calibrate
-    from jaxphoto.procedures.compare import compare
-    from jaxphoto.procedures.halves import halves
+    from jaxphoto.procedures.compare import compare, halves
     from jaxphoto.procedures.lidar import simultaneous
     from jaxphoto.procedures.orientation import orient
     from jaxphoto.report import Tables
@@ -112,8 +111,7 @@ _LATER = {
     "extras.formats": ("convert", "read_source"),
     "io": ("read_block", "read_recipe", "write_block", "write_simulation"),
     "procedures.calibration": ("calibrate",),
-    "procedures.compare": ("compare",),
-    "procedures.halves": ("halves",),
+    "procedures.compare": ("compare", "halves"),
     "procedures.lidar": ("simultaneous",),
     "procedures.orientation": ("orient",),
     "report": ("Tables",),

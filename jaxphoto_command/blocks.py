@@ -63,10 +63,10 @@ def adjust(
     from jaxphoto.io import read_block, read_truth, write_block
     from jaxphoto.losses import LOSSES
     from jaxphoto.procedures import adjust_for_tables
-    from jaxphoto.procedures.weights import made_by_blunders
+    from jaxphoto.procedures.blunder_causes import inflated_components
     from jaxphoto.statistics import SPLITS
     from jaxphoto.writing import check_folder, whole_folder
-    from jaxphoto_command.provenance import Provenance
+    from jaxphoto_command.certificate import Provenance
 
     splits = tuple(dict.fromkeys(opt.names(weights)))
     if unknown := [name for name in splits if name not in (*SPLITS, "group")]:
@@ -78,7 +78,7 @@ def adjust(
     with output.progress("reading the block") as progress:
         read = read_block(block)
         provenance = Provenance.of_block(block)
-        made = output.made_by(block)
+        record = output.command_record(block)
         seconds = {"read": time.perf_counter() - start}
         progress.update("computing initial values")
         snooped = components = None
@@ -90,7 +90,7 @@ def adjust(
         if weights is not None and bool(adjusted.converged):
             progress.update("estimating variance components")
             components = jaxphoto.variance_components(adjusted, splits, max_steps=max_steps)
-            masked += made_by_blunders(adjusted, components, splits, max_steps=max_steps, report=progress.update)
+            masked += inflated_components(adjusted, components, splits, max_steps=max_steps, report=progress.update)
             adjusted = components.adjusted
         progress.update("computing statistics")
         tables = jaxphoto.Tables(adjusted, rotations, read_truth(block))  # type: ignore[arg-type]
@@ -102,7 +102,7 @@ def adjust(
         times = {name: times[name] for name in ("read", "start", "compile", "solve", "covariance") if name in times}
         with whole_folder(out) as work:
             source = "block" if snooped else os.path.relpath(block.resolve(), out.resolve())
-            report.write_results(tables, verdict, work, times, {"block": source, **output.options()}, made)
+            report.write_results(tables, verdict, work, times, {"block": source, **output.options()}, record)
             provenance.write(read.images, work)
             for name, table in (report.component_tables(components) if components else {}).items():
                 table.to_csv(work / f"{name}.csv", index=False)
@@ -142,11 +142,11 @@ def boresight(
     check_folder(out, block)
     start = time.perf_counter()
     with output.progress("reading the block") as progress:
-        read, made = read_block(block), output.made_by(block)
+        read, record = read_block(block), output.command_record(block)
         seconds = {"read": time.perf_counter() - start}
         steps = estimate(read, go_on=go_on, max_steps=max_steps, report=progress.update)
         progress.update(f"writing {out}")
-        write_boresight(steps, out, seconds, made)
+        write_boresight(steps, out, seconds, record)
     print_boresight(steps, output.screen)
     output.wrote(out, f"results in {out} (open report.html)")
     if not all(step.go_on for step in steps):
@@ -166,7 +166,7 @@ def certificate(
     camera: opt.Camera = None,
 ) -> None:
     """Write the certificate of a calibration: parameters, precision, stability, inputs."""
-    from jaxphoto.io.results_judged import read_summary, reservation
+    from jaxphoto.io.result_tables import read_summary, reservation
     from jaxphoto.writing import check_room
     from jaxphoto_command.certificate import certificate_document, write_certificate
 
@@ -190,7 +190,7 @@ def tables(
 ) -> None:
     """Write tables of results as CSV, Parquet, Markdown or LaTeX, rounded to their standard deviations."""
     from jaxphoto.io import read_result_tables
-    from jaxphoto.io.results_judged import read_summary, reservation
+    from jaxphoto.io.result_tables import read_summary, reservation
     from jaxphoto.report import write_table
     from jaxphoto.writing import check_folder, whole_folder
 
@@ -252,7 +252,7 @@ def monte_carlo(
     check_place(out)
     sigmas = _sigmas(kind, {"m": sigma_m, "deg": sigma_deg, "mm": sigma_mm, "own": sigma})
     with output.progress("reading the block") as progress:
-        read, made = read_block(block), output.made_by(block)
+        read, record = read_block(block), output.command_record(block)
         drawn = noise(read) if kind == "noise" else bias(read, kind, sigmas, per, of=on or [], parameter=parameter)
         progress.update("adjusting the nominal block")
         adjusted = adjust(read)
@@ -265,7 +265,7 @@ def monte_carlo(
         study.draw(lambda done: progress.steps("draws", done, draws))
         progress.update(f"writing {out}")
         summary, table = study.write()
-        write_draws_page(summary, table, read.sensors, out, made)
+        write_draws_page(summary, table, read.sensors, out, record)
     output.say(
         f"{summary['draws']} draws, {summary['converged']} converged, {summary['fallbacks']} by a full adjustment; "
         f"{summary['draws_per_second']:.0f} draws per second"
@@ -317,7 +317,7 @@ def sensitivity(
     check_folder(out, block)
     start = time.perf_counter()
     with output.progress("reading the block") as progress:
-        read, made = read_block(block), output.made_by(block)
+        read, record = read_block(block), output.command_record(block)
         seconds = {"read": time.perf_counter() - start}
         progress.update("computing initial values")
         adjusted = adjust_for_tables(read, max_steps, progress.update)
@@ -326,7 +326,7 @@ def sensitivity(
         largest = results.largest
         progress.update(f"writing {out}")
         order = ("compile", "solve", "covariance", "sensitivity")
-        write_sensitivity(results, out, seconds | {name: adjusted.seconds[name] for name in order}, made)
+        write_sensitivity(results, out, seconds | {name: adjusted.seconds[name] for name in order}, record)
     warn_of_contradictions(adjusted, output)
     columns = ["estimate", "estimate_unit", "exact", "over_sigma", "first_order", "unit", "axis"]
     headings = "estimate", "exact", "in sigmas", "first-order", "by stations of"
@@ -365,14 +365,14 @@ def halves(
     """
     from jaxphoto.extras.formats import write_camera_file
     from jaxphoto.io import read_block
-    from jaxphoto.procedures.halves import camera_of
-    from jaxphoto.procedures.halves import halves as compare_halves
-    from jaxphoto.report.halves import print_halves, write_halves
+    from jaxphoto.procedures.compare import camera_of
+    from jaxphoto.procedures.compare import halves as compare_halves
+    from jaxphoto.report.stability import print_halves, write_halves
     from jaxphoto.writing import check_folder
 
     check_folder(out, block)
     with output.progress("reading the block") as progress:
-        read, made = read_block(block), output.made_by(block)
+        read, record = read_block(block), output.command_record(block)
         cells = opt.grid_points(read.sensors[camera_of(read, camera)], grid, extent)
         result = compare_halves(
             read, cells, by=by, camera=camera, n_cuts=cuts, seed=seed, method=method, report=progress.update
@@ -385,7 +385,7 @@ def halves(
             path, sensor = folder / "camera.toml", read.sensors[name]
             return write_camera_file(path, sensor, interior, name=name, covariance=result.widened)
 
-        write_halves(result, out, write_camera, made)
+        write_halves(result, out, write_camera, record)
     warn_of_contradictions(result.adjusted, output)
     print_halves(result, output.screen)
     output.wrote(out, f"results in {out} (open report.html)")

@@ -52,7 +52,7 @@ def stability(
     print_stability(analysis, sets, a.sensor.pixel_mm, noise_mm, method, output.screen)
     output.add(**stability_summary(analysis, sets, noise_mm, method))
     if out is not None:
-        write_stability(analysis, sets, a.sensor, noise_mm, method, out, output.made_by(first, second))
+        write_stability(analysis, sets, a.sensor, noise_mm, method, out, output.command_record(first, second))
         output.wrote(out, f"results in {out} (open report.html)")
 
 
@@ -89,7 +89,7 @@ def compare(
     print_change(result, sets, a.sensor, output.screen)
     output.add(**change_summary(result, a.sensor))
     if out is not None:
-        write_change(result, sets, a.sensor, out, output.made_by(first, second))
+        write_change(result, sets, a.sensor, out, output.command_record(first, second))
         output.wrote(out, f"results in {out} (open report.html)")
 
 
@@ -183,12 +183,12 @@ def models(
     check_folder(out, block)
     start = time.perf_counter()
     with output.progress("reading the block") as progress:
-        read, made = read_block(block), output.made_by(block)
+        read, record = read_block(block), output.command_record(block)
         seconds = {"read": time.perf_counter() - start}
         choice = model_choice(read, opt.names(models), k=folds, seed=seed, report=progress.update)
         seconds["adjust"] = time.perf_counter() - start - seconds["read"]
         progress.update(f"writing {out}")
-        write_model_choice(choice, read, out, seconds, made)
+        write_model_choice(choice, read, out, seconds, record)
     print_model_choice(choice, output.screen)
     output.wrote(out, f"results in {out} (open report.html)")
     if not choice.by_bic:

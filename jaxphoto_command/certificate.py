@@ -1,26 +1,23 @@
-"""Certificates from folders of results, and pairs of camera files."""
+"""Provenance of results (hashes of inputs, conditions of photographs), certificates, and pairs of camera files."""
 
 import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from jaxphoto.camera.conditions import Conditions
 from jaxphoto.errors import InputError
+from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.camera_files import CameraFile, read_camera_file, results_in
-from jaxphoto.io.conditions import CONDITIONS, conditions_of, read_conditions
-from jaxphoto.io.input_hashes import INPUTS, read_inputs
-from jaxphoto.io.json_file import read_json
+from jaxphoto.io.conditions import CONDITIONS, conditions_of, marked, read_conditions, write_conditions
 from jaxphoto.io.photographs import SUFFIXES, picture_files
+from jaxphoto.io.result_tables import INPUTS, block_inputs, read_inputs, write_inputs
+from jaxphoto.io.text_files import read_json
 from jaxphoto.io.text_tables import read_csv
-from jaxphoto.report.certificate import (
-    Certified,
-    ExteriorCorrelation,
-    FormatBand,
-    LastCalibration,
-    certificate_page,
-)
+from jaxphoto.report.certificate import Certified, ExteriorCorrelation, FormatBand, LastCalibration, certificate_page
 from jaxphoto.report.page import write_pdf
 from jaxphoto.report.stability import Compared
 from jaxphoto.writing import InputFile, input_file, whole_file
@@ -167,3 +164,64 @@ def _measurements(results: Path) -> set[str]:
     files = read_inputs(inputs) if inputs.is_file() else []
     photographs = read_conditions(conditions) if conditions.is_file() else []
     return {f.sha256 for f in files if f.file.lower().endswith(_MEASUREMENTS)} | {c.sha256 for c in photographs}
+
+
+# Files read of a folder of results or of an experiment.
+_READ = (".csv", ".json", ".toml", ".py")
+
+
+def hashes(path: Path) -> Iterator[InputFile]:
+    """Yield the hashes of a file, or of the input files of a folder."""
+    if path.is_file():
+        yield input_file(path)
+    elif (path / TOML).is_file():
+        yield from (f._replace(file=f"{path.name}/{f.file}") for f in block_inputs(path))
+    else:
+        files = (file for file in sorted(path.iterdir()) if file.suffix in _READ and not file.name.startswith("."))
+        yield from (input_file(file, f"{path.name}/{file.name}") for file in files)
+
+
+class Provenance(NamedTuple):
+    """Input files of results, and the conditions of their photographs."""
+
+    conditions: Sequence[Conditions]
+    inputs: Sequence[InputFile]
+
+    @classmethod
+    def of(cls, photographs: Sequence[Path], others: Sequence[Path]) -> "Provenance":
+        """Return the provenance of a flight; `others` are files of control and exposures."""
+        conditions = [conditions_of(path) for path in photographs]
+        return cls(conditions, [*_photograph_hashes(conditions, photographs), *map(input_file, others)])
+
+    @classmethod
+    def of_block(cls, block: Path, others: Sequence[Path] = (), photographs: Sequence[Path] = ()) -> "Provenance":
+        """Return the provenance of a block folder, other files and photographs; it prefers the block's conditions."""
+        inspected = [conditions_of(path) for path in photographs]
+        conditions = read_conditions(block / CONDITIONS) if (block / CONDITIONS).is_file() else inspected
+        return cls(
+            conditions, [*block_inputs(block), *map(input_file, others), *_photograph_hashes(inspected, photographs)]
+        )
+
+    def conditions_for(self, images: Sequence[str]) -> list[Conditions]:
+        """Return the conditions of all photographs, with `images` marked as used."""
+        return marked(self.conditions, images)
+
+    def write(self, images: Sequence[str], folder: Path) -> None:
+        """Write inputs.csv, and conditions.csv if known, with `images` marked as used."""
+        if self.conditions:
+            write_conditions(self.conditions, folder, images)
+        write_inputs(self.inputs, folder)
+
+
+def certify(flight: Path) -> str:
+    """Write certificate.html of the largest part of a flight, or return why not."""
+    try:
+        page = certificate_document(flight)
+    except InputError as error:
+        return str(error)
+    write_certificate(page, flight / "certificate.html")
+    return ""
+
+
+def _photograph_hashes(conditions: Sequence[Conditions], photographs: Sequence[Path]) -> list[InputFile]:
+    return [InputFile(c.file, path.stat().st_size, c.sha256) for c, path in zip(conditions, photographs, strict=True)]

@@ -112,12 +112,12 @@ def experiment(
     folders = find_experiments(experiments, name)
     check_folder(out, *folders)
     declared = {folder: load_experiment(folder) for folder in folders}
-    runs, made = {}, {folder: output.made_by(folder) for folder in folders}
+    runs, record = {}, {folder: output.command_record(folder) for folder in folders}
     for folder, declaration in declared.items():
         with output.progress(folder.name) as progress:
             runs[folder] = run_experiment(declaration, folder, layouts, progress.update)
         # After each, to keep results if a later experiment fails.
-        write_runs(runs, out, made)
+        write_runs(runs, out, record)
         judged = compare(runs[folder], folder)
         groups = list(judged.groupby("table", sort=False))
         rows = []

@@ -12,16 +12,23 @@ from jaxphoto_command.output import Output
 
 PANEL = "Files and formats"
 _ADJUSTED = "jaxphoto example cross_block && jaxphoto adjust cross_block --out results && "
-_Source = Literal[
-    "block", "dbat", "photomodeler", "aicon", "bal", "colmap", "opensfm", "openmvg", "blocksexchange", "metashape",
-    "pix4d", "nerfstudio", "orthority", "texts", "bundler"
-]  # fmt: skip
-_Target = Literal[
-    "block", "colmap", "colmap-binary", "metashape", "opensfm", "openmvg", "blocksexchange", "nerfstudio", "bundler",
-    "bal", "opk", "orthority", "geojson", "geopackage"
-]  # fmt: skip
 Source = Annotated[Path, Argument(help="Results, block folder, or file or folder of another program.")]
 Second = Annotated[Path | None, Argument(hidden=True, metavar="OUT")]
+
+
+def _one_of(table: str) -> Any:
+    """Return a check that a value names a format of `table`; formats are imported only if a value is given."""
+
+    def check(context: typer.Context, value: str | None) -> str | None:
+        if value not in (None, "block"):
+            from jaxphoto.extras import formats
+
+            known = dict.fromkeys(("block", *getattr(formats, table)))
+            if value not in known:
+                raise typer.BadParameter(f"{value!r} is not one of {', '.join(map(repr, known))}.")
+        return value
+
+    return check
 
 
 def _target(out: Path | None, second: Path | None) -> Path:
@@ -38,9 +45,17 @@ def convert(
     second: Second = None,
     out: Annotated[Path | None, Option(help="Folder to write (required).")] = None,
     source_format: Annotated[
-        _Source | None, Option("--format", help="Format of SOURCE (docs/command_line.md; default: by its content).")
+        str | None,
+        Option(
+            "--format",
+            metavar="FORMAT",
+            callback=_one_of("FORMATS"),
+            help="Format of SOURCE (docs/formats.md; default: by its content).",
+        ),
     ] = None,
-    to: Annotated[_Target, Option(help="Format of --out (docs/exports.md).")] = "block",
+    to: Annotated[
+        str, Option(metavar="FORMAT", callback=_one_of("EXPORTS"), help="Format of --out (docs/formats.md).")
+    ] = "block",
     block: Annotated[Path | None, Option(help="Block of the results in SOURCE, if it was moved.")] = None,
     part: Annotated[int, Option(min=1, help="Part of a flight; the largest is 1.")] = 1,
     photographs: Annotated[list[Path] | None, Option(help="Folder of the photographs, for their file names.")] = None,

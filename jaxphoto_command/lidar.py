@@ -22,7 +22,7 @@ SigmaXY = Annotated[float, Option(help="Standard deviation of a laser point in e
 Systematic = Annotated[float, Option(help="Standard deviation of a common error of all heights.")]
 MaxRounds = Annotated[int, Option(min=1, help="Maximum number of outer iterations (surface lookup, adjustment).")]
 Trajectory = Annotated[
-    Path | None, Option(help="Trajectory of the scanner (docs/trajectory.md), on the clock of the cloud.")
+    Path | None, Option(help="Trajectory of the scanner (docs/georeferencing.md), on the clock of the cloud.")
 ]
 TrajectoryShift = Annotated[float, Option(callback=opt.finite, help="Trajectory time minus point cloud time.")]
 ExposureShift = Annotated[float, Option(callback=opt.finite, help="Point cloud time minus time_s of images.csv.")]
@@ -79,13 +79,13 @@ def lidar_control(
         progress.update(f"writing {out}")
         heights, rounds = heights_table(result), rounds_table(result.rounds)
         picture = heights_figure(result)
-        page = heights_page(result, picture, output.made_by(block, cloud))
+        page = heights_page(result, picture, output.command_record(block, cloud))
         with whole_block(result.block, out) as folder:
             heights.to_csv(folder / "lidar_heights.csv", index=False)
             rounds.to_csv(folder / "lidar_rounds.csv", index=False)
             picture.savefig(folder / "lidar_heights.png")
             (folder / "report.html").write_text(page, encoding="utf-8")
-    print_rounds(result.rounds, result.still, output.screen)
+    print_rounds(result.rounds, result.converged, output.screen)
     rejected = flag_counts(result.flag[~np.isfinite(result.height)]).items()
     note = f" (rejected: {', '.join(f'{name.lower()} {n}' for name, n in rejected)})" if rejected else ""
     used = int(result.used.sum())
@@ -125,7 +125,7 @@ def roof_control(
         result = roof_control(read, points, settings, centroids=opt.names(centroids), **options)
         progress.update(f"writing {out}")
         write_block(result.block, out)
-    print_rounds(result.rounds, result.still, output.screen)
+    print_rounds(result.rounds, result.converged, output.screen)
     output.wrote(out, f"wrote {out}: {len(result.points)} tie points lie on {result.faces} roof faces")
     output.add(n_tie_points=len(result.points), n_roof_faces=result.faces)
     _end_of_rounds(output, result)
@@ -159,7 +159,7 @@ def simultaneous(
     max_rounds: MaxRounds = 20,
     adjust: Annotated[
         str | None,
-        Option(help="Estimate of the whole system, comma-separated: scanner,trajectory,camera (docs/joint.md)."),
+        Option(help="Estimate of the whole system, comma-separated: scanner,trajectory,camera (docs/boresight.md)."),
     ] = None,
     exposure_shift_s: ExposureShift = 0.0,
     control: Control = None,
@@ -181,12 +181,11 @@ def simultaneous(
 
     from jaxphoto.georeferencing import Scanner
     from jaxphoto.io import clouds, read_block
-    from jaxphoto.io.trajectory import write_moved
-    from jaxphoto.io.trajectory.in_frame import trajectory_in, with_positions
+    from jaxphoto.io.trajectory import trajectory_in, with_positions, write_moved
     from jaxphoto.lidar import HeightSettings
     from jaxphoto.lidar.correction import correct_cloud, scanner_path
     from jaxphoto.lidar.coverage import check_covered
-    from jaxphoto.lidar.strip_settings import StripSettings
+    from jaxphoto.lidar.strip_planes import StripSettings
     from jaxphoto.procedures.lidar import simultaneous
     from jaxphoto.report.lidar import print_moved, print_rounds, write_simultaneous
     from jaxphoto.writing import check_folder
@@ -241,17 +240,17 @@ def simultaneous(
         result = simultaneous(read, surface, path, priors, **options)
         progress.update(f"writing {out}")
         track = None if path is None else scanner_path(path)
-        with write_simultaneous(result, out, seconds, output.made_by(block, cloud, trajectory)) as folder:
+        with write_simultaneous(result, out, seconds, output.command_record(block, cloud, trajectory)) as folder:
             strips = tuple(result.scanner.shifts)
             corrected = lambda part: correct_cloud(part, result.scanner, track).xyz  # noqa: E731
             write_corrected(cloud, folder, corrected, strips, path, read.frame, system)
             if trajectory is not None and records is not None and result.trajectory is not None:
                 moved = with_positions(records, np.asarray(result.trajectory.position), read.frame)
                 write_moved(moved._replace(time=moved.time + trajectory_shift_s), trajectory, folder)
-    print_rounds(result.rounds, result.still, output.screen)
+    print_rounds(result.rounds, result.converged, output.screen)
     print_moved(result, output.screen)
     output.wrote(out, f"results in {out}")
-    if not result.still:
+    if not result.converged:
         raise typer.Exit(1)
 
 
@@ -320,7 +319,7 @@ def strips(
     --class and --returns select the points of the planes; the whole cloud is corrected. Exit code 1: written, but the
     verdict is red, or not converged.
     """
-    from jaxphoto.lidar.strip_settings import StripSettings
+    from jaxphoto.lidar.strip_planes import StripSettings
     from jaxphoto_command.strip_flight import StripChoices, StripFiles, adjust_flight, scanner_priors
 
     sigmas = {
@@ -427,7 +426,7 @@ def orthophoto(
 
     from jaxphoto.errors import BlockError, InputError
     from jaxphoto.io import clouds, raster, read_block
-    from jaxphoto.lidar.orthophoto import orthophoto
+    from jaxphoto.lidar.raster import orthophoto
     from jaxphoto.procedures import adjust
     from jaxphoto.writing import check_file
 
@@ -535,6 +534,6 @@ def _report_rounds(progress: Progress) -> Any:
 
 def _end_of_rounds(output: Output, result: Any) -> None:
     """Report the outer iterations; exit code 1 if they did not converge."""
-    output.add(rounds=len(result.rounds), came_to_rest=result.still, rmse_m=result.rounds[-1].rmse_m)
-    if not result.still:
+    output.add(rounds=len(result.rounds), iteration_converged=result.converged, rmse_m=result.rounds[-1].rmse_m)
+    if not result.converged:
         raise typer.Exit(1)

@@ -145,7 +145,7 @@ class Output:
 
     def wrote(self, path: Path, text: str) -> None:
         """Print that a file or folder was written; its summary.json goes into the JSON object."""
-        from jaxphoto.io.json_file import read_json
+        from jaxphoto.io.text_files import read_json
         from jaxphoto.writing import files_in
 
         inside = files_in(path) if path.is_dir() else []
@@ -174,12 +174,14 @@ class Output:
                 words += (word for v in values for word in (parameter.opts[0], v))
         return shlex.join(words)
 
-    def made_by(self, *inputs: Path | None) -> Any:
+    def command_record(self, *inputs: Path | None) -> Any:
         """Return the command line and the hashes of its input files and folders."""
-        from jaxphoto.report.page import Made
-        from jaxphoto_command.provenance import hashes
+        from jaxphoto.report.page import CommandRecord
+        from jaxphoto_command.certificate import hashes
 
-        return Made(self.command_line(), [file for path in inputs if path is not None for file in hashes(path)])
+        return CommandRecord(
+            self.command_line(), [file for path in inputs if path is not None for file in hashes(path)]
+        )
 
     def options(self, **values: Any) -> dict[str, Any]:
         """Return the options that are not paths, with those of `values` replaced, as the method of a result."""

@@ -32,7 +32,7 @@ def fly(
     pixel_mm: opt.PixelSize = None,
     model: opt.Distortion = "brown",
     no_lens_prior: Annotated[
-        bool, Option("--no-lens-prior", help="Omit the prior information of such lenses (docs/lens_priors.md).")
+        bool, Option("--no-lens-prior", help="Omit the prior information of such lenses (docs/target_calibration.md).")
     ] = False,
     rolling_shutter: Annotated[
         bool, Option("--rolling-shutter", help="Estimate the readout time of the rows from positions and times.")
@@ -92,7 +92,7 @@ def fly(
         write_part_orientation,
     )
     from jaxphoto.writing import check_folder, whole_folder
-    from jaxphoto_command.provenance import Provenance, certify
+    from jaxphoto_command.certificate import Provenance, certify
 
     if control is None and (marks or control_epsg or targets):
         raise typer.BadParameter("--marks, --control-epsg and --targets need --control FILE.")
@@ -232,7 +232,7 @@ def control(
     from jaxphoto.report.page import versions
     from jaxphoto.report.results import write_results, write_summary
     from jaxphoto.writing import check_folder, whole_folder
-    from jaxphoto_command.provenance import Provenance
+    from jaxphoto_command.certificate import Provenance
 
     files = [path for path in (file, marks) if path]
     check_folder(out, block, *files)
@@ -266,7 +266,7 @@ def control(
         with whole_folder(out) as work:
             with whole_folder(work / "result") as folder:
                 method = {"block": "../block", **output.options()}
-                write_results(tables, verdict, folder, times, method, output.made_by(block, file, marks))
+                write_results(tables, verdict, folder, times, method, output.command_record(block, file, marks))
                 provenance.write(images, folder)
             write_control(result, work)
             write_summary({**verdict.summary, **control_summary(result), "versions": versions()}, work)
@@ -354,7 +354,7 @@ def calibrate(
             lambda folder: write_block(result.adjusted.block, folder / "block"),
             detections=targets.detections,
             start=camera.origin,
-            made=output.made_by(*images),
+            record=output.command_record(*images),
             # An assumed pixel size is the unit of every length in the report.
             notes=() if pixel_mm is not None else (camera.origin,),
         )
@@ -390,9 +390,9 @@ def orient(
     from jaxphoto.extras.photos.photograph_pairs import photograph_pairs, usual_choice
     from jaxphoto.io.block_folder import check_block_target, whole_block
     from jaxphoto.io.block_folder.table_layout import TOML
-    from jaxphoto.io.json_file import read_json
     from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
     from jaxphoto.io.photographs import photographs, sensor_and_interior
+    from jaxphoto.io.text_files import read_json
     from jaxphoto.procedures.calibration import distortion_model
     from jaxphoto.procedures.orientation import orient
     from jaxphoto.report.orientation import print_orientation, write_orientation

@@ -19,17 +19,13 @@ from jaxphoto.initial import approximate
 from jaxphoto.io import clouds, read_block, write_block
 from jaxphoto.io.block_folder import exposure_times
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, Placement
-from jaxphoto.io.names import points_called
 from jaxphoto.io.raster import write_dsm
-from jaxphoto.io.trajectory import Records, read_records, write_moved
-from jaxphoto.io.trajectory.in_frame import trajectory_in, with_poses
-from jaxphoto.lidar.cell_returns import CellTally
-from jaxphoto.lidar.correction import scanner_path
+from jaxphoto.io.text_tables import points_matching
+from jaxphoto.io.trajectory import Records, read_records, trajectory_in, with_poses, write_moved
+from jaxphoto.lidar.correction import correct_strips, scanner_path
 from jaxphoto.lidar.coverage import CoveredTimes
-from jaxphoto.lidar.raster import Raster
-from jaxphoto.lidar.strip_correction import correct_strips
-from jaxphoto.lidar.strip_differences import strip_differences
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.raster import Raster, strip_differences
+from jaxphoto.lidar.strip_planes import CellTally, StripSettings
 from jaxphoto.procedures.control import SurveyedPoints
 from jaxphoto.procedures.control.surveyed import system_of
 from jaxphoto.procedures.lidar import (
@@ -40,9 +36,9 @@ from jaxphoto.procedures.lidar import (
     adjust_strips,
     kept_returns,
 )
-from jaxphoto.procedures.lidar.iterate_to_convergence import at_result, interior_held
-from jaxphoto.procedures.lidar.looks import looks_of
+from jaxphoto.procedures.lidar.iterate_to_convergence import at_result, fix_interior
 from jaxphoto.procedures.lidar.strip_control import check_complete
+from jaxphoto.procedures.lidar.strip_model import looks_of
 from jaxphoto.procedures.lidar.vertical_control import tie_points
 from jaxphoto.report.strips import print_strips, strips_verdict, write_strips
 from jaxphoto.report.tables import Tables
@@ -149,7 +145,7 @@ def adjust_flight(output: Output, flight: StripFiles, choices: StripChoices, out
             priors,
             photographs=photographs,
             control=control,
-            held=choices.fixed_strips,
+            fixed=choices.fixed_strips,
             max_rounds=choices.max_rounds,
             report=report,
         )
@@ -177,8 +173,8 @@ def adjust_flight(output: Output, flight: StripFiles, choices: StripChoices, out
                 write_dsm(folder / f"differences_{name}.tif", raster, differences.system)
             return maps
 
-        made = output.made_by(cloud, trajectory, block, flight.control)
-        write_strips(result, tables, verdict, out, write_files, made)
+        record = output.command_record(cloud, trajectory, block, flight.control)
+        write_strips(result, tables, verdict, out, write_files, record)
     print_verdict(verdict, output.screen)
     print_strips(result, output.screen)
     output.wrote(out, f"results in {out} (open report.html)")
@@ -194,8 +190,8 @@ def cloud_records(trajectory: Path, shift_s: float) -> Records:
 
 def _photographs(block: Path, flight: StripFiles, fixed_camera: bool) -> Photographs:
     read, times = read_block(block), exposure_times(block) + flight.exposure_shift_s
-    breaklines = points_called(read.points, names(flight.breaklines), "--breaklines")
-    return Photographs(interior_held(read) if fixed_camera else read, times, breaklines)
+    breaklines = points_matching(read.points, names(flight.breaklines), "--breaklines")
+    return Photographs(fix_interior(read) if fixed_camera else read, times, breaklines)
 
 
 def _stated_sigmas(records: Records, stated: set[str]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:

@@ -1,19 +1,19 @@
 """Small blocks with known truth for the tests of the core: seeded, simulated by the library's own models.
 
-`simulated(name)` gives one of `VARIANTS`: the block with noisy observations and rough start values, and its truth. All
-aerial variants show the same points in the same images, so that what is compiled for one serves the next where only
-numbers differ.
+`simulated(name)` is one of `VARIANTS`: the block with noisy observations and rough start values, and its truth. All
+aerial variants have the same points in the same images and share compiled programs where only numbers differ.
 """
 
 import dataclasses
 import functools
+from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from jaxphoto import FIXED, FREE, Outcome, Unknowns, Weighted, adjust, covariance
+from jaxphoto import FIXED, FREE, Outcome, Unknowns, Weighted, adjust, covariance, read_block
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import Balanced, Brown, InteriorOrientation, Sensor, Smac, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
@@ -83,7 +83,7 @@ def close_range(seed: int = 6) -> Scene:
 
 
 def bare(scene: Scene, cameras: dict[str, InteriorOrientation], of_image, mounts=None, strips=None) -> Simulated:
-    """A block in which nothing but image points is observed and no camera is free; image points hold zeros."""
+    """Block of image points alone, which are zero, with fixed cameras."""
     n_images, n_points = len(scene.positions), len(scene.points)
     of_image = tuple(of_image)
     rows = []
@@ -134,7 +134,7 @@ def bare(scene: Scene, cameras: dict[str, InteriorOrientation], of_image, mounts
 
 
 def rows(who, axes=(0, 1, 2), sigma=0.03, kind=ControlCoordinates):
-    """Every axis of `axes` of `who`; values are for `measured` to fill."""
+    """Rows of all `axes` of `who`; `measured` fills the values."""
     who, axis = (v.ravel() for v in np.meshgrid(np.asarray(who, int), axes, indexing="ij"))
     return kind(who, axis, np.zeros(len(who)), np.full(len(who), sigma))
 
@@ -149,7 +149,7 @@ def all_attitudes(block: Block, sigma=1e-4) -> Attitudes:
 
 
 def with_priors(block: Block, camera: str, **priors) -> Block:
-    """The block with priors of one camera's parameters."""
+    """Replace the priors of parameters of one camera."""
     tree = block.priors.interior[camera]
     for name, prior in priors.items():
         tree = set_parameter(tree, name, prior)
@@ -161,20 +161,20 @@ def free(block: Block, camera: str, names=FIVE) -> Block:
 
 
 def measured(simulated: Simulated, seed: int = 1) -> Simulated:
-    """The block with observations of its truth, and start values that are off."""
+    """Replace observations by noisy ones of the truth, and start values by rough ones."""
     block, truth = simulated
     block = _remeasured(block, truth, jax.random.key(seed))
     return Simulated(eqx.tree_at(lambda b: b.start.unknowns, block, rough(block, truth)), truth)
 
 
 def _remeasured(block: Block, truth: Unknowns, key) -> Block:
-    # Compiled, because eager JAX would compile every operation.
+    # Eager JAX would compile every operation.
     once = jit_quickly(lambda u, k: observed(remeasure(block, u, k)))
     return eqx.tree_at(observed, block, jax.tree.map(np.asarray, once(truth, key)))
 
 
 def observed(b: Block):
-    """The numbers of a block that `remeasure` draws."""
+    """Observations of a block that `remeasure` draws."""
     rows = (b.stations, b.control, b.fixed, b.check, b.distances)
     return b.image_points.xy, b.attitudes.roll_pitch_yaw, *(r.value for r in rows), b.surfaces.foot
 
@@ -351,14 +351,14 @@ def _close(datum: Datum, bars: bool = True) -> Simulated:
 
 
 def free_network(kind: str = "inner", distances: Distances | None = None) -> Block:
-    """The aerial block with image points alone, and perhaps distances."""
+    """Aerial block of image points alone, or with distances."""
     block, truth = bare(aerial(), {"one": BROWN}, ("one",) * 10)
     own = {"datum": Datum(kind), "distances": distances or Distances.none()}
     return measured(Simulated(dataclasses.replace(block, **own), truth)).block
 
 
 def from_afar(block: Block, known: Unknowns) -> Block:
-    """The block with a start so far off from what is `known` that steps are rejected from there."""
+    """Move the start values so far from `known` that steps are rejected."""
     rng, n = np.random.default_rng(1), len(block.images)
     turn = np.asarray(jax.jit(jax.vmap(small_rotation))(rng.normal(0, 0.3, (n, 3))))
     exterior = dataclasses.replace(
@@ -419,7 +419,7 @@ def _field_and_ground() -> Simulated:
     return Simulated(block, truth)
 
 
-# Blocks of which fixed points lie at several places of the padded arrays.
+# Blocks with fixed points at several places of the padded arrays.
 FIELDS = {"field": _field, "field_and_ground": _field_and_ground}
 
 
@@ -431,7 +431,7 @@ def simulated(name: str) -> Simulated:
 
 @functools.cache
 def adjusted(name: str):
-    """The adjustment of one of `VARIANTS`, made once a session."""
+    """Adjustment of one of `VARIANTS`, once per session."""
     block = simulated(name).block
     result = adjust(block, block.start.unknowns)
     assert result.outcome is Outcome.CONVERGED
@@ -440,5 +440,17 @@ def adjusted(name: str):
 
 @functools.cache
 def covariance_of(name: str):
-    """The covariance of `adjusted(name)`, rotations about the camera's axes."""
+    """Covariance of `adjusted(name)`, rotations about the camera axes."""
     return covariance(adjusted(name), "camera")
+
+
+@functools.cache
+def example() -> Block:
+    """The block of examples/cross_block."""
+    return read_block(Path(__file__).parents[1] / "examples" / "cross_block")
+
+
+@functools.cache
+def adjusted_example():
+    """`example`, adjusted."""
+    return adjust(example())

@@ -1,4 +1,4 @@
-"""Types and shapes are checked by jaxtyping and beartype while the tests run: where a function is traced or called."""
+"""Types and shapes checked by jaxtyping and beartype while tests run, whenever a function is traced or called."""
 
 import contextlib
 import functools
@@ -14,7 +14,7 @@ import numpy as np
 import optimistix  # noqa: F401
 from beartype import BeartypeConf, beartype
 
-# The rooms that are checked: all that compute.
+# The checked packages: all that compute.
 CHECKED = (
     "adjustment", "arrays", "block_from_arrays", "camera", "cloud", "collinearity", "columns", "experiment",
     "georeferencing", "extras", "io", "lidar", "observations", "orientation", "parameters", "procedures",
@@ -23,17 +23,17 @@ CHECKED = (
 
 
 def check_types() -> None:
-    """Check the rooms `CHECKED` from their import on; to be called before it."""
-    # An array is NumPy's where it lies still and JAX's where it is traced (jaxphoto/arrays.py), and a number alone may
-    # be Python's: all functions take all. The packages of others, imported above, keep their own meaning.
+    """Check the packages `CHECKED`; call before importing them."""
+    # Functions take NumPy arrays, traced JAX arrays (jaxphoto/arrays.py) and Python numbers alike. The third-party
+    # packages imported above keep their own meaning.
     jaxtyping.Array = jax.Array | np.ndarray | np.generic | float
     jaxtyping.install_import_hook([f"jaxphoto.{room}" for room in CHECKED], "tests.checked_types.checked")
 
 
 def checked(function: Callable) -> Callable:
-    """`function` with its types checked. A tree of priors has priors where that of the unknowns has numbers."""
+    """Return `function` with its types checked, but for trees of priors in place of numbers."""
     for name, hint in function.__annotations__.items():
-        # Beartype knows `Self` only of classes that it was given whole.
+        # Beartype knows `Self` only of decorated classes.
         if "typing.Self" in str(hint):
             function.__annotations__[name] = Any
         else:
@@ -52,7 +52,7 @@ def checked(function: Callable) -> Callable:
 
 
 def _widened(hint: Any) -> Any:
-    """The hint with JAX's arrays beside NumPy's: what lies still for a user is traced where JAX maps over the whole."""
+    """Return the hint with JAX arrays admitted for NumPy arrays, which JAX traces under a transformation."""
     if hint is np.ndarray:
         return np.ndarray | jax.Array
     if isinstance(hint, type) and issubclass(hint, jaxtyping.AbstractArray) and hint.array_type is np.ndarray:
@@ -67,7 +67,7 @@ def _widened(hint: Any) -> Any:
 
 @contextlib.contextmanager
 def unchecked() -> Iterator[None]:
-    """What is called herein is not checked: for what users, who have no checker, are told of a wrong type."""
+    """Switch the checks off, to test what a user without a checker sees after passing a wrong type."""
     before = jaxtyping.config.jaxtyping_disable
     jaxtyping.config.update("jaxtyping_disable", True)
     try:

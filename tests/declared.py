@@ -1,7 +1,4 @@
-"""One block in which everything that can be declared is observed and estimated: jaxphoto's own kinds and a user's.
-
-One block, because what costs is compiling: all tests of `test_declared` ask the same adjustment.
-"""
+"""One block that observes and estimates every declared kind, of jaxphoto and of a user: it compiles once."""
 
 import dataclasses
 import functools
@@ -119,7 +116,7 @@ OWN = {
     "clocks": {"early": Clocks(np.float64(0.006)), "late": Clocks(np.float64(-0.004))},
     "shifts": {"": CommonShift(np.array([0.3, -0.2]))},
 }
-"""Truth of the unknowns of a user's own, one of each kind of owner."""
+"""Truth of the user-defined unknowns, one of each kind of owner."""
 LASER = {
     "scanner_calibration": {
         "": ScannerCalibration(
@@ -195,7 +192,7 @@ def _weighted(rng, truth, sigma) -> Weighted:
 
 
 def _further(n_images: int, angles: np.ndarray) -> tuple:
-    """Observations of all further kinds; values are for `_observed` to fill."""
+    """Observations of all further kinds; `_observed` fills the values."""
     rng = np.random.default_rng(4)
     factor = rng.normal(0, 0.02, (n_images, 3, 3)) + 0.05 * np.eye(3)
     gnss = rows(range(n_images), sigma=1.0, kind=CameraPositions)
@@ -222,7 +219,7 @@ def _further(n_images: int, angles: np.ndarray) -> tuple:
 
 
 def _strips() -> tuple:
-    """Planes that two strips see, and steps from knot to knot of one of them."""
+    """Planes seen from two strips, and steps between knots of one of them."""
     rng, n = np.random.default_rng(6), 12
     point = rng.uniform(-300, 300, (n, 3)) * [1, 1, 0.05]
     knots, weights = StripSpline(0, 5, 0.0, 1.0).weights(np.linspace(0, 2, n))
@@ -279,7 +276,7 @@ def _with_motion(block: Block) -> Block:
 
 @functools.cache
 def own_alone() -> Simulated:
-    """A block in which nothing but a user's own unknowns is declared: it compiles in a tenth of the time."""
+    """Block of user-defined unknowns alone, which compiles in a tenth of the time."""
     block, truth = VARIANTS["cross"]()
     block, _ = measured(Simulated(_with_motion(block), truth))
     truth = dataclasses.replace(truth, more=OWN)
@@ -291,7 +288,7 @@ def own_alone() -> Simulated:
 
 @functools.cache
 def simulated(seed: int = 1) -> Simulated:
-    """The block, noisy, with a rough start, and its truth."""
+    """Block of all kinds, with noise and rough start values, and its truth."""
     block, truth = VARIANTS["surfaces"]()
     n, rng = len(block.images), np.random.default_rng(seed + 100)
     ends = np.array([[3, 17], [17, 40], [5, 35]])
@@ -334,7 +331,7 @@ def simulated(seed: int = 1) -> Simulated:
 
 @functools.cache
 def adjusted():
-    """The adjustment of `simulated`, the further observations given as from a notebook."""
+    """Adjustment of `simulated`, the further observations passed by the argument `more`."""
     block = simulated().block
     result = adjust(dataclasses.replace(block, more=()), block.start.unknowns, more=block.more)
     assert result.outcome is Outcome.CONVERGED

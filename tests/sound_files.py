@@ -1,16 +1,4 @@
-"""Small sound files of formats whose real ones are large or not ours, for tests that spoil them."""
-
-import io
-import tempfile
-from pathlib import Path
-
-import numpy as np
-from PIL import Image
-
-from jaxphoto.io import clouds
-from tests.io.test_clouds import sample
-
-Files = dict[str, bytes]
+"""Small valid files of formats whose real ones are large or not ours."""
 
 AICON = {
     "a.ior": "1 1 -28.785 0.01 -0.02 -1.0e-4 1.5e-7 8.0\n-2.0e-10\n1.0e-5 -2.0e-5\n3.0e-5 4.0e-5\n"
@@ -54,35 +42,6 @@ PHOTOMODELER = {
 }
 
 
-def cloud(kind: str) -> Files:
-    """A cloud of some hundred points."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"a.{kind}"
-        clouds.write_cloud(sample(400), path)
-        return {path.name: path.read_bytes()}
-
-
-def ply_text() -> Files:
-    """A PLY file in text."""
-    names = ("x", "y", "z", "classification", "time_s", "strip")
-    header = ["ply", "format ascii 1.0", "element vertex 40", *(f"property double {name}" for name in names)]
-    rows = [f"{k}.5 {2 * k} -{k}.25 2 {k}.125 {k // 20}" for k in range(40)]
-    return {"a.ply": "\n".join([*header, "end_header", *rows, ""]).encode()}
-
-
-def picture(kind: str) -> Files:
-    """A small photograph with EXIF."""
-    rows, columns = np.mgrid[:48, :64]
-    exif = Image.Exif()
-    exif[271], exif[274] = "Maker", 1
-    exif.get_ifd(0x8769).update({37386: 24.0, 41989: 36, 41486: 3000.0, 41488: 2})
-    buffer = io.BytesIO()
-    Image.fromarray(np.stack([rows * 5, columns * 3, rows + columns], axis=2).astype(np.uint8)).save(
-        buffer, {"jpg": "JPEG", "tif": "TIFF"}.get(kind, kind), exif=exif
-    )
-    return {f"a.{kind}": buffer.getvalue()}
-
-
 MARKS = (
     "1\t268619.354051\t[2129]\t    24,N\t     9,E\t   193,V\t-21.97273819,Lat\t113.93433129,Lon\t91.071,Ellh\t"
     "1.056360, 1.085926, 3.245131\t16,Q\n"
@@ -101,17 +60,6 @@ image,X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg,sigma_X_m,sigma_Y_m,sigma_Z_m,sigm
 a.JPG,500010.5,6170000.25,120.5,1.5,-2.25,91,0.02,0.02,0.04,0.1,0.1,0.5,fixed
 b.JPG,500030.5,6170000.75,120.75,0.5,-1.25,90,,,,,,,
 """
-GEO_TXT = """EPSG:32633
-a.JPG 500010.5 6170000.25 120.5 91 1.5 -2.25 0.02 0.04
-b.JPG 500030.5 6170000.75 120.75 0 0 0 0.02 0.04 spare
-"""
-REFERENCE = """# Cameras (2)
-#CoordinateSystem: GEOGCS["WGS 84",DATUM["World Geodetic System 1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],UNIT["degree",0.01745329251994328],AUTHORITY["EPSG","4326"]]
-#Label,Enable,X/Longitude,Y/Latitude,Z/Altitude,Yaw,Pitch,Roll,X_acc_(m),Y_acc_(m),Z_acc_(m),Yaw_acc,Pitch_acc,Roll_acc
-a.JPG,1,15.001,55.7,120.5,91,1.5,-2.25,0.02,0.02,0.04,1,1,1
-b.JPG,1,15.002,55.7,120.75,,,,0.02,0.02,0.04,,,
-# Total Error,,
-"""  # noqa: E501
 POSPAC_HEAD = """***
  POS Export Utility
  Copyright (C) 1997-2018 by Applanix Corporation      [May 17 2018]
@@ -127,19 +75,4 @@ POSPAC_HEAD = """***
  Lever arm values: lx =        0.0000 m, ly =        0.0000 m, lz =        0.0000 m.
  ID, # EVENT, TIME (s), EASTING, NORTHING, ELLIPSOID HEIGHT, OMEGA, PHI, KAPPA, LAT, LONG
 ( time in Sec, position in Meters, orientation and lat/long in Degrees )
-"""
-POSPAC = (
-    POSPAC_HEAD
-    + """ DJI_0001 1 292325.2 500074.307 5338529.783 320.5 1.5 -2.25 91 48.2 15.001
- DJI_0002 2 292327.4 500111.460 5338529.784 320.75 0.5 -1.25 90 48.2 15.0015
-"""
-)
-XMP = """<?xpacket begin=""?><rdf:Description rdf:about="DJI Meta Data" drone-dji:AltitudeType="RtkAlt"
- drone-dji:AbsoluteAltitude="+139.231" drone-dji:RelativeAltitude="+80.012" drone-dji:GimbalRollDegree="+180.00"
- drone-dji:GimbalYawDegree="-92.70" drone-dji:GimbalPitchDegree="-90.00" drone-dji:FlightYawDegree="+87.20"
- drone-dji:RtkFlag="50" drone-dji:RtkStdLon="0.01174" drone-dji:UTCAtExposure="2022-07-23T07:12:22.872778"
- Camera:GPSXYAccuracy="845389/2097152" Camera:GPSZAccuracy="5117051/8388608" Camera:IMUYawAccuracy="10">
-<Camera:Roll>-6.93</Camera:Roll><Camera:Pitch>2.5</Camera:Pitch><Camera:Yaw>-146.9</Camera:Yaw>
-<drone-skydio:CameraOrientationNED rdf:parseType="Resource"><drone-skydio:Yaw>101.5</drone-skydio:Yaw>
-<drone-skydio:Pitch>-7.4</drone-skydio:Pitch></drone-skydio:CameraOrientationNED></rdf:Description>
 """

@@ -68,7 +68,7 @@ def test_two_calibrations_are_compared(folder, monkeypatch, capsys, tmp_path):
     outs = tmp_path / "[a]", tmp_path / "b"
     for out, r0 in zip(outs, (0, 2), strict=True):
         arguments = (*named, tmp_path / "[red]wall.png", "--board", BOARD, "--r0-mm", r0, "--out", out)
-        code, screen, error = run(monkeypatch, capsys, "calibrate", *arguments)
+        code, screen, error = run(monkeypatch, capsys, "calibrate", *arguments, pictures=out == outs[0])
         assert code == 0, error
         assert "[red]wall" in screen
     summary = json.loads((outs[0] / "summary.json").read_text())

@@ -12,7 +12,7 @@ from PIL import Image
 from jaxphoto import Tables
 from jaxphoto.io import write_block
 from jaxphoto.io.conditions import CONDITIONS, conditions_of, read_conditions, write_conditions
-from jaxphoto.io.input_hashes import block_inputs, read_inputs, write_inputs
+from jaxphoto.io.result_tables import block_inputs, read_inputs, write_inputs
 from jaxphoto.procedures import adjust_for_tables
 from jaxphoto.report import verdict_of
 from jaxphoto.report.results import write_results
@@ -38,15 +38,15 @@ def results(adjusted, tmp_path_factory):
     return folder / "results"
 
 
-def certified(results, out, monkeypatch, capsys, *options):
-    code, _, error = run(monkeypatch, capsys, "certificate", results, "--out", out, *options)
+def certified(results, out, monkeypatch, capsys, *options, pictures=False):
+    code, _, error = run(monkeypatch, capsys, "certificate", results, "--out", out, *options, pictures=pictures)
     assert code == 0, error
     return out.read_bytes()
 
 
 def test_the_same_inputs_make_the_same_bytes(results, tmp_path, monkeypatch, capsys):
-    one = certified(results, tmp_path / "a.html", monkeypatch, capsys)
-    assert certified(results, tmp_path / "b.html", monkeypatch, capsys) == one
+    one = certified(results, tmp_path / "a.html", monkeypatch, capsys, pictures=True)
+    assert certified(results, tmp_path / "b.html", monkeypatch, capsys, pictures=True) == one
 
 
 def test_a_browser_prints_it_as_pdf(results, tmp_path, monkeypatch, capsys):

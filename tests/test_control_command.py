@@ -10,7 +10,7 @@ from PIL import Image
 from jaxphoto.camera.conditions import Conditions
 from jaxphoto.io import adjusted_block, read_block, write_block
 from jaxphoto.io.conditions import read_conditions, write_conditions
-from jaxphoto.io.input_hashes import read_inputs
+from jaxphoto.io.result_tables import read_inputs
 from tests.commands import run
 from tests.procedures.controlled import CHECK, CODE, CONTROL, marked_block
 

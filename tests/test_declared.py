@@ -1,6 +1,6 @@
-"""Whatever is declared as an observation or an unknown holds what the adjustment, statistics and tables promise.
+"""Every declared kind of observation and unknown works in the adjustment, its statistics and tables.
 
-All cases ask one adjustment (`tests.declared`), in which everything that can be declared is observed and estimated.
+All tests share one adjustment of every kind (`tests.declared`).
 """
 
 import dataclasses
@@ -23,16 +23,18 @@ from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.adjustment.right_hand_sides import solve_many
 from jaxphoto.adjustment.solver.optimum import typical_scale
 from jaxphoto.compiling import run_compiled
+from jaxphoto.compiling.quickly import jit_quickly
 from jaxphoto.observations import Correlated, KnownParameters
 from jaxphoto.parameters import numbers_of
 from jaxphoto.report import Verdict, write_results
+from jaxphoto.report.formatting import in_file_unit
 from jaxphoto.sensitivity import noise, sensitivity
 from jaxphoto.sensitivity.sweep import prepare_design
 from jaxphoto.statistics import observation_groups, redundancy_numbers
 from tests.adjustment.dense import in_order, own_order, rows_of
 from tests.declared import OWN, adjusted, own_alone, own_priors, residuals_of, simulated
 
-# Every class that a file or a notebook gives rows of, by the groups of the block that show it.
+# Observation classes and their groups in the block.
 SHOWN = {
     "ImagePoints": ("image_points",),
     "CameraPositions": ("stations",),
@@ -64,7 +66,7 @@ each_group = pytest.mark.parametrize("group", GROUPS)
 
 
 def concrete(cls: type) -> set[type]:
-    """The classes below, without those that declare nothing themselves."""
+    """Concrete subclasses."""
     below = {c for one in cls.__subclasses__() for c in {one, *concrete(one)}}
     return {c for c in below if not c.__name__.startswith("Abstract")}
 
@@ -84,22 +86,24 @@ def dense():
 
 @functools.cache
 def rows_of_groups() -> dict[str, slice]:
-    """Where the residuals of each group stand among all."""
+    """Places of the residuals of each group among all."""
     ends = np.cumsum([0, *(np.size(v) for v in adjusted().residuals.named.values())])
     return {name: slice(*ends[k : k + 2]) for k, name in enumerate(adjusted().residuals.named)}
 
 
 @functools.cache
 def differences() -> tuple[np.ndarray, np.ndarray]:
-    """What all residuals answer to eight random directions: by the Jacobian, and by central differences."""
+    """Derivatives of all residuals along eight random directions, by the Jacobian and by central differences."""
     a = adjusted()
     equations = a.equations
     values, s = equations.values, equations.structure
     scale, back = typical_scale(values, s), ravel_pytree(zero_increments(s))[1]
 
+    moved = jit_quickly(lambda increments: state_at(back(increments), scale, values, s))
+
     def at(increments) -> np.ndarray:
-        """By the program of the residuals alone, which knows of no derivative."""
-        there = with_start(values, state_at(back(increments), scale, values, s))
+        """By the program of the residuals alone, which contains no derivative."""
+        there = with_start(values, moved(increments))
         return in_order(a.padded.crop_residuals(run_compiled(_residuals, (there, s), {}, "residuals")))
 
     unknowns = own_order(values, a.padded)[0]
@@ -111,7 +115,7 @@ def differences() -> tuple[np.ndarray, np.ndarray]:
     return dense().jacobian @ directions[:, unknowns].T, np.stack(found, axis=1)
 
 
-# Of increments that are typical of an unknown: fourth-order differences are then right to eight digits and more.
+# In typical increments of an unknown: fourth-order differences then have eight correct digits.
 _STEP = 1e-3
 
 
@@ -125,7 +129,7 @@ def test_derivatives_of_the_rows_are_central_differences(group):
 
 @each_group
 def test_every_row_weighs_in_the_normal_equations(group):
-    """The sums of the structured code, group by group: without a group the dense sums are others."""
+    """The sums of the structured solver contain every group."""
     d = dense()
     own = rows_of_groups()[group]
     terms = np.abs(d.jacobian).T @ np.abs(d.residuals)
@@ -162,17 +166,18 @@ def covariance_of():
 
 @functools.cache
 def dense_cofactors() -> np.ndarray:
-    """Of the residuals over their standard deviations, or times L^-1: I - J N^-1 J'."""
+    """Cofactors of the whitened residuals, I - J N^-1 J'."""
     j = dense().jacobian[:, dense().free]
     return np.eye(len(j)) - j @ np.linalg.solve(j.T @ j, j.T)
 
 
+@pytest.mark.slow
 @each_group
 def test_redundancy_numbers_are_those_of_the_dense_matrix(group):
     found, own = redundancy().named[group], rows_of_groups()[group]
     expected, rows = dense_cofactors()[own, own], observation_groups(adjusted())[group]
     if isinstance(rows, Correlated):
-        # Of observations themselves: the diagonal of Q_vv P = L (I - J N^-1 J') L^-1.
+        # Of the observations: the diagonal of Q_vv P = L (I - J N^-1 J') L^-1.
         factor = np.linalg.cholesky(np.asarray(rows.covariance))
         sets, n = factor.shape[:2]
         expected = expected.reshape(n, sets, n, sets)
@@ -185,6 +190,7 @@ def test_redundancy_numbers_are_those_of_the_dense_matrix(group):
     np.testing.assert_allclose(np.ravel(found), np.ravel(expected), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_redundancy_numbers_sum_to_the_redundancy():
     total = sum(float(np.sum(v)) for v in redundancy().named.values())
     assert abs(total - adjusted().redundancy) < 1e-5
@@ -207,7 +213,7 @@ def test_larger_sizes_change_nothing():
 
 @functools.cache
 def whitened_by_noise() -> dict[str, np.ndarray]:
-    """By group, the derivatives of the residuals by errors of unit size, all that `noise` knows."""
+    """Derivatives of the residuals by unit errors of `noise`, by group."""
     a = adjusted()
     errors, nominal = noise(a.block), residuals_of(a.block, a.unknowns)[0]
     step = 1e-3
@@ -223,7 +229,7 @@ def whitened_by_noise() -> dict[str, np.ndarray]:
 
 @each_group
 def test_noise_moves_every_number_by_its_own_standard_deviation(group):
-    """Errors of +1 and -1 standard deviations: what is not correlated moves by as much, what is by unit variance."""
+    """Under errors of one standard deviation uncorrelated residuals move by one, correlated ones by unit variance."""
     moved = whitened_by_noise()[group]
     assert (np.abs(moved).max(0) > 0.1).all(), "a number has no noise"
     if group.startswith(("correlated", "priors_together")):
@@ -232,8 +238,8 @@ def test_noise_moves_every_number_by_its_own_standard_deviation(group):
         np.testing.assert_allclose(np.abs(moved), 1.0, atol=_BENT.get(group, 1e-3))
 
 
-# By how much what is observed differs from what the residual is of: ideal coordinates, small rotations of an aircraft
-# that is tilted (errors of two angles meet in one axis), small rotations from what is off by 2 mrad.
+# Residuals differ from errors: they are of ideal coordinates, of small rotations of a tilted aircraft (errors of two
+# angles meet in one axis), of small rotations from a start that is 2 mrad off.
 _BENT = {
     "image_points": 0.1, "attitudes": 0.15, "relative_attitudes": 0.15, "trajectory_attitudes": 0.15,
     "prior_rotations": 0.01,
@@ -247,19 +253,16 @@ def test_noise_knows_each_number_once():
 N_DRAWS = 300
 
 
-@functools.cache
-def draws():
-    return monte_carlo(adjusted(), noise(adjusted().block), N_DRAWS, seed=2)
-
-
+@pytest.mark.slow
 def test_scatter_of_re_adjustments_is_the_covariance():
-    """Of cameras, scanner, mounts and a user's own alike: within four times the sampling error, alone and together."""
-    found, cov = draws(), covariance_of()
+    """Cameras, scanner, mounts and a user's own unknowns: within four times the sampling error, alone and together."""
+    a = adjusted()
+    found, cov = monte_carlo(a, noise(a.block), N_DRAWS, seed=2), covariance_of()
     assert found.converged.all()
-    at = np.array([found.labels.index(label) for label in adjusted().structure.labels])
+    at = np.array([found.labels.index(label) for label in a.structure.labels])
     n = len(at)
     expected = np.asarray(cov.matrix)[-n:, -n:]
-    off = found.shared[:, at] - np.asarray(adjusted().values.shared)[adjusted().structure.free]
+    off = found.shared[:, at] - np.asarray(a.values.shared)[a.structure.free]
     ratio = off.std(0) / np.sqrt(np.diag(expected))
     np.testing.assert_allclose(ratio, 1.0, atol=4 / np.sqrt(2 * N_DRAWS))
     unit = np.linalg.solve(np.linalg.cholesky(expected), off.T)
@@ -268,7 +271,7 @@ def test_scatter_of_re_adjustments_is_the_covariance():
 
 @functools.cache
 def from_optimum():
-    """The adjustment from its own optimum."""
+    """Adjustment restarted at its optimum."""
     return adjust(adjusted().block, adjusted().unknowns)
 
 
@@ -277,7 +280,7 @@ def derivatives():
     return sensitivity(from_optimum())
 
 
-# The second number of a group, which is enough of it to move.
+# The second number of a group is changed.
 _PLACES = {
     "stations": ("stations", "value"), "attitudes": ("attitudes", "roll_pitch_yaw"),
     "control_points": ("control", "value"), "surfaces": ("surfaces", "rise"), "distances": ("distances", "value"),
@@ -287,7 +290,7 @@ _PLACES = {
 
 
 def with_one_changed(group: str, h: float):
-    """The adjusted block with the second number of a group changed by h."""
+    """Adjusted block with the second number of a group changed by h."""
     block = from_optimum().block
     place = _PLACES[group]
     where = (lambda b: b.more[place]) if isinstance(place, int) else (lambda b: getattr(b, place[0]))
@@ -297,6 +300,7 @@ def with_one_changed(group: str, h: float):
     return eqx.tree_at(where, block, jax.tree.map(np.asarray, rows.with_observation(value)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", _PLACES)
 def test_exact_sensitivity_is_the_difference_of_re_adjustments(group):
     a = from_optimum()
@@ -305,7 +309,7 @@ def test_exact_sensitivity_is_the_difference_of_re_adjustments(group):
 
     def estimates(h):
         unknowns = a.unknowns
-        # Once more, so that nothing of the iteration is left.
+        # Twice, to remove the iteration error.
         for _ in range(2):
             found = adjust(with_one_changed(group, h), unknowns)
             unknowns = found.unknowns
@@ -333,31 +337,37 @@ def test_a_design_has_the_redundancy_of_the_adjustment():
 
 
 @functools.cache
-def table():
-    return Tables(adjusted()).residuals
+def tables():
+    return Tables(adjusted())
 
 
+@pytest.mark.slow
 @each_group
 def test_the_table_of_residuals_names_each_number(group):
-    own = table()[table()["group"] == group]
+    table = tables().residuals
+    own = table[table["group"] == group]
     assert len(own) == np.size(adjusted().residuals[group])
     names = own[["image", "point", "axis"]]
-    # Two numbers that are called the same could not be told apart. Points may lie on several surfaces.
-    # Planes and steps of strips belong to no image and no point: their place in the table tells them.
+    # Points may lie on several surfaces. Planes and steps of strips have neither image nor point.
     alike = ("surfaces", "strip_planes", "strip_points", "position_steps", "attitude_steps")
     assert not names.duplicated().any() or group in alike
     assert (names != "").any(axis=1).all()
-    rows = observation_groups(adjusted())[group]
-    assert set(own["unit"]) == {"deg" if rows.unit == "rad" else rows.unit}
-    called = adjusted().block.images, adjusted().block.points
-    sentences = np.broadcast_to(rows.words(*called), np.shape(np.atleast_2d(adjusted().residuals[group])))
-    assert sentences.all()
-    assert rows.words_of(*np.indices(sentences.shape).reshape(2, -1), *called) == sentences.ravel().tolist()
+    assert set(own["unit"]) == {in_file_unit(observation_groups(adjusted())[group].unit)[1]}
     assert np.isfinite(own[["residual", "sigma", "redundancy_number", "w"]].to_numpy(float)).all()
 
 
+@each_group
+def test_a_sentence_names_each_number(group):
+    rows, block = observation_groups(adjusted())[group], adjusted().block
+    called = block.images, block.points
+    sentences = np.broadcast_to(rows.words(*called), np.shape(np.atleast_2d(adjusted().residuals[group])))
+    assert sentences.all()
+    assert rows.words_of(*np.indices(sentences.shape).reshape(2, -1), *called) == sentences.ravel().tolist()
+
+
+@pytest.mark.slow
 def test_results_and_report_are_written(tmp_path):
-    write_results(Tables(adjusted()), Verdict(()), tmp_path / "out", {})
+    write_results(tables(), Verdict(()), tmp_path / "out", {})
     page = (tmp_path / "out/report.html").read_text(encoding="utf-8")
     for name in ("height differences", "baselines"):
         assert name in page.replace("_", " "), name
@@ -366,7 +376,7 @@ def test_results_and_report_are_written(tmp_path):
         assert label in summary, label
 
 
-# Unknowns of a user's own ------------------------------------------------------------------------------------
+# User-defined unknowns ---------------------------------------------------------------------------------------
 
 
 TRUE = {
@@ -381,11 +391,24 @@ def numbers_of_own(more) -> np.ndarray:
     return np.array([v for kind, owners in OWN.items() for name in owners for v in numbers_of(more[kind][name])])
 
 
+@functools.cache
+def dense_sigmas() -> dict[str, float]:
+    """Standard deviations of the shared unknowns, by the dense normal equations."""
+    a, d = adjusted(), dense()
+    scale = ravel_pytree(typical_scale(a.equations.values, a.equations.structure))[0]
+    scale, j = scale[own_order(a.equations.values, a.padded)[0]], d.jacobian[:, d.free]
+    sigma = np.zeros(len(scale))
+    sigma[d.free] = scale[d.free] * np.sqrt(np.diagonal(np.linalg.inv(j.T @ j)))
+    labels, first = a.structure.labels, 6 * len(a.block.images)
+    return dict(zip(labels, sigma[first : first + len(labels)], strict=True))
+
+
 @pytest.mark.parametrize("label", TRUE)
 def test_truth_of_an_own_unknown_is_recovered(label):
-    found = Tables(adjusted()).georeferencing.set_index("parameter").loc[label]
-    assert abs(TRUE[label]) > 3 * found.sigma, "nothing is known of it"
-    assert abs(found.value - TRUE[label]) < 3 * found.sigma
+    a, sigma = adjusted(), dense_sigmas()[label]
+    found = np.asarray(a.values.shared)[a.structure.free][a.structure.labels.index(label)]
+    assert abs(TRUE[label]) > 3 * sigma, "nothing is known of it"
+    assert abs(found - TRUE[label]) < 3 * sigma
 
 
 def with_own(prior_of):
@@ -401,7 +424,7 @@ def freely():
 
 @functools.cache
 def by_prior(kind: str):
-    """Own unknowns held at half their truth, or known beforehand as that, hardly or well."""
+    """User-defined unknowns fixed at half their truth, or with a weak or strong prior there."""
     half = jax.tree.map(lambda v: 0.5 * v, OWN)
     given = own_alone().block.start.unknowns
     start = dataclasses.replace(given, more=given.more | half)
@@ -414,7 +437,7 @@ def by_prior(kind: str):
 
 
 def off(a, b) -> float:
-    """The largest difference of two adjustments' own unknowns and camera, in standard deviations of the free ones."""
+    """Largest difference of the shared unknowns of two adjustments, in standard deviations of the free one."""
     free = freely()
     sigma = np.asarray(covariance(free).shared_sigma)
     v = [np.asarray(x.values.shared)[free.structure.free] for x in (a, b)]
@@ -436,7 +459,7 @@ def test_an_own_unknown_held_fixed_stays_as_it_starts_and_a_strong_prior_does_th
 
 @pytest.mark.slow
 def test_a_covariance_of_a_vector_is_what_known_parameters_say_and_both_pull():
-    """Known beforehand with a correlation near one, the shift moves along it."""
+    """A prior with a correlation near one moves the shift along it."""
     known = np.array([0.5, -0.1])
     matrix = np.array([[1.0, 0.999], [0.999, 1.0]]) * 0.02**2
     free = own_alone().block
@@ -450,7 +473,7 @@ def test_a_covariance_of_a_vector_is_what_known_parameters_say_and_both_pull():
     assert abs(moved[0] - moved[1]) < 0.1 * np.abs(moved).max() + 4e-3
 
 
-# Priors that are none ----------------------------------------------------------------------------------------
+# Invalid priors ----------------------------------------------------------------------------------------------
 
 PLACES = {
     "exterior.position": lambda p: p.exterior.position,
@@ -476,7 +499,7 @@ def test_what_is_no_prior_is_refused_by_name(label, garbage):
 
 
 def test_a_table_of_priors_that_is_none_is_refused_by_name():
-    block = simulated().block
+    block = own_alone().block
     for garbage in (0.0, FREE, None):
         more = {**block.priors.more, "clocks": {"early": garbage, "late": block.priors.more["clocks"]["late"]}}
         with pytest.raises(JaxphotoError, match=r"^[^\n]*clocks\[early\][^\n]*$"):

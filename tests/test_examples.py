@@ -12,6 +12,7 @@ import pytest
 
 import jaxphoto
 from jaxphoto.camera.distortion import DISTORTIONS
+from jaxphoto.extras.formats import EXPORTS, FORMATS
 from jaxphoto.io.block_folder.settings import read_settings
 from jaxphoto.io.block_folder.table_layout import LAYOUTS
 from jaxphoto.report.results import _TABLES
@@ -25,13 +26,16 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *EXAMPLES.gl
 LONG = (
     "boresight",
     "control",
-    "correlation_studies",
-    "experiments",
     "extending",
+    "georeferencing",
     "monte_carlo",
     "network_design",
+    "notebook",
+    "papers",
     "sensitivity",
-    "weights",
+    "statistics",
+    "time_dependent_cameras",
+    "trust",
 )
 
 
@@ -92,15 +96,12 @@ def _python(page: Path) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
-# What a page writes is written in a folder of its own: tests/docs/test_extending_files.py.
 @pytest.mark.parametrize(
-    "page",
-    slow_but(lambda p: p.stem not in LONG, [p for p in PAGES if _python(p) and p.stem != "extending_files"]),
-    ids=lambda p: p.name,
+    "page", slow_but(lambda p: p.stem not in LONG, [p for p in PAGES if _python(p)]), ids=lambda p: p.name
 )
 def test_python_on_pages_runs(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
-    # A page's own command is gone afterwards; its classes are those of the page, run it who will.
+    # Commands and formats that a page registers are removed afterwards.
     monkeypatch.setattr(app, "registered_commands", list(app.registered_commands))
     names: dict[str, object] = {"__name__": page.stem}
     try:
@@ -108,6 +109,8 @@ def test_python_on_pages_runs(page: Path, monkeypatch: pytest.MonkeyPatch) -> No
             exec(compile(text, f"{page.name}, block {number + 1}", "exec"), names)
     finally:
         jax.config.update("jax_enable_x64", True)
+        for registered in (FORMATS, EXPORTS):
+            registered.pop("track", None)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)

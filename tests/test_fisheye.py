@@ -10,7 +10,7 @@ import jaxphoto
 from jaxphoto.camera import Equidistant, InteriorOrientation, OpenCvFisheye, get_parameter, parameter_names
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, image_ray
 from jaxphoto.errors import BlockError
-from jaxphoto.simulation.visibility import photograph
+from jaxphoto.simulation.points import photograph
 
 TRUTH = InteriorOrientation(
     1.7, 0.012, -0.02, OpenCvFisheye(k1=-0.012, k2=0.003, k3=-0.0011, k4=0.00012), projection=Equidistant()

@@ -58,7 +58,7 @@ def test_a_folder_becomes_blocks_results_and_a_page(flown, tmp_path, monkeypatch
     given = ("--c-mm", 3.7, "--pixel-mm", PIXEL_MM, "--features", 500)
     _, said, wrong = run(monkeypatch, capsys, "fly", flown, "--out", out, *given)
     assert "cut.jpg: the picture is cut off or damaged" in wrong
-    assert "the position of a05 contradicts the others by" in said
+    assert "the position of a05 differs by" in said
     assert said.count("  c = ") == 2 and " +- " in said.split("  c = ")[1].split(", x_p = ")[0]
     summary = json.loads((out / "summary.json").read_text())
     assert [p["n_images"] for p in summary["parts"]] == [12, 3]

@@ -12,6 +12,8 @@ from jaxphoto.io.photographs import photographs, sensor_and_interior
 from jaxphoto.procedures.calibration import calibrate, interior_covariance
 from jaxphoto.stability import analyse, image_grid
 
+# Quick: the targets of rendered photographs (photos/test_targets.py) and mrcal's board.
+pytestmark = pytest.mark.slow
 PATTERN = read_board("chessboard:8x6:square_mm=30")
 
 
@@ -86,7 +88,6 @@ def test_any_balance_radius_gives_the_same_bundle(seen, calibrated):
     assert float(zero.adjusted.sigma0) == pytest.approx(float(three.adjusted.sigma0), rel=1e-9)
 
 
-@pytest.mark.slow
 def test_any_balance_radius_gives_the_same_board(calibrated):
     """The same where the points of the board are estimated, too."""
     zero, three = (calibrated(board_sigma_m=1e-3, r0_mm=r0) for r0 in (0.0, 3.0))

@@ -58,8 +58,8 @@ def test_commands_without_an_extra_start():
             "cv2",
             "photos",
         ),
-        ("import jaxphoto.io.raster", "rasterio", "lidar"),
-        ("import jaxphoto.io.clouds.las", "laspy", "lidar"),
+        pytest.param("import jaxphoto.io.raster", "rasterio", "lidar", marks=pytest.mark.slow),
+        pytest.param("import jaxphoto.io.clouds.las", "laspy", "lidar", marks=pytest.mark.slow),
     ],
 )
 def test_a_missing_extra_is_named_with_the_line_that_installs_it(program, module, extra):

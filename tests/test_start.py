@@ -12,17 +12,17 @@ import pytest
 from typer.main import get_command
 
 from jaxphoto.camera.undistortion import Keep
-from jaxphoto.extras.formats import CAMERAS_WRITTEN, EXPORTS, FORMATS, LOSS_PX
+from jaxphoto.extras.formats import CAMERAS_WRITTEN, LOSS_PX
 from jaxphoto.extras.photos.features import LONGEST_PX
 from jaxphoto.georeferencing import PATTERN_OF, ScannerCalibration
 from jaxphoto.io.clouds.cloud_reader import Returns
 from jaxphoto.io.clouds.coordinate_system import UNITS
 from jaxphoto.io.shipped import EXAMPLES
 from jaxphoto.lidar.raster import Statistic
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.losses import LOSSES
 from jaxphoto.parameters import dynamic_fields
-from jaxphoto.procedures.halves import CUTS
+from jaxphoto.procedures.compare import CUTS
 from jaxphoto.procedures.lidar.images_and_cloud import SHIFT_SIGMA, SURFACES
 from jaxphoto.procedures.lidar.iterate_to_convergence import MAX_ROUNDS
 from jaxphoto.procedures.lidar.strip_adjustment import MAX_STRIP_ROUNDS
@@ -46,8 +46,6 @@ CHOICES = [
     (blocks.monte_carlo, "kind", [*PER, "noise"]),
     (blocks.sensitivity, "per", get_args(Per)),
     (blocks.halves, "method", ALIGNMENTS),
-    (files.convert, "source_format", FORMATS),
-    (files.convert, "to", ["block", *EXPORTS]),
     (files.camera, "out_format", CAMERAS_WRITTEN),
     (photographs.undistort, "keep", get_args(Keep)),
     (lidar.lidar_control, "method", METHODS),

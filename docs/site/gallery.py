@@ -23,8 +23,7 @@ import jaxphoto
 PAGE = ROOT / "docs" / "gallery.md"
 _HEAD = """# Gallery
 
-What the notebooks show, one picture each and their own last words; behind each title the whole notebook, on the
-site with every table and picture of the same run. `python docs/site/gallery.py` runs them and makes all that.
+One figure and the conclusion of every notebook. `python docs/site/gallery.py` runs the notebooks and writes this page.
 """
 _PICTURE = re.compile(r'<img src="\.\./(images/gallery/[^"]+)"')
 

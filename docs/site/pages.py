@@ -178,7 +178,7 @@ def _notebook_title(path: Path) -> str:
 
 
 def _public() -> dict[str, list[str]]:
-    """List the public names, the plots, and the names on the pages of the papers, by package."""
+    """List the public names, the plots, and the names on papers.md, by package."""
     found: dict[str, set[str]] = {}
     for identifier in _identifiers().values():
         found.setdefault(identifier.split(".")[1], set()).add(identifier)
@@ -189,7 +189,7 @@ def _public() -> dict[str, list[str]]:
 def _identifiers() -> dict[str, str]:
     """`project` or `variants.direct`, as a page says it after `jaxphoto.` -> where it is defined."""
     jaxphoto = importlib.import_module("jaxphoto")
-    papers = "".join(page.read_text("utf-8") for page in (ROOT / "docs" / "papers").glob("*.md"))
+    papers = (ROOT / "docs" / "papers.md").read_text("utf-8")
     report = importlib.import_module("jaxphoto.report")
     pictures = [f"report.{name}" for name in report.__all__ if name.startswith("plot_")]
     found = {}

@@ -17,7 +17,7 @@ import pandas as pd
 
 from jaxphoto.georeferencing import ScannerCalibration
 from jaxphoto.io import read_recipe
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.procedures.lidar import Photographs, ScannerPriors, StripAdjustment, adjust_strips
 from jaxphoto.report.strips import all_correlations, calibration_table
 from jaxphoto.simulation import Recipe, Simulation, simulate
@@ -79,7 +79,7 @@ def main(out: Path, manoeuvres: Path) -> None:
     rows = []
     for one in tomllib.loads(manoeuvres.read_text(encoding="utf-8"))["manoeuvre"]:
         found = adjusted(simulate(planned(one["strips"]), seed=5))
-        rows.append({"manoeuvre": one["name"], "still": found.still, **told(found)})
+        rows.append({"manoeuvre": one["name"], "converged": found.converged, **told(found)})
         said = (
             f"  {name}: {value:.3g}" if isinstance(value, float) else f"  {value}" for name, value in rows[-1].items()
         )

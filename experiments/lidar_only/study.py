@@ -49,7 +49,7 @@ def layout(seed: int) -> pd.DataFrame:
     grid, truth, rows = index_cloud(simulation.cloud), truth_of(simulation), []
     for name, variant in EXPERIMENTS.items():
         found = lidar_control(variant(simulation.block), grid, "plane", HeightSettings(sigma_z_m=0.15, sigma_xy_m=0.5))
-        assert found.still and set(found.block.control.axis.tolist()) == {2}
+        assert found.converged and set(found.block.control.axis.tolist()) == {2}
         tables = Tables(found.adjusted)
         for one in tables.interior.dropna(subset="sigma").itertuples(index=False):
             rows.append((name, f"error_over_sigma_{one.parameter}", (one.value - truth[one.parameter]) / one.sigma))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from jaxphoto import adjust, simulate
 from jaxphoto.io import recipe_from
-from jaxphoto.report.posterior import posterior_figure, posterior_table
+from jaxphoto.report.draws import posterior_figure, posterior_table
 from jaxphoto.sensitivity.posterior import posterior
 
 RECIPE = Path(__file__).with_name("recipe.toml")

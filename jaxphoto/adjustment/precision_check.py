@@ -1,4 +1,4 @@
-"""Warnings about numbers with fewer digits than an adjustment needs (docs/precision.md)."""
+"""Warnings about numbers with fewer digits than an adjustment needs (docs/statistics.md)."""
 
 import warnings
 

@@ -7,7 +7,7 @@ For time or temperature t of the camera, the interior orientation of an exposure
 Time is in hours from the middle of the flight, the mean time of all exposures; temperature in kelvins from the
 reference of the block (`Temperatures`), by default the mean of all exposures. The interior orientation estimated along
 with the rates is that of the middle of the flight, or at the reference temperature. A positive rate of c is an
-increasing principal distance. Effects that rates may absorb: docs/live_cameras.md.
+increasing principal distance. Effects that rates may absorb: docs/time_dependent_cameras.md.
 """
 
 import abc

@@ -104,7 +104,7 @@ def run_experiment(
     recipes = {name: _recipe(variant, folder) for name, variant in experiment.variants.items()}
     failures: list[str] = []
     simulations: dict[int, dict[str, Simulation]] = {}
-    wanted, made = layouts or experiment.layouts, count(1)
+    wanted, counter = layouts or experiment.layouts, count(1)
     for layout in range(wanted):
         progress(f"simulating layout {layout + 1} of {wanted}")
         try:
@@ -118,7 +118,7 @@ def run_experiment(
         adjusted = {}
         try:
             for name, simulation in variants.items():
-                progress(f"adjusting: block {next(made)} of {len(simulations) * len(variants)}")
+                progress(f"adjusting: block {next(counter)} of {len(simulations) * len(variants)}")
                 adjusted[name] = _adjusted(simulation.block, sizes[name])
         except JaxphotoError as error:
             failures.append(f"layout {layout}, {name}: {error}")
@@ -142,13 +142,13 @@ def simulated(experiment: Experiment, folder: Path, variant: str, layout: int = 
 
 def _simulated(experiment: Experiment, recipes: Mapping[str, Recipe], layout: int) -> dict[str, Simulation]:
     """The simulation of each variant; variants of one recipe share it."""
-    made: dict[tuple[str, str], Simulation] = {}
+    simulations: dict[tuple[str, str], Simulation] = {}
     variants = {}
     for name, variant in experiment.variants.items():
         key = (variant.file, repr(variant.recipe))
-        if key not in made:
-            made[key] = simulate(recipes[name], layout)
-        variants[name] = dataclasses.replace(made[key], block=variant.change(made[key].block))
+        if key not in simulations:
+            simulations[key] = simulate(recipes[name], layout)
+        variants[name] = dataclasses.replace(simulations[key], block=variant.change(simulations[key].block))
     return variants
 
 
@@ -235,8 +235,8 @@ def side_by_side(comparison: pd.DataFrame, table: str) -> pd.DataFrame:
     """
     cells = comparison[comparison["table"] == table]
     if cells.empty:
-        known = ", ".join(dict.fromkeys(comparison["table"]))
-        raise ValueError(f"{table!r} is not a table of this experiment; its tables are {known}")
+        names = ", ".join(dict.fromkeys(comparison["table"]))
+        raise ValueError(f"{table!r} is not a table of this experiment; its tables are {names}")
     of = cells.set_index(["row", "column"])
     columns = pd.MultiIndex.from_product([dict.fromkeys(cells["column"]), ["published", "ours"]])
     wide = pd.DataFrame(index=pd.Index(list(dict.fromkeys(cells["row"])), name="row"), columns=columns, dtype=float)

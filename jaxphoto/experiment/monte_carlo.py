@@ -14,7 +14,7 @@ import pandas as pd
 
 from jaxphoto.block import Block
 from jaxphoto.io.draws_folder import DrawsFolder, digest_of
-from jaxphoto.io.json_file import read_json
+from jaxphoto.io.text_files import read_json
 from jaxphoto.report.draws import (
     LONG,
     Moments,
@@ -164,16 +164,11 @@ class MonteCarlo:
             with whole_file(directory / "effects.png") as work:
                 effects_figure(effects, table, shared).savefig(work)
         summary = {
-            "title": self.title,
-            "draws": len(good),
-            "draws_asked_for": folder.draws,
-            "converged": int(good.sum()),
-            "fallbacks": int(flags["fallback"].sum()),
-            "computed_now": self.computed,
+            "title": self.title, "draws": len(good), "draws_asked_for": folder.draws, "converged": int(good.sum()),
+            "fallbacks": int(flags["fallback"].sum()), "computed_now": self.computed,
             "seconds": {"compile": self.run.seconds["compile"], "draws": self.seconds},
-            "draws_per_second": self.computed / self.seconds if self.seconds else 0.0,
-            "versions": versions(),
-        }
+            "draws_per_second": self.computed / self.seconds if self.seconds else 0.0, "versions": versions(),
+        }  # fmt: skip
         with whole_file(directory / "summary.json") as work:
             work.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
         return summary, table

@@ -19,7 +19,7 @@ from markupsafe import Markup
 from jaxphoto.experiment.experiment import MEAN_DIFFERENCE, Run, compare
 from jaxphoto.report import check_points_figure, new_figure, plot_block
 from jaxphoto.report.block_plot import block_words
-from jaxphoto.report.page import Heading, Link, Made, Paragraph, Part, Plot, page, provenance
+from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, Plot, page, provenance
 from jaxphoto.report.plots import axes_or_new
 from jaxphoto.writing import whole_folder
 
@@ -59,7 +59,7 @@ def index_page(experiments: Mapping[str, tuple[str, pd.DataFrame]]) -> str:
     return page("Experiments", parts)
 
 
-def experiment_page(run: Run, comparison: pd.DataFrame, made: Made | None = None) -> str:
+def experiment_page(run: Run, comparison: pd.DataFrame, record: CommandRecord | None = None) -> str:
     """The page as HTML: agreement, the block of the first layout, each table as printed, check points."""
     tables = [table_texts(str(name), cells) for name, cells in comparison.groupby("table", sort=False)]
     judged, good = (sum(table[name] for table in tables) for name in ("judged", "good"))
@@ -69,7 +69,7 @@ def experiment_page(run: Run, comparison: pd.DataFrame, made: Made | None = None
     if not judged:
         verdict = "no printed value has a tolerance"
     colour = "" if not judged else "green" if good == judged else "amber"
-    parts = [*_parts(run, comparison, tables), *(provenance(made) if made else ())]
+    parts = [*_parts(run, comparison, tables), *(provenance(record) if record else ())]
     return page(run.experiment.title, parts, (verdict, colour), _STYLE)
 
 
@@ -117,16 +117,11 @@ def table_texts(name: str, cells: pd.DataFrame) -> dict:
     names = list(dict.fromkeys(shown["column"]))
     rows = [{"name": r, "cells": [texts.get((r, c), empty) for c in names]} for r in dict.fromkeys(shown["row"])]
     return {
-        "name": name,
-        "title": table_title(name),
-        "judged": int((cells["within"] != "").sum()),
-        "good": int((cells["within"] == "yes").sum()),
-        "columns": columns,
-        "rows": rows,
-        "printed": bool(shown["published"].notna().any()),
-        "notes": list(numbers),
+        "name": name, "title": table_title(name), "judged": int((cells["within"] != "").sum()),
+        "good": int((cells["within"] == "yes").sum()), "columns": columns, "rows": rows,
+        "printed": bool(shown["published"].notna().any()), "notes": list(numbers),
         "difference": _difference(cells[overall].iloc[0]) if overall.any() else None,
-    }
+    }  # fmt: skip
 
 
 def _column(of: pd.DataFrame, power: int, marks: dict[str, int]) -> list[tuple[pd.Series, dict]]:
@@ -156,16 +151,18 @@ def _difference(cell: pd.Series) -> dict[str, str]:
     return {"words": f"{cell['ours']:.3g}{promised}", "within": cell["within"]}
 
 
-def write_runs(runs: Mapping[Path, Run], out: Path, made: Mapping[Path, Made] = MappingProxyType({})) -> None:
+def write_runs(
+    runs: Mapping[Path, Run], out: Path, record: Mapping[Path, CommandRecord] = MappingProxyType({})
+) -> None:
     """Write tables.csv, cells.csv (every layout) and report.html of the `runs` of experiment folders into `out`.
 
-    Several experiments have a page each and report.html as index; `made` is the provenance of each run. Raises what
+    Several experiments have a page each and report.html as index; `record` is the provenance of each run. Raises what
     `whole_folder` raises.
     """
     tables = {folder: compare(run, folder) for folder, run in runs.items()}
     only = len(runs) == 1
     pages = {
-        "report.html" if only else f"{folder.name}.html": experiment_page(run, tables[folder], made.get(folder))
+        "report.html" if only else f"{folder.name}.html": experiment_page(run, tables[folder], record.get(folder))
         for folder, run in runs.items()
     }
     if not only:

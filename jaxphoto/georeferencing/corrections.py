@@ -1,6 +1,6 @@
 """Atmospheric refraction and earth curvature as displacements of the object point, for any tilt of the camera.
 
-For a vertical image both are, to first order, the textbook's radial image displacements (docs/frames.md). A block
+For a vertical image both are, to first order, the textbook's radial image displacements (docs/conventions.md). A block
 enables them; curvature applies only to map-grid coordinates.
 """
 

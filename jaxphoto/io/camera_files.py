@@ -16,24 +16,15 @@ import pandas as pd
 from jaxtyping import Float
 
 from jaxphoto.arrays import as_jax_array
-from jaxphoto.camera import (
-    InteriorOrientation,
-    Sensor,
-    constant_names,
-    empty_camera,
-    parameter_names,
-    set_parameter,
-)
+from jaxphoto.camera import InteriorOrientation, Sensor, constant_names, empty_camera, parameter_names, set_parameter
 from jaxphoto.errors import InputError, JaxphotoError, quoted
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section, known_together, read_sensor
 from jaxphoto.io.block_folder.settings import read_settings
 from jaxphoto.io.block_folder.table_layout import TOML
-from jaxphoto.io.json_file import read_json
-from jaxphoto.io.names import harm_in
-from jaxphoto.io.results_judged import SUMMARY, read_summary, reservation
+from jaxphoto.io.result_tables import SUMMARY, read_summary, reservation
+from jaxphoto.io.text_files import read_json, read_legacy_text
 from jaxphoto.io.text_tables import LARGEST, read_csv
 from jaxphoto.io.toml import Section, read_toml, toml_text
-from jaxphoto.io.whole_text import SMALL, read_whole
 from jaxphoto.unknowns import FIXED
 
 ASSUMED_PIXEL_MM = 0.001
@@ -82,14 +73,10 @@ class CameraSource(NamedTuple):
 
     def text(self) -> str:
         """Return the whole text, UTF-8 or else Windows-1252. Raise InputError for a binary file."""
-        content = read_whole(self.path, SMALL)
-        if b"\0" in content:
+        text = read_legacy_text(self.path)
+        if "\0" in text:
             raise self.error("the file is no text; give a camera file")
-        try:
-            text = content.decode("utf-8-sig")
-        except UnicodeDecodeError:
-            text = content.decode("cp1252", "replace")
-        return text.replace("\r\n", "\n").replace("\r", "\n")
+        return text
 
     def number(self, name: str, text: Any) -> float:
         """Return a finite number of the file."""
@@ -106,9 +93,6 @@ class CameraSource(NamedTuple):
         listed = ", ".join(names)
         if not names:
             raise self.error("there is no camera in it; give a file with one")
-        for name in names:
-            if harm := harm_in(name):
-                raise self.error(f"the camera {quoted(name)} {harm}")
         if self.camera is None and len(names) > 1:
             raise SeveralCamerasError(f"{self.path}: it holds {len(names)} cameras; name one of {listed}")
         if self.camera not in (None, *names):
@@ -163,7 +147,7 @@ def camera_readers() -> dict[str, CameraReader]:
 
 
 def is_camera_file(path: Path) -> bool:
-    """True if the content of a file is that of a camera file other than block.toml."""
+    """Return True if the content of a file is that of a camera file other than block.toml."""
     try:
         text = CameraSource(path).text()
     except InputError:
@@ -179,7 +163,7 @@ def read_camera_file(
     size_px: tuple[int, int] | None = None,
     block: str | Path | None = None,
 ) -> CameraFile:
-    """Read the camera in a file of another program (docs/camera_files.md) or of jaxphoto itself.
+    """Read the camera in a file of another program (docs/formats.md) or of jaxphoto itself.
 
     The content tells the format. `path` may be a folder of results, of a flight, a block folder or a COLMAP model.
     `camera` chooses one of several; `pixel_mm` and `size_px` complete what the file lacks; `block` is the block of an
@@ -201,14 +185,14 @@ def read_camera_file(
     for reader in camera_readers().values():
         if reader.recognise(path, text):
             with reading(path, "camera file"):
-                found = reader.read(source)
-            if pixel_mm is not None and not math.isclose(found.sensor.pixel_mm, pixel_mm, rel_tol=1e-6):
+                result = reader.read(source)
+            if pixel_mm is not None and not math.isclose(result.sensor.pixel_mm, pixel_mm, rel_tol=1e-6):
                 raise source.error(
-                    f"it says itself that a pixel is {found.sensor.pixel_mm:g} mm, not {pixel_mm:g}: leave --pixel-mm "
+                    f"it says itself that a pixel is {result.sensor.pixel_mm:g} mm, not {pixel_mm:g}: leave --pixel-mm "
                     "out, or, if that was assumed, write it in pixels first: jaxphoto camera "
                     f"{quoted(str(path))} --out pixels.yml"
                 )
-            return found
+            return result
     if not text.strip():
         raise source.error("the file is empty; write it again")
     raise source.error(f"this is no camera file that is known; {CAMERAS_READ} are")

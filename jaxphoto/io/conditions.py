@@ -13,7 +13,6 @@ import pandas as pd
 
 from jaxphoto.camera.conditions import NUMBERS, TEXTS, Conditions
 from jaxphoto.errors import InputError
-from jaxphoto.io.names import LONGEST, harm_in
 from jaxphoto.io.photograph_metadata import TAG, Exif, number, open_picture, read_exif, text
 from jaxphoto.writing import input_file
 
@@ -47,13 +46,13 @@ def _conditions(exif: Exif) -> dict[str, Any]:
     }
     return {name: number(value, positive=True) for name, value in positive.items()} | {
         "time": _time(shot),
-        "make": _text(top.get(TAG.Make)),
-        "model": _text(top.get(TAG.Model)),
-        "serial": _text(shot.get(TAG.BodySerialNumber)) or _text(xmp.get("CameraSerialNumber")),
-        "lens": " ".join(filter(None, (_text(shot.get(tag)) for tag in (TAG.LensMake, TAG.LensModel)))),
-        "lens_serial": _text(shot.get(TAG.LensSerialNumber)),
-        "drone": " ".join(filter(None, (_text(xmp.get(key)) for key in ("DroneModel", "DroneSerialNumber")))),
-        "firmware": _text(top.get(TAG.Software)),
+        "make": text(top.get(TAG.Make)),
+        "model": text(top.get(TAG.Model)),
+        "serial": text(shot.get(TAG.BodySerialNumber)) or text(xmp.get("CameraSerialNumber")),
+        "lens": " ".join(filter(None, (text(shot.get(tag)) for tag in (TAG.LensMake, TAG.LensModel)))),
+        "lens_serial": text(shot.get(TAG.LensSerialNumber)),
+        "drone": " ".join(filter(None, (text(xmp.get(key)) for key in ("DroneModel", "DroneSerialNumber")))),
+        "firmware": text(top.get(TAG.Software)),
         "temperature_c": number(shot.get(_TEMPERATURE)),
         "lens_temperature_c": number(xmp.get("LensTemperature")),
         "sensor_temperature_c": number(xmp.get("SensorTemperature")),
@@ -69,12 +68,6 @@ def _time(shot: Any) -> str:
     fraction, offset = text(shot.get(TAG.SubsecTimeOriginal)), text(shot.get(TAG.OffsetTimeOriginal))
     time = "{}-{}-{} {}".format(*match.groups()) + (f".{fraction}" if re.fullmatch(r"[0-9]+", fraction) else "")
     return time + (offset if re.fullmatch(r"[+-]\d\d:\d\d|Z", offset) else "")
-
-
-def _text(value: Any) -> str:
-    """A text of a file; "" if a spreadsheet would read it as a formula."""
-    words = text(value)
-    return "" if len(words) > LONGEST or harm_in(words) else words
 
 
 def marked(conditions: Sequence[Conditions], used: Collection[str]) -> list[Conditions]:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxphoto.errors import InputError, RowError, quoted
-from jaxphoto.io.text_tables import LARGEST, LONGEST_LINE, MOST_COLUMNS, finite
+from jaxphoto.io.text_tables import LARGEST, finite
 
 SYSTEM = re.compile(r"EPSG:\d|\+proj=|WGS84\s+UTM\s", re.IGNORECASE)
 """The first line of a file of OpenDroneMap, which names its coordinate system."""
@@ -100,7 +100,7 @@ def columns_of(header: Sequence[str], words: Mapping[str, tuple[str, ...]]) -> C
 
 
 def in_degrees(header: Sequence[str], columns: Columns) -> bool:
-    """True if the header calls the first two coordinates longitude and latitude."""
+    """Return True if the header calls the first two coordinates longitude and latitude."""
     return not {"longitude", "lon", "long", "latitude", "lat"}.isdisjoint(header_words(header[columns["x"]]))
 
 
@@ -124,12 +124,10 @@ def split_row(file: str, line: str, row: int, separator: str) -> list[str]:
         (cells,) = (
             [line.split()]
             if separator == " "
-            else csv.reader([line[: LONGEST_LINE + 1]], delimiter=separator, skipinitialspace=True, strict=True)
+            else csv.reader([line], delimiter=separator, skipinitialspace=True, strict=True)
         )
     except csv.Error:
         raise RowError(f"{file}, row {row}: the quotation marks do not pair; close or remove them", [row]) from None
-    if len(cells) > MOST_COLUMNS or len(line) > LONGEST_LINE:
-        raise RowError(f"{file}, row {row}: the row has more than {MOST_COLUMNS} cells; correct it", [row])
     return [cell.strip() for cell in cells]
 
 

@@ -1,7 +1,6 @@
-"""Draws on disk: Parquet parts while a Monte Carlo runs, one file when it is done.
+"""Monte Carlo draws on disk: Parquet parts during a run, one file afterwards.
 
-A part is written whole or not at all, so a run that was stopped at any moment goes on after its last part, and gives
-the same file as one that was not.
+Parts are written atomically: an interrupted run resumes after its last part and gives the same file.
 """
 
 import contextlib
@@ -19,16 +18,16 @@ import pyarrow.parquet as pq
 
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError
-from jaxphoto.io.json_file import read_json
+from jaxphoto.io.text_files import read_json
 from jaxphoto.writing import check_room, clear_leftovers, is_place, locked, whole_file
 
 _RUN, _PARTS, DRAWS = "run.json", "parts", "draws.parquet"
 
 
 class DrawsFolder:
-    """The folder of one run: its settings, its parts, and the file of all draws.
+    """Folder of one run: settings, parts, and the file of all draws.
 
-    `settings` are all that the draws depend on. Raises InputError where the folder holds another run or something else.
+    `settings` are all that the draws depend on. Raises InputError if the folder holds another run or other files.
     """
 
     def __init__(self, directory: Path, settings: dict, draws: int, per_part: int):
@@ -37,18 +36,16 @@ class DrawsFolder:
         settings = settings | {"draws": draws, "per_part": per_part}
         run = directory / _RUN
         if run.is_file():
-            self._check(_settings_in(run), settings)
+            self._check(run, settings)
         else:
             with whole_file(run) as work:
                 work.write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
         if not self.done:
             (directory / _PARTS).mkdir(exist_ok=True)
 
-    def _check(self, held: dict, settings: dict) -> None:
-        wanted = json.loads(json.dumps(settings))
-        different = [name for name in {**held, **wanted} if held.get(name) != wanted.get(name)]
-        if different:
-            name = different[0]
+    def _check(self, run: Path, settings: dict) -> None:
+        held, wanted = read_json(run), json.loads(json.dumps(settings))
+        for name in [name for name in {**held, **wanted} if held.get(name) != wanted.get(name)][:1]:
             raise InputError(
                 f"{self.directory} holds a run with other settings ({name} {held.get(name)}, now {wanted.get(name)}): "
                 "name a new folder, or give the settings of that run to go on with it"
@@ -56,12 +53,12 @@ class DrawsFolder:
 
     @property
     def done(self) -> bool:
-        """Whether all draws are in one file."""
+        """True if all draws are in one file."""
         return (self.directory / DRAWS).is_file()
 
     @property
     def next_part(self) -> int:
-        """The first part that is not there; parts are written in order. Raises InputError for one that is damaged."""
+        """Index of the first missing part. Raises InputError for a damaged one."""
         k = 0
         while self._part(k).is_file():
             with _reading(self._part(k)):
@@ -71,24 +68,26 @@ class DrawsFolder:
 
     @property
     def n_parts(self) -> int:
-        """Parts of the whole run."""
+        """Number of parts of the whole run."""
         return -(-self.draws // self.per_part)
 
     @contextlib.contextmanager
     def alone(self) -> Iterator[None]:
-        """Keep other processes from drawing into this folder meanwhile. Raises InputError where one does."""
+        """Lock the folder against other processes. Raises InputError if another one draws into it."""
         with locked(self.directory / _PARTS) as own:
             if own is False:
                 raise InputError(f"another run is drawing into {self.directory}: wait for it, or name a new folder")
             yield
 
     def write_part(self, k: int, table: pd.DataFrame) -> None:
-        """Keep the draws of part `k`."""
+        """Write the draws of part `k`."""
         with whole_file(self._part(k)) as work:
-            pq.write_table(_arrow(table), work, write_page_checksum=True)
+            # Without pandas' metadata, which contains versions.
+            arrow = pa.Table.from_pandas(table, preserve_index=False).replace_schema_metadata(None)
+            pq.write_table(arrow, work, write_page_checksum=True)
 
     def join(self) -> None:
-        """Bring all parts to one file, part by part."""
+        """Join all parts into one file."""
         parts = [self._part(k) for k in range(self.n_parts)]
         with _reading(parts[0]):
             schema = pq.read_schema(parts[0])
@@ -101,7 +100,7 @@ class DrawsFolder:
                     writer.write_table(pq.read_table(part, page_checksum_verification=True))
 
     def tidy(self) -> None:
-        """Remove the parts, which the file of all draws holds; what else somebody put beside them stays."""
+        """Remove the parts after they were joined."""
         for k in range(self.n_parts):
             self._part(k).unlink(missing_ok=True)
         clear_leftovers(self.directory / _PARTS)
@@ -109,12 +108,12 @@ class DrawsFolder:
             (self.directory / _PARTS).rmdir()
 
     def columns(self) -> list[str]:
-        """Names of the columns of the draws there are."""
+        """Names of the columns."""
         with _reading(self._files[0]):
             return pq.read_schema(self._files[0]).names
 
     def read(self, names: list[str]) -> dict[str, np.ndarray]:
-        """Columns of the draws there are."""
+        """Read columns of all draws so far."""
         tables = []
         for file in self._files:
             with _reading(file):
@@ -124,7 +123,7 @@ class DrawsFolder:
 
     @property
     def _files(self) -> list[Path]:
-        """The file of all draws, or the parts there are."""
+        """The file of all draws, or the parts so far."""
         return [self.directory / DRAWS] if self.done else [self._part(k) for k in range(self.next_part)]
 
     def _part(self, k: int) -> Path:
@@ -132,7 +131,7 @@ class DrawsFolder:
 
 
 def digest_of(block: Block) -> str:
-    """A hash of everything that a block says."""
+    """SHA-256 of the content of a block."""
     arrays, structure = jax.tree.flatten(block)
     digest = hashlib.sha256(repr(structure).encode())
     for array in arrays:
@@ -141,7 +140,7 @@ def digest_of(block: Block) -> str:
 
 
 def check_place(directory: Path) -> None:
-    """Raises InputError where no run can be kept: a file, below a file, among something else."""
+    """Raise InputError if no run can be written: a file, or a folder with other files."""
     for path in (directory, *directory.parents):
         if path.is_file():
             raise InputError(f"{path} is a file: name a folder for the draws")
@@ -151,23 +150,11 @@ def check_place(directory: Path) -> None:
     check_room(directory / _RUN)
 
 
-def _settings_in(run: Path) -> dict:
-    try:
-        return read_json(run)
-    except InputError:
-        raise InputError(f"{run} holds no settings of a Monte Carlo run: name a new folder") from None
-
-
 @contextmanager
 def _reading(file: Path) -> Iterator[None]:
-    """Raises InputError where a file of draws is cut off or was changed."""
+    """Raise InputError if a file of draws is damaged."""
     try:
         yield
-    # A name of a column that is no text is an error of Python's own.
+    # pyarrow raises KeyError or UnicodeDecodeError for damaged column names.
     except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError):
         raise InputError(f"{file} is damaged: delete it, and its draws are made anew") from None
-
-
-def _arrow(table: pd.DataFrame) -> pa.Table:
-    # Without pandas' own description, which tells of versions.
-    return pa.Table.from_pandas(table, preserve_index=False).replace_schema_metadata(None)

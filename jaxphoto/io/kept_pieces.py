@@ -1,7 +1,7 @@
-"""What a long run has worked out so far, piece by piece in a folder beside its results, for a run that goes on.
+"""Checkpoints of a long run: intermediate results in a folder beside its output, from which a later run resumes.
 
-A piece is some arrays under a name that says all that they depend on. It is written whole or not at all and begins with
-the SHA-256 of what follows, so that one that is damaged counts as not there and is made anew.
+A piece is a set of arrays under a name that is a hash of all its inputs. It is written atomically and begins with the
+SHA-256 of its content; a damaged piece counts as missing and is computed again.
 """
 
 import contextlib
@@ -19,14 +19,14 @@ from jaxphoto.writing import check_room, clear_leftovers, is_place, locked, whol
 
 _MARKER, _SUFFIX = "kept.txt", ".piece"
 _SAYS = "What a run of jaxphoto has worked out so far. The same command goes on from here, and removes it at its end.\n"
-# Of a piece in bytes: some million features.
+# Maximum size of a piece in bytes: some million features.
 _MOST = 1_000_000_000
 
 
 class KeptPieces:
-    """The pieces in `folder`, which is made where it is not there.
+    """The pieces in `folder`, which is created if missing.
 
-    Raises InputError where `folder` is a file or holds something else.
+    Raises InputError if `folder` is a file or holds something else.
     """
 
     def __init__(self, folder: Path):
@@ -41,7 +41,7 @@ class KeptPieces:
         return self._path(name).is_file()
 
     def read(self, name: str) -> dict[str, np.ndarray] | None:
-        """The arrays of a piece; None where it is not there, or damaged."""
+        """Read the arrays of a piece; None if it is missing or damaged."""
         path = self._path(name)
         try:
             if path.stat().st_size > _MOST:
@@ -56,7 +56,7 @@ class KeptPieces:
             return dict(arrays)
 
     def write(self, name: str, **arrays: np.ndarray) -> None:
-        """Keep `arrays` as the piece `name`. Raises OSError where there is no room for it."""
+        """Write `arrays` as the piece `name`."""
         packed = io.BytesIO()
         np.savez(packed, **arrays)  # type: ignore[arg-type]
         content = packed.getvalue()
@@ -65,9 +65,9 @@ class KeptPieces:
 
     @contextmanager
     def alone(self) -> Iterator["KeptPieces"]:
-        """These pieces, kept from other processes meanwhile; without any the folder goes at the end.
+        """Lock the pieces against other processes; an empty folder is removed at the end.
 
-        Raises InputError where another process has them.
+        Raises InputError if another process uses them.
         """
         with locked(self.folder) as own:
             if own is False:
@@ -83,7 +83,7 @@ class KeptPieces:
                     self.remove()
 
     def remove(self) -> None:
-        """Remove all pieces; what somebody else put beside them stays, and the folder with it."""
+        """Remove all pieces, and the folder if nothing else is in it."""
         for path in self.folder.glob(f"*{_SUFFIX}"):
             path.unlink(missing_ok=True)
         clear_leftovers(self.folder)
@@ -100,13 +100,13 @@ class KeptPieces:
 
 
 def beside(out: Path) -> Path:
-    """The folder of pieces of a run that writes to `out`."""
+    """Folder of the pieces of a run that writes to `out`."""
     target = Path(os.path.realpath(out))
     return target.with_name(f"{target.name}.progress")
 
 
 def check_pieces(folder: Path) -> None:
-    """Raises InputError where no pieces can be kept in `folder`: a file, or something else is in it."""
+    """Raise InputError if `folder` is a file or holds something else."""
     if os.path.lexists(folder) and not folder.is_dir():
         raise InputError(f"{folder} is a file, where what is worked out is kept meanwhile: move it away")
     known = not folder.is_dir() or (folder / _MARKER).is_file()
@@ -119,7 +119,7 @@ def check_pieces(folder: Path) -> None:
 
 
 def name_of(*content: object) -> str:
-    """A name for a piece that depends on `content`: bytes, text and numbers."""
+    """Name of a piece: a hash of `content` (bytes, text and numbers)."""
     digest = hashlib.sha256()
     for part in content:
         packed = b"bytes" + part if isinstance(part, bytes) else repr(part).encode()

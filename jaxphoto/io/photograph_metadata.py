@@ -26,12 +26,7 @@ from typing import Any, NamedTuple
 
 from PIL import ExifTags, Image
 
-from jaxphoto.georeferencing.camera_attitude import (
-    USUAL_SIGMA_DEG,
-    CameraAttitude,
-    level_from_belly,
-    level_from_gimbal,
-)
+from jaxphoto.georeferencing.camera_attitude import USUAL_SIGMA_DEG, CameraAttitude, level_from_belly, level_from_gimbal
 from jaxphoto.georeferencing.exposure_times import Taken, gps_seconds
 from jaxphoto.georeferencing.gps import Fix, Gps, Heights
 

@@ -1,4 +1,4 @@
-"""Rasters by rasterio: surface models, hillshades, photographs and orthophotos (docs/surface_model.md)."""
+"""Rasters by rasterio: surface models, hillshades, photographs and orthophotos (docs/clouds.md)."""
 
 import warnings
 from collections.abc import Iterator
@@ -14,8 +14,7 @@ from jaxphoto.camera import Sensor
 from jaxphoto.errors import InputError
 from jaxphoto.io.clouds.cloud_source import check_file
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, epsg_system, system_of
-from jaxphoto.lidar.orthophoto import Picture
-from jaxphoto.lidar.raster import Raster
+from jaxphoto.lidar.raster import Picture, Raster
 from jaxphoto.optional import extra
 from jaxphoto.writing import whole_file
 

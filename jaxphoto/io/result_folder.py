@@ -9,7 +9,7 @@ import dataclasses
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -24,9 +24,8 @@ from jaxphoto.errors import InputError, few
 from jaxphoto.io.block_folder import read_block
 from jaxphoto.io.block_folder.table_layout import ANGLES, TOML, XYZ, check_angles
 from jaxphoto.io.camera_files import INTERIOR, read_camera_file
-from jaxphoto.io.json_file import read_json
-from jaxphoto.io.names import control_in
-from jaxphoto.io.results_judged import SUMMARY
+from jaxphoto.io.result_tables import SUMMARY
+from jaxphoto.io.text_files import read_json
 from jaxphoto.io.text_tables import read_csv
 
 EXTERIOR, POINTS = "exterior.csv", "object_points.csv"
@@ -34,13 +33,11 @@ PHOTOGRAPHS = "photographs.csv"
 """Names of the photographs of a flight by the ids of images."""
 _from_angles = eqx.filter_jit(ExteriorOrientation.from_angles)
 _CURE = "name the block that was adjusted by --block, or adjust again"
-# Bytes of a file name, characters of a path.
-_LONGEST_NAME, _LONGEST_PATH = 255, 1000
 _PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".dng", ".bmp", ".webp", ".jp2")
 
 
 def is_result(folder: Path) -> bool:
-    """True for a folder of results of `adjust` or of `fly`."""
+    """Return True for a folder of results of `adjust` or of `fly`."""
     return (folder / INTERIOR).is_file() or _parts(folder) is not None
 
 
@@ -134,7 +131,7 @@ def _sources(folder: Path, block: Path | None, part: int) -> tuple[Path, Path]:
 def _block_of(folder: Path) -> Path:
     """The block of results that their summary names, or the flight around them."""
     name = read_json(folder / SUMMARY).get("block") if (folder / SUMMARY).is_file() else None
-    if _is_path(name):
+    if isinstance(name, str) and name:
         return folder / name
     for other in _parts(folder.parent) or []:
         if isinstance(other, dict) and other.get("result") == folder.name:
@@ -145,14 +142,8 @@ def _block_of(folder: Path) -> Path:
 
 
 def _below(folder: Path, name: Any) -> Path | None:
-    """A folder in `folder`; None for a name that leads elsewhere."""
-    return folder / name if _is_path(name) and name not in (".", "..") and not set(name) & set("/\\") else None
-
-
-def _is_path(text: Any) -> TypeGuard[str]:
-    if not isinstance(text, str) or text == "" or control_in(text) or len(text) > _LONGEST_PATH:
-        return False
-    return max(len(part.encode()) for part in text.split("/")) <= _LONGEST_NAME
+    """A folder in `folder`; None for any other name."""
+    return folder / name if isinstance(name, str) and name != ".." and Path(name).name == name != "" else None
 
 
 def _camera(result: Path, name: str, block: Block, source: Path) -> InteriorOrientation:

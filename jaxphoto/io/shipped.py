@@ -1,4 +1,4 @@
-"""The examples and experiments that come with jaxphoto: in a wheel beside its modules, in a clone at its root."""
+"""Examples and experiments that come with jaxphoto: in a wheel beside its modules, in a clone at its root."""
 
 from pathlib import Path
 
@@ -13,11 +13,11 @@ EXAMPLES = {
     "strips": "a simulated flight of overlapping strips of a scanner and a camera on one trajectory, all of them wrong",
     "experiments": "the published experiments as runnable declarations",
 }
-"""What can be handed out, and what it is."""
+"""Examples and their descriptions."""
 
 
 def shipped(name: str) -> Path:
-    """Where an example lies: a file, or a folder. Raises InputError for a name that there is not."""
+    """Path of an example, a file or folder. Raises InputError for an unknown name."""
     if name not in EXAMPLES:
         raise InputError(f"there is no example {name}; there are {', '.join(EXAMPLES)}")
     root = next((r for r in (_PACKAGE / "shipped", _PACKAGE.parent) if (r / "examples").is_dir()), None)

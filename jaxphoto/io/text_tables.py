@@ -1,41 +1,37 @@
-"""Tables of text files, read by pandas: every line keeps its file and row, which messages name.
+"""Text tables read by pandas; each line keeps its file and row for messages.
 
-A row is counted as a spreadsheet counts it: header, comments and empty lines included, from 1.
+Rows are counted as a spreadsheet counts them, from 1, including header, comments and empty lines.
 """
 
 import dataclasses
+import fnmatch
 import io
 import math
 import re
 import warnings
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from jaxphoto.errors import BlockError, InputError, RowError, quoted, shown
-from jaxphoto.io.whole_text import LARGE, read_text
+from jaxphoto.io.text_files import read_text
 
-T = TypeVar("T")
-# The index of a line in its table, from Python or from numpy.
+# Index of a line in its table, from Python or from NumPy.
 Line = int | np.integer
-# The columns in which a comma is not a decimal comma.
+# Columns in which a comma is not a decimal comma.
 _TEXT = frozenset({"image", "camera", "strip", "point", "role"})
 LARGEST = 1e30
-"""No length, angle, time or coefficient is larger; its square is still a number."""
-# What fits into 64 bits.
-_DIGITS = 18
-MOST_COLUMNS, LONGEST_LINE = 1_000, 100_000
-"""Columns of a table, and characters of a row."""
+"""Limit of lengths, angles, times and coefficients; the square of a smaller number is finite."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """Columns of equal length: arrays of text or of floats (NaN: empty), or pandas' arrays of text.
+    """Columns of equal length: text, or floats with NaN for empty cells.
 
-    `files` and `rows` (both (n,)) give the place of each line, `file` that of the whole table.
+    `files` and `rows` (n,) locate each line; `file` names the whole table.
     """
 
     file: str
@@ -45,7 +41,7 @@ class Table:
 
     @staticmethod
     def of(file: str, columns: dict[str, Any], rows: np.ndarray | None = None) -> "Table":
-        """A table all of whose lines stand in one file (`rows` None: one after the other from 1)."""
+        """A table of one file; without `rows`, lines are counted from 1."""
         n = len(next(iter(columns.values()))) if columns else 0
         return Table(file, columns, np.full(n, file, object), np.arange(1, n + 1) if rows is None else rows)
 
@@ -56,41 +52,41 @@ class Table:
         return column in self.columns
 
     def take(self, chosen: np.ndarray) -> "Table":
-        """The lines chosen by a mask or by indices."""
+        """Select lines by a mask or by indices."""
         columns = {name: values[chosen] for name, values in self.columns.items()}
         return Table(self.file, columns, self.files[chosen], self.rows[chosen])
 
     def place(self, line: Line) -> str:
-        """The file and row of a line, as messages name it."""
+        """File and row of a line, for messages."""
         return f"{self.files[line]}, row {self.rows[line]}"
 
     def bad(self, line: Line, message: str) -> RowError:
-        """An error about the content of one line."""
+        """Error in the content of one line."""
         return RowError(f"{self.place(line)}: {message}", [int(self.rows[line])])
 
+    def misfit(self, line: Line, message: str) -> BlockError:
+        """Error in the relation of one line to others."""
+        return BlockError(f"{self.place(line)}: {message}")
+
     def check(self, wrong: np.ndarray, message: Callable[[Line], str]) -> None:
-        """Raise RowError, with the message of the first, for lines that are `wrong` (a mask)."""
+        """Raise RowError for the lines of a mask, with the message of the first."""
         lines = np.flatnonzero(wrong)
         if len(lines):
             raise RowError(f"{self.place(lines[0])}: {message(lines[0])}", self.rows[lines].tolist())
 
-    def misfit(self, line: Line, message: str) -> BlockError:
-        """An error about how one line fits the others."""
-        return BlockError(f"{self.place(line)}: {message}")
-
     def text(self, column: str) -> np.ndarray:
-        """A column as text; empty everywhere where the file has no such column."""
+        """A column of text; empty strings if the file lacks it."""
         cells = self.columns.get(column)
         return np.full(len(self), "", object) if cells is None else np.asarray(cells, object)
 
     def ids(self, column: str) -> np.ndarray:
-        """A column of ids, none of them empty."""
+        """A column of ids. Raises RowError for an empty one."""
         values = self.text(column)
         self.check(values == "", lambda line: f"the {column} is empty; give its id or delete the row")
         return values
 
     def find(self, column: str, known: Sequence[str], message: Callable[[str], str]) -> np.ndarray:
-        """The index in `known` of the id in each line. Raises BlockError with the `message` about an unknown id."""
+        """Index in `known` of the id of each line. Raises BlockError with the `message` about an unknown id."""
         named = self.ids(column)
         index = pd.Index(np.array(known, object)).get_indexer(pd.Index(named))
         for line in np.flatnonzero(index < 0)[:1]:
@@ -98,7 +94,7 @@ class Table:
         return index
 
     def numbers(self, column: str, *, empty: bool = False) -> np.ndarray:
-        """A column of finite numbers; NaN stands for an empty cell or a missing column where `empty` allows it."""
+        """A column of finite numbers; `empty` permits NaN for empty cells and missing columns."""
         cells = self.columns.get(column)
         if cells is None:
             return np.full(len(self), np.nan)
@@ -112,11 +108,11 @@ class Table:
         return values
 
     def matrix(self, columns: Sequence[str], *, empty: bool = False) -> np.ndarray:
-        """Columns of numbers beside each other, (n, columns)."""
+        """Columns of numbers, (n, columns)."""
         return np.stack([self.numbers(column, empty=empty) for column in columns], axis=1)
 
     def sigmas(self, column: str) -> np.ndarray:
-        """A column of standard deviations, positive where given and NaN where not."""
+        """A column of positive standard deviations; NaN for empty cells."""
         values = self.numbers(column, empty=True)
         self.check(
             values <= 0,
@@ -127,7 +123,7 @@ class Table:
     def _parsed(self, column: str, cells: Any) -> np.ndarray:
         cells = np.asarray(cells, object)
         try:
-            # Python's conversion rounds correctly: a number written by repr comes back exactly.
+            # Python rounds correctly: a number written by repr comes back exactly.
             values = np.where(cells == "", "nan", cells).astype(float)
             wrong = np.array(["_" in cell for cell in cells], bool)
         except ValueError:
@@ -141,7 +137,7 @@ class Table:
 
 
 def concatenate(tables: Sequence[Table]) -> Table:
-    """One table of several with the same columns."""
+    """Concatenate tables with the same columns."""
     first = tables[0]
     columns = {name: np.concatenate([t.columns[name] for t in tables]) for name in first.columns}
     return Table(
@@ -152,21 +148,18 @@ def concatenate(tables: Sequence[Table]) -> Table:
     )
 
 
-def read_csv(
-    path: Path,
-    needed: Sequence[str],
-    optional: Sequence[str] = (),
-    text: Sequence[str] = (),
-    without: Container[int] = (),
-) -> Table:
-    """A CSV file with a header: separated by commas, or by semicolons or tabs (then with decimal commas, too).
+def read_csv(path: Path, needed: Sequence[str], optional: Sequence[str] = (), text: Sequence[str] = ()) -> Table:
+    """Read a CSV file with a header, separated by commas, semicolons or tabs (the latter two also with decimal commas).
 
-    Lines that start with `#`, empty lines and rows `without` are skipped. Columns in neither list are left out, with a
-    UserWarning. A comma in the columns `text` is not a decimal comma.
+    Lines that start with `#` and empty lines are skipped. Columns in neither list are skipped with a UserWarning. A
+    comma in the columns `text` is not a decimal comma.
 
-    Raises InputError where the file or a needed column is missing, or a row has too many cells.
+    Raises InputError if the file or a needed column is missing, or a row has too many cells.
     """
-    lines, rows = content_lines(path, without)
+    # Not splitlines(): that also ends lines at form feeds and other characters an editor does not count.
+    numbered = enumerate(read_text(path).split("\n"), 1)
+    content = [(row, line) for row, line in numbered if line.strip() and not line.lstrip().startswith("#")]
+    rows, lines = [row for row, _ in content], [line for _, line in content]
     if not lines:
         raise InputError(f"{path.name}: the file is empty; give it a header with the columns {', '.join(needed)}")
     separator = ";" if ";" in lines[0] else "\t" if "\t" in lines[0] and "," not in lines[0] else ","
@@ -196,7 +189,7 @@ def read_csv(
 
 
 def _cells(path: Path, lines: list[str], rows: list[int], separator: str) -> pd.DataFrame:
-    """All cells as text. Raises RowError for a row with too many cells or an open quotation."""
+    """Read all cells as text. Raises RowError for a row with too many cells or an open quotation."""
     try:
         return pd.read_csv(
             io.StringIO("\n".join(lines)), sep=separator, header=None, dtype=str, na_filter=False, skipinitialspace=True
@@ -214,43 +207,25 @@ def _cells(path: Path, lines: list[str], rows: list[int], separator: str) -> pd.
     raise RowError(f"{path.name}, row {row}: {message}", [row])
 
 
-def content_lines(path: Path, without: Container[int] = ()) -> tuple[list[str], list[int]]:
-    """The lines of a text file that are neither empty nor comments nor `without`, and their row numbers."""
-    # Not splitlines(): that also ends lines at form feeds and other characters an editor does not count.
-    lines = read_text(path, LARGE).split("\n")
-    content = lambda line: line.strip() and not line.lstrip().startswith("#")  # noqa: E731
-    rows = [row for row, line in enumerate(lines, 1) if content(line) and row not in without]
-    return [lines[row - 1] for row in rows], rows
-
-
-def each_row(read: Callable[[int, str], T], numbered: Iterable[tuple[int, str]]) -> list[T]:
-    """What `read` makes of the rows and their lines. Raises the first RowError that it raises, with the rows of all."""
-    values: list[T] = []
-    first, rows = None, set[int]()
-    for row, line in numbered:
-        try:
-            values.append(read(row, line))
-        except RowError as error:
-            first = first or error
-            rows.update(error.rows)
-    if first is not None:
-        raise RowError(str(first), rows)
-    return values
-
-
-def natural(cell: str) -> int | None:
-    """The whole number, zero or more, that a cell is; None where it is none, or has more digits than any count."""
-    return int(cell) if cell.isascii() and cell.isdigit() and len(cell) <= _DIGITS else None
+def points_matching(points: Sequence[str], patterns: Iterable[str], where: str) -> tuple[str, ...]:
+    """The points that match `patterns` (* for any characters). Raises InputError for a pattern without a match."""
+    matching: dict[str, None] = {}
+    for pattern in patterns:
+        names = [point for point in points if fnmatch.fnmatchcase(point, pattern)]
+        if not names:
+            raise InputError(f"{where} {pattern}: no point of the block has this name; correct it")
+        matching |= dict.fromkeys(names)
+    return tuple(matching)
 
 
 def finite(cell: str) -> float | None:
-    """The number that a cell is; None where it is none, not finite or larger than any can be here."""
+    """Parse a number; None if it is not one, or larger than `LARGEST`."""
     value = float(cell) if is_number(cell) else math.inf
     return value if abs(value) <= LARGEST else None
 
 
 def is_number(cell: str) -> bool:
-    """Whether a cell reads as a number."""
+    """Return True if a cell is a number."""
     try:
         float(cell)
     except ValueError:

@@ -25,8 +25,8 @@ from pydantic import (
 
 from jaxphoto.arrays import as_jax_array
 from jaxphoto.errors import BlockError, InputError, quoted
+from jaxphoto.io.text_files import read_text
 from jaxphoto.io.text_tables import LARGEST
-from jaxphoto.io.whole_text import SMALL, read_text
 from jaxphoto.observations import is_covariance
 from jaxphoto.unknowns import FIXED, FREE, Prior, Weighted
 
@@ -44,7 +44,7 @@ M = TypeVar("M", bound="Keys")
 
 
 class KeyMistake(ValueError):
-    """A mistake that the validator of a model finds in one of its keys ("": in the table as a whole)."""
+    """Validation error of a model in one of its keys ("": in the table as a whole)."""
 
     def __init__(self, key: str, message: str):
         super().__init__(message)
@@ -91,7 +91,7 @@ class Section:
                 raise self.error(key, f"no such key is known; use {', '.join(keys)} or remove it")
 
     def section(self, key: str) -> "Section":
-        """The table under `key`, empty where there is none."""
+        """The table under `key`; empty if missing."""
         return Section(self.file, f"{self.path}.{key}" if self.path else key, self.values.get(key, {}))
 
     def model(self, kind: type[M]) -> M:
@@ -115,14 +115,15 @@ class Section:
         return self._value(_TEXT, key, default)
 
     def vector(self, key: str, size: int = 3) -> np.ndarray:
-        """Finite numbers, zeros where the key is absent."""
+        """Finite numbers; zeros if the key is missing."""
         return np.array(self._value(_vector(size), key, [0.0] * size), float)
 
     def prior(self, key: str, start: Any, unit: str = "", scale: float = 1.0) -> Prior | Weighted:
-        """`"free"`, `"fixed"` (also where absent) or `{ sigma = ... }`, weighted at `start` unless `value` is given.
+        """Read a prior: `"free"`, `"fixed"` (the default) or `{ sigma = ... }`, weighted at `start` unless `value` is
+        given.
 
-        A vector may have `covariance`, the rows of a matrix, in place of `sigma`. `start` is in jaxphoto's unit, which
-        is the file's times `scale`; `unit` may end the names (sigma_deg).
+        A vector may have `covariance`, the rows of a matrix, instead of `sigma`. `start` is in the unit of jaxphoto,
+        the file's times `scale`; `unit` may end the keys (sigma_deg).
         """
         status = self.values.get(key, "fixed")
         if status in ("free", "fixed"):
@@ -181,16 +182,16 @@ class Section:
         for part in place[:-1]:
             path += f", number {part + 1}" if isinstance(part, int) else f".{part}" if path else part
         name = place[-1] if place else ""
-        told = {
+        context = {
             "input": quoted(error["input"]),
             "msg": error["msg"],
             "table": f"{path}.{name}" if path else name,
             **error.get("ctx", {}),
         }
-        if "expected" in told:
-            told["expected"] = told["expected"].replace("'", '"')
+        if "expected" in context:
+            context["expected"] = context["expected"].replace("'", '"')
         sentence = str(mistake) if mistake else _SENTENCES.get(error["type"], "{input} is not valid: {msg}")
-        return Section(self.file, path, {}).error(name, sentence if mistake else sentence.format(**told))
+        return Section(self.file, path, {}).error(name, sentence if mistake else sentence.format(**context))
 
 
 _NUMBER, _POSITIVE, _COUNT = TypeAdapter(Number), TypeAdapter(Positive), TypeAdapter(Count)
@@ -225,8 +226,8 @@ def _vector(size: int) -> TypeAdapter:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The content of a TOML file. Raises InputError with the line of a syntax error."""
-    text = read_text(path, SMALL)
+    """Read a TOML file. Raises InputError with the line of a syntax error."""
+    text = read_text(path)
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -234,7 +235,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def toml_text(values: dict[str, Any]) -> str:
-    """Nested tables as TOML; numbers come back exactly."""
+    """Write nested tables as TOML; numbers come back exactly."""
     return "\n".join(_table_lines("", values)).lstrip("\n") + "\n"
 
 
@@ -254,7 +255,7 @@ def status(prior: Any, start: Any, scale: float = 1.0) -> str | dict[str, Any]:
 
 
 def _table_lines(path: str, values: dict[str, Any]) -> list[str]:
-    # A weighted status is the one table that is written in the line of its key.
+    # A weighted status is the only inline table.
     tables = {k: v for k, v in values.items() if isinstance(v, dict) and not {"sigma", "covariance"} & set(v)}
     lines = [f"{_key(k)} = {_value(v)}" for k, v in values.items() if k not in tables]
     if path and lines:

@@ -1,4 +1,4 @@
-"""Photographs without distortion: resampled to a pinhole camera, which is written beside them."""
+"""Resample photographs to a pinhole camera, without distortion."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,7 +16,7 @@ from jaxphoto.io.photographs import Photograph
 from jaxphoto.io.raster import read_photograph
 from jaxphoto.writing import whole_folder
 
-# Modes of Pillow that are resampled.
+# Modes of Pillow that can be resampled.
 _MODES = ("L", "RGB", "RGBA", "I;16")
 _JPEG = (".jpg", ".jpeg")
 _TIFF = (".tif", ".tiff")
@@ -26,7 +26,7 @@ _TAG = ExifTags.Base
 
 
 class Undistorted(NamedTuple):
-    """The camera of the new photographs, and why others were left out, by path."""
+    """The camera of the new photographs, and the reason for each skipped file."""
 
     camera: Pinhole
     left_out: dict[str, str]
@@ -39,14 +39,14 @@ def write_undistorted(
     keep: Keep = "crop",
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Undistorted:
-    """Write `photographs` of `camera` without distortion into `folder`, with camera.toml beside them.
+    """Write `photographs` of `camera` without distortion into `folder`, with camera.toml.
 
-    Resampled bicubically (OpenCV, places to 1/32 px). Names and EXIF, XMP and colour profile are kept; a JPEG is one of
-    quality 95, a TIFF is not compressed (libtiff would lose its EXIF), what is neither JPEG, PNG nor TIFF becomes PNG.
-    A picture is taken as it lies in the file, whatever its orientation flag. `keep`: see `camera.undistortion.pinhole`.
+    Resampled bicubically (OpenCV, places to 1/32 px). Names, EXIF, XMP and colour profile are kept; JPEG has quality
+    95, TIFF is not compressed (libtiff would lose its EXIF), other formats become PNG. Pictures are read as stored,
+    whatever their orientation flag. `keep`: see `camera.undistortion.pinhole`.
 
-    Left out and told: photographs of another size than the camera's, and what is damaged. Raises InputError where none
-    is left, and for a camera in whose place there is no pinhole.
+    Photographs of another size and damaged ones are skipped and reported. Raises InputError if none is left, and for a
+    camera without an equivalent pinhole.
     """
     try:
         new = pinhole(camera.sensor, camera.interior, keep)
@@ -70,14 +70,14 @@ def write_undistorted(
 
 
 def _read(path: Path, sensor: Sensor) -> tuple[np.ndarray, Image.Exif, dict[str, Any]]:
-    """The pixels of a photograph (rows, columns, bands), its EXIF, and what else is kept of it."""
-    # Not Pillow's pixels: it turns a TIFF by its orientation flag.
+    """Read the pixels of a photograph (rows, columns, bands), its EXIF, and other metadata to keep."""
+    # Not Pillow's pixels: it rotates a TIFF by its orientation flag.
     bands = read_photograph(path, sensor)
     with Image.open(path) as picture:
         if picture.mode not in _MODES:
             known = ", ".join(_MODES)
             raise InputError(f"its pixels are {picture.mode}, and undistorted are {known}; convert it to RGB")
-        # Pillow reads colours of 16 bits as 8, and cannot write them.
+        # Pillow reads 16-bit colours as 8-bit, and cannot write them.
         if bands.dtype != np.uint8 and picture.mode != "I;16":
             raise InputError("its colours have 16 bits, and undistorted are those of 8; convert it to 8 bits")
         kept: dict[str, Any] = {key: picture.info[key] for key in ("icc_profile", "xmp") if key in picture.info}
@@ -86,19 +86,19 @@ def _read(path: Path, sensor: Sensor) -> tuple[np.ndarray, Image.Exif, dict[str,
         exif = picture.getexif()
         for part in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo):
             exif.get_ifd(part)
-    # cv2 asks for rows that lie in one piece.
+    # cv2 needs contiguous rows.
     return np.ascontiguousarray(np.moveaxis(bands, 0, -1).squeeze()), exif, kept
 
 
 def _write(pixels: np.ndarray, exif: Image.Exif, kept: dict[str, Any], path: Path, folder: Path) -> None:
-    """Write the new photograph in place of `path`, EXIF with its size."""
+    """Write the new photograph to `path`, with its size in EXIF."""
     taken = exif.get_ifd(ExifTags.IFD.Exif)
     for tag, side in ((_TAG.ExifImageWidth, pixels.shape[1]), (_TAG.ExifImageHeight, pixels.shape[0])):
         if tag in taken:
             taken[tag] = side
-    # Of the layout of a TIFF, which the new one has of its own.
-    for own in [tag for tag in exif if tag in _LAYOUT]:
-        del exif[own]
+    # Tags of the layout of a TIFF; the new file has others.
+    for layout in [tag for tag in exif if tag in _LAYOUT]:
+        del exif[layout]
     suffix = path.suffix.lower()
     name = path.name if suffix in (*_JPEG, *_TIFF, ".png") else f"{path.stem}.png"
     options: dict[str, Any] = {"quality": _QUALITY, "subsampling": 0} if suffix in _JPEG else {}

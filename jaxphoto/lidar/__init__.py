@@ -1,12 +1,19 @@
 """Laser point clouds: spatial index, heights, planes, strips, surface models."""
 
-from jaxphoto.lidar.block_control import BlockControl, pseudo_control_of_block
 from jaxphoto.lidar.grid import Grid, Nearest, around, index_cloud, nearest
-from jaxphoto.lidar.height_settings import HeightFlag, HeightSettings
+from jaxphoto.lidar.height_estimate import HeightFlag, HeightSettings
 from jaxphoto.lidar.heights import Heights, heights_at
-from jaxphoto.lidar.planes import Plane, fit_plane, plane_distance, plane_feet
-from jaxphoto.lidar.pseudo_control import PseudoControl, pseudo_control_points
-from jaxphoto.lidar.roofs import Patch, planar_patches, ridge_line, roof_centroid
+from jaxphoto.lidar.planes import (
+    Patch,
+    Plane,
+    fit_plane,
+    planar_patches,
+    plane_distance,
+    plane_feet,
+    ridge_line,
+    roof_centroid,
+)
+from jaxphoto.lidar.pseudo_control import BlockControl, PseudoControl, pseudo_control_of_block, pseudo_control_points
 
 __all__ = [
     "BlockControl", "Grid", "HeightFlag", "HeightSettings", "Heights", "Nearest", "Patch", "Plane", "PseudoControl",

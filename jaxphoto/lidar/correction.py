@@ -13,8 +13,17 @@ from jaxtyping import Array, Bool, Float
 from jaxphoto.arrays import ArrayLike
 from jaxphoto.cloud import Cloud
 from jaxphoto.compiling import call_compiled
-from jaxphoto.georeferencing import Scanner, Trajectory, TrajectorySpline, corrected_point, spline_through
+from jaxphoto.georeferencing import (
+    Scanner,
+    StripErrors,
+    Trajectory,
+    TrajectorySpline,
+    corrected_point,
+    corrected_return,
+    spline_through,
+)
 from jaxphoto.lidar.coverage import longest_interval, not_covered
+from jaxphoto.rotation import matrix_from_quaternion, quaternion_from_matrix, small_rotation
 
 PORTION = 1 << 17
 """Laser points processed at a time, within the processor's cache; fewer are padded to a power of two."""
@@ -84,9 +93,9 @@ def correct_cloud(cloud: Cloud, scanner: Scanner, path: ScannerPath | None) -> C
     turned = path is not None and bool(np.any(np.asarray(scanner.boresight)))
     for strip, shift in _strips(cloud, scanner):
         for first in range(0, len(strip), PORTION):
-            own = strip[first : first + PORTION]
-            poses = scanner_poses(path, cloud.time[own]) if turned and cloud.time is not None else None  # type: ignore[arg-type]
-            xyz[own] = corrected_xyz(cloud.xyz[own], poses, scanner.boresight, shift)
+            portion = strip[first : first + PORTION]
+            poses = scanner_poses(path, cloud.time[portion]) if turned and cloud.time is not None else None  # type: ignore[arg-type]
+            xyz[portion] = corrected_xyz(cloud.xyz[portion], poses, scanner.boresight, shift)
     return dataclasses.replace(cloud, xyz=xyz)
 
 
@@ -96,10 +105,10 @@ def correct_trajectory(trajectory: Trajectory, cloud: Cloud, scanner: Scanner) -
         return trajectory
     time = np.asarray(trajectory.time)
     away, shifts = [], []
-    for own, shift in _strips(cloud, scanner):
-        flown = cloud.time[own]
-        if len(flown):
-            away.append(np.maximum(flown.min() - time, time - flown.max()))
+    for of_strip, shift in _strips(cloud, scanner):
+        times = cloud.time[of_strip]
+        if len(times):
+            away.append(np.maximum(times.min() - time, time - times.max()))
             shifts.append(np.asarray(shift))
     nearest = np.argmin(np.maximum(np.stack(away), 0.0), axis=0)
     return dataclasses.replace(
@@ -122,12 +131,12 @@ def in_portions(
     """Apply `function`, made by `eqx.filter_jit`, to the rows of `points` in portions, and to `common` data."""
     result = np.empty((len(points[0]), 3))
     for first in range(0, len(result), PORTION):
-        own = slice(first, first + PORTION)
-        some = [v[own] for v in points]
+        portion = slice(first, first + PORTION)
+        some = [v[portion] for v in points]
         n = len(some[0])
         padded = (np.concatenate([v, np.broadcast_to(v[:1], (padded_size(n) - n, *v.shape[1:]))]) for v in some)
         # Slicing a JAX array would compile a program for each length.
-        result[own] = np.asarray(call_compiled(function, *padded, *common))[:n]
+        result[portion] = np.asarray(call_compiled(function, *padded, *common))[:n]
     return result
 
 
@@ -166,3 +175,70 @@ def _motions(spline: TrajectorySpline, time: Float[Array, "n"]) -> tuple[Float[A
 @eqx.filter_jit
 def _corrected(xyz, position, object_from_body, boresight, shift) -> Float[Array, "n 3"]:
     return jax.vmap(corrected_point, (0, 0, 0, None, None))(xyz, position, object_from_body, boresight, shift)
+
+
+def corrected_strip(
+    xyz: Float[np.ndarray, "n 3"],
+    time: Float[np.ndarray, "n"],
+    strip: int,
+    errors: StripErrors,
+    path: ScannerPath | None,
+) -> Float[np.ndarray, "n 3"]:
+    """Apply `georeferencing.corrected_return` to returns of one strip; without a path, its constant shift alone.
+
+    Raises BlockError for times (s) that the trajectory does not cover.
+    """
+    if path is None:
+        return xyz - errors.at(strip, time)[0]
+    common = path.spline, errors.of_strip(strip), errors.boresight, errors.calibration
+    result = in_portions(_corrected_returns, (xyz, time), *common)
+    if np.isnan(result[:, 0]).any():
+        raise not_covered(path.trajectory, time)
+    return result
+
+
+def correct_strips(cloud: Cloud, errors: StripErrors, path: ScannerPath | None) -> Cloud:
+    """Correct a cloud for these errors; all its other fields are kept."""
+    xyz = np.array(cloud.xyz)
+    for k in range(len(errors.splines)):
+        of_strip = np.flatnonzero(cloud.strip == k) if cloud.strip is not None else np.arange(len(cloud))
+        if len(of_strip):
+            xyz[of_strip] = corrected_strip(cloud.xyz[of_strip], times_of(cloud)[of_strip], k, errors, path)
+    return dataclasses.replace(cloud, xyz=xyz)
+
+
+def correct_flight(trajectory: Trajectory, errors: StripErrors) -> Trajectory:
+    """Correct a trajectory; between two strips, by the errors of the strip end closer in time."""
+    time = np.asarray(trajectory.time)
+    ends = np.array([(s.start, s.start + s.interval * max(s.size - 3, 0)) for s in errors.splines])
+    away = np.maximum(ends[:, :1] - time, time - ends[:, 1:])
+    nearest = np.argmin(np.maximum(away, 0.0), axis=0)
+    offset, turn = np.zeros((len(time), 3)), np.zeros((len(time), 3))
+    for k in range(len(ends)):
+        closest = nearest == k
+        offset[closest], turn[closest] = errors.at(k, time[closest])
+    quaternion = call_compiled(_turned, np.asarray(trajectory.quaternion), turn)
+    return dataclasses.replace(
+        trajectory, position=jnp.asarray(np.asarray(trajectory.position) - offset), quaternion=quaternion
+    )
+
+
+def times_of(cloud: Cloud) -> Float[np.ndarray, "n"]:
+    """Return the times of the points (s); zero if the cloud has none, as a constant shift needs none."""
+    return np.zeros(len(cloud)) if cloud.time is None else cloud.time
+
+
+@eqx.filter_jit
+def _corrected_returns(point, time, spline, errors, boresight, calibration) -> Float[Array, "n 3"]:
+    """NaN where the trajectory has no records."""
+    position, object_from_body, known = spline.poses(time)
+    off, each = errors.at(time), (0, 0, 0, 0, 0, 0, 0, None, None)
+    points = point, position, object_from_body, *spline.motions(time), off[:, :3], off[:, 3:], boresight, calibration
+    return jnp.where(known[:, None], jax.vmap(corrected_return, each)(*points), jnp.nan)
+
+
+@eqx.filter_jit
+@jax.vmap
+def _turned(quaternion: Float[Array, "4"], turn: Float[Array, "3"]) -> Float[Array, "4"]:
+    turned = quaternion_from_matrix(jnp.matmul(matrix_from_quaternion(quaternion), small_rotation(turn)))
+    return jnp.where(jnp.sum(turned * quaternion) < 0, -turned, turned)

@@ -109,26 +109,26 @@ class CoveredTimes:
         shift = shift_that_fits(np.array([first, last]), start + shift_s, end + shift_s)
         option, leap = f"--trajectory-shift-s {shift or 0.0:.15g}", LEAP_SECONDS[0]
         if last < start or first > end or (shift is not None and abs(shift - shift_s) > leap):
-            mend = "give the trajectory of this flight, or the difference of the clocks (--trajectory-shift-s)"
+            advice = "give the trajectory of this flight, or the difference of the clocks (--trajectory-shift-s)"
             if start + shift_s <= first and last <= end + shift_s:
-                mend = "leave --trajectory-shift-s out, without which all of them lie in it"
+                advice = "leave --trajectory-shift-s out, without which all of them lie in it"
             elif shift is not None:
-                mend = f"give {option}, which brings all of them into it"
+                advice = f"give {option}, which brings all of them into it"
                 if shift % DAY in (0.0, LAS_OFFSET % DAY, -LAS_OFFSET % DAY):
-                    mend += f" ({leap} s more if the cloud's clock is UTC, {leap} s less if the trajectory's is)"
+                    advice += f" ({leap} s more if the cloud's clock is UTC, {leap} s less if the trajectory's is)"
             cloud, trajectory = np.array([first, last]), np.array([start, end]) + shift_s
             return BlockError(
                 f"{self._measured(outside)}: the cloud's clock shows {looks_like(cloud, _START)}, the trajectory's "
-                f"{looks_like(trajectory, _START)}; {mend}"
+                f"{looks_like(trajectory, _START)}; {advice}"
             )
-        off = [f"begins {start - first:.3f} s later"] if first < start else []
-        off += [f"ends {last - end:.3f} s earlier"] if last > end else []
-        mend = "give the trajectory of the whole flight, or the cloud without these points"
+        gaps = [f"begins {start - first:.3f} s later"] if first < start else []
+        gaps += [f"ends {last - end:.3f} s earlier"] if last > end else []
+        advice = "give the trajectory of the whole flight, or the cloud without these points"
         if shift is not None:
-            mend += f", or, if one clock is UTC and the other GPS time, {option}"
+            advice += f", or, if one clock is UTC and the other GPS time, {option}"
         return BlockError(
             f"{self._measured(outside)}: the cloud goes from {first:.3f} to {last:.3f} s, and the trajectory, from "
-            f"{start:.3f} to {end:.3f} s, {' and '.join(off)}; {mend}"
+            f"{start:.3f} to {end:.3f} s, {' and '.join(gaps)}; {advice}"
         )
 
     def _in_a_gap(self) -> BlockError | None:
@@ -149,7 +149,7 @@ class CoveredTimes:
                 )
             return BlockError(
                 f"{gap}, which the scanner crosses as quickly as from one record to the next, so that the trajectory's "
-                f"clock jumps: take {jump:.3f} s off its times from then on, or export it anew"
+                f"clock jumps: take {jump:.3f} s off its times from then on, or export it again"
             )
         return None
 
@@ -171,9 +171,9 @@ class CoveredTimes:
         if not usual.any():
             return None
         speed = float(np.median(moves[usual] / lasts[usual]))
-        own = record - near.start
-        needed = moves[own] / speed if speed > _FLYING else np.inf
-        return lasts[own] - needed if needed < longest_interval(self._trajectory) else None
+        index = record - near.start
+        needed = moves[index] / speed if speed > _FLYING else np.inf
+        return lasts[index] - needed if needed < longest_interval(self._trajectory) else None
 
     def _of_two_lines(self) -> BlockError | None:
         for strip, first in self._first.items():

@@ -20,12 +20,20 @@ from jaxphoto.arrays import ArrayLike
 from jaxphoto.cloud import Cloud
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
-from jaxphoto.lidar.breaklines import lie_on_two_planes
 from jaxphoto.lidar.grid import Grid, index_cloud, nearest
-from jaxphoto.lidar.height_error import LidarNoise
-from jaxphoto.lidar.height_estimate import APART, TIMES, WIDE, HeightEstimate, HeightNumbers, estimate_heights
-from jaxphoto.lidar.height_settings import HeightFlag, HeightSettings
-from jaxphoto.lidar.local_surface import Neighbours
+from jaxphoto.lidar.height_estimate import (
+    APART,
+    TIMES,
+    WIDE,
+    HeightEstimate,
+    HeightFlag,
+    HeightNumbers,
+    HeightSettings,
+    LidarNoise,
+    Neighbours,
+    estimate_heights,
+    lie_on_two_planes,
+)
 
 Method = Literal["idw", "plane", "tin", "local"]
 # Places of a call are padded to one of these: few programs.
@@ -88,8 +96,8 @@ def heights_at(
     wide = max(WIDE, TIMES * settings.points, _points_of_noise(grid, settings.sigma_xy_m))
     if settings.radius_m is not None:
         wide = _points_of_radius(grid, xy, settings.radius_m, wide)
-    found = _estimates(grid, xy, method, settings, wide)
-    return _judged(found, _broken(grid, xy, found, wide), settings)
+    estimate = _estimates(grid, xy, method, settings, wide)
+    return _judged(estimate, _broken(grid, xy, estimate, wide), settings)
 
 
 def _points_of_noise(grid: Grid, sigma_xy_m: float) -> int:
@@ -111,18 +119,18 @@ def _points_of_radius(grid: Grid, xy: np.ndarray, radius_m: float, wide: int) ->
 
 def _estimates(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSettings, k: int) -> HeightEstimate:
     """Estimate all places, and with more points again those whose triangle might change."""
-    found = _with_points(grid, xy, method, settings, k)
-    refused = found.hole * HeightFlag.HOLE | ~found.surrounded * HeightFlag.EDGE
-    left = np.flatnonzero(~found.final & (refused & settings.refuse == 0))
+    estimate = _with_points(grid, xy, method, settings, k)
+    refused = estimate.hole * HeightFlag.HOLE | ~estimate.surrounded * HeightFlag.EDGE
+    left = np.flatnonzero(~estimate.final & (refused & settings.refuse == 0))
     while len(left) and k < min(_MOST, len(grid)):
         k *= _MORE
         again = _with_points(grid, xy[left], method, settings, k)
-        for old, new in zip(found, again, strict=True):
+        for old, new in zip(estimate, again, strict=True):
             old[left] = new
         left = left[~again.final]
     if k < len(grid):
-        np.asarray(found.height)[left] = np.nan
-    return found
+        np.asarray(estimate.height)[left] = np.nan
+    return estimate
 
 
 def _with_points(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSettings, k: int) -> HeightEstimate:
@@ -147,42 +155,79 @@ def _with_points(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSet
 
 def _neighbours(grid: Grid, xy: np.ndarray, k: int) -> tuple[Neighbours, ArrayLike, ArrayLike]:
     """Return the nearest points of places, the height of the nearest of all, and which of them are vegetation."""
-    found = nearest(grid, xy, k)
-    points = grid.xyz[found.index]
-    there = np.isfinite(found.distance)
+    neighbours = nearest(grid, xy, k)
+    points = grid.xyz[neighbours.index]
+    there = np.isfinite(neighbours.distance)
     base = points[:, 0, 2]
-    near = Neighbours(points[:, :, :2] - xy[:, None], points[:, :, 2] - base[:, None], found.distance, there)
-    return near, base, grid.leafy[found.index] & there
+    near = Neighbours(points[:, :, :2] - xy[:, None], points[:, :, 2] - base[:, None], neighbours.distance, there)
+    return near, base, grid.leafy[neighbours.index] & there
 
 
-def _judged(found: HeightEstimate, broken: np.ndarray, settings: HeightSettings) -> Heights:
+def _judged(estimate: HeightEstimate, broken: np.ndarray, settings: HeightSettings) -> Heights:
     """Combine flags, and remove refused heights."""
-    rough = found.misfit & found.rough & ~broken
-    of_leaves = (found.leafy > 0) & (found.leafy >= settings.leafy_share)
-    flag = found.hole * HeightFlag.HOLE | ~(found.surrounded & np.isfinite(found.height)) * HeightFlag.EDGE
+    rough = estimate.misfit & estimate.rough & ~broken
+    of_leaves = (estimate.leafy > 0) & (estimate.leafy >= settings.leafy_share)
+    flag = estimate.hole * HeightFlag.HOLE | ~(estimate.surrounded & np.isfinite(estimate.height)) * HeightFlag.EDGE
     flag = flag | (rough | of_leaves) * HeightFlag.VEGETATION | broken * HeightFlag.BREAKLINE
-    flag = flag | found.plane * HeightFlag.PLANE
+    flag = flag | estimate.plane * HeightFlag.PLANE
     refused = flag & settings.refuse != 0
     return Heights(
-        z=np.where(refused, np.nan, found.height),
-        sigma=np.where(refused, np.nan, np.hypot(found.sigma, settings.sigma_systematic_m)),
+        z=np.where(refused, np.nan, estimate.height),
+        sigma=np.where(refused, np.nan, np.hypot(estimate.sigma, settings.sigma_systematic_m)),
         flag=flag.astype(np.uint8),
-        count=found.used,
-        density=found.density,
-        roughness=found.roughness,
-        gradient=found.gradient,
+        count=estimate.used,
+        density=estimate.density,
+        roughness=estimate.roughness,
+        gradient=estimate.gradient,
     )
 
 
-def _broken(grid: Grid, xy: np.ndarray, found: HeightEstimate, k: int) -> np.ndarray:
+def _broken(grid: Grid, xy: np.ndarray, estimate: HeightEstimate, k: int) -> np.ndarray:
     """Return True for places at the border of two surfaces, among those where one smooth surface does not fit."""
     broken = np.zeros(len(xy), bool)
-    doubtful = np.flatnonzero(found.misfit)
+    doubtful = np.flatnonzero(estimate.misfit)
     for first in range(0, len(doubtful), _PLACES[1]):
         some = doubtful[first : first + _PLACES[1]]
         padded = np.concatenate([some, np.full(_PLACES[1] - len(some), some[0])])
         near, _, _ = _neighbours(grid, xy[padded], k)
-        there = near.there & (np.arange(k) < found.wide[padded, None])
+        there = near.there & (np.arange(k) < estimate.wide[padded, None])
         near = near._replace(xy=np.where(there[..., None], near.xy, 0.0), there=there)
-        broken[some] = np.asarray(call_compiled(lie_on_two_planes, near, found.one_surface[padded]))[: len(some)]
+        broken[some] = np.asarray(call_compiled(lie_on_two_planes, near, estimate.one_surface[padded]))[: len(some)]
     return broken
+
+
+class TangentPlanes(eqx.Module):
+    """Planes at places; NaN where the cloud does not determine the surface (see `heights_at`)."""
+
+    foot: Float[np.ndarray, "places 3"]
+    """Point on the surface above or below the place (m)."""
+    normal: Float[np.ndarray, "places 3"]
+    """Unit vectors, upwards."""
+    sigma: Float[np.ndarray, "places"]
+    """Standard deviation of the surface along the normal (m)."""
+    flag: Integer[np.ndarray, "places"]
+    """Sums of `HeightFlag`."""
+    nearest: Int[np.ndarray, "places"]
+    """Laser point nearest to the place, in the order of the cloud."""
+
+
+def tangent_planes(
+    grid: Grid, xy: Float[np.ndarray, "places 2"], method: Method, settings: HeightSettings
+) -> TangentPlanes:
+    """Return the tangent planes of the surface at places X, Y (m).
+
+    With the gradient g of the surface, the normal is (-g, 1) / sqrt(1 + g.g), and its height error is projected
+    accordingly. Raises what `heights_at` raises.
+    """
+    heights = heights_at(grid, xy, method, settings)
+    normal = np.column_stack([-heights.gradient, np.ones(len(xy))])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal[np.isnan(heights.z)] = np.nan
+    nearest_index = nearest(grid, xy, 1).index[:, 0]
+    return TangentPlanes(
+        np.column_stack([xy, heights.z]),
+        normal,
+        np.asarray(heights.sigma) * normal[:, 2],
+        np.asarray(heights.flag),
+        np.asarray(grid.order)[nearest_index],
+    )

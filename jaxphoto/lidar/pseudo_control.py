@@ -1,6 +1,6 @@
 """Pseudo control points: image features with heights from surrounding laser points.
 
-For a feature at (x, y) in an image of known orientation (paper 001, equations (1)-(3); docs/pseudo_control.md):
+For a feature at (x, y) in an image of known orientation (paper 001, equations (1)-(3); docs/lidar_heights.md):
 
 1. down the ray, cell by cell, to the first with a laser point as high as the ray: the visible surface (`sight`); 2.
 project the laser points around that place into the image; if they lie on two levels, as at a building, those of the
@@ -33,19 +33,30 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Integer
 
 from jaxphoto.arrays import ArrayLike, as_jax_array, to_numpy
+from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.cloud import Cloud
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, image_ray, project, project_ideal
 from jaxphoto.compiling import call_compiled
-from jaxphoto.errors import InputError
+from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import Corrections, apparent_point, ground_point
 from jaxphoto.georeferencing.corrections import NO_CORRECTIONS
 from jaxphoto.lidar.grid import Grid, around, index_cloud
-from jaxphoto.lidar.height_error import LidarNoise, excess, height_sigma, noise_variance
-from jaxphoto.lidar.height_settings import HeightFlag, HeightSettings
-from jaxphoto.lidar.inverse_distance import inverse_distance_weights
-from jaxphoto.lidar.local_surface import LocalFit, Neighbours, fit_surface
+from jaxphoto.lidar.height_estimate import (
+    HeightFlag,
+    HeightSettings,
+    LidarNoise,
+    LocalFit,
+    Neighbours,
+    excess,
+    fit_surface,
+    height_sigma,
+    inverse_distance_weights,
+    noise_variance,
+)
 from jaxphoto.lidar.sight import Skyline, empty_about, first_met, levels, skyline, surrounded, window_reach
+from jaxphoto.observations import ControlCoordinates
+from jaxphoto.unknowns import Unknowns
 
 Interpolation = Literal["weighted", "plane"]
 
@@ -63,7 +74,7 @@ class PseudoControl(eqx.Module):
     """Intersections of the rays of features with a cloud, one per feature; NaN where refused or undetermined."""
 
     xyz: Float[ArrayLike, "*n 3"]
-    """X, Y, Z (m); X and Y are only as accurate as the orientation (docs/pseudo_control.md)."""
+    """X, Y, Z (m); X and Y are only as accurate as the orientation (docs/lidar_heights.md)."""
     sigma_z: Float[ArrayLike, "*n"]
     """Standard deviation of Z (m): 95 % of the errors are within 1.96 of it."""
     flag: Integer[ArrayLike, "*n"]
@@ -149,18 +160,11 @@ def pseudo_control_points(
     rows = np.arange(_room(n)) % n
     one = exterior.position.ndim == 1
     found = call_compiled(
-        _pseudo_control,
-        jax.tree.map(to_numpy, interior),
-        jax.tree.map(lambda v: to_numpy(v) if one else to_numpy(v)[rows], exterior),
-        to_numpy(xy)[rows],
-        grid,
-        skyline(grid),
-        _Numbers(*map(as_jax_array, numbers)),
-        settings.points,
-        window_reach(grid, _CANDIDATES * settings.points),
-        interpolation,
-        corrections,
-    )
+        _pseudo_control, jax.tree.map(to_numpy, interior),
+        jax.tree.map(lambda v: to_numpy(v) if one else to_numpy(v)[rows], exterior), to_numpy(xy)[rows], grid,
+        skyline(grid), _Numbers(*map(as_jax_array, numbers)), settings.points,
+        window_reach(grid, _CANDIDATES * settings.points), interpolation, corrections,
+    )  # fmt: skip
     return jax.tree.map(lambda v: to_numpy(v)[:n], found)
 
 
@@ -179,16 +183,18 @@ def _pseudo_control(
 ) -> PseudoControl:
     one = exterior.position.ndim == 1
 
-    def of_feature(given):
-        image, at = (exterior, given) if one else given
+    def of_feature(data):
+        image, at = (exterior, data) if one else data
         held = jax.lax.stop_gradient((interior, image, at))
-        chosen, met = _choose(*held, grid, sky, numbers, points, reach, corrections)
-        return _interpolated(interior, image, at, grid, chosen, met, numbers, points, interpolation, corrections)
+        chosen, intersected = _choose(*held, grid, sky, numbers, points, reach, corrections)
+        return _interpolated(
+            interior, image, at, grid, chosen, intersected, numbers, points, interpolation, corrections
+        )
 
-    given = xy if one else (exterior, xy)
-    portions = jax.tree.map(lambda v: v.reshape(-1, min(_AT_ONCE, len(v)), *v.shape[1:]), given)
-    found = jax.lax.map(jax.vmap(of_feature), portions)
-    return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), found)
+    data = xy if one else (exterior, xy)
+    portions = jax.tree.map(lambda v: v.reshape(-1, min(_AT_ONCE, len(v)), *v.shape[1:]), data)
+    results = jax.lax.map(jax.vmap(of_feature), portions)
+    return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), results)
 
 
 def _choose(
@@ -205,12 +211,12 @@ def _choose(
     """Return the candidates of a feature, and True if its ray meets the cloud."""
     ideal = interior.ideal_from_measured(xy)
     ray = _Ray(*image_ray(interior, exterior, xy))
-    place, met = first_met(ray.origin, ray.direction, sky, grid)
+    place, intersected = first_met(ray.origin, ray.direction, sky, grid)
 
     def squared_distance(point):
         aim = apparent_point(exterior.position, point, corrections)
-        off = project_ideal(interior, exterior, aim) - ideal
-        return jnp.where(interior.projection.sees(*camera_coordinates(exterior, aim)), off @ off, jnp.inf)
+        offset = project_ideal(interior, exterior, aim) - ideal
+        return jnp.where(interior.projection.sees(*camera_coordinates(exterior, aim)), offset @ offset, jnp.inf)
 
     def candidates(place):
         index, there = around(grid, place, reach)
@@ -223,17 +229,17 @@ def _choose(
         return _Candidates(index, level.seen, level.broken), z
 
     def again(_, state):
-        place, found = state
+        place, previous = state
         new, z = candidates(place)
         near = new.seen & (jnp.cumsum(new.seen) <= points)
         mean = jnp.sum(jnp.where(near, z, 0)) / jnp.maximum(near.sum(), 1)
         # The image may show a step that the ray passes on its way.
-        new = _Candidates(new.index, new.seen, new.broken | found.broken)
+        new = _Candidates(new.index, new.seen, new.broken | previous.broken)
         return jnp.where(near.any(), ray.at(mean), place), new
 
     some = around(grid, place, reach)[0][: _CANDIDATES * points]
     none = _Candidates(some, jnp.zeros(len(some), bool), jnp.array(False))
-    return jax.lax.fori_loop(0, _ROUNDS, again, (place, none))[1], met
+    return jax.lax.fori_loop(0, _ROUNDS, again, (place, none))[1], intersected
 
 
 def _interpolated(
@@ -242,7 +248,7 @@ def _interpolated(
     xy: Float[Array, "2"],
     grid: Grid,
     chosen: _Candidates,
-    met: Bool[Array, ""],
+    intersected: Bool[Array, ""],
     numbers: _Numbers,
     points: int,
     interpolation: Interpolation,
@@ -261,20 +267,20 @@ def _interpolated(
     else:
         shown = jax.vmap(lambda p: project(interior, exterior, apparent_point(exterior.position, p, corrections)))(xyz)
         squared = jnp.sum((shown - xy) ** 2, axis=1)
-        known = jax.lax.stop_gradient(jnp.where(chosen.seen, squared, jnp.inf))
-        nearest = chosen.seen & (jnp.sum(known < known[:, None], axis=1) < points)
+        distances = jax.lax.stop_gradient(jnp.where(chosen.seen, squared, jnp.inf))
+        nearest = chosen.seen & (jnp.sum(distances < distances[:, None], axis=1) < points)
         weight = inverse_distance_weights(squared, nearest, numbers.power)
     z = base + weight @ around_ray.z
     point, ahead = ground_point(interior, exterior, xy, z, corrections)
 
-    lost = ~(met & ahead & chosen.seen.any())
+    lost = ~(intersected & ahead & chosen.seen.any())
     described = _described(around_ray, weight, fit, ray, chosen.broken, numbers, points)
     sigma, flag, gradient, roughness = jax.lax.stop_gradient(described)
     leafy = jnp.sum(jnp.where(weight != 0, jnp.asarray(grid.leafy)[chosen.index], False)) / jnp.sum(weight != 0)
     flag |= ((leafy > 0) & (leafy >= numbers.leafy)) * int(HeightFlag.VEGETATION)
     flag = jnp.where(lost, int(HeightFlag.HOLE), flag)
-    told = lambda value: jnp.where(lost | (flag & numbers.refuse.astype(int) != 0), jnp.nan, value)  # noqa: E731
-    return PseudoControl(told(point), told(sigma), flag, gradient, roughness)
+    unless_refused = lambda value: jnp.where(lost | (flag & numbers.refuse.astype(int) != 0), jnp.nan, value)  # noqa: E731
+    return PseudoControl(unless_refused(point), unless_refused(sigma), flag, gradient, roughness)
 
 
 def _described(
@@ -305,3 +311,74 @@ def _room(n: int) -> int:
         return _FEW
     step = max(_AT_ONCE, 1 << n.bit_length() - 3)
     return -(-n // step) * step
+
+
+# Pseudo control points of a whole block: heights for its measured image points.
+#
+# A point appears in several images, each of which gives it a height. These share laser points, so their mean is hardly
+# better than one; the image that sees the point most steeply is best, because an orientation error there changes the
+# place least, and occlusions are rare.
+
+
+class BlockControl(eqx.Module):
+    """Pseudo control of the points of a block, one entry each."""
+
+    point: Int[np.ndarray, "n"]
+    """Indices of the block's points."""
+    image: Int[np.ndarray, "n"]
+    """Image used for each."""
+    control: PseudoControl
+
+    def rows(self) -> ControlCoordinates:
+        """Return vertical control: Z of the determined points, with its standard deviation."""
+        good = np.flatnonzero(np.isfinite(self.control.sigma_z))
+        z, sigma = self.control.xyz[good, 2], self.control.sigma_z[good]
+        return ControlCoordinates(self.point[good], np.full(len(good), 2), z, sigma)
+
+
+def pseudo_control_of_block(
+    block: Block,
+    unknowns: Unknowns,
+    grid: Grid,
+    points: Int[np.ndarray, "chosen"] | None = None,
+    settings: HeightSettings | None = None,
+    *,
+    interpolation: Interpolation = "weighted",
+) -> BlockControl:
+    """Return heights from the cloud of `grid`, in the block's frame, for measured `points` (by index; all by default).
+
+    Interior and exterior orientation are those of `unknowns`; the control changes with them. Of the images that
+    determine the height of a point, the one with the steepest ray is used. Raises BlockError if no image measured any
+    of the points.
+    """
+    rows = block.image_points
+    chosen = np.isin(rows.point, points) if points is not None else np.ones(len(rows.point), bool)
+    measured = np.flatnonzero(chosen)
+    if not len(measured):
+        raise BlockError("no image measured any of the points that are to take heights from the cloud; name others")
+    image, point, xy = rows.image[measured], rows.point[measured], to_numpy(rows.xy)[measured]
+    exterior = jax.tree.map(lambda v: to_numpy(v)[image], unknowns.exterior)
+    camera = np.array(block.image_camera, object)[image]
+    found: list[tuple[np.ndarray, PseudoControl, np.ndarray]] = []
+    for name in dict.fromkeys(camera):
+        of = np.flatnonzero(camera == name)
+        one, taken = jax.tree.map(lambda v, of=of: v[of], exterior), xy[of]
+        interior = jax.tree.map(to_numpy, unknowns.interior[name])
+        control = pseudo_control_points(
+            interior, one, taken, grid, settings, interpolation=interpolation, corrections=block.corrections
+        )
+        steep = call_compiled(_falls, interior, one, taken)
+        found.append((of, jax.tree.map(np.asarray, control), np.asarray(steep)))
+    back = np.argsort(np.concatenate([of for of, _, _ in found]))
+    control = jax.tree.map(lambda *parts: np.concatenate(parts)[back], *(part for _, part, _ in found))
+    fall = np.concatenate([steep for _, _, steep in found])[back]
+    # By point, valid heights before refused ones, steepest first: the first row of each point.
+    order = np.lexsort((fall, np.isnan(control.sigma_z), point))
+    first = order[np.unique(point[order], return_index=True)[1]]
+    return BlockControl(point[first], image[first], jax.tree.map(lambda v: v[first], control))
+
+
+@eqx.filter_jit
+def _falls(interior, exterior: ExteriorOrientation, xy: Float[Array, "n 2"]) -> Float[Array, "n"]:
+    """Return the third components of the rays: -1 straight down."""
+    return jax.vmap(lambda image, at: image_ray(interior, image, at)[1][2])(exterior, xy)

@@ -6,10 +6,10 @@ redundancy numbers, noise, sensitivities, datum, tables and files follow from it
     class HeightDifferences(AbstractObservations):
         group = "height_differences"
         unit = "m"
-        start: Int[np.ndarray, "n"] = touching("point")
-        end: Int[np.ndarray, "n"] = touching("point")
-        value: Float[Numbers, "n"]
-        sigma: Float[Numbers, "n"]
+        start: Int[np.ndarray, "n"] = index_of("point")
+        end: Int[np.ndarray, "n"] = index_of("point")
+        value: Float[ArrayLike, "n"]
+        sigma: Float[ArrayLike, "n"]
 
         def residual(self, start, end):
             return self.value - (end[2] - start[2])
@@ -17,9 +17,9 @@ redundancy numbers, noise, sensitivities, datum, tables and files follow from it
 Its file is height_differences.csv with the columns start, end, value_m and sigma_m (`observations.columns`).
 
 Inside `residual` the module is *one* row: `self.value` is a number. Its arguments are what the fields marked `index_of`
-refer to, in order (a field of several indices per row gives a stack with a leading axis), then the kinds in `also`. A
-point is its three coordinates (m), an image an `ImageState`; any kind of declared unknowns (`jaxphoto.parameters`)
-gives parameters of that kind.
+refer to, in order (a field of several indices per row gives a stack with a leading axis), then the kinds in
+`block_parameters`. A point is its three coordinates (m), an image an `ImageState`; any kind of declared unknowns
+(`jaxphoto.parameters`) gives parameters of that kind.
 """
 
 import abc

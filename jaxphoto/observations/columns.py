@@ -1,7 +1,7 @@
 """Columns of the table of an observation class in a block folder, derived from its fields.
 
-    touching("point"), one per row      start                           an id
-    touching("point"), m per row        points_1, points_2              ids
+    index_of("point"), one per row      start                           an id
+    index_of("point"), m per row        points_1, points_2              ids
     integers                            axis
     numbers, one per row                value_m                         unit of the class; rad are degrees in files
     numbers, one per axis               value_X_m, value_Y_m, value_Z_m

@@ -1,4 +1,4 @@
-"""The main job: complete the start values of a block and adjust it."""
+"""Bundle adjustment with completion of approximate values."""
 
 import dataclasses
 import time
@@ -27,15 +27,15 @@ from jaxphoto.variants import without_observations
 _FromStart = Callable[[Block, Unknowns], Adjustment]
 
 ABSURD = 30.0
-"""A sigma naught that neither blunders nor weights explain: the place is wrong."""
-# Of the square sum: with blunders in a block nothing fits, but some places are no place at all.
-_FAR_BETTER = 0.01
-# Tie points that may be left out, as a part of all points: where more are gone, cameras stand in the wrong place.
-_GONE = 0.05
-# A sigma naught with points that were gone, over that without, up to which nothing speaks against them.
-_AS_GOOD = 1.5
-# Rays that miss by more (rad) are off by more than lenses distort.
-_NEAR = 0.02
+"""A sigma0 that neither blunders nor weights explain: the approximate values are wrong."""
+# Maximum ratio of v'Pv of a solution with large sigma0 that replaces another.
+_VPV_RATIO = 0.01
+# Maximum fraction of diverged tie points that may be rejected; more indicate wrong orientations.
+_MAX_DIVERGED = 0.05
+# Maximum ratio of sigma0 with reinstated points to that without them.
+_SIGMA0_RATIO = 1.5
+# Maximum misclosure (rad) of rays that lens distortion may explain.
+_MAX_MISCLOSURE_RAD = 0.02
 
 
 def adjust(
@@ -49,20 +49,18 @@ def adjust(
 ) -> Adjustment:
     """Self-calibrating bundle adjustment of `block`.
 
-    `start` gives every unknown an approximate value; where it is None, those of the block are completed by resection
-    and intersection, and where these do not reach all images, or lead nowhere, found from image points alone and
-    brought to the frame of what is known (docs/orient.md). `priors` says what is FREE, FIXED or Weighted; where it is
-    None, what the block says. `more` are observations of any kind, those of your own among them (docs/extending.md),
-    and parameters known beforehand together: they are added to `block.more`, so that the block of the result has them.
+    `start` are approximate values of all unknowns. By default those of the block are completed by resection and
+    intersection; if these do not reach all images, or diverge, images are oriented by their image points alone and
+    transformed to the frame of the control (docs/photographs.md). `priors` are FREE, FIXED or Weighted, by default the
+    block's. `more` are further observations of any kind, also your own (docs/extending.md), and jointly known
+    parameters; they are added to `block.more` of the result.
 
-    What is compiled for a block serves all of similar size; a study of many blocks compiles once if it gives `sizes`
-    that all fit into (`common_sizes`).
+    Compiled code serves all blocks of similar size; a study of many blocks compiles once if it gives common `sizes`
+    (`common_sizes`). With `start`, the result is a pure function of the numbers in the arguments: `jax.grad` and
+    `jax.vmap` apply.
 
-    With `start` given it is a pure function of the numbers in its arguments: `jax.grad` and `jax.vmap` go through it.
-
-    Raises BlockError where no approximate values can be found, DatumError where position, orientation or scale are left
-    open, RankError where the observations cannot tell unknowns apart. A solve that does not converge is no error: see
-    `Adjustment.outcome`.
+    Raises BlockError if approximate values cannot be found, DatumError if position, orientation or scale are
+    undetermined, RankError if unknowns are inseparable. Failure to converge is no error: see `Adjustment.outcome`.
     """
     if more:
         block = dataclasses.replace(block, more=(*block.more, *more))
@@ -71,15 +69,15 @@ def adjust(
         start = _start_in_transformation(block)
     if start is not None:
         return solve(block, start, priors, max_steps, sizes)
-    own = priors is block.priors
+    default_priors = priors is block.priors
 
     def from_start(part: Block, start: Unknowns) -> Adjustment:
-        return solve(part, start, part.priors if own else priors, max_steps, sizes)
+        return solve(part, start, part.priors if default_priors else priors, max_steps, sizes)
 
-    found = _from_the_best_start(block, priors, from_start, max_steps, may_lose_points=own)
-    if found.left_out:
-        warnings.warn(left_out_words(found), stacklevel=2)
-    return found
+    adjusted = _adjust_from_best_start(block, priors, from_start, max_steps, may_lose_points=default_priors)
+    if adjusted.left_out:
+        warnings.warn(left_out_words(adjusted), stacklevel=2)
+    return adjusted
 
 
 def adjust_for_tables(
@@ -88,9 +86,9 @@ def adjust_for_tables(
     report: Callable[[str], object] = lambda text: None,
     sizes: PaddedSizes = MINIMAL_SIZES,
 ) -> Adjustment:
-    """`adjust`, with what tables and report will want compiled meanwhile; `report` is told what is being done.
+    """`adjust`, compiling the statistics of tables and reports meanwhile; `report` receives progress.
 
-    The seconds of the result have those of the search for approximate values, too: start.
+    `seconds["start"]` of the result includes the search for approximate values.
     """
     spent, began = {"start": 0.0}, time.perf_counter()
 
@@ -103,20 +101,20 @@ def adjust_for_tables(
         began = time.perf_counter()
         return done
 
-    found = _from_the_best_start(block, block.priors, from_start, max_steps, report=report)
-    found.seconds.update(spent)
-    return found
+    adjusted = _adjust_from_best_start(block, block.priors, from_start, max_steps, report=report)
+    adjusted.seconds.update(spent)
+    return adjusted
 
 
 def left_out_words(adjusted: Adjustment) -> str:
-    """What became of `Adjustment.left_out`, in a sentence."""
+    """Message about `Adjustment.left_out`."""
     return (
-        f"left out, because their rays meet nowhere: point {few(adjusted.left_out)}; look for blunders in their image "
-        "points, or let jaxphoto adjust --snoop find them"
+        f"rejected points whose rays do not intersect: {few(adjusted.left_out)}. Check their image points, or use "
+        "jaxphoto adjust --snoop"
     )
 
 
-def _from_the_best_start(
+def _adjust_from_best_start(
     block: Block,
     priors: Unknowns,
     from_start: _FromStart,
@@ -124,9 +122,9 @@ def _from_the_best_start(
     may_lose_points: bool = True,
     report: Callable[[str], object] = lambda text: None,
 ) -> Adjustment:
-    """The adjustment from the approximate values that are given; or, where these lead nowhere, from image points alone.
+    """Adjust from the given approximate values; if that fails, from image points alone.
 
-    Warns where the second is the better one.
+    Warns if the second is used.
     """
     first, refused = None, None
     try:
@@ -134,54 +132,54 @@ def _from_the_best_start(
     except PointsBehind as error:
         refused = error
     if first is not None and may_lose_points:
-        first = _without_points_gone(first, from_start)
-    # What is known of exterior orientations is not to be looked for elsewhere.
+        first = _without_diverged_points(first, from_start)
+    # Prior information about exterior orientations excludes a search elsewhere.
     free = priors.exterior.position == FREE and priors.exterior.camera_from_object == FREE
     elsewhere = free and np.asarray(block.start.image_known).any()
-    if first is not None and (not elsewhere or _somewhere(first, max_steps)):
+    if first is not None and (not elsewhere or _is_plausible(first, max_steps)):
         return first
     second = _from_image_points(block, from_start, report) if elsewhere else None
     if second is not None and may_lose_points:
-        second = _without_points_gone(second, from_start)
+        second = _without_diverged_points(second, from_start)
     if second is None or not _better(second, first):
         if first is None:
             assert refused is not None
             raise refused
         return first
     warnings.warn(
-        "the approximate exterior orientations that were given lead nowhere: the images were oriented by their common "
-        "points instead, which fits better; look at the frame, angles and units of images.csv, at the "
-        "coordinates of points where they are given, and at the interior orientation where it is held",
+        "the adjustment fails from the given exterior orientations: the images were oriented by their common points "
+        "instead. Check frame, angles and units of images.csv, given point coordinates, and a fixed interior "
+        "orientation",
         stacklevel=3,
     )
     return second
 
 
-def _without_points_gone(adjusted: Adjustment, from_start: _FromStart) -> Adjustment:
-    """Once more without tie points that went astray, where they are few: blunders, or a start that is far off.
+def _without_diverged_points(adjusted: Adjustment, from_start: _FromStart) -> Adjustment:
+    """Repeat the adjustment without diverged tie points, if these are few.
 
-    From where that leads they are placed anew, and stay if they do not go astray again and fit.
+    Their positions are then recomputed, and they are reinstated if they converge and fit.
     """
     if adjusted.factored is None:
         return adjusted
-    block, found, names = adjusted.block, adjusted, list[str]()
-    most = _GONE * len(block.points)
-    while (gone := found.diverged_points).any() and len(names) + gone.sum() <= most:
-        rows = gone[found.block.image_points.point]
-        part, kept = without_observations(found.block, {IMAGE_POINTS: rows})
-        if len(kept) == len(gone):
+    block, reduced, names = adjusted.block, adjusted, list[str]()
+    most = _MAX_DIVERGED * len(block.points)
+    while (diverged := reduced.diverged_points).any() and len(names) + diverged.sum() <= most:
+        rows = diverged[reduced.block.image_points.point]
+        part, point = without_observations(reduced.block, {IMAGE_POINTS: rows})
+        if len(point) == len(diverged):
             break
-        names += [found.block.points[p] for p in np.setdiff1d(np.arange(len(gone)), kept)]
+        names += [reduced.block.points[p] for p in np.setdiff1d(np.arange(len(diverged)), point)]
         try:
-            found = from_start(part, start_of(part))
+            reduced = from_start(part, start_of(part))
         except (BlockError, DatumError, RankError):
             return adjusted
-    if not names or not bool(found.converged):
+    if not names or not bool(reduced.converged):
         return adjusted
     start = dataclasses.replace(
         block.start,
         unknowns=dataclasses.replace(
-            block.start.unknowns, interior=found.unknowns.interior, exterior=found.unknowns.exterior
+            block.start.unknowns, interior=reduced.unknowns.interior, exterior=reduced.unknowns.exterior
         ),
         image_known=np.ones(len(block.images), bool),
     )
@@ -189,17 +187,17 @@ def _without_points_gone(adjusted: Adjustment, from_start: _FromStart) -> Adjust
         whole = from_start(block, approximate(dataclasses.replace(block, start=start)))
     except (BlockError, DatumError, RankError):
         whole = adjusted
-    if bool(whole.converged) and float(whole.sigma0) < _AS_GOOD * float(found.sigma0):
+    if bool(whole.converged) and float(whole.sigma0) < _SIGMA0_RATIO * float(reduced.sigma0):
         return whole
-    return dataclasses.replace(found, left_out=tuple(names))
+    return dataclasses.replace(reduced, left_out=tuple(names))
 
 
 def _from_image_points(block: Block, from_start: _FromStart, report: Callable[[str], object]) -> Adjustment | None:
-    """The adjustment without given exterior orientations and points, but for known ones; None: it leads nowhere."""
-    known, s = np.zeros((len(block.points), 3), bool), block.start
+    """Adjust without given exterior orientations and tie points; None if that fails."""
+    is_control, s = np.zeros((len(block.points), 3), bool), block.start
     for rows in (block.control, block.fixed):
-        known[rows.who, rows.axis] = True
-    images, points = np.zeros_like(np.asarray(s.image_known)), known.all(axis=1) & np.asarray(s.point_known)
+        is_control[rows.who, rows.axis] = True
+    images, points = np.zeros_like(np.asarray(s.image_known)), is_control.all(axis=1) & np.asarray(s.point_known)
     try:
         oriented = orient_block(
             dataclasses.replace(block, start=dataclasses.replace(s, image_known=images, point_known=points)), report
@@ -210,40 +208,43 @@ def _from_image_points(block: Block, from_start: _FromStart, report: Callable[[s
 
 
 def _better(one: Adjustment, other: Adjustment | None) -> bool:
-    """Whether an adjustment from elsewhere is an optimum, and fits; or fits incomparably better than another."""
+    """Return True if `one` converged and fits, or has a far smaller v'Pv than `other`."""
     if not bool(one.converged):
         return False
     least = np.inf if other is None else float(np.nan_to_num(other.sum_of_squares, nan=np.inf))
-    return float(one.sum_of_squares) < (1.0 if float(one.sigma0) < ABSURD else _FAR_BETTER) * least
+    return float(one.sum_of_squares) < (1.0 if float(one.sigma0) < ABSURD else _VPV_RATIO) * least
 
 
-def _somewhere(adjusted: Adjustment, max_steps: int) -> bool:
-    """Whether an adjustment ended where its observations might belong; or was given too few steps to tell."""
+def _is_plausible(adjusted: Adjustment, max_steps: int) -> bool:
+    """Return True if the solution is plausible, or had too few steps to tell."""
     if adjusted.factored is None or (adjusted.outcome is Outcome.STEPS and max_steps < MAX_STEPS):
         return True
     return adjusted.outcome in (Outcome.CONVERGED, Outcome.STEPS, Outcome.FLAT) and float(adjusted.sigma0) < ABSURD
 
 
 def _start_in_transformation(block: Block) -> Unknowns:
-    """Approximate values of a block that a JAX transformation traces; only what is known has derivatives."""
-    numbers, known = jax.lax.stop_gradient(block), block.start.unknowns
+    """Approximate values of a traced block; only given values have derivatives."""
+    numbers, start = jax.lax.stop_gradient(block), block.start.unknowns
     if block.start.image_known.all() and block.start.point_known.all():
-        return known
-    found = intersected(numbers) if is_traced(numbers) else start_of(numbers)
+        return start
+    completed_start = intersected(numbers) if is_traced(numbers) else start_of(numbers)
     image_known, point_known = np.asarray(block.start.image_known), np.asarray(block.start.point_known)[:, None]
     exterior = ExteriorOrientation(
-        jnp.where(image_known[:, None], known.exterior.position, found.exterior.position),
-        jnp.where(image_known[:, None, None], known.exterior.camera_from_object, found.exterior.camera_from_object),
+        jnp.where(image_known[:, None], start.exterior.position, completed_start.exterior.position),
+        jnp.where(
+            image_known[:, None, None], start.exterior.camera_from_object, completed_start.exterior.camera_from_object
+        ),
     )
-    return dataclasses.replace(known, exterior=exterior, points=jnp.where(point_known, known.points, found.points))
+    return dataclasses.replace(
+        start, exterior=exterior, points=jnp.where(point_known, start.points, completed_start.points)
+    )
 
 
 def start_of(block: Block, report: Callable[[str], object] = lambda text: None) -> Unknowns:
-    """All approximate values of `block`: `approximate`, after its images are oriented to one another if need be.
+    """Approximate values of all unknowns: `approximate`, after relative orientation of the images if necessary.
 
-    `report` is told what is being done.
-
-    Raises BlockError where neither reaches all images, naming those that are left, and where points are not met.
+    `report` receives progress. Raises BlockError, with the images, if some cannot be oriented, and for points whose
+    rays do not intersect.
     """
     reached, enough = _reached(block)
     if enough:
@@ -256,29 +257,26 @@ def start_of(block: Block, report: Callable[[str], object] = lambda text: None) 
         try:
             return approximate(reached)
         except BlockError as why:
-            raise BlockError(f"{why}; nor can they be oriented by their common points: {error}") from error
+            raise BlockError(f"{why}; orientation by common points fails, too: {error}") from error
     return approximate(oriented)
 
 
 def needs_orientation(block: Block) -> bool:
-    """Whether resection and intersection from what is known do not reach all images of `block`.
-
-    Or reach them so badly, as from a few images known roughly, that rays miss their points by far.
-    """
+    """Return True if resection and intersection do not reach all images, or only with large misclosures."""
     return not _reached(block)[1]
 
 
 def _reached(block: Block) -> tuple[Block, bool]:
-    """`block` with what resection and intersection find, and whether that will do."""
+    """Complete the start by resection and intersection; also return True if that suffices."""
     reached = dataclasses.replace(block, start=completed(block))
-    given = np.array(block.start.image_known)
-    if not given.all():
-        given[sensor_rows(block, block.start.unknowns).image] = True
-    return reached, bool(given.all() or (np.all(reached.start.image_known) and _fits(reached)))
+    is_given = np.array(block.start.image_known)
+    if not is_given.all():
+        is_given[sensor_rows(block, block.start.unknowns).image] = True
+    return reached, bool(is_given.all() or (np.all(reached.start.image_known) and _rays_fit(reached)))
 
 
-def _fits(block: Block) -> bool:
-    """True if nine in ten rays to known points pass near them, and none of these lies behind its image."""
+def _rays_fit(block: Block) -> bool:
+    """Return True if 90 % of the rays to known points pass near them and none has its point behind the image."""
     start, rows = block.start.unknowns, block.image_points
     known = np.asarray(block.start.point_known)[np.asarray(rows.point)]
     image, point, xy = (np.asarray(v)[known] for v in (rows.image, rows.point, rows.xy))
@@ -293,4 +291,4 @@ def _fits(block: Block) -> bool:
     towards = np.asarray(start.points)[point] - np.asarray(exterior.position)[image]
     across = np.linalg.norm(np.cross(direction, towards), axis=1) / np.linalg.norm(towards, axis=1)
     in_front = np.einsum("ni,ni->n", direction, towards) > 0
-    return bool(in_front.all() and np.quantile(across, 0.9) < _NEAR)
+    return bool(in_front.all() and np.quantile(across, 0.9) < _MAX_MISCLOSURE_RAD)

@@ -1,11 +1,11 @@
-"""Direct georeferencing of a block: orientation from the sensors, ground from the images, each with its covariance.
+"""Direct georeferencing: exterior orientation from the sensors, points from the images, each with covariance.
 
     from jaxphoto import georeference, read_block
     found = georeference(read_block("block"))
     found.exterior_sigma, found.point_sigma, found.discrepancies.value
 
-Nothing is adjusted: control says only how good it is. The points are those that an adjustment of `variants.direct`
-without control would find.
+Nothing is adjusted: control serves as check points. The points are those of an adjustment of `variants.direct` without
+control.
 """
 
 from functools import partial
@@ -39,27 +39,29 @@ from jaxphoto.short_repr import pretty_repr
 from jaxphoto.tracing import outside_transformations
 from jaxphoto.unknowns import Weighted
 
-# From the point nearest to the rays the first step leaves micrometres, the second nothing.
+# Gauss-Newton iterations from the intersection: the first leaves micrometres, the second nothing.
 _STEPS = 4
 
 
 @pretty_repr
 class Georeferenced(eqx.Module):
-    """What GNSS, IMU, mount and camera give without an adjustment. All covariances are a priori."""
+    """Result of direct georeferencing. All covariances are a priori."""
 
     images: tuple[str, ...] = eqx.field(static=True)
-    """The images that have both a whole station and an attitude."""
+    """Images with both a complete station and an attitude."""
     points: tuple[str, ...] = eqx.field(static=True)
-    """The points that at least two of them show from two sides."""
+    """Points intersected by two or more of these."""
     exterior: ExteriorOrientation
     exterior_covariance: Float[ArrayLike, "images 6 6"]
     """Of X, Y, Z (m) and a small rotation in the camera frame (rad)."""
     positions: Float[np.ndarray, "points 3"]
     """Of `points`, m."""
     covariance: Float[np.ndarray, "points 3 3"]
-    """Of `positions` (m^2), errors that images share by a mount or a camera included."""
+    """Of `positions` (m^2), including errors common to images of a mount or a camera."""
     discrepancies: ControlCoordinates
-    """Surveyed minus computed (m) at control, fixed and check points, with the survey's sigmas; `who`: of `points`."""
+    """Surveyed minus computed (m) at control, fixed and check points, with the survey's sigmas; `who` refers to
+    `points`.
+    """
 
     @property
     def exterior_sigma(self) -> Float[np.ndarray, "images 6"]:
@@ -74,21 +76,22 @@ class Georeferenced(eqx.Module):
 
 @outside_transformations
 def georeference(block: Block) -> Georeferenced:
-    """Exterior orientation of the images of `block` from stations, attitudes and mounts, and its points from them.
+    """Exterior orientation of the images of `block` from stations, attitudes and mounts, and its points from these.
 
-    Mounts, cameras and strips are those of `block.start`. What `block.priors` says is Weighted has an error of that
-    sigma (strips excepted), everything else is taken as given. Raises BlockError where no image has both a whole
-    station and an attitude.
+    Mounts, cameras and strips are those of `block.start`. Weighted parameters in `block.priors` (except strips) have an
+    error of that sigma; all others are error-free. Raises BlockError if no image has both a complete station and an
+    attitude.
     """
     sensors = sensor_rows(block, block.start.unknowns)
     if not len(sensors.image):
         raise BlockError(
-            "no image has both a whole station and an attitude, so none can be georeferenced directly: give stations "
-            "and attitudes, or adjust the block"
+            "no image has both a complete station and an attitude: give stations and attitudes, or adjust the block"
         )
     exterior = jax.tree.map(np.asarray, direct_exterior(sensors))
     by = jax.tree.map(np.asarray, _direct_partials(sensors))
-    own = _propagated(by.station, sensors.station_sigma) + _propagated(by.attitude, sensors.attitude_sigma)
+    sensor_covariance = _propagated(by.station, sensors.station_sigma) + _propagated(
+        by.attitude, sensors.attitude_sigma
+    )
     mount_of = np.array(block.image_mount, object)[sensors.image]
     mounts = block.start.unknowns.mounts
     mount_sigma = {name: _sigmas(scalar_priors(prior, mounts[name])) for name, prior in block.priors.mounts.items()}
@@ -96,7 +99,7 @@ def georeference(block: Block) -> Georeferenced:
 
     rays, positions, shown = _intersected(block, sensors.image, exterior)
     point, n = rays.point, len(shown)
-    own_of_ray = rays.exterior @ own[rays.image] @ rays.exterior.transpose(0, 2, 1)
+    own_of_ray = rays.exterior @ sensor_covariance[rays.image] @ rays.exterior.transpose(0, 2, 1)
     own_of_ray += rays.sigma[:, :, None] ** 2 * np.eye(2)
     covariance = _own_covariance(rays.gain, own_of_ray, point, n)
     for name, sigma in mount_sigma.items():
@@ -111,23 +114,23 @@ def georeference(block: Block) -> Georeferenced:
     surveyed = ControlCoordinates.joined(block.control, block.fixed, block.check)
     place = np.full(len(block.points), -1)
     place[shown] = np.arange(n)
-    known = surveyed.take(place[surveyed.who] >= 0)
-    who = place[known.who]
+    on_points = surveyed.take(place[surveyed.who] >= 0)
+    who = place[on_points.who]
     return Georeferenced(
         images=tuple(block.images[i] for i in sensors.image),
         points=tuple(block.points[p] for p in shown),
         exterior=exterior,
-        exterior_covariance=own + _propagated(by.mount, of_image),
+        exterior_covariance=sensor_covariance + _propagated(by.mount, of_image),
         positions=positions,
         covariance=np.asarray(covariance),
         discrepancies=ControlCoordinates(
-            who, known.axis, np.asarray(known.value) - positions[who, known.axis], known.sigma
+            who, on_points.axis, np.asarray(on_points.value) - positions[who, on_points.axis], on_points.sigma
         ),
     )
 
 
 class _Rays(NamedTuple):
-    """The rays that meet in points: oriented image, point, gain, image sigma (mm), derivatives; see `ray_partials`."""
+    """Intersecting rays: oriented image, point, gain, image sigma (mm), derivatives; see `ray_partials`."""
 
     image: Int[np.ndarray, "rows"]
     point: Int[np.ndarray, "rows"]
@@ -135,13 +138,13 @@ class _Rays(NamedTuple):
     sigma: Float[np.ndarray, "rows 2"]
     exterior: Float[np.ndarray, "rows 2 6"]
     interior: dict[str, tuple[np.ndarray, np.ndarray]]
-    """The rows of each camera, and their derivatives by its parameters."""
+    """By camera: its rows and their derivatives by its parameters."""
 
 
 def _intersected(
     block: Block, oriented: Int[np.ndarray, "images"], exterior: ExteriorOrientation
 ) -> tuple[_Rays, Float[np.ndarray, "points 3"], Int[np.ndarray, "points"]]:
-    """Rays of the images `oriented`, the points (m) they determine, and which of the block's points these are."""
+    """Rays of the `oriented` images, the points (m) they determine, and their indices in the block."""
     observed = block.image_points
     place = np.full(len(block.images), -1)
     place[oriented] = np.arange(len(oriented))
@@ -154,24 +157,24 @@ def _intersected(
     directions = np.zeros((len(rows), 3))
     interior = block.start.unknowns.interior
     for name, of in interior.items():
-        mine = camera == name
-        rays = camera_rays(of, xy[mine])
-        directions[mine] = turn_to_object(matrix, image[mine], rays)
-    found, good = intersect_points(position[image], directions, point, len(block.points))
-    behind = np.einsum("ni,ni->n", directions, found[point] - position[image]) <= 0
-    good[point[behind]] = False
+        of_camera = camera == name
+        rays = camera_rays(of, xy[of_camera])
+        directions[of_camera] = turn_to_object(matrix, image[of_camera], rays)
+    positions, good = intersect_points(position[image], directions, point, len(block.points))
+    is_behind = np.einsum("ni,ni->n", directions, positions[point] - position[image]) <= 0
+    good[point[is_behind]] = False
 
     shown = np.flatnonzero(good)
-    kept = good[point]
-    image, xy, sigma, camera = image[kept], xy[kept], sigma[kept], camera[kept]
+    intersected = good[point]
+    image, xy, sigma, camera = image[intersected], xy[intersected], sigma[intersected], camera[intersected]
     number = np.cumsum(good) - 1
-    point, points, n = number[point[kept]], found[shown], len(shown)
-    mine = {name: np.flatnonzero(camera == name) for name in interior if name in camera}
+    point, points, n = number[point[intersected]], positions[shown], len(shown)
+    rows_of = {name: np.flatnonzero(camera == name) for name in interior if name in camera}
     residual, by_point, by_exterior = np.zeros((len(xy), 2)), np.zeros((len(xy), 2, 3)), np.zeros((len(xy), 2, 6))
     by_interior: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for _ in range(_STEPS):
-        for name, r in mine.items():
-            # Filled up with rows that are dropped again, so that cameras of one model share compiled code.
+        for name, r in rows_of.items():
+            # Padded with repeated rows, so that cameras of one model share compiled code.
             rows = np.resize(r, padded_length(len(r)))
             of_rows = ExteriorOrientation(position[image[rows]], matrix[image[rows]])  # type: ignore[arg-type]
             by = _ray_partials(_numbers(interior[name]), of_rows, points[point[rows]], xy[rows], block.corrections)
@@ -187,12 +190,12 @@ def _propagated(by: Float[np.ndarray, "n 6 m"], sigma: Float[ArrayLike, "n m"]) 
 
 
 def _sigmas(priors: list) -> np.ndarray:
-    """The sigma of each prior that has one, zero for the others."""
+    """Sigma of each prior, zero if it has none."""
     return np.array([float(p.sigma) if isinstance(p, Weighted) else 0.0 for p in priors])
 
 
 def _numbers(interior: InteriorOrientation) -> InteriorOrientation:
-    """Numbers as arrays: a float in the tree would be compiled in, and every camera compiled anew."""
+    """Convert floats to arrays: a float would be compiled in, for every camera again."""
     return jax.tree.map(partial(np.asarray, dtype=float), interior)
 
 

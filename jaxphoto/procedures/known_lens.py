@@ -1,4 +1,4 @@
-"""What is known of the lens beforehand as observations of a block's camera, where no earlier calibration says more."""
+"""Prior information about a lens as observations of a camera without earlier calibration."""
 
 import dataclasses
 import math
@@ -10,48 +10,47 @@ from jaxphoto.camera.lens_prior import LensPrior, prior_sigmas
 from jaxphoto.observations import KnownParameters
 from jaxphoto.unknowns import FIXED, Weighted
 
-# Between the season of one flight and that of the next.
+# Temperature difference between flights of different seasons.
 _KELVIN = 10.0
 
 
 class KnownLens(NamedTuple):
-    """A lens as EXIF tells it, and how far such lenses are from that."""
+    """Nominal lens by EXIF, and the deviations of such lenses from it."""
 
     nominal: InteriorOrientation
     prior: LensPrior
     c_rounding: float
-    """Relative standard deviation of the nominal c that is due to how it was noted."""
+    """Relative standard deviation of the nominal c by the rounding in EXIF."""
 
     def sentences(self, block: Block, camera: str) -> tuple[str, ...]:
-        """What a report says of it."""
+        """Messages for a report."""
         sigma, c = prior_sigmas(self.prior, self.nominal, block.sensors[camera], self.c_rounding), float(self.nominal.c)
         p = self.prior
         sensor = block.sensors[camera]
-        noted = f", of which {100 * self.c_rounding:.2g} % by how EXIF notes it" if self.c_rounding else ""
+        rounding = f", of which {100 * self.c_rounding:.2g} % rounding in EXIF" if self.c_rounding else ""
         return (
-            f"the lens is one of {p.name}: c is observed as {c:.5g} mm with a standard deviation of "
-            f"{sigma['c_mm']:.2g} mm ({100 * sigma['c_mm'] / c:.2g} %{noted}), the principal point as in the middle "
-            f"with {sigma['xp_mm']:.2g} mm ({sigma['xp_mm'] / sensor.pixel_mm:.2g} px), and distortion as none with "
-            f"{p.radial_percent:g} % of the distance of the corner for each radial term, {p.decentring_percent:g} % "
-            "for each other one",
-            f"source: {' '.join(p.source.split())}" + ("" if p.published else "; an earlier calibration says more"),
-            f"c of such lenses changes by about {1e-3 * _KELVIN * p.drift_ppm_per_K * c:.2g} µm with {_KELVIN:g} K, "
-            "so much less than this is not known of another day's c",
+            f"lens of class {p.name}: c observed as {c:.5g} mm, sigma {sigma['c_mm']:.2g} mm "
+            f"({100 * sigma['c_mm'] / c:.2g} %{rounding}); principal point in the centre, sigma {sigma['xp_mm']:.2g} "
+            f"mm ({sigma['xp_mm'] / sensor.pixel_mm:.2g} px); distortion zero, sigma {p.radial_percent:g} % of the "
+            f"corner's distance for each radial term, {p.decentring_percent:g} % for each other term",
+            f"source: {' '.join(p.source.split())}" + ("" if p.published else "; use an earlier calibration if any"),
+            f"c of such lenses changes by about {1e-3 * _KELVIN * p.drift_ppm_per_K * c:.2g} µm with {_KELVIN:g} K: "
+            "smaller differences from another day's c are not significant",
         )
 
 
-def known_from_before(block: Block, camera: str) -> bool:
-    """Whether an earlier calibration tells anything of a camera of the block."""
-    told = (label for rows in block.more if isinstance(rows, KnownParameters) for label in rows.labels)
-    return any(label.startswith(f"interior[{camera}].") for label in told)
+def has_prior(block: Block, camera: str) -> bool:
+    """Return True if an earlier calibration observes parameters of the camera."""
+    labels = (label for rows in block.more if isinstance(rows, KnownParameters) for label in rows.labels)
+    return any(label.startswith(f"interior[{camera}].") for label in labels)
 
 
 def with_known_lens(block: Block, camera: str, lens: KnownLens) -> Block:
-    """The block in which all that is estimated of the camera is observed as what is known of its lens.
+    """Observe all free parameters of the camera by the prior information about its lens.
 
-    What is held stays held, and a camera with an earlier calibration as it is.
+    Fixed parameters, and cameras with an earlier calibration, are unchanged.
     """
-    if known_from_before(block, camera):
+    if has_prior(block, camera):
         return block
     sigma = prior_sigmas(lens.prior, lens.nominal, block.sensors[camera], lens.c_rounding)
     priors = block.priors.interior[camera]

@@ -1,4 +1,4 @@
-"""Photographs with what they show in common, and the groups of them that hang together."""
+"""Matched photographs and their connected groups."""
 
 from collections.abc import Container
 from typing import NamedTuple
@@ -10,33 +10,33 @@ from jaxphoto.initial.matches import PairMatches, connected_images
 
 
 class MatchedPart(NamedTuple):
-    """Photographs: their features and which of them are the same places, as `orient` takes them."""
+    """Features of photographs and their matches, as input of `orient`."""
 
     names: list[str]
     xy_mm: list[Float[np.ndarray, "n 2"]]
     sigma_mm: list[Float[np.ndarray, "n"]]
     pairs: list[PairMatches]
     gross: Int[np.ndarray, "compared 3"]
-    """Of all pairs compared: first, second, matches by looks that were left out."""
+    """By compared pair: first, second, number of rejected matches."""
     sigma_factor: float
-    """How far the others scatter, over what is expected of features of a plane."""
+    """Ratio of the scatter of the accepted matches to that expected of coplanar features."""
 
     @property
     def n_gross(self) -> int:
-        """Matches by looks that were left out, of all pairs."""
+        """Number of rejected matches of all pairs."""
         return int(self.gross[:, 2].sum())
 
     def groups(self, least: int = 2) -> list["MatchedPart"]:
-        """Those that hang together, the most first; groups of fewer than `least` are left out."""
+        """Connected groups, the largest first, of `least` photographs or more."""
         together = connected_images(len(self.names), self.pairs)
         return [self._of(group) for group in together if len(group) >= least]
 
     def among(self, names: Container[str]) -> "MatchedPart":
-        """Those of `names`, with what they show in common."""
+        """Select photographs by name."""
         return self._of(np.array([k for k, name in enumerate(self.names) if name in names], int))
 
     def _of(self, photographs: Int[np.ndarray, "photographs"]) -> "MatchedPart":
-        """Some of them, counted anew."""
+        """Select photographs and renumber."""
         new = np.full(len(self.names), -1)
         new[photographs] = np.arange(len(photographs))
         ends = new[self.gross[:, :2]]

@@ -1,46 +1,214 @@
-"""Which distortion model does one block need: cross-validation, information criteria and significance of several.
+"""Choose the distortion model of a block: cross-validation, information criteria and significance.
 
-Every candidate is adjusted to all observations, and to the block without each of k folds (`cross_validation`); each by
-the same residuals, those of *measured* image coordinates. Orientations and points are estimated anew with
-every candidate and grow with the block: they are not what is chosen. What is left for the camera are
+Every candidate (a model with some coefficients estimated, others fixed at 0) is adjusted to all observations and to the
+block without each of k folds; all by residuals of *measured* image coordinates. Image points are omitted such that
+every object point keeps two rays or more, and predicted by the cameras, orientations and points of the others.
+
+Orientations and points are estimated with every candidate and increase with the block: they are not chosen. For the
+camera remain
 
     N = observations + constraints - unknowns other than interior ones = redundancy + p
 
-numbers, of which a candidate with p interior unknowns and the common variance factor explains all but S = v'Pv:
+numbers, of which a candidate with p interior unknowns and the variance factor explains all but S = v'Pv:
 
     AIC = N ln(S / N) + 2 (p + 1),    AICc = AIC + 2 (p + 1)(p + 2) / (N - p - 2),    BIC = N ln(S / N) + (p + 1) ln N
     F   = (S_smaller - S) / (p - p_smaller) / (S / redundancy)    of a candidate and one that it contains
 
-Counting all unknowns instead would put S / n in the place of S / N and favour large models, as n is often twice N.
-Source: Burnham and Anderson (2002), Model selection; residual likelihood: Patterson and Thompson (1971).
+Counting all unknowns would replace S / N by S / n and favour large models, as n is often twice N. Sources: Burnham and
+Anderson (2002), Model selection; residual likelihood: Patterson and Thompson (1971).
 """
 
+import dataclasses
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
 import numpy as np
 import scipy
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
-from jaxphoto.adjustment import Adjustment, PaddedSizes
-from jaxphoto.block import Block
+from jaxphoto.adjustment import Adjustment, PaddedSizes, common_sizes
+from jaxphoto.arrays import as_jax_array, to_numpy
+from jaxphoto.block import Block, bent_cameras
+from jaxphoto.camera import AbstractDistortion, InteriorOrientation, Sensor, exact, get_parameter, set_parameter
+from jaxphoto.camera.conversion import fitted
+from jaxphoto.collinearity import ExteriorOrientation, image_residual
+from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError, DatumError, InputError, RankError
+from jaxphoto.georeferencing import apparent_point
+from jaxphoto.observations import ImagePoints
 from jaxphoto.procedures.adjust import adjust
-from jaxphoto.procedures.camera_candidates import Candidate, candidate_of, with_candidate
-from jaxphoto.procedures.cross_validation import fold_blocks, folds, measured_discrepancies
 from jaxphoto.statistics import Significance, covariance, significance
-from jaxphoto.unknowns import Unknowns
+from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
+
+
+class Candidate(NamedTuple):
+    """Distortion model of which only `free` is estimated; its other coefficients are fixed at 0."""
+
+    name: str
+    distortion: type[AbstractDistortion]
+    free: tuple[str, ...]
+
+    def within(self, other: "Candidate") -> bool:
+        """Return True if `other` is this candidate with more coefficients."""
+        return self.distortion is other.distortion and set(self.free) < set(other.free)
+
+
+def candidate_of(text: str) -> Candidate:
+    """Parse `brown` (its usual coefficients), `brown:all`, `brown:none` or `brown:k1+k2`.
+
+    Raises InputError for an unknown model or coefficient.
+    """
+    model, _, listed = text.strip().partition(":")
+    kind = AbstractDistortion.called(model)
+    estimable = tuple(name for name in kind.coefficients if name not in kind.scales)
+    if listed in ("", "all"):
+        return Candidate(text.strip(), kind, estimable if listed else kind.usual())
+    names = () if listed == "none" else tuple(name.strip() for name in listed.split("+"))
+    for name in names:
+        if name not in estimable:
+            raise InputError(f"{text}: {model} has no coefficient {name!r} to estimate; it has {', '.join(estimable)}")
+    return Candidate(text.strip(), kind, tuple(name for name in estimable if name in names))
+
+
+def with_candidate(block: Block, candidate: Candidate, unknowns: Unknowns | None) -> Block:
+    """Return the block with the candidate for all cameras, starting at `known` orientations and points if given.
+
+    c, x_p and y_p keep their priors: a weighted value is transformed if the conversion to another model changes it, as
+    SMAC's c with R0. All coefficients of the candidate are free, even weighted ones: otherwise models with a prior
+    would explain an additional observation. They start from the block's distortion, converted if its model differs.
+    Residuals are of measured coordinates, for every model.
+    """
+    interior, priors = {}, {}
+    for name, camera in block.start.unknowns.interior.items():
+        interior[name] = _start(camera, candidate, block.sensors[name])
+        priors[name] = _priors(camera, block.priors.interior[name], interior[name], candidate.free)
+    block = eqx.tree_at(lambda b: (b.start.unknowns.interior, b.priors.interior), block, (interior, priors))
+    if unknowns is None:
+        return block
+    places = lambda b: (b.start.unknowns.exterior, b.start.unknowns.points)  # noqa: E731
+    block = eqx.tree_at(places, block, (unknowns.exterior, unknowns.points))
+    everything = (np.ones(len(block.images), bool), np.ones(len(block.points), bool))
+    return eqx.tree_at(lambda b: (b.start.image_known, b.start.point_known), block, everything)
+
+
+def _start(camera: InteriorOrientation, candidate: Candidate, sensor: Sensor) -> InteriorOrientation:
+    kind = candidate.distortion
+    fixed = tuple(name for name in kind.coefficients if name not in candidate.free)
+    try:
+        same = exact(camera, kind)
+        # A fit must know the fixed coefficients: rational terms are meaningless without each other.
+        interior = same if same is not None else fitted(camera, kind, sensor, fixed).interior
+    except ValueError:
+        # A candidate that does not fit the given distortion starts without distortion.
+        interior = dataclasses.replace(camera, distortion=kind.plain(sensor))
+    interior = dataclasses.replace(interior, residuals="measured")
+    for name in fixed:
+        interior = set_parameter(interior, name, 0.0)
+    return jax.tree.map(as_jax_array, interior)
+
+
+def _priors(camera: InteriorOrientation, priors, interior: InteriorOrientation, free: tuple[str, ...]):
+    """Return priors of the candidate, whose camera `interior` was converted from `camera`."""
+    new = jax.tree.map(lambda _: FIXED, interior)
+    scale = float(interior.c) / float(camera.c)
+    for name, factor in (("c_mm", scale), ("xp_mm", 1.0), ("yp_mm", 1.0)):
+        prior = get_parameter(priors, name)
+        if isinstance(prior, Weighted):
+            # At the same distance from the start, in the unit that c now has.
+            start, before = (float(get_parameter(one, name)) for one in (interior, camera))
+            prior = Weighted(start + factor * (float(prior.value) - before), factor * float(prior.sigma))
+        new = set_parameter(new, name, prior)
+    for name in free:
+        new = set_parameter(new, name, FREE)
+    return new
+
+
+_LEAST_RAYS = 2
+
+
+def folds(block: Block, k: int, seed: int = 0) -> Int[np.ndarray, "rows"]:
+    """Return the fold (0 ... k - 1) in which each image row is omitted; -1 for rows that never are.
+
+    Rows of a point are assigned to the folds in turn and at random, leaving the point two rays in each. Raises
+    BlockError if no point was measured in three images.
+    """
+    point = np.asarray(block.image_points.point)
+    rng = np.random.default_rng(seed)
+    order = rng.permutation(len(point))
+    order = order[np.argsort(point[order], kind="stable")]
+    rays = np.bincount(point, minlength=len(block.points))
+    first = np.concatenate([[0], np.cumsum(rays)[:-1]])
+    place = np.arange(len(order)) - first[point[order]]
+    turn = rng.integers(0, k, len(block.points))
+    fold = np.full(len(point), -1)
+    # The place // k-th of its fold: the point keeps the others.
+    allowed = place // k < rays[point[order]] - _LEAST_RAYS
+    fold[order] = np.where(allowed, (place + turn[point[order]]) % k, -1)
+    if not (fold >= 0).any():
+        raise BlockError("no point was measured in three images: no image point can be omitted; measure more rays")
+    return fold
+
+
+def without_rows(block: Block, left_out: Bool[np.ndarray, "rows"]) -> Block:
+    """Remove some image points of the block."""
+    selected, p = ~left_out, block.image_points
+    rows = ImagePoints(p.image[selected], p.point[selected], to_numpy(p.xy)[selected], to_numpy(p.sigma)[selected])
+    return dataclasses.replace(block, image_points=rows)
+
+
+def fold_blocks(block: Block, fold: Int[np.ndarray, "rows"]) -> tuple[list[Block], PaddedSizes]:
+    """Return the block without each of the folds, and sizes that fit these and the block itself."""
+    parts = [without_rows(block, fold == k) for k in range(fold.max() + 1)]
+    return parts, common_sizes([block, *parts])
+
+
+def measured_discrepancies(block: Block, unknowns: Unknowns) -> Float[np.ndarray, "rows 2"]:
+    """Return measured minus predicted image coordinate (mm) of every image row, whatever the domain of the distortion.
+
+    It is the residual "measured" of `InteriorOrientation`, so that all models are compared by the same numbers.
+    """
+    p = block.image_points
+    discrepancies = np.zeros((len(p.image), 2))
+    camera = np.array(block.image_camera, object)[p.image]
+    positions, matrices = (to_numpy(v) for v in (unknowns.exterior.position, unknowns.exterior.camera_from_object))
+    bent = bent_cameras(block, unknowns)
+    for name, interior in unknowns.interior.items():
+        rows_of_camera = np.flatnonzero(camera == name)
+        if len(rows_of_camera):
+            image, point = p.image[rows_of_camera], p.point[rows_of_camera]
+            exterior = ExteriorOrientation(positions[image], matrices[image])
+            camera_of_row = interior if bent is None else jax.tree.map(lambda v: to_numpy(v)[image], bent[name])  # noqa: B023
+            numbers = jax.tree.map(
+                lambda v: np.asarray(v, float), dataclasses.replace(camera_of_row, residuals="measured")
+            )
+            rows = (exterior, to_numpy(unknowns.points)[point], to_numpy(p.xy)[rows_of_camera])
+            discrepancies[rows_of_camera] = call_compiled(
+                _discrepancies, numbers, *rows, block.corrections, bent is not None
+            )
+    return discrepancies
+
+
+@eqx.filter_jit
+def _discrepancies(interior, exterior, points, xy, corrections, by_row: bool):
+    def of_one(interior, exterior, point, xy):
+        aim = apparent_point(exterior.position, point, corrections)
+        return image_residual(interior, exterior, aim, xy)
+
+    return jax.vmap(of_one, (0 if by_row else None, 0, 0, 0))(interior, exterior, points, xy)
+
 
 FOLDS = 5
 _NAN = float("nan")
 
 
 class Judged(NamedTuple):
-    """What one candidate is worth; numbers are NaN where it could not be adjusted, and `problem` says why.
+    """Result of a candidate; NaN, and the reason in `problem`, if it could not be adjusted.
 
-    `rms_px` and `cv_rms_px` are root mean squares of the length of the image discrepancy (both axes together) of
-    adjusted and of left-out image points. `cv_excess` is by how many standard errors the mean square of the latter is
-    above that of the candidate that predicts best, from the differences image point by image point.
+    `rms_px` and `cv_rms_px` are the RMS length of the image discrepancy (both axes) of adjusted and of omitted image
+    points. `cv_excess` is the excess of the mean square of the latter over that of the best candidate, in standard
+    errors of the differences by image point.
     """
 
     candidate: Candidate
@@ -56,28 +224,28 @@ class Judged(NamedTuple):
     aicc: float = _NAN
     bic: float = _NAN
     smaller: str = ""
-    """The largest candidate that this one contains, against which F tests it."""
+    """Largest candidate contained in this one, compared by the F test."""
     f: float = _NAN
     f_p: float = _NAN
     parameters: tuple[Significance, ...] = ()
 
     @property
     def sigma0(self) -> float:
-        """Of residuals of measured coordinates."""
+        """Sigma0 of residuals of measured coordinates."""
         return float(np.sqrt(self.sum_of_squares / self.redundancy)) if self.redundancy > 0 else _NAN
 
     @property
     def weakest(self) -> Significance | None:
-        """The estimated coefficient of the distortion with the smallest ratio to its standard deviation."""
-        own = [s for s in self.parameters if s.parameter in self.candidate.free]
-        return min(own, key=lambda s: s.ratio, default=None)
+        """Estimated distortion coefficient with the smallest ratio to its standard deviation."""
+        coefficients = [s for s in self.parameters if s.parameter in self.candidate.free]
+        return min(coefficients, key=lambda s: s.ratio, default=None)
 
 
 class ModelChoice(NamedTuple):
-    """All candidates as judged, in the order given; `by_bic` and `by_prediction` are names, "" where none converged.
+    """Results of all candidates, in the order given; `by_bic` and `by_prediction` are names, "" if none converged.
 
-    `by_prediction` is the candidate with fewest parameters that predicts left-out points no more than one standard
-    error worse than the best.
+    `by_prediction` is the candidate with fewest parameters whose prediction error is within one standard error of the
+    best.
     """
 
     judged: tuple[Judged, ...]
@@ -94,40 +262,40 @@ def model_choice(
     seed: int = 0,
     report: Callable[[str], object] = lambda text: None,
 ) -> ModelChoice:
-    """Compare candidates (`candidate_of`) for all cameras of `block`; `k` = 0 leaves cross-validation out.
+    """Compare candidates (`candidate_of`) for all cameras of `block`; `k` = 0 omits cross-validation.
 
-    c, x_p and y_p are what the block says of them (`with_candidate`), the coefficients of a candidate are free. What
-    cannot be adjusted is judged unfit, with the reason. `report` is told of each adjustment.
+    c, x_p and y_p keep their priors (`with_candidate`); the coefficients of a candidate are free. Candidates that
+    cannot be adjusted have the reason as `problem`. `report` receives progress.
 
-    Raises InputError for unknown or repeated candidates or fewer than two folds, BlockError where nothing can be left
-    out.
+    Raises InputError for unknown or repeated candidates or fewer than two folds, BlockError if no image point can be
+    omitted.
     """
     candidates = [c if isinstance(c, Candidate) else candidate_of(c) for c in models]
     names = [c.name for c in candidates]
     if not candidates or len(set(names)) < len(names):
-        raise InputError(f"name at least one model, and each but once; there are {', '.join(names) or 'none'}")
+        raise InputError(f"name one or more models, each once; got {', '.join(names) or 'none'}")
     if k == 1 or k < 0:
-        raise InputError(f"{k} folds cannot be; leave out one of at least 2, or 0 for no cross-validation")
+        raise InputError(f"{k} folds: give 2 or more, or 0 for no cross-validation")
     fold = folds(block, k, seed) if k else np.full(len(block.image_points.image), -1)
     _, sizes = fold_blocks(block, fold)
     judged: list[Judged] = []
     squares: list[np.ndarray | None] = []
-    known: Unknowns | None = None
+    unknowns: Unknowns | None = None
     for number, candidate in enumerate(candidates):
         counted = lambda fold, first=1 + number * (k + 1): report(  # noqa: E731
             f"comparing {len(names)} models: adjustment {first + fold} of {len(names) * (k + 1)}"
         )
         counted(0)
-        own = with_candidate(block, candidate, known)
+        posed = with_candidate(block, candidate, unknowns)
         try:
-            adjusted = adjust(own, None if known is None else own.start.unknowns, sizes=sizes)
-            found = _judge(candidate, adjusted)
-            squares.append(_predicted(own, adjusted, fold, sizes, counted) if k else None)
-            known = adjusted.unknowns if known is None and bool(adjusted.converged) else known
+            adjusted = adjust(posed, None if unknowns is None else posed.start.unknowns, sizes=sizes)
+            result = _judge(candidate, adjusted)
+            squares.append(_predicted(posed, adjusted, fold, sizes, counted) if k else None)
+            unknowns = adjusted.unknowns if unknowns is None and bool(adjusted.converged) else unknowns
         except (BlockError, DatumError, RankError) as error:
-            found = Judged(candidate, str(error))
+            result = Judged(candidate, str(error))
             squares.append(None)
-        judged.append(found)
+        judged.append(result)
     return _compared(judged, squares, int((fold >= 0).sum()))
 
 
@@ -141,21 +309,15 @@ def _judge(candidate: Candidate, adjusted: Adjustment) -> Judged:
     fit = n * np.log(s / n) if r > 0 else _NAN
     aic = fit + 2 * (p + 1)
     return Judged(
-        candidate=candidate,
-        n_parameters=p,
-        n_effective=n,
-        redundancy=r,
-        sum_of_squares=s,
-        rms_px=float(np.sqrt(np.mean(_squares_px(block, apart)))),
-        aic=aic,
-        aicc=aic + 2 * (p + 1) * (p + 2) / (n - p - 2) if n > p + 2 else _NAN,
-        bic=fit + (p + 1) * np.log(n),
+        candidate=candidate, n_parameters=p, n_effective=n, redundancy=r, sum_of_squares=s,
+        rms_px=float(np.sqrt(np.mean(_squares_px(block, apart)))), aic=aic,
+        aicc=aic + 2 * (p + 1) * (p + 2) / (n - p - 2) if n > p + 2 else _NAN, bic=fit + (p + 1) * np.log(n),
         parameters=tuple(significance(adjusted, covariance(adjusted))),
-    )
+    )  # fmt: skip
 
 
 def _squares_px(block: Block, apart_mm: Float[np.ndarray, "rows 2"]) -> Float[np.ndarray, "rows"]:
-    """Squared lengths of image discrepancies in pixels of their cameras."""
+    """Squared lengths of image discrepancies in pixels."""
     pixel = np.array([block.sensors[camera].pixel_mm for camera in block.image_camera])[block.image_points.image]
     return (apart_mm**2).sum(1) / pixel**2
 
@@ -163,7 +325,7 @@ def _squares_px(block: Block, apart_mm: Float[np.ndarray, "rows 2"]) -> Float[np
 def _predicted(
     block: Block, adjusted: Adjustment, fold: np.ndarray, sizes: PaddedSizes, counted: Callable[[int], object]
 ) -> Float[np.ndarray, "left_out"] | None:
-    """Squared prediction errors (px) of all rows that are ever left out; None where a fold does not converge."""
+    """Squared prediction errors (px) of all rows that are ever omitted; None if a fold does not converge."""
     if not bool(adjusted.converged):
         return None
     squares = np.full(len(fold), _NAN)
@@ -173,37 +335,37 @@ def _predicted(
         without = adjust(part, adjusted.unknowns, sizes=sizes)
         if not bool(without.converged):
             return None
-        own = fold == number
-        squares[own] = _squares_px(block, measured_discrepancies(block, without.unknowns))[own]
+        omitted = fold == number
+        squares[omitted] = _squares_px(block, measured_discrepancies(block, without.unknowns))[omitted]
     return squares[fold >= 0]
 
 
 def _compared(judged: list[Judged], squares: list[np.ndarray | None], n_left_out: int) -> ModelChoice:
-    """What needs all candidates: prediction beside the best, F against smaller ones, and the choice."""
+    """Add the results that need all candidates: excess over the best prediction, F tests, and the choice."""
     means = [float(v.mean()) if v is not None else np.inf for v in squares]
     best = squares[int(np.argmin(means))]
     done = []
-    for one, mine, mean in zip(judged, squares, means, strict=True):
+    for one, own_squares, mean in zip(judged, squares, means, strict=True):
         excess = _NAN
-        if mine is not None and best is not None:
-            apart = mine - best
+        if own_squares is not None and best is not None:
+            apart = own_squares - best
             error = apart.std(ddof=1) / np.sqrt(len(apart))
             excess = float(apart.mean() / error) if error > 0 else 0.0
         smaller = [j for j in judged if not j.problem and not one.problem and j.candidate.within(one.candidate)]
         tested = max(smaller, key=lambda j: j.n_parameters, default=None)
         f, p = _f_test(tested, one) if tested is not None else (_NAN, _NAN)
         name = tested.candidate.name if tested is not None else ""
-        rms = float(np.sqrt(mean)) if mine is not None else _NAN
+        rms = float(np.sqrt(mean)) if own_squares is not None else _NAN
         done.append(one._replace(cv_rms_px=rms, cv_excess=excess, smaller=name, f=f, f_p=p))
-    sound = [j for j in done if np.isfinite(j.bic)]
+    converged = [j for j in done if np.isfinite(j.bic)]
     predicting = [j for j in done if j.cv_excess <= 1]
-    by_bic = min(sound, key=lambda j: j.bic).candidate.name if sound else ""
+    by_bic = min(converged, key=lambda j: j.bic).candidate.name if converged else ""
     by_cv = min(predicting, key=lambda j: (j.n_parameters, j.cv_rms_px)).candidate.name if predicting else ""
     return ModelChoice(tuple(done), n_left_out, by_bic, by_cv)
 
 
 def _f_test(smaller: Judged, larger: Judged) -> tuple[float, float]:
-    """F of the coefficients that `larger` has more, and how probable so large a one is if they were all 0."""
+    """F of the additional coefficients of `larger`, and its p-value if they were all 0."""
     more = larger.n_parameters - smaller.n_parameters
     if larger.redundancy <= 0 or more <= 0:
         return _NAN, _NAN

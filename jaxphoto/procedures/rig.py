@@ -1,4 +1,4 @@
-"""Photographs of one event as those of a rig: which belong together, and where its cameras are, roughly."""
+"""Observe a rig of cameras by photographs of one event."""
 
 import dataclasses
 import warnings
@@ -15,51 +15,56 @@ from jaxphoto.observations import RigPlaces, RigTurns
 from jaxphoto.unknowns import FIXED, FREE
 
 EVENT = "event"
-"""The partition of the block that says which photographs were exposed together."""
+"""Partition of the block whose images were exposed together."""
 
 
 def with_rig(block: Block, reference: str, place_m: float, turn_rad: float) -> Block:
-    """The block with its cameras in a rig beside the camera `reference`.
+    """Add a rig of the block's cameras relative to the camera `reference`.
 
-    `Block.partitions["event"]` (a column of images.csv) says which photographs belong together. The rig is rigid to
-    `place_m` and `turn_rad` from one event to the next. Relative orientations start at the medians of those of the
-    approximate orientations, and are free: `block.fix("place")`, `block.weigh("place", 0.005)`. All cameras are taken
-    to expose at once; `block.free("delay")` of a block that knows how it moved finds out when they do. The place that
-    it starts with holds what was flown in the meantime: weigh one that was measured, by its value.
+    `Block.partitions["event"]` (a column of images.csv) groups the photographs. The rig is rigid to `place_m` and
+    `turn_rad` between events. Relative orientations start at the medians of the approximate ones, and are free:
+    `block.fix("place")`, `block.weigh("place", 0.005)`. Exposures are assumed simultaneous; `block.free("delay")`
+    estimates delays if the motion is known. The start then contains the distance flown during the delay: weigh a
+    measured position by its value.
 
-    Raises InputError where nothing says what belongs together, none of it is of the camera `reference`, or of a camera
-    no orientation is known beside it. A UserWarning tells of photographs that are in no event of it.
+    Raises InputError without events, if none has an image of `reference`, or a camera has no approximate orientation
+    relative to it. Issues a UserWarning about photographs without event.
     """
     if EVENT not in block.partitions:
         raise InputError(
-            f"the block has no partition {EVENT}; add the column {EVENT} to images.csv, and to the top of block.toml "
-            f'partitions = ["{EVENT}"]'
+            f"the block has no partition {EVENT}; add the column {EVENT} to images.csv, and "
+            f'partitions = ["{EVENT}"] to the top of block.toml'
         )
     cameras, events = np.array(block.image_camera), np.array(block.partitions[EVENT])
-    own = np.flatnonzero((cameras == reference) & (events != ""))
-    if not len(own):
-        raise InputError(f"no image of camera {reference} is in an event, so no rig has it; name another camera")
-    first = {event: int(i) for i, event in zip(own[::-1], events[own[::-1]], strict=True)}
+    references = np.flatnonzero((cameras == reference) & (events != ""))
+    if not len(references):
+        raise InputError(f"no image of camera {reference} is in an event; name another reference camera")
+    first = {event: int(i) for i, event in zip(references[::-1], events[references[::-1]], strict=True)}
     image = np.array([i for i, event in enumerate(events) if cameras[i] != reference and event in first], int)
     if not len(image):
         raise InputError(
-            f"no image of another camera is in an event of camera {reference}; correct the column {EVENT}, in which "
-            "photographs that were exposed together have the same word"
+            f"no image of another camera is in an event of camera {reference}; give photographs exposed together the "
+            f"same value in the column {EVENT}"
         )
-    _tell_left_out(block, image, own, len(first))
+    if alone := len(block.images) - len(image) - len(references):
+        warnings.warn(f"{alone} photographs are in no event of the rig and are not constrained by it", stacklevel=2)
+    if more := len(references) - len(first):
+        warnings.warn(
+            f"{more} events have a second photograph of the reference camera, not constrained by the rig", stacklevel=2
+        )
     at = np.array([first[event] for event in events[image]], int)
     none, each = np.zeros((len(image), 3)), np.ones((len(image), 3))
     rows = RigPlaces(at, image, none, place_m * each), RigTurns(at, image, none, turn_rad * each)
-    known = block.start.image_known[at] & block.start.image_known[image]
+    oriented = block.start.image_known[at] & block.start.image_known[image]
     start: dict[str, Any] = {}
     for camera in dict.fromkeys(cameras[image].tolist()):
-        mine = (cameras[image] == camera) & known
-        if not mine.any():
+        pairs = (cameras[image] == camera) & oriented
+        if not pairs.any():
             raise InputError(
-                f"no images of cameras {camera} and {reference} in one event have approximate orientations, so nothing "
-                f"says where {camera} is in the rig; orient the block first"
+                f"no images of cameras {camera} and {reference} in one event have approximate orientations, which "
+                f"locate {camera} in the rig; orient the block first"
             )
-        start[camera] = RigCamera(*map(as_jax_array, _middle(block, at[mine], image[mine])))
+        start[camera] = RigCamera(*map(as_jax_array, _median_pose(block, at[pairs], image[pairs])))
     free: Any = {camera: RigCamera(FREE, FREE, FIXED) for camera in start}  # type: ignore[arg-type]
     unknowns = dataclasses.replace(block.start.unknowns, more=block.start.unknowns.more | {RigCamera.kind: start})
     return dataclasses.replace(
@@ -70,24 +75,12 @@ def with_rig(block: Block, reference: str, place_m: float, turn_rad: float) -> B
     )
 
 
-def _tell_left_out(block: Block, image: Int[np.ndarray, "n"], own: Int[np.ndarray, "m"], n_events: int) -> None:
-    """A UserWarning of photographs that the rig does not hold."""
-    alone = len(block.images) - len(image) - len(own)
-    if alone:
-        warnings.warn(f"{alone} photographs are in no event of the rig and stand by themselves", stacklevel=3)
-    if len(own) > n_events:
-        warnings.warn(
-            f"{len(own) - n_events} events have a second photograph of the reference camera, which stands by itself",
-            stacklevel=3,
-        )
-
-
-def _middle(
+def _median_pose(
     block: Block, reference: Int[np.ndarray, "n"], image: Int[np.ndarray, "n"]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """The median place (m) and turn (rad) of images beside those of their reference, as they start.
+    """Median position (m) and rotation vector (rad) of images relative to their reference, from approximate values.
 
-    Turns are median matrices made orthogonal again: rotation vectors of half a turn may have either sign.
+    Rotations are median matrices made orthogonal: rotation vectors near pi may have either sign.
     """
     exterior = block.start.unknowns.exterior
     position, rotation = to_numpy(exterior.position), to_numpy(exterior.camera_from_object)

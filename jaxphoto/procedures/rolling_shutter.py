@@ -1,8 +1,7 @@
-"""A rolling shutter for a block whose photographs have times: how each moves, its neighbours tell.
+"""Rolling shutter of a block with exposure times: velocities from neighbouring photographs.
 
-Velocities are slopes of straight lines through the positions of a photograph and of its neighbours in the same run, as
-far as the track goes straight on; what positions and times are off by makes their standard deviations. Rates of turn
-nobody tells: they are unknowns about zero.
+Velocities are slopes of straight lines through the positions of a photograph and its neighbours in the same straight
+run; errors of positions and times give their standard deviations. Rotation rates are unknowns with expectation zero.
 """
 
 import dataclasses
@@ -18,37 +17,37 @@ from jaxphoto.errors import InputError
 from jaxphoto.unknowns import FREE, Prior, Unknowns, Weighted
 
 Moment = tuple[float, float]
-"""When a photograph was taken (s, of any origin), and the step in which that is counted (s)."""
+"""Exposure time (s, any origin) and its resolution (s)."""
 RATE_DEG_PER_S = 0.5
-"""Standard deviation of the rates of turn of a camera in a gimbal: a judgement."""
-# Photographs on either side that a line goes through, while the track turns by less, and no gap is between them.
+"""Standard deviation of rotation rates of a camera in a gimbal (assumed)."""
+# Maximum number of neighbours on either side in a line, which turns by less and has no gap.
 _NEIGHBOURS, _STRAIGHT_DEG = 2, 20.0
 GAP = 3.0
-"""Of the usual interval between photographs: a longer one is a gap."""
+"""Ratio to the usual interval between photographs above which an interval is a gap."""
 NEIGHBOUR_M = 0.05
-"""What adjusted positions are off by against their neighbours (m): a judgement."""
-# Drones speed up and slow down between photographs by so much of their speed, and are never still.
+"""Relative standard deviation of adjusted positions of neighbours (m, assumed)."""
+# Relative change of a drone's speed between photographs, and minimum standard deviation of a velocity.
 _UNSTEADY, _LEAST_M_PER_S = 0.03, 0.1
-# Share of the photographs whose neighbours have to tell how they move.
+# Minimum fraction of photographs with a velocity.
 _ENOUGH = 0.5
 
 
 def usual_interval(time: Float[np.ndarray, "images"]) -> float:
-    """The median interval (s) between times in their order, infinite where there is none.
+    """Median interval (s) between ordered times, infinite without any.
 
-    Of those that are no zero: photographs that follow one another within a step of the clock have the same time.
+    Zeros are excluded: exposures within the resolution of the clock have the same time.
     """
     later = np.diff(time)
     return float(np.median(later[later > 0])) if (later > 0).any() else np.inf
 
 
 class Velocities(NamedTuple):
-    """Of every photograph, in the object frame, as its neighbours tell it."""
+    """Velocities of all photographs in the object frame."""
 
     velocity: Float[np.ndarray, "images 3"]
     sigma: Float[np.ndarray, "images 3"]
     known: Bool[np.ndarray, "images"]
-    """Whether they do; where not, the velocity is zero and its standard deviation the speed of the others."""
+    """False without neighbours; then the velocity is zero and its standard deviation the usual speed."""
 
 
 def velocities(
@@ -57,15 +56,15 @@ def velocities(
     step: Float[np.ndarray, "images"],
     sigma_m: float,
 ) -> Velocities:
-    """Velocities (m/s) from positions (m, each with `sigma_m`) and times (s, counted in steps of `step`; NaN: none)."""
+    """Velocities (m/s) from positions (m, with `sigma_m`) and times (s, with resolution `step`; NaN: unknown)."""
     n = len(time)
-    velocity, sigma, known = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, bool)
+    velocity, sigma, has_velocity = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, bool)
     order = [int(k) for k in np.argsort(time, kind="stable") if np.isfinite(time[k])]
     usual = usual_interval(time[order])
     for rank, k in enumerate(order):
         before, after = (_run(order, rank, side, position, time, GAP * usual) for side in (-1, 1))
         if before and after and not _straight(position[k] - position[before[0]], position[after[0]] - position[k]):
-            # The end of a strip: it belongs to the one whose next photograph is nearer in time.
+            # End of a strip: it belongs to the side whose next photograph is nearer in time.
             nearer = time[k] - time[before[0]] <= time[after[0]] - time[k]
             before, after = (before, []) if nearer else ([], after)
         run = [k, *before, *after]
@@ -75,17 +74,17 @@ def velocities(
             continue
         velocity[k] = t @ position[run] / spread
         speed = float(np.linalg.norm(velocity[k]))
-        # What a time is off by, uniform within its step, is as much of the way.
+        # The uniform error of a time within its resolution is a position error.
         noise = np.hypot(sigma_m, velocity[k] * float(step[run].mean()) / np.sqrt(12))
         sigma[k] = np.sqrt(noise**2 / spread + (_UNSTEADY * speed) ** 2 + _LEAST_M_PER_S**2)
-        known[k] = True
-    usual_speed = float(np.sqrt(np.mean(np.sum(velocity[known] ** 2, axis=1)))) if known.any() else 0.0
-    sigma[~known] = max(usual_speed, _LEAST_M_PER_S)
-    return Velocities(velocity, sigma, known)
+        has_velocity[k] = True
+    usual_speed = float(np.sqrt(np.mean(np.sum(velocity[has_velocity] ** 2, axis=1)))) if has_velocity.any() else 0.0
+    sigma[~has_velocity] = max(usual_speed, _LEAST_M_PER_S)
+    return Velocities(velocity, sigma, has_velocity)
 
 
 def _run(order: list[int], rank: int, side: int, position: np.ndarray, time: np.ndarray, gap: float) -> list[int]:
-    """Photographs on one side of another, as far as the track goes straight on, the nearest first."""
+    """Neighbours on one side within the straight run, the nearest first."""
     run, last, ahead = [], order[rank], None
     for k in order[rank + 1 : rank + 1 + _NEIGHBOURS] if side > 0 else order[:rank][::-1][:_NEIGHBOURS]:
         way = position[k] - position[last]
@@ -97,7 +96,7 @@ def _run(order: list[int], rank: int, side: int, position: np.ndarray, time: np.
 
 
 def _straight(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether a track goes on in plan as it came."""
+    """Return True if two steps have the same direction in plan."""
     a, b = one[:2], other[:2]
     return bool(a @ b > np.cos(np.radians(_STRAIGHT_DEG)) * np.hypot(*a) * np.hypot(*b))
 
@@ -109,28 +108,27 @@ def with_rolling_shutter(
     readout: Prior | Weighted = FREE,
     known: Unknowns | None = None,
 ) -> Block:
-    """The block in which every camera reads its rows one after another, in a time that starts at zero.
+    """Add a rolling shutter to every camera, with a readout time that starts at zero.
 
-    `known` has the positions (each good to `sigma_m` against its neighbours) and orientations that motions follow from
-    and the adjustment then starts with; None: those of the block. `taken` is by image. Raises InputError where
-    neighbours tell too few motions.
+    `known` are the positions (with `sigma_m` relative to neighbours) and orientations that define the motions and the
+    start; None: those of the block. `taken` is by image. Raises InputError if too few photographs have a velocity.
     """
     exterior = (block.start.unknowns if known is None else known).exterior
     moments = np.array([taken.get(name, (np.nan, 1.0)) for name in block.images]).reshape(-1, 2)
-    found = velocities(np.asarray(exterior.position), moments[:, 0], moments[:, 1], sigma_m)
-    if found.known.mean() < _ENOUGH:
+    motion = velocities(np.asarray(exterior.position), moments[:, 0], moments[:, 1], sigma_m)
+    if motion.known.mean() < _ENOUGH:
         raise InputError(
-            f"only {found.known.sum()} of {len(block.images)} photographs have neighbours in time that tell how they "
-            "move, so a rolling shutter cannot be estimated; give photographs with times, or leave it out"
+            f"only {motion.known.sum()} of {len(block.images)} photographs have neighbours in time that determine "
+            "their velocity: a rolling shutter cannot be estimated. Use photographs with exposure times, or omit it"
         )
     turn = np.asarray(exterior.camera_from_object)
-    velocity = np.einsum("nij,nj->ni", turn, found.velocity)
-    covariance = np.einsum("nij,nj,nkj->nik", turn, found.sigma**2, turn)
-    still, rate = np.zeros(3), Weighted(np.zeros(3), np.full(3, np.radians(RATE_DEG_PER_S)))
+    velocity = np.einsum("nij,nj->ni", turn, motion.velocity)
+    covariance = np.einsum("nij,nj,nkj->nik", turn, motion.sigma**2, turn)
+    no_rotation, rate = np.zeros(3), Weighted(np.zeros(3), np.full(3, np.radians(RATE_DEG_PER_S)))
     start: dict[str, Any] = {}
     priors: dict[str, Any] = {}
     for name, v, own in zip(block.images, velocity, covariance, strict=True):
-        start[name] = ImageMotion(v, still)  # type: ignore[arg-type]
+        start[name] = ImageMotion(v, no_rotation)  # type: ignore[arg-type]
         priors[name] = ImageMotion(Weighted(v, np.sqrt(np.diag(own))), rate)  # type: ignore[arg-type]
     shutters, motions = RollingShutter.kind, ImageMotion.kind
     before: dict[str, Any] = {} if known is None else known.more.get(shutters, {})
@@ -140,9 +138,9 @@ def with_rolling_shutter(
     of_cameras: dict[str, Any] = dict.fromkeys(block.sensors, RollingShutter(readout))  # type: ignore[arg-type]
     known_before = dataclasses.replace(block.priors, more=block.priors.more | {shutters: of_cameras, motions: priors})
     n, m = len(block.images), len(block.points)
-    given = (
+    begin_start = (
         block.start
         if known is None
         else dataclasses.replace(block.start, image_known=np.ones(n, bool), point_known=np.ones(m, bool))
     )
-    return dataclasses.replace(block, start=dataclasses.replace(given, unknowns=unknowns), priors=known_before)
+    return dataclasses.replace(block, start=dataclasses.replace(begin_start, unknowns=unknowns), priors=known_before)

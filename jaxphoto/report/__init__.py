@@ -2,12 +2,10 @@
 
 from jaxphoto.report.block_plot import block_in_space, plot_block
 from jaxphoto.report.boresight import plot_boresight, print_boresight, write_boresight
-from jaxphoto.report.cubes import correlation_cube, covariance_array, draws_cube
-from jaxphoto.report.draws import plot_draws, plot_effects
+from jaxphoto.report.draws import correlation_cube, covariance_array, draws_cube, plot_draws, plot_effects
 from jaxphoto.report.findings import Finding, Verdict
 from jaxphoto.report.flight_plots import plot_photograph_residuals, plot_position_offsets, plot_time_line
 from jaxphoto.report.formatting import TABLE_FORMATS, check_table_format, to_latex, to_markdown, write_table
-from jaxphoto.report.halves import plot_halves
 from jaxphoto.report.lidar import plot_above, plot_lidar_heights
 from jaxphoto.report.model_choice import plot_models
 from jaxphoto.report.plots import (
@@ -38,7 +36,7 @@ from jaxphoto.report.plots import (
 from jaxphoto.report.residual_findings import component_findings, component_tables, left_out_table, snooped_findings
 from jaxphoto.report.results import report_page, summary_of, write_results, write_tables
 from jaxphoto.report.sensitivity import plot_sensitivity
-from jaxphoto.report.stability import plot_change, plot_ray_offsets
+from jaxphoto.report.stability import plot_change, plot_halves, plot_ray_offsets
 from jaxphoto.report.strips import plot_scanner_correlation, plot_strip_differences, plot_trajectory_errors
 from jaxphoto.report.sweep import plot_sweep
 from jaxphoto.report.tables import Tables, recovery_spread, recovery_table

@@ -117,8 +117,8 @@ def plot_block(source: Block | Adjustment, ax: Axes | None = None, *, in_3d: boo
         ax.plot(*places.points[tie, :n].T, ".", ms=2, color="0.65", label="object points", rasterized=len(tie) > 2000)
     if places.image_known.any():
         ax.plot(*places.stations[places.image_known, :n].T, "+", ms=8, color="tab:blue", label="camera stations")
-    for mine in places.strips:
-        ax.plot(*places.stations[mine, :n].T, "-", lw=0.7, color="tab:blue", alpha=0.5)
+    for strip in places.strips:
+        ax.plot(*places.stations[strip, :n].T, "-", lw=0.7, color="tab:blue", alpha=0.5)
     control: dict[str, Any] = {"marker": "^", "ls": "", "ms": 6, "color": "tab:red", "label": "control points"}
     check: dict[str, Any] = {"marker": "s", "ls": "", "ms": 5, "mfc": "none", "color": "tab:green"}
     for index, style in ((places.control, control), (places.check, check | {"label": "check points"})):

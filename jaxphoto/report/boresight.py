@@ -16,7 +16,7 @@ from rich.text import Text
 from jaxphoto.errors import InputError
 from jaxphoto.procedures import Step
 from jaxphoto.report.findings import as_sentence
-from jaxphoto.report.page import Heading, Link, Made, Paragraph, Part, Plot
+from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, Plot
 from jaxphoto.report.plots import axes_or_new, label, new_figure
 from jaxphoto.report.results import rounded, write_results, write_study
 from jaxphoto.report.tables import Tables
@@ -81,11 +81,11 @@ def plot_boresight(steps: Sequence[Step], ax: Axes | None = None, *, shifts: boo
     names = [_short(str(parameter)) for parameter in rows["parameter"]]
     places = {name: k for k, name in enumerate(dict.fromkeys(names))}
     several = len(set(rows["step"])) > 1
-    for k, (step, own) in enumerate(rows.assign(at=[places[name] for name in names]).groupby("step")):
-        at = own["at"] + (0.3 * (k - 0.5) if several else 0.0)
+    for k, (step, of_step) in enumerate(rows.assign(at=[places[name] for name in names]).groupby("step")):
+        at = of_step["at"] + (0.3 * (k - 0.5) if several else 0.0)
         marker, colour = ("s", "0.5") if several and k == 0 else ("o", "tab:blue")
-        bars: dict[str, Any] = {"xerr": _BARS * own["sigma"], "fmt": marker, "ms": 4, "capsize": 3}
-        ax.errorbar(own["value"], at, color=colour, label=f"step {step}", **bars)
+        bars: dict[str, Any] = {"xerr": _BARS * of_step["sigma"], "fmt": marker, "ms": 4, "capsize": 3}
+        ax.errorbar(of_step["value"], at, color=colour, label=f"step {step}", **bars)
     ax.set_yticks(list(places.values()), [label(name) for name in places], fontsize=8)
     ax.set_ylim(len(places) - 0.5, -0.5)
     ax.axvline(0, color="0.4", lw=0.6)
@@ -125,7 +125,7 @@ def boresight_parts(steps: Sequence[Step]) -> list[Part]:
     return parts
 
 
-def write_boresight(steps: Sequence[Step], directory: Path, seconds: dict[str, float], made: Made) -> None:
+def write_boresight(steps: Sequence[Step], directory: Path, seconds: dict[str, float], record: CommandRecord) -> None:
     """steps.csv, summary.json, report.html and step_1 ... step_4.
 
     Raises InputError if `directory` holds something else than an earlier result.
@@ -136,29 +136,25 @@ def write_boresight(steps: Sequence[Step], directory: Path, seconds: dict[str, f
         for step in steps:
             tables, times = Tables(step.adjusted), step.adjusted.seconds
             spent = {name: times[name] for name in ("compile", "solve", "covariance")}
-            write_results(tables, verdict_of(tables), work / f"step_{step.number}", spent, made=made)
+            write_results(tables, verdict_of(tables), work / f"step_{step.number}", spent, record=record)
         summary = {
             "title": block.title,
             "verdict": verdict,
             "passed": passed,
             "steps": [
                 {
-                    "step": step.number,
-                    "title": step.title,
-                    "go_on": step.go_on,
-                    "converged": bool(step.adjusted.converged),
-                    "sigma0": float(step.adjusted.sigma0),
-                    "redundancy": step.adjusted.redundancy,
-                    "findings": list(step.findings),
+                    "step": step.number, "title": step.title, "go_on": step.go_on,
+                    "converged": bool(step.adjusted.converged), "sigma0": float(step.adjusted.sigma0),
+                    "redundancy": step.adjusted.redundancy, "findings": list(step.findings),
                     "estimates": [estimate._asdict() for estimate in step.estimates],
                 }
                 for step in steps
             ],
             "seconds": rounded(seconds | {"write": time.perf_counter() - began}),
-        }
+        }  # fmt: skip
         write_study(
             work, f"{block.title or 'block'}: boresight", (verdict, "green" if passed else "red"),
-            boresight_parts(steps), summary, made, {"steps": steps_table(steps)},
+            boresight_parts(steps), summary, record, {"steps": steps_table(steps)},
         )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from jaxphoto.camera import Sensor
 from jaxphoto.errors import counted
 from jaxphoto.procedures.calibration import Calibration, Detection, rms_px
 from jaxphoto.report.findings import Finding, Verdict
-from jaxphoto.report.page import Heading, Link, Made, Part, PictureFile, page
+from jaxphoto.report.page import CommandRecord, Heading, Link, Part, PictureFile, page
 from jaxphoto.report.plots import label, new_figure
 from jaxphoto.report.results import write_results, write_summary
 from jaxphoto.report.tables import Tables
@@ -46,8 +46,8 @@ def photographs_table(calibration: Calibration) -> pd.DataFrame:
 def targets_figure(calibration: Calibration, image: str, picture: np.ndarray | None = None) -> Figure:
     """The targets of one image, over its grey values if given, with enlarged residual vectors."""
     rows, sensor = calibration.measured, calibration.sensor
-    own = rows.image == rows.images.index(image)
-    place, v = sensor.px_from_mm(rows.xy_mm[own]), calibration.residuals_px[own]
+    of_image = rows.image == rows.images.index(image)
+    place, v = sensor.px_from_mm(rows.xy_mm[of_image]), calibration.residuals_px[of_image]
     scale = _ARROW * sensor.width_px / max(rms_px(calibration.residuals_px), 1e-12)
     figure = _image_figure(sensor, picture, f"{image}: RMS {rms_px(v):.3f} px, residuals {scale:.0f} times enlarged")
     (axes,) = figure.axes
@@ -114,7 +114,7 @@ def write_calibration(
     beside: Callable[[Path], None] = lambda folder: None,
     *,
     detections: Sequence[Detection] = (),
-    made: Made,
+    record: CommandRecord,
     start: str = "",
     notes: Sequence[str] = (),
 ) -> Tables:
@@ -132,7 +132,7 @@ def write_calibration(
     times = calibration.adjusted.seconds
     with whole_folder(directory) as work:
         spent = seconds | {k: times[k] for k in ("compile", "solve", "covariance")}
-        write_results(tables, verdict, work, spent, made=made)
+        write_results(tables, verdict, work, spent, record=record)
         photographs = photographs_table(calibration)
         photographs.to_csv(work / "photographs.csv", index=False)
         (work / PICTURES).mkdir()

@@ -39,15 +39,11 @@ _ALIGNMENTS: tuple[tuple[Method, str], ...] = (
 )
 _UNKNOWN = "not in the image files"
 _QUANTITIES = (
-    ("exposure", "exposure_s", "s"),
-    ("f-number", "f_number", ""),
-    ("sensitivity", "iso", "ISO"),
-    ("focal length", "focal_length_mm", "mm (as stated by the lens)"),
-    ("focus distance", "subject_distance_m", "m"),
-    ("temperature", "temperature_c", "degrees Celsius"),
-    ("relative humidity", "humidity_percent", "%"),
+    ("exposure", "exposure_s", "s"), ("f-number", "f_number", ""), ("sensitivity", "iso", "ISO"),
+    ("focal length", "focal_length_mm", "mm (as stated by the lens)"), ("focus distance", "subject_distance_m", "m"),
+    ("temperature", "temperature_c", "degrees Celsius"), ("relative humidity", "humidity_percent", "%"),
     ("air pressure", "pressure_hpa", "hPa"),
-)
+)  # fmt: skip
 
 
 class LastCalibration(NamedTuple):
@@ -125,61 +121,61 @@ class Certified(NamedTuple):
         return [(str(f.get("severity", "")), str(f.get("text", ""))) for f in rows if isinstance(f, dict)]
 
 
-def certificate_page(given: Certified) -> str:
+def certificate_page(certified: Certified) -> str:
     """The certificate as HTML. Raises InputError for a non-invertible distortion, and what `change` raises."""
-    model = next((f"{c.camera} {c.serial}".strip() for c in given.conditions if c.camera), "")
-    foot = f"inputs SHA-256 {digest_of_all(given.files)[:16]}" if given.all_inputs else "inputs unknown"
-    parts = [part for section in _SECTIONS for part in section(given)]
-    title = f"Certificate of calibration: {model or camera_words(given.camera)}"
-    return page(title, parts, _statement(given), foot=foot)
+    model = next((f"{c.camera} {c.serial}".strip() for c in certified.conditions if c.camera), "")
+    foot = f"inputs SHA-256 {digest_of_all(certified.files)[:16]}" if certified.all_inputs else "inputs unknown"
+    parts = [part for section in _SECTIONS for part in section(certified)]
+    title = f"Certificate of calibration: {model or camera_words(certified.camera)}"
+    return page(title, parts, _statement(certified), foot=foot)
 
 
-def _statement(given: Certified) -> tuple[str, str]:
+def _statement(certified: Certified) -> tuple[str, str]:
     """The first sentence and its colour."""
-    colour, severities = given.summary.get("verdict"), [severity for severity, _ in given.findings]
-    if given.covariance is None:
+    colour, severities = certified.summary.get("verdict"), [severity for severity, _ in certified.findings]
+    if certified.covariance is None:
         return "Not to be signed: nothing of this camera was estimated, or no correlations are kept.", "red"
     if colour == "red":
-        first = next((f" First error: {text}" for severity, text in given.findings if severity == "error"), "")
+        first = next((f" First error: {text}" for severity, text in certified.findings if severity == "error"), "")
         return f"Not to be signed: the verdict on the adjustment is red.{first}", "red"
     if colour == "amber":
         return f"Calibrated with {severities.count('warning')} warnings, which are listed under Findings.", "amber"
-    if axes := ", ".join(given.shifted_axes):
+    if axes := ", ".join(certified.shifted_axes):
         return f"Calibrated; check points are shifted in {axes}: look into this before signing.", "amber"
     return "Calibrated; all tests of the adjustment are passed.", "green"
 
 
-def _camera(given: Certified) -> Iterator[Part]:
-    if given.sigma_factor > 1:
+def _camera(certified: Certified) -> Iterator[Part]:
+    if certified.sigma_factor > 1:
         yield Paragraph(
             "Residuals are spatially correlated: standard deviations and bands of this certificate are those of the "
-            f"adjustment times {given.sigma_factor:.2f}."
+            f"adjustment times {certified.sigma_factor:.2f}."
         )
     yield Heading("Camera")
-    s, fields = given.sensor, {}
+    s, fields = certified.sensor, {}
     for name, field in (
         ("make", "make"), ("model", "model"), ("serial number", "serial"), ("lens", "lens"),
         ("serial number of the lens", "lens_serial"), ("firmware", "firmware"),
     ):  # fmt: skip
-        values = dict.fromkeys(getattr(c, field) for c in given.conditions if getattr(c, field))
-        fields[name] = ", ".join(values) or (_UNKNOWN if given.conditions else "unknown: no image files were read")
+        values = dict.fromkeys(getattr(c, field) for c in certified.conditions if getattr(c, field))
+        fields[name] = ", ".join(values) or (_UNKNOWN if certified.conditions else "unknown: no image files were read")
     yield fields | {
         "format": f"{s.width_px} x {s.height_px} pixels, {s.width_mm:.4g} x {s.height_mm:.4g} mm",
         "pixel": f"{1e3 * s.pixel_mm:.5g} µm (scale of all lengths below; not calibrated)",
-        "name in the block": given.camera,
+        "name in the block": certified.camera,
     }
-    yield from assumed_pixels({given.camera: s})
+    yield from assumed_pixels({certified.camera: s})
 
 
-def _flight(given: Certified) -> Iterator[Part]:
-    conditions, known = given.conditions, dict(known_conditions(given.conditions))
+def _flight(certified: Certified) -> Iterator[Part]:
+    conditions, known = certified.conditions, dict(known_conditions(certified.conditions))
     yield Heading("Flight and conditions")
     images = f"{sum(c.used for c in conditions)} of {len(conditions)} used" if conditions else ""
-    flight = given.summary.get("flight")
+    flight = certified.summary.get("flight")
     yield {
-        "flight": str(given.summary.get("title") or "without a title"),
+        "flight": str(certified.summary.get("title") or "without a title"),
         "date": dates(conditions),
-        "images": images or str(given.summary.get("n_images", "unknown")),
+        "images": images or str(certified.summary.get("n_images", "unknown")),
         "aircraft": ", ".join(dict.fromkeys(c.drone for c in conditions if c.drone)) or _UNKNOWN,
         **({str(k): str(v) for k, v in flight.items()} if isinstance(flight, dict) else {}),
         **{name: known.get(name, _UNKNOWN) for name, _, _ in _QUANTITIES},
@@ -205,13 +201,13 @@ def known_conditions(conditions: Sequence[Conditions]) -> Iterator[tuple[str, st
             yield name, f"{text} {unit}".strip()
 
 
-def _method(given: Certified) -> Iterator[Part]:
+def _method(certified: Certified) -> Iterator[Part]:
     yield Heading("Method")
-    of, sigma0 = given.summary, given.summary.get("sigma0")
+    of, sigma0 = certified.summary, certified.summary.get("sigma0")
     counts = ", ".join(
         f"{v} of {k.replace('_', ' ')}" for k, v in of.get("n_observations", {}).items() if k != "total" and v
     )
-    distortion, projection = given.interior.distortion.name, given.interior.projection.name
+    distortion, projection = certified.interior.distortion.name, certified.interior.projection.name
     yield {
         "adjustment": "self-calibrating bundle adjustment by least squares, exact covariances",
         "model": f"projection {projection}, distortion {distortion} (docs/models.md)",
@@ -223,22 +219,22 @@ def _method(given: Certified) -> Iterator[Part]:
     }
 
 
-def _interior(given: Certified) -> Iterator[Part]:
+def _interior(certified: Certified) -> Iterator[Part]:
     yield Heading("Interior orientation")
-    names, pixel = parameter_names(given.interior), given.sensor.pixel_mm
-    sigmas = np.zeros(len(names)) if given.covariance is None else np.sqrt(np.diagonal(given.covariance))
+    names, pixel = parameter_names(certified.interior), certified.sensor.pixel_mm
+    sigmas = np.zeros(len(names)) if certified.covariance is None else np.sqrt(np.diagonal(certified.covariance))
     rows = []
-    for name, sigma in zip(names, sigmas * given.sigma_factor, strict=True):
-        value, in_px = float(get_parameter(given.interior, name)), ""
+    for name, sigma in zip(names, sigmas * certified.sigma_factor, strict=True):
+        value, in_px = float(get_parameter(certified.interior, name)), ""
         if name.endswith("_mm"):
             in_px = with_sigma(value / pixel, sigma / pixel) + (f", {of_sigma(sigma / pixel)}" if sigma else "")
         if sigma > 0 or value:
-            unit = parameter_unit(given.interior, name)
+            unit = parameter_unit(certified.interior, name)
             rows.append((name, with_sigma(value, sigma), of_sigma(sigma) or "fixed", unit, in_px))
-    for name in constant_names(given.interior):
-        value, unit = float(get_parameter(given.interior, name)), parameter_unit(given.interior, name)
+    for name in constant_names(certified.interior):
+        value, unit = float(get_parameter(certified.interior, name)), parameter_unit(certified.interior, name)
         rows.append((name, f"{value:.8g}", "constant", unit, ""))
-    readout = dict(given.summary.get("georeferencing", {})).get(readout_of(given.camera), {})
+    readout = dict(certified.summary.get("georeferencing", {})).get(readout_of(certified.camera), {})
     value, sigma = readout.get("value"), readout.get("sigma")
     if isinstance(value, int | float) and isinstance(sigma, int | float):
         rows.append(("readout_ms", with_sigma(value, sigma), of_sigma(sigma), "ms", ""))
@@ -249,9 +245,9 @@ def _interior(given: Certified) -> Iterator[Part]:
     )
 
 
-def _distortion(given: Certified) -> Iterator[Part]:
+def _distortion(certified: Certified) -> Iterator[Part]:
     yield Heading("Distortion")
-    curve, factor = distortion_curve(given.interior, given.sensor, given.covariance), given.sigma_factor
+    curve, factor = distortion_curve(certified.interior, certified.sensor, certified.covariance), certified.sigma_factor
     alt = f"Radial distortion, at most {1e3 * np.abs(curve.radial).max():.3g} µm, with its 95 % band"
     yield [Plot(partial(draw_distortion, curve=curve, factor=factor), alt)]
     columns = {"distance [mm]": curve.r, "radial [µm]": 1e3 * curve.radial}
@@ -265,96 +261,100 @@ def _distortion(given: Certified) -> Iterator[Part]:
     )
 
 
-def _precision(given: Certified) -> Iterator[Part]:
+def _precision(certified: Certified) -> Iterator[Part]:
     yield Heading("Precision over the format")
-    if given.covariance is None:
+    if certified.covariance is None:
         yield Paragraph("Unknown: no covariance.")
         return
-    points, scale = image_grid(given.sensor, *_GRID), given.sigma_factor / given.sensor.pixel_mm
-    maps = {words: scale * frame_sigma(given.interior, given.covariance, points, how) for how, words in _ALIGNMENTS}
-    plots = [_map(given, points, sigma, f"sigma [px], {words}") for words, sigma in maps.items()]
-    if given.band:
-        plots.append(_map(given, given.band.cells_mm, given.band.band_px, "95 % by split halves [px]"))
+    points, scale = image_grid(certified.sensor, *_GRID), certified.sigma_factor / certified.sensor.pixel_mm
+    maps = {
+        words: scale * frame_sigma(certified.interior, certified.covariance, points, how) for how, words in _ALIGNMENTS
+    }
+    plots = [_map(certified, points, sigma, f"sigma [px], {words}") for words, sigma in maps.items()]
+    if certified.band:
+        plots.append(_map(certified, certified.band.cells_mm, certified.band.band_px, "95 % by split halves [px]"))
     yield plots
     rows = [(w, *(f"{v:.3g}" for v in (s.min(), np.median(s), s.max()))) for w, s in maps.items()]
     yield pd.DataFrame(rows, columns=["RMS error of a ray [px]", "least", "median", "most"])
     yield Paragraph(
-        f"Random halves of the block ({given.band.input.file}): standard deviations are to be multiplied by "
-        f"{given.band.factor:.2f} +- {given.band.sigma_factor:.2f}."
-        if given.band
+        f"Random halves of the block ({certified.band.input.file}): standard deviations are to be multiplied by "
+        f"{certified.band.factor:.2f} +- {certified.band.sigma_factor:.2f}."
+        if certified.band
         else "By the covariance of the adjustment; no split-half validation (jaxphoto halves)."
     )
 
 
-def _map(given: Certified, cells_mm: np.ndarray, values: np.ndarray, name: str) -> Plot:
-    draw = partial(draw_format_map, sensor=given.sensor, cells_mm=cells_mm, name=name, values=values)
+def _map(certified: Certified, cells_mm: np.ndarray, values: np.ndarray, name: str) -> Plot:
+    draw = partial(draw_format_map, sensor=certified.sensor, cells_mm=cells_mm, name=name, values=values)
     return Plot(draw, f"Map over the format: {name}, {values.min():.2g} to {values.max():.2g}")
 
 
-def _correlations(given: Certified) -> Iterator[Part]:
+def _correlations(certified: Certified) -> Iterator[Part]:
     yield Heading("Correlations")
-    if given.covariance is None:
+    if certified.covariance is None:
         yield Paragraph("Unknown: no covariance.")
         return
-    sigma = np.sqrt(np.diagonal(given.covariance))
+    sigma = np.sqrt(np.diagonal(certified.covariance))
     free = np.flatnonzero(sigma > 0)
-    names = [parameter_names(given.interior)[k] for k in free]
-    rho = given.covariance[np.ix_(free, free)] / sigma[free, None] / sigma[free]
+    names = [parameter_names(certified.interior)[k] for k in free]
+    rho = certified.covariance[np.ix_(free, free)] / sigma[free, None] / sigma[free]
     high = [f"{symbol(a)} and {symbol(b)} {r:+.3f}" for a, b, r in high_pairs(names, rho, _HIGH)]
     words = f"Above {_HIGH}: {', '.join(high)}; interpret these jointly." if high else f"None is above {_HIGH}."
     draw = partial(draw_matrix, values=rho, rows=names, columns=names, name="correlation of the interior orientation")
     yield [Plot(draw, f"Matrix of correlations. {words}", 3.8)]
     yield Paragraph(words)
-    if given.with_exterior:
-        table = pd.DataFrame(given.with_exterior)
-        cells = table.assign(rho=[f"{c.mean_abs:.2f} ({c.max_abs:.2f})" for c in given.with_exterior])
+    if certified.with_exterior:
+        table = pd.DataFrame(certified.with_exterior)
+        cells = table.assign(rho=[f"{c.mean_abs:.2f} ({c.max_abs:.2f})" for c in certified.with_exterior])
         wide = cells.pivot_table("rho", "interior", "exterior", aggfunc="first", sort=False).fillna("")
         yield wide.reset_index(names="mean (largest) |rho| over the images")
 
 
-def _stability(given: Certified) -> Iterator[Part]:
+def _stability(certified: Certified) -> Iterator[Part]:
     yield Heading("Stability since the last calibration")
-    last = given.last
+    last = certified.last
     if last is None:
         yield Paragraph("No earlier calibration was given (--last).")
         return
-    points = image_grid(given.sensor, *_GRID)
-    widened = None if given.covariance is None else given.covariance * given.sigma_factor**2
-    changed = change(last.interior, given.interior, points, (last.covariance, widened))
+    points = image_grid(certified.sensor, *_GRID)
+    widened = None if certified.covariance is None else certified.covariance * certified.sigma_factor**2
+    changed = change(last.interior, certified.interior, points, (last.covariance, widened))
     yield Paragraph(f"Compared with {last.name} (first: that, second: this).")
     if last.shared:
         yield Paragraph(
             "Both calibrations have images in common: their agreement does not show that nothing has changed. Compare "
             "with a calibration by other images."
         )
-    yield from (Paragraph(as_sentence(sentence)) for sentence in change_verdict(changed, given.sensor))
+    yield from (Paragraph(as_sentence(sentence)) for sentence in change_verdict(changed, certified.sensor))
     yield [
-        _map(given, points, changed.offset_mm / given.sensor.pixel_mm, "offset of rays [px]"),
-        _map(given, points, changed.offset_mm / changed.limit_mm, f"offset over its {100 * LEVEL:.0f} % limit"),
+        _map(certified, points, changed.offset_mm / certified.sensor.pixel_mm, "offset of rays [px]"),
+        _map(certified, points, changed.offset_mm / changed.limit_mm, f"offset over its {100 * LEVEL:.0f} % limit"),
     ]
     table = parameter_changes(changed).drop(columns="ratio")
     if len(table := table[table["sigma"] > 0]):
         yield table
 
 
-def _accuracy(given: Certified) -> Iterator[Part]:
-    sentences = given.summary.get("positional_accuracy")
+def _accuracy(certified: Certified) -> Iterator[Part]:
+    sentences = certified.summary.get("positional_accuracy")
     yield Heading("Check points")
     yield from (Paragraph(str(sentence)) for sentence in sentences or ["None: no positional accuracy was tested."])
 
 
-def _findings(given: Certified) -> Iterator[Part]:
+def _findings(certified: Certified) -> Iterator[Part]:
     yield Heading("Findings")
-    yield from [Paragraph(f"{s.capitalize()}: {as_sentence(t)}", s) for s, t in given.findings] or [Paragraph("None.")]
+    yield from [Paragraph(f"{s.capitalize()}: {as_sentence(t)}", s) for s, t in certified.findings] or [
+        Paragraph("None.")
+    ]
 
 
-def _inputs(given: Certified) -> Iterator[Part]:
+def _inputs(certified: Certified) -> Iterator[Part]:
     yield Heading("Inputs")
-    files = given.files
+    files = certified.files
     if not files:
         yield Paragraph("Unknown: the results have no hashes of their inputs; repeat the adjustment.")
         return
-    if not given.all_inputs:
+    if not certified.all_inputs:
         yield Paragraph("Incomplete: the results have no hashes of their inputs; repeat the adjustment.")
     else:
         yield Paragraph(
@@ -362,11 +362,11 @@ def _inputs(given: Certified) -> Iterator[Part]:
             "sha256sum, in the order of their names."
         )
         equal = "The same inputs, options and software give the numbers of this certificate to the printed digit."
-        yield Paragraph(equal if given.summary.get("method") else "The options are unknown.")
+        yield Paragraph(equal if certified.summary.get("method") else "The options are unknown.")
     yield hash_table(files)
 
 
-def _signature(given: Certified) -> Iterator[Part]:
+def _signature(certified: Certified) -> Iterator[Part]:
     yield Heading("Signature")
     yield dict.fromkeys(("calibrated by", "place and date", "signature"), "_" * 40)
 

@@ -45,9 +45,9 @@ def control_marks(control: ControlledBlock) -> pd.DataFrame:
 
 def rmse(control: ControlledBlock, state: str) -> np.ndarray:
     """RMS of surveyed minus adjusted X, Y, Z (m) of the points in a state; NaN if there are none."""
-    off = control.off_m[np.array(control.state, object) == state]
-    n = np.isfinite(off).sum(axis=0)
-    return np.where(n > 0, np.sqrt(np.nansum(off**2, axis=0) / np.maximum(n, 1)), np.nan)
+    discrepancy = control.off_m[np.array(control.state, object) == state]
+    n = np.isfinite(discrepancy).sum(axis=0)
+    return np.where(n > 0, np.sqrt(np.nansum(discrepancy**2, axis=0) / np.maximum(n, 1)), np.nan)
 
 
 def control_findings(control: ControlledBlock) -> list[Finding]:
@@ -58,8 +58,8 @@ def control_findings(control: ControlledBlock) -> list[Finding]:
         n = int((~control.check).sum())
         found.append(Finding("control_rejected", "warning", few(rejected), len(rejected), numbers={"n": n}))
     if check:
-        off = ", ".join(of_sigma(v) or "-" for v in rmse(control, "check"))
-        found.append(Finding("check_points", "note", off, len(check)))
+        sizes = ", ".join(of_sigma(v) or "-" for v in rmse(control, "check"))
+        found.append(Finding("check_points", "note", sizes, len(check)))
         w = np.nan_to_num(control.w).max(axis=1)
         if beyond := [control.ids[k] for k in check if w[k] > CRITICAL]:
             found.append(Finding("check_points_far", "warning", few(beyond), len(beyond), CRITICAL))

@@ -15,15 +15,19 @@ from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.observations import AXES
 from jaxphoto.report.formatting import column_unit
-from jaxphoto.report.page import Heading, Made, Paragraph, Part, Plot, page, provenance
+from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot, page, provenance
 from jaxphoto.report.plots import axes_or_new, label, new_figure
 from jaxphoto.report.results import assumed_pixels
 from jaxphoto.sensitivity import Draws
+from jaxphoto.statistics import Correlations, Covariance, correlation_matrix
 from jaxphoto.writing import whole_file
 
 if TYPE_CHECKING:
+    import xarray as xr
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from jaxphoto.sensitivity.posterior import Posterior
 
 _PICTURES = {
     "interior": (
@@ -108,17 +112,17 @@ def moments(values: np.ndarray) -> Moments:
 
 
 def summary_table(
-    found: Mapping[str, Moments],
+    moments_of: Mapping[str, Moments],
     nominal: Mapping[str, float],
     predicted: Mapping[str, float],
     cameras: Mapping[str, InteriorOrientation],
 ) -> pd.DataFrame:
     """quantity, nominal, mean, sd, quantiles, predicted_sigma, ratio (sd over predicted), unit."""
-    rows = [(name, nominal.get(name, np.nan), m.mean, m.sd, *m.quantiles) for name, m in found.items()]
+    rows = [(name, nominal.get(name, np.nan), m.mean, m.sd, *m.quantiles) for name, m in moments_of.items()]
     table = pd.DataFrame(rows, columns=["quantity", "nominal", "mean", "sd", *_QUANTILES])
-    table["predicted_sigma"] = [predicted.get(name, np.nan) for name in found]
+    table["predicted_sigma"] = [predicted.get(name, np.nan) for name in moments_of]
     table["ratio"] = table["sd"] / table["predicted_sigma"]
-    return table.assign(unit=[column_unit(name, cameras) for name in found])
+    return table.assign(unit=[column_unit(name, cameras) for name in moments_of])
 
 
 def draws_figure(columns: Mapping[str, np.ndarray], summary: pd.DataFrame) -> Figure:
@@ -143,8 +147,8 @@ def plot_draws(draws: pd.DataFrame, summary: pd.DataFrame, quantity: str, ax: Ax
     """
     quantities = summary["quantity"].tolist()
     if quantity not in quantities or quantity not in draws:
-        known = ", ".join(name for name in quantities if name in draws and not name.startswith(LONG))
-        raise InputError(f"the draws have no {quantity!r}; they have {known}, and those of images and points")
+        names = ", ".join(name for name in quantities if name in draws and not name.startswith(LONG))
+        raise InputError(f"the draws have no {quantity!r}; they have {names}, and those of images and points")
     ax = axes_or_new(ax)
     _draw_histogram(ax, quantity, draws[quantity].to_numpy(float), summary)
     return ax
@@ -175,9 +179,9 @@ def plot_effects(
     `effects` is effects.csv and `summary` summary.csv of a Monte Carlo. Raises InputError for unknown quantities.
     """
     names = list(quantities)
-    known = [name for name in summary["quantity"] if name in effects]
-    if missing := [name for name in names if name not in known]:
-        raise InputError(f"the effects have no {missing[0]!r}; they have {', '.join(known)}")
+    available = [name for name in summary["quantity"] if name in effects]
+    if missing := [name for name in names if name not in available]:
+        raise InputError(f"the effects have no {missing[0]!r}; they have {', '.join(available)}")
     ax, predicted = axes_or_new(ax), summary.set_index("quantity")["predicted_sigma"][names].to_numpy()
     fractions = effects[names].to_numpy() / np.where(predicted > 0, predicted, np.nan)
     image = ax.imshow(fractions, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
@@ -195,7 +199,11 @@ def effects_figure(effects: pd.DataFrame, summary: pd.DataFrame, quantities: lis
 
 
 def write_draws_page(
-    summary: Mapping[str, Any], table: pd.DataFrame, sensors: Mapping[str, Sensor], directory: Path, made: Made
+    summary: Mapping[str, Any],
+    table: pd.DataFrame,
+    sensors: Mapping[str, Sensor],
+    directory: Path,
+    record: CommandRecord,
 ) -> None:
     """report.html of the draws in `directory`, from the summary, its table and the plots in the folder."""
     few = ~table["quantity"].str.startswith(LONG)
@@ -213,6 +221,152 @@ def write_draws_page(
     parts += [Heading("Means and standard deviations"), ordered]
     if not few.all():
         parts.append(Paragraph("Images, points and trajectory knots are in summary.csv."))
-    text = page(f"Monte Carlo: {summary.get('title') or 'block'}", [*parts, *provenance(made)], (verdict, ""))
+    text = page(f"Monte Carlo: {summary.get('title') or 'block'}", [*parts, *provenance(record)], (verdict, ""))
     with whole_file(directory / "report.html") as work:
         work.write_text(text, encoding="utf-8")
+
+
+# Arrays of more than two dimensions as xarray: correlations by image, draws by image and point.
+#
+# Values are in radians, metres and millimetres, as the coordinate names say.
+
+
+def correlation_cube(correlations: Correlations) -> xr.Dataset:
+    """The correlations of a camera: `interior` (parameter, with_parameter), `exterior` (image, element, parameter) and
+    `within_image` (image, element, with_element).
+    """
+    # Imported here because it takes a third of a second.
+    import xarray as xr
+
+    c = correlations
+    return xr.Dataset(
+        {
+            "interior": (("parameter", "with_parameter"), c.interior),
+            "exterior": (("image", "element", "parameter"), c.exterior),
+            "within_image": (("image", "element", "with_element"), c.within_image),
+        },
+        coords={
+            "parameter": list(c.parameters),
+            "with_parameter": list(c.parameters),
+            "image": list(c.images),
+            "element": list(c.eop_names),
+            "with_element": list(c.eop_names),
+        },
+        attrs={"camera": c.camera},
+    )
+
+
+def covariance_array(known: Covariance) -> xr.DataArray:
+    """All correlations of exterior orientations and shared unknowns: (unknown, with_unknown), with `sigma` (unknown),
+    a posteriori, in the units of the labels. A fixed unknown has a sigma of zero, and no correlation.
+    """
+    import xarray as xr
+
+    names = list(known.labels)
+    sigma = np.concatenate([np.asarray(known.exterior_sigma).ravel(), np.asarray(known.shared_sigma)])
+    coords = {"unknown": names, "with_unknown": names, "sigma": ("unknown", sigma)}
+    return xr.DataArray(correlation_matrix(known), coords, ("unknown", "with_unknown"), name="correlation")
+
+
+def draws_cube(draws: Draws, adjusted: Adjustment) -> xr.Dataset:
+    """A Monte Carlo: `shared` (draw, parameter), `error` (draw, of_error), `converged`, `iterations` and `fallback`
+    (draw); if kept, `exterior` (draw, image, element) and `points` (draw, point, axis).
+    """
+    import xarray as xr
+
+    variables: dict[str, tuple[tuple[str, ...], np.ndarray]] = {
+        "shared": (("draw", "parameter"), draws.shared),
+        "converged": (("draw",), draws.converged),
+        "iterations": (("draw",), draws.steps),
+        "fallback": (("draw",), draws.fallback),
+    }
+    coords: dict[str, object] = {"draw": np.arange(len(draws.steps)), "parameter": list(draws.labels)}
+    if draws.recorded:
+        variables["error"] = ("draw", "of_error"), np.stack(list(draws.recorded.values()), axis=1)
+        coords["of_error"] = list(draws.recorded)
+    if draws.exterior is not None:
+        variables["exterior"] = ("draw", "image", "element"), draws.exterior
+        coords |= {"image": list(adjusted.block.images), "element": list(EXTERIOR)}
+    if draws.points is not None:
+        variables["points"] = ("draw", "point", "axis"), draws.points
+        coords |= {"point": list(adjusted.block.points), "axis": list(AXES)}
+    return xr.Dataset(variables, coords)
+
+
+_ANGLES = ("omega", "phi", "kappa")
+_PANEL, _ACROSS = 2.6, 4
+_NORMAL_97_5 = 1.959964
+
+
+def posterior_table(posterior: Posterior) -> pd.DataFrame:
+    """Least squares and posterior of each parameter; both a priori.
+
+    Columns: parameter, optimum, laplace_sigma, laplace_2.5_percent, laplace_97.5_percent, posterior_mean,
+    posterior_sigma, posterior_2.5_percent, posterior_97.5_percent, skewness, rhat, ess. Units are in the parameters'
+    names, angles in degrees.
+    """
+    names, factor = _names_and_factors(posterior)
+    optimum, sigma = posterior.optimum * factor, np.sqrt(np.diagonal(posterior.laplace)) * factor
+    low, high = np.quantile(posterior.draws, [0.025, 0.975], axis=0) * factor
+    return pd.DataFrame(
+        {
+            "parameter": names, "optimum": optimum, "laplace_sigma": sigma,
+            "laplace_2.5_percent": optimum - _NORMAL_97_5 * sigma,
+            "laplace_97.5_percent": optimum + _NORMAL_97_5 * sigma, "posterior_mean": posterior.mean * factor,
+            "posterior_sigma": np.sqrt(np.diagonal(posterior.covariance)) * factor, "posterior_2.5_percent": low,
+            "posterior_97.5_percent": high, "skewness": posterior.skewness, "rhat": posterior.rhat,
+            "ess": posterior.ess,
+        }
+    )  # fmt: skip
+
+
+def posterior_figure(posterior: Posterior) -> Figure:
+    """The sample of each parameter with its Gaussian, and the pair that deviates most from its 95 % ellipse."""
+    names, factor = _names_and_factors(posterior)
+    k = len(names)
+    panels = k + (k > 1)
+    down = -(-panels // _ACROSS)
+    figure = new_figure(_PANEL * min(panels, _ACROSS), _PANEL * down)
+    places = [figure.add_subplot(down, min(panels, _ACROSS), 1 + n) for n in range(panels)]
+    draws, optimum = posterior.draws * factor, posterior.optimum * factor
+    laplace = posterior.laplace * np.outer(factor, factor)
+    for j, axes in enumerate(places[:k]):
+        _marginal(axes, draws[:, j], optimum[j], np.sqrt(laplace[j, j]))
+        axes.set_xlabel(label(names[j]), fontsize=8)
+    if k > 1:
+        pair = list(np.unravel_index(np.argmax(posterior.outside), posterior.outside.shape))
+        _pair(places[k], draws[:, pair], optimum[pair], laplace[np.ix_(pair, pair)])
+        places[k].set_xlabel(label(names[pair[0]]), fontsize=8)
+        places[k].set_ylabel(label(names[pair[1]]), fontsize=8)
+        places[k].set_title(f"{100 * posterior.outside[tuple(pair)]:.0f} % outside, not 5 %", fontsize=8)
+    for axes in places:
+        axes.tick_params(labelsize=7)
+        axes.locator_params(axis="x", nbins=4)
+    places[0].legend(fontsize=7)
+    return figure
+
+
+def _names_and_factors(posterior: Posterior) -> tuple[list[str], np.ndarray]:
+    """Names with units, and factors to these units."""
+    names, factor = [], np.ones(len(posterior.parameters))
+    for j, parameter in enumerate(posterior.parameters):
+        last = parameter.rsplit(".", 1)[-1]
+        if last in _ANGLES:
+            factor[j] = np.rad2deg(1.0)
+        names.append(parameter + ("_deg" if last in _ANGLES else "_m" if last in ("X", "Y", "Z") else ""))
+    return names, factor
+
+
+def _marginal(axes: Axes, sample: np.ndarray, optimum: float, sigma: float) -> None:
+    axes.hist(sample, bins=40, density=True, color="tab:blue", alpha=0.5, label="posterior")
+    x = np.linspace(min(sample.min(), optimum - 3 * sigma), max(sample.max(), optimum + 3 * sigma), 200)
+    density = np.exp(-0.5 * ((x - optimum) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
+    axes.plot(x, density, color="tab:red", lw=1.2, label="Laplace")
+    axes.set_yticks([])
+
+
+def _pair(axes: Axes, sample: np.ndarray, optimum: np.ndarray, covariance: np.ndarray) -> None:
+    axes.plot(*sample.T, ".", ms=1.5, color="tab:blue", alpha=0.4)
+    turn = np.linspace(0, 2 * np.pi, 200)
+    circle = np.sqrt(-2 * np.log(0.05)) * np.stack([np.cos(turn), np.sin(turn)])
+    axes.plot(*(optimum[:, None] + np.linalg.cholesky(covariance) @ circle), color="tab:red", lw=1.2)

@@ -30,7 +30,7 @@ from jaxphoto.report.flight_plots import (
     time_line,
 )
 from jaxphoto.report.formatting import plus_minus, without_empty
-from jaxphoto.report.orientation import ALIKE, orientation_sentences, write_orientation
+from jaxphoto.report.orientation import CORRELATED, orientation_sentences, write_orientation
 from jaxphoto.report.page import (
     Heading,
     Link,
@@ -80,8 +80,8 @@ class FlightSource(NamedTuple):
     """Exposure times by image."""
     conditions: Sequence[Conditions] = ()
     inputs: Sequence[InputFile] = ()
-    told: Mapping[str, Any] = MappingProxyType({})
-    """How the results came about: goes into the summaries."""
+    entries: Mapping[str, Any] = MappingProxyType({})
+    """Further entries of the summaries: options and inputs."""
     written: str = ""
     """Date of the results."""
     command: str = ""
@@ -104,8 +104,8 @@ def _findings(part: FlightPart) -> Iterator[Finding]:
     report = part.oriented.report
     if not report.converged:
         yield Finding("orientation_not_converged", "error", hint="See the section on the orientation")
-    if part.why_still:
-        yield Finding("message", "warning", part.why_still)
+    if part.why_no_shutter:
+        yield Finding("message", "warning", part.why_no_shutter)
     if part.no_control:
         yield Finding("control_unused", "error", part.no_control)
     if part.controlled:
@@ -117,9 +117,9 @@ def _findings(part: FlightPart) -> Iterator[Finding]:
     if part.placed and not part.placed.used.all():
         used = part.placed.used
         yield Finding("positions_rejected", "warning", value=int((~used).sum()), numbers={"n": len(used)})
-    if report.alike > ALIKE:
+    if report.alike > CORRELATED:
         hint = "jaxphoto halves on the block determines the factor better"
-        yield Finding("correlated_residuals", "warning", value=report.alike, limit=ALIKE, hint=hint)
+        yield Finding("correlated_residuals", "warning", value=report.alike, limit=CORRELATED, hint=hint)
 
 
 def _images(part: FlightPart) -> pd.DataFrame:
@@ -129,15 +129,15 @@ def _images(part: FlightPart) -> pd.DataFrame:
     v = np.asarray(a.residuals.image) * np.asarray(a.values.sigma_xy)
     count = np.bincount(a.structure.image, minlength=n)
     square = np.bincount(a.structure.image, (v**2).sum(axis=0), minlength=n)
-    off, position = np.full((n, 3), np.nan), np.full(n, "none", object)
+    offset, position = np.full((n, 3), np.nan), np.full(n, "none", object)
     if part.placed:
         at = [block.images.index(name) for name in part.placed.images]
         start = np.asarray(part.placed.block.start.unknowns.exterior.position)[at]
-        off[at] = part.placed.offsets_m + start - np.asarray(a.unknowns.exterior.position)[at]
+        offset[at] = part.placed.offsets_m + start - np.asarray(a.unknowns.exterior.position)[at]
         position[at] = np.where(part.placed.used, "used", "left out")
     rms = np.sqrt(square / np.maximum(2 * count, 1)) / pixel
     columns = {"image": block.images, "n_image_points": count, "rms_px": rms}
-    columns |= {f"d{axis}_m": off[:, k] for k, axis in enumerate(AXES)}
+    columns |= {f"d{axis}_m": offset[:, k] for k, axis in enumerate(AXES)}
     return pd.DataFrame(columns | {"position": position})
 
 
@@ -156,8 +156,8 @@ def flight_verdict(flight: CalibratedFlight, reports: Sequence[PartReport], spoi
 def camera_sentences(report: PartReport) -> Iterator[str]:
     """c, x_p and y_p with their standard deviations, and the readout of a rolling shutter."""
     table = report.tables.interior
-    known = table[table["sigma"].notna() & table["parameter"].isin(("c_mm", "xp_mm", "yp_mm"))]
-    each = zip(known["parameter"], known["value"], known["sigma"], strict=True)
+    estimated = table[table["sigma"].notna() & table["parameter"].isin(("c_mm", "xp_mm", "yp_mm"))]
+    each = zip(estimated["parameter"], estimated["value"], estimated["sigma"], strict=True)
     if values := [f"{symbol(name)} = {plus_minus(value, sigma)}" for name, value, sigma in each]:
         yield f"{', '.join(values)} mm"
     yield from (finding.text for finding in shutter_findings(report.tables))
@@ -175,8 +175,8 @@ def flight_page(
     folders: Sequence[str],
 ) -> str:
     """The page as HTML; `folders` have the results of the parts. The largest part is reported in full."""
-    given = sum(len(r.images) for r in reports) + len(left_out) + len(spoilt)
-    parts: list[Part] = [flight_summary(reports, given), *verdict_parts(verdict)]
+    n_images = sum(len(r.images) for r in reports) + len(left_out) + len(spoilt)
+    parts: list[Part] = [flight_summary(reports, n_images), *verdict_parts(verdict)]
     parts += _unused(left_out, spoilt)
     first, *others = reports
     for sections in (coverage_section(first), positions_section(first, source), surveyed_section(first)):
@@ -198,14 +198,14 @@ def flight_page(
     return page(f"Flight report: {first.part.adjusted.block.title}", parts, (verdict.headline, verdict.colour))
 
 
-def flight_summary(reports: Sequence[PartReport], given: int) -> pd.DataFrame:
+def flight_summary(reports: Sequence[PartReport], n_images: int) -> pd.DataFrame:
     """The summary of each part of the images that were `given`."""
     columns = {}
     for number, r in enumerate(reports, 1):
         adjusted, used = r.part.adjusted, r.images[r.images["position"] == "used"]
         rms = ", ".join(f"{float(np.sqrt((used[f'd{axis}_m'] ** 2).mean())):.3g}" for axis in AXES)
         state = r.part.controlled.state if r.part.controlled else ()
-        rows = {"images oriented": f"{len(adjusted.block.images)} of {given}"} | summary_table(r.tables)
+        rows = {"images oriented": f"{len(adjusted.block.images)} of {n_images}"} | summary_table(r.tables)
         del rows["images"]
         rows |= flight_words(r.coverage, adjusted.block)
         rows["recorded positions"] = f"{len(used)} used, RMS difference {rms} m (X, Y, Z)" if len(used) else "none used"
@@ -298,14 +298,16 @@ def offset_statistics(table: pd.DataFrame) -> pd.DataFrame:
     """axis, n, mean_m, sd_m, rms_m, rms_of_steps_m, largest_m, image: offsets of images in their order, by axis."""
     rows = []
     for axis in AXES:
-        known = table[table[f"d{axis}_m"].notna()]
-        d = known[f"d{axis}_m"].to_numpy(float)
+        with_offset = table[table[f"d{axis}_m"].notna()]
+        d = with_offset[f"d{axis}_m"].to_numpy(float)
         if not len(d):
             continue
         sd = float(np.std(d, ddof=1)) if len(d) > 1 else np.nan
         step = float(np.sqrt(np.mean(np.diff(d) ** 2) / 2)) if len(d) > 1 else np.nan
         k = int(np.abs(d).argmax())
-        rows.append((axis, len(d), d.mean(), sd, float(np.sqrt(np.mean(d**2))), step, d[k], known["image"].iloc[k]))
+        rows.append(
+            (axis, len(d), d.mean(), sd, float(np.sqrt(np.mean(d**2))), step, d[k], with_offset["image"].iloc[k])
+        )
     columns = ["axis", "n", "mean_m", "sd_m", "rms_m", "rms_of_steps_m", "largest_m", "image"]
     return pd.DataFrame(rows, columns=columns).round(3)
 
@@ -327,13 +329,13 @@ def surveyed_parts(control: ControlledBlock) -> Iterator[Part]:
     """The same without a heading."""
     state, rows = np.array(control.state, object), []
     for what in ("control", "check"):
-        off = control.off_m[state == what]
-        if len(off):
+        discrepancy = control.off_m[state == what]
+        if len(discrepancy):
             cells = {
                 f"d{axis}: mean / sd / rms [m]": axis_cell(d, r)
-                for axis, d, r in zip(AXES, off.T, rmse(control, what), strict=True)
+                for axis, d, r in zip(AXES, discrepancy.T, rmse(control, what), strict=True)
             }
-            rows.append({"points": what, "n": len(off), **cells})
+            rows.append({"points": what, "n": len(discrepancy), **cells})
     yield pd.DataFrame(rows)
     if control.sentences:
         yield Paragraph(" ".join(map(as_sentence, control.sentences)))
@@ -347,11 +349,11 @@ def surveyed_parts(control: ControlledBlock) -> Iterator[Part]:
 
 def axis_cell(off_m: np.ndarray, rms_m: float) -> str:
     """Mean, standard deviation and RMS of the points that have the axis; "-" is undefined."""
-    known = off_m[np.isfinite(off_m)]
-    if not len(known):
+    values = off_m[np.isfinite(off_m)]
+    if not len(values):
         return ""
-    sd = f"{np.std(known, ddof=1):.3f}" if len(known) > 1 else "-"
-    return f"{known.mean():+.3f} / {sd} / {rms_m:.3f}"
+    sd = f"{np.std(values, ddof=1):.3f}" if len(values) > 1 else "-"
+    return f"{values.mean():+.3f} / {sd} / {rms_m:.3f}"
 
 
 def links_section(report: PartReport) -> Iterator[Part]:
@@ -479,7 +481,7 @@ def provenance_section(source: FlightSource) -> Iterator[Part]:
         rows[name] = ", ".join(dict.fromkeys(v for c in conditions if (v := getattr(c, field))))
     rows |= dict(known_conditions(conditions))
     rows["command"] = source.command
-    method = {k: v for k, v in dict(source.told.get("method", {})).items() if k != "command" and v is not None}
+    method = {k: v for k, v in dict(source.entries.get("method", {})).items() if k != "command" and v is not None}
     rows["options as used"] = ", ".join(f"{k} {option_word(v)}" for k, v in method.items())
     rows["versions"] = ", ".join(f"{name} {number}" for name, number in versions().items())
     if source.inputs:
@@ -525,10 +527,10 @@ def write_flight(
     for folder_name, r in zip(folders, reports, strict=True):
         times = {name: r.part.adjusted.seconds[name] for name in ("compile", "solve", "covariance")}
         with whole_folder(work / folder_name) as folder:
-            own = {"sigma_factor": r.sigma_factor, "flight": flight_words(r.coverage, r.part.adjusted.block)}
-            write_results(r.tables, r.verdict, folder, times, {**source.told, **own})
-            alike = with_correlated_sigma(r.tables.interior, r.part.adjusted, r.part.oriented.report.alike)
-            alike.to_csv(folder / "interior_alike.csv", index=False)
+            entries = {"sigma_factor": r.sigma_factor, "flight": flight_words(r.coverage, r.part.adjusted.block)}
+            write_results(r.tables, r.verdict, folder, times, {**source.entries, **entries})
+            correlated = with_correlated_sigma(r.tables.interior, r.part.adjusted, r.part.oriented.report.alike)
+            correlated.to_csv(folder / "interior_correlated.csv", index=False)
             if r.part.controlled:
                 write_control(r.part.controlled, folder)
             beside(r.part, folder)
@@ -545,7 +547,7 @@ def write_flight(
         "not_used": {**spoilt, **flight.left_out},
         "versions": versions(),
     }
-    write_summary(summary | dict(source.told), work)
+    write_summary(summary | dict(source.entries), work)
     return verdict
 
 
@@ -557,17 +559,11 @@ def write_part_orientation(part: FlightPart, folder: Path) -> None:
 def _summary(r: PartReport, number: int) -> dict:
     report, placed = r.part.oriented.report, r.part.placed
     return {
-        "verdict": r.verdict.colour,
-        "block": block_folder(number),
-        "result": part_folder(number),
-        "n_images": len(r.part.adjusted.block.images),
-        "n_image_points": report.n_image_points,
-        "n_points": report.n_points,
-        "mean_px": report.mean_px,
-        "alike": report.alike,
-        "epsg": r.part.adjusted.block.frame.code,
-        "positions_used": int(placed.used.sum()) if placed else 0,
+        "verdict": r.verdict.colour, "block": block_folder(number), "result": part_folder(number),
+        "n_images": len(r.part.adjusted.block.images), "n_image_points": report.n_image_points,
+        "n_points": report.n_points, "mean_px": report.mean_px, "alike": report.alike,
+        "epsg": r.part.adjusted.block.frame.code, "positions_used": int(placed.used.sum()) if placed else 0,
         "positions_left_out": [n for n, u in zip(placed.images, placed.used, strict=True) if not u] if placed else [],
         "sigma0": float(r.part.adjusted.sigma0),
         "control": control_summary(r.part.controlled) if r.part.controlled else None,
-    }
+    }  # fmt: skip

@@ -15,7 +15,7 @@ from jaxphoto.observations import AXES
 from jaxphoto.procedures.flight import FlightPart
 from jaxphoto.procedures.rolling_shutter import GAP, NEIGHBOUR_M, Moment, usual_interval, velocities
 from jaxphoto.report.findings import Verdict
-from jaxphoto.report.orientation import ALIKE
+from jaxphoto.report.orientation import CORRELATED
 from jaxphoto.report.plots import axes_or_new, label, title
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics.block_geometry import Coverage
@@ -49,8 +49,8 @@ class PartReport(NamedTuple):
     @property
     def sigma_factor(self) -> float:
         """Factor of camera sigmas for spatially correlated residuals; 1 if not significant."""
-        alike = self.part.oriented.report.alike
-        return alike if alike > ALIKE else 1.0
+        factor = self.part.oriented.report.alike
+        return factor if factor > CORRELATED else 1.0
 
 
 def offsets_less_mean(report: PartReport) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -147,11 +147,11 @@ def time_line(report: PartReport, taken: Mapping[str, Moment]) -> TimeLine:
     """The images of a part in the order in which they were `taken`."""
     images, position = report.part.adjusted.block.images, np.asarray(report.part.adjusted.unknowns.exterior.position)
     moments = np.array([taken.get(name, (np.nan, 1.0)) for name in images]).reshape(-1, 2)
-    known, n = np.isfinite(moments[:, 0]), len(images)
-    if known.sum() < 2:
+    timed_images, n = np.isfinite(moments[:, 0]), len(images)
+    if timed_images.sum() < 2:
         number = np.arange(n)
         return TimeLine(number, number.astype(float), False, np.zeros(max(n - 1, 0), bool), np.full(n, np.nan))
-    order = np.flatnonzero(known)[np.argsort(moments[known, 0], kind="stable")]
+    order = np.flatnonzero(timed_images)[np.argsort(moments[timed_images, 0], kind="stable")]
     at, speed = moments[order, 0] - moments[order[0], 0], np.full(n, np.nan)
     if report.coverage is not None:
         moving = velocities(position, moments[:, 0], moments[:, 1], NEIGHBOUR_M)

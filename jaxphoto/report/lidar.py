@@ -20,7 +20,7 @@ from jaxphoto.procedures.lidar import LidarControl, Round, Simultaneous
 from jaxphoto.procedures.lidar.vertical_control import flag_counts
 from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.formatting import without_empty, without_unit
-from jaxphoto.report.page import Heading, Link, Made, Paragraph, Part, Plot, page, provenance, verdict_parts
+from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, Plot, page, provenance, verdict_parts
 from jaxphoto.report.plots import axes_or_new, new_figure, title
 from jaxphoto.report.results import summary_of, write_results, write_study
 from jaxphoto.report.tables import Tables
@@ -98,9 +98,9 @@ def _rms(values: np.ndarray) -> float:
 
 def scanner_correlations(adjusted: Adjustment) -> pd.DataFrame:
     """parameter_a, parameter_b, rho: boresight and shifts of the scanner with each other and with the cameras."""
-    known = Tables(adjusted).covariance
-    first = 6 * known.n_images
-    rho, paths = correlation_matrix(known)[first:, first:], known.labels[first:]
+    covariance = Tables(adjusted).covariance
+    first = 6 * covariance.n_images
+    rho, paths = correlation_matrix(covariance)[first:, first:], covariance.labels[first:]
     scanner = [k for k, path in enumerate(paths) if path.startswith("scanner")]
     rows = [(paths[a], paths[b], rho[a, b]) for a in scanner for b in range(len(paths)) if a != b]
     return pd.DataFrame(rows, columns=["parameter_a", "parameter_b", "rho"])
@@ -128,9 +128,9 @@ def plot_lidar_heights(control: LidarControl, ax: Axes | None = None, *, residua
         raise InputError("no height of the cloud is control: there are no residuals to be drawn")
     ax = axes_or_new(ax)
     if residuals:
-        off = (control.height - points[:, 2])[used]
-        name = f"cloud minus adjusted: RMSE {_rms(off):.3f} m"
-        _draw_heights(ax, points[used], off, off, "cloud minus adjusted height [m]", name)
+        difference = (control.height - points[:, 2])[used]
+        name = f"cloud minus adjusted: RMSE {_rms(difference):.3f} m"
+        _draw_heights(ax, points[used], difference, difference, "cloud minus adjusted height [m]", name)
         return ax
     missing = ~np.isfinite(control.height)
     sets = ((missing, "refused", "0.6", "+"), (used, "control", "tab:blue", "o"))
@@ -176,7 +176,9 @@ def heights_figure(control: LidarControl) -> Figure:
 
 
 @contextmanager
-def write_simultaneous(result: Simultaneous, directory: Path, seconds: dict[str, float], made: Made) -> Iterator[Path]:
+def write_simultaneous(
+    result: Simultaneous, directory: Path, seconds: dict[str, float], record: CommandRecord
+) -> Iterator[Path]:
     """Tables of iterations, moves, surfaces and correlations, plot, report, summary.json, and the folder `adjustment`.
 
     Yields the folder before it is in place, for further files. Raises InputError if `directory` holds something else
@@ -187,7 +189,7 @@ def write_simultaneous(result: Simultaneous, directory: Path, seconds: dict[str,
         tables = Tables(result.adjusted)
         verdict, times = verdict_of(tables), result.adjusted.seconds
         spent = {name: times[name] for name in ("compile", "solve", "covariance")}
-        write_results(tables, verdict, work / "adjustment", spent, made=made)
+        write_results(tables, verdict, work / "adjustment", spent, record=record)
         rounds, moved, correlations = (
             rounds_table(result.rounds),
             moved_table(result),
@@ -196,19 +198,13 @@ def write_simultaneous(result: Simultaneous, directory: Path, seconds: dict[str,
         figure, free = above_figure(result), moved["sigma"].notna()
         parts: list[Part] = [
             *verdict_parts(verdict),
-            *(Paragraph(as_sentence(sentence)) for sentence in rounds_words(result.rounds, result.still)),
-            Link("all results of the images", "adjustment/report.html"),
-            Heading("Changes"),
-            moved[free],
-            Paragraph("Root mean square changes:"),
-            without_empty(moved[~free]),
-            Plot(figure, "points above the surface of the cloud, before and after"),
-            Heading("Iterations"),
-            rounds.replace(np.inf, np.nan),
-            Heading("Correlations of the scanner"),
-            Paragraph("The strongest; all are in scanner_correlation.csv."),
-            _strongest(correlations),
-        ]
+            *(Paragraph(as_sentence(sentence)) for sentence in rounds_words(result.rounds, result.converged)),
+            Link("all results of the images", "adjustment/report.html"), Heading("Changes"), moved[free],
+            Paragraph("Root mean square changes:"), without_empty(moved[~free]),
+            Plot(figure, "points above the surface of the cloud, before and after"), Heading("Iterations"),
+            rounds.replace(np.inf, np.nan), Heading("Correlations of the scanner"),
+            Paragraph("The strongest; all are in scanner_correlation.csv."), _strongest(correlations),
+        ]  # fmt: skip
         files = {
             "rounds": rounds,
             "moved": moved,
@@ -219,7 +215,8 @@ def write_simultaneous(result: Simultaneous, directory: Path, seconds: dict[str,
         write_study(
             work, f"{tables.adjusted.block.title or 'Block'} and cloud, adjusted together",
             (verdict.headline, verdict.colour), parts,
-            summary | {"rounds": len(result.rounds), "came_to_rest": result.still}, made, files, {"above": figure},
+            summary | {"rounds": len(result.rounds), "iteration_converged": result.converged}, record, files,
+            {"above": figure},
         )  # fmt: skip
         yield work
 
@@ -248,14 +245,14 @@ def print_rounds(rounds: Sequence[Round], converged: bool, console: Console) -> 
     print_lines(rounds_words(rounds, converged), console)
 
 
-def heights_page(control: LidarControl, figure: Figure, made: Made) -> str:
+def heights_page(control: LidarControl, figure: Figure, record: CommandRecord) -> str:
     """The page of heights of a cloud as control: iterations, flags, plot, and the largest differences."""
     heights = heights_table(control)
     heights.insert(5, "difference_m", heights["height_m"] - heights["Z_m"])
     largest = heights.sort_values("difference_m", key=np.abs, ascending=False, kind="stable")[:_ROWS]
     metres = largest.select_dtypes(float)
     written = {str(name): metres[name].map("{:z.3f}".format).where(metres[name].notna(), "") for name in metres}
-    words = [*rounds_words(control.rounds, control.still)]
+    words = [*rounds_words(control.rounds, control.converged)]
     words.append(f"{int(control.used.sum())} of {len(control.points)} tie points have a control height")
     parts: list[Part] = [
         *(Paragraph(as_sentence(sentence)) for sentence in words[1:]),
@@ -267,7 +264,7 @@ def heights_page(control: LidarControl, figure: Figure, made: Made) -> str:
     if flags := flag_counts(control.flag):
         parts.append(pd.DataFrame({"flag": [name.lower() for name in flags], "heights": list(flags.values())}))
     parts += [Heading("Largest differences"), without_empty(largest.assign(**written))]
-    parts += [Paragraph("All heights are in lidar_heights.csv."), *provenance(made)]
+    parts += [Paragraph("All heights are in lidar_heights.csv."), *provenance(record)]
     return page(f"{control.block.title or 'Block'}: heights of a cloud as control", parts, (words[0], ""))
 
 
@@ -275,7 +272,7 @@ def print_moved(result: Simultaneous, console: Console) -> None:
     """Print every change, one per line."""
     lines = []
     for what, before, after, moved, sigma, unit in moved_table(result).itertuples(index=False):
-        known = f" from {before:.6g} to {after:.6g}" if np.isfinite(before) else ""
+        range_words = f" from {before:.6g} to {after:.6g}" if np.isfinite(before) else ""
         spread = f" (sigma {sigma:.2g})" if np.isfinite(sigma) else ""
-        lines.append(f"  {what}:{known} by {moved:.4g} {unit}{spread}".rstrip())
+        lines.append(f"  {what}:{range_words} by {moved:.4g} {unit}{spread}".rstrip())
     print_lines(lines, console)

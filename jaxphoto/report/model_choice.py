@@ -16,7 +16,7 @@ from jaxphoto.block import Block
 from jaxphoto.errors import InputError
 from jaxphoto.procedures.model_choice import ModelChoice
 from jaxphoto.report.formatting import of_p, to_rich, without_empty
-from jaxphoto.report.page import Heading, Made, Part, Plot
+from jaxphoto.report.page import CommandRecord, Heading, Part, Plot
 from jaxphoto.report.plots import axes_or_new, label, new_figure, title
 from jaxphoto.report.results import assumed_pixels, rounded, write_study
 from jaxphoto.report.terminal import print_lines
@@ -141,7 +141,7 @@ def plot_models(choice: ModelChoice, ax: Axes | None = None, *, rms: bool = Fals
 
 
 def write_model_choice(
-    choice: ModelChoice, block: Block, directory: Path, seconds: dict[str, float], made: Made
+    choice: ModelChoice, block: Block, directory: Path, seconds: dict[str, float], record: CommandRecord
 ) -> None:
     """models.csv, parameters.csv, models.png, report.html and summary.json.
 
@@ -158,17 +158,13 @@ def write_model_choice(
         parameters,
     ]
     summary = {
-        "title": block.title,
-        "verdict": verdict,
-        "by_bic": choice.by_bic,
-        "by_prediction": choice.by_prediction,
-        "n_left_out": choice.n_left_out,
-        "models": table["model"].tolist(),
+        "title": block.title, "verdict": verdict, "by_bic": choice.by_bic, "by_prediction": choice.by_prediction,
+        "n_left_out": choice.n_left_out, "models": table["model"].tolist(),
         "seconds": rounded(seconds | {"write": time.perf_counter() - began}),
-    }
+    }  # fmt: skip
     with whole_folder(directory) as work:
         write_study(
-            work, f"{block.title or 'block'}: models", (". ".join(verdict), ""), parts, summary, made,
+            work, f"{block.title or 'block'}: models", (". ".join(verdict), ""), parts, summary, record,
             {"models": table, "parameters": parameters}, {"models": figure},
         )  # fmt: skip
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SHOWN = 6
-ALIKE = 1.2
+CORRELATED = 1.2
 """Factor of spatially correlated residuals that is significant with a few hundred rays."""
 
 
@@ -46,7 +46,7 @@ def orientation_sentences(report: OrientationReport) -> list[str]:
     elif not report.converged:
         sentences.append("warning: the last adjustment did not converge; adjust with more iterations (--max-steps)")
     sentences.append(f"estimated camera parameters: {', '.join(report.estimated) or 'none'}")
-    if report.alike > ALIKE:
+    if report.alike > CORRELATED:
         sentences.append(
             f"residuals are spatially correlated: standard deviations of the camera are {report.alike:.2g} times those "
             "of an adjustment of independent rays"

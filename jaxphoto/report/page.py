@@ -83,7 +83,7 @@ Part = Heading | Paragraph | pd.DataFrame | dict[str, str] | Plot | list[Plot] |
 """A part of a page: a dict is a list of names and values, a list of plots stands side by side, Markup as it is."""
 
 
-class Made(NamedTuple):
+class CommandRecord(NamedTuple):
     """How results came about: the command line without its output path, and the files that were read."""
 
     command: str
@@ -173,14 +173,14 @@ def verdict_parts(verdict: Verdict) -> list[Part]:
     return [Paragraph(as_sentence(f.text), f.severity) for f in verdict.findings]
 
 
-def provenance(made: Made) -> list[Part]:
+def provenance(record: CommandRecord) -> list[Part]:
     """Section of date, command, versions and hashes of the input files."""
     about = {
         "computed": datetime.date.today().isoformat(),
-        "command": made.command,
+        "command": record.command,
         "versions": ", ".join(f"{name} {number}" for name, number in versions().items()),
     }
-    return [Heading("Provenance"), about, *([hash_table(made.inputs)] if made.inputs else [])]
+    return [Heading("Provenance"), about, *([hash_table(record.inputs)] if record.inputs else [])]
 
 
 def hash_table(files: Iterable[InputFile]) -> pd.DataFrame:

@@ -142,8 +142,10 @@ _RINGS, _OF_RING = 12, 10
 def residuals_of(tables: Tables, camera: str) -> tuple[np.ndarray, np.ndarray]:
     """Image points of a camera and their residuals (2 x n, mm)."""
     a = tables.adjusted
-    mine = np.array([c == camera for c in a.block.image_camera])[a.structure.image]
-    return np.asarray(a.values.xy)[:, mine], (np.asarray(a.residuals.image) * np.asarray(a.values.sigma_xy))[:, mine]
+    of_camera = np.array([c == camera for c in a.block.image_camera])[a.structure.image]
+    return np.asarray(a.values.xy)[:, of_camera], (np.asarray(a.residuals.image) * np.asarray(a.values.sigma_xy))[
+        :, of_camera
+    ]
 
 
 def plot_residuals(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
@@ -242,10 +244,10 @@ def plot_station_residuals(tables: Tables, ax: Axes | None = None) -> Axes:
     observed = tables.residuals[tables.residuals["group"] == "stations"]
     place = observed["image"].map(dict(zip(a.block.images, number + 1, strict=True))).to_numpy(float)
     for axis, colour, mark in zip(AXES, _COLOURS, _MARKS, strict=True):
-        mine = (observed["axis"] == axis).to_numpy()
-        order = np.argsort(place[mine])
-        values = observed["residual"].to_numpy(float)[mine][order]
-        ax.plot(place[mine][order], values, f"{mark}-", ms=3, lw=0.6, color=colour, label=axis)
+        of_axis = (observed["axis"] == axis).to_numpy()
+        order = np.argsort(place[of_axis])
+        values = observed["residual"].to_numpy(float)[of_axis][order]
+        ax.plot(place[of_axis][order], values, f"{mark}-", ms=3, lw=0.6, color=colour, label=axis)
     sigma = float(np.median(a.block.stations.sigma))
     for level, style in ((0.0, "-"), (-_BARS * sigma, ":"), (_BARS * sigma, ":")):
         ax.axhline(level, color="0.6", lw=0.6, ls=style)
@@ -509,9 +511,9 @@ def plot_overlap(tables: Tables, ax: Axes | None = None) -> Axes:
 
 def draw_overlap(ax: Axes, cover: Coverage, adjusted: Adjustment) -> None:
     """Number of images per cell, and the stations."""
-    seen = np.ma.masked_less(cover.seen_by, 1)
+    counts = np.ma.masked_less(cover.seen_by, 1)
     x, y = (np.append(v - cover.step_m / 2, v[-1] + cover.step_m / 2) for v in (cover.x, cover.y))
-    shown = ax.pcolormesh(x, y, seen, cmap="viridis", rasterized=True)
+    shown = ax.pcolormesh(x, y, counts, cmap="viridis", rasterized=True)
     ax.figure.colorbar(shown, ax=ax, label="images", shrink=0.8)
     station = np.asarray(adjusted.unknowns.exterior.position)
     ax.plot(station[:, 0], station[:, 1], "w+", ms=5, mew=0.8)
@@ -543,17 +545,19 @@ def draw_network(axes: Axes, station: Float[np.ndarray, "n 2"], links: ImageLink
     lines = []
     for k, low in enumerate(limits):
         high = limits[k + 1] if k + 1 < len(limits) else np.inf
-        own = np.flatnonzero((links.common >= low) & (links.common < high))
-        one_in = max(1, -(-len(own) // _LINKS))
+        members = np.flatnonzero((links.common >= low) & (links.common < high))
+        one_in = max(1, -(-len(members) // _LINKS))
         name = f"{low} or more" if np.isinf(high) else f"{low} to {high - 1}"
         strength = k / max(len(limits) - 1, 1)
-        lines.append((own[::one_in], strength, name if one_in == 1 else f"{name}: 1 in {one_in}"))
+        lines.append((members[::one_in], strength, name if one_in == 1 else f"{name}: 1 in {one_in}"))
     way = np.linalg.norm(station[links.second] - station[links.first], axis=1)
     size = max(float(np.ptp(station, axis=0).max()), 1e-9)
-    ink = sum(float(way[own].sum()) * (0.3 + 2 * strength) for own, strength, _ in lines) / (size * _ACROSS)
+    ink = sum(float(way[members].sum()) * (0.3 + 2 * strength) for members, strength, _ in lines) / (size * _ACROSS)
     thinner = min(1.0, _INK / ink) if ink > 0 else 1.0
-    for own, strength, name in lines:
-        ends = np.stack([station[links.first[own]], station[links.second[own]], np.full((len(own), 2), np.nan)], axis=1)
+    for members, strength, name in lines:
+        ends = np.stack(
+            [station[links.first[members]], station[links.second[members]], np.full((len(members), 2), np.nan)], axis=1
+        )
         width = max(_THINNEST, thinner * (0.3 + 2 * strength))
         axes.plot(*ends.reshape(-1, 2).T, "-", color=str(0.85 - 0.75 * strength), lw=width, label=name)
     for k, w in enumerate(weak):
@@ -561,7 +565,7 @@ def draw_network(axes: Axes, station: Float[np.ndarray, "n 2"], links: ImageLink
         axes.plot(*station[[w.first, w.second]].T, "--", color="tab:red", lw=1.2, label=text)
     axes.plot(*station.T, "o", ms=3, color="tab:blue")
     axes.legend(fontsize=6, title="common points", title_fontsize=6, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    shown, n = sum(len(own) for own, _, _ in lines), len(links.common)
+    shown, n = sum(len(members) for members, _, _ in lines), len(links.common)
     title(axes, f"images and their common points{f': {shown} of {n} links' if shown < n else ''}")
     axes.set_aspect("equal", adjustable="datalim")
 

@@ -15,9 +15,8 @@ from jaxphoto.errors import camera_words, few
 from jaxphoto.observations import PRIORS, AbstractObservations, Correlated
 from jaxphoto.procedures import Snooped
 from jaxphoto.procedures.adjust import ABSURD
-from jaxphoto.procedures.mistakes import coordinate_mistakes, is_mirrored
-from jaxphoto.procedures.snooping import SEVERAL, images_out, mostly_out
-from jaxphoto.procedures.weights import MadeByBlunders
+from jaxphoto.procedures.blunder_causes import InflatedComponent, coordinate_mistakes, is_mirrored
+from jaxphoto.procedures.snooping import SEVERAL, mostly_rejected, rejected_images
 from jaxphoto.report.findings import SEVERITIES, Finding, Severity, p_words, symbol
 from jaxphoto.report.formatting import in_file_unit
 from jaxphoto.report.tables import Tables
@@ -230,7 +229,7 @@ def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
                 matters, spoilt = True, moved > _SPOILT_BY_EFFECT
                 detail += f"; {path} would move by {moved:.1f} sigma"
         elif t.pattern.camera:
-            detail += ": no single usual term is most of it; try a distortion of more terms (docs/model_choice.md)"
+            detail += ": no single usual term is most of it; try a distortion of more terms (docs/stability.md)"
         elif several := [h for h in t.hints if abs(h.amount) > SIGNIFICANT_RATIO * h.sigma][:_SHOWN]:
             detail += f", each alone {_terms(t.pattern, several)}"
         # Suspects that the term explains are no blunders.
@@ -362,7 +361,7 @@ def _common_of(name: str, rows: AbstractObservations, left: list[Suspect], block
 
 def _too_many(snooped: Snooped, block: Block) -> Iterator[Finding]:
     """Images and groups of which too much is rejected to be single errors."""
-    most = images_out(snooped, block)
+    most = rejected_images(snooped, block)
     mirrored = [k for k in most if is_mirrored(snooped, block, k)]
     for which, hint in (
         (mirrored, "They fit mirrored: x and y are exchanged, or one of them has the wrong sign"),
@@ -371,7 +370,7 @@ def _too_many(snooped: Snooped, block: Block) -> Iterator[Finding]:
         if images := [f"{block.images[k]} ({most[k][0]} of {most[k][1]})" for k in which]:
             yield Finding("rejected_images", "error", few(images), len(images), hint=hint)
     mistakes = coordinate_mistakes(snooped, block)
-    for name, counts in mostly_out(snooped, block).items():
+    for name, counts in mostly_rejected(snooped, block).items():
         many = ", ".join(f"{n} of {of} in {axis}" for axis, (n, of) in counts.items())
         hint = "Check their units, axes, names and signs, and what is held fixed"
         if name in mistakes:
@@ -399,13 +398,15 @@ def component_tables(components: VarianceComponents) -> dict[str, pd.DataFrame]:
     return {"variance_components": pd.DataFrame(columns), "variance_component_correlation": correlation}
 
 
-def component_findings(components: VarianceComponents, blunders: Sequence[MadeByBlunders] = ()) -> list[Finding]:
+def component_findings(components: VarianceComponents, blunders: Sequence[InflatedComponent] = ()) -> list[Finding]:
     """Components caused by blunders, missing convergence, and groups that support no component."""
     found = []
-    for made in blunders:
+    for component in blunders:
         hint = "Blunders are no measure of precision: adjust with --snoop as well"
-        numbers = {"words": few(list(made.words))}
-        found.append(Finding("component_blunder", "error", made.label, made.factor, made.without, hint, numbers))
+        numbers = {"words": few(list(component.words))}
+        found.append(
+            Finding("component_blunder", "error", component.label, component.factor, component.without, hint, numbers)
+        )
     if not components.converged:
         hint = "Estimate them for fewer groups"
         found.append(Finding("components_not_converged", "warning", value=components.iterations, hint=hint))

@@ -30,7 +30,17 @@ from jaxphoto.report.formatting import (
     without_empty,
     write_table,
 )
-from jaxphoto.report.page import Heading, Made, Paragraph, Part, Plot, page, provenance, verdict_parts, versions
+from jaxphoto.report.page import (
+    CommandRecord,
+    Heading,
+    Paragraph,
+    Part,
+    Plot,
+    page,
+    provenance,
+    verdict_parts,
+    versions,
+)
 from jaxphoto.report.tables import Tables, check_spread, recovery_spread, side_by_side, with_correlated_sigma
 from jaxphoto.statistics import (
     LEAST_CHECK_POINTS,
@@ -70,12 +80,12 @@ def write_results(
     verdict: Verdict,
     directory: Path,
     seconds: dict[str, float],
-    told: Mapping[str, Any] = MappingProxyType({}),
-    made: Made | None = None,
+    entries: Mapping[str, Any] = MappingProxyType({}),
+    record: CommandRecord | None = None,
 ) -> None:
     """Write the files of docs/block_folder.md into `directory`, replacing earlier results when all is written.
 
-    `seconds` (read, compile, solve, covariance) and `told` (how the results came about) go into summary.json; `made` is
+    `seconds` (read, compile, solve, covariance) and `entries` (options and inputs) go into summary.json; `record` is
     the provenance in the report. Raises what `whole_folder` raises.
     """
     began = time.perf_counter()
@@ -84,9 +94,9 @@ def write_results(
             getattr(tables, name).to_csv(work / f"{name}.csv", index=False)
             # A table of millions of rows leaves hundreds of MB behind.
             return_freed_memory()
-        (work / "report.html").write_text(report_page(tables, verdict, made), encoding="utf-8")
+        (work / "report.html").write_text(report_page(tables, verdict, record), encoding="utf-8")
         summary = summary_of(tables, verdict, seconds | {"write": time.perf_counter() - began})
-        write_summary(summary | dict(told), work)
+        write_summary(summary | dict(entries), work)
 
 
 def table_names(tables: Tables) -> tuple[str, ...]:
@@ -161,7 +171,7 @@ def write_study(
     verdict: tuple[str, str],
     parts: Iterable[Part],
     summary: Mapping[str, Any],
-    made: Made,
+    record: CommandRecord,
     tables: Mapping[str, pd.DataFrame] = MappingProxyType({}),
     figures: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
@@ -170,7 +180,7 @@ def write_study(
         table.to_csv(work / f"{name}.csv", index=False)
     for name, figure in figures.items():
         figure.savefig(work / f"{name}.png")
-    text = page(title, [*parts, *provenance(made)], verdict)
+    text = page(title, [*parts, *provenance(record)], verdict)
     (work / "report.html").write_text(text, encoding="utf-8")
     write_summary({**summary, "versions": versions()}, work)
 
@@ -191,15 +201,15 @@ def _global_test(tables: Tables) -> dict[str, Any]:
 # Report ----------------------------------------------------------------------------------------------------------
 
 
-def report_page(tables: Tables, verdict: Verdict, made: Made | None = None) -> str:
+def report_page(tables: Tables, verdict: Verdict, record: CommandRecord | None = None) -> str:
     """The report as HTML: verdict, summary, at most three findings, then all sections."""
     block = tables.adjusted.block
     parts: list[Part] = [summary_table(tables), *verdict_parts(verdict)[:_TOP]]
     if len(verdict.findings) > _TOP:
         parts += [Heading("All findings"), *verdict_parts(verdict)]
     parts += adjustment_sections(tables)
-    if made:
-        parts += provenance(made)
+    if record:
+        parts += provenance(record)
         if block.converted_from:
             parts.append(Paragraph(f"The block was converted from {block.converted_from}."))
     return page(report_title(block), parts, (verdict.headline, verdict.colour))
@@ -332,12 +342,14 @@ def interior_table(tables: Tables, start: InteriorOrientation | None = None, fac
     rows = []
     for p in table[table["sigma"].notna() | (table["value"] != 0)].to_dict("records"):
         name, pixel, estimated = p["parameter"], tables.adjusted.block.sensors[p["camera"]].pixel_mm, p["sigma"] > 0
-        in_px = plus_minus(p["value"] / pixel, p["sigma_alike"] / pixel) if estimated and name.endswith("_mm") else ""
+        in_px = (
+            plus_minus(p["value"] / pixel, p["sigma_correlated"] / pixel) if estimated and name.endswith("_mm") else ""
+        )
         rows.append({
             "camera": p["camera"], "parameter": name,
             "initial": f"{float(get_parameter(start, name)):.6g}" if start and name in parameter_names(start) else "",
             "value": with_sigma(p["value"], p["sigma"]), "sigma": of_sigma(p["sigma"]) if estimated else "fixed",
-            "sigma (correlated residuals)": of_sigma(p["sigma_alike"]) if estimated and factor > 1 else "",
+            "sigma (correlated residuals)": of_sigma(p["sigma_correlated"]) if estimated and factor > 1 else "",
             "unit": p["unit"], "in pixels": in_px, "significant": {True: "yes", False: "no"}.get(p["significant"], ""),
         })  # fmt: skip
     shown = pd.DataFrame(rows)

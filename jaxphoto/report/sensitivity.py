@@ -15,7 +15,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.observations import AXES
 from jaxphoto.report.findings import in_symbols
 from jaxphoto.report.formatting import label_unit, readable
-from jaxphoto.report.page import Heading, Made, Paragraph, Part, Plot
+from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot
 from jaxphoto.report.plots import axes_or_new, label, new_figure
 from jaxphoto.report.results import assumed_pixels, rounded, write_study
 from jaxphoto.report.tables import Tables
@@ -199,7 +199,9 @@ def _rms(values: pd.Series) -> float:
     return float(np.sqrt((values**2).mean()))
 
 
-def write_sensitivity(tables: SensitivityTables, directory: Path, seconds: dict[str, float], made: Made) -> None:
+def write_sensitivity(
+    tables: SensitivityTables, directory: Path, seconds: dict[str, float], record: CommandRecord
+) -> None:
     """Three tables, sensitivity.png, report.html and summary.json in `directory`.
 
     Raises InputError if `directory` holds something else than an earlier result.
@@ -236,7 +238,7 @@ def write_sensitivity(tables: SensitivityTables, directory: Path, seconds: dict[
     ]
     with whole_folder(directory) as work:
         summary = _summary(tables, seconds | {"write": time.perf_counter() - began})
-        write_study(work, "Sensitivity", (verdict, ""), parts, summary, made, files, {"sensitivity": figure})
+        write_study(work, "Sensitivity", (verdict, ""), parts, summary, record, files, {"sensitivity": figure})
 
 
 def _summary(tables: SensitivityTables, seconds: dict[str, float]) -> dict:
@@ -250,14 +252,8 @@ def _summary(tables: SensitivityTables, seconds: dict[str, float]) -> dict:
             "variance_shares": {str(group): float(share) for group, share in groups.items()},
         }
     return {
-        "title": adjusted.block.title,
-        "bias_m": tables.bias_m,
-        "per": tables.per,
-        "delta0": tables.delta0,
-        "sigma0": float(adjusted.sigma0),
-        "redundancy": adjusted.redundancy,
-        "check_points": len(tables.check),
-        "unchecked_observations": {name: int((~np.isfinite(v)).sum()) for name, v in mdb.items()},
-        "interior": interior,
+        "title": adjusted.block.title, "bias_m": tables.bias_m, "per": tables.per, "delta0": tables.delta0,
+        "sigma0": float(adjusted.sigma0), "redundancy": adjusted.redundancy, "check_points": len(tables.check),
+        "unchecked_observations": {name: int((~np.isfinite(v)).sum()) for name, v in mdb.items()}, "interior": interior,
         "seconds": rounded(seconds),
-    }
+    }  # fmt: skip

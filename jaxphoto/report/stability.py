@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -11,11 +11,13 @@ import pandas as pd
 from rich.console import Console
 
 from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.errors import camera_words
+from jaxphoto.procedures.compare import Halves
 from jaxphoto.report.findings import as_sentence, p_words
-from jaxphoto.report.formatting import to_rich
-from jaxphoto.report.page import Heading, Made, Paragraph, Part, Plot
+from jaxphoto.report.formatting import to_rich, without_empty
+from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot
 from jaxphoto.report.plots import axes_or_new, draw_format, draw_format_map, new_figure, title
-from jaxphoto.report.results import assumed_pixel_words, write_study
+from jaxphoto.report.results import assumed_pixel_words, assumed_pixels, write_study
 from jaxphoto.report.terminal import print_lines
 from jaxphoto.stability import ALIGNED, LEVEL, Analysis, Change, Method
 from jaxphoto.stability.comparison import change_meaning
@@ -70,14 +72,10 @@ def stability_table(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_
         alignment = np.full(6, np.nan)
         alignment[: len(v.alignment)] = v.alignment
         row = {
-            "method": method,
-            "unknowns": len(v.alignment),
-            "rmse_offset_mm": float(v.rmse_mm),
-            "rmse_offset_px": float(v.rmse_mm) / pixel_mm,
-            "rmse_measured_mm": float(v.rmse_measured_mm),
-            "largest_mm": float(np.linalg.norm(v.offsets, axis=1).max()),
-            "similar": one.similar(noise_mm),
-        }
+            "method": method, "unknowns": len(v.alignment), "rmse_offset_mm": float(v.rmse_mm),
+            "rmse_offset_px": float(v.rmse_mm) / pixel_mm, "rmse_measured_mm": float(v.rmse_measured_mm),
+            "largest_mm": float(np.linalg.norm(v.offsets, axis=1).max()), "similar": one.similar(noise_mm),
+        }  # fmt: skip
         row |= one.uncertainty._asdict() if one.uncertainty is not None else {}
         row |= dict(zip(("rx_deg", "ry_deg", "rz_deg"), np.rad2deg(alignment[:3]), strict=True))
         row |= dict(zip(("X_of_distance", "Y_of_distance", "Z_of_distance"), alignment[3:], strict=True))
@@ -89,15 +87,15 @@ def by_method(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_mm: fl
     """The same for reading, in micrometres, with a column per method."""
     table = stability_table(analyses, pixel_mm, noise_mm).set_index("method")
     um = {"RMSE_offset": "rmse_offset_mm", "as measured": "rmse_measured_mm", "largest": "largest_mm"}
-    known = "sigma_mm" in table
+    with_sigma = "sigma_mm" in table
     um |= (
         {"sigma": "sigma_mm", "95 % from": "low_mm", "95 % to": "high_mm", "one camera": "expected_of_one_mm"}
-        if known
+        if with_sigma
         else {}
     )
     rows = {f"{name} [um]": (1e3 * table[column]).map("{:.4g}".format) for name, column in um.items()}
     rows["in pixels"] = table["rmse_offset_px"].map("{:.4g}".format)
-    rows |= {"p": table["p_value"].map("{:.2g}".format)} if known else {}
+    rows |= {"p": table["p_value"].map("{:.2g}".format)} if with_sigma else {}
     return pd.DataFrame(rows).T.reset_index(names="quantity")
 
 
@@ -140,7 +138,7 @@ def print_stability(
 
 def write_stability(
     analyses: Mapping[Method, Analysis], sets: tuple[Compared, Compared], sensor: Sensor, noise_mm: float,
-    method: Method, directory: Path, made: Made,
+    method: Method, directory: Path, record: CommandRecord,
 ) -> None:  # fmt: skip
     """stability.csv, and of `method` offsets.csv and offsets.png; report.html and summary.json.
 
@@ -163,7 +161,7 @@ def write_stability(
     with whole_folder(directory) as work:
         write_study(
             work, "Stability of interior orientation", (verdict, colour), parts,
-            stability_summary(analyses, sets, noise_mm, method), made, tables, {"offsets": figure},
+            stability_summary(analyses, sets, noise_mm, method), record, tables, {"offsets": figure},
         )  # fmt: skip
 
 
@@ -173,14 +171,10 @@ def stability_summary(
     """The comparison in summary.json."""
     chosen = analyses[method]
     return {
-        "verdict": f"{method}: {chosen.verdict(noise_mm)}",
-        "method": method,
-        "similar": chosen.similar(noise_mm),
-        "noise_mm": noise_mm,
-        "rmse_offset_mm": {name: float(one.offsets.rmse_mm) for name, one in analyses.items()},
-        "n_points": len(chosen.offsets.points),
-        "covariance": {"A": sets[0].known, "B": sets[1].known},
-    }
+        "verdict": f"{method}: {chosen.verdict(noise_mm)}", "method": method, "similar": chosen.similar(noise_mm),
+        "noise_mm": noise_mm, "rmse_offset_mm": {name: float(one.offsets.rmse_mm) for name, one in analyses.items()},
+        "n_points": len(chosen.offsets.points), "covariance": {"A": sets[0].known, "B": sets[1].known},
+    }  # fmt: skip
 
 
 # Change ----------------------------------------------------------------------------------------------------------
@@ -191,8 +185,8 @@ def parameter_changes(change: Change) -> pd.DataFrame:
     different models."""
     columns = ["parameter", "first", "second", "difference", "sigma", "p_value", "unit"]
     table = pd.DataFrame(change.parameters, columns=columns)
-    known = table["sigma"] > 0
-    table.insert(5, "ratio", table["difference"].where(known) / table["sigma"].where(known))
+    estimated = table["sigma"] > 0
+    table.insert(5, "ratio", table["difference"].where(estimated) / table["sigma"].where(estimated))
     return table
 
 
@@ -275,7 +269,9 @@ def print_change(change: Change, sets: tuple[Compared, Compared], sensor: Sensor
     print_lines(change_verdict(change, sensor), console)
 
 
-def write_change(change: Change, sets: tuple[Compared, Compared], sensor: Sensor, directory: Path, made: Made) -> None:
+def write_change(
+    change: Change, sets: tuple[Compared, Compared], sensor: Sensor, directory: Path, record: CommandRecord
+) -> None:
     """parameters.csv, cells.csv, change.png, report.html and summary.json.
 
     Raises InputError if `directory` holds something else than an earlier result.
@@ -293,8 +289,9 @@ def write_change(change: Change, sets: tuple[Compared, Compared], sensor: Sensor
     verdict = change_headline(change), "amber" if change.changed else "green"
     with whole_folder(directory) as work:
         write_study(
-            work, "Change of a camera", verdict, parts, change_summary(change, sensor), made, tables, {"change": figure}
-        )
+            work, "Change of a camera", verdict, parts, change_summary(change, sensor), record, tables,
+            {"change": figure},
+        )  # fmt: skip
 
 
 def change_summary(change: Change, sensor: Sensor) -> dict[str, Any]:
@@ -310,3 +307,128 @@ def change_summary(change: Change, sensor: Sensor) -> dict[str, Any]:
         "n_beyond": int(change.beyond.sum()),
         "n_points": len(change.limit_mm),
     }
+
+
+# Sigmas from 1 from which on a factor is significant.
+_SURE = 2.0
+# Fraction of the squared differences that one unit explains, and the number of splits that makes it significant.
+_LEADS, _ENOUGH_CUTS = 0.5, 16
+
+
+def cell_table(halves: Halves) -> pd.DataFrame:
+    """One row per cell: x_mm, y_mm from the image centre; then, in pixels of the measured image,
+
+    promised_px (RMS error by the covariance of the whole block), factor, halves_px (RMS difference of two halves),
+    halves_band_px and band_px: radii that hold 95 % of the differences of halves, and of the errors of the calibration.
+    """
+    offsets = np.stack([cut.offsets_px for cut in halves.cuts])
+    columns = {
+        "x_mm": halves.cells_mm[:, 0], "y_mm": halves.cells_mm[:, 1], "promised_px": halves.promised_px,
+        "factor": halves.band.cell_factor, "halves_px": np.sqrt((offsets**2).sum(axis=2).mean(axis=0)),
+        "halves_band_px": halves.band.halves, "band_px": halves.band.calibration,
+    }  # fmt: skip
+    return pd.DataFrame(columns)
+
+
+def cut_table(halves: Halves) -> pd.DataFrame:
+    """One row per split: cut, factor, inside (fraction of cells within the band of the other splits), rms_px (of the
+    difference over the format), sigma0_first, sigma0_second, problem, first (units of one half)."""
+    by, rows = halves.adjusted.block.owners(halves.by), []
+    for k, cut in enumerate([*halves.cuts, *halves.failed]):
+        good = k < len(halves.cuts)
+        units = dict.fromkeys(unit for unit, first in zip(by, cut.first, strict=True) if first)
+        sigma0 = cut.sigma0 or (np.nan, np.nan)
+        rows.append({
+            "cut": k + 1,
+            "factor": halves.band.of_cuts[k] if good else np.nan,
+            "inside": halves.band.inside[k] if good else np.nan,
+            "rms_px": float(np.sqrt((cut.offsets_px**2).sum(axis=1).mean())) if good else np.nan,
+            "sigma0_first": sigma0[0], "sigma0_second": sigma0[1], "problem": cut.problem, "first": " ".join(units),
+        })  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def halves_verdict(halves: Halves) -> list[str]:
+    """The result in sentences."""
+    band, n, camera = halves.band, len(halves.cuts), camera_words(halves.camera)
+    deviation, factor = (band.factor - 1) / band.sigma_factor, f"{band.factor:.2f} +- {band.sigma_factor:.2f}"
+    size = "too small" if deviation > _SURE else "too large" if deviation < -_SURE else "consistent with the halves"
+    cell, wide = band.cell_factor, band.calibration
+    sentences = [
+        f"standard deviations of {camera} are {size}: factor {factor} ({n} splits by {halves.by}; bundles of rays "
+        f"{ALIGNED[halves.method]})",
+        f"over the format the factor is {cell.min():.2f} to {cell.max():.2f}; 95 % of the errors are within "
+        f"{wide.min():.3g} to {wide.max():.3g} px, by the covariances alone {(wide / cell).min():.3g} to "
+        f"{(wide / cell).max():.3g} px",
+    ]
+    inside, sigma = halves.inside
+    if np.isfinite(sigma):
+        sentences.append(
+            f"{100 * inside:.1f} +- {100 * sigma:.1f} % of the cells differ by less than the band of the other splits"
+        )
+    unit, fraction = halves.leading
+    if n >= _ENOUGH_CUTS and fraction > _LEADS:
+        sentences.append(
+            f"{100 * fraction:.0f} % of the squared differences follow {halves.by} {unit} alone: it contradicts the "
+            "others or determines what they cannot; compare with a calibration without it"
+        )
+    if halves.failed:
+        sentences.append(
+            f"{len(halves.failed)} of {n + len(halves.failed)} splits could not be compared, the first: "
+            f"{halves.failed[0].problem}"
+        )
+    return [*sentences, "errors common to both halves, such as those of fixed points, show in no difference"]
+
+
+def plot_halves(halves: Halves, ax: Axes | None = None, *, band: bool = False) -> Axes:
+    """The factor of the standard deviations over the format, or the radius of the `band` that holds 95 % (px)."""
+    ax = axes_or_new(ax)
+    name = "95 % of the errors are smaller [px]" if band else "factor of the standard deviations"
+    values = halves.band.calibration if band else halves.band.cell_factor
+    draw_format_map(ax, halves.adjusted.block.sensors[halves.camera], halves.cells_mm, name, values)
+    return ax
+
+
+def halves_figure(halves: Halves) -> Figure:
+    """Both maps of `plot_halves` side by side."""
+    figure = new_figure(9.6, 3.9)
+    for axes, band in zip(figure.subplots(1, 2), (False, True), strict=True):
+        plot_halves(halves, axes, band=band)
+    return figure
+
+
+def print_halves(halves: Halves, console: Console) -> None:
+    """Print the result."""
+    print_lines(halves_verdict(halves), console)
+
+
+def write_halves(
+    halves: Halves, directory: Path, write_camera: Callable[[Path], object], record: CommandRecord
+) -> None:
+    """cells.csv, cuts.csv, halves.png, report.html and summary.json; `write_camera` writes the camera as well.
+
+    Raises InputError if `directory` holds something else than an earlier result.
+    """
+    cells, cuts, verdict, figure = cell_table(halves), cut_table(halves), halves_verdict(halves), halves_figure(halves)
+    colour = "amber" if abs(halves.band.factor - 1) > _SURE * halves.band.sigma_factor else "green"
+    parts: list[Part] = [
+        *(Paragraph(as_sentence(sentence)) for sentence in verdict[1:]),
+        *assumed_pixels(halves.adjusted.block.sensors),
+        Heading("Over the format"),
+        Plot(figure, "maps over the format: factor of the standard deviations, radius that holds 95 % of the errors"),
+        Heading("Splits"),
+        without_empty(cuts).rename(columns={"cut": "split", "first": "first half"}),
+    ]
+    inside, sigma = halves.inside
+    summary = {
+        "title": halves.adjusted.block.title, "verdict": verdict, "camera": halves.camera, "by": halves.by,
+        "method": halves.method, "factor": halves.band.factor, "sigma_factor": halves.band.sigma_factor,
+        "inside": inside if np.isfinite(inside) else None, "sigma_inside": sigma if np.isfinite(sigma) else None,
+        "n_cuts": len(halves.cuts), "n_failed": len(halves.failed),
+    }  # fmt: skip
+    with whole_folder(directory) as work:
+        write_camera(work)
+        write_study(
+            work, f"{halves.adjusted.block.title or 'block'}: halves", (verdict[0], colour), parts, summary, record,
+            {"cells": cells, "cuts": cuts}, {"halves": figure},
+        )  # fmt: skip

@@ -18,12 +18,11 @@ from jaxphoto.lidar.raster import Raster
 from jaxphoto.observations import AttitudeSteps, PositionSteps
 from jaxphoto.procedures.lidar import StripAdjustment, StripDifference, StripRound
 from jaxphoto.procedures.lidar.strip_adjustment import PHOTOGRAPHS
-from jaxphoto.procedures.lidar.strip_control import CHECK, CONTROL
-from jaxphoto.procedures.lidar.surveyed_gaps import SurveyedGap
+from jaxphoto.procedures.lidar.strip_control import CHECK, CONTROL, SurveyedGap
 from jaxphoto.report.draws import in_degrees
 from jaxphoto.report.findings import Finding, Severity, Verdict, p_words
 from jaxphoto.report.formatting import label_unit, of_sigma, with_sigma
-from jaxphoto.report.page import Heading, Made, Paragraph, Part, Plot, verdict_parts
+from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot, verdict_parts
 from jaxphoto.report.plots import axes_or_new, draw_matrix, label, new_figure
 from jaxphoto.report.results import write_results, write_study
 from jaxphoto.report.tables import Tables
@@ -79,8 +78,8 @@ def calibration_table(result: StripAdjustment) -> pd.DataFrame:
 
     Angles in degrees.
     """
-    known, s = result.covariance, result.adjusted.structure
-    rho, sigma = correlation_matrix(known), np.asarray(known.shared_sigma)
+    covariance, s = result.covariance, result.adjusted.structure
+    rho, sigma = correlation_matrix(covariance), np.asarray(covariance.shared_sigma)
     value = np.asarray(result.adjusted.values.shared)[s.free]
     first, rows = len(rho) - len(s.free), []
     for k, path in enumerate(s.labels):
@@ -119,9 +118,9 @@ def errors_along(
     covariances, variance = np.asarray(result.covariance.matrix)[-len(place) :, -len(place) :], np.zeros_like(value)
     for c in range(value.shape[1]):
         # Fixed knots are not among the estimated ones.
-        own = np.array([place.get(labels[k][c], -1) for k in range(spline.first, spline.first + spline.size)])
-        known, by = own[own >= 0], weights[:, own >= 0]
-        variance[:, c] = np.einsum("ni,ij,nj->n", by, covariances[np.ix_(known, known)], by)
+        columns = np.array([place.get(labels[k][c], -1) for k in range(spline.first, spline.first + spline.size)])
+        estimated, by = columns[columns >= 0], weights[:, columns >= 0]
+        variance[:, c] = np.einsum("ni,ij,nj->n", by, covariances[np.ix_(estimated, estimated)], by)
     return value * _IN_FILES, np.sqrt(np.maximum(variance, 0.0)) * _IN_FILES
 
 
@@ -138,12 +137,12 @@ def _knot_labels(result: StripAdjustment) -> list[list[str]]:
 def strips_verdict(result: StripAdjustment, tables: Tables | None) -> Verdict:
     """Judge a strip adjustment; `tables` are those of the adjustment if it has images."""
     found = _sigma_naught(result) if tables is None else verdict_of(tables).findings
-    odd = (Finding("message", "warning", sentence) for sentence in result.odd)
-    return Verdict.of((*_lookups(result), *_steps(result), *odd, *_surveyed(result), *found))
+    warnings = (Finding("message", "warning", sentence) for sentence in result.warnings)
+    return Verdict.of((*_lookups(result), *_steps(result), *warnings, *_surveyed(result), *found))
 
 
 def _lookups(result: StripAdjustment) -> Iterator[Finding]:
-    if not result.still:
+    if not result.converged:
         n, change = len(result.rounds), result.rounds[-1].largest_change
         hint = "Ask for more iterations"
         yield Finding("lookups_not_converged", "error", value=change, hint=hint, numbers={"n": n})
@@ -185,11 +184,11 @@ def surveyed_summary(result: StripAdjustment) -> dict[str, dict[str, float]]:
     """Control and check points over all strips: planes, RMS of their gaps (m) before and after, and noise."""
     summary: dict[str, dict[str, float]] = {}
     for what in (CONTROL, CHECK):
-        own = [d for d in result.differences if d.one == what]
-        if own:
-            now, then = ([getattr(d, name) for d in own] for name in ("planes", "planes_before"))
+        rows = [d for d in result.differences if d.one == what]
+        if rows:
+            now, then = ([getattr(d, name) for d in rows] for name in ("planes", "planes_before"))
             counts = {"rms_before_m": then, "rms_m": now, "noise_m": now}
-            pooled = {name: _pooled([getattr(d, name) for d in own], n) for name, n in counts.items()}
+            pooled = {name: _pooled([getattr(d, name) for d in rows], n) for name, n in counts.items()}
             summary[what.replace(" ", "_")] = {"planes": sum(now), **pooled}
     return summary
 
@@ -360,7 +359,7 @@ def write_strips(
     verdict: Verdict,
     directory: Path,
     write_corrected: Callable[[Path], tuple[Raster, Raster] | None],
-    made: Made,
+    record: CommandRecord,
 ) -> None:
     """Tables, differences.png, report.html, summary.json; with images the folder `adjustment`.
 
@@ -376,19 +375,20 @@ def write_strips(
     files |= {"surveyed_points": surveyed_table(result)} if result.surveyed else {}
     with whole_folder(directory) as work:
         if tables is not None:
-            write_results(tables, verdict, work / "adjustment", seconds, made=made)
+            write_results(tables, verdict, work / "adjustment", seconds, record=record)
         all_correlations(result).round(_DIGITS).to_csv(work / "correlation.csv")
         gaps = write_corrected(work)
         figures = {} if gaps is None else {"differences": differences_figure(*gaps)}
         n = len(result.cloud.strips)
         name = f"{n} strip{'s' * (n > 1)}{' and photographs' if result.before else ''}: strip adjustment"
         summary = verdict.summary | {
-            "rounds": len(result.rounds), "came_to_rest": result.still, "sigma0": float(result.adjusted.sigma0),
+            "rounds": len(result.rounds), "iteration_converged": result.converged,
+            "sigma0": float(result.adjusted.sigma0),
             "pattern": result.errors.calibration.pattern, **surveyed_summary(result),
             "seconds": seconds | {"write": time.perf_counter() - began},
         }  # fmt: skip
         parts = [*verdict_parts(verdict), *_sections(result, files, figures.get("differences"))]
-        write_study(work, name, (verdict.headline, verdict.colour), parts, summary, made, files, figures)
+        write_study(work, name, (verdict.headline, verdict.colour), parts, summary, record, files, figures)
 
 
 def _sections(result: StripAdjustment, files: dict[str, pd.DataFrame], gaps: Figure | None) -> Iterator[Part]:
@@ -437,7 +437,7 @@ def _in_tenths_of_mm(table: pd.DataFrame) -> pd.DataFrame:
 def print_strips(result: StripAdjustment, console: Console) -> None:
     """Print iterations, gaps of strips, and the scanner."""
     last = result.rounds[-1]
-    end = f"{'' if result.still else 'not '}converged after {last.number} iterations"
+    end = f"{'' if result.converged else 'not '}converged after {last.number} iterations"
     ties = f" and {last.points} tie points on them" if last.points else ""
     ties += f" and {last.control} of control" if last.control else ""
     lines = [f"{end}; {last.planes} planes{ties}, {last.left_out} rejected"]
@@ -449,8 +449,8 @@ def print_strips(result: StripAdjustment, console: Console) -> None:
         )
     if result.trajectory is None:
         for one in trajectory_errors_table(result).to_dict("records"):
-            known = [(a, one[f"{a}_m"], one[f"sigma_{a}_m"]) for a in "XYZ" if one[f"sigma_{a}_m"] > 0]
-            shift = ", ".join(f"{a} {with_sigma(v, s)} m (sigma {of_sigma(s)})" for a, v, s in known)
+            estimated = [(a, one[f"{a}_m"], one[f"sigma_{a}_m"]) for a in "XYZ" if one[f"sigma_{a}_m"] > 0]
+            shift = ", ".join(f"{a} {with_sigma(v, s)} m (sigma {of_sigma(s)})" for a, v, s in estimated)
             lines.append(f"  strip {one['strip']}: {'shift ' + shift if shift else 'fixed'}")
     for parameter, value, sigma in calibration_table(result)[["parameter", "value", "sigma"]].itertuples(index=False):
         lines.append(f"  {parameter}: {with_sigma(value, sigma)} (sigma {of_sigma(sigma)})")

@@ -63,8 +63,8 @@ def sweep_table(sweep: Sweep) -> pd.DataFrame:
     table["value"] = np.stack([c.values for c in columns], axis=1).ravel()
     table["unit"] = [c.unit for c in columns] * n
     # NaN of a determined design means that it lacks the quantity.
-    kept = table["value"].notna() | ~(table["converged"] & table["determined"])
-    return table[kept].reset_index(drop=True)
+    usable = table["value"].notna() | ~(table["converged"] & table["determined"])
+    return table[usable].reset_index(drop=True)
 
 
 def _columns(sweep: Sweep) -> Iterator[_Column]:

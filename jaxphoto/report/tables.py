@@ -295,19 +295,15 @@ class Tables:
             return np.where(axes == "", rows.names_of("parameter", labels), axes)
 
         columns = {
-            "group": names(lambda g, rows: g),
-            "image": names(lambda g, rows: rows.names_of("image", block.images)),
-            "point": names(lambda g, rows: rows.names_of("point", block.points)),
-            "axis": names(axis),
-            "residual": in_units(residual),
-            "sigma": in_units(sigma),
+            "group": names(lambda g, rows: g), "image": names(lambda g, rows: rows.names_of("image", block.images)),
+            "point": names(lambda g, rows: rows.names_of("point", block.points)), "axis": names(axis),
+            "residual": in_units(residual), "sigma": in_units(sigma),
             "unit": names(lambda g, rows: in_file_unit(rows.unit)[1]),
-            "redundancy_number": numbers(self.redundancy.named),
-            "w": numbers(self.w.named),
+            "redundancy_number": numbers(self.redundancy.named), "w": numbers(self.w.named),
             "detectable": in_units(detectable),
             **{f"{p.removesuffix('_mm')}_moves": numbers(v) for p, v in self.undetected.interior.items()},
             "most_moves": numbers(self.undetected.most),
-        }
+        }  # fmt: skip
         return pd.DataFrame(columns, copy=False)
 
     @cached_property
@@ -342,11 +338,11 @@ class Tables:
         points = list(dict.fromkeys(rows.who.tolist()))
         place = {p: k for k, p in enumerate(points)}
         at = [place[p] for p in rows.who.tolist()], rows.axis
-        off, sigma = np.full((len(points), 3), np.nan), np.full((len(points), 3), np.nan)
-        off[at] = rows.value
+        difference, sigma = np.full((len(points), 3), np.nan), np.full((len(points), 3), np.nan)
+        difference[at] = rows.value
         sigma[at] = np.hypot(np.asarray(rows.sigma), np.asarray(self.covariance.point_sigma)[rows.who, rows.axis])
         columns: dict[str, Any] = {"point": [self.adjusted.block.points[p] for p in points]}
-        columns |= {f"d{axis}_m": off[:, k] for k, axis in enumerate(AXES)}
+        columns |= {f"d{axis}_m": difference[:, k] for k, axis in enumerate(AXES)}
         return pd.DataFrame(columns | {f"sigma_d{axis}_m": sigma[:, k] for k, axis in enumerate(AXES)})
 
     @cached_property
@@ -480,10 +476,10 @@ def side_by_side(table: pd.DataFrame, rows: list[str], column: str, value: str) 
 
 
 def with_correlated_sigma(interior: pd.DataFrame, adjusted: Adjustment, factor: float) -> pd.DataFrame:
-    """The interior orientations with the column `sigma_alike`: `sigma` for spatially correlated residuals.
+    """The interior orientations with the column `sigma_correlated`: `sigma` for spatially correlated residuals.
 
     The information of the rays is divided by `factor`^2, that of priors is not: with sigma s and prior p, the rays
-    alone give 1 / d^2 = 1 / s^2 - 1 / p^2, and `sigma_alike` combines p and `factor` d, parameter by parameter.
+    alone give 1 / d^2 = 1 / s^2 - 1 / p^2, and `sigma_correlated` combines p and `factor` d, parameter by parameter.
     """
     weights = []
     for camera, parameter in interior[["camera", "parameter"]].itertuples(index=False):
@@ -492,7 +488,7 @@ def with_correlated_sigma(interior: pd.DataFrame, adjusted: Adjustment, factor: 
     before, sigma = np.array(weights), interior["sigma"].to_numpy(float)
     total = before + np.maximum(1 / sigma**2 - before, 0.0) / max(factor, 1.0) ** 2
     scaled = np.where(total > 0, 1 / np.sqrt(np.where(total > 0, total, 1.0)), sigma)
-    return interior.assign(sigma_alike=np.where(np.isfinite(sigma), np.maximum(scaled, sigma), np.nan))
+    return interior.assign(sigma_correlated=np.where(np.isfinite(sigma), np.maximum(scaled, sigma), np.nan))
 
 
 # Recovery of a simulation: (estimate - truth) / sigma is standard normal if the model is right, except for the datum.

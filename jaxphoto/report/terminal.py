@@ -59,9 +59,9 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
     if len(points := tables.check_points):
         spread = check_spread(points)
         spread = spread[spread["n"] > 0].drop(columns="unit").rename(columns=lambda c: f"{c}_m" if c[0] in "mr" else c)
-        off = [(points[f"d{a}_m"], points[f"sigma_d{a}_m"]) for a in spread["axis"]]
-        spread["largest at"] = [str(points["point"].iloc[int(np.nanargmax(np.abs(d)))]) for d, _ in off]
-        spread["RMS / sigma"] = [f"{np.sqrt(np.nanmean((d / s) ** 2)):.2f}" for d, s in off]
+        spreads = [(points[f"d{a}_m"], points[f"sigma_d{a}_m"]) for a in spread["axis"]]
+        spread["largest at"] = [str(points["point"].iloc[int(np.nanargmax(np.abs(d)))]) for d, _ in spreads]
+        spread["RMS / sigma"] = [f"{np.sqrt(np.nanmean((d / s) ** 2)):.2f}" for d, s in spreads]
         console.print(to_rich(spread, "check points"))
     if tables.truth:
         recovery = recovery_spread(tables.recovery)

@@ -183,12 +183,12 @@ def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
         return []
     geometry = f"nearly flat ground (relief {100 * relief:.0f} % of the flying height) in near-vertical images"
     sigma = {s.parameter: s.sigma for s in tables.significance if s.camera == camera}
-    corner, words, found = at_corner(tables, camera), camera_words(camera), []
+    corner, words, findings = at_corner(tables, camera), camera_words(camera), []
 
     def add(code: str, parameters: tuple[str, ...], value: float, hint: str, numbers: dict[str, Any]) -> None:
         finding = Finding(code, "warning", words, value, hint=hint, numbers={"geometry": geometry, **numbers})
         pairs = frozenset((e, p) for e in c.eop_names for p in c.parameters if p in parameters)
-        found.append(Weakness(finding, pairs, frozenset(f"interior[{camera}].{name}" for name in parameters)))
+        findings.append(Weakness(finding, pairs, frozenset(f"interior[{camera}].{name}" for name in parameters)))
 
     rho = _strongest(c, _HEIGHT, _C)
     if rho > WEAK_CORRELATION and corner["c_mm"] > FELT:
@@ -204,7 +204,7 @@ def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
         hint = f"{cure} with strips in both directions, relief or oblique images, or hold it fixed"
         numbers = {"sigmas": sigmas, "tilts": " and ".join(c.eop_names[_TILTS]), "tilt": tilt, "shift": shift}
         add("principal_point_weak", _POINT, max(sigma.get(n, 0.0) for n in _POINT), hint, {**numbers, "why": why})
-    return found
+    return findings
 
 
 def at_corner(tables: Tables, camera: str) -> dict[str, float]:
@@ -214,22 +214,22 @@ def at_corner(tables: Tables, camera: str) -> dict[str, float]:
     """
     adjusted = tables.adjusted
     sensor, rows = adjusted.block.sensors[camera], adjusted.block.image_points
-    mine = np.isin(adjusted.structure.image, np.flatnonzero(np.array(adjusted.block.image_camera) == camera))
-    measured = float(np.median(np.asarray(rows.sigma)[mine])) if mine.any() else 1.0
+    of_camera = np.isin(adjusted.structure.image, np.flatnonzero(np.array(adjusted.block.image_camera) == camera))
+    measured = float(np.median(np.asarray(rows.sigma)[of_camera])) if of_camera.any() else 1.0
     tangent = np.hypot(sensor.width_mm, sensor.height_mm) / 2 / float(adjusted.unknowns.interior[camera].c)
     units = dict(zip(adjusted.structure.labels, yardsticks(adjusted).shared.tolist(), strict=True))
     units |= {f"interior[{camera}].c_mm": measured / tangent}
     units |= {f"interior[{camera}].{name}": measured for name in _POINT}
-    own = [s for s in tables.significance if s.camera == camera]
-    return {s.parameter: s.sigma / units[f"interior[{camera}].{s.parameter}"] for s in own}
+    tests = [s for s in tables.significance if s.camera == camera]
+    return {s.parameter: s.sigma / units[f"interior[{camera}].{s.parameter}"] for s in tests}
 
 
 def _geometry(adjusted: Adjustment, images: np.ndarray) -> tuple[float, float]:
     """Relief over flying height, and the largest tilt (degrees); infinite if the images do not look down."""
     rows = adjusted.structure
-    seen = np.unique(rows.point[np.isin(rows.image, images)])
-    heights = np.asarray(adjusted.unknowns.points)[seen, 2]
-    flying = np.asarray(adjusted.unknowns.exterior.position)[images, 2].mean() - heights.mean() if len(seen) else 0.0
+    points = np.unique(rows.point[np.isin(rows.image, images)])
+    heights = np.asarray(adjusted.unknowns.points)[points, 2]
+    flying = np.asarray(adjusted.unknowns.exterior.position)[images, 2].mean() - heights.mean() if len(points) else 0.0
     if not flying > 0:
         return math.inf, math.inf
     axis = np.asarray(adjusted.unknowns.exterior.camera_from_object)[images][:, 2, 2]
@@ -311,8 +311,8 @@ def _correlated(
         yield finding("correlation_interior", "note", pairs[0][2], names)
     if len(c.images) == 0:
         return
-    known = [[(e, p) in explained for p in c.parameters] for e in c.eop_names]
-    worst = np.where(np.reshape(known, c.max_abs.shape), 0.0, c.max_abs)
+    expected = [[(e, p) in explained for p in c.parameters] for e in c.eop_names]
+    worst = np.where(np.reshape(expected, c.max_abs.shape), 0.0, c.max_abs)
     high = sorted(np.argwhere(worst > HIGH_CORRELATION).tolist(), key=lambda k: -worst[k[0], k[1]])
     if high:
         images = [c.images[int(np.abs(c.exterior[:, i, j]).argmax())] for i, j in high]
@@ -325,8 +325,8 @@ def _correlated(
         hint = f"Add {', or '.join(cures)}" if weak else f"Its uncertainty moves no image corner by {FELT:g} sigma"
         severity: Severity = "warning" if weak else "note"
         yield finding("correlation_exterior", severity, float(worst.max()), names, hint)
-    own = np.abs(c.within_image).max(axis=0)
-    strong = [(own[i, j], i, j) for i in range(6) for j in range(i) if own[i, j] > HIGH_OWN_CORRELATION]
+    within = np.abs(c.within_image).max(axis=0)
+    strong = [(within[i, j], i, j) for i in range(6) for j in range(i) if within[i, j] > HIGH_OWN_CORRELATION]
     if strong:
         names = [f"{c.eop_names[j]} and {c.eop_names[i]} (up to {r:.3f})" for r, i, j in sorted(strong)[::-1]]
         reason = "usual without camera stations or attitudes, their effects on the ground cancel"
@@ -453,8 +453,8 @@ def differences_finding(differences: CameraDifferences) -> Finding:
             words, over, test, _mdbs([n for n, _ in each], [float(test.detectable[k].max()) for _, k in each])
         )
     changes = []
-    for name, own in each:
-        ends = (int(own[end(test.value[own])]) for end in (np.argmin, np.argmax))
+    for name, tables_of in each:
+        ends = (int(tables_of[end(test.value[tables_of])]) for end in (np.argmin, np.argmax))
         place = "at {} min" if spline else "in strip {}"
         texts = (f"{_signed(name, test, k)} {place.format(differences.at[k])}" for k in ends)
         changes.append(f"{_symbol(name)} from {' to '.join(texts)}")

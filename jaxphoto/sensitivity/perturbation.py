@@ -117,7 +117,7 @@ def trajectory_arrays(block: Block, kind: str, per: str) -> list[BiasedArray]:
     if not any(isinstance(rows, steps) and len(rows) for rows in block.more):
         raise InputError(
             f"block {block.title!r} has no trajectory of a laser scanner for a bias of kind {kind}: use the block of a "
-            "strip adjustment (docs/joint.md), or --bias station"
+            "strip adjustment (docs/boresight.md), or --bias station"
         )
     return [*_knots(block, field, per), *_steps(block, steps, per)]
 

@@ -14,11 +14,8 @@ from jaxphoto.camera import InteriorOrientation, RollingShutter, Sensor
 from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.parameters import AbstractParameters
 from jaxphoto.short_repr import pretty_repr
-from jaxphoto.simulation.convergent_plan import ConvergentPlan, Field
-from jaxphoto.simulation.flight_plan import FlightPlan, Swaths
-from jaxphoto.simulation.scan_plan import ScanPlan, Triple
-from jaxphoto.simulation.settlement import Settlement
-from jaxphoto.simulation.terrain import Terrain
+from jaxphoto.simulation.plans import ConvergentPlan, Field, FlightPlan, ScanPlan, Swaths, Triple
+from jaxphoto.simulation.scene import Settlement, Terrain
 
 Role = Literal["control", "vertical", "check", "tie"]
 """Role of a target: control in X, Y and Z, control in Z only, check point, or tie point of a target's precision."""

@@ -4,25 +4,231 @@ Every pulse travels from the scanner along a ray fixed in the aircraft. It ends 
 comes first; a hit on a wall gives no return, so buildings cast shadows. On its way it may hit leaves.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Array, Float, Int, UInt8
 
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError
-from jaxphoto.georeferencing import PATTERN_OF, Scanner, StripErrors, Trajectory
-from jaxphoto.rotation import quaternion_from_matrix, small_rotation
-from jaxphoto.simulation.buildings import entered, solids
-from jaxphoto.simulation.chunks import in_chunks
-from jaxphoto.simulation.nearby import pairs_along
-from jaxphoto.simulation.platform_path import Path, matrices
-from jaxphoto.simulation.scan_errors import drawn_errors, drawn_shift, measured_shot, turned_by
-from jaxphoto.simulation.scan_plan import ScanPlan
-from jaxphoto.simulation.streams import stream
-from jaxphoto.simulation.terrain import Terrain
-from jaxphoto.simulation.trees import met_leaves
+from jaxphoto.georeferencing import (
+    PATTERN_OF,
+    Mount,
+    Scanner,
+    ScannerCalibration,
+    StripErrors,
+    StripSpline,
+    Trajectory,
+    corrected_shot,
+)
+from jaxphoto.rotation import (
+    matrix_from_quaternion,
+    matrix_from_roll_pitch_yaw,
+    quaternion_from_matrix,
+    roll_pitch_yaw_from_matrix,
+    small_rotation,
+)
+from jaxphoto.simulation.flight import NO_BIAS, NO_MOUNT, Flight, fly, record
+from jaxphoto.simulation.plans import FlightPlan, ScanPlan, strip_value
+from jaxphoto.simulation.recipe import Recipe
+from jaxphoto.simulation.sampling import in_chunks, stream
+from jaxphoto.simulation.scene import Terrain, entry_distances, intersect_crowns, pairs_along, solids
+
+_CHUNK_EXPOSURES, _CHUNK_POINTS = 64, 65_536
+# From the end of a strip to the beginning of the next.
+_GAP_S = 60.0
+
+
+class Path(NamedTuple):
+    """True path of the scanner during one strip."""
+
+    strip: str
+    height_m: float
+    """Planned height above the mean terrain."""
+    length_m: float
+    """Planned length over ground."""
+    node: Float[np.ndarray, "nodes"]
+    """Times (s), from the beginning to the end of the strip."""
+    position: Float[np.ndarray, "nodes 3"]
+    velocity: Float[np.ndarray, "nodes 3"]
+    """Metres and metres per second."""
+    quaternion: Float[np.ndarray, "nodes 4"]
+    turn: Float[np.ndarray, "nodes 4"]
+    """(w, x, y, z) of `object_from_body`, with continuous signs, and its derivative (1/s)."""
+
+    def pose(self, time: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 4"]]:
+        """Return position (m) and unit quaternion of `object_from_body` at times (s)."""
+        quaternion = _hermite(self.node, self.quaternion, self.turn, time)
+        length = np.linalg.norm(quaternion, axis=1, keepdims=True)
+        return _hermite(self.node, self.position, self.velocity, time), quaternion / length
+
+
+def matrices(quaternion: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
+    """Return rotation matrices of quaternions."""
+    return in_chunks(_matrices_from_quaternions, _CHUNK_POINTS, quaternion)
+
+
+def paths(recipe: Recipe, plan: ScanPlan, flight: Flight, mean_height: float, seed: int) -> list[Path]:
+    """Return the path of every strip of `plan`, consecutively from time zero: of `flight` or of its own.
+
+    If exposures lie on the trajectory of the scanner, time zero is their mean.
+
+    The scanner is at the reference point of GNSS and IMU, at their true positions. Positions and quaternions are cubic
+    Hermite splines through each exposure with its velocity and rotation rate. Over the ground of the first and last
+    image the path is extended straight beyond their exposures. Nodes of a separate flight deviate from the plan as
+    exposures do.
+    """
+    flown = cast(FlightPlan, recipe.plan)
+    if plan.strips:
+        flown = FlightPlan(plan.strips, flown.speed_m_per_s)
+        flight = fly(recipe, flown, mean_height, seed, "flight of the scanner")
+    names = [recipe.mount_of(camera) for camera in flight.cameras]
+    true = [recipe.mounts[name].truth if name else NO_MOUNT for name in names]
+    # At the true time of the exposure, whatever the camera's clock.
+    mounts = [Mount(m.lever_arm, m.boresight, 0.0, m.image_x) for m in true]
+    position, attitude = record(flight, mounts, [NO_BIAS] * len(mounts))
+    quaternion = in_chunks(_quaternions_from_angles, _CHUNK_EXPOSURES, attitude)
+    turn = _turn(quaternion, np.asarray(flight.motion.rate))
+    motion = (flight.time, position, np.asarray(flight.motion.velocity), quaternion, turn)
+    result, begin, of = [], 0.0, np.array(flight.strips)
+    for strip in flown.strips:
+        lead = strip.footprint.along / 2 / flown.speed_m_per_s
+        time, *nodes = _led(lead, *(a[of == strip.name] for a in motion))
+        length = (time[-1] - time[0]) * flown.speed_m_per_s
+        result.append(Path(strip.name, strip.height_m, length, time - time[0] + begin, *nodes))
+        begin = result[-1].node[-1] + _GAP_S
+    if plan.same_trajectory:
+        middle = np.mean(np.concatenate([path.node[1:-1] for path in result]))
+        result = [path._replace(node=path.node - middle) for path in result]
+    return result
+
+
+def _led(lead: float, time, position, velocity, quaternion, turn) -> tuple[np.ndarray, ...]:
+    """Return the nodes of one strip and two more, `lead` seconds before and after; signs of quaternions are continuous.
+
+    There the velocity and the attitude are those of the first and the last exposure, without rotation.
+    """
+    turned = np.einsum("ni,ni->n", quaternion[1:], quaternion[:-1]) < 0
+    sign = np.concatenate([[1.0], np.cumprod(np.where(turned, -1.0, 1.0))])[:, None]
+    quaternion, turn = quaternion * sign, turn * sign
+    if lead:
+        time = np.concatenate([[time[0] - lead], time, [time[-1] + lead]])
+        position = np.vstack([position[0] - lead * velocity[0], position, position[-1] + lead * velocity[-1]])
+        velocity, quaternion = (np.vstack([a[:1], a, a[-1:]]) for a in (velocity, quaternion))
+        turn = np.vstack([np.zeros(4), turn, np.zeros(4)])
+    return time, position, velocity, quaternion, turn
+
+
+def _turn(quaternion: Float[np.ndarray, "n 4"], rate: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4"]:
+    """Return the derivative of the quaternion: q (0, rate / 2), the rate about the body's axes (rad/s)."""
+    (w, v), half = (quaternion[:, :1], quaternion[:, 1:]), rate / 2
+    return np.hstack([-np.sum(v * half, axis=1, keepdims=True), w * half + np.cross(v, half)])
+
+
+@jax.jit
+@jax.vmap
+def _quaternions_from_angles(roll_pitch_yaw):
+    return quaternion_from_matrix(matrix_from_roll_pitch_yaw(roll_pitch_yaw))
+
+
+@jax.jit
+@jax.vmap
+def _matrices_from_quaternions(quaternion):
+    return matrix_from_quaternion(quaternion)
+
+
+def _hermite(
+    node: Float[np.ndarray, "k"], value: Float[np.ndarray, "k m"], slope: Float[np.ndarray, "k m"], at: np.ndarray
+) -> Float[np.ndarray, "n m"]:
+    """Return the cubics with `value` and `slope` at every node."""
+    i = np.clip(np.searchsorted(node, at, side="right") - 1, 0, len(node) - 2)
+    step = (node[i + 1] - node[i])[:, None]
+    u = (at - node[i])[:, None] / step
+    ends = value[i] * (1 + 2 * u) * (1 - u) ** 2 + value[i + 1] * (3 - 2 * u) * u**2
+    return ends + step * u * (1 - u) * (slope[i] * (1 - u) - slope[i + 1] * u)
+
+
+# Iterations from a corrected shot to the measured one: each reduces the error by a factor of the errors' size.
+_STEPS = 3
+
+
+def draw_errors(plan: ScanPlan, paths: list[Path], seed: int) -> StripErrors:
+    """Draw the errors of the scanner of `plan`, and those of its trajectory: shifts, and drifts about them.
+
+    Drifts are Gauss-Markov processes (`observations.knot_steps`) from knot to knot.
+    """
+    splines: list[StripSpline] = []
+    position, attitude = [], []
+    for path in paths:
+        first = sum(s.size for s in splines)
+        splines.append(StripSpline.over(first, float(path.node[0]), float(path.node[-1]), plan.knots_s))
+        drift = _drift(splines[-1], plan.correlation_s, stream(seed, f"drift of lidar strip {path.strip}"))
+        # Linear in the times of the coefficients is linear in time.
+        gone = (splines[-1].times - np.mean(path.node[[0, -1]]))[:, None]
+        shift = draw_shift(plan, path.strip, seed) + gone * strip_value(plan.drift_m_per_s, path.strip)
+        turn = strip_value(plan.attitude_deg, path.strip) + gone * strip_value(
+            plan.attitude_drift_deg_per_s, path.strip
+        )
+        position.append(shift + np.array(plan.drift_sigma_m) * drift[:, :3])
+        attitude.append(np.deg2rad(turn + np.array(plan.drift_sigma_deg) * drift[:, 3:]))
+    scales = (np.array(v) for v in (plan.range_offset_m, plan.range_scale_ppm, plan.angle_scale_ppm))
+    numbers: Any = (
+        np.array(plan.lever_arm_m),
+        *scales,
+        np.deg2rad(plan.eccentricity_deg),
+        np.array(plan.time_offset_s),
+    )
+    calibration = ScannerCalibration(*numbers, PATTERN_OF[plan.pattern])  # type: ignore[call-arg]
+    boresight = np.deg2rad(plan.boresight_deg)
+    return StripErrors(tuple(splines), np.concatenate(position), np.concatenate(attitude), boresight, calibration)
+
+
+def draw_shift(plan: ScanPlan, strip: str, seed: int) -> Float[np.ndarray, "3"]:
+    """Draw the shift of a strip (m), about which it drifts."""
+    drawn = stream(seed, f"shift of lidar strip {strip}").standard_normal(3)
+    return strip_value(plan.shift_m, strip) + np.array(plan.shift_sigma_m) * drawn
+
+
+def recorded_shot(
+    in_body: Float[np.ndarray, "n 3"], boresight: Float[np.ndarray, "3"], calibration: ScannerCalibration
+) -> Float[np.ndarray, "n 3"]:
+    """Return the shots (m) as georeferencing assumes them, from those between trajectory and hit.
+
+    The inverse of `georeferencing.corrected_return` at a trajectory without error.
+    """
+    true = (in_body + calibration.lever_arm) @ np.asarray(_rotation(boresight))
+    shot = true
+    if any(np.any(of) for of in jax.tree.leaves(calibration)):
+        for _ in range(_STEPS):
+            shot = shot + true - in_chunks(lambda s: _corrected(s, calibration), _CHUNK_POINTS, shot)
+    return shot
+
+
+def rotate_body(
+    object_from_body: Float[np.ndarray, "n 3 3"], attitude: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3 3"]:
+    """Return the attitudes of a trajectory with the error `attitude` (rad)."""
+    return object_from_body @ in_chunks(_rotations, _CHUNK_POINTS, -attitude) if np.any(attitude) else object_from_body
+
+
+def _drift(spline: StripSpline, correlation_s: float, rng: np.random.Generator) -> Float[np.ndarray, "knots 6"]:
+    """Draw six processes of standard deviation 1."""
+    noise = rng.standard_normal((spline.size, 6))
+    memory = np.exp(-spline.interval / correlation_s)
+    for k in range(1, spline.size):
+        noise[k] = memory * noise[k - 1] + np.sqrt(1 - memory**2) * noise[k]
+    return noise
+
+
+_rotation = jax.jit(small_rotation)
+_rotations = jax.jit(jax.vmap(small_rotation))
+
+
+@jax.jit
+def _corrected(shot: Float[Array, "n 3"], calibration: ScannerCalibration) -> Float[Array, "n 3"]:
+    return jax.vmap(corrected_shot, (0, None))(shot, calibration)
+
 
 GROUND, VEGETATION, ROOF = 2, 5, 6
 """LAS classes (ASPRS): ground, high vegetation, building."""
@@ -33,8 +239,7 @@ _PRISMS_HZ = (121.7, -77.3)
 _ENOUGH_M = 1e-7
 _ROUNDS = 60
 # Pulses processed at a time: bounds the memory.
-_CHUNK = 500_000
-_CHUNK_RECORDS = 65_536
+_PULSES_AT_ONCE = 500_000
 # Limits of the memory of a cloud, and of a trajectory.
 _PULSES, _RECORDS = 1e8, 2e7
 
@@ -58,27 +263,21 @@ class _Returns(NamedTuple):
     by: UInt8[np.ndarray, "returns"]
 
 
-def scan(
-    plan: ScanPlan,
-    paths: list[Path],
-    terrain: Terrain,
-    noise_m: Float[np.ndarray, "3"],
-    seed: int,
-) -> Scan:
+def scan(plan: ScanPlan, paths: list[Path], terrain: Terrain, noise_m: Float[np.ndarray, "3"], seed: int) -> Scan:
     """Scan `terrain`, which is drawn and settled, from the path of every strip; strips are called 1, 2 ... in turn.
 
     The trajectory has shift and drift errors by strip, the shots those of boresight and calibration: with these,
     `corrected_return` of every point is the point that was hit plus normal noise of `noise_m` (X, Y, Z). Raises
     BlockError without returns, and with more than memory can hold.
     """
-    errors = drawn_errors(plan, paths, seed)
+    errors = draw_errors(plan, paths, seed)
     leaves, noise = stream(seed, "laser returns from crowns"), stream(seed, "noise of laser points")
     parts = []
     pulses_of = _pulses(plan, paths)
     for number, path in enumerate(paths):
         n = round(pulses_of[number])
-        for begin in range(0, n, _CHUNK):
-            pulses = np.arange(begin, min(begin + _CHUNK, n))
+        for begin in range(0, n, _PULSES_AT_ONCE):
+            pulses = np.arange(begin, min(begin + _PULSES_AT_ONCE, n))
             time, aside = _pattern(plan, path, pulses, n)
             parts.append(_measured(path, time, aside, terrain, errors, number, noise_m, leaves, noise))
             parts[-1]["strip"] = np.full(len(parts[-1]["time"]), number)
@@ -87,7 +286,7 @@ def scan(
     of_points = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     # Integers, as cloud files require.
     names = tuple(f"{number + 1}" for number in range(len(paths)))
-    shifts = [drawn_shift(plan, path.strip, seed) for path in paths]
+    shifts = [draw_shift(plan, path.strip, seed) for path in paths]
     truth = Scanner(errors.boresight, dict(zip(names, shifts, strict=True)))  # type: ignore[arg-type]
     return Scan(Cloud(**of_points, strips=names), _trajectory(paths, errors), truth, errors)
 
@@ -173,12 +372,12 @@ def _measured(
     number = np.arange(len(pulse)) - first[of_pulse] + 1
     # Solve `corrected_return` for the recorded point; noise is that of the corrected point.
     hit = ray[pulse] * at[:, None] + origin[pulse] - position[pulse] + noise.standard_normal((len(pulse), 3)) * noise_m
-    shot = measured_shot(
+    shot = recorded_shot(
         _rotated(object_from_body[pulse].transpose(0, 2, 1), hit), errors.boresight, errors.calibration
     )
     shift, turn = errors.at(strip, recorded[pulse])
     return {
-        "xyz": believed_position[pulse] + shift + _rotated(turned_by(believed_turn[pulse], turn), shot),
+        "xyz": believed_position[pulse] + shift + _rotated(rotate_body(believed_turn[pulse], turn), shot),
         "classification": by,
         "returns": np.column_stack([number, count[of_pulse]]).astype(np.uint8),
         "time": recorded[pulse],
@@ -193,12 +392,12 @@ def _returned(
     if terrain.buildings:
         roof, wall = _built(origin, ray, ground, terrain)
     end = np.minimum(np.minimum(ground, roof), wall)
-    seen = np.isfinite(ground)
-    met = met_leaves(terrain.trees, origin, ray, np.where(seen, end, 0.0), rng)
-    last = np.flatnonzero(seen & (wall > end) & ~met.stopped)
+    hits = np.isfinite(ground)
+    leaves = intersect_crowns(terrain.trees, origin, ray, np.where(hits, end, 0.0), rng)
+    last = np.flatnonzero(hits & (wall > end) & ~leaves.stopped)
     by_last = np.where(roof[last] <= ground[last], ROOF, GROUND)
-    by = np.concatenate([np.full(len(met.pulse), VEGETATION), by_last]).astype(np.uint8)
-    return _Returns(np.concatenate([met.pulse, last]), np.concatenate([met.at, end[last]]), by)
+    by = np.concatenate([np.full(len(leaves.pulse), VEGETATION), by_last]).astype(np.uint8)
+    return _Returns(np.concatenate([leaves.pulse, last]), np.concatenate([leaves.at, end[last]]), by)
 
 
 def _ground(origin: np.ndarray, ray: np.ndarray, terrain: Terrain) -> Float[np.ndarray, "n"]:
@@ -222,11 +421,11 @@ def _built(
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Return the distance at which each ray first enters a building by its roof, and by a wall."""
     planes = solids(terrain.buildings)
-    seen = np.flatnonzero(np.isfinite(ground))
-    hit = origin[seen] + ground[seen, None] * ray[seen]
-    which, place = pairs_along(hit, ray[seen], planes.centre, planes.radius, planes.top)
-    pulse = seen[place]
-    by_roof, by_wall = entered(planes, which, origin[pulse], ray[pulse])
+    hits = np.flatnonzero(np.isfinite(ground))
+    hit = origin[hits] + ground[hits, None] * ray[hits]
+    which, place = pairs_along(hit, ray[hits], planes.centre, planes.radius, planes.top)
+    pulse = hits[place]
+    by_roof, by_wall = entry_distances(planes, which, origin[pulse], ray[pulse])
     roof, wall = (np.full(len(ray), np.inf) for _ in range(2))
     np.minimum.at(roof, pulse, by_roof)
     np.minimum.at(wall, pulse, by_wall)
@@ -238,12 +437,12 @@ def _trajectory(paths: list[Path], errors: StripErrors) -> Trajectory:
     ends = [(path.node[0], path.node[-1]) for path in paths]
     times = [np.linspace(begin, end, int(np.ceil((end - begin) * _RATE_HZ)) + 1) for begin, end in ends]
     poses = [path.pose(time) for path, time in zip(paths, times, strict=True)]
-    off = [errors.at(k, time) for k, time in enumerate(times)]
-    position = np.vstack([x + shift for (shift, _), (x, _) in zip(off, poses, strict=True)])
+    errors_at = [errors.at(k, time) for k, time in enumerate(times)]
+    position = np.vstack([x + shift for (shift, _), (x, _) in zip(errors_at, poses, strict=True)])
     exact = np.zeros((len(position), 3))
-    quaternion, turn = np.vstack([q for _, q in poses]), np.vstack([turn for _, turn in off])
+    quaternion, turn = np.vstack([q for _, q in poses]), np.vstack([turn for _, turn in errors_at])
     if np.any(turn):
-        quaternion = in_chunks(_quaternions, _CHUNK_RECORDS, turned_by(matrices(quaternion), turn))
+        quaternion = in_chunks(_quaternions, _CHUNK_POINTS, rotate_body(matrices(quaternion), turn))
     return Trajectory(np.concatenate(times), position, quaternion, exact, exact)  # type: ignore[arg-type]
 
 
@@ -253,3 +452,33 @@ def _rotated(matrix: Float[np.ndarray, "n 3 3"], vector: Float[np.ndarray, "n 3"
 
 _small_rotation = jax.jit(small_rotation)
 _quaternions = jax.jit(jax.vmap(quaternion_from_matrix))
+
+
+def exposure_times(paths: list[Path], flight: Flight) -> Float[np.ndarray, "images"]:
+    """Return the times of all images, on the clock of the paths (s)."""
+    time, of = np.zeros(len(flight.images)), np.array(flight.strips)
+    for path in paths:
+        # A path extends beyond its first and last exposure.
+        time[of == path.strip] = path.node[1:-1]
+    return time
+
+
+def recorded_on_path(
+    position: Float[np.ndarray, "images 3"],
+    roll_pitch_yaw: Float[np.ndarray, "images 3"],
+    time: Float[np.ndarray, "images"],
+    paths: list[Path],
+    flight: Flight,
+    errors: StripErrors,
+) -> tuple[Float[np.ndarray, "images 3"], Float[np.ndarray, "images 3"]]:
+    """Return positions (m) and angles (rad) of the exposures with the trajectory errors at their times."""
+    offset, turn, of = np.zeros_like(position), np.zeros_like(position), np.array(flight.strips)
+    for k, path in enumerate(paths):
+        on_path = of == path.strip
+        offset[on_path], turn[on_path] = errors.at(k, time[on_path])
+    turned = rotate_body(in_chunks(_matrices_from_angles, _CHUNK_EXPOSURES, roll_pitch_yaw), turn)
+    return position + offset, in_chunks(_angles, _CHUNK_EXPOSURES, turned)
+
+
+_matrices_from_angles = jax.jit(jax.vmap(matrix_from_roll_pitch_yaw))
+_angles = jax.jit(jax.vmap(roll_pitch_yaw_from_matrix))

@@ -1,4 +1,4 @@
-"""A recipe and a seed -> a block with known truth."""
+"""Simulate a block with known truth from a recipe and a seed."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -17,55 +17,61 @@ from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Mount, RigCamera, StripBias, StripErrors, Trajectory
 from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
 from jaxphoto.short_repr import simulation_html, simulation_repr
-from jaxphoto.simulation.changing_cameras import (
+from jaxphoto.simulation.camera_changes import (
     Circumstances,
+    camera_motions,
     camera_steps,
-    deviated,
-    drawn,
-    seen_by_changing,
+    draw_changes,
+    draw_deviations,
+    reproject_changing,
     with_changes,
+    with_shutters,
 )
-from jaxphoto.simulation.convergent import take_images
-from jaxphoto.simulation.convergent_plan import ConvergentPlan
-from jaxphoto.simulation.exposures_on_path import exposure_times, recorded_on_path
-from jaxphoto.simulation.flight import NO_BIAS, NO_MOUNT, Flight, fly, record, turned
-from jaxphoto.simulation.flight_plan import FlightPlan
-from jaxphoto.simulation.platform_path import Path, paths
-from jaxphoto.simulation.points import TruePoints, scatter
+from jaxphoto.simulation.flight import (
+    NO_BIAS,
+    NO_MOUNT,
+    Flight,
+    add_rig_images,
+    fly,
+    gnss_images,
+    has_delay,
+    record,
+    relative_rows,
+    rig_rows,
+    rotate_cameras,
+    take_images,
+)
+from jaxphoto.simulation.plans import ConvergentPlan, FlightPlan
+from jaxphoto.simulation.points import TruePoints, scatter, thin_rays
 from jaxphoto.simulation.recipe import Assumed, Recipe, SimulatedBias, Triple, triple
-from jaxphoto.simulation.relative_poses import relative_rows
-from jaxphoto.simulation.rig import rig_rows, rigged, runs_late, with_gnss
-from jaxphoto.simulation.rolling_shutter import camera_motions, with_shutters
-from jaxphoto.simulation.scan import Scan, scan
-from jaxphoto.simulation.streams import stream
-from jaxphoto.simulation.terrain import Terrain
-from jaxphoto.simulation.visibility import thinned
+from jaxphoto.simulation.sampling import stream
+from jaxphoto.simulation.scan import Path, Scan, exposure_times, paths, recorded_on_path, scan
+from jaxphoto.simulation.scene import Terrain
 from jaxphoto.unknowns import FIXED, FREE, Unknowns
 
-# Control axes of each role, and the places that the mean height of the ground is taken from.
+# Control axes of each role, and number of places for the mean height of the ground.
 _AXES = {"control": (0, 1, 2), "vertical": (2,), "check": (0, 1, 2)}
 _PLACES = 4096
 
 
 class Simulation(eqx.Module):
-    """A block and what is true of it; with a lidar also its cloud and trajectory. As a tuple: the first three.
+    """Simulated block and its truth; with a lidar also cloud and trajectory. As a tuple: the first three.
 
-    `truth` has the mounts and strips of the recipe, whether the block's model knows of them or not, and the scanner;
-    the shifts of its strips contain `datum_offset_m`. So `remeasure(block, truth, key)` measures the same flight once
-    more, with noise of the stated sigmas.
+    `truth` has all mounts and strips of the recipe, modelled or not, and the scanner; the shifts of its strips contain
+    `datum_offset_m`. `remeasure(block, truth, key)` draws new observations with noise of the stated sigmas.
     """
 
     block: Block
     truth: Unknowns
     datum_offset_m: Float[np.ndarray, "3"]
     terrain: Terrain = eqx.field(static=True)
-    """The ground that was drawn, and what stands on it."""
+    """With its random parts drawn."""
     cloud: Cloud | None = None
-    """As measured; where neither drifts nor calibration are wrong, `corrected_point` with `truth.scanner` mends it."""
+    """As measured; without drifts and calibration errors, `corrected_point` with `truth.scanner` corrects it."""
     trajectory: Trajectory | None = None
-    """Of the scanner, as GNSS and IMU gave it; its time is that of the cloud."""
+    """Recorded trajectory of the scanner, on the clock of the cloud."""
     errors: StripErrors | None = None
-    """All that the cloud is truly off by: `corrected_return` by these is where pulses came back, but for noise."""
+    """True errors of the cloud: `corrected_return` with these gives the hits, except for noise."""
 
     def __iter__(self) -> Iterator[Any]:
         return iter((self.block, self.truth, self.datum_offset_m))
@@ -77,21 +83,21 @@ class Simulation(eqx.Module):
 
 
 def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
-    """Fly (or stand), place points, measure: the block of `recipe` that `seed` draws, bit for bit the same each time.
+    """Simulate the block of `recipe` for `seed`, reproducible bit by bit.
 
-    Ground, flight, points and each kind of noise have random streams of their own: a change of a sigma changes neither
-    geometry nor the other noise, and scales its own. Raises BlockError where points or images see too little.
+    Ground, flight, points and each kind of noise have independent random streams: changing a sigma changes neither
+    geometry nor other noise, and scales its own. Raises BlockError if points or images have too few rays.
     """
     terrain = recipe.settlement.settled(recipe.terrain.drawn(stream(seed, "terrain")), recipe.ground, seed)
-    # The same places for every seed: over ground that stays, the flight stays as high.
+    # The same places for every seed: over unchanged ground, the flight keeps its height.
     height = float(np.mean(terrain.height(recipe.ground.draw(stream(0, "ground"), _PLACES))))
     if isinstance(recipe.plan, ConvergentPlan):
         flight = take_images(recipe.plan, recipe.jitter, height, seed)
     else:
         flight = fly(recipe, recipe.plan, height, seed)
-    rig = deviated(recipe.rig, seed)
+    rig = draw_deviations(recipe.rig, seed)
     alone = flight
-    flight, event = rigged(recipe, alone, rig, seed)
+    flight, event = add_rig_images(recipe, alone, rig, seed)
     scene = _seen(recipe, flight, scatter(recipe, flight, terrain, seed), seed)
     mounts = [recipe.mounts[name].truth if (name := recipe.mount_of(c)) else NO_MOUNT for c in flight.cameras]
     motions = camera_motions(flight.exterior, flight.motion.velocity, flight.motion.rate, mounts)
@@ -103,8 +109,8 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     times = flight.time if clock is None else clock
     temperatures = _temperatures(recipe, times)
     when = Circumstances(times, np.zeros(len(times)) if temperatures is None else np.asarray(temperatures.above))
-    changes = drawn(recipe, flight, times, seed)
-    scene = scene._replace(rays=seen_by_changing(recipe, flight, scene.rays, scene.xyz, motions, when, changes))
+    changes = draw_changes(recipe, flight, times, seed)
+    scene = scene._replace(rays=reproject_changing(recipe, flight, scene.rays, scene.xyz, motions, when, changes))
     truth = Unknowns(
         {name: _numbers(camera.truth) for name, camera in recipe.cameras.items()},
         flight.exterior,
@@ -117,36 +123,22 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     relative = relative_rows(recipe, flight, mounts, seed)
     if on_path and clock is not None and errors is not None:
         position, attitude = recorded_on_path(position, attitude, clock, flown, flight, errors)
-    stations, attitudes = _georeferencing(recipe, position, attitude, with_gnss(recipe, flight), seed)
+    stations, attitudes = _georeferencing(recipe, position, attitude, gnss_images(recipe, flight), seed)
     control, check = _control(recipe, scene, seed)
     start, priors = _start(recipe, flight, scene, control, seed)
     known = with_shutters(recipe, flight, motions, seed, start.unknowns, priors, truth)
     unknowns, priors, truth = with_changes({**changes, RigCamera.kind: rig}, *known)
     start = dataclasses.replace(start, unknowns=unknowns)
     block = Block(
-        title=recipe.title,
-        images=flight.images,
-        points=scene.ids,
-        sensors=recipe.sensors,
-        image_camera=flight.cameras,
-        image_mount=tuple(recipe.mount_of(camera) for camera in flight.cameras),
-        image_strip=flight.strips,
-        image_time=flight.time,
-        image_points=_image_points(recipe, scene, seed),
-        control=control,
-        fixed=ControlCoordinates.none(),
-        check=check,
-        stations=stations,
-        attitudes=attitudes,
-        distances=Distances.none(),
-        datum=recipe.datum,
-        start=start,
-        priors=priors,
-        motion=flight.motion if runs_late(rig) or any(map(_runs_late, recipe.mounts.values())) else None,
-        flight_time=clock,
-        temperatures=temperatures,
+        title=recipe.title, images=flight.images, points=scene.ids, sensors=recipe.sensors, image_camera=flight.cameras,
+        image_mount=tuple(recipe.mount_of(camera) for camera in flight.cameras), image_strip=flight.strips,
+        image_time=flight.time, image_points=_image_points(recipe, scene, seed), control=control,
+        fixed=ControlCoordinates.none(), check=check, stations=stations, attitudes=attitudes,
+        distances=Distances.none(), datum=recipe.datum, start=start, priors=priors,
+        motion=flight.motion if has_delay(rig) or any(map(_has_time_offset, recipe.mounts.values())) else None,
+        flight_time=clock, temperatures=temperatures,
         more=(*camera_steps(recipe, flight, times, start.unknowns), *rig_rows(recipe, flight), *relative),
-    )
+    )  # fmt: skip
     return Simulation(block, truth, triple(recipe.datum_offset_m), terrain, cloud, trajectory, errors)
 
 
@@ -171,7 +163,7 @@ def _seen(recipe: Recipe, flight: Flight, scene: TruePoints, seed: int) -> TrueP
     """Return the scene after thinning. Raises BlockError for an image that cannot be oriented."""
     points, rays = recipe.points, scene.rays
     if points.mean_rays is not None:
-        rays = thinned(rays, len(scene.ids), points.min_images, points.mean_rays, stream(seed, "thinning"))
+        rays = thin_rays(rays, len(scene.ids), points.min_images, points.mean_rays, stream(seed, "thinning"))
     per_image = np.bincount(rays.image, minlength=len(flight.images))
     for k in np.flatnonzero(per_image < 3):
         raise BlockError(
@@ -191,7 +183,7 @@ def _image_points(recipe: Recipe, scene: TruePoints, seed: int) -> ImagePoints:
 
 
 def _control(recipe: Recipe, scene: TruePoints, seed: int) -> tuple[ControlCoordinates, ControlCoordinates]:
-    """Surveyed coordinates of control and of check points; every point draws, so roles do not move the noise."""
+    """Surveyed coordinates of control and check points; every point draws, so that roles do not change the noise."""
     surveyed = scene.xyz + _sigma(recipe.noise.control_m) * _draw(seed, "noise of control", scene.xyz.shape)
     sigma = _sigma(recipe.stated.control_m)
 
@@ -225,7 +217,7 @@ def _georeferencing(
 
 
 def _true_biases(recipe: Recipe, flight: Flight, seed: int) -> dict[str, StripBias]:
-    """Shift and drift of every strip that has any; the datum offset is part of the shift."""
+    """Shift and drift of every strip with any, including the datum offset."""
     offset, biases = triple(recipe.datum_offset_m), {}
     for strip in dict.fromkeys(flight.strips):
         bias = _bias_of(recipe, strip)
@@ -243,12 +235,12 @@ def _true_biases(recipe: Recipe, flight: Flight, seed: int) -> dict[str, StripBi
 def _start(
     recipe: Recipe, flight: Flight, scene: TruePoints, control: ControlCoordinates, seed: int
 ) -> tuple[Start, Unknowns]:
-    """Where the adjustment starts, and its priors; control stands in for approximate coordinates where it is given."""
+    """Start values and priors; control replaces approximate coordinates."""
     n, near = len(flight.images), recipe.start
-    off = _draw(seed, "approximate orientation", (2, n, 3))
-    position = np.asarray(flight.exterior.position) + near.position_m * off[0]
-    turn = np.deg2rad(near.angle_deg) * off[1]
-    exterior = ExteriorOrientation(position, turned(flight.exterior, turn))  # type: ignore[arg-type]
+    deviation = _draw(seed, "approximate orientation", (2, n, 3))
+    position = np.asarray(flight.exterior.position) + near.position_m * deviation[0]
+    turn = np.deg2rad(near.angle_deg) * deviation[1]
+    exterior = ExteriorOrientation(position, rotate_cameras(flight.exterior, turn))  # type: ignore[arg-type]
     points = np.full(scene.xyz.shape, np.nan)
     if near.points_m is not None:
         points = scene.xyz + near.points_m * _draw(seed, "approximate points", scene.xyz.shape)
@@ -278,8 +270,8 @@ def _bias_of(recipe: Recipe, strip: str) -> SimulatedBias | None:
     return recipe.biases.get(strip, recipe.biases.get("default"))
 
 
-def _runs_late(mount: Assumed[Mount]) -> bool:
-    """Whether the time offset matters: then the block needs to know how the sensor moves."""
+def _has_time_offset(mount: Assumed[Mount]) -> bool:
+    """Return True if the block needs the motion of the sensor, because a time offset is nonzero or estimated."""
     offsets = (mount.truth.time_offset, mount.start.time_offset)
     return any(float(offset) != 0 for offset in offsets) or mount.prior.time_offset != FIXED
 

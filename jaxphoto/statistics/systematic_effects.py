@@ -303,7 +303,7 @@ def _polynomials(xy: Float[np.ndarray, "2 n"], degree: int) -> Float[np.ndarray,
     return np.stack([x[i] * y[j] for i in range(degree + 1) for j in range(degree + 1 - i)])
 
 
-_CURE_ROLLING = ", or estimate a rolling shutter, which stretches the image likewise (docs/rolling_shutter.md)"
+_CURE_ROLLING = ", or estimate a rolling shutter, which stretches the image likewise (docs/time_dependent_cameras.md)"
 # Terms of Brown's model (docs/models.md), for cameras whose model lacks them.
 _BROWN_TERMS = {
     "k1": lambda x, y: (x * (x * x + y * y), y * (x * x + y * y)),

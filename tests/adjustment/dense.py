@@ -1,4 +1,4 @@
-"""The adjustment once more with dense matrices: what the structured one is tested against."""
+"""Dense matrices of an adjustment, to test the structured solver against."""
 
 import functools
 from typing import NamedTuple
@@ -34,7 +34,7 @@ def with_constraints(block):
 
 
 def prepared(block, **layout):
-    """The same in padded sizes, and where everything went."""
+    """Values and structure in padded sizes, and the padding."""
     values, structure = with_constraints(block)
     coupled = len(values.datum_eop) > 0 or bool(structure.coupled)
     padded = pad_structure(structure, dense=coupled, **layout)
@@ -84,12 +84,12 @@ class Dense(NamedTuple):
 
 @functools.cache
 def at_optimum(name: str) -> Dense:
-    """Of one of the variants of `tests.blocks`."""
+    """`Dense` of one of the variants of `tests.blocks`."""
     return dense_of(adjusted(name))
 
 
 def dense_of(a) -> Dense:
-    """Of any adjustment."""
+    """`Dense` of any adjustment."""
     equations = a.equations
     whole = jax.tree.map(np.asarray, _dense(equations.values, equations.structure))
     unknowns, rows = own_order(equations.values, a.padded)
@@ -112,7 +112,7 @@ def dense_of(a) -> Dense:
 
 
 def couples(a) -> np.ndarray:
-    """Of each residual of an adjustment, whether it couples points: distances do, and constraints of the datum."""
+    """True for each residual that couples points: distances and datum constraints."""
     named, coupled = a.residuals.named, {g.name for g in a.structure.coupled} | {"datum"}
     sizes = {name: np.size(v) for name, v in named.items()} | {"datum": len(a.residuals.datum)}
     return np.concatenate([np.full(n, name in coupled) for name, n in sizes.items()])
@@ -128,8 +128,17 @@ def in_one_list(residuals):
     return jnp.concatenate([jnp.ravel(v) for v in (residuals.image, *residuals.others, residuals.datum)])
 
 
+_ORDERS: dict[int, tuple] = {}
+
+
 def own_order(values, block):
-    """Of the block's own unknowns and residuals, in their order: their places among the padded ones."""
+    """Indices of the block's own unknowns and residuals, in their order, among the padded ones."""
+    if id(block) not in _ORDERS:
+        _ORDERS[id(block)] = block, *_own_order(values, block)
+    return _ORDERS[id(block)][1:]
+
+
+def _own_order(values, block):
     padded, places = block.structure, block.places
     zero = zero_increments(padded)
     flat, back = ravel_pytree(zero)
@@ -145,7 +154,7 @@ def own_order(values, block):
 
 
 class Rows(NamedTuple):
-    """Of `Dense` what takes no more than half of its time to compile."""
+    """The part of `Dense` that compiles in half the time."""
 
     jacobian: np.ndarray
     residuals: np.ndarray
@@ -154,7 +163,7 @@ class Rows(NamedTuple):
 
 
 def rows_of(a) -> Rows:
-    """Of any adjustment."""
+    """`Rows` of any adjustment."""
     equations = a.equations
     jacobian, residuals, sums, scale = map(np.asarray, _rows(equations.values, equations.structure))
     unknowns, rows = own_order(equations.values, a.padded)
@@ -222,7 +231,7 @@ def _dense(values, structure) -> Dense:
 
 
 def assemble(dense: Dense, s) -> np.ndarray:
-    """The dense Jacobian of image rows that the columns of rays stand for."""
+    """Assemble the dense Jacobian of image rows from the columns of rays."""
     e, q, n = 6 * s.n_images, s.n_shared, len(s.image)
     result = np.zeros((2 * n, e + q + 3 * s.n_points + 1))
     each = np.arange(n)

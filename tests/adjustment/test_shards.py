@@ -1,6 +1,6 @@
-"""Several devices and several processes: the same optimum and the same statistics as on one device.
+"""Several devices and processes give the optimum and statistics of one device.
 
-Devices and processes are set up before JAX computes, so what is compared runs in processes of its own: `main`.
+Devices are configured before JAX computes, so each case runs in a subprocess (`main`).
 """
 
 import dataclasses
@@ -27,6 +27,7 @@ from jaxphoto.statistics.reliability import redundancy_numbers
 from tests import declared
 from tests.blocks import free_network, from_afar, simulated
 from tests.levelling import HeightDifferences
+from tests.marks import slow_but
 
 ROOT = Path(__file__).resolve().parents[2]
 BLOCKS = {
@@ -37,7 +38,7 @@ BLOCKS = {
     "afar": lambda: from_afar(network := free_network(), network.start.unknowns),
     "declared": lambda: _without_coupled(declared.simulated().block),
 }
-# Compiling takes most of it (seconds); what is much slower hangs.
+# Seconds, mostly compilation.
 PATIENCE = 300
 ADDRESS, PROCESS = "JAXPHOTO_TEST_ADDRESS", "JAXPHOTO_TEST_PROCESS"
 
@@ -127,28 +128,15 @@ def assert_same(found: dict[str, np.ndarray], name: str) -> None:
     assert np.abs((found["points"] - wanted["points"]) / sigma).max() < 1e-6
 
 
-@pytest.fixture(scope="module")
-def on_three_devices(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("devices")
-    run_all(",".join(f"{name}:{shards}" for name, shards in CASES), folder, 3, [{}])
-    return folder
-
-
 # Two and three devices, each once with every kind of block: a case compiles for ten seconds.
-CASES = [("two_cameras", 3), ("surfaces", 2), ("afar", 3)]
+CASES = [("two_cameras", 3), ("surfaces", 2), ("afar", 3), ("declared", 2)]
 
 
-@pytest.mark.slow
-def test_everything_declared_is_dealt_out(tmp_path: Path) -> None:
-    run_all("declared:2", tmp_path, 2, [{}])
-    found = dict(np.load(tmp_path / "declared_2_0.npz"))
-    assert found["shards"] == 2
-    assert_same(found, "declared")
-
-
-@pytest.mark.parametrize(("name", "shards"), CASES)
-def test_several_devices_find_the_same(on_three_devices: Path, name: str, shards: int) -> None:
-    found = dict(np.load(on_three_devices / f"{name}_{shards}_0.npz"))
+@pytest.mark.parametrize("case", slow_but([("surfaces", 2)], CASES))
+def test_several_devices_find_the_same(tmp_path: Path, case: tuple[str, int]) -> None:
+    name, shards = case
+    run_all(f"{name}:{shards}", tmp_path, 3, [{}])
+    found = dict(np.load(tmp_path / f"{name}_{shards}_0.npz"))
     assert found["shards"] == shards
     assert_same(found, name)
 

@@ -28,6 +28,7 @@ def adjusted_before():
     adjusted("cross")
 
 
+@pytest.mark.slow
 def test_two_thousand_draws_as_in_the_readme_end():
     """Batched calls of LAPACK would wait for each other, at any number of cores."""
     text = (REPOSITORY / "README.md").read_text()
@@ -58,7 +59,8 @@ def test_many_draws_are_each_at_their_own_optimum():
     assert np.abs(together[40] - together[39]).max() > 1
 
 
-@pytest.mark.parametrize("order", slow_but(("vmap of grad",), ("vmap of grad", "grad of vmap", "jvp of vmap")))
+@pytest.mark.slow
+@pytest.mark.parametrize("order", ("vmap of grad", "grad of vmap", "jvp of vmap"))
 def test_derivatives_of_many_draws(order):
     """Each that of its own draw, at whose optimum differences are taken."""
     draws = np.array([[0.0, 0, 0, 0], [5.0, 0.01, 0, 0]])

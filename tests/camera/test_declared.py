@@ -31,7 +31,7 @@ from jaxphoto.io.block_folder.camera_section import Camera, camera_section
 from jaxphoto.io.block_folder.settings import read_settings
 from jaxphoto.io.toml import toml_text
 from jaxphoto.procedures.calibration import distortion_model
-from jaxphoto.procedures.camera_candidates import candidate_of
+from jaxphoto.procedures.model_choice import candidate_of
 from jaxphoto.unknowns import FIXED, FREE
 
 SENSOR = Sensor(4500, 3000, 0.008)

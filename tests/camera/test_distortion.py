@@ -4,11 +4,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxphoto.camera import DISTORTIONS, Balanced, Brown, BundlerRadial, InteriorOrientation, Sensor, Smac, invert
+from jaxphoto.camera import (
+    DISTORTIONS,
+    Balanced,
+    Brown,
+    BundlerRadial,
+    Ebner,
+    InteriorOrientation,
+    OpenCv,
+    Sensor,
+    Smac,
+    invert,
+)
 from jaxphoto.camera.distortion import AffineBrown, BrownAffine, StretchedBrown
 from tests.camera.models import AICON, FLICKR, GOPRO, GOPRO_XY, KODAK, MOST, UNITS, build
 from tests.checked_types import unchecked
 from tests.derivatives import check_derivatives, compiled
+from tests.marks import slow_but
 
 bounded = settings(max_examples=40, deadline=None, derandomize=True, database=None)
 
@@ -283,7 +295,7 @@ XY = np.concatenate([RNG.uniform(-1, 1, (8, 2)), [[0, 0], [0, 0.9], [-0.7, 0]]])
 COEFFICIENTS = np.concatenate([RNG.uniform(-1, 1, (8, MOST)), np.full((1, MOST), 0.5), np.zeros((2, MOST))])
 
 
-@pytest.mark.parametrize("model", DISTORTIONS.values())
+@pytest.mark.parametrize("model", slow_but((Brown, Smac, Balanced, OpenCv, Ebner), DISTORTIONS.values()))
 def test_derivatives_in_both_directions(model):
     # By every coefficient and both coordinates, at random points and on the optical axis.
     def both(numbers, xy):

@@ -24,70 +24,42 @@ class Given(NamedTuple):
 
 _BLOCK = "jaxphoto example cross_block --out BLOCK\n"
 _RESULTS = "jaxphoto example cross_block\njaxphoto adjust cross_block --out RESULTS\n"
-_LIDAR = "jaxphoto example lidar --out BLOCK\ncp BLOCK/cloud.laz CLOUD.laz\ncp BLOCK/trajectory.csv flight.csv\n"
-_STRIPS = _LIDAR.replace("example lidar", "example strips")
 _FLIGHT = "made_photographs flight PHOTOGRAPHS\ncp PHOTOGRAPHS.txt FILE\n"
-_YEARS = """for year in LAST_YEAR THIS_YEAR 2023 2024 2025; do
+_YEARS = """for year in LAST_YEAR THIS_YEAR; do
     jaxphoto simulate examples/recipe.toml --seed $((seed = ${seed:-0} + 1)) --out of_$year
     jaxphoto adjust of_$year --out $year
 done
 """
 
 GIVEN = {
-    "docs/boresight.md": Given("jaxphoto simulate examples/boresight.toml --out BLOCK\n"),
-    "docs/camera_files.md": Given(
-        "jaxphoto example cross_block --out block\njaxphoto adjust block --out results\n"
-        "jaxphoto camera block/block.toml --out calib.yml\n"
-        "jaxphoto camera block/block.toml --distortion smac --out report.txt\n"
-    ),
-    "docs/certificate.md": Given(_RESULTS),
-    "docs/command_line.md": Given(_BLOCK),
-    "docs/control.md": Given(
-        _FLIGHT + "jaxphoto orient PHOTOGRAPHS/*.jpg --out BLOCK\n", {"--out DIR --control": "--out FLOWN --control"}
-    ),
-    "docs/exports.md": Given(
-        _BLOCK + _RESULTS + _FLIGHT,
+    "docs/boresight.md": Given(
+        "",
         {
-            "CAMERA_OR_RESULTS": "PHOTOGRAPHS.toml",
-            "RESULTS OUT --to FORMAT": "RESULTS A --to colmap",
-            "FORMAT": "opensfm",
-        },
-    ),
-    "docs/experiments.md": Given("jaxphoto example experiments\n", {"000": "000 --layouts 1"}),
-    "docs/fly.md": Given(_FLIGHT),
-    "docs/halves.md": Given(_BLOCK + _YEARS, {"--cuts 64": "--cuts 8"}),
-    "docs/joint.md": Given(
-        _STRIPS,
-        {
-            "flight.csv --": "flight.csv --cell-m 8 --",
             # The verdict on so small a flight may be red.
-            "trajectory,camera": "trajectory,camera --knots-s 5 || test $? = 1",
+            "--out JOINT": "--knots-s 5 --out JOINT || test $? = 1",
             "--out ADJUSTED": "--out ADJUSTED || test $? = 1",
             "--out DRAWS": "--draws 20 --out DRAWS",
         },
     ),
-    "docs/orient.md": Given(_FLIGHT, {"IMAGES...": "PHOTOGRAPHS/*.jpg"}),
-    "docs/orientations.md": Given(
-        "jaxphoto example cross_block\njaxphoto convert cross_block FOLDER --to metashape --adjust\n"
+    "docs/clouds.md": Given("made_photographs blank PHOTO\n"),
+    "docs/command_line.md": Given(_BLOCK),
+    "docs/control.md": Given(_FLIGHT + "jaxphoto orient PHOTOGRAPHS/*.jpg --out BLOCK\n"),
+    "docs/formats.md": Given(_FLIGHT, {"CAMERA_OR_RESULTS": "PHOTOGRAPHS.toml"}),
+    "docs/photographs.md": Given(_FLIGHT),
+    "docs/solver.md": Given(_BLOCK + "cp -r BLOCK block\necho 'import jaxphoto' > my_script.py\n"),
+    "docs/statistics.md": Given(_BLOCK),
+    "docs/stability.md": Given(
+        _BLOCK + _RESULTS + _YEARS + "cp -r RESULTS RESULTS_A\ncp -r RESULTS RESULTS_B\n", {"--cuts 64": "--cuts 8"}
     ),
-    "docs/reconstructions.md": Given(
-        "jaxphoto example cross_block\njaxphoto convert cross_block FILE_OR_FOLDER --to openmvg --adjust\n"
-    ),
-    "docs/scaling.md": Given(_BLOCK.replace("BLOCK", "block") + "echo 'import jaxphoto' > my_script.py\n"),
-    "docs/simultaneous.md": Given(_LIDAR, {" --centroids R1,R2": ""}),
-    "docs/stability.md": Given(_RESULTS + "cp -r RESULTS RESULTS_A\ncp -r RESULTS RESULTS_B\n"),
     "docs/strip_adjustment.md": Given(
-        _STRIPS + "echo point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m > surveyed.csv\n"
-        "sed '1d; s/$/,0.02,0.02,0.02/' BLOCK/truth/object_points.csv >> surveyed.csv\n",
-        {"CLOUD.laz --": "CLOUD.laz --cell-m 8 --"},
-    ),
-    "docs/surface_model.md": Given(
-        _LIDAR + "made_photographs blank PHOTO\n", {"--cell-m 1.0": "--cell-m 5.0", "8936": "E1_03"}
+        "jaxphoto example strips --out SURVEYED\n"
+        "echo point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m > surveyed.csv\n"
+        "sed '1d; s/$/,0.02,0.02,0.02/' SURVEYED/truth/object_points.csv >> surveyed.csv\n"
     ),
     "docs/target_calibration.md": Given(
         "made_photographs board photographs\nmade_photographs board odd\nmade_photographs board even\n"
     ),
-    "docs/weights.md": Given(_BLOCK),
+    "docs/trust.md": Given(_BLOCK),
     "README.md": Given("", {".venv/bin/": ""}),
 }
 
@@ -105,24 +77,31 @@ NOT_RUN = {
         "checks that .ci/run makes",
         ".venv/bin/pytest -m quick\n.venv/bin/pytest -n 2 tests/camera\n": "runs these tests",
     },
-    "docs/experiments.md": {"jaxphoto experiment all --layouts 4\n": "hours; the pages of docs/papers run each alone"},
+    "docs/formats.md": {
+        **{
+            f"jaxphoto convert cross_block {name} --to {format} --adjust\n\njaxphoto convert {name} from_{name}\n"
+            f"jaxphoto adjust from_{name} --out results_{name}\n": "runs in test_other_programs.py"
+            for name, format in (("metashape", "metashape"), ("colmap", "colmap"), ("pix4d", "opk"))
+        },
+        'jaxphoto convert "$JAXPHOTO_DATA/sxb" strasbourg\njaxphoto adjust strasbourg --out results_dbat\n': "runs in "
+        "test_other_programs.py",
+    },
     "docs/half_an_hour.md": {"python3 -m venv venv && . venv/bin/activate && pip install jaxphoto": _INSTALLS},
     "docs/install.md": {
         "pip install 'jaxphoto'\n": _INSTALLS,
     },
-    "docs/scaling.md": {
+    "docs/solver.md": {
         "srun --cpus-per-task=32 --cpu-bind=cores python adjust_block.py\n": "wants a cluster with Slurm"
     },
 }
 
 
 # Whose blocks are of `py`, which does not run: they want several processes, as tests/adjustment/test_shards.py has.
-PYTHON_NOT_RUN = ("docs/scaling.md",)
+PYTHON_NOT_RUN = ("docs/solver.md",)
 # Pages whose blocks run in a test of their own, which looks at what comes out.
 ELSEWHERE = {
-    "docs/from_other_programs.md": "test_from_other_programs.py",
     "docs/half_an_hour.md": "test_half_an_hour.py",
-    **{f"docs/papers/{paper}.md": "test_commands_on_pages.py" for paper in ("000", "001", "003", "004")},
+    "docs/papers.md": "test_commands_on_pages.py",
 }
 _FIRST = f"""cp -r "{ROOT}/examples" .
 made_photographs() {{ PYTHONPATH="{ROOT}" python -m tests.docs.made_photographs "$@"; }}

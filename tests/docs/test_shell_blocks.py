@@ -12,7 +12,7 @@ RUN = {page.relative_to(ROOT).as_posix(): page for page in PAGES if script(page)
 QUICK = ("docs/index.md",)
 KINDS = {
     "photographs": [name for name in RUN if "made_photographs" in GIVEN.get(name, ("",))[0] and name != "README.md"],
-    "clouds": [name for name in RUN if "CLOUD" in GIVEN.get(name, ("",))[0] and name != "README.md"],
+    "clouds": [f"docs/{name}.md" for name in ("boresight", "lidar_heights", "strip_adjustment")],
 }
 HERE = set(RUN) - set(ELSEWHERE) - {"README.md"}
 OTHERS = sorted(HERE - {name for names in KINDS.values() for name in names} - set(QUICK))

@@ -17,7 +17,7 @@ from jaxphoto.experiment import read_published
 ROOT = Path(__file__).resolve().parents[2]
 
 
-PAPERS = ROOT / "docs" / "papers"
+PAPERS = ROOT / "docs" / "papers.md"
 
 
 def module_of(name):
@@ -75,10 +75,11 @@ def test_which_of_roll_and_pitch_is_omega_is_what_the_page_says():
 def test_tables_of_the_papers_are_what_is_kept_and_what_is_printed():
     tables = module_of("paper_tables")
     kept = pd.read_csv(tables.KEPT, dtype={"paper": str, "row": str})
+    page = PAPERS.read_text(encoding="utf-8")
+    assert tables.with_tables(page) == page
     for paper, cells in kept.groupby("paper"):
-        page = (PAPERS / f"{paper}.md").read_text(encoding="utf-8")
-        assert tables.with_tables(page, paper) == page
-        assert f"{(cells['within'] == 'yes').sum()} are within" in page
+        place = page.split(f"<!-- tables {paper} -->")[1].split("<!-- end of tables -->")[0]
+        assert f"{(cells['within'] == 'yes').sum()} are within" in place
         key = ["table", "row", "column"]
         printed = read_published(ROOT / "experiments" / paper).set_index(key)["published"].dropna()
         ours = cells.set_index(key)["published"].dropna()
@@ -101,15 +102,14 @@ def test_the_site_is_built_without_a_warning(tmp_path):
         # The page of what is not found is shown under any address.
         assert page.name == "404.html" or not [k for k in set(links) if not (page.parent / k).exists()], page.name
     # Names on the pages lead to the reference, formulas are MathML.
-    paper = (tmp_path / "site" / "papers" / "000.html").read_text(encoding="utf-8")
-    assert 'href="../reference/collinearity.html#jaxphoto.collinearity.project"' in paper
+    paper = (tmp_path / "site" / "papers.html").read_text(encoding="utf-8")
+    assert 'href="reference/collinearity.html#jaxphoto.collinearity.project"' in paper
     assert "<math" in paper and "$" not in re.sub(r"<annotation.*?</annotation>", "", paper)
     assert "jaxphoto.procedures.adjust.adjust" in (tmp_path / "site" / "reference" / "procedures.html").read_text()
 
 
 def test_functions_of_the_papers_are_there():
-    pages = [path.read_text(encoding="utf-8") for path in PAPERS.glob("*.md")]
-    names = {name for page in pages for name in re.findall(r"`jaxphoto\.([\w.]+)`", page)}
+    names = set(re.findall(r"`jaxphoto\.([\w.]+)`", PAPERS.read_text(encoding="utf-8")))
     assert len(names) > 35
     for name in names:
         *rooms, last = name.split(".")

@@ -1,4 +1,4 @@
-"""The experiment that docs/experiments.md writes down can be read and simulated, and its measures exist."""
+"""The example of docs/papers.md is read and simulated, and its measures exist."""
 
 import re
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import jaxphoto.experiment
 from jaxphoto.experiment import load_experiment, read_published, simulated
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "experiments.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "papers.md").read_text(encoding="utf-8")
 
 
 def listing(start: str) -> str:
@@ -32,7 +32,7 @@ def test_the_example_is_an_experiment(tmp_path):
 
 
 def test_every_measure_of_the_page_is_there():
-    rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \| ", PAGE.split("### Tables")[1].split("## Results")[0], re.MULTILINE)
+    rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \| ", PAGE.split("### Tables")[1].split("\n## ")[0], re.MULTILINE)
     named = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
     assert named <= set(jaxphoto.experiment.__all__)
     assert {"iops", "effects", "check_points"} <= named

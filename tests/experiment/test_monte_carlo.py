@@ -1,4 +1,4 @@
-"""A Monte Carlo on disk: what is promised of its files, and what becomes of a run that is stopped."""
+"""Monte Carlo runs on disk: files, and resumption after a stop."""
 
 import dataclasses
 import json
@@ -72,7 +72,7 @@ class Stop(Exception):
 
 
 @pytest.mark.parametrize("at", slow_but((1030,), (1, 1030, 1100)))
-def test_a_run_that_was_stopped_goes_on_to_the_same_file(whole, tmp_path, at):
+def test_a_stopped_run_continues_to_the_same_file(whole, tmp_path, at):
     def stop(done: int) -> None:
         if done >= at:
             raise Stop
@@ -89,7 +89,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_file(whole, tmp_path, at):
     assert not (tmp_path / "run" / "parts").exists()
 
 
-def test_what_there_is_is_summed_up_while_a_run_lasts(whole, tmp_path, monkeypatch):
+def test_partial_results_are_summarised_during_a_run(whole, tmp_path, monkeypatch):
     def stop(done: int) -> None:
         if done >= 1030:
             raise Stop
@@ -126,7 +126,7 @@ def test_of_a_large_block_every_batch_is_kept(tmp_path, monkeypatch):
     assert len(pd.read_parquet(tmp_path / "run" / "parts")) == made.run.batch_size
 
 
-def test_a_run_that_is_done_is_only_read(whole):
+def test_a_finished_run_is_only_read(whole):
     directory, (summary, _) = whole
     before = (directory / "summary.json").stat().st_mtime_ns
     again = study(directory)
@@ -155,7 +155,7 @@ def test_other_errors_of_the_same_names_are_another_run(whole):
         study(directory, errors=laplace)
 
 
-def test_settings_that_cannot_be_read_are_said_to_be_so(tmp_path):
+def test_unreadable_settings_are_refused(tmp_path):
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(InputError, match="holds no settings"):
         study(tmp_path)
@@ -198,6 +198,7 @@ def test_a_block_that_estimates_no_camera(tmp_path):
     assert not (tmp_path / "run" / "interior.png").exists()
 
 
+@pytest.mark.slow
 def test_a_block_that_estimates_a_scanner(tmp_path):
     nominal = adjusted("surfaces")
     wrong = bias(nominal.block, "station", 0.1, "block")
@@ -231,25 +232,20 @@ def folder(tmp_path_factory):
 def test_the_command(folder, monkeypatch, capsys, tmp_path):
     out = tmp_path / "run"
     options = ("--bias", "station", "--per", "strip", "--sigma-m", "0.05,0.05,0.1", "--draws", 20, "--seed", 3)
-    code, printed, _ = run(
-        monkeypatch, capsys, "monte-carlo", folder, *options, "--with", "exterior", "--with", "points", "--out", out
-    )
-    assert code == 0
-    assert "20 draws, 20 converged" in printed
+    command = ("monte-carlo", folder, *options, "--with", "exterior", "--with", "points", "--out", out)
+    code, printed, _ = run(monkeypatch, capsys, *command)
+    assert code == 0 and "20 draws, 20 converged" in printed
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "20 draws, 20 converged." in page and "--sigma-m 0.05,0.05,0.1" in page
-    assert (
-        "Images, points and trajectory knots are in summary.csv." in page
-        and f"exterior.{simulated(NOMINAL).block.images[0]}" not in page
-    )
+    assert "Images, points and trajectory knots are in summary.csv." in page
+    assert f"exterior.{simulated(NOMINAL).block.images[0]}" not in page
     draws = pd.read_parquet(out / "draws.parquet")
     block = simulated(NOMINAL).block
     strips = set(block.image_strip)
     assert {f"bias.{strip}.{axis}_m" for strip in strips for axis in "XYZ"} <= set(draws.columns)
     assert f"exterior.{block.images[0]}.kappa_deg" in draws.columns
     assert f"point.{block.points[0]}.Z_m" in draws.columns
-    shifts = [c for c in draws.columns if c.startswith("strips.")]
-    assert shifts
+    assert any(c.startswith("strips.") for c in draws.columns)
 
 
 @pytest.mark.parametrize(
@@ -257,9 +253,7 @@ def test_the_command(folder, monkeypatch, capsys, tmp_path):
     [
         (("--bias", "station", "--sigma-m", "0.1", "--on", "S9", "--per", "strip"), "unknown strip 'S9'"),
         (("--bias", "station", "--sigma-m", "0.1", "--draws", "0"), "must be positive, got 0"),
-        (("--bias", "station", "--sigma-m", "0.1", "--draws", "-5"), "must be positive, got -5"),
         (("--bias", "station", "--sigma-deg", "0.1"), "takes --sigma-m"),
-        (("--bias", "station"), "takes --sigma-m"),
         (("--bias", "station", "--sigma-m", "much"), "--sigma-m much"),
         (("--bias", "station", "--sigma-m", "-1"), "above zero"),
         (("--bias", "wind", "--sigma-m", "1"), "'wind' is not one of 'station'"),
@@ -270,20 +264,16 @@ def test_the_command(folder, monkeypatch, capsys, tmp_path):
 )
 def test_a_mistake_is_one_sentence_and_nothing_written(folder, monkeypatch, capsys, tmp_path, options, words):
     code, _, error = run(monkeypatch, capsys, "monte-carlo", folder, "--out", tmp_path / "run", *options)
-    assert code == 2
-    assert words in error
-    assert "Traceback" not in error
-    assert not (tmp_path / "run").exists()
+    assert code == 2 and words in error and "Traceback" not in error and not (tmp_path / "run").exists()
 
 
 @pytest.mark.slow
-def test_killed_in_the_middle_it_goes_on_to_the_same_file(folder, tmp_path):
+def test_a_killed_run_continues_to_the_same_file(folder, tmp_path):
     program = [sys.executable, "-c", "from jaxphoto_command import main; main()", "monte-carlo", str(folder)]
     program += ["--bias", "station", "--per", "image", "--sigma-m", "0.1", "--draws", "10000"]
     subprocess.run([*program, "--out", str(tmp_path / "whole")], check=True, capture_output=True)
-    killed = subprocess.Popen(
-        [*program, "--out", str(tmp_path / "killed")], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    killed = subprocess.Popen([*program, "--out", str(tmp_path / "killed")], **silent)
     parts = tmp_path / "killed" / "parts"
     while not list(parts.glob("part-*.parquet")):
         assert killed.poll() is None

@@ -1,4 +1,4 @@
-"""What an experiment prints for readers: names, digits, tables and pictures say what tables.csv says."""
+"""Pages of experiments: names, digits, tables and plots agree with tables.csv."""
 
 import re
 
@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from jaxphoto import Tables
 from jaxphoto.experiment import Experiment, Run, comparison_figure, plot_agreement, plot_comparison, side_by_side
 from jaxphoto.experiment.page import (
-    _STYLE,
     experiment_page,
     heading,
     own_decimals,
@@ -108,12 +107,6 @@ def test_comparison_figure_draws_ours_and_the_print():
         comparison_figure(COMPARISON, "own")
 
 
-def test_what_is_not_within_is_marked_by_more_than_colour_and_printed():
-    assert '.no::before { content: "\\2717' in _STYLE and "print-color-adjust: exact" in _STYLE
-    # A table of twenty columns would else shrink every sheet.
-    assert re.search(r"@media print .*td \+ td, th\) { white-space: normal }", _STYLE)
-
-
 def test_plots_take_and_return_axes():
     axes = Figure().add_subplot()
     assert plot_agreement(COMPARISON, axes) is axes
@@ -134,11 +127,8 @@ def test_the_page_is_made_of_the_parts_of_all_pages():
     run = Run(Experiment("A paper", {}, {}), pd.DataFrame({"layout": [0, 1]}), {"first": Tables(adjusted("cross"))}, ())
     page = experiment_page(run, COMPARISON)
     assert '<p class="verdict amber">2 of 3 printed values with a tolerance are within it' in page
-    assert [f'<a href="#{name}">' in page for name in ("table-2-iops", "own", "block-of-the-first-layout")] == [
-        True
-    ] * 3
+    assert all(f'<a href="#{name}">' in page for name in ("table-2-iops", "own", "block-of-the-first-layout"))
     # Heads that come again on every sheet and that sort, by what is ours.
-    assert (
-        page.count('<table class="as-printed">\n<thead><tr><th></th>') == 2 and 'class="no" data-value="4.10"' in page
-    )
+    assert page.count('<table class="as-printed">\n<thead><tr><th></th>') == 2
+    assert 'class="no" data-value="4.10"' in page
     assert 'querySelectorAll("table:has(thead)")' in page and not re.search(r'(src|href)="(?!data:|#)', page)

@@ -1,4 +1,4 @@
-"""The published experiments: their printed numbers are the papers', and ours come out beside them as promised."""
+"""Published experiments: printed numbers are those of the papers, and ours agree within the tolerances."""
 
 from pathlib import Path
 

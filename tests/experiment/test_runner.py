@@ -1,4 +1,4 @@
-"""Experiments: what is run is what was declared, and what is written is what was run."""
+"""Experiments run as declared, and results are written completely."""
 
 import numpy as np
 import pandas as pd
@@ -130,12 +130,9 @@ def test_comparison_holds_every_printed_and_every_own_cell_with_its_judgement(fo
 def test_a_run_is_written_whole_and_read_back(folder, run, tmp_path):
     out = tmp_path / "out"
     write_runs({folder: run}, out)
-    pd.testing.assert_frame_equal(
-        pd.read_csv(out / "tables.csv", dtype={"row": str}, keep_default_na=False, na_values=[""])[
-            ["ours", "published"]
-        ],
-        compare(run, folder)[["ours", "published"]],
-    )
+    columns = ["ours", "published"]
+    table = pd.read_csv(out / "tables.csv", dtype={"row": str}, keep_default_na=False, na_values=[""])
+    pd.testing.assert_frame_equal(table[columns], compare(run, folder)[columns])
     assert len(pd.read_csv(out / "cells.csv")) == len(run.cells)
     page = (out / "report.html").read_text()
     assert "far off" in page and "34.25" in page and "<svg" in page
@@ -160,7 +157,7 @@ def test_several_experiments_share_the_tables_and_have_a_page_each(folder, run, 
         assert "<svg" in (tmp_path / "out" / f"{name}.html").read_text()
 
 
-def test_layouts_that_cannot_be_made_are_left_out_and_told_of(folder, tmp_path):
+def test_impossible_layouts_are_skipped_with_a_message(folder, tmp_path):
     broken = tmp_path / "broken"
     broken.mkdir()
     (broken / "recipe.toml").write_text(RECIPE)
@@ -196,7 +193,7 @@ def first_coordinate(folder) -> float:
         ({"other/experiment.py": DECLARED}, "there is no experiment small.*choose other or all"),
     ],
 )
-def test_what_is_no_experiment_is_refused_with_the_mend(files, message, tmp_path):
+def test_what_is_no_experiment_is_refused(files, message, tmp_path):
     for name, text in files.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
@@ -220,15 +217,8 @@ def test_published_tables_that_cannot_be_are_refused(text, message, run, tmp_pat
 
 def test_the_command_runs_a_users_own_experiments(folder, tmp_path):
     arguments = [
-        "experiment",
-        "all",
-        "--experiments",
-        str(folder.parent),
-        "--layouts",
-        "1",
-        "--out",
-        str(tmp_path / "out"),
-    ]
+        "experiment", "all", "--experiments", str(folder.parent), "--layouts", "1", "--out", str(tmp_path / "out"),
+    ]  # fmt: skip
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
     table = pd.read_csv(tmp_path / "out" / "tables.csv")

@@ -1,4 +1,4 @@
-"""Systematic errors are found where they are modelled; where they are not, they go where first-order reasoning says."""
+"""Systematic errors are estimated if modelled, and otherwise propagate as first-order theory predicts."""
 
 import dataclasses
 from pathlib import Path

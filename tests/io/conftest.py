@@ -1,9 +1,13 @@
-"""A small block folder that has every file, for tests to read and to spoil."""
+"""A small block folder with every file, to read and to modify."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+from jaxphoto import Tables, adjust
+from jaxphoto.report import summary_of, verdict_of
+from jaxphoto.report.results import write_summary
 
 FILES = {
     "block.toml": """\
@@ -109,3 +113,12 @@ def write_folder(tmp_path: Path) -> Callable[..., Path]:
         return folder
 
     return write
+
+
+def write_calibration(block, folder: Path) -> None:
+    """Adjust a block, and write those files of results that later calibrations read."""
+    tables = Tables(adjust(block))
+    folder.mkdir()
+    for name in ("interior", "correlation"):
+        getattr(tables, name).to_csv(folder / f"{name}.csv", index=False)
+    write_summary(summary_of(tables, verdict_of(tables), {}), folder)

@@ -1,18 +1,35 @@
-"""Exported photographs of `tests.io.test_exports`, with image points as texts beside them."""
+"""Exported photographs of `tests.io.test_exports`, with image points as texts beside them; reprojection errors."""
 
 import csv
 import json
 import math
 
+import jax
 import numpy as np
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.extras.formats import ControlPoints, ProjectCamera, export
+from jaxphoto.collinearity import ExteriorOrientation, project
+from jaxphoto.extras.formats import ProjectCamera, export
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
 from tests.formulas import camera_from_object
 from tests.io.test_exports import SENSOR, photographs
+
+_projected = jax.jit(jax.vmap(project, (None, 0, 0)))
+
+
+def misfits_px(block, points=None, exterior=None):
+    """Image points measured minus projected (px), of the start values or of `points` and `exterior`."""
+    rows, start = block.image_points, block.start.unknowns
+    image = np.asarray(rows.image)
+    xyz = np.asarray(start.points if points is None else points)[np.asarray(rows.point)]
+    at = jax.tree.map(lambda leaf: np.asarray(leaf)[image], start.exterior if exterior is None else exterior)
+    cameras, found = np.array(block.image_camera, object)[image], np.zeros((len(image), 2))
+    for name, interior in start.interior.items():
+        of = np.flatnonzero(cameras == name)
+        projected = _projected(interior, jax.tree.map(lambda leaf, of=of: leaf[of], at), xyz[of])
+        found[of] = (np.asarray(rows.xy)[of] - projected) / block.sensors[name].pixel_mm
+    return found
 
 
 def inside(camera="agisoft", kind="epsg"):
@@ -48,15 +65,6 @@ def write_metashape(folder, camera="agisoft", kind="epsg", change=lambda text: t
     (folder / "image_points.csv").unlink()
     if ties:
         (folder / "bingo.txt").write_text(text_of_points(p, BINGO))
-    return folder
-
-
-def write_metashape_beside(folder):
-    """cameras.xml, image_points.csv and markers.xml as `--to metashape` writes them."""
-    p = inside()
-    often = np.argsort(-np.bincount(p.point, minlength=len(p.points)), kind="stable")[:5]
-    known = ControlPoints(often, p.xyz[often], np.full((5, 3), 0.02), np.arange(5) > 3)
-    export(p._replace(control=known, sigma_px=np.full((len(p.image), 2), 0.5)), folder, "metashape")
     return folder
 
 

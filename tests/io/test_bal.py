@@ -1,4 +1,4 @@
-"""Problems of "Bundle Adjustment in the Large": the block of a small one, its cost, and what is refused."""
+"""Problems of "Bundle Adjustment in the Large": block, cost and refusals."""
 
 import jax
 import jax.numpy as jnp
@@ -80,7 +80,7 @@ def test_half_the_weighted_square_sum_is_the_cost_of_the_problem(write):
     np.testing.assert_allclose(0.5 * np.sum(v**2), 0.5 * np.sum(NOISE**2), rtol=1e-11)
 
 
-def test_what_a_problem_becomes(write):
+def test_a_problem_is_read_as_a_block(write):
     path = write()
     block = read_source(path)
     assert block.title == "problem-3-5-pre"
@@ -152,19 +152,13 @@ def shortened(lines):
     ("change", "place"),
     [
         (replaced(1, "3 5"), "row 1"),
-        (replaced(1, "3 5 0"), "row 1"),
-        (replaced(1, "3 5 " + "9" * 5000), "row 1"),
-        (replaced(4, "0 " + "9" * 5000 + " 1.0 2.0"), "row 4"),
         (replaced(4, None), "row 15: .* is not 4 numbers"),
         (replaced(1, "3 5 13"), "46 numbers follow .* have 42 .* row 1"),
         (replaced(57, None), r"41 numbers follow .* have 42 \(9 a camera, 3 a point\)"),
         (shortened, "ends after 9 of 14 observations"),
         (replaced(3, "3 0 1.0 2.0"), "row 3: camera is 3; .* from 0 to 2"),
         (replaced(3, "1 -1 1.0 2.0"), "row 3: point is -1; .* from 0 to 4"),
-        (replaced(3, "1 0 1.0 2,0"), "row 3"),
-        (replaced(3, "1 0 nan 2.0"), "row 3"),
         (replaced(20, "1.0e"), "row 20"),
-        (replaced(20, "inf"), "row 20"),
         (replaced(31, "-500.0"), "row 31: f of camera 1 is -500"),
         (replaced(3, "0 0 1.0 2.0"), "row 3: point 0 is measured twice in image 0"),
     ],

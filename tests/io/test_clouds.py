@@ -1,4 +1,4 @@
-"""Clouds: LAS, LAZ, CSV and PLY, their systems and units, filters, and what is said of those that cannot be used."""
+"""Point clouds in LAS, LAZ, CSV and PLY: systems, units, filters, and refusals."""
 
 import dataclasses
 import warnings
@@ -69,7 +69,7 @@ def small_chunks(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["c.las", "c.laz", "c.csv", "c.ply"])
-def test_what_is_written_is_read(tmp_path, name):
+def test_clouds_round_trip(tmp_path, name):
     cloud = sample()
     clouds.write_cloud(cloud, tmp_path / name)
     read = clouds.read_cloud(tmp_path / name, LOCAL)
@@ -80,7 +80,7 @@ def test_what_is_written_is_read(tmp_path, name):
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
-def test_what_a_file_does_not_tell_is_none(tmp_path):
+def test_missing_columns_are_none(tmp_path):
     bare = Cloud(sample(50).xyz)
     for name in ("c.csv", "c.ply"):
         clouds.write_cloud(bare, tmp_path / name)
@@ -119,7 +119,7 @@ def test_strips_without_points_are_left_out(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["las", "laz"])
-def test_withheld_points_are_not_read_but_stay_in_what_is_written(tmp_path, kind):
+def test_withheld_points_are_kept_in_written_files(tmp_path, kind):
     cloud = sample(500)
     withheld = np.arange(500) % 3 == 0
     kinds = np.where(np.arange(500) % 5 == 0, 7, 2)
@@ -141,7 +141,7 @@ def test_withheld_points_are_not_read_but_stay_in_what_is_written(tmp_path, kind
             np.testing.assert_array_equal(written[name], values)
 
 
-def test_withheld_points_that_cannot_be_moved_stay(tmp_path):
+def test_withheld_points_outside_the_system_stay(tmp_path):
     """Far from any map, without a time or of a strip that nobody knows: that is why a file withholds them."""
     xyz = sample(500).xyz
     xyz[3] = [9e8, 0.0, 0.0]
@@ -340,7 +340,7 @@ def test_rewritten_part_by_part_in_its_own_system_and_units(tmp_path, name, fram
         )
 
 
-def test_what_cannot_be_rewritten_leaves_nothing(tmp_path):
+def test_failed_writes_leave_nothing(tmp_path):
     clouds.write_cloud(sample(), tmp_path / "c.laz")
 
     def moved(part):
@@ -348,10 +348,15 @@ def test_what_cannot_be_rewritten_leaves_nothing(tmp_path):
             raise InputError("no farther")
         return part.xyz
 
-    with pytest.raises(InputError, match="no farther"):
-        clouds.rewrite_cloud(tmp_path / "c.laz", tmp_path / "d.laz", moved)
-    with pytest.raises(InputError, match="of one kind"):
-        clouds.rewrite_cloud(tmp_path / "c.laz", tmp_path / "d.csv", lambda part: part.xyz)
+    source = tmp_path / "c.laz"
+    for message, write in (
+        ("no farther", lambda: clouds.rewrite_cloud(source, tmp_path / "d.laz", moved)),
+        ("of one kind", lambda: clouds.rewrite_cloud(source, tmp_path / "d.csv", lambda part: part.xyz)),
+        (r"\.laz", lambda: clouds.write_cloud(sample(10), tmp_path / "c.txt")),
+        ("both must be", lambda: clouds.write_cloud(sample(), tmp_path / "d.csv", like=source)),
+    ):
+        with pytest.raises(InputError, match=message):
+            write()
     assert [p.name for p in tmp_path.iterdir()] == ["c.laz"]
 
 
@@ -416,26 +421,19 @@ def complaint(path, frame=None, **options):
 
 
 @pytest.mark.parametrize("kind", ["las", "laz"])
-def test_cut_off_at_any_byte(tmp_path, kind):
+def test_files_that_are_cut_off(tmp_path, kind):
     clouds.write_cloud(sample(2000), tmp_path / f"c.{kind}")
     whole = (tmp_path / f"c.{kind}").read_bytes()
     cut = tmp_path / f"cut.{kind}"
-    for length in [1, 3, 4, 50, 104, 226, 300, 374, *np.linspace(380, len(whole) - 1, 25).astype(int)]:
+    for length in [0, 3, 104, 300, *np.linspace(380, len(whole) - 1, 6).astype(int)]:
         cut.write_bytes(whole[:length])
-        assert "cut off" in complaint(cut) or "no points" in complaint(cut)
-    cut.write_bytes(b"")
-    complaint(cut)
-
-
-@pytest.mark.parametrize("kind", ["las", "laz"])
-@pytest.mark.parametrize("promised", [2001, 50_000, 4_000_000_000])
-def test_fewer_points_than_promised(tmp_path, kind, promised):
-    clouds.write_cloud(sample(2000), tmp_path / f"c.{kind}")
-    content = bytearray((tmp_path / f"c.{kind}").read_bytes())
-    content[247:255] = promised.to_bytes(8, "little")
-    (tmp_path / f"c.{kind}").write_bytes(content)
-    message = complaint(tmp_path / f"c.{kind}")
-    assert "cut off" in message or ("memory" in message and promised > 1e9)
+        message = complaint(cut)
+        assert not length or "cut off" in message or "no points" in message
+    # The header promises more points.
+    content = bytearray(whole)
+    content[247:255] = (50_000).to_bytes(8, "little")
+    cut.write_bytes(content)
+    assert "cut off" in complaint(cut)
 
 
 def test_points_outside_the_header_show_damage(tmp_path):
@@ -446,22 +444,7 @@ def test_points_outside_the_header_show_damage(tmp_path):
     assert "outside the extent" in complaint(path)
 
 
-def test_damaged_bytes_never_show_a_bare_error(tmp_path):
-    clouds.write_cloud(sample(2000), tmp_path / "c.laz")
-    whole = (tmp_path / "c.laz").read_bytes()
-    rng = np.random.default_rng(7)
-    for _ in range(60):
-        content = bytearray(whole)
-        at = rng.integers(0, len(whole)) if rng.random() < 0.5 else rng.integers(0, 600)
-        content[at] ^= int(rng.integers(1, 256))
-        (tmp_path / "d.laz").write_bytes(content)
-        try:
-            clouds.read_cloud(tmp_path / "d.laz")
-        except InputError as error:
-            assert "\n" not in str(error)
-
-
-def test_files_that_are_none(tmp_path):
+def test_invalid_files_are_refused(tmp_path):
     assert "no file" in complaint(tmp_path / "none.las")
     assert "folder" in complaint(tmp_path)
     (tmp_path / "c.xyz").write_text("1 2 3\n")
@@ -486,7 +469,8 @@ def test_systems_that_do_not_fit(tmp_path):
     assert "degrees" in complaint(degrees, GRID)
     assert "99999 is unknown" in complaint(bare, UTM, epsg=99999)
     assert "not a map or geographic system" in complaint(bare, epsg=4978)
-    assert "'yard' is unknown" in complaint_of_unit(bare)
+    with pytest.raises(InputError, match="'yard' is unknown"):
+        clouds.read_cloud(bare, unit="yard")
     assert "outside the area" in complaint(utm, UTM, epsg=4326)
     assert "outside the area" in complaint(utm, UTM, epsg=4326, within=np.array([[-1e3, -1e3], [1e3, 1e3]]))
     # EGM96 needs a geoid; where it is on this computer, it lifts the points by metres.
@@ -531,14 +515,8 @@ def test_coordinates_that_a_scale_cannot_count(tmp_path):
         clouds.write_cloud(far, tmp_path / "d.las", like=path)
 
 
-def complaint_of_unit(path):
-    with pytest.raises(InputError) as said:
-        clouds.read_cloud(path, unit="yard")
-    return str(said.value)
-
-
 @pytest.mark.parametrize("name", ["c.las", "c.csv", "c.ply"])
-def test_beside_the_block(tmp_path, name):
+def test_clouds_off_the_block_are_refused(tmp_path, name):
     cloud = sample(middle=(600_000.0, 800_000.0, 0.0))
     clouds.write_cloud(Cloud(cloud.xyz), tmp_path / name)
     away = np.array([[0.0, 0.0], [1000.0, 2000.0]])
@@ -554,7 +532,7 @@ def test_beside_the_block(tmp_path, name):
     assert "--cloud-unit m)" in message or "--cloud-unit m " in message
 
 
-def test_filters_that_leave_nothing_say_what_there_is(tmp_path):
+def test_empty_selections_list_classes_and_returns(tmp_path):
     cloud = sample()
     clouds.write_cloud(cloud, tmp_path / "c.laz")
     message = complaint(tmp_path / "c.laz", classes=[3, 9])
@@ -587,24 +565,28 @@ def test_tables_as_spreadsheets_write_them(tmp_path):
 @pytest.mark.parametrize(
     ("row", "says"),
     [
-        ("1.0,two,3.0,2", "row 404: Y_m is 'two'"),
-        ("1.0,,3.0,2", "row 404: Y_m is ''"),
-        ("1.0,nan,3.0,2", "row 404: Y_m is 'nan'"),
-        ("1.0,2.0,inf,2", "row 404: Z_m is 'inf'"),
-        ("1.0,2.0", "row 404: Z_m is ''"),
-        ("1.0,2.0,3.0,2,5", "row 404: 5 cells"),
-        ("1.0,2.0,3.0,300", "row 404: classification is '300'"),
-        ("1.0,2.0,3.0,2.5", "row 404: classification is '2.5'"),
+        ("1.0,two,3.0,2", "Y_m is 'two'"),
+        ("1.0,2.0,inf,2", "Z_m is 'inf'"),
+        ("1.0,2.0", "Z_m is ''"),
+        ("1.0,2.0,3.0,2,5", "5 cells"),
+        ("1.0,2.0,3.0,300", "classification is '300'"),
+        ("1.0,2.0,3.0,2.5", "classification is '2.5'"),
     ],
 )
-def test_a_faulty_row_is_named(tmp_path, row, says):
-    """Beyond the first chunk, after a comment and an empty line."""
+def test_faulty_rows_are_named(tmp_path, row, says):
+    """Beyond the first chunk, after a comment and an empty line; in a PLY file in text likewise."""
     rows = ["X_m,Y_m,Z_m,classification", "# a comment", "", *["1.0,2.0,3.0,2"] * 400, row, "1.0,2.0,3.0,2"]
     (tmp_path / "c.csv").write_text("\n".join(rows))
-    assert f"c.csv, {says}" in complaint(tmp_path / "c.csv")
+    assert f"c.csv, row 404: {says}" in complaint(tmp_path / "c.csv")
+    if says != "5 cells":
+        header = ["ply", "format ascii 1.0", "element vertex 402", *map("property double {}".format, PLY_FIELDS)]
+        ply = [*header, "end_header", *(r.replace(",", " ") for r in rows[3:])]
+        (tmp_path / "c.ply").write_text("\n".join(ply))
+        where = says if says != "Z_m is ''" else "Z_m"
+        assert f"c.ply, row {404 - 3 + len(header) + 1}: {where}" in complaint(tmp_path / "c.ply")
 
 
-def test_tables_that_are_none(tmp_path):
+def test_invalid_tables_are_refused(tmp_path):
     path = tmp_path / "c.csv"
     for text, says in (("", "is empty"), ("X_m,Y_m\n1,2\n", "Z_m is missing"), ("x y z\n1 2 3\n", "X_m is missing")):
         path.write_text(text)
@@ -614,6 +596,7 @@ def test_tables_that_are_none(tmp_path):
         assert "UTF-8" in complaint(path)
 
 
+PLY_FIELDS = ("x", "y", "z", "classification")
 PLY = """ply
 format {} 1.0
 comment made by hand
@@ -662,43 +645,20 @@ def test_ply_of_all_kinds(tmp_path, order, kind):
     assert "vertex 457: Y_m" in complaint(path)
 
 
-def test_ply_in_text_names_the_row(tmp_path):
-    path = tmp_path / "c.ply"
-    header = (
-        "ply\nformat ascii 1.0\nelement vertex 3\nproperty double x\nproperty double y\nproperty double z\nend_header\n"
-    )
-    path.write_text(header + "1 2 3\n4 five 6\n7 8 9\n")
-    assert "row 9" in complaint(path)
-    path.write_text(header + "1 2 3\n4 5 6\n")
-    assert "promises 3 points, but there are 2" in complaint(path)
-
-
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
+def test_ply_headers_that_are_invalid(tmp_path):
+    path, xyz = tmp_path / "c.ply", "".join(f"property float {axis}\n" for axis in "xyz")
+    for text, says in (
         ("solid\n", "does not begin"),
         ("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "no vertices with x, y and z"),
-        ("ply\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n", "no format"),
+        (f"ply\nelement vertex 1\n{xyz}end_header\n", "no format"),
         ("ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\n", "row 4"),
-        ("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n",
-         "no points"),
+        (f"ply\nformat ascii 1.0\nelement vertex 0\n{xyz}end_header\n", "no points"),
+        (f"ply\nformat ascii 1.0\nelement vertex 3\n{xyz}end_header\n1 2 3\n4 5 6\n", "promises 3 points"),
         ("ply\nformat ascii 1.0\n", "does not end"),
-        ("ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int v\nelement vertex 1\nproperty float x\n"
-         "property float y\nproperty float z\nend_header\n", "vertices first"),
-    ],
-)  # fmt: skip
-def test_ply_headers_that_are_none(tmp_path, text, says):
-    (tmp_path / "c.ply").write_text(text)
-    assert says in complaint(tmp_path / "c.ply")
-
-
-def test_names_that_no_cloud_has(tmp_path):
-    cloud = sample(10)
-    with pytest.raises(InputError, match=r"\.laz"):
-        clouds.write_cloud(cloud, tmp_path / "c.txt")
-    clouds.write_cloud(cloud, tmp_path / "c.csv")
-    with pytest.raises(InputError, match="both must be"):
-        clouds.write_cloud(cloud, tmp_path / "d.las", like=tmp_path / "c.csv")
+        (f"ply\nformat ascii 1.0\nelement face 1\nelement vertex 1\n{xyz}end_header\n", "vertices first"),
+    ):
+        path.write_text(text)
+        assert says in complaint(path)
 
 
 # COPC
@@ -727,33 +687,6 @@ def test_copc_is_read_and_rewritten_as_laz(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["las", "laz"])
-def test_a_time_that_is_none(tmp_path, kind):
+def test_nonfinite_times_are_refused(tmp_path, kind):
     time = np.where(np.arange(1000) == 700, np.nan, 5.0)
     assert "no finite time" in complaint(write_las(tmp_path / f"c.{kind}", sample().xyz, gps_time=time))
-
-
-PLY_TEXT = (
-    "ply\nformat ascii 1.0\nelement vertex 3\n"
-    + "".join(f"property double {name}\n" for name in ("x", "y", "z", "classification", "time_s", "strip"))
-    + "end_header\n1 2 3 1 5 7\n1 2 3 1 5 7\n"
-)
-
-
-@pytest.mark.parametrize(
-    ("row", "says"),
-    [
-        ("1 2 3 1 5", "strip"),
-        ('1 2 "3 1 5 7', "Z_m"),
-        ("1 2 3 one 5 7", "classification"),
-        ("1 2 " + "9" * 400 + " 1 5 7", "Z_m"),
-        ("1 2 3 1.5 5 7", "classification"),
-        ("1 2 3 1 nan 7", "time_s"),
-        ("1 2 3 1 5 1e300", "strip"),
-    ],
-)
-def test_rows_of_a_ply_file_in_text(tmp_path, row, says):
-    path = tmp_path / "c.ply"
-    path.write_text(PLY_TEXT + row)
-    assert f"row 13: {says} is" in complaint(path)
-    path.write_text(PLY_TEXT + "1 2 3 1 5 7")
-    assert len(clouds.read_cloud(path)) == 3

@@ -1,4 +1,4 @@
-"""Other programs' projects -> blocks, on real data: counts as published, and published orientations reproject."""
+"""Projects of other programs as blocks, with real data: published counts and orientations."""
 
 import re
 import shutil
@@ -9,20 +9,13 @@ import pytest
 
 from jaxphoto.block import Datum
 from jaxphoto.camera import AffineBrown, Balanced, get_parameter, parameter_names
-from jaxphoto.collinearity import ExteriorOrientation, project
+from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
 from jaxphoto.extras.formats import FORMATS, convert, read_source, read_tables, recognise
 from jaxphoto.io import read_block, write_block
 from jaxphoto.unknowns import FIXED, FREE
+from tests.io.oriented_files import misfits_px
 from tests.sound_files import DBAT
-
-
-def residuals(block, exterior, points):
-    """Measured minus projected, in millimetres."""
-    rows = block.image_points
-    camera = block.start.unknowns.interior[block.image_camera[0]]
-    at = jax.tree.map(lambda leaf: leaf[rows.image], exterior)
-    return np.asarray(rows.xy - jax.jit(jax.vmap(lambda e, p: project(camera, e, p)))(at, points[rows.point]))
 
 
 def reported(text, name):
@@ -63,7 +56,10 @@ def test_sxb(data_dir):
     position = np.stack([reported(report, name) for name in ("Xc", "Yc", "Zc")], axis=1)
     points = block.start.unknowns.points
     shown = block.start.point_known[block.image_points.point]
-    v = residuals(block, ExteriorOrientation.from_angles(position, angles), points)[shown]
+    v = (
+        block.sensors["camera"].pixel_mm
+        * misfits_px(block, points, ExteriorOrientation.from_angles(position, angles))[shown]
+    )
     # Control as surveyed, not as adjusted (it moves by up to 7 cm, nearly a pixel).
     assert np.sqrt(np.mean(v**2)) < 1.2 * 0.006
 
@@ -131,7 +127,7 @@ def test_aicon(data_dir):
     assert block.priors.interior["1"].distortion.r0 == FIXED
 
     # The files hold the adjusted values to 1e-4 mm and 1e-8 rad: their residuals are the report's.
-    v = residuals(block, block.start.unknowns.exterior, block.start.unknowns.points)
+    v = misfits_px(block) * block.sensors["1"].pixel_mm
     s0 = np.sqrt(np.sum(v**2) / 18804)
     np.testing.assert_allclose(s0, 0.0004056, rtol=2e-3)
     # Per image: rays and rms vx, vy of images 1 and 3 as the report prints them.
@@ -177,10 +173,7 @@ def test_unknown_formats_list_the_known_ones(tmp_path):
     [
         ("</document>", "", ("project.xml", "line")),
         ("<model>3</model>", "<model>6</model>", ("project.xml", "model 6", "use one of")),
-        ("<image>2272,1704</image>", "<image>2272</image>", ("project.xml", "<image>", "2 numbers")),
         ("auto,5.43764", "auto,auto", ("project.xml", "<sensor>", "give width,height")),
-        ("auto,5.43764", "auto,nan", ("project.xml", "<sensor>", "give width,height")),
-        ("<image>2272,1704</image>", "<image>1e999,1704</image>", ("project.xml", "<image>", "2 numbers")),
         (
             "<image>2272,1704</image>",
             "<image>0,1704</image>",
@@ -190,7 +183,6 @@ def test_unknown_formats_list_the_known_ones(tmp_path):
         ("<skew>false</skew>", "<focus>false</focus>", ("project.xml", "<focus>", "use all")),
         ("<skew>false</skew>", "<skew>no</skew>", ("project.xml", "<skew>", "true or false")),
         ("im,id,x,y,sxy", "im,id,x,y,s", ("project.xml", "markpts.txt", "add sxy")),
-        ("im,id,x,y,sxy", "im,id,x,y", ("markpts.txt, row 3", "5 cells", "correct the format")),
         ("im,id,x,y,sxy", "im,label,x,y,sxy", ("project.xml", "image_pts", "no id")),
         ("camcal-fixed.txt", "camcal-free.txt", ("camcal-free.txt", "add it")),
         ("<ctrl_pts>", "<extra/><ctrl_pts>", ("project.xml", "<extra>", "remove it")),
@@ -225,11 +217,8 @@ def test_a_bad_row_of_an_aicon_file_is_named(data_dir, tmp_path):
 @pytest.mark.parametrize(
     ("line", "old", "new", "message"),
     [
-        (0, "28.78507", "28.7 8507", r"example\.ior: the five lines of one camera"),
         (0, "-28.78507", "c", r"example\.ior, row 1: a cell is not a finite number; correct it"),
-        (4, "35.96800", "9" * 400, r"example\.ior, row 5: a cell is not a finite number; correct it"),
         (4, "35.96800", "0", r"example\.ior, row 5: the format in mm and pixels is positive; correct it"),
-        (4, "35.96800", "0.035968", r"pixel_mm: .* is no size of a pixel"),
     ],
 )
 def test_a_bad_camera_of_an_aicon_project_is_named(data_dir, tmp_path, line, old, new, message):
@@ -256,8 +245,6 @@ def test_an_aicon_project_needs_its_files(data_dir, tmp_path):
     [
         ("   0      333 2158.2500", "   9      333 2158.2500", r"pmexport\.txt, row \d+: image 9 is not among"),
         ("0.000500 20 8858 12996", "0.000500 20 8858", "is of no format that is known"),
-        ("0.000500 20 8858 12996", "0.000500 20 1e999 12996", r"pmexport\.txt, row 2: .* is not 4 numbers"),
-        ("0.000500 20 8858 12996", "0.000500 20 0 12996", r"the format of the camera is not positive"),
     ],
 )
 def test_a_bad_export_is_refused(data_dir, tmp_path, old, new, message):

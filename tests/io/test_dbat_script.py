@@ -1,4 +1,4 @@
-"""DBAT's scripts: lens models by their own equations, cameras from a file, prior orientations, and refusals."""
+"""Scripts of DBAT: lens models by its equations, camera files, prior orientations, and refusals."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def corrected(column, row, model):
 
 
 @pytest.mark.parametrize("model", [1, 2, 3, 4, 5])
-def test_a_lens_model_of_dbat_is_what_it_computes(tmp_path, model):
+def test_lens_models_agree_with_dbat(tmp_path, model):
     tables = _read(script(tmp_path, model, ASPECT if model > 2 else 1.0))
     ((name, values),) = tables.settings["cameras"].items()
     sensor, interior, *_ = read_camera(Section("a", name, dict(values)))
@@ -95,7 +95,7 @@ def test_a_camera_in_a_file_is_that_of_the_script(tmp_path):
     assert one.settings["cameras"] == two.settings["cameras"]
 
 
-def test_prior_orientations_are_where_images_start(tmp_path):
+def test_prior_orientations_are_start_values(tmp_path):
     images = _read(eo_script(tmp_path)).tables["images"]
     assert images.text("image").tolist() == ["one", "two"]
     names = ("X_m", "Y_m", "Z_m", "omega_deg", "phi_deg", "kappa_deg")
@@ -124,7 +124,7 @@ def test_a_dependent_datum_is_a_minimal_one(tmp_path):
         ({"rows": "7,1,2,8,5,0,50\n"}, r"eo.txt, row 1: image 7 is not in images.txt"),
     ],
 )
-def test_prior_orientations_that_cannot_be_are_refused(tmp_path, change, message):
+def test_invalid_prior_orientations_are_refused(tmp_path, change, message):
     with pytest.raises(InputError, match=message):
         _read(eo_script(tmp_path, **change))
 

@@ -1,4 +1,4 @@
-"""Every declared class of observations, jaxphoto's and a user's, in files and back; mistakes in them named."""
+"""Round trips of every declared class of observations, of jaxphoto and a user, and errors in their files."""
 
 import dataclasses
 from collections.abc import Callable
@@ -137,7 +137,7 @@ def many(kind: type[AbstractObservations]) -> int:
 
 
 @pytest.mark.parametrize("kind", (*OBSERVATIONS, *OWN), ids=lambda kind: kind.group)
-def test_rows_come_back(block, tmp_path, kind):
+def test_rows_round_trip(block, tmp_path, kind):
     if kind.group == "image_points":
         pytest.skip("a block is made of these: test_write_block")
     rows = rows_of(kind, many(kind))
@@ -146,7 +146,7 @@ def test_rows_come_back(block, tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", (*OBSERVATIONS, *OWN), ids=lambda kind: kind.group)
-def test_correlated_sets_come_back_whatever_their_sizes(block, tmp_path, kind):
+def test_correlated_sets_round_trip(block, tmp_path, kind):
     rows, k = rows_of(kind, 6), len(kind.axes)
     rng = np.random.default_rng(1)
 
@@ -170,7 +170,7 @@ def test_correlated_sets_come_back_whatever_their_sizes(block, tmp_path, kind):
         assert (got.group, got.unit, got.axes) == (want.group, want.unit, want.axes)
 
 
-def test_known_parameters_come_back(block, tmp_path):
+def test_known_parameters_round_trip(block, tmp_path):
     known = (
         KnownParameters(
             ("interior[kodak].c_mm", "mounts[default].boresight_x_rad"), np.array([5.1, 0.1]), np.eye(2) / 3
@@ -192,7 +192,7 @@ numbers = st.floats(-1e9, 1e9, allow_subnormal=False)
 
 @given(st.lists(st.tuples(st.permutations(range(4)), numbers, st.floats(1e-9, 1e9)), min_size=1, max_size=5))
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_numbers_of_a_class_of_ones_own_come_back_exactly(write_folder, tmp_path_factory, rows):
+def test_numbers_of_user_classes_round_trip(write_folder, tmp_path_factory, rows):
     folder = tmp_path_factory.mktemp("any")
     source = folder.parent / "source_of_declared"
     if not source.exists():
@@ -209,7 +209,7 @@ LEVELLED = ("height_differences.csv", "start,end,value_m,sigma_m\np1,p2,0.5,0.00
 SIGMA = ("block.toml", "station_m", "height_difference_m = 0.002\nstation_m")
 
 
-def test_what_an_author_need_not_write(write_folder):
+def test_defaults_of_user_classes(write_folder):
     folder = write_folder(SIGMA)
     (folder / LEVELLED[0]).write_text(LEVELLED[1])
     (rows,) = read(folder).more
@@ -269,7 +269,7 @@ def test_a_comma_in_an_id_is_no_decimal_comma(write_folder):
     assert (float(rows.value[0]), float(rows.sigma[0])) == (0.5, 0.001)
 
 
-def test_rows_that_nobody_can_read_are_not_lost_in_silence(block, tmp_path):
+def test_tables_without_a_class_are_refused(block, tmp_path):
     write_block(dataclasses.replace(block, more=(rows_of(HeightDifferences, 2),)), tmp_path / "copy")
     with pytest.raises(
         InputError, match=r"observations: jaxphoto has no class for height_differences\.csv; give yours"
@@ -280,7 +280,7 @@ def test_rows_that_nobody_can_read_are_not_lost_in_silence(block, tmp_path):
     assert_same(read_block(tmp_path / "copy"), block)
 
 
-def test_what_files_cannot_say_is_refused(block, tmp_path):
+def test_observations_that_files_cannot_hold_are_refused(block, tmp_path):
     second = rows_of(CameraPositions, 2)
     with pytest.raises(
         BlockError, match=r"Block\.more has stations, but stations\.csv is for those of Block\.stations"
@@ -328,7 +328,7 @@ def test_mistakes_in_covariances_are_named(block, tmp_path, change, words):
         read(tmp_path / "copy")
 
 
-def test_annotations_and_columns_that_say_too_little():
+def test_incomplete_annotations_and_columns_are_refused():
     class Open(HeightDifferences):
         group = "open"
         extra: Float[ArrayLike, "n k"]

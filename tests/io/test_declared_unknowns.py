@@ -1,4 +1,4 @@
-"""Every declared class of unknowns, jaxphoto's and a user's, in block.toml and back; mistakes in it named."""
+"""Round trips of every declared class of unknowns, of jaxphoto and a user, and errors in block.toml."""
 
 import dataclasses
 from collections.abc import Callable
@@ -125,7 +125,7 @@ GENERIC = tuple(kind for kind in (*UNKNOWNS, *OWN) if kind.kind not in ("scanner
 
 @pytest.mark.parametrize("prior", PRIORS)
 @pytest.mark.parametrize("kind", GENERIC, ids=lambda kind: kind.kind)
-def test_unknowns_come_back(block, tmp_path, kind, prior):
+def test_unknowns_round_trip(block, tmp_path, kind, prior):
     made = in_files(block, kind, PRIORS[prior])
     write_block(made, tmp_path / "copy")
     got = read(tmp_path / "copy")
@@ -140,7 +140,7 @@ def test_unknowns_come_back(block, tmp_path, kind, prior):
 
 
 @pytest.mark.parametrize("kind", GENERIC, ids=lambda kind: kind.kind)
-def test_covariances_of_vectors_come_back(block, tmp_path, kind):
+def test_covariances_of_vectors_round_trip(block, tmp_path, kind):
     made = in_files(block, kind, lambda value: covariance_of(value) if np.ndim(value) else FREE)
     write_block(made, tmp_path / "copy")
     for name, want in made.priors.tables[kind.kind].items():
@@ -158,7 +158,7 @@ numbers = st.floats(-1e9, 1e9, allow_subnormal=False)
 
 @given(height=numbers, factor=numbers, sigma=st.floats(1e-9, 1e9))
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_numbers_come_back_exactly(write_folder, tmp_path_factory, height, factor, sigma):
+def test_numbers_round_trip_exactly(write_folder, tmp_path_factory, height, factor, sigma):
     folder = tmp_path_factory.mktemp("any")
     source = folder.parent / "source_of_unknowns"
     if not source.exists():
@@ -189,7 +189,7 @@ def section(text: str):
     return "block.toml", "[datum]", f"{text}\n[datum]"
 
 
-def test_what_block_toml_says(write_folder):
+def test_unknowns_of_block_toml_are_read(write_folder):
     text = """[unknowns.flight_bias]
 shift_m = [0.1, 0.2, 0.3]
 shift = "free"
@@ -227,26 +227,15 @@ model = "ciddor"
             [section("[unknowns.camera_rates.leica]")],
             r"\[unknowns\.camera_rates\] leica: no such key is known; use default, kodak",
         ),
-        ([section("[unknowns.flight_bias]\nshift_mm = 1")], r"flight_bias\] shift_mm: no such key is known"),
         ([section("[unknowns.flight_bias]\nshift_m = [1, 2]")], r"shift_m: \[1, 2\] has 2 entries; give 3"),
-        ([section('[unknowns.flight_bias]\nshift = "open"')], r"shift: 'open' is no status"),
-        (
-            [section("[unknowns.flight_bias]\nshift = { covariance = [[1.0]] }")],
-            r"shift: the covariance is no matrix of 3 x 3; write 3 lists of 3 numbers",
-        ),
         (
             [section("[unknowns.flight_bias]\nshift = { covariance = [[1,2,0],[2,1,0],[0,0,1]] }")],
             r"shift: the covariance is not symmetric and positive definite",
         ),
         (
-            [section("[unknowns.flight_bias]\nshift = { sigma = 1, covariance = [[1,0,0],[0,1,0],[0,0,1]] }")],
-            r"is no status",
-        ),
-        (
             [section('[unknowns.shutters.kodak]\nreadout_ms = 20000.0\nreadout = "free"')],
             r"\[unknowns\.shutters\.kodak\] readout_ms: 20000 ms is no readout time; give milliseconds",
         ),
-        ([section("[unknowns.shutters.kodak]\nreadout_ms = 0.03")], r"readout_ms: 0\.03 ms is no readout time; give"),
         (
             [section("[unknowns.shutters.default]\nreadout_ms = 30.0\n[unknowns.motions.a]\n[unknowns.motions.c]")],
             r"shutters\.kodak\]: 1 photograph of this camera \(b\) have no motion; give velocity_m_per_s",
@@ -261,7 +250,6 @@ model = "ciddor"
         ),
         ([TOP], r"images\.csv, row 1: the column hour is missing"),
         ([("block.toml", 'title = "small"', 'partitions = ["strip"]')], r"partitions: strip has a meaning already"),
-        ([("block.toml", 'title = "small"', 'partitions = "hour"')], r"partitions: 'hour' is not a list"),
         (
             [*HOURS[:3], ("images.csv", "c,kodak", "default,c,kodak"), TOP],
             r"images\.csv, row 4: the hour default means every hour in \[unknowns\]",
@@ -281,7 +269,7 @@ def test_two_classes_of_one_name_are_refused(write_folder):
         read_block(write_folder(), more=(Strips,))
 
 
-def test_fields_that_files_cannot_say(write_folder):
+def test_fields_that_files_cannot_hold_are_refused(write_folder):
     class Mixed(AbstractParameters):
         kind = "mixed"
         owner = "block"

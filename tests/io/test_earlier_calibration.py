@@ -1,4 +1,4 @@
-"""Last year's calibration as a prior: read as a user names it, and worth what its covariance says."""
+"""An earlier calibration as prior information with its covariance."""
 
 import shutil
 
@@ -15,6 +15,7 @@ from jaxphoto.io.toml import read_toml
 from jaxphoto.simulation import remeasure
 from tests.blocks import FIVE, measured, simulated
 from tests.commands import run
+from tests.io.conftest import write_calibration
 
 
 def values_of(adjusted):
@@ -37,14 +38,7 @@ def years(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def results(years):
-    patch = pytest.MonkeyPatch()
-    with patch.context() as m:
-        m.setattr("sys.argv", ["jaxphoto", "adjust", str(years / "last"), "--out", str(years / "results")])
-        import jaxphoto_command
-
-        with pytest.raises(SystemExit) as stop:
-            jaxphoto_command.main()
-    assert not stop.value.code
+    write_calibration(read_block(years / "last"), years / "results")
     return years / "results"
 
 
@@ -100,14 +94,11 @@ def test_a_camera_file_keeps_the_covariance(years, results, monkeypatch, capsys)
     [
         ('calibration = "../this"', "has no covariance; name results of jaxphoto adjust, or a camera file of it"),
         ('calibration = "../nothing"', "there is no file"),
-        (
-            'calibration = "../results"\nwidth_px = 3',
-            "width_px: the calibration gives it; only residuals, unknowns",
-        ),
+        ('calibration = "../results"\nwidth_px = 3', "width_px: the calibration gives it; only residuals, unknowns"),
         ('calibration = "../results"\n[cameras.one.unknowns]\nc_mm = "fixed"', "it is known beforehand by"),
     ],
 )
-def test_what_is_no_prior_is_refused(years, results, table, sentence):
+def test_invalid_calibrations_are_refused(years, results, table, sentence):
     name = f"bad{abs(hash(table))}"
     folder = with_camera(years, name, f"[cameras.one]\n{table}")
     with pytest.raises(InputError, match=sentence.replace("(", r"\(")):

@@ -1,6 +1,7 @@
-"""Files of exposures beside photographs: read, matched with their gaps, brought to the camera; the spoilt are named."""
+"""Files of exposures: read, matched to photographs, reduced to the camera; each invalid input costs one message."""
 
 import re
+import shutil
 from datetime import datetime, timedelta
 
 import numpy as np
@@ -15,7 +16,7 @@ from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS, WEEK_S, Taken
 from jaxphoto.georeferencing.gps import FIX_SIGMA_M, Gps, moved
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.io.exposures import located, read_exposures, with_exposures
-from jaxphoto.io.photographs import Photograph, photographs
+from jaxphoto.io.photographs import Photograph, valid_photographs
 from jaxphoto.io.trajectory import write_sbet
 from tests import sound_files
 
@@ -88,7 +89,7 @@ def test_marks_are_read(tmp_path):
     nothing = read_exposures(written(tmp_path / "a.MRK", FLIGHT.mark(3, flag=0)))
     assert nothing.gps(0) is None
     with pytest.raises(InputError, match=r"row 2: '2.* is not a time mark"):
-        read_exposures(written(tmp_path / "b.MRK", FLIGHT.mark(0) + FLIGHT.mark(1)[:60]))
+        located([FLIGHT.photograph(3)], [], [written(tmp_path / "b.MRK", FLIGHT.mark(0) + FLIGHT.mark(1)[:60])])
 
 
 def test_marks_by_number_with_fewer_and_more_lines_than_photographs(tmp_path):
@@ -104,7 +105,7 @@ def test_marks_by_number_with_fewer_and_more_lines_than_photographs(tmp_path):
 
 
 @pytest.mark.parametrize(("shift_s", "words"), [(-8 * 3600.0, "+8 h (time zone)"), (-18.0, "+18 s (leap seconds")])
-def test_marks_in_a_wrong_time_zone_or_in_utc_are_found_and_said(tmp_path, shift_s, words):
+def test_marks_in_a_wrong_time_zone_or_in_utc_are_corrected_and_reported(tmp_path, shift_s, words):
     file = read_exposures(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k, k + 31, shift_s) for k in ALL)))
     taken, said = with_exposures([FLIGHT.photograph(k, told=True, name=f"IMG{k}") for k in ALL], [file])
     assert all(same(p.gps, c) for p, c in zip(taken, FLIGHT.camera, strict=True))
@@ -112,7 +113,7 @@ def test_marks_in_a_wrong_time_zone_or_in_utc_are_found_and_said(tmp_path, shift
 
 
 @pytest.mark.parametrize("lost", [0, 2])
-def test_marks_numbered_anew_after_a_loss_are_joined_by_the_positions(tmp_path, lost):
+def test_renumbered_marks_are_matched_by_positions(tmp_path, lost):
     """Exposures at equal intervals: the numbers fit the times as well, shifted by one."""
     steady = Flight()
     steady.time = BEGIN_S + 3.0 * np.arange(10)
@@ -260,7 +261,7 @@ def test_an_sbet_gives_positions_and_attitudes(tmp_path):
     assert all(same(p.gps, c, 0.1) for p, c in zip(taken, FLIGHT.camera, strict=True) if p.gps.fix == "integrated")
 
 
-def test_a_lever_arm_that_turns_nothing_is_said(tmp_path):
+def test_unused_lever_arm_is_reported(tmp_path):
     file = read_exposures(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k) for k in ALL)))
     photographs = [FLIGHT.photograph(k) for k in ALL]
     arm = (0.0, 0.1, 0.2)
@@ -402,7 +403,7 @@ def test_tables_of_other_programs(tmp_path, form):
         ("EASTING, NORTHING", "E, N", "its head names no columns"),
     ],
 )
-def test_a_text_of_pospac_that_is_not_what_it_says_is_refused(tmp_path, old, new, words):
+def test_inconsistent_pospac_texts_are_refused(tmp_path, old, new, words):
     text = OTHERS["pospac"][0]
     assert old in text
     with pytest.raises(InputError, match=words):
@@ -414,7 +415,7 @@ def test_a_row_of_pospac_that_is_too_short_is_left_out(tmp_path):
     assert "row 18: 10 cells, and the header has 11" in read_exposures(written(tmp_path / "eo.txt", text)).why
 
 
-def test_tables_that_nobody_can_know_are_refused(tmp_path):
+def test_ambiguous_tables_are_refused(tmp_path):
     for text, words in (
         (table_of("imageName,X,Y,Z", "{0},{4},{5},{3}"), "are map coordinates; give the EPSG code"),
         (table_of("#imagename,coordinate1,coordinate2,z", "{0},{1},{2},{3}"), "add a header"),
@@ -445,47 +446,6 @@ def test_a_table_on_a_national_datum_is_brought_to_that_of_receivers(tmp_path):
     assert read_exposures(file, 31287).place[0, 2] == 400.5
 
 
-def test_a_folder_of_pictures_and_all_that_lies_in_it(tmp_path):
-    """Small JPEGs with EXIF and XMP: marks, spoilt files, and photographs without positions are each one sentence."""
-    rng = np.random.default_rng(0)
-    for k in ALL:
-        gps = FLIGHT.camera[k]
-        exif = Image.Exif()
-        at = datetime(1980, 1, 6) + timedelta(seconds=int(FLIGHT.time[k] - 18 + 7200))
-        exif.get_ifd(0x8769).update({0x9003: f"{at:%Y:%m:%d %H:%M:%S}", 0x9011: "+02:00"})
-        parts = [(v, 0, 0) for v in (gps.latitude_deg, gps.longitude_deg)]
-        if k == 3:
-            parts = parts[::-1]
-        if k == 4:
-            parts = [(0, 0, 0), (0, 0, 0)]
-        if k != 5:
-            exif.get_ifd(0x8825).update({1: "N", 2: parts[0], 3: "E", 4: parts[1], 5: b"\0", 6: 57.0})
-        heights = {"Absolute": 40 * (k != 6) + 17 + k, "Relative": 17 + k}
-        xmp = "<rdf:Description " + " ".join(f'drone-dji:{n}Altitude="+{h}"' for n, h in heights.items()) + "/>"
-        picture = Image.fromarray(rng.integers(0, 255, (30, 40), dtype=np.uint8))
-        picture.save(tmp_path / f"DJI_{k + 1:04}.jpg", exif=exif, xmp=xmp.encode())
-    read = photographs(sorted(tmp_path.glob("*.jpg")))
-    taken, said = located(read, [tmp_path])
-    assert [p.name for p in taken if p.gps is None] == ["DJI_0005", "DJI_0006"]
-    assert same(taken[3].gps._replace(altitude_m=0.0), FLIGHT.camera[3]._replace(altitude_m=0.0), 0.5)
-    assert [p.gps.altitude_m for p in taken if p.gps] == [57 + k for k in ALL if k not in (4, 5)]
-    for words in (
-        "DJI_0004 have changed places",
-        "DJI_0005 are (0, 0)",
-        "1 of 10 photographs has no position (DJI_0006)",
-        "DJI_0007 are above take-off",
-    ):
-        assert sum(words in s for s in said) == 1, said
-    (tmp_path / "bad.MRK").write_text("no marks\n")
-    (tmp_path / "DJI_Timestamp.MRK").write_text("".join(FLIGHT.mark(k) for k in ALL))
-    taken, said = located(read, [tmp_path])
-    assert all(same(p.gps, c) for p, c in zip(taken, FLIGHT.camera, strict=True))
-    assert {p.gps.heights for p in taken} == {"ellipsoid"} and "heights are above the ellipsoid" in said
-    assert any("bad.MRK, row 1" in s and s.endswith("the file is not used") for s in said)
-    with pytest.raises(InputError, match=r"bad.MRK, row 1"):
-        located(read, [], [tmp_path / "bad.MRK"])
-
-
 TABLE_ROWS = "image,longitude_deg,latitude_deg,height_m,sigma_X_m,sigma_Y_m,sigma_Z_m\n" + "".join(
     f"DJI_{k + 1:04}.JPG,{g.longitude_deg!r},{g.latitude_deg!r},{g.altitude_m:.4f},0.02,0.02,0.0456\n"
     for k, g in enumerate(FLIGHT.camera)
@@ -508,7 +468,7 @@ def at_row(text, row, change):
 
 
 @pytest.mark.parametrize("name", FORMS)
-def test_rows_that_are_wrong_are_left_out_and_named(tmp_path, name):
+def test_invalid_rows_are_skipped_and_named(tmp_path, name):
     text, first = FORMS[name]
     path = tmp_path / name
     whole = read_exposures(written(path, text))
@@ -537,7 +497,7 @@ def test_rows_that_are_wrong_are_left_out_and_named(tmp_path, name):
         read_exposures(written(path, worse))
 
 
-def test_what_is_wrong_with_a_whole_table_is_not_said_of_a_row(tmp_path):
+def test_errors_of_a_whole_table_name_no_row(tmp_path):
     text = table_of("imageName,X,Y,Z", "{0},{4},{5},{3}")
     with pytest.raises(InputError, match="are map coordinates; give the EPSG code"):
         read_exposures(written(tmp_path / "a.csv", at_row(text, 3, lambda line: line + '"')))
@@ -548,7 +508,7 @@ def test_what_is_wrong_with_a_whole_table_is_not_said_of_a_row(tmp_path):
     assert found.without == (2, 5) and "it is there twice" in found.why and len(found.rows) == 8
 
 
-def test_numbers_are_not_trusted_where_a_row_that_was_lost_may_have_hidden_that_they_began_anew(tmp_path):
+def test_numbers_are_not_used_if_an_invalid_row_may_hide_a_renumbering(tmp_path):
     """The first exposure is not in the file, which counts from 1, and a row in its middle is spoilt."""
     steady = Flight()
     steady.time = BEGIN_S + 3.0 * np.arange(10)
@@ -557,3 +517,105 @@ def test_numbers_are_not_trusted_where_a_row_that_was_lost_may_have_hidden_that_
     blind = [steady.photograph(k, gps=None) for k in ALL]
     taken, said = with_exposures(blind, [file])
     assert taken == blind and "not used" in said[0] and "1 of 9 rows is left out (4); row 4" in said[0]
+
+
+GPS, ZONE_S = 0x8825, 7200
+TAKE_OFF_M = 40.0
+
+
+def picture(path, k, place=None, above_m=None, model="Model", seed=0):
+    """A photograph of `FLIGHT` with its position (`place` instead: latitude, longitude; () for none) and heights."""
+    at = datetime(1980, 1, 6) + timedelta(seconds=int(FLIGHT.time[k] - LEAP_SECONDS + ZONE_S))
+    exif = Image.Exif()
+    exif[271], exif[272] = "Maker", model
+    exif.get_ifd(0x8769).update({0x9003: f"{at:%Y:%m:%d %H:%M:%S}", 0x9011: "+02:00"})
+    place = FLIGHT.camera[k][:2] if place is None else place
+    if place:
+        latitude, longitude = ((v, 0, 0) for v in place)
+        exif.get_ifd(GPS).update({1: "N", 2: latitude, 3: "E", 4: longitude, 5: b"\0", 6: 57.0 + k})
+    heights = {"Absolute": TAKE_OFF_M + 17 + k if above_m is None else above_m, "Relative": 17 + k}
+    xmp = "<rdf:Description " + " ".join(f'drone-dji:{n}Altitude="+{h}"' for n, h in heights.items()) + "/>"
+    grey = np.random.default_rng(100 * seed + k).integers(0, 255, (300, 400), dtype=np.uint8)
+    Image.fromarray(grey).save(path / f"DJI_{k + 1:04}.jpg", exif=exif, xmp=xmp.encode())
+
+
+def marks(path, shift_s=0.0):
+    # Names that carry no number of the marks: times alone join them.
+    (path / "a.MRK").write_text("".join(FLIGHT.mark(k, k + 31, shift_s) for k in ALL))
+
+
+def cut(path):
+    whole = (path / "DJI_0003.jpg").read_bytes()
+    (path / "cut.jpg").write_bytes(whole[: len(whole) // 2])
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clean")
+    for k in ALL:
+        picture(folder, k)
+    return folder
+
+
+def said_of(folder):
+    """All sentences, each without its folder, and the photographs that are left with their positions."""
+    kept, left = valid_photographs([folder])
+    taken, sentences = located(kept, [folder])
+    said = [s.replace(f"{folder}/", "") for s in (*left.values(), *sentences)]
+    return said, {p.name: p.gps for p in taken}
+
+
+FAR = (56.7, 13.2)
+SPOILT = {
+    "truncated": (cut, "cut.jpg: the picture is cut off or damaged", ()),
+    "no picture": (lambda f: (f / "x.jpg").write_text("none"), "x.jpg: this is no picture", ()),
+    "doubled": (lambda f: shutil.copy(f / "DJI_0002.jpg", f / "DJI_0002 (1).jpg"), "it is a copy of DJI_0002", ()),
+    "screenshot": (lambda f: Image.new("RGB", (640, 480)).save(f / "s.png"), "s.png: its size is 640 x 480 px", ()),
+    "other camera": (lambda f: picture(f, 4, model="Other"), "its camera is Maker Other", ("DJI_0005",)),
+    "without a position": (
+        lambda f: picture(f, 4, ()),
+        "1 of 10 photographs has no position (DJI_0005)",
+        ("DJI_0005",),
+    ),
+    "at (0, 0)": (lambda f: picture(f, 4, (0.0, 0.0)), "DJI_0005 are (0, 0)", ("DJI_0005",)),
+    "swapped": (lambda f: picture(f, 4, FLIGHT.camera[4][1::-1]), "DJI_0005 have changed places", ()),
+    "far away": (lambda f: picture(f, 4, FAR), "DJI_0005 are more than 50 km from the others", ("DJI_0005",)),
+    "above take-off": (lambda f: picture(f, 4, above_m=21), "DJI_0005 are above take-off", ()),
+    "file of no marks": (lambda f: (f / "b.MRK").write_text("no\n"), "b.MRK, row 1", ()),
+}
+
+
+@pytest.mark.parametrize("kind", SPOILT)
+def test_each_invalid_input_costs_one_message(clean, tmp_path, kind):
+    spoil, words, lost = SPOILT[kind]
+    before, sound = said_of(clean)
+    folder = shutil.copytree(clean, tmp_path / "flight")
+    spoil(folder)
+    said, found = said_of(folder)
+    assert [words in s for s in said if s not in before] == [True], said
+    assert {n: g for n, g in found.items() if g} == {n: g for n, g in sound.items() if n not in lost}
+
+
+@pytest.mark.parametrize(("zone_s", "words"), [(-8 * 3600.0, "+8 h (time zone)"), (7200.0, "-2 h (time zone)")])
+def test_a_wrong_time_zone_of_marks_is_one_sentence(clean, tmp_path, zone_s, words):
+    right, wrong = (shutil.copytree(clean, tmp_path / name) for name in ("right", "wrong"))
+    # Names with numbers that are not those of the marks.
+    for folder in (right, wrong):
+        for path in folder.glob("*.jpg"):
+            path.rename(folder / path.name.replace("DJI_", "IMG"))
+    marks(right)
+    marks(wrong, zone_s)
+    (before, sound), (said, found) = said_of(right), said_of(wrong)
+    assert [words in s and s.endswith("which is corrected") for s in said if s not in before] == [True], said
+    assert found == sound and all(g.heights == "ellipsoid" for g in found.values())
+
+
+def test_a_wrong_row_of_marks_is_one_sentence(clean, tmp_path):
+    right, wrong = (shutil.copytree(clean, tmp_path / name) for name in ("right", "wrong"))
+    for folder in (right, wrong):
+        marks(folder)
+    (wrong / "a.MRK").write_text((right / "a.MRK").read_text().replace("34\t", "34\tx"))
+    (before, sound), (said, found) = said_of(right), said_of(wrong)
+    mine = [s for s in said if s.startswith("a.MRK")]
+    assert len(mine) == 1 and mine[0] not in before and "1 of 10 rows is left out (4); row 4: " in mine[0], mine
+    assert [n for n, g in found.items() if g != sound[n]] == ["DJI_0004"] and found["DJI_0004"] is not None

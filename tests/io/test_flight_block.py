@@ -1,4 +1,4 @@
-"""Blocks whose stations, attitudes and motion come from a trajectory, or whose motion stands in the tables."""
+"""Blocks with stations, attitudes and motion from a trajectory or from tables."""
 
 import dataclasses
 
@@ -12,12 +12,11 @@ from jaxphoto.block import Frame
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import read_block, write_block
 from jaxphoto.io.block_folder.settings import frame_section
-from jaxphoto.io.trajectory import FIELDS, Records, write_flight_csv, write_sbet
-from jaxphoto.io.trajectory.in_frame import trajectory_in, with_poses
+from jaxphoto.io.trajectory import FIELDS, Records, trajectory_in, with_poses, write_flight_csv, write_sbet
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw, roll_pitch_yaw_from_matrix
 from tests.derivatives import compiled
 
-START = 350_000.0
+START, TIMES = 350_000.0, (1.01, 3.33, 9.99)
 FIX_OFFSET = ("block.toml", "[mounts.default]", '[mounts.default]\ntime_offset = "free"')
 
 matrices = compiled(jax.vmap(matrix_from_roll_pitch_yaw))
@@ -48,7 +47,7 @@ def timed(*seconds) -> tuple[str, str, str]:
 def fly(write_folder):
     """Writes the small block with a trajectory for its stations; `text` goes under [trajectory]."""
 
-    def make(records=None, times=(1.01, 3.33, 9.99), text="", *changes):
+    def make(records=None, times=TIMES, text="", *changes):
         files = [("stations.csv", "", None), ("attitudes.csv", "", None), timed(*times)]
         toml = ("block.toml", "[sigmas]", f'[trajectory]\nfile = "flight.csv"\n{text}\n[sigmas]')
         folder = write_folder(*files, toml, *changes)
@@ -59,7 +58,7 @@ def fly(write_folder):
 
 
 def test_positions_attitudes_and_motion_are_those_of_the_flight(fly):
-    times = np.array([1.01, 3.33, 9.99])
+    times = np.array(TIMES)
     block = read_block(fly())
     position, angles = motion(times)
     np.testing.assert_array_equal(block.stations.who, np.repeat([0, 1, 2], 3))
@@ -83,25 +82,18 @@ def test_coarse_records_cost_accuracy(fly):
     coarse = flight(keep=lambda t: np.isclose(t % 2, 0) | np.isclose(t % 2, 2))
     block = read_block(fly(coarse))
     assert (np.asarray(block.stations.sigma).reshape(-1, 3)[:, 2] > 0.025).any()
-    position = motion(np.array([1.01, 3.33, 9.99]))[0].ravel()
+    position = motion(np.array(TIMES))[0].ravel()
     assert (np.abs(block.stations.value - position) < 3 * np.asarray(block.stations.sigma)).all()
 
 
-def test_sigmas_are_those_of_block_toml_where_the_file_has_none(fly, write_folder):
+def test_default_sigmas_are_those_of_block_toml(fly, write_folder):
     records = flight()._replace(sigma_m=np.full((len(flight().time), 3), np.nan))
     np.testing.assert_allclose(read_block(fly(records)).stations.sigma, 0.10, rtol=1e-3)
 
 
-def test_no_sigma_at_all(fly):
-    unknown = np.full((len(flight().time), 3), np.nan)
-    folder = fly(flight()._replace(sigma_deg=unknown), (1, 2, 3), "", ("block.toml", "attitude_deg = 0.01\n", ""))
-    with pytest.raises(InputError, match=r"flight\.csv: .* add attitude_deg under \[sigmas\] in block\.toml"):
-        read_block(folder)
-
-
 def test_an_image_without_a_time_has_no_station(fly):
     images = ("images.csv", f"b,kodak,one,{START + 3.33!r}", "b,kodak,one,")
-    folder = fly(None, (1.01, 3.33, 9.99), "", ("block.toml", 'drift = "free"', ""))
+    folder = fly(None, TIMES, "", ("block.toml", 'drift = "free"', ""))
     (folder / "images.csv").write_text((folder / "images.csv").read_text().replace(*images[1:]))
     np.testing.assert_array_equal(read_block(folder).attitudes.image, [0, 2])
 
@@ -130,11 +122,11 @@ def test_sbet_in_an_epsg_frame(fly, wander):
     epsg = 'kind = "epsg"\ncode = 32722\nvertical = "ellipsoidal"\norigin = [-50.2, -25.1, 0.0]'
     frame = ("block.toml", 'kind = "local"', epsg)
     points = ("control_points.csv", "", None), ("object_points.csv", "", None)
-    folder = fly(records, (1.01, 3.33, 9.99), "", frame, *points, ("distances.csv", "", None))
+    folder = fly(records, TIMES, "", frame, *points, ("distances.csv", "", None))
     write_sbet(values, folder / "flight.sbet")
     (folder / "block.toml").write_text((folder / "block.toml").read_text().replace("flight.csv", "flight.sbet"))
     block = read_block(folder)
-    position, angles = motion(np.array([1.01, 3.33, 9.99]))
+    position, angles = motion(np.array(TIMES))
     np.testing.assert_allclose(np.asarray(block.stations.value).reshape(-1, 3), position, rtol=0, atol=1e-5)
     level = block.frame.map.local_from_level(position)
     expected = level @ matrices(np.deg2rad(angles))
@@ -153,9 +145,9 @@ def test_csv_in_a_map_system(fly, north):
     angles = compiled(jax.vmap(roll_pitch_yaw_from_matrix))(np.swapaxes(axes(records.coordinates), 1, 2) @ bodies)
     written = records._replace(coordinates=frame.map.map(records.coordinates), roll_pitch_yaw_deg=np.rad2deg(angles))
     points = ("control_points.csv", "", None), ("object_points.csv", "", None), ("distances.csv", "", None)
-    folder = fly(written, (1.01, 3.33, 9.99), "", ("block.toml", 'kind = "local"', epsg), *points)
+    folder = fly(written, TIMES, "", ("block.toml", 'kind = "local"', epsg), *points)
     block = read_block(folder)
-    position, expected = motion(np.array([1.01, 3.33, 9.99]))
+    position, expected = motion(np.array(TIMES))
     assert block.frame == frame
     np.testing.assert_allclose(np.asarray(block.stations.value).reshape(-1, 3), position, rtol=0, atol=1e-5)
     np.testing.assert_allclose(np.rad2deg(block.attitudes.roll_pitch_yaw), expected, rtol=0, atol=1e-5)
@@ -174,12 +166,6 @@ def test_poses_in_the_frame_of_a_block_go_back_into_records(frame):
     np.testing.assert_allclose(off, 0.0, rtol=0, atol=1e-9)
 
 
-def test_longitude_and_latitude_need_an_epsg_frame(fly):
-    records = flight()
-    with pytest.raises(InputError, match=r'flight\.csv: .*longitude.*"local".*write kind = "epsg"'):
-        read_block(fly(records._replace(coordinates=records.coordinates / 100, geographic=True)))
-
-
 DAY, WEEK = 86_400, 604_800
 CLOCKS = {
     "seconds of day": (-4 * DAY, ["seconds of a day", "GPS week", "shift_s = 345600", "18 s more if time_s is UTC"]),
@@ -196,14 +182,9 @@ CLOCKS = {
 def test_clocks_that_are_mixed_up(fly, name):
     shift, words = CLOCKS[name]
     with pytest.raises(BlockError) as caught:
-        read_block(fly(times=np.array([1.01, 3.33, 9.99]) + shift))
+        read_block(fly(times=np.array(TIMES) + shift))
     for word in ("images.csv, row ", "image ", "exposed outside flight.csv", *words):
         assert word in str(caught.value), str(caught.value)
-
-
-def test_a_shift_that_is_there_already_is_counted(fly):
-    with pytest.raises(BlockError, match="write shift_s = 345600 under"):
-        read_block(fly(times=np.array([1.01, 3.33, 9.99]) - 4 * DAY, text="shift_s = -86400.0"))
 
 
 def test_leap_seconds_inside_the_trajectory_are_found_by_approximate_positions(fly):
@@ -225,35 +206,53 @@ def test_leap_seconds_inside_the_trajectory_are_found_by_approximate_positions(f
     np.testing.assert_allclose(read_block(folder).stations.value[:3], motion(21.01)[0], rtol=0, atol=1e-5)
 
 
-def test_an_exposure_in_a_gap(fly):
-    holed = flight(keep=lambda t: (t < 3.01) | (t > 4.02))
-    with pytest.raises(BlockError, match=r"row 3: image b .* 350003\.330 s in a gap of flight\.csv.*max_gap_s"):
-        read_block(fly(holed))
+def holed():
+    return flight(keep=lambda t: (t < 3.01) | (t > 4.02))
 
 
 def test_a_gap_that_is_allowed(fly):
-    holed = flight(keep=lambda t: (t < 3.01) | (t > 4.02))
-    block = read_block(fly(holed, text="max_gap_s = 2.0"))
+    block = read_block(fly(holed(), text="max_gap_s = 2.0"))
     np.testing.assert_allclose(block.stations.value[3:6], motion(3.33)[0], rtol=0, atol=0.01)
 
 
-def test_stations_beside_a_trajectory(fly):
-    folder = fly()
-    (folder / "stations.csv").write_text("image,X_m,Y_m,Z_m\na,1,2,3\n")
-    with pytest.raises(InputError, match=r"stations\.csv: .* flight\.csv; remove this file, or \[trajectory\]"):
-        read_block(folder)
+UNKNOWN = np.full((len(flight().time), 3), np.nan)
+REFUSED = {
+    "no sigma": (
+        lambda fly: fly(flight()._replace(sigma_deg=UNKNOWN), TIMES, "", ("block.toml", "attitude_deg = 0.01\n", "")),
+        r"flight\.csv: .* add attitude_deg under \[sigmas\] in block\.toml",
+    ),
+    "places in a local frame": (
+        lambda fly: fly(flight()._replace(coordinates=flight().coordinates / 100, geographic=True)),
+        r'flight\.csv: .*longitude.*"local".*write kind = "epsg"',
+    ),
+    "shift": (
+        lambda fly: fly(times=np.array(TIMES) - 4 * DAY, text="shift_s = -86400.0"), "write shift_s = 345600 under",
+    ),
+    "gap": (lambda fly: fly(holed()), r"row 3: image b .* 350003\.330 s in a gap of flight\.csv.*max_gap_s"),
+    "key": (
+        lambda fly: fly(text="max_gap = 1.0"),
+        r"\[trajectory\] max_gap: no such key is known; use file, shift_s, max_gap_s",
+    ),
+    "stations": (
+        lambda fly: _beside(fly(), "stations.csv", "image,X_m,Y_m,Z_m\na,1,2,3\n"),
+        r"stations\.csv: .* flight\.csv; remove this file, or \[trajectory\]",
+    ),
+    "no file": (lambda fly: _beside(fly(), "flight.csv", None), r"there is no file .*flight\.csv; add it"),
+}  # fmt: skip
 
 
-def test_misspelt_key(fly):
-    with pytest.raises(InputError, match=r"\[trajectory\] max_gap: no such key is known; use file, shift_s, max_gap_s"):
-        read_block(fly(text="max_gap = 1.0"))
+def _beside(folder, name, text):
+    (folder / name).unlink(missing_ok=True)
+    if text is not None:
+        (folder / name).write_text(text)
+    return folder
 
 
-def test_no_file(fly):
-    folder = fly()
-    (folder / "flight.csv").unlink()
-    with pytest.raises(InputError, match=r"there is no file .*flight\.csv; add it"):
-        read_block(folder)
+@pytest.mark.parametrize("name", REFUSED)
+def test_invalid_trajectories_are_refused(fly, name):
+    write, message = REFUSED[name]
+    with pytest.raises((InputError, BlockError), match=message):
+        read_block(write(fly))
 
 
 def radians(records: Records, yaw) -> Records:
@@ -287,7 +286,7 @@ def with_motion(folder, velocity=True, rate=True):
     return folder
 
 
-def test_motion_from_tables_comes_back(write_folder, tmp_path):
+def test_motion_from_tables_round_trip(write_folder, tmp_path):
     block = read_block(with_motion(write_folder(FIX_OFFSET)))
     np.testing.assert_array_equal(block.motion.velocity, [[60, 0.5, -0.1], [61, 0.25, 0.3], [0, 0, 0]])
     np.testing.assert_allclose(np.rad2deg(block.motion.rate), [[0.5, 1.5, 2.5], [0, -1, -2], [0, 0, 0]])
@@ -298,7 +297,7 @@ def test_motion_from_tables_comes_back(write_folder, tmp_path):
 
 
 def test_a_flight_is_written_as_tables(fly, tmp_path):
-    block = read_block(fly(None, (1.01, 3.33, 9.99), "", FIX_OFFSET))
+    block = read_block(fly(None, TIMES, "", FIX_OFFSET))
     write_block(block, tmp_path / "copy")
     again = read_block(tmp_path / "copy")
     assert jax.tree.structure(again) == jax.tree.structure(block)

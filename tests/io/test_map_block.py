@@ -1,4 +1,4 @@
-"""Blocks in an EPSG system: read into a local frame, written back into their own."""
+"""Blocks in an EPSG system: read into a local frame and written back."""
 
 import dataclasses
 
@@ -56,7 +56,7 @@ def test_coordinates_come_into_the_local_frame(write_folder):
     np.testing.assert_allclose(block.control.value[3], block.start.unknowns.points[1, 2], rtol=0, atol=1e-9)
 
 
-def test_heights_are_ellipsoidal_unless_told_and_that_is_said(write_folder, tmp_path):
+def test_heights_are_ellipsoidal_by_default_with_a_warning(write_folder, tmp_path):
     told = read_block(to_utm(write_folder()))
     (tmp_path / "block").rename(tmp_path / "first")
     silent = to_utm(write_folder(), EPSG.replace('\nvertical = "ellipsoidal"', ""))
@@ -181,7 +181,7 @@ def test_one_table_outside_the_area_is_named(write_folder, origin):
         read_block(folder)
 
 
-def test_what_a_conversion_needs_is_asked_for(write_folder):
+def test_incomplete_coordinates_are_refused(write_folder):
     folder = to_utm(write_folder(("object_points.csv", "p2,2.5,2.5,4.5\n", "")))
     with pytest.raises(InputError, match=r"control_points\.csv, row 3: .*EPSG:32722 needs X_m .* object_points\.csv"):
         read_block(folder)
@@ -204,7 +204,7 @@ def test_frames_without_a_place(write_folder):
         read_block(write_folder(*changes, images, distances, FRAME))
 
 
-def test_a_grid_is_taken_as_it_stands_with_a_warning(write_folder, tmp_path):
+def test_grid_coordinates_are_kept_with_a_warning(write_folder, tmp_path):
     folder = write_folder(("block.toml", 'kind = "local"', 'kind = "grid"\n[corrections]\ncurvature = true'))
     with pytest.warns(UserWarning, match="not Cartesian"):
         block = read_block(folder)
@@ -286,7 +286,7 @@ def test_an_adjustment_does_not_depend_on_the_system_of_the_files(tmp_path):
     )
 
 
-def test_what_is_no_coordinate_is_not_converted(write_folder, tmp_path):
+def test_vectors_and_lengths_are_not_converted(write_folder, tmp_path):
     block = read_block(to_utm(write_folder()))
     near = PointRows(np.array([1]), np.array([[1.0, 2.0, 3.0]]), np.full((1, 3), 0.1))
     axes = CameraPositions(np.array([0, 0, 0]), np.arange(3), np.array([4.0, 5.0, 6.0]), np.ones(3))

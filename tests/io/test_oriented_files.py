@@ -1,10 +1,9 @@
-"""Orientations with image points beside them: read as they were written, in map systems too; refused in a sentence."""
+"""Orientations with separate image points, in local and map systems, and refusals."""
 
 import dataclasses
 import json
 import re
 
-import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,13 +14,15 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
 from jaxphoto.extras.formats import ProjectCamera, export, read_source, read_tables
 from jaxphoto.extras.formats.points_beside import joined, named, points_of
-from jaxphoto.extras.formats.texts import is_exterior, read_exterior
+from jaxphoto.extras.formats.texts import is_exterior, ray_misfit, read_exterior
 from jaxphoto.io.block_folder.table_layout import XYZ
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
 from tests.formulas import camera_from_object
 from tests.io.oriented_files import (
     inside,
     markers,
+    misfits_px,
+    poses,
     write_angles,
     write_bingo,
     write_metashape,
@@ -30,19 +31,13 @@ from tests.io.oriented_files import (
     write_patb,
 )
 from tests.io.test_exports import SENSOR, photographs
-from tests.io.test_reconstructions import _projected, free_of
+from tests.io.test_reconstructions import free_of
 
 
-def misfits_px(block, p):
-    """Measured minus projected, from the start values and the points that were photographed."""
-    rows = block.image_points
+def misfits_of(block, p):
+    """Reprojection errors (px) of the start values and the points that were photographed."""
     points = p.xyz[[p.points.index(name) for name in block.points]]
-    if block.frame.kind == "epsg":
-        points = block.frame.map.local(p.frame.map.map(points))
-    at = jax.tree.map(lambda leaf: np.asarray(leaf)[np.asarray(rows.image)], block.start.unknowns.exterior)
-    (camera,) = block.sensors
-    found = np.asarray(rows.xy) - _projected(block.start.unknowns.interior[camera], at, points[np.asarray(rows.point)])
-    return found / block.sensors[camera].pixel_mm
+    return misfits_px(block, block.frame.map.local(p.frame.map.map(points)) if block.frame.kind == "epsg" else points)
 
 
 @pytest.mark.filterwarnings("ignore:.*fewer than")
@@ -52,39 +47,8 @@ def test_cameras_of_metashape_and_image_points_of_bingo_are_a_block(tmp_path, ca
     block = read_source(write_metashape(tmp_path / "in", camera, kind))
     assert block.sensors["one"] == SENSOR and block.frame.kind == kind and block.datum.kind == "inner"
     assert len(block.images) == len(set(p.image.tolist())) and len(block.image_points.image) > 60
-    assert np.abs(misfits_px(block, p)).max() < 1e-6
+    assert np.abs(misfits_of(block, p)).max() < 1e-6
     assert free_of(block, "one") == {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "k4", "p1", "p2", "b1", "b2"}
-
-
-angle = st.floats(-3.1, 3.1)
-metres = st.floats(-2000.0, 2000.0)
-
-
-@settings(max_examples=25, deadline=None)
-@given(
-    kind=st.sampled_from(["local", "epsg"]),
-    poses=st.lists(st.tuples(metres, metres, metres, angle, st.floats(-1.5, 1.5), angle), min_size=4, max_size=4),
-)
-@pytest.mark.filterwarnings("ignore:.*fewer than", "ignore:.*not read")
-def test_positions_and_rotations_of_metashape_come_back(tmp_path_factory, kind, poses):
-    folder = tmp_path_factory.mktemp("poses")
-    values = np.array(poses)
-    turn = np.stack([camera_from_object(*angles) for angles in values[:, 3:]])
-    p = photographs("agisoft", kind)._replace(exterior=ExteriorOrientation(values[:, :3], turn))
-    export(p, folder, "metashape")
-    rows = "".join(f"{k} {k}.5 {k}.25\n" for k in range(3))
-    (folder / "image_points.csv").unlink()
-    (folder / "ties.txt").write_text("".join(f"{name} camera\n{rows}-99\n" for name in p.images))
-    table = read_tables(folder, "metashape").tables["images"]
-    wanted = p.in_map().exterior
-    order = [p.images.index(name) for name in table.text("image")]
-    position = np.stack([table.numbers(name) for name in XYZ], axis=1)
-    # A northing of a map has nine digits before those of a nanometre.
-    tolerance = 1e-9 if kind == "local" else 1e-8
-    np.testing.assert_allclose(position, np.asarray(wanted.position)[order], rtol=0, atol=tolerance)
-    angles = np.deg2rad(np.stack([table.numbers(f"{name}_deg") for name in ("omega", "phi", "kappa")], axis=1))
-    again = np.stack([camera_from_object(*row) for row in angles])
-    np.testing.assert_allclose(again, np.asarray(wanted.camera_from_object)[order], rtol=0, atol=1e-9)
 
 
 REAL = """<document version="2.0.0"><chunk label="Chunk 1"><sensors><sensor id="0" label="M3M" type="frame">
@@ -100,7 +64,7 @@ REAL = """<document version="2.0.0"><chunk label="Chunk 1"><sensors><sensor id="
 -0.01288400 0.02326485 -0.99964631 0.43561421 0 0 0 1</transform></camera></group></cameras></chunk></document>"""
 
 
-def test_a_camera_of_metashape_itself_is_where_its_receiver_was_and_looks_down(tmp_path):
+def test_a_camera_exported_by_metashape_agrees_with_gnss_and_looks_down(tmp_path):
     """One photograph of a flight that is public: its GNSS says -120.417985477, 39.41191747, 2420.109."""
     # Two of it, because points of one photograph tie nothing.
     twice = re.sub(r"(<camera .*?</camera>)", lambda m: m[1] + m[1].replace("one.JPG", "two.JPG"), REAL, flags=re.S)
@@ -144,7 +108,7 @@ def test_texts_of_orientations_image_points_and_a_camera_are_a_block(tmp_path, n
     block = read_source(TEXTS[name](tmp_path / "in"))
     p = inside("opencv", block.frame.kind)
     assert block.sensors == {"one": SENSOR} and set(block.images) <= set(p.images) and len(block.images) > 2
-    assert np.abs(misfits_px(block, p)).max() < 1e-6
+    assert np.abs(misfits_of(block, p)).max() < 1e-6
     assert free_of(block, "one") == {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2", "b1"}
 
 
@@ -166,7 +130,7 @@ def test_parameters_and_image_points_are_a_block(tmp_path, name):
     write, camera = PARAMETERS[name]
     block = read_source(write(tmp_path / "in"))
     (own,) = block.sensors
-    assert np.abs(misfits_px(block, inside(camera, block.frame.kind))).max() < 1e-6
+    assert np.abs(misfits_of(block, inside(camera, block.frame.kind))).max() < 1e-6
     assert {"c_mm", "xp_mm", "yp_mm", "k1", "k2"} <= free_of(block, own)
     # Pixels have no size in nerfstudio.
     assert block.sensors[own] == (
@@ -176,49 +140,36 @@ def test_parameters_and_image_points_are_a_block(tmp_path, name):
 
 @settings(max_examples=25, deadline=None)
 @given(
-    format=st.sampled_from(["nerfstudio", "orthority"]),
-    poses=st.lists(st.tuples(metres, metres, metres, angle, st.floats(-1.5, 1.5), angle), min_size=4, max_size=4),
-)
-def test_poses_come_back(tmp_path_factory, format, poses):
-    folder, values = tmp_path_factory.mktemp("poses"), np.array(poses)
+    case=st.sampled_from(
+        [("metashape", "agisoft", "local"), ("metashape", "agisoft", "epsg"), ("opk", "opencv", "local"),
+         ("nerfstudio", "opencv", "local"), ("orthority", "opencv", "local")]
+    ),
+    values=poses,
+)  # fmt: skip
+@pytest.mark.filterwarnings("ignore:.*fewer than", "ignore:.*not read")
+def test_poses_round_trip(tmp_path_factory, case, values):
+    (format, camera, kind), folder, values = case, tmp_path_factory.mktemp("poses"), np.array(values)
     turn = np.stack([camera_from_object(*angles) for angles in values[:, 3:]])
-    p = photographs("opencv", "local")._replace(exterior=ExteriorOrientation(values[:, :3], turn))
+    p = photographs(camera, kind)._replace(exterior=ExteriorOrientation(values[:, :3], turn))
     export(p, folder, format)
     rows = "".join(f"{k} {k}.5 {k}.25\n" for k in range(3))
     (folder / "image_points.csv").unlink()
     (folder / "ties.txt").write_text("".join(f"{name} camera\n{rows}-99\n" for name in p.images))
-    tables = read_tables(folder, format)
-    table, (camera,) = tables.tables["images"], tables.settings["cameras"].values()
+    tables = read_tables(folder, "texts" if format == "opk" else format)
+    table, (read,) = tables.tables["images"], tables.settings["cameras"].values()
+    wanted = p.in_map().exterior
     order = [p.images.index(name) for name in table.text("image")]
     position = np.stack([table.numbers(name) for name in XYZ], axis=1)
-    np.testing.assert_allclose(position, values[order, :3], rtol=0, atol=1e-9)
+    # A northing of a map has nine digits before those of a nanometre.
+    tolerance = 1e-9 if kind == "local" else 1e-8
+    np.testing.assert_allclose(position, np.asarray(wanted.position)[order], rtol=0, atol=tolerance)
     angles = np.deg2rad(np.stack([table.numbers(f"{name}_deg") for name in ("omega", "phi", "kappa")], axis=1))
     again = np.stack([camera_from_object(*row) for row in angles])
-    np.testing.assert_allclose(again, turn[order], rtol=0, atol=1e-9)
-    given = p.cameras["one"].interior
-    scale = camera["pixel_mm"] / SENSOR.pixel_mm
-    interior = {key: value / scale if key.endswith("_mm") else value for key, value in camera["interior"].items()}
-    for name in parameter_names(given):
-        assert interior[name] == pytest.approx(float(get_parameter(given, name)), abs=1e-9)
-
-
-@settings(max_examples=25, deadline=None)
-@given(poses=st.lists(st.tuples(metres, metres, metres, angle, st.floats(-1.5, 1.5), angle), min_size=4, max_size=4))
-def test_positions_and_angles_come_back(tmp_path_factory, poses):
-    folder, values = tmp_path_factory.mktemp("angles"), np.array(poses)
-    turn = np.stack([camera_from_object(*angles) for angles in values[:, 3:]])
-    p = photographs("opencv", "local")._replace(exterior=ExteriorOrientation(values[:, :3], turn))
-    export(p, folder, "opk")
-    (folder / "image_points.csv").unlink()
-    rows = "".join(f"{k} {k}.5 {k}.25\n" for k in range(3))
-    (folder / "ties.txt").write_text("".join(f"{name} camera\n{rows}-99\n" for name in p.images))
-    table = read_tables(folder, "texts").tables["images"]
-    order = [p.images.index(name) for name in table.text("image")]
-    position = np.stack([table.numbers(name) for name in XYZ], axis=1)
-    np.testing.assert_allclose(position, values[order, :3], rtol=0, atol=1e-9)
-    angles = np.deg2rad(np.stack([table.numbers(f"{name}_deg") for name in ("omega", "phi", "kappa")], axis=1))
-    again = np.stack([camera_from_object(*row) for row in angles])
-    np.testing.assert_allclose(again, turn[order], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(again, np.asarray(wanted.camera_from_object)[order], rtol=0, atol=1e-9)
+    interior, scale = p.cameras["one"].interior, read["pixel_mm"] / SENSOR.pixel_mm
+    for name in parameter_names(interior):
+        value = read["interior"][name] / (scale if name.endswith("_mm") else 1)
+        assert value == pytest.approx(float(get_parameter(interior, name)), abs=1e-9), name
 
 
 @pytest.mark.filterwarnings("ignore:.*fewer than")
@@ -232,7 +183,7 @@ def test_markers_of_metashape_are_control_and_tie_photographs(tmp_path):
     assert set(block.points) == set(names) and block.datum.kind == "control"
     assert len(block.check.who) == 3 and len(block.control.who) == 21
     assert np.asarray(block.control.sigma).tolist() == [0.02, 0.02, 0.03] * 7
-    assert np.abs(misfits_px(block, p)).max() < 1e-6
+    assert np.abs(misfits_of(block, p)).max() < 1e-6
 
 
 def _without(pattern):
@@ -276,18 +227,10 @@ def appended(folder, text, name="ties.dat"):
     return folder
 
 
-def _with_markers(folder):
-    text = (folder / "cameras.xml").read_text()
-    (folder / "markers.xml").write_text(text)
-    return folder
-
-
 REFUSED = {
     "no ties": (_metashape(ties=False), "cameras.xml has no tie points and no marks.*as BINGO or PATB"),
     "not aligned": (_metashape(_without("<transform>-?[0-9].*?</transform>")), "no camera is aligned; align"),
-    "not aligned, and markers": (
-        lambda f: _with_markers(_metashape(_without("<transform>-?[0-9].*?</transform>"))(f)), "cameras.xml: no camera",
-    ),
+
     "no size": (_nerf(lambda t: {k: v for k, v in t.items() if k not in "wh"}), "does not say how large its"),
     "cut": (_metashape(lambda text: text[:-30]), "cameras.xml: damaged"),
     "no sensor": (_metashape(_without("<calibration.*</calibration>")), "'a b': its sensor is not calibrated"),
@@ -298,7 +241,7 @@ REFUSED = {
         "not on the earth",
     ),
     "row": (_angles(lambda text: text + "lost 1 2 3\n" * 2), "row 8: 'lost 1 2 3' is not name, X, Y, Z, omega"),
-    "angle": (_angles(lambda text: text + "x.jpg 1 2 3 4 5 1e99\n" * 2), "row 8: '1 2 3 4 5 1e99' is not 6 numbers"),
+
     "system": (_angles(lambda text: text.replace("EPSG:32633", "EPSG:99999")), "EPSG code 99999 is unknown"),
     "no camera": (lambda folder: without(write_angles(folder), "camera.toml"), "0 camera files and needs one"),
     "no points": (lambda folder: without(write_angles(folder), "ties.dat") / "exterior.txt", "has no image points"),
@@ -309,7 +252,7 @@ REFUSED = {
         lambda folder: write_bingo(folder, change=lambda t: re.sub(r" \S+ 1$", "", t.rstrip())) / "itera.dat",
         r"itera.dat, row \d+: .* is not ORIA, name, X, Y, Z, phi, omega, kappa",
     ),
-    "matrix row": (_patb(lambda text: text.rstrip() + "x\n"), "patb.ori, row 12: .* is not 4 numbers"),
+
     "frames": (_nerf(lambda t: {**t, "frames": 5}), "transforms.json: damaged"),
     "model": (_nerf(lambda t: {**t, "camera_model": "EQUIRECTANGULAR"}), "'EQUIRECTANGULAR' is not known here"),
     "focal": (_nerf(lambda t: {**t, "fl_x": 0}), "fl_x: 0 is not positive"),
@@ -330,13 +273,13 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_is_told_in_a_sentence(tmp_path, name):
+def test_invalid_files_are_refused(tmp_path, name):
     write, message = REFUSED[name]
     with pytest.raises(InputError, match=message):
         read_source(write(tmp_path / "in"))
 
 
-def test_photographs_that_nothing_ties_are_told(tmp_path):
+def test_untied_photographs_are_reported(tmp_path):
     write_metashape(tmp_path / "in", ties=False)
     (tmp_path / "in" / "ties.txt").write_text("a b camera\n1 0.5 0.5\n2 0.5 0.6\n3 0.5 0.7\n-99\nlost camera\n")
     with (
@@ -404,7 +347,7 @@ def test_a_tie_point_of_a_markers_name_is_another_point_unless_it_lies_there():
     }  # fmt: skip
 
 
-def test_an_empty_line_ends_a_photograph_and_millimetres_are_told_by_their_signs(tmp_path):
+def test_empty_lines_end_photographs_and_signs_identify_millimetres(tmp_path):
     text = tmp_path / "ties.txt"
     text.write_text("a.jpg\n1 -1.0 2.0\n2 3.0 1.0\n\nb.jpg\n1 4.0 2.0\n2 1.0 0.5\n\n")
     sensor = Sensor(1000, 800, 0.01)
@@ -416,7 +359,7 @@ def test_an_empty_line_ends_a_photograph_and_millimetres_are_told_by_their_signs
     np.testing.assert_allclose(pixels, [[1.0, 2.0], [3.0, 1.0], [4.0, 2.0], [1.0, 0.5]])
 
 
-def test_a_fisheye_of_instant_ngp_is_one_and_a_term_that_is_not_read_is_refused(tmp_path):
+def test_instant_ngp_fisheye_and_unknown_terms(tmp_path):
     path = write_nerfstudio(tmp_path, "fisheye") / "transforms.json"
     content = json.loads(path.read_text())
     del content["camera_model"]
@@ -426,3 +369,10 @@ def test_a_fisheye_of_instant_ngp_is_one_and_a_term_that_is_not_read_is_refused(
     path.write_text(json.dumps(content | {"k4": 0.1}))
     with pytest.raises(InputError, match="k4: cameras of kind OPENCV have no such term here"):
         read_source(tmp_path, "nerfstudio")
+
+
+def test_parallel_rays_of_a_row_that_is_repeated_have_a_misfit():
+    # Found among spoilt files: the sum of so many of these rays is singular to the last digit.
+    number = 594
+    rays, first = np.tile([-0.9, 0.5, 1.5], (number, 1)), np.zeros(number, int)
+    assert np.isfinite(ray_misfit(np.zeros((1, 3)), np.eye(3)[None], rays, first, first))

@@ -51,10 +51,7 @@ def test_damaged_exif_says_nothing(tmp_path):
     path = write(
         tmp_path / "a.jpg",
         top={BASE.Orientation: 77},
-        taken={
-            BASE.FocalLength: TiffImagePlugin.IFDRational(3, 0),
-            BASE.FocalLengthIn35mmFilm: 0,
-        },
+        taken={BASE.FocalLength: TiffImagePlugin.IFDRational(3, 0), BASE.FocalLengthIn35mmFilm: 0},
         gps={1: "N", 2: (ratio(13.0), ratio(0.0), ratio(0.0)), 3: "E", 4: (ratio(203.0), ratio(0.0), ratio(0.0))},
     )
     (found,) = photographs([path])

@@ -1,4 +1,4 @@
-"""BAL and Bundler, whose cameras are f, k1 and k2: rays are kept, by each format's equations, and all comes back."""
+"""BAL and Bundler with cameras f, k1, k2: rays are kept by the equations of each format; round trips."""
 
 import numpy as np
 import pytest
@@ -73,7 +73,7 @@ def test_rays_are_kept(tmp_path, format, camera):
 
 
 @pytest.mark.parametrize("format", OF)
-def test_residuals_stay_what_they_were(tmp_path, format):
+def test_residuals_are_preserved(tmp_path, format):
     """What was measured wrong by pixels is so by the same afterwards, but for how the fit stretches there."""
     p = named(inside("agisoft", "local"))
     noise = np.random.default_rng(3).normal(0, 2.0, p.column_row.shape)
@@ -89,7 +89,7 @@ term = st.floats(-0.2, 0.2)
 @given(
     format=st.sampled_from(list(OF)), values=poses, c=st.floats(2.0, 200.0), at=st.tuples(term, term), k1=term, k2=term
 )
-def test_cameras_poses_points_and_image_points_come_back(tmp_path_factory, format, values, c, at, k1, k2):
+def test_cameras_poses_points_and_image_points_round_trip(tmp_path_factory, format, values, c, at, k1, k2):
     folder = tmp_path_factory.mktemp("radial")
     p = named(posed(values, InteriorOrientation(c, *at, BundlerRadial(k1, k2))))
     done = export(p, folder, format)
@@ -109,7 +109,7 @@ def test_cameras_poses_points_and_image_points_come_back(tmp_path_factory, forma
     np.testing.assert_allclose(rows[:, 2:], wanted, rtol=0, atol=1e-9)
 
 
-def test_what_these_cameras_cannot_be(tmp_path):
+def test_cameras_without_an_equivalent_are_refused(tmp_path):
     p = named(inside("brown", "local"))
     wide = InteriorOrientation(3.0, 0.0, 0.0, projection=Equisolid())
     with pytest.raises(InputError, match="cannot be written as bal, whose cameras are perspective, because it is a f"):

@@ -15,8 +15,7 @@ from jaxphoto import InputError, Sensor
 from jaxphoto.block import Frame
 from jaxphoto.cloud import Cloud
 from jaxphoto.io import clouds, raster, write_block
-from jaxphoto.lidar.orthophoto import Picture
-from jaxphoto.lidar.raster import Raster, filled, hillshade, surface_model
+from jaxphoto.lidar.raster import Picture, Raster, filled, hillshade, surface_model
 from tests.checked_types import unchecked
 from tests.commands import run
 from tests.lidar.photographs import rendered
@@ -38,7 +37,7 @@ def surface(seed=1, shape=(300, 410), west=194_000.0, north=258_900.0):
 
 
 @pytest.mark.parametrize("code", [None, 32610, 2993])
-def test_what_is_written_is_read_by_rasterio(tmp_path, code):
+def test_rasterio_reads_written_models(tmp_path, code):
     model = surface()
     system = clouds.CoordinateSystem() if code is None else clouds.CoordinateSystem(CRS.from_epsg(code))
     path = tmp_path / "out" / "dsm.tif"
@@ -58,7 +57,7 @@ def test_what_is_written_is_read_by_rasterio(tmp_path, code):
     assert [p.name for p in path.parent.iterdir()] == ["dsm.tif"]
 
 
-def test_systems_of_heights_come_back(tmp_path):
+def test_systems_of_heights_round_trip(tmp_path):
     raster.write_dsm(tmp_path / "dsm.tif", surface(), clouds.CoordinateSystem(CRS.from_epsg(32610), 5703))
     _, system = raster.read_dsm(tmp_path / "dsm.tif")
     assert (system.plane.to_epsg(), system.heights) == (32610, 5703)
@@ -80,21 +79,8 @@ def test_real_strip_to_a_surface_model(data_dir, tmp_path, monkeypatch, capsys):
     """The command against every cell by NumPy; and the PNG is the shading of that."""
     cloud, out = data_dir / "lidar" / "autzen_trim.laz", tmp_path / "dsm.tif"
     hill = tmp_path / "hill.png"
-    arguments = (
-        "dsm",
-        cloud,
-        "--out",
-        out,
-        "--cell-m",
-        1.5,
-        "--returns",
-        "first",
-        "--fill-m",
-        1.5,
-        "--hillshade",
-        hill,
-    )
-    code, said, errors = run(monkeypatch, capsys, *arguments)
+    arguments = ("--cell-m", 1.5, "--returns", "first", "--fill-m", 1.5, "--hillshade", hill)
+    code, said, errors = run(monkeypatch, capsys, "dsm", cloud, "--out", out, *arguments)
     assert (code, errors) == (0, "") and "NAD_1983_HARN" in said
     xyz = clouds.read_cloud(cloud, returns="first").xyz
     column, row = (np.floor(xyz[:, :2] / 1.5).astype(int) * [1, -1]).T
@@ -163,7 +149,7 @@ def test_rasters_that_are_no_surface_models(tmp_path):
             raster.read_dsm(path)
 
 
-def test_heights_that_are_none(tmp_path):
+def test_nonfinite_heights_are_missing(tmp_path):
     path = tmp_path / "d.tif"
     place = {"transform": north_up(5, 5, 1, 1), "crs": "EPSG:32633"}
     signalling = np.array([0x7F800001], "<u4").view("<f4")[0]
@@ -279,7 +265,7 @@ def test_the_command_lays_a_photograph_over_the_ground(tmp_path, monkeypatch, ca
         ({"photo": "none"}, "no file"),
     ],
 )
-def test_what_the_command_cannot_do(tmp_path, monkeypatch, capsys, changes, says):
+def test_invalid_options_of_orthophoto_are_refused(tmp_path, monkeypatch, capsys, changes, says):
     block = flown().block
     write_block(block, tmp_path / "block")
     photographed(tmp_path, block.images[0], lambda x, y: 0 * x)
@@ -307,7 +293,7 @@ def test_what_the_command_cannot_do(tmp_path, monkeypatch, capsys, changes, says
         (("--cloud-epsg", "1"), "EPSG code 1 is unknown"),
     ],
 )
-def test_what_dsm_cannot_do(tmp_path, monkeypatch, capsys, arguments, says):
+def test_invalid_options_of_dsm_are_refused(tmp_path, monkeypatch, capsys, arguments, says):
     clouds.write_cloud(Cloud(np.arange(30.0).reshape(10, 3), np.ones(10, np.uint8)), tmp_path / "c.las")
     with unchecked():
         code, _, errors = run(monkeypatch, capsys, "dsm", tmp_path / "c.las", "--out", tmp_path / "d.tif", *arguments)

@@ -1,4 +1,4 @@
-"""What was exported comes back by `read_source`: whole, and adjusting to the same values."""
+"""Round trips of exports by `read_source`: identical values, identical adjustments."""
 
 import dataclasses
 import json
@@ -46,7 +46,7 @@ def test_image_points_come_back_with_their_standard_deviations(tmp_path, format)
 
 
 @pytest.mark.filterwarnings("ignore:.*fewer than")
-def test_standard_deviations_that_differ_by_axis_are_told(tmp_path):
+def test_different_standard_deviations_of_x_and_y_are_reported(tmp_path):
     p = inside("opencv", "local")
     with pytest.warns(UserWarning, match="image_points.csv has one standard deviation for x and y"):
         export(p._replace(sigma_px=np.tile([3.0, 4.0], (len(p.image), 1))), tmp_path / "out", "nerfstudio")
@@ -116,7 +116,7 @@ WHOLE = {"openmvg": {}, "opensfm": {}, "blocksexchange": {"p1": "p2", "p2": "p1"
     terms=st.sampled_from([(), ("k1",), ("k1", "k2", "k3"), ("k1", "k2", "k3", "p1", "p2")]),
     numbers=st.lists(term.filter(bool), min_size=5, max_size=5),
 )
-def test_cameras_poses_points_and_image_points_come_back(tmp_path_factory, format, values, c, at, terms, numbers):
+def test_cameras_poses_points_and_image_points_round_trip(tmp_path_factory, format, values, c, at, terms, numbers):
     folder = tmp_path_factory.mktemp("scene")
     given = dict(zip(terms, numbers, strict=False))
     p = posed(values, InteriorOrientation(c, *at, OpenCv(**given)))
@@ -139,7 +139,7 @@ def test_cameras_poses_points_and_image_points_come_back(tmp_path_factory, forma
 
 
 @pytest.mark.filterwarnings("ignore:.*fewer than")
-def test_several_cameras_of_openmvg_are_told_apart_as_cereal_does(tmp_path):
+def test_several_cameras_of_openmvg_have_the_ids_of_cereal(tmp_path):
     """The name of a kind stands with the first of it alone, and numbers of objects do not come twice."""
     p = inside("brown", "local")
     more = {
@@ -224,7 +224,7 @@ def test_a_block_with_control_adjusts_to_the_same_values_again(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:.*fewer than two images")
-def test_markers_in_another_system_are_refused_and_what_markers_cannot_be_is_told(tmp_path):
+def test_markers_in_another_system_are_refused_and_incomplete_ones_reported(tmp_path):
     p = inside("agisoft", "local")
     none = np.full((4, 3), np.nan)
     heights = with_control(p, np.array([[0.0, 0, 0]] * 3 + [[np.nan, np.nan, 0]]), none, np.zeros(4, bool))

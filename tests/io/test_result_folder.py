@@ -1,4 +1,4 @@
-"""Results of an adjustment read with their block: the adjusted values, and what is refused."""
+"""Results of an adjustment read with their block, and refusals."""
 
 import json
 import re
@@ -103,7 +103,7 @@ def diverged(folder):
         (lambda f: (f / "result" / "interior.csv").unlink(), r"has no interior\.csv; give a folder that"),
     ],
 )  # fmt: skip
-def test_what_is_no_result_of_its_block_is_told_in_a_sentence(own, spoil, message):
+def test_results_of_another_block_are_refused(own, spoil, message):
     spoil(own)
     with pytest.raises(InputError, match=message):
         adjusted_block(own / "result")
@@ -134,7 +134,7 @@ def test_photographs_are_called_by_their_files(tmp_path):
         Project.of_block(block, block.start.unknowns, {"b": "a"})
 
 
-def test_the_command_writes_what_was_adjusted(own, tmp_path, monkeypatch, capsys):
+def test_the_command_writes_adjusted_values(own, tmp_path, monkeypatch, capsys):
     (tmp_path / "pictures").mkdir()
     (tmp_path / "pictures" / "i0.jpg").touch()
     out = tmp_path / "block"

@@ -1,4 +1,4 @@
-"""Whatever numbers a file is given, it gives back: every format of cameras, COLMAP, clouds, trajectories, exposures."""
+"""Round trips of arbitrary numbers: camera formats, COLMAP, clouds, trajectories, exposures."""
 
 import jax
 import numpy as np
@@ -8,14 +8,7 @@ from hypothesis import strategies as st
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from jaxphoto.camera import (
-    DISTORTIONS,
-    PROJECTIONS,
-    InteriorOrientation,
-    Sensor,
-    get_parameter,
-    parameter_names,
-)
+from jaxphoto.camera import DISTORTIONS, PROJECTIONS, InteriorOrientation, Sensor, get_parameter, parameter_names
 from jaxphoto.cloud import Cloud
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.extras.formats import CAMERA_FORMATS, export, write_camera_file
@@ -61,7 +54,7 @@ def same_camera(back, interior):
 )
 @few
 @given(lens=lens, values=coefficients)
-def test_a_camera_that_a_format_holds_comes_back(tmp_path, kind, model, lens, values):
+def test_a_camera_that_a_format_holds_round_trip(tmp_path, kind, model, lens, values):
     held = [name for name in model.distortion.coefficients if name not in model.lacks]
     # A report adds what it calls distortion.
     sign = {"sign": "add"} if kind == "smac" else {}
@@ -101,7 +94,7 @@ KALIBR = """cam0:
 @pytest.mark.parametrize("model", ["radtan", "equidistant"])
 @few
 @given(focal=st.tuples(st.floats(300, 9000), st.floats(300, 9000)), values=coefficients)
-def test_a_chain_of_kalibr_is_what_its_numbers_say(tmp_path, model, focal, values):
+def test_kalibr_chain_has_the_numbers_of_its_file(tmp_path, model, focal, values):
     centre = 2249.5 + 100 * values[4], 1499.5 + 100 * values[5]
     (tmp_path / "chain.yaml").write_text(KALIBR.format(*focal, *centre, model, *values[:4]))
     read = read_camera_file(tmp_path / "chain.yaml", pixel_mm=0.008).interior
@@ -122,7 +115,7 @@ poses = st.lists(st.tuples(metres, metres, metres, angle, st.floats(-1.5, 1.5), 
 @pytest.mark.parametrize("format", ["colmap", "colmap-binary"])
 @few
 @given(poses=poses, seed=st.integers(0, 2**32 - 1))
-def test_a_model_of_colmap_comes_back(tmp_path_factory, format, poses, seed):
+def test_a_model_of_colmap_round_trip(tmp_path_factory, format, poses, seed):
     values, rng = np.array(poses), np.random.default_rng(seed)
     turn = np.stack([camera_from_object(*angles) for angles in values[:, 3:]])
     p = photographs("rational", "local")
@@ -195,7 +188,7 @@ def records(seed, geographic=True):
 
 @few
 @given(seed=seeds, geographic=st.booleans())
-def test_a_trajectory_as_csv_comes_back(tmp_path, seed, geographic):
+def test_a_trajectory_as_csv_round_trip(tmp_path, seed, geographic):
     given_ = records(seed, geographic)
     write_flight_csv(given_, tmp_path / "a.csv")
     back = read_records(tmp_path / "a.csv")
@@ -229,7 +222,7 @@ def test_an_sbet_comes_back_as_records_and_as_exposures(tmp_path, seed, wander):
 
 @few
 @given(poses=poses)
-def test_exposures_that_are_exported_are_read_where_they_are(tmp_path_factory, poses):
+def test_exported_exposures_round_trip(tmp_path_factory, poses):
     values = np.array(poses)
     turn = np.stack([camera_from_object(*angles) for angles in values[:, 3:]])
     p = photographs("opencv")._replace(exterior=ExteriorOrientation(values[:, :3], turn))

@@ -1,4 +1,4 @@
-"""surfaces.csv and [scanner]: read, written, refused."""
+"""surfaces.csv and [scanner]: round trips and refusals."""
 
 import numpy as np
 import pytest

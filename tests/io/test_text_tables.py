@@ -1,4 +1,4 @@
-"""Tables of text: cells of long files are those of Python's own reader, and keep their rows."""
+"""Text tables: cells as of Python's csv reader, with their rows."""
 
 import csv
 import io
@@ -29,7 +29,7 @@ def test_cells_are_those_of_the_csv_module(tmp_path_factory, records, separator)
     assert table.rows.tolist() == list(range(2, len(records) + 2))
 
 
-def test_numbers_come_back_with_every_digit_and_bad_ones_with_their_row(tmp_path: Path):
+def test_numbers_round_trip_and_invalid_ones_name_their_row(tmp_path: Path):
     values = np.random.default_rng(1).normal(0, 1e3, 25_000)
     lines = ["# measured", "image,v", *(f"i,{value!r}" for value in values.tolist())]
     path = tmp_path / "t.csv"

@@ -1,4 +1,4 @@
-"""A clock that runs late is found from a trajectory, image points and a little control, to its standard deviation."""
+"""Estimate the time offset of a camera from a trajectory, image points and little control."""
 
 import jax
 import numpy as np

@@ -9,9 +9,9 @@ import pytest
 from jaxphoto import adjust, covariance, simulate
 from jaxphoto.errors import BlockError
 from jaxphoto.io import recipe_from
-from jaxphoto.lidar.block_control import pseudo_control_of_block
 from jaxphoto.lidar.grid import index_cloud
-from jaxphoto.simulation.terrain import ROLLING
+from jaxphoto.lidar.pseudo_control import pseudo_control_of_block
+from jaxphoto.simulation.scene import ROLLING
 from tests.simulation.small import changed
 
 
@@ -19,17 +19,11 @@ from tests.simulation.small import changed
 def flown():
     """A small block, stations only, whose c is wrong by 1 % and whose images by 1 m and 0.1 deg, and a lidar."""
     values = {
-        "noise.image_mm": 0.004,
-        "noise.station_m": 0.1,
-        "sigmas.attitude_deg": None,
-        "noise.attitude_deg": None,
-        "points.ties": 150,
-        "targets": None,
-        "start": {"position_m": 1.0, "angle_deg": 0.1},
-        "cameras.kodak.interior.c_mm": 34.25 * 1.01,
-        "cameras.kodak.unknowns": {"c_mm": "free"},
+        "noise.image_mm": 0.004, "noise.station_m": 0.1, "sigmas.attitude_deg": None, "noise.attitude_deg": None,
+        "points.ties": 150, "targets": None, "start": {"position_m": 1.0, "angle_deg": 0.1},
+        "cameras.kodak.interior.c_mm": 34.25 * 1.01, "cameras.kodak.unknowns": {"c_mm": "free"},
         "cameras.kodak.truth": {"c_mm": 34.25},
-    }
+    }  # fmt: skip
     recipe = recipe_from(changed(values))
     recipe = dataclasses.replace(recipe, terrain=dataclasses.replace(ROLLING, roughness_m=0.0))
     simulated = simulate(recipe, seed=3)

@@ -1,4 +1,4 @@
-"""Clouds that do not go with their trajectory: each is told by what is wrong with it, and how to mend it."""
+"""Clouds that do not match their trajectory: messages with cause and remedy."""
 
 import dataclasses
 

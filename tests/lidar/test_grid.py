@@ -40,15 +40,9 @@ def on_one_spot() -> np.ndarray:
 
 
 CLOUDS = {
-    "uniform": uniform(5000),
-    "few": uniform(7),
-    "one": uniform(1),
-    "outliers": with_outliers(),
-    "crowded": crowded(),
-    "line": on_a_line(),
-    "spot": on_one_spot(),
-    "lattice": np.round(uniform(4000)),
-}
+    "uniform": uniform(5000), "few": uniform(7), "one": uniform(1), "outliers": with_outliers(), "crowded": crowded(),
+    "line": on_a_line(), "spot": on_one_spot(), "lattice": np.round(uniform(4000)),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", CLOUDS)

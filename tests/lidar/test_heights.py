@@ -1,9 +1,10 @@
-"""Heights equal independent interpolations, are as good as they say, and are refused where the cloud tells none."""
+"""Heights equal independent interpolations, have correct standard deviations, and are NaN where undetermined."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.interpolate import LinearNDInterpolator
 from scipy.optimize import brentq
 from scipy.spatial import ConvexHull, cKDTree
 from scipy.stats import norm
@@ -11,11 +12,11 @@ from scipy.stats import norm
 from jaxphoto import InputError
 from jaxphoto.cloud import Cloud
 from jaxphoto.lidar import HeightFlag, HeightSettings, heights_at, index_cloud
-from jaxphoto.lidar.height_error import normal_equivalent
-from jaxphoto.lidar.height_settings import REFUSED
+from jaxphoto.lidar.height_estimate import REFUSED, normal_equivalent
 from jaxphoto.lidar.sight import surrounded
 from tests.checked_types import unchecked
 from tests.lidar.clouds import SURFACES, gable, ground, places_over, read_autzen
+from tests.marks import slow_but
 
 METHODS = ("idw", "plane", "tin", "local")
 # Small horizontal errors, so that few points tell the surface and few programs are compiled.
@@ -215,3 +216,53 @@ def test_few_points_and_bad_questions() -> None:
         HeightSettings(power=-1.0)
     with pytest.raises(InputError, match="points is 2"):
         HeightSettings(points=2)
+
+
+LIDARS = [(0.5, 0.15, 0.5), (4.0, 0.02, 0.05)]
+
+
+@pytest.mark.parametrize("lidar", slow_but(LIDARS[:1], LIDARS), ids=str)
+@pytest.mark.parametrize("method", ("idw", "plane", "tin", "local"))
+def test_errors_are_within_the_standard_deviation(method: str, lidar: tuple[float, float, float]) -> None:
+    density, sigma_z, sigma_xy = lidar
+    settings = HeightSettings(sigma_z_m=sigma_z, sigma_xy_m=sigma_xy)
+    within = {}
+    for name, height in SURFACES.items():
+        side = np.sqrt(20_000 / density)
+        grid = index_cloud(ground(height, density, sigma_z, sigma_xy, side))
+        places = np.random.default_rng(1).uniform(5, side - 5, (1500, 2))
+        found = heights_at(grid, places, method, settings)
+        told = np.isfinite(found.z)
+        error = found.z[told] - height(*places[told].T)
+        within[name] = np.mean(np.abs(error) <= 1.96 * found.sigma[told])
+        assert told.mean() > (0.5 if name == "gable" else 0.97)
+    # A surface by itself: what the local surface cannot tell, such as a ridge under noise, costs some hundredths.
+    assert abs(np.mean(list(within.values())) - 0.95) < 0.02, within
+    assert min(within.values()) > 0.92, within
+    assert max(within.values()) < 0.98, within
+
+
+@pytest.mark.slow
+def test_tin_of_real_cloud_is_that_of_the_whole_triangulation(data_dir: Path) -> None:
+    autzen = read_autzen(data_dir)
+    places = places_over(autzen)
+    found = heights_at(Cloud(autzen), places, "tin", HeightSettings(sigma_z_m=0.05, sigma_xy_m=0.05))
+    # About their middle: unreduced map coordinates cost SciPy's triangulation its last digits.
+    middle = autzen[:, :2].mean(axis=0)
+    expected = LinearNDInterpolator(autzen[:, :2] - middle, autzen[:, 2])(places - middle)
+    told = np.isfinite(found.z)
+    assert told.sum() > 3000
+    np.testing.assert_allclose(found.z[told], expected[told], rtol=0, atol=1e-9)
+
+
+def test_tin_inside_the_hull_and_none_outside() -> None:
+    rng = np.random.default_rng(1)
+    xyz = np.column_stack([rng.uniform(0, 50, (300, 2)), rng.normal(size=300)])
+    places = rng.uniform(-5, 55, (400, 2))
+    found = heights_at(Cloud(xyz), places, "tin", HeightSettings(sigma_xy_m=0.05, refuse=HeightFlag.OK))
+    expected = LinearNDInterpolator(xyz[:, :2], xyz[:, 2])(places)
+    # All points are looked at here, so that slivers along the hull are found as well.
+    np.testing.assert_allclose(found.z, expected, rtol=0, atol=1e-9)
+    outside = np.isnan(expected)
+    assert outside.sum() > 50
+    assert found.flagged(HeightFlag.EDGE)[outside].all()

@@ -1,4 +1,4 @@
-"""Planes through laser points: the truth recovered, its covariance that of many draws, blunders left out."""
+"""Planes of laser points: truth, covariance by simulation, rejection of blunders."""
 
 import numpy as np
 import pytest

@@ -8,8 +8,7 @@ from scipy.stats import binned_statistic_2d
 from jaxphoto import Brown, ExteriorOrientation, InputError, InteriorOrientation, Sensor
 from jaxphoto.camera import BundlerRadial
 from jaxphoto.georeferencing import Corrections
-from jaxphoto.lidar.orthophoto import hidden, orthophoto
-from jaxphoto.lidar.raster import Raster, filled, hillshade, surface_model
+from jaxphoto.lidar.raster import Raster, filled, hidden, hillshade, orthophoto, surface_model
 from tests.checked_types import unchecked
 from tests.formulas import camera_from_object
 from tests.lidar.photographs import rendered
@@ -151,14 +150,9 @@ def test_orthophoto_of_whole_numbers_in_another_frame():
     moved = Raster(raster.heights + shift[2], raster.west + shift[0], raster.north + shift[1], raster.cell_m)
     here = orthophoto(raster, photograph, SENSOR, INTERIOR, EXTERIOR)
     there = orthophoto(
-        moved,
-        photograph,
-        SENSOR,
-        INTERIOR,
-        EXTERIOR,
-        object_from_map=lambda xyz: xyz - shift,
+        moved, photograph, SENSOR, INTERIOR, EXTERIOR, object_from_map=lambda xyz: xyz - shift,
         map_from_object=lambda xyz: xyz + shift,
-    )
+    )  # fmt: skip
     assert here.pixels.dtype == np.uint8
     np.testing.assert_array_equal(here.seen, there.seen)
     assert np.abs(here.pixels.astype(int) - there.pixels).max() <= 1

@@ -1,12 +1,11 @@
-"""Roofs: their faces told apart, with planes, outlines, centroids and ridges of known truth."""
+"""Roofs: segmentation into faces, planes, outlines, centroids and ridges of known truth."""
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 from jaxphoto.errors import InputError
-from jaxphoto.lidar.planes import fit_plane
-from jaxphoto.lidar.roofs import planar_patches, ridge_line, roof_centroid
+from jaxphoto.lidar.planes import fit_plane, planar_patches, ridge_line, roof_centroid
 
 SIGMA_XY, SIGMA_Z = 0.5, 0.15
 WIDTH, LENGTH, EAVES = 12.0, 16.0, 6.0

@@ -61,14 +61,10 @@ def marked_block(seed: int = 3, xy_mm: np.ndarray | None = None) -> Marked:
     start = dataclasses.replace(truth, exterior=exterior, points=away(truth.points)[points])
     kept = eqx.tree_at(lambda b: b.start.unknowns, kept, start)
     control = SurveyedPoints(
-        "control.csv",
-        tuple(f"G{p}" for p in which),
-        MapFrame(CODE, None, ORIGIN).map(surveyed),
-        np.full(true.shape, SIGMA_M),
-        np.isin(which, CHECK),
-        tuple(f"control.csv, row {k + 2}" for k in range(len(which))),
-        f"EPSG:{CODE}",
-    )
+        "control.csv", tuple(f"G{p}" for p in which), MapFrame(CODE, None, ORIGIN).map(surveyed),
+        np.full(true.shape, SIGMA_M), np.isin(which, CHECK),
+        tuple(f"control.csv, row {k + 2}" for k in range(len(which))), f"EPSG:{CODE}",
+    )  # fmt: skip
     return Marked(kept, truth, GivenControl(control, marks), true)
 
 

@@ -6,10 +6,7 @@ import functools
 from jaxphoto.simulation import Simulation
 from tests.simulation.small import made
 
-TRUTH = {
-    "boresight_deg": [0.12, -0.08, 0.3],
-    "shift_m": {"B": [-1.0, 1.1, -0.9], "C": [0.8, 1.3, 0.7]},
-}
+TRUTH = {"boresight_deg": [0.12, -0.08, 0.3], "shift_m": {"B": [-1.0, 1.1, -0.9], "C": [0.8, 1.3, 0.7]}}
 SCENE = {
     "flight.height_m": 600.0,
     "points": {"ties": 90},

@@ -1,11 +1,11 @@
-"""A flight of three strips with everything wrong that a strip adjustment mends, simulated once, and adjusted once."""
+"""A flight of three strips with all errors that a strip adjustment corrects, simulated and adjusted once."""
 
 import copy
 import dataclasses
 import functools
 
 from jaxphoto.georeferencing import ScannerCalibration
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.procedures.lidar import ScannerPriors, StripAdjustment, adjust_strips
 from jaxphoto.simulation import Simulation
 from jaxphoto.unknowns import FIXED, FREE, Weighted
@@ -13,14 +13,10 @@ from tests.simulation.small import made
 
 NOISE_M = 0.03
 TRUTH = {
-    "boresight_deg": [0.02, -0.03, 0.04],
-    "range_offset_m": 0.06,
-    "angle_scale_ppm": 300.0,
-    "drift_sigma_m": [0.05, 0.05, 0.05],
-    "drift_sigma_deg": [0.003, 0.003, 0.006],
-    "correlation_s": 60.0,
+    "boresight_deg": [0.02, -0.03, 0.04], "range_offset_m": 0.06, "angle_scale_ppm": 300.0,
+    "drift_sigma_m": [0.05, 0.05, 0.05], "drift_sigma_deg": [0.003, 0.003, 0.006], "correlation_s": 60.0,
     "knots_s": 5.0,
-}
+}  # fmt: skip
 STRIPS = {
     "flight.height_m": 500.0,
     "flight.strips": [
@@ -45,14 +41,9 @@ STRIPS = {
     "lidar": {"density_per_m2": 0.2, "scan_angle_deg": 25.0, "truth": TRUTH},
 }
 SETTINGS = StripSettings(
-    cell_m=8.0,
-    most=1200,
-    knots_s=5.0,
-    correlation_s=60.0,
-    sigma_position_m=0.05,
-    sigma_attitude_deg=0.003,
+    cell_m=8.0, most=1200, knots_s=5.0, correlation_s=60.0, sigma_position_m=0.05, sigma_attitude_deg=0.003,
     sigma_heading_deg=0.006,
-)
+)  # fmt: skip
 PRIORS = ScannerPriors(FREE, ScannerCalibration(FIXED, Weighted(0.0, 0.1), FIXED, FREE, FIXED, FIXED))  # type: ignore[arg-type]
 
 # The same with a scanner of two prisms, which looks all around.

@@ -1,4 +1,4 @@
-"""The boresight in four steps: truth recovered, and a stop where it makes no sense to continue."""
+"""Boresight calibration in four steps: truth recovered, and a stop after a failed step."""
 
 import dataclasses
 import functools
@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import jaxphoto_command
 from jaxphoto import FIXED, FREE, BlockError, boresight
 from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.io import write_block
@@ -19,6 +18,7 @@ from jaxphoto.procedures import step_block
 from jaxphoto.writing import MARKER
 from tests.blocks import BORESIGHT, BROWN, CONTROL, Simulated, aerial, all_attitudes, all_stations, bare, measured, rows
 from tests.blocks import free as free_interior
+from tests.commands import run
 
 STATION = 0.05
 ZERO = np.zeros(3)
@@ -119,7 +119,7 @@ def test_without_and_with_control_differ_by_what_their_sigmas_allow():
     assert "no systematic tendency" in said(fourth)
 
 
-def test_control_of_another_datum_bends_the_misalignment():
+def test_control_in_another_datum_biases_the_misalignment():
     """Control that leans against the stations, 2.5 m over the block: only step 4 shows what it does."""
     made = block()
     control = made.control
@@ -137,7 +137,7 @@ def test_a_blunder_stops_at_the_first_step():
     assert [s.number for s in found] == [1]
     assert not found[0].go_on
     assert f"blunders, the largest first: {name}" in said(found[0])
-    assert "makes no sense to continue" in said(found[0])
+    assert "continuing is pointless" in said(found[0])
     assert len(boresight(made, go_on=True)) == 4
 
 
@@ -150,7 +150,7 @@ def test_a_major_shift_stops_at_the_second_step():
 
 
 @pytest.mark.slow
-def test_a_moderate_shift_is_carried():
+def test_a_moderate_shift_is_estimated():
     """Free in step 3, held at its value in step 4; nothing else of the strips is kept."""
     shift = 0.4
     found = steps(shift)
@@ -209,7 +209,7 @@ def test_priors_of_each_step():
         step_block(made, 5)
 
 
-def test_without_times_no_drift_is_looked_for():
+def test_without_times_no_drift_is_estimated():
     made = eqx.tree_at(lambda b: b.image_time, block(), np.zeros(10))
     assert step_block(made, 2).priors.strips["a"] == StripBias(FREE, FIXED)
 
@@ -234,25 +234,17 @@ def lone_control():
     ],
     ids=["control", "stations", "attitudes", "strips", "one-strip", "mount", "lone-control"],
 )
-def test_what_a_step_lacks_is_said_before_the_first(spoil, words, monkeypatch):
+def test_missing_data_of_any_step_are_reported_first(spoil, words, monkeypatch):
     monkeypatch.setattr(sys.modules["jaxphoto.procedures.boresight"], "adjust", None)
     with pytest.raises(BlockError) as caught:
         boresight(spoil())
     assert all(word in str(caught.value) for word in words), str(caught.value)
 
 
-def run(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr(sys, "argv", ["jaxphoto", "boresight", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        jaxphoto_command.main()
-    captured = capsys.readouterr()
-    return stop.value.code or 0, captured.out, captured.err
-
-
 def test_the_command_writes_all_four_steps(monkeypatch, capsys, tmp_path):
     folder, out = tmp_path / "block", tmp_path / "out"
     write_block(block(), folder)
-    code, screen, _ = run(monkeypatch, capsys, folder, "--out", out)
+    code, screen, _ = run(monkeypatch, capsys, "boresight", folder, "--out", out)
     assert code == 0
     names = {MARKER, "steps.csv", "summary.json", "report.html", "step_1", "step_2", "step_3", "step_4"}
     assert {p.name for p in out.iterdir()} == names
@@ -280,17 +272,17 @@ def test_the_command_writes_all_four_steps(monkeypatch, capsys, tmp_path):
     assert "misalignment of mount one" in screen
     # Earlier results are replaced whole, and exit code 1 says that a step is not passed.
     write_block(block(2.0), folder)
-    code, screen, _ = run(monkeypatch, capsys, folder, "--out", out)
+    code, screen, _ = run(monkeypatch, capsys, "boresight", folder, "--out", out)
     assert code == 1
     assert "stopped at step 2" in screen
     assert {p.name for p in out.iterdir()} == names - {"step_3", "step_4"}
     assert {p.name for p in tmp_path.iterdir()} == {"block", "out"}
 
 
-def test_a_block_without_attitudes_is_one_sentence(monkeypatch, capsys, tmp_path):
+def test_a_block_without_attitudes_is_refused(monkeypatch, capsys, tmp_path):
     folder = tmp_path / "block"
     write_block(dataclasses.replace(block(), attitudes=Attitudes.none()), folder)
-    code, screen, error = run(monkeypatch, capsys, folder, "--out", tmp_path / "out")
+    code, screen, error = run(monkeypatch, capsys, "boresight", folder, "--out", tmp_path / "out")
     assert (code, screen) == (2, "")
     assert "attitudes.csv" in error
     assert not (tmp_path / "out").exists()

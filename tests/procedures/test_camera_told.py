@@ -7,21 +7,13 @@ import pytest
 from scipy import stats
 
 from jaxphoto.camera import InteriorOrientation, Sensor
-from jaxphoto.io import read_block
 from jaxphoto.observations import ImagePoints
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.orientation import orient
 from jaxphoto.procedures.orientation.self_calibration import correlation_factor
+from tests.blocks import example
 from tests.marks import slow_but
-from tests.procedures.orientable import (
-    PIXEL,
-    SENSOR,
-    Camera,
-    aerial,
-    errors_with_covariance,
-    photographed,
-    projected,
-)
+from tests.procedures.orientable import PIXEL, SENSOR, Camera, aerial, errors_with_covariance, photographed, projected
 
 pytest.importorskip("pycolmap", reason="pycolmap, which orients images, is not installed (extra photos)")
 
@@ -32,7 +24,7 @@ N_IMAGES, PER_IMAGE = 9, 800
 def block():
     """Nine images of 8 x 6 square cells, with rays all over them."""
     rng = np.random.default_rng(1)
-    block = read_block("examples/cross_block")
+    block = example()
     assert len(block.images) >= N_IMAGES
     image = np.repeat(np.arange(N_IMAGES), PER_IMAGE)
     xy = rng.uniform([-4, -3], [4, 3], (len(image), 2))

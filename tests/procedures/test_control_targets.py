@@ -182,14 +182,10 @@ def flown(folder, kind, rng):
     block = dataclasses.replace(block, frame=Frame("epsg", CODE, None, origin=ORIGIN))
     true = np.column_stack([SURVEYED, np.full(len(SURVEYED), FIRST_M)])
     points = SurveyedPoints(
-        "survey.csv",
-        tuple(f"P{k}" for k in range(len(true))),
-        MapFrame(CODE, None, ORIGIN).map(true + rng.normal(0, 0.01, true.shape)),
-        np.full(true.shape, 0.01),
-        np.arange(len(true)) >= 5,
-        ("survey.csv",) * len(true),
-        f"EPSG:{CODE}",
-    )
+        "survey.csv", tuple(f"P{k}" for k in range(len(true))),
+        MapFrame(CODE, None, ORIGIN).map(true + rng.normal(0, 0.01, true.shape)), np.full(true.shape, 0.01),
+        np.arange(len(true)) >= 5, ("survey.csv",) * len(true), f"EPSG:{CODE}",
+    )  # fmt: skip
     return block, GivenControl(points, Marks.none()), true
 
 

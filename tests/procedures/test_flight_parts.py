@@ -1,4 +1,4 @@
-"""Photographs that the others see too little of are a part of their own, and are not lost."""
+"""Photographs with little overlap to the others are a part of their own."""
 
 import numpy as np
 import pytest

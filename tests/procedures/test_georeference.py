@@ -1,4 +1,4 @@
-"""Direct georeferencing of a block: the same points as an adjustment with held images, and honest covariances."""
+"""Direct georeferencing: points of an adjustment with fixed images, and correct covariances."""
 
 import dataclasses
 import functools
@@ -143,5 +143,5 @@ def test_refraction_and_curvature_of_the_block_are_applied():
 
 
 def test_no_sensors():
-    with pytest.raises(BlockError, match="no image has both a whole station and an attitude"):
+    with pytest.raises(BlockError, match="no image has both a complete station and an attitude"):
         georeference(without_attitudes(uncertain()[0]))

@@ -1,8 +1,7 @@
-"""Halves of a block: factors that simulation confirms, bands that hold, and what both halves share."""
+"""Split-half validation: factors and bands confirmed by simulation, and the common covariance."""
 
 import dataclasses
 import json
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -16,13 +15,13 @@ from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import InputError
 from jaxphoto.io import write_block
 from jaxphoto.io.camera_files import read_camera_file
-from jaxphoto.procedures.halves import halved, halves
+from jaxphoto.procedures.compare import halved, halves
 from jaxphoto.simulation import image_coordinates, remeasure
 from jaxphoto.stability import Differences, bundle_offsets, concentration, error_band, image_grid, leading_unit, overlap
 from jaxphoto.stability.band import square_radius
 from jaxphoto.statistics import common_covariance
 from jaxphoto.variants import some_images
-from tests.blocks import FIELDS, FIVE, SENSOR, simulated
+from tests.blocks import FIELDS, FIVE, SENSOR, adjusted_example, example, simulated
 from tests.commands import run
 
 CELLS = image_grid(SENSOR, 7, 5)
@@ -92,7 +91,7 @@ def measured(field, seed, **lens):
     return jax.tree.map(lambda v: np.asarray(v) if isinstance(v, jax.Array) else v, new)
 
 
-def test_what_control_does_to_both_halves_is_what_moving_it_does():
+def test_common_covariance_of_halves_is_that_of_finite_differences():
     """Against central differences of both adjustments by every coordinate of control."""
     block, truth = simulated("cross")
     # Without residuals, which would add their curvature to the differences and nothing to the linear covariance.
@@ -121,7 +120,7 @@ def test_what_control_does_to_both_halves_is_what_moving_it_does():
     assert np.abs((found - expected) / size).max() < 0.02
 
 
-def test_halves_of_a_sound_block_are_as_close_as_promised(field):
+def test_halves_agree_within_their_covariance(field):
     found = halves(measured(field, 3), CELLS, n_cuts=12)
     assert len(found.cuts) == 12 and not found.failed
     null = found.band.sigma_factor / found.band.factor
@@ -167,7 +166,7 @@ def test_the_command_writes_cells_and_cuts(field, tmp_path, monkeypatch, capsys)
     assert (code, "image i0 is in no strip; give it one, or cut by image" in error) == (2, True)
 
 
-def test_what_cannot_be_cut_is_said(field):
+def test_impossible_splits_are_refused(field):
     block, _ = simulated("strips")
     with pytest.raises(InputError, match="name one of one"):
         halves(block, CELLS, camera="two")
@@ -176,7 +175,7 @@ def test_what_cannot_be_cut_is_said(field):
         halves(one, CELLS, by="strip")
 
 
-def test_a_unit_that_all_differences_follow_is_found():
+def test_a_dominating_unit_is_found():
     """One of forty photographs moves its half by ten times what all others do together."""
     rng = np.random.default_rng(5)
     first = rng.random((24, 40)) < 0.5
@@ -194,10 +193,10 @@ def test_a_unit_that_all_differences_follow_is_found():
     assert leading_unit(first, alike)[1] < 0.4
 
 
-def test_an_image_that_a_cut_leaves_without_points_does_not_spoil_it():
+def test_an_image_without_points_in_a_half_is_skipped():
     """It says nothing of the camera: the half goes without it."""
-    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
-    adjusted, rng = adjust(block), np.random.default_rng(0)
+    block = example()
+    adjusted, rng = adjusted_example(), np.random.default_rng(0)
     masks = (rng.permutation(len(block.images)) < len(block.images) // 2 for _ in range(1000))
 
     def few(mask):
@@ -210,8 +209,8 @@ def test_an_image_that_a_cut_leaves_without_points_does_not_spoil_it():
     assert not cut.problem and cut.offsets_px.shape == (len(cells), 2)
 
 
-def test_too_few_images_to_cut_are_refused():
-    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+def test_too_few_images_to_split_are_refused():
+    block = example()
     block = some_images(block, np.isin(block.images, ["A3", "A4"]))
-    with pytest.raises(InputError, match="no two halves of this block can be compared: the images of a half have no"):
+    with pytest.raises(InputError, match=r"no two halves .* compared: the images of a half have too few"):
         halves(block, image_grid(block.sensors["kodak"], 7, 5), n_cuts=1)

@@ -1,4 +1,4 @@
-"""Simultaneous adjustment: camera, scanner and strips are found together, and the cloud is mended."""
+"""Simultaneous adjustment of camera, scanner and strips, and correction of the cloud."""
 
 import dataclasses
 import functools
@@ -38,7 +38,7 @@ def test_boresight_and_shifts_of_the_scanner_are_recovered():
     sigma = np.array([s for label, s in zip(labels, known.shared_sigma, strict=True) if label.startswith("scanner")])
     free, truth = np.r_[:3, 6:12], scanner_vector(flight.truth.scanner)
     off = (scanner_vector(found.scanner) - truth)[free]
-    assert found.still
+    assert found.converged
     assert (np.abs(off) < 3 * sigma).all()
     # The simulated ones are many sigma: not to find them would show.
     assert (np.abs(truth[free]) > 3 * sigma).sum() > 5
@@ -60,7 +60,7 @@ def test_points_lie_on_the_corrected_cloud():
     assert found.rounds[-1].rmse_m == pytest.approx(after, rel=0.1)
 
 
-def test_the_cloud_is_mended():
+def test_the_cloud_is_corrected():
     """Laser points of the ground lie on the true ground as far as the strips' heights are known, and did not before."""
     before, after = above_ground(misaligned().cloud), above_ground(both().cloud)
     known = covariance(both().adjusted)
@@ -77,7 +77,7 @@ def above_ground(cloud) -> np.ndarray:
     return np.array([off[strip == k].mean() for k in range(len(cloud.strips))])
 
 
-def test_cloud_and_trajectory_are_corrected_alike():
+def test_cloud_and_trajectory_are_corrected_consistently():
     """A shift moves both; a boresight the cloud alone. The truth mends all of it."""
     flight = misaligned()
     mended = correct_cloud(flight.cloud, flight.truth.scanner, scanner_path(flight.trajectory))

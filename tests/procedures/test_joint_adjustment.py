@@ -1,29 +1,34 @@
-"""Trajectory, scanner and camera of one flight are found at once, and are what formulas written down again say."""
+"""Joint adjustment of trajectory, scanner and camera, compared with independent formulas."""
 
 import dataclasses
+import functools
 
 import jax
 import numpy as np
 import pytest
+from jaxphoto.io.names import points_called
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from jaxphoto import BlockError, InputError
+from jaxphoto import BlockError, InputError, JaxphotoError, adjust, bias, covariance, read_block, write_block
 from jaxphoto.adjustment import Outcome
 from jaxphoto.camera import get_parameter
-from jaxphoto.observations import Attitudes, CameraPositions
-from jaxphoto.procedures.lidar import adjust_strips
-from jaxphoto.procedures.lidar.photographs import check_photographs
+from jaxphoto.georeferencing import StripSpline
+from jaxphoto.lidar.strip_planes import StripSettings
+from jaxphoto.observations import Attitudes, CameraPositions, StripPlanes
+from jaxphoto.procedures.lidar import Photographs, adjust_strips
+from jaxphoto.procedures.lidar.iterate_to_convergence import at_result
+from jaxphoto.procedures.lidar.photographs import check_photographs, on_trajectory
+from jaxphoto.procedures.lidar.plane_search import PointSearch, StripSearch
 from jaxphoto.report import plot_scanner_correlation, plot_trajectory_errors
-from jaxphoto.report.strips import (
-    all_correlations,
-    errors_along,
-    scanner_correlation_figure,
-    trajectory_errors_figure,
-)
+from jaxphoto.report.strips import all_correlations, errors_along, scanner_correlation_figure, trajectory_errors_figure
 from jaxphoto.statistics import correlation_matrix
-from tests.procedures.joint import CAMERA, fitted, flown, photographs, truth
-from tests.procedures.strips import SETTINGS
+from tests.commands import run
+from tests.lidar.clouds import gable
+from tests.procedures.joint import CAMERA, JOINT, fitted, flown, photographs, truth
+from tests.procedures.strips import PRIORS, SETTINGS
+from tests.procedures.test_strip_control import COMMON, SHIFT, two_strips
+from tests.simulation.small import made
 
 
 def estimates() -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
@@ -34,7 +39,7 @@ def estimates() -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     return labels, value, np.asarray(fitted().covariance.matrix)[-len(labels) :, -len(labels) :]
 
 
-def test_camera_and_scanner_are_found():
+def test_camera_and_scanner_are_recovered():
     """All of it together: chi squared of thirteen, because some of it is told apart badly."""
     labels, value, matrix = estimates()
     true = truth(flown())
@@ -48,9 +53,9 @@ def test_camera_and_scanner_are_found():
     assert max(v for label, v in sigma.items() if label.startswith("mounts")) < 2e-4
 
 
-def test_nothing_changes_any_more_and_weights_are_right():
+def test_the_iteration_converges_with_correct_weights():
     found = fitted()
-    assert found.still and found.adjusted.outcome is Outcome.CONVERGED
+    assert found.converged and found.adjusted.outcome is Outcome.CONVERGED
     assert float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
     over = [d for d in found.differences if d.one == "photographs"]
     assert [d.other for d in over] == ["1", "2", "3"]
@@ -60,7 +65,7 @@ def test_nothing_changes_any_more_and_weights_are_right():
         assert d.planes > 50 and d.rms_m < d.noise_m
 
 
-def test_pictures_take_names_as_they_are():
+def test_plots_show_names_literally():
     """A dollar begins a formula of matplotlib, and a unit may end a name."""
     result = fitted()
     named = dataclasses.replace(result, cloud=dataclasses.replace(result.cloud, strips=("L$^$1", "b_rad", "c")))
@@ -95,7 +100,7 @@ def test_errors_along_a_strip_have_the_spread_of_their_knots():
     assert (np.abs(value - true) < 4 * sigma).all()
 
 
-def test_errors_of_the_trajectory_are_found():
+def test_trajectory_errors_are_recovered():
     labels, value, matrix = estimates()
     errors = flown().errors
     own = [k for k, label in enumerate(labels) if label.startswith("trajectory_knots")]
@@ -277,3 +282,141 @@ def test_what_cannot_be_adjusted_together():
     refused(InputError, "the block has no stations", taken._replace(block=bare))
     late = taken.time + np.where(taken.time > 0, -1.0, 1.0)
     refused(BlockError, "stations of the block lie .* m from where the trajectory is", taken._replace(time=late))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("joint") / "block"
+    result = fitted().adjusted
+    write_block(at_result(result.block, result.unknowns), path)
+    return path
+
+
+@functools.cache
+def read(folder):
+    return read_block(folder)
+
+
+def test_the_block_comes_back_and_adjusts_to_the_same(folder):
+    before = fitted().adjusted
+    after = adjust(read(folder))
+    labels = before.structure.labels
+    assert after.structure.labels == labels
+    assert after.redundancy == before.redundancy
+    sigma = np.asarray(fitted().covariance.shared_sigma)
+    one, other = (np.asarray(a.values.shared)[a.structure.free] for a in (before, after))
+    # Both ended within a hundred-thousandth of a standard deviation of the optimum, and far nearer in fact.
+    np.testing.assert_allclose((other - one) / sigma, 0.0, atol=1e-6)
+    np.testing.assert_allclose(covariance(after).shared_sigma, sigma, rtol=1e-9)
+    for name, rows in before.block.named_observations.items():
+        assert len(after.block.named_observations[name]) == len(rows)
+    assert list(read(folder).start.unknowns.more["trajectory_knots"]) == list(before.unknowns.more["trajectory_knots"])
+    assert bias(read(folder), "trajectory", 0.1, "strip").names[:3] == ("1.X_m", "1.Y_m", "1.Z_m")
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "match"),
+    [
+        ("trajectory_stations.csv", ",0,", ",3,", r"row 2: axis is 3; it is 0, 1 or 2"),
+        ("position_steps.csv", "1 at ", "7 at ", r"row 2: trajectory_knots 7 at .* is none of the trajectory_knots"),
+    ],
+)
+def test_mistakes_are_named(folder, tmp_path, file, old, new, match):
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    for path in folder.glob("[!.]*"):
+        text = path.read_text()
+        if path.name == file:
+            assert old in text
+            text = text.replace(old, new, 1)
+        (copy / path.name).write_text(text)
+    with pytest.raises(JaxphotoError, match=match):
+        read_block(copy)
+
+
+@pytest.mark.slow
+def test_commands_take_the_block(folder, tmp_path, monkeypatch, capsys):
+    given = ("--bias", "trajectory", "--per", "strip", "--sigma-m", "0.05", "--draws", "20")
+    code, said, _ = run(monkeypatch, capsys, "monte-carlo", folder, *given, "--out", tmp_path / "draws")
+    assert code == 0 and "20 draws, 20 converged" in said
+    assert run(monkeypatch, capsys, "sensitivity", folder, "--out", tmp_path / "sensitivity")[0] == 0
+
+
+COARSE = StripSettings(cell_m=2.0, roughness_m=0.04, returns=8)
+# On ridges of the roofs of `two_strips`, which lie along Y.
+RIDGES = np.array([[x, y] for x in (24.0, 40.0, 56.0, 72.0) for y in (10.0, 20.0, 30.0)])
+FACE = np.array([[20.0, 20.0]])
+
+
+def test_of_each_point_on_a_breakline_both_faces_are_sought_in_every_strip():
+    search = StripSearch(two_strips(1), None, COARSE)
+    search.corrected = [search.cloud.xyz[look.returns] for look in search.looks]
+    # The last of those on breaklines lies on a face.
+    xy = np.vstack([FACE, np.repeat(RIDGES, 2, axis=0), FACE, FACE])
+    place = np.column_stack([xy, gable(*xy.T)]) + COMMON
+    points = PointSearch(search, np.array([7]), np.arange(10, 11 + len(RIDGES)))
+    np.testing.assert_array_equal(points.points, [7, *np.repeat(np.arange(10, 11 + len(RIDGES)), 2)])
+    seen = points.look(place, np.zeros((len(place), 3, 3)), settled=False)
+    for found, shift in zip(seen, (np.zeros(3), SHIFT), strict=True):
+        np.testing.assert_array_equal(np.sort(found.found.point), np.arange(1 + 2 * len(RIDGES)))
+        w = (found.found.gap + found.patches.normal[found.found.patch] @ shift) / found.found.sigma
+        assert 0.6 < np.sqrt(np.mean(w**2)) < 1.5
+    names = tuple(f"P{k}" for k in range(30))
+    (sentence,) = points.unseen(seen, names)
+    assert sentence.startswith("1 of 13 points on breaklines have no two smooth faces about them") and "P22" in sentence
+
+
+def test_points_on_breaklines_are_named_by_patterns():
+    assert points_called(("A1", "R1", "R2", "B"), ["R*", "A1", "R1"], "") == ("R1", "R2", "A1")
+    with pytest.raises(InputError, match=r"--breaklines X\*: no point of the block is called so"):
+        points_called(("A1",), ["X*"], "--breaklines")
+
+
+def test_points_on_breaklines_come_back_with_their_block(tmp_path):
+    flight = flown()
+    names = flight.block.points[:3]
+    on = Photographs(dataclasses.replace(flight.block, breaklines=names), photographs(flight).time)
+    assert on.breaklines == names and on._replace(on_breaklines=names[1:]).breaklines == names[1:]
+    spans = np.array([[on.time.min(), on.time.max()]])
+    posed = on_trajectory(on, (StripSpline.over(0, *spans[0].tolist(), 5.0),), spans, SETTINGS)
+    assert posed.breaklines == names
+    # Of points that are gone nothing is said, in which it would not be read again.
+    kept = dataclasses.replace(on.block, breaklines=(*names, "gone"))
+    write_block(kept, tmp_path / "block")
+    assert read_block(tmp_path / "block").breaklines == names
+    settings = tmp_path / "block" / "block.toml"
+    settings.write_text(settings.read_text().replace(f'"{names[0]}"', '"R*"', 1))
+    with pytest.raises(InputError, match=r"block\.toml, breaklines: R\*: no point of the block is called so"):
+        read_block(tmp_path / "block")
+
+
+def test_the_block_of_a_joint_adjustment_is_not_joined_again():
+    flight = flown()
+    joined = dataclasses.replace(flight.block, more=(*flight.block.more, StripPlanes.none()))
+    with pytest.raises(BlockError, match="that of a joint adjustment, with its planes in strip_planes"):
+        check_photographs(photographs(flight)._replace(block=joined), flight.trajectory)
+
+
+@pytest.mark.slow
+def test_breaklines_tell_where_ridges_are():
+    """The flight of `joint` over halls with ridges along the map's axes."""
+    at = [[x, y] for x in (-100.0, 0.0, 100.0) for y in (-40.0, 60.0)]
+    hall = {"roof": "gable", "length_m": 60.0, "width_m": 28.0, "slope_deg": 30.0}
+    halls = [hall | {"at_m": at[k::2], "heading_deg": 90.0 * k} for k in range(2)]
+    ends = [[x + s * k, y + s * (1 - k)] for k in range(2) for x, y in at[k::2] for s in (-15.0, 15.0)]
+    flight = made(JOINT | {"terrain.buildings": halls, "targets": [{"role": "tie", "prefix": "R", "at_m": ends}]}, 5)
+    given = photographs(flight)
+    number = [k for k, name in enumerate(flight.block.points) if name.startswith("R")]
+    assert len(number) > 8
+    truth = np.asarray(flight.truth.points)[number]
+    spread = {}
+    for names in ((), tuple(flight.block.points[k] for k in number)):
+        how = {"photographs": given._replace(on_breaklines=names), "max_rounds": 3}
+        found = adjust_strips(flight.cloud, flight.trajectory, SETTINGS, PRIORS, **how)
+        covariance = np.asarray(found.covariance.points)[number]
+        off = np.asarray(found.adjusted.unknowns.points)[number] - truth
+        spread[bool(names)] = np.sqrt(np.trace(covariance[:, :2, :2], axis1=1, axis2=2)).mean()
+        assert float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1) and not found.warnings
+        chi = np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off)
+        assert chi.mean() < 8
+    assert spread[True] < 0.95 * spread[False]

@@ -1,4 +1,4 @@
-"""A trajectory that is wrong, in the data themselves, and as errors of a Monte Carlo: the same comes of both."""
+"""Trajectory errors applied to the data and as errors of a Monte Carlo have the same effects."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Of a cloud that is larger than memory whole cells are kept, those that tell something; what is found is the same."""
+"""Clouds larger than memory: whole informative cells are kept, with the same result."""
 
 from collections.abc import Iterator
 
@@ -7,8 +7,8 @@ import pytest
 
 from jaxphoto import InputError
 from jaxphoto.cloud import Cloud
-from jaxphoto.lidar.cell_returns import cells_of
 from jaxphoto.lidar.correction import scanner_path
+from jaxphoto.lidar.strip_planes import cells_of
 from jaxphoto.procedures.lidar import adjust_strips, kept_returns
 from tests.procedures.strips import PRIORS, SETTINGS, fitted, flown
 
@@ -53,7 +53,7 @@ def test_whole_cells_are_kept_as_many_as_there_is_room_for(kept):
 def test_what_is_found_is_what_all_returns_say(kept):
     flight = flown()
     found, asked = adjust_strips(kept, flight.trajectory, SETTINGS, PRIORS), fitted()
-    assert found.still and float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
+    assert found.converged and float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
     labels = found.adjusted.structure.labels
     assert labels == asked.adjusted.structure.labels
     own = np.array([label.startswith("scanner") for label in labels])

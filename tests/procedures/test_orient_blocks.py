@@ -124,10 +124,7 @@ def with_stations(block, scene, which):
     noise = 0.05 * np.random.default_rng(1).normal(size=(len(which), 3))
     n = len(which)
     rows = CameraPositions(
-        np.repeat(which, 3),
-        np.tile(np.arange(3), n),
-        (scene.positions[which] + noise).ravel(),
-        np.full(3 * n, 0.05),
+        np.repeat(which, 3), np.tile(np.arange(3), n), (scene.positions[which] + noise).ravel(), np.full(3 * n, 0.05)
     )
     return dataclasses.replace(block, stations=rows)
 

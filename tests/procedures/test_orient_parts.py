@@ -156,8 +156,7 @@ def known_start(block, there, images=(), points=()):
     pick = lambda n, which: np.isin(np.arange(n), which)  # noqa: E731
     image, point = pick(len(block.images), images), pick(len(block.points), points)
     exterior = ExteriorOrientation(
-        np.where(image[:, None], there.positions, 0.0),
-        np.where(image[:, None, None], there.matrices, np.eye(3)),
+        np.where(image[:, None], there.positions, 0.0), np.where(image[:, None, None], there.matrices, np.eye(3))
     )
     unknowns = dataclasses.replace(
         block.start.unknowns, exterior=exterior, points=np.where(point[:, None], there.points, 0.0)

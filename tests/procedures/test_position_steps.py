@@ -1,4 +1,4 @@
-"""Steps of recorded positions: found where they are, not where noise is white or wanders, and taken off a block."""
+"""Steps of recorded positions: detection, false alarms by white and correlated noise, correction."""
 
 import dataclasses
 import functools
@@ -9,7 +9,7 @@ import pytest
 
 from jaxphoto.io import recipe_from
 from jaxphoto.procedures.georeference_photographs import georeference_photographs
-from jaxphoto.procedures.position_steps import steps_of
+from jaxphoto.procedures.position_steps import detect_steps
 from jaxphoto.simulation import simulate
 from tests.procedures.test_georeference_photographs import recorded
 
@@ -41,7 +41,7 @@ def test_noise_is_no_step_in_95_of_100_flights(persistence):
     rng = np.random.default_rng(3)
     for n, a_strip in ((20, 10), (60, 12)):
         at = flight(rng, n, a_strip)
-        found = [bool(steps_of(noise(rng, n, persistence) + similarity(rng, at), at, ZERO)) for _ in range(150)]
+        found = [bool(detect_steps(noise(rng, n, persistence) + similarity(rng, at), at, ZERO)) for _ in range(150)]
         # Five of 100, and what 150 flights may have more by chance (99 %).
         assert np.mean(found) <= 0.05 + 2.3 * np.sqrt(0.05 * 0.95 / 150), (n, np.mean(found))
 
@@ -55,24 +55,24 @@ def test_a_step_is_found_where_it_is_with_its_size(by):
         stepped = np.arange(n)[:, None] >= first
         offsets = noise(rng, n, 0.0) + similarity(rng, at) + stepped * np.array(by)
         offsets[(first + 9) % n] += [40.0, -30.0, 0.0]
-        steps = steps_of(offsets, at, ZERO)
+        steps = detect_steps(offsets, at, ZERO)
         if [s.first for s in steps] == [first]:
             found += 1
             off.append((steps[0].by_m - by) / steps[0].sigma_m)
     assert found >= 34
     assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.5
     # The same, where standard deviations allow as much.
-    assert steps_of(offsets, at, np.array(by) + 10.0) == []
+    assert detect_steps(offsets, at, np.array(by) + 10.0) == []
 
 
 def test_an_excursion_is_two_steps_and_a_change_at_every_strip_none():
     rng, n = np.random.default_rng(8), 60
     at = flight(rng, n, 12)
     gone = ((np.arange(n) >= 20) & (np.arange(n) < 31))[:, None] * np.array([10.0, -20.0, 0.0])
-    assert [s.first for s in steps_of(noise(rng, n, 0.0) + gone, at, ZERO)] == [20, 31]
+    assert [s.first for s in detect_steps(noise(rng, n, 0.0) + gone, at, ZERO)] == [20, 31]
     # As an exposure that is told too late puts them.
     late = np.where(np.arange(n) // 12 % 2, -1.0, 1.0)[:, None] * np.array([20.0, 0.0, 0.0])
-    assert steps_of(noise(rng, n, 0.0) + late, at, ZERO) == []
+    assert detect_steps(noise(rng, n, 0.0) + late, at, ZERO) == []
 
 
 @functools.cache
@@ -113,8 +113,8 @@ def test_a_part_that_is_off_has_a_shift_of_its_own_and_the_block_does_not_tilt()
         for p, o in ((position + off * by, order), (position, order), (position + off * by, ()))
     )
     assert found.used.all() and not clean.steps and len(found.steps) == 1
-    assert f"between {block.images[-1]} and {block.images[0]}, as where" in found.steps[0]
-    assert f"those of the 16 photographs from {block.images[8]} on count" in found.steps[0]
+    assert f"between {block.images[-1]} and {block.images[0]} " in found.steps[0]
+    assert f"the 16 photographs from {block.images[8]} on are the reference" in found.steps[0]
     (shift,) = found.block.start.unknowns.strips.values()
     np.testing.assert_allclose(shift.shift, by, atol=0.1)
     assert [s != "" for s in found.block.image_strip] == [k < 8 for k in range(n)]

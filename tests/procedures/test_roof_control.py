@@ -21,7 +21,7 @@ def on_roofs() -> RoofControl:
 
 def test_points_on_roofs_are_held_on_their_planes():
     found = on_roofs()
-    assert found.still and found.faces > 2 and len(found.points) >= found.faces
+    assert found.converged and found.faces > 2 and len(found.points) >= found.faces
     truth = scanned().truth.points[found.points]
     rows = found.block.surfaces
     # The true points are on the planes as far as these are known, and true roofs slope.

@@ -1,4 +1,4 @@
-"""Strips are fitted to each other, and what was wrong with scanner and trajectory is found."""
+"""Strip adjustment recovers the errors of scanner and trajectory."""
 
 import dataclasses
 import functools
@@ -12,13 +12,18 @@ from jaxphoto.adjustment import Outcome
 from jaxphoto.cloud import Cloud
 from jaxphoto.georeferencing import StripSpline, TrajectoryKnot
 from jaxphoto.io.recipe.truth import truth_tables
-from jaxphoto.lidar.correction import in_portions, scanner_path, scanner_poses
-from jaxphoto.lidar.strip_correction import correct_flight, correct_strips, corrected_strip
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.correction import (
+    correct_flight,
+    correct_strips,
+    corrected_strip,
+    in_portions,
+    scanner_path,
+    scanner_poses,
+)
+from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.procedures.lidar import ScannerPriors, adjust_strips
 from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
-from jaxphoto.procedures.lidar.strip_rows import _angles, step_rows
-from jaxphoto.procedures.lidar.strip_unknowns import knot_sigmas
+from jaxphoto.procedures.lidar.strip_model import _angles, knot_sigmas, step_rows
 from jaxphoto.report.strips import calibration_table, trajectory_errors_table
 from jaxphoto.rotation import (
     matrix_from_quaternion,
@@ -41,7 +46,7 @@ def above_ground(cloud: Cloud) -> np.ndarray:
     return cloud.xyz[some, 2] - flown().terrain.height(cloud.xyz[some, :2])
 
 
-def test_the_truth_mends_the_cloud():
+def test_true_errors_correct_the_cloud():
     flight = flown()
     off = above_ground(correct_strips(flight.cloud, flight.errors, scanner_path(flight.trajectory)))
     assert abs(off.mean()) < 0.002 and off.std() == pytest.approx(NOISE_M, rel=0.1)
@@ -50,7 +55,7 @@ def test_the_truth_mends_the_cloud():
 
 def test_strips_fit_to_the_noise_of_their_planes():
     found = fitted()
-    assert found.still and found.adjusted.outcome is Outcome.CONVERGED
+    assert found.converged and found.adjusted.outcome is Outcome.CONVERGED
     assert len(found.differences) == 3
     for d in found.differences:
         assert d.rms_before_m > 0.06
@@ -71,10 +76,8 @@ def test_parts_of_a_cloud_of_any_length_compile_nothing_new(caplog):
             corrected_strip(cloud.xyz[some], cloud.time[some], 0, flight.errors, path)
             angles = in_portions(_angles, (scanner_poses(path, cloud.time[some]).object_from_body,))
             assert angles.shape == (n, 3)
-            compiled = [
-                r.getMessage() for r in caplog.records if r.getMessage().startswith(("Compiling", "Finished tr"))
-            ]
-            assert n == 300 or not compiled
+            messages = [r.getMessage() for r in caplog.records]
+            assert n == 300 or not any(m.startswith(("Compiling", "Finished tr")) for m in messages)
 
 
 @functools.cache
@@ -95,7 +98,7 @@ def chi_squared_of_the_scanner(flight, found) -> float:
     return float(off @ np.linalg.solve(matrix[np.ix_(own, own)], off))
 
 
-def test_the_scanner_is_found():
+def test_scanner_parameters_are_recovered():
     found = fitted()
     assert chi_squared_of_the_scanner(flown(), found) < 20.5  # 99.9 %
     # All but the range offset are many sigma: not to find them would show.
@@ -103,10 +106,10 @@ def test_the_scanner_is_found():
     assert len(table) == 5 and (table.value.abs() > 4 * table.sigma).sum() >= 4
 
 
-def test_a_scanner_of_prisms_is_found_by_what_it_sees_ahead_and_behind():
+def test_a_risley_scanner_is_calibrated_by_its_two_looks():
     flight = flown_around()
     found = adjust_strips(flight.cloud, flight.trajectory, SETTINGS, PRIORS_AROUND)
-    assert found.still and float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
+    assert found.converged and float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
     assert chi_squared_of_the_scanner(flight, found) < 20.5  # 99.9 %
     within = [d for d in found.differences if (d.one, d.other) == ("1 ahead", "1 behind")]
     assert len(within) == 1 and within[0].rms_before_m > 0.03
@@ -119,7 +122,7 @@ def test_a_scanner_of_prisms_is_found_by_what_it_sees_ahead_and_behind():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["rotating", "oscillating"])
-def test_angles_and_clock_of_a_scanner_are_found(kind):
+def test_angles_and_clock_of_a_scanner_are_recovered(kind):
     """By the options of the command, in the words of a recipe; errors of the trajectory as they drift."""
     true = {"eccentricity_deg": [0.02, -0.03], "time_offset_s": 0.005}
     drifts = {key: TRUTH[key] for key in ("drift_sigma_m", "drift_sigma_deg", "correlation_s", "knots_s")}
@@ -127,17 +130,12 @@ def test_angles_and_clock_of_a_scanner_are_found(kind):
     flight, priors = made(STRIPS | {"lidar": lidar}, 5), scanner_priors(["eccentricity", "time-offset"], kind)
     found = adjust_strips(flight.cloud, flight.trajectory, SETTINGS, priors)
     table, told = calibration_table(found), truth_tables(flight)["scanner"].set_index("parameter").value
-    assert len(table) == 3 and found.still
+    assert len(table) == 3 and found.converged
     assert (np.abs(table.value - told[table.parameter].to_numpy()) < 3 * table.sigma).all()
     assert (table.value.abs() > 4 * table.sigma).all()
 
 
-def test_the_clock_of_a_scanner_that_looks_all_around_is_not_estimated():
-    with pytest.raises(InputError, match="what it sees of one plane is seconds apart: leave out time-offset"):
-        adjust_strips(flown().cloud, flown().trajectory, SETTINGS, scanner_priors(["time-offset"], "risley"))
-
-
-def test_another_pattern_than_that_of_the_scanner_is_told():
+def test_a_wrong_scan_pattern_is_refused():
     flight, other = flown(), flown_around()
     with pytest.raises(BlockError, match="as those of a scanner that draws lines across the track"):
         check_measured_from(flight.cloud, scanner_path(flight.trajectory), "circle")
@@ -147,7 +145,7 @@ def test_another_pattern_than_that_of_the_scanner_is_told():
     check_measured_from(other.cloud, scanner_path(other.trajectory), "circle")
 
 
-def test_the_errors_of_the_trajectory_are_found():
+def test_trajectory_errors_are_recovered():
     """At the times of the flight, as far as their covariance says."""
     table, errors, w = trajectory_errors_table(fitted()), flown().errors, []
     names = ["X_m", "Y_m", "Z_m", "right_deg", "forward_deg", "up_deg"]
@@ -159,14 +157,13 @@ def test_the_errors_of_the_trajectory_are_found():
     assert np.mean(np.abs(np.concatenate(w)) < 3) > 0.95
 
 
-def test_cloud_and_trajectory_are_mended_alike():
+def test_cloud_and_trajectory_are_corrected_consistently():
     found, flight = fitted(), flown()
     assert found.cloud.strips == flight.cloud.strips
     np.testing.assert_array_equal(found.cloud.time, flight.cloud.time)
     true = correct_flight(flight.trajectory, flight.errors)
-    before, after = (
-        np.asarray(t.quaternion) - np.asarray(true.quaternion) for t in (flight.trajectory, found.trajectory)
-    )
+    both = (flight.trajectory, found.trajectory)
+    before, after = (np.asarray(t.quaternion) - np.asarray(true.quaternion) for t in both)
     assert np.sqrt((after**2).mean()) < np.sqrt((before**2).mean())
     # What strips have in common no difference of strips can tell.
     assert above_ground(found.cloud).std() < 1.2 * NOISE_M
@@ -183,14 +180,14 @@ MOST = 1000
 COARSE = StripSettings(cell_m=2.0, roughness_m=0.04, returns=8, most=MOST)
 
 
-def test_without_a_trajectory_shifts_are_found():
+def test_without_a_trajectory_shifts_are_estimated():
     shift = np.array([0.15, -0.2, 0.1])
     found = adjust_strips(two_strips(shift), settings=COARSE)
     sigma = np.asarray(found.covariance.shared_sigma)
-    assert found.still
+    assert found.converged
     assert (np.abs(found.errors.position[1] - shift) < 3.5 * sigma).all() and (sigma < 0.01).all()
     assert not found.errors.position[0].any()
-    other = adjust_strips(two_strips(shift), settings=COARSE, held=("2",))
+    other = adjust_strips(two_strips(shift), settings=COARSE, fixed=("2",))
     np.testing.assert_allclose(other.errors.position[0], -found.errors.position[1], atol=2 * sigma.max())
 
 
@@ -208,21 +205,20 @@ def test_a_real_cloud_cut_in_two(data_dir):
     assert (np.abs(found.errors.position[1] - shift) < 3 * sigma).all() and (sigma < 0.015).all()
 
 
-def test_a_scanner_without_a_trajectory_is_refused():
-    with pytest.raises(InputError, match="without a trajectory strips have shifts alone"):
-        adjust_strips(flown().cloud, priors=PRIORS_AROUND)
-
-
 def test_what_cannot_be_adjusted():
     cloud, flight = two_strips(np.zeros(3), 30.0), flown()
+    with pytest.raises(InputError, match="what it sees of one plane is seconds apart: leave out time-offset"):
+        adjust_strips(flight.cloud, flight.trajectory, SETTINGS, scanner_priors(["time-offset"], "risley"))
+    with pytest.raises(InputError, match="without a trajectory strips have shifts alone"):
+        adjust_strips(flight.cloud, priors=PRIORS_AROUND)
     with pytest.raises(InputError, match="the cloud has one strip"):
         adjust_strips(dataclasses.replace(cloud, strip=None, strips=()))
     with pytest.raises(InputError, match="north is no strip of the cloud, which has 1, 2"):
-        adjust_strips(cloud, held=("north",))
-    with pytest.raises(InputError, match="all strips are held"):
-        adjust_strips(cloud, held=("1", "2"))
-    with pytest.raises(InputError, match="all strips are held"):
-        adjust_strips(flight.cloud, flight.trajectory, priors=ScannerPriors(FIXED), held="all")
+        adjust_strips(cloud, fixed=("north",))
+    with pytest.raises(InputError, match="all strips are fixed"):
+        adjust_strips(cloud, fixed=("1", "2"))
+    with pytest.raises(InputError, match="all strips are fixed"):
+        adjust_strips(flight.cloud, flight.trajectory, priors=ScannerPriors(FIXED), fixed="all")
     with pytest.raises(InputError, match=r"with knots 1e-05 s apart .* take them farther apart \(--knots-s\)"):
         adjust_strips(flight.cloud, flight.trajectory, StripSettings(knots_s=1e-5))
     with pytest.raises(InputError, match="the cloud has no times"):
@@ -238,7 +234,7 @@ def test_what_cannot_be_adjusted():
         adjust_strips(apart, settings=COARSE)
 
 
-def test_trajectories_that_do_not_go_with_the_cloud():
+def test_inconsistent_trajectories_are_refused():
     flight = flown()
     path = flight.trajectory
     cut = dataclasses.replace(path, **{f: getattr(path, f)[:1500] for f in vars(path)})
@@ -257,7 +253,7 @@ def test_trajectories_that_do_not_go_with_the_cloud():
         adjust_strips(flight.cloud, jump)
 
 
-def test_knots_are_called_by_strip_and_time():
+def test_knots_are_named_by_strip_and_time():
     owners = list(fitted().adjusted.unknowns.more[TrajectoryKnot.kind])
     assert owners[1].startswith("1 at 0.0") and owners[-1].startswith("3 at ")
 
@@ -265,16 +261,10 @@ def test_knots_are_called_by_strip_and_time():
 @pytest.mark.parametrize(
     ("coordinates", "sentence"),
     [
-        (
-            lambda xyz, quaternion: (xyz + np.array([3000.0, 0.0, 0.0]), quaternion),
-            "now here, now there about the scanner",
-        ),
-        (lambda xyz, quaternion: (xyz / 0.3048, quaternion), "now here, now there about the scanner"),
-        (
-            lambda xyz, quaternion: (xyz + np.array([4e5, 5e6, 0.0]), quaternion),
-            r"lie \d+ km from where the trajectory",
-        ),
-        (lambda xyz, quaternion: (xyz, as_radians(quaternion)), "follows its course as radians"),
+        (lambda xyz, q: (xyz + np.array([3000.0, 0.0, 0.0]), q), "now here, now there about the scanner"),
+        (lambda xyz, q: (xyz / 0.3048, q), "now here, now there about the scanner"),
+        (lambda xyz, q: (xyz + np.array([4e5, 5e6, 0.0]), q), r"lie \d+ km from where the trajectory"),
+        (lambda xyz, q: (xyz, as_radians(q)), "follows its course as radians"),
     ],
 )
 def test_a_trajectory_that_cannot_be_the_cloud_s_is_refused(coordinates, sentence):
@@ -286,7 +276,7 @@ def test_a_trajectory_that_cannot_be_the_cloud_s_is_refused(coordinates, sentenc
         adjust_strips(flight.cloud, other, SETTINGS)
 
 
-def test_a_body_that_flies_backwards_is_told():
+def test_backward_flight_is_reported():
     flight = flown()
     back = np.asarray(flight.trajectory.quaternion)[:, [3, 2, 1, 0]] * [-1.0, 1.0, -1.0, 1.0]  # times a half turn
     odd = check_measured_from(flight.cloud, scanner_path(dataclasses.replace(flight.trajectory, quaternion=back)))
@@ -294,7 +284,7 @@ def test_a_body_that_flies_backwards_is_told():
     assert 170 < float(odd[0].split(" degrees")[0].split()[-1]) <= 180
 
 
-def test_a_trajectory_that_jumps_is_told():
+def test_a_jump_of_the_trajectory_is_reported():
     flight = flown()
     time, xyz = np.asarray(flight.trajectory.time), np.array(flight.trajectory.position)
     k = len(time) // 2
@@ -310,10 +300,8 @@ def as_radians(quaternion):
 
 
 def test_the_sigmas_of_a_trajectory_are_those_of_its_knots():
-    trajectory, splines = (
-        flown().trajectory,
-        (StripSpline.over(0, 0.0, 20.0, 5.0), StripSpline.over(7, 40.0, 50.0, 5.0)),
-    )
+    trajectory = flown().trajectory
+    splines = StripSpline.over(0, 0.0, 20.0, 5.0), StripSpline.over(7, 40.0, 50.0, 5.0)
     n = len(np.asarray(trajectory.time))
     stated = dataclasses.replace(
         trajectory,

@@ -12,7 +12,7 @@ from jaxphoto import BlockError, InputError
 from jaxphoto.block import Frame
 from jaxphoto.cloud import Cloud
 from jaxphoto.io import clouds
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.procedures.control import SurveyedPoints
 from jaxphoto.procedures.lidar import StripAdjustment, adjust_strips
 from jaxphoto.procedures.lidar.strip_control import with_control
@@ -66,19 +66,19 @@ def on_roofs(n: int, seed: int) -> np.ndarray:
 def pulls(seed: int) -> np.ndarray:
     """Errors of the six shifts over their standard deviations, found by control on roofs."""
     found = adjust_strips(two_strips(seed), settings=COARSE, control=surveyed(on_roofs(12, seed), seed))
-    assert found.still
+    assert found.converged
     return (found.errors.position - [COMMON, COMMON + SHIFT]).ravel() / np.asarray(found.covariance.shared_sigma)
 
 
 @pytest.mark.slow
-def test_control_finds_what_strips_have_in_common_without_a_trajectory():
+def test_control_determines_common_shifts_without_a_trajectory():
     control = surveyed(on_roofs(24, 3), 3)
     control = control._replace(check=np.arange(24) % 4 == 3)
     control.coordinates[0, 2] += 0.5  # A blunder.
     found = adjust_strips(two_strips(3), settings=COARSE, control=control)
     sigma = np.asarray(found.covariance.shared_sigma)
     off = found.errors.position - [COMMON, COMMON + SHIFT]
-    assert found.still and (np.abs(off.ravel()) < 3.5 * sigma).all() and (sigma < 0.025).all()
+    assert found.converged and (np.abs(off.ravel()) < 3.5 * sigma).all() and (sigma < 0.025).all()
     # Both strips stand on the same survey of 18 points, which does not get better by that.
     assert (sigma[2::3] > SIGMA_M / np.sqrt(18)).all()
     told = {(d.one, d.other): d for d in found.differences}
@@ -95,12 +95,12 @@ def test_control_finds_what_strips_have_in_common_without_a_trajectory():
     assert (used.sigma_m < used.noise_m).all() and len(used) == found.rounds[-1].control
 
 
-def test_one_strip_goes_through_control():
+def test_one_strip_is_fitted_to_control():
     both = two_strips(3)
     one = dataclasses.replace(both, xyz=both.xyz[both.strip == 0], strip=both.strip[both.strip == 0], strips=("1",))
     found = adjust_strips(one, settings=COARSE, control=surveyed(on_roofs(24, 3), 3))
     sigma = np.asarray(found.covariance.shared_sigma)
-    assert found.still and found.rounds[-1].planes == 0 and np.isnan(found.rounds[-1].rms_m)
+    assert found.converged and found.rounds[-1].planes == 0 and np.isnan(found.rounds[-1].rms_m)
     assert (np.abs(found.errors.position[0] - COMMON) < 3.5 * sigma).all() and (sigma < 0.025).all()
     assert [(d.one, d.other) for d in found.differences] == [("control", "1")]
     assert strips_verdict(found, None).findings[0].severity == "note"
@@ -112,13 +112,13 @@ def test_one_strip_goes_through_control():
     assert 0.6 < np.sqrt(np.mean(used.w**2)) < 1.4 and not told.w.isna().any()
 
 
-def test_on_level_ground_control_tells_heights_and_the_first_strip_the_rest():
+def test_on_level_ground_control_determines_heights_only():
     # No more than two points, which would not do for photographs.
     xy = np.array([[42.0, 50.0], [58.0, 50.0]])
     control = surveyed(np.column_stack([xy, level(*xy.T)]))
     found = adjust_strips(two_strips(1, level), settings=COARSE, control=control)
     sigma = np.asarray(found.covariance.shared_sigma).reshape(2, 3)
-    assert found.still
+    assert found.converged
     np.testing.assert_allclose(found.errors.position[0, :2], 0.0, atol=2e-3)
     off = found.errors.position[:, 2] - [COMMON[2], COMMON[2] + SHIFT[2]]
     assert (np.abs(off) < 3.5 * sigma[:, 2]).all() and (sigma[:, 2] < 0.02).all()
@@ -148,18 +148,17 @@ def raised(rise: float = 0.25) -> tuple[Simulation, StripAdjustment, StripAdjust
     xy = some[np.random.default_rng(2).choice(len(some), 60, replace=False), :2]
     control = surveyed(np.column_stack([xy, flight.terrain.height(xy)]), 7)
     cloud = dataclasses.replace(flight.cloud, xyz=flight.cloud.xyz + np.array([0.0, 0.0, rise]))
-    path = dataclasses.replace(
-        flight.trajectory, position=np.asarray(flight.trajectory.position) + np.array([0.0, 0.0, rise])
-    )
+    position = np.asarray(flight.trajectory.position) + np.array([0.0, 0.0, rise])
+    path = dataclasses.replace(flight.trajectory, position=position)
     settings = dataclasses.replace(SETTINGS, sigma_position_m=0.2, correlation_s=200.0)
     both = [adjust_strips(cloud, path, settings, PRIORS, control=given) for given in (None, control)]
     return flight, both[0], both[1]
 
 
 @pytest.mark.slow
-def test_with_a_trajectory_control_finds_the_height_of_a_flight():
+def test_with_a_trajectory_control_determines_the_height_of_a_flight():
     flight, alone, found = raised()
-    assert found.still and found.rounds[-1].control > 40
+    assert found.converged and found.rounds[-1].control > 40
 
     def off(result: StripAdjustment) -> float:
         ground = np.flatnonzero(result.cloud.classification == 2)[::20]
@@ -193,10 +192,7 @@ def test_control_of_a_block_is_the_same_point_and_counts_once():
         (lambda c: c._replace(coordinates=c.coordinates + np.array([5000.0, 0, 0])), r"lie 49\d\d m from the strips"),
         (lambda c: c._replace(coordinates=c.coordinates + np.array([0, 0, 47.0])), r"lie 4\d\.\d m above the strips"),
         (lambda c: c._replace(coordinates=c.coordinates * np.array([1, 1, np.nan])), "point K0 has no height"),
-        (
-            lambda c: c._replace(coordinates=c.coordinates * 0 + np.array([8.0, 20.0, 4.6])),
-            "lies on a plane of a strip",
-        ),
+        (lambda c: c._replace(coordinates=0 * c.coordinates + [8.0, 20.0, 4.6]), "lies on a plane of a strip"),
     ],
 )
 def test_control_that_cannot_be(change, sentence):

@@ -33,7 +33,7 @@ def errors(control: LidarControl) -> np.ndarray:
 @pytest.mark.parametrize("method", slow_but(("plane",), ("plane", "local", "image")))
 def test_heights_alone_calibrate_the_camera(method):
     control = controlled(method)
-    assert control.still and bool(control.adjusted.converged)
+    assert control.converged and bool(control.adjusted.converged)
     assert (np.abs(errors(control)) < 3).all()
     # And they are what does it: the block by itself knows c many times worse.
     assert (control.block.control.axis == 2).all() and len(control.block.control.who) == control.used.sum()
@@ -91,7 +91,7 @@ def test_a_triplet_is_calibrated_by_pseudo_control():
     control = lidar_control(flight.block, flight.cloud, "image", settings)
     a, c = control.adjusted, flight.truth.interior["kodak"].c
     (sigma,) = np.asarray(covariance(a).shared_sigma) / float(a.sigma0)
-    assert control.still
+    assert control.converged
     assert abs(float(a.unknowns.interior["kodak"].c) - c) < 3 * sigma
     # At best: stations and heights together say how high the camera flies over the points. (The base of so few images,
     # as good as two stations, allows much less.)

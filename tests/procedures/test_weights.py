@@ -1,25 +1,25 @@
-"""A variance component that a few blunders make is told from one of weights that are stated too high."""
+"""Variance components inflated by a few blunders are distinguished from wrong weights."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from jaxphoto import adjust, read_block, variance_components
-from jaxphoto.procedures.weights import made_by_blunders
+from jaxphoto import adjust, variance_components
+from jaxphoto.procedures.blunder_causes import inflated_components
 from jaxphoto.report import component_findings
+from tests.blocks import adjusted_example, example
 
 
 @pytest.fixture(scope="module")
 def block():
-    return read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    return example()
 
 
 def found_in(block):
-    adjusted = adjust(block)
+    adjusted = adjusted_example() if block is example() else adjust(block)
     components = variance_components(adjusted, ("xy-z",))
-    return components, made_by_blunders(adjusted, components, ("xy-z",))
+    return components, inflated_components(adjusted, components, ("xy-z",))
 
 
 def test_the_component_that_one_wrong_height_makes_is_an_alarm(block):

@@ -1,4 +1,4 @@
-"""The report of a flight without a flight: a small adjusted block in the place of photographs."""
+"""The report of a small adjusted block in place of a flight."""
 
 import functools
 
@@ -55,13 +55,9 @@ def source() -> FlightSource:
     images = part_report().part.adjusted.block.images
     at = 2.0 * np.arange(len(images)) + np.where(np.arange(len(images)) >= 5, 8.0, 0.0)
     return FlightSource(
-        ("positions are of EXIF",),
-        "c is the focal length of EXIF.",
-        BROWN,
+        ("positions are of EXIF",), "c is the focal length of EXIF.", BROWN,
         {name: (float(t), 0.01) for name, t in zip(images, at, strict=True)},
         (Conditions("i0", "i0.jpg", "0" * 64, time="2024-05-01 10:00:00"),),
         (InputFile("i0.jpg", 3, "0" * 64), InputFile("survey.csv", 5, "ab" * 32)),
-        {"method": {"command": "fly", "features": 500, "epsg": None}},
-        "2024-05-02",
-        "jaxphoto fly photographs",
-    )
+        {"method": {"command": "fly", "features": 500, "epsg": None}}, "2024-05-02", "jaxphoto fly photographs",
+    )  # fmt: skip

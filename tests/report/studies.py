@@ -1,4 +1,4 @@
-"""What studies found, without the studies: small results with known numbers, for their pictures and pages."""
+"""Small results of studies with known numbers, for their plots and pages."""
 
 import functools
 import math
@@ -9,11 +9,10 @@ from jaxphoto import Tables
 from jaxphoto.camera import Brown, InteriorOrientation, Sensor, Smac
 from jaxphoto.lidar import HeightFlag
 from jaxphoto.procedures import Step
-from jaxphoto.procedures.boresight_judgement import BoresightEstimate
-from jaxphoto.procedures.camera_candidates import Candidate
-from jaxphoto.procedures.halves import Cut, Halves
+from jaxphoto.procedures.boresight import BoresightEstimate
+from jaxphoto.procedures.compare import Cut, Halves
 from jaxphoto.procedures.lidar import LidarControl, Round, Simultaneous
-from jaxphoto.procedures.model_choice import Judged, ModelChoice
+from jaxphoto.procedures.model_choice import Candidate, Judged, ModelChoice
 from jaxphoto.stability import Analysis, image_grid
 from jaxphoto.stability.band import ErrorBand
 from jaxphoto.stability.comparison import analyse

@@ -1,4 +1,4 @@
-"""What is printed of lens priors, rays that err alike, a rolling shutter, and the camera with the ground."""
+"""Reports of lens priors, correlated residuals, rolling shutter, camera and ground, duplicates and convergence."""
 
 import dataclasses
 
@@ -6,14 +6,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from jaxphoto import FREE, Tables, Weighted
+import jaxphoto
+from jaxphoto import FREE, InputError, Outcome, Tables, Weighted, report
+from jaxphoto.adjustment.iteration_log import step_lines
 from jaxphoto.camera import Brown, InteriorOrientation, set_parameter
 from jaxphoto.camera.lens_prior import lens_prior, prior_sigmas
 from jaxphoto.observations import KnownParameters
 from jaxphoto.procedures.known_lens import KnownLens, with_known_lens
-from jaxphoto.report.tables import with_correlated_sigma
-from jaxphoto.report.verdict import lens_findings, shutter_findings
-from tests.blocks import SENSOR, adjusted
+from jaxphoto.report.results import convergence_words
+from jaxphoto.report.tables import convergence_table, side_by_side, with_correlated_sigma
+from jaxphoto.report.verdict import duplicate_findings, duplicate_images, lens_findings, shutter_findings
+from tests.blocks import SENSOR, adjusted, simulated
 
 LENS = KnownLens(InteriorOrientation(35.0, 0.0, 0.0, Brown()), lens_prior("Canon", "Canon EOS 5D"), 0.01)
 
@@ -37,7 +40,7 @@ def test_all_that_is_estimated_is_observed_and_an_earlier_calibration_counts_mor
     assert with_known_lens(dataclasses.replace(block, more=(known,)), "one", LENS).priors is block.priors
     said = " ".join(LENS.sentences(block, "one"))
     assert "interchangeable lenses" in said and "no published figure" in said and "2.2 %" in said
-    assert "an earlier calibration says more" in said
+    assert "earlier calibration" in said
 
 
 def test_rays_that_err_alike_widen_what_they_say_and_not_what_was_known():
@@ -47,7 +50,11 @@ def test_rays_that_err_alike_widen_what_they_say_and_not_what_was_known():
     block = dataclasses.replace(found.block, priors=dataclasses.replace(found.block.priors, interior={"one": priors}))
     rows = [("one", "c_mm", 35.0, 0.012), ("one", "k1", 1e-5, 1e-6), ("one", "p1", 0.0, np.nan)]
     table = pd.DataFrame(rows, columns=["camera", "parameter", "value", "sigma"])
-    wide = with_correlated_sigma(table, dataclasses.replace(found, block=block), 2.0).set_index("parameter").sigma_alike
+    wide = (
+        with_correlated_sigma(table, dataclasses.replace(found, block=block), 2.0)
+        .set_index("parameter")
+        .sigma_correlated
+    )
     # 1 / 0.012^2 = 1 / 0.02^2 + 1 / 0.015^2; the rays' 0.015 become 0.030.
     assert wide["c_mm"] == pytest.approx(1 / np.sqrt(1 / 0.02**2 + 1 / 0.03**2))
     assert wide["k1"] == pytest.approx(2e-6) and np.isnan(wide["p1"])
@@ -82,3 +89,64 @@ def test_the_table_of_the_ground():
     together = table[table.parameter == "all"].set_index("ground").rho
     largest = table[table.parameter != "all"].assign(size=lambda t: t.rho.abs()).groupby("ground")["size"].max()
     assert (together >= largest[together.index] - 1e-9).all() and (together <= 1).all()
+
+
+def test_side_by_side_stands_what_the_long_table_says():
+    table = Tables(adjusted("cross")).correlation_summary
+    wide = side_by_side(table, ["camera", "exterior"], "interior", "max_abs_rho")
+    assert wide.columns.tolist()[:4] == ["exterior", "c", "xp", "yp"]
+    assert wide["exterior"].tolist() == table["exterior"].unique().tolist()
+    one = table[(table["exterior"] == "omega") & (table["interior"] == "yp_mm")]["max_abs_rho"].item()
+    assert wide.set_index("exterior").loc["omega", "yp"] == f"{one:.3f}"
+
+
+def test_duplicated_images_are_reported():
+    block = simulated("cross").block
+    assert duplicate_images(block) == []
+    rows = block.image_points
+    xy = np.array(rows.xy)
+    n = 0
+    for k in np.flatnonzero(rows.image == 1):
+        for other in np.flatnonzero((rows.image == 0) & (rows.point == rows.point[k])):
+            xy[k] = xy[other]
+            n += 1
+    doubled = block.with_observations({"image_points": dataclasses.replace(rows, xy=xy)})
+    assert duplicate_images(doubled) == [(*sorted(block.images[:2]), n)]
+    (finding,) = duplicate_findings(doubled)
+    assert finding.value == n
+    # Written with fewer digits, it is the same photograph; measured anew, it is another observation.
+    rng, sigma, mine = np.random.default_rng(3), np.asarray(rows.sigma), (rows.image == 1)[:, None]
+    for part, told in ((0.05, True), (1.0, False)):
+        moved = xy + mine * part * sigma * rng.uniform(-1, 1, xy.shape)
+        again = block.with_observations({"image_points": dataclasses.replace(rows, xy=moved)})
+        assert bool(duplicate_images(again)) == told
+
+
+def test_sigma_naught_falls_from_that_of_the_start_to_that_of_the_optimum():
+    result = adjusted("cross")
+    table = convergence_table(result)
+    assert len(table) == int(result.steps) + 1 and table["step"].iloc[-1] == "end"
+    assert table["sigma0"].iloc[-1] == pytest.approx(float(result.sigma0))
+    assert (np.diff(table["sigma0"]) <= 1e-9).all()
+    lines = list(step_lines(result))
+    assert lines[0].startswith("step 1: sigma naught") and "moves" in lines[0] and "moves" not in lines[-1]
+    assert lines[-1] == f"end: sigma naught {float(result.sigma0):.6g}"
+    # One step from the start leads to where the second begins.
+    one = jaxphoto.adjust(simulated("cross").block, max_steps=1)
+    assert one.history.sum_of_squares[0] == pytest.approx(result.history.sum_of_squares[0])
+    assert float(one.sum_of_squares) == pytest.approx(result.history.sum_of_squares[1], rel=1e-6)
+    assert "1 step, which is the limit (--max-steps)" in convergence_words(one) and one.outcome is Outcome.STEPS
+
+
+def test_the_last_step_is_shorter_than_what_ends_an_adjustment():
+    result = adjusted("cross")
+    last = result.history.length[-1]
+    assert 0 <= last < 1e-4 and (result.history.length[:-1] > last).all()
+    assert f"by more than {last:.1e} of its standard deviation" in convergence_words(result)
+
+
+def test_without_iterations_nothing_is_reported():
+    without = dataclasses.replace(adjusted("cross"), history=None)
+    assert convergence_table(without).empty and convergence_words(without) == ""
+    with pytest.raises(InputError, match="adjust the block to draw its convergence"):
+        report.plot_convergence(Tables(without))

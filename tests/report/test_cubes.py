@@ -45,15 +45,11 @@ def test_draws_are_those_of_their_table(whole):
     a, rng, n = adjusted("cross"), np.random.default_rng(2), 4
     images, points, labels = a.block.images, a.block.points, a.structure.labels
     draws = Draws(
-        {"block.X_m": rng.normal(size=n)} if whole else {},
-        rng.normal(size=(n, len(labels))),
+        {"block.X_m": rng.normal(size=n)} if whole else {}, rng.normal(size=(n, len(labels))),
         rng.normal(size=(n, len(images), 6)) if whole else None,
-        rng.normal(size=(n, len(points), 3)) if whole else None,
-        np.ones(n, bool),
-        np.arange(n),
-        np.zeros(n, bool),
+        rng.normal(size=(n, len(points), 3)) if whole else None, np.ones(n, bool), np.arange(n), np.zeros(n, bool),
         tuple(labels),
-    )
+    )  # fmt: skip
     cube, table = draws_cube(draws, a), draws_table(draws, a)
     np.testing.assert_array_equal(cube.shared.sel(parameter="interior[one].c_mm"), table["one.c_mm"])
     assert ("exterior" in cube) == ("points" in cube) == ("error" in cube) == whole

@@ -1,12 +1,21 @@
-"""Figures draw what the tables hold."""
+"""Plots have the numbers of the tables."""
 
+import equinox as eqx
 import numpy as np
+import pytest
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver, QuiverKey
 
 from jaxphoto import Tables
-from jaxphoto.report import check_points_figure, plot_error_ellipses, plots
+from jaxphoto.report import (
+    check_points_figure,
+    plot_error_ellipses,
+    plot_residuals_by_radius,
+    plot_station_residuals,
+    plots,
+    results,
+)
 from jaxphoto.report.plots import ellipse_axes
 from tests.blocks import adjusted
 
@@ -82,3 +91,41 @@ def test_ellipses_are_as_long_as_the_standard_deviations_of_the_table():
     sigma = tables.exterior[["sigma_X_m", "sigma_Y_m", "sigma_Z_m"]].to_numpy().T
     np.testing.assert_allclose(reach, sigma[:2], rtol=1e-9)
     np.testing.assert_allclose(drawn.get_array(), sigma[2], rtol=1e-9)
+
+
+def test_radial_residuals_are_told_from_tangential_ones():
+    a = adjusted("cross")
+    from_centre = np.asarray(a.values.xy) - np.asarray(a.unknowns.interior["one"].principal_point)[:, None]
+    along = from_centre / np.hypot(*from_centre)
+    v = 1e-3 * (2.0 * along + 3.0 * np.stack([-along[1], along[0]]))
+    of_image = eqx.tree_at(lambda r: r.image, a.residuals, v / np.asarray(a.values.sigma_xy))
+    axes = plot_residuals_by_radius(
+        Tables(eqx.tree_at(lambda b: b.residuals, a, of_image)), "one", Figure().add_subplot()
+    )
+    radial, tangential = (np.asarray(bars.lines[0].get_ydata()) for bars in axes.containers)
+    np.testing.assert_allclose(radial, 2.0, atol=1e-9)
+    np.testing.assert_allclose(tangential, 3.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_station_residuals_are_those_of_the_table(axis):
+    tables = Tables(adjusted("cross"))
+    line = plot_station_residuals(tables, Figure().add_subplot()).lines[axis]
+    rows = tables.residuals[(tables.residuals["group"] == "stations") & (tables.residuals["axis"] == "XYZ"[axis])]
+    assert sorted(line.get_ydata()) == sorted(rows["residual"])
+    assert list(line.get_xdata()) == sorted(line.get_xdata())
+
+
+@pytest.fixture
+def of_points(monkeypatch):
+    """Tables of two cameras of which one is pictured, and the names by the number of image points."""
+    tables = Tables(adjusted("two_cameras"))
+    monkeypatch.setattr(results, "_PLOTTED", 1)
+    of = tables.adjusted.block.image_camera
+    seen = [of[i] for i in tables.adjusted.structure.image.tolist()]
+    return tables, sorted(("one", "two"), key=seen.count)
+
+
+def test_of_many_cameras_those_with_the_most_image_points_are_pictured(of_points):
+    tables, (_, most) = of_points
+    assert results.plotted_cameras(tables) == [most]

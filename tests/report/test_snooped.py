@@ -1,28 +1,28 @@
-"""What was left out is told as what it is: single errors, or one that many rows have in common."""
+"""Findings on rejected observations: single errors, or one common error of many rows."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from jaxphoto import adjust, read_block, snoop
+from jaxphoto import snoop
 from jaxphoto.initial.approximate import in_front, looking_away
 from jaxphoto.observations import Distances
 from jaxphoto.procedures import Snooped
-from jaxphoto.procedures.mistakes import coordinate_mistakes
+from jaxphoto.procedures.blunder_causes import coordinate_mistakes
 from jaxphoto.report import Tables, verdict_of
 from jaxphoto.report.residual_findings import snooped_findings
 from jaxphoto.statistics import Suspect, covariance
 from jaxphoto.statistics.systematic_effects import truncated_inverse
+from tests.blocks import adjusted, adjusted_example, example
 
 
 @pytest.fixture(scope="module")
 def block():
-    return read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    return example()
 
 
-def test_the_shift_of_a_strip_is_told_as_one(block):
+def test_the_shift_of_a_strip_is_one_finding(block):
     rows = block.stations
     in_b = np.array(block.image_strip)[rows.who] == "B"
     value = np.asarray(rows.value) + np.where(in_b & (rows.axis == 2), 3.0, 0.0)
@@ -44,7 +44,7 @@ def test_single_errors_are_no_shift(block):
     assert codes == ["rejected_observation"] * 5
 
 
-def test_a_group_all_of_whose_rows_go_is_told(block):
+def test_a_wholly_rejected_group_is_reported(block):
     """A single scale bar, which nothing is left of."""
     control = block.control
     ends = np.array([block.points.index(name) for name in ("T1", "T3")])
@@ -55,15 +55,30 @@ def test_a_group_all_of_whose_rows_go_is_told(block):
     assert left.group == "distances" and abs(left.error - 5.0) < 1.0
 
 
-def test_what_is_too_much_to_be_single_errors_is_an_alarm(block):
-    """x and y of an image exchanged."""
+def mirrored(block, name):
+    """Exchange x and y of an image."""
     rows = block.image_points
-    xy, mine = np.array(rows.xy), rows.image == block.images.index("A3")
+    xy, mine = np.array(rows.xy), rows.image == block.images.index(name)
     xy[mine] = xy[mine][:, ::-1]
-    spoilt = block.with_observations({"image_points": dataclasses.replace(rows, xy=xy)})
-    first = snooped_findings(snoop(spoilt), spoilt)[0]
-    assert (first.code, first.severity) == ("rejected_images", "error") and first.subject.startswith("A3")
+    return block.with_observations({"image_points": dataclasses.replace(rows, xy=xy)}), np.flatnonzero(mine)
+
+
+def assert_mirrored(snooped, block, name):
+    first = snooped_findings(snooped, block)[0]
+    assert (first.code, first.severity) == ("rejected_images", "error") and first.subject.startswith(name)
     assert "mirrored" in first.hint
+
+
+def test_a_mostly_rejected_image_is_an_error():
+    block, mine = mirrored(adjusted("cross").block, "i3")
+    rejected = tuple(Suspect("image_points", int(k), 0, "", 99.0, 1.0, 0.01, "mm") for k in mine)
+    assert_mirrored(Snooped(adjusted("cross"), rejected, (), ()), block, "i3")
+
+
+@pytest.mark.slow
+def test_a_mirrored_image_is_an_error(block):
+    spoilt, _ = mirrored(block, "A3")
+    assert_mirrored(snoop(spoilt), spoilt, "A3")
 
 
 def test_an_image_that_is_mirrored_is_an_alarm(block):
@@ -77,7 +92,7 @@ def test_an_image_that_is_mirrored_is_an_alarm(block):
     verdict = verdict_of(Tables(found.adjusted))
     assert any("image D4" in text for text in (*alarms, *(verdict.texts if verdict.colour == "red" else ())))
     # Of the block as it is, no point is behind its image.
-    sound = adjust(block)
+    sound = adjusted_example()
     seen = in_front(block, sound.unknowns)
     assert seen.all() and not len(looking_away(block, seen))
 
@@ -88,7 +103,8 @@ def test_numbers_that_overflow_are_no_pattern():
     assert freedom == 0 and not inverse.any()
 
 
-def test_the_file_whose_units_are_wrong_is_left_out_and_its_mistake_named(block):
+@pytest.mark.slow
+def test_a_file_in_wrong_units_is_rejected_with_its_cause(block):
     """Heights of control in feet: the stations are right, and the search begins without control."""
     rows = block.control
     value = np.asarray(rows.value) / np.where(rows.axis == 2, 0.3048, 1.0)
@@ -119,7 +135,7 @@ def test_the_file_whose_units_are_wrong_is_left_out_and_its_mistake_named(block)
         (lambda xyz: xyz + np.array([0, 0, 48]), None),
     ],
 )
-def test_mistakes_of_a_file_are_told_from_other_errors(block, mistake, said):
+def test_mistakes_of_a_file_are_distinguished_from_other_errors(block, mistake, said):
     rows = block.stations
     xyz = np.asarray(rows.value).reshape(-1, 3)
     given = block.with_observations({"stations": dataclasses.replace(rows, value=mistake(xyz).ravel())})

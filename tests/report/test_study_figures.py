@@ -1,4 +1,4 @@
-"""Pictures of flights, strips, sensitivity and draws, one by one: on given axes, with the numbers of their tables."""
+"""Plots of flights, strips, sensitivity and draws on given axes have the numbers of their tables."""
 
 import numpy as np
 import pandas as pd

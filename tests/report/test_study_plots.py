@@ -18,10 +18,9 @@ from jaxphoto.report import (
     plot_ray_offsets,
 )
 from jaxphoto.report.boresight import boresight_figure
-from jaxphoto.report.halves import halves_figure
 from jaxphoto.report.lidar import above_figure, heights_figure
 from jaxphoto.report.model_choice import choice_figure
-from jaxphoto.report.stability import change_headline
+from jaxphoto.report.stability import change_headline, halves_figure
 from jaxphoto.stability import change, image_grid
 from tests.report.studies import (
     GOPRO,

@@ -1,4 +1,4 @@
-"""Names of files are text on the terminal and in pictures, whatever they look like."""
+"""Names of files are literal text on the terminal and in plots."""
 
 import dataclasses
 import io

@@ -1,4 +1,4 @@
-"""A flat block without stations says in words that c and the principal point are hardly determined."""
+"""Weak determination of c and the principal point of a flat block without stations is reported."""
 
 import dataclasses
 import functools
@@ -27,7 +27,8 @@ def tables(relief: float, stations: bool | float, names=("c_mm", "xp_mm", "yp_mm
     return Tables(adjust(measured(Simulated(free(built, "one", names), truth)).block))
 
 
-def test_a_field_of_known_targets_has_cures_of_its_own(monkeypatch):
+@pytest.mark.slow
+def test_a_target_field_has_its_own_remedies(monkeypatch):
     monkeypatch.setattr(verdict, "HIGH_CORRELATION", 0.5)
     monkeypatch.setattr(verdict, "HIGH_OWN_CORRELATION", 0.5)
     # Any image feels it.
@@ -41,7 +42,8 @@ def test_a_field_of_known_targets_has_cures_of_its_own(monkeypatch):
     assert "rotated by 90 degrees" in of_field and "targets alone" in of_field and "stations (GNSS)" not in of_field
 
 
-def test_a_high_correlation_that_no_image_feels_has_no_cure():
+@pytest.mark.slow
+def test_a_harmless_high_correlation_has_no_remedy():
     """Stations that all shift alike: Z and c go together, and c is known well enough."""
     said = [f for f in verdict_of(tables(0.1, 1.0)).findings if "Z with c " in f.text]
     assert [(f.code, f.severity) for f in said] == [("correlation_exterior", "note")] and "10 sigma" in said[0].hint
@@ -51,7 +53,7 @@ def weak(warnings):
     return [w for w in warnings if "poorly determined" in w]
 
 
-def test_flat_ground_without_stations_is_put_into_words():
+def test_flat_ground_without_stations_is_reported():
     found = verdict_of(tables(0.1, False)).texts
     c, point = weak(found)
     assert found[:2] == [c, point]
@@ -86,7 +88,7 @@ def test_stations_that_are_too_weak_do_not_cure_it():
     assert "stations of sigma 50 m hardly separate them. Add better camera stations" in found[0]
 
 
-def test_a_solve_that_stopped_says_what_was_open():
+def test_a_stopped_solution_reports_weak_directions():
     """Where it was before the optimum the observations fit already, and the same direction is weak."""
     optimum = tables(0.1, False).adjusted
     stopped = dataclasses.replace(optimum, converged=np.array(False))
@@ -96,7 +98,7 @@ def test_a_solve_that_stopped_says_what_was_open():
     assert {f.severity for f in (first, *others)} == {"error"}
 
 
-def test_a_solve_that_stopped_where_nothing_fits_says_who_finds_out():
+def test_a_stopped_solution_without_fit_suggests_snooping():
     """Then no direction is weak for sure, and the errors are gross ones."""
     optimum = tables(0.1, True).adjusted
     far = jax.tree.map(lambda v: 100.0 * np.asarray(v), optimum.residuals)
@@ -110,7 +112,7 @@ def test_relief_cures_it():
 
 
 @pytest.mark.slow
-def test_a_held_c_is_not_complained_of():
+def test_a_fixed_c_is_not_reported():
     (only,) = weak(verdict_of(tables(0.1, False, ("xp_mm", "yp_mm"))).texts)
     assert "principal point" in only
 

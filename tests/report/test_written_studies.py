@@ -7,24 +7,16 @@ import pytest
 
 from jaxphoto.camera import Brown, InteriorOrientation, parameter_names
 from jaxphoto.report.boresight import boresight_parts
-from jaxphoto.report.halves import write_halves
 from jaxphoto.report.lidar import heights_figure, heights_page
 from jaxphoto.report.model_choice import write_model_choice
-from jaxphoto.report.page import Made, page
+from jaxphoto.report.page import CommandRecord, page
 from jaxphoto.report.sensitivity import SensitivityTables, write_sensitivity
-from jaxphoto.report.stability import Compared, write_change, write_stability
+from jaxphoto.report.stability import Compared, write_change, write_halves, write_stability
 from jaxphoto.stability import change, image_grid
 from tests.blocks import adjusted
-from tests.report.studies import (
-    GOPRO,
-    boresight_steps,
-    halves_found,
-    lidar_control_of,
-    model_choice_of,
-    ray_offsets,
-)
+from tests.report.studies import GOPRO, boresight_steps, halves_found, lidar_control_of, model_choice_of, ray_offsets
 
-MADE = Made("jaxphoto study")
+MADE = CommandRecord("jaxphoto study")
 ONE, TWO = (InteriorOrientation(c, 0.0, 0.0, Brown()) for c in (2.69, 2.70))
 SETS = Compared("A", ONE, True, GOPRO), Compared("B", TWO, False, GOPRO)
 

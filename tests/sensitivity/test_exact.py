@@ -26,6 +26,7 @@ from jaxphoto.sensitivity.hessian import image_columns
 from jaxphoto.unknowns import FIXED, FREE
 from tests.adjustment.dense import couples, in_one_list, own_order
 from tests.blocks import adjusted, simulated
+from tests.marks import slow_but
 from tests.test_examples import ROOT
 
 POINTS = ("p1", "p17")
@@ -189,7 +190,7 @@ def test_free_network(group: str) -> None:
     assert relative_error("inner", derivatives("inner")[group][at], expected) < 1e-6
 
 
-@pytest.mark.parametrize("curvature", [True, False])
+@pytest.mark.parametrize("curvature", slow_but([True], [True, False]))
 def test_response_is_the_sum_of_derivatives(curvature: bool) -> None:
     a, result = nominal("everything"), derivatives("everything", curvature)
     rng = np.random.default_rng(3)
@@ -316,6 +317,7 @@ def both():
     return leaves_of(OpenCv), leaves_of(Agisoft)
 
 
+@pytest.mark.slow
 def test_two_names_of_one_camera_have_one_sensitivity(both):
     # Regression test for "mul got incompatible shapes"; with these coefficients both are the same polynomial.
     of_opencv, of_agisoft = both
@@ -362,6 +364,7 @@ def dense_products():
     return functools.partial(jax.jit(jax.hessian(half_square, (0, 1))), *at), columns < s.n_shared
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("curved", [0.0, 1.0])
 @pytest.mark.parametrize("at_once", [8192, 64])
 def test_products_of_rows_are_the_dense_ones(curved: float, at_once: int, monkeypatch) -> None:

@@ -177,8 +177,8 @@ def test_draws_do_not_depend_on_how_many_there_are():
     assert not np.array_equal(few.shared, other.shared)
 
 
-@pytest.mark.parametrize("name", ["everything", "three_models"])
-@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize("name", slow_but(["everything"], ["everything", "three_models"]))
+@pytest.mark.parametrize("measured", slow_but([True], [True, False]))
 def test_rows_that_come_in_chunks_add_up_to_the_same(name, measured):
     nominal, rng = adjusted(name), np.random.default_rng(5)
     near = jax.tree.map(lambda v: rng.normal(0, 0.3, (*v.shape, 3)), nominal.equations.scale)

@@ -65,6 +65,7 @@ def test_search_stays_between_its_bounds(optimised):
     np.testing.assert_array_equal(optimised.best.control, USUAL.control)
 
 
+@pytest.mark.slow
 def test_the_gain_is_there_when_the_layout_is_measured(optimised):
     """By `jaxphoto.covariance` of a block with whole image points only."""
     measured = []

@@ -12,7 +12,7 @@ import pytest
 from jaxphoto import FIXED, InputError, adjust, covariance
 from jaxphoto.camera import Brown, InteriorOrientation
 from jaxphoto.observations import ControlCoordinates
-from jaxphoto.report.posterior import posterior_figure, posterior_table
+from jaxphoto.report.draws import posterior_figure, posterior_table
 from jaxphoto.sensitivity.posterior import Posterior, posterior
 from tests.blocks import Scene, Simulated, adjusted, bare, free, measured
 

@@ -1,4 +1,4 @@
-"""A small recipe that tests change key by key, and shorthands to simulate it."""
+"""A small recipe that tests change key by key, and functions to simulate it."""
 
 import copy
 import functools

@@ -1,4 +1,4 @@
-"""`jaxphoto simulate`: the folder says what the simulation is, and an adjustment of it finds the truth."""
+"""`jaxphoto simulate`: files of the folder, and an adjustment that recovers the truth."""
 
 import functools
 

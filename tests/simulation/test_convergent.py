@@ -1,4 +1,4 @@
-"""Convergent sets: cameras stand, aim and turn as asked, and the test fields of the papers are what their pages say."""
+"""Convergent sets: positions, directions and rotations as given, and the test fields of the papers."""
 
 import tomllib
 from pathlib import Path
@@ -176,7 +176,7 @@ def test_approximate_positions_are_near_as_distances_are():
         ({"targets.0.grid": [7, True]}, "grid: True is not a whole number"),
     ],
 )
-def test_mistakes_are_named_with_their_mend(changes, message):
+def test_mistakes_are_named_with_a_remedy(changes, message):
     with pytest.raises(InputError, match=f"^gopro.toml.*{message}"):
         recipe_from(changed(changes, GOPRO), "gopro.toml")
 

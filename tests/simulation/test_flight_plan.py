@@ -1,4 +1,4 @@
-"""Overlaps, headings and heights are those asked for, whatever is asked for."""
+"""Overlaps, headings and heights are those given."""
 
 import numpy as np
 import pytest

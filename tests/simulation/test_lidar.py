@@ -1,4 +1,4 @@
-"""A simulated cloud lies on the ground and roofs that were scanned, but for what the truth says is wrong with it."""
+"""Simulated clouds lie on ground and roofs, except for the simulated errors."""
 
 import functools
 import tomllib
@@ -17,11 +17,10 @@ from jaxphoto.io import read_block, recipe_from, write_simulation
 from jaxphoto.io.clouds import read_cloud
 from jaxphoto.io.recipe.truth import truth_tables
 from jaxphoto.io.trajectory import read_flight_csv
-from jaxphoto.lidar.correction import scanner_path
-from jaxphoto.lidar.strip_correction import correct_strips
+from jaxphoto.lidar.correction import correct_strips, scanner_path
 from jaxphoto.rotation import matrix_from_quaternion
 from jaxphoto.simulation import Simulation
-from jaxphoto.simulation.buildings import roof_height
+from jaxphoto.simulation.scene import roof_height
 from tests.commands import run
 from tests.simulation.small import RECIPES, changed, made
 
@@ -154,7 +153,7 @@ WRONG = TRUTH | {
 
 
 @pytest.mark.parametrize("kind", ["oscillating", "nutating"])
-def test_all_that_is_wrong_comes_off_by_the_truth(kind):
+def test_all_errors_are_removed_by_the_truth(kind):
     simulation = made(SCENE | {"lidar": {"density_per_m2": 0.02, "pattern": kind, "truth": WRONG}})
     cloud, errors = cloud_of(simulation), simulation.errors
     ground = cloud.classification == GROUND
@@ -442,7 +441,7 @@ def test_a_mirror_that_oscillates_looks_to_and_fro_and_longer_at_the_edges():
         ({"terrain": {"kind": "rolling"}}, r"roughness_m: points 6 m .* in place of .rolling. give its waves"),
     ],
 )  # fmt: skip
-def test_mistakes_are_named_with_their_mend(changes, message):
+def test_mistakes_are_named_with_a_remedy(changes, message):
     with pytest.raises(InputError, match=f"^small.toml.*{message}") as error:
         recipe_from(changed(changes, changed(SCENE)), "small.toml")
     assert "\n" not in str(error.value)

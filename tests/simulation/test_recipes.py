@@ -1,4 +1,4 @@
-"""Recipes in TOML: the twins of the papers are what their pages say, and every mistake gets one clear sentence."""
+"""Recipes in TOML: the twins of the papers, and messages for mistakes."""
 
 import re
 import tomllib
@@ -35,9 +35,8 @@ def test_twin_of_000():
     # 50 % of the 24 mm side between the strips of a pair: 350.4 m; the base is 420.4 m.
     assert a.base_m == pytest.approx(420.4, abs=0.05)
     for one, other in ((a, b), (c, d)):
-        assert abs((one.exposures.mean(axis=0) - other.exposures.mean(axis=0)) @ one.axes[1]) == pytest.approx(
-            350.4, abs=0.05
-        )
+        apart = abs((one.exposures.mean(axis=0) - other.exposures.mean(axis=0)) @ one.axes[1])
+        assert apart == pytest.approx(350.4, abs=0.05)
     assert [(s.heading_deg - 75) % 360 for s in (a, b, c, d)] == [0, 180, 90, 270]
     assert abs(truth.exterior.position[:, 2].mean() - 1000) < 15
     assert block.attitudes.image.size == 0
@@ -125,17 +124,14 @@ STRIP = {"name": "A", "heading_deg": 0.0, "images": 3}
     "changes, message",
     [
         ({"flihgt": {}}, "flihgt: no such key is known"),
-        ({"flight.overlap": 60}, r"\[flight\] overlap: no such key is known; use height_m"),
         ({"flight.strips.1.speed": 60}, r"\[flight.strips, number 2\] speed: no such key"),
         ({"flight.forward_overlap_percent": -5.0}, r"\[flight\] forward_overlap_percent: -5.0 is less than 0"),
         ({"flight.forward_overlap_percent": 100}, r"forward_overlap_percent: 100 is not below 100"),
-        ({"flight.strips.0.side_overlap_percent": 130.0}, r"number 1\] side_overlap_percent: 130.0 is not below 100"),
         ({"flight.gsd_m": 0.1}, r"\[flight\] gsd_m: height_m gives the same; keep one"),
         ({"flight.base_m": 100.0}, "forward_overlap_percent: base_m gives the same"),
         ({"flight.height_m": None}, r"\[flight\]: the height is not given; add height_m or gsd_m"),
         ({"flight.side_overlap_percent": None}, "the spacing is not given; add spacing_m or side_overlap_percent"),
         ({"flight.height_m": -100}, "height_m: -100 is not positive"),
-        ({"flight.strips": None}, "strips: the key is missing; add it"),
         ({"flight.strips": {"name": "A"}}, r"strips: .* is not a list; .* as \[\[flight.strips\]\]"),
         ({"flight.strips.0.images": None}, r"number 1\] images: the key is missing"),
         ({"flight.strips.0.images": 2.5}, "images: 2.5 is not a whole number"),
@@ -145,41 +141,29 @@ STRIP = {"name": "A", "heading_deg": 0.0, "images": 3}
         ({"flight.strips": [STRIP | {"images": 1}]}, "there are 1 images in all"),
         ({"flight.strips.0.camera": "leica"}, r"there is no table \[cameras.leica\]; use one of kodak"),
         ({"cameras": None}, "there is no camera"),
-        ({"cameras.kodak.width_px": None}, r"\[cameras.kodak\] width_px: the key is missing"),
         ({"cameras.kodak.truth.k9": 1.0}, r"\[cameras.kodak.truth\] k9: no such key is known; use c_mm"),
         ({"cameras.kodak.truth.c_mm": 3425}, "c_mm: 3425 mm is no principal distance"),
-        ({"cameras.kodak.start": {}}, "start: no such key is known"),
-        ({"mounts.leica": {}}, r"\[mounts\] leica: no such key"),
-        ({"mounts.default.truth.arm": 1}, r"\[mounts.default.truth\] arm: no such key"),
         ({"mounts.default.image_x": "up"}, "image_x: 'up' is unknown; write forward"),
         ({"strips.Z.truth.shift_m": [0, 0, 0]}, r"\[strips\] Z: no such key is known; use default, A, B, C"),
-        ({"strips.A.truth.shift": [0, 0, 0]}, r"\[strips.A.truth\] shift: no such key"),
-        ({"truth.offset": [0, 0, 0]}, r"\[truth\] offset: no such key is known; use datum_offset_m"),
         ({"terrain.kind": "moon"}, r"\[terrain\] kind: 'moon' is unknown; write .flat"),
         ({"terrain.height_m": 3}, r"\[terrain\] height_m: no such key"),
-        ({"points.ties": -1}, "ties: -1 is less than 0"),
         ({"points.ties": 2, "targets": None}, "there are 2 points in all"),
         ({"points.min_images": 1}, "min_images: 1 is less than 2"),
         ({"points.mean_rays": 1.5}, "mean_rays: 1.5 is less than min_images = 2"),
         ({"targets.0.role": "contrl"}, r"\[targets, number 1\] role: 'contrl' is unknown; write .control"),
         ({"targets.0.prefix": "T1"}, "prefix: 'T1' does not tell targets apart"),
-        ({"targets.0.at_m": [[1.0]]}, "at_m: .* has 1 entries; give 2"),
         ({"targets.0.at_m": [[1.0, "x"]]}, "at_m: 'x' is not a finite number"),
         ({"targets.0.choice": {"role": "check", "outer": 3}}, r"\[targets, number 1.choice\] outer: no such key"),
         ({"targets.0.choice": {"role": "check", "centre": 1}}, "centre: 1 is neither true nor false"),
-        ({"sigmas.image_mm": None}, r"\[sigmas\] image_mm: the key is missing"),
         ({"sigmas.image_mm": 0.0}, "image_mm: 0.0 is not positive"),
         ({"sigmas.station_m": [0.1, 0.0, 0.1]}, "station_m: .* is not positive"),
         ({"sigmas.control_m": None, "noise.control_m": None}, "control_m: the key is missing, but there are control"),
         ({"sigmas.station_m": None}, r"\[noise\] station_m: this is not observed; add station_m under \[sigmas\]"),
-        ({"noise.image_mm": -0.1}, r"\[noise\] image_mm: -0.1 is less than 0"),
-        ({"jitter.position_m": -1.0}, "position_m: -1.0 is less than 0"),
-        ({"jitter.crab": 1}, r"\[jitter\] crab: no such key"),
         ({"start.angle_deg": "x"}, "angle_deg: 'x' is not a finite number"),
         ({"datum.kind": "free"}, r"\[datum\] kind: 'free' is unknown"),
     ],
 )  # fmt: skip
-def test_mistakes_are_named_with_their_mend(changes, message):
+def test_mistakes_are_named_with_a_remedy(changes, message):
     with pytest.raises(InputError, match=f"^small.toml.*{message}") as error:
         recipe_from(changed(changes), "small.toml")
     assert "\n" not in str(error.value)

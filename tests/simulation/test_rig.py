@@ -1,4 +1,4 @@
-"""A rig in a recipe: where its cameras are, what the block is told, and that the block finds them."""
+"""Rigs in recipes: poses of their cameras, observations, and recovery by adjustment."""
 
 import dataclasses
 import functools
@@ -16,7 +16,7 @@ from jaxphoto.io import read_block, read_truth, recipe_from, write_block, write_
 from jaxphoto.parameters import numbers_of
 from jaxphoto.procedures.rig import with_rig
 from jaxphoto.simulation import remeasure, simulate
-from jaxphoto.simulation.further_rows import observed_anew
+from jaxphoto.simulation.remeasure import remeasure_rows
 from jaxphoto.variants import indirect, some_images
 from tests.derivatives import compiled
 from tests.simulation.small import SMALL, changed
@@ -39,9 +39,9 @@ RIG = {
 
 
 @functools.cache
-def flown(modifies_interior: bool = True):
-    still = {} if modifies_interior else {"noise.rig_place_m": 0.0, "noise.rig_turn_deg": 0.0}
-    return simulate(recipe_from(changed(RIG | still)), 1)
+def flown(noisy: bool = True):
+    exact = {} if noisy else {"noise.rig_place_m": 0.0, "noise.rig_turn_deg": 0.0}
+    return simulate(recipe_from(changed(RIG | exact)), 1)
 
 
 def poses(simulation):
@@ -52,18 +52,18 @@ def poses(simulation):
 
 
 def test_cameras_sit_beside_the_one_that_is_flown():
-    place, turn = poses(flown(modifies_interior=False))
+    place, turn = poses(flown(noisy=False))
     np.testing.assert_allclose(place, np.tile(TRUE_PLACE, (14, 1)), atol=1e-9)
     np.testing.assert_allclose(turn, np.tile(TRUE_TURN, (14, 1)), atol=1e-9)
 
 
-def test_the_rig_bends_by_its_noise():
+def test_the_rig_has_flexure_of_its_noise():
     place, turn = poses(flown())
     for off in ((place - TRUE_PLACE) / 0.001, (turn - TRUE_TURN) / 0.001):
         assert abs(np.std(off) - 1) < 4 / np.sqrt(2 * off.size)
 
 
-def test_the_block_is_told_which_photographs_belong_together():
+def test_the_block_has_the_rows_of_its_rig():
     block = flown().block
     assert block.images[:4] == ("A_01", "A_01_oblique", "A_02", "A_02_oblique")
     assert block.image_camera[:2] == ("kodak", "oblique")
@@ -107,10 +107,10 @@ def test_it_goes_through_files(tmp_path):
         read_block(tmp_path / "block")
 
 
-def test_measured_once_more_the_rig_bends_anew():
+def test_remeasured_rigs_have_new_flexure():
     block, truth, _ = flown()
     place, _ = poses(flown())
-    off = np.array([observed_anew(block.more[0], block, truth, jax.random.key(k)).off for k in range(40)])
+    off = np.array([remeasure_rows(block.more[0], block, truth, jax.random.key(k)).off for k in range(40)])
     np.testing.assert_allclose(off.mean(0), place - TRUE_PLACE, atol=4 * 0.001 / np.sqrt(40))
     assert abs(off.std(0).mean() / 0.001 - 1) < 0.1
     assert not np.array_equal(remeasure(block, truth, jax.random.key(1)).more[1].off, block.more[1].off)
@@ -137,7 +137,7 @@ def test_a_rig_is_made_of_photographs_of_one_event():
     with pytest.raises(InputError, match="no image of another camera is in an event of camera kodak"):
         with_rig(apart, "kodak", 0.001, 1e-5)
     unknown = dataclasses.replace(bare.start, image_known=np.zeros(28, bool))
-    with pytest.raises(InputError, match="nothing says where oblique is in the rig; orient the block first"):
+    with pytest.raises(InputError, match="which locate oblique in the rig; orient the block first"):
         with_rig(dataclasses.replace(bare, start=unknown), "kodak", 0.001, 1e-5)
     fewer = tuple(f"{name} alone" if k == 1 else name for k, name in enumerate(events))
     with pytest.warns(UserWarning, match="1 photographs are in no event of the rig"):
@@ -153,14 +153,14 @@ LATE = {
 
 
 @functools.cache
-def late(modifies_interior: bool = True):
-    still = {} if modifies_interior else {"noise.rig_place_m": 0.0, "noise.rig_turn_deg": 0.0}
-    return simulate(recipe_from(changed(RIG | LATE | still)), 1)
+def late(noisy: bool = True):
+    exact = {} if noisy else {"noise.rig_place_m": 0.0, "noise.rig_turn_deg": 0.0}
+    return simulate(recipe_from(changed(RIG | LATE | exact)), 1)
 
 
-def test_a_late_camera_is_where_the_rig_has_come_to():
+def test_a_delayed_camera_is_at_the_later_pose_of_the_rig():
     """Beside the reference as it was at its own exposure: the way flown in the meantime, and the turn."""
-    simulation = late(modifies_interior=False)
+    simulation = late(noisy=False)
     position, rotation = (np.asarray(v) for v in vars(simulation.truth.exterior).values())
     motion = simulation.block.motion
     for k in range(0, 28, 2):
@@ -175,7 +175,8 @@ def test_a_late_camera_is_where_the_rig_has_come_to():
         np.testing.assert_allclose(rotation[k + 1], own, atol=1e-12)
 
 
-def test_the_delay_of_a_camera_is_found():
+@pytest.mark.slow
+def test_the_delay_of_a_camera_is_recovered():
     adjusted = adjust(late().block)
     assert adjusted.outcome is Outcome.CONVERGED
     sigma = dict(zip(adjusted.structure.labels, np.asarray(covariance(adjusted).shared_sigma), strict=True))
@@ -226,10 +227,10 @@ def test_a_rig_flies_beside_a_scanner_on_one_trajectory():
     """As one camera would: the scanner sees the same, and stations are those of the reference, on its clock."""
     with_rig_on = {name: RIG[name] for name in ("cameras.oblique", "rig_cameras", "points")}
     drift = {"drift_sigma_m": [0.2] * 3, "correlation_s": 60.0}
-    modifies_interior = {"sigmas.rig_place_m": 0.001, "sigmas.rig_turn_deg": 0.001}
+    rigidity = {"sigmas.rig_place_m": 0.001, "sigmas.rig_turn_deg": 0.001}
     scanned = {"terrain": {"kind": "waves"}, "lidar": {"density_per_m2": 0.01, "same_trajectory": True, "truth": drift},
                "sigmas.lidar_m": 0.03, "noise.station_m": 0.0}  # fmt: skip
-    one, rigged = (simulate(recipe_from(changed(own | scanned)), 1) for own in ({}, with_rig_on | modifies_interior))
+    one, rigged = (simulate(recipe_from(changed(own | scanned)), 1) for own in ({}, with_rig_on | rigidity))
     np.testing.assert_array_equal(rigged.cloud.xyz, one.cloud.xyz)
     time = np.asarray(rigged.block.flight_time)
     np.testing.assert_array_equal(time[::2], one.block.flight_time)
@@ -246,7 +247,7 @@ def test_a_photograph_of_a_camera_outside_the_rig_is_refused():
         adjust(dataclasses.replace(block, more=(places,)))
 
 
-def test_a_rig_of_which_nobody_says_how_rigid_it_is_is_refused():
+def test_a_rig_without_rigidity_is_refused():
     unsaid = {key: value for key, value in RIG.items() if not key.startswith("sigmas")}
     with pytest.raises(InputError, match=r"\[sigmas\]: the rigidity of the rig is missing; add rig_place_m"):
         recipe_from(changed(unsaid))

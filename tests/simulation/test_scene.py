@@ -1,4 +1,4 @@
-"""Buildings and trees: roofs are where geometry says, things stand apart, and points lie where images see them."""
+"""Terrain, buildings and trees: heights, placement, visibility of points."""
 
 import dataclasses
 
@@ -10,9 +10,8 @@ from scipy.stats import poisson
 
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import recipe_from
-from jaxphoto.simulation import Building, Terrain, Tree
-from jaxphoto.simulation.buildings import entered, roof_height, solids
-from jaxphoto.simulation.trees import met_leaves
+from jaxphoto.simulation import ROLLING, Building, RandomWaves, Terrain, Tree
+from jaxphoto.simulation.scene import entry_distances, intersect_crowns, roof_height, solids
 from tests.simulation.small import changed, made
 
 bounded = settings(max_examples=40, deadline=None, derandomize=True, database=None)
@@ -66,7 +65,7 @@ def test_rays_enter_where_they_first_fall_below_the_surface(roof, heading, lengt
     origin = np.column_stack([rng.uniform(-30, 30, (n, 2)), rng.uniform(35, 40, n)])
     aim = np.column_stack([rng.uniform(-20, 20, (n, 2)) + building.centre_m, np.zeros(n)])
     direction = (aim - origin) / np.linalg.norm(aim - origin, axis=1, keepdims=True)
-    by_roof, by_wall = entered(solids((building,)), np.zeros(n, int), origin, direction)
+    by_roof, by_wall = entry_distances(solids((building,)), np.zeros(n, int), origin, direction)
     assert not (np.isfinite(by_roof) & np.isfinite(by_wall)).any()
     way = np.arange(0, 90, step)
     for k in range(n):
@@ -170,7 +169,7 @@ def test_pulses_pass_a_crown_as_poisson_says():
     """Straight down through the middle of a crown 14 m deep: returns within it, and what reaches the ground."""
     tree, n = Tree((0.0, 0.0), 0.0, 20.0, 4.0), 40_000
     origin, down = np.tile([0.0, 0.0, 500.0], (n, 1)), np.tile([0.0, 0.0, -1.0], (n, 1))
-    leaves = met_leaves((tree,), origin, down, np.full(n, 500.0), np.random.default_rng(4))
+    leaves = intersect_crowns((tree,), origin, down, np.full(n, 500.0), np.random.default_rng(4))
     z = 500 - leaves.at
     assert z.min() >= 6 - 1e-9 and z.max() <= 20
     # Of k meetings (at most 3 count) a pulse survives all with 2^-k.
@@ -185,7 +184,9 @@ def test_pulses_pass_a_crown_as_poisson_says():
     depth = leaves.at[first] - 480
     expected = 1 - np.exp(-2.5 / 2.5)
     assert abs((depth < 2.5).sum() / n - expected) < 4 * np.sqrt(expected * (1 - expected) / n)
-    beside = met_leaves((tree,), origin + np.array([4.01, 0, 0]), down, np.full(n, 500.0), np.random.default_rng(4))
+    beside = intersect_crowns(
+        (tree,), origin + np.array([4.01, 0, 0]), down, np.full(n, 500.0), np.random.default_rng(4)
+    )
     assert not len(beside.pulse) and not beside.stopped.any()
 
 
@@ -209,7 +210,44 @@ def test_no_room_is_said():
         ({"points.on_roofs": 20.0}, "on_roofs: 20.0 is too large"),
     ],
 )  # fmt: skip
-def test_mistakes_are_named_with_their_mend(changes, message):
+def test_mistakes_are_named_with_a_remedy(changes, message):
     with pytest.raises(InputError, match=f"^small.toml.*{message}") as error:
         recipe_from(changed(changes), "small.toml")
     assert "\n" not in str(error.value)
+
+
+XY = np.random.default_rng(8).uniform(-4000, 4000, (20000, 2))
+
+
+def terrain(**section) -> Terrain:
+    return recipe_from(changed({"terrain": section})).terrain
+
+
+def test_rolling_country_is_the_formula_of_the_twins():
+    expected = 14 * np.sin(XY[:, 0] / 420) + 10 * np.cos(XY[:, 1] / 310)
+    np.testing.assert_allclose(ROLLING.height(XY), expected, atol=1e-9)
+    rough = ROLLING.place(XY, np.random.default_rng(1))
+    np.testing.assert_array_equal(rough[:, :2], XY)
+    off = rough[:, 2] - expected
+    assert -6 <= off.min() < -5.99 and 5.99 < off.max() <= 6
+    assert abs(off.std() - 6 / np.sqrt(3)) < 0.05
+
+
+def test_plane_and_waves_of_a_recipe():
+    plane = terrain(kind="plane", height_m=50.0, slope_east_percent=2.0, slope_north_percent=-1.0)
+    np.testing.assert_allclose(plane.height(XY), 50 + 0.02 * XY[:, 0] - 0.01 * XY[:, 1], atol=1e-9)
+    wave = {"amplitude_m": 3.0, "length_m": 500.0, "heading_deg": 0.0, "phase_deg": 30.0}
+    waves = terrain(kind="waves", waves=[wave, wave])
+    np.testing.assert_allclose(waves.height(XY), 6 * np.sin(2 * np.pi * XY[:, 1] / 500 + np.pi / 6), atol=1e-9)
+    assert not terrain(kind="flat").height(XY).any()
+
+
+def test_random_waves_have_their_height_and_follow_their_seed():
+    ground = terrain(kind="random", count=40, rms_m=25.0, length_m=300.0)
+    assert ground.random == RandomWaves(40, 25.0, 300.0)
+    one, other = (ground.drawn(np.random.default_rng(k)).height(XY) for k in (1, 2))
+    assert abs(one.std() - 25) < 2.5
+    assert np.abs(one - other).max() > 10
+    kept = terrain(kind="random", count=40, rms_m=25.0, length_m=300.0, seed=4)
+    one, other = (kept.drawn(np.random.default_rng(k)).height(XY) for k in (1, 2))
+    np.testing.assert_array_equal(one, other)

@@ -1,4 +1,4 @@
-"""What a simulated block holds is its truth, plus the noise and the systematic effects asked for, and no more."""
+"""Simulated blocks are their truth plus the noise and the systematic effects of the recipe."""
 
 import dataclasses
 
@@ -355,7 +355,7 @@ def test_blocks_that_cannot_be_are_refused(changes, message):
         made(changes)
 
 
-def test_truth_measures_the_same_flight_anew():
+def test_remeasuring_with_the_truth_gives_the_same_observations():
     changes = {
         "truth.datum_offset_m": [0.5, 0.0, 0.0],
         "strips.default.truth": {"shift_sigma_m": 0.5},

@@ -1,4 +1,4 @@
-"""Who sees what: against the formulas of the field, for every pair of image and point."""
+"""Visibility compared with formulas, for every pair of image and point."""
 
 import jax
 import numpy as np
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from jaxphoto.camera import Balanced, Brown, InteriorOrientation, RadialPolynomial, Sensor, Smac
 from jaxphoto.collinearity import ExteriorOrientation, project, project_ideal
 from jaxphoto.simulation import Rays, photograph
-from jaxphoto.simulation.visibility import thinned
+from jaxphoto.simulation.points import thin_rays
 from tests.formulas import camera_from_object, collinearity
 
 SENSOR = Sensor(4500, 3000, 0.008)
@@ -110,7 +110,7 @@ def test_thinning_leaves_the_mean_asked_for(seed, mean, least):
     pairs = np.argwhere(rng.random((40, 12)) < 0.4)
     rays = Rays(pairs[:, 1], pairs[:, 0], np.zeros((len(pairs), 2)))
     before = rays.per_point(40)
-    after = thinned(rays, 40, least, mean, rng).per_point(40)
+    after = thin_rays(rays, 40, least, mean, rng).per_point(40)
     assert (after <= before).all()
     assert (after >= np.minimum(before, least)).all()
     bound = max(round(mean * 40), int(np.minimum(before, least).sum()))

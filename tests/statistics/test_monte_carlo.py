@@ -16,6 +16,8 @@ from tests.blocks import observed, simulated
 DRAWS = 500
 # Probability that any bound below fails by chance.
 FALSE_ALARM = 1e-3
+# sensitivity/test_monte_carlo.py tests the scatter of 600 vectorised draws.
+pytestmark = pytest.mark.slow
 
 _turn = jax.jit(jax.vmap(lambda estimated, true: small_angles(estimated @ true.T)))
 

@@ -37,6 +37,7 @@ def effects_in(block) -> dict:
     return {t.pattern.what: t for t in systematic_effect_tests(a, np.asarray(covariance(a).shared_sigma))}
 
 
+@pytest.mark.slow
 def test_where_nothing_is_missing_p_values_are_uniform():
     block, truth = in_strips()
     rng, true = np.random.default_rng(1), truth.interior["one"]

@@ -17,6 +17,7 @@ from tests.adjustment.dense import at_optimum
 from tests.blocks import adjusted, rows
 from tests.checked_types import unchecked
 from tests.commands import run
+from tests.marks import slow_but
 
 BLOCK = "everything"
 # Seven parts each; image points are one of them, or three.
@@ -32,7 +33,7 @@ def dense_traces(parts, name=BLOCK) -> np.ndarray:
     return membership.T @ r[: len(part), : len(part)] ** 2 @ membership
 
 
-@pytest.mark.parametrize("split", SPLITS)
+@pytest.mark.parametrize("split", slow_but([SPLITS[0]], SPLITS))
 def test_traces_are_those_of_dense_matrices(split):
     parts = partition_observations(adjusted(BLOCK), split)
     assert len(parts.labels) == 7
@@ -192,7 +193,7 @@ def test_scatter_is_sigma_and_the_truth_lies_within_three():
     assert result["converged"].all()
     for k, true_factor in enumerate(TRUE.values()):
         supported = result["supported"][:, k]
-        # Of stations in plan 71 of 75 other flights supported one (docs/weights.md); the limit is three sigma below.
+        # Of stations in plan 71 of 75 other flights supported one (docs/statistics.md); the limit is three sigma below.
         assert supported.mean() >= 0.75
         factor, sigma = result["factor"][supported, k], result["sigma"][supported, k]
         assert (np.abs(factor - true_factor**2) > 3 * sigma).sum() <= 1

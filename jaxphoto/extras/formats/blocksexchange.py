@@ -28,7 +28,7 @@ from jaxphoto.extras.formats.camera_models import AGISOFT, BROWN_TERMS, ProjectC
 from jaxphoto.extras.formats.files import Format, add, by_content, number_rows, warn, xml_text
 from jaxphoto.extras.formats.project import Project, about_place, in_system, pose
 from jaxphoto.io.camera_files import CameraSource
-from jaxphoto.io.whole_text import LARGE, has_words, read_whole
+from jaxphoto.io.text_files import has_words, read_bytes
 
 FILE = "blocks_exchange.xml"
 _NUMBER = r"\s*([-+]?\d{1,4}(?:\.\d*)?(?:e-\d\d)?)\s*"
@@ -97,7 +97,7 @@ def read(path: Path) -> Project:
 def _parsed(path: Path) -> tuple[ElementTree.Element, _Ties, int]:
     """The tree without tie points (gigabytes in it), the tie points, and the number of control points."""
     ties, n_control = _Ties([], [], [], []), 0
-    events = ElementTree.iterparse(io.BytesIO(read_whole(path, LARGE)), ("start", "end"))
+    events = ElementTree.iterparse(io.BytesIO(read_bytes(path)), ("start", "end"))
     _, root = next(events)
     for event, element in events:
         if event == "end" and element.tag == "TiePoint":

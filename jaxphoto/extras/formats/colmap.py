@@ -19,11 +19,11 @@ import scipy
 from jaxphoto.camera import InteriorOrientation, OpenCvFisheye, Sensor
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.extras.formats.camera_models import OPENCV, OPENCV_FISHEYE, ProjectCamera, in_pixels, pixels_of
-from jaxphoto.extras.formats.files import CameraFormat, Format, content_rows, read_text, row_numbers
+from jaxphoto.extras.formats.files import CameraFormat, Format, content_rows, row_numbers
 from jaxphoto.extras.formats.project import Project, numbered, pose, translations
 from jaxphoto.io.camera_files import CameraFile, CameraReader, CameraSource
-from jaxphoto.io.text_tables import is_number, natural
-from jaxphoto.io.whole_text import LARGE, read_whole
+from jaxphoto.io.text_files import read_bytes, read_legacy_text
+from jaxphoto.io.text_tables import is_number
 
 FILES = ("cameras", "images", "points3D")
 _PLANES = {
@@ -96,7 +96,7 @@ class _Binary:
     """Little-endian records."""
 
     def __init__(self, path: Path):
-        self.path, self.data, self.at = path, read_whole(path, 8 * LARGE), 0
+        self.path, self.data, self.at = path, read_bytes(path), 0
 
     def take(self, layout: str) -> tuple:
         try:
@@ -193,7 +193,7 @@ def _cells_error(path: Path, row: int, count: int, expected: str) -> InputError:
 
 
 def _text_images(path: Path) -> Iterator[ColmapImage]:
-    numbered_lines = enumerate(read_text(path).split("\n"), 1)
+    numbered_lines = enumerate(read_legacy_text(path).split("\n"), 1)
     lines = iter([(row, line) for row, line in numbered_lines if not line.lstrip().startswith("#")])
     for row, line in lines:
         if not line.strip():
@@ -253,7 +253,7 @@ def _binary_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def recognise_cameras(path: Path, text: str) -> bool:
-    """True for the file names of COLMAP, or if the first line is an id, a model and numbers."""
+    """Return True for the file names of COLMAP, or if the first line is an id, a model and numbers."""
     lines = (line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#"))
     first = next(lines, [])
     named = path.name in ("cameras.txt", "cameras.bin")
@@ -290,7 +290,7 @@ def _lines_by_id(source: CameraSource) -> dict[int, list[str]]:
     lines: dict[int, list[str]] = {}
     for row, line in content_rows(source.path):
         cells = line.split()
-        identifier = natural(cells[0])
+        identifier = int(cells[0]) if cells[0].isdecimal() else None
         if identifier is None:
             raise source.error(f"row {row} begins with {quoted(cells[0])}, which is no id")
         if identifier in lines:

@@ -6,9 +6,8 @@
                   coordinates in the order of the system's axes, z [, horizontal and vertical accuracy], or image,
                   label, x, y [, accuracy]. Pixels are ours.
     gcp_list.txt  a line that names the system, then geo_x geo_y geo_z im_x im_y image_name [gcp_name] [extras]; geo_x
-    is
-                  the easting or longitude; pixels count from the centre of the upper left one. A list without marks has
-                  rows of gcp_name geo_x geo_y geo_z, or of geo_x geo_y geo_z [gcp_name].
+                  is the easting or longitude; pixels count from the centre of the upper left one. A list without marks
+                  has rows of gcp_name geo_x geo_y geo_z, or of geo_x geo_y geo_z [gcp_name].
     geoin.dat     rows that begin with CONT are control, with CHCK check points: CONT point X Y Z ...
 
 Sources: OpenDroneMap and OpenSfM documentation, "Ground Control Points"; for BINGO, whose manual is not public, S.
@@ -37,8 +36,7 @@ from jaxphoto.io.control_table import (
     split_row,
     with_points,
 )
-from jaxphoto.io.names import LONGEST, harm_in
-from jaxphoto.io.text_tables import MOST_COLUMNS, is_number
+from jaxphoto.io.text_tables import is_number
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 
 GCP_LIST = "gcp_list.txt"
@@ -128,11 +126,9 @@ def read_marks(rows: Sequence[Mark]) -> Marks:
 
 
 def check_name(name: str, what: str, place: str) -> None:
-    """Raise InputError for a name that is empty, too long or harmful in results."""
+    """Raise InputError for an empty name."""
     if not name:
         raise InputError(f"{place}: the {what} is empty; give its name or delete the row")
-    if len(name) > LONGEST or harm_in(name):
-        raise InputError(f"{place}: the {what} {quoted(name)} {harm_in(name)}")
 
 
 def numbered_lines(text: str) -> list[tuple[int, str]]:
@@ -158,13 +154,13 @@ def read_table(path: Path, text: str) -> SurveyedPoints | Marks:
         raise cells.none("the file is empty; give it points or marks")
     width = len(cells.records[0])
     in_comments = [line.lstrip("#").strip().split(None if separator == " " else separator) for line in comments]
-    for k, header in enumerate([cells.records[0], *(words for words in in_comments if len(words) <= MOST_COLUMNS)]):
+    for k, header in enumerate([cells.records[0], *in_comments]):
         below = cells._replace(records=cells.records[k == 0 :], rows=cells.rows[k == 0 :])
         marks, points = columns_of(header, _MARK), columns_of(header, _POINT)
         # A comment whose columns the rows do not have is a sentence.
-        if _has(marks, ("image", "point", "x", "y"), width if k else MOST_COLUMNS):
+        if _has(marks, ("image", "point", "x", "y"), width if k else len(header)):
             return _marks(below, marks, separator)
-        if "image" not in marks and _has(points, ("point", "x", "y"), width if k else MOST_COLUMNS):
+        if "image" not in marks and _has(points, ("point", "x", "y"), width if k else len(header)):
             return read_points(below, points, separator, system, in_degrees(header, points))
     records = with_points(cells, separator).records
     kind, columns = _without_header(records)
@@ -328,7 +324,7 @@ def write_gcp_list(p: Project, folder: Path) -> None:
 
 
 def is_geoin(lines: list[str]) -> bool:
-    """True if all lines are records of BINGO, points among them."""
+    """Return True if all lines are records of BINGO, points among them."""
     rows = [row for line in lines if (row := line.split(maxsplit=5)) and row[0][0] not in "*#"]
     records = all(re.fullmatch("[A-Z]{4}|C", row[0]) for row in rows)
     points = (row for row in rows if row[0] in _BINGO_CHECK and len(row) >= 5)

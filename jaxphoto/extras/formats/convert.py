@@ -1,9 +1,10 @@
 """Read and write projects, camera files and control files of any registered format."""
 
 import dataclasses
+import inspect
 import warnings
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -13,46 +14,52 @@ from jaxphoto.block import Block
 from jaxphoto.camera import AbstractDistortion, InteriorOrientation, Perspective, Sensor
 from jaxphoto.camera.conversion import Conversion, converted
 from jaxphoto.errors import InputError, few
-from jaxphoto.extras.formats import (
-    aicon,
-    blocksexchange,
-    colmap,
-    control,
-    dbat,
-    gis,
-    metashape,
-    nerfstudio,
-    opencv,
-    openmvg,
-    opensfm,
-    orthority,
-    photomodeler,
-    pix4d,
-    radial,
-    smac,
-    texts,
-)
 from jaxphoto.extras.formats.camera_models import CameraModel
-from jaxphoto.extras.formats.files import CameraFormat, Format, by_content, read_text
+from jaxphoto.extras.formats.files import CameraFormat, Format, by_content
 from jaxphoto.extras.formats.project import Project
 from jaxphoto.io.block_folder import BlockTables, assemble, write_block
 from jaxphoto.io.block_folder.block_reader import read_folder
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.camera_files import CAMERA_READERS, is_camera_file, joined_notes, reading, write_block_camera
+from jaxphoto.io.text_files import read_legacy_text
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 from jaxphoto.writing import check_folder, whole_file, whole_folder
 
-_MODULES = (
-    dbat, photomodeler, aicon, colmap, metashape, opensfm, openmvg, blocksexchange, nerfstudio, radial, texts,
-    orthority, pix4d, gis,
-)  # fmt: skip
+# One module per program, in the order of docs and help; a new format is one file here and its line below.
+# ruff: isort: off
+from jaxphoto.extras.formats import dbat as dbat
+from jaxphoto.extras.formats import photomodeler as photomodeler
+from jaxphoto.extras.formats import aicon as aicon
+from jaxphoto.extras.formats import opencv as opencv
+from jaxphoto.extras.formats import colmap as colmap
+from jaxphoto.extras.formats import metashape as metashape
+from jaxphoto.extras.formats import opensfm as opensfm
+from jaxphoto.extras.formats import openmvg as openmvg
+from jaxphoto.extras.formats import blocksexchange as blocksexchange
+from jaxphoto.extras.formats import nerfstudio as nerfstudio
+from jaxphoto.extras.formats import radial as radial
+from jaxphoto.extras.formats import texts as texts
+from jaxphoto.extras.formats import orthority as orthority
+from jaxphoto.extras.formats import pix4d as pix4d
+from jaxphoto.extras.formats import gis as gis
+from jaxphoto.extras.formats import smac as smac
+from jaxphoto.extras.formats import control as control
+# ruff: isort: on
+
+_MODULES = [module for module in globals().values() if inspect.ismodule(module)]
+
+
+def _declared(name: str) -> list[Any]:
+    return [format for module in _MODULES for format in getattr(module, name, ())]
+
+
 _BLOCK = Format("block", "block folder", by_content(TOML, lambda p: p.name == TOML), lambda p: read_folder(p.parent))
-_DECLARED = (_BLOCK, *(format for module in _MODULES for format in module.FORMATS))
+_DECLARED: tuple[Format, ...] = (_BLOCK, *_declared("FORMATS"))
 FORMATS = {format.name: format for format in _DECLARED if format.read}
 """The formats of projects that are read."""
 EXPORTS = {format.name: format for format in _DECLARED if format.write}
 """The formats of projects that are written, in the order of docs and help."""
-_CAMERAS = (*opencv.CAMERAS, *colmap.CAMERAS, *metashape.CAMERAS, *smac.CAMERAS)
+_CAMERAS: list[CameraFormat] = _declared("CAMERAS")
 CAMERA_FORMATS = {format.name: format for format in (*_CAMERAS, CameraFormat("block", suffixes=(".toml",)))}
 """The formats of camera files of other programs, and block.toml."""
 CAMERA_READERS.update({format.name: format.reader for format in _CAMERAS if format.reader})
@@ -324,8 +331,8 @@ def _target(
 
 
 def is_control_file(path: Path) -> bool:
-    """True if the content of a file is that of a control file other than a plain table."""
-    text = "" if gis.is_geopackage(path) else read_text(path)
+    """Return True if the content of a file is that of a control file other than a plain table."""
+    text = "" if gis.is_geopackage(path) else read_legacy_text(path)
     return any(format.recognise(path, text) for format in CONTROL_FORMATS.values())
 
 
@@ -334,10 +341,10 @@ def read_control(control: str | Path, marks: str | Path | None = None) -> GivenC
 
     The content tells the format of `FORMS`. Raises InputError if either is none.
     """
-    own = _read_control(Path(control))
-    if isinstance(own, Marks):
+    content = _read_control(Path(control))
+    if isinstance(content, Marks):
         raise InputError(f"{Path(control).name} has marks but no coordinates; give it as the marks")
-    points, seen = (own.points, own.marks) if isinstance(own, GivenControl) else (own, Marks.none())
+    points, seen = content if isinstance(content, GivenControl) else (content, Marks.none())
     if marks is not None:
         other = _read_control(Path(marks))
         if isinstance(other, SurveyedPoints):
@@ -356,7 +363,7 @@ def read_control(control: str | Path, marks: str | Path | None = None) -> GivenC
 
 
 def _read_control(path: Path) -> GivenControl | SurveyedPoints | Marks:
-    text = "" if gis.is_geopackage(path) else read_text(path)
+    text = "" if gis.is_geopackage(path) else read_legacy_text(path)
     chosen = next((f for f in CONTROL_FORMATS.values() if f.recognise(path, text)), control.TABLES)
     with reading(path, chosen.about):
         return chosen.read(path, text)

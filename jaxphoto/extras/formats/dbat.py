@@ -18,8 +18,8 @@ from jaxphoto.errors import InputError, quoted
 from jaxphoto.extras.formats.files import Format, by_content, read_columns
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.table_layout import SIGMA_XYZ, XYZ
+from jaxphoto.io.text_files import read_bytes
 from jaxphoto.io.text_tables import Table, concatenate, finite
-from jaxphoto.io.whole_text import SMALL, read_whole
 
 CAMERA = "camera"
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -104,7 +104,7 @@ def _names_itself(path: Path) -> bool:
 
 
 def _open(path: Path) -> _Script:
-    return _Script(path, ElementTree.fromstring(read_whole(path, SMALL)))
+    return _Script(path, ElementTree.fromstring(read_bytes(path)))
 
 
 def read(path: Path) -> BlockTables:

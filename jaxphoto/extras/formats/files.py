@@ -16,8 +16,8 @@ from jaxphoto.extras.formats.camera_models import CameraModel
 from jaxphoto.extras.formats.project import Project
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.camera_files import CameraReader
+from jaxphoto.io.text_files import read_legacy_text
 from jaxphoto.io.text_tables import LARGEST, Table
-from jaxphoto.io.whole_text import LARGE, read_whole
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 
 Find = Callable[[Path], list[Path]]
@@ -92,19 +92,9 @@ def warn(message: str) -> None:
 
 
 def begins_with(path: Path, words: str) -> bool:
-    """True if a file begins with `words`."""
+    """Return True if a file begins with `words`."""
     with path.open("rb") as file:
         return file.read(len(words)) == words.encode()
-
-
-def read_text(path: Path) -> str:
-    """Return the text of a file, UTF-8 or else Windows-1252, with any line ends."""
-    content = read_whole(path, LARGE)
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = content.decode("cp1252", "replace")
-    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def beginning(path: Path, n_bytes: int) -> list[str]:
@@ -115,7 +105,7 @@ def beginning(path: Path, n_bytes: int) -> list[str]:
 
 def content_rows(path: Path) -> list[tuple[int, str]]:
     """Return numbered lines that are neither empty nor comments."""
-    rows = enumerate(read_text(path).split("\n"), 1)
+    rows = enumerate(read_legacy_text(path).split("\n"), 1)
     return [(row, line) for row, line in rows if line.strip() and not line.lstrip().startswith("#")]
 
 
@@ -134,7 +124,7 @@ def read_columns(path: Path, columns: Sequence[str], separator: str | None = ","
 
 def read_json(path: Path) -> Any:
     """Return the content of a JSON file."""
-    return json.loads(read_text(path))
+    return json.loads(read_legacy_text(path))
 
 
 def add(parent: ElementTree.Element, tag: str, content: Any = None, **attributes: str) -> ElementTree.Element:

@@ -33,9 +33,8 @@ from jaxphoto.extras.formats.texts import angles_deg
 from jaxphoto.georeferencing.datum_change import wgs84_places
 from jaxphoto.georeferencing.map_frame import map_system
 from jaxphoto.io.control_table import Cells
-from jaxphoto.io.json_file import read_json
+from jaxphoto.io.text_files import read_bytes, read_json
 from jaxphoto.io.text_tables import LARGEST
-from jaxphoto.io.whole_text import LARGE, read_whole
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
 
 PACKAGE = "photographs.gpkg"
@@ -262,7 +261,7 @@ def _geojson_system(path: Path, content: dict[str, Any]) -> str:
 
 
 def is_geopackage(path: Path) -> bool:
-    """True if a file is a database of SQLite."""
+    """Return True if a file is a database of SQLite."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
@@ -271,7 +270,7 @@ def is_geopackage(path: Path) -> bool:
 
 def read_geopackage(path: Path, text: str) -> SurveyedPoints:
     """Read the one layer of points with an attribute that names them."""
-    content, log = read_whole(path, LARGE), path.with_name(path.name + "-wal")
+    content, log = read_bytes(path), path.with_name(path.name + "-wal")
     if log.is_file() and log.stat().st_size:
         raise InputError(f"{path.name} is open in another program, which has not written all of it; close it there")
     try:

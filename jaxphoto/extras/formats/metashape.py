@@ -1,8 +1,9 @@
 """Agisoft Metashape and PhotoScan: calibrations, exported cameras and markers as XML.
 
     calibration                              f, cx, cy, b1, b2 in pixels, k1-k4, p1-p4; cx, cy from the image centre, y
-    down document/chunk/sensors/sensor            id, label, calibration .../components/component/transform
-    rotation, translation, scale: from the chunk to geocentric axes of the
+                                             down
+    document/chunk/sensors/sensor            id, label, calibration
+    .../components/component/transform       rotation, translation, scale: from the chunk to geocentric axes of the
                                              datum, or to the local system; chunk/transform in older files
     .../cameras//camera                      id, sensor_id, component_id, label; transform: 4 x 4, from the axes of the
                                              camera, x right, y down, z ahead, to the chunk
@@ -42,7 +43,6 @@ from jaxphoto.extras.formats.files import (
     Format,
     add,
     number_rows,
-    read_text,
     warn,
     xml_text,
 )
@@ -50,8 +50,8 @@ from jaxphoto.extras.formats.points_beside import joined, marks_shown, points_be
 from jaxphoto.extras.formats.project import WGS84, ControlPoints, Project, geocentric, is_geocentric, pose
 from jaxphoto.georeferencing.map_frame import map_system
 from jaxphoto.io.camera_files import CameraFile, CameraReader, CameraSource, joined_notes
+from jaxphoto.io.text_files import has_words, read_legacy_text
 from jaxphoto.io.text_tables import finite
-from jaxphoto.io.whole_text import has_words
 from jaxphoto.procedures.control.surveyed import ControlSystem, GivenControl, system_of
 
 CAMERAS_FILE, MARKERS_FILE = "cameras.xml", "markers.xml"
@@ -185,7 +185,7 @@ def read(path: Path) -> Project:
     Positions are in the file's coordinate system, in which markers are control. Of several components that with the
     most cameras is read.
     """
-    chunk = _chunk(path, read_text(path))
+    chunk = _chunk(path, read_legacy_text(path))
     photos, component = _photos(path, chunk)
     sensors, names = _project_cameras(path, chunk), _sensor_names(chunk)
     for photo in photos:
@@ -335,7 +335,7 @@ def _markers(path: Path, chunk: ElementTree.Element) -> tuple[SurveyRows, list[M
     beside = path.with_name(MARKERS_FILE)
     if chunk.find("markers//marker") is not None or not beside.is_file() or beside == path:
         return _markers_of(path.name, chunk)
-    other = _chunk(beside, read_text(beside))
+    other = _chunk(beside, read_legacy_text(beside))
     if _system_words(other) != _system_words(chunk):
         raise InputError(f"{MARKERS_FILE} is in another coordinate system than {path.name}")
     return _markers_of(MARKERS_FILE, other)

@@ -32,8 +32,8 @@ from jaxphoto.extras.formats.points_beside import points_beside, write_image_poi
 from jaxphoto.extras.formats.project import Project
 from jaxphoto.extras.formats.texts import oriented_project
 from jaxphoto.io.camera_files import CameraSource
+from jaxphoto.io.text_files import has_words
 from jaxphoto.io.toml import Section
-from jaxphoto.io.whole_text import has_words
 
 FILE = "transforms.json"
 _KINDS: dict[str, tuple[CameraModel, tuple[str, ...]]] = {
@@ -57,10 +57,10 @@ def read(path: Path) -> Project:
     files = [Section(path.name, f"frames.{k}", frame).text("file_path") for k, frame in enumerate(frames)]
     shared = {key: content[key] for key in _OF_CAMERA if key in content}
     values = [shared | {key: frame[key] for key in _OF_CAMERA if key in frame} for frame in frames]
-    first = {json.dumps(own): k for k, own in reversed(list(enumerate(values)))}
+    first = {json.dumps(camera): k for k, camera in reversed(list(enumerate(values)))}
     names = {text: str(number) for number, text in enumerate(reversed(first))}
     cameras = {names[text]: _camera(path, f"frames.{k}", values[k]) for text, k in first.items()}
-    camera_of = [names[json.dumps(own)] for own in values]
+    camera_of = [names[json.dumps(camera)] for camera in values]
     matrices = [frame.get("transform_matrix") for frame in frames]
     poses = number_rows(matrices, (4, 4), lambda k: f"{path.name}, frame {quoted(files[k])}, transform_matrix")
     shown = points_beside(path, files, [cameras[name] for name in camera_of])

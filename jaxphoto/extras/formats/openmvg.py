@@ -31,8 +31,8 @@ from jaxphoto.extras.formats.camera_models import (
 from jaxphoto.extras.formats.files import Format, by_content, number_rows, read_json
 from jaxphoto.extras.formats.project import Project, numbered, pose
 from jaxphoto.io.camera_files import CameraSource
+from jaxphoto.io.text_files import has_words
 from jaxphoto.io.toml import Section
-from jaxphoto.io.whole_text import has_words
 
 FILE = "sfm_data.json"
 _LISTS = ("views", "intrinsics", "extrinsics", "structure")

@@ -29,12 +29,12 @@ from jaxphoto.extras.formats.camera_models import (
     in_pixels,
 )
 from jaxphoto.extras.formats.control import write_gcp_list
-from jaxphoto.extras.formats.files import Format, by_content, number_rows, read_json, read_text, warn
+from jaxphoto.extras.formats.files import Format, by_content, number_rows, read_json, warn
 from jaxphoto.extras.formats.project import Project, about_place, pose, translations
 from jaxphoto.georeferencing.map_frame import Place
 from jaxphoto.io.camera_files import CameraSource
+from jaxphoto.io.text_files import has_words, read_legacy_text
 from jaxphoto.io.toml import Section
-from jaxphoto.io.whole_text import has_words
 
 RECONSTRUCTION, TRACKS, REFERENCE = "reconstruction.json", "tracks.csv", "reference_lla.json"
 _KINDS = {
@@ -130,7 +130,7 @@ def _tracks(
     path: Path, files: list[str], ids: list[str], cameras: list[ProjectCamera]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Image, point and pixels of the image points of known shots and points."""
-    lines = read_text(path).split("\n")
+    lines = read_legacy_text(path).split("\n")
     begin = 1 if lines[0].startswith("OPENSFM_TRACKS_VERSION_") else 0
     shot_of, point_of = {name: k for k, name in enumerate(files)}, {name: k for k, name in enumerate(ids)}
     index, xy, rows = [], [], []

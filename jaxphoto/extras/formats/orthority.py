@@ -19,19 +19,14 @@ import numpy as np
 
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError, few, quoted
-from jaxphoto.extras.formats.camera_models import (
-    FISHEYE_TERMS,
-    OPENCV,
-    OPENCV_FISHEYE,
-    ProjectCamera,
-    in_pixels,
-)
-from jaxphoto.extras.formats.files import Format, beginning, number_rows, read_json, read_text
+from jaxphoto.extras.formats.camera_models import FISHEYE_TERMS, OPENCV, OPENCV_FISHEYE, ProjectCamera, in_pixels
+from jaxphoto.extras.formats.files import Format, beginning, number_rows, read_json
 from jaxphoto.extras.formats.opencv import yaml_cameras
 from jaxphoto.extras.formats.points_beside import points_beside, write_image_points
 from jaxphoto.extras.formats.project import Project
 from jaxphoto.extras.formats.texts import angles_deg, oriented_project
 from jaxphoto.io.camera_files import CameraSource
+from jaxphoto.io.text_files import read_legacy_text
 from jaxphoto.io.text_tables import read_csv
 from jaxphoto.io.toml import Section
 
@@ -101,7 +96,7 @@ def _of_csv(path: Path) -> _Exterior:
     table = read_csv(path, ("filename", *names), ("camera",), ("filename", "camera"))
     values = np.stack([table.numbers(n) for n in names], axis=1)
     prj = path.with_suffix(".prj")
-    system = read_text(prj).strip() if prj.is_file() else ""
+    system = read_legacy_text(prj).strip() if prj.is_file() else ""
     files, cameras = table.ids("filename").tolist(), table.text("camera").tolist()
     return _Exterior(files, cameras, values[:, :3], np.deg2rad(values[:, 3:]), system)
 

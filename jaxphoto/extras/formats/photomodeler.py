@@ -22,10 +22,11 @@ import numpy as np
 
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.extras.formats.dbat import CAMERA, control_table
-from jaxphoto.extras.formats.files import Format, by_content, read_columns, read_text, row_numbers, warn
+from jaxphoto.extras.formats.files import Format, by_content, read_columns, row_numbers, warn
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.camera_section import PIXEL_MM
 from jaxphoto.io.block_folder.table_layout import ANGLES, SIGMA_XYZ, XYZ
+from jaxphoto.io.text_files import read_legacy_text
 from jaxphoto.io.text_tables import Table, is_number
 
 CONTROL, STATIONS = "ctrlpts-weighted.txt", "fake-camera-positions.txt"
@@ -54,7 +55,7 @@ def read(path: Path) -> BlockTables:
     Without these it starts at the orientations and points of the export, with its control if that has three points and
     as a free network otherwise; the camera is free in c, xp, yp and the coefficients that are not zero.
     """
-    lines = read_text(path).split("\n")
+    lines = read_legacy_text(path).split("\n")
     if len(lines) < 6:
         raise InputError(f"{path.name}: the export ends within its header. Export it again")
     camera = _camera(path, lines)

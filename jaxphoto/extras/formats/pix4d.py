@@ -18,10 +18,11 @@ import numpy as np
 
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.extras.formats.camera_models import BROWN_TERMS, OPENCV, ProjectCamera, in_pixels
-from jaxphoto.extras.formats.files import Format, begins_with, read_text, row_numbers
+from jaxphoto.extras.formats.files import Format, begins_with, row_numbers
 from jaxphoto.extras.formats.points_beside import points_of
 from jaxphoto.extras.formats.project import Project, pose
 from jaxphoto.io.camera_files import CameraSource
+from jaxphoto.io.text_files import read_legacy_text
 
 CAMERAS_FILE, POINTS_FILE, OFFSET_FILE = "calibrated_camera_parameters.txt", "tp_pix4d.txt", "offset.xyz"
 _HEAD = "fileName imageWidth imageHeight"
@@ -43,7 +44,9 @@ def read(path: Path) -> Project:
     kinds, number = np.unique(np.column_stack([sizes, numbers[:, :14]]), axis=0, return_inverse=True)
     shown = points_of(path.with_name(name + POINTS_FILE), files, path.name)
     offset_path = path.with_name(name + OFFSET_FILE)
-    offset = row_numbers(offset_path, 1, read_text(offset_path).split(), 3) if offset_path.is_file() else np.zeros(3)
+    offset = (
+        row_numbers(offset_path, 1, read_legacy_text(offset_path).split(), 3) if offset_path.is_file() else np.zeros(3)
+    )
     return Project(
         name.strip("_"), {str(k): _camera(path, values.tolist()) for k, values in enumerate(kinds)}, (), files,
         [str(k) for k in number.tolist()], pose(numbers[:, 17:].reshape(-1, 3, 3), numbers[:, 14:17] + offset),
@@ -53,7 +56,7 @@ def read(path: Path) -> Project:
 
 def _read_cameras(path: Path) -> tuple[list[str], list[tuple[int, int]], np.ndarray]:
     """Names, sizes, and 26 numbers of each photograph."""
-    lines = read_text(path).split("\n")
+    lines = read_legacy_text(path).split("\n")
     # The head ends at the first empty line.
     begin = lines.index("") + 1 if "" in lines else len(lines)
     rows = [(k + 1, line) for k, line in enumerate(lines) if k >= begin and line.strip()]

@@ -23,8 +23,9 @@ from jaxtyping import Float, Int
 from jaxphoto.errors import InputError, few, quoted
 from jaxphoto.extras.formats.camera_models import ProjectCamera
 from jaxphoto.extras.formats.control import Mark, is_geoin
-from jaxphoto.extras.formats.files import beginning, read_text, row_numbers, warn
+from jaxphoto.extras.formats.files import beginning, row_numbers, warn
 from jaxphoto.extras.formats.project import Project
+from jaxphoto.io.text_files import read_legacy_text
 from jaxphoto.io.text_tables import is_number, read_csv
 
 TABLE = "image_points.csv"
@@ -77,11 +78,11 @@ def points_of(text: Path, files: Sequence[str], of: str, cameras: Sequence[Proje
     """Read a text of image points; in pixels without `cameras`. `of` names the file that lists `files`."""
     heads, photograph, points, xy = _read_measured(text)
     places = places_by_name(files)
-    found = [_photograph(head, places) for head in heads]
-    _warn_unknown([head for head, (k, _) in zip(heads, found, strict=True) if k < 0], text, of)
-    image = np.array([k for k, _ in found], int)[photograph]
+    photographs = [_photograph(head, places) for head in heads]
+    _warn_unknown([head for head, (k, _) in zip(heads, photographs, strict=True) if k < 0], text, of)
+    image = np.array([k for k, _ in photographs], int)[photograph]
     centred = bool((xy < 0).any())
-    scales = [_scale(None if cameras is None or k < 0 else cameras[k], rest, centred) for k, rest in found]
+    scales = [_scale(None if cameras is None or k < 0 else cameras[k], rest, centred) for k, rest in photographs]
     scale, offset = np.array(scales).reshape(-1, 2, 2)[photograph].transpose(1, 0, 2)
     kept = image >= 0
     return named(image[kept], [points[k] for k in np.flatnonzero(kept).tolist()], (xy * scale + offset)[kept])
@@ -174,7 +175,7 @@ def write_image_points(p: Project, folder: Path, names: Sequence[str] | None = N
 
 
 def _is_measured(path: Path) -> bool:
-    """True if a file begins with a head and a row of point, x, y, and has an end somewhere."""
+    """Return True if a file begins with a head and a row of point, x, y, and has an end somewhere."""
     begin = beginning(path, _HEAD)
     lines = [line.split() for line in begin]
     if len(lines) < 3 or is_geoin(begin) or not _is_row(lines[1]) or _is_head(lines[1]):
@@ -187,14 +188,14 @@ def _is_row(words: list[str]) -> bool:
 
 
 def _is_head(words: list[str]) -> bool:
-    """True for a head without an end before it: an image and what cannot be a coordinate."""
+    """Return True for a head without an end before it: an image and what cannot be a coordinate."""
     return len(words) == 2 and not is_number(words[1])
 
 
 def _read_measured(path: Path) -> tuple[list[str], np.ndarray, list[str], np.ndarray]:
     """Heads, and of every point the number of its head, its name and coordinates."""
     heads, photograph, points, rows, within = [], [], [], [], False
-    for k, line in enumerate(read_text(path).split("\n"), 1):
+    for k, line in enumerate(read_legacy_text(path).split("\n"), 1):
         words = line.split()
         if not words or words == [_END]:
             within = False

@@ -382,7 +382,7 @@ def _image_names(files: list[str]) -> list[str]:
 
 
 def is_geocentric(xyz: Float[np.ndarray, "n 3"]) -> bool:
-    """True if all positions are as far from the origin as places are from the centre of the earth."""
+    """Return True if all positions are as far from the origin as places are from the centre of the earth."""
     with np.errstate(over="ignore"):
         distance = np.linalg.norm(xyz, axis=1)
     return len(xyz) > 0 and bool(((distance > _EARTH_M[0]) & (distance < _EARTH_M[1])).all())

@@ -33,9 +33,10 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.extras.formats.camera_models import CameraModel, ProjectCamera
-from jaxphoto.extras.formats.files import Format, begins_with, by_content, content_rows, read_text, row_numbers, warn
+from jaxphoto.extras.formats.files import Format, begins_with, by_content, content_rows, row_numbers, warn
 from jaxphoto.extras.formats.project import Project, translations
 from jaxphoto.io.camera_files import ASSUMED_PIXEL_MM
+from jaxphoto.io.text_files import read_legacy_text
 from jaxphoto.io.text_tables import LARGEST
 
 BUNDLE, LIST = "bundle.out", "list.txt"
@@ -87,7 +88,7 @@ def _project(path: Path, title: str, s: _Scene) -> Project:
 
 def read_bundler(path: Path) -> Project:
     """Read a bundle file; images that are not oriented are skipped."""
-    lines = read_text(path).split("\n")
+    lines = read_legacy_text(path).split("\n")
     numbers = np.array(" ".join(line for line in lines if not line.startswith("#")).split(), float)
     if not (np.abs(numbers) <= LARGEST).all():
         raise InputError(f"{path.name}: a number is not finite or too large. Export it again")
@@ -127,7 +128,7 @@ def _listed_names(path: Path, number: int) -> list[str]:
     for name in (f"{path.stem}.txt", f"{stem}.txt", f"{stem}.out", LIST, "bundle.out.list.txt"):
         file = path.with_name(name)
         if file != path and file.is_file():
-            names = [line.split()[0] for line in read_text(file).split("\n") if line.strip()]
+            names = [line.split()[0] for line in read_legacy_text(file).split("\n") if line.strip()]
             if len(names) != number:
                 raise InputError(f"{file.name} names {len(names)} photographs and {path.name} has {number} cameras")
             return names
@@ -152,14 +153,14 @@ def write_bundler(p: Project, folder: Path) -> None:
     moved = translations(rotations, p.exterior.position).tolist()
     shown = [rows for rows in p.rows_of_points if len(rows)]
     lines = [_HEAD, f"{len(p.files)} {len(shown)}"]
-    for own, rotation, translation in zip(values, rotations.tolist(), moved, strict=True):
-        lines += [words(own), *map(words, rotation), words(translation)]
+    for camera, rotation, translation in zip(values, rotations.tolist(), moved, strict=True):
+        lines += [words(camera), *map(words, rotation), words(translation)]
     xy, image, key, xyz = (a.tolist() for a in (_from_middle(p), p.image, p.number_in_image, np.asarray(p.xyz)))
     for rows in shown:
         seen = " ".join(f"{image[k]} {key[k]} {words(xy[k])}" for k in rows.tolist())
         lines += [words(xyz[p.point[rows[0]]]), "0 0 0", f"{len(rows)} {seen}"]
     (folder / BUNDLE).write_text("\n".join(lines) + "\n", encoding="utf-8")
-    listed = "".join(f"{file} 0 {own[0]!r}\n" for file, own in zip(p.files, values, strict=True))
+    listed = "".join(f"{file} 0 {camera[0]!r}\n" for file, camera in zip(p.files, values, strict=True))
     (folder / LIST).write_text(listed, encoding="utf-8")
 
 
@@ -167,7 +168,7 @@ def write_bundler(p: Project, folder: Path) -> None:
 
 
 def _is_bal(path: Path) -> bool:
-    """True for three counts, then two indices and two numbers."""
+    """Return True for three counts, then two indices and two numbers."""
     with path.open("rb") as file:
         first, second = (file.readline(200).split() for _ in range(2))
     indices = [cell.isdigit() for cell in (*first, *second[:2])]

@@ -34,7 +34,7 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError, few, quoted
 from jaxphoto.extras.formats.camera_models import ProjectCamera
 from jaxphoto.extras.formats.control import is_geoin
-from jaxphoto.extras.formats.files import Format, beginning, read_text, row_numbers
+from jaxphoto.extras.formats.files import Format, beginning, row_numbers
 from jaxphoto.extras.formats.points_beside import (
     Shown,
     measured_texts,
@@ -45,6 +45,7 @@ from jaxphoto.extras.formats.points_beside import (
 from jaxphoto.extras.formats.project import Project, with_system
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
 from jaxphoto.io.camera_files import CAMERA, SeveralCamerasError, read_camera_file
+from jaxphoto.io.text_files import read_legacy_text
 from jaxphoto.io.text_tables import is_number, read_csv
 from jaxphoto.io.toml import toml_text
 from jaxphoto.unknowns import FIXED
@@ -137,7 +138,7 @@ def _cameras(path: Path, names: list[str]) -> tuple[dict[str, ProjectCamera], li
     near = (p for p in sorted(path.parent.iterdir()) if p.is_file() and not p.name.startswith("."))
     files = [p for p in near if p.suffix.lower() in _CAMERAS]
     if len(files) != 1:
-        raise InputError(f"{path.parent} holds {len(files)} camera files and needs one (docs/camera_files.md)")
+        raise InputError(f"{path.parent} holds {len(files)} camera files and needs one (docs/formats.md)")
     file, beside = files[0], path.with_name(IMAGES)
     if not beside.is_file():
         try:
@@ -204,7 +205,7 @@ def ray_misfit(
 
 
 def is_exterior(path: Path) -> bool:
-    """True if a file begins as a text of orientations, or has a row of BINGO's."""
+    """Return True if a file begins as a text of orientations, or has a row of BINGO's."""
     if _ORIA_ROW.search(path.read_bytes()):
         return True
     lines = beginning(path, _HEAD)
@@ -214,7 +215,7 @@ def is_exterior(path: Path) -> bool:
 
 def read_exterior(path: Path) -> ExteriorText:
     """Read the orientations in a text. Raise InputError with the row that is invalid."""
-    numbered = [(k, line) for k, line in enumerate(read_text(path).split("\n"), 1) if line.strip()]
+    numbered = [(k, line) for k, line in enumerate(read_legacy_text(path).split("\n"), 1) if line.strip()]
     begin = [line for _, line in numbered[:_BEGIN]]
     if any(_oria(line.split()) is not None for _, line in numbered):
         return _of_bingo(path, numbered)._replace(system=_system(path, "\n".join(begin)))
@@ -247,7 +248,7 @@ def _system(path: Path, head: str) -> str:
         return named[1]
     same = path.with_suffix(".prj")
     files = [same] if same.is_file() else sorted(path.parent.glob("*.prj"))
-    return read_text(files[0]).strip() if len(files) == 1 else ""
+    return read_legacy_text(files[0]).strip() if len(files) == 1 else ""
 
 
 def _cells(line: str) -> list[str]:
@@ -259,7 +260,7 @@ def _cells(line: str) -> list[str]:
 
 
 def _is_angles(row: list[str]) -> bool:
-    """True for a name and six numbers; a name of several words has no three numbers in it."""
+    """Return True for a name and six numbers; a name of several words has no three numbers in it."""
     surplus = len(row) - len(_COLUMNS)
     if surplus < 1 or not all(map(is_number, row[surplus:])):
         return False

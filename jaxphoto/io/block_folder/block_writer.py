@@ -69,7 +69,7 @@ def whole_block(block: Block, folder: str | Path) -> Iterator[Path]:
 
 
 def _tables_of(kinds: Iterable[Kind]) -> Clashes:
-    """True for files that a block folder with these kinds of rows is read from."""
+    """Return True for files that a block folder with these kinds of rows is read from."""
     return {TOML, *(f"{name}.csv" for name in layouts(kinds))}.__contains__
 
 

@@ -235,9 +235,9 @@ def with_earlier_calibrations(settings: dict[str, Any], file: str, folder: Path)
             )
         known = known_together(read.interior, read.covariance)
         fixed = jax.tree.map(lambda _: FIXED, read.interior)
-        told = camera_section(Camera(read.sensor, read.interior, fixed, known, read.note))
-        unknowns = {key: value for key, value in told["unknowns"].items() if key not in known.parameters}
-        completed[name] = told | table | {"unknowns": unknowns | table.get("unknowns", {})}
+        calibrated = camera_section(Camera(read.sensor, read.interior, fixed, known, read.note))
+        unknowns = {key: value for key, value in calibrated["unknowns"].items() if key not in known.parameters}
+        completed[name] = calibrated | table | {"unknowns": unknowns | table.get("unknowns", {})}
         del completed[name][_CALIBRATION]
     return settings | {"cameras": completed}
 

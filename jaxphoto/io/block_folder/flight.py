@@ -19,8 +19,7 @@ from jaxphoto.io.block_folder.observations import Images, read_attitudes, read_s
 from jaxphoto.io.block_folder.settings import Settings, default_sigma
 from jaxphoto.io.block_folder.table_layout import RATE, VELOCITY
 from jaxphoto.io.text_tables import Table
-from jaxphoto.io.trajectory import Records
-from jaxphoto.io.trajectory.in_frame import positions_in, trajectory_in
+from jaxphoto.io.trajectory import Records, positions_in, trajectory_in
 from jaxphoto.observations import Attitudes, CameraPositions, RelativeAttitudes, RelativePositions, RigPlaces, RigTurns
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 from jaxphoto.unknowns import FIXED, Unknowns, late_cameras
@@ -265,13 +264,7 @@ def _check_inside(times: np.ndarray, image: np.ndarray, records: Records, images
 
 
 def _check_leap_seconds(
-    poses: Poses,
-    times: np.ndarray,
-    image: np.ndarray,
-    records: Records,
-    images: Images,
-    frame: Frame,
-    shift: float,
+    poses: Poses, times: np.ndarray, image: np.ndarray, records: Records, images: Images, frame: Frame, shift: float
 ) -> None:
     """Raise BlockError where approximate positions fit a clock that is off by leap seconds, and not this one."""
     known = images.known[image]

@@ -322,8 +322,7 @@ def read_control(table: Table, approximations: Table, points: ObservedPoints, se
     )
     value, lines, axes = _given_coordinates(table)
     refuse_duplicates(
-        table.take(lines),
-        {"point": table.text("point")[lines], "coordinate": np.array(AXES, object)[axes]},
+        table.take(lines), {"point": table.text("point")[lines], "coordinate": np.array(AXES, object)[axes]}
     )
     sigma = np.zeros((len(table), 3))
     for a, axis in enumerate(AXES):

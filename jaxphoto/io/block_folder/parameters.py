@@ -231,8 +231,10 @@ def unknown_sections(block: Block) -> dict[str, Any]:
     """The [unknowns] table of a block."""
     priors, written = block.priors.more, {}
     for kind, owners in block.start.unknowns.more.items():
-        tables: dict[str, Any] = {n: parameters_section(own, priors[kind][n]) for n, own in owners.items()}
-        if any(type(own).owner in _ONE for own in owners.values()):
+        tables: dict[str, Any] = {
+            n: parameters_section(parameters, priors[kind][n]) for n, parameters in owners.items()
+        }
+        if any(type(parameters).owner in _ONE for parameters in owners.values()):
             if set(tables) != {""}:
                 raise BlockError(f"{kind} belongs to the whole block, whose name is '', not {', '.join(tables)}")
             tables = tables[""]

@@ -158,11 +158,7 @@ def read_settings(values: dict[str, Any], file: str = TOML, sigma_keys: Sequence
     over = keys.datum.over
     datum = Datum(keys.datum.kind, tuple(over) if isinstance(over, list) else over, keys.datum.scale)
     return Settings(
-        top,
-        keys,
-        frame_of(keys.frame, file),
-        {name: read_camera(cameras.section(name)) for name in cameras},
-        datum,
+        top, keys, frame_of(keys.frame, file), {name: read_camera(cameras.section(name)) for name in cameras}, datum
     )
 
 

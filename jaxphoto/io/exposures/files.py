@@ -24,12 +24,13 @@ import numpy as np
 from jaxphoto.errors import InputError, few, quoted
 from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS, WEEK_S, gps_seconds
 from jaxphoto.georeferencing.gps import Fix, Heights
+from jaxphoto.io.control_table import separator_of
 from jaxphoto.io.exposures.records import Exposures, Lines
-from jaxphoto.io.exposures.tables import read_table, separator_of
+from jaxphoto.io.exposures.tables import read_table
 from jaxphoto.io.photograph_metadata import fix_of
+from jaxphoto.io.text_files import read_text
 from jaxphoto.io.text_tables import finite
 from jaxphoto.io.trajectory import read_sbet, sbet_records
-from jaxphoto.io.whole_text import LARGE, read_text
 
 SUFFIXES = (".mrk", ".pos", ".sbet")
 """Extensions of files of exposures."""
@@ -61,7 +62,7 @@ def read_exposures(path: Path, code: int | None = None, heights: Heights = "unkn
     suffix = path.suffix.lower()
     if suffix in (".sbet", ".out"):
         return _read_sbet(path)
-    content = read_text(path, LARGE)
+    content = read_text(path)
     lines = [(row, line) for row, line in enumerate(content.split("\n"), 1) if line.strip()]
     errors: dict[int, str] = {}
     # Half a number reads as well as a whole one: only missing cells show that the last row is cut off.

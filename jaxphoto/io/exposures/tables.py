@@ -19,7 +19,6 @@ Sources: Pix4D support, articles 202558539 and 202558969; OpenDroneMap documenta
 (github.com/nilsbore/auvlib, src/data_tools/src/csv_data.cpp).
 """
 
-import csv
 import re
 from collections.abc import Sequence
 from pathlib import PureWindowsPath
@@ -31,12 +30,12 @@ import pandas as pd
 from pyproj import Transformer
 
 from jaxphoto.compiling import jit_quickly
-from jaxphoto.errors import InputError, quoted
+from jaxphoto.errors import InputError, RowError, quoted
 from jaxphoto.georeferencing.camera_attitude import USUAL_SIGMA_DEG, CameraAttitude, level_from_belly
 from jaxphoto.georeferencing.datum_change import wgs84_places
 from jaxphoto.georeferencing.gps import Fix, Heights
 from jaxphoto.georeferencing.map_frame import MapFrame
-from jaxphoto.io.control_table import PLACE, SYSTEM, columns_of, in_degrees
+from jaxphoto.io.control_table import PLACE, SYSTEM, columns_of, in_degrees, separator_of, split_row
 from jaxphoto.io.exposures.records import Exposures, Lines
 from jaxphoto.procedures.control.surveyed import ControlSystem, system_of
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
@@ -72,11 +71,6 @@ class _Table(NamedTuple):
     true_north: bool
     """True if yaw counts from true north in map coordinates, too."""
     ellipsoid: bool
-
-
-def separator_of(line: str) -> str:
-    """Separator of the cells of a row: a tab, a semicolon, a comma, else blanks."""
-    return next((s for s in ("\t", ";", ",") if s in line), " ")
 
 
 def read_table(file: str, lines: Lines, errors: dict[int, str], code: int | None, heights: Heights) -> Exposures:
@@ -158,8 +152,8 @@ def _table(file: str, lines: Lines, errors: dict[int, str]) -> _Table:
     records = {}
     for row, line in content:
         try:
-            records[row] = _split(line, separator)
-        except csv.Error:
+            records[row] = split_row(file, line, row, separator)
+        except RowError:
             errors[row] = "the quotation marks do not pair; close or remove them"
     first = records.get(content[0][0], [])
     comment_cells = [line.lstrip("# ").split(None if separator == " " else separator) for line in comments]
@@ -190,13 +184,6 @@ def _table(file: str, lines: Lines, errors: dict[int, str]) -> _Table:
         not own_yaw,
         any("heights above the ellipsoid" in line for line in comments),
     )
-
-
-def _split(line: str, separator: str) -> list[str]:
-    if separator == " ":
-        return line.split()
-    (cells,) = csv.reader([line], delimiter=separator, skipinitialspace=True, strict=True)
-    return [cell.strip() for cell in cells]
 
 
 def _cells(
@@ -297,10 +284,15 @@ def _from_map(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Longitude, latitude, height of WGS 84, and the rotations from the axes of the grid to those of true north."""
     place = MapFrame(code, vertical, (0.0, 0.0, 0.0)).place(coordinates)
-    frame = MapFrame(code, None, (*np.nanmedian(place[:, :2], axis=0).tolist(), 0.0))
-    local = frame.local_from_place(place)
-    rotation = np.swapaxes(frame.local_from_level(local), 1, 2) @ frame.local_from_grid(local)
-    return wgs84_places(code, place, heights == "ellipsoid"), rotation
+    inside = np.isfinite(place).all(axis=1)
+    on_wgs84, rotation = np.full_like(place, np.nan), np.tile(np.eye(3), (len(place), 1, 1))
+    if inside.any():
+        place = place[inside]
+        frame = MapFrame(code, None, (*np.median(place[:, :2], axis=0).tolist(), 0.0))
+        local = frame.local_from_place(place)
+        rotation[inside] = np.swapaxes(frame.local_from_level(local), 1, 2) @ frame.local_from_grid(local)
+        on_wgs84[inside] = wgs84_places(code, place, heights == "ellipsoid")
+    return on_wgs84, rotation
 
 
 def _attitudes(

@@ -1,4 +1,4 @@
-"""Recipes of simulations (TOML) and what a simulation leaves beside its block (docs/simulation.md)."""
+"""Recipes of simulations (TOML), and the files of simulated blocks (docs/simulation.md)."""
 
 from jaxphoto.io.recipe.recipe_reader import read_recipe, recipe_from
 from jaxphoto.io.recipe.truth import read_truth, truth_tables, write_simulation

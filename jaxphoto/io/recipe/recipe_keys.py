@@ -1,6 +1,6 @@
-"""The keys of a recipe, table by table (docs/simulation.md).
+"""Keys of a recipe, table by table (docs/simulation.md).
 
-Tables that describe a plan of `jaxphoto.simulation` have the names of its fields, and its defaults.
+Tables that describe a plan of `jaxphoto.simulation` have the fields of its class, with its defaults.
 """
 # mypy: disable-error-code="valid-type"
 
@@ -33,17 +33,17 @@ from jaxphoto.simulation import (
     Terrain,
     Trees,
     Wave,
-    scan_plan,
-    settlement,
+    plans,
+    scene,
 )
 
 _KINDS: tuple[type[AbstractParameters], ...] = (*RATES, CameraSpline, StripCamera)
 CHANGES = {kind.kind: kind for kind in _KINDS}
-"""Changes of cameras, by the names of their tables."""
+"""Changes of cameras by the names of their tables."""
 IMAGES = 20_000
-# More pairs of an image and a point would take hours.
+# Maximum number of pairs of image and point: more would take hours.
 PAIRS = 2_000_000_000
-# Steeper roofs would rise by more than they are wide; beyond this angle a rolling aircraft scans the horizon.
+# Steeper roofs rise by more than their width; beyond this angle a rolling aircraft scans the horizon.
 _STEEPEST_DEG, _WIDEST_DEG = 60.0, 60.0
 
 
@@ -85,7 +85,7 @@ Prefix = Annotated[StrictStr, AfterValidator(_prefix)]
 
 
 def plain(value: Any) -> Any:
-    """Values of a dataclass: tuples for lists, plans for tables."""
+    """Convert values of a dataclass: lists to tuples, tables to plans."""
     if isinstance(value, PlanKeys):
         return value.plan()
     if isinstance(value, dict):
@@ -94,12 +94,12 @@ def plain(value: Any) -> Any:
 
 
 class PlanKeys(Keys):
-    """The keys of a dataclass of `jaxphoto.simulation`, by the names of its fields."""
+    """Keys of a dataclass of `jaxphoto.simulation`: its fields."""
 
     kind_of_plan: ClassVar[type]
 
     def plan(self, **more: Any) -> Any:
-        """The plan; what the table does not give has the plan's default."""
+        """Return the plan; missing keys have its defaults."""
         fields = {f.name for f in dataclasses.fields(self.kind_of_plan)}
         given = {name: plain(getattr(self, name)) for name in self.model_fields_set & fields}
         return self.kind_of_plan(**(given | more))
@@ -108,21 +108,21 @@ class PlanKeys(Keys):
 # Types of keys by types of fields.
 _TYPES: dict[Any, Any] = {
     float: Number, int: Whole, bool: StrictBool, str: StrictStr,
-    scan_plan.Triple: Triple, settlement.Range: PositiveRange,
+    plans.Triple: Triple, scene.Range: PositiveRange,
     tuple[tuple[float, float], ...]: list[Pair], tuple[tuple[float, ...], ...]: list[Place],
-    dict[str, scan_plan.Triple]: dict[str, Vector],
+    dict[str, plans.Triple]: dict[str, Vector],
 }  # fmt: skip
 
 
 def plan_keys(kind: type, base: type[PlanKeys] = PlanKeys, /, **keys: Any) -> Any:
-    """A model of the fields of a dataclass; `keys` are types of keys that its fields do not say, None for no key."""
+    """Return a model of the fields of a dataclass; `keys` replace types of fields, None removes a field."""
     hints, types = typing.get_type_hints(kind), {}
     for field in dataclasses.fields(kind):
         hint = hints[field.name]
         optional = type(None) in typing.get_args(hint)
         inner = typing.get_args(hint)[0] if optional else hint
         key = keys.get(field.name, _TYPES.get(inner, inner)) if field.name not in base.model_fields else None
-        # Keys that may be absent have the default of the field.
+        # Optional keys have the default of the field.
         required = field.default is field.default_factory is dataclasses.MISSING
         if key is not None:
             types[field.name] = (
@@ -148,7 +148,7 @@ class _TargetKeys(PlanKeys):
     grid: Annotated[list[Annotated[Whole, Field(ge=2, le=2_000)]], Field(min_length=2, max_length=2)] | None = None
 
     def plan(self: Any, **more: Any) -> TargetPlan:
-        """Places of the grid, row by row, are further places."""
+        """Return the plan; the places of a grid are further places."""
         sides = [np.linspace(-1, 1, n).tolist() for n in self.grid or ()]
         grid = tuple((x, y) for y in sides[1] for x in sides[0]) if sides else ()
         return super().plan(at=plain(self.at or []) + grid, **more)
@@ -220,7 +220,7 @@ class TerrainKeys(Keys):
         return self
 
     def terrain(self, section: Section) -> Terrain:
-        """The ground."""
+        """Return the terrain."""
         if self.kind == "rolling":
             return dataclasses.replace(ROLLING, seed=self.seed)
         random = None
@@ -232,7 +232,7 @@ class TerrainKeys(Keys):
 
 
 class _Flown(Keys):
-    """Keys of [flight] that its strips may change: two ways to say each."""
+    """Keys of [flight] that its strips may override; alternatives in pairs."""
 
     height_m: Positive | None = None
     gsd_m: Positive | None = None
@@ -254,7 +254,7 @@ class _Flown(Keys):
         return self
 
     def either(self, thing: str) -> tuple[str, float] | None:
-        """The one of the two keys that is given, and its value."""
+        """Return the given one of two alternative keys, and its value."""
         return next(((key, getattr(self, key)) for key in self.pairs[thing] if getattr(self, key) is not None), None)
 
 
@@ -281,7 +281,7 @@ class FlightKeys(_Flown):
 
 
 class StationKeys(Keys):
-    """[[convergent.stations]]: every distance with every azimuth, tilt and roll"""
+    """[[convergent.stations]]: the product of distances, azimuths, tilts and rolls"""
 
     name: StrictStr
     camera: StrictStr | None = None
@@ -302,7 +302,7 @@ class StationKeys(Keys):
         return self
 
     def stations(self, camera: str) -> Iterator[Station]:
-        """The stations of the table."""
+        """Return the stations of the table."""
         each = itertools.product(self.distance_m, self.azimuth_deg, self.tilt_deg, self.roll_deg)
         for k, numbers in enumerate(each, start=1):
             yield Station(f"{self.name}_{k:02d}", camera, *numbers)

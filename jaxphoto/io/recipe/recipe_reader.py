@@ -1,7 +1,7 @@
-"""A recipe in TOML -> `Recipe`.
+"""Read a recipe in TOML as `Recipe`.
 
-Cameras, mounts, strips and datum are written as in block.toml. What is truly otherwise stands in a table `truth`
-below each (docs/simulation.md).
+Cameras, mounts, strips and datum are written as in block.toml; a table `truth` below each holds true values that differ
+(docs/simulation.md).
 """
 
 import math
@@ -24,6 +24,7 @@ from jaxphoto.io.block_folder.camera_section import Camera, read_camera
 from jaxphoto.io.block_folder.parameters import (
     by_owner,
     keys_of,
+    mounts_of,
     read_mounts,
     read_parameters,
     read_strips,
@@ -37,7 +38,6 @@ from jaxphoto.simulation import (
     Assumed,
     CameraWalk,
     ConvergentPlan,
-    Cooling,
     Field,
     FlightPlan,
     Footprint,
@@ -55,14 +55,14 @@ from jaxphoto.simulation import (
 from jaxphoto.unknowns import FREE
 
 _ZERO = (0.0, 0.0, 0.0)
-# Approximate positions at close range are off by this part of the shortest distance, unless the recipe says otherwise.
+# Default error of approximate positions at close range, as a fraction of the shortest distance.
 _NEAR = 0.02
-# About the interval of nodes along a strip of the scanner.
+# Approximate interval of nodes along a strip of the scanner.
 _NODES_S = 5.0
 
 
 class BiasTruthKeys(Keys):
-    """Standard deviations that [strips.X.truth] draws by."""
+    """Standard deviations from which [strips.X.truth] draws."""
 
     shift_sigma_m: Triple = [0.0, 0.0, 0.0]  # noqa: RUF012
     drift_sigma_m_per_s: Triple = [0.0, 0.0, 0.0]  # noqa: RUF012
@@ -76,7 +76,7 @@ class MotionKeys(Keys):
 
 
 def read_recipe(path: str | Path) -> Recipe:
-    """The recipe in a TOML file. Raises InputError, naming file, key and cure."""
+    """Read the recipe in a TOML file. Raises InputError with file, key and cure."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"there is no file {path}; give the TOML file of a recipe")
@@ -84,13 +84,13 @@ def read_recipe(path: str | Path) -> Recipe:
 
 
 def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
-    """The recipe that the content of a TOML file describes; `file` is its name in messages.
+    """Read the recipe in the content of a TOML file; `file` is its name in messages.
 
-    Experiments change `values` between reading and this: a variant is another dictionary. Raises InputError.
+    Experiments modify `values` before this call. Raises InputError.
     """
     top = Section(file, "", dict(values))
     keys = top.model(RecipeKeys)
-    # The tables of block.toml; residuals are those of the image that has the noise, unless a camera says otherwise.
+    # Tables of block.toml; the default of residuals is "measured", because noise is added to measured coordinates.
     stated = {name: _without_truth(getattr(keys, name)) for name in ("cameras", "mounts", "strips")}
     stated["cameras"] = {name: {"residuals": "measured"} | camera for name, camera in stated["cameras"].items()}
     settings = read_settings(stated | {key: top.values[key] for key in ("title", "datum") if key in top}, file)
@@ -99,10 +99,15 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
         for name, camera in settings.cameras.items()
     }
     sensors = {name: camera.sensor for name, camera in settings.cameras.items()}
-    mounts = _mounts(settings.top.section("mounts"), top.section("mounts"), cameras)
+    mount_starts, mount_priors = read_mounts(settings.top.section("mounts"), cameras)
+    mounts = {
+        name: Assumed(_truth(Mount, top.section("mounts").section(name))[0], start, mount_priors[name])
+        for name, start in mount_starts.items()
+    }
     rig = top.section(RigCamera.kind)
     flown = _flown_cameras(top, rig, list(cameras))
-    image_x = {n: (mounts[m].truth.image_x if (m := _mount_of(n, mounts)) else "forward") for n in flown}
+    mount_of = mounts_of(flown, mounts)
+    image_x = {name: mounts[mount].truth.image_x if mount else "forward" for name, mount in mount_of.items()}
     plan = _plan(top, keys, {name: (sensors[name], cameras[name].truth, image_x[name]) for name in flown})
     strips = [strip.name for strip in plan.strips] if isinstance(plan, FlightPlan) else []
     targets = plain(keys.targets)
@@ -118,7 +123,7 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
     stated_sigmas, noise = _sigmas(top, keys, targets)
     if rig.values and (stated_sigmas.rig_place_m is None or stated_sigmas.rig_turn_deg is None):
         raise top.section("sigmas").error("", "the rigidity of the rig is missing; add rig_place_m and rig_turn_deg")
-    terrain = keys.terrain.terrain(top.section("terrain"))
+    terrain, air = keys.terrain.terrain(top.section("terrain")), keys.temperature
     near = {}
     if isinstance(plan, ConvergentPlan) and "position_m" not in keys.start.model_fields_set:
         near["position_m"] = _NEAR * min(station.distance_m for station in plan.stations)
@@ -135,7 +140,7 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
         biases=_biases(settings.top.section("strips"), top.section("strips"), strips),
         shutters={n: _shutter(table) for n, table in by_owner(top.section("shutters"), cameras).items()},
         changes=_changes(top, keys, list(cameras), strips),
-        temperature=_temperature(keys.temperature),
+        temperature=air and air.plan(reference_c=air.air_c if air.reference_c is None else air.reference_c),
         walk=_walk(top, keys.camera_walk),
         rig=_change(RigCamera, rig, cameras),
         datum_offset_m=tuple(keys.truth.datum_offset_m),
@@ -164,9 +169,9 @@ def _camera(stated: Section, section: Section, camera: Camera) -> Assumed[Interi
 
 
 def _truth(kind: type[AbstractParameters], section: Section, *others: str, drawn: bool = False) -> tuple[Any, Any]:
-    """The true parameters of a table, and the priors by which they may be `drawn`; `others` are no parameters.
+    """Read the true parameters of a table, and the priors by which they may be `drawn`; `others` are no parameters.
 
-    Parameters that its table `truth` does not give are those of the block.
+    Parameters that `truth` does not give have the values of the block.
     """
     starts = {key.start for key in keys_of(kind)} | set(static_fields(kind))
     truth = section.section("truth")
@@ -177,19 +182,8 @@ def _truth(kind: type[AbstractParameters], section: Section, *others: str, drawn
     return read_parameters(kind, Section(truth.file, truth.path, values))
 
 
-def _mount_of(camera: str, mounts: Mapping[str, Any]) -> str:
-    return camera if camera in mounts else "default" if "default" in mounts else ""
-
-
-def _mounts(stated: Section, section: Section, cameras: Iterable[str]) -> dict[str, Assumed[Mount]]:
-    starts, priors = read_mounts(stated, cameras)
-    return {
-        name: Assumed(_truth(Mount, section.section(name))[0], start, priors[name]) for name, start in starts.items()
-    }
-
-
 def _biases(stated: Section, section: Section, strips: list[str]) -> dict[str, SimulatedBias]:
-    """A table with nothing but a `truth` leaves the bias out of the block's model."""
+    """Read biases; a table with a `truth` only omits the bias from the block's model."""
     tables = by_owner(section, strips)
     modelled = Section(stated.file, stated.path, {name: values for name, values in stated.values.items() if values})
     starts, priors = read_strips(modelled, strips)
@@ -219,7 +213,7 @@ def _shutter(table: Section) -> SimulatedShutter:
 
 
 def _change(kind: type[AbstractParameters], section: Section, owners: Iterable[str]) -> dict[str, SimulatedChange]:
-    """Changes by owner; the block's model does not know of one whose table has nothing but a `truth`."""
+    """Read changes by owner; a table with a `truth` only is unknown to the block's model."""
     changes = {}
     for name, table in by_owner(section, owners).items():
         true, spread = _truth(kind, table, drawn=True)
@@ -244,13 +238,8 @@ def _changes(top: Section, keys: Any, cameras: list[str], strips: list[str]) -> 
     return changes
 
 
-def _temperature(keys: Any) -> Cooling | None:
-    """The temperature of the cameras; its reference is the air unless it is given."""
-    return keys and keys.plan(reference_c=keys.air_c if keys.reference_c is None else keys.reference_c)
-
-
 def _walk(top: Section, keys: Any) -> CameraWalk | None:
-    """How cameras of strips truly walk, and what the block knows of it."""
+    """Read the true drift of cameras along strips, and its prior in the block."""
     if keys is None:
         return None
     if not top.section(StripCamera.kind).values:
@@ -265,7 +254,7 @@ def _walk(top: Section, keys: Any) -> CameraWalk | None:
 
 
 def _sigmas(top: Section, keys: Any, targets: Sequence[Any]) -> tuple[Sigmas, Sigmas]:
-    """The stated sigmas, and the true ones, which are the same where [noise] does not say otherwise."""
+    """Read stated and true sigmas; the latter are equal unless [noise] overrides them."""
     section, image = top.section("sigmas"), keys.sigmas.image_mm
     stated = keys.sigmas.plan(target_mm=keys.sigmas.target_mm or image)
     for key in keys.noise.model_fields_set:
@@ -279,7 +268,7 @@ def _sigmas(top: Section, keys: Any, targets: Sequence[Any]) -> tuple[Sigmas, Si
         raise section.error("control_m", "the key is missing, but there are control points; add it")
     noise = vars(stated) | {name: plain(getattr(keys.noise, name)) for name in keys.noise.model_fields_set}
     if "target_mm" not in section and "target_mm" not in keys.noise.model_fields_set:
-        # Targets are measured as well as ties, unless one of the tables gives them a standard deviation.
+        # The default standard deviation of targets is that of ties.
         noise["target_mm"] = noise["image_mm"]
     return stated, Sigmas(**noise)
 
@@ -303,7 +292,7 @@ Flown = Mapping[str, tuple[Sensor, InteriorOrientation, Any]]
 
 
 def _plan(top: Section, keys: Any, cameras: Flown) -> FlightPlan | ConvergentPlan:
-    """The flight or the convergent set; every camera takes part in it."""
+    """Read the flight or the convergent set; every camera must be used."""
     if ("flight" in top) == ("convergent" in top):
         raise top.error("", "a recipe has a table [flight] or a table [convergent]; give one of the two")
     plan = _flight(top, keys.flight, cameras) if keys.flight else _convergent(top, keys.convergent, list(cameras))
@@ -319,7 +308,7 @@ def _plan(top: Section, keys: Any, cameras: Flown) -> FlightPlan | ConvergentPla
 
 
 def _camera_of(section: Section, name: str | None, cameras: Iterable[str], number: int) -> str:
-    """The camera of a strip or station: the only one, where none is named."""
+    """Camera of a strip or station; the only camera by default."""
     cameras = list(cameras)
     if name is None and len(cameras) == 1:
         return cameras[0]
@@ -361,7 +350,7 @@ def _flight(top: Section, keys: Any, cameras: Flown) -> FlightPlan:
 
 
 def _strips(table: Any, flight: Any, camera: str, flown: tuple, section: Section) -> list[Strip]:
-    """The parallel strips of one table, flown to and fro, from left to right of the first."""
+    """Return the parallel strips of one table, flown in alternating directions, from left to right of the first."""
     sensor, interior, image_x = flown
 
     def either(thing: str) -> tuple[str, float]:
@@ -383,7 +372,7 @@ def _strips(table: Any, flight: Any, camera: str, flown: tuple, section: Section
     along = table.along_m + table.along_bases * base
     strips = []
     for k in range(table.count):
-        # Along and across are those of the first strip's heading, and change sign for those flown the other way.
+        # Along and across refer to the heading of the first strip, and change sign in the opposite direction.
         sign = -1 if k % 2 else 1
         across = table.across_m + (table.across_spacings + k - (table.count - 1) / 2) * spacing
         strips.append(
@@ -405,7 +394,7 @@ def _strips(table: Any, flight: Any, camera: str, flown: tuple, section: Section
 def _lidar(
     top: Section, keys: Any, plan: FlightPlan | ConvergentPlan, terrain: Terrain, stated: Sigmas
 ) -> ScanPlan | None:
-    """The plan of the scanner, None without [lidar]."""
+    """Read the plan of the scanner; None without [lidar]."""
     sigmas = top.section("sigmas")
     if keys.lidar is None:
         if stated.lidar_m is not None:
@@ -430,7 +419,7 @@ def _lidar(
 
 
 def _lidar_strip(keys: Any, speed: float, top: Section) -> Strip:
-    """A strip of the scanner's own flight."""
+    """Read a strip of a separate scanner flight."""
     nodes = 1 + max(1, math.ceil(keys.length_m / (_NODES_S * speed)))
     if nodes > IMAGES:
         hours = keys.length_m / speed / 3600

@@ -1,4 +1,4 @@
-"""A simulation -> its block folder with cloud and trajectory; the truth is written in the columns of result tables."""
+"""Write a simulation as a block folder with point cloud and trajectory; the truth has the columns of result tables."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,14 +7,12 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.camera import constant_names, get_parameter, parameter_names
-from jaxphoto.cloud import Cloud
-from jaxphoto.georeferencing import Scanner, StripErrors, Trajectory
+from jaxphoto.georeferencing import Scanner, StripErrors
 from jaxphoto.io import clouds
 from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
 from jaxphoto.io.result_tables import read_table
-from jaxphoto.io.trajectory import write_flight_csv
-from jaxphoto.io.trajectory.in_frame import records_of
+from jaxphoto.io.trajectory import records_of, write_flight_csv
 from jaxphoto.observations import AXES
 from jaxphoto.parameters import AbstractParameters, numbers_of
 from jaxphoto.simulation import Simulation
@@ -29,24 +27,24 @@ _DRIFT = "trajectory_errors"
 
 @outside_transformations
 def write_simulation(simulation: Simulation, folder: str | Path) -> None:
-    """Write the block as `write_block` does, with the truth in its sub-folder `truth` (docs/simulation.md).
+    """Write the block, and its truth into the sub-folder `truth` (docs/simulation.md).
 
-    Of a lidar there are also `cloud.laz` and `trajectory.csv`. All of it takes its place in one step, and that of an
-    older simulation goes. Raises what `write_block` raises.
+    A lidar adds `cloud.laz` and `trajectory.csv`. Everything is written in one step and replaces an older simulation.
+    Raises what `write_block` raises.
     """
     with whole_block(simulation.block, folder) as work:
         (work / FOLDER).mkdir()
         for name, table in truth_tables(simulation).items():
             table.to_csv(work / FOLDER / f"{name}.csv", index=False)
         if simulation.cloud is not None and simulation.trajectory is not None:
-            _write_scan(simulation.cloud, simulation.trajectory, work)
+            clouds.write_cloud(simulation.cloud, work / CLOUD)
+            write_flight_csv(records_of(simulation.trajectory, TRAJECTORY), work / TRAJECTORY)
 
 
 def truth_tables(simulation: Simulation) -> dict[str, pd.DataFrame]:
-    """The truth by name of the result table that it joins: interior, exterior, object_points, georeferencing.
+    """Return the truth by name of the corresponding result table: interior, exterior, object_points, georeferencing.
 
-    That of a scanner, which joins georeferencing too, is the table scanner; what its trajectory is off by, shift and
-    drift, is trajectory_errors.
+    The table scanner also joins georeferencing; trajectory_errors has the shift and drift of its trajectory.
     """
     block, truth = simulation.block, simulation.truth
     interior = [
@@ -70,7 +68,7 @@ def truth_tables(simulation: Simulation) -> dict[str, pd.DataFrame]:
 
 
 def read_truth(folder: str | Path) -> dict[str, pd.DataFrame]:
-    """The tables that `write_simulation` wrote beside a block; none where the block of `folder` was not simulated."""
+    """Read the truth beside a block; empty if the block of `folder` was not simulated."""
     return {path.stem: read_table(path) for path in sorted((Path(folder) / FOLDER).glob("*.csv"))}
 
 
@@ -98,14 +96,8 @@ def _georeferencing(simulation: Simulation) -> list[tuple[str, float]]:
     return rows + [(f"datum_offset_{a}_m", v) for a, v in zip(AXES, simulation.datum_offset_m, strict=True)]
 
 
-def _write_scan(cloud: Cloud, trajectory: Trajectory, folder: Path) -> None:
-    """Write the cloud and the trajectory, both in the frame of the block."""
-    clouds.write_cloud(cloud, folder / CLOUD)
-    write_flight_csv(records_of(trajectory, TRAJECTORY), folder / TRAJECTORY)
-
-
 def _scanner_rows(scanner: Scanner, errors: StripErrors) -> list[tuple[str, float]]:
-    """parameter, value of the scanner, as the result tables name them; of its calibration what is not zero."""
+    """Table parameter, value of the scanner, with labels of the result tables; calibration values that are not zero."""
     angles = zip(("right", "forward", "up"), np.degrees(scanner.boresight), strict=True)
     rows = [(f"scanner.boresight_{axis}_deg", float(v)) for axis, v in angles]
     for name, shift in scanner.shifts.items():
@@ -114,13 +106,13 @@ def _scanner_rows(scanner: Scanner, errors: StripErrors) -> list[tuple[str, floa
 
 
 def _in_degrees(parameters: AbstractParameters, owner: str) -> list[tuple[str, float]]:
-    """parameter, value of declared parameters, angles in degrees."""
+    """Table parameter, value of declared parameters, angles in degrees."""
     pairs = zip(parameters.labels(owner), numbers_of(parameters), strict=True)
     return [(name.replace("_rad", "_deg"), float(np.degrees(v) if "_rad" in name else v)) for name, v in pairs]
 
 
 def _drift_table(errors: StripErrors, strips: Sequence[str]) -> pd.DataFrame:
-    """strip, time_s, X_m ... right_deg ...: what the trajectory is off by at the knots of its splines."""
+    """Table strip, time_s, X_m ... right_deg ...: errors of the trajectory at the knots of its splines."""
     of = np.repeat(np.array(strips, object), [s.size for s in errors.splines])
     time = np.concatenate([s.times for s in errors.splines])
     values = np.column_stack([errors.position, np.rad2deg(errors.attitude)])

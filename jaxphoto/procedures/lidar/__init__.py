@@ -6,7 +6,7 @@ from jaxphoto.procedures.lidar.kept_returns import kept_returns
 from jaxphoto.procedures.lidar.photographs import Photographs
 from jaxphoto.procedures.lidar.roof_control import RoofControl, roof_control
 from jaxphoto.procedures.lidar.strip_adjustment import StripAdjustment, StripDifference, StripRound, adjust_strips
-from jaxphoto.procedures.lidar.strip_unknowns import ScannerPriors
+from jaxphoto.procedures.lidar.strip_model import ScannerPriors
 from jaxphoto.procedures.lidar.vertical_control import LidarControl, lidar_control
 
 __all__ = [

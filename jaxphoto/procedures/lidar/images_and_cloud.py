@@ -36,21 +36,20 @@ from jaxphoto.lidar.correction import (
     scanner_poses,
 )
 from jaxphoto.lidar.coverage import check_covered
-from jaxphoto.lidar.heights import Method
-from jaxphoto.lidar.tangent_planes import TangentPlanes, tangent_planes
+from jaxphoto.lidar.heights import Method, TangentPlanes, tangent_planes
 from jaxphoto.observations import SurfaceRows
 from jaxphoto.procedures.lidar.iterate_to_convergence import (
     MAX_ROUNDS,
     Round,
-    SeenByCloud,
+    SurfaceAtPoints,
+    adjust_with_fixed_interior,
     at_result,
     check_without_surfaces,
     iterate_to_convergence,
     with_common_error,
-    with_interior_held,
 )
 from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
-from jaxphoto.procedures.lidar.vertical_control import nothing_seen, tie_points
+from jaxphoto.procedures.lidar.vertical_control import no_surface_error, tie_points
 from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics import Covariance
 from jaxphoto.unknowns import FIXED, FREE, Weighted
@@ -86,7 +85,7 @@ class Simultaneous(eqx.Module):
     moved_cloud: Float[np.ndarray, "3"]
     """Root mean square motion (m) of the laser points along X, Y and Z."""
     rounds: tuple[Round, ...]
-    still: bool
+    converged: bool
     """True if the iteration converged."""
 
 
@@ -134,14 +133,14 @@ def simultaneous(
     priors = Scanner(priors.boresight, {name: priors.shifts[name] for name in names})
     if priors.boresight != FIXED and not timed:
         raise InputError(
-            "the boresight of the scanner needs its trajectory and the time of each laser point, which say from where "
-            "a point was measured: give them, or fix the boresight"
+            "the boresight of the scanner needs its trajectory and the time of each laser point, from which "
+            "points were measured: give them, or fix the boresight"
         )
     check_without_surfaces(block)
     if timed:
         check_covered(cloud, trajectory)  # type: ignore[arg-type]
     which = tie_points(block, points)
-    first = with_interior_held(block)
+    first = adjust_with_fixed_interior(block)
     path = scanner_path(trajectory) if timed else None  # type: ignore[arg-type]
     for sentence in [] if path is None else check_measured_from(cloud, path):
         warnings.warn(sentence, UserWarning, stacklevel=2)
@@ -152,16 +151,18 @@ def simultaneous(
     def planes(adjusted: Adjustment) -> list[tuple[TangentPlanes, ScannerPoses | None]]:
         scanner = adjusted.unknowns.scanner or none
         xy = np.asarray(adjusted.unknowns.points)[which, :2]
-        found = []
+        result = []
         for of, shift in zip(strips, scanner.shifts.values(), strict=True):
             near, poses = _near(of, xy, scanner.boresight, shift, settings)
             index_of = tangent_planes(index_cloud(near), xy, method, settings)
-            found.append((index_of, None if poses is None else jax.tree.map(lambda v, k=index_of.nearest: v[k], poses)))
-        return found
+            result.append(
+                (index_of, None if poses is None else jax.tree.map(lambda v, k=index_of.nearest: v[k], poses))
+            )
+        return result
 
     last: dict[str, Any] = {}
 
-    def look(adjusted: Adjustment) -> SeenByCloud:
+    def look(adjusted: Adjustment) -> SurfaceAtPoints:
         last["planes"] = planes(adjusted)
         foot, normal, sigma, flag = (
             np.concatenate([getattr(p, name) for p, _ in last["planes"]])
@@ -170,54 +171,44 @@ def simultaneous(
         usable = np.isfinite(foot).all(axis=1)
         sigma = with_common_error(sigma, usable, settings.sigma_systematic_m)
         if not usable.any():
-            raise nothing_seen(np.asarray(adjusted.unknowns.points)[which], cloud.xyz, flag)
-        return SeenByCloud(np.tile(which, len(names)), foot, normal, sigma, usable)
+            raise no_surface_error(np.asarray(adjusted.unknowns.points)[which], cloud.xyz, flag)
+        return SurfaceAtPoints(np.tile(which, len(names)), foot, normal, sigma, usable)
 
-    def build(adjusted: Adjustment, known: Covariance, seen: SeenByCloud, used: np.ndarray) -> Block:
+    def build(adjusted: Adjustment, cov: Covariance, surface: SurfaceAtPoints, used: np.ndarray) -> Block:
         scanner = adjusted.unknowns.scanner or none
-        last["turn"] = _turns(seen, strip, [poses for _, poses in last["planes"]])
-        rows = _surface_rows(seen, used, strip, last["turn"], scanner)
+        last["turn"] = _turns(surface, strip, [poses for _, poses in last["planes"]])
+        rows = _surface_rows(surface, used, strip, last["turn"], scanner)
         unknowns = dataclasses.replace(adjusted.unknowns, scanner=scanner)
         posed = dataclasses.replace(block, surfaces=rows, priors=dataclasses.replace(block.priors, scanner=priors))
         return at_result(posed, unknowns)
 
-    def carry(seen: SeenByCloud, before: Adjustment, now: Adjustment) -> SeenByCloud:
+    def carry(surface: SurfaceAtPoints, before: Adjustment, now: Adjustment) -> SurfaceAtPoints:
         old, new = before.unknowns.scanner or none, now.unknowns.scanner or none
         shift = np.stack([np.asarray(new.shifts[name]) - np.asarray(old.shifts[name]) for name in names])[strip]
         raised = last["turn"] @ (np.asarray(new.boresight) - np.asarray(old.boresight))
-        return seen._replace(foot=seen.foot - shift - raised[:, None] * seen.normal)
+        return surface._replace(foot=surface.foot - shift - raised[:, None] * surface.normal)
 
-    found = iterate_to_convergence(first, look, build, max_rounds, report, "surfaces", carry)
-    scanner = found.adjusted.unknowns.scanner
+    result = iterate_to_convergence(first, look, build, max_rounds, report, "surfaces", carry)
+    scanner = result.adjusted.unknowns.scanner
     assert scanner is not None
-    corrected, used = correct_cloud(cloud, scanner, path), found.used
-    after = look(found.adjusted)
+    corrected, used = correct_cloud(cloud, scanner, path), result.used
+    after = look(result.adjusted)
     return Simultaneous(
-        first,
-        found.adjusted,
-        corrected,
-        correct_trajectory(trajectory, cloud, scanner) if trajectory is not None else None,
-        scanner,
-        found.seen.point[used],
-        strip[used],
-        found.before.apart(first)[used],
-        after.apart(found.adjusted)[used],
-        np.sqrt(((corrected.xyz - cloud.xyz) ** 2).mean(axis=0)),
-        found.rounds,
-        found.still,
-    )
+        first, result.adjusted, corrected,
+        correct_trajectory(trajectory, cloud, scanner) if trajectory is not None else None, scanner,
+        result.seen.point[used], strip[used], result.before.apart(first)[used], after.apart(result.adjusted)[used],
+        np.sqrt(((corrected.xyz - cloud.xyz) ** 2).mean(axis=0)), result.rounds, result.converged,
+    )  # fmt: skip
 
 
 def _strips(cloud: Cloud, names: tuple[str, ...], path: ScannerPath | None) -> list[_Strip]:
     """Split the cloud by strip."""
     strips = []
     for k, name in enumerate(names):
-        own = cloud if cloud.strip is None else cloud.take(np.flatnonzero(cloud.strip == k))
-        if not len(own):
-            raise InputError(
-                f"strip {name} of the cloud has no points: leave it out, or read other classes and returns"
-            )
-        strips.append(_Strip(own, index_cloud(own.xyz), path))
+        returns = cloud if cloud.strip is None else cloud.take(np.flatnonzero(cloud.strip == k))
+        if not len(returns):
+            raise InputError(f"strip {name} of the cloud has no points: omit it, or read other classes and returns")
+        strips.append(_Strip(returns, index_cloud(returns.xyz), path))
     return strips
 
 
@@ -231,44 +222,46 @@ def _near(
     """Return the corrected laser points that the surface at some places can depend on, and their scanner poses."""
 
     def corrected(index: Int[np.ndarray, "m"]) -> tuple[Cloud, ScannerPoses | None]:
-        own = strip.cloud.take(index)
-        timed = strip.path is not None and own.time is not None
-        poses = scanner_poses(strip.path, own.time) if timed else None  # type: ignore[arg-type]
-        return dataclasses.replace(own, xyz=corrected_xyz(own.xyz, poses, boresight, shift)), poses
+        returns = strip.cloud.take(index)
+        timed = strip.path is not None and returns.time is not None
+        poses = scanner_poses(strip.path, returns.time) if timed else None  # type: ignore[arg-type]
+        return dataclasses.replace(returns, xyz=corrected_xyz(returns.xyz, poses, boresight, shift)), poses
 
     order = np.asarray(strip.grid.order)
     # Places in the measured cloud: displaced like the laser points there.
     one = order[nearest(strip.grid, xy, 1).index[:, 0]]
-    off = strip.cloud.xyz[one, :2] - corrected(one)[0].xyz[:, :2]
+    offset = strip.cloud.xyz[one, :2] - corrected(one)[0].xyz[:, :2]
     enough = min(max(_NEAR, _TIMES * settings.points), len(strip.cloud))
-    return corrected(np.unique(order[nearest(strip.grid, xy + off, enough).index]))
+    return corrected(np.unique(order[nearest(strip.grid, xy + offset, enough).index]))
 
 
 def _turns(
-    seen: SeenByCloud, strip: Int[np.ndarray, "rows"], poses: list[ScannerPoses | None]
+    surface: SurfaceAtPoints, strip: Int[np.ndarray, "rows"], poses: list[ScannerPoses | None]
 ) -> Float[np.ndarray, "rows 3"]:
     """Return `SurfaceRows.turn` of every row, used or not: an equal number in every iteration."""
-    turn = np.zeros_like(seen.foot)
+    turn = np.zeros_like(surface.foot)
     for k, one in enumerate(poses):
-        own = strip == k
         if one is not None:
-            rows = seen.foot[own], seen.normal[own], one.position, one.object_from_body
-            turn[own] = in_portions(_raised, rows)
+            mask = strip == k
+            rows = surface.foot[mask], surface.normal[mask], one.position, one.object_from_body
+            turn[mask] = in_portions(_raised, rows)
     return turn
 
 
 def _surface_rows(
-    seen: SeenByCloud,
+    surface: SurfaceAtPoints,
     used: Bool[np.ndarray, "rows"],
     strip: Int[np.ndarray, "rows"],
     turn: Float[np.ndarray, "rows 3"],
     scanner: Scanner,
 ) -> SurfaceRows:
     """Return observations by the measured cloud: linear in shift and boresight about those of `scanner`."""
-    of, turn, foot, normal = strip[used], turn[used], seen.foot[used], seen.normal[used]
+    of, turn, foot, normal = strip[used], turn[used], surface.foot[used], surface.normal[used]
     shift = np.stack([np.asarray(v) for v in scanner.shifts.values()])[of]
     raised = turn @ np.asarray(scanner.boresight)
-    return SurfaceRows(seen.point[used], of, foot + shift + raised[:, None] * normal, normal, turn, seen.sigma[used])
+    return SurfaceRows(
+        surface.point[used], of, foot + shift + raised[:, None] * normal, normal, turn, surface.sigma[used]
+    )
 
 
 _raised = eqx.filter_jit(jax.vmap(raised_by_boresight))

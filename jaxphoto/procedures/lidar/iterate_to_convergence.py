@@ -18,7 +18,7 @@ from jaxphoto.statistics import LEAST_CHECKED, Covariance, angle_differences, co
 from jaxphoto.unknowns import FIXED, Unknowns
 
 MAX_ROUNDS = 20
-STILL = 0.1
+CHANGE_LIMIT = 0.1
 """Converged if no unknown moves by more than this fraction of its standard deviation.
 
 Smaller limits may never be reached: with each motion some laser point becomes a neighbour, and another ceases to be.
@@ -55,7 +55,7 @@ class Round(NamedTuple):
     """Of the distances between the observed points and the surface, after the adjustment."""
 
 
-class SeenByCloud(NamedTuple):
+class SurfaceAtPoints(NamedTuple):
     """Surface at points: one row per candidate, in an order that stays from iteration to iteration."""
 
     point: Int[np.ndarray, "rows"]
@@ -74,44 +74,44 @@ class SeenByCloud(NamedTuple):
 class Observed(NamedTuple):
     """Last iteration: its adjustment, surface, and used observations."""
 
-    before: SeenByCloud
+    before: SurfaceAtPoints
     """Surface at the first iteration."""
     adjusted: Adjustment
     covariance: Covariance
-    seen: SeenByCloud
+    seen: SurfaceAtPoints
     used: Bool[np.ndarray, "rows"]
     rounds: tuple[Round, ...]
-    still: bool
+    converged: bool
     """True if converged."""
 
 
-Look = Callable[[Adjustment], SeenByCloud]
-Carry = Callable[[SeenByCloud, Adjustment, Adjustment], SeenByCloud]
-Build = Callable[[Adjustment, Covariance, SeenByCloud, Bool[np.ndarray, "rows"]], Block]
+Look = Callable[[Adjustment], SurfaceAtPoints]
+Carry = Callable[[SurfaceAtPoints, Adjustment, Adjustment], SurfaceAtPoints]
+Build = Callable[[Adjustment, Covariance, SurfaceAtPoints, Bool[np.ndarray, "rows"]], Block]
 
 
-def with_interior_held(block: Block) -> Adjustment:
+def adjust_with_fixed_interior(block: Block) -> Adjustment:
     """Adjust `block` with fixed interior orientation, for the positions of its points.
 
     If its datum is open or nearly so, as that of a strip with collinear stations, exterior orientation is fixed at its
     start values from direct georeferencing: the cloud may close the datum. Raises what `adjust` raises, and BlockError
     if it does not converge.
     """
-    held = interior_held(block).priors
+    held = fix_interior(block).priors
     try:
-        found = adjust(block, priors=held)
-        placed = bool(found.converged)
+        adjusted = adjust(block, priors=held)
+        placed = bool(adjusted.converged)
     except (DatumError, RankError):
         placed = False
     if not placed:
         exterior = ExteriorOrientation(FIXED, FIXED)  # type: ignore[arg-type]
-        found = adjust(block, priors=dataclasses.replace(held, exterior=exterior))
-    if not bool(found.converged):
-        raise BlockError(f"the block by itself, its interior orientation held, is {found.outcome.value}")
-    return found
+        adjusted = adjust(block, priors=dataclasses.replace(held, exterior=exterior))
+    if not bool(adjusted.converged):
+        raise BlockError(f"the block alone, with fixed interior orientation, is {adjusted.outcome.value}")
+    return adjusted
 
 
-def interior_held(block: Block) -> Block:
+def fix_interior(block: Block) -> Block:
     """Fix the interior orientation of `block`."""
     interior = jax.tree.map(lambda _: FIXED, block.start.unknowns.interior)
     return dataclasses.replace(block, priors=dataclasses.replace(block.priors, interior=interior))
@@ -143,7 +143,7 @@ def iterate_to_convergence(
     max_rounds: int,
     report: Callable[[Round], None],
     group: Literal["control_points", "surfaces"],
-    carry: Carry = lambda seen, before, now: seen,
+    carry: Carry = lambda surface, before, now: surface,
 ) -> Observed:
     """Iterate `look` at the cloud, `build` a block with the result, adjust; from `first` on, to convergence.
 
@@ -154,69 +154,69 @@ def iterate_to_convergence(
 
     Raises BlockError if the cloud does not lie where the points are.
     """
-    adjusted, known, fits = first, covariance(first), np.array(True)
+    adjusted, cov, fits = first, covariance(first), np.array(True)
     before, at_first = first, look(first)
-    seen = at_first
-    _check_heights(first, seen)
+    surface = at_first
+    _check_heights(first, surface)
     rounds: list[Round] = []
     while True:
-        used = seen.usable & fits
-        block = build(adjusted, known, seen, used)
+        used = surface.usable & fits
+        block = build(adjusted, cov, surface, used)
         new = adjust(block, block.start.unknowns)
         now = covariance(new)
         moved = np.asarray(new.unknowns.points) - np.asarray(adjusted.unknowns.points)
         change = _change(adjusted, new, now)
-        apart = seen.apart(new)[used]
+        apart = surface.apart(new)[used]
         rounds.append(
             Round(
                 len(rounds) + 1,
                 int(used.sum()),
-                int((seen.usable & ~used).sum()),
+                int((surface.usable & ~used).sum()),
                 float(np.sqrt((moved**2).sum(axis=1).mean())),
                 change,
                 float(np.sqrt((apart**2).mean())) if len(apart) else np.nan,
             )
         )
         report(rounds[-1])
-        before, adjusted, known = adjusted, new, now
-        still = len(rounds) > _JUDGED and change < STILL and bool(new.converged)
-        if still or len(rounds) >= max_rounds:
-            _check_used(seen, used)
+        before, adjusted, cov = adjusted, new, now
+        converged = len(rounds) > _JUDGED and change < CHANGE_LIMIT and bool(new.converged)
+        if converged or len(rounds) >= max_rounds:
+            _check_used(surface, used)
             _warn_of_scale(first, new)
-            return Observed(at_first, adjusted, known, seen, used, tuple(rounds), still)
+            return Observed(at_first, adjusted, cov, surface, used, tuple(rounds), converged)
         if len(rounds) >= _JUDGED:
             # In later iterations rejected observations stay rejected, to avoid alternation.
-            fits = _fit(seen, adjusted, known, used, group) & (fits if len(rounds) >= _SETTLED else True)
+            fits = _fit(surface, adjusted, cov, used, group) & (fits if len(rounds) >= _SETTLED else True)
         if len(rounds) < _SETTLED:
-            seen = look(adjusted)
+            surface = look(adjusted)
             continue
-        seen = carry(seen, before, adjusted)
+        surface = carry(surface, before, adjusted)
         if len(rounds) < _LAST_LOOK:
-            seen = _kept(seen, look(adjusted), adjusted)
+            surface = _keep_similar(surface, look(adjusted), adjusted)
 
 
 def at_result(block: Block, unknowns: Unknowns) -> Block:
     """Return `block` with an adjustment's unknowns as start values."""
-    known = Start(unknowns, np.ones(len(block.images), bool), np.ones(len(block.points), bool))
-    return dataclasses.replace(block, start=known)
+    start = Start(unknowns, np.ones(len(block.images), bool), np.ones(len(block.points), bool))
+    return dataclasses.replace(block, start=start)
 
 
-def _check_heights(first: Adjustment, seen: SeenByCloud) -> None:
+def _check_heights(first: Adjustment, surface: SurfaceAtPoints) -> None:
     """Raise BlockError if the distance of the cloud from the points exceeds any error of the principal distance."""
-    apart = seen.apart(first)[seen.usable]
+    apart = surface.apart(first)[surface.usable]
     camera = float(np.mean(np.asarray(first.unknowns.exterior.position)[:, 2]))
-    off, height = (float(np.median(v)) for v in (apart, camera - seen.foot[seen.usable, 2]))
-    if abs(off) > _FAR * abs(height):
+    offset, height = (float(np.median(v)) for v in (apart, camera - surface.foot[surface.usable, 2]))
+    if abs(offset) > _FAR * abs(height):
         raise BlockError(
-            f"the cloud lies {abs(off):.0f} m {'below' if off > 0 else 'above'} where the block puts its points, with "
-            f"the cameras {height:.0f} m over the cloud: its heights may count in feet or belong to another vertical "
-            "system, or the principal distance that the block begins with is wrong"
+            f"the cloud lies {abs(offset):.0f} m {'below' if offset > 0 else 'above'} where the block puts its points, "
+            f"with the cameras {height:.0f} m over the cloud: its heights may count in feet or belong to another "
+            "vertical system, or the principal distance that the block begins with is wrong"
         )
 
 
-def _check_used(seen: SeenByCloud, used: Bool[np.ndarray, "rows"]) -> None:
+def _check_used(surface: SurfaceAtPoints, used: Bool[np.ndarray, "rows"]) -> None:
     """Raise BlockError if the block contradicts the cloud at most points."""
-    n, most = int(used.sum()), int(seen.usable.sum())
+    n, most = int(used.sum()), int(surface.usable.sum())
     if n < max(1.0, _BORNE_OUT * most):
         raise BlockError(
             f"the block bears out only {n} of {most} observations of the cloud: check that cloud and block are in one "
@@ -224,50 +224,50 @@ def _check_used(seen: SeenByCloud, used: Bool[np.ndarray, "rows"]) -> None:
         )
 
 
-def _warn_of_scale(first: Adjustment, found: Adjustment) -> None:
+def _warn_of_scale(first: Adjustment, adjusted: Adjustment) -> None:
     """Warn if the heights imply a principal distance that differs from any laboratory value."""
-    for name, interior in found.unknowns.interior.items():
+    for name, interior in adjusted.unknowns.interior.items():
         before, after = float(first.unknowns.interior[name].c), float(interior.c)
         if abs(after - before) > _UNUSUAL * abs(before):
             warnings.warn(
-                f"the principal distance of {name} became {after:.3f} mm from {before:.3f} mm, which is much: heights "
-                "of another vertical system than that of the stations would do this",
+                f"the principal distance of {name} became {after:.3f} mm from {before:.3f} mm, an unusual change: "
+                "heights may be of another vertical system than the stations",
                 UserWarning,
                 stacklevel=4,
             )
 
 
-def _kept(old: SeenByCloud, new: SeenByCloud, adjusted: Adjustment) -> SeenByCloud:
+def _keep_similar(old: SurfaceAtPoints, new: SurfaceAtPoints, adjusted: Adjustment) -> SurfaceAtPoints:
     """Keep old observations that hardly differ from the new ones."""
     same = np.abs(old.apart(adjusted) - new.apart(adjusted)) < _SAME * new.sigma
     chosen = (np.where(same[:, None] if v.ndim > 1 else same, u, v) for u, v in zip(old[1:], new[1:], strict=True))
-    return SeenByCloud(new.point, *chosen)
+    return SurfaceAtPoints(new.point, *chosen)
 
 
 def _fit(
-    seen: SeenByCloud, adjusted: Adjustment, known: Covariance, used: Bool[np.ndarray, "rows"], group: str
+    surface: SurfaceAtPoints, adjusted: Adjustment, cov: Covariance, used: Bool[np.ndarray, "rows"], group: str
 ) -> Bool[np.ndarray, "rows"]:
     """Return which observations are consistent with the others."""
     # Used ones, by their normalised residuals: those of the lidar are the last of their group.
-    numbers, residuals = redundancy_numbers(adjusted, known), adjusted.residuals
+    numbers, residuals = redundancy_numbers(adjusted, cov), adjusted.residuals
     # A group without rows has no residuals.
     none = np.zeros(0)
     v, r = (np.asarray(of.named.get(group, none)) for of in (residuals, numbers))
     v, r = (of_group[len(of_group) - int(used.sum()) :] for of_group in (v, r))
     # Others, relative to the adjusted positions.
-    points = np.einsum("ni,nij,nj->n", seen.normal, np.asarray(known.points)[seen.point], seen.normal)
-    w = np.where(seen.usable, np.abs(seen.apart(adjusted)) / np.sqrt(seen.sigma**2 + points), 0.0)
+    points = np.einsum("ni,nij,nj->n", surface.normal, np.asarray(cov.points)[surface.point], surface.normal)
+    w = np.where(surface.usable, np.abs(surface.apart(adjusted)) / np.sqrt(surface.sigma**2 + points), 0.0)
     w[used] = np.abs(v) / np.sqrt(np.maximum(r, LEAST_CHECKED))
     # The largest first: they affect the others.
     limit = _OUTLIER * max(1.0, float(adjusted.sigma0))
     return w <= max(limit, _LARGEST * w.max(initial=0.0))
 
 
-def _change(old: Adjustment, new: Adjustment, known: Covariance) -> float:
+def _change(old: Adjustment, new: Adjustment, cov: Covariance) -> float:
     """Return the largest change of a free interior or exterior orientation, in standard deviations."""
     if old.structure.labels != new.structure.labels:
         return np.inf
-    sigma = np.sqrt(np.maximum(np.asarray(known.matrix).diagonal(), 0.0))
+    sigma = np.sqrt(np.maximum(np.asarray(cov.matrix).diagonal(), 0.0))
     moved = np.asarray(new.unknowns.exterior.position) - np.asarray(old.unknowns.exterior.position)
     exterior = np.column_stack([moved, angle_differences(new, old)[1]]).ravel()
     free = new.structure.free

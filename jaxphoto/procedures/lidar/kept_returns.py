@@ -13,12 +13,9 @@ from jaxtyping import Bool, Float, Int
 
 from jaxphoto.cloud import Cloud
 from jaxphoto.georeferencing import Pattern
-from jaxphoto.lidar.cell_returns import CellReturns, CellTally, cells_of
 from jaxphoto.lidar.correction import ScannerPath
-from jaxphoto.lidar.corresponding_planes import corresponding, planes_from
-from jaxphoto.lidar.strip_settings import StripSettings
-from jaxphoto.procedures.lidar.looks import Look, looks_of
-from jaxphoto.procedures.lidar.strip_rows import thinned
+from jaxphoto.lidar.strip_planes import CellReturns, CellTally, StripSettings, cells_of, corresponding, planes_from
+from jaxphoto.procedures.lidar.strip_model import Look, looks_of, thinned
 
 KEPT = 10_000_000
 """Returns in memory: about a gigabyte with the search, and far more than 4,000 planes need."""
@@ -84,16 +81,16 @@ class _Passed:
 
     def returns(self, part: Cloud, cells: dict[str, Int[np.ndarray, "cells"]]) -> Bool[np.ndarray, "n"]:
         """Return the returns of a part in `cells`; and of each strip the first and last, the ends of its splines."""
-        kept = np.zeros(len(part), bool)
+        selected = np.zeros(len(part), bool)
         for look in self._looks(part):
-            own = look.returns
-            kept[own] = np.isin(cells_of(part.xyz[own], self.settings), cells[look.name])
+            own_returns = look.returns
+            selected[own_returns] = np.isin(cells_of(part.xyz[own_returns], self.settings), cells[look.name])
             if part.time is None:
                 # Without times, an adjustment needs only the extents of strips.
-                kept[own[:1]] = True
+                selected[own_returns[:1]] = True
             else:
-                kept[own] |= np.isin(part.time[own], self._spans[look.strip])
-        return kept
+                selected[own_returns] |= np.isin(part.time[own_returns], self._spans[look.strip])
+        return selected
 
     def _looks(self, part: Cloud) -> list[Look]:
         path = self.path if part.time is not None else None
@@ -110,20 +107,20 @@ def _chosen(
     """Return the cells of each look whose returns are kept, at most `most`; those in `always`, and others."""
     most -= _number(looks, always)
     part, room = 1.0, _ABOUT_POINTS * most
-    while (kept := _number(looks, about := _about(looks, places, part, settings))) > room and part > _LEAST:
+    while (n_about := _number(looks, about := _about(looks, places, part, settings))) > room and part > _LEAST:
         part *= _LESS
-    most -= kept
+    most -= n_about
     planes = {name: planes_from(cells, settings) for name, cells in looks.items()}
     pairs = [(a, b, corresponding(planes[a], planes[b], settings)) for a, b in combinations(looks, 2)]
     part = 1.0
     while True:
         chosen: dict[str, list[np.ndarray]] = {name: [about[name], always[name]] for name in looks}
-        for a, b, found in pairs:
-            share = max(_FEWEST, round(part * len(found.cell)))
-            own = found.cell[thinned(found.normal, found.cell, share)]
-            chosen[a].append(own)
-            chosen[b].append(own)
-        cells = {name: np.unique(np.concatenate(own)) for name, own in chosen.items()}
+        for a, b, pairs_of in pairs:
+            share = max(_FEWEST, round(part * len(pairs_of.cell)))
+            cells_of_pair = pairs_of.cell[thinned(pairs_of.normal, pairs_of.cell, share)]
+            chosen[a].append(cells_of_pair)
+            chosen[b].append(cells_of_pair)
+        cells = {name: np.unique(np.concatenate(cells_of_pair)) for name, cells_of_pair in chosen.items()}
         if _number(looks, cells) <= most or part * max((len(f.cell) for *_, f in pairs), default=0) < _FEWEST:
             return cells
         part *= _LESS
@@ -137,11 +134,12 @@ def _about(
     some = places[np.linspace(0, len(places) - 1, number).astype(int)] if len(places) else places
     beside = [np.array([x, y, 0.0]) * settings.cell_m for x in (-1, 0, 1) for y in (-1, 0, 1)]
     cells = np.unique(np.concatenate([cells_of(some + step, settings) for step in beside]))
-    return {name: np.intersect1d(cells, own.cell, assume_unique=True) for name, own in looks.items()}
+    return {name: np.intersect1d(cells, look_cells.cell, assume_unique=True) for name, look_cells in looks.items()}
 
 
 def _number(looks: dict[str, CellReturns], cells: dict[str, Int[np.ndarray, "cells"]]) -> int:
     """Return the number of returns in cells of the looks."""
     return sum(
-        int(own.returns[np.isin(own.cell, cells[name], assume_unique=True)].sum()) for name, own in looks.items()
+        int(look_cells.returns[np.isin(look_cells.cell, cells[name], assume_unique=True)].sum())
+        for name, look_cells in looks.items()
     )

@@ -13,7 +13,7 @@ from jaxphoto.georeferencing import StripSpline, Trajectory
 from jaxphoto.georeferencing.time_scales import looks_like, shift_that_fits
 from jaxphoto.lidar.correction import scanner_path, scanner_poses
 from jaxphoto.lidar.coverage import CoveredTimes
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.observations import Attitudes, CameraPositions, StripPlanes, TrajectoryAttitudes, TrajectoryStations
 from jaxphoto.procedures.lidar.iterate_to_convergence import check_without_surfaces
 
@@ -62,28 +62,28 @@ def check_photographs(photographs: Photographs, trajectory: Trajectory | None) -
             "the block has no stations, which the trajectory gives the exposures: add [trajectory] to block.toml, or "
             "stations.csv"
         )
-    known = np.asarray(trajectory.time)
-    outside = np.flatnonzero((time < known[0]) | (time > known[-1]))
+    times = np.asarray(trajectory.time)
+    outside = np.flatnonzero((time < times[0]) | (time > times[-1]))
     if len(outside):
-        shift = shift_that_fits(time, known[0], known[-1])
+        shift = shift_that_fits(time, times[0], times[-1])
         on_its_clock = "on its clock (--exposure-shift-s)"
         if shift is not None:
             on_its_clock = f"{shift:+.15g} s later, which brings all of them into it (--exposure-shift-s)"
         raise BlockError(
             f"image {block.images[outside[0]]} was exposed at {time[outside[0]]:.3f} s, where the trajectory has no "
-            f"records: the exposures are at {looks_like(time)}, the trajectory at {looks_like(known)}; give the "
+            f"records: the exposures are at {looks_like(time)}, the trajectory at {looks_like(times)}; give the "
             f"trajectory of the whole flight, or the exposures {on_its_clock}"
         )
     for k in np.flatnonzero(~CoveredTimes(trajectory).covers(time)):
-        before, after = known[known <= time[k]][-1], known[known >= time[k]][0]
+        before, after = times[times <= time[k]][-1], times[times >= time[k]][0]
         raise BlockError(
             f"image {block.images[k]} was exposed at {time[k]:.3f} s, in a gap of the trajectory from {before:.3f} to "
             f"{after:.3f} s: give the trajectory with the records of this time, or the block without this image"
         )
     rows = block.stations
     at = scanner_poses(scanner_path(trajectory), time[rows.who]).position
-    off = np.asarray(rows.value) - at[np.arange(len(rows)), rows.axis]
-    apart = float(np.median(np.sqrt(np.bincount(rows.who, off**2)[np.unique(rows.who)])))
+    offset = np.asarray(rows.value) - at[np.arange(len(rows)), rows.axis]
+    apart = float(np.median(np.sqrt(np.bincount(rows.who, offset**2)[np.unique(rows.who)])))
     if apart > _FAR_M:
         raise BlockError(
             f"the stations of the block lie {apart:.0f} m from where the trajectory is at their times: bring "
@@ -96,8 +96,8 @@ def spans_with(
 ) -> Float[np.ndarray, "strips 2"]:
     """Return first and last times of strips (s) including the exposures on their trajectories."""
     strip = _strip_of(time, spans)
-    own = [np.append(time[strip == k], span) for k, span in enumerate(spans)]
-    return np.array([(t.min(), t.max()) for t in own])
+    times_of_strip = [np.append(time[strip == k], span) for k, span in enumerate(spans)]
+    return np.array([(t.min(), t.max()) for t in times_of_strip])
 
 
 def on_trajectory(
@@ -113,8 +113,8 @@ def on_trajectory(
     block, time = photographs.block, photographs.time
     strip, knots, weights = _strip_of(time, spans), np.zeros((len(time), 4), int), np.zeros((len(time), 4))
     for k, spline in enumerate(splines):
-        own = strip == k
-        knots[own], weights[own] = spline.weights(time[own])
+        in_strip = strip == k
+        knots[in_strip], weights[in_strip] = spline.weights(time[in_strip])
     s, a = block.stations, block.attitudes
     sigma, turn = np.full(len(s), settings.sigma_exposure_m), np.deg2rad(settings.sigma_exposure_deg)
     position = TrajectoryStations(s.who, knots[s.who], weights[s.who], s.axis, np.asarray(s.value), sigma)
@@ -122,11 +122,7 @@ def on_trajectory(
     attitude = TrajectoryAttitudes(a.image, knots[a.image], weights[a.image], angles, np.full(angles.shape, turn))
     more = (*block.more, position, *([attitude] if len(attitude) else []))
     return dataclasses.replace(
-        block,
-        stations=CameraPositions.none(),
-        attitudes=Attitudes.none(),
-        breaklines=photographs.breaklines,
-        more=more,
+        block, stations=CameraPositions.none(), attitudes=Attitudes.none(), breaklines=photographs.breaklines, more=more
     )
 
 

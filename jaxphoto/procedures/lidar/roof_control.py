@@ -19,13 +19,12 @@ from jaxphoto.block import Block
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.lidar import HeightSettings
-from jaxphoto.lidar.planes import plane_feet
-from jaxphoto.lidar.roofs import Patch, planar_patches, roof_centroid
+from jaxphoto.lidar.planes import Patch, planar_patches, plane_feet, roof_centroid
 from jaxphoto.observations import ControlCoordinates, SurfaceRows
 from jaxphoto.procedures.lidar.iterate_to_convergence import (
     MAX_ROUNDS,
     Round,
-    SeenByCloud,
+    SurfaceAtPoints,
     at_result,
     check_without_surfaces,
     iterate_to_convergence,
@@ -56,7 +55,7 @@ class RoofControl(eqx.Module):
     faces: int
     """Number of roof faces with a tie point."""
     rounds: tuple[Round, ...]
-    still: bool
+    converged: bool
     """True if the iteration converged."""
 
 
@@ -94,7 +93,7 @@ def roof_control(
     of_heights = heights.block.control.take(np.arange(len(block.control.who), len(heights.block.control.who)))
     chosen = np.full(len(which), -1)
 
-    def look(adjusted: Adjustment) -> SeenByCloud:
+    def look(adjusted: Adjustment) -> SurfaceAtPoints:
         xyz = np.asarray(adjusted.unknowns.points)[which]
         chosen[:] = _faces(xyz[:, :2], patches, margin)
         if not (chosen >= 0).any() and not len(middles):
@@ -104,40 +103,41 @@ def roof_control(
             )
         foot, normal, sigma = np.full((len(which), 3), np.nan), np.full((len(which), 3), np.nan), np.ones(len(which))
         for k in np.unique(chosen[chosen >= 0]):
-            own = chosen == k
-            foot[own], normal[own], of_plane = plane_feet(patches[k].plane, xyz[own])
+            members = chosen == k
+            foot[members], normal[members], of_plane = plane_feet(patches[k].plane, xyz[members])
             # The error of a plane is common to its points.
-            sigma[own] = of_plane * np.sqrt(own.sum())
+            sigma[members] = of_plane * np.sqrt(members.sum())
         # A yard between wings of a house lies within the outline of its roof, too.
-        off = np.einsum("nk,nk->n", normal, xyz - foot)
-        chosen[~(np.abs(off) < _STOREY)] = -1
-        return SeenByCloud(which, foot, normal, sigma, chosen >= 0)
+        distance = np.einsum("nk,nk->n", normal, xyz - foot)
+        chosen[~(np.abs(distance) < _STOREY)] = -1
+        return SurfaceAtPoints(which, foot, normal, sigma, chosen >= 0)
 
-    def build(adjusted: Adjustment, known: Covariance, seen: SeenByCloud, used: Bool[np.ndarray, "rows"]) -> Block:
-        n, own = int(used.sum()), np.concatenate([which[used], middles])
-        others = of_heights.take(~np.isin(of_heights.who, own))
+    def build(adjusted: Adjustment, cov: Covariance, surface: SurfaceAtPoints, used: Bool[np.ndarray, "rows"]) -> Block:
+        n, observed = int(used.sum()), np.concatenate([which[used], middles])
+        others = of_heights.take(~np.isin(of_heights.who, observed))
         held = dataclasses.replace(block, control=ControlCoordinates.joined(block.control, centres, others))
         rows = SurfaceRows(
-            which[used], np.zeros(n, int), seen.foot[used], seen.normal[used], np.zeros((n, 3)), seen.sigma[used]
+            which[used],
+            np.zeros(n, int),
+            surface.foot[used],
+            surface.normal[used],
+            np.zeros((n, 3)),
+            surface.sigma[used],
         )
         return at_result(dataclasses.replace(held, surfaces=rows), adjusted.unknowns)
 
-    found = iterate_to_convergence(first, look, build, max_rounds, report, "surfaces")
+    result = iterate_to_convergence(first, look, build, max_rounds, report, "surfaces")
     return RoofControl(
-        at_result(found.adjusted.block, found.adjusted.unknowns),
-        found.adjusted,
-        which[found.used],
-        found.seen.apart(found.adjusted)[found.used],
-        len(np.unique(chosen[found.used])),
-        found.rounds,
-        found.still,
-    )
+        at_result(result.adjusted.block, result.adjusted.unknowns), result.adjusted, which[result.used],
+        result.seen.apart(result.adjusted)[result.used], len(np.unique(chosen[result.used])), result.rounds,
+        result.converged,
+    )  # fmt: skip
 
 
 def _patches(cloud: Cloud, places: Float[np.ndarray, "n 3"], settings: HeightSettings) -> list[Patch]:
     """Return roof faces near places; `Patch.index` refers to the points of `cloud`."""
-    told = cloud.classification is not None and bool(np.any(cloud.classification > 1))
-    roofs = np.flatnonzero(cloud.classification == BUILDING) if told else np.arange(len(cloud))
+    classified = cloud.classification is not None and bool(np.any(cloud.classification > 1))
+    roofs = np.flatnonzero(cloud.classification == BUILDING) if classified else np.arange(len(cloud))
     if len(roofs):
         away, _ = scipy.spatial.KDTree(places[:, :2]).query(cloud.xyz[roofs, :2], distance_upper_bound=_NEAR)
         roofs = roofs[np.isfinite(away)]
@@ -146,20 +146,20 @@ def _patches(cloud: Cloud, places: Float[np.ndarray, "n 3"], settings: HeightSet
             f"within {_NEAR:g} m of the points the cloud has {len(roofs)} laser points of roofs (class {BUILDING}): "
             "classify the cloud, or take heights for control (lidar_control)"
         )
-    found = planar_patches(cloud.xyz[roofs], settings.sigma_xy_m, settings.sigma_z_m, _LEAST)
-    return [eqx.tree_at(lambda p: p.index, patch, roofs[patch.index]) for patch in found]
+    patches = planar_patches(cloud.xyz[roofs], settings.sigma_xy_m, settings.sigma_z_m, _LEAST)
+    return [eqx.tree_at(lambda p: p.index, patch, roofs[patch.index]) for patch in patches]
 
 
 def _faces(xy: Float[np.ndarray, "n 2"], patches: list[Patch], margin: float) -> Int[np.ndarray, "n"]:
     """Return the patch of each place, at least `margin` (m) inside its outline; -1 for none."""
-    found = np.full(len(xy), -1)
+    face = np.full(len(xy), -1)
     for k, patch in reversed(list(enumerate(patches))):
         corners = patch.outline[:, :2]
         along = np.roll(corners, -1, axis=0) - corners
         inward = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
         inside = np.einsum("nek,ek->ne", xy[:, None] - corners, inward).min(axis=1)
-        found[inside >= margin] = k
-    return found
+        face[inside >= margin] = k
+    return face
 
 
 def _centroid_rows(

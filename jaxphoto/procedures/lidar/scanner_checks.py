@@ -17,7 +17,7 @@ from jaxphoto.georeferencing.time_scales import LEAP_SECONDS
 from jaxphoto.georeferencing.yaw_units import counts_in_radians
 from jaxphoto.lidar.correction import ScannerPath, scanner_poses
 from jaxphoto.lidar.coverage import CoveredTimes, longest_interval
-from jaxphoto.procedures.lidar.looks import aside
+from jaxphoto.procedures.lidar.strip_model import aside
 
 # Maximum range of an airborne laser scanner (m).
 _FARTHEST_M = 10_000.0
@@ -63,15 +63,15 @@ def check_measured_from(cloud: Cloud, path: ScannerPath, pattern: Pattern | None
             "was: bring cloud and trajectory into one coordinate system, in metres, and onto one clock"
         )
     _check_leap_seconds(cloud, path)
-    odd = [*_odd_yaw(path.trajectory), *_jumps(path.trajectory)]
-    seen = _seen(cloud, path)
-    if seen is None:
-        return odd
-    moves = np.subtract(*np.quantile(seen.middle, (0.9, 0.1), axis=0)) / 2
-    looks = np.median(seen.middle, axis=0)
-    if max(moves) > _WANDERS * max(seen.half_width) or max(np.abs(looks)) > _ASIDE:
-        furthest = np.abs(seen.middle).max()
-        if elsewhere := _elsewhere(cloud, path, _WANDERS * max(seen.half_width)):
+    messages = [*_odd_yaw(path.trajectory), *_jumps(path.trajectory)]
+    positions = _positions_in_body(cloud, path)
+    if positions is None:
+        return messages
+    moves = np.subtract(*np.quantile(positions.middle, (0.9, 0.1), axis=0)) / 2
+    looks = np.median(positions.middle, axis=0)
+    if max(moves) > _WANDERS * max(positions.half_width) or max(np.abs(looks)) > _ASIDE:
+        furthest = np.abs(positions.middle).max()
+        if elsewhere := _distant_strips(cloud, path, _WANDERS * max(positions.half_width)):
             raise BlockError(
                 f"the laser points of strip {few(elsewhere)} lie up to {furthest:.1f} of the scanner's height to one "
                 "side, and those of the other strips do not: bring all strips and their trajectory into one coordinate "
@@ -79,28 +79,28 @@ def check_measured_from(cloud: Cloud, path: ScannerPath, pattern: Pattern | None
             )
         raise BlockError(
             f"the laser points of a second lie now here, now there about the scanner, up to {furthest:.1f} of its "
-            f"height to one side, while the swath is {2 * max(seen.half_width):.2f} of it wide: bring cloud and "
+            f"height to one side, while the swath is {2 * max(positions.half_width):.2f} of it wide: bring cloud and "
             "trajectory into one coordinate system, both in metres, and onto one clock, with angles in degrees"
         )
     if pattern is not None:
-        _check_pattern(seen, pattern)
-    return odd
+        _check_pattern(positions, pattern)
+    return messages
 
 
-def _elsewhere(cloud: Cloud, path: ScannerPath, most: float) -> list[str]:
+def _distant_strips(cloud: Cloud, path: ScannerPath, most: float) -> list[str]:
     """Return strips whose mean lies farther across than `most` (a tangent); none if all do."""
     some = _probed(cloud)
     if cloud.strip is None:
         return []
-    off, strip = aside(cloud, some, path), cloud.strip[some]
+    distance, strip = aside(cloud, some, path), cloud.strip[some]
     numbers = np.flatnonzero(np.bincount(strip))
-    far = [k for k in numbers if np.abs(np.median(off[strip == k], axis=0)).max() > most]
+    far = [k for k in numbers if np.abs(np.median(distance[strip == k], axis=0)).max() > most]
     return [] if len(far) == len(numbers) else [cloud.strips[k] for k in far]
 
 
-def _check_pattern(seen: _FromBody, pattern: Pattern) -> None:
+def _check_pattern(positions: _FromBody, pattern: Pattern) -> None:
     """Raise BlockError if the points correspond to another pattern."""
-    right, ahead = seen.half_width
+    right, ahead = positions.half_width
     spread = f"to the side by {right:.2f} of the height and ahead by {ahead:.2f}"
     if right < _ALIKE * ahead:
         raise BlockError(
@@ -125,16 +125,16 @@ def _check_leap_seconds(cloud: Cloud, path: ScannerPath) -> None:
     times.
     """
     some = cloud.take(np.linspace(0, len(cloud) - 1, _SOME).astype(int))
-    own = np.asarray(some.time)
+    times = np.asarray(some.time)
     covered = CoveredTimes(path.trajectory)
 
     def ahead(shift: float) -> float:
         """Return the median tangent of the angle ahead; infinite if the trajectory covers few of the shifted times."""
-        time = own + shift
-        known = np.flatnonzero(covered.covers(time))
-        if len(known) < _SOME / 2:
+        time = times + shift
+        covered_points = np.flatnonzero(covered.covers(time))
+        if len(covered_points) < _SOME / 2:
             return np.inf
-        return float(np.median(np.abs(aside(dataclasses.replace(some, time=time), known, path)[:, 1])))
+        return float(np.median(np.abs(aside(dataclasses.replace(some, time=time), covered_points, path)[:, 1])))
 
     now = ahead(0.0)
     if now < _OBLIQUE:
@@ -164,10 +164,10 @@ def _odd_yaw(trajectory: Trajectory) -> list[str]:
             "the yaw of the trajectory follows its course as radians, not as degrees: convert roll, pitch and yaw to "
             "degrees"
         )
-    off = np.rad2deg(np.median(np.abs(np.arctan2(np.sin(yaw - course), np.cos(yaw - course)))))
+    deviation = np.rad2deg(np.median(np.abs(np.arctan2(np.sin(yaw - course), np.cos(yaw - course)))))
     return [
-        f"the yaw of the trajectory is {off:.0f} degrees off its course in the median, as of an aircraft that flies "
-        "sideways or backwards: boresight and lever arm refer to these axes; correct yaw if it does not"
+        f"the yaw of the trajectory is {deviation:.0f} degrees off its course in the median, as of an aircraft that "
+        "flies sideways or backwards: boresight and lever arm refer to these axes; correct yaw if it does not"
     ]
 
 
@@ -177,16 +177,16 @@ def _jumps(trajectory: Trajectory) -> list[str]:
     between = np.diff(time)[:, None]
     speed = np.diff(position, axis=0) / between
     # Relative to extrapolation from the steps before and after.
-    off = np.linalg.norm((speed[1:-1] - (speed[:-2] + speed[2:]) / 2) * between[1:-1], axis=1)
+    jump = np.linalg.norm((speed[1:-1] - (speed[:-2] + speed[2:]) / 2) * between[1:-1], axis=1)
     # Nothing is expected across a gap, as in the turn between strips.
     gap = between[:, 0] > longest_interval(trajectory)
-    off[gap[1:-1] | gap[:-2] | gap[2:]] = 0.0
-    k = int(np.argmax(off))
-    if off[k] < max(_JUMP_M, _TIMES * float(np.median(off))):
+    jump[gap[1:-1] | gap[:-2] | gap[2:]] = 0.0
+    k = int(np.argmax(jump))
+    if jump[k] < max(_JUMP_M, _TIMES * float(np.median(jump))):
         return []
     return [
-        f"the trajectory jumps by {off[k]:.2g} m at {time[k + 2]:.3f} s from one record to the next, which no aircraft "
-        "does: splines go over it; process the trajectory anew, or leave out the strip that was flown then"
+        f"the trajectory jumps by {jump[k]:.2g} m at {time[k + 2]:.3f} s from one record to the next, which no "
+        "aircraft does: splines go over it; process the trajectory again, or leave out the strip that was flown then"
     ]
 
 
@@ -200,7 +200,7 @@ def _probed(cloud: Cloud) -> Int[np.ndarray, "n"]:
     return np.linspace(0, len(cloud) - 1, min(_PROBED, len(cloud))).astype(int)
 
 
-def _seen(cloud: Cloud, path: ScannerPath) -> _FromBody | None:
+def _positions_in_body(cloud: Cloud, path: ScannerPath) -> _FromBody | None:
     """Return the positions; None for a narrow swath, or for few points."""
     some = _probed(cloud)
     time = cloud.time[some]  # type: ignore[index]

@@ -18,30 +18,28 @@ from jaxphoto.block import empty_block
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import StripErrors, StripSpline, Trajectory
-from jaxphoto.lidar.correction import scanner_path
+from jaxphoto.lidar.correction import correct_flight, scanner_path, times_of
 from jaxphoto.lidar.coverage import check_covered
-from jaxphoto.lidar.strip_correction import correct_flight, times_of
-from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.observations import StripPoints
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
-from jaxphoto.procedures.lidar.iterate_to_convergence import STILL, at_result, with_interior_held
+from jaxphoto.procedures.lidar.iterate_to_convergence import CHANGE_LIMIT, adjust_with_fixed_interior, at_result
 from jaxphoto.procedures.lidar.photographs import Photographs, check_photographs, on_trajectory, spans_with
+from jaxphoto.procedures.lidar.plane_search import CommonPlanes, PointPlanes, PointSearch, StripSearch, check_joined
 from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
 from jaxphoto.procedures.lidar.strip_control import (
     CHECK,
     CONTROL,
     ControlSearch,
     OnStrips,
+    SurveyedGap,
     check_seen,
+    surveyed_gaps,
     with_control,
     with_datum,
 )
-from jaxphoto.procedures.lidar.strip_rows import step_rows
-from jaxphoto.procedures.lidar.strip_search import CommonPlanes, StripSearch, check_joined
-from jaxphoto.procedures.lidar.strip_unknowns import ScannerPriors, errors_of, knot_sigmas, strip_block
-from jaxphoto.procedures.lidar.surveyed_gaps import SurveyedGap, surveyed_gaps
-from jaxphoto.procedures.lidar.tie_point_search import PointPlanes, PointSearch
+from jaxphoto.procedures.lidar.strip_model import ScannerPriors, errors_of, knot_sigmas, step_rows, strip_block
 from jaxphoto.procedures.lidar.vertical_control import tie_points
 from jaxphoto.statistics import Covariance, covariance
 from jaxphoto.unknowns import FIXED
@@ -107,9 +105,9 @@ class StripAdjustment(eqx.Module):
     """Errors that were removed."""
     differences: tuple[StripDifference, ...]
     rounds: tuple[StripRound, ...]
-    still: bool
+    converged: bool
     """True if the iteration converged."""
-    odd: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     """Messages about inconsistencies of cloud and trajectory."""
     surveyed: tuple[SurveyedGap, ...] = ()
     """Control and check points, each above the plane of each strip that has one."""
@@ -123,7 +121,7 @@ def adjust_strips(
     *,
     photographs: Photographs | None = None,
     control: SurveyedPoints | None = None,
-    held: Collection[str] | Literal["all"] = (),
+    fixed: Collection[str] | Literal["all"] = (),
     max_rounds: int = MAX_STRIP_ROUNDS,
     report: Callable[[StripRound], None] = lambda made: None,
 ) -> StripAdjustment:
@@ -139,8 +137,8 @@ def adjust_strips(
     through them. Its check points are only compared. Without a trajectory it is the datum, too.
 
     `priors` are those of the scanner and include its pattern; by default lines, its boresight FREE and all else FIXED.
-    For circular patterns, forward and backward looks of a strip are compared, too. The trajectory of strips named in
-    `held` is fixed, or that of all. Without a trajectory each strip has only a shift, and the first is fixed if none is
+    For circular patterns, forward and backward looks of a strip are compared, too. `fixed` are strips whose trajectory
+    is not corrected, or "all". Without a trajectory each strip has only a shift, and the first is fixed if none is
     named, in the directions that control does not determine.
 
     Raises InputError for a cloud of one strip without control, of strips without points or without the times that a
@@ -160,86 +158,94 @@ def adjust_strips(
             "the time offset of a scanner that looks all around is not estimated, because what it sees of one plane is "
             "seconds apart: leave out time-offset, and shift the trajectory (--trajectory-shift-s)"
         )
-    held = cloud.strips if held == "all" else held
-    names = _check(cloud, trajectory, held, photographs is None and priors.right, control is not None)
+    fixed = cloud.strips if fixed == "all" else fixed
+    names = _check(cloud, trajectory, fixed, photographs is None and priors.right, control is not None)
     path = None if trajectory is None else scanner_path(trajectory)
     pattern = priors.calibration.pattern
-    odd = [] if path is None else check_measured_from(cloud, path, None if priors.right else pattern)
+    messages = [] if path is None else check_measured_from(cloud, path, None if priors.right else pattern)
     spans, images = _spans(cloud), None
     if photographs is not None:
         check_photographs(photographs, trajectory)
         spans = spans_with(photographs.time, spans)
     splines = _splines(spans, trajectory, settings)
-    alone = None if photographs is None else with_interior_held(photographs.block)
-    if photographs is not None and alone is not None:
-        images = at_result(on_trajectory(photographs, splines, spans, settings), alone.unknowns)
+    before_strips = None if photographs is None else adjust_with_fixed_interior(photographs.block)
+    if photographs is not None and before_strips is not None:
+        images = at_result(on_trajectory(photographs, splines, spans, settings), before_strips.unknowns)
     sigmas = knot_sigmas(splines, trajectory, settings)
     block, number = images, np.zeros(0, int)
     if control is not None:
         block, number = with_control(empty_block("strips and control") if images is None else images, control)
     if trajectory is None:
         # With control, its datum below replaces that of a strip.
-        right = held if held or control is not None else names[:1]
+        right = fixed if fixed or control is not None else names[:1]
         block = strip_block(names, splines, right, sigmas, None, block)
     else:
-        block = strip_block(names, splines, held, sigmas, priors, block)
+        block = strip_block(names, splines, fixed, sigmas, priors, block)
     steps = tuple(rows for rows in step_rows(splines, sigmas, settings) if len(rows))
     search, errors = StripSearch(cloud, path, settings, pattern), errors_of(block.start.unknowns, splines)
-    first = seen = search.look(errors, settled=False)
-    check_joined(names, seen)
+    first = common = search.look(errors, settled=False)
+    check_joined(names, common)
     ties = None
     if images is not None and photographs is not None:
         lines = tie_points(images, photographs.breaklines)
         ties = PointSearch(search, np.setdiff1d(tie_points(images), lines), lines)
-    first_on = on = [] if ties is None or alone is None else ties.look(*_of(ties, alone, covariance(alone)), False)
+    first_on_ties = on_ties = (
+        []
+        if ties is None or before_strips is None
+        else ties.look(*_points_and_covariances(ties, before_strips, covariance(before_strips)), False)
+    )
     surveyed = None if control is None else ControlSearch(search, control, number)
-    first_met = met = OnStrips([], []) if surveyed is None else surveyed.look(settled=False)
+    first_on_surveyed = on_surveyed = OnStrips([], []) if surveyed is None else surveyed.look(settled=False)
     if control is not None:
-        check_seen(control, met, search)
-        block = block if trajectory is not None or held else with_datum(block, names[0], met, settings)
+        check_seen(control, on_surveyed, search)
+        block = block if trajectory is not None or fixed else with_datum(block, names[0], on_surveyed, settings)
     rounds: list[StripRound] = []
     before = np.zeros(())
     while True:
-        planes, points = search.rows(seen, errors), () if ties is None else ties.rows(on, errors)
-        given = () if surveyed is None else surveyed.rows(met, errors)
-        lying = (StripPoints.joined(*points, *given),) if points or given else ()
-        posed = dataclasses.replace(block, more=(*block.more, planes, *lying, *steps))
-        adjusted = adjust(posed, posed.start.unknowns)
+        planes, points = search.rows(common, errors), () if ties is None else ties.rows(on_ties, errors)
+        control_rows = () if surveyed is None else surveyed.rows(on_surveyed, errors)
+        point_rows = (StripPoints.joined(*points, *control_rows),) if points or control_rows else ()
+        observed = dataclasses.replace(block, more=(*block.more, planes, *point_rows, *steps))
+        adjusted = adjust(observed, observed.start.unknowns)
         # With rows, because any iteration may be the last: its covariance also serves the tables of the result.
-        known = covariance(adjusted, rows=True)
+        cov = covariance(adjusted, rows=True)
         now = np.asarray(adjusted.values.shared)[adjusted.structure.free]
-        counted = len(planes), sum(map(len, points)), sum(map(len, given))
-        rounds.append(_round(len(rounds) + 1, counted, seen, [*on, *met.control], _change(now - before, known)))
+        counted = len(planes), sum(map(len, points)), sum(map(len, control_rows))
+        rounds.append(
+            _iteration_record(
+                len(rounds) + 1, counted, common, [*on_ties, *on_surveyed.control], _change(now - before, cov)
+            )
+        )
         report(rounds[-1])
-        still = rounds[-1].largest_change < STILL and bool(adjusted.converged)
+        converged = rounds[-1].largest_change < CHANGE_LIMIT and bool(adjusted.converged)
         block, before, errors = at_result(block, adjusted.unknowns), now, errors_of(adjusted.unknowns, splines)
         settled = len(rounds) >= _SETTLED
-        seen = search.look(errors, settled)
-        on = [] if ties is None else ties.look(*_of(ties, adjusted, known), settled)
-        met = OnStrips([], []) if surveyed is None else surveyed.look(settled)
-        if still or len(rounds) >= max_rounds:
+        common = search.look(errors, settled)
+        on_ties = [] if ties is None else ties.look(*_points_and_covariances(ties, adjusted, cov), settled)
+        on_surveyed = OnStrips([], []) if surveyed is None else surveyed.look(settled)
+        if converged or len(rounds) >= max_rounds:
             return StripAdjustment(
-                alone,
+                before_strips,
                 adjusted,
-                known,
+                cov,
                 search.corrected_cloud,
                 None if trajectory is None else correct_flight(trajectory, errors),
                 errors,
-                _differences(first, seen)
-                + _point_differences(PHOTOGRAPHS, first_on, on)
-                + _point_differences(CONTROL, first_met.control, met.control)
-                + _point_differences(CHECK, first_met.check, met.check),
+                _differences(first, common)
+                + _point_differences(PHOTOGRAPHS, first_on_ties, on_ties)
+                + _point_differences(CONTROL, first_on_surveyed.control, on_surveyed.control)
+                + _point_differences(CHECK, first_on_surveyed.check, on_surveyed.check),
                 tuple(rounds),
-                still,
-                (*odd, *(() if ties is None else ties.unseen(on, adjusted.block.points))),
-                () if control is None else surveyed_gaps(control, met, errors, path, adjusted, known),
+                converged,
+                (*messages, *(() if ties is None else ties.unseen(on_ties, adjusted.block.points))),
+                () if control is None else surveyed_gaps(control, on_surveyed, errors, path, adjusted, cov),
             )
         # For a large flight gigabytes, which the next iteration needs.
-        del adjusted, known
+        del adjusted, cov
 
 
 def _check(
-    cloud: Cloud, trajectory: Trajectory | None, held: Collection[str], strips_alone: bool, controlled: bool
+    cloud: Cloud, trajectory: Trajectory | None, fixed: Collection[str], strips_alone: bool, controlled: bool
 ) -> tuple[str, ...]:
     names = cloud.strips
     if cloud.strip is None or len(names) < (1 if controlled else 2):
@@ -249,18 +255,16 @@ def _check(
         )
     for k, name in enumerate(names):
         if not np.any(cloud.strip == k):
-            raise InputError(
-                f"strip {name} of the cloud has no points: leave it out, or read other classes and returns"
-            )
-    for name in held:
+            raise InputError(f"strip {name} of the cloud has no points: omit it, or read other classes and returns")
+    for name in fixed:
         if name not in names:
             raise InputError(f"{name} is no strip of the cloud, which has {', '.join(names)}: correct its name")
-    if set(names) <= set(held) and (strips_alone or trajectory is None):
-        raise InputError("all strips are held, so that nothing is left to adjust: hold fewer")
+    if set(names) <= set(fixed) and (strips_alone or trajectory is None):
+        raise InputError("all strips are fixed: nothing is left to adjust; fix fewer")
     if trajectory is not None and cloud.time is None:
         raise InputError(
-            "the cloud has no times, and a trajectory says nothing of points without them: take a cloud with GPS "
-            "times, or leave the trajectory out, for a shift of each strip"
+            "the cloud has no times, which a trajectory requires: use a cloud with GPS times, or omit the trajectory "
+            "to estimate one shift per strip"
         )
     if trajectory is not None:
         check_covered(cloud, trajectory)
@@ -270,8 +274,8 @@ def _check(
 def _spans(cloud: Cloud) -> Float[np.ndarray, "strips 2"]:
     """Return first and last time of each strip (s)."""
     time = times_of(cloud)
-    own = [time[cloud.strip == k] for k in range(len(cloud.strips))]
-    return np.array([(t.min(), t.max()) for t in own])
+    times = [time[cloud.strip == k] for k in range(len(cloud.strips))]
+    return np.array([(t.min(), t.max()) for t in times])
 
 
 def _splines(
@@ -293,22 +297,28 @@ def _splines(
     return tuple(splines)
 
 
-def _round(
-    number: int, observed: tuple[int, int, int], seen: Sequence[CommonPlanes], on: Sequence[PointPlanes], change: float
+def _iteration_record(
+    number: int,
+    observed: tuple[int, int, int],
+    planes: Sequence[CommonPlanes],
+    on: Sequence[PointPlanes],
+    change: float,
 ) -> StripRound:
-    gaps = np.concatenate([np.zeros(0), *(f.pairs.gap[f.fits] for f in seen)])
-    left_out = sum(int((~f).sum()) for f in (*(f.fits for f in seen), *(f.fits for f in on)))
+    gaps = np.concatenate([np.zeros(0), *(f.pairs.gap[f.fits] for f in planes)])
+    left_out = sum(int((~f).sum()) for f in (*(f.fits for f in planes), *(f.fits for f in on)))
     return StripRound(number, *observed, left_out, _rms(gaps), change)
 
 
-def _of(search: PointSearch, adjusted: Adjustment, known: Covariance) -> tuple[np.ndarray, np.ndarray]:
+def _points_and_covariances(
+    search: PointSearch, adjusted: Adjustment, cov: Covariance
+) -> tuple[np.ndarray, np.ndarray]:
     """Return adjusted positions of points (m), and their covariances."""
-    return np.asarray(adjusted.unknowns.points)[search.points], np.asarray(known.points)[search.points]
+    return np.asarray(adjusted.unknowns.points)[search.points], np.asarray(cov.points)[search.points]
 
 
-def _change(moved: Float[np.ndarray, "unknowns"], known: Covariance) -> float:
+def _change(moved: Float[np.ndarray, "unknowns"], cov: Covariance) -> float:
     """Return the largest change of an unknown, in standard deviations."""
-    sigma = np.asarray(known.shared_sigma)
+    sigma = np.asarray(cov.shared_sigma)
     return float(np.max(np.abs(moved)[sigma > 0] / sigma[sigma > 0], initial=0.0))
 
 

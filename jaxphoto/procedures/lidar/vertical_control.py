@@ -3,7 +3,7 @@
 The images give the position of a tie point, the cloud the height there, and the images are re-adjusted with this
 height: iterated to convergence (paper 001). With `method` "image" the height is that of the pseudo control point of
 paper 001, interpolated in the image; otherwise it is `lidar.heights_at`. Control is vertical only; the reason is in
-docs/pseudo_control.md.
+docs/lidar_heights.md.
 """
 
 import dataclasses
@@ -19,16 +19,16 @@ from jaxphoto.block import Block
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.lidar import Grid, HeightFlag, HeightSettings, heights_at, index_cloud
-from jaxphoto.lidar.block_control import pseudo_control_of_block
+from jaxphoto.lidar.pseudo_control import pseudo_control_of_block
 from jaxphoto.observations import ControlCoordinates
 from jaxphoto.procedures.lidar.iterate_to_convergence import (
     MAX_ROUNDS,
     Round,
-    SeenByCloud,
+    SurfaceAtPoints,
+    adjust_with_fixed_interior,
     at_result,
     iterate_to_convergence,
     with_common_error,
-    with_interior_held,
 )
 from jaxphoto.statistics import Covariance
 
@@ -54,7 +54,7 @@ class LidarControl(eqx.Module):
     used: Bool[np.ndarray, "points"]
     """True if the height is control: neither refused nor an outlier."""
     rounds: tuple[Round, ...]
-    still: bool
+    converged: bool
     """True if the iteration converged."""
 
 
@@ -81,37 +81,32 @@ def lidar_control(
     which = tie_points(block, points)
     heights: dict[str, np.ndarray] = {}
 
-    def look(adjusted: Adjustment) -> SeenByCloud:
+    def look(adjusted: Adjustment) -> SurfaceAtPoints:
         z, sigma, gradient, heights["flag"] = _heights(adjusted, which, grid, method, settings)
         usable = np.isfinite(z)
         if not usable.any():
-            raise nothing_seen(np.asarray(adjusted.unknowns.points)[which], np.asarray(grid.xyz), heights["flag"])
+            raise no_surface_error(np.asarray(adjusted.unknowns.points)[which], np.asarray(grid.xyz), heights["flag"])
         place = np.asarray(adjusted.unknowns.points)[which]
         normal = np.column_stack([-gradient, np.ones(len(which))])
         slant = np.linalg.norm(normal, axis=1)
         foot = np.column_stack([place[:, :2], z])
         sigma = with_common_error(sigma, usable, settings.sigma_systematic_m)
-        return SeenByCloud(which, foot, normal / slant[:, None], sigma / slant, usable)
+        return SurfaceAtPoints(which, foot, normal / slant[:, None], sigma / slant, usable)
 
-    def build(adjusted: Adjustment, known: Covariance, seen: SeenByCloud, used: np.ndarray) -> Block:
-        heights["sigma"] = _sigma(known, seen)
-        rows = ControlCoordinates(which[used], np.full(used.sum(), 2), seen.foot[used, 2], heights["sigma"][used])
+    def build(adjusted: Adjustment, cov: Covariance, surface: SurfaceAtPoints, used: np.ndarray) -> Block:
+        heights["sigma"] = _sigma(cov, surface)
+        rows = ControlCoordinates(which[used], np.full(used.sum(), 2), surface.foot[used, 2], heights["sigma"][used])
         return dataclasses.replace(
             at_result(block, adjusted.unknowns), control=ControlCoordinates.joined(block.control, rows)
         )
 
-    found = iterate_to_convergence(with_interior_held(block), look, build, max_rounds, report, "control_points")
-    return LidarControl(
-        at_result(found.adjusted.block, found.adjusted.unknowns),
-        found.adjusted,
-        which,
-        found.seen.foot[:, 2],
-        heights["sigma"],
-        heights["flag"],
-        found.used,
-        found.rounds,
-        found.still,
+    result = iterate_to_convergence(
+        adjust_with_fixed_interior(block), look, build, max_rounds, report, "control_points"
     )
+    return LidarControl(
+        at_result(result.adjusted.block, result.adjusted.unknowns), result.adjusted, which, result.seen.foot[:, 2],
+        heights["sigma"], heights["flag"], result.used, result.rounds, result.converged,
+    )  # fmt: skip
 
 
 def tie_points(block: Block, names: Collection[str] | None = None) -> Int[np.ndarray, "points"]:
@@ -140,7 +135,7 @@ def tie_points(block: Block, names: Collection[str] | None = None) -> Int[np.nda
     return np.array(sorted(place[name] for name in set(names)), int)
 
 
-def nothing_seen(points: np.ndarray, cloud: np.ndarray, flag: np.ndarray) -> BlockError:
+def no_surface_error(points: np.ndarray, cloud: np.ndarray, flag: np.ndarray) -> BlockError:
     """Return the reason why no point has a height: the cloud lies elsewhere, or all heights were refused."""
     (low, high), (least, most) = ((v[:, :2].min(axis=0), v[:, :2].max(axis=0)) for v in (points, cloud))
     if np.any(low > most) or np.any(high < least):
@@ -170,13 +165,13 @@ def _heights(adjusted: Adjustment, which: np.ndarray, grid: Grid, method: Method
         # In the order of `which`, which is sorted, too.
         pseudo = pseudo_control_of_block(adjusted.block, adjusted.unknowns, grid, which, settings).control
         return np.asarray(pseudo.xyz)[:, 2], *map(np.asarray, (pseudo.sigma_z, pseudo.gradient, pseudo.flag))
-    found = heights_at(grid, np.asarray(adjusted.unknowns.points)[which, :2], method, settings)
-    return found.z, found.sigma, found.gradient, found.flag
+    heights = heights_at(grid, np.asarray(adjusted.unknowns.points)[which, :2], method, settings)
+    return heights.z, heights.sigma, heights.gradient, heights.flag
 
 
-def _sigma(known: Covariance, seen: SeenByCloud) -> Float[np.ndarray, "points"]:
+def _sigma(cov: Covariance, surface: SurfaceAtPoints) -> Float[np.ndarray, "points"]:
     """Return the sigma of control heights: of the surface, and of the point's uncertain position on a slope."""
-    of_place = np.asarray(known.points)[seen.point][:, :2, :2]
-    upright = seen.normal[:, 2]
-    gradient = -seen.normal[:, :2] / upright[:, None]
-    return np.sqrt((seen.sigma / upright) ** 2 + np.einsum("ni,nij,nj->n", gradient, of_place, gradient))
+    of_place = np.asarray(cov.points)[surface.point][:, :2, :2]
+    upright = surface.normal[:, 2]
+    gradient = -surface.normal[:, :2] / upright[:, None]
+    return np.sqrt((surface.sigma / upright) ** 2 + np.einsum("ni,nij,nj->n", gradient, of_place, gradient))

@@ -1,0 +1,242 @@
+"""Looks of a scanner: forward and backward returns of a strip.
+
+A line scanner sees a place once per strip. A circular scanner sees it ahead and, seconds later, behind: at other
+angles, at another time of the trajectory. Planes from the two looks of one strip are compared like those of two strips.
+"""
+
+import dataclasses
+from collections.abc import Collection, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.block import Block, empty_block
+from jaxphoto.cloud import Cloud
+from jaxphoto.georeferencing import (
+    Pattern,
+    Scanner,
+    ScannerCalibration,
+    StripErrors,
+    StripSpline,
+    Trajectory,
+    TrajectoryKnot,
+    knot_name,
+)
+from jaxphoto.lidar.correction import PORTION, ScannerPath, corrected_strip, in_portions, scanner_motions, scanner_poses
+from jaxphoto.lidar.strip_planes import PlanePairs, StripPatches, StripSettings, steep
+from jaxphoto.observations import AttitudeSteps, PositionSteps, StripPlanes
+from jaxphoto.parameters import AbstractParameters, dynamic_fields
+from jaxphoto.procedures.lidar.iterate_to_convergence import at_result
+from jaxphoto.rotation import roll_pitch_yaw_from_matrix
+from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
+
+
+class Look(NamedTuple):
+    """Returns of one strip."""
+
+    strip: int
+    name: str
+    returns: Int[np.ndarray, "n"]
+    """Indices in the cloud."""
+
+
+def looks_of(cloud: Cloud, path: ScannerPath | None, pattern: Pattern) -> list[Look]:
+    """Return one look per strip; for a circular scanner two, "1 ahead" and "1 behind" of strip 1."""
+    looks = []
+    for k, name in enumerate(cloud.strips):
+        returns_of_strip = np.flatnonzero(cloud.strip == k)
+        if pattern == "line" or path is None:
+            looks.append(Look(k, name, returns_of_strip))
+            continue
+        ahead = aside(cloud, returns_of_strip, path)[:, 1] > 0
+        sides = (f"{name} ahead", returns_of_strip[ahead]), (f"{name} behind", returns_of_strip[~ahead])
+        looks += [Look(k, side, returns) for side, returns in sides if len(returns)]
+    return looks
+
+
+def aside(cloud: Cloud, which: Int[np.ndarray, "n"], path: ScannerPath) -> Float[np.ndarray, "n 2"]:
+    """Return tangents of the angles of returns to the right and ahead, from the body's nadir."""
+    parts = [np.zeros((0, 2))]
+    for first in range(0, len(which), PORTION):
+        portion = which[first : first + PORTION]
+        poses = scanner_poses(path, cloud.time[portion])  # type: ignore[index]
+        shot = np.einsum("nji,nj->ni", poses.object_from_body, cloud.xyz[portion] - poses.position)
+        parts.append(shot[:, :2] / np.maximum(-shot[:, 2:], 1e-9))
+    return np.concatenate(parts)
+
+
+_ZERO = np.zeros(3)
+NO_CALIBRATION = ScannerCalibration(_ZERO, *[np.zeros(())] * 3, np.zeros(2), np.zeros(()))  # type: ignore[arg-type, call-arg]
+"""Scanner without errors."""
+
+
+class KnotSigmas(NamedTuple):
+    """Standard deviations of the trajectory errors at each knot of all strips."""
+
+    position: Float[np.ndarray, "knots 3"]
+    """Along X, Y and Z (m)."""
+    attitude: Float[np.ndarray, "knots 3"]
+    """About right, forward and up (rad)."""
+
+
+def knot_sigmas(splines: Sequence[StripSpline], trajectory: Trajectory | None, settings: StripSettings) -> KnotSigmas:
+    """Return those stated by the trajectory, or those of the settings where it states none (zero)."""
+    times = np.concatenate([spline.times for spline in splines])
+    position = np.full((len(times), 3), settings.sigma_position_m)
+    attitude = np.tile(settings.sigma_attitude, (len(times), 1))
+    if trajectory is None:
+        return KnotSigmas(position, attitude)
+    # Of roll, pitch and yaw, which are rotations about forward, right and up.
+    stated = np.asarray(trajectory.sigma_position), np.asarray(trajectory.sigma_attitude)[:, [1, 0, 2]]
+    for sigma_of_knots, sigmas in zip((position, attitude), stated, strict=True):
+        for axis, column in enumerate(sigmas.T):
+            if (column > 0).all():
+                sigma_of_knots[:, axis] = np.interp(times, np.asarray(trajectory.time), column)
+    return KnotSigmas(position, attitude)
+
+
+class ScannerPriors(NamedTuple):
+    """Priors of the scanner: FREE, FIXED or Weighted, each."""
+
+    boresight: Any = FREE
+    calibration: ScannerCalibration = ScannerCalibration(*[FIXED] * len(dynamic_fields(ScannerCalibration)))  # type: ignore[arg-type]
+
+    @property
+    def right(self) -> bool:
+        """Return True if nothing of the scanner is estimated."""
+        calibration = (getattr(self.calibration, name) for name in dynamic_fields(ScannerCalibration))
+        return all(prior == FIXED for prior in (self.boresight, *calibration))
+
+
+def strip_block(
+    names: Sequence[str],
+    splines: Sequence[StripSpline],
+    held: Collection[str],
+    sigmas: KnotSigmas,
+    priors: ScannerPriors | None,
+    photographs: Block | None = None,
+) -> Block:
+    """Create a block of these unknowns, all zero, added to `photographs` if given.
+
+    The first knot of each strip has the trajectory's sigma as prior.
+
+    Without `priors` strips have only a shift, which is free. The trajectory of strips in `held` is fixed.
+    """
+    knots: dict[str, AbstractParameters] = {}
+    knot_priors: dict[str, AbstractParameters] = {}
+    later = TrajectoryKnot(FREE, FREE)  # type: ignore[arg-type]
+    shift, right = TrajectoryKnot(FREE, FIXED), TrajectoryKnot(FIXED, FIXED)  # type: ignore[arg-type]
+    for name, spline in zip(names, splines, strict=True):
+        first = TrajectoryKnot(*(Weighted(_ZERO, of[spline.first]) for of in sigmas))  # type: ignore[arg-type]
+        for k, time in enumerate(spline.times):
+            owner = name if priors is None else knot_name(name, time)
+            knots[owner] = TrajectoryKnot(_ZERO, _ZERO)  # type: ignore[arg-type]
+            knot_priors[owner] = right if name in held else shift if priors is None else later if k else first
+    block = empty_block("strips of a laser scanner") if photographs is None else photographs
+    start, prior = block.start.unknowns, block.priors
+    start = dataclasses.replace(start, more=start.more | {TrajectoryKnot.kind: knots})
+    prior = dataclasses.replace(prior, more=prior.more | {TrajectoryKnot.kind: knot_priors})
+    if priors is not None:
+        of_scanner, calibration = ScannerCalibration.kind, priors.calibration
+        right_scanner = Scanner(_ZERO, {})  # type: ignore[arg-type]
+        none = dataclasses.replace(NO_CALIBRATION, pattern=calibration.pattern)
+        start = dataclasses.replace(start, scanner=right_scanner, more=start.more | {of_scanner: {"": none}})
+        prior = dataclasses.replace(
+            prior, scanner=Scanner(priors.boresight, {}), more=prior.more | {of_scanner: {"": calibration}}
+        )
+    return dataclasses.replace(at_result(block, start), priors=prior)
+
+
+def errors_of(unknowns: Unknowns, splines: tuple[StripSpline, ...]) -> StripErrors:
+    """Return the strip errors for the unknowns of `strip_block`."""
+    knots = unknowns.more[TrajectoryKnot.kind].values()
+    position, attitude = (np.array([getattr(k, name) for k in knots], float) for name in ("position", "attitude"))
+    calibration: Any = unknowns.more.get(ScannerCalibration.kind, {"": NO_CALIBRATION})[""]
+    boresight = _ZERO if unknowns.scanner is None else np.asarray(unknowns.scanner.boresight)
+    return StripErrors(splines, position, attitude, boresight, calibration)
+
+
+# Iterations from a corrected point to the measured one: each reduces the error by a factor of the corrections' size.
+_STEPS = 2
+# Odd multiplier (Knuth) that scatters neighbouring integers over 64 bits.
+_SCATTER = np.uint64(0x9E3779B97F4A7C15)
+
+
+class Side(NamedTuple):
+    """One strip's part of rows: knots (n, 4), weights (n, 4), all others (n, 3)."""
+
+    knots: np.ndarray
+    weights: np.ndarray
+    point: np.ndarray
+    scanner: np.ndarray
+    roll_pitch_yaw: np.ndarray
+    velocity: np.ndarray
+    rate: np.ndarray
+
+
+def side_of(
+    patches: StripPatches,
+    which: Int[np.ndarray, "n"],
+    foot: Float[np.ndarray, "n 3"],
+    strip: int,
+    errors: StripErrors,
+    path: ScannerPath | None,
+) -> Side:
+    """Return the places `foot` (m, corrected by `errors`) of patches as measured, and the scanner poses."""
+    time = patches.time[which]
+    knots, weights = errors.splines[strip].weights(time)
+    point = foot + patches.measured[which] - patches.mean[which]
+    for _ in range(_STEPS):
+        point = point - (corrected_strip(point, time, strip, errors, path) - foot)
+    if path is None or not len(time):
+        # From vertically above: nothing that rotates the shot is estimated.
+        none = np.zeros_like(point)
+        return Side(knots, weights, point, point + np.array([0.0, 0.0, 1.0]), none, none, none)
+    poses = scanner_poses(path, time)
+    angles = in_portions(_angles, (poses.object_from_body,))
+    return Side(knots, weights, point, poses.position, angles, *scanner_motions(path, time))
+
+
+def plane_rows(pairs: PlanePairs, a: Side, b: Side) -> StripPlanes:
+    """Return planes common to two strips as observations."""
+    of_a = {f"{name}_a": v for name, v in a._asdict().items()}
+    of_b = {f"{name}_b": v for name, v in b._asdict().items()}
+    return StripPlanes(**of_a, **of_b, normal=pairs.normal, sigma=pairs.sigma, gap=np.zeros(len(pairs.gap)))
+
+
+def thinned(normal: Float[np.ndarray, "n 3"], cell: Int[np.ndarray, "n"], most: int) -> np.ndarray:
+    """Select at most `most` planes: half of them steep ones if possible, otherwise at random.
+
+    Randomness depends on the cell, so that nearly equal planes give the same selection.
+    """
+    tells = steep(normal)
+    order = np.argsort(cell.astype(np.uint64) * _SCATTER, kind="stable")
+    parts = order[tells[order]], order[~tells[order]]
+    first = min(len(parts[0]), max(most // 2, most - len(parts[1])))
+    return np.sort(np.concatenate([parts[0][:first], parts[1][: most - first]]))
+
+
+def step_rows(
+    splines: tuple[StripSpline, ...], sigmas: KnotSigmas, settings: StripSettings
+) -> tuple[PositionSteps, AttitudeSteps]:
+    """Return steps from knot to knot of every strip, so that every knot has its a priori standard deviation."""
+    start = np.concatenate([s.first + np.arange(s.size - 1) for s in splines])
+    interval = np.concatenate([np.full(s.size - 1, s.interval) for s in splines])
+    decay = np.exp(-interval / settings.correlation_s)
+    part, none = decay[:, None] ** 2, np.zeros((len(start), 3))
+
+    def new(sigma: Float[np.ndarray, "knots 3"]) -> Float[np.ndarray, "steps 3"]:
+        # If errors decrease faster than their correlation decays, new variance still enters.
+        before, after = sigma[start] ** 2, sigma[start + 1] ** 2
+        return np.sqrt(np.maximum(after - part * before, (1 - part) * np.minimum(before, after)))
+
+    return (
+        PositionSteps(start, start + 1, decay, new(sigmas.position), none),
+        AttitudeSteps(start, start + 1, decay, new(sigmas.attitude), none),
+    )
+
+
+_angles = eqx.filter_jit(jax.vmap(roll_pitch_yaw_from_matrix))
