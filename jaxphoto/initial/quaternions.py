@@ -50,3 +50,18 @@ def best_rotations(products: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "
     axis = np.stack([m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], axis=-1)
     n[..., 0, 1:] = n[..., 1:, 0] = axis
     return matrices_from_quaternions(np.linalg.eigh(n)[1][..., -1])
+
+
+def average_rotation(
+    rotations: Float[np.ndarray, "n 3 3"], weights: Float[np.ndarray, " n"] | None = None
+) -> tuple[Float[np.ndarray, "3 3"], float]:
+    """Return the average of rotations, and the weighted root mean square (rad) of the angles to it.
+
+    The eigenvector of the largest eigenvalue of sum w q q', with the unit quaternions q: their signs do not count.
+    """
+    w = np.ones(len(rotations)) if weights is None else np.asarray(weights, float)
+    average = best_rotations(np.einsum("n,nij->ij", w, rotations))
+    # From the chord, which has all digits where the arc cosine of the trace has half of them.
+    chord = np.linalg.norm(rotations - average, axis=(1, 2))
+    angles = 2 * np.arcsin(np.clip(chord / np.sqrt(8), 0, 1))
+    return average, float(np.sqrt(np.sum(w * angles**2) / np.sum(w)))

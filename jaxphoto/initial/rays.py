@@ -71,20 +71,6 @@ def unit_rays(
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-def ray_noise(rays: Float[np.ndarray, "rows 3"], sigma_rad: float) -> Float[np.ndarray, "rows 3 2"]:
-    """Return the errors of unit rays in the camera frame due to one sigma in each of the two ideal image coordinates.
-
-        d ray = (I - ray ray') (e_x, e_y) |z| sigma_rad
-
-    `sigma_rad` is the standard deviation of an image coordinate as a fraction of c: the angle at the principal point.
-    Off axis the same image error is a smaller angle. Raises ValueError for a ray that does not point forward (z < 0).
-    """
-    if not np.all(rays[:, 2] < 0):
-        raise ValueError("rays in the camera frame must have a negative z (point to the front of the camera)")
-    across = np.eye(3)[:, :2] - rays[:, :, None] * rays[:, None, :2]
-    return across * (sigma_rad * np.abs(rays[:, 2]))[:, None, None]
-
-
 def turn_to_object(
     camera_from_object: Float[np.ndarray, "images 3 3"],
     image: Int[np.ndarray, " rows"],

@@ -23,7 +23,7 @@ from jaxphoto.compiling import jit_quickly
 from jaxphoto.georeferencing import Mount
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.map_frame import MapFrame
-from jaxphoto.initial.averaging import average_rotation
+from jaxphoto.initial.quaternions import average_rotation
 from jaxphoto.observations import Attitudes
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 from jaxphoto.unknowns import FIXED, Weighted

@@ -1,13 +1,13 @@
-"""Images, pairs and intersections of any geometry, with known truth: wide and narrow, flat, hilly and in space."""
+"""Images and intersections of any geometry, with known truth: wide and narrow, flat, hilly and in space."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from tests.formulas import random_rotations, turns
-from tests.initial.image_pairs import PairScene, rays_of
+from tests.initial.image_pairs import rays_of
 
-SIGMA_MM, SIGMA_RAD = 0.005, 5e-4
+SIGMA_MM = 0.005
 
 
 class ImageScene(NamedTuple):
@@ -42,38 +42,6 @@ def image_scene(seed, sigma=SIGMA_MM) -> ImageScene:
     return ImageScene(
         kind, c, position, matrix, position + rays * depth[:, None] @ matrix, xy + sigma * rng.normal(size=(n, 2))
     )
-
-
-def random_pair(seed, sigma=SIGMA_RAD) -> tuple[str, PairScene]:
-    """Twelve to eighty points of two images that look at the same, or the one along the base, rolled by any angle."""
-    rng = np.random.default_rng(seed)
-    kind = str(rng.choice(["space", "hilly", "flat", "forward"]))
-    while True:
-        n, half, length = int(rng.integers(12, 81)), rng.choice([0.25, 0.6, 1.0]), rng.choice([0.1, 0.3, 0.6])
-        uv = rng.uniform(-half, half, (n, 2))
-        rays = np.column_stack([uv, -np.ones(n)])
-        lean, side = rng.uniform(0, 0.5), rng.uniform(0, 2 * np.pi)
-        depth = np.cos(lean) / (np.cos(lean) - np.sin(lean) * uv @ [np.cos(side), np.sin(side)])
-        if kind in ("space", "forward"):
-            depth = rng.uniform(0.6, 1.6, n)
-        if kind == "hilly":
-            depth = depth * (1 + rng.uniform(-0.15, 0.15, n))
-        points = rays * depth[:, None]
-        base = (
-            rng.normal(size=3) * [1, 1, 0.3] if kind != "forward" else np.array([0, 0, -1]) + 0.05 * rng.normal(size=3)
-        )
-        base /= np.linalg.norm(base)
-        back = length * base + [0, 0, 1] if kind != "forward" else np.array([0.0, 0, 1])
-        back /= np.linalg.norm(back)
-        roll = rng.uniform(0, 2 * np.pi)
-        right = np.cross([np.cos(roll), np.sin(roll), 0], back)
-        right /= np.linalg.norm(right)
-        rotation = turns(0.03 * rng.normal(size=3))[0] @ np.stack([right, np.cross(back, right), back])
-        in_2 = (points - length * base) @ rotation.T
-        if np.all((depth > 0.3) & (depth < 3) & (in_2[:, 2] < -0.1)):
-            break
-    rays_1, rays_2 = (rays_of(p[:, :2] / -p[:, 2:] + sigma * rng.normal(size=(n, 2))) for p in (points, in_2))
-    return kind, PairScene(rays_1, rays_2, rotation, base, 0)
 
 
 class Intersections(NamedTuple):

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from jaxphoto.block import Block, Start
 from jaxphoto.errors import BlockError
-from jaxphoto.initial.averaging import average_rotation
+from jaxphoto.initial.quaternions import average_rotation
 from jaxphoto.procedures.orientation.colmap import Network
 
 # Minimum ratio of the spread of known points across their line to the spread along it; below, a rotation is
