@@ -126,17 +126,13 @@ def _report_export(output: Output, written: Any, values: str, cameras: bool) -> 
     """Report the written values and the loss of accuracy."""
     output.say(values)
     losses = {name: {"rms_px": c.rms_px, "max_px": c.max_px} for name, c in written.cameras.items()}
-    misfits = {"map_misfit": written.map_misfit, "moved": written.moved}
-    output.add(values=values, cameras=losses, **{name: m and m._asdict() for name, m in misfits.items()})
+    output.add(values=values, cameras=losses, moved_px=written.moved_px)
     for name, conversion in written.cameras.items() if cameras else ():
         output.say(f"camera {name}: {conversion.lost}")
-    if written.moved is not None:
-        moved = f"rms {written.moved.rms_px:.3g} px, maximum {written.moved.max_px:.3g} px"
-        note = f"; moved by {moved} to fit the written cameras" if written.moved.max_px else ""
-        output.say(f"image points are relative to the principal point{note}")
-    if written.map_misfit is not None:
-        misfit = f"rms {written.map_misfit.rms_px:.3g} px, maximum {written.map_misfit.max_px:.3g} px"
-        output.say(f"map coordinates are not Cartesian: image residuals {misfit}")
+    if written.moved_px is not None:
+        rms, largest = written.moved_px
+        moved = f"; moved by rms {rms:.3g} px, maximum {largest:.3g} px to fit the written cameras" if largest else ""
+        output.say(f"image points are relative to the principal point{moved}")
 
 
 @command("camera", PANEL, f"{_ADJUSTED}jaxphoto camera results --out cameras.txt")
@@ -146,13 +142,13 @@ def camera(
         Path,
         Argument(
             help="Results, block folder or COLMAP model; or a file: OpenCV's and ROS' YAML, COLMAP's cameras.txt, "
-            "Agisoft's XML, mrcal's .cameramodel, Kalibr's camera chain, a SMAC report, interior.csv, block.toml."
+            "Agisoft's XML, mrcal's .cameramodel, a SMAC report, interior.csv, block.toml."
         ),
     ],
     second: Second = None,
     out: Annotated[Path | None, Option(help="Camera file to write (required).")] = None,
     out_format: Annotated[
-        Literal["opencv", "colmap", "agisoft", "mrcal", "ros", "smac", "block"] | None,
+        Literal["opencv", "mrcal", "colmap", "agisoft", "block"] | None,
         Option("--format", help="Format of --out (default: by its name)."),
     ] = None,
     camera: opt.Camera = None,

@@ -31,8 +31,8 @@ ASSUMED_PIXEL_MM = 0.001
 """Default pixel size if none is specified; c in micrometres then equals the focal length in pixels."""
 INTERIOR, CAMERA = "interior.csv", "camera.toml"
 CAMERAS_READ = (
-    "OpenCV's and ROS' YAML, COLMAP's cameras.txt, Agisoft's XML, mrcal's .cameramodel, Kalibr's camera chain, a "
-    "SMAC report, interior.csv and block.toml"
+    "OpenCV's and ROS' YAML, COLMAP's cameras.txt, Agisoft's XML, mrcal's .cameramodel, a SMAC report, interior.csv "
+    "and block.toml"
 )
 """Formats that `read_camera_file` reads, for messages and help."""
 _IN_FOLDER = (INTERIOR, TOML, CAMERA, "cameras.txt", "cameras.bin")

@@ -1,4 +1,4 @@
-"""Cameras of mrcal, ROS, Kalibr and COLMAP, of fisheyes, and in models of fewer terms: projection, conversion, loss."""
+"""Cameras of mrcal, ROS and COLMAP, of fisheyes, and in models of fewer terms: projection, conversion, loss."""
 
 import struct
 
@@ -24,7 +24,7 @@ from jaxphoto.extras.formats import CAMERA_FORMATS, CAMERA_MODELS, write_camera_
 from jaxphoto.extras.formats.colmap import MODELS
 from jaxphoto.io.camera_files import read_camera_file
 from tests.commands import run
-from tests.io.test_cameras import POINTS, SENSOR, columns_rows, written
+from tests.io.test_cameras import POINTS, columns_rows, written
 
 RATIONAL = [-0.21, 0.11, 1.1e-3, -2.3e-3, 0.02, 0.03, -0.01, 0.004]
 MRCAL = """# generated on a board
@@ -37,24 +37,18 @@ MRCAL = """# generated on a board
     'icam_intrinsics': 0,
 }}
 """
-KALIBR = """cam0:
-  camera_model: pinhole
-  distortion_coeffs: [-0.21, 0.11, 0.0011, -0.0023]
-  distortion_model: radtan
-  intrinsics: [912.25, 910.75, 655.5, 471.25]
-  resolution: [1280, 960]
-  rostopic: /cam0/image_raw
-cam1:
-  T_cn_cnm1:
-  - [1.0, 0.0, 0.0, -0.1]
-  - [0.0, 1.0, 0.0, 0.0]
-  - [0.0, 0.0, 1.0, 0.0]
-  - [0.0, 0.0, 0.0, 1.0]
-  camera_model: pinhole
-  distortion_coeffs: [-0.02, 0.01, -0.003, 0.001]
-  distortion_model: equidistant
-  intrinsics: [912.25, 910.75, 655.5, 471.25]
-  resolution: [1280, 960]
+ROS = """image_width: 1280
+image_height: 960
+camera_name: nadir
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [912.25, 0.0, 655.5, 0.0, 910.75, 471.25, 0.0, 0.0, 1.0]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.21, 0.11, 0.0011, -0.0023, 0.02]
 """
 MATRIX = np.array([[912.25, 0, 655.5], [0, 910.75, 471.25], [0, 0, 1]])
 
@@ -67,11 +61,6 @@ def plane(coefficients):
     return cv2.projectPoints(POINTS, np.zeros(3), np.zeros(3), MATRIX, np.array(coefficients))[0][:, 0] + 0.5
 
 
-def fisheye(coefficients):
-    given = POINTS[:, None], np.zeros(3), np.zeros(3), MATRIX, np.array(coefficients)
-    return cv2.fisheye.projectPoints(*given)[0][:, 0] + 0.5
-
-
 @pytest.mark.parametrize(
     ("model", "n"), [("PINHOLE", 0), ("OPENCV4", 4), ("OPENCV5", 5), ("OPENCV8", 8), ("OPENCV12", 12)]
 )
@@ -81,37 +70,11 @@ def test_a_camera_of_mrcal_projects_as_opencv(tmp_path, model, n):
     np.testing.assert_allclose(columns_rows(camera), plane(given or [0.0] * 4), rtol=0, atol=1e-9)
 
 
-def test_cameras_of_a_chain_of_kalibr_project_as_opencv(tmp_path):
-    path = written(tmp_path, KALIBR, "camchain.yaml")
-    first, second = (read_camera_file(path, camera=name) for name in ("cam0", "cam1"))
-    np.testing.assert_allclose(columns_rows(first), plane(RATIONAL[:4]), rtol=0, atol=1e-9)
-    # As far from the axis as its angle, in the plane that `columns_rows` divides by.
-    away = np.hypot(*POINTS[:, :2].T)
-    equidistant = POINTS * np.stack(
-        [(np.arctan2(away, POINTS[:, 2]) * POINTS[:, 2] / away)] * 2 + [np.ones(40)], axis=1
-    )
-    found = columns_rows(second, equidistant)
-    np.testing.assert_allclose(found, fisheye([-0.02, 0.01, -0.003, 0.001]), rtol=0, atol=1e-9)
-    with pytest.raises(InputError, match="choose one of cam0, cam1"):
-        read_camera_file(path)
-
-
-def test_ros_file_has_the_keys_of_opencv(tmp_path):
-    interior = InteriorOrientation(35.0, 0.065, 0.274, OpenCv(k1=-0.2, k2=0.1, p1=1e-3, p2=-2e-3))
-    write_camera_file(tmp_path / "a.yaml", SENSOR, interior, "ros", name="nadir")
-    text = (tmp_path / "a.yaml").read_text()
-    assert 'camera_name: "nadir"' in text and "distortion_model: plumb_bob" in text
-    for key in ("rectification_matrix", "projection_matrix"):
-        assert f"{key}:\n  rows: 3\n" in text
-
-
 SPLINED = "SPLINED_STEREOGRAPHIC_order=3_Nx=30_Ny=20_fov_x_deg=170"
 REFUSED = {
     "splined": ("a.cameramodel", mrcal(SPLINED, []), f"'LENSMODEL_{SPLINED}' is not supported"),
     "prism": ("a.cameramodel", mrcal("OPENCV12", [*RATIONAL, 0.1, 0.0, 0.0, 0.0]), "terms of a thin prism"),
     "a word": ("a.cameramodel", mrcal("OPENCV4", RATIONAL[:4]).replace("655.5", "'x'"), "intrinsics .*'x'"),
-    "omni": ("a.yaml", KALIBR.replace("camera_model: pinhole", "camera_model: omni"), "cam0 is a 'omni'"),
-    "fov": ("a.yaml", KALIBR.replace("radtan", "fov"), "unknown distortion 'fov' of cam0"),
 }  # fmt: skip
 
 
@@ -119,15 +82,22 @@ REFUSED = {
 def test_invalid_camera_files_are_refused(tmp_path, name):
     file, text, message = REFUSED[name]
     with pytest.raises(InputError, match=message):
-        read_camera_file(written(tmp_path, text, file), camera="cam0" if file.endswith("yaml") else None)
+        read_camera_file(written(tmp_path, text, file))
 
 
 def test_a_distortion_that_ros_has_and_opencv_not_is_refused(tmp_path):
-    interior = InteriorOrientation(35.0, 0.065, 0.274, OpenCv(k1=-0.2))
-    write_camera_file(tmp_path / "a.yaml", SENSOR, interior, "ros")
-    text = (tmp_path / "a.yaml").read_text().replace("plumb_bob", "thin_prism_fisheye")
+    text = ROS.replace("plumb_bob", "thin_prism_fisheye")
     with pytest.raises(InputError, match="distortion_model 'thin_prism_fisheye' is not supported"):
         read_camera_file(written(tmp_path, text, "b.yaml"))
+
+
+@pytest.mark.parametrize(("model", "kind"), [("plumb_bob", OpenCv), ("equidistant", OpenCvFisheye)])
+def test_a_file_of_ros_is_read(tmp_path, model, kind):
+    text = ROS.replace("plumb_bob", model)
+    if model == "equidistant":
+        text = text.replace("cols: 5", "cols: 4").replace(", 0.02]", "]")
+    distortion = read_camera_file(written(tmp_path, text, "b.yaml")).interior.distortion
+    assert type(distortion) is kind and (float(distortion.k1), float(distortion.k2)) == (-0.21, 0.11)
 
 
 FISHEYE_SENSOR = Sensor(1280, 960, 0.003)
@@ -203,16 +173,18 @@ def test_a_perspective_camera_stays_one(tmp_path):
 @pytest.mark.parametrize("c_mm", [0.8, 5.0])  # 143 degrees in the corner, and less than 90
 def test_a_format_of_planes_refuses_a_fisheye_and_names_those_that_have_one(tmp_path, c_mm):
     wide = InteriorOrientation(c_mm, 0.0, 0.0, projection=Equidistant())
-    with pytest.raises(InputError, match=r"a\.txt: .* cameras of smac are perspective.* one of opencv, ros, colmap"):
-        write_camera_file(tmp_path / "a.txt", FISHEYE_SENSOR, wide)
-    assert not (tmp_path / "a.txt").exists()
+    with pytest.raises(
+        InputError, match=r"a\.cameramodel: .* cameras of mrcal are perspective.* one of opencv, colmap"
+    ):
+        write_camera_file(tmp_path / "a.cameramodel", FISHEYE_SENSOR, wide)
+    assert not (tmp_path / "a.cameramodel").exists()
 
 
 FITTED_SENSOR = Sensor(1280, 960, 0.01)
 RATIONAL_CAMERA = InteriorOrientation(
     11.0, 0.02, -0.03, OpenCv(k1=-0.1, k2=0.03, k3=-0.01, k4=0.2, k5=0.02, p1=1e-3, p2=-2e-3)
 )
-NAMES = {"opencv": "a.yml", "colmap": "cameras.txt", "mrcal": "a.cameramodel", "ros": "ros.yaml"}
+NAMES = {"opencv": "a.yml", "colmap": "cameras.txt", "mrcal": "a.cameramodel"}
 EVERY = [(kind, name) for kind, known in CAMERA_FORMATS.items() for name in known.models]
 
 
@@ -287,9 +259,9 @@ def test_the_command_reports_loss_and_worst_point(tmp_path, monkeypatch, capsys)
     brown = InteriorOrientation(9.0, 0.02, -0.03, Brown(k1=-9e-4, k2=1e-6))
     write_camera_file(tmp_path / "block.toml", FITTED_SENSOR, brown)
     files = tmp_path / "block.toml", tmp_path / "a.yaml"
-    code, out, _ = run(monkeypatch, capsys, "camera", *files, "--format", "ros", "--model", "plumb_bob")
+    code, out, _ = run(monkeypatch, capsys, "camera", *files, "--model", "OPENCV5")
     said = [line for line in out.splitlines() if "at column" in line]
     assert code == 0
     assert len(said) == 1
     text = (tmp_path / "a.yaml").read_text()
-    assert said[0] in text and "distortion_model: plumb_bob" in text
+    assert said[0] in text and "rows: 5" in text

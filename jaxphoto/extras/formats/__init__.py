@@ -12,9 +12,7 @@ from jaxphoto.extras.formats.convert import (
     CONTROL_FORMATS,
     EXPORTS,
     FORMATS,
-    FORMS,
     LOSS_PX,
-    Exported,
     check_export_target,
     convert,
     export,
@@ -27,7 +25,7 @@ from jaxphoto.extras.formats.convert import (
 from jaxphoto.extras.formats.project import ControlPoints, Project
 
 __all__ = [
-    "CAMERAS_WRITTEN", "CAMERA_FORMATS", "CAMERA_MODELS", "CONTROL_FORMATS", "EXPORTS", "FORMATS", "FORMS", "LOSS_PX",
-    "ControlPoints", "Exported", "Project", "ProjectCamera", "check_export_target", "convert", "export", "read_control",
+    "CAMERAS_WRITTEN", "CAMERA_FORMATS", "CAMERA_MODELS", "CONTROL_FORMATS", "EXPORTS", "FORMATS", "LOSS_PX",
+    "ControlPoints", "Project", "ProjectCamera", "check_export_target", "convert", "export", "read_control",
     "read_source", "read_tables", "recognise", "write_camera_file",
 ]  # fmt: skip

@@ -6,10 +6,9 @@ projection. Frames and rigs repeat the image poses and are not read. Exported mo
 deviations. Source: COLMAP documentation, "Camera models" and "Output format"; src/colmap/sensor/models.h.
 """
 
-import math
 import struct
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -54,21 +53,10 @@ _NUMBERS = (
     "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
 )  # fmt: skip
 _PLACES = ("f", "fx", "fy", "cx", "cy")
-_NO_POINT = 2**64 - 1
-# Maximum length of a quaternion, and inverse of its minimum; unit quaternions are expected.
-_LONGEST = 1e6
-_FEATURE = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
+_NO_POINT = -1
+_FEATURE = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 # Colour (black) and mean error (unknown) of exported points.
 _COLOUR, _ERROR = (0, 0, 0), -1
-
-
-class ColmapCamera(NamedTuple):
-    """Camera: model, format in pixels, and parameters in the order of `MODELS`."""
-
-    model: str
-    width_px: int
-    height_px: int
-    values: tuple[float, ...]
 
 
 class ColmapImage(NamedTuple):
@@ -76,20 +64,11 @@ class ColmapImage(NamedTuple):
 
     name: str
     camera: int
-    quaternion: tuple[float, ...]
+    quaternion: Sequence[float]
     """w, x, y, z of R."""
-    translation: tuple[float, ...]
+    translation: Sequence[float]
     xy_px: np.ndarray
     point: np.ndarray
-
-
-class ColmapModel(NamedTuple):
-    """Content of the three files; images sorted by name."""
-
-    cameras: dict[int, ColmapCamera]
-    images: list[ColmapImage]
-    point_ids: np.ndarray
-    xyz: np.ndarray
 
 
 class _Binary:
@@ -104,86 +83,67 @@ class _Binary:
         except struct.error:
             raise InputError(f"{self.path}: the file ends early. Copy it again") from None
         self.at += struct.calcsize("<" + layout)
-        if not np.isfinite([v for v in values if isinstance(v, float)]).all():
-            raise InputError(f"{self.path}: a number is not finite. Export it from COLMAP again")
         return values
-
-    def count(self, size: int) -> int:
-        """Read the number of records; each has at least `size` bytes."""
-        (count,) = self.take("Q")
-        if count * size > len(self.data) - self.at:
-            raise InputError(f"{self.path}: the file ends early. Copy it again")
-        return count
 
     def rows(self, kind: np.dtype) -> np.ndarray:
-        values = np.frombuffer(self.data, kind, self.count(kind.itemsize), self.at)
-        self.at += values.nbytes
-        return values
+        (count,) = self.take("Q")
+        data = self.data[self.at : self.at + count * kind.itemsize]
+        if len(data) < count * kind.itemsize:
+            raise InputError(f"{self.path}: the file ends early. Copy it again")
+        self.at += len(data)
+        return np.frombuffer(data, kind)
 
     def name(self) -> str:
         end = self.data.find(b"\0", self.at)
-        if end < 0:
-            raise InputError(f"{self.path}: the file ends early. Copy it again")
-        text, self.at = self.data[self.at : end].decode("utf-8", "replace"), end + 1
-        return text
+        text, self.at = self.data[self.at : end], end + 1
+        return text.decode("utf-8", "replace")
 
 
 def find(source: Path) -> list[Path]:
     """Return the cameras file of a model; .txt is preferred to .bin."""
-    folder = source if source.is_dir() else source.parent if source.stem == FILES[0] else Path("/nonexistent")
+    if source.is_file() and source.stem != FILES[0]:
+        return []
+    folder = source if source.is_dir() else source.parent
     suffixes = (end for end in (".txt", ".bin") if all((folder / (name + end)).is_file() for name in FILES))
     return [folder / (FILES[0] + end) for end in suffixes][:1]
 
 
 def read(path: Path) -> Project:
     """Read a model; free camera parameters are the parameters of COLMAP's model, point ids are COLMAP's ids."""
-    model = read_model(path)
-    images, ids = model.images, np.sort(model.point_ids)
+    images_path, points_path = (path.with_name(name + path.suffix) for name in FILES[1:])
+    text, source, folder = path.suffix == ".txt", CameraSource(path), path.resolve().parent.name
+    cameras, models = read_cameras(source), dict[str, ProjectCamera]()
+    images = sorted((_text_images if text else _binary_images)(images_path), key=lambda image: image.name)
+    ids, xyz = (_text_points if text else _binary_points)(points_path)
+    for what, names in (("image", [i.name for i in images]), ("point", ids.tolist())):
+        if twice := [name for name, times in Counter(names).items() if times > 1]:
+            raise InputError(f"{path.parent}: duplicate {what} {twice[0]}. Keep one of them")
     point = np.concatenate([np.zeros(0, int), *(i.point for i in images)])
     if len(missing := np.setdiff1d(point, ids)):
         raise InputError(
             f"{path.parent}: {len(missing)} point(s) of the images are missing in points3D, for example {missing[0]}. "
             "Export the model from COLMAP again"
         )
-    cameras = {str(k): _project_camera(path, model.cameras[k]) for k in sorted({i.camera for i in images})}
+    for image in images:
+        if image.camera not in cameras:
+            raise InputError(f"{path.parent}: camera {image.camera} of image {image.name} is missing. Add it")
+        model, *_ = cameras[image.camera]
+        names = MODELS[model]
+        free = ["c_mm", "xp_mm", "yp_mm", *(k for k in names if k not in _PLACES), *["b1"] * ("fx" in names)]
+        camera = _camera_file(source, str(image.camera), cameras[image.camera])
+        models[camera.name] = ProjectCamera(camera.sensor, camera.interior, tuple(free))
     quaternions = np.array([i.quaternion for i in images]).reshape(-1, 4)[:, [1, 2, 3, 0]]
     # SciPy before 1.17 rejects empty arrays.
     of = scipy.spatial.transform.Rotation.from_quat
     rotations = of(quaternions).as_matrix() if len(quaternions) else np.zeros((0, 3, 3))
     moved = np.array([i.translation for i in images]).reshape(-1, 3)
-    folder = path.resolve().parent.name
+    order = np.argsort(ids)
     return Project(
-        folder, cameras, (), [i.name for i in images], [str(i.camera) for i in images],
-        pose(rotations, translations(np.swapaxes(rotations, 1, 2), moved)), ids.astype(str).tolist(),
-        model.xyz[np.argsort(model.point_ids)], np.repeat(np.arange(len(images)), [len(i.point) for i in images]),
-        np.searchsorted(ids, point), np.concatenate([np.zeros((0, 2)), *(i.xy_px for i in images)]), file=folder,
+        folder, models, (), [i.name for i in images], [str(i.camera) for i in images],
+        pose(rotations, translations(np.swapaxes(rotations, 1, 2), moved)), ids[order].astype(str).tolist(), xyz[order],
+        np.repeat(np.arange(len(images)), [len(i.point) for i in images]), np.searchsorted(ids[order], point),
+        np.concatenate([np.zeros((0, 2)), *(i.xy_px for i in images)]), file=folder,
     )  # fmt: skip
-
-
-def read_model(path: Path) -> ColmapModel:
-    """Read a model from its folder or its cameras file. Raise InputError for inconsistent content."""
-    path = find(path)[0] if path.is_dir() else path
-    images_path, points_path = (path.with_name(name + path.suffix) for name in FILES[1:])
-    cameras = read_cameras(CameraSource(path))
-    if path.suffix == ".txt":
-        images = sorted(_text_images(images_path), key=lambda image: image.name)
-        ids, xyz = _text_points(points_path)
-    else:
-        images = sorted(_binary_images(images_path), key=lambda image: image.name)
-        ids, xyz = _binary_points(points_path)
-    for image in images:
-        if image.camera not in cameras:
-            raise InputError(f"{path.parent}: camera {image.camera} of image {image.name} is missing. Add it")
-        length = math.hypot(*image.quaternion)
-        if not 1 / _LONGEST < length < _LONGEST:
-            raise InputError(
-                f"{path.parent}: the quaternion of image {image.name} has the length {length:.3g} instead of 1. "
-                "Export the model from COLMAP again"
-            )
-    for what, names in (("image", [i.name for i in images]), ("point", ids.tolist())):
-        if twice := [name for name, times in Counter(names).items() if times > 1]:
-            raise InputError(f"{path.parent}: duplicate {what} {twice[0]}. Keep one of them")
-    return ColmapModel(cameras, images, ids, xyz)
 
 
 def _cells_error(path: Path, row: int, count: int, expected: str) -> InputError:
@@ -207,9 +167,9 @@ def _text_images(path: Path) -> Iterator[ColmapImage]:
         if len(features) % 3:
             raise _cells_error(path, row, len(features), "X Y POINT3D_ID of some features")
         measured = np.array(row_numbers(path, row, features, len(features))).reshape(-1, 3)
-        measured = measured[measured[:, 2] >= 0]
+        measured = measured[measured[:, 2] != _NO_POINT]
         ids = measured[:, 2].astype(np.int64)
-        yield ColmapImage(cells[9].strip(), int(camera), tuple(numbers[:4]), tuple(numbers[4:]), measured[:, :2], ids)
+        yield ColmapImage(cells[9].strip(), int(camera), numbers[:4], numbers[4:], measured[:, :2], ids)
 
 
 def _text_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -219,34 +179,27 @@ def _text_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
         if len(cells) < 4:
             raise _cells_error(path, row, len(cells), "POINT3D_ID X Y Z and more")
         points.append(row_numbers(path, row, cells, 4))
-        if points[-1][0] % 1 or abs(points[-1][0]) >= 2**53:
-            raise InputError(f"{path}, row {row}: {cells[0]} is not an id. Write a whole number")
     values = np.array(points).reshape(-1, 4)
     return values[:, 0].astype(np.int64), values[:, 1:]
 
 
 def _binary_images(path: Path) -> Iterator[ColmapImage]:
     file = _Binary(path)
-    for _ in range(file.count(73)):
+    for _ in range(*file.take("Q")):
         _, *numbers, camera = file.take("I7dI")
-        name = file.name()
-        features = file.rows(_FEATURE)
+        name, features = file.name(), file.rows(_FEATURE)
         features = features[features["point"] != _NO_POINT]
-        if not np.isfinite(features["xy"]).all():
-            raise InputError(f"{path}: image {name} has a coordinate that is not finite. Copy the file again")
-        point = features["point"].astype(np.int64)
-        yield ColmapImage(name, camera, tuple(numbers[:4]), tuple(numbers[4:]), features["xy"], point)
+        yield ColmapImage(name, camera, numbers[:4], numbers[4:], features["xy"], features["point"].astype(np.int64))
 
 
 def _binary_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    file = _Binary(path)
-    count = file.count(51)
-    ids, xyz = np.zeros(count, np.int64), np.zeros((count, 3))
-    for k in range(count):
-        identifier, *xyz[k], _ = file.take("Q3d3xd")
-        ids[k] = np.uint64(identifier).astype(np.int64)
+    file, ids, xyz = _Binary(path), list[int](), list[list[float]]()
+    for _ in range(*file.take("Q")):
+        identifier, *at, _ = file.take("q3d3xd")
+        ids.append(identifier)
+        xyz.append(at)
         file.rows(np.dtype("<u4,<u4"))
-    return ids, xyz
+    return np.array(ids, np.int64), np.array(xyz).reshape(-1, 3)
 
 
 # Cameras ------------------------------------------------------------------------------------------------------
@@ -261,85 +214,58 @@ def recognise_cameras(path: Path, text: str) -> bool:
 
 
 def read_camera(source: CameraSource) -> CameraFile:
-    """Read one camera; other cameras in the file may be invalid."""
-    lines = read_cameras(source) if source.path.suffix == ".bin" else _lines_by_id(source)
-    name = source.chosen([str(identifier) for identifier in lines])
-    chosen = lines[int(name)]
-    camera = chosen if isinstance(chosen, ColmapCamera) else _camera_of(source, name, chosen)
-    sensor, interior, assumed = _sensor_and_interior(source, camera)
-    return CameraFile(name, sensor, interior, None, assumed)
+    """Read one camera."""
+    cameras = read_cameras(source)
+    name = source.chosen([str(identifier) for identifier in cameras])
+    return _camera_file(source, name, cameras[int(name)])
 
 
-def read_cameras(source: CameraSource) -> dict[int, ColmapCamera]:
-    """Read all cameras by id."""
-    if source.path.suffix != ".bin":
-        return {key: _camera_of(source, str(key), cells) for key, cells in _lines_by_id(source).items()}
-    cameras: dict[int, ColmapCamera] = {}
-    file = _Binary(source.path)
-    for _ in range(file.count(24)):
-        identifier, number, width, height = file.take("IiQQ")
-        model = _NUMBERS[number] if 0 <= number < len(_NUMBERS) else f"number {number}"
-        _check_known(source, model, str(identifier))
-        if identifier in cameras:
-            raise source.error(f"duplicate camera {identifier}; keep one of the two")
-        cameras[identifier] = ColmapCamera(model, width, height, file.take(f"{len(MODELS[model])}d"))
+def read_cameras(source: CameraSource) -> dict[int, tuple[str, float, float, list[float]]]:
+    """Return model, width, height and parameters of all cameras by id."""
+    cameras: dict[int, tuple[str, float, float, list[float]]] = {}
+    if source.path.suffix == ".bin":
+        file = _Binary(source.path)
+        for _ in range(*file.take("Q")):
+            identifier, number, width, height = file.take("IiQQ")
+            model = _NUMBERS[number] if 0 <= number < len(_NUMBERS) else f"number {number}"
+            names = _names(source, model, identifier)
+            cameras[identifier] = model, width, height, list(file.take(f"{len(names)}d"))
+        return cameras
+    for row, line in content_rows(source.path):
+        cells = line.split()
+        if not cells[0].isdecimal() or len(cells) < 4:
+            raise source.error(f"row {row}: {quoted(line)}; write CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
+        if (identifier := int(cells[0])) in cameras:
+            raise source.error(f"duplicate camera {identifier}; keep one of the two lines")
+        names, count = _names(source, cells[1], identifier), len(cells) - 4
+        if count != len(names):
+            raise source.error(
+                f"camera {identifier} has {count} parameters instead of the {len(names)} of {cells[1]}: "
+                f"{', '.join(names)}"
+            )
+        width, height, *values = row_numbers(source.path, row, cells[2:], 2 + count)
+        cameras[identifier] = cells[1], width, height, values
     return cameras
 
 
-def _lines_by_id(source: CameraSource) -> dict[int, list[str]]:
-    lines: dict[int, list[str]] = {}
-    for row, line in content_rows(source.path):
-        cells = line.split()
-        identifier = int(cells[0]) if cells[0].isdecimal() else None
-        if identifier is None:
-            raise source.error(
-                f"row {row} begins with {quoted(cells[0])}, not an id; write CAMERA_ID MODEL WIDTH HEIGHT PARAMS"
-            )
-        if identifier in lines:
-            raise source.error(f"duplicate camera {identifier}; keep one of the two lines")
-        lines[identifier] = cells
-    return lines
-
-
-def _camera_of(source: CameraSource, name: str, cells: list[str]) -> ColmapCamera:
-    if len(cells) < 4:
-        raise source.error(f"camera {name} has {len(cells)} cells; write CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
-    model = cells[1]
-    _check_known(source, model, name)
-    names = MODELS[model]
-    if len(cells) != 4 + len(names):
-        count = len(cells) - 4
-        raise source.error(
-            f"camera {name} has {count} parameters instead of the {len(names)} of {model}: {', '.join(names)}"
-        )
-    sensor, _ = source.sensor(*(source.number(f"the size of camera {name}", cell) for cell in cells[2:4]))
-    values = (source.number(f"{key} of camera {name}", cell) for key, cell in zip(names, cells[4:], strict=True))
-    return ColmapCamera(model, sensor.width_px, sensor.height_px, tuple(values))
-
-
-def _check_known(source: CameraSource, model: str, name: str) -> None:
+def _names(source: CameraSource, model: str, identifier: int) -> tuple[str, ...]:
     if model not in MODELS:
-        raise source.error(f"model {model} of camera {name} is not supported; use one of {', '.join(MODELS)}")
+        raise source.error(f"model {model} of camera {identifier} is not supported; use one of {', '.join(MODELS)}")
+    return MODELS[model]
 
 
-def _sensor_and_interior(source: CameraSource, camera: ColmapCamera) -> tuple[Sensor, InteriorOrientation, str]:
-    sensor, assumed = source.sensor(camera.width_px, camera.height_px)
-    values = dict(zip(MODELS[camera.model], camera.values, strict=True))
+def _camera_file(source: CameraSource, name: str, camera: tuple[str, float, float, list[float]]) -> CameraFile:
+    kind, width, height, numbers = camera
+    sensor, assumed = source.sensor(width, height)
+    values = {key: source.number(key, value) for key, value in zip(MODELS[kind], numbers, strict=True)}
     fx, fy = (values.pop("f"),) * 2 if "f" in values else (values.pop("fx"), values.pop("fy"))
     centre = values.pop("cx"), values.pop("cy")
-    model = FISHEYE if camera.model in _FISHEYES else OPENCV
-    return sensor, in_pixels(source, sensor, fx, fy, centre, model, **values), assumed
+    interior = in_pixels(source, sensor, fx, fy, centre, FISHEYE if kind in _FISHEYES else OPENCV, **values)
+    return CameraFile(name, sensor, interior, None, assumed)
 
 
-def _project_camera(path: Path, camera: ColmapCamera) -> ProjectCamera:
-    sensor, interior, _ = _sensor_and_interior(CameraSource(path), camera)
-    names = MODELS[camera.model]
-    free = ["c_mm", "xp_mm", "yp_mm", *(k for k in names if k not in _PLACES)]
-    return ProjectCamera(sensor, interior, (*free, *["b1"] * ("fx" in names)))
-
-
-def colmap_camera(sensor: Sensor, interior: InteriorOrientation) -> ColmapCamera:
-    """Return a camera in the simplest COLMAP model with all its nonzero coefficients."""
+def colmap_camera(sensor: Sensor, interior: InteriorOrientation) -> tuple[str, int, int, list[float]]:
+    """Return the simplest COLMAP model with all nonzero coefficients, width, height and parameters."""
     fx, fy, column, row = pixels_of(interior, sensor)
     d = interior.distortion
     coefficients = {k: float(getattr(d, k)) for k in d.coefficients if k not in ("b1", "b2")}
@@ -347,13 +273,13 @@ def colmap_camera(sensor: Sensor, interior: InteriorOrientation) -> ColmapCamera
     models = _FISHEYES if isinstance(d, OpenCvFisheye) else _PLANES
     model = next(m for m, names in models.items() if needed <= set(names))
     values = {"fx": fx, "fy": fy, "f": fy, "cx": column, "cy": row} | coefficients
-    return ColmapCamera(model, sensor.width_px, sensor.height_px, tuple(values[key] for key in MODELS[model]))
+    return model, sensor.width_px, sensor.height_px, [values[key] for key in MODELS[model]]
 
 
-def _cameras_text(cameras: dict[int, ColmapCamera]) -> str:
+def _cameras_text(cameras: dict[int, tuple[str, int, int, list[float]]]) -> str:
     lines = ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
-    for identifier, c in cameras.items():
-        lines.append(" ".join([f"{identifier} {c.model} {c.width_px} {c.height_px}", *map(repr, c.values)]))
+    for identifier, (model, width, height, values) in cameras.items():
+        lines.append(" ".join([f"{identifier} {model} {width} {height}", *map(repr, values)]))
     return "\n".join(lines) + "\n"
 
 
@@ -365,35 +291,26 @@ def write_camera(path: Path, name: str, sensor: Sensor, interior: InteriorOrient
 
 # Written models -----------------------------------------------------------------------------------------------
 
-
-class _Point(NamedTuple):
-    id: int
-    xyz: list[float]
-    track: np.ndarray
-    """Image id and feature index of each measurement."""
+_Points = list[tuple[int, list[float], np.ndarray]]
+"""Id, coordinates and track (image id and feature index) of each point."""
 
 
-def _model(p: Project) -> tuple[dict[int, ColmapCamera], list[ColmapImage], list[_Point]]:
+def _model(p: Project) -> tuple[dict[int, tuple[str, int, int, list[float]]], list[ColmapImage], _Points]:
     """Return cameras, images by id (from 1), and points; numeric ids of cameras and points are retained."""
     camera_ids, point_ids = numbered(tuple(p.cameras)), np.array(list(numbered(p.points).values()), int)
     rotations = p.world_to_camera
     quaternions = scipy.spatial.transform.Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]].tolist()
     moved = translations(rotations, p.exterior.position).tolist()
+    cameras = [camera_ids[name] for name in p.image_camera]
+    heads = zip(p.files, cameras, quaternions, moved, strict=True)
     images = [
-        ColmapImage(
-            p.files[i], camera_ids[p.image_camera[i]], tuple(quaternions[i]), tuple(moved[i]), p.column_row[rows],
-            point_ids[p.point[rows]],
-        )
-        for i, rows in enumerate(p.rows_of_images)
-    ]  # fmt: skip
-    feature = p.number_in_image
-    points = [
-        _Point(int(identifier), xyz, np.stack([p.image[rows] + 1, feature[rows]], axis=1))
-        for identifier, xyz, rows in zip(point_ids, np.asarray(p.xyz).tolist(), p.rows_of_points, strict=True)
-        if len(rows)
+        ColmapImage(*head, p.column_row[rows], point_ids[p.point[rows]])
+        for head, rows in zip(heads, p.rows_of_images, strict=True)
     ]
-    cameras = {camera_ids[name]: colmap_camera(c.sensor, c.interior) for name, c in p.cameras.items()}
-    return cameras, images, points
+    tracks = np.stack([p.image + 1, p.number_in_image], axis=1)
+    every = zip(point_ids.tolist(), np.asarray(p.xyz).tolist(), p.rows_of_points, strict=True)
+    points = [(identifier, xyz, tracks[rows]) for identifier, xyz, rows in every if len(rows)]
+    return {camera_ids[name]: colmap_camera(c.sensor, c.interior) for name, c in p.cameras.items()}, images, points
 
 
 def write_text(p: Project, folder: Path) -> None:
@@ -407,7 +324,7 @@ def write_text(p: Project, folder: Path) -> None:
         lines.append(" ".join(f"{column!r} {row!r} {point}" for (column, row), point in features))
     rest = " ".join(map(str, (*_COLOUR, _ERROR)))
     rows = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
-    rows += [" ".join([str(q.id), *map(repr, q.xyz), rest, *map(str, q.track.ravel().tolist())]) for q in points]
+    rows += [" ".join([str(k), *map(repr, xyz), rest, *map(str, track.ravel().tolist())]) for k, xyz, track in points]
     texts = (_cameras_text(cameras), "\n".join(lines) + "\n", "\n".join(rows) + "\n")
     for name, text in zip(FILES, texts, strict=True):
         (folder / f"{name}.txt").write_text(text, encoding="utf-8")
@@ -417,17 +334,16 @@ def write_binary(p: Project, folder: Path) -> None:
     """Write cameras.bin, images.bin and points3D.bin."""
     cameras, images, points = _model(p)
     parts = [[struct.pack("<Q", len(records))] for records in (cameras, images, points)]
-    for identifier, c in cameras.items():
-        layout = f"<IiQQ{len(c.values)}d"
-        parts[0].append(struct.pack(layout, identifier, _NUMBERS.index(c.model), c.width_px, c.height_px, *c.values))
+    for identifier, (model, width, height, values) in cameras.items():
+        parts[0].append(struct.pack(f"<IiQQ{len(values)}d", identifier, _NUMBERS.index(model), width, height, *values))
     for k, image in enumerate(images, 1):
         features = np.zeros(len(image.point), _FEATURE)
         features["xy"], features["point"] = image.xy_px, image.point
         head = struct.pack("<I7dI", k, *image.quaternion, *image.translation, image.camera)
         parts[1] += [head, image.name.encode() + b"\0", struct.pack("<Q", len(features)), features.tobytes()]
-    for q in points:
-        head = struct.pack("<Q3d3BdQ", q.id, *q.xyz, *_COLOUR, _ERROR, len(q.track))
-        parts[2] += [head, q.track.astype("<u4").tobytes()]
+    for identifier, xyz, track in points:
+        head = struct.pack("<Q3d3BdQ", identifier, *xyz, *_COLOUR, _ERROR, len(track))
+        parts[2] += [head, track.astype("<u4").tobytes()]
     for name, content in zip(FILES, parts, strict=True):
         (folder / f"{name}.bin").write_bytes(b"".join(content))
 

@@ -24,14 +24,13 @@ import numpy as np
 
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.extras.formats.dbat import CAMERA, control_table
-from jaxphoto.extras.formats.files import Format, by_content, read_columns, row_numbers, warn
+from jaxphoto.extras.formats.files import Format, beginning, by_content, read_columns, row_numbers, warn
 from jaxphoto.io.block_folder import BlockTables
-from jaxphoto.io.block_folder.camera_section import PIXEL_MM
 from jaxphoto.io.block_folder.table_layout import ANGLES, SIGMA_XYZ, XYZ
 from jaxphoto.io.text_files import read_legacy_text
 from jaxphoto.io.text_tables import Table, is_number
 
-CONTROL, STATIONS = "ctrlpts-weighted.txt", "fake-camera-positions.txt"
+CONTROL_FILE, STATIONS = "ctrlpts-weighted.txt", "fake-camera-positions.txt"
 # Assumed standard deviation of image points (px), as in DBAT: the sigmas of the export are flags (1 manual, 0
 # automatic).
 _SIGMA_PX = 1.0
@@ -39,17 +38,16 @@ _SIGMA_PX = 1.0
 _HEADERS = ((4, 9, 10), (2, 9, 10))
 _LINES_PER_PHOTOGRAPH = 6
 _POINT, _MARK = ("id", "x", "y", "z", "sx", "sy", "sz"), ("im", "id", "x", "y", "sx", "sy")
-_FREE = {"c_mm": "free", "xp_mm": "free", "yp_mm": "free"}
+_FREE = ("c_mm", "xp_mm", "yp_mm")
 _LEAST_CONTROL = 3
 # Maximum relative difference of the sides of a pixel treated as square.
 _SQUARE = 1e-9
 
 
 def _is_export(path: Path) -> bool:
-    with path.open("rb") as file:
-        begin = file.read(2_000).decode("utf-8", "replace").splitlines()
-    rows = [line.split() for line in begin[1:4]]
-    return len(begin) > 5 and tuple(map(len, rows)) in _HEADERS and all(is_number(cell) for row in rows for cell in row)
+    begin = [line.split() for line in beginning(path, 2_000)]
+    numeric = all(is_number(cell) for row in begin[1:4] for cell in row)
+    return len(begin) > 5 and tuple(map(len, begin[1:4])) in _HEADERS and numeric
 
 
 def read(path: Path) -> BlockTables:
@@ -62,30 +60,38 @@ def read(path: Path) -> BlockTables:
     lines = read_legacy_text(path).split("\n")
     if len(lines) < 6:
         raise InputError(f"{path.name}: the file ends within its header. Export it again")
-    camera = _camera(path, lines)
-    name_of, images, at = _photographs(path, lines)
+    camera, at, names = _camera(path, lines), 5, dict[str, str]()
+    poses, rows = [], []
+    while at < len(lines) and lines[at].strip():
+        words = lines[at].split(maxsplit=1)
+        if len(words) != 2 or len(lines) < at + _LINES_PER_PHOTOGRAPH:
+            raise InputError(
+                f"{path.name}, row {at + 1}: {quoted(lines[at])} does not start a photograph. Export it again"
+            )
+        names[words[0]] = _stem(words[1].strip())
+        poses.append(row_numbers(path, at + 2, lines[at + 1].split(), 7)[1:])
+        rows.append(at + 2)
+        at += _LINES_PER_PHOTOGRAPH
+    images = {"image": np.array(list(names.values()), object), "camera": np.full(len(names), CAMERA, object)}
+    x, y, z, kappa, phi, omega = np.array(poses).T
+    outer = dict(zip((*XYZ, *ANGLES), (x, y, z, omega, phi, kappa), strict=True))
     control, points, marks = _sections(path, lines, at)
-    for line, number in enumerate(marks.text("im")):
-        if number not in name_of:
-            raise marks.bad(line, f"image {number} is not among the export's images. Export it again")
-    columns = {
-        "image": np.array([name_of[number] for number in marks.text("im")], object),
-        "point": marks.text("id"),
-        "column_px": marks.numbers("x") - 0.5,
-        "row_px": marks.numbers("y") - 0.5,
-        "sigma_px": np.full(len(marks), _SIGMA_PX),
-    }
-    tables = {"images": images, "image_points": Table(path.name, columns, marks.files, marks.rows)}
+    numbers, stems = list(names), np.array(list(names.values()), object)
+    shown = stems[marks.find("im", numbers, lambda number: f"image {number} is not among the export's images")]
+    columns = {"image": shown, "point": marks.text("id"), "sigma_px": np.full(len(marks), _SIGMA_PX)}
+    columns |= {"column_px": marks.numbers("x") - 0.5, "row_px": marks.numbers("y") - 0.5}
+    tables = {"image_points": Table(path.name, columns, marks.files, marks.rows)}
     settings: dict[str, Any] = {"title": lines[0].strip(), "cameras": {CAMERA: camera}}
-    if (path.parent / CONTROL).is_file():
-        tables["images"] = Table.of(path.name, {name: images.columns[name] for name in ("image", "camera")})
-        control = read_columns(path.parent / CONTROL, ("id", "label", "x", "y", "z", "sx", "sy", "sz"))
+    if (path.parent / CONTROL_FILE).is_file():
+        tables["images"] = Table.of(path.name, images)
+        control = read_columns(path.parent / CONTROL_FILE, ("id", "label", "x", "y", "z", "sx", "sy", "sz"))
         tables["control_points"] = control_table(control, "", 1.0)
     else:
+        tables["images"] = Table.of(path.name, images | outer, np.array(rows, int))
         xyz = {name: points.numbers(axis) for name, axis in zip(XYZ, "xyz", strict=True)}
         tables["object_points"] = Table(path.name, {"point": points.ids("id")} | xyz, points.files, points.rows)
         estimated = [name for name, value in camera["interior"].items() if value != 0]
-        camera["unknowns"] = _FREE | dict.fromkeys(estimated, "free")
+        camera["unknowns"] = dict.fromkeys([*_FREE, *estimated], "free")
         if len(control) < _LEAST_CONTROL:
             settings["datum"] = {"kind": "inner", "over": "points"}
             if len(control):
@@ -113,8 +119,6 @@ def _camera(path: Path, lines: list[str]) -> dict[str, Any]:
     if min(width, height, width_mm, height_mm) <= 0:
         raise InputError(f"{path.name}: the format of the camera is not positive. Export it again")
     sides = width_mm / width, height_mm / height
-    if not all(PIXEL_MM[0] <= side <= PIXEL_MM[1] for side in sides):
-        raise InputError(f"{path.name}: pixels of {sides[0]:g} x {sides[1]:g} mm are implausible. Export it again")
     square = abs(sides[0] / sides[1] - 1) < _SQUARE
     # Affinity is applied first: it makes the pixels square.
     pixel = sides[0] if square else sides[1]
@@ -126,30 +130,6 @@ def _camera(path: Path, lines: list[str]) -> dict[str, Any]:
         "width_px": int(width), "height_px": int(height), "pixel_mm": pixel,
         "distortion": "brown" if square else "affine_brown", "interior": interior | ({} if square else {"b1": b1}),
     }  # fmt: skip
-
-
-def _photographs(path: Path, lines: list[str]) -> tuple[dict[str, str], Table, int]:
-    """Return photograph names by number, the images table, and the index of the next line."""
-    at, names = 5, dict[str, str]()
-    poses, rows = [], []
-    while at < len(lines) and lines[at].strip():
-        words = lines[at].split(maxsplit=1)
-        if len(words) != 2 or len(lines) < at + _LINES_PER_PHOTOGRAPH:
-            raise InputError(
-                f"{path.name}, row {at + 1}: {quoted(lines[at])} does not start a photograph. Export it again"
-            )
-        names[words[0]] = _stem(words[1].strip())
-        poses.append(row_numbers(path, at + 2, lines[at + 1].split(), 7)[1:])
-        rows.append(at + 2)
-        at += _LINES_PER_PHOTOGRAPH
-    if not names:
-        raise InputError(f"{path.name}, row 6: no photograph. Export it again")
-    if len(names) < len(poses):
-        raise InputError(f"{path.name}: two photographs have the same number. Export it again")
-    x, y, z, kappa, phi, omega = np.array(poses).T
-    columns = {"image": np.array(list(names.values()), object), "camera": np.full(len(names), CAMERA, object)}
-    columns |= dict(zip((*XYZ, *ANGLES), (x, y, z, omega, phi, kappa), strict=True))
-    return names, Table.of(path.name, columns, np.array(rows, int)), at
 
 
 def _sections(path: Path, lines: list[str], at: int) -> list[Table]:

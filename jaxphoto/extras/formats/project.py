@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import pandas as pd
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
@@ -23,7 +24,6 @@ from jaxphoto.io.block_folder.camera_section import Camera, camera_section
 from jaxphoto.io.block_folder.settings import frame_section
 from jaxphoto.io.block_folder.table_layout import ANGLES, SIGMA_XYZ, coordinate_names
 from jaxphoto.io.text_tables import Table
-from jaxphoto.observations import ControlCoordinates
 from jaxphoto.procedures.control.surveyed import SIGMA_M, system_of
 from jaxphoto.procedures.georeference_photographs import utm_of
 from jaxphoto.unknowns import FIXED, FREE, Unknowns
@@ -35,13 +35,10 @@ _ROTATION_TOLERANCE = 1e-3
 _LEAST = 3
 # Standard deviation (m) of fixed coordinates in formats without fixed coordinates.
 _FIXED_M = 1e-4
+# Radius of the earth (m), and its relative range with heights of flights.
+_EARTH_M, _ROUGHLY = 6.37e6, 0.02
 # Semi-major axis (m) of WGS 84 and GRS 80.
 _WGS84_M = 6378137.0
-WGS84 = 4326
-# Minimum and maximum distance (m) of positions from the centre of the earth.
-_EARTH_M = (6.3e6, 6.5e6)
-# Maximum distance (m) of camera positions from the origin of the frame.
-_NEAR_M = 100e3
 
 
 class ControlPoints(NamedTuple):
@@ -61,21 +58,17 @@ class ControlPoints(NamedTuple):
     @staticmethod
     def of(block: Block) -> "ControlPoints":
         """Return the control and check points of a block, control points first."""
-        control = _points([(block.control, np.nan), (block.fixed, _FIXED_M)], len(block.points))
-        check = _points([(block.check, np.nan)], len(block.points))
-        only = ~np.isin(check.point, control.point)
-        point, xyz, sigma, _ = (np.concatenate([a, b[only]]) for a, b in zip(control, check, strict=True))
-        return ControlPoints(point, xyz, sigma, np.arange(len(point)) >= len(control.point))
-
-
-def _points(kinds: list[tuple[ControlCoordinates, float]], n_points: int) -> ControlPoints:
-    """Collect coordinates by point; each kind has a default for missing standard deviations."""
-    xyz, sigma = np.full((n_points, 3), np.nan), np.full((n_points, 3), np.nan)
-    for rows, none in kinds:
-        at, sigmas = (np.asarray(rows.who), np.asarray(rows.axis)), np.asarray(rows.sigma)
-        xyz[at], sigma[at] = np.asarray(rows.value), np.where(sigmas > 0, sigmas, none)
-    known = np.flatnonzero(~np.isnan(xyz).all(axis=1))
-    return ControlPoints(known, xyz[known], sigma[known], np.zeros(len(known), bool))
+        n_points, parts = len(block.points), list[ControlPoints]()
+        for kinds in (((block.control, np.nan), (block.fixed, _FIXED_M)), ((block.check, np.nan),)):
+            xyz, sigma = np.full((2, n_points, 3), np.nan)
+            for rows, missing in kinds:
+                at, sigmas = (np.asarray(rows.who), np.asarray(rows.axis)), np.asarray(rows.sigma)
+                xyz[at], sigma[at] = np.asarray(rows.value), np.where(sigmas > 0, sigmas, missing)
+            known = np.flatnonzero(~np.isnan(xyz).all(axis=1))
+            if parts:
+                known = known[~np.isin(known, parts[0].point)]
+            parts.append(ControlPoints(known, xyz[known], sigma[known], np.full(len(known), bool(parts))))
+        return ControlPoints(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
 class Project(NamedTuple):
@@ -184,21 +177,14 @@ class Project(NamedTuple):
         """EPSG:code, with the code of the vertical system unless heights are ellipsoidal; "" for a local frame."""
         return map_name(self.frame.code, self.frame.vertical) if self.frame.code is not None else ""
 
-    @property
-    def geographic(self) -> bool:
-        """True if map coordinates are longitude and latitude."""
-        return self.frame.code is not None and map_system(self.frame.code).is_geographic
-
-    def in_map(self, *, ellipsoidal: bool = False) -> "Project":
+    def in_map(self) -> "Project":
         """Convert the project to map coordinates of its frame; a local frame is unchanged.
 
         Positions and rotations are exact. Collinearity is approximate because of map scale and earth curvature.
-        `ellipsoidal` requests ellipsoidal heights in every frame.
         """
         if self.on_map or self.frame.kind != "epsg" or self.frame.code is None:
             return self
-        assert self.frame.origin is not None
-        system = MapFrame(self.frame.code, None, self.frame.origin) if ellipsoidal else self.frame.map
+        system = self.frame.map
         position = np.asarray(self.exterior.position)
         rotations = np.asarray(self.exterior.camera_from_object) @ system.local_from_grid(position)
         control = self.control
@@ -294,32 +280,32 @@ class Project(NamedTuple):
 
     def _measurements(self, image: np.ndarray, control: dict[str, np.ndarray] | None) -> tuple[np.ndarray, ...]:
         """Return image, point, pixel coordinates and sigma of valid measurements."""
-        point, xy = self.point, self.column_row
-        sigma = np.full(len(point), np.nan) if self.sigma_px is None else self.sigma_px[:, 0]
+        (x, y), sigma = self.column_row.T, np.nan if self.sigma_px is None else self.sigma_px[:, 0]
+        rows = pd.DataFrame({"image": image, "point": self.point, "x": x, "y": y, "sigma": sigma})
         # A feature of several points belongs to the lowest index; a point measured twice in an image takes the first
         # feature.
-        order = np.lexsort((point, image))
-        image, point, xy, sigma = image[order], point[order], xy[order], sigma[order]
-        for by in ("xy", "point"):
-            columns = np.column_stack([image, xy if by == "xy" else point])
-            kept = np.sort(np.unique(columns, axis=0, return_index=True)[1])
-            image, point, xy, sigma = image[kept], point[kept], xy[kept], sigma[kept]
-        n_once, n_points = len(point), len(np.unique(point))
+        rows = rows.sort_values(["image", "point"], kind="stable")
+        rows = rows.drop_duplicates(["image", "x", "y"]).drop_duplicates(["image", "point"])
+        n_once, n_points = len(rows), rows.point.nunique()
         fixed = set() if control is None else set(control["point"][control["role"] == "control"])
         is_control = np.array([name in fixed for name in self.points], bool)
-        while True:
+        tied = np.zeros(0, bool)
+        while not tied.all() or len(tied) != len(rows):
+            image, point = rows.image.to_numpy(), rows.point.to_numpy()
             tied = (np.bincount(point, minlength=len(is_control))[point] >= 2) | is_control[point]
             tied &= np.bincount(image[tied], minlength=len(self.files))[image] >= _LEAST
-            if tied.all():
-                break
-            image, point, xy, sigma = image[tied], point[tied], xy[tied], sigma[tied]
-        n_skipped = n_points - len(np.unique(point))
-        if n_once < len(order) or n_skipped:
+            rows = rows[tied]
+        n_skipped = n_points - rows.point.nunique()
+        if n_once < len(self.point) or n_skipped:
             _warn(
-                f"{self.file}: skipped {len(order) - n_once} duplicate measurement(s) and {n_skipped} point(s) "
+                f"{self.file}: skipped {len(self.point) - n_once} duplicate measurement(s) and {n_skipped} point(s) "
                 "in fewer than two images"
             )
-        return image, point, xy, sigma
+        return (
+            *(rows[name].to_numpy() for name in ("image", "point")),
+            rows[["x", "y"]].to_numpy(),
+            rows.sigma.to_numpy(),
+        )
 
 
 def flipped(rotations: ArrayLike) -> Float[np.ndarray, "n 3 3"]:
@@ -389,9 +375,7 @@ def _image_names(files: list[str]) -> list[str]:
 
 def is_geocentric(xyz: Float[np.ndarray, "n 3"]) -> bool:
     """Return True if the distance of all positions from the origin is near the radius of the earth."""
-    with np.errstate(over="ignore"):
-        distance = np.linalg.norm(xyz, axis=1)
-    return len(xyz) > 0 and bool(((distance > _EARTH_M[0]) & (distance < _EARTH_M[1])).all())
+    return len(xyz) > 0 and bool((np.abs(np.linalg.norm(xyz / _EARTH_M, axis=1) - 1) < _ROUGHLY).all())
 
 
 def geocentric(p: Project, code: int, vertical: int | None) -> Project:
@@ -406,25 +390,8 @@ def geocentric(p: Project, code: int, vertical: int | None) -> Project:
 
 
 def about_place(p: Project, place: Place) -> Project:
-    """Place a project in east-north-up axes at `place` (WGS 84) into a frame of the UTM zone there.
-
-    The frame stays local, with a UserWarning, if camera positions are more than 100 km away or `place` is invalid.
-    """
-    far = float(np.abs(np.asarray(p.exterior.position)).max(initial=0.0))
-    if not (far < _NEAR_M and abs(place[0]) <= 180 and abs(place[1]) <= 90):
-        return _local(p, f"photographs are {far / 1000:.0f} km from its origin")
-    try:
-        return p._replace(frame=Frame("epsg", utm_of(*place[:2]), None, "true", place))
-    except InputError as error:
-        return _local(p, str(error))
-
-
-def in_system(p: Project, words: str) -> Project:
-    """Set the map system named in `words`; the project stays local, with a UserWarning, if this fails."""
-    try:
-        return with_system(p, words)
-    except InputError as error:
-        return _local(p, str(error).removeprefix(f"{p.file}: "))
+    """Place a project in east-north-up axes at `place` (WGS 84) into a frame of the UTM zone there."""
+    return p._replace(frame=Frame("epsg", utm_of(*place[:2]), None, "true", place))
 
 
 def with_system(p: Project, words: str) -> Project:
@@ -447,8 +414,3 @@ def _frame_amid(code: int, vertical: int | None, places: Float[np.ndarray, "n 3"
     """Return a frame whose origin is the rounded median of `places`."""
     longitude, latitude, _ = np.median(places, axis=0)
     return Frame("epsg", code, vertical, "true", (round(float(longitude), 4), round(float(latitude), 4), 0.0))
-
-
-def _local(p: Project, why: str) -> Project:
-    _warn(f"{p.file}: the georeference is skipped and coordinates are used as Cartesian metres: {why}")
-    return p
