@@ -11,8 +11,7 @@ from jaxphoto.camera import Brown, InteriorOrientation, Sensor, get_parameter, p
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
 from jaxphoto.extras.formats import ProjectCamera, export, read_source, read_tables
-from jaxphoto.extras.formats.points_beside import named, points_of, with_marks
-from jaxphoto.extras.formats.texts import read_exterior
+from jaxphoto.extras.formats.texts import named, points_of, read_exterior, with_marks
 from jaxphoto.io.block_folder.table_layout import XYZ
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
 from tests.formulas import camera_from_object
@@ -264,7 +263,7 @@ def test_columns_of_orientations_are_those_that_their_header_names(tmp_path, hea
 def test_orientations_without_a_header_are_refused(tmp_path, head):
     path = tmp_path / "ext.txt"
     path.write_text(head + "\n" + "a.jpg 1.5 2.5 100 3 -2 90\n" * 3)
-    with pytest.raises(InputError, match="ext.txt has no orientations; write the header"):
+    with pytest.raises(InputError, match=r"ext\.txt has no orientations; write the header"):
         read_exterior(path)
 
 

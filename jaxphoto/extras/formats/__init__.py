@@ -4,7 +4,6 @@ Modules declare FORMATS (oriented projects), CAMERAS (camera files) and CONTROL 
 `convert` registers them.
 """
 
-from jaxphoto.extras.formats.camera_models import ProjectCamera
 from jaxphoto.extras.formats.convert import (
     CAMERA_FORMATS,
     CAMERA_MODELS,
@@ -22,7 +21,7 @@ from jaxphoto.extras.formats.convert import (
     recognise,
     write_camera_file,
 )
-from jaxphoto.extras.formats.project import ControlPoints, Project
+from jaxphoto.extras.formats.project import ControlPoints, Project, ProjectCamera
 
 __all__ = [
     "CAMERAS_WRITTEN", "CAMERA_FORMATS", "CAMERA_MODELS", "CONTROL_FORMATS", "EXPORTS", "FORMATS", "LOSS_PX",

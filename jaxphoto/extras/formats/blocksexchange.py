@@ -21,9 +21,18 @@ from pathlib import Path
 import numpy as np
 
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.extras.formats.camera_models import AGISOFT, BROWN_TERMS, ProjectCamera, in_pixels, pixels_of
 from jaxphoto.extras.formats.files import Format, add, by_content, number_rows, warn, xml_text
-from jaxphoto.extras.formats.project import Project, about_place, pose, with_system
+from jaxphoto.extras.formats.project import (
+    AGISOFT,
+    BROWN_TERMS,
+    Project,
+    ProjectCamera,
+    about_place,
+    in_pixels,
+    pixels_of,
+    pose,
+    with_system,
+)
 from jaxphoto.georeferencing.map_frame import map_system
 from jaxphoto.io.camera_files import CameraSource
 from jaxphoto.io.text_files import has_words, read_bytes

@@ -7,7 +7,6 @@ deviations. Source: COLMAP documentation, "Camera models" and "Output format"; s
 """
 
 import struct
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -17,9 +16,18 @@ import scipy
 
 from jaxphoto.camera import InteriorOrientation, OpenCvFisheye, Sensor
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.extras.formats.camera_models import OPENCV, OPENCV_FISHEYE, ProjectCamera, in_pixels, pixels_of
 from jaxphoto.extras.formats.files import CameraFormat, Format, content_rows, row_numbers
-from jaxphoto.extras.formats.project import Project, numbered, pose, translations
+from jaxphoto.extras.formats.project import (
+    OPENCV,
+    OPENCV_FISHEYE,
+    Project,
+    ProjectCamera,
+    in_pixels,
+    numbered,
+    pixels_of,
+    pose,
+    translations,
+)
 from jaxphoto.io.camera_files import CameraFile, CameraReader, CameraSource
 from jaxphoto.io.text_files import read_bytes, read_legacy_text
 from jaxphoto.io.text_tables import is_number
@@ -115,9 +123,6 @@ def read(path: Path) -> Project:
     cameras, models = read_cameras(source), dict[str, ProjectCamera]()
     images = sorted((_text_images if text else _binary_images)(images_path), key=lambda image: image.name)
     ids, xyz = (_text_points if text else _binary_points)(points_path)
-    for what, names in (("image", [i.name for i in images]), ("point", ids.tolist())):
-        if twice := [name for name, times in Counter(names).items() if times > 1]:
-            raise InputError(f"{path.parent}: duplicate {what} {twice[0]}. Keep one of them")
     point = np.concatenate([np.zeros(0, int), *(i.point for i in images)])
     if len(missing := np.setdiff1d(point, ids)):
         raise InputError(

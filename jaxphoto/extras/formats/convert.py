@@ -27,9 +27,8 @@ from jaxphoto.extras.formats import (
     smac,
     texts,
 )
-from jaxphoto.extras.formats.camera_models import CameraModel
 from jaxphoto.extras.formats.files import CameraFormat, Format, by_content
-from jaxphoto.extras.formats.project import Project
+from jaxphoto.extras.formats.project import CameraModel, Project
 from jaxphoto.io.block_folder import BlockTables, assemble, write_block
 from jaxphoto.io.block_folder.block_reader import read_folder
 from jaxphoto.io.block_folder.table_layout import TOML

@@ -12,8 +12,7 @@ from jaxtyping import Float
 
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.extras.formats.camera_models import CameraModel
-from jaxphoto.extras.formats.project import Project
+from jaxphoto.extras.formats.project import CameraModel, Project
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.camera_files import CameraReader
 from jaxphoto.io.text_files import read_legacy_text

@@ -28,10 +28,8 @@ import numpy as np
 from pyproj import CRS
 
 from jaxphoto.arrays import as_jax_array
-from jaxphoto.block import Frame
 from jaxphoto.camera import Agisoft, InteriorOrientation, Sensor
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.extras.formats.camera_models import AGISOFT, AGISOFT_FISHEYE, ProjectCamera
 from jaxphoto.extras.formats.control import Mark, SurveyRows, read_marks
 from jaxphoto.extras.formats.files import (
     CameraFormat,
@@ -43,9 +41,17 @@ from jaxphoto.extras.formats.files import (
     warn,
     xml_text,
 )
-from jaxphoto.extras.formats.points_beside import points_beside, with_marks, write_image_points
-from jaxphoto.extras.formats.project import ControlPoints, Project, geocentric, is_geocentric, pose
-from jaxphoto.georeferencing.map_frame import map_system
+from jaxphoto.extras.formats.project import (
+    AGISOFT,
+    AGISOFT_FISHEYE,
+    ControlPoints,
+    Project,
+    ProjectCamera,
+    geocentric,
+    is_geocentric,
+    pose,
+)
+from jaxphoto.extras.formats.texts import points_beside, with_marks, write_image_points
 from jaxphoto.io.camera_files import CameraFile, CameraReader, CameraSource
 from jaxphoto.io.text_files import has_words, read_legacy_text
 from jaxphoto.io.text_tables import finite
@@ -176,7 +182,9 @@ def read(path: Path) -> Project:
     place = lambda k: f"{path.name}, camera {quoted(labels[k])}, transform"  # noqa: E731
     words = [(photo.findtext("transform") or "").split() for photo in photos]
     poses = number_rows(words, (16,), place).reshape(-1, 4, 4)
-    rotation, translation, scale, georeferenced = _transform(path, chunk, component)
+    georeferenced = _transform(path, chunk, component)
+    rotation, translation, scale = georeferenced or (np.eye(3), np.zeros(3), np.ones(1))
+    rotation = rotation.reshape(3, 3)
     centres = translation + scale * poses[:, :3, 3] @ rotation.T
     rotations = np.swapaxes(rotation @ poses[:, :3, :3], 1, 2)
     # Without the name of a system, geocentric positions are on WGS 84.
@@ -225,20 +233,19 @@ def _project_cameras(path: Path, chunk: ElementTree.Element) -> dict[str, tuple[
     return cameras
 
 
-def _transform(path: Path, chunk: ElementTree.Element, component: str) -> tuple[np.ndarray, np.ndarray, float, bool]:
-    """Return rotation, translation and scale from the chunk to the world, and False if the file has no transform."""
+def _transform(path: Path, chunk: ElementTree.Element, component: str) -> list[np.ndarray] | None:
+    """Return rotation, translation and scale from the chunk to the world; None if the file has no transform."""
     transforms = [c.find("transform") for c in chunk.iterfind("components/component") if c.get("id", "") == component]
     transform = next((t for t in [*transforms, chunk.find("transform")] if t is not None), None)
     if transform is None or transform.find("rotation") is None:
-        return np.eye(3), np.zeros(3), 1.0, False
+        return None
     values = []
     for key, size in (("rotation", 9), ("translation", 3), ("scale", 1)):
-        words = (transform.findtext(key) or ("1" if key == "scale" else "")).split()
-        values.append(number_rows([words], (size,), lambda _, key=key: f"{path.name}, transform, {key}")[0])  # type: ignore[misc]
-    rotation, translation, (scale,) = values
-    if not scale > 0:
-        raise InputError(f"{path.name}, transform: scale {scale:g} is not positive; re-export the cameras")
-    return rotation.reshape(3, 3), translation, float(scale), True
+        words = transform.findtext(key, "1").split()
+        values += [*number_rows([words], (size,), lambda _, key=key: f"{path.name}, transform, {key}")]  # type: ignore[misc]
+    if not values[2] > 0:
+        raise InputError(f"{path.name}, transform: scale {values[2][0]:g} is not positive; re-export the cameras")
+    return values
 
 
 # Markers ------------------------------------------------------------------------------------------------------
@@ -274,10 +281,11 @@ def _markers(file: str, chunk: ElementTree.Element) -> tuple[SurveyRows, list[Ma
         if reference is None or reference.get("x") is None or reference.get("y") is None:
             continue
         name = labels[marker.get("id", "")]
-        place = f"{file}, marker {quoted(name)}"
-        xyz = [_number(reference, key, place) for key in "xyz"]
-        sigma = [_sigma(reference, key, place) for key in ("sx", "sy", "sz")]
-        points.add(name, xyz, place, sigma, reference.get("enabled", "true").lower() in ("false", "0"))
+        place, get = f"{file}, marker {quoted(name)}", reference.get
+        xyz = [_number(get(key, "nan" if key == "z" else ""), key, place) for key in "xyz"]
+        # A standard deviation of 0 means unknown in Metashape.
+        sigma = [_number(get(key, get("sxyz", "nan")), key, place) or np.nan for key in ("sx", "sy", "sz")]
+        points.add(name, xyz, place, sigma, get("enabled", "true").lower() in ("false", "0"))
     marks: list[Mark] = []
     for marker in chunk.iterfind("frames/frame/markers/marker"):
         number = marker.get("marker_id", "")
@@ -287,31 +295,18 @@ def _markers(file: str, chunk: ElementTree.Element) -> tuple[SurveyRows, list[Ma
             camera = location.get("camera_id", "")
             place = f"{file}, marker {quoted(labels.get(number, number))}, camera {quoted(camera)}"
             if camera not in cameras or number not in labels:
-                raise InputError(
-                    f"{place}: unknown {'marker' if camera in cameras else 'camera'}. Export the markers again"
-                )
-            column_row = [_number(location, key, place) for key in "xy"]
+                raise InputError(f"{place}: unknown marker or camera. Export the markers again")
+            column_row = [_number(location.get(key, ""), key, place) for key in "xy"]
             marks.append((cameras[camera], labels[number], column_row, np.nan, place))
     return points, marks
 
 
-def _number(element: ElementTree.Element, key: str, place: str) -> float:
-    text = element.get(key)
-    if text is None and key == "z":
-        return np.nan
-    value = finite(text or "")
-    if value is None:
-        raise InputError(f"{place}: {key} is {quoted(text)}, not a number. Export the markers again")
+def _number(text: str, key: str, place: str) -> float:
+    """Parse a number; "nan" stands for a missing one."""
+    value = np.nan if text == "nan" and key not in ("x", "y") else finite(text)
+    if value is None or (key.startswith("s") and value < 0):
+        raise InputError(f"{place}: {key} is {quoted(text)}, not a valid number. Export the markers again")
     return value
-
-
-def _sigma(reference: ElementTree.Element, key: str, place: str) -> float:
-    """Return the standard deviation of an axis, or the common one; 0 means unknown in Metashape."""
-    key = key if reference.get(key) is not None else "sxyz"
-    value = _number(reference, key, place) if reference.get(key) is not None else np.nan
-    if value < 0:
-        raise InputError(f"{place}: standard deviation {key} is {value:g}, not positive; correct it")
-    return value if value > 0 else np.nan
 
 
 # Written ------------------------------------------------------------------------------------------------------
@@ -325,8 +320,16 @@ def write(p: Project, folder: Path) -> None:
     root = ElementTree.Element("document", version="2.0.0")
     chunk = add(root, "chunk", label=p.title or "jaxphoto", enabled="true")
     sensors = add(chunk, "sensors", next_id=str(len(p.cameras)))
-    for number, (name, camera) in enumerate(p.cameras.items()):
-        _add_sensor(sensors, number, name, camera)
+    for number, (name, (camera_sensor, interior, _)) in enumerate(p.cameras.items()):
+        kind, pixel_mm = _kind_of(interior), camera_sensor.pixel_mm
+        sensor = add(sensors, "sensor", id=str(number), label=name, type=kind)
+        size = {"width": str(camera_sensor.width_px), "height": str(camera_sensor.height_px)}
+        add(sensor, "resolution", **size)
+        for key, mm in (("pixel_width", pixel_mm), ("pixel_height", pixel_mm), ("focal_length", interior.c)):
+            add(sensor, "property", name=key, value=repr(float(mm)))
+        calibration = add(sensor, "calibration", type=kind, **{"class": "adjusted"})
+        add(calibration, "resolution", **size)
+        _add_values(calibration, camera_sensor, interior)
     components = add(chunk, "components", next_id="1", active_id="0")
     transform = add(add(components, "component", id="0", label="Component 1"), "transform")
     of_earth = p.frame.kind == "epsg"
@@ -341,7 +344,9 @@ def write(p: Project, folder: Path) -> None:
         element = add(cameras, "camera", **ids, label=name, enabled="true")
         add(element, "transform", np.vstack([np.column_stack([rotations[i], positions[i]]), [0.0, 0.0, 0.0, 1.0]]))
     _add_markers(chunk, p)
-    add(chunk, "reference", _reference(p.frame))
+    code, vertical = p.frame.code, p.frame.vertical
+    system = CRS.from_epsg(f"{code}" if vertical is None else f"{code}+{vertical}") if of_earth else None
+    add(chunk, "reference", _LOCAL if system is None else system.to_wkt("WKT1_GDAL"))
     (folder / CAMERAS_FILE).write_text(xml_text(root), encoding="utf-8")
     write_image_points(p, folder, p.images)
 
@@ -367,28 +372,6 @@ def _add_markers(chunk: ElementTree.Element, p: Project) -> None:
         for row in rows[point].tolist():
             x, y = map(repr, p.column_row[row].tolist())
             add(mark, "location", camera_id=str(p.image[row]), pinned="true", x=x, y=y)
-
-
-def _add_sensor(sensors: ElementTree.Element, number: int, name: str, camera: ProjectCamera) -> None:
-    kind, pixel_mm = _kind_of(camera.interior), camera.sensor.pixel_mm
-    sensor = add(sensors, "sensor", id=str(number), label=name, type=kind)
-    size = {"width": str(camera.sensor.width_px), "height": str(camera.sensor.height_px)}
-    add(sensor, "resolution", **size)
-    values = {"pixel_width": pixel_mm, "pixel_height": pixel_mm, "focal_length": float(camera.interior.c)}
-    for key, value in values.items():
-        add(sensor, "property", name=key, value=repr(float(value)))
-    calibration = add(sensor, "calibration", type=kind, **{"class": "adjusted"})
-    add(calibration, "resolution", **size)
-    _add_values(calibration, camera.sensor, camera.interior)
-
-
-def _reference(frame: Frame) -> str:
-    """Return the coordinate system as WKT."""
-    if frame.kind != "epsg" or frame.code is None:
-        return _LOCAL
-    compound = frame.vertical is not None
-    system = CRS.from_epsg(f"{frame.code}+{frame.vertical}") if compound else map_system(frame.code)
-    return system.to_wkt("WKT1_GDAL")
 
 
 FORMATS = (

@@ -19,7 +19,8 @@ import numpy as np
 
 from jaxphoto.camera import InteriorOrientation, OpenCvFisheye, Sensor
 from jaxphoto.errors import quoted
-from jaxphoto.extras.formats.camera_models import (
+from jaxphoto.extras.formats.files import CameraFormat
+from jaxphoto.extras.formats.project import (
     FISHEYE_TERMS,
     OPENCV,
     OPENCV_FISHEYE,
@@ -28,7 +29,6 @@ from jaxphoto.extras.formats.camera_models import (
     in_pixels,
     pixels_of,
 )
-from jaxphoto.extras.formats.files import CameraFormat
 from jaxphoto.io.camera_files import CameraFile, CameraReader, CameraSource, joined_notes
 
 _COUNTS = (4, 5, 8, 12, 14)

@@ -19,17 +19,20 @@ import numpy as np
 import scipy
 
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.extras.formats.camera_models import (
+from jaxphoto.extras.formats.files import Format, by_content, number_rows, read_json, warn
+from jaxphoto.extras.formats.project import (
     BROWN,
     BROWN_TERMS,
     FISHEYE_TERMS,
     OPENCV,
     OPENCV_FISHEYE,
+    Project,
     ProjectCamera,
+    about_place,
     in_pixels,
+    pose,
+    translations,
 )
-from jaxphoto.extras.formats.files import Format, by_content, number_rows, read_json, warn
-from jaxphoto.extras.formats.project import Project, about_place, pose, translations
 from jaxphoto.georeferencing.map_frame import Place
 from jaxphoto.io.camera_files import CameraSource
 from jaxphoto.io.text_files import has_words, read_legacy_text

@@ -18,10 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from jaxphoto.errors import InputError
-from jaxphoto.extras.formats.camera_models import BROWN_TERMS, OPENCV, ProjectCamera, in_pixels
 from jaxphoto.extras.formats.files import Format, row_numbers
-from jaxphoto.extras.formats.points_beside import points_of
-from jaxphoto.extras.formats.project import Project, pose
+from jaxphoto.extras.formats.project import BROWN_TERMS, OPENCV, Project, ProjectCamera, in_pixels, pose
+from jaxphoto.extras.formats.texts import points_of
 from jaxphoto.io.camera_files import CameraSource
 from jaxphoto.io.text_files import has_words, read_legacy_text
 

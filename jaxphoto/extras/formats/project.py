@@ -1,4 +1,8 @@
-"""Format-independent project: cameras, oriented images, object points, image points and control points."""
+"""Format-independent project: cameras, oriented images, object points, image points and control points.
+
+Computer vision uses camera axes x right, y down, z forward; we use x right, y up, z backward. Pixel coordinates follow
+docs/conventions.md: the centre of the upper left pixel is (0.5, 0.5).
+"""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -12,17 +16,30 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.arrays import to_numpy
+from jaxphoto.arrays import as_jax_array, to_numpy
 from jaxphoto.block import Block, Frame
-from jaxphoto.camera import set_parameter
+from jaxphoto.camera import (
+    AbstractDistortion,
+    AbstractProjection,
+    Agisoft,
+    Equidistant,
+    InteriorOrientation,
+    OpenCv,
+    OpenCvFisheye,
+    Perspective,
+    Sensor,
+    get_parameter,
+    parameter_names,
+    set_parameter,
+)
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError, few, quoted
-from jaxphoto.extras.formats.camera_models import ProjectCamera
-from jaxphoto.georeferencing.map_frame import MapFrame, Place, map_name, map_system, place_from_geocentric
+from jaxphoto.georeferencing.map_frame import MapFrame, Place, map_system, place_from_geocentric
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
 from jaxphoto.io.block_folder.settings import frame_section
 from jaxphoto.io.block_folder.table_layout import ANGLES, SIGMA_XYZ, coordinate_names
+from jaxphoto.io.camera_files import CameraSource
 from jaxphoto.io.text_tables import Table
 from jaxphoto.procedures.control.surveyed import SIGMA_M, system_of
 from jaxphoto.procedures.georeference_photographs import utm_of
@@ -39,6 +56,77 @@ _FIXED_M = 1e-4
 _EARTH_M, _ROUGHLY = 6.37e6, 0.02
 # Semi-major axis (m) of WGS 84 and GRS 80.
 _WGS84_M = 6378137.0
+
+
+# Cameras -----------------------------------------------------------------------------------------------------
+
+
+class CameraModel(NamedTuple):
+    """Distortion and projection; the distortion coefficients `lacks` are zero."""
+
+    distortion: type[AbstractDistortion]
+    lacks: tuple[str, ...]
+    projection: AbstractProjection
+
+    def only(self, *terms: str) -> "CameraModel":
+        """Return the model restricted to the coefficients `terms`."""
+        return self._replace(lacks=tuple(name for name in self.distortion.coefficients if name not in terms))
+
+
+OPENCV = CameraModel(OpenCv, ("b2",), Perspective())
+"""OpenCV's rational model with fx and fy."""
+OPENCV_FISHEYE = CameraModel(OpenCvFisheye, ("p1", "p2", "s1", "s2", "b2"), Equidistant())
+"""OpenCV's fisheye model with fx and fy."""
+BROWN = CameraModel(OpenCv, ("k4", "k5", "k6", "b2"), Perspective())
+"""OpenCV's model with k1 to k3, p1, p2, fx and fy."""
+AGISOFT = CameraModel(Agisoft, ("p3", "p4"), Perspective())
+AGISOFT_FISHEYE = CameraModel(Agisoft, ("p3", "p4"), Equidistant())
+BROWN_TERMS, FISHEYE_TERMS = ("k1", "k2", "k3", "p1", "p2"), ("k1", "k2", "k3", "k4")
+OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""OpenCV's coefficients in the order of its files."""
+
+
+class ProjectCamera(NamedTuple):
+    """Camera of a project, and the names of its free parameters."""
+
+    sensor: Sensor
+    interior: InteriorOrientation
+    free: tuple[str, ...] = ()
+
+    @staticmethod
+    def estimated(sensor: Sensor, interior: InteriorOrientation) -> "ProjectCamera":
+        """Return a camera with free c, xp, yp and all nonzero coefficients."""
+        first = ("c_mm", "xp_mm", "yp_mm")
+        names = (n for n in parameter_names(interior) if n in first or float(get_parameter(interior, n)) != 0)
+        return ProjectCamera(sensor, interior, tuple(names))
+
+    def terms(self, names: tuple[str, ...]) -> dict[str, float]:
+        """Return distortion coefficients by name."""
+        return {name: float(getattr(self.interior.distortion, name)) for name in names}
+
+
+def in_pixels(
+    source: CameraSource, sensor: Sensor, fx: float, fy: float, centre: tuple[float, float], model: CameraModel, **terms
+) -> InteriorOrientation:
+    """Convert focal lengths and principal point in pixels to an interior orientation: c is fy, b1 is fx / fy - 1."""
+    if not (fx > 0 and fy > 0):
+        raise source.error(f"focal lengths {fx:g} and {fy:g} px are not positive; give positive values")
+    if fx != fy:
+        terms["b1"] = fx / fy - 1
+    x_p, y_p = sensor.mm_from_px(np.array([centre], float))[0]
+    distortion = model.distortion(**terms)
+    interior = InteriorOrientation(fy * sensor.pixel_mm, x_p, y_p, distortion, projection=model.projection)
+    return jax.tree.map(as_jax_array, interior)
+
+
+def pixels_of(interior: InteriorOrientation, sensor: Sensor) -> tuple[float, float, float, float]:
+    """Return fx, fy and the principal point (column, row) in pixels: the inverse of `in_pixels`."""
+    fy = float(interior.c / sensor.pixel_mm)
+    column, row = sensor.px_from_mm(np.array([[float(interior.x_p), float(interior.y_p)]]))[0]
+    return fy * (1 + float(getattr(interior.distortion, "b1", 0.0))), fy, float(column), float(row)
+
+
+# Projects ----------------------------------------------------------------------------------------------------
 
 
 class ControlPoints(NamedTuple):
@@ -164,18 +252,12 @@ class Project(NamedTuple):
     @property
     def place(self) -> tuple[float, float, float] | None:
         """Longitude, latitude (degrees) and ellipsoidal height (m) of the origin; None except on WGS 84 or GRS 80."""
-        if self.frame.kind != "epsg" or self.frame.code is None or self.frame.origin is None:
-            return None
-        ellipsoid = map_system(self.frame.code).ellipsoid
-        if ellipsoid is None or ellipsoid.semi_major_metre != _WGS84_M:
+        code = self.frame.code
+        ellipsoid = None if code is None else map_system(code).ellipsoid
+        if self.frame.origin is None or ellipsoid is None or ellipsoid.semi_major_metre != _WGS84_M:
             return None
         longitude, latitude, height = map(float, self.frame.origin)
         return longitude, latitude, height
-
-    @property
-    def system(self) -> str:
-        """EPSG:code, with the code of the vertical system unless heights are ellipsoidal; "" for a local frame."""
-        return map_name(self.frame.code, self.frame.vertical) if self.frame.code is not None else ""
 
     def in_map(self) -> "Project":
         """Convert the project to map coordinates of its frame; a local frame is unchanged.
@@ -230,12 +312,10 @@ class Project(NamedTuple):
             _warn(f"{p.file}: skipped {len(skipped)} image(s) with fewer than {_LEAST} points: {few(skipped)}")
         order, names, image = order[kept], names[kept], np.searchsorted(kept, image)
         seen, point_of = np.unique(point, return_inverse=True)
-        ids = np.array(p.points, object)[seen]
+        ids, camera = np.array(p.points, object)[seen], np.array(p.image_camera, object)[order]
         exterior = jax.tree.map(lambda leaf: np.asarray(leaf)[order], p.exterior)
-        angles = np.rad2deg(np.asarray(exterior.omega_phi_kappa))
-        camera = np.array(p.image_camera, object)[order]
         coordinates = coordinate_names(p.frame)
-        pose = np.column_stack([exterior.position, angles]).T
+        pose = np.column_stack([exterior.position, np.rad2deg(np.asarray(exterior.omega_phi_kappa))]).T
         tables: dict[str, dict[str, np.ndarray]] = {
             "images": {"image": names, "camera": camera} | dict(zip((*coordinates, *ANGLES), pose, strict=True)),
             "image_points": {
@@ -255,8 +335,13 @@ class Project(NamedTuple):
         else:
             tables["control_points"] = control
             settings["sigmas"] |= dict(zip(("control_X_m", "control_Y_m", "control_Z_m"), SIGMA_M, strict=True))
-        used = set(camera)
-        settings["cameras"] = {name: _section(of) for name, of in p.cameras.items() if name in used}
+        settings["cameras"] = {}
+        for name in dict.fromkeys(camera):
+            sensor, interior, free = p.cameras[name]
+            priors = jax.tree.map(lambda _: FIXED, interior)
+            for parameter in free:
+                priors = set_parameter(priors, parameter, FREE)
+            settings["cameras"][name] = camera_section(Camera(sensor, interior, priors))
         return BlockTables(settings, {key: Table.of(p.file, values) for key, values in tables.items()}, p.file)
 
     def _control_table(self) -> dict[str, np.ndarray] | None:
@@ -342,14 +427,6 @@ def _warn(message: str) -> None:
 def _cells(values: Float[np.ndarray, "n"]) -> np.ndarray:
     """Format values as table cells; NaN is an empty cell."""
     return np.array(["" if np.isnan(v) else repr(v) for v in values.tolist()], object)
-
-
-def _section(camera: ProjectCamera) -> dict[str, Any]:
-    """Return the [cameras.X] table of a camera."""
-    priors = jax.tree.map(lambda _: FIXED, camera.interior)
-    for name in camera.free:
-        priors = set_parameter(priors, name, FREE)
-    return camera_section(Camera(camera.sensor, camera.interior, priors))
 
 
 def _check_rotations(p: Project) -> None:

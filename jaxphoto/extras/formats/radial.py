@@ -31,9 +31,8 @@ from jaxphoto.camera.conversion import Conversion
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.extras.formats.camera_models import CameraModel, ProjectCamera
 from jaxphoto.extras.formats.files import Format, by_content, content_rows, row_numbers, warn
-from jaxphoto.extras.formats.project import Project, translations
+from jaxphoto.extras.formats.project import CameraModel, Project, ProjectCamera, pixels_of, translations
 from jaxphoto.io.camera_files import ASSUMED_PIXEL_MM
 from jaxphoto.io.text_files import has_words, read_legacy_text
 from jaxphoto.io.text_tables import LARGEST
@@ -167,24 +166,18 @@ def read_bal(path: Path) -> Project:
     observed = np.array([row_numbers(path, row, line.split(), 4) for row, line in rows[1 : n + 1]])
     for k, (what, count) in enumerate((("camera", n_cameras), ("point", n_points))):
         for wrong in np.flatnonzero(~np.isin(observed[:, k], np.arange(count))):
-            raise InputError(
-                f"{path.name}, row {rows[wrong + 1][0]}: {what} {observed[wrong, k]:g} is not an integer from 0 "
-                f"to {count - 1}; correct it"
-            )
-    words = [(row, word) for row, line in rows[n + 1 :] for word in line.split()]
+            raise InputError(f"{path.name}, row {rows[wrong + 1][0]}: {what} is not an integer from 0 to {count - 1}")
+    rest = [(row, line.split()) for row, line in rows[n + 1 :]]
+    values = np.array([number for row, words in rest for number in row_numbers(path, row, words, len(words))])
     needed = 9 * n_cameras + 3 * n_points
-    if len(words) != needed:
+    if len(values) != needed:
         raise InputError(
-            f"{path.name}: {len(words)} numbers follow the observations, but {n_cameras} cameras and {n_points} points "
-            f"need {needed} (9 per camera, 3 per point). Complete the file or correct row {rows[0][0]}"
+            f"{path.name}: {len(values)} numbers follow the observations, but {n_cameras} cameras and {n_points} "
+            f"points need {needed} (9 per camera, 3 per point). Complete the file or correct row {rows[0][0]}"
         )
-    values = np.array([row_numbers(path, row, [word], 1)[0] for row, word in words])
     cameras = values[: 9 * n_cameras].reshape(-1, 9)
     for camera in np.flatnonzero(cameras[:, 6] <= 0).tolist():
-        raise InputError(
-            f"{path.name}, row {words[9 * camera + 6][0]}: f of camera {camera} is {cameras[camera, 6]:g}. Give a "
-            "positive focal length"
-        )
+        raise InputError(f"{path.name}: f of camera {camera} is {cameras[camera, 6]:g}. Give a positive focal length")
     rotations = scipy.spatial.transform.Rotation.from_rotvec(cameras[:, :3]).as_matrix()
     names, xyz = [str(k) for k in range(n_cameras)], values[9 * n_cameras :].reshape(-1, 3)
     return _project(path, names, rotations, cameras[:, 3:6], cameras[:, 6:], xyz, observed)
@@ -217,9 +210,8 @@ def on_same_rays(p: Project, cameras: Mapping[str, Conversion]) -> Float[np.ndar
         rows = np.flatnonzero(of_row == name)
         if cameras[name].max_px == 0 or not len(rows):
             continue
-        moved, good = map(
-            np.asarray, call_compiled(_moved, interior, cameras[name].interior, sensor.mm_from_px(column_row[rows]))
-        )
+        xy = sensor.mm_from_px(column_row[rows])
+        moved, good = map(np.asarray, call_compiled(_moved, interior, cameras[name].interior, xy))
         for k in rows[~good]:
             raise InputError(
                 f"point {p.points[p.point[k]]} in image {p.images[p.image[k]]} is where the distortion of camera "
@@ -231,9 +223,7 @@ def on_same_rays(p: Project, cameras: Mapping[str, Conversion]) -> Float[np.ndar
 
 @eqx.filter_jit
 def _moved(one: InteriorOrientation, other: InteriorOrientation, xy):
-    """Map image points (mm) of camera `one` to camera `other` by their rays; the mask is True if both are invertible
-    there.
-    """
+    """Map image points (mm) of camera `one` to `other` by their rays; the mask is True where both are invertible."""
 
     def of_one(at):
         ideal = one.ideal_from_measured(at)
@@ -247,10 +237,7 @@ def _moved(one: InteriorOrientation, other: InteriorOrientation, xy):
 
 def _from_middle(p: Project) -> Float[np.ndarray, "n 2"]:
     """Return image points in pixels relative to the principal point, x right, y up."""
-    middle = {
-        name: sensor.px_from_mm(np.array([[float(interior.x_p), float(interior.y_p)]]))[0]
-        for name, (sensor, interior, _) in p.cameras.items()
-    }
+    middle = {name: pixels_of(camera.interior, camera.sensor)[2:] for name, camera in p.cameras.items()}
     of_image = np.array([middle[name] for name in p.image_camera]).reshape(-1, 2)
     return (p.column_row - of_image[p.image]) * [1.0, -1.0]
 
@@ -258,8 +245,7 @@ def _from_middle(p: Project) -> Float[np.ndarray, "n 2"]:
 def _radial_values(p: Project) -> Float[np.ndarray, "images 3"]:
     """Return f in pixels, k1 and k2 of each image."""
     values = {
-        name: [float(c.interior.c) / c.sensor.pixel_mm, *c.terms(("k1", "k2")).values()]
-        for name, c in p.cameras.items()
+        name: [pixels_of(c.interior, c.sensor)[1], *c.terms(("k1", "k2")).values()] for name, c in p.cameras.items()
     }
     return np.array([values[name] for name in p.image_camera]).reshape(-1, 3)
 
