@@ -141,6 +141,8 @@ def test_a_binary_file_is_the_same_camera(tmp_path, kind, number):
     write_camera_file(tmp_path / "cameras.txt", FISHEYE_SENSOR, FISHEYES[kind])
     values = list(map(float, (tmp_path / "cameras.txt").read_text().split()[-len(MODELS[kind]) :]))
     (tmp_path / "cameras.bin").write_bytes(struct.pack(f"<QIiQQ{len(values)}d", 1, 7, number, 1280, 960, *values))
+    for name in ("images", "points3D"):
+        (tmp_path / f"{name}.bin").write_bytes(struct.pack("<Q", 0))
     text, binary = (read_camera_file(tmp_path / f"cameras.{end}").interior for end in ("txt", "bin"))
     assert eqx.tree_equal(text, binary)
 

@@ -116,8 +116,8 @@ def test_our_own_tables(tmp_path):
         (files.GCP_LIST + "1 2 3 4 5\n", None, "row 7: 5 cells"),
         (files.GCP_LIST.replace("30.5 512.5", "31.5 512.5"), None, "row 3: point 'G1' is also in a, row 2"),
         (files.MARKERS[:900], None, "a: damaged"),
-        (files.MARKERS.replace('camera_id="0"', 'camera_id="5"'), None, "unknown camera"),
-        (files.MARKERS.replace('x="100.25"', 'x="nan"'), None, "x is 'nan', not a number"),
+        (files.MARKERS.replace('camera_id="0"', 'camera_id="5"'), None, "unknown marker or camera"),
+        (files.MARKERS.replace('x="100.25"', 'x="nan"'), None, "x is 'nan', not a valid number"),
     ],
 )
 def test_what_cannot_be_is_refused_in_a_sentence(tmp_path, points, marks, words):

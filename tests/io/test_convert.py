@@ -9,7 +9,7 @@ import pytest
 
 from jaxphoto.camera import AffineBrown, get_parameter, parameter_names
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.extras.formats import FORMATS, convert, read_source, read_tables, recognise
 from jaxphoto.io import read_block, write_block
 from jaxphoto.unknowns import FREE
@@ -175,7 +175,7 @@ def test_a_bad_export_is_refused(data_dir, tmp_path, old, new, message):
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(JaxphotoError, match=message):
         read_source(folder)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.extras.formats import read_tables
 from jaxphoto.io.block_folder.camera_section import read_camera
 from jaxphoto.io.toml import Section
@@ -125,7 +125,7 @@ def test_a_dependent_datum_is_a_minimal_one(tmp_path):
     ],
 )
 def test_invalid_prior_orientations_are_refused(tmp_path, change, message):
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(JaxphotoError, match=message):
         _read(eo_script(tmp_path, **change))
 
 
