@@ -148,7 +148,7 @@ def camera(
     second: Second = None,
     out: Annotated[Path | None, Option(help="Camera file to write (required).")] = None,
     out_format: Annotated[
-        Literal["opencv", "mrcal", "colmap", "agisoft", "block"] | None,
+        Literal["opencv", "colmap", "agisoft", "block"] | None,
         Option("--format", help="Format of --out (default: by its name)."),
     ] = None,
     camera: opt.Camera = None,
@@ -157,9 +157,6 @@ def camera(
     height_px: Annotated[int | None, Option(min=1, help="Image height, if SOURCE lacks it.")] = None,
     block: Annotated[Path | None, Option(help="Block folder of the results in SOURCE.")] = None,
     distortion: Annotated[str | None, Option(help="Distortion model of a .toml file (default: as in SOURCE).")] = None,
-    model: Annotated[
-        str | None, Option(help="Largest model of the format to use, like OPENCV (default: as required).")
-    ] = None,
     loss_px: Annotated[float, Option(min=0, help="Maximum misfit of a fitted model.")] = 1.0,
 ) -> None:
     """Convert a camera file: exactly if possible, otherwise by a fitted model with its misfit in pixels."""
@@ -184,7 +181,6 @@ def camera(
             distortion=None if distortion is None else AbstractDistortion.called(distortion),
             covariance=read.covariance,
             reservation=read.note,
-            model=model,
             loss_px=loss_px,
         )
     models = [type(interior.distortion).__name__ for interior in (read.interior, written.interior)]

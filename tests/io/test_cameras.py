@@ -213,7 +213,6 @@ SENSOR = Sensor(4500, 3000, 0.008)
         ("opencv", "a.yml"),
         ("colmap", "cameras.txt"),
         ("agisoft", "a.xml"),
-        ("mrcal", "a.cameramodel"),
     ],
 )
 def test_reservations_are_comments_of_camera_files(tmp_path, kind, file):
@@ -396,7 +395,7 @@ def test_wrong_use_is_refused(tmp_path):
     with pytest.raises(InputError, match="unknown camera '9'"):
         read_camera_file(written(tmp_path, COLMAP, "cameras.txt"), camera="9")
     interior = InteriorOrientation(35.0, 0.0, 0.0, Brown())
-    with pytest.raises(InputError, match="give one of opencv, mrcal, colmap"):
+    with pytest.raises(InputError, match="give one of opencv, colmap"):
         write_camera_file(tmp_path / "a.dat", SENSOR, interior)
     folding = InteriorOrientation(10.0, 0.0, 0.0, Brown(k1=5e-3))
     with pytest.raises(InputError, match=r"a\.xml: the camera cannot be written as agisoft: .* is not invertible"):

@@ -6,7 +6,6 @@ Modules declare FORMATS (oriented projects), CAMERAS (camera files) and CONTROL 
 
 from jaxphoto.extras.formats.convert import (
     CAMERA_FORMATS,
-    CAMERA_MODELS,
     CAMERAS_WRITTEN,
     CONTROL_FORMATS,
     EXPORTS,
@@ -24,7 +23,7 @@ from jaxphoto.extras.formats.convert import (
 from jaxphoto.extras.formats.project import ControlPoints, Project, ProjectCamera
 
 __all__ = [
-    "CAMERAS_WRITTEN", "CAMERA_FORMATS", "CAMERA_MODELS", "CONTROL_FORMATS", "EXPORTS", "FORMATS", "LOSS_PX",
+    "CAMERAS_WRITTEN", "CAMERA_FORMATS", "CONTROL_FORMATS", "EXPORTS", "FORMATS", "LOSS_PX",
     "ControlPoints", "Project", "ProjectCamera", "check_export_target", "convert", "export", "read_control",
     "read_source", "read_tables", "recognise", "write_camera_file",
 ]  # fmt: skip

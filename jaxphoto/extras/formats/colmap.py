@@ -47,11 +47,6 @@ _FISHEYES = {
 MODELS = _PLANES | _FISHEYES
 """Parameters of each model in COLMAP's order, simplest model first; `f` means fx = fy."""
 FISHEYE = OPENCV_FISHEYE._replace(lacks=("b2",))
-PARTS = {
-    name: (OPENCV if name in _PLANES else FISHEYE).only(*parameters, *["b1"] * ("fx" in parameters))
-    for name, parameters in MODELS.items()
-}
-"""Distortion and projection of each COLMAP model."""
 _PLACES = ("f", "fx", "fy", "cx", "cy")
 
 
@@ -216,7 +211,5 @@ FORMATS = (
     Format("colmap-binary", "the same, binary", write=write_binary, plane=OPENCV, fisheye=FISHEYE, endings=(".bin",)),
 )  # fmt: skip
 CAMERAS = (
-    CameraFormat(
-        "colmap", CameraReader(recognise_cameras, read_camera), write_camera, OPENCV, FISHEYE, (), "# {}", PARTS
-    ),
+    CameraFormat("colmap", CameraReader(recognise_cameras, read_camera), write_camera, OPENCV, FISHEYE, (), "# {}"),
 )

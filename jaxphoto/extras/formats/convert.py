@@ -21,7 +21,6 @@ from jaxphoto.extras.formats import (
     metashape,
     opencv,
     opensfm,
-    photomodeler,
     pix4d,
     radial,
     smac,
@@ -39,7 +38,7 @@ from jaxphoto.writing import check_folder, whole_file, whole_folder
 
 # One module per program, in the order of docs and help. To add a format, write a module and add it here.
 _MODULES = (
-    dbat, photomodeler, opencv, colmap, metashape, opensfm, blocksexchange, radial, texts, pix4d, geojson, smac,
+    dbat, opencv, colmap, metashape, opensfm, blocksexchange, radial, texts, pix4d, geojson, smac,
     control,
 )  # fmt: skip
 
@@ -59,8 +58,6 @@ CAMERA_FORMATS = {f.name: f for f in (*_CAMERAS, CameraFormat("block", suffixes=
 """Camera file formats that can be written: of other programs, and block.toml."""
 CAMERA_READERS.update({format.name: format.reader for format in _CAMERAS if format.reader})
 CAMERAS_WRITTEN = tuple(CAMERA_FORMATS)
-CAMERA_MODELS = tuple(dict.fromkeys(name for format in CAMERA_FORMATS.values() for name in format.models))
-"""Camera models that can be requested by name."""
 CONTROL_FORMATS = {format.name: format for format in _declared("CONTROL")}
 """Control file formats recognised by content; every other text file is a table."""
 LOSS_PX = 1.0
@@ -217,19 +214,17 @@ def write_camera_file(
     distortion: type[AbstractDistortion] | None = None,
     covariance: np.ndarray | None = None,
     reservation: str = "",
-    model: str | None = None,
     loss_px: float = LOSS_PX,
 ) -> Conversion:
     """Write a camera in one of `CAMERAS_WRITTEN`, and return the difference between the file's camera and `interior`.
 
     If `format` is None, the suffix determines it; cameras.txt is COLMAP's. The distortion is converted exactly if the
-    file's model has all its terms, otherwise fitted over the image format. `model`, one of `CAMERA_MODELS`, is the
-    largest model of the format to use. The loss is written as a comment if the format has comments; a loss of more than
-    `loss_px` at the worst point is an error. `distortion` is the model in a block.toml. A block.toml also stores the
-    `reservation` about the calibration and, if the model is unchanged, the `covariance` of `parameter_names(interior)`.
+    file's model has all its terms, otherwise fitted over the image format. The loss is written as a comment if the
+    format has comments; a loss of more than `loss_px` at the worst point is an error. `distortion` is the model in a
+    block.toml. A block.toml also stores the `reservation` about the calibration and, if the model is unchanged, the
+    `covariance` of `parameter_names(interior)`.
 
-    Raises InputError for an unknown format, a `distortion` or `model` that the format does not support, and a camera
-    that it cannot represent.
+    Raises InputError for an unknown format, a `distortion` of another format, and a camera that it cannot represent.
     """
     path = Path(path)
     if format is None:
@@ -238,14 +233,9 @@ def write_camera_file(
     if format not in CAMERA_FORMATS:
         raise InputError(f"{path}: unknown camera format; give one of {', '.join(CAMERAS_WRITTEN)}")
     chosen = CAMERA_FORMATS[format]
-    if model is not None and model not in chosen.models:
-        there = f"use one of {', '.join(chosen.models)}" if chosen.models else "omit the model"
-        raise InputError(f"{path}: unknown model {model} of format {format}; {there}")
     if distortion is not None and format != "block":
         raise InputError(f"{path}: --distortion {distortion.__name__} applies to a .toml; omit it, or write a .toml")
-    target = chosen.models[model] if model is not None else None
-    if distortion is not None:
-        target = CameraModel(distortion, (), interior.projection)
+    target = None if distortion is None else CameraModel(distortion, (), interior.projection)
     conversion = _in_model(interior, sensor, chosen, CAMERA_FORMATS, f"{path}: the camera", target)
     if not conversion.max_px <= loss_px:
         raise InputError(

@@ -1,9 +1,8 @@
 """Format declarations; readers of text, XML, JSON and numeric rows with error locations."""
 
-import json
 import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -58,8 +57,6 @@ class CameraFormat(NamedTuple):
     suffixes: tuple[str, ...] = ()
     comment: str = ""
     """Template of a comment line; "" if the format has no comments."""
-    models: Mapping[str, CameraModel] = {}
-    """Camera models that can be requested, by their names in the format."""
 
 
 class ControlFormat(NamedTuple):
@@ -113,11 +110,6 @@ def read_columns(path: Path, columns: Sequence[str]) -> Table:
             )
     values = {name: np.array([cells[j] for _, cells in rows], object) for j, name in enumerate(columns)}
     return Table.of(path.name, values, np.array([row for row, _ in rows], int))
-
-
-def read_json(path: Path) -> Any:
-    """Return the content of a JSON file."""
-    return json.loads(read_legacy_text(path))
 
 
 def add(parent: ElementTree.Element, tag: str, content: Any = None, **attributes: str) -> ElementTree.Element:

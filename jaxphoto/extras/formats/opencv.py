@@ -3,8 +3,8 @@
     OpenCV    YAML, XML or JSON of cv2.FileStorage; the skew element is ignored, as in OpenCV; files of cv2.fisheye
               contain `fisheye_model: 1` and have four coefficients
     ROS       camera_info: the same keys and a distortion_model (read only)
-    mrcal     .cameramodel: a Python literal with lensmodel (LENSMODEL_PINHOLE, LENSMODEL_OPENCV4 to 12), intrinsics
-              (fx, fy, cx, cy, coefficients of OpenCV), imagersize
+    mrcal     .cameramodel, a Python literal with lensmodel (LENSMODEL_PINHOLE, LENSMODEL_OPENCV4 to 12), intrinsics
+              (fx, fy, cx, cy, coefficients of OpenCV), imagersize (read only)
 
 Sources: OpenCV documentation, calib3d; ROS sensor_msgs/CameraInfo; mrcal documentation, "Camera model file formats" and
 "Lens models".
@@ -32,11 +32,9 @@ from jaxphoto.extras.formats.project import (
 from jaxphoto.io.camera_files import CameraFile, CameraReader, CameraSource, joined_notes
 
 _COUNTS = (4, 5, 8, 12, 14)
-MODELS = {f"OPENCV{n}": OPENCV.only("b1", *OPENCV_ORDER[:n]) for n in (4, 5, 8)} | {"FISHEYE": OPENCV_FISHEYE}
 _ROS_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
 # Number of coefficients of each lens model; coefficients after k6 belong to a thin prism.
 _MRCAL = {"LENSMODEL_PINHOLE": 0} | {f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)}
-MRCAL_MODELS = {name: OPENCV.only("b1", *OPENCV_ORDER[:n]) for name, n in _MRCAL.items() if n <= len(OPENCV_ORDER)}
 
 
 def _camera_file(
@@ -122,24 +120,19 @@ def _matrix(source: CameraSource, storage: Any, key: str, many: int | None = Non
     return np.array(values, float)
 
 
-def _parts(sensor: Sensor, interior: InteriorOrientation) -> tuple[list[float], list[float]]:
-    """Return (fx, fy, cx, cy) and the distortion coefficients in OpenCV's order."""
-    fx, fy, column, row = pixels_of(interior, sensor)
-    terms = FISHEYE_TERMS if isinstance(interior.distortion, OpenCvFisheye) else OPENCV_ORDER
-    return [fx, fy, column - 0.5, row - 0.5], [float(getattr(interior.distortion, k)) for k in terms]
-
-
 def write_opencv(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
     """Write a camera as YAML, XML or JSON; the suffix of `path` determines the format."""
     import cv2
 
-    (fx, fy, cx, cy), values = _parts(sensor, interior)
+    fx, fy, column, row = pixels_of(interior, sensor)
+    terms = FISHEYE_TERMS if isinstance(interior.distortion, OpenCvFisheye) else OPENCV_ORDER
+    values = [float(getattr(interior.distortion, name)) for name in terms]
     storage = cv2.FileStorage(path.name, cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
     storage.write("image_width", sensor.width_px)
     storage.write("image_height", sensor.height_px)
     if len(values) == len(FISHEYE_TERMS):
         storage.write("fisheye_model", 1)
-    storage.write("camera_matrix", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]))
+    storage.write("camera_matrix", np.array([[fx, 0, column - 0.5], [0, fy, row - 0.5], [0, 0, 1.0]]))
     storage.write("distortion_coefficients", np.array(values if any(values[5:]) else values[:5])[:, None])
     path.write_text(storage.releaseAndGetString(), encoding="utf-8")
 
@@ -167,25 +160,10 @@ def read_mrcal(source: CameraSource) -> CameraFile:
     return _camera_file(source, size, intrinsics[:2], intrinsics[2:4], intrinsics[4:], OPENCV)
 
 
-def write_mrcal(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
-    """Write a .cameramodel file in the smallest lens model with all nonzero coefficients; extrinsics are zero."""
-    values, coefficients = _parts(sensor, interior)
-    model = next(m for m, n in _MRCAL.items() if not any(coefficients[n:]))
-    path.write_text(
-        f"{{\n    'lensmodel': '{model}',\n    'intrinsics': {[*values, *coefficients[: _MRCAL[model]]]},\n"
-        f"    'extrinsics': [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],\n"
-        f"    'imagersize': [{sensor.width_px}, {sensor.height_px}],\n}}\n",
-        encoding="utf-8",
-    )
-
-
 CAMERAS = (
     CameraFormat(
         "opencv", CameraReader(_recognise, read_opencv), write_opencv, OPENCV, OPENCV_FISHEYE,
-        (".yml", ".yaml", ".json"), "# {}", MODELS,
+        (".yml", ".yaml", ".json"), "# {}",
     ),
-    CameraFormat(
-        "mrcal", CameraReader(_recognise_mrcal, read_mrcal), write_mrcal, OPENCV, None, (".cameramodel",), "# {}",
-        MRCAL_MODELS,
-    ),
+    CameraFormat("mrcal", CameraReader(_recognise_mrcal, read_mrcal)),
 )  # fmt: skip

@@ -19,7 +19,7 @@ import numpy as np
 import scipy
 
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.extras.formats.files import Format, by_content, number_rows, read_json, warn
+from jaxphoto.extras.formats.files import Format, by_content, number_rows, warn
 from jaxphoto.extras.formats.project import (
     BROWN,
     BROWN_TERMS,
@@ -60,7 +60,7 @@ def read(path: Path) -> Project:
     folder = path.parent
     if not (folder / TRACKS).is_file():
         raise InputError(f"{path}: {TRACKS} not found in its folder. Copy it from the project's folder (opensfm)")
-    content = _largest(path, read_json(path))
+    content = _largest(path, json.loads(read_legacy_text(path)))
     shots, points = content.section("shots").values, content.section("points").values
     cameras = {name: _camera(path, content.section("cameras").section(name)) for name in content.section("cameras")}
     sections = [Section(path.name, f"shots.{name}", shot) for name, shot in shots.items()]
@@ -91,7 +91,7 @@ def _reference(folder: Path, content: Section) -> Place | None:
     """Return the origin of the world on WGS 84; None if unknown (0, 0 in reconstructions without GPS)."""
     path, reference = folder / REFERENCE, content.section("reference_lla")
     if "reference_lla" not in content:
-        reference = Section(path.name, "", read_json(path) if path.is_file() else {})
+        reference = Section(path.name, "", json.loads(read_legacy_text(path)) if path.is_file() else {})
     place = tuple(reference.number(key, 0.0) for key in ("longitude", "latitude", "altitude"))
     return place if any(place[:2]) else None  # type: ignore[return-value]
 
