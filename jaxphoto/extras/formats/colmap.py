@@ -66,7 +66,7 @@ def read(path: Path) -> Project:
     cameras = {}
     for number in sorted({image.camera_id for image in images}):
         c = model.cameras[number]
-        camera = _camera(CameraSource(path), str(number), c.model_name, c.width, c.height, c.params)
+        camera = _camera(CameraSource(path), str(number), c.model_name, c.width, c.height, c.params.tolist())
         names = MODELS[c.model_name]
         free = ["c_mm", "xp_mm", "yp_mm", *(k for k in names if k not in _PLACES), *["b1"] * ("fx" in names)]
         cameras[str(number)] = ProjectCamera(camera.sensor, camera.interior, tuple(free))
@@ -109,7 +109,7 @@ def read_camera(source: CameraSource) -> CameraFile:
     if source.path.suffix == ".bin":
         cameras = {str(key): camera for key, camera in _model(source.path).cameras.items()}
         c = cameras[name := source.chosen(list(cameras))]
-        return _camera(source, name, c.model_name, c.width, c.height, c.params)
+        return _camera(source, name, c.model_name, c.width, c.height, c.params.tolist())
     lines = {}
     for row, line in content_rows(source.path):
         cells = line.split()

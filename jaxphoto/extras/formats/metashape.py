@@ -86,30 +86,29 @@ def _sensors(root: ElementTree.Element) -> dict[str, tuple[str, ElementTree.Elem
     The name is the label, followed by the id if labels are equal.
     """
     sensors, labels = list(root.iter("sensor")), [(s.get("label") or "camera").strip() for s in root.iter("sensor")]
-    names = [n if labels.count(n) == 1 else f"{n} {s.get('id')}" for n, s in zip(labels, sensors, strict=True)]
-    calibrations = [{c.get("class", "adjusted"): c for c in sensor.findall("calibration")} for sensor in sensors]
-    best = [kinds.get("adjusted", kinds.get("initial")) for kinds in calibrations]
-    every = zip(names, sensors, best, strict=True)
-    return {sensor.get("id", ""): (name, sensor, c) for name, sensor, c in every if c is not None}
+    calibrated = {}
+    for sensor, label in zip(sensors, labels, strict=True):
+        calibration = sensor.find("calibration[@class='adjusted']")
+        calibration = sensor.find("calibration") if calibration is None else calibration
+        if calibration is not None:
+            key = sensor.get("id", "")
+            calibrated[key] = label if labels.count(label) == 1 else f"{label} {key}", sensor, calibration
+    return calibrated
 
 
 def _camera(
-    source: CameraSource, name: str, calibration: ElementTree.Element, sensor_element: ElementTree.Element | None = None
+    source: CameraSource, name: str, calibration: ElementTree.Element, element: ElementTree.Element | None = None
 ) -> CameraFile:
     kind = (calibration.findtext("projection") or calibration.get("type") or "frame").strip()
     if kind not in _MODELS:
         raise source.error(f"projection {quoted(kind)} is not supported; use one of {', '.join(_MODELS)}")
     resolution = calibration.find("resolution")
-    sides = ("width", "height")
-    size = [calibration.findtext(side) if resolution is None else resolution.get(side) for side in sides]
-    if None in size and source.size_px is not None:
-        size = list(map(str, source.size_px))
-    if None in size:
-        raise source.error("<width> or <height> is missing; add both")
-    properties = () if sensor_element is None else sensor_element.iter("property")
-    pixel = {p.get("name"): p.get("value") for p in properties}.get("pixel_width")
-    pixel_mm = source.number("pixel_width", pixel) if pixel is not None else None
-    width, height = map(source.number, sides, size)
+    width, height = (
+        source.number(side, calibration.findtext(side) if resolution is None else resolution.get(side))
+        for side in ("width", "height")
+    )
+    pixel = None if element is None else element.find(".//property[@name='pixel_width']")
+    pixel_mm = None if pixel is None else source.number("pixel_width", pixel.get("value"))
     sensor, assumed = source.sensor(width, height, pixel_mm)
     numbers = {child.tag: source.number(child.tag, child.text) for child in calibration if child.tag in _TERMS}
     values = dict.fromkeys(_TERMS, 0.0) | numbers
@@ -227,7 +226,7 @@ def _project_cameras(path: Path, chunk: ElementTree.Element) -> dict[str, tuple[
         estimated = (sensor.findtext("covariance/params") or "").split()
         if free := tuple(_PARAMETERS[term] for term in estimated if term in _PARAMETERS):
             camera = camera._replace(free=free)
-        if any(p.get("name") == "fixed" and p.get("value") == "true" for p in sensor.iterfind("property")):
+        if sensor.find("property[@name='fixed'][@value='true']") is not None:
             camera = camera._replace(free=())
         cameras[key] = name, camera
     return cameras
@@ -235,8 +234,8 @@ def _project_cameras(path: Path, chunk: ElementTree.Element) -> dict[str, tuple[
 
 def _transform(path: Path, chunk: ElementTree.Element, component: str) -> list[np.ndarray] | None:
     """Return rotation, translation and scale from the chunk to the world; None if the file has no transform."""
-    transforms = [c.find("transform") for c in chunk.iterfind("components/component") if c.get("id", "") == component]
-    transform = next((t for t in [*transforms, chunk.find("transform")] if t is not None), None)
+    transform = chunk.find(f"components/component[@id='{component}']/transform")
+    transform = chunk.find("transform") if transform is None else transform
     if transform is None or transform.find("rotation") is None:
         return None
     values = []
