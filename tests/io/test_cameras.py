@@ -431,22 +431,6 @@ def test_correlations_of_another_adjustment_are_refused(tmp_path, text):
         read_camera_file(folder, block=block)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("nadir,yp_mm", "nadir,xp_mm", "row 4: xp_mm of camera nadir is given twice"),
-        ("0.002,True", "-0.002,True", "row 2: sigma is -0.002"),
-        ("r0_mm,8.0", "r0_mm,-8.0", "r0_mm of camera nadir is -8"),
-        ("35.5", "-35.5", "c_mm of camera nadir is -35.5"),
-    ],
-)
-def test_an_invalid_interior_csv_is_refused(tmp_path, old, new, message):
-    block, folder = written(tmp_path, TOML, "b.toml"), results_folder(tmp_path)
-    written(tmp_path, INTERIOR.replace(old, new, 1), "interior.csv")
-    with pytest.raises(InputError, match=message):
-        read_camera_file(folder, block=block)
-
-
 def test_results_that_are_incomplete_are_refused(tmp_path):
     folder = results_folder(tmp_path)
     block = written(tmp_path, TOML, "b.toml")

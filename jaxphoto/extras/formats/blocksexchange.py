@@ -16,7 +16,9 @@ ContextCapture User Guide, "BlocksExchange XML/XMLZ format" and "Perspective cam
 import io
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -120,11 +122,8 @@ def _photogroups(
 
 
 def _camera(source: CameraSource, name: str, group: ElementTree.Element) -> ProjectCamera:
-    def number(key: str, default: float | None = None) -> float:
-        text = group.findtext(key)
-        if text is None and default is not None:
-            return default
-        return source.number(f"{key} of camera {quoted(name)}", text)
+    def number(key: str, default: Any = None) -> float:
+        return source.number(f"{key} of camera {quoted(name)}", group.findtext(key, default))
 
     width, height = number("ImageDimensions/Width"), number("ImageDimensions/Height")
     pixel_mm = number("SensorSize") / max(width, height) if group.find("SensorSize") is not None else None
@@ -148,21 +147,26 @@ def write(p: Project, folder: Path) -> None:
     if p.place is not None:
         longitude, latitude, height = p.place
         shift[2] = height
-        system = add(add(root, "SpatialReferenceSystems"), "SRS")
-        _add_all(system, Id="0", Name="Local East-North-Up", Definition=f"ENU:{latitude!r},{longitude!r}")
+        srs = {"Id": "0", "Name": "Local East-North-Up", "Definition": f"ENU:{latitude!r},{longitude!r}"}
+        _add_all(root, {"SpatialReferenceSystems": {"SRS": srs}})
     block = add(root, "Block")
-    _add_all(block, Name=p.title or "jaxphoto", **({} if p.place is None else {"SRSId": "0"}))
+    _add_all(block, {"Name": p.title or "jaxphoto"} | ({} if p.place is None else {"SRSId": "0"}))
     groups = add(block, "Photogroups")
     rotations, centres = p.world_to_camera, np.asarray(p.exterior.position) + shift
     for name, camera in p.cameras.items():
-        group = add(groups, "Photogroup")
-        _add_camera(group, name, camera)
+        group, (f, _, column, row) = add(groups, "Photogroup"), pixels_of(camera.interior, camera.sensor)
+        content = {
+            "Name": name,
+            "ImageDimensions": {"Width": str(camera.sensor.width_px), "Height": str(camera.sensor.height_px)},
+            "CameraModelType": "Perspective", "FocalLengthPixels": f, "CameraOrientation": "XRightYDown",
+            "PrincipalPoint": {"x": column - _FIRST_PX, "y": row - _FIRST_PX},
+            "Distortion": {term.upper(): value for term, value in camera.terms(BROWN_TERMS).items()},
+        }  # fmt: skip
+        _add_all(group, content)
         for i in np.flatnonzero(np.array(p.image_camera, object) == name).tolist():
-            photo = add(group, "Photo")
-            _add_all(photo, Id=str(i), ImagePath=p.files[i])
-            position = add(photo, "Pose")
-            _add_all(add(position, "Rotation"), **dict(zip(_MATRIX, rotations[i].ravel().tolist(), strict=True)))
-            _add_all(add(position, "Center"), **dict(zip("xyz", centres[i].tolist(), strict=True)))
+            matrix = dict(zip(_MATRIX, rotations[i].ravel().tolist(), strict=True))
+            position = {"Rotation": matrix, "Center": dict(zip("xyz", centres[i].tolist(), strict=True))}
+            _add_all(add(group, "Photo"), {"Id": str(i), "ImagePath": p.files[i], "Pose": position})
     add(block, "TiePoints")
     # Write tie points as text: XML elements of a million image points take a gigabyte.
     before, after = xml_text(root).split("<TiePoints />")
@@ -179,19 +183,13 @@ def write(p: Project, folder: Path) -> None:
     (folder / FILE).write_text(text, encoding="utf-8")
 
 
-def _add_camera(group: ElementTree.Element, name: str, camera: ProjectCamera) -> None:
-    f, _, column, row = pixels_of(camera.interior, camera.sensor)
-    add(group, "Name", name)
-    size = {"Width": str(camera.sensor.width_px), "Height": str(camera.sensor.height_px)}
-    _add_all(add(group, "ImageDimensions"), **size)
-    _add_all(group, CameraModelType="Perspective", FocalLengthPixels=f, CameraOrientation="XRightYDown")
-    _add_all(add(group, "PrincipalPoint"), x=column - _FIRST_PX, y=row - _FIRST_PX)
-    _add_all(add(group, "Distortion"), **{n.upper(): value for n, value in camera.terms(BROWN_TERMS).items()})
-
-
-def _add_all(parent: ElementTree.Element, **content: str | float) -> None:
+def _add_all(parent: ElementTree.Element, content: Mapping[str, Any]) -> None:
+    """Add an element for each item; a mapping is an element with elements."""
     for tag, value in content.items():
-        add(parent, tag, value)
+        if isinstance(value, dict):
+            _add_all(add(parent, tag), value)
+        else:
+            add(parent, tag, value)
 
 
 FORMATS = (

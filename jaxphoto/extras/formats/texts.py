@@ -87,21 +87,10 @@ class ExteriorText(NamedTuple):
     """EPSG code, or "" if the file names none."""
 
 
-class _Lines(NamedTuple):
-    """Row numbers and lines of a file that are not empty; kind and index of the first row of values."""
-
-    numbered: list[tuple[int, str]]
-    kind: str
-    """angles, matrices, bingo, or "" if the file has no orientations."""
-    first: int
-    columns: dict[str, int]
-    """Indices of the columns of angles, counted from the end of a row: names may contain blanks."""
-
-
 def find(source: Path) -> list[Path]:
     """Return text files of orientations; in a folder only if it contains image points, too."""
     paths = [source] if source.is_file() else sorted(source.iterdir())
-    texts = [p for p in paths if p.is_file() and p.suffix.lower() in _TEXTS and p.name != IMAGES and _lines(p).kind]
+    texts = [p for p in paths if p.is_file() and p.suffix.lower() in _TEXTS and p.name != IMAGES and _layout(p)[0]]
     return texts if texts and (source.is_file() or measured_texts(texts[0])) else []
 
 
@@ -144,12 +133,14 @@ def _cameras(path: Path, names: list[str]) -> tuple[dict[str, ProjectCamera], li
 # Exterior orientations ----------------------------------------------------------------------------------------
 
 
-def _lines(path: Path) -> _Lines:
-    """Read the lines of a file, and recognise its kind."""
-    lines = _Lines(numbered_lines(read_legacy_text(path)), "", 0, {})
-    if any(line.split(maxsplit=1)[0] == _ORIA for _, line in lines.numbered):
-        return lines._replace(kind="bingo")
-    cells = [_cells(line) for _, line in lines.numbered[:_BEGIN]]
+def _layout(path: Path) -> tuple[str, int, dict[str, int]]:
+    """Return angles, matrices, bingo or "" (no orientations), the index of the first nonempty line of values, and the
+    columns of angles, counted from the end of a row: names may contain blanks.
+    """
+    lines = numbered_lines(read_legacy_text(path))
+    if any(line.split(maxsplit=1)[0] == _ORIA for _, line in lines):
+        return "bingo", 0, {}
+    cells = [_cells(line) for _, line in lines[:_BEGIN]]
     numeric = [len(row) if all(map(is_number, row)) else 0 for row in cells]
     begins = [len(row) > 3 and all(map(is_number, row[-3:])) and not row[0].startswith("#") for row in cells]
     for k in range(len(cells) - 1):
@@ -157,12 +148,12 @@ def _lines(path: Path) -> _Lines:
         below = cells[k + 1]
         complete = len(columns) == len(_COLUMNS) and len(below) > -min(columns.values())
         if complete and all(is_number(below[at]) for at in columns.values()):
-            return lines._replace(kind="angles", first=k + 1, columns=columns)
+            return "angles", k + 1, columns
         # The next photograph of PATB, if any, must follow immediately.
         follows = k + 3 >= len(cells) or begins[k + 3] or cells[k + 3] == ["-99"]
         if begins[k] and tuple(numeric[k + 1 : k + 3]) == _MATRIX and follows:
-            return lines._replace(kind="matrices", first=k)
-    return lines
+            return "matrices", k, {}
+    return "", 0, {}
 
 
 def _cells(line: str) -> list[str]:
@@ -173,14 +164,13 @@ def _cells(line: str) -> list[str]:
 
 def read_exterior(path: Path) -> ExteriorText:
     """Read the orientations in a text file. Raise InputError with the row number if a row is invalid."""
-    lines = _lines(path)
-    if not lines.kind:
+    (kind, first, columns), lines = _layout(path), numbered_lines(read_legacy_text(path))
+    if not kind:
         raise InputError(f"{path.name} has no orientations; write the header {_HEADER!r} above the rows")
-    above = "\n".join(line for _, line in lines.numbered[: lines.first or _BEGIN])
-    rows = lines.numbered[lines.first :]
-    content = [(k, _cells(line), line) for k, line in rows if not line.lstrip().startswith("#")]
+    above = "\n".join(line for _, line in lines[: first or _BEGIN])
+    content = [(k, _cells(line), line) for k, line in lines[first:] if not line.lstrip().startswith("#")]
     names, values = [], []
-    if lines.kind == "matrices":
+    if kind == "matrices":
         content = [row for row in content if row[1] != ["-99"]]
         for at in range(0, len(content), 3):
             (k, cells, line), below = content[at], content[at + 1 : at + 3]
@@ -193,7 +183,7 @@ def read_exterior(path: Path) -> ExteriorText:
             # A principal distance may precede the position.
             name = cells[:-3]
             names.append(" ".join(name[:-1] if len(name) > 1 and is_number(name[-1]) else name))
-    elif lines.kind == "bingo":
+    elif kind == "bingo":
         for k, cells, line in content:
             if cells[0] == _ORIA:
                 begin = next((j for j in range(2, len(cells) - 5) if all(map(is_number, cells[j : j + 6]))), 0)
@@ -202,17 +192,17 @@ def read_exterior(path: Path) -> ExteriorText:
                 names.append(" ".join(cells[1:begin]))
                 values.append(row_numbers(path, k, cells[begin : begin + 6], 6))
     else:
-        most = -min(lines.columns.values())
+        most = -min(columns.values())
         for k, cells, line in content:
             if len(cells) <= most:
                 raise _error(path, k, line, "name, X, Y, Z, omega, phi, kappa")
-            values.append(row_numbers(path, k, [cells[lines.columns[name]] for name in _COLUMNS], len(_COLUMNS)))
+            values.append(row_numbers(path, k, [cells[columns[name]] for name in _COLUMNS], len(_COLUMNS)))
             names.append(" ".join(cells[:-most]))
     numbers = np.array(values).reshape(len(values), -1)
-    angles = numbers[:, 3:6] * (_GON_DEG if lines.kind == "bingo" or _GON.search(above) else 1.0)
-    if lines.kind == "matrices":
+    angles = numbers[:, 3:6] * (_GON_DEG if kind == "bingo" or _GON.search(above) else 1.0)
+    if kind == "matrices":
         rotations = np.swapaxes(numbers[:, 3:].reshape(-1, 3, 3), 1, 2)
-    elif lines.kind == "bingo":
+    elif kind == "bingo":
         rotations = scipy.spatial.transform.Rotation.from_euler("YXZ", angles, degrees=True).inv().as_matrix()
     else:
         exterior = ExteriorOrientation.from_angles(numbers[:, :3], np.deg2rad(angles))  # type: ignore[arg-type]
