@@ -92,6 +92,7 @@ def test_a_model_of_colmap_round_trip(tmp_path_factory, format, poses, seed):
     turn = np.stack([camera_from_object(*angles) for angles in values[:, 3:]])
     p = photographs("rational", "local")
     p = p._replace(
+        files=tuple(name.replace(" ", "_") for name in p.files),
         exterior=ExteriorOrientation(values[:, :3], turn),
         xyz=rng.uniform(-5000, 5000, p.xyz.shape),
         column_row=rng.uniform(0, 4000, p.column_row.shape),

@@ -20,6 +20,7 @@ from jaxphoto.extras.formats.project import (
     OPENCV_FISHEYE,
     Project,
     ProjectCamera,
+    check_blanks,
     in_pixels,
     numbered,
     pixels_of,
@@ -195,6 +196,7 @@ def _written(p: Project) -> Any:
 
 def write_text(p: Project, folder: Path) -> None:
     """Write cameras.txt, images.txt, points3D.txt, and COLMAP's rigs.txt and frames.txt."""
+    check_blanks(p, "images.txt")
     _written(p).write_text(str(folder))
 
 

@@ -30,9 +30,9 @@ from jaxphoto.camera import BundlerRadial, InteriorOrientation, Perspective, Sen
 from jaxphoto.camera.conversion import Conversion
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.compiling import call_compiled
-from jaxphoto.errors import InputError, quoted
+from jaxphoto.errors import InputError
 from jaxphoto.extras.formats.files import Format, by_content, content_rows, row_numbers, warn
-from jaxphoto.extras.formats.project import CameraModel, Project, ProjectCamera, pixels_of, translations
+from jaxphoto.extras.formats.project import CameraModel, Project, ProjectCamera, check_blanks, pixels_of, translations
 from jaxphoto.io.camera_files import ASSUMED_PIXEL_MM
 from jaxphoto.io.text_files import has_words, read_legacy_text
 from jaxphoto.io.text_tables import LARGEST
@@ -125,9 +125,7 @@ def _listed_names(path: Path, number: int) -> list[str]:
 
 def write_bundler(p: Project, folder: Path) -> None:
     """Write bundle.out and list.txt; object points without image points are omitted."""
-    for file in p.files:
-        if len(file.split()) != 1:
-            raise InputError(f"{LIST} allows no blanks, but {quoted(file)} has one; rename the photograph")
+    check_blanks(p, LIST)
     words = lambda values: " ".join(map(repr, values))  # noqa: E731
     rotations, values = np.asarray(p.exterior.camera_from_object), _radial_values(p).tolist()
     moved = translations(rotations, p.exterior.position).tolist()
