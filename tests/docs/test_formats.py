@@ -109,7 +109,7 @@ PROJECTS = {
     "colmap": [test_colmap.write_text, test_colmap.write_binary, _exported("colmap")],
     "opensfm": [test_reconstructions.write_open_sfm, _exported("opensfm")],
     "blocksexchange": [test_reconstructions.write_blocks_exchange, _exported("blocksexchange")],
-    "bundler": [test_reconstructions.write_bundler, _exported("bundler")],
+    "bundler": [test_reconstructions.write_bundler],
     "pix4d": [test_reconstructions.write_pix4d],
     "metashape": [oriented_files.write_metashape, _exported("metashape")],
     "texts": [oriented_files.write_angles, oriented_files.write_patb, oriented_files.write_bingo, _exported("opk")],

@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 
 from jaxphoto.camera import InteriorOrientation, OpenCvFisheye, Sensor
-from jaxphoto.errors import quoted
+from jaxphoto.errors import InputError, quoted
 from jaxphoto.extras.formats.files import CameraFormat, Format, content_rows, row_numbers
 from jaxphoto.extras.formats.project import (
     OPENCV,
     OPENCV_FISHEYE,
     Project,
     ProjectCamera,
-    check_blanks,
     in_pixels,
     numbered,
     pixels_of,
@@ -196,7 +195,8 @@ def _written(p: Project) -> Any:
 
 def write_text(p: Project, folder: Path) -> None:
     """Write cameras.txt, images.txt, points3D.txt, and COLMAP's rigs.txt and frames.txt."""
-    check_blanks(p, "images.txt")
+    if blank := [name for name in p.files if len(name.split()) != 1]:
+        raise InputError(f"images.txt allows no blanks, but {quoted(blank[0])} has one; write colmap-binary")
     _written(p).write_text(str(folder))
 
 

@@ -398,13 +398,6 @@ def flipped(rotations: ArrayLike) -> Float[np.ndarray, "n 3 3"]:
     return np.array([[1.0], [-1.0], [-1.0]]) * np.asarray(rotations)
 
 
-def check_blanks(p: Project, file: str) -> None:
-    """Raise InputError for a photograph name with blanks, which the text file `file` separates."""
-    for name in p.files:
-        if len(name.split()) != 1:
-            raise InputError(f"{file} allows no blanks, but {quoted(name)} has one; rename the photograph")
-
-
 def translations(rotations: ArrayLike, positions: ArrayLike) -> np.ndarray:
     """Return t of x = R (X - position) = R X + t."""
     return -np.einsum("nij,nj->ni", np.asarray(rotations), np.asarray(positions))

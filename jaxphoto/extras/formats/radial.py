@@ -10,8 +10,8 @@
 Camera coordinates P = R X + t have x right, y up and view along -z, like ours. With p = -P / P_z the image point is f
 (1 + k1 |p|^2 + k2 |p|^4) p pixels from the image centre. In Bundler f = 0 marks an image without orientation; names of
 photographs are in list.txt of the same folder (OpenSfM: list_r000.out for bundle_r000.out). Neither file contains the
-image format: the smallest centred format that contains the image points is used. Exported image points are computed
-from the rays of the adjusted camera by the exported one, so the geometry is preserved exactly. Sources: N. Snavely,
+image format: the smallest centred format that contains the image points is used. Image points exported as BAL are
+computed from the rays of the adjusted camera by the exported one, so the geometry is preserved exactly. Sources: N. Snavely,
 Bundler v0.4 User's Manual, "Output format and scene representation"; grail.cs.washington.edu/projects/bal.
 """
 
@@ -32,12 +32,12 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
 from jaxphoto.extras.formats.files import Format, by_content, content_rows, row_numbers, warn
-from jaxphoto.extras.formats.project import CameraModel, Project, ProjectCamera, check_blanks, pixels_of, translations
+from jaxphoto.extras.formats.project import CameraModel, Project, ProjectCamera, pixels_of, translations
 from jaxphoto.io.camera_files import ASSUMED_PIXEL_MM
 from jaxphoto.io.text_files import has_words, read_legacy_text
 from jaxphoto.io.text_tables import LARGEST
 
-BUNDLE, LIST = "bundle.out", "list.txt"
+LIST = "list.txt"
 RADIAL = CameraModel(BundlerRadial, (), Perspective())
 _HEAD = "# Bundle file v0.3"
 # Minimum half format as a fraction of f (for images with central points only), and maximum half format (px).
@@ -121,25 +121,6 @@ def _listed_names(path: Path, number: int) -> list[str]:
             return names
     warn(f"{path.name}: list.txt not found; photographs are numbered")
     return [str(k) for k in range(number)]
-
-
-def write_bundler(p: Project, folder: Path) -> None:
-    """Write bundle.out and list.txt; object points without image points are omitted."""
-    check_blanks(p, LIST)
-    words = lambda values: " ".join(map(repr, values))  # noqa: E731
-    rotations, values = np.asarray(p.exterior.camera_from_object), _radial_values(p).tolist()
-    moved = translations(rotations, p.exterior.position).tolist()
-    shown = [rows for rows in p.rows_of_points if len(rows)]
-    lines = [_HEAD, f"{len(p.files)} {len(shown)}"]
-    for camera, rotation, translation in zip(values, rotations.tolist(), moved, strict=True):
-        lines += [words(camera), *map(words, rotation), words(translation)]
-    xy, image, key, xyz = (a.tolist() for a in (_from_middle(p), p.image, p.number_in_image, np.asarray(p.xyz)))
-    for rows in shown:
-        seen = " ".join(f"{image[k]} {key[k]} {words(xy[k])}" for k in rows.tolist())
-        lines += [words(xyz[p.point[rows[0]]]), "0 0 0", f"{len(rows)} {seen}"]
-    (folder / BUNDLE).write_text("\n".join(lines) + "\n", encoding="utf-8")
-    listed = "".join(f"{file} 0 {camera[0]!r}\n" for file, camera in zip(p.files, values, strict=True))
-    (folder / LIST).write_text(listed, encoding="utf-8")
 
 
 # BAL ----------------------------------------------------------------------------------------------------------
@@ -251,8 +232,7 @@ def _radial_values(p: Project) -> Float[np.ndarray, "images 3"]:
 FORMATS = (
     Format(
         "bundler", "bundle.out of Bundler, with list.txt: f, k1, k2",
-        by_content("*.out", lambda path: has_words(path, _HEAD)), read_bundler, write=write_bundler, plane=RADIAL,
-        endings=(".out", ".txt"), keeps_rays=True,
+        by_content("*.out", lambda path: has_words(path, _HEAD)), read_bundler,
     ),
     Format(
         "bal", "problem of bundle adjustment in the large: f, k1, k2", by_content("*.txt", _is_bal), read_bal,
