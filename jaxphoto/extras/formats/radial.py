@@ -11,7 +11,7 @@ Camera coordinates P = R X + t have x right, y up and view along -z, like ours. 
 (1 + k1 |p|^2 + k2 |p|^4) p pixels from the image centre. In Bundler f = 0 marks an image without orientation; names of
 photographs are in list.txt of the same folder (OpenSfM: list_r000.out for bundle_r000.out). Neither file contains the
 image format: the smallest centred format that contains the image points is used. Image points exported as BAL are
-computed from the rays of the adjusted camera by the exported one, so the geometry is preserved exactly. Sources: N. Snavely,
+computed from the rays of the adjusted camera: the geometry is preserved exactly. Sources: N. Snavely,
 Bundler v0.4 User's Manual, "Output format and scene representation"; grail.cs.washington.edu/projects/bal.
 """
 
