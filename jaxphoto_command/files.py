@@ -16,21 +16,6 @@ Source = Annotated[Path, Argument(help="Results, block folder, or file or folder
 Second = Annotated[Path | None, Argument(hidden=True, metavar="OUT")]
 
 
-def _one_of(table: str) -> Any:
-    """Return a check that a value is a format of `table`; formats are imported only if a value is given."""
-
-    def check(context: typer.Context, value: str | None) -> str | None:
-        if value not in (None, "block"):
-            from jaxphoto.extras import formats
-
-            known = dict.fromkeys(("block", *getattr(formats, table)))
-            if value not in known:
-                raise typer.BadParameter(f"{value!r} is not one of {', '.join(map(repr, known))}.")
-        return value
-
-    return check
-
-
 def _target(out: Path | None, second: Path | None) -> Path:
     """Return --out, or the second argument."""
     if (out is None) == (second is None):
@@ -48,16 +33,9 @@ def convert(
     out: Annotated[Path | None, Option(help="Folder to write (required).")] = None,
     source_format: Annotated[
         str | None,
-        Option(
-            "--format",
-            metavar="FORMAT",
-            callback=_one_of("FORMATS"),
-            help="Format of SOURCE (docs/formats.md; default: by its content).",
-        ),
+        Option("--format", metavar="FORMAT", help="Format of SOURCE (docs/formats.md; default: by its content)."),
     ] = None,
-    to: Annotated[
-        str, Option(metavar="FORMAT", callback=_one_of("EXPORTS"), help="Format of --out (docs/formats.md).")
-    ] = "block",
+    to: Annotated[str, Option(metavar="FORMAT", help="Format of --out (docs/formats.md).")] = "block",
     block: Annotated[Path | None, Option(help="Block folder of the results in SOURCE, if moved.")] = None,
     part: Annotated[int, Option(min=1, help="Number of the part of a flight; 1 is the largest.")] = 1,
     photographs: Annotated[list[Path] | None, Option(help="Folder of the photographs, for their file names.")] = None,
@@ -79,6 +57,8 @@ def convert(
     if out.suffix.lower() in {suffix for known in EXPORTS.values() for suffix in known.endings}:
         raise typer.BadParameter(f"--out {out}: {to} is a folder of files; omit {out.suffix}.")
     (check_block_target if to == "block" else check_export_target)(out, source)
+    if to != "block" and to not in EXPORTS:
+        raise typer.BadParameter(f"--to {to}: unknown format; choose one of block, {', '.join(EXPORTS)}.")
     lacks: Any = EXPORTS[to].lacks if to in EXPORTS else ()
     with output.progress(f"reading {source}") as progress:
         read = adjusted_block(source, block, part) if result else read_source(source, source_format)

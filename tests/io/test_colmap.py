@@ -302,7 +302,7 @@ def test_the_command_converts_there_and_back(tmp_path, monkeypatch, capsys):
     same_block(read_source(tmp_path / "back"), read_source(model))
     for out, to, message in (
         (tmp_path / "block", "colmap", "is or contains the input"),
-        (tmp_path / "new", "colmop", "'colmop' is not one of"),
+        (tmp_path / "new", "colmop", "--to colmop: unknown format"),
     ):
         code, _, error = run(monkeypatch, capsys, "convert", tmp_path / "block", out, "--to", to)
         assert (code, message in error) == (2, True)
