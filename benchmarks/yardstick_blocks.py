@@ -266,7 +266,7 @@ def _measured(folder: str) -> Path:
 def real_sxb() -> Blocks:
     folder = _measured("sxb")
     return {"sxb": jaxphoto.read_source(folder),
-            "stations": jaxphoto.read_source(folder / "prior_eo", "photomodeler", stations=True)}  # fmt: skip
+            "stations": jaxphoto.read_source(folder / "prior_eo", "photomodeler")}  # fmt: skip
 
 
 @case
@@ -276,7 +276,9 @@ def real_camcal() -> Blocks:
 
 @case
 def real_aicon() -> Blocks:
-    return {"aicon": jaxphoto.read_source(_measured("aicon"))}
+    from tests.aicon import read_aicon
+
+    return {"aicon": read_aicon(_measured("aicon"))}
 
 
 @case

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 EXTRAS = {
     "laspy": "lidar", "lazrs": "lidar", "rasterio": "lidar",
-    "cv2": "photos", "pycolmap": "photos", "yaml": "photos",
+    "cv2": "photos", "pycolmap": "photos",
     "pyarrow": "parquet",
     "plotly": "report", "xarray": "report",
     "blackjax": "posterior",

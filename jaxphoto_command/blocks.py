@@ -32,7 +32,7 @@ _SHOWN = 12
     PANEL,
     f"{_EXAMPLE}jaxphoto adjust cross_block --out results",
     "Earlier calibrations in block.toml may be OpenCV's and ROS' YAML, COLMAP's cameras.txt, Agisoft's XML, "
-    "mrcal's .cameramodel, Kalibr's camera chain, a SMAC report, interior.csv and block.toml.",
+    "mrcal's .cameramodel, a SMAC report, interior.csv and block.toml.",
 )
 def adjust(
     output: Output,

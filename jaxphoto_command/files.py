@@ -16,21 +16,6 @@ Source = Annotated[Path, Argument(help="Results, block folder, or file or folder
 Second = Annotated[Path | None, Argument(hidden=True, metavar="OUT")]
 
 
-def _one_of(table: str) -> Any:
-    """Return a check that a value is a format of `table`; formats are imported only if a value is given."""
-
-    def check(context: typer.Context, value: str | None) -> str | None:
-        if value not in (None, "block"):
-            from jaxphoto.extras import formats
-
-            known = dict.fromkeys(("block", *getattr(formats, table)))
-            if value not in known:
-                raise typer.BadParameter(f"{value!r} is not one of {', '.join(map(repr, known))}.")
-        return value
-
-    return check
-
-
 def _target(out: Path | None, second: Path | None) -> Path:
     """Return --out, or the second argument."""
     if (out is None) == (second is None):
@@ -48,16 +33,9 @@ def convert(
     out: Annotated[Path | None, Option(help="Folder to write (required).")] = None,
     source_format: Annotated[
         str | None,
-        Option(
-            "--format",
-            metavar="FORMAT",
-            callback=_one_of("FORMATS"),
-            help="Format of SOURCE (docs/formats.md; default: by its content).",
-        ),
+        Option("--format", metavar="FORMAT", help="Format of SOURCE (docs/formats.md; default: by its content)."),
     ] = None,
-    to: Annotated[
-        str, Option(metavar="FORMAT", callback=_one_of("EXPORTS"), help="Format of --out (docs/formats.md).")
-    ] = "block",
+    to: Annotated[str, Option(metavar="FORMAT", help="Format of --out (docs/formats.md).")] = "block",
     block: Annotated[Path | None, Option(help="Block folder of the results in SOURCE, if moved.")] = None,
     part: Annotated[int, Option(min=1, help="Number of the part of a flight; 1 is the largest.")] = 1,
     photographs: Annotated[list[Path] | None, Option(help="Folder of the photographs, for their file names.")] = None,
@@ -79,6 +57,8 @@ def convert(
     if out.suffix.lower() in {suffix for known in EXPORTS.values() for suffix in known.endings}:
         raise typer.BadParameter(f"--out {out}: {to} is a folder of files; omit {out.suffix}.")
     (check_block_target if to == "block" else check_export_target)(out, source)
+    if to != "block" and to not in EXPORTS:
+        raise typer.BadParameter(f"--to {to}: unknown format; choose one of block, {', '.join(EXPORTS)}.")
     lacks: Any = EXPORTS[to].lacks if to in EXPORTS else ()
     with output.progress(f"reading {source}") as progress:
         read = adjusted_block(source, block, part) if result else read_source(source, source_format)
@@ -126,17 +106,13 @@ def _report_export(output: Output, written: Any, values: str, cameras: bool) -> 
     """Report the written values and the loss of accuracy."""
     output.say(values)
     losses = {name: {"rms_px": c.rms_px, "max_px": c.max_px} for name, c in written.cameras.items()}
-    misfits = {"map_misfit": written.map_misfit, "moved": written.moved}
-    output.add(values=values, cameras=losses, **{name: m and m._asdict() for name, m in misfits.items()})
+    output.add(values=values, cameras=losses, moved_px=written.moved_px)
     for name, conversion in written.cameras.items() if cameras else ():
         output.say(f"camera {name}: {conversion.lost}")
-    if written.moved is not None:
-        moved = f"rms {written.moved.rms_px:.3g} px, maximum {written.moved.max_px:.3g} px"
-        note = f"; moved by {moved} to fit the written cameras" if written.moved.max_px else ""
-        output.say(f"image points are relative to the principal point{note}")
-    if written.map_misfit is not None:
-        misfit = f"rms {written.map_misfit.rms_px:.3g} px, maximum {written.map_misfit.max_px:.3g} px"
-        output.say(f"map coordinates are not Cartesian: image residuals {misfit}")
+    if written.moved_px is not None:
+        rms, largest = written.moved_px
+        moved = f"; moved by rms {rms:.3g} px, maximum {largest:.3g} px to fit the written cameras" if largest else ""
+        output.say(f"image points are relative to the principal point{moved}")
 
 
 @command("camera", PANEL, f"{_ADJUSTED}jaxphoto camera results --out cameras.txt")
@@ -146,13 +122,13 @@ def camera(
         Path,
         Argument(
             help="Results, block folder or COLMAP model; or a file: OpenCV's and ROS' YAML, COLMAP's cameras.txt, "
-            "Agisoft's XML, mrcal's .cameramodel, Kalibr's camera chain, a SMAC report, interior.csv, block.toml."
+            "Agisoft's XML, mrcal's .cameramodel, a SMAC report, interior.csv, block.toml."
         ),
     ],
     second: Second = None,
     out: Annotated[Path | None, Option(help="Camera file to write (required).")] = None,
     out_format: Annotated[
-        Literal["opencv", "colmap", "agisoft", "mrcal", "ros", "smac", "block"] | None,
+        Literal["opencv", "colmap", "agisoft", "block"] | None,
         Option("--format", help="Format of --out (default: by its name)."),
     ] = None,
     camera: opt.Camera = None,
@@ -161,9 +137,6 @@ def camera(
     height_px: Annotated[int | None, Option(min=1, help="Image height, if SOURCE lacks it.")] = None,
     block: Annotated[Path | None, Option(help="Block folder of the results in SOURCE.")] = None,
     distortion: Annotated[str | None, Option(help="Distortion model of a .toml file (default: as in SOURCE).")] = None,
-    model: Annotated[
-        str | None, Option(help="Largest model of the format to use, like OPENCV (default: as required).")
-    ] = None,
     loss_px: Annotated[float, Option(min=0, help="Maximum misfit of a fitted model.")] = 1.0,
 ) -> None:
     """Convert a camera file: exactly if possible, otherwise by a fitted model with its misfit in pixels."""
@@ -188,7 +161,6 @@ def camera(
             distortion=None if distortion is None else AbstractDistortion.called(distortion),
             covariance=read.covariance,
             reservation=read.note,
-            model=model,
             loss_px=loss_px,
         )
     models = [type(interior.distortion).__name__ for interior in (read.interior, written.interior)]

@@ -16,7 +16,7 @@ from jaxphoto_command.application import command
 from jaxphoto_command.output import Output
 
 PANEL = "Photographs"
-_CONTROL = "gcp_list.txt, markers of Metashape, GeoJSON, GeoPackage, geoin.dat of BINGO, CSV, table of Pix4D"
+_CONTROL = "gcp_list.txt, markers of Metashape, CSV, table of Pix4D"
 
 
 @command("fly", PANEL, "jaxphoto fly photographs --out flight")

@@ -1,15 +1,5 @@
 """Small valid files of formats whose real ones are large or not ours."""
 
-AICON = {
-    "a.ior": "1 1 -28.785 0.01 -0.02 -1.0e-4 1.5e-7 8.0\n-2.0e-10\n1.0e-5 -2.0e-5\n3.0e-5 4.0e-5\n"
-    "35.968 23.979 6000 4000\n",
-    "a.phc": "".join(
-        f"{i} {p} {x}.5 {-x}.25 0.0005 0.0005 0.0 0.0 1 1 1\n" for i in (1, 2) for p, x in ((11, 1), (12, 2), (13, 5))
-    ),
-    "a.eor": "1 1 10.0 20.0 3000.0 0.1 0.2 0.3 1 1 1\n2 1 500.0 20.0 3000.0 -0.1 0.2 0.3 1 1 1\n",
-    "a.obc": "".join(f"{p} {p}.5 {2 * p} 0.125 0.01 0.01 0.01 2 1 1 1\n" for p in (11, 12, 13)),
-    "a.scale": "1 bar 11 12 1000.25 0.01 1\n",
-}
 DBAT = {
     "a.xml": """<?xml version="1.0" encoding="utf-8"?>
 <document dbat_script_version="1.0"><meta><name>small</name><project_unit>m</project_unit></meta>

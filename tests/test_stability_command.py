@@ -117,7 +117,7 @@ def kinds(tmp_path_factory):
     folder = tmp_path_factory.mktemp("kinds")
     sensor = Sensor(**SENSOR)
     interior = InteriorOrientation(2.7, -0.07, 0.08, Smac())
-    files = {"opencv": "a.yml", "colmap": "cameras.txt", "agisoft": "a.xml", "smac": "a.txt", "block": "block.toml"}
+    files = {"opencv": "a.yml", "colmap": "cameras.txt", "agisoft": "a.xml", "block": "block.toml"}
     result = {}
     for kind, name in files.items():
         (folder / kind).mkdir()
@@ -132,7 +132,6 @@ def kinds(tmp_path_factory):
 PAIRS = (
     ("results", "results"), ("results", "interior.csv"), ("block", "results"), ("results", "block folder"),
     ("opencv", "results"), ("colmap", "interior.csv"), ("model folder", "block"), ("agisoft", "results"),
-    ("smac", "results"),
 )  # fmt: skip
 
 

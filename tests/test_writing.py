@@ -55,7 +55,7 @@ def cloud(path):
 WRITERS = {
     "dsm.tif": lambda path: write_dsm(path, Raster(HEIGHTS, 0.0, 0.0, 1.0)),
     "shade.png": lambda path: write_hillshade(path, np.abs(HEIGHTS) % 1),
-    "camera.yml": camera, "camera.json": camera, "camera.xml": camera, "camera.txt": camera,
+    "camera.yml": camera, "camera.json": camera, "camera.xml": camera,
     "cloud.las": cloud, "cloud.laz": cloud, "cloud.csv": cloud, "cloud.ply": cloud,
 }  # fmt: skip
 

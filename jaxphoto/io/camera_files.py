@@ -31,8 +31,8 @@ ASSUMED_PIXEL_MM = 0.001
 """Default pixel size if none is specified; c in micrometres then equals the focal length in pixels."""
 INTERIOR, CAMERA = "interior.csv", "camera.toml"
 CAMERAS_READ = (
-    "OpenCV's and ROS' YAML, COLMAP's cameras.txt, Agisoft's XML, mrcal's .cameramodel, Kalibr's camera chain, a "
-    "SMAC report, interior.csv and block.toml"
+    "OpenCV's and ROS' YAML, COLMAP's cameras.txt, Agisoft's XML, mrcal's .cameramodel, a SMAC report, interior.csv "
+    "and block.toml"
 )
 """Formats that `read_camera_file` reads, for messages and help."""
 _IN_FOLDER = (INTERIOR, TOML, CAMERA, "cameras.txt", "cameras.bin")
@@ -248,23 +248,13 @@ def read_results(source: CameraSource) -> CameraFile:
     sensor, empty = _described(source, name)
     table = table.take(of == name)
     parameters = table.ids("parameter").tolist()
-    for row, parameter in enumerate(parameters):
-        if parameter in parameters[:row]:
-            raise table.bad(row, f"{parameter} of camera {name} is given twice; keep one of the two rows")
     values = dict(zip(parameters, table.numbers("value").tolist(), strict=True))
     sigma = np.nan_to_num(table.numbers("sigma", empty=True))
-    for line in np.flatnonzero(sigma < 0):
-        raise table.bad(line, f"sigma is {sigma[line]:g}; leave it empty for a fixed parameter")
     sigmas = dict(zip(parameters, sigma.tolist(), strict=True))
     names, constants = parameter_names(empty), constant_names(empty)
     if missing := [n for n in (*names, *constants) if n not in values]:
         model = type(empty.distortion).__name__
         raise source.error(f"camera {name} has no {', '.join(missing)}, which {model} needs; give its block")
-    if not values["c_mm"] > 0:
-        raise source.error(f"c_mm of camera {name} is {values['c_mm']:g}; a principal distance is positive")
-    for constant in constants:
-        if not (values[constant] > 0 or (constant == "r0_mm" and values[constant] == 0)):
-            raise source.error(f"{constant} of camera {name} is {values[constant]:g}; give it as a positive length")
     interior = empty
     for parameter in (*names, *constants):
         interior = set_parameter(interior, parameter, as_jax_array(values[parameter]))

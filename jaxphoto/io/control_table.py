@@ -45,12 +45,10 @@ class Cells(NamedTuple):
     file: str
     records: list[list[str]]
     rows: list[int]
-    called: str = "row"
-    """Word for a row in messages."""
 
     def place(self, k: int) -> str:
         """Return file and row for messages."""
-        return f"{self.file}, {self.called} {self.rows[k]}"
+        return f"{self.file}, row {self.rows[k]}"
 
     def bad(self, k: int, message: str) -> RowError:
         """Return an error about row `k`."""

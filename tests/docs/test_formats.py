@@ -105,30 +105,22 @@ PROJECTS = {
     "block": [_texts(FILES)],
     "dbat": [_texts(sound_files.DBAT)],
     "photomodeler": [_texts(sound_files.PHOTOMODELER)],
-    "aicon": [_texts(sound_files.AICON)],
     "bal": [_texts({"problem.txt": "\n".join(test_bal.lines_of())}), _exported("bal")],
     "colmap": [test_colmap.write_text, test_colmap.write_binary, _exported("colmap")],
     "opensfm": [test_reconstructions.write_open_sfm, _exported("opensfm")],
-    "openmvg": [test_reconstructions.write_open_mvg, _exported("openmvg")],
     "blocksexchange": [test_reconstructions.write_blocks_exchange, _exported("blocksexchange")],
-    "bundler": [test_reconstructions.write_bundler, _exported("bundler")],
+    "bundler": [test_reconstructions.write_bundler],
     "pix4d": [test_reconstructions.write_pix4d],
     "metashape": [oriented_files.write_metashape, _exported("metashape")],
     "texts": [oriented_files.write_angles, oriented_files.write_patb, oriented_files.write_bingo, _exported("opk")],
-    "nerfstudio": [oriented_files.write_nerfstudio],
-    "orthority": [oriented_files.write_orthority, _exported("orthority")],
 }
 CAMERAS = {
     "interior": ("interior.csv", test_cameras.INTERIOR), "block": ("a.toml", test_cameras.TOML),
     "agisoft": ("a.xml", test_cameras.AGISOFT), "smac": ("a.txt", test_cameras.SMAC),
     "colmap": ("cameras.txt", test_cameras.COLMAP), "opencv": ("a.yml", test_cameras.OPENCV),
     "mrcal": ("a", test_camera_formats.mrcal("OPENCV8", test_camera_formats.RATIONAL)),
-    "kalibr": ("a.yaml", test_camera_formats.KALIBR),
 }  # fmt: skip
-CONTROL = {
-    "gcp_list": control_files.GCP_LIST, "metashape": control_files.MARKERS, "geo_json": control_files.GEO_JSON,
-    "bingo": control_files.GEOIN,
-}  # fmt: skip
+CONTROL = {"gcp_list": control_files.GCP_LIST, "metashape": control_files.MARKERS}
 TABLES = (control_files.REFERENCE, control_files.PIX4D, control_files.PIX4D_MARKS, control_files.OWN)
 
 
@@ -146,7 +138,7 @@ def test_every_project_is_recognised_by_its_format_alone(tmp_path, name):
 
 
 def test_every_camera_and_control_file_is_recognised_by_its_format_alone(tmp_path):
-    assert CAMERAS.keys() == CAMERA_READERS.keys() and {*CONTROL, "geo_package"} == CONTROL_FORMATS.keys()
+    assert CAMERAS.keys() == CAMERA_READERS.keys() and CONTROL.keys() == CONTROL_FORMATS.keys()
     for name, (file, text) in CAMERAS.items():
         assert [key for key, reader in CAMERA_READERS.items() if reader.recognise(Path(file), text)] == [name]
         assert recognise(tmp_path) == []
@@ -156,6 +148,3 @@ def test_every_camera_and_control_file_is_recognised_by_its_format_alone(tmp_pat
         names = [key for key, format in CONTROL_FORMATS.items() if format.recognise(path, text)]
         assert names == ([name] if name else [])
         assert recognise(path) == (["metashape"] if name == "metashape" else [])
-    _exported("geopackage")(tmp_path)
-    path = tmp_path / "out" / "photographs.gpkg"
-    assert [key for key, format in CONTROL_FORMATS.items() if format.recognise(path, "")] == ["geo_package"]

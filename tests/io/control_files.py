@@ -58,19 +58,3 @@ OWN_MARKS = """image;point;x_px;y_px;sigma_px
 DJI_0001;G1;100,25;200,5;0,1
 DJI_0002;G1;110,25;210,5;
 """
-GEO_JSON = """{"type": "FeatureCollection", "name": "gcps",
-"crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32633"}},
-"features": [
-{"type": "Feature", "properties": {"fid": 1, "name": "G1", "role": null, "sigma": 0.01},
- "geometry": {"type": "Point", "coordinates": [386800.1, 6175000.2, 30.5]}},
-{"type": "Feature", "properties": {"fid": 2, "name": "G2", "role": "check", "sigma": null},
- "geometry": {"type": "Point", "coordinates": [386900.0, 6175100.0]}}
-]}
-"""
-
-GEOIN = """* a project
-CAPA cam 1 50.1 0.01 -0.02
-CONT 11 500.5 600.5 70.25
-CHCK 12 510.5 610.5 71.25 0.02
-CONT A-3 520.5 620.5 nan
-"""

@@ -1,9 +1,5 @@
 """Exported photographs of `tests.io.test_exports`, with image points as texts beside them; reprojection errors."""
 
-import csv
-import json
-import math
-
 import jax
 import numpy as np
 from hypothesis import strategies as st
@@ -100,7 +96,7 @@ def write_angles(folder, kind="epsg", change=lambda text: text, points="bingo"):
     return folder
 
 
-def write_patb(folder, kind="local", turned=False, change=lambda text: text):
+def write_patb(folder, kind="local", change=lambda text: text):
     """PATB's orientations, in three rows a photograph, with PATB's image points and the camera of `--to opk`."""
     p = inside("opencv", kind)
     write_angles(folder, kind, points="patb")
@@ -108,59 +104,25 @@ def write_patb(folder, kind="local", turned=False, change=lambda text: text):
     on_map = p.in_map().exterior
     lines = []
     for name, at, r in zip(p.images, *map(np.asarray, (on_map.position, on_map.camera_from_object)), strict=True):
-        a = [f"{value:.17g}" for value in (r if turned else r.T).ravel()]
+        a = [f"{value:.17g}" for value in r.T.ravel()]
         lines += [" ".join([name, "8800.0", *map(repr, at.tolist())]), " ".join(a[:5]), " ".join(a[5:])]
     (folder / "patb.ori").write_text(change("\n".join(lines) + "\n"))
     return folder
 
 
-def write_bingo(folder, kind="local", axes="YXZ", unit=0.9, change=lambda text: text):
-    """itera.dat: object points, then orientations whose angles turn about `axes` one after the other."""
+def write_bingo(folder, kind="local", change=lambda text: text):
+    """itera.dat: object points, then orientations whose angles turn about Y, X and Z one after the other, in gon."""
     p = inside("opencv", kind)
     write_angles(folder, kind)
     (folder / "exterior.txt").unlink()
     on_map = p.in_map().exterior
     lines = ["* phi omega kappa", *(f"CORD {k} {k}.5 2.5 3.5" for k in range(60))]
     for name, at, r in zip(p.images, *map(np.asarray, (on_map.position, on_map.camera_from_object)), strict=True):
-        angles = Rotation.from_matrix(r.T).as_euler(axes, degrees=True) / unit
+        angles = Rotation.from_matrix(r.T).as_euler("YXZ", degrees=True) / 0.9
         lines.append(" ".join(["ORIA", name, *map(repr, at.tolist()), *map(repr, angles.tolist()), "1"]))
     control = [f"CONT {k} {k}00.5 20.5 3.5 0.02 0.02 0.03" for k in range(9)]
     (folder / "geoin.dat").write_text("\n".join(["* a project", *control]) + "\n")
     (folder / "itera.dat").write_text(change("\n".join(lines) + "\n"))
-    return folder
-
-
-def write_nerfstudio(folder, camera="opencv", change=lambda content: content):
-    """transforms.json as `--to nerfstudio` writes it, and image_points.csv."""
-    export(inside(camera, "local"), folder, "nerfstudio")
-    path = folder / "transforms.json"
-    path.write_text(json.dumps(change(json.loads(path.read_text()))))
-    return folder
-
-
-def write_orthority(folder, camera="opencv", kind="epsg", collection=True, change=lambda text: text):
-    """Parameters as `--to orthority` writes them, the exterior ones as GeoJSON in radians, and BINGO's image points."""
-    p = inside(camera, kind)
-    export(p, folder, "orthority")
-    table = folder / "ext_param.csv"
-    if collection:
-        with table.open() as file:
-            rows = list(csv.DictReader(file))
-        system = {"world_crs": (folder / "ext_param.prj").read_text().strip()} if kind == "epsg" else {"world_crs": ""}
-        own = [
-            {"filename": row["filename"], "camera": row["camera"], "xyz": [float(row[k]) for k in "xyz"]}
-            | {"opk": [math.radians(float(row[k])) for k in ("omega", "phi", "kappa")]}
-            for row in rows
-        ]
-        point = {"type": "Point", "coordinates": [0.0, 0.0]}
-        features = [{"type": "Feature", "geometry": point, "properties": values} for values in own]
-        text = json.dumps({"type": "FeatureCollection", **system, "features": features})
-        (folder / "ext_param.geojson").write_text(change(text))
-        table.unlink()
-    else:
-        table.write_text(change(table.read_text()))
-    (folder / "image_points.csv").unlink()
-    (folder / "bingo.txt").write_text(text_of_points(p, BINGO))
     return folder
 
 

@@ -156,11 +156,10 @@ def shortened(lines):
         (replaced(1, "3 5 13"), "46 numbers follow .* need 42 .* row 1"),
         (replaced(57, None), r"41 numbers follow .* need 42 \(9 per camera, 3 per point\)"),
         (shortened, "ends after 9 of 14 observations"),
-        (replaced(3, "3 0 1.0 2.0"), "row 3: camera 3 is not .* from 0 to 2"),
-        (replaced(3, "1 -1 1.0 2.0"), "row 3: point -1 is not .* from 0 to 4"),
+        (replaced(3, "3 0 1.0 2.0"), "row 3: camera is not .* from 0 to 2"),
+        (replaced(3, "1 -1 1.0 2.0"), "row 3: point is not .* from 0 to 4"),
         (replaced(20, "1.0e"), "row 20"),
-        (replaced(31, "-500.0"), "row 31: f of camera 1 is -500"),
-        (replaced(3, "0 0 1.0 2.0"), "row 3: point 0 is measured twice in image 0"),
+        (replaced(31, "-500.0"), "f of camera 1 is -500"),
     ],
 )
 def test_a_bad_problem_is_refused(write, change, place):

@@ -18,7 +18,7 @@ from tests.docs.test_formats import CAMERAS, CONTROL, PROJECTS, TABLES
 
 RECIPE = Path(__file__).resolve().parents[2] / "examples" / "recipe.toml"
 EXPOSURES = {"a.MRK": sound_files.MARKS, "a.pos": sound_files.POS, "a.csv": sound_files.EXPOSURES}
-CHOSEN = {"colmap": "5", "kalibr": "cam1"}
+CHOSEN = {"colmap": "5"}
 
 
 def project(format, write):

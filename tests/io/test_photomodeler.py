@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxphoto.camera import AffineBrown, Brown
-from jaxphoto.errors import InputError
+from jaxphoto.errors import JaxphotoError
 from jaxphoto.extras.formats import read_source
 from tests.formulas import camera_from_object
 from tests.io.oriented_files import misfits_px
@@ -98,5 +98,5 @@ REFUSED = {
 def test_invalid_exports_are_refused(tmp_path, name):
     text, message = REFUSED[name]
     (tmp_path / "a.txt").write_text(text)
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(JaxphotoError, match=message):
         read_source(tmp_path, "photomodeler")

@@ -1,7 +1,6 @@
 """Round trips of exports by `read_source`: identical values, identical adjustments."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxphoto
-from jaxphoto.block import Frame
 from jaxphoto.camera import InteriorOrientation, OpenCv, Sensor, get_parameter, parameter_names
 from jaxphoto.errors import InputError
 from jaxphoto.extras.formats import (
@@ -17,23 +15,21 @@ from jaxphoto.extras.formats import (
     Project,
     ProjectCamera,
     export,
-    read_control,
     read_source,
     read_tables,
-    recognise,
 )
 from jaxphoto.io.block_folder.table_layout import SIGMA_XYZ, XYZ
 from tests.io.oriented_files import come_back, inside, posed, poses
 from tests.io.test_exports import CAMERAS, SENSOR
 
 # Formats whose image points stand beside their files.
-BESIDE = {"metashape": "agisoft", "nerfstudio": "opencv", "orthority": "opencv", "opk": "opencv"}
+BESIDE = {"metashape": "agisoft", "opk": "opencv"}
 
 
 @pytest.mark.filterwarnings("ignore:.*fewer than")
 @pytest.mark.parametrize("format", BESIDE)
 def test_image_points_come_back_with_their_standard_deviations(tmp_path, format):
-    p = inside(BESIDE[format], "epsg" if format != "nerfstudio" else "local")
+    p = inside(BESIDE[format], "epsg")
     sigma = np.random.default_rng(1).uniform(0.2, 2.0, len(p.image))
     export(p._replace(sigma_px=np.repeat(sigma[:, None], 2, axis=1)), tmp_path / "out", format)
     block = read_source(tmp_path / "out")
@@ -49,13 +45,13 @@ def test_image_points_come_back_with_their_standard_deviations(tmp_path, format)
 def test_different_standard_deviations_of_x_and_y_are_reported(tmp_path):
     p = inside("opencv", "local")
     with pytest.warns(UserWarning, match="sigma_x and sigma_y differ, but image_points.csv has one column"):
-        export(p._replace(sigma_px=np.tile([3.0, 4.0], (len(p.image), 1))), tmp_path / "out", "nerfstudio")
+        export(p._replace(sigma_px=np.tile([3.0, 4.0], (len(p.image), 1))), tmp_path / "out", "opk")
     block = read_source(tmp_path / "out")
-    np.testing.assert_allclose(np.asarray(block.image_points.sigma) / 0.001, np.sqrt(12.5), rtol=1e-12)
+    np.testing.assert_allclose(np.asarray(block.image_points.sigma) / SENSOR.pixel_mm, np.sqrt(12.5), rtol=1e-12)
 
 
 @pytest.mark.filterwarnings("ignore:.*fewer than")
-@pytest.mark.parametrize("format", ["metashape", "nerfstudio", "orthority"])
+@pytest.mark.parametrize("format", ["metashape", "opk"])
 def test_a_block_adjusts_to_the_same_values_again(tmp_path, format):
     p = inside(BESIDE[format], "local")
     rng = np.random.default_rng(2)
@@ -104,7 +100,7 @@ def test_several_cameras_come_back_with_their_photographs_from_opk(tmp_path):
 
 term = st.floats(-0.2, 0.2)
 # Formats that hold points with their image points, and the names of OpenCV's coefficients there.
-WHOLE = {"openmvg": {}, "opensfm": {}, "blocksexchange": {"p1": "p2", "p2": "p1"}}
+WHOLE = {"opensfm": {}, "blocksexchange": {"p1": "p2", "p2": "p1"}}
 
 
 @settings(max_examples=40, deadline=None)
@@ -136,28 +132,6 @@ def test_cameras_poses_points_and_image_points_round_trip(tmp_path_factory, form
     names = list(zip(rows.text("image"), rows.text("point"), strict=True))
     assert set(names) == set(own)
     np.testing.assert_allclose(shown, [own[name] for name in names], rtol=0, atol=1e-9)
-
-
-@pytest.mark.filterwarnings("ignore:.*fewer than")
-def test_several_cameras_of_openmvg_have_the_ids_of_cereal(tmp_path):
-    """The name of a kind stands with the first of it alone, and numbers of objects do not come twice."""
-    p = inside("brown", "local")
-    more = {
-        n: ProjectCamera(SENSOR, InteriorOrientation(9.0, 0, 0, OpenCv(k1=k))) for n, k in (("b", 0.0), ("c", 1e-2))
-    }
-    p = p._replace(cameras=p.cameras | more | {"d": p.cameras["one"]}, image_camera=("one", "b", "c", "d"))
-    export(p, tmp_path / "out", "openmvg")
-    scene = json.loads((tmp_path / "out" / "sfm_data.json").read_text())
-    values = [item["value"] for item in scene["intrinsics"]]
-    assert [v.get("polymorphic_name") for v in values] == ["pinhole_brown_t2", "pinhole", "pinhole_radial_k1", None]
-    assert [v["polymorphic_id"] & 0x7FFFFFFF for v in values] == [1, 2, 3, 1]
-    assert [v["polymorphic_id"] >> 31 for v in values] == [1, 1, 1, 0]
-    ids = [item["value"]["ptr_wrapper"]["id"] for item in scene["views"] + scene["intrinsics"]]
-    assert len(set(ids)) == len(ids) and all(number >> 31 for number in ids)
-    tables = read_tables(tmp_path / "out", "openmvg")
-    assert dict(zip(tables.tables["images"].text("image"), tables.tables["images"].text("camera"), strict=True)) == {
-        name: str(k) for k, name in enumerate(p.images)
-    }
 
 
 # Control ------------------------------------------------------------------------------------------------------------
@@ -224,44 +198,13 @@ def test_a_block_with_control_adjusts_to_the_same_values_again(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:.*fewer than two images")
-def test_markers_in_another_system_are_refused_and_incomplete_ones_reported(tmp_path):
+def test_incomplete_markers_are_reported(tmp_path):
     p = inside("agisoft", "local")
     none = np.full((4, 3), np.nan)
     heights = with_control(p, np.array([[0.0, 0, 0]] * 3 + [[np.nan, np.nan, 0]]), none, np.zeros(4, bool))
-    with pytest.warns(UserWarning, match="markers.xml: skipped 1 control or check points without X and Y"):
+    with pytest.warns(UserWarning, match="skipped 1 control or check points without X and Y"):
         export(heights, tmp_path / "out", "metashape")
     assert len(read_source(tmp_path / "out").control.who) == 9
-    path = tmp_path / "out" / "markers.xml"
-    path.write_text(path.read_text().replace("LOCAL_CS[", "GEOGCS["))
-    with pytest.raises(InputError, match=r"markers.xml and cameras.xml differ in coordinate system"):
-        read_source(tmp_path / "out")
-
-
-def test_control_of_opensfm_is_a_gcp_list(tmp_path):
-    p = inside("opencv", "epsg")
-    p = p._replace(files=tuple(name.replace(" ", "_") for name in p.files))
-    p = with_control(p, np.full((5, 3), 0.25), np.full((5, 3), 0.02), np.arange(5) == 4)
-    with pytest.warns(UserWarning, match="gcp_list.txt skips 1 check points or points without X and Y"):
-        export(p, tmp_path / "out", "opensfm")
-    lines = (tmp_path / "out" / "gcp_list.txt").read_text().splitlines()
-    assert lines[0] == "EPSG:32633"
-    names = [p.points[j] for j in p.control.point[:4]]
-    wanted = dict(zip(names, p.frame.map.map(p.control.xyz[:4]), strict=True))
-    rows = [line.split("\t") for line in lines[1:]]
-    shown = {(p.files[i], p.points[j]): at for i, j, at in zip(p.image, p.point, p.column_row, strict=True)}
-    assert {tuple(row[5:]) for row in rows} == {key for key in shown if key[1] in names}
-    for *numbers, file, name in rows:
-        values = np.array(numbers, float)
-        np.testing.assert_allclose(values[:3], wanted[name], rtol=0, atol=1e-9)
-        # OpenSfM's pixels: the centre of the first is (0, 0).
-        np.testing.assert_allclose(values[3:] + 0.5, shown[file, name], rtol=0, atol=1e-9)
-    given = read_control(tmp_path / "out" / "gcp_list.txt")
-    assert given.points.system == "EPSG:32633" and set(given.points.ids) == set(names)
-    # A list of control beside tracks makes no project of texts.
-    assert recognise(tmp_path / "out") == ["opensfm"]
-    with pytest.warns(UserWarning, match="it needs a map system, but the block is in a local frame"):
-        export(p._replace(frame=Frame("local")), tmp_path / "local", "opensfm")
-    assert not (tmp_path / "local" / "gcp_list.txt").exists()
 
 
 def test_control_of_a_block_by_point(tmp_path):

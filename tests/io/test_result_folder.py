@@ -143,8 +143,6 @@ def test_the_command_writes_adjusted_values(own, tmp_path, monkeypatch, capsys):
     assert code == 0 and "adjusted values\ncamera one: the conversion is exact\n" in said
     # What a format has no place for is not called written.
     assert "image points\n" in said and not re.search(r"images, \d+ points", said)
-    code, more, _ = run(monkeypatch, capsys, "convert", own / "result", tmp_path / "map", "--to", "geopackage")
-    assert code == 0 and "camera" not in more and "image points" not in more
     lines = (tmp_path / "opk" / "exterior.txt").read_text().splitlines()
     position = np.asarray(adjusted("cross").unknowns.exterior.position)
     assert lines[3].split("\t")[:4] == ["i0.jpg", *map(repr, position[0].tolist())]

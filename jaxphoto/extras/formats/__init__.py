@@ -4,17 +4,13 @@ Modules declare FORMATS (oriented projects), CAMERAS (camera files) and CONTROL 
 `convert` registers them.
 """
 
-from jaxphoto.extras.formats.camera_models import ProjectCamera
 from jaxphoto.extras.formats.convert import (
     CAMERA_FORMATS,
-    CAMERA_MODELS,
     CAMERAS_WRITTEN,
     CONTROL_FORMATS,
     EXPORTS,
     FORMATS,
-    FORMS,
     LOSS_PX,
-    Exported,
     check_export_target,
     convert,
     export,
@@ -24,10 +20,10 @@ from jaxphoto.extras.formats.convert import (
     recognise,
     write_camera_file,
 )
-from jaxphoto.extras.formats.project import ControlPoints, Project
+from jaxphoto.extras.formats.project import ControlPoints, Project, ProjectCamera
 
 __all__ = [
-    "CAMERAS_WRITTEN", "CAMERA_FORMATS", "CAMERA_MODELS", "CONTROL_FORMATS", "EXPORTS", "FORMATS", "FORMS", "LOSS_PX",
-    "ControlPoints", "Exported", "Project", "ProjectCamera", "check_export_target", "convert", "export", "read_control",
+    "CAMERAS_WRITTEN", "CAMERA_FORMATS", "CONTROL_FORMATS", "EXPORTS", "FORMATS", "LOSS_PX",
+    "ControlPoints", "Project", "ProjectCamera", "check_export_target", "convert", "export", "read_control",
     "read_source", "read_tables", "recognise", "write_camera_file",
 ]  # fmt: skip

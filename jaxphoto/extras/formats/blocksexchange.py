@@ -2,7 +2,7 @@
 
     SpatialReferenceSystems/SRS                 Id, Definition
     Block/Photogroups/Photogroup                ImageDimensions, FocalLengthPixels (or FocalLength with SensorSize, mm),
-                                                PrincipalPoint, Distortion (K1-K3, P1, P2), CameraOrientation
+                                                PrincipalPoint, Distortion (K1-K3, P1, P2)
     .../Photo                                   Id, ImagePath, Pose/Rotation (M_00 to M_22), Pose/Center
     Block/TiePoints/TiePoint                    Position, Measurement (PhotoId, x, y)
 
@@ -16,17 +16,26 @@ ContextCapture User Guide, "BlocksExchange XML/XMLZ format" and "Perspective cam
 import io
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
-from pyproj import CRS
-from pyproj.exceptions import CRSError
 
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.extras.formats.camera_models import AGISOFT, BROWN_TERMS, ProjectCamera, in_pixels, pixels_of
 from jaxphoto.extras.formats.files import Format, add, by_content, number_rows, warn, xml_text
-from jaxphoto.extras.formats.project import Project, about_place, in_system, pose
+from jaxphoto.extras.formats.project import (
+    AGISOFT,
+    BROWN_TERMS,
+    Project,
+    ProjectCamera,
+    about_place,
+    in_pixels,
+    pixels_of,
+    pose,
+    with_system,
+)
+from jaxphoto.georeferencing.map_frame import map_system
 from jaxphoto.io.camera_files import CameraSource
 from jaxphoto.io.text_files import has_words, read_bytes
 
@@ -35,147 +44,92 @@ _NUMBER = r"\s*([-+]?\d{1,4}(?:\.\d*)?(?:e-\d\d)?)\s*"
 _ENU = re.compile(f"ENU:{_NUMBER},{_NUMBER}(?:,{_NUMBER})?")
 _FIRST_PX = 0.5
 _MATRIX = [f"M_{row}{column}" for row in range(3) for column in range(3)]
-# Sign that converts the camera's y and z axes to y down, z forward.
-_AXES = {"XRightYDown": 1.0, "XRightYUp": -1.0}
 _COLOUR = "<Color><Red>0</Red><Green>0</Green><Blue>0</Blue></Color>"
-
-
-class _Photo(NamedTuple):
-    number: str
-    file: str
-    camera: str
-    pose: ElementTree.Element
-    sign: float
-
-
-class _Ties(NamedTuple):
-    """Tie point coordinates as text; photograph, point index and image coordinates of each measurement."""
-
-    xyz: list[list[str | None]]
-    photo: list[str]
-    point: list[int]
-    xy: list[list[str | None]]
 
 
 def read(path: Path) -> Project:
     """Read a block; cameras have free c, xp, yp, k1 to k3, p1, p2. Control points are not read."""
-    root, ties, n_control = _parsed(path)
-    blocks = root.findall("Block")
-    if len(blocks) != 1:
-        raise InputError(f"{path.name} has {len(blocks)} blocks, not 1; export one block")
-    (block,) = blocks
-    system = _system(path, root, block)
-    cameras, photos, n_unposed = _photogroups(path, block)
-    if skipped := [
-        f"{n} {what}" for n, what in ((n_unposed, "photographs without pose"), (n_control, "control points")) if n
-    ]:
-        warn(f"{path.name}: skipped {' and '.join(skipped)}")
-    index = {photo.number: k for k, photo in enumerate(photos)}
-    if len(index) < len(photos):
-        raise InputError(f"{path.name}: two photographs have the same Id. Export the file again")
-    here = lambda what: lambda k: f"{path.name}, photo {photos[k].number}, {what}"  # noqa: E731
-    matrices = [[photo.pose.findtext(f"Rotation/{name}") for name in _MATRIX] for photo in photos]
-    rotations = number_rows(matrices, (9,), here("Rotation")).reshape(-1, 3, 3)
-    rotations = rotations * np.array([[1.0, p.sign, p.sign] for p in photos]).reshape(-1, 3, 1)
-    centres = [[photo.pose.findtext(f"Center/{axis}") for axis in "xyz"] for photo in photos]
-    kept = [k for k, number in enumerate(ties.photo) if number in index]
-    of_tie = lambda k: f"{path.name}, tie point {ties.point[kept[k]] + 1}"  # noqa: E731
-    project = Project(
-        (block.findtext("Name") or path.stem).strip(), cameras, (), [photo.file for photo in photos],
-        [photo.camera for photo in photos], pose(rotations, number_rows(centres, (3,), here("Center"))),
-        [f"t{k + 1}" for k in range(len(ties.xyz))],
-        number_rows(ties.xyz, (3,), lambda k: f"{path.name}, tie point {k + 1}"),
-        np.array([index[ties.photo[k]] for k in kept], int), np.array([ties.point[k] for k in kept], int),
-        number_rows([ties.xy[k] for k in kept], (2,), of_tie) + _FIRST_PX, file=path.name,
-    )  # fmt: skip
-    if origin := _ENU.fullmatch(system):
-        latitude, longitude, height = (float(number or 0) for number in origin.groups())
-        return about_place(project, (longitude, latitude, height))
-    return in_system(project, system) if system else project
-
-
-def _parsed(path: Path) -> tuple[ElementTree.Element, _Ties, int]:
-    """Parse the tree without tie points (they may take gigabytes), the tie points, and the number of control points."""
-    ties, n_control = _Ties([], [], [], []), 0
+    # Parse tie points one by one: as a tree they may take gigabytes.
+    xyz: list[list[str | None]] = []
+    rows: list[tuple[str, int, list[str | None]]] = []
     events = ElementTree.iterparse(io.BytesIO(read_bytes(path)), ("start", "end"))
     _, root = next(events)
     for event, element in events:
         if event == "end" and element.tag == "TiePoint":
-            ties.xyz.append([element.findtext(f"Position/{axis}") for axis in "xyz"])
-            for measurement in element.iterfind("Measurement"):
-                ties.photo.append((measurement.findtext("PhotoId") or "").strip())
-                ties.point.append(len(ties.xyz) - 1)
-                ties.xy.append([measurement.findtext(axis) for axis in "xy"])
+            for m in element.iterfind("Measurement"):
+                rows.append(((m.findtext("PhotoId") or "").strip(), len(xyz), [m.findtext(axis) for axis in "xy"]))
+            xyz.append([element.findtext(f"Position/{axis}") for axis in "xyz"])
             element.clear()
-        elif event == "end" and element.tag == "ControlPoint":
-            n_control += 1
-            element.clear()
-    return root, ties, n_control
-
-
-def _system(path: Path, root: ElementTree.Element, block: ElementTree.Element) -> str:
-    """Return the block's system as EPSG code, ENU or WKT; "" if local. Raise InputError for a geographic system."""
+    blocks = root.findall("Block")
+    if len(blocks) != 1:
+        raise InputError(f"{path.name} has {len(blocks)} blocks, not 1; export one block")
+    (block,) = blocks
+    cameras, photos, camera_of = _photogroups(path, block)
+    if (n_control := len(block.findall("ControlPoints/ControlPoint"))) > 0:
+        warn(f"{path.name}: skipped {n_control} control points; add them by jaxphoto control")
+    ids = [(photo.findtext("Id") or "").strip() for photo in photos]
+    index = {number: k for k, number in enumerate(ids)}
+    if len(index) < len(photos):
+        raise InputError(f"{path.name}: two photographs have the same Id. Export the file again")
+    here = lambda what: lambda k: f"{path.name}, photo {ids[k]}, {what}"  # noqa: E731
+    matrices = [[photo.findtext(f"Pose/Rotation/{name}") for name in _MATRIX] for photo in photos]
+    centres = [[photo.findtext(f"Pose/Center/{axis}") for axis in "xyz"] for photo in photos]
+    rotations = number_rows(matrices, (9,), here("Rotation")).reshape(-1, 3, 3)
+    rows = [row for row in rows if row[0] in index]
+    project = Project(
+        (block.findtext("Name") or path.stem).strip(), cameras, (),
+        [(photo.findtext("ImagePath") or number).strip() for photo, number in zip(photos, ids, strict=True)], camera_of,
+        pose(rotations, number_rows(centres, (3,), here("Center"))), [f"t{k + 1}" for k in range(len(xyz))],
+        number_rows(xyz, (3,), lambda k: f"{path.name}, tie point {k + 1}"),
+        np.array([index[row[0]] for row in rows], int), np.array([row[1] for row in rows], int),
+        number_rows([row[2] for row in rows], (2,), lambda k: f"{path.name}, tie point {rows[k][1] + 1}") + _FIRST_PX,
+        file=path.name,
+    )  # fmt: skip
     number = (block.findtext("SRSId") or "").strip()
-    for system in root.iterfind("SpatialReferenceSystems/SRS"):
-        words = (system.findtext("Definition") or "").strip()
-        if (system.findtext("Id") or "").strip() != number or words.startswith("LOCAL_CS"):
-            continue
-        try:
-            geographic = CRS.from_user_input(words).is_geographic
-        except (CRSError, UnicodeError, ValueError):
-            geographic = False
-        if geographic:
-            raise InputError(f"{path.name}: {quoted(words)} is a geographic system. Export it in a map system")
-        return words
-    return ""
+    systems = {s.findtext("Id", "").strip(): s for s in root.iterfind("SpatialReferenceSystems/SRS")}
+    system = (systems[number].findtext("Definition") or "").strip() if number in systems else ""
+    if origin := _ENU.fullmatch(system):
+        latitude, longitude, height = (float(value or 0) for value in origin.groups())
+        return about_place(project, (longitude, latitude, height))
+    project = with_system(project, system)
+    if project.frame.code is not None and map_system(project.frame.code).is_geographic:
+        raise InputError(f"{path.name}: {quoted(system)} is a geographic system. Export it in a map system")
+    return project
 
 
-def _photogroups(path: Path, block: ElementTree.Element) -> tuple[dict[str, ProjectCamera], list[_Photo], int]:
-    """Return cameras by name, photographs with a pose, and the number of photographs without pose."""
+def _photogroups(
+    path: Path, block: ElementTree.Element
+) -> tuple[dict[str, ProjectCamera], list[ElementTree.Element], list[str]]:
+    """Return cameras by name, photographs with a pose, and their cameras."""
     cameras: dict[str, ProjectCamera] = {}
-    photos: list[_Photo] = []
-    n_unposed = 0
+    photos: list[ElementTree.Element] = []
+    camera_of: list[str] = []
     for count, group in enumerate(block.iterfind("Photogroups/Photogroup"), 1):
         name = (group.findtext("Name") or "").strip() or f"photogroup {count}"
         name = name if name not in cameras else f"{name} {count}"
-        axes = (group.findtext("CameraOrientation") or "XRightYDown").strip()
-        if axes not in _AXES:
-            raise InputError(
-                f"{path.name}, {name}: unknown CameraOrientation {quoted(axes)}; use one of {', '.join(_AXES)}"
-            )
-        posed = []
-        for photo in group.iterfind("Photo"):
-            position, file = photo.find("Pose"), (photo.findtext("ImagePath") or "").strip()
-            number = (photo.findtext("Id") or "").strip()
-            if position is None or position.find("Rotation") is None or position.find("Center/x") is None:
-                n_unposed += 1
-            else:
-                posed.append(_Photo(number, file or number, name, position, _AXES[axes]))
+        kinds = group.findtext("CameraModelType", "Perspective"), group.findtext("CameraOrientation", "XRightYDown")
+        for kind, usual in zip(kinds, ("Perspective", "XRightYDown"), strict=True):
+            if kind.strip() != usual:
+                raise InputError(f"{path.name}, camera {name}: {quoted(kind)} is not supported; export {usual}")
+        posed = group.findall("Photo/Pose/Rotation/../..")
+        if left := len(group.findall("Photo")) - len(posed):
+            warn(f"{path.name}: skipped {left} photographs without pose")
         if posed:
             cameras[name] = _camera(CameraSource(path), name, group)
             photos += posed
-    return cameras, photos, n_unposed
+            camera_of += [name] * len(posed)
+    return cameras, photos, camera_of
 
 
 def _camera(source: CameraSource, name: str, group: ElementTree.Element) -> ProjectCamera:
-    kind = (group.findtext("CameraModelType") or "Perspective").strip()
-    if kind != "Perspective":
-        raise source.error(f"camera {quoted(name)} is a {quoted(kind)}, not perspective; export perspective cameras")
-
-    def number(key: str, default: float | None = None) -> float:
-        text = group.findtext(key)
-        if text is None and default is not None:
-            return default
-        return source.number(f"{key} of camera {quoted(name)}", text)
+    def number(key: str, default: Any = None) -> float:
+        return source.number(f"{key} of camera {quoted(name)}", group.findtext(key, default))
 
     width, height = number("ImageDimensions/Width"), number("ImageDimensions/Height")
-    longer = max(width, height, 1.0)
-    pixel_mm = number("SensorSize") / longer if group.find("SensorSize") is not None else None
+    pixel_mm = number("SensorSize") / max(width, height) if group.find("SensorSize") is not None else None
     sensor, _ = source.sensor(width, height, pixel_mm)
-    if group.find("FocalLengthPixels") is not None:
-        focal = number("FocalLengthPixels")
-    else:
-        focal = number("FocalLength") / number("SensorSize") * longer
+    in_mm = group.find("FocalLengthPixels") is None
+    focal = number("FocalLength") / number("SensorSize") * max(width, height) if in_mm else number("FocalLengthPixels")
     if number("AspectRatio", 1.0) != 1.0 or number("Skew", 0.0) != 0.0:
         warn(f"{source.path.name}: skipped aspect ratio and skew of camera {name}; free b1 and b2 to estimate them")
     middle = zip("xy", (width / 2 - _FIRST_PX, height / 2 - _FIRST_PX), strict=True)
@@ -193,21 +147,26 @@ def write(p: Project, folder: Path) -> None:
     if p.place is not None:
         longitude, latitude, height = p.place
         shift[2] = height
-        system = add(add(root, "SpatialReferenceSystems"), "SRS")
-        _add_all(system, Id="0", Name="Local East-North-Up", Definition=f"ENU:{latitude!r},{longitude!r}")
+        srs = {"Id": "0", "Name": "Local East-North-Up", "Definition": f"ENU:{latitude!r},{longitude!r}"}
+        _add_all(root, {"SpatialReferenceSystems": {"SRS": srs}})
     block = add(root, "Block")
-    _add_all(block, Name=p.title or "jaxphoto", **({} if p.place is None else {"SRSId": "0"}))
+    _add_all(block, {"Name": p.title or "jaxphoto"} | ({} if p.place is None else {"SRSId": "0"}))
     groups = add(block, "Photogroups")
     rotations, centres = p.world_to_camera, np.asarray(p.exterior.position) + shift
     for name, camera in p.cameras.items():
-        group = add(groups, "Photogroup")
-        _add_camera(group, name, camera)
+        group, (f, _, column, row) = add(groups, "Photogroup"), pixels_of(camera.interior, camera.sensor)
+        content = {
+            "Name": name,
+            "ImageDimensions": {"Width": str(camera.sensor.width_px), "Height": str(camera.sensor.height_px)},
+            "CameraModelType": "Perspective", "FocalLengthPixels": f, "CameraOrientation": "XRightYDown",
+            "PrincipalPoint": {"x": column - _FIRST_PX, "y": row - _FIRST_PX},
+            "Distortion": {term.upper(): value for term, value in camera.terms(BROWN_TERMS).items()},
+        }  # fmt: skip
+        _add_all(group, content)
         for i in np.flatnonzero(np.array(p.image_camera, object) == name).tolist():
-            photo = add(group, "Photo")
-            _add_all(photo, Id=str(i), ImagePath=p.files[i])
-            position = add(photo, "Pose")
-            _add_all(add(position, "Rotation"), **dict(zip(_MATRIX, rotations[i].ravel().tolist(), strict=True)))
-            _add_all(add(position, "Center"), **dict(zip("xyz", centres[i].tolist(), strict=True)))
+            matrix = dict(zip(_MATRIX, rotations[i].ravel().tolist(), strict=True))
+            position = {"Rotation": matrix, "Center": dict(zip("xyz", centres[i].tolist(), strict=True))}
+            _add_all(add(group, "Photo"), {"Id": str(i), "ImagePath": p.files[i], "Pose": position})
     add(block, "TiePoints")
     # Write tie points as text: XML elements of a million image points take a gigabyte.
     before, after = xml_text(root).split("<TiePoints />")
@@ -224,19 +183,13 @@ def write(p: Project, folder: Path) -> None:
     (folder / FILE).write_text(text, encoding="utf-8")
 
 
-def _add_camera(group: ElementTree.Element, name: str, camera: ProjectCamera) -> None:
-    f, _, column, row = pixels_of(camera.interior, camera.sensor)
-    add(group, "Name", name)
-    size = {"Width": str(camera.sensor.width_px), "Height": str(camera.sensor.height_px)}
-    _add_all(add(group, "ImageDimensions"), **size)
-    _add_all(group, CameraModelType="Perspective", FocalLengthPixels=f, CameraOrientation="XRightYDown")
-    _add_all(add(group, "PrincipalPoint"), x=column - _FIRST_PX, y=row - _FIRST_PX)
-    _add_all(add(group, "Distortion"), **{n.upper(): value for n, value in camera.terms(BROWN_TERMS).items()})
-
-
-def _add_all(parent: ElementTree.Element, **content: str | float) -> None:
+def _add_all(parent: ElementTree.Element, content: Mapping[str, Any]) -> None:
+    """Add an element for each item; a mapping is an element with elements."""
     for tag, value in content.items():
-        add(parent, tag, value)
+        if isinstance(value, dict):
+            _add_all(add(parent, tag), value)
+        else:
+            add(parent, tag, value)
 
 
 FORMATS = (

@@ -1,4 +1,4 @@
-"""Control points and image marks: tables, gcp_list.txt of OpenDroneMap, and geoin.dat of BINGO.
+"""Control points and image marks: tables, and gcp_list.txt of OpenDroneMap.
 
     tables        points (point, X_m, Y_m, Z_m, sigma_X_m ..., role) or marks (image, point, x_px, y_px, sigma_px) of
                   jaxphoto, Metashape and Pix4D, separated by commas, semicolons, tabs or blanks. A comment may name the
@@ -8,14 +8,11 @@
     gcp_list.txt  a line with the coordinate system, then geo_x geo_y geo_z im_x im_y image_name [gcp_name] [extras];
                   geo_x is easting or longitude; pixel (0, 0) is at the centre of the upper left pixel. A list without
                   marks has rows of gcp_name geo_x geo_y geo_z, or of geo_x geo_y geo_z [gcp_name].
-    geoin.dat     rows starting with CONT are control points, with CHCK check points: CONT point X Y Z ...
 
-Sources: OpenDroneMap and OpenSfM documentation, "Ground Control Points"; for BINGO, whose manual is not public, S.
-Turek's bundle block adjustment for GRASS, 2014.
+Source: OpenDroneMap and OpenSfM documentation, "Ground Control Points".
 """
 
 import re
-import warnings
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,8 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxphoto.errors import InputError, counted, quoted
-from jaxphoto.extras.formats.files import ControlFormat
-from jaxphoto.extras.formats.project import Project
+from jaxphoto.extras.formats.files import ControlFormat, numbered_lines
 from jaxphoto.io.control_table import (
     PLACE,
     SYSTEM,
@@ -39,7 +35,6 @@ from jaxphoto.io.control_table import (
 from jaxphoto.io.text_tables import is_number
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 
-GCP_LIST = "gcp_list.txt"
 # Our column and row of the centre of the upper left pixel, (0, 0) in gcp_list.txt.
 _FIRST_PX = 0.5
 _POINT = {
@@ -63,7 +58,6 @@ _ROLES = {
     "check": True, "cp": True, "check point": True, "checkpoint": True,
 }  # fmt: skip
 _HEAD_LINES = 20
-_BINGO_CHECK = {"CONT": False, "CHCK": True}
 
 
 Mark = tuple[str, str, list[float], float, str]
@@ -76,32 +70,20 @@ class SurveyRows:
     def __init__(self, file: str) -> None:
         self.file = file
         self._rows: dict[str, tuple[list[float], list[float], bool, str]] = {}
-        self._names: dict[tuple[str, ...], str] = {}
 
     def __len__(self) -> int:
         return len(self._rows)
 
-    def named_by(self, xyz: Sequence[float]) -> str:
-        """Return a generated name for an unnamed point: P1, P2 ..., one per position."""
-        return self._names.setdefault(tuple(map(repr, xyz)), f"P{len(self._names) + 1}")
-
     def add(
-        self,
-        name: str,
-        xyz: list[float],
-        place: str,
-        sigma: list[float] | None = None,
-        check: bool = False,
-        once: bool = False,
+        self, name: str, xyz: list[float], place: str, sigma: Sequence[float] = (np.nan,) * 3, check: bool = False
     ) -> None:
-        """Add a point. With `once`, repeated points raise InputError even if the coordinates are equal."""
-        check_name(name, "point", place)
-        row = (xyz, sigma or [np.nan] * 3, check, place)
+        """Add a point. Raise InputError for a name that is empty, or has other coordinates above."""
+        if not name:
+            raise InputError(f"{place}: the point is empty; give its name or delete the row")
+        row = (xyz, list(sigma), check, place)
         first = self._rows.setdefault(name, row)
-        same = np.array_equal(np.array(first[0]), np.array(xyz), equal_nan=True)
-        if first is not row and (once or not same):
-            other = "" if same else " with other coordinates"
-            raise InputError(f"{place}: point {quoted(name)} is also in {first[3]}{other}; keep one of them")
+        if not np.array_equal(np.array(first[0]), np.array(xyz), equal_nan=True):
+            raise InputError(f"{place}: point {quoted(name)} is also in {first[3]} with other coordinates; keep one")
 
     def surveyed(self, system: str = "") -> SurveyedPoints:
         """Return all points. Raise InputError if there is none."""
@@ -116,24 +98,13 @@ def read_marks(rows: Sequence[Mark]) -> Marks:
     """Collect marks. Raise InputError for empty names, and for a point marked twice in an image."""
     seen: dict[tuple[str, str], str] = {}
     for image, point, _, _, place in rows:
-        check_name(image, "image", place)
-        check_name(point, "point", place)
+        if not (image and point):
+            raise InputError(f"{place}: the image or point is empty; give its name or delete the row")
         first = seen.setdefault((image, point), place)
         if first is not place:
             raise InputError(f"{place}: {quoted(point)} in {quoted(image)} is also marked in {first}; keep one of them")
     images, points, at, sigma, places = zip(*rows, strict=True) if rows else ((),) * 5
     return Marks(images, points, np.array(at, float).reshape(-1, 2), np.array(sigma, float), places)
-
-
-def check_name(name: str, what: str, place: str) -> None:
-    """Raise InputError for an empty name."""
-    if not name:
-        raise InputError(f"{place}: the {what} is empty; give its name or delete the row")
-
-
-def numbered_lines(text: str) -> list[tuple[int, str]]:
-    """Return (row number, line) for each line that is not empty."""
-    return [(row, line) for row, line in enumerate(text.split("\n"), 1) if line.strip()]
 
 
 # Tables -------------------------------------------------------------------------------------------------------
@@ -174,7 +145,7 @@ def read_table(path: Path, text: str) -> SurveyedPoints | Marks:
         raise cells.bad(odd[0], f"{counted(len(records[odd[0]]), 'cell')}, but most rows have {usual}; complete it")
     raise cells.none(
         f"not a control file (it begins with {quoted(' '.join(cells.records[0]))}): give points (point, X_m, "
-        "Y_m, Z_m), marks (image, point, x_px, y_px), a gcp_list.txt, markers of Metashape, GeoJSON or a GeoPackage"
+        "Y_m, Z_m), marks (image, point, x_px, y_px), a gcp_list.txt or markers of Metashape"
     )
 
 
@@ -217,20 +188,13 @@ def read_points(cells: Cells, columns: Columns, separator: str, system: str, deg
         if role not in _ROLES:
             raise cells.bad(k, f"unknown role {quoted(role)}; write control or check")
         check = _ROLES[role] or enabled in ("0", "false", "no")
-        points.add(row[columns["point"]], xyz, cells.place(k), sigma, check, once=True)
+        points.add(row[columns["point"]], xyz, cells.place(k), sigma, check)
     surveyed = points.surveyed(system)
     if degrees and not (np.abs(surveyed.coordinates[:, 0]) <= 360).all():
         raise cells.none(
             "the header contains longitude and latitude, but the numbers are not degrees; correct the header"
         )
     return surveyed
-
-
-def point_attributes(header: Sequence[str]) -> Columns | None:
-    """Return the columns of point features by attribute name; None for other features, such as images."""
-    columns = columns_of(header, _POINT)
-    of_images = {"image", "image name", "filename"} & {name.lower() for name in header}
-    return columns if {"point", "x", "y"} <= set(columns) and not of_images else None
 
 
 def _marks(cells: Cells, columns: Columns, separator: str) -> Marks:
@@ -278,7 +242,7 @@ def read_gcp_list(path: Path, text: str) -> GivenControl:
     cells = Cells(path.name, [line.split() for _, line in rows], [row for row, _ in rows])
     if not cells.records:
         raise cells.none(f"no marks after {quoted(system.strip())}; add rows")
-    points, marks = SurveyRows(path.name), list[Mark]()
+    points, marks, names = SurveyRows(path.name), list[Mark](), dict[str, str]()
     marked = _unmarked(cells.records[0]) is None
     for k, row in enumerate(cells.records):
         unmarked = None if marked else _unmarked(row)
@@ -286,7 +250,8 @@ def read_gcp_list(path: Path, text: str) -> GivenControl:
             raise cells.bad(k, f"{len(row)} cells; write geo_x, geo_y, geo_z, im_x, im_y, image_name")
         name, first = unmarked or (row[6] if len(row) > 6 else "", 0)
         xyz = [cells.number(k, first, "geo_x"), cells.number(k, first + 1, "geo_y"), cells.height(k, first + 2)]
-        name = name or points.named_by(xyz)
+        # Points without names are called P1, P2 ..., one per position.
+        name = name or names.setdefault(repr(xyz), f"P{len(names) + 1}")
         points.add(name, xyz, cells.place(k))
         if unmarked is None:
             column_row = [cells.number(k, 3, "im_x") + _FIRST_PX, cells.number(k, 4, "im_y") + _FIRST_PX]
@@ -294,64 +259,6 @@ def read_gcp_list(path: Path, text: str) -> GivenControl:
     return GivenControl(points.surveyed(system.strip()), read_marks(marks))
 
 
-def write_gcp_list(p: Project, folder: Path) -> None:
-    """Write gcp_list.txt if the block has control points in a map system. Heights are ellipsoidal; check points are
-    omitted.
-    """
-    if p.control is None or not len(p.control.point):
-        return
-    chosen = np.flatnonzero(~p.control.check & ~np.isnan(p.control.xyz[:, :2]).any(axis=1))
-    names = [*p.files, *(p.points[j] for j in p.control.point[chosen])]
-    message = ""
-    if p.frame.kind != "epsg":
-        message = "is not written: it needs a map system, but the block is in a local frame"
-    elif blank := next((name for name in names if len(name.split()) != 1), None):
-        message = f"is not written: {blank!r} contains a blank; rename it"
-    elif left := len(p.control.point) - len(chosen):
-        message = f"skips {left} check points or points without X and Y: it has control points only"
-    if message:
-        warnings.warn(f"{GCP_LIST} {message}", UserWarning, stacklevel=4)
-    if message.startswith("is not written"):
-        return
-    control, rows = p.in_map(ellipsoidal=True).control, p.rows_of_points
-    assert control is not None
-    lines = [f"EPSG:{p.frame.code}"]
-    for k in chosen.tolist():
-        point = int(control.point[k])
-        for row in rows[point].tolist():
-            values = map(repr, [*control.xyz[k].tolist(), *(p.column_row[row] - _FIRST_PX).tolist()])
-            lines.append("\t".join([*values, p.files[p.image[row]], p.points[point]]))
-    (folder / GCP_LIST).write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-# geoin.dat ----------------------------------------------------------------------------------------------------
-
-
-def is_geoin(lines: list[str]) -> bool:
-    """Return True if all lines are BINGO records and at least one is a point."""
-    rows = [row for line in lines if (row := line.split(maxsplit=5)) and row[0][0] not in "*#"]
-    records = all(re.fullmatch("[A-Z]{4}|C", row[0]) for row in rows)
-    points = (row for row in rows if row[0] in _BINGO_CHECK and len(row) >= 5)
-    return records and any(all(map(is_number, row[2:5])) for row in points)
-
-
-def read_geoin(path: Path, text: str) -> SurveyedPoints:
-    """Read the points; other records are skipped."""
-    rows = [(row, line.split()) for row, line in numbered_lines(text) if line.split()[0] in _BINGO_CHECK]
-    cells, points = Cells(path.name, [line for _, line in rows], [row for row, _ in rows]), SurveyRows(path.name)
-    for k, row in enumerate(cells.records):
-        if len(row) < 5:
-            raise cells.bad(k, f"{len(row)} cells instead of {row[0]}, point, X, Y and Z; complete it")
-        xyz = [cells.number(k, 2, "X"), cells.number(k, 3, "Y"), cells.height(k, 4)]
-        points.add(row[1], xyz, cells.place(k), check=_BINGO_CHECK[row[0]], once=True)
-    return points.surveyed()
-
-
-CONTROL = (
-    ControlFormat("gcp_list", "gcp_list.txt", _is_gcp_list, read_gcp_list),
-    ControlFormat(
-        "bingo", "geoin.dat of BINGO", lambda _, text: is_geoin([line for _, line in numbered_lines(text)]), read_geoin
-    ),
-)
+CONTROL = (ControlFormat("gcp_list", "gcp_list.txt", _is_gcp_list, read_gcp_list),)
 TABLES = ControlFormat("tables", "CSV, table of Metashape or Pix4D", lambda path, text: True, read_table)
 """Format of all text files that no other control format recognises."""

@@ -1,22 +1,33 @@
 """Read and write projects, camera files and control files of any registered format."""
 
 import dataclasses
-import inspect
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
-from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block
 from jaxphoto.camera import AbstractDistortion, InteriorOrientation, Perspective, Sensor
 from jaxphoto.camera.conversion import Conversion, converted
 from jaxphoto.errors import InputError, few
-from jaxphoto.extras.formats.camera_models import CameraModel
+from jaxphoto.extras.formats import (
+    blocksexchange,
+    colmap,
+    control,
+    dbat,
+    geojson,
+    metashape,
+    opencv,
+    opensfm,
+    pix4d,
+    radial,
+    smac,
+    texts,
+)
 from jaxphoto.extras.formats.files import CameraFormat, Format, by_content
-from jaxphoto.extras.formats.project import Project
+from jaxphoto.extras.formats.project import CameraModel, Project
 from jaxphoto.io.block_folder import BlockTables, assemble, write_block
 from jaxphoto.io.block_folder.block_reader import read_folder
 from jaxphoto.io.block_folder.table_layout import TOML
@@ -25,28 +36,11 @@ from jaxphoto.io.text_files import read_legacy_text
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 from jaxphoto.writing import check_folder, whole_file, whole_folder
 
-# One module per program, in the order of docs and help. To add a format, write a module and add its line below.
-# ruff: isort: off
-from jaxphoto.extras.formats import dbat as dbat
-from jaxphoto.extras.formats import photomodeler as photomodeler
-from jaxphoto.extras.formats import aicon as aicon
-from jaxphoto.extras.formats import opencv as opencv
-from jaxphoto.extras.formats import colmap as colmap
-from jaxphoto.extras.formats import metashape as metashape
-from jaxphoto.extras.formats import opensfm as opensfm
-from jaxphoto.extras.formats import openmvg as openmvg
-from jaxphoto.extras.formats import blocksexchange as blocksexchange
-from jaxphoto.extras.formats import nerfstudio as nerfstudio
-from jaxphoto.extras.formats import radial as radial
-from jaxphoto.extras.formats import texts as texts
-from jaxphoto.extras.formats import orthority as orthority
-from jaxphoto.extras.formats import pix4d as pix4d
-from jaxphoto.extras.formats import gis as gis
-from jaxphoto.extras.formats import smac as smac
-from jaxphoto.extras.formats import control as control
-# ruff: isort: on
-
-_MODULES = [module for module in globals().values() if inspect.ismodule(module)]
+# One module per program, in the order of docs and help. To add a format, write a module and add it here.
+_MODULES = (
+    dbat, opencv, colmap, metashape, opensfm, blocksexchange, radial, texts, pix4d, geojson, smac,
+    control,
+)  # fmt: skip
 
 
 def _declared(name: str) -> list[Any]:
@@ -60,16 +54,12 @@ FORMATS = {format.name: format for format in _DECLARED if format.read}
 EXPORTS = {format.name: format for format in _DECLARED if format.write}
 """Project formats that can be written, in the order of docs and help."""
 _CAMERAS: list[CameraFormat] = _declared("CAMERAS")
-CAMERA_FORMATS = {format.name: format for format in (*_CAMERAS, CameraFormat("block", suffixes=(".toml",)))}
-"""Camera file formats of other programs, and block.toml."""
+CAMERA_FORMATS = {f.name: f for f in (*_CAMERAS, CameraFormat("block", suffixes=(".toml",))) if f.write or f.suffixes}
+"""Camera file formats that can be written: of other programs, and block.toml."""
 CAMERA_READERS.update({format.name: format.reader for format in _CAMERAS if format.reader})
-CAMERAS_WRITTEN = tuple(name for name, format in CAMERA_FORMATS.items() if format.write or name == "block")
-CAMERA_MODELS = tuple(dict.fromkeys(name for format in CAMERA_FORMATS.values() for name in format.models))
-"""Camera models that can be requested by name."""
-CONTROL_FORMATS = {f.name: f for f in (*gis.CONTROL[::-1], *metashape.CONTROL, *control.CONTROL)}
+CAMERAS_WRITTEN = tuple(CAMERA_FORMATS)
+CONTROL_FORMATS = {format.name: format for format in _declared("CONTROL")}
 """Control file formats recognised by content; every other text file is a table."""
-FORMS = (*(f.about for f in CONTROL_FORMATS.values()), control.TABLES.about)
-"""Control formats for the help text."""
 LOSS_PX = 1.0
 """Default maximum loss of a camera conversion at the worst point (px)."""
 
@@ -104,27 +94,22 @@ def read_tables(source: str | Path, format: str | None = None) -> BlockTables:
         return content.tables() if isinstance(content, Project) else content
 
 
-def read_source(source: str | Path, format: str | None = None, *, stations: bool = True) -> Block:
+def read_source(source: str | Path, format: str | None = None) -> Block:
     """Read the block in a file or folder in one of `FORMATS`. The format is detected unless `format` names it.
 
-    `stations=False` omits observed camera positions. Raises InputError for an unknown format, and the errors of
-    `jaxphoto.io.read_block`.
+    Raises InputError for an unknown format, and the errors of `jaxphoto.io.read_block`.
     """
     source = Path(source)
-    tables = read_tables(source, format)
-    if not stations:
-        kept = {name: table for name, table in tables.tables.items() if name != "stations"}
-        tables = BlockTables(tables.settings, kept, tables.file)
-    block = assemble(tables)
+    block = assemble(read_tables(source, format))
     name = format or _format_name(source, None)
     if name == "block":
         return block
     return dataclasses.replace(block, converted_from=f"{name}: {'/'.join(source.resolve().parts[-2:])}")
 
 
-def convert(source: str | Path, folder: str | Path, format: str | None = None, *, stations: bool = True) -> Block:
+def convert(source: str | Path, folder: str | Path, format: str | None = None) -> Block:
     """Read a block by `read_source`, write it as a block folder, and return it."""
-    block = read_source(source, format, stations=stations)
+    block = read_source(source, format)
     write_block(block, folder)
     return block
 
@@ -140,27 +125,18 @@ def _format_name(source: Path, name: str | None) -> str:
         return names[0]
     if not names and source.is_file() and is_camera_file(source):
         raise InputError(f"{source} is a camera file, without photographs; jaxphoto camera converts it")
-    if not names and source.is_file() and is_control_file(source):
+    if not names and source.is_file() and _control_format(source, read_legacy_text(source)) is not control.TABLES:
         raise InputError(f"{source} is a control file, without photographs; jaxphoto control adds it to a block")
     what = f"fits several formats ({', '.join(names)})" if names else "has an unknown format"
     raise InputError(f"{source} {what}; give the format, one of {known}")
-
-
-class Misfit(NamedTuple):
-    """RMS and maximum length of image point displacements (px)."""
-
-    rms_px: float
-    max_px: float
 
 
 class Exported(NamedTuple):
     """Losses of an export."""
 
     cameras: dict[str, Conversion]
-    map_misfit: Misfit | None
-    """Displacements if collinearity is computed in map coordinates; None in a Cartesian frame."""
-    moved: Misfit | None = None
-    """Displacements if the format preserves rays instead of image points."""
+    moved_px: tuple[float, float] | None = None
+    """RMS and maximum displacement (px) if the format preserves rays instead of image points."""
 
 
 def export(project: Project, folder: str | Path, format: str) -> Exported:
@@ -175,7 +151,10 @@ def export(project: Project, folder: str | Path, format: str) -> Exported:
     chosen, folder = EXPORTS[format], Path(folder)
     assert chosen.write is not None
     check_export_target(folder)
-    cameras = {name: _converted(project, name, chosen) for name in project.cameras}
+    cameras = {
+        name: _in_model(interior, sensor, chosen, EXPORTS, f"camera {name}")
+        for name, (sensor, interior, _) in project.cameras.items()
+    }
     if project.changes:
         corrections = ", ".join(project.changes)
         warnings.warn(f"{format} does not support {corrections}: points will not fit the photographs", stacklevel=2)
@@ -185,11 +164,11 @@ def export(project: Project, folder: str | Path, format: str) -> Exported:
     moved = None
     if chosen.keeps_rays:
         written = written._replace(column_row=radial.on_same_rays(project, cameras))
-        moved = _misfit(written.column_row - project.column_row)
+        lengths = np.linalg.norm(written.column_row - project.column_row, axis=1)
+        moved = float(np.sqrt(np.mean(lengths**2))), float(lengths.max())
     with whole_folder(folder, lambda name: True) as work:
         chosen.write(written, work)
-    on_map = chosen.in_map and project.frame.kind == "epsg"
-    return Exported(cameras, map_misfit(project) if on_map else None, moved)
+    return Exported(cameras, moved)
 
 
 def check_export_target(folder: Path, *inputs: Path) -> None:
@@ -197,47 +176,29 @@ def check_export_target(folder: Path, *inputs: Path) -> None:
     check_folder(folder, *inputs, clashes=lambda name: True)
 
 
-def _converted(project: Project, name: str, format: Format) -> Conversion:
-    """Convert a camera to the model of the format."""
-    sensor, interior, _ = project.cameras[name]
-    model = format.plane if type(interior.projection) is Perspective else format.fisheye
-    if format.plane is None:
+def _in_model(
+    interior: InteriorOrientation,
+    sensor: Sensor,
+    format: Format | CameraFormat,
+    formats: Mapping[str, Format] | Mapping[str, CameraFormat],
+    what: str,
+    model: CameraModel | None = None,
+) -> Conversion:
+    """Convert a camera to `model`, by default the model of the format for its projection."""
+    model = model or (format.plane if type(interior.projection) is Perspective else format.fisheye)
+    if model is None and format.plane is None:
         return Conversion(interior, 0.0, 0.0, 1.0)
     if model is None:
         # Perspective polynomials misfit fisheye images by hundreds of pixels at the border.
-        others = ", ".join(key for key, other in EXPORTS.items() if other.fisheye)
+        others = ", ".join(name for name, other in formats.items() if other.fisheye)
         raise InputError(
-            f"camera {name} is a fisheye, but cameras of {format.name} are perspective; write one of {others}, "
-            "or undistort its photographs"
+            f"{what} is a fisheye, but cameras of {format.name} are perspective; write one of {others}, or undistort "
+            "its photographs"
         )
     try:
         return converted(interior, model.distortion, sensor, model.lacks, model.projection)
     except ValueError as error:
-        raise InputError(f"camera {name} cannot be written as {format.name}: {error}") from None
-
-
-def map_misfit(project: Project) -> Misfit | None:
-    """Return the misfit of collinearity in map coordinates, without distortion; None if they are not in metres."""
-    on_map = project.in_map()
-    if on_map.geographic or not len(project.image):
-        return None
-    return _misfit(_ideal_px(on_map) - _ideal_px(project))
-
-
-def _ideal_px(p: Project) -> Float[np.ndarray, "n 2"]:
-    ray = np.asarray(p.xyz)[p.point] - np.asarray(p.exterior.position)[p.image]
-    in_camera = np.einsum("nij,nj->ni", np.asarray(p.exterior.camera_from_object)[p.image], ray)
-    of_row, ideal = np.array(p.image_camera, object)[p.image], np.zeros((len(ray), 2))
-    for name, (sensor, interior, _) in p.cameras.items():
-        rows = of_row == name
-        xy = interior.projection.ideal_from_direction(to_numpy(interior.c), *in_camera[rows].T)
-        ideal[rows] = np.stack([to_numpy(v) for v in xy], axis=1) / sensor.pixel_mm
-    return ideal
-
-
-def _misfit(displacements: Float[np.ndarray, "n 2"]) -> Misfit:
-    lengths = np.linalg.norm(displacements, axis=1)
-    return Misfit(float(np.sqrt(np.mean(lengths**2))), float(lengths.max())) if len(lengths) else Misfit(0.0, 0.0)
+        raise InputError(f"{what} cannot be written as {format.name}: {error}") from None
 
 
 # Camera files -------------------------------------------------------------------------------------------------
@@ -253,32 +214,29 @@ def write_camera_file(
     distortion: type[AbstractDistortion] | None = None,
     covariance: np.ndarray | None = None,
     reservation: str = "",
-    model: str | None = None,
     loss_px: float = LOSS_PX,
 ) -> Conversion:
     """Write a camera in one of `CAMERAS_WRITTEN`, and return the difference between the file's camera and `interior`.
 
     If `format` is None, the suffix determines it; cameras.txt is COLMAP's. The distortion is converted exactly if the
-    file's model has all its terms, otherwise fitted over the image format. `model`, one of `CAMERA_MODELS`, is the
-    largest model of the format to use. The loss is written as a comment if the format has comments; a loss of more than
-    `loss_px` at the worst point is an error. `distortion` is the model in a block.toml. A block.toml also stores the
-    `reservation` about the calibration and, if the model is unchanged, the `covariance` of `parameter_names(interior)`.
+    file's model has all its terms, otherwise fitted over the image format. The loss is written as a comment if the
+    format has comments; a loss of more than `loss_px` at the worst point is an error. `distortion` is the model in a
+    block.toml. A block.toml also stores the `reservation` about the calibration and, if the model is unchanged, the
+    `covariance` of `parameter_names(interior)`.
 
-    Raises InputError for an unknown format, a `distortion` or `model` that the format does not support, and a camera
-    that it cannot represent.
+    Raises InputError for an unknown format, a `distortion` of another format, and a camera that it cannot represent.
     """
     path = Path(path)
     if format is None:
         by_suffix = [key for key, other in CAMERA_FORMATS.items() if path.suffix.lower() in other.suffixes]
         format = "colmap" if path.name == "cameras.txt" else by_suffix[0] if by_suffix else ""
-    if format not in CAMERAS_WRITTEN:
+    if format not in CAMERA_FORMATS:
         raise InputError(f"{path}: unknown camera format; give one of {', '.join(CAMERAS_WRITTEN)}")
     chosen = CAMERA_FORMATS[format]
-    target = _target(path, chosen, interior, model, distortion)
-    try:
-        conversion = converted(interior, target.distortion, sensor, target.lacks, target.projection)
-    except ValueError as error:
-        raise InputError(f"{path} cannot be written: {error}") from None
+    if distortion is not None and format != "block":
+        raise InputError(f"{path}: --distortion {distortion.__name__} applies to a .toml; omit it, or write a .toml")
+    target = None if distortion is None else CameraModel(distortion, (), interior.projection)
+    conversion = _in_model(interior, sensor, chosen, CAMERA_FORMATS, f"{path}: the camera", target)
     if not conversion.max_px <= loss_px:
         raise InputError(
             f"{path} would change the camera ({conversion.lost}): choose a model or format with more terms, "
@@ -302,46 +260,13 @@ def write_camera_file(
     return conversion
 
 
-def _target(
-    path: Path,
-    format: CameraFormat,
-    interior: InteriorOrientation,
-    model: str | None,
-    distortion: type[AbstractDistortion] | None,
-) -> CameraModel:
-    """Return the camera model to write."""
-    if format.plane is not None and format.fisheye is None and type(interior.projection) is not Perspective:
-        others = ", ".join(n for n in CAMERAS_WRITTEN if CAMERA_FORMATS[n].fisheye or not CAMERA_FORMATS[n].plane)
-        raise InputError(
-            f"{path}: the camera is a fisheye, but cameras of {format.name} are perspective; write one of {others}"
-        )
-    if model is not None and model not in format.models:
-        there = f"use one of {', '.join(format.models)}" if format.models else "omit the model"
-        raise InputError(f"{path}: unknown model {model} of format {format.name}; {there}")
-    target = format.model_of(interior) if model is None else format.models[model]
-    if target is None:
-        return CameraModel(distortion or type(interior.distortion), (), interior.projection)
-    if distortion not in (None, target.distortion):
-        raise InputError(
-            f"{path}: format {format.name} has the distortion {target.distortion.__name__}, not "
-            f"{distortion.__name__}; omit the distortion, or write a .toml"
-        )
-    return target
-
-
 # Control ------------------------------------------------------------------------------------------------------
 
 
-def is_control_file(path: Path) -> bool:
-    """Return True for a control file of any format but plain tables, by its content."""
-    text = "" if gis.is_geopackage(path) else read_legacy_text(path)
-    return any(format.recognise(path, text) for format in CONTROL_FORMATS.values())
-
-
 def read_control(control: str | Path, marks: str | Path | None = None) -> GivenControl:
-    """Read the points and marks of the file `control`, and further marks from the file `marks`.
+    """Read the points and marks of `control`, and further marks from the file `marks`.
 
-    The format, one of `FORMS`, is detected from the content. Raises InputError if it is not detected.
+    The format is detected from the content. Raises InputError if it is not detected.
     """
     content = _read_control(Path(control))
     if isinstance(content, Marks):
@@ -365,7 +290,11 @@ def read_control(control: str | Path, marks: str | Path | None = None) -> GivenC
 
 
 def _read_control(path: Path) -> GivenControl | SurveyedPoints | Marks:
-    text = "" if gis.is_geopackage(path) else read_legacy_text(path)
-    chosen = next((f for f in CONTROL_FORMATS.values() if f.recognise(path, text)), control.TABLES)
+    text = read_legacy_text(path)
+    chosen = _control_format(path, text)
     with reading(path, chosen.about):
         return chosen.read(path, text)
+
+
+def _control_format(path: Path, text: str) -> Any:
+    return next((f for f in CONTROL_FORMATS.values() if f.recognise(path, text)), control.TABLES)

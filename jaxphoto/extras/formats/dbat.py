@@ -1,4 +1,4 @@
-"""DBAT (Damped Bundle Adjustment Toolbox): an XML script and the text files that it references.
+"""DBAT (Damped Bundle Adjustment Toolbox): an XML script and the text files that it references; PhotoModeler's export.
 
 DBAT's pixel coordinates are (1, 1) at the centre of the upper left pixel, ours (0.5, 0.5). Its principal point is in mm
 from pixel (0, 0). It *adds* K, P and the aspect `as` to the measured coordinates; our Brown model subtracts them, so
@@ -6,6 +6,24 @@ all of them change sign. Model 3 applies 1 + as and the skew before the polynomi
 <aspect> is 1 - as. Models 1 and 2 have neither aspect nor skew. Model 4 applies both after the polynomial:
 `brown_affine`. Model 5 applies 1 + as before the principal point is subtracted, which divides px by it, and the skew
 after the polynomial: `stretched_brown`. Source: DBAT, github.com/niclasborlin/dbat.
+
+PhotoModeler's text export, optionally with DBAT's control files in the same folder.
+
+    title; tolerance, iterations, width, height; standard deviations; c, px, py, width, height (mm), K1 K2 K3 P1 P2
+    for each photograph six lines: number name; X Y Z kappa phi omega; standard deviations; covariances or nothing;
+        camera; standard deviations of the camera
+    an empty line, then three tables, each ended by an empty line:
+        control points (id X Y Z and sigmas); object points (the same);
+        marks (photograph id x y and sigmas; pixels counted as in DBAT)
+
+K and P are added to coordinates reduced to the principal point; our Brown model subtracts them, so all change sign. px
+and py are relative to DBAT's pixel (0, 0), half a pixel outside the upper left corner; y points down. Angles are
+defined in docs/conventions.md, in degrees. Control points are read from `ctrlpts-weighted.txt`, camera stations from
+`fake-camera-positions.txt`, in the same folder. The orientations and object points of the export are in an arbitrary
+frame; they are read only if these control files do not exist.
+
+Sources: PhotoModeler's help, "Lens Distortion Formulation" and "Decentering lens distortion"; exports distributed with
+DBAT.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -15,22 +33,38 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.extras.formats.files import Format, by_content, read_columns
+from jaxphoto.extras.formats.files import Format, beginning, by_content, read_columns, row_numbers, warn
 from jaxphoto.io.block_folder import BlockTables
-from jaxphoto.io.block_folder.table_layout import SIGMA_XYZ, XYZ
-from jaxphoto.io.text_files import read_bytes
-from jaxphoto.io.text_tables import Table, concatenate, finite
+from jaxphoto.io.block_folder.table_layout import ANGLES, SIGMA_XYZ, XYZ
+from jaxphoto.io.text_files import has_words, read_bytes, read_legacy_text
+from jaxphoto.io.text_tables import Table, concatenate, finite, is_number
 
 CAMERA = "camera"
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _DEGREES = {"degrees": 1.0, "radian": float(np.rad2deg(1.0)), "gon": 0.9}
 _INPUT = ("c", "ctrl_pts", "check_pts", "images", "image_pts", "cameras", "prior_eo")
-_POSITION, _ANGLES, _SIGMAS = ("x", "y", "z"), ("omega", "phi", "kappa"), ("sxyz", "sx", "sy", "sz")
+_ANGLES, _SIGMAS = ("omega", "phi", "kappa"), ("sxyz", "sx", "sy", "sz")
 # Our distortion for each of DBAT's lens models ("Backward (Photogrammetry)"), up to sign.
 _MODELS = {
     "1": "affine_brown", "2": "affine_brown", "3": "affine_brown", "4": "brown_affine", "5": "stretched_brown"
 }  # fmt: skip
-_CAMERA_PLACE = "input/cameras/camera"
+_PARAMETERS = {
+    "cc": ("c_mm",), "pp": ("xp_mm", "yp_mm"), "px": ("xp_mm",), "py": ("yp_mm",), "aspect": ("b1",), "as": ("b1",),
+    "skew": ("b2",), "sk": ("b2",),
+}  # fmt: skip
+_CAMERA_PLACE, _ESTIMATE = "input/cameras/camera", "set_bundle_estimate_params"
+CONTROL_FILE, STATIONS = "ctrlpts-weighted.txt", "fake-camera-positions.txt"
+# Assumed standard deviation of image points (px), as in DBAT: the sigmas of the export are flags (1 manual, 0
+# automatic).
+_SIGMA_PX = 1.0
+# Number of values in rows 2 to 4 of the header; row 2 may lack the size of the photographs.
+_HEADERS = ((4, 9, 10), (2, 9, 10))
+_LINES_PER_PHOTOGRAPH = 6
+_POINT, _MARK = ("id", "x", "y", "z", "sx", "sy", "sz"), ("im", "id", "x", "y", "sx", "sy")
+_ALWAYS_FREE = ("c_mm", "xp_mm", "yp_mm")
+_LEAST_CONTROL = 3
+# Maximum relative difference of the sides of a pixel treated as square.
+_SQUARE = 1e-9
 
 
 class _Script(NamedTuple):
@@ -51,20 +85,22 @@ class _Script(NamedTuple):
     def text(self, place: str, default: str) -> str:
         return (self.root.findtext(place) or default).strip()
 
+    def one_of(self, values: dict[str, Any], name: str, value: str) -> Any:
+        if value not in values:
+            raise self.error(f"{name} {quoted(value)} is not supported; use one of {', '.join(values)}")
+        return values[value]
+
     def numbers(self, place: str, default: str, n: int | None = None) -> list[float]:
         """Parse the comma-separated values of an element; `n` is the required count, if given."""
-        text = self.text(place, default)
-        values = [finite(part) for part in text.split(",")]
-        numbers = [value for value in values if value is not None]
-        if len(numbers) < len(values) or n not in (None, len(values)):
-            many = f"{n} numbers" if n else "numbers"
-            raise self.error(f"<{place.split('/')[-1]}> is {quoted(text)}; give {many} separated by commas")
+        text = self.text(f"{_CAMERA_PLACE}/{place}", default)
+        numbers = [value for part in text.split(",") if (value := finite(part)) is not None]
+        if len(numbers) <= text.count(",") or n not in (None, len(numbers)):
+            raise self.error(f"<{place}> is {quoted(text)}; give {n or ''} numbers separated by commas")
         return numbers
 
     def file(self, element: ElementTree.Element) -> Path:
         """Return the path of a file element, relative to the base folder of <input>."""
         base = self.find("input").get("base_dir", "$HERE").replace("$HERE", str(self.path.parent))
-        base = base.replace("$HOME", str(Path.home()))
         name = (element.text or "").strip()
         if "$" in base or "$" in name:
             raise self.error(f"unknown folder {base} of {name}; write it with $HERE")
@@ -78,29 +114,15 @@ class _Script(NamedTuple):
         tables = []
         for element in elements:
             names = [name.strip() for name in element.get("format", "").split(",")]
-            table = read_columns(self.file(element), names)
-            for name in columns:
-                if name not in table:
-                    raise self.error(f"the format of <{tag}> has no {name}; add it ({', '.join(columns)} are needed)")
-            tables.append((table, element))
+            if missing := [name for name in columns if name not in names]:
+                raise self.error(f"the format of <{tag}> has no {missing[0]}; {', '.join(columns)} are needed")
+            tables.append((read_columns(self.file(element), names), element))
         return tables
 
     def setting(self, operation: str, key: str) -> str:
         """Return the text of an operation's element, or of its <all> child."""
         element = self.root.find(f"operations/operation/{operation}/{key}")
         return "default" if element is None else (element.findtext("all") or element.text or "").strip()
-
-    @property
-    def metres(self) -> float:
-        unit = self.text("meta/project_unit", "m")
-        if unit not in _METRES:
-            raise self.error(f"unknown project_unit {unit!r}; use one of {', '.join(_METRES)}")
-        return _METRES[unit]
-
-
-def _names_itself(path: Path) -> bool:
-    with path.open("rb") as file:
-        return b"dbat_script_version" in file.read(2000)
 
 
 def _open(path: Path) -> _Script:
@@ -115,26 +137,43 @@ def read(path: Path) -> BlockTables:
             raise script.error(
                 f"<{element.tag}> in <input> is not supported; remove it, or convert the project by hand"
             )
-    _include_cameras(script)
+    # Replace the file references in <cameras> by the cameras of these files.
+    cameras = script.find("input/cameras")
+    for element in cameras.findall("file"):
+        cameras.remove(element)
+        cameras.extend(_open(script.file(element)).root.findall("cameras/camera"))
+    metres = script.one_of(_METRES, "project_unit", script.text("meta/project_unit", "m"))
     images = concatenate([table for table, _ in script.tables("images", "id", "path")])
     stems = [Path(path.replace("\\", "/")).stem for path in images.text("path")]
     names = images.ids("id") if len(set(stems)) < len(stems) else np.array(stems, object)
-    name_of = dict(zip(images.text("id"), names, strict=True))
+    ids = images.text("id").tolist()
+
+    def images_of(table: Table, column: str) -> np.ndarray:
+        found = table.find(column, ids, lambda image: f"image {image} is not in {images.file}; add it there")
+        return names[found]
+
     camera = _camera(script)
     columns = {"image": names, "camera": np.full(len(images), CAMERA, object)}
-    tables = {
-        "images": Table(images.file, columns, images.files, images.rows),
-        "image_points": _image_points(script, images.file, name_of, camera["pixel_mm"]),
-    }
+    tables = {"images": Table(images.file, columns, images.files, images.rows)}
+    parts = []
+    for table, element in script.tables("image_pts", "id", "im", "x", "y"):
+        columns = {"image": images_of(table, "im"), "point": table.ids("id")}
+        columns |= {"column_px": table.numbers("x") - 0.5, "row_px": table.numbers("y") - 0.5}
+        for axis in "xy":
+            columns[f"sigma_{axis}_mm"] = _image_sigma(script, element, table, axis) * camera["pixel_mm"]
+        parts.append(Table(table.file, columns, table.files, table.rows))
+    tables["image_points"] = concatenate(parts)
     if script.root.find("input/prior_eo") is not None:
-        prior = _prior_orientations(script, images.file, name_of)
-        tables["images"] = _oriented(tables["images"], prior)
-        if any(name in prior for name in SIGMA_XYZ):
-            stations = {name: prior.columns[name] for name in ("image", *XYZ, *SIGMA_XYZ) if name in prior}
-            tables["stations"] = Table(prior.file, stations, prior.files, prior.rows)
-    control = [_control(script, tag, role) for tag, role in (("ctrl_pts", ""), ("check_pts", "check"))]
-    if known := [table for table in control if table is not None]:
-        tables["control_points"] = concatenate(known)
+        tables |= _prior_orientations(script, metres, tables["images"], images_of)
+    control = [
+        _filtered(
+            script, tag, concatenate([control_table(t, role, metres) for t, _ in script.tables(tag, "id", *"xyz")])
+        )
+        for tag, role in (("ctrl_pts", ""), ("check_pts", "check"))
+        if script.root.find(f"input/{tag}") is not None
+    ]
+    if control:
+        tables["control_points"] = concatenate(control)
     settings: dict[str, Any] = {"title": script.text("meta/name", path.stem), "cameras": {CAMERA: camera}}
     if script.text("operations/operation/set_datum", "") == "depend":
         # All minimal datums give the same interior orientation, residuals and sigma naught.
@@ -142,104 +181,46 @@ def read(path: Path) -> BlockTables:
     return BlockTables(settings, tables, path.name)
 
 
-def _include_cameras(script: _Script) -> None:
-    """Replace the file references in <cameras> by the cameras of these files."""
-    cameras = script.find("input/cameras")
-    for element in cameras.findall("file"):
-        path = script.file(element)
-        included = _open(path).root.findall("cameras/camera")
-        if not included:
-            raise script.error(f"{path.name} has no <cameras><camera>; give a camera file of DBAT")
-        cameras.remove(element)
-        cameras.extend(included)
-
-
-def _check_images(table: Table, column: str, name_of: dict[str, str], file: str) -> np.ndarray:
-    """Return the image names for a column of ids. Raise InputError for an unknown id."""
-    ids = table.ids(column)
-    for line, image in enumerate(ids):
-        if image not in name_of:
-            raise table.bad(line, f"image {image} is not in {file}; add it there or delete this row")
-    return np.array([name_of[image] for image in ids], object)
-
-
-def _prior_orientations(script: _Script, file: str, name_of: dict[str, str]) -> Table:
-    """Return image, camera position and, if given, angles in degrees and standard deviations."""
-    ((table, element), *more) = script.tables("prior_eo", "id", *_POSITION)
-    if more:
-        raise script.error(f"<prior_eo> has {1 + len(more)} files, not 1; put all orientations into one")
-    if other := [name for name in table.columns if name not in ("id", "label", *_POSITION, *_ANGLES, *_SIGMAS)]:
+def _prior_orientations(script: _Script, metres: float, images: Table, images_of: Any) -> dict[str, Table]:
+    """Return the images table with the given orientations, and positions with standard deviations as stations."""
+    table, element = script.tables("prior_eo", "id", *"xyz")[0]
+    if other := [name for name in table.columns if name not in ("id", "label", *"xyz", *_ANGLES, *_SIGMAS)]:
         raise script.error(f"<prior_eo> has the unsupported column {quoted(other[0])}; remove it")
-    metres, unit = script.metres, element.get("units", "")
-    columns = {"image": _check_images(table, "id", name_of, file)}
-    columns |= {name: table.numbers(axis) * metres for name, axis in zip(XYZ, _POSITION, strict=True)}
-    if any(name in table for name in _ANGLES):
-        if not all(name in table for name in _ANGLES):
-            raise script.error("<prior_eo> has some of omega, phi, kappa; give all three or none")
-        if unit not in _DEGREES:
-            raise script.error(f"unknown units {quoted(unit)} of <prior_eo>; use one of {', '.join(_DEGREES)}")
-        columns |= {f"{name}_deg": table.numbers(name) * _DEGREES[unit] for name in _ANGLES}
-    for name, axis in zip(SIGMA_XYZ, _POSITION, strict=True):
-        if sigma := _first(table, "sxyz", f"s{axis}"):
-            columns[name] = table.sigmas(sigma) * metres
-    return Table(table.file, columns, table.files, table.rows)
-
-
-def _oriented(images: Table, prior: Table) -> Table:
-    """Add orientations to the images table, for images with all six values."""
-    columns = (*XYZ, *(f"{name}_deg" for name in _ANGLES))
-    if not all(name in prior for name in columns):
-        return images
-    row = {name: k for k, name in enumerate(prior.text("image"))}
-    place = [row.get(name) for name in images.text("image")]
-    cells = {
-        name: np.array(["" if k is None else repr(float(prior.columns[name][k])) for k in place], object)
-        for name in columns
-    }
-    return Table(images.file, images.columns | cells, images.files, images.rows)
-
-
-def _image_points(script: _Script, file: str, name_of: dict[str, str], pixel_mm: float) -> Table:
-    parts = []
-    for table, element in script.tables("image_pts", "id", "im", "x", "y"):
-        columns = {
-            "image": _check_images(table, "im", name_of, file),
-            "point": table.ids("id"),
-            "column_px": table.numbers("x") - 0.5,
-            "row_px": table.numbers("y") - 0.5,
+    columns = {"image": images_of(table, "id")}
+    columns |= {name: table.numbers(axis) * metres for name, axis in zip(XYZ, "xyz", strict=True)}
+    tables = {}
+    if sigmas := [_first(table, "sxyz", f"s{axis}") for axis in "xyz" if _first(table, "sxyz", f"s{axis}")]:
+        sigma = {name: table.sigmas(column) * metres for name, column in zip(SIGMA_XYZ, sigmas, strict=True)}  # type: ignore[arg-type]
+        tables["stations"] = Table(table.file, columns | sigma, table.files, table.rows)
+    if all(name in table for name in _ANGLES):
+        degrees = script.one_of(_DEGREES, "the unit of <prior_eo>", element.get("units", ""))
+        columns |= {name: table.numbers(angle) * degrees for name, angle in zip(ANGLES, _ANGLES, strict=True)}
+        row = {name: k for k, name in enumerate(columns.pop("image"))}
+        place = [row.get(name) for name in images.text("image")]
+        cells = {
+            name: np.array(["" if k is None else repr(float(values[k])) for k in place], object)
+            for name, values in columns.items()
         }
-        for axis in "xy":
-            columns[f"sigma_{axis}_mm"] = _image_sigma(script, element, table, axis) * pixel_mm
-        parts.append(Table(table.file, columns, table.files, table.rows))
-    return concatenate(parts)
+        tables["images"] = Table(images.file, images.columns | cells, images.files, images.rows)
+    return tables
 
 
 def _image_sigma(script: _Script, element: ElementTree.Element, table: Table, axis: str) -> np.ndarray:
     """Return the standard deviation in pixels; the <file> attribute has priority over the column."""
     for name in ("sxy", f"s{axis}"):
-        if name in element.attrib:
-            value = finite(element.attrib[name])
-            if value is None:
-                raise script.error(f"{name} = {quoted(element.attrib[name])} is not a number; give it in pixels")
+        if (value := finite(element.get(name, ""))) is not None:
             return np.full(len(table), value)
     if column := _first(table, "sxy", f"s{axis}"):
         return table.sigmas(column)
     raise script.error(f"the points of {table.file} have no standard deviation; add sxy='...' (pixels) to their <file>")
 
 
-def _control(script: _Script, tag: str, role: str) -> Table | None:
-    """Return control points (fixed if without standard deviations) or check points, in metres."""
-    section = script.root.find(f"input/{tag}")
-    if section is None:
-        return None
-    table = concatenate([control_table(t, role, script.metres) for t, _ in script.tables(tag, "id", *_POSITION)])
-    for element in section.findall("filter"):
+def _filtered(script: _Script, tag: str, table: Table) -> Table:
+    """Select points by the filters of a section."""
+    for element in script.find(f"input/{tag}").findall("filter"):
         ids = {part.strip() for part in element.get("id", "").split(",")}
-        action = (element.text or "").strip()
-        if action not in ("keep", "remove") or ids == {""}:
-            raise script.error(f"invalid <filter> in <{tag}>; write <filter id='1,2'>keep or remove</filter>")
-        chosen = np.array([point in ids for point in table.text("point")], bool)
-        table = table.take(chosen if action == "keep" else ~chosen)
+        keep = script.one_of({"keep": True, "remove": False}, f"<filter> in <{tag}>", (element.text or "").strip())
+        table = table.take(np.array([(point in ids) == keep for point in table.text("point")], bool))
     return table
 
 
@@ -268,29 +249,39 @@ def _first(table: Table, *names: str) -> str | None:
 
 def _camera(script: _Script) -> dict[str, Any]:
     """Return the [cameras.X] table of the only camera."""
-    c = _CAMERA_PLACE
-    if len(script.find("input/cameras").findall("camera")) != 1:
-        raise script.error("the number of <camera> is not 1; convert the project by hand")
-    if (unit := script.text(f"{c}/unit", "mm")) != "mm":
+    if (count := len(script.find("input/cameras").findall("camera"))) != 1:
+        raise script.error(
+            f"{count} <camera> in <cameras> or its camera file of DBAT, not 1; convert the project by hand"
+        )
+    if (unit := script.text(f"{_CAMERA_PLACE}/unit", "mm")) != "mm":
         raise script.error(f"the camera's unit is {unit!r}; give the camera in mm")
-    if (model := script.text(f"{c}/model", "3")) not in _MODELS:
-        raise script.error(f"lens model {model} is not supported; use one of {', '.join(_MODELS)}")
-    width, height = (int(n) for n in script.numbers(f"{c}/image", "", 2))
-    if min(width, height) < 1:
-        raise script.error(f"<image> is {width} x {height} pixels; give the format of the camera")
-    pixel = _pixel_mm(script, f"{c}/sensor", width, height)
+    model = script.text(f"{_CAMERA_PLACE}/model", "3")
+    distortion = script.one_of(_MODELS, "lens model", model)
+    width, height = (int(n) for n in script.numbers("image", "", 2))
+    sides = script.text(f"{_CAMERA_PLACE}/sensor", "").split(",")
+    lengths = [finite(side) for side in sides]
+    sizes = [length / n for length, n in zip(lengths, (width, height), strict=False) if length and n > 0]
+    if len(sides) != 2 or not sizes or min(sizes) <= 0:
+        raise script.error(f"<sensor> is {quoted(','.join(sides))}; give width,height in mm, one of which may be auto")
+    if abs(sizes[0] - sizes[-1]) > 1e-6 * sizes[0]:
+        raise script.error(f"the pixels of {sizes[0]:g} x {sizes[-1]:g} mm are not square; give the aspect instead")
+    pixel = sizes[-1]
     # DBAT's pixel (1, 1) is our (0.5, 0.5): the image centre is at (width / 2 + 0.5) pixels.
     middle = pixel * (width / 2 + 0.5), pixel * (height / 2 + 0.5)
     interior = dict.fromkeys(("c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2", "b1"), 0.0)
-    interior["c_mm"] = script.numbers(f"{c}/focal", "0")[0]
+    interior["c_mm"] = script.numbers("focal", "0")[0]
     if script.setting("set_initial_values", "io") != "default":
-        interior["c_mm"] = script.numbers(f"{c}/cc", "0")[0] or interior["c_mm"]
-        px, py = script.numbers(f"{c}/pp", "0,0", 2)
+        interior["c_mm"] = script.numbers("cc", "0")[0] or interior["c_mm"]
+        px, py = script.numbers("pp", "0,0", 2)
         if (px, py) != (0, 0):
             interior["xp_mm"], interior["yp_mm"] = px - middle[0], -(py - middle[1])
-        interior |= _coefficients(script, "K", 3) | _coefficients(script, "P", 2)
-        interior["b1"] = script.numbers(f"{c}/aspect", "1")[0] - 1.0
-        if script.numbers(f"{c}/skew", "0")[0] != 0:
+        for tag, most in (("K", 3), ("P", 2)):
+            values = script.numbers(tag, "0")
+            if any(values[most:]):
+                raise script.error(f"<{tag}> has more than {most} coefficients; remove the rest")
+            interior |= {f"{tag.lower()}{i}": 0.0 - value for i, value in enumerate(values[:most], start=1)}
+        interior["b1"] = script.numbers("aspect", "1")[0] - 1.0
+        if script.numbers("skew", "0")[0] != 0:
             raise script.error("<skew> is not 0; set it to 0")
     unknowns = _free(script)
     if model in "12" and (interior["b1"] != 0 or {"b1", "b2"} & set(unknowns)):
@@ -298,57 +289,150 @@ def _camera(script: _Script) -> dict[str, Any]:
     if model == "5" and interior["xp_mm"] != 0:
         interior["xp_mm"] = (interior["xp_mm"] + middle[0]) / (1.0 - interior["b1"]) - middle[0]
     return {
-        "width_px": width, "height_px": height, "pixel_mm": pixel, "distortion": _MODELS[model],
-        "interior": interior, "unknowns": unknowns,
+        "width_px": width, "height_px": height, "pixel_mm": pixel, "distortion": distortion, "interior": interior,
+        "unknowns": unknowns,
     }  # fmt: skip
-
-
-def _pixel_mm(script: _Script, place: str, width: int, height: int) -> float:
-    text = script.text(place, "")
-    parts = [part.strip() for part in text.split(",")]
-    lengths = [(finite(part), n) for part, n in zip(parts, (width, height), strict=False) if part != "auto"]
-    sizes = [length / n for length, n in lengths if length is not None and length > 0]
-    if len(parts) != 2 or not sizes or len(sizes) < len(lengths):
-        raise script.error(f"<sensor> is {quoted(text)}; give width,height in mm, one of which may be auto")
-    if abs(sizes[0] - sizes[-1]) > 1e-6 * sizes[0]:
-        raise script.error(f"the pixels of {sizes[0]:g} x {sizes[-1]:g} mm are not square; give the aspect instead")
-    return sizes[-1]
-
-
-def _coefficients(script: _Script, tag: str, most: int) -> dict[str, float]:
-    values = script.numbers(f"{_CAMERA_PLACE}/{tag}", "0")
-    if any(value != 0 for value in values[most:]):
-        raise script.error(f"<{tag}> has more than {most} coefficients; remove the rest")
-    return {f"{tag.lower()}{i}": 0.0 - value for i, value in enumerate(values[:most], start=1)}
 
 
 def _free(script: _Script) -> dict[str, str]:
     """Return the names of the interior parameters that the script estimates."""
-    n_k, n_p = (int(script.numbers(f"{_CAMERA_PLACE}/{name}", n)[0]) for name, n in (("nK", "3"), ("nP", "2")))
-    if n_k > 3 or n_p > 2:
-        raise script.error(f"nK = {n_k}, nP = {n_p} are more coefficients than Brown's model has; use at most 3 and 2")
-    ks, ps = tuple(f"k{i + 1}" for i in range(n_k)), tuple(f"p{i + 1}" for i in range(n_p))
-    groups: dict[str, tuple[str, ...]] = {
-        "cc": ("c_mm",), "pp": ("xp_mm", "yp_mm"), "px": ("xp_mm",), "py": ("yp_mm",), "K": ks, "P": ps,
-        "aspect": ("b1",), "as": ("b1",), "skew": ("b2",), "sk": ("b2",),
-    }  # fmt: skip
-    groups |= {name.upper(): (name,) for name in (*ks, *ps)}
-    estimate = "set_bundle_estimate_params"
+    groups = dict(_PARAMETERS)
+    for tag, most in (("K", 3), ("P", 2)):
+        n = int(script.numbers(f"n{tag}", str(most))[0])
+        if n > most:
+            raise script.error(f"n{tag} = {n} is more than Brown's model has; use at most {most}")
+        groups[tag] = tuple(f"{tag.lower()}{i + 1}" for i in range(n))
+        groups |= {name.upper(): (name,) for name in groups[tag]}
     for key in ("eo", "op"):
-        if (value := script.setting(estimate, key)) not in ("true", "default"):
-            raise script.error(f"<{key}> {value!r} in <{estimate}> is not supported; set it to true")
-    every = script.setting(estimate, "io") == "true"
+        if (value := script.setting(_ESTIMATE, key)) not in ("true", "default"):
+            raise script.error(f"<{key}> {value!r} in <{_ESTIMATE}> is not supported; set it to true")
+    every = script.setting(_ESTIMATE, "io") == "true"
     free = {name for names in groups.values() for name in names} if every else set()
-    for element in script.root.findall(f"operations/operation/{estimate}/io/*"):
+    for element in script.root.findall(f"operations/operation/{_ESTIMATE}/io/*"):
         if element.tag in ("c", "all"):
             continue
-        if element.tag not in groups:
-            raise script.error(f"unknown <{element.tag}> in <io>; use all, {', '.join(groups)}")
-        value = (element.text or "").strip()
-        if value not in ("true", "false"):
-            raise script.error(f"<{element.tag}> in <io> is {value!r}; write true or false")
-        free = free | set(groups[element.tag]) if value == "true" else free - set(groups[element.tag])
+        names = set(script.one_of(groups, "in <io>", element.tag))
+        estimated = script.one_of(
+            {"true": True, "false": False}, f"<{element.tag}> in <io>", (element.text or "").strip()
+        )
+        free = free | names if estimated else free - names
     return dict.fromkeys(sorted(free), "free")
 
 
-FORMATS = (Format("dbat", "script of DBAT, XML", by_content("*.xml", _names_itself), read),)
+# PhotoModeler ------------------------------------------------------------------------------------------------
+
+
+def _is_export(path: Path) -> bool:
+    begin = [line.split() for line in beginning(path, 2_000)]
+    numeric = all(is_number(cell) for row in begin[1:4] for cell in row)
+    return len(begin) > 5 and tuple(map(len, begin[1:4])) in _HEADERS and numeric
+
+
+def read_export(path: Path) -> BlockTables:
+    """Read the block of an export and of DBAT's control files in the same folder.
+
+    Without control files the initial values are the orientations and points of the export. Its control points define
+    the datum if there are at least three, otherwise the network is free. The camera has free c, xp, yp and nonzero
+    coefficients.
+    """
+    lines = read_legacy_text(path).split("\n")
+    if len(lines) < 6:
+        raise InputError(f"{path.name}: the file ends within its header. Export it again")
+    camera, at, names = _export_camera(path, lines), 5, dict[str, str]()
+    poses, rows = [], []
+    while at < len(lines) and lines[at].strip():
+        words = lines[at].split(maxsplit=1)
+        if len(words) != 2 or len(lines) < at + _LINES_PER_PHOTOGRAPH:
+            raise InputError(
+                f"{path.name}, row {at + 1}: {quoted(lines[at])} does not start a photograph. Export it again"
+            )
+        names[words[0]] = _stem(words[1].strip())
+        poses.append(row_numbers(path, at + 2, lines[at + 1].split(), 7)[1:])
+        rows.append(at + 2)
+        at += _LINES_PER_PHOTOGRAPH
+    images = {"image": np.array(list(names.values()), object), "camera": np.full(len(names), CAMERA, object)}
+    x, y, z, kappa, phi, omega = np.array(poses).T
+    outer = dict(zip((*XYZ, *ANGLES), (x, y, z, omega, phi, kappa), strict=True))
+    control, points, marks = _sections(path, lines, at)
+    numbers, stems = list(names), np.array(list(names.values()), object)
+    shown = stems[marks.find("im", numbers, lambda number: f"image {number} is not among the export's images")]
+    columns = {"image": shown, "point": marks.text("id"), "sigma_px": np.full(len(marks), _SIGMA_PX)}
+    columns |= {"column_px": marks.numbers("x") - 0.5, "row_px": marks.numbers("y") - 0.5}
+    tables = {"image_points": Table(path.name, columns, marks.files, marks.rows)}
+    settings: dict[str, Any] = {"title": lines[0].strip(), "cameras": {CAMERA: camera}}
+    if (path.parent / CONTROL_FILE).is_file():
+        tables["images"] = Table.of(path.name, images)
+        control = read_columns(path.parent / CONTROL_FILE, ("id", "label", "x", "y", "z", "sx", "sy", "sz"))
+        tables["control_points"] = control_table(control, "", 1.0)
+    else:
+        tables["images"] = Table.of(path.name, images | outer, np.array(rows, int))
+        xyz = {name: points.numbers(axis) for name, axis in zip(XYZ, "xyz", strict=True)}
+        tables["object_points"] = Table(path.name, {"point": points.ids("id")} | xyz, points.files, points.rows)
+        estimated = [name for name, value in camera["interior"].items() if value != 0]
+        camera["unknowns"] = dict.fromkeys([*_ALWAYS_FREE, *estimated], "free")
+        if len(control) < _LEAST_CONTROL:
+            settings["datum"] = {"kind": "inner", "over": "points"}
+            if len(control):
+                warn(f"{path.name}: {len(control)} control points are too few for a datum; the block is a free network")
+        else:
+            # Negative sigmas mark fixed coordinates in PhotoModeler, zeros in DBAT.
+            sigmas = {name: np.maximum(control.numbers(name), 0.0) for name in ("sx", "sy", "sz")}
+            fixed = Table(path.name, control.columns | sigmas, control.files, control.rows)
+            tables["control_points"] = control_table(fixed, "", 1.0)
+    if (path.parent / STATIONS).is_file():
+        table = read_columns(path.parent / STATIONS, ("image", *XYZ, "sigma"))
+        stations = {"image": np.array([_stem(name) for name in table.ids("image")], object)}
+        stations |= {name: table.numbers(name) for name in XYZ}
+        stations |= {name: table.numbers("sigma") for name in SIGMA_XYZ}
+        tables["stations"] = Table(table.file, stations, table.files, table.rows)
+    return BlockTables(settings, tables, path.name)
+
+
+def _export_camera(path: Path, lines: list[str]) -> dict[str, Any]:
+    """Return the [cameras.X] table of the camera."""
+    if len(lines[1].split()) == 2:
+        raise InputError(f"{path.name}, row 2: no size of the photographs; write width, height at its end")
+    _, _, width, height = row_numbers(path, 2, lines[1].split(), 4)
+    c, px, py, width_mm, height_mm, *coefficients = row_numbers(path, 4, lines[3].split(), 10)
+    if min(width, height, width_mm, height_mm) <= 0:
+        raise InputError(f"{path.name}: the format of the camera is not positive. Export it again")
+    sides = width_mm / width, height_mm / height
+    square = abs(sides[0] / sides[1] - 1) < _SQUARE
+    # Affinity is applied first: it makes the pixels square.
+    pixel = sides[0] if square else sides[1]
+    b1 = 0.0 if square else 1.0 - sides[0] / pixel
+    xp, yp = px / (1.0 - b1) - pixel * (width / 2 + 0.5), -(py - pixel * (height / 2 + 0.5))
+    interior = {"c_mm": c, "xp_mm": xp, "yp_mm": yp}
+    interior |= dict(zip(("k1", "k2", "k3", "p1", "p2"), (0.0 - value for value in coefficients), strict=True))
+    return {
+        "width_px": int(width), "height_px": int(height), "pixel_mm": pixel,
+        "distortion": "brown" if square else "affine_brown", "interior": interior | ({} if square else {"b1": b1}),
+    }  # fmt: skip
+
+
+def _sections(path: Path, lines: list[str], at: int) -> list[Table]:
+    """Read control points, object points and marks; an empty line ends each table."""
+    tables = []
+    for columns in (_POINT, _POINT, _MARK):
+        at, cells, rows = at + 1, [], []
+        while at < len(lines) and lines[at].strip():
+            cells.append(lines[at].split())
+            at += 1
+            rows.append(at)
+            if len(cells[-1]) != len(columns):
+                raise InputError(f"{path.name}, row {at}: expected {len(columns)} numbers. Export it again")
+        values = {name: np.array([row[j] for row in cells], object) for j, name in enumerate(columns)}
+        tables.append(Table.of(path.name, values, np.array(rows, int)))
+    return tables
+
+
+def _stem(name: str) -> str:
+    return Path(name.replace("\\", "/")).stem
+
+
+FORMATS = (
+    Format(
+        "dbat", "script of DBAT, XML", by_content("*.xml", lambda path: has_words(path, "dbat_script_version")), read
+    ),
+    Format("photomodeler", "export of PhotoModeler", by_content("*.txt", _is_export), read_export),
+)

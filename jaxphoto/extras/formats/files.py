@@ -1,19 +1,17 @@
 """Format declarations; readers of text, XML, JSON and numeric rows with error locations."""
 
-import json
 import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.camera import InteriorOrientation, Perspective, Sensor
+from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.extras.formats.camera_models import CameraModel
-from jaxphoto.extras.formats.project import Project
+from jaxphoto.extras.formats.project import CameraModel, Project
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.camera_files import CameraReader
 from jaxphoto.io.text_files import read_legacy_text
@@ -41,8 +39,6 @@ class Format(NamedTuple):
     fisheye: CameraModel | None = None
     endings: tuple[str, ...] = ()
     """Suffixes of the exported files."""
-    in_map: bool = False
-    """True if exported coordinates are map coordinates, where collinearity is approximate."""
     keeps_rays: bool = False
     """True if image points are recomputed so that the fitted camera has the same rays."""
     lacks: tuple[str, ...] = ()
@@ -61,16 +57,10 @@ class CameraFormat(NamedTuple):
     suffixes: tuple[str, ...] = ()
     comment: str = ""
     """Template of a comment line; "" if the format has no comments."""
-    models: Mapping[str, CameraModel] = {}
-    """Camera models that can be requested, by their names in the format."""
-
-    def model_of(self, interior: InteriorOrientation) -> CameraModel | None:
-        """Return the camera model to write for `interior`."""
-        return self.plane if type(interior.projection) is Perspective else self.fisheye
 
 
 class ControlFormat(NamedTuple):
-    """Format of control points or marks; `recognise` and `read` take path and text (text "" if the file is binary)."""
+    """Format of control points or marks; `recognise` and `read` take path and text."""
 
     name: str
     about: str
@@ -93,27 +83,25 @@ def warn(message: str) -> None:
     warnings.warn(message, UserWarning, stacklevel=3)
 
 
-def begins_with(path: Path, words: str) -> bool:
-    """Return True if a file begins with `words`."""
-    with path.open("rb") as file:
-        return file.read(len(words)) == words.encode()
-
-
 def beginning(path: Path, n_bytes: int) -> list[str]:
     """Return the nonempty lines in the first `n_bytes` of a file."""
     with path.open("rb") as file:
         return [line for line in file.read(n_bytes).decode("utf-8", "replace").splitlines() if line.strip()]
 
 
+def numbered_lines(text: str) -> list[tuple[int, str]]:
+    """Return (row number, line) for each line that is not empty."""
+    return [(row, line) for row, line in enumerate(text.split("\n"), 1) if line.strip()]
+
+
 def content_rows(path: Path) -> list[tuple[int, str]]:
     """Return (row number, line) for each line that is neither empty nor a comment."""
-    rows = enumerate(read_legacy_text(path).split("\n"), 1)
-    return [(row, line) for row, line in rows if line.strip() and not line.lstrip().startswith("#")]
+    return [(row, line) for row, line in numbered_lines(read_legacy_text(path)) if not line.lstrip().startswith("#")]
 
 
-def read_columns(path: Path, columns: Sequence[str], separator: str | None = ",") -> Table:
-    """Read a file without a header into named columns; `separator=None` means whitespace."""
-    rows = [(row, [cell.strip() for cell in line.split(separator)]) for row, line in content_rows(path)]
+def read_columns(path: Path, columns: Sequence[str]) -> Table:
+    """Read a comma-separated file without a header into named columns."""
+    rows = [(row, [cell.strip() for cell in line.split(",")]) for row, line in content_rows(path)]
     for row, cells in rows:
         if len(cells) != len(columns):
             raise InputError(
@@ -122,11 +110,6 @@ def read_columns(path: Path, columns: Sequence[str], separator: str | None = ","
             )
     values = {name: np.array([cells[j] for _, cells in rows], object) for j, name in enumerate(columns)}
     return Table.of(path.name, values, np.array([row for row, _ in rows], int))
-
-
-def read_json(path: Path) -> Any:
-    """Return the content of a JSON file."""
-    return json.loads(read_legacy_text(path))
 
 
 def add(parent: ElementTree.Element, tag: str, content: Any = None, **attributes: str) -> ElementTree.Element:
@@ -148,21 +131,21 @@ def number_rows(
     values: Sequence[Any], shape: tuple[int, ...], place: Callable[[int], str]
 ) -> Float[np.ndarray, "n *shape"]:
     """Convert equally shaped values to an array. Raise InputError at `place(k)` for the first deviating shape."""
-    try:
-        rows = np.array(values, float).reshape(-1, *shape)
-        if len(rows) == len(values) and np.shape(values)[1:] in (shape, ()) and (np.abs(rows) <= LARGEST).all():
-            return rows
-    except (TypeError, ValueError, OverflowError):
-        pass
-    for k, value in enumerate(values):
+
+    def parsed(some: Sequence[Any]) -> np.ndarray | None:
         try:
-            row = np.array(value, float)
+            rows = np.array(some, float).reshape(-1, *shape)
+            return rows if np.shape(some) == (len(some), *shape) and (np.abs(rows) <= LARGEST).all() else None
         except (TypeError, ValueError, OverflowError):
-            row = np.array(np.nan)
-        if row.shape != shape or not (np.abs(row) <= LARGEST).all():
-            many = " x ".join(map(str, shape))
-            raise InputError(f"{place(k)}: {quoted(value)} is not {many} finite numbers. Correct it or export it again")
-    raise InputError(f"{place(0)}: the numbers differ in shape. Export the file again")
+            return None
+
+    if not len(values):
+        return np.zeros((0, *shape))
+    if (rows := parsed(values)) is not None:
+        return rows
+    k = next(k for k, value in enumerate(values) if parsed([value]) is None)
+    many = " x ".join(map(str, shape))
+    raise InputError(f"{place(k)}: {quoted(values[k])} is not {many} finite numbers. Correct it or export it again")
 
 
 def row_numbers(path: Path, row: int, words: Sequence[str], many: int) -> list[float]:

@@ -11,55 +11,56 @@
     .../frames/frame/markers/marker/location camera_id, pinned (measured; others are ignored), x, y in our pixels
     .../reference                            WKT of the coordinate system
 
-PhotoScan before 1.2 and Agisoft Lens write calibrations with fx, fy and skew: cx and cy count from the upper left
-corner, f = fy, b1 = fx - fy, b2 = skew, and p1 and p2 are in OpenCV's order. A "fisheye" (from 2.3 on
-"equidistant_fisheye") is the same polynomial on the equidistant projection. Exported cameras have no tie points: they
-are read from a text file in the same folder, and written to image_points.csv. Markers are also read from and written to
-markers.xml.
+A "fisheye" (from 2.3 on "equidistant_fisheye") is the same polynomial on the equidistant projection. Exported cameras
+have no tie points: they are read from a text file in the same folder, and written to image_points.csv.
 
 Source: Agisoft Metashape User Manual, "Export cameras", "Export markers" and Appendix D; Metashape Python Reference,
-Chunk.transform and Camera.transform; Agisoft Lens User Manual 0.4; Agisoft's forum, topic 6437; exported files of
-versions 1.5 and 2.0.
+Chunk.transform and Camera.transform; exported files of versions 1.5 and 2.0.
 """
 
 import re
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
 from pyproj import CRS
 
 from jaxphoto.arrays import as_jax_array
-from jaxphoto.block import Frame
 from jaxphoto.camera import Agisoft, InteriorOrientation, Sensor
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.extras.formats.camera_models import AGISOFT, AGISOFT_FISHEYE, ProjectCamera
 from jaxphoto.extras.formats.control import Mark, SurveyRows, read_marks
 from jaxphoto.extras.formats.files import (
     CameraFormat,
     ControlFormat,
     Format,
     add,
+    by_content,
     number_rows,
     warn,
     xml_text,
 )
-from jaxphoto.extras.formats.points_beside import joined, marks_shown, points_beside, write_image_points
-from jaxphoto.extras.formats.project import WGS84, ControlPoints, Project, geocentric, is_geocentric, pose
-from jaxphoto.georeferencing.map_frame import map_system
-from jaxphoto.io.camera_files import CameraFile, CameraReader, CameraSource, joined_notes
+from jaxphoto.extras.formats.project import (
+    AGISOFT,
+    AGISOFT_FISHEYE,
+    ControlPoints,
+    Project,
+    ProjectCamera,
+    geocentric,
+    is_geocentric,
+    pose,
+)
+from jaxphoto.extras.formats.texts import points_beside, with_marks, write_image_points
+from jaxphoto.io.camera_files import CameraFile, CameraReader, CameraSource
 from jaxphoto.io.text_files import has_words, read_legacy_text
 from jaxphoto.io.text_tables import finite
-from jaxphoto.procedures.control.surveyed import ControlSystem, GivenControl, system_of
+from jaxphoto.procedures.control.surveyed import GivenControl, system_of
 
-CAMERAS_FILE, MARKERS_FILE = "cameras.xml", "markers.xml"
+CAMERAS_FILE = "cameras.xml"
 _MODELS = {"frame": AGISOFT, "fisheye": AGISOFT_FISHEYE, "equidistant_fisheye": AGISOFT_FISHEYE}
 _SCALED = ("b1", "b2")
-_TERMS = ("f", "fx", "fy", "cx", "cy", "skew", *Agisoft.coefficients)
+_TERMS = ("f", "cx", "cy", *Agisoft.coefficients)
 _PARAMETERS = {"f": "c_mm", "cx": "xp_mm", "cy": "yp_mm"} | {name: name for name in Agisoft.coefficients}
 _REFERENCE = ("x", "y", "z", "sx", "sy", "sz")
 _WKT = re.compile(r"\s*[A-Z_]{5,}\[")
@@ -72,70 +73,53 @@ _LOCAL = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["me
 def read_calibration(source: CameraSource) -> CameraFile:
     """Read the camera of a calibration file, or one sensor of exported cameras."""
     root = ElementTree.fromstring(source.text())
-    sensors = {source.path.stem: (root, None)} if root.tag == "calibration" else _sensors(root)
+    if root.tag == "calibration":
+        return _camera(source, source.path.stem, root)
+    sensors = {name: (calibration, sensor) for name, sensor, calibration in _sensors(root).values()}
     name = source.chosen(list(sensors))
     return _camera(source, name, *sensors[name])
 
 
-def _sensors(root: ElementTree.Element) -> dict[str, tuple[ElementTree.Element, str | None]]:
-    """Return calibration and pixel size of each calibrated sensor by label."""
-    sensors = {}
-    for sensor in root.iter("sensor"):
-        calibration, pixel = _calibration(sensor)
+def _sensors(root: ElementTree.Element) -> dict[str, tuple[str, ElementTree.Element, ElementTree.Element]]:
+    """Return name, element and calibration (adjusted, otherwise initial) of each calibrated sensor by id.
+
+    The name is the label, followed by the id if labels are equal.
+    """
+    sensors, labels = list(root.iter("sensor")), [(s.get("label") or "camera").strip() for s in root.iter("sensor")]
+    calibrated = {}
+    for sensor, label in zip(sensors, labels, strict=True):
+        calibration = sensor.find("calibration[@class='adjusted']")
+        calibration = sensor.find("calibration") if calibration is None else calibration
         if calibration is not None:
-            label = sensor.get("label", sensor.get("id", ""))
-            sensors[label if label not in sensors else f"{label} {sensor.get('id')}"] = (calibration, pixel)
-    return sensors
+            key = sensor.get("id", "")
+            calibrated[key] = label if labels.count(label) == 1 else f"{label} {key}", sensor, calibration
+    return calibrated
 
 
-def _calibration(sensor: ElementTree.Element) -> tuple[ElementTree.Element | None, str | None]:
-    """Return the adjusted calibration of a sensor, otherwise the initial one, and its pixel size."""
-    calibrations = {c.get("class", "adjusted"): c for c in sensor.findall("calibration")}
-    sizes = {p.get("name"): p.get("value") for p in sensor.iter("property")}
-    return calibrations.get("adjusted", calibrations.get("initial")), sizes.get("pixel_width")
-
-
-def _camera(source: CameraSource, name: str, calibration: ElementTree.Element, pixel: str | None) -> CameraFile:
+def _camera(
+    source: CameraSource, name: str, calibration: ElementTree.Element, element: ElementTree.Element | None = None
+) -> CameraFile:
     kind = (calibration.findtext("projection") or calibration.get("type") or "frame").strip()
     if kind not in _MODELS:
         raise source.error(f"projection {quoted(kind)} is not supported; use one of {', '.join(_MODELS)}")
     resolution = calibration.find("resolution")
-    sides = ("width", "height")
-    size = [calibration.findtext(side) if resolution is None else resolution.get(side) for side in sides]
-    if None in size and source.size_px is not None:
-        size = list(map(str, source.size_px))
-    if None in size:
-        raise source.error("<width> or <height> is missing; add both")
-    pixel_mm = source.number("pixel_width", pixel) if pixel is not None else None
-    width, height = map(source.number, sides, size)
+    width, height = (
+        source.number(side, calibration.findtext(side) if resolution is None else resolution.get(side))
+        for side in ("width", "height")
+    )
+    pixel = None if element is None else element.find(".//property[@name='pixel_width']")
+    pixel_mm = None if pixel is None else source.number("pixel_width", pixel.get("value"))
     sensor, assumed = source.sensor(width, height, pixel_mm)
-    values, note = _values(source, calibration, sensor)
+    numbers = {child.tag: source.number(child.tag, child.text) for child in calibration if child.tag in _TERMS}
+    values = dict.fromkeys(_TERMS, 0.0) | numbers
     f = values.pop("f")
+    if not f > 0:
+        raise source.error("<f> is missing or not positive; give the focal length in pixels")
     x_p, y_p = values.pop("cx") * sensor.pixel_mm, -values.pop("cy") * sensor.pixel_mm
     distortion = Agisoft(**{k: v / f if k in _SCALED else v for k, v in values.items()})
     projection = _MODELS[kind].projection
     interior = InteriorOrientation(f * sensor.pixel_mm, x_p, y_p, distortion, projection=projection)
-    return CameraFile(name, sensor, jax.tree.map(as_jax_array, interior), None, joined_notes(note, assumed))
-
-
-def _values(source: CameraSource, calibration: ElementTree.Element, sensor: Sensor) -> tuple[dict[str, float], str]:
-    """Return f, cx, cy, b1, b2 and coefficients in Metashape's units, and a note if the file is of an old version."""
-    older = calibration.find("f") is None and calibration.find("fx") is not None
-    numbers = {child.tag: source.number(child.tag, child.text) for child in calibration if child.tag in _TERMS}
-    for key in ("fx", "fy") if older else ("f",):
-        if key not in numbers:
-            raise source.error(f"<{key}> is missing; add it")
-        if not numbers[key] > 0:
-            raise source.error(f"{key} is {numbers[key]:g} pixels; give a positive focal length")
-    values = {key: numbers.get(key, 0.0) for key in ("f", "cx", "cy", *Agisoft.coefficients)}
-    if not older:
-        return values, ""
-    values |= {"f": numbers["fy"], "b1": numbers["fx"] - numbers["fy"], "b2": numbers.get("skew", 0.0)}
-    for key, side in (("cx", sensor.width_px), ("cy", sensor.height_px)):
-        values[key] = numbers[key] - side / 2 if key in numbers else 0.0
-    values |= {"p1": values["p2"], "p2": values["p1"]}
-    tangential = values["p1"] != 0 or values["p2"] != 0
-    return values, "fx and fy are of an old version; p1 and p2 are used in OpenCV's order" * tangential
+    return CameraFile(name, sensor, jax.tree.map(as_jax_array, interior), None, assumed)
 
 
 def write_calibration(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
@@ -155,7 +139,7 @@ def _kind_of(interior: InteriorOrientation) -> str:
 def _add_values(calibration: ElementTree.Element, sensor: Sensor, interior: InteriorOrientation) -> None:
     f = float(interior.c) / sensor.pixel_mm
     values = {"f": f, "cx": float(interior.x_p) / sensor.pixel_mm, "cy": -float(interior.y_p) / sensor.pixel_mm}
-    for key in (*_SCALED, *(k for k in Agisoft.coefficients if k not in _SCALED)):
+    for key in Agisoft.coefficients:
         values[key] = float(getattr(interior.distortion, key)) * (f if key in _SCALED else 1.0)
     for key, number in values.items():
         if number != 0:
@@ -165,20 +149,10 @@ def _add_values(calibration: ElementTree.Element, sensor: Sensor, interior: Inte
 # Exported cameras ---------------------------------------------------------------------------------------------
 
 
-class _Aligned(NamedTuple):
-    label: str
-    sensor: str
-    """Sensor id."""
-    component: str
-    transform: str
-
-
 def find(source: Path) -> list[Path]:
-    """Return files of exported cameras. In a folder, files with aligned cameras have priority; markers.xml is last."""
-    paths = sorted(source.glob("*.xml")) if source.is_dir() else [source]
-    exported = [path for path in paths if has_words(path, "<document", "<chunk", "<cameras")]
-    cameras = [path for path in exported if path.name != MARKERS_FILE] or exported
-    return [path for path in cameras if has_words(path, "<transform")] or cameras
+    """Return files of exported cameras; in a folder, files with aligned cameras have priority."""
+    exported = by_content("*.xml", lambda path: has_words(path, "<document", "<chunk", "<cameras"))(source)
+    return [path for path in exported if has_words(path, "<transform")] or exported
 
 
 def read(path: Path) -> Project:
@@ -189,127 +163,88 @@ def read(path: Path) -> Project:
     the one with most cameras is read.
     """
     chunk = _chunk(path, read_legacy_text(path))
-    photos, component = _photos(path, chunk)
-    sensors, names = _project_cameras(path, chunk), _sensor_names(chunk)
-    for photo in photos:
-        if photo.sensor not in sensors:
-            raise InputError(f"{path.name}, camera {quoted(photo.label)}: its sensor is not calibrated. Calibrate it")
-    labels = [photo.label for photo in photos]
+    every = chunk.findall("cameras//camera")
+    components = Counter(photo.get("component_id", "") for photo in every if photo.find("transform") is not None)
+    if not components:
+        raise InputError(f"{path.name}: no camera is aligned; align them (markers alone are for jaxphoto control)")
+    ((component, _),) = components.most_common(1)
+    photos = [p for p in every if p.find("transform") is not None and p.get("component_id", "") == component]
+    if len(photos) < len(every):
+        warn(f"{path.name}: skipped {len(every) - len(photos)} camera(s), unaligned or of smaller components")
+    sensors = _project_cameras(path, chunk)
+    labels = [(photo.get("label") or "").strip() for photo in photos]
+    for photo, label in zip(photos, labels, strict=True):
+        if not label or photo.get("sensor_id", "") not in sensors:
+            raise InputError(
+                f"{path.name}, camera {quoted(label)}: no label, or its sensor is not calibrated. Calibrate it"
+            )
     place = lambda k: f"{path.name}, camera {quoted(labels[k])}, transform"  # noqa: E731
-    poses = number_rows([photo.transform.split() for photo in photos], (16,), place).reshape(-1, 4, 4)
-    rotation, translation, scale, georeferenced = _transform(path, chunk, component)
+    words = [(photo.findtext("transform") or "").split() for photo in photos]
+    poses = number_rows(words, (16,), place).reshape(-1, 4, 4)
+    georeferenced = _transform(path, chunk, component)
+    rotation, translation, scale = georeferenced or (np.eye(3), np.zeros(3), np.ones(1))
+    rotation = rotation.reshape(3, 3)
     centres = translation + scale * poses[:, :3, 3] @ rotation.T
     rotations = np.swapaxes(rotation @ poses[:, :3, :3], 1, 2)
-    system = _system(path, chunk, centres) if georeferenced else ControlSystem(None, None, None)
-    rows, marks = _markers(path, chunk)
-    cameras = [sensors[photo.sensor] for photo in photos]
-    shown = joined(points_beside(path, labels, cameras), marks_shown(marks, labels), path.name)
+    # Without the name of a system, geocentric positions are on WGS 84.
+    system = system_of(_system_words(chunk) or ("EPSG:4326" if is_geocentric(centres) else "local"), path.name)
+    if georeferenced and system.crs is not None and system.code is None:
+        raise InputError(f"{path.name}: {system.name} has no EPSG code; export it in an EPSG system")
+    rows, marks = _markers(path.name, chunk)
+    camera_of = [sensors[photo.get("sensor_id", "")] for photo in photos]
+    shown = points_beside(path, labels, [camera for _, camera in camera_of])
+    shown = with_marks(shown, marks, labels, path.name)
     if not len(shown.image):
         raise InputError(
             f"{path.name} has no tie points and no marks; export tie points as BINGO or PATB into its folder"
         )
     project = Project(
-        chunk.get("label") or path.stem, {names[key]: camera for key, camera in sensors.items()}, (), labels,
-        [names[photo.sensor] for photo in photos], pose(rotations, centres), shown.points, None, shown.image,
-        shown.point, shown.column_row, sigma_px=shown.sigma_px, file=path.name,
+        chunk.get("label") or path.stem, dict(sensors.values()), (), labels, [name for name, _ in camera_of],
+        pose(rotations, centres), shown.points, None, shown.image, shown.point, shown.column_row,
+        sigma_px=shown.sigma_px, file=path.name,
     )  # fmt: skip
-    if system.crs is not None:
-        project = geocentric(project, _datum_code(path, system), system.vertical).in_map()
+    if georeferenced and system.code is not None:
+        project = geocentric(project, system.code, system.vertical).in_map()
     if not len(rows):
         return project
-    if (georeferenced and system.crs is None) or system.code is not None:
-        return project._replace(control=_control(rows, shown.points))
-    why = "has no EPSG system" if georeferenced else "is not georeferenced"
-    warn(f"{path.name} {why}: skipped {len(rows)} markers with coordinates; add them by jaxphoto control")
-    return project
-
-
-def _control(rows: SurveyRows, points: list[str]) -> ControlPoints:
-    surveyed = rows.surveyed()
-    number = {name: k for k, name in enumerate(points)}
+    if not georeferenced:
+        warn(f"{path.name} is not georeferenced: skipped {len(rows)} markers with coordinates")
+        return project
+    surveyed, number = rows.surveyed(), {name: k for k, name in enumerate(shown.points)}
     there = [k for k, name in enumerate(surveyed.ids) if name in number]
     point = np.array([number[surveyed.ids[k]] for k in there], int)
-    return ControlPoints(point, surveyed.coordinates[there], surveyed.sigma_m[there], surveyed.check[there])
+    control = ControlPoints(point, surveyed.coordinates[there], surveyed.sigma_m[there], surveyed.check[there])
+    return project._replace(control=control)
 
 
-def _photos(path: Path, chunk: ElementTree.Element) -> tuple[list[_Aligned], str]:
-    """Return the aligned cameras of the largest component, and the id of this component."""
-    photos, unaligned = [], 0
-    for camera in chunk.iterfind("cameras//camera"):
-        transform, label = camera.findtext("transform"), (camera.get("label") or "").strip()
-        if transform is None:
-            unaligned += 1
-        elif not label:
-            raise InputError(f"{path.name}: a <camera> has no label. Export the cameras again")
-        else:
-            photos.append(_Aligned(label, camera.get("sensor_id", ""), camera.get("component_id", ""), transform))
-    if not photos:
-        raise InputError(f"{path.name}: no camera is aligned; align them (markers alone are for jaxphoto control)")
-    ((component, count),) = Counter(photo.component for photo in photos).most_common(1)
-    if unaligned or count < len(photos):
-        warn(
-            f"{path.name}: skipped {unaligned} unaligned camera(s) and {len(photos) - count} camera(s) of smaller "
-            "components"
-        )
-    return [photo for photo in photos if photo.component == component], component
-
-
-def _project_cameras(path: Path, chunk: ElementTree.Element) -> dict[str, ProjectCamera]:
-    """Return calibrated cameras by sensor id."""
+def _project_cameras(path: Path, chunk: ElementTree.Element) -> dict[str, tuple[str, ProjectCamera]]:
+    """Return name and camera of each calibrated sensor by id."""
     cameras = {}
-    for sensor in chunk.iterfind("sensors/sensor"):
-        calibration, pixel = _calibration(sensor)
-        if calibration is not None:
-            read_camera = _camera(CameraSource(path), sensor.get("id", ""), calibration, pixel)
-            camera = ProjectCamera.estimated(read_camera.sensor, read_camera.interior)
-            estimated = (sensor.findtext("covariance/params") or "").split()
-            if free := tuple(_PARAMETERS[key] for key in estimated if key in _PARAMETERS):
-                camera = camera._replace(free=free)
-            if any(p.get("name") == "fixed" and p.get("value") == "true" for p in sensor.iterfind("property")):
-                camera = camera._replace(free=())
-            cameras[read_camera.name] = camera
+    for key, (name, sensor, calibration) in _sensors(chunk).items():
+        read_camera = _camera(CameraSource(path), name, calibration, sensor)
+        camera = ProjectCamera.estimated(read_camera.sensor, read_camera.interior)
+        estimated = (sensor.findtext("covariance/params") or "").split()
+        if free := tuple(_PARAMETERS[term] for term in estimated if term in _PARAMETERS):
+            camera = camera._replace(free=free)
+        if sensor.find("property[@name='fixed'][@value='true']") is not None:
+            camera = camera._replace(free=())
+        cameras[key] = name, camera
     return cameras
 
 
-def _sensor_names(chunk: ElementTree.Element) -> dict[str, str]:
-    """Return camera names by sensor id: the sensor's label, followed by the id if labels are equal."""
-    labels = {s.get("id", ""): (s.get("label") or "camera").strip() for s in chunk.iterfind("sensors/sensor")}
-    times = Counter(labels.values())
-    return {key: label if times[label] == 1 else f"{label} {key}" for key, label in labels.items()}
-
-
-def _transform(path: Path, chunk: ElementTree.Element, component: str) -> tuple[np.ndarray, np.ndarray, float, bool]:
-    """Return rotation, translation and scale from the chunk to the world, and False if the file has no transform."""
-    transforms = [c.find("transform") for c in chunk.iterfind("components/component") if c.get("id", "") == component]
-    transform = next((t for t in [*transforms, chunk.find("transform")] if t is not None), None)
+def _transform(path: Path, chunk: ElementTree.Element, component: str) -> list[np.ndarray] | None:
+    """Return rotation, translation and scale from the chunk to the world; None if the file has no transform."""
+    transform = chunk.find(f"components/component[@id='{component}']/transform")
+    transform = chunk.find("transform") if transform is None else transform
     if transform is None or transform.find("rotation") is None:
-        return np.eye(3), np.zeros(3), 1.0, False
+        return None
     values = []
     for key, size in (("rotation", 9), ("translation", 3), ("scale", 1)):
-        words = (transform.findtext(key) or ("1" if key == "scale" else "")).split()
-        values.append(number_rows([words], (size,), lambda _, key=key: f"{path.name}, transform, {key}")[0])  # type: ignore[misc]
-    rotation, translation, (scale,) = values
-    if not scale > 0:
-        raise InputError(f"{path.name}, transform: scale {scale:g} is not positive; re-export the cameras")
-    return rotation.reshape(3, 3), translation, float(scale), True
-
-
-def _system(path: Path, chunk: ElementTree.Element, centres: Float[np.ndarray, "images 3"]) -> ControlSystem:
-    """Return the coordinate system of the file; if none is named, WGS 84 for geocentric positions, otherwise local."""
-    words = _system_words(chunk) or (f"EPSG:{WGS84}" if is_geocentric(centres) else "local")
-    return system_of(words, path.name)
-
-
-def _datum_code(path: Path, system: ControlSystem) -> int:
-    """Return the EPSG code of the system, otherwise of its geographic system."""
-    if system.code is not None:
-        return system.code
-    geodetic = None if system.crs is None else system.crs.geodetic_crs
-    code = None if geodetic is None else geodetic.to_epsg()
-    if code is None:
-        raise InputError(f"{path.name}: {system.name} and its datum have no EPSG code; export it in an EPSG system")
-    warn(f"{path.name}: its system has no EPSG code; converted to EPSG:{code}")
-    return code
+        words = transform.findtext(key, "1").split()
+        values += [*number_rows([words], (size,), lambda _, key=key: f"{path.name}, transform, {key}")]  # type: ignore[misc]
+    if not values[2] > 0:
+        raise InputError(f"{path.name}, transform: scale {values[2][0]:g} is not positive; re-export the cameras")
+    return values
 
 
 # Markers ------------------------------------------------------------------------------------------------------
@@ -318,7 +253,7 @@ def _datum_code(path: Path, system: ControlSystem) -> int:
 def read_markers(path: Path, text: str) -> GivenControl:
     """Read markers with reference coordinates, and their pinned projections."""
     chunk = _chunk(path, text)
-    rows, marks = _markers_of(path.name, chunk)
+    rows, marks = _markers(path.name, chunk)
     return GivenControl(rows.surveyed(_system_words(chunk)), read_marks(marks))
 
 
@@ -335,18 +270,7 @@ def _system_words(chunk: ElementTree.Element) -> str:
     return words if _WKT.match(words) else ""
 
 
-def _markers(path: Path, chunk: ElementTree.Element) -> tuple[SurveyRows, list[Mark]]:
-    """Read the markers of the file, otherwise of markers.xml in the same folder."""
-    beside = path.with_name(MARKERS_FILE)
-    if chunk.find("markers//marker") is not None or not beside.is_file() or beside == path:
-        return _markers_of(path.name, chunk)
-    other = _chunk(beside, read_legacy_text(beside))
-    if _system_words(other) != _system_words(chunk):
-        raise InputError(f"{MARKERS_FILE} and {path.name} differ in coordinate system; export both in one")
-    return _markers_of(MARKERS_FILE, other)
-
-
-def _markers_of(file: str, chunk: ElementTree.Element) -> tuple[SurveyRows, list[Mark]]:
+def _markers(file: str, chunk: ElementTree.Element) -> tuple[SurveyRows, list[Mark]]:
     """Return markers with reference coordinates, and the pinned projections of all markers by camera label."""
     cameras = {e.get("id", ""): (e.get("label") or "").strip() for e in chunk.iterfind("cameras//camera")}
     labels = {e.get("id", ""): (e.get("label") or "").strip() for e in chunk.iterfind("markers//marker")}
@@ -356,10 +280,11 @@ def _markers_of(file: str, chunk: ElementTree.Element) -> tuple[SurveyRows, list
         if reference is None or reference.get("x") is None or reference.get("y") is None:
             continue
         name = labels[marker.get("id", "")]
-        place = f"{file}, marker {quoted(name)}"
-        xyz = [_number(reference, key, place) for key in "xyz"]
-        sigma = [_sigma(reference, key, place) for key in ("sx", "sy", "sz")]
-        points.add(name, xyz, place, sigma, reference.get("enabled", "true").lower() in ("false", "0"), once=True)
+        place, get = f"{file}, marker {quoted(name)}", reference.get
+        xyz = [_number(get(key, "nan" if key == "z" else ""), key, place) for key in "xyz"]
+        # A standard deviation of 0 means unknown in Metashape.
+        sigma = [_number(get(key, get("sxyz", "nan")), key, place) or np.nan for key in ("sx", "sy", "sz")]
+        points.add(name, xyz, place, sigma, get("enabled", "true").lower() in ("false", "0"))
     marks: list[Mark] = []
     for marker in chunk.iterfind("frames/frame/markers/marker"):
         number = marker.get("marker_id", "")
@@ -369,45 +294,41 @@ def _markers_of(file: str, chunk: ElementTree.Element) -> tuple[SurveyRows, list
             camera = location.get("camera_id", "")
             place = f"{file}, marker {quoted(labels.get(number, number))}, camera {quoted(camera)}"
             if camera not in cameras or number not in labels:
-                raise InputError(
-                    f"{place}: unknown {'marker' if camera in cameras else 'camera'}. Export the markers again"
-                )
-            column_row = [_number(location, key, place) for key in "xy"]
+                raise InputError(f"{place}: unknown marker or camera. Export the markers again")
+            column_row = [_number(location.get(key, ""), key, place) for key in "xy"]
             marks.append((cameras[camera], labels[number], column_row, np.nan, place))
     return points, marks
 
 
-def _number(element: ElementTree.Element, key: str, place: str) -> float:
-    text = element.get(key)
-    if text is None and key == "z":
-        return np.nan
-    value = finite(text or "")
-    if value is None:
-        raise InputError(f"{place}: {key} is {quoted(text)}, not a number. Export the markers again")
+def _number(text: str, key: str, place: str) -> float:
+    """Parse a number; "nan" stands for a missing one."""
+    value = np.nan if text == "nan" and key not in ("x", "y") else finite(text)
+    if value is None or (key.startswith("s") and value < 0):
+        raise InputError(f"{place}: {key} is {quoted(text)}, not a valid number. Export the markers again")
     return value
-
-
-def _sigma(reference: ElementTree.Element, key: str, place: str) -> float:
-    """Return the standard deviation of an axis, or the common one; 0 means unknown in Metashape."""
-    key = key if reference.get(key) is not None else "sxyz"
-    value = _number(reference, key, place) if reference.get(key) is not None else np.nan
-    if value < 0:
-        raise InputError(f"{place}: standard deviation {key} is {value:g}, not positive; correct it")
-    return value if value > 0 else np.nan
 
 
 # Written ------------------------------------------------------------------------------------------------------
 
 
 def write(p: Project, folder: Path) -> None:
-    """Write cameras.xml, image_points.csv and, if there are control points, markers.xml. Camera labels are image ids.
+    """Write cameras.xml, with control points as markers, and image_points.csv. Camera labels are image ids.
 
     The chunk uses the axes of the block; the component's transform converts to geocentric axes.
     """
-    root, chunk = _document(p)
+    root = ElementTree.Element("document", version="2.0.0")
+    chunk = add(root, "chunk", label=p.title or "jaxphoto", enabled="true")
     sensors = add(chunk, "sensors", next_id=str(len(p.cameras)))
-    for number, (name, camera) in enumerate(p.cameras.items()):
-        _add_sensor(sensors, number, name, camera)
+    for number, (name, (camera_sensor, interior, _)) in enumerate(p.cameras.items()):
+        kind, pixel_mm = _kind_of(interior), camera_sensor.pixel_mm
+        sensor = add(sensors, "sensor", id=str(number), label=name, type=kind)
+        size = {"width": str(camera_sensor.width_px), "height": str(camera_sensor.height_px)}
+        add(sensor, "resolution", **size)
+        for key, mm in (("pixel_width", pixel_mm), ("pixel_height", pixel_mm), ("focal_length", interior.c)):
+            add(sensor, "property", name=key, value=repr(float(mm)))
+        calibration = add(sensor, "calibration", type=kind, **{"class": "adjusted"})
+        add(calibration, "resolution", **size)
+        _add_values(calibration, camera_sensor, interior)
     components = add(chunk, "components", next_id="1", active_id="0")
     transform = add(add(components, "component", id="0", label="Component 1"), "transform")
     of_earth = p.frame.kind == "epsg"
@@ -416,35 +337,27 @@ def write(p: Project, folder: Path) -> None:
         add(transform, key, value, locked="true")
     rotations, positions = np.swapaxes(p.world_to_camera, 1, 2), np.asarray(p.exterior.position)
     sensor_of = {name: str(number) for number, name in enumerate(p.cameras)}
-    for i, element in enumerate(_add_cameras(chunk, p)):
-        element.attrib |= {"sensor_id": sensor_of[p.image_camera[i]], "component_id": "0"}
+    cameras = add(chunk, "cameras", next_id=str(len(p.images)), next_group_id="0")
+    for i, name in enumerate(p.images):
+        ids = {"id": str(i), "sensor_id": sensor_of[p.image_camera[i]], "component_id": "0"}
+        element = add(cameras, "camera", **ids, label=name, enabled="true")
         add(element, "transform", np.vstack([np.column_stack([rotations[i], positions[i]]), [0.0, 0.0, 0.0, 1.0]]))
-    add(chunk, "reference", _reference(p.frame))
+    _add_markers(chunk, p)
+    code, vertical = p.frame.code, p.frame.vertical
+    system = CRS.from_epsg(f"{code}" if vertical is None else f"{code}+{vertical}") if of_earth else None
+    add(chunk, "reference", _LOCAL if system is None else system.to_wkt("WKT1_GDAL"))
     (folder / CAMERAS_FILE).write_text(xml_text(root), encoding="utf-8")
     write_image_points(p, folder, p.images)
-    if p.control is not None and len(p.control.point):
-        _write_markers(p, folder)
 
 
-def _document(p: Project) -> tuple[ElementTree.Element, ElementTree.Element]:
-    root = ElementTree.Element("document", version="2.0.0")
-    return root, add(root, "chunk", label=p.title or "jaxphoto", enabled="true")
-
-
-def _add_cameras(chunk: ElementTree.Element, p: Project) -> list[ElementTree.Element]:
-    cameras = add(chunk, "cameras", next_id=str(len(p.images)), next_group_id="0")
-    return [add(cameras, "camera", id=str(i), label=name, enabled="true") for i, name in enumerate(p.images)]
-
-
-def _write_markers(p: Project, folder: Path) -> None:
-    """Write control and check points as markers in the coordinate system of the export."""
+def _add_markers(chunk: ElementTree.Element, p: Project) -> None:
+    """Add control and check points in the coordinate system of the export, and their image points."""
     control = p.in_map().control
-    assert control is not None
+    if control is None or not len(control.point):
+        return
     placed = np.flatnonzero(~np.isnan(control.xyz[:, :2]).any(axis=1))
     if left := len(control.xyz) - len(placed):
-        warn(f"{MARKERS_FILE}: skipped {left} control or check points without X and Y (markers of Metashape need both)")
-    root, chunk = _document(p)
-    _add_cameras(chunk, p)
+        warn(f"{CAMERAS_FILE}: skipped {left} control or check points without X and Y (markers of Metashape need both)")
     markers = add(chunk, "markers", next_id=str(len(placed)), next_group_id="0")
     frame = add(add(chunk, "frames", next_id="1"), "frame", id="0")
     marks, rows = add(frame, "markers"), p.rows_of_points
@@ -458,30 +371,6 @@ def _write_markers(p: Project, folder: Path) -> None:
         for row in rows[point].tolist():
             x, y = map(repr, p.column_row[row].tolist())
             add(mark, "location", camera_id=str(p.image[row]), pinned="true", x=x, y=y)
-    add(chunk, "reference", _reference(p.frame))
-    (folder / MARKERS_FILE).write_text(xml_text(root), encoding="utf-8")
-
-
-def _add_sensor(sensors: ElementTree.Element, number: int, name: str, camera: ProjectCamera) -> None:
-    kind, pixel_mm = _kind_of(camera.interior), camera.sensor.pixel_mm
-    sensor = add(sensors, "sensor", id=str(number), label=name, type=kind)
-    size = {"width": str(camera.sensor.width_px), "height": str(camera.sensor.height_px)}
-    add(sensor, "resolution", **size)
-    values = {"pixel_width": pixel_mm, "pixel_height": pixel_mm, "focal_length": float(camera.interior.c)}
-    for key, value in values.items():
-        add(sensor, "property", name=key, value=repr(float(value)))
-    calibration = add(sensor, "calibration", type=kind, **{"class": "adjusted"})
-    add(calibration, "resolution", **size)
-    _add_values(calibration, camera.sensor, camera.interior)
-
-
-def _reference(frame: Frame) -> str:
-    """Return the coordinate system as WKT."""
-    if frame.kind != "epsg" or frame.code is None:
-        return _LOCAL
-    compound = frame.vertical is not None
-    system = CRS.from_epsg(f"{frame.code}+{frame.vertical}") if compound else map_system(frame.code)
-    return system.to_wkt("WKT1_GDAL")
 
 
 FORMATS = (

@@ -7,9 +7,8 @@
 
 Image coordinates are relative to the image centre, y down, divided by the longer side of the format; focal lengths and
 c_x, c_y are divided by it, too. If there are several reconstructions, the one with most shots is read. The export
-contains cameras `brown` and `fisheye_opencv`, and gcp_list.txt if the control points are in a map system. Source:
-OpenSfM documentation, "Geometric Models", "Reconstruction file format"; opensfm/io.py, opensfm/geo.py,
-src/map/tracks_manager.
+contains cameras `brown` and `fisheye_opencv`. Source: OpenSfM documentation, "Geometric Models", "Reconstruction file
+format"; opensfm/io.py, opensfm/geo.py, src/map/tracks_manager.
 """
 
 import json
@@ -20,18 +19,20 @@ import numpy as np
 import scipy
 
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.extras.formats.camera_models import (
+from jaxphoto.extras.formats.files import Format, by_content, number_rows, warn
+from jaxphoto.extras.formats.project import (
     BROWN,
     BROWN_TERMS,
     FISHEYE_TERMS,
     OPENCV,
     OPENCV_FISHEYE,
+    Project,
     ProjectCamera,
+    about_place,
     in_pixels,
+    pose,
+    translations,
 )
-from jaxphoto.extras.formats.control import write_gcp_list
-from jaxphoto.extras.formats.files import Format, by_content, number_rows, read_json, warn
-from jaxphoto.extras.formats.project import Project, about_place, pose, translations
 from jaxphoto.georeferencing.map_frame import Place
 from jaxphoto.io.camera_files import CameraSource
 from jaxphoto.io.text_files import has_words, read_legacy_text
@@ -59,14 +60,14 @@ def read(path: Path) -> Project:
     folder = path.parent
     if not (folder / TRACKS).is_file():
         raise InputError(f"{path}: {TRACKS} not found in its folder. Copy it from the project's folder (opensfm)")
-    content = _largest(path, read_json(path))
+    content = _largest(path, json.loads(read_legacy_text(path)))
     shots, points = content.section("shots").values, content.section("points").values
     cameras = {name: _camera(path, content.section("cameras").section(name)) for name in content.section("cameras")}
     sections = [Section(path.name, f"shots.{name}", shot) for name, shot in shots.items()]
     camera_of = [shot.text("camera") for shot in sections]
-    for shot, camera in zip(sections, camera_of, strict=True):
-        if camera not in cameras:
-            raise shot.error("camera", f"unknown camera {quoted(camera)}; correct it")
+    for shot in sections:
+        if shot.text("camera") not in cameras:
+            raise shot.error("camera", f"unknown camera {quoted(shot.text('camera'))}; correct it")
     files, ids = list(shots), list(points)
 
     def vectors(key: str) -> np.ndarray:
@@ -88,15 +89,11 @@ def read(path: Path) -> Project:
 
 def _reference(folder: Path, content: Section) -> Place | None:
     """Return the origin of the world on WGS 84; None if unknown (0, 0 in reconstructions without GPS)."""
-    path = folder / REFERENCE
-    if "reference_lla" in content:
-        reference = content.section("reference_lla")
-    elif path.is_file():
-        reference = Section(path.name, "", read_json(path))
-    else:
-        return None
-    place = reference.number("longitude"), reference.number("latitude"), reference.number("altitude", 0.0)
-    return place if any(place[:2]) else None
+    path, reference = folder / REFERENCE, content.section("reference_lla")
+    if "reference_lla" not in content:
+        reference = Section(path.name, "", json.loads(read_legacy_text(path)) if path.is_file() else {})
+    place = tuple(reference.number(key, 0.0) for key in ("longitude", "latitude", "altitude"))
+    return place if any(place[:2]) else None  # type: ignore[return-value]
 
 
 def _largest(path: Path, content: Any) -> Section:
@@ -147,12 +144,16 @@ def _tracks(
             rows.append(row)
     image, point = np.array(index, int).reshape(-1, 2).T
     normalised = number_rows(xy, (2,), lambda k: f"{path.name}, row {rows[k]}")
-    size = np.array([[c.sensor.width_px, c.sensor.height_px] for c in cameras]).reshape(-1, 2)[image]
+    size = _sizes(cameras)[image]
     return image, point, normalised * size.max(axis=1, keepdims=True) + size / 2
 
 
+def _sizes(cameras: list[ProjectCamera]) -> np.ndarray:
+    return np.array([[c.sensor.width_px, c.sensor.height_px] for c in cameras]).reshape(-1, 2)
+
+
 def write(p: Project, folder: Path) -> None:
-    """Write reconstruction.json, camera_models.json, tracks.csv, gcp_list.txt and, on WGS 84, reference_lla.json."""
+    """Write reconstruction.json, camera_models.json, tracks.csv and, on WGS 84, reference_lla.json."""
     rotations = p.world_to_camera
     vectors = scipy.spatial.transform.Rotation.from_matrix(rotations).as_rotvec().tolist()
     moved = translations(rotations, p.exterior.position).tolist()
@@ -169,23 +170,17 @@ def write(p: Project, folder: Path) -> None:
         _write_json(folder / REFERENCE, reconstruction["reference_lla"])
     _write_json(folder / RECONSTRUCTION, [reconstruction])
     _write_json(folder / "camera_models.json", cameras)
-    lines = []
-    for i, rows in enumerate(p.rows_of_images):
-        sensor = p.cameras[p.image_camera[i]].sensor
-        size = np.array([sensor.width_px, sensor.height_px])
-        xy = (p.column_row[rows] - size / 2) / size.max()
-        for feature, ((x, y), point) in enumerate(zip(xy.tolist(), p.point[rows].tolist(), strict=True)):
-            lines.append(f"{p.files[i]}\t{p.points[point]}\t{feature}\t{x!r}\t{y!r}\t0\t0\t0\n")
+    size = _sizes([p.cameras[name] for name in p.image_camera])[p.image]
+    xy = ((p.column_row - size / 2) / size.max(axis=1, keepdims=True)).tolist()
+    rows = zip(p.image.tolist(), p.point.tolist(), p.number_in_image.tolist(), xy, strict=True)
+    lines = [f"{p.files[i]}\t{p.points[j]}\t{k}\t{x!r}\t{y!r}\t0\t0\t0\n" for i, j, k, (x, y) in rows]
     (folder / TRACKS).write_text("".join(lines), encoding="utf-8")
-    write_gcp_list(p, folder)
 
 
 def _written(camera: ProjectCamera) -> dict[str, Any]:
     sensor, interior, _ = camera
-    longer_mm, focal = (
-        max(sensor.width_mm, sensor.height_mm),
-        float(interior.c) / max(sensor.width_mm, sensor.height_mm),
-    )
+    longer_mm = max(sensor.width_mm, sensor.height_mm)
+    focal = float(interior.c) / longer_mm
     fisheye = type(interior.distortion) is OPENCV_FISHEYE.distortion
     return {
         "projection_type": "fisheye_opencv" if fisheye else "brown",

@@ -17,13 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxphoto.errors import InputError, quoted
-from jaxphoto.extras.formats.camera_models import BROWN_TERMS, OPENCV, ProjectCamera, in_pixels
-from jaxphoto.extras.formats.files import Format, begins_with, row_numbers
-from jaxphoto.extras.formats.points_beside import points_of
-from jaxphoto.extras.formats.project import Project, pose
+from jaxphoto.errors import InputError
+from jaxphoto.extras.formats.files import Format, row_numbers
+from jaxphoto.extras.formats.project import BROWN_TERMS, OPENCV, Project, ProjectCamera, in_pixels, pose
+from jaxphoto.extras.formats.texts import points_of
 from jaxphoto.io.camera_files import CameraSource
-from jaxphoto.io.text_files import read_legacy_text
+from jaxphoto.io.text_files import has_words, read_legacy_text
 
 CAMERAS_FILE, POINTS_FILE, OFFSET_FILE = "calibrated_camera_parameters.txt", "tp_pix4d.txt", "offset.xyz"
 _HEAD = "fileName imageWidth imageHeight"
@@ -35,29 +34,12 @@ def find(source: Path) -> list[Path]:
     """Return the camera parameter files in a params folder or a project folder."""
     folders = (source, source / "params", source / "1_initial" / "params") if source.is_dir() else ()
     paths = [path for folder in folders for path in sorted(folder.glob(f"*{CAMERAS_FILE}"))] or [source]
-    return [p for p in paths if p.is_file() and p.name.endswith(CAMERAS_FILE) and begins_with(p, _HEAD)]
+    return [p for p in paths if p.is_file() and p.name.endswith(CAMERAS_FILE) and has_words(p, _HEAD)]
 
 
 def read(path: Path) -> Project:
     """Read a project. Photographs with equal K and distortion share a camera with all parameters free."""
-    name = path.name.removesuffix(CAMERAS_FILE)
-    files, sizes, numbers = _read_cameras(path)
-    kinds, number = np.unique(np.column_stack([sizes, numbers[:, :14]]), axis=0, return_inverse=True)
-    shown = points_of(path.with_name(name + POINTS_FILE), files, path.name)
-    offset_path = path.with_name(name + OFFSET_FILE)
-    offset = (
-        row_numbers(offset_path, 1, read_legacy_text(offset_path).split(), 3) if offset_path.is_file() else np.zeros(3)
-    )
-    return Project(
-        name.strip("_"), {str(k): _camera(path, values.tolist()) for k, values in enumerate(kinds)}, (), files,
-        [str(k) for k in number.tolist()], pose(numbers[:, 17:].reshape(-1, 3, 3), numbers[:, 14:17] + offset),
-        shown.points, None, shown.image, shown.point, shown.column_row, file=path.name,
-    )  # fmt: skip
-
-
-def _read_cameras(path: Path) -> tuple[list[str], list[tuple[int, int]], np.ndarray]:
-    """Return names, sizes, and 26 values per photograph."""
-    lines = read_legacy_text(path).split("\n")
+    name, lines = path.name.removesuffix(CAMERAS_FILE), read_legacy_text(path).split("\n")
     # The header ends at the first empty line.
     begin = lines.index("") + 1 if "" in lines else len(lines)
     rows = [(k + 1, line) for k, line in enumerate(lines) if k >= begin and line.strip()]
@@ -67,27 +49,35 @@ def _read_cameras(path: Path) -> tuple[list[str], list[tuple[int, int]], np.ndar
             f"{path.name}: {len(rows)} rows, not a multiple of {each} (rows per photograph); the file is truncated "
             "or has fisheye cameras. Re-export it for perspective cameras"
         )
-    names, sizes, numbers = [], [], []
+    files, values = [], []
     for first in range(0, len(rows), each):
         row, line = rows[first]
-        words = line.rsplit(maxsplit=2)
-        if len(words) != 3 or not all(word.isdigit() and len(word) < 9 for word in words[1:]):
-            raise InputError(
-                f'{path.name}, row {row}: expected "NAME WIDTH HEIGHT", got {quoted(line)}; re-export the file'
-            )
-        names.append(words[0])
-        sizes.append((int(words[1]), int(words[2])))
+        file, *size = line.rsplit(maxsplit=2)
         below = zip(rows[first + 1 : first + each], _ROWS, strict=True)
-        numbers.append([x for (k, line), n in below for x in row_numbers(path, k, line.split(), n)])
-    return names, sizes, np.array(numbers)
+        files.append(file)
+        values.append(
+            row_numbers(path, row, size, 2)
+            + [x for (k, line), n in below for x in row_numbers(path, k, line.split(), n)]
+        )
+    numbers = np.array(values)
+    kinds, number = np.unique(numbers[:, :16], axis=0, return_inverse=True)
+    shown = points_of(path.with_name(name + POINTS_FILE), files, path.name)
+    offset, offset_path = [0.0] * 3, path.with_name(name + OFFSET_FILE)
+    if offset_path.is_file():
+        offset = row_numbers(offset_path, 1, read_legacy_text(offset_path).split(), 3)
+    return Project(
+        name.strip("_"), {str(k): _camera(path, kind.tolist()) for k, kind in enumerate(kinds)}, (), files,
+        [str(k) for k in number.tolist()], pose(numbers[:, 19:].reshape(-1, 3, 3), numbers[:, 16:19] + offset),
+        shown.points, None, shown.image, shown.point, shown.column_row, file=path.name,
+    )  # fmt: skip
 
 
 def _camera(path: Path, values: list[float]) -> ProjectCamera:
     width, height, fx, skew, cx, _, fy, cy, *_, k1, k2, k3, p1, p2 = values
-    if not (fx > 0 and fx == fy and skew == 0):
+    if fx != fy or skew != 0:
         raise InputError(f"{path.name}: K has two focal lengths or skew. Export it again")
     source = CameraSource(path)
-    sensor, _ = source.sensor(int(width), int(height))
+    sensor, _ = source.sensor(width, height)
     interior = in_pixels(source, sensor, fx, fy, (cx, cy), OPENCV, k1=k1, k2=k2, k3=k3, p1=p1, p2=p2)
     return ProjectCamera(sensor, interior, ("c_mm", "xp_mm", "yp_mm", *BROWN_TERMS))
 

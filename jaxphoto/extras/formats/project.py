@@ -1,4 +1,8 @@
-"""Format-independent project: cameras, oriented images, object points, image points and control points."""
+"""Format-independent project: cameras, oriented images, object points, image points and control points.
+
+Computer vision uses camera axes x right, y down, z forward; we use x right, y up, z backward. Pixel coordinates follow
+docs/conventions.md: the centre of the upper left pixel is (0.5, 0.5).
+"""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -7,23 +11,36 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import pandas as pd
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.arrays import to_numpy
+from jaxphoto.arrays import as_jax_array, to_numpy
 from jaxphoto.block import Block, Frame
-from jaxphoto.camera import set_parameter
+from jaxphoto.camera import (
+    AbstractDistortion,
+    AbstractProjection,
+    Agisoft,
+    Equidistant,
+    InteriorOrientation,
+    OpenCv,
+    OpenCvFisheye,
+    Perspective,
+    Sensor,
+    get_parameter,
+    parameter_names,
+    set_parameter,
+)
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError, few, quoted
-from jaxphoto.extras.formats.camera_models import ProjectCamera
-from jaxphoto.georeferencing.map_frame import MapFrame, Place, map_name, map_system, place_from_geocentric
+from jaxphoto.georeferencing.map_frame import MapFrame, Place, map_system, place_from_geocentric
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
 from jaxphoto.io.block_folder.settings import frame_section
 from jaxphoto.io.block_folder.table_layout import ANGLES, SIGMA_XYZ, coordinate_names
+from jaxphoto.io.camera_files import CameraSource
 from jaxphoto.io.text_tables import Table
-from jaxphoto.observations import ControlCoordinates
 from jaxphoto.procedures.control.surveyed import SIGMA_M, system_of
 from jaxphoto.procedures.georeference_photographs import utm_of
 from jaxphoto.unknowns import FIXED, FREE, Unknowns
@@ -35,13 +52,81 @@ _ROTATION_TOLERANCE = 1e-3
 _LEAST = 3
 # Standard deviation (m) of fixed coordinates in formats without fixed coordinates.
 _FIXED_M = 1e-4
+# Radius of the earth (m), and its relative range with heights of flights.
+_EARTH_M, _ROUGHLY = 6.37e6, 0.02
 # Semi-major axis (m) of WGS 84 and GRS 80.
 _WGS84_M = 6378137.0
-WGS84 = 4326
-# Minimum and maximum distance (m) of positions from the centre of the earth.
-_EARTH_M = (6.3e6, 6.5e6)
-# Maximum distance (m) of camera positions from the origin of the frame.
-_NEAR_M = 100e3
+
+
+# Cameras -----------------------------------------------------------------------------------------------------
+
+
+class CameraModel(NamedTuple):
+    """Distortion and projection; the distortion coefficients `lacks` are zero."""
+
+    distortion: type[AbstractDistortion]
+    lacks: tuple[str, ...]
+    projection: AbstractProjection
+
+    def only(self, *terms: str) -> "CameraModel":
+        """Return the model restricted to the coefficients `terms`."""
+        return self._replace(lacks=tuple(name for name in self.distortion.coefficients if name not in terms))
+
+
+OPENCV = CameraModel(OpenCv, ("b2",), Perspective())
+"""OpenCV's rational model with fx and fy."""
+OPENCV_FISHEYE = CameraModel(OpenCvFisheye, ("p1", "p2", "s1", "s2", "b2"), Equidistant())
+"""OpenCV's fisheye model with fx and fy."""
+BROWN = CameraModel(OpenCv, ("k4", "k5", "k6", "b2"), Perspective())
+"""OpenCV's model with k1 to k3, p1, p2, fx and fy."""
+AGISOFT = CameraModel(Agisoft, ("p3", "p4"), Perspective())
+AGISOFT_FISHEYE = CameraModel(Agisoft, ("p3", "p4"), Equidistant())
+BROWN_TERMS, FISHEYE_TERMS = ("k1", "k2", "k3", "p1", "p2"), ("k1", "k2", "k3", "k4")
+OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""OpenCV's coefficients in the order of its files."""
+
+
+class ProjectCamera(NamedTuple):
+    """Camera of a project, and the names of its free parameters."""
+
+    sensor: Sensor
+    interior: InteriorOrientation
+    free: tuple[str, ...] = ()
+
+    @staticmethod
+    def estimated(sensor: Sensor, interior: InteriorOrientation) -> "ProjectCamera":
+        """Return a camera with free c, xp, yp and all nonzero coefficients."""
+        first = ("c_mm", "xp_mm", "yp_mm")
+        names = (n for n in parameter_names(interior) if n in first or float(get_parameter(interior, n)) != 0)
+        return ProjectCamera(sensor, interior, tuple(names))
+
+    def terms(self, names: tuple[str, ...]) -> dict[str, float]:
+        """Return distortion coefficients by name."""
+        return {name: float(getattr(self.interior.distortion, name)) for name in names}
+
+
+def in_pixels(
+    source: CameraSource, sensor: Sensor, fx: float, fy: float, centre: tuple[float, float], model: CameraModel, **terms
+) -> InteriorOrientation:
+    """Convert focal lengths and principal point in pixels to an interior orientation: c is fy, b1 is fx / fy - 1."""
+    if not (fx > 0 and fy > 0):
+        raise source.error(f"focal lengths {fx:g} and {fy:g} px are not positive; give positive values")
+    if fx != fy:
+        terms["b1"] = fx / fy - 1
+    x_p, y_p = sensor.mm_from_px(np.array([centre], float))[0]
+    distortion = model.distortion(**terms)
+    interior = InteriorOrientation(fy * sensor.pixel_mm, x_p, y_p, distortion, projection=model.projection)
+    return jax.tree.map(as_jax_array, interior)
+
+
+def pixels_of(interior: InteriorOrientation, sensor: Sensor) -> tuple[float, float, float, float]:
+    """Return fx, fy and the principal point (column, row) in pixels: the inverse of `in_pixels`."""
+    fy = float(interior.c / sensor.pixel_mm)
+    column, row = sensor.px_from_mm(np.array([[float(interior.x_p), float(interior.y_p)]]))[0]
+    return fy * (1 + float(getattr(interior.distortion, "b1", 0.0))), fy, float(column), float(row)
+
+
+# Projects ----------------------------------------------------------------------------------------------------
 
 
 class ControlPoints(NamedTuple):
@@ -61,21 +146,17 @@ class ControlPoints(NamedTuple):
     @staticmethod
     def of(block: Block) -> "ControlPoints":
         """Return the control and check points of a block, control points first."""
-        control = _points([(block.control, np.nan), (block.fixed, _FIXED_M)], len(block.points))
-        check = _points([(block.check, np.nan)], len(block.points))
-        only = ~np.isin(check.point, control.point)
-        point, xyz, sigma, _ = (np.concatenate([a, b[only]]) for a, b in zip(control, check, strict=True))
-        return ControlPoints(point, xyz, sigma, np.arange(len(point)) >= len(control.point))
-
-
-def _points(kinds: list[tuple[ControlCoordinates, float]], n_points: int) -> ControlPoints:
-    """Collect coordinates by point; each kind has a default for missing standard deviations."""
-    xyz, sigma = np.full((n_points, 3), np.nan), np.full((n_points, 3), np.nan)
-    for rows, none in kinds:
-        at, sigmas = (np.asarray(rows.who), np.asarray(rows.axis)), np.asarray(rows.sigma)
-        xyz[at], sigma[at] = np.asarray(rows.value), np.where(sigmas > 0, sigmas, none)
-    known = np.flatnonzero(~np.isnan(xyz).all(axis=1))
-    return ControlPoints(known, xyz[known], sigma[known], np.zeros(len(known), bool))
+        n_points, parts = len(block.points), list[ControlPoints]()
+        for kinds in (((block.control, np.nan), (block.fixed, _FIXED_M)), ((block.check, np.nan),)):
+            xyz, sigma = np.full((2, n_points, 3), np.nan)
+            for rows, missing in kinds:
+                at, sigmas = (np.asarray(rows.who), np.asarray(rows.axis)), np.asarray(rows.sigma)
+                xyz[at], sigma[at] = np.asarray(rows.value), np.where(sigmas > 0, sigmas, missing)
+            known = np.flatnonzero(~np.isnan(xyz).all(axis=1))
+            if parts:
+                known = known[~np.isin(known, parts[0].point)]
+            parts.append(ControlPoints(known, xyz[known], sigma[known], np.full(len(known), bool(parts))))
+        return ControlPoints(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
 class Project(NamedTuple):
@@ -171,34 +252,21 @@ class Project(NamedTuple):
     @property
     def place(self) -> tuple[float, float, float] | None:
         """Longitude, latitude (degrees) and ellipsoidal height (m) of the origin; None except on WGS 84 or GRS 80."""
-        if self.frame.kind != "epsg" or self.frame.code is None or self.frame.origin is None:
-            return None
-        ellipsoid = map_system(self.frame.code).ellipsoid
-        if ellipsoid is None or ellipsoid.semi_major_metre != _WGS84_M:
+        code = self.frame.code
+        ellipsoid = None if code is None else map_system(code).ellipsoid
+        if self.frame.origin is None or ellipsoid is None or ellipsoid.semi_major_metre != _WGS84_M:
             return None
         longitude, latitude, height = map(float, self.frame.origin)
         return longitude, latitude, height
 
-    @property
-    def system(self) -> str:
-        """EPSG:code, with the code of the vertical system unless heights are ellipsoidal; "" for a local frame."""
-        return map_name(self.frame.code, self.frame.vertical) if self.frame.code is not None else ""
-
-    @property
-    def geographic(self) -> bool:
-        """True if map coordinates are longitude and latitude."""
-        return self.frame.code is not None and map_system(self.frame.code).is_geographic
-
-    def in_map(self, *, ellipsoidal: bool = False) -> "Project":
+    def in_map(self) -> "Project":
         """Convert the project to map coordinates of its frame; a local frame is unchanged.
 
         Positions and rotations are exact. Collinearity is approximate because of map scale and earth curvature.
-        `ellipsoidal` requests ellipsoidal heights in every frame.
         """
         if self.on_map or self.frame.kind != "epsg" or self.frame.code is None:
             return self
-        assert self.frame.origin is not None
-        system = MapFrame(self.frame.code, None, self.frame.origin) if ellipsoidal else self.frame.map
+        system = self.frame.map
         position = np.asarray(self.exterior.position)
         rotations = np.asarray(self.exterior.camera_from_object) @ system.local_from_grid(position)
         control = self.control
@@ -244,12 +312,10 @@ class Project(NamedTuple):
             _warn(f"{p.file}: skipped {len(skipped)} image(s) with fewer than {_LEAST} points: {few(skipped)}")
         order, names, image = order[kept], names[kept], np.searchsorted(kept, image)
         seen, point_of = np.unique(point, return_inverse=True)
-        ids = np.array(p.points, object)[seen]
+        ids, camera = np.array(p.points, object)[seen], np.array(p.image_camera, object)[order]
         exterior = jax.tree.map(lambda leaf: np.asarray(leaf)[order], p.exterior)
-        angles = np.rad2deg(np.asarray(exterior.omega_phi_kappa))
-        camera = np.array(p.image_camera, object)[order]
         coordinates = coordinate_names(p.frame)
-        pose = np.column_stack([exterior.position, angles]).T
+        pose = np.column_stack([exterior.position, np.rad2deg(np.asarray(exterior.omega_phi_kappa))]).T
         tables: dict[str, dict[str, np.ndarray]] = {
             "images": {"image": names, "camera": camera} | dict(zip((*coordinates, *ANGLES), pose, strict=True)),
             "image_points": {
@@ -269,8 +335,13 @@ class Project(NamedTuple):
         else:
             tables["control_points"] = control
             settings["sigmas"] |= dict(zip(("control_X_m", "control_Y_m", "control_Z_m"), SIGMA_M, strict=True))
-        used = set(camera)
-        settings["cameras"] = {name: _section(of) for name, of in p.cameras.items() if name in used}
+        settings["cameras"] = {}
+        for name in dict.fromkeys(camera):
+            sensor, interior, free = p.cameras[name]
+            priors = jax.tree.map(lambda _: FIXED, interior)
+            for parameter in free:
+                priors = set_parameter(priors, parameter, FREE)
+            settings["cameras"][name] = camera_section(Camera(sensor, interior, priors))
         return BlockTables(settings, {key: Table.of(p.file, values) for key, values in tables.items()}, p.file)
 
     def _control_table(self) -> dict[str, np.ndarray] | None:
@@ -294,32 +365,32 @@ class Project(NamedTuple):
 
     def _measurements(self, image: np.ndarray, control: dict[str, np.ndarray] | None) -> tuple[np.ndarray, ...]:
         """Return image, point, pixel coordinates and sigma of valid measurements."""
-        point, xy = self.point, self.column_row
-        sigma = np.full(len(point), np.nan) if self.sigma_px is None else self.sigma_px[:, 0]
+        (x, y), sigma = self.column_row.T, np.nan if self.sigma_px is None else self.sigma_px[:, 0]
+        rows = pd.DataFrame({"image": image, "point": self.point, "x": x, "y": y, "sigma": sigma})
         # A feature of several points belongs to the lowest index; a point measured twice in an image takes the first
         # feature.
-        order = np.lexsort((point, image))
-        image, point, xy, sigma = image[order], point[order], xy[order], sigma[order]
-        for by in ("xy", "point"):
-            columns = np.column_stack([image, xy if by == "xy" else point])
-            kept = np.sort(np.unique(columns, axis=0, return_index=True)[1])
-            image, point, xy, sigma = image[kept], point[kept], xy[kept], sigma[kept]
-        n_once, n_points = len(point), len(np.unique(point))
+        rows = rows.sort_values(["image", "point"], kind="stable")
+        rows = rows.drop_duplicates(["image", "x", "y"]).drop_duplicates(["image", "point"])
+        n_once, n_points = len(rows), rows.point.nunique()
         fixed = set() if control is None else set(control["point"][control["role"] == "control"])
         is_control = np.array([name in fixed for name in self.points], bool)
-        while True:
+        tied = np.zeros(0, bool)
+        while not tied.all() or len(tied) != len(rows):
+            image, point = rows.image.to_numpy(), rows.point.to_numpy()
             tied = (np.bincount(point, minlength=len(is_control))[point] >= 2) | is_control[point]
             tied &= np.bincount(image[tied], minlength=len(self.files))[image] >= _LEAST
-            if tied.all():
-                break
-            image, point, xy, sigma = image[tied], point[tied], xy[tied], sigma[tied]
-        n_skipped = n_points - len(np.unique(point))
-        if n_once < len(order) or n_skipped:
+            rows = rows[tied]
+        n_skipped = n_points - rows.point.nunique()
+        if n_once < len(self.point) or n_skipped:
             _warn(
-                f"{self.file}: skipped {len(order) - n_once} duplicate measurement(s) and {n_skipped} point(s) "
+                f"{self.file}: skipped {len(self.point) - n_once} duplicate measurement(s) and {n_skipped} point(s) "
                 "in fewer than two images"
             )
-        return image, point, xy, sigma
+        return (
+            *(rows[name].to_numpy() for name in ("image", "point")),
+            rows[["x", "y"]].to_numpy(),
+            rows.sigma.to_numpy(),
+        )
 
 
 def flipped(rotations: ArrayLike) -> Float[np.ndarray, "n 3 3"]:
@@ -358,14 +429,6 @@ def _cells(values: Float[np.ndarray, "n"]) -> np.ndarray:
     return np.array(["" if np.isnan(v) else repr(v) for v in values.tolist()], object)
 
 
-def _section(camera: ProjectCamera) -> dict[str, Any]:
-    """Return the [cameras.X] table of a camera."""
-    priors = jax.tree.map(lambda _: FIXED, camera.interior)
-    for name in camera.free:
-        priors = set_parameter(priors, name, FREE)
-    return camera_section(Camera(camera.sensor, camera.interior, priors))
-
-
 def _check_rotations(p: Project) -> None:
     r = np.asarray(p.exterior.camera_from_object)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -389,9 +452,7 @@ def _image_names(files: list[str]) -> list[str]:
 
 def is_geocentric(xyz: Float[np.ndarray, "n 3"]) -> bool:
     """Return True if the distance of all positions from the origin is near the radius of the earth."""
-    with np.errstate(over="ignore"):
-        distance = np.linalg.norm(xyz, axis=1)
-    return len(xyz) > 0 and bool(((distance > _EARTH_M[0]) & (distance < _EARTH_M[1])).all())
+    return len(xyz) > 0 and bool((np.abs(np.linalg.norm(xyz / _EARTH_M, axis=1) - 1) < _ROUGHLY).all())
 
 
 def geocentric(p: Project, code: int, vertical: int | None) -> Project:
@@ -406,25 +467,8 @@ def geocentric(p: Project, code: int, vertical: int | None) -> Project:
 
 
 def about_place(p: Project, place: Place) -> Project:
-    """Place a project in east-north-up axes at `place` (WGS 84) into a frame of the UTM zone there.
-
-    The frame stays local, with a UserWarning, if camera positions are more than 100 km away or `place` is invalid.
-    """
-    far = float(np.abs(np.asarray(p.exterior.position)).max(initial=0.0))
-    if not (far < _NEAR_M and abs(place[0]) <= 180 and abs(place[1]) <= 90):
-        return _local(p, f"photographs are {far / 1000:.0f} km from its origin")
-    try:
-        return p._replace(frame=Frame("epsg", utm_of(*place[:2]), None, "true", place))
-    except InputError as error:
-        return _local(p, str(error))
-
-
-def in_system(p: Project, words: str) -> Project:
-    """Set the map system named in `words`; the project stays local, with a UserWarning, if this fails."""
-    try:
-        return with_system(p, words)
-    except InputError as error:
-        return _local(p, str(error).removeprefix(f"{p.file}: "))
+    """Place a project in east-north-up axes at `place` (WGS 84) into a frame of the UTM zone there."""
+    return p._replace(frame=Frame("epsg", utm_of(*place[:2]), None, "true", place))
 
 
 def with_system(p: Project, words: str) -> Project:
@@ -447,8 +491,3 @@ def _frame_amid(code: int, vertical: int | None, places: Float[np.ndarray, "n 3"
     """Return a frame whose origin is the rounded median of `places`."""
     longitude, latitude, _ = np.median(places, axis=0)
     return Frame("epsg", code, vertical, "true", (round(float(longitude), 4), round(float(latitude), 4), 0.0))
-
-
-def _local(p: Project, why: str) -> Project:
-    _warn(f"{p.file}: the georeference is skipped and coordinates are used as Cartesian metres: {why}")
-    return p
