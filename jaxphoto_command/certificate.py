@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
-import numpy as np
+import pandas as pd
 
 from jaxphoto.camera.conditions import Conditions
 from jaxphoto.errors import InputError
@@ -16,13 +16,11 @@ from jaxphoto.io.conditions import CONDITIONS, conditions_of, marked, read_condi
 from jaxphoto.io.photographs import SUFFIXES, picture_files
 from jaxphoto.io.result_tables import INPUTS, block_inputs, read_inputs, write_inputs
 from jaxphoto.io.text_files import read_json
-from jaxphoto.io.text_tables import read_csv
-from jaxphoto.report.certificate import Certified, ExteriorCorrelation, FormatBand, LastCalibration, certificate_page
+from jaxphoto.report.certificate import Certified, FormatBand, LastCalibration, certificate_page
 from jaxphoto.report.page import write_pdf
 from jaxphoto.report.stability import Compared
 from jaxphoto.writing import InputFile, input_file, whole_file
 
-_MIN_CELLS = 4
 # Files that identify the previous calibration.
 _CAMERA_FILES = ("interior.csv", "correlation.csv", "camera.toml", "block.toml")
 _MEASUREMENTS = ("image_points.csv", *SUFFIXES)
@@ -61,6 +59,8 @@ def certificate_document(
         conditions = read_conditions(folder / CONDITIONS)
     if (folder / INPUTS).is_file():
         inputs += read_inputs(folder / INPUTS)
+    path = folder / "correlation_summary.csv"
+    correlations = pd.read_csv(path) if path.is_file() else pd.DataFrame({"camera": []})
     return certificate_page(
         Certified(
             camera=file.name,
@@ -68,7 +68,7 @@ def certificate_document(
             interior=file.interior,
             covariance=file.covariance,
             summary=read_json(folder / "summary.json"),
-            with_exterior=_exterior_correlations(folder, file.name),
+            with_exterior=correlations[correlations["camera"].astype(str) == file.name],
             conditions=conditions,
             inputs=inputs,
             all_inputs=(folder / INPUTS).is_file(),
@@ -76,17 +76,6 @@ def certificate_document(
             band=_format_band(halves) if halves else None,
         )
     )
-
-
-def _exterior_correlations(folder: Path, camera: str) -> list[ExteriorCorrelation]:
-    path = folder / "correlation_summary.csv"
-    if not path.is_file():
-        return []
-    table = read_csv(path, ("camera", "exterior", "interior", "mean_abs_rho", "max_abs_rho"), text=("exterior",))
-    rows = table.take(table.ids("camera") == camera)
-    labels = (rows.ids(name).tolist() for name in ("exterior", "interior"))
-    values = (rows.numbers(name).tolist() for name in ("mean_abs_rho", "max_abs_rho"))
-    return [ExteriorCorrelation(*row) for row in zip(*labels, *values, strict=True)]
 
 
 def _last_calibration(current: CameraFile, folder: Path, last: Path) -> LastCalibration:
@@ -103,14 +92,15 @@ def _last_calibration(current: CameraFile, folder: Path, last: Path) -> LastCali
 
 
 def _format_band(folder: Path) -> FormatBand:
-    path, summary = folder / "cells.csv", read_json(folder / "summary.json")
-    columns = ("x_mm", "y_mm", "band_px")
-    table = read_csv(path, columns, ("promised_px", "factor", "halves_px", "halves_band_px"))
-    x, y, band = (table.numbers(name) for name in columns)
-    factor, sigma = (summary.get(name) for name in ("factor", "sigma_factor"))
-    if not all(isinstance(v, int | float) and math.isfinite(v) for v in (factor, sigma)) or len(band) < _MIN_CELLS:
+    summary = read_json(folder / "summary.json") if (folder / "cells.csv").is_file() else {}
+    if "sigma_factor" not in summary:
         raise InputError(f"{folder} is not a result folder of jaxphoto halves; give one")
-    return FormatBand(np.stack([x, y], axis=1), band, float(factor), float(sigma), input_file(path, "halves/cells.csv"))  # type: ignore[arg-type]
+    table = pd.read_csv(folder / "cells.csv")
+    factors = float(summary["factor"]), float(summary["sigma_factor"])
+    band = table["band_px"].to_numpy()
+    return FormatBand(
+        table[["x_mm", "y_mm"]].to_numpy(), band, *factors, input_file(folder / "cells.csv", "halves/cells.csv")
+    )
 
 
 def read_two(

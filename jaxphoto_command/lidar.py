@@ -67,7 +67,7 @@ def lidar_control(
     from jaxphoto.lidar import HeightSettings
     from jaxphoto.procedures.lidar import lidar_control
     from jaxphoto.procedures.lidar.vertical_control import flag_counts
-    from jaxphoto.report.lidar import heights_figure, heights_page, heights_table, print_rounds, rounds_table
+    from jaxphoto.report.lidar import heights_page, heights_table, print_rounds, rounds_table
 
     settings = HeightSettings(sigma_z_m=sigma_z_m, sigma_xy_m=sigma_xy_m, sigma_systematic_m=sigma_systematic_m)
     selection = {"classes": opt.class_numbers(classes), "returns": returns, "epsg": cloud_epsg, "unit": cloud_unit}
@@ -78,12 +78,10 @@ def lidar_control(
         result = lidar_control(read, points, method, settings, max_rounds=max_rounds, report=report)  # type: ignore[arg-type]
         progress.update(f"writing {out}")
         heights, rounds = heights_table(result), rounds_table(result.rounds)
-        picture = heights_figure(result)
-        page = heights_page(result, picture, output.command_record(block, cloud))
+        page = heights_page(result, output.command_record(block, cloud))
         with whole_block(result.block, out) as folder:
             heights.to_csv(folder / "lidar_heights.csv", index=False)
             rounds.to_csv(folder / "lidar_rounds.csv", index=False)
-            picture.savefig(folder / "lidar_heights.png")
             (folder / "report.html").write_text(page, encoding="utf-8")
     print_rounds(result.rounds, result.converged, output.screen)
     rejected = flag_counts(result.flag[~np.isfinite(result.height)]).items()

@@ -51,7 +51,6 @@ def test_photographs_become_a_block(taken, tmp_path, monkeypatch, capsys):
     # Simulated rays err independently.
     assert 1 <= summary["alike"] < 1.2
     assert summary["matching"] == {"n_gross": 2 * summary["n_pairs"], "sigma_factor": 1.0}
-    assert {p.name for p in out.glob("*.png")} == {"orientation_network.png", "orientation_residuals.png"}
 
 
 @pytest.mark.parametrize(

@@ -19,11 +19,9 @@ from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot, 
 from jaxphoto.report.plots import axes_or_new, label, new_figure
 from jaxphoto.report.results import assumed_pixels
 from jaxphoto.sensitivity import Draws
-from jaxphoto.statistics import Correlations, Covariance, correlation_matrix
 from jaxphoto.writing import whole_file
 
 if TYPE_CHECKING:
-    import xarray as xr
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -132,13 +130,10 @@ def draws_figure(columns: Mapping[str, np.ndarray], summary: pd.DataFrame) -> Fi
     """Draw histograms of some columns, with the nominal value and the predicted normal density."""
     chosen = list(columns)[:_SHOWN]
     across = min(3, len(chosen))
-    down = -(-len(chosen) // across)
-    figure = new_figure(3.3 * across, 2.5 * down)
-    figure.set_layout_engine("constrained", h_pad=0.1)
-    for axes, name in zip(figure.subplots(down, across, squeeze=False).flat, chosen, strict=False):
-        _draw_histogram(axes, name, np.asarray(columns[name], float), summary)
-    for axes in figure.axes[len(chosen) :]:
-        axes.set_axis_off()
+    figure = new_figure(3.3 * across, 2.5 * -(-len(chosen) // across))
+    for k, name in enumerate(chosen):
+        panel = figure.add_subplot(-(-len(chosen) // across), across, k + 1)
+        plot_draws(pd.DataFrame({name: columns[name]}), summary, name, panel)
     return figure
 
 
@@ -152,14 +147,12 @@ def plot_draws(draws: pd.DataFrame, summary: pd.DataFrame, quantity: str, ax: Ax
     if quantity not in quantities or quantity not in draws:
         names = ", ".join(name for name in quantities if name in draws and not name.startswith(LONG))
         raise InputError(f"unknown quantity {quantity!r} of the draws; use one of {names}, or one of images or points")
-    ax = axes_or_new(ax)
-    _draw_histogram(ax, quantity, draws[quantity].to_numpy(float), summary)
+    ax, of = axes_or_new(ax), summary.set_index("quantity").loc[quantity]
+    _draw_histogram(ax, quantity, draws[quantity].to_numpy(float), float(of["nominal"]), float(of["predicted_sigma"]))
     return ax
 
 
-def _draw_histogram(axes: Axes, name: str, values: np.ndarray, summary: pd.DataFrame) -> None:
-    of = summary.set_index("quantity")
-    nominal, sigma = (float(of[column].loc[name]) for column in ("nominal", "predicted_sigma"))
+def _draw_histogram(axes: Axes, name: str, values: np.ndarray, nominal: float, sigma: float) -> None:
     # Skip the histogram if draws differ only by rounding.
     if len(values) and np.ptp(values) > 1e-12 * np.abs(values).max(initial=1e-300):
         axes.hist(values, bins=min(60, max(5, int(np.sqrt(len(values))))), density=True, color="0.75")
@@ -230,80 +223,7 @@ def write_draws_page(
         work.write_text(text, encoding="utf-8")
 
 
-# xarray data sets for arrays of more than two dimensions: correlations by image, draws by image and point. Values are
-# in radians, metres and millimetres, as stated in the coordinate names.
-
-
-def correlation_cube(correlations: Correlations) -> xr.Dataset:
-    """Return the correlations of a camera as an xarray data set.
-
-    Variables: `interior` (parameter, with_parameter), `exterior` (image, element, parameter), `within_image` (image,
-    element, with_element).
-    """
-    # Import locally: xarray takes a third of a second.
-    import xarray as xr
-
-    c = correlations
-    return xr.Dataset(
-        {
-            "interior": (("parameter", "with_parameter"), c.interior),
-            "exterior": (("image", "element", "parameter"), c.exterior),
-            "within_image": (("image", "element", "with_element"), c.within_image),
-        },
-        coords={
-            "parameter": list(c.parameters),
-            "with_parameter": list(c.parameters),
-            "image": list(c.images),
-            "element": list(c.eop_names),
-            "with_element": list(c.eop_names),
-        },
-        attrs={"camera": c.camera},
-    )
-
-
-def covariance_array(known: Covariance) -> xr.DataArray:
-    """Return the correlations of all exterior orientations and shared unknowns as an xarray array.
-
-    Dimensions: (unknown, with_unknown). The coordinate `sigma` (unknown) is a posteriori, in the units of the labels. A
-    fixed unknown has zero sigma and no correlation.
-    """
-    import xarray as xr
-
-    names = list(known.labels)
-    sigma = np.concatenate([np.asarray(known.exterior_sigma).ravel(), np.asarray(known.shared_sigma)])
-    coords = {"unknown": names, "with_unknown": names, "sigma": ("unknown", sigma)}
-    return xr.DataArray(correlation_matrix(known), coords, ("unknown", "with_unknown"), name="correlation")
-
-
-def draws_cube(draws: Draws, adjusted: Adjustment) -> xr.Dataset:
-    """Return the draws of a Monte Carlo simulation as an xarray data set.
-
-    Variables: `shared` (draw, parameter), `error` (draw, of_error), `converged`, `iterations` and `fallback` (draw). If
-    stored, also `exterior` (draw, image, element) and `points` (draw, point, axis).
-    """
-    import xarray as xr
-
-    variables: dict[str, tuple[tuple[str, ...], np.ndarray]] = {
-        "shared": (("draw", "parameter"), draws.shared),
-        "converged": (("draw",), draws.converged),
-        "iterations": (("draw",), draws.steps),
-        "fallback": (("draw",), draws.fallback),
-    }
-    coords: dict[str, object] = {"draw": np.arange(len(draws.steps)), "parameter": list(draws.labels)}
-    if draws.recorded:
-        variables["error"] = ("draw", "of_error"), np.stack(list(draws.recorded.values()), axis=1)
-        coords["of_error"] = list(draws.recorded)
-    if draws.exterior is not None:
-        variables["exterior"] = ("draw", "image", "element"), draws.exterior
-        coords |= {"image": list(adjusted.block.images), "element": list(EXTERIOR)}
-    if draws.points is not None:
-        variables["points"] = ("draw", "point", "axis"), draws.points
-        coords |= {"point": list(adjusted.block.points), "axis": list(AXES)}
-    return xr.Dataset(variables, coords)
-
-
 _ANGLES = ("omega", "phi", "kappa")
-_PANEL, _ACROSS = 2.6, 4
 _NORMAL_97_5 = 1.959964
 
 
@@ -333,49 +253,27 @@ def posterior_figure(posterior: Posterior) -> Figure:
     """Draw the sample of each parameter with its Gaussian, and the pair that deviates most from its 95 % ellipse."""
     names, factor = _names_and_factors(posterior)
     k = len(names)
-    panels = k + (k > 1)
-    down = -(-panels // _ACROSS)
-    figure = new_figure(_PANEL * min(panels, _ACROSS), _PANEL * down)
-    places = [figure.add_subplot(down, min(panels, _ACROSS), 1 + n) for n in range(panels)]
+    figure = new_figure(2.6 * min(k + 1, 4), 2.6 * -(-(k + 1) // 4))
+    panels = [figure.add_subplot(-(-(k + 1) // 4), min(k + 1, 4), 1 + n) for n in range(k + (k > 1))]
     draws, optimum = posterior.draws * factor, posterior.optimum * factor
     laplace = posterior.laplace * np.outer(factor, factor)
-    for j, axes in enumerate(places[:k]):
-        _marginal(axes, draws[:, j], optimum[j], np.sqrt(laplace[j, j]))
-        axes.set_xlabel(label(names[j]), fontsize=8)
+    for j, name in enumerate(names):
+        _draw_histogram(panels[j], name, draws[:, j], optimum[j], float(np.sqrt(laplace[j, j])))
     if k > 1:
         pair = list(np.unravel_index(np.argmax(posterior.outside), posterior.outside.shape))
-        _pair(places[k], draws[:, pair], optimum[pair], laplace[np.ix_(pair, pair)])
-        places[k].set_xlabel(label(names[pair[0]]), fontsize=8)
-        places[k].set_ylabel(label(names[pair[1]]), fontsize=8)
-        places[k].set_title(f"{100 * posterior.outside[tuple(pair)]:.0f} % outside, not 5 %", fontsize=8)
-    for axes in places:
-        axes.tick_params(labelsize=7)
-        axes.locator_params(axis="x", nbins=4)
-    places[0].legend(fontsize=7)
+        turn = np.linspace(0, 2 * np.pi, 200)
+        circle = np.sqrt(-2 * np.log(0.05)) * np.stack([np.cos(turn), np.sin(turn)])
+        panels[k].plot(*draws[:, pair].T, ".", ms=1.5, color="tab:blue", alpha=0.4)
+        ellipse = np.linalg.cholesky(laplace[np.ix_(pair, pair)]) @ circle
+        panels[k].plot(*(optimum[pair][:, None] + ellipse), color="tab:red", lw=1.2)
+        panels[k].set(xlabel=label(names[pair[0]]), ylabel=label(names[pair[1]]))
+        panels[k].set_title(f"{100 * posterior.outside[tuple(pair)]:.0f} % outside, not 5 %", fontsize=8)
     return figure
 
 
 def _names_and_factors(posterior: Posterior) -> tuple[list[str], np.ndarray]:
     """Return the names with units, and the factors to these units."""
-    names, factor = [], np.ones(len(posterior.parameters))
-    for j, parameter in enumerate(posterior.parameters):
-        last = parameter.rsplit(".", 1)[-1]
-        if last in _ANGLES:
-            factor[j] = np.rad2deg(1.0)
-        names.append(parameter + ("_deg" if last in _ANGLES else "_m" if last in ("X", "Y", "Z") else ""))
-    return names, factor
-
-
-def _marginal(axes: Axes, sample: np.ndarray, optimum: float, sigma: float) -> None:
-    axes.hist(sample, bins=40, density=True, color="tab:blue", alpha=0.5, label="posterior")
-    x = np.linspace(min(sample.min(), optimum - 3 * sigma), max(sample.max(), optimum + 3 * sigma), 200)
-    density = np.exp(-0.5 * ((x - optimum) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
-    axes.plot(x, density, color="tab:red", lw=1.2, label="Laplace")
-    axes.set_yticks([])
-
-
-def _pair(axes: Axes, sample: np.ndarray, optimum: np.ndarray, covariance: np.ndarray) -> None:
-    axes.plot(*sample.T, ".", ms=1.5, color="tab:blue", alpha=0.4)
-    turn = np.linspace(0, 2 * np.pi, 200)
-    circle = np.sqrt(-2 * np.log(0.05)) * np.stack([np.cos(turn), np.sin(turn)])
-    axes.plot(*(optimum[:, None] + np.linalg.cholesky(covariance) @ circle), color="tab:red", lw=1.2)
+    last = [parameter.rsplit(".", 1)[-1] for parameter in posterior.parameters]
+    units = ["_deg" if name in _ANGLES else "_m" if name in AXES else "" for name in last]
+    names = [parameter + unit for parameter, unit in zip(posterior.parameters, units, strict=True)]
+    return names, np.where([unit == "_deg" for unit in units], np.rad2deg(1.0), 1.0)

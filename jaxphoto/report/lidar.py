@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ from jaxphoto.procedures.lidar.vertical_control import flag_counts
 from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.formatting import without_empty, without_unit
 from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, Plot, page, provenance, verdict_parts
-from jaxphoto.report.plots import axes_or_new, new_figure, title
+from jaxphoto.report.plots import axes_or_new, title
 from jaxphoto.report.results import summary_of, write_results, write_study
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.terminal import print_lines
@@ -31,7 +31,6 @@ from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # Maximum number of rows of a long table on a page.
 _ROWS = 30
@@ -167,33 +166,14 @@ def _ground(axes: Axes) -> None:
     axes.locator_params(nbins=6)
 
 
-def above_figure(result: Simultaneous) -> Figure:
-    """Draw `plot_above` before and after."""
-    figure = new_figure(10.0, 4.6)
-    for axes, before in zip(figure.subplots(1, 2, sharex=True, sharey=True), (True, False), strict=True):
-        plot_above(result, axes, before=before)
-    return figure
-
-
-def heights_figure(control: LidarControl) -> Figure:
-    """Draw both plots of `plot_lidar_heights`."""
-    figure = new_figure(10.0, 4.6)
-    for axes, residuals in zip(figure.subplots(1, 2, sharex=True, sharey=True), (False, True), strict=True):
-        if not residuals or control.used.any():
-            plot_lidar_heights(control, axes, residuals=residuals)
-    return figure
-
-
 @contextmanager
 def write_simultaneous(
     result: Simultaneous, directory: Path, seconds: dict[str, float], record: CommandRecord
 ) -> Iterator[Path]:
-    """Write the tables of iterations, changes, surfaces and correlations, a plot, the report and the adjustment.
+    """Write the tables of iterations, changes, surfaces and correlations, the report and the folder `adjustment`.
 
-    Files also include summary.json and the result folder `adjustment`. Yields the temporary folder so that the caller
-    can add files. Raises InputError if `directory` contains anything but an earlier result.
+    Yields the temporary folder so that the caller can add files.
     """
-    began = time.perf_counter()
     with whole_folder(directory) as work:
         tables = Tables(result.adjusted)
         verdict, times = verdict_of(tables), result.adjusted.seconds
@@ -204,13 +184,14 @@ def write_simultaneous(
             moved_table(result),
             scanner_correlations(result.adjusted),
         )
-        figure, free = above_figure(result), moved["sigma"].notna()
+        free = moved["sigma"].notna()
         parts: list[Part] = [
             *verdict_parts(verdict),
             *(Paragraph(as_sentence(sentence)) for sentence in rounds_words(result.rounds, result.converged)),
             Link("all results of the images", "adjustment/report.html"), Heading("Changes"), moved[free],
             Paragraph("Root mean square changes:"), without_empty(moved[~free]),
-            Plot(figure, "points above the surface of the cloud, before and after"), Heading("Iterations"),
+            [Plot(partial(plot_above, result, before=b), f"points above the cloud {w}", 4)
+             for b, w in ((True, "before"), (False, "after"))], Heading("Iterations"),
             rounds.replace(np.inf, np.nan), Heading("Correlations of the scanner"),
             Paragraph("The strongest; all are in scanner_correlation.csv."), _strongest(correlations),
         ]  # fmt: skip
@@ -220,12 +201,11 @@ def write_simultaneous(
             "surfaces": surfaces_table(result),
             "scanner_correlation": correlations,
         }
-        summary = summary_of(tables, verdict, seconds | {"write": time.perf_counter() - began})
+        summary = summary_of(tables, verdict, seconds)
         write_study(
             work, f"{tables.adjusted.block.title or 'Block'} and cloud, adjusted together",
             (verdict.headline, verdict.colour), parts,
             summary | {"rounds": len(result.rounds), "iteration_converged": result.converged}, record, files,
-            {"above": figure},
         )  # fmt: skip
         yield work
 
@@ -254,7 +234,7 @@ def print_rounds(rounds: Sequence[Round], converged: bool, console: Console) -> 
     print_lines(rounds_words(rounds, converged), console)
 
 
-def heights_page(control: LidarControl, figure: Figure, record: CommandRecord) -> str:
+def heights_page(control: LidarControl, record: CommandRecord) -> str:
     """Return the page of cloud heights as control: iterations, flags, plot, and the largest differences."""
     heights = heights_table(control)
     heights.insert(5, "difference_m", heights["height_m"] - heights["Z_m"])
@@ -266,7 +246,11 @@ def heights_page(control: LidarControl, figure: Figure, record: CommandRecord) -
     parts: list[Part] = [
         *(Paragraph(as_sentence(sentence)) for sentence in words[1:]),
         Heading("Over the ground"),
-        Plot(figure, "heights of the cloud as control, and their residuals"),
+        [
+            Plot(partial(plot_lidar_heights, control, residuals=r), words, 4)
+            for r, words in ((False, "heights of the cloud as control"), (True, "residuals of the control heights"))
+            if control.used.any() or not r
+        ],
         Heading("Iterations"),
         rounds_table(control.rounds).replace(np.inf, np.nan),
     ]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,14 +17,13 @@ from jaxphoto.errors import InputError
 from jaxphoto.procedures.model_choice import ModelChoice
 from jaxphoto.report.formatting import of_p, to_rich, without_empty
 from jaxphoto.report.page import CommandRecord, Heading, Part, Plot
-from jaxphoto.report.plots import axes_or_new, label, new_figure, title
+from jaxphoto.report.plots import axes_or_new, label, title
 from jaxphoto.report.results import assumed_pixels, rounded, write_study
 from jaxphoto.report.terminal import print_lines
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # Columns of `choice_table` on the page, with their formats; the terminal shows only some of them.
 _SHOWN: dict[str, Callable[[Any], str]] = {
@@ -96,16 +95,6 @@ def choice_verdict(choice: ModelChoice) -> list[str]:
     return sentences + [f"{j.candidate.name} could not be adjusted: {j.problem}" for j in choice.judged if j.problem]
 
 
-def choice_figure(choice: ModelChoice) -> Figure:
-    """Draw both plots of `plot_models` side by side; empty if no model could be adjusted."""
-    known = [j for j in choice.judged if math.isfinite(j.bic)]
-    figure = new_figure(9.6, 1.2 + 0.36 * max(len(known), 3))
-    if known:
-        for axes, rms in zip(figure.subplots(1, 2, sharey=True), (False, True), strict=True):
-            plot_models(choice, axes, rms=rms)
-    return figure
-
-
 def plot_models(choice: ModelChoice, ax: Axes | None = None, *, rms: bool = False) -> Axes:
     """Draw BIC minus the smallest BIC by model, or the `rms` of adjusted and held-out image points (px).
 
@@ -146,30 +135,26 @@ def plot_models(choice: ModelChoice, ax: Axes | None = None, *, rms: bool = Fals
 def write_model_choice(
     choice: ModelChoice, block: Block, directory: Path, seconds: dict[str, float], record: CommandRecord
 ) -> None:
-    """Write models.csv, parameters.csv, models.png, report.html and summary.json.
-
-    Raises InputError if `directory` contains anything but an earlier result.
-    """
-    began, verdict, figure = time.perf_counter(), choice_verdict(choice), choice_figure(choice)
-    table, parameters = choice_table(choice), parameter_table(choice)
+    """Write models.csv, parameters.csv, report.html and summary.json."""
+    verdict, table, parameters = choice_verdict(choice), choice_table(choice), parameter_table(choice)
+    names = {False: "BIC above the smallest, by model", True: "RMS of image points adjusted and held out, by model"}
+    plots: list[Plot] = [Plot(partial(plot_models, choice, rms=rms), name) for rms, name in names.items()]
     parts: list[Part] = [
         *assumed_pixels(block.sensors),
         Heading("Models"),
         _shown(table),
-        Plot(figure, "BIC above the smallest, and RMS of image points adjusted and held out, by model"),
+        plots if choice.by_bic else [],
         Heading("Estimated parameters of every model"),
         parameters,
     ]
     summary = {
         "title": block.title, "verdict": verdict, "by_bic": choice.by_bic, "by_prediction": choice.by_prediction,
-        "n_left_out": choice.n_left_out, "models": table["model"].tolist(),
-        "seconds": rounded(seconds | {"write": time.perf_counter() - began}),
+        "n_left_out": choice.n_left_out, "models": table["model"].tolist(), "seconds": rounded(seconds),
     }  # fmt: skip
+    tables = {"models": table, "parameters": parameters}
     with whole_folder(directory) as work:
-        write_study(
-            work, f"{block.title or 'block'}: models", (". ".join(verdict), ""), parts, summary, record,
-            {"models": table, "parameters": parameters}, {"models": figure},
-        )  # fmt: skip
+        name = f"{block.title or 'block'}: models"
+        write_study(work, name, (". ".join(verdict), ""), parts, summary, record, tables)
 
 
 def print_model_choice(choice: ModelChoice, console: Console) -> None:

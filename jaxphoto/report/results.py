@@ -1,5 +1,6 @@
 """The result folder of an adjustment: tables, summary.json and the report."""
 
+import itertools
 import json
 import math
 import time
@@ -18,8 +19,8 @@ from jaxphoto.camera import RATES, InteriorOrientation, Sensor, get_parameter, m
 from jaxphoto.compiling.freed_memory import return_freed_memory
 from jaxphoto.errors import InputError, camera_words, counted
 from jaxphoto.observations import AXES
-from jaxphoto.report import distortion, plots
-from jaxphoto.report.block_plot import block_view, block_words, plot_block
+from jaxphoto.report import plots
+from jaxphoto.report.block_plot import block_words, plot_block
 from jaxphoto.report.findings import Verdict, as_sentence, p_words
 from jaxphoto.report.formatting import (
     check_table_format,
@@ -46,7 +47,6 @@ from jaxphoto.statistics import (
     LEAST_CHECK_POINTS,
     LEAST_CHECKED,
     LEVEL,
-    ComponentAccuracy,
     PositionalAccuracy,
     global_test,
 )
@@ -173,13 +173,10 @@ def write_study(
     summary: Mapping[str, Any],
     record: CommandRecord,
     tables: Mapping[str, pd.DataFrame] = MappingProxyType({}),
-    figures: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
-    """Write tables (CSV), figures (PNG), report.html and summary.json of a study into the folder `work`."""
+    """Write tables (CSV), report.html and summary.json of a study into the folder `work`."""
     for name, table in tables.items():
         table.to_csv(work / f"{name}.csv", index=False)
-    for name, figure in figures.items():
-        figure.savefig(work / f"{name}.png")
     text = page(title, [*parts, *provenance(record)], verdict)
     (work / "report.html").write_text(text, encoding="utf-8")
     write_summary({**summary, "versions": versions()}, work)
@@ -282,13 +279,13 @@ def adjustment_sections(
         yield Heading("Distortion")
         yield Paragraph("Measured minus ideal image coordinates along the radius, for the adjusted c.")
         for camera in mapped:
-            curve, words = distortion.distortion_of(tables, camera), camera_words(camera)
+            curve, words = plots.distortion_of(tables, camera), camera_words(camera)
             yield [
                 Plot(
-                    partial(distortion.draw_distortion, curve=curve, factor=factor),
+                    partial(plots.draw_distortion, curve=curve, factor=factor),
                     f"distortion of {words} by distance",
                 ),
-                Plot(partial(distortion.plot_distortion_band, tables, camera), f"95 % band for {words}"),
+                Plot(partial(plots.plot_distortion_band, tables, camera), f"95 % band for {words}"),
             ]
         yield Heading("Projection uncertainty over the image format")
         yield Paragraph(
@@ -314,8 +311,6 @@ def adjustment_sections(
         yield tables.georeferencing
     yield Heading("Block")
     yield [Plot(partial(plot_block, a), block_words(a.block), 4.2)]
-    if (view := block_view(a, tables.covariance)) is not None:
-        yield view
     yield from _residuals(tables, cameras)
     yield from points_section(tables, unit)
     yield from _check_points(tables)
@@ -326,10 +321,7 @@ def adjustment_sections(
     if len(tables.convergence):
         yield Heading("Convergence")
         yield Paragraph(convergence_words(a))
-        yield [
-            Plot(partial(plots.plot_convergence, tables), "sigma naught before each step and at the end", 3),
-            Plot(partial(plots.plot_convergence, tables, steps=True), "length of each step and tolerance", 3),
-        ]
+        yield [Plot(partial(plots.plot_convergence, tables), "sigma naught before each step and at the end", 3)]
         yield tables.convergence.tail(_STEPS).rename(columns={"length": "step in sigmas"})
 
 
@@ -437,32 +429,23 @@ def points_section(tables: Tables, unit: str = "m") -> Iterator[Part]:
     table = table[table["n_images"] > 0]
     if table.empty:
         return
-    yield Heading("Object points")
+    edges = pd.IntervalIndex.from_breaks([*_RAYS, math.inf], closed="left")
+    names = [f"{low} to {high - 1}" if high > low + 1 else str(low) for low, high in itertools.pairwise(_RAYS)]
+    rays = pd.cut(table["n_images"], edges).cat.rename_categories([*names, f"{_RAYS[-1]} or more"])
     rows = []
-    classes = [(low, high) for low, high in zip(_RAYS, (*_RAYS[1:], math.inf), strict=True)]
-    for low, high in [*classes, (0, math.inf)]:
-        of = table[(table["n_images"] >= low) & (table["n_images"] < high)]
-        name = str(low) if high == low + 1 else f"{low} to {high - 1}" if high < math.inf else f"{low} or more"
-        sigmas = {f"median sigma {axis} [{unit}]": of_sigma(of[f"sigma_{axis}_m"].median()) for axis in AXES}
-        counts = {"points": len(of), "fraction": f"{100 * len(of) / len(table):.1f} %"}
-        angle = {"median angle [deg]": f"{of['angle_deg'].median():.1f}"}
-        row = {"rays": name if low else "all", **counts, **angle, **sigmas}
-        rows += [row] if len(of) else []
-    yield pd.DataFrame(rows)
+    for name, of in [*table.groupby(rays.rename("rays"), observed=True), ("all", table)]:
+        row = {"rays": name, "points": len(of), "fraction": f"{100 * len(of) / len(table):.1f} %"}
+        row["median angle [deg]"] = f"{of['angle_deg'].median():.1f}"
+        row |= {f"median sigma {axis} [{unit}]": of_sigma(of[f"sigma_{axis}_m"].median()) for axis in AXES}
+        rows.append(row)
     small = int((table["angle_deg"] < _SMALL_DEG).sum())
+    yield Heading("Object points")
+    yield pd.DataFrame(rows)
     yield Paragraph(
         f"{table['n_images'].mean():.2f} rays per point on average. The angle is the largest between two rays; {small} "
         f"points have less than {_SMALL_DEG:g} degrees."
     )
-    panels = [
-        Plot(partial(plots.plot_intersection_angles, tables), "histogram of intersection angles"),
-        Plot(partial(plots.plot_rays, tables), "number of points by number of rays"),
-    ]
-    in_z = table["sigma_Z_m"][table["sigma_Z_m"] > 0]
-    if len(in_z):
-        words = f"standard deviations of points; 95 % have less than {in_z.quantile(0.95):.3g} {unit} in Z"
-        panels.append(Plot(partial(plots.plot_point_sigmas, tables, unit=unit), words))
-    yield panels
+    yield [Plot(partial(plots.plot_intersection_angles, tables), "histogram of intersection angles")]
 
 
 def _check_points(tables: Tables) -> Iterator[Part]:
@@ -503,15 +486,12 @@ def convergence_words(adjusted: Adjustment) -> str:
     if history is None or not n:
         return ""
     refused = int((history.accepted == 0).sum())
-    bent = int(((history.bent > 0) & (history.accepted > 0)).sum())
-    words = counted(n, "step") + (f", {bent} of them along a curve (weakly determined unknowns)" if bent else "")
-    words += f", {refused} of them rejected and repeated with more damping" if refused else ""
+    words = counted(n, "step") + (f", {refused} of them rejected and repeated with more damping" if refused else "")
     last = history.length[-1] if len(history.length) == n else np.nan
     if adjusted.outcome is Outcome.CONVERGED:
         return f"{words}. Converged: the last moved no unknown by more than {last:.1e} of its standard deviation."
     if adjusted.outcome is Outcome.STEPS:
-        moved = f"; the last would still move unknowns by up to {last:.2g} sigma" if np.isfinite(last) else ""
-        return f"{words}, the maximum (--max-steps){moved}."
+        return f"{words}, the maximum (--max-steps); the last would still move unknowns by up to {last:.2g} sigma."
     return f"{words}. {adjusted.outcome.value.partition(': ')[2]}."
 
 
@@ -519,11 +499,6 @@ def report_title(block: Block) -> str:
     """Return the title of a block and the program it was converted from."""
     name = block.title or "jaxphoto adjustment"
     return f"{name}, converted from {block.converted_from}" if block.converted_from else name
-
-
-def assumed_pixels(sensors: Mapping[str, Sensor]) -> list[Part]:
-    """Return a paragraph on cameras with assumed pixel size, if there are any."""
-    return [Paragraph(words)] if (words := assumed_pixel_words(sensors)) else []
 
 
 def assumed_pixel_words(sensors: Mapping[str, Sensor]) -> str:
@@ -536,6 +511,11 @@ def assumed_pixel_words(sensors: Mapping[str, Sensor]) -> str:
         f"The pixel size {which} is unknown: {sensors[cameras[0]].pixel_mm:g} mm is assumed. All camera "
         "parameters in mm or its powers scale with it; values in pixels and on the ground do not."
     )
+
+
+def assumed_pixels(sensors: Mapping[str, Sensor]) -> list[Part]:
+    """Return a paragraph on cameras with assumed pixel size, if there are any."""
+    return [Paragraph(words)] if (words := assumed_pixel_words(sensors)) else []
 
 
 # Positional accuracy ---------------------------------------------------------------------------------------------
@@ -552,12 +532,12 @@ def accuracy_sentences(accuracy: PositionalAccuracy) -> list[str]:
             f"Survey standard deviations are missing for some check points ({', '.join(unknown)}): add them to "
             "control_points.csv to claim the class."
         )
-    for axis in accuracy.axes:
-        if axis.biased:
-            sentences.append(
-                f"The mean error in {axis.axis}, {_cm(axis.mean_m)}, exceeds a quarter of its RMSE "
-                f"({_cm(axis.rmse_m)}): look for a shift, such as of a datum or of a geoid, before signing."
-            )
+    sentences += [
+        f"The mean error in {axis.axis}, {_cm(axis.mean_m)}, exceeds a quarter of its RMSE ({_cm(axis.rmse_m)}): look "
+        "for a shift, such as of a datum or of a geoid, before signing."
+        for axis in accuracy.axes
+        if axis.biased
+    ]
     if weak := [t.name for t in accuracy.tested[:2] if t.survey_m > t.rmse_m / 2]:
         sentences.append(
             f"The survey of the check points is not twice as accurate as the tested product ({', '.join(weak)}), as "
@@ -568,19 +548,19 @@ def accuracy_sentences(accuracy: PositionalAccuracy) -> list[str]:
 
 def class_sentences(accuracy: PositionalAccuracy) -> list[str]:
     """Return one sentence on the accuracy class of each component, horizontal first."""
-    return [_class_sentence(t) for t in accuracy.tested]
-
-
-def _class_sentence(t: ComponentAccuracy) -> str:
-    survey = "unknown" if math.isnan(t.survey_m) else _cm(t.survey_m)
-    measured = f"{t.symbol} = {_cm(t.rmse_m)} (block to check points {_cm(t.fit_m)}, survey {survey})"
-    accuracy_class = f"the {t.class_cm:g}-cm {t.symbol} {t.name} positional accuracy class"
-    points = counted(t.n, "check point")
-    if t.claimed:
-        return f"Tested with {points} to meet {accuracy_class}: {measured}."
-    few = f"tested with {points} only, where the standard asks for {LEAST_CHECK_POINTS}"
-    why = few if t.n < LEAST_CHECK_POINTS else f"tested with {points} whose survey errors are not all known"
-    return f"Cannot be claimed: {why}: {measured}, which would be {accuracy_class}."
+    sentences = []
+    for t in accuracy.tested:
+        survey, points = "unknown" if math.isnan(t.survey_m) else _cm(t.survey_m), counted(t.n, "check point")
+        measured = f"{t.symbol} = {_cm(t.rmse_m)} (block to check points {_cm(t.fit_m)}, survey {survey})"
+        accuracy_class = f"the {t.class_cm:g}-cm {t.symbol} {t.name} positional accuracy class"
+        few = f"tested with {points} only, where the standard asks for {LEAST_CHECK_POINTS}"
+        why = few if t.n < LEAST_CHECK_POINTS else f"tested with {points} whose survey errors are not all known"
+        sentences.append(
+            f"Tested with {points} to meet {accuracy_class}: {measured}."
+            if t.claimed
+            else f"Cannot be claimed: {why}: {measured}, which would be {accuracy_class}."
+        )
+    return sentences
 
 
 def _cm(metres: float) -> str:

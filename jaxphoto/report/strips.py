@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +23,7 @@ from jaxphoto.report.draws import in_degrees
 from jaxphoto.report.findings import Finding, Severity, Verdict, p_words
 from jaxphoto.report.formatting import label_unit, of_sigma, with_sigma
 from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot, verdict_parts
-from jaxphoto.report.plots import axes_or_new, draw_matrix, label, new_figure
+from jaxphoto.report.plots import axes_or_new, draw_matrix, label, title
 from jaxphoto.report.results import write_results, write_study
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.terminal import print_lines
@@ -34,8 +34,6 @@ from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from matplotlib.image import AxesImage
 
 _OF_POINTS = (PHOTOGRAPHS, CONTROL, CHECK)
 # Ratio of gaps at surveyed points to their noise above which they are a warning; additional tolerance for few planes
@@ -225,45 +223,28 @@ def _sigma_naught(result: StripAdjustment) -> Iterator[Finding]:
 
 # Plots -----------------------------------------------------------------------------------------------------------
 
-_GAP = "later strip above earlier (cm)"
-# Number of points of a curve per knot; number of strips per row of panels.
-_PLACES, _ABREAST = 12, 4
+# Number of points of a curve per knot.
+_PLACES = 12
 _COMPONENTS = (("position (cm)", 100.0, ("X", "Y", "Z")), ("attitude (mdeg)", 1000.0, ("right", "forward", "up")))
 # Okabe and Ito (2008): distinguishable by colour-blind readers.
 _COLOURS = ("#0072B2", "#E69F00", "#009E73")
 
 
-def differences_figure(before: Raster, after: Raster) -> Figure:
-    """Draw gaps of strips before and after; one colour scale spans 95 % of the gaps before."""
-    figure = new_figure(10.0, 4.6)
-    both = figure.subplots(1, 2, sharex=True, sharey=True)
-    for axes, raster, name in zip(both, (before, after), ("before", "after"), strict=True):
-        shown = _draw_differences(axes, raster, _limit(before))
-        axes.set_title(f"{name}: {axes.get_title(loc='left')}", loc="left")
-    figure.colorbar(shown, ax=list(both), label=_GAP, shrink=0.8)
-    return figure
-
-
 def plot_strip_differences(gaps: Raster, ax: Axes | None = None, *, limit_m: float | None = None) -> Axes:
     """Draw gaps of strips in plan (`lidar.strip_differences`); colours up to `limit_m` (default: 95 % of the gaps)."""
-    ax = axes_or_new(ax)
-    shown = _draw_differences(ax, gaps, _limit(gaps) if limit_m is None else 100 * limit_m)
-    ax.figure.colorbar(shown, ax=ax, label=_GAP, shrink=0.8)
+    ax, limit = axes_or_new(ax), 100 * (_limit(gaps) if limit_m is None else limit_m)
+    (west, south), (east, north) = gaps.extent
+    shown = ax.imshow(100 * gaps.heights, extent=(west, east, south, north), cmap="RdBu_r", vmin=-limit, vmax=limit)
+    ax.figure.colorbar(shown, ax=ax, label="later strip above earlier [cm]", shrink=0.8)
+    title(ax, f"{100 * float(np.sqrt(np.nanmean(gaps.heights**2))):.2g} cm RMS")
+    ax.set(xlabel="X [m]", ylabel="Y [m]", aspect="equal")
+    ax.ticklabel_format(useOffset=False, style="plain")
     return ax
 
 
 def _limit(gaps: Raster) -> float:
-    return 100 * float(np.nanpercentile(np.abs(gaps.heights), 95)) or 1.0
-
-
-def _draw_differences(axes: Axes, gaps: Raster, limit: float) -> AxesImage:
-    """Draw gaps and `limit` in centimetres."""
-    (west, south), (east, north) = gaps.extent
-    shown = axes.imshow(100 * gaps.heights, extent=(west, east, south, north), cmap="RdBu_r", vmin=-limit, vmax=limit)
-    axes.set_title(f"{100 * float(np.sqrt(np.nanmean(gaps.heights**2))):.2g} cm RMS", loc="left")
-    axes.set(xlabel="X (m)", ylabel="Y (m)", aspect="equal")
-    axes.ticklabel_format(useOffset=False, style="plain")
-    return shown
+    """Return the 95 % quantile of the gaps (m)."""
+    return float(np.nanpercentile(np.abs(gaps.heights), 95)) or 0.01
 
 
 def plot_scanner_correlation(result: StripAdjustment, ax: Axes | None = None, *, itself: bool = False) -> Axes:
@@ -278,17 +259,6 @@ def plot_scanner_correlation(result: StripAdjustment, ax: Axes | None = None, *,
     ax, name = axes_or_new(ax), f"scanner with {'itself' if itself else 'camera and mount'}"
     draw_matrix(ax, rho.loc[scanner, columns].to_numpy(), _short(scanner), _short(columns), name)
     return ax
-
-
-def scanner_correlation_figure(result: StripAdjustment) -> Figure:
-    """Draw correlations of the scanner with cameras and mounts, and with itself."""
-    _, scanner, others = _scanner_and_others(result)
-    sets = [(itself, names) for itself, names in ((False, others), (True, scanner)) if names]
-    figure = new_figure(3.4 + 0.52 * sum(len(names) for _, names in sets), 1.9 + 0.33 * len(scanner))
-    panels = figure.subplots(1, len(sets), squeeze=False, width_ratios=[len(names) for _, names in sets])[0]
-    for axes, (itself, _) in zip(panels, sets, strict=True):
-        plot_scanner_correlation(result, axes, itself=itself)
-    return figure
 
 
 def _scanner_and_others(result: StripAdjustment) -> tuple[pd.DataFrame, list[str], list[str]]:
@@ -329,22 +299,6 @@ def plot_trajectory_errors(
     return ax
 
 
-def trajectory_errors_figure(result: StripAdjustment) -> Figure:
-    """Draw position and attitude errors along each strip."""
-    names = result.cloud.strips
-    rows, columns = 2 * -(-len(names) // _ABREAST), min(len(names), _ABREAST)
-    figure = new_figure(1.2 + 2.6 * columns, 0.6 + 1.9 * rows)
-    panels = figure.subplots(rows, columns, squeeze=False)
-    for k, name in enumerate(names):
-        for part in (False, True):
-            panel = panels[2 * (k // _ABREAST) + part, k % _ABREAST]
-            plot_trajectory_errors(result, name, panel, attitude=part)
-            panel.tick_params(labelsize=7)
-    for panel in panels.flat:
-        panel.set_visible(panel.has_data())
-    return figure
-
-
 # Files and terminal ----------------------------------------------------------------------------------------------
 
 # Columns of the strip shifts without a trajectory.
@@ -365,13 +319,12 @@ def write_strips(
     write_corrected: Callable[[Path], tuple[Raster, Raster] | None],
     record: CommandRecord,
 ) -> None:
-    """Write tables, differences.png, report.html, summary.json; with images also the folder `adjustment`.
+    """Write tables, report.html, summary.json; with images also the folder `adjustment`.
 
     `tables` contains the adjustment if it has images. `write_corrected` writes cloud and trajectory into the folder and
-    returns the gaps of the strips before and after. Raises InputError if `directory` contains anything but an earlier
-    result.
+    returns the gaps of the strips before and after.
     """
-    began, seconds = time.perf_counter(), dict(result.adjusted.seconds)
+    seconds = dict(result.adjusted.seconds)
     files = {
         "strips": differences_table(result.differences), "rounds": strip_rounds_table(result.rounds),
         "scanner": calibration_table(result), "trajectory_errors": trajectory_errors_table(result),
@@ -382,24 +335,29 @@ def write_strips(
             write_results(tables, verdict, work / "adjustment", seconds, record=record)
         all_correlations(result).round(_DIGITS).to_csv(work / "correlation.csv")
         gaps = write_corrected(work)
-        figures = {} if gaps is None else {"differences": differences_figure(*gaps)}
         n = len(result.cloud.strips)
         name = f"{n} strip{'s' * (n > 1)}{' and photographs' if result.before else ''}: strip adjustment"
         summary = verdict.summary | {
             "rounds": len(result.rounds), "iteration_converged": result.converged,
             "sigma0": float(result.adjusted.sigma0),
             "pattern": result.errors.calibration.pattern, **surveyed_summary(result),
-            "seconds": seconds | {"write": time.perf_counter() - began},
+            "seconds": seconds,
         }  # fmt: skip
-        parts = [*verdict_parts(verdict), *_sections(result, files, figures.get("differences"))]
-        write_study(work, name, (verdict.headline, verdict.colour), parts, summary, record, files, figures)
+        parts = [*verdict_parts(verdict), *_sections(result, files, gaps)]
+        write_study(work, name, (verdict.headline, verdict.colour), parts, summary, record, files)
 
 
-def _sections(result: StripAdjustment, files: dict[str, pd.DataFrame], gaps: Figure | None) -> Iterator[Part]:
+def _sections(
+    result: StripAdjustment, files: dict[str, pd.DataFrame], gaps: tuple[Raster, Raster] | None
+) -> Iterator[Part]:
     yield Heading("Strips before and after")
     yield _in_tenths_of_mm(files["strips"])
     if gaps is not None:
-        yield Plot(gaps, "gaps of strips over the ground, before and after")
+        limit = _limit(gaps[0])
+        yield [
+            Plot(partial(plot_strip_differences, raster, limit_m=limit), f"gaps of strips over the ground, {when}", 4)
+            for raster, when in zip(gaps, ("before", "after"), strict=True)
+        ]
     if "surveyed_points" in files:
         yield Heading("Control and check points")
         yield Paragraph(
@@ -417,7 +375,14 @@ def _sections(result: StripAdjustment, files: dict[str, pd.DataFrame], gaps: Fig
         yield Paragraph(
             "Parameters with correlations near 1 or -1 are not separable. correlation.csv has all unknowns."
         )
-        yield Plot(scanner_correlation_figure(result), "correlations of the scanner")
+        _, _, others = _scanner_and_others(result)
+        yield [
+            Plot(
+                partial(plot_scanner_correlation, result, itself=itself), f"correlations of the scanner with {words}", 4
+            )
+            for itself, words in ((False, "camera and mount"), (True, "itself"))
+            if itself or others
+        ]
     if result.trajectory is None:
         yield Heading("Shifts of the strips")
         yield files["trajectory_errors"][_SHIFTS]
@@ -427,7 +392,15 @@ def _sections(result: StripAdjustment, files: dict[str, pd.DataFrame], gaps: Fig
             "Trajectory errors along each strip with bands of two standard deviations. Most of these is a common shift "
             "or rotation of all strips, which overlaps do not determine; between strips far less is undetermined."
         )
-        yield Plot(trajectory_errors_figure(result), "errors of the trajectory along each strip")
+        yield [
+            Plot(
+                partial(plot_trajectory_errors, result, name, attitude=attitude),
+                f"trajectory errors of strip {name}",
+                2.6,
+            )
+            for name in result.cloud.strips
+            for attitude in (False, True)
+        ]
     yield Heading("Iterations")
     yield files["rounds"]
 

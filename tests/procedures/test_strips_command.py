@@ -92,7 +92,7 @@ def test_shifts_are_taken_off_the_cloud(cloud_file, tmp_path, monkeypatch, capsy
     (before, _), (after, _) = (read_dsm(out / f"differences_{name}.tif") for name in ("before", "after"))
     # On rolling ground a shift in X and Y makes gaps of both signs about that in Z.
     assert np.nanmedian(before.heights) == pytest.approx(SHIFT[2], abs=0.03) and np.nanstd(before.heights) > 0.01
-    assert np.sqrt(np.nanmean(after.heights**2)) < 0.015 and (out / "differences.png").stat().st_size > 10_000
+    assert np.sqrt(np.nanmean(after.heights**2)) < 0.015
     assert {f.name for f in out.iterdir() if f.suffix == ".csv"} == {
         "strips.csv", "rounds.csv", "scanner.csv", "trajectory_errors.csv", "correlation.csv"
     }  # fmt: skip
